@@ -1,0 +1,37 @@
+"""Shapes of the torch floors are checked while the tests run; fixtures that several folders share."""
+
+import os
+from pathlib import Path
+
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+from jaxtyping import install_import_hook
+
+TORCH_FLOORS = ["linalg", "kernels", "optim", "gp", "models"]
+install_import_hook([f"torch_pbd.{floor}" for floor in TORCH_FLOORS], "beartype.beartype")
+
+import numpy as np  # noqa: E402 - the hook must come first
+import pytest  # noqa: E402
+import torch  # noqa: E402
+
+torch.set_num_threads(1)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
+@pytest.fixture
+def generator():
+    return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture(scope="session")
+def recordings():
+    """Folder of recorded human demonstrations, beside a development checkout; skipped where absent."""
+    default = Path(__file__).parents[2] / "shared" / "data"
+    folder = Path(os.environ.get("TORCH_PBD_DATA", default))
+    if not folder.is_dir():
+        pytest.skip("no recorded demonstrations here; set TORCH_PBD_DATA to a folder that has them")
+    return folder

@@ -1,0 +1,110 @@
+import numpy as np
+import pytest
+import torch
+from scipy.stats import multivariate_normal
+
+from torch_pbd.exceptions import NotPositiveDefiniteError
+from torch_pbd.linalg import (
+    cholesky_with_jitter,
+    gaussian_log_density,
+    safe_cholesky,
+    scale_tril_from_root,
+    symmetrize,
+    tril_to_vector,
+    vector_to_tril,
+)
+
+
+def randn(*shape, generator):
+    return torch.randn(*shape, dtype=torch.float64, generator=generator)
+
+
+@pytest.mark.parametrize("d", [1, 2, 9])
+def test_packing_a_triangle_and_unpacking_it_is_the_identity(d, generator):
+    factor = randn(4, 3, d, d, generator=generator).tril()
+    vector = tril_to_vector(factor)
+    assert vector.shape == (4, 3, d * (d + 1) // 2)
+    assert torch.equal(vector_to_tril(vector), factor)
+
+
+def test_packing_goes_row_by_row():
+    factor = torch.tensor([[1.0, 0.0], [2.0, 3.0]], dtype=torch.float64)
+    assert tril_to_vector(factor).tolist() == [1.0, 2.0, 3.0]
+
+
+def test_unpacking_is_differentiable(generator):
+    vector = randn(2, 6, generator=generator).requires_grad_()
+    assert torch.autograd.gradcheck(vector_to_tril, vector)
+
+
+@pytest.mark.parametrize("d", [9, 10, 11, 13])
+def test_symmetrize_is_symmetric_to_the_last_bit(d, generator):
+    factor = randn(50, d, d, generator=generator).tril()
+    covariance = symmetrize(factor @ factor.mT)
+    assert torch.equal(covariance, covariance.mT)
+
+
+@pytest.mark.parametrize(("d", "rank"), [(1, 3), (2, 2), (9, 20)])
+def test_the_factor_of_a_root_is_that_of_cholesky(d, rank, generator):
+    root = randn(5, d, rank, generator=generator)
+    torch.testing.assert_close(
+        scale_tril_from_root(root), torch.linalg.cholesky(root @ root.mT), rtol=1e-9, atol=1e-11
+    )
+
+
+def test_the_factor_of_a_root_keeps_small_variances_that_a_product_would_lose():
+    small = 1e-12
+    root = torch.tensor([[1.0, 0.0], [1.0, small]], dtype=torch.float64)
+    assert scale_tril_from_root(root)[1, 1].item() == pytest.approx(small, rel=1e-9)
+    assert torch.linalg.cholesky_ex(root @ root.mT).info > 0
+
+
+@pytest.mark.parametrize("rank", [0, 1, 2])
+def test_a_root_of_low_rank_gives_a_singular_factor_and_no_failure(rank, generator):
+    root = randn(4, 3, rank, generator=generator)
+    factor = scale_tril_from_root(root)
+    torch.testing.assert_close(factor @ factor.mT, root @ root.mT, rtol=0, atol=1e-12)
+    assert (factor.diagonal(dim1=-2, dim2=-1) >= 0).all()
+
+
+def test_the_factor_of_a_root_is_differentiable(generator):
+    root = randn(3, 2, 4, generator=generator).requires_grad_()
+    assert torch.autograd.gradcheck(scale_tril_from_root, root)
+
+
+def test_cholesky_adds_no_jitter_where_none_is_needed(generator):
+    root = randn(6, 4, 9, generator=generator)
+    factor, jitter = cholesky_with_jitter(root @ root.mT, name="matrix")
+    assert jitter == 0.0
+    assert torch.equal(factor, torch.linalg.cholesky(root @ root.mT))
+
+
+@pytest.mark.parametrize("scale", [1e-18, 1.0, 1e18])
+def test_jitter_is_relative_and_only_where_it_is_needed(scale):
+    singular = scale * torch.ones(3, 3, dtype=torch.float64)
+    regular = scale * torch.eye(3, dtype=torch.float64)
+    factor, jitter = cholesky_with_jitter(torch.stack([singular, regular]), name="matrix")
+    assert 0 < jitter <= 1e-12
+    torch.testing.assert_close(factor[0] @ factor[0].mT, singular, rtol=1e-11, atol=0)
+    assert torch.equal(factor[1], torch.linalg.cholesky(regular))
+
+
+@pytest.mark.parametrize(
+    ("matrix", "message"),
+    [
+        ([[1.0, 2.0], [2.0, 1.0]], "the prior is not positive definite"),
+        ([[1.0, np.nan], [np.nan, 1.0]], "finite"),
+    ],
+)
+def test_what_is_not_positive_definite_is_an_error_that_names_it(matrix, message):
+    with pytest.raises(NotPositiveDefiniteError, match=message):
+        safe_cholesky(torch.tensor(matrix, dtype=torch.float64), name="the prior")
+
+
+@pytest.mark.parametrize("d", [1, 2, 9])
+def test_log_density_is_that_of_scipy(d, generator):
+    root, residual = randn(d, d + 2, generator=generator), randn(7, d, generator=generator)
+    covariance = root @ root.mT
+    factor = torch.linalg.cholesky(covariance).expand(7, d, d)
+    expected = multivariate_normal(cov=covariance.numpy()).logpdf(residual.numpy())
+    np.testing.assert_allclose(gaussian_log_density(residual, factor), expected.ravel(), rtol=1e-9)

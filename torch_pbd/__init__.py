@@ -1,0 +1,1 @@
+"""Learn how precise people are from demonstrations."""

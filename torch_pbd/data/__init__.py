@@ -1,0 +1,1 @@
+"""Demonstrations: the container, files, alignment, and made ones."""

@@ -1,0 +1,21 @@
+"""The few errors and warnings of this package that Python and scikit-learn do not have."""
+
+
+class NotPositiveDefiniteError(ValueError):
+    """A matrix that must be positive definite is not, even with the largest jitter allowed."""
+
+
+class ModelFileError(ValueError):
+    """A model file is damaged, of a newer version, or not a model of this package."""
+
+
+class DataRankWarning(UserWarning):
+    """The data leave directions of the covariance undetermined; a documented fallback was used."""
+
+
+class DataFormatError(ValueError):
+    """A file of demonstrations cannot be read as what its suffix says."""
+
+
+class ConfigError(ValueError):
+    """A configuration file or a command line cannot be used."""

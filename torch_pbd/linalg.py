@@ -1,0 +1,95 @@
+"""Algebra of symmetric positive definite matrices, batched: ``...`` dimensions come first."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torch_pbd.exceptions import NotPositiveDefiniteError
+
+MAX_JITTER = 1e-6
+"""Largest jitter that :func:`safe_cholesky` adds, relative to the mean of the diagonal."""
+
+
+def symmetrize(matrix: Float[Tensor, "*b d d"]) -> Float[Tensor, "*b d d"]:
+    """Symmetric to the last bit, which ``factor @ factor.mT`` is not for every size."""
+    return 0.5 * (matrix + matrix.mT)
+
+
+def tril_to_vector(scale_tril: Float[Tensor, "*b d d"]) -> Float[Tensor, "*b p"]:
+    """Entries of the lower triangle row by row: (0, 0), (1, 0), (1, 1), (2, 0), ..."""
+    row, column = torch.tril_indices(*scale_tril.shape[-2:], device=scale_tril.device)
+    return scale_tril[..., row, column]
+
+
+def vector_to_tril(vector: Float[Tensor, "*b p"]) -> Float[Tensor, "*b d d"]:
+    """Lower triangular matrix of the entries :func:`tril_to_vector` reads, p = d(d+1)/2."""
+    size = (math.isqrt(8 * vector.shape[-1] + 1) - 1) // 2
+    row, column = torch.tril_indices(size, size, device=vector.device)
+    scale_tril = vector.new_zeros(*vector.shape[:-1], size, size)
+    scale_tril[..., row, column] = vector
+    return scale_tril
+
+
+def scale_tril_from_root(root: Float[Tensor, "*b d r"]) -> Float[Tensor, "*b d d"]:
+    """Lower Cholesky factor of ``root @ root.mT``, its diagonal not negative.
+
+    By a QR decomposition of the transpose, so the product is never formed: small variances keep all their
+    digits beside large ones, and a root of rank below d (fewer demonstrations than outputs, an output that
+    is constant) gives zeros on the diagonal instead of a failure.
+    """
+    n_outputs, rank = root.shape[-2:]
+    if rank < n_outputs:
+        root = torch.cat([root, root.new_zeros(*root.shape[:-1], n_outputs - rank)], dim=-1)
+    upper = torch.linalg.qr(root.mT).R
+    sign = torch.where(upper.diagonal(dim1=-2, dim2=-1) < 0, -1.0, 1.0).to(upper)
+    return (sign.unsqueeze(-1) * upper).mT
+
+
+def cholesky_with_jitter(
+    matrix: Float[Tensor, "*b n n"], *, name: str
+) -> tuple[Float[Tensor, "*b n n"], float]:
+    """Lower Cholesky factors, and the largest jitter any of them needed.
+
+    The jitter is relative to the mean of a matrix's diagonal: none first, then 1e-14 to 1e-6 by factors of
+    ten, only for the matrices of the batch that need it.
+
+    Raises
+    ------
+    NotPositiveDefiniteError
+        If a matrix has an entry that is not finite, or is not positive definite with a jitter of 1e-6.
+    """
+    if not torch.isfinite(matrix).all():
+        raise NotPositiveDefiniteError(f"{name} has entries that are not finite.")
+    factor, info = torch.linalg.cholesky_ex(matrix)
+    identity = torch.eye(matrix.shape[-1]).to(matrix)
+    scale = matrix.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None].abs()
+    jitter, exponent = 0.0, -14
+    while bool((info > 0).any()):
+        jitter = 10.0**exponent
+        if jitter > 1.01 * MAX_JITTER:
+            raise NotPositiveDefiniteError(
+                f"{name} is not positive definite, even with {MAX_JITTER:g} of its mean diagonal added. "
+                "Look for inputs that nearly coincide, a length_scale far above the range of the inputs, "
+                "or a noise_scale of zero on noisy data."
+            )
+        failed = (info > 0)[..., None, None]
+        retried, retried_info = torch.linalg.cholesky_ex(matrix + jitter * scale * identity)
+        factor, info = torch.where(failed, retried, factor), torch.where(info > 0, retried_info, info)
+        exponent += 1
+    return factor, jitter
+
+
+def safe_cholesky(matrix: Float[Tensor, "*b n n"], *, name: str) -> Float[Tensor, "*b n n"]:
+    """Lower Cholesky factors, with the least relative jitter they need; see :func:`cholesky_with_jitter`."""
+    return cholesky_with_jitter(matrix, name=name)[0]
+
+
+def gaussian_log_density(
+    residual: Float[Tensor, "*b d"], scale_tril: Float[Tensor, "*b d d"]
+) -> Float[Tensor, "*b"]:
+    """Log density of N(0, scale_tril @ scale_tril.mT) at each residual."""
+    whitened = torch.linalg.solve_triangular(scale_tril, residual.unsqueeze(-1), upper=False).squeeze(-1)
+    log_det = scale_tril.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    return -0.5 * whitened.square().sum(-1) - log_det - 0.5 * residual.shape[-1] * math.log(2 * math.pi)

@@ -1,0 +1,1 @@
+"""Torch modules that predict a mean and a covariance; batched and differentiable."""
