@@ -1,0 +1,301 @@
+"""L-BFGS that never loses its best point: for one objective, and for many small ones side by side."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from torch_pbd.exceptions import NotPositiveDefiniteError
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a progress callback is told after each evaluation that improved the loss."""
+
+    n_evaluations: int
+    loss: float
+    elapsed: float
+    """Seconds since the start."""
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """How an optimization ended."""
+
+    loss: float
+    loss_curve: tuple[float, ...]
+    """Best loss so far, at each evaluation that improved it; the first is the loss at the start."""
+    n_iter: int
+    converged: bool
+    message: str
+
+
+class _NotFiniteError(ArithmeticError):
+    """The loss or its gradient is not a finite number."""
+
+
+_FAILURES = (
+    _NotFiniteError,
+    NotPositiveDefiniteError,
+    torch.linalg.LinAlgError,  # type: ignore[attr-defined]
+    IndexError,  # torch's strong Wolfe search, when it brackets no minimum
+)
+
+
+@dataclass
+class _BestPoint:
+    """The closure L-BFGS calls: evaluates, and remembers the best parameters it has seen."""
+
+    objective: Callable[[], Tensor]
+    parameters: Sequence[Tensor]
+    callback: Callable[[Progress], None] | None
+    n_evaluations: int = 0
+    curve: list[float] = field(default_factory=list)
+    best: list[Tensor] = field(default_factory=list)
+    started: float = field(default_factory=time.perf_counter)
+
+    def __call__(self) -> float:
+        self.n_evaluations += 1
+        with torch.enable_grad():
+            loss = self.objective()
+            gradients = torch.autograd.grad(loss, self.parameters, allow_unused=True)
+        value = float(loss.detach())
+        for parameter, gradient in zip(self.parameters, gradients, strict=True):
+            parameter.grad = torch.zeros_like(parameter) if gradient is None else gradient.contiguous()
+        finite = all(bool(torch.isfinite(p.grad).all()) for p in self.parameters if p.grad is not None)
+        if value != value or abs(value) == float("inf") or not finite:
+            raise _NotFiniteError(f"the loss or its gradient is not finite (loss {value})")
+        if not self.curve or value < self.curve[-1]:
+            self.curve.append(value)
+            self.best = [parameter.detach().clone() for parameter in self.parameters]
+            if self.callback is not None:
+                self.callback(Progress(self.n_evaluations, value, time.perf_counter() - self.started))
+        return value
+
+    def restore(self) -> None:
+        """Put the best parameters seen back, and drop the gradients."""
+        with torch.no_grad():
+            for parameter, best in zip(self.parameters, self.best, strict=True):
+                parameter.copy_(best)
+                parameter.grad = None
+
+
+def minimize(
+    objective: Callable[[], Tensor],
+    parameters: Sequence[Tensor],
+    *,
+    max_iter: int = 200,
+    tol: float = 1e-8,
+    history_size: int = 20,
+    callback: Callable[[Progress], None] | None = None,
+) -> FitReport:
+    """Minimize a scalar objective by L-BFGS with a strong Wolfe line search; leaves the best point seen.
+
+    ``torch.optim.LBFGS`` can raise from its line search, and can return from a failed one at a worse point.
+    Here every evaluation is remembered, and a failed run is restarted from the best point with a halved
+    first step, at most three times.
+
+    Parameters
+    ----------
+    objective : callable
+        Returns the loss, a scalar tensor, at the present values of ``parameters``.
+    parameters : sequence of Tensor
+        Leaf tensors, changed in place.
+    max_iter : int, default=200
+        Largest number of L-BFGS iterations, over all restarts.
+    tol : float, default=1e-8
+        Stop when the largest gradient entry, or the change of the loss, is below it: scale the objective
+        so that one unit matters.
+    history_size : int, default=20
+        Pairs of steps and gradient changes kept.
+    callback : callable, optional
+        Called with a :class:`Progress` after each improvement.
+
+    Returns
+    -------
+    FitReport
+        Its loss is never above that of the start.
+
+    Raises
+    ------
+    ValueError
+        If the loss or its gradient is not finite at the start.
+    """
+    point = _BestPoint(objective, parameters, callback)
+    try:
+        point()
+    except _FAILURES as error:
+        raise ValueError(f"The optimization cannot start: {error}.") from error
+    n_iter, step_size, reason = 0, 1.0, ""
+    for _ in range(4):
+        optimizer = torch.optim.LBFGS(
+            list(parameters),
+            lr=step_size,
+            max_iter=max_iter - n_iter,
+            max_eval=2 * (max_iter - n_iter) + 20,
+            tolerance_grad=tol,
+            tolerance_change=tol * max(1.0, abs(point.curve[0])) * 1e-2,
+            history_size=history_size,
+            line_search_fn="strong_wolfe",
+        )
+        reason = ""
+        try:
+            optimizer.step(point)
+        except _FAILURES as error:
+            reason = str(error) or type(error).__name__
+        n_iter += max(1, optimizer.state[optimizer._params[0]].get("n_iter", 0))
+        point.restore()
+        if not reason or n_iter >= max_iter:
+            break
+        step_size /= 2
+    converged = not reason and n_iter < max_iter
+    message = reason or ("converged" if converged else f"stopped at max_iter={max_iter} iterations")
+    return FitReport(point.curve[-1], tuple(point.curve), n_iter, converged, message)
+
+
+@dataclass(frozen=True)
+class BatchReport:
+    """How the optimizations of a batch ended, each for itself."""
+
+    loss: Float[Tensor, " b"]
+    n_iter: int
+    converged: bool
+    """All of them."""
+
+
+def minimize_batch(
+    objective: Callable[[Float[Tensor, "a p"], Int64[Tensor, " a"]], Float[Tensor, " a"]],
+    start: Float[Tensor, "b p"],
+    *,
+    max_iter: int = 100,
+    tol: float = 1e-6,
+    history_size: int = 10,
+) -> tuple[Float[Tensor, "b p"], BatchReport]:
+    """Minimize b unrelated objectives of p parameters by L-BFGS, their evaluations in one batch.
+
+    Each problem has its own curvature pairs, its own step and its own end: a joint L-BFGS over all of them
+    would share one line search and one memory between problems that have nothing to do with each other.
+    Steps are accepted by the Armijo rule, so the loss never rises; a value that is not finite counts as
+    too far.
+
+    Parameters
+    ----------
+    objective : callable
+        Given parameters of a problems and their indices in the batch, returns their a losses.
+    start : Tensor of shape (b, p)
+        Where to start; the losses there must be finite.
+    max_iter, tol, history_size
+        As in :func:`minimize`.
+
+    Returns
+    -------
+    parameters : Tensor of shape (b, p)
+    report : BatchReport
+    """
+    x = start.detach().clone()
+    rows = torch.arange(len(x), device=x.device)
+    loss, gradient = _value_and_gradient(objective, x, rows)
+    if not torch.isfinite(loss).all():
+        raise ValueError("The optimization cannot start: a loss is not finite at the start.")
+    memory = _CurvatureMemory(history_size)
+    active = gradient.abs().amax(-1) > tol
+    n_iter = 0
+    while n_iter < max_iter and bool(active.any()):
+        n_iter += 1
+        direction = memory.direction(gradient)
+        slope = (direction * gradient).sum(-1)
+        uphill = ~(slope < 0)
+        direction = torch.where(uphill[:, None], -gradient, direction)
+        slope = torch.where(uphill, -gradient.square().sum(-1), slope)
+        norm = direction.norm(dim=-1)
+        step = (
+            torch.where(norm > 1.0, 1.0 / norm, torch.ones_like(norm))
+            if n_iter == 1
+            else torch.ones_like(norm)
+        )
+        new_x, new_loss, new_gradient = _backtrack(
+            objective, x, loss, gradient, direction, slope, step, active
+        )
+        memory.add(new_x - x, new_gradient - gradient)
+        gain = loss - new_loss
+        x, loss, gradient = new_x, new_loss, new_gradient
+        settled = gain <= tol * 1e-2 * loss.abs().clamp_min(1.0)
+        active = active & (gradient.abs().amax(-1) > tol) & ~settled
+    return x, BatchReport(loss, n_iter, not bool(active.any()))
+
+
+class _CurvatureMemory:
+    """Pairs of steps and gradient changes, for each problem of a batch; the two-loop recursion on them."""
+
+    def __init__(self, size: int) -> None:
+        self._size = size
+        self._pairs: list[tuple[Tensor, Tensor, Tensor]] = []
+
+    def add(self, step: Tensor, change: Tensor) -> None:
+        curvature = (step * change).sum(-1)
+        usable = curvature > 1e-10 * step.norm(dim=-1) * change.norm(dim=-1)
+        inverse = torch.where(usable, 1.0 / curvature.where(usable, torch.ones_like(curvature)), 0.0)
+        self._pairs = [*self._pairs, (step, change, inverse)][-self._size :]
+
+    def direction(self, gradient: Tensor) -> Tensor:
+        vector = -gradient
+        scale = torch.ones_like(gradient[:, 0])
+        projections = []
+        for step, change, inverse in reversed(self._pairs):
+            projection = inverse * (step * vector).sum(-1)
+            vector = vector - projection[:, None] * change
+            projections.append(projection)
+        for step, change, inverse in self._pairs:
+            fitted = (step * change).sum(-1) / change.square().sum(-1).clamp_min(1e-300)
+            scale = torch.where(inverse > 0, fitted, scale)
+        vector = scale[:, None] * vector
+        for (step, change, inverse), projection in zip(self._pairs, reversed(projections), strict=True):
+            vector = vector + (projection - inverse * (change * vector).sum(-1))[:, None] * step
+        return vector
+
+
+def _value_and_gradient(
+    objective: Callable[[Tensor, Tensor], Tensor], x: Tensor, rows: Tensor
+) -> tuple[Tensor, Tensor]:
+    with torch.enable_grad():
+        leaf = x.detach().requires_grad_()
+        loss = objective(leaf, rows)
+        (gradient,) = torch.autograd.grad(loss.sum(), leaf)
+    return loss.detach(), gradient
+
+
+def _backtrack(
+    objective: Callable[[Tensor, Tensor], Tensor],
+    x: Tensor,
+    loss: Tensor,
+    gradient: Tensor,
+    direction: Tensor,
+    slope: Tensor,
+    step: Tensor,
+    active: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Shorten each active problem's step until its loss falls enough; the others stay where they are."""
+    new_x, new_loss, new_gradient = x.clone(), loss.clone(), gradient.clone()
+    rows = active.nonzero().squeeze(-1)
+    for _ in range(25):
+        if len(rows) == 0:
+            break
+        trial = x[rows] + step[rows, None] * direction[rows]
+        value, trial_gradient = _value_and_gradient(objective, trial, rows)
+        finite = torch.isfinite(value) & torch.isfinite(trial_gradient).all(-1)
+        accepted = finite & (value <= loss[rows] + 1e-4 * step[rows] * slope[rows])
+        done = rows[accepted]
+        new_x[done], new_loss[done], new_gradient[done] = (
+            trial[accepted],
+            value[accepted],
+            trial_gradient[accepted],
+        )
+        # The minimum of the parabola through both values and the slope, kept within a tenth and a half.
+        parabola = -0.5 * step[rows] * slope[rows] / ((value - loss[rows]) / step[rows] - slope[rows])
+        shorter = torch.where(finite, parabola, 0.1 * step[rows])
+        step = step.index_copy(0, rows, shorter.clamp(0.1 * step[rows], 0.5 * step[rows]))
+        rows = rows[~accepted]
+    return new_x, new_loss, new_gradient
