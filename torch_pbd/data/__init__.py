@@ -1,1 +1,24 @@
 """Demonstrations: the container, files, alignment, and made ones."""
+
+from torch_pbd.data.demonstrations import Demonstrations
+from torch_pbd.data.io import load_demonstrations, save_demonstrations
+from torch_pbd.data.synthetic import (
+    make_paper_simulation,
+    make_tunnel_demonstrations,
+    paper_covariance,
+    paper_mean,
+    tunnel_center,
+    tunnel_half_width,
+)
+
+__all__ = [
+    "Demonstrations",
+    "load_demonstrations",
+    "make_paper_simulation",
+    "make_tunnel_demonstrations",
+    "paper_covariance",
+    "paper_mean",
+    "save_demonstrations",
+    "tunnel_center",
+    "tunnel_half_width",
+]

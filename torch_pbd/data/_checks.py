@@ -1,0 +1,182 @@
+"""What a set of recordings must be before it becomes ``Demonstrations``."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torch_pbd.data.alignment import Floats
+
+MIN_SAMPLES = 2
+
+
+def as_recordings(times: Any, positions: Any) -> tuple[tuple[Floats, ...], tuple[Floats, ...]]:
+    """Read-only float64 copies: K times (T_k,) and K positions (T_k, d)."""
+    recordings = [_as_position(p, k) for k, p in enumerate(_as_list(positions, "positions"))]
+    stamps = _as_list(times, "times")
+    if _as_numbers(stamps[0], "times[0]").ndim == 0:
+        time = _as_time(times, "times")
+        _check_shared_length(len(time), recordings)
+        grids = [time] * len(recordings)
+    elif len(stamps) != len(recordings):
+        raise ValueError(
+            f"times has {len(stamps)} arrays but positions has {len(recordings)} demonstrations: give one "
+            "time array for each demonstration, or one 1-D array that all of them share."
+        )
+    else:
+        grids = [_as_time(time, f"times[{k}]") for k, time in enumerate(stamps)]
+    _check_consistent(grids, recordings)
+    return tuple(grids), tuple(recordings)
+
+
+def as_labels(labels: str | Sequence[str], n_outputs: int, argument: str) -> tuple[str, ...]:
+    """One string for each output."""
+    values = (labels,) if isinstance(labels, str) else tuple(labels)
+    if not all(isinstance(value, str) for value in values):
+        raise ValueError(f"{argument} must be strings, one for each output; got {values}.")
+    if len(values) != n_outputs:
+        raise ValueError(
+            f"{argument} has {len(values)} entries {preview(values)} but the demonstrations have {n_outputs} "
+            "outputs: give one for each output."
+        )
+    return values
+
+
+def preview(values: Sequence[object], limit: int = 12) -> str:
+    """The values as a list, cut where it gets long."""
+    shown = ", ".join(str(value) for value in values[:limit])
+    return f"[{shown}, ... {len(values)} in all]" if len(values) > limit else f"[{shown}]"
+
+
+def check_choice(value: str, choices: Sequence[str], argument: str) -> None:
+    """A string that must be one of a few."""
+    if value not in choices:
+        raise ValueError(f"{argument}={value!r} is not one of {', '.join(map(repr, choices))}.")
+
+
+def check_n_steps(n: int) -> None:
+    """A number of samples."""
+    if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < MIN_SAMPLES:
+        raise ValueError(f"n={n!r} must be an integer of at least {MIN_SAMPLES}: the number of points.")
+
+
+def _as_list(values: Any, argument: str) -> list[Any]:
+    try:
+        entries = list(values)
+    except TypeError as error:
+        raise ValueError(
+            f"{argument} must be a list with one array for each demonstration, or one array; got {values!r}."
+        ) from error
+    if not entries:
+        raise ValueError(f"{argument} is empty: at least one demonstration is needed.")
+    return entries
+
+
+def _as_numbers(values: Any, argument: str) -> NDArray[Any]:
+    if np.ma.is_masked(values):
+        raise ValueError(f"{argument} has masked entries: drop these samples or fill them in first.")
+    try:
+        array = np.asarray(values)
+    except ValueError as error:
+        raise ValueError(f"{argument} is ragged, its rows have different lengths: {error}") from error
+    if array.dtype.kind not in "fiu":
+        raise ValueError(
+            f"{argument} has dtype {array.dtype}: real numbers are needed. Convert it, e.g. with "
+            ".astype(float), once it holds nothing else."
+        )
+    return array
+
+
+def _frozen(array: NDArray[Any]) -> Floats:
+    copy = np.array(array, dtype=np.float64, order="C")
+    copy.setflags(write=False)
+    return copy
+
+
+def _as_position(values: Any, k: int) -> Floats:
+    array = _as_numbers(values, f"positions[{k}]")
+    if array.ndim == 1:
+        array = array[:, np.newaxis]
+    if array.ndim != 2 or array.shape[1] == 0:
+        raise ValueError(
+            f"positions[{k}] has shape {np.shape(values)}: a demonstration is (n_samples, n_outputs), or "
+            "(n_samples,) for one output. One demonstration alone is written [positions]."
+        )
+    position = _frozen(array)
+    if not np.isfinite(position).all():
+        i, j = np.argwhere(~np.isfinite(position))[0]
+        raise ValueError(
+            f"positions[{k}] is {position[i, j]} at sample {i}, output {j}: all values must be finite. "
+            "Drop or fill in the missing samples first."
+        )
+    return position
+
+
+def _as_time(values: Any, argument: str) -> Floats:
+    array = _as_numbers(values, argument)
+    if array.ndim != 1:
+        raise ValueError(f"{argument} has shape {array.shape}: times are 1-D, one for each sample.")
+    if len(array) < MIN_SAMPLES:
+        raise ValueError(
+            f"{argument} has {len(array)} samples: a demonstration needs at least {MIN_SAMPLES}."
+        )
+    time = _frozen(array)
+    if not np.isfinite(time).all():
+        i = int(np.argmin(np.isfinite(time)))
+        raise ValueError(f"{argument} is {time[i]} at sample {i}: all times must be finite.")
+    _check_rising(time, array, argument)
+    return time
+
+
+def _check_rising(time: Floats, original: NDArray[Any], argument: str) -> None:
+    coarse = _coarseness(original)
+    falls = np.flatnonzero(np.diff(time) <= 0)
+    if len(falls):
+        i = int(falls[0]) + 1
+        raise ValueError(
+            f"{argument} must increase strictly, but sample {i} is at {time[i]!s} after {time[i - 1]!s}. "
+            f"Sort the samples by time and drop repeated ones.{coarse}"
+        )
+    if coarse:
+        raise ValueError(f"{argument} is too coarse for its own steps.{coarse}")
+
+
+def _coarseness(time: NDArray[Any]) -> str:
+    """Why times of low precision (unix time in float32) are unusable; empty if they are not."""
+    if time.dtype.kind != "f" or time.dtype.itemsize >= 8:
+        return ""
+    resolution = float(np.spacing(np.abs(time).max()))
+    step = float(time[-1] - time[0]) / (len(time) - 1)
+    if resolution <= 0.25 * step:
+        return ""
+    return (
+        f" It is {time.dtype}, which resolves {resolution:.3g} at {float(time[-1]):.6g}, where the mean "
+        f"step is {step:.3g}: record times as float64, or count them from the start of the demonstration."
+    )
+
+
+def _check_shared_length(n_samples: int, recordings: list[Floats]) -> None:
+    lengths = [len(position) for position in recordings]
+    if any(length != n_samples for length in lengths):
+        alone = " One demonstration alone is written [positions]." if len(recordings) == n_samples else ""
+        raise ValueError(
+            f"times is one array of {n_samples} samples for all demonstrations, but positions have lengths "
+            f"{preview(lengths)}: give each demonstration its own times, then use .resample() or "
+            f".align().{alone}"
+        )
+
+
+def _check_consistent(grids: list[Floats], recordings: list[Floats]) -> None:
+    n_outputs = recordings[0].shape[1]
+    for k, (time, position) in enumerate(zip(grids, recordings, strict=True)):
+        if len(time) != len(position):
+            raise ValueError(
+                f"times[{k}] has {len(time)} samples but positions[{k}] has {len(position)}: each sample "
+                "needs its time."
+            )
+        if position.shape[1] != n_outputs:
+            raise ValueError(
+                f"positions[{k}] has {position.shape[1]} outputs but positions[0] has {n_outputs}: all "
+                "demonstrations must have the same outputs."
+            )

@@ -1,0 +1,163 @@
+"""Demonstrations as CSV text: one line a sample."""
+
+import csv
+import io
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from math import isfinite
+from pathlib import Path
+from typing import BinaryIO, TextIO
+
+from torch_pbd.data._checks import check_choice, preview
+from torch_pbd.data.demonstrations import Demonstrations
+from torch_pbd.exceptions import DataFormatError
+
+DELIMITERS = (",", ";", "\t")
+
+
+def read_csv(
+    path: Path,
+    max_bytes: int,
+    demo: str | None = "demo",
+    time: str = "time",
+    outputs: Sequence[str] | None = None,
+    delimiter: str | None = None,
+    decimal: str = ".",
+    units: str | Sequence[str] | None = None,
+    frame: str | None = None,
+    time_unit: str = "s",
+) -> Demonstrations:
+    """Read the format of `torch_pbd.data.load_demonstrations`, where the options are told."""
+    check_choice(decimal, (".", ","), "decimal")
+    if delimiter is not None and (len(delimiter) != 1 or delimiter == decimal):
+        raise ValueError(
+            f"delimiter={delimiter!r} must be one character, and not the decimal mark {decimal!r}."
+        )
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        try:
+            table = _open_table(path, file, delimiter, decimal, wanted=[*([demo] if demo else []), time])
+            names = table.output_names(outputs, taken=[demo, time])
+            recorded = table.recordings(demo, [time, *names])
+        except UnicodeDecodeError as error:
+            raise DataFormatError(f"{path} is not text in UTF-8: {error}.") from error
+    try:
+        return Demonstrations(
+            [[row[0] for row in rows] for rows in recorded],
+            [[row[1:] for row in rows] for rows in recorded],
+            names=names,
+            units=units,
+            frame=frame,
+            time_unit=time_unit,
+        )
+    except ValueError as error:
+        raise DataFormatError(f"{path}: {error}") from error
+
+
+def write_csv(demonstrations: Demonstrations, handle: BinaryIO) -> None:
+    """Write columns ``demo,time,<names>``; the shortest decimals that come back to the last bit."""
+    unusable = [name for name in demonstrations.names if name in ("demo", "time") or name != name.strip()]
+    if unusable:
+        raise ValueError(f"an output named {unusable[0]!r} cannot be told from the other columns: rename it.")
+    text = io.TextIOWrapper(handle, encoding="utf-8", newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["demo", "time", *demonstrations.names])
+    for k, (time, position) in enumerate(demonstrations):
+        rows = zip(time.tolist(), position.tolist(), strict=True)
+        writer.writerows([k, t, *values] for t, values in rows)
+    text.detach()
+
+
+def _open_table(path: Path, file: TextIO, delimiter: str | None, decimal: str, wanted: list[str]) -> "_Table":
+    """Read the header; the delimiter is the one that finds the columns wanted, and most columns."""
+    first = file.readline()
+    candidates = [delimiter] if delimiter else [mark for mark in DELIMITERS if mark != decimal]
+    headers = [[name.strip() for name in next(csv.reader([first], delimiter=c), [])] for c in candidates]
+    header = max(headers, key=lambda names: (set(wanted) <= set(names), len(names)))
+    missing = [name for name in wanted if name not in header]
+    if missing:
+        raise DataFormatError(
+            f"{path}, line 1: no column {missing[0]!r} among {preview(header)}. Name the columns by "
+            "the options demo=, time= and outputs= (demo=None: one demonstration), or give the delimiter."
+        )
+    twice = [name for name in header if header.count(name) > 1]
+    if twice:
+        raise DataFormatError(f"{path}, line 1: there are two columns {twice[0]!r}.")
+    return _Table(path, file, header, candidates[headers.index(header)], decimal)
+
+
+@dataclass(frozen=True)
+class _Table:
+    """A CSV file whose header has been read: its numbers, with the lines they stand in."""
+
+    path: Path
+    file: TextIO
+    header: list[str]
+    delimiter: str
+    decimal: str
+
+    def output_names(self, outputs: Sequence[str] | None, taken: Sequence[str | None]) -> list[str]:
+        """Columns of the outputs, in their order."""
+        if outputs is None:
+            names = [name for name in self.header if name not in taken]
+        else:
+            names = [outputs] if isinstance(outputs, str) else list(outputs)
+        missing = [name for name in names if name not in self.header]
+        if missing or not names:
+            what = f"no column {missing[0]!r}" if missing else "no column of outputs"
+            raise DataFormatError(f"{self.path}, line 1: {what} among {preview(self.header)}.")
+        return names
+
+    def recordings(self, demo: str | None, columns: Sequence[str]) -> list[list[list[float]]]:
+        """Rows of ``columns``, time first, of each demonstration, in the order they first appear."""
+        indices = [self.header.index(name) for name in columns]
+        label_index = None if demo is None else self.header.index(demo)
+        recorded: dict[str, list[list[float]]] = {}
+        for line, cells in self._rows():
+            label = "" if label_index is None else cells[label_index].strip()
+            if label_index is not None and not label:
+                raise DataFormatError(f"{self.path}, line {line}, column {demo!r}: the cell is blank.")
+            row = [self._number(cells[i], line, self.header[i]) for i in indices]
+            rows = recorded.setdefault(label, [])
+            if rows and row[0] <= rows[-1][0]:
+                raise DataFormatError(
+                    f"{self.path}, line {line}, column {columns[0]!r}: {row[0]!r} comes after "
+                    f"{rows[-1][0]!r} in demonstration {label!r}: times must increase strictly. Sort the "
+                    "lines by time and drop repeated ones."
+                )
+            rows.append(row)
+        return list(recorded.values())
+
+    def _rows(self) -> Iterator[tuple[int, list[str]]]:
+        reader = csv.reader(self.file, delimiter=self.delimiter)
+        while True:
+            try:
+                cells = next(reader, None)
+            except csv.Error as error:
+                raise DataFormatError(f"{self.path}, line {reader.line_num + 1}: {error}.") from error
+            if cells is None:
+                return
+            if not cells:
+                continue
+            if len(cells) != len(self.header):
+                raise DataFormatError(
+                    f"{self.path}, line {reader.line_num + 1}: {len(cells)} cells under {len(self.header)} "
+                    f"column names (delimiter {self.delimiter!r}, decimal mark {self.decimal!r})."
+                )
+            yield reader.line_num + 1, cells
+
+    def _number(self, cell: str, line: int, column: str) -> float:
+        text = cell.strip()
+        foreign = "_" if self.decimal == "." else "_."
+        try:
+            if any(mark in text for mark in foreign):
+                raise ValueError
+            value = float(text.replace(self.decimal, "."))
+        except ValueError:
+            value = float("nan")
+        if not isfinite(value):
+            what = f"{text!r} is not a finite number" if text else "the cell is blank"
+            raise DataFormatError(
+                f"{self.path}, line {line}, column {column!r}: {what} (decimal mark {self.decimal!r}). "
+                "Drop the line, or fill the value in."
+            )
+        return value

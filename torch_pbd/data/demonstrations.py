@@ -1,0 +1,297 @@
+"""The container: K recordings of one task, checked once, never changed."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal, NamedTuple, final, overload
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from torch_pbd.data._checks import as_labels, as_recordings, check_choice, check_n_steps, preview
+from torch_pbd.data.alignment import Floats, dtw_warps, interpolate, unit_phases
+
+MAX_DEFAULT_STEPS = 200
+"""Most points `Demonstrations.align` takes of its own accord."""
+
+
+class Demonstration(NamedTuple):
+    """One recording: ``time`` (T,) and ``position`` (T, d), both read-only."""
+
+    time: Floats
+    position: Floats
+
+
+@final
+class Demonstrations:
+    """K recordings of one task, of any lengths and sampling times, with the same d outputs.
+
+    The container is immutable: its arrays are read-only float64 copies, and every method returns a new one.
+    Axis order is (demonstration, step, output).
+
+    Parameters
+    ----------
+    times : sequence of K array_like of shape (T_k,), or array_like of shape (T,)
+        Strictly increasing times of the samples, or one array that all demonstrations share.
+    positions : sequence of K array_like of shape (T_k, d), or array_like of shape (K, T, d)
+        What was recorded. Demonstrations of one output may be 1-D.
+    names : sequence of d str, default=None
+        Names of the outputs; None calls them y0, y1, ...
+    units : str or sequence of d str, default=None
+        Units of the outputs; one string is the unit of all of them.
+    frame : str, default=None
+        Name of the coordinate frame.
+    time_unit : str, default="s"
+        Unit of ``times``; "1" for phase.
+
+    Raises
+    ------
+    ValueError
+        If there is no demonstration, if lengths or numbers of outputs disagree, if a demonstration has fewer
+        than two samples, if a value is not a finite real number, or if times do not increase strictly or are
+        stored too coarsely to tell samples apart.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from torch_pbd.data import Demonstrations
+    >>> recorded = Demonstrations([[0.0, 1.0, 2.0], [0.0, 2.0]], [[0.0, 1.0, 4.0], [0.0, 4.0]], names=["x"])
+    >>> recorded
+    Demonstrations(n_demos=2, n_steps=2..3, outputs=('x',), time_unit='s', aligned=False)
+    >>> recorded.align(n=3).to_array()[:, :, 0]
+    array([[0., 1., 4.],
+           [0., 2., 4.]])
+    """
+
+    __slots__ = ("_frame", "_names", "_positions", "_time_unit", "_times", "_units")
+
+    def __init__(
+        self,
+        times: ArrayLike | Sequence[ArrayLike],
+        positions: ArrayLike | Sequence[ArrayLike],
+        *,
+        names: Sequence[str] | None = None,
+        units: str | Sequence[str] | None = None,
+        frame: str | None = None,
+        time_unit: str = "s",
+    ) -> None:
+        self._times, self._positions = as_recordings(times, positions)
+        d = self.n_outputs
+        self._names = as_labels([f"y{i}" for i in range(d)] if names is None else names, d, "names")
+        if len(set(self._names)) < d:
+            raise ValueError(f"names must differ from each other; got {preview(self._names)}.")
+        per_output = (units,) * d if isinstance(units, str) else units
+        self._units = None if per_output is None else as_labels(per_output, d, "units")
+        self._frame = frame
+        self._time_unit = time_unit
+
+    @property
+    def times(self) -> tuple[Floats, ...]:
+        """Times (T_k,) of each demonstration."""
+        return self._times
+
+    @property
+    def positions(self) -> tuple[Floats, ...]:
+        """Positions (T_k, d) of each demonstration."""
+        return self._positions
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Name of each output."""
+        return self._names
+
+    @property
+    def units(self) -> tuple[str, ...] | None:
+        """Unit of each output, or None where it was not told."""
+        return self._units
+
+    @property
+    def frame(self) -> str | None:
+        """Name of the coordinate frame."""
+        return self._frame
+
+    @property
+    def time_unit(self) -> str:
+        """Unit of the times; "1" where they are phases."""
+        return self._time_unit
+
+    @property
+    def n_outputs(self) -> int:
+        """Number of outputs d."""
+        return self._positions[0].shape[1]
+
+    @property
+    def n_steps(self) -> tuple[int, ...]:
+        """Number of samples T_k of each demonstration."""
+        return tuple(len(time) for time in self._times)
+
+    @property
+    def is_aligned(self) -> bool:
+        """Whether all demonstrations share exactly one grid of times."""
+        first = self._times[0]
+        return all(time is first or np.array_equal(time, first) for time in self._times)
+
+    def __len__(self) -> int:
+        return len(self._times)
+
+    def __iter__(self) -> Iterator[Demonstration]:
+        return map(Demonstration, self._times, self._positions)
+
+    @overload
+    def __getitem__(self, index: int) -> Demonstration: ...
+    @overload
+    def __getitem__(self, index: slice | Sequence[int] | NDArray[Any]) -> "Demonstrations": ...
+    def __getitem__(
+        self, index: int | slice | Sequence[int] | NDArray[Any]
+    ) -> "Demonstration | Demonstrations":
+        """One demonstration by its number; several by a slice, a list of numbers or a mask."""
+        chosen = np.arange(len(self))[index]
+        if chosen.ndim == 0:
+            return Demonstration(self._times[chosen], self._positions[chosen])
+        return self._replace([self._times[k] for k in chosen], [self._positions[k] for k in chosen])
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Demonstrations):
+            return NotImplemented
+        return self._labels() == other._labels() and all(
+            len(mine) == len(theirs) and all(map(np.array_equal, mine, theirs))
+            for mine, theirs in [(self._times, other._times), (self._positions, other._positions)]
+        )
+
+    def __repr__(self) -> str:
+        shortest, longest = min(self.n_steps), max(self.n_steps)
+        n_steps = f"{longest}" if shortest == longest else f"{shortest}..{longest}"
+        outputs = f"outputs={self._names}" if self.n_outputs <= 6 else f"n_outputs={self.n_outputs}"
+        return (
+            f"Demonstrations(n_demos={len(self)}, n_steps={n_steps}, {outputs}, "
+            f"time_unit={self._time_unit!r}, aligned={self.is_aligned})"
+        )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # By way of __init__: NumPy forgets that an array is read-only when it is pickled or copied.
+        return _rebuild, (self._times, self._positions, self._labels())
+
+    def stack(self, input: Literal["time", "phase"] = "time") -> tuple[Floats, Floats, NDArray[np.intp]]:
+        """All samples below each other, as scikit-learn's estimators want them.
+
+        Parameters
+        ----------
+        input : {"time", "phase"}, default="time"
+            "phase" maps the time of each demonstration affinely onto 0..1. Rows of demonstrations whose grids
+            differ only by offset and duration repeat to the last bit, by which estimators know aligned data.
+
+        Returns
+        -------
+        X : ndarray of shape (n, 1)
+            Time in ``time_unit``, or phase.
+        y : ndarray of shape (n, d)
+        groups : ndarray of shape (n,)
+            Number of the demonstration, for GroupKFold and LeaveOneGroupOut.
+        """
+        check_choice(input, ("time", "phase"), "input")
+        inputs = self._times if input == "time" else unit_phases(self._times)
+        groups = np.repeat(np.arange(len(self)), self.n_steps)
+        return np.concatenate(inputs)[:, np.newaxis], np.concatenate(self._positions), groups
+
+    def to_array(self) -> Floats:
+        """Positions (K, T, d) of aligned demonstrations.
+
+        Raises
+        ------
+        ValueError
+            If the demonstrations do not share one grid of times.
+        """
+        if not self.is_aligned:
+            lengths = preview(self.n_steps)
+            raise ValueError(
+                f"the demonstrations are not aligned (lengths {lengths}, or times that differ): use .align() "
+                "for a common phase, or .resample(n) where all cover the same time."
+            )
+        return np.stack(self._positions)
+
+    def resample(self, n: int) -> "Demonstrations":
+        """Each demonstration at ``n`` points evenly spaced over its own time, by linear interpolation.
+
+        Demonstrations that start and end at the same times are aligned afterwards.
+        """
+        check_n_steps(n)
+        grids = [np.linspace(time[0], time[-1], n) for time in self._times]
+        return self._replace(grids, list(map(interpolate, self._times, self._positions, grids)))
+
+    def align(self, method: Literal["phase", "dtw"] = "phase", n: int | None = None) -> "Demonstrations":
+        """All demonstrations on one grid of phases, evenly spaced over 0..1; ``time_unit`` becomes "1".
+
+        Parameters
+        ----------
+        method : {"phase", "dtw"}, default="phase"
+            "phase" is linear time normalization. "dtw" then takes differences of timing out by dynamic time
+            warping (`torch_pbd.data.alignment.dtw_warps`), keeping the ends of each demonstration and the
+            mean timing of all. It also takes for timing what only looks like it: use it where the
+            shape is what matters. It compares positions in their units; outputs whose ``units`` differ are
+            compared in standard deviations.
+        n : int, default=None
+            Number of phases; None takes the median number of samples, at most 200. "dtw" takes time and
+            memory in proportion to its square.
+
+        Returns
+        -------
+        Demonstrations
+            Aligned.
+        """
+        check_choice(method, ("phase", "dtw"), "method")
+        if n is None:
+            n = min(round(float(np.median(self.n_steps))), MAX_DEFAULT_STEPS)
+        check_n_steps(n)
+        grid = np.linspace(0.0, 1.0, n)
+        phases = unit_phases(self._times)
+        warps = np.tile(grid, (len(self), 1))
+        if method == "dtw":
+            curves = np.stack(list(map(interpolate, phases, self._positions, warps)))
+            warps = dtw_warps(curves / self._comparable_scale(curves))
+        aligned = list(map(interpolate, phases, self._positions, warps))
+        return self._replace(grid, aligned, time_unit="1")
+
+    def split(self, k: int | Sequence[int]) -> tuple["Demonstrations", "Demonstrations"]:
+        """Leave demonstrations out: ``(train, test)``, where ``test`` has those numbered ``k``.
+
+        Raises
+        ------
+        ValueError
+            If there is no such demonstration, or if either part would be empty.
+        """
+        held_out = np.zeros(len(self), dtype=bool)
+        numbers = np.atleast_1d(np.asarray(k))
+        if numbers.ndim != 1 or numbers.dtype.kind not in "iu":
+            raise ValueError(f"k must be the number of a demonstration or a list of numbers; got {k!r}.")
+        wrong = numbers[(numbers < -len(self)) | (numbers >= len(self))]
+        if len(wrong):
+            raise ValueError(f"k has {wrong[0]}, but demonstrations are numbered 0 to {len(self) - 1}.")
+        held_out[numbers] = True
+        if held_out.all() or not held_out.any():
+            raise ValueError(
+                f"k leaves out {held_out.sum()} of {len(self)} demonstrations: both parts need some."
+            )
+        return self[~held_out], self[held_out]
+
+    def _labels(self) -> dict[str, Any]:
+        return {
+            "names": self._names,
+            "units": self._units,
+            "frame": self._frame,
+            "time_unit": self._time_unit,
+        }
+
+    def _replace(
+        self, times: ArrayLike | Sequence[ArrayLike], positions: Sequence[ArrayLike], **labels: str
+    ) -> "Demonstrations":
+        return Demonstrations(times, positions, **{**self._labels(), **labels})
+
+    def _comparable_scale(self, curves: Floats) -> Floats:
+        """What to divide each output by before distances are taken over all of them."""
+        if self._units is None or len(set(self._units)) == 1:
+            return np.ones(self.n_outputs)
+        scale = curves.std(axis=(0, 1))
+        rounding = 1e-12 * np.abs(curves).max(axis=(0, 1))
+        return np.where(scale > rounding, scale, np.inf)  # a constant output tells nothing about timing
+
+
+def _rebuild(times: Sequence[Floats], positions: Sequence[Floats], labels: dict[str, Any]) -> Demonstrations:
+    return Demonstrations(times, positions, **labels)

@@ -1,0 +1,128 @@
+"""Demonstrations from files and to files: the doors; each format has its own module."""
+
+import inspect
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from torch_pbd.data._format_csv import read_csv, write_csv
+from torch_pbd.data._format_npz import read_npz, write_npz
+from torch_pbd.data.demonstrations import Demonstrations
+from torch_pbd.exceptions import DataFormatError
+
+MAX_BYTES = 512 * 2**20
+
+_READERS: dict[str, Callable[..., Demonstrations]] = {".npz": read_npz, ".csv": read_csv}
+_WRITERS: dict[str, Callable[[Demonstrations, BinaryIO], None]] = {".npz": write_npz, ".csv": write_csv}
+
+
+def load_demonstrations(
+    path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES, **options: Any
+) -> Demonstrations:
+    """Demonstrations from a file, in the format that its suffix says.
+
+    ``.npz`` (no options): either ``t`` (T,) and ``x`` (K, T, d), where all demonstrations share one grid of
+    times, or ``t_0`` (T_0,), ``x_0`` (T_0, d), ``t_1``, ``x_1``, ...; and, if it is there, ``meta``, a 0-d
+    string with a JSON object, of which ``dims`` (names of the outputs), ``units`` or ``unit``, ``time_unit``
+    or ``t_unit`` and ``frame`` are read, and ``K`` and ``d`` checked. Other arrays are ignored. Pickled
+    objects are never loaded.
+
+    ``.csv``: a header, then one line a sample. Lines of different demonstrations may be mixed; each
+    demonstration's own must be in order of time.
+
+    Parameters
+    ----------
+    path : str or path-like
+    max_bytes : int, default=512 MiB
+        Larger files (.npz: unpacked) are refused before they are read.
+    demo : str or None, default="demo"
+        CSV: column that tells the demonstrations apart, by any text. None: the file is one demonstration.
+    time : str, default="time"
+        CSV: column of times.
+    outputs : sequence of str, default=None
+        CSV: columns of the outputs, in the order wanted; None takes all the others.
+    delimiter : str, default=None
+        CSV: None finds it among comma, semicolon and tab.
+    decimal : {".", ","}, default="."
+        CSV: decimal mark.
+    units, frame, time_unit
+        CSV: as in `Demonstrations`; such a file does not hold them.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ValueError
+        If the suffix is not known.
+    TypeError
+        If an option is not one of the format's.
+    DataFormatError
+        If the file is not what its suffix says; names the array, or the line and the column.
+    """
+    file = Path(path)
+    reader = _READERS[_known_suffix(file)]
+    known = list(inspect.signature(reader).parameters)[2:]
+    unknown = [option for option in options if option not in known]
+    if unknown:
+        raise TypeError(
+            f"{file.suffix} files have no option {unknown[0]!r}; they have: {', '.join(known) or 'none'}."
+        )
+    if not file.is_file():
+        raise FileNotFoundError(f"{file} does not exist, or is not a file.")
+    if file.stat().st_size > max_bytes:
+        raise DataFormatError(
+            f"{file} has {file.stat().st_size} bytes, more than max_bytes={max_bytes}: raise it to read this."
+        )
+    return reader(file, max_bytes, **options)
+
+
+def save_demonstrations(demonstrations: Demonstrations, path: str | os.PathLike[str]) -> None:
+    """Write demonstrations to ``path``, in the format that its suffix says (.npz or .csv).
+
+    All numbers come back to the last bit. A CSV file does not hold units and frame. The file appears complete
+    or not at all, and replaces one that is there.
+
+    Parameters
+    ----------
+    demonstrations : Demonstrations
+    path : str or path-like
+        Its folder must exist.
+
+    Raises
+    ------
+    ValueError
+        If the suffix is not known, or a name of an output cannot be a column of a CSV file.
+    FileNotFoundError
+        If the folder does not exist.
+    """
+    file = Path(path)
+    write = _WRITERS[_known_suffix(file)]
+    with _replacing(file) as handle:
+        write(demonstrations, handle)
+
+
+def _known_suffix(file: Path) -> str:
+    suffix = file.suffix.lower()
+    if suffix not in _READERS:
+        raise ValueError(
+            f"{file} has the suffix {file.suffix!r}; known formats of demonstrations: {', '.join(_READERS)}."
+        )
+    return suffix
+
+
+@contextmanager
+def _replacing(file: Path) -> Iterator[BinaryIO]:
+    """A new file beside ``file`` that takes its place once it is complete."""
+    if not file.parent.is_dir():
+        raise FileNotFoundError(
+            f"the folder {file.parent} does not exist: make it before saving {file.name}."
+        )
+    draft = file.with_name(f".{file.name}.{os.getpid()}.tmp")
+    try:
+        with draft.open("wb") as handle:
+            yield handle
+        draft.replace(file)
+    finally:
+        draft.unlink(missing_ok=True)

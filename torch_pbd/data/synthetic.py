@@ -1,0 +1,256 @@
+"""Demonstrations whose covariance is known: the simulation of the paper, and a tunnel that narrows."""
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sklearn.utils import check_random_state
+
+from torch_pbd.data._checks import check_choice
+from torch_pbd.data.alignment import Floats
+from torch_pbd.data.demonstrations import Demonstrations
+
+Reading = Literal["printed", "bell", "bowl"]
+Variant = Literal["plain", "unequal", "dropped", "jitter", "outlier", "two_path"]
+Random = np.random.Generator | np.random.RandomState
+Seed = int | Random | None
+
+PATH_LENGTH = 0.6
+"""Distance that the tunnel task covers along y, in m."""
+
+_VARIANTS = ("plain", "unequal", "dropped", "jitter", "outlier", "two_path")
+_QUANTUM = 5e-6  # resolution of the recorded positions, m
+
+
+def paper_mean(xi: ArrayLike) -> Floats:
+    """Mean of eq. (14): ``[30 sin(xi / 20), 30 tanh(xi / 20)]``.
+
+    Parameters
+    ----------
+    xi : array_like of shape (n,) or (n, 1)
+
+    Returns
+    -------
+    ndarray of shape (n, 2)
+    """
+    x = _column(xi)
+    return np.column_stack([30.0 * np.sin(x / 20.0), 30.0 * np.tanh(x / 20.0)])
+
+
+def paper_covariance(xi: ArrayLike, reading: Reading = "bell") -> Floats:
+    """Covariance of eq. (14): ``diag(s(xi), xi + 150)``.
+
+    Parameters
+    ----------
+    xi : array_like of shape (n,) or (n, 1)
+        Above -150; the paper uses -100 to 100.
+    reading : {"bell", "printed", "bowl"}, default="bell"
+        The paper prints s as ``150 exp(-xi/50)^2``, which can be read as ``150 exp(-(xi/50)^2)`` ("bell"),
+        as ``150 (exp(-xi/50))^2`` ("printed"), or with the sign inside the square, ``150 exp((xi/50)^2)``
+        ("bowl"). The paper's Table I fits "bell" and "printed", and rules "bowl" out.
+
+    Returns
+    -------
+    ndarray of shape (n, 2, 2)
+
+    Raises
+    ------
+    ValueError
+        If ``reading`` is not one of these, or an input is -150 or below, where a variance is negative.
+    """
+    check_choice(reading, ("printed", "bell", "bowl"), "reading")
+    x = _column(xi)
+    if (x <= -150.0).any():
+        i = int(np.argmax(x <= -150.0))
+        raise ValueError(
+            f"xi is {x[i]} at index {i}: eq. (14) has a variance of xi + 150, so xi must be above -150."
+        )
+    exponent = {"printed": -2.0 * x / 50.0, "bell": -((x / 50.0) ** 2), "bowl": (x / 50.0) ** 2}[reading]
+    covariance = np.zeros((len(x), 2, 2))
+    covariance[:, 0, 0] = 150.0 * np.exp(exponent)
+    covariance[:, 1, 1] = x + 150.0
+    return covariance
+
+
+def make_paper_simulation(
+    n_inputs: int = 10, n_demos: int = 50, *, reading: Reading = "bell", random_state: Seed = None
+) -> tuple[Floats, Floats, NDArray[np.intp]]:
+    """Draws from eq. (14), independent of each other, at inputs evenly spaced over [-100, 100].
+
+    Parameters
+    ----------
+    n_inputs : int, default=10
+    n_demos : int, default=50
+        Draws at each input.
+    reading : {"bell", "printed", "bowl"}, default="bell"
+        See `paper_covariance`.
+    random_state : int, Generator, RandomState or None, default=None
+
+    Returns
+    -------
+    X : ndarray of shape (n_inputs * n_demos, 1)
+        Demonstration by demonstration; the inputs repeat exactly.
+    y : ndarray of shape (n_inputs * n_demos, 2)
+    groups : ndarray of shape (n_inputs * n_demos,)
+        Number of the demonstration.
+    """
+    _check_count(n_inputs, "n_inputs")
+    _check_count(n_demos, "n_demos")
+    xi = np.linspace(-100.0, 100.0, n_inputs)
+    scale = np.sqrt(np.diagonal(paper_covariance(xi, reading), axis1=1, axis2=2))
+    y = paper_mean(xi) + scale * _generator(random_state).normal(size=(n_demos, n_inputs, 2))
+    return np.tile(xi, n_demos)[:, np.newaxis], y.reshape(-1, 2), np.repeat(np.arange(n_demos), n_inputs)
+
+
+def tunnel_center(y: ArrayLike) -> Floats:
+    """Centre line of the tunnel: x in m at y in m, one period of a 2 cm sine over the path of 0.6 m."""
+    return 0.02 * np.sin(2.0 * np.pi * np.asarray(y, dtype=np.float64) / PATH_LENGTH)
+
+
+def tunnel_half_width(y: ArrayLike) -> Floats:
+    """Half the width of the tunnel, in m, at y in m.
+
+    12 cm up to y = 0.2 m, 1 cm from y = 0.45 m, and a smoothstep ``3 s^2 - 2 s^3`` between them.
+    """
+    s = np.clip((np.asarray(y, dtype=np.float64) - 0.2) / 0.25, 0.0, 1.0)
+    return 0.12 - 0.11 * s**2 * (3.0 - 2.0 * s)
+
+
+def make_tunnel_demonstrations(
+    n_demos: int = 6,
+    duration: float = 10.0,
+    rate: float = 100.0,
+    *,
+    random_state: Seed = None,
+    variant: Variant = "plain",
+    common_start: bool = False,
+) -> Demonstrations:
+    """A hand that moves through a tunnel which narrows: free where it is wide, precise where it is narrow.
+
+    The hand moves along y at constant speed over 0.6 m. Across, it is at ``tunnel_center(y) + 0.85
+    tunnel_half_width(y) tanh(lane + 0.12 w(t) + 0.04 c(t))`` with a lane drawn uniformly from [-0.6, 0.6] for
+    each demonstration, w wandering (up to 0.25 Hz) and c correcting (0.25 to 1 Hz) with unit variance. A
+    tremor in x (0.1 mm rms, 8 to 12 Hz), noise in y (2 um rms) and quantization to 5 um are added. The
+    standard deviation of x over demonstrations is 35 mm at the start and 2.9 mm at the end.
+
+    Parameters
+    ----------
+    n_demos : int, default=6
+    duration : float, default=10.0
+        In s.
+    rate : float, default=100.0
+        Samples a second.
+    random_state : int, Generator, RandomState or None, default=None
+    variant : str, default="plain"
+        - "plain": aligned;
+        - "unequal": each demonstration takes 0.8 to 1.25 times ``duration``;
+        - "dropped": each sample but the ends is lost with a probability of 0.1;
+        - "jitter": each sample but the ends is taken up to 20 % of a step early or late;
+        - "outlier": the last demonstration leaves the tunnel, by 10 cm where it is narrow;
+        - "two_path": lanes keep to one side or the other, 0.4 to 0.6 from the middle, in equal numbers.
+    common_start : bool, default=False
+        Start all demonstrations on the centre line; they reach their lanes by a minimum-jerk blend in the
+        first 15 % of the duration.
+
+    Returns
+    -------
+    Demonstrations
+        Outputs x and y in m, times in s.
+
+    Raises
+    ------
+    ValueError
+        If ``variant`` is unknown, or the numbers leave no demonstration of two samples.
+    """
+    check_choice(variant, _VARIANTS, "variant")
+    _check_count(n_demos, "n_demos")
+    if not (np.isfinite(duration * rate) and duration > 0.0 and round(duration * rate) >= 1):
+        raise ValueError(
+            f"duration={duration} s at rate={rate} /s is not a recording: both must be positive, and their "
+            "product, the number of steps, at least 1."
+        )
+    random = _generator(random_state)
+    lanes = _lanes(n_demos, variant, random)
+    times, positions = [], []
+    for lane in lanes:
+        lasting = duration * random.uniform(0.8, 1.25) if variant == "unequal" else duration
+        time = _sample_times(lasting, rate, variant, random)
+        times.append(time)
+        positions.append(_tunnel_path(time, lasting, lane, common_start, random))
+    if variant == "outlier":
+        positions[-1][:, 0] += 0.1 * np.exp(-(((positions[-1][:, 1] - 0.5) / 0.05) ** 2))
+    quantized = [np.round(position / _QUANTUM) * _QUANTUM for position in positions]
+    return Demonstrations(times, quantized, names=("x", "y"), units="m")
+
+
+def _lanes(n_demos: int, variant: Variant, random: Random) -> NDArray[np.float64]:
+    lanes = random.uniform(-0.6, 0.6, size=n_demos)
+    if variant != "two_path":
+        return lanes
+    side = random.permutation(np.where(np.arange(n_demos) % 2, 1.0, -1.0))
+    return side * (0.4 + np.abs(lanes) / 3.0)
+
+
+def _sample_times(duration: float, rate: float, variant: Variant, random: Random) -> Floats:
+    time = np.arange(max(1, round(duration * rate)) + 1) / rate
+    if variant == "dropped":
+        kept = random.uniform(size=len(time)) >= 0.1
+        kept[[0, -1]] = True
+        return time[kept]
+    if variant == "jitter":
+        time[1:-1] += random.uniform(-0.2, 0.2, size=len(time) - 2) / rate
+    return time
+
+
+def _tunnel_path(
+    time: Floats,
+    duration: float,
+    lane: float,
+    common_start: bool,
+    random: Random,
+) -> Floats:
+    wander, correction, tremor = (
+        _band_noise(time, low, high, random) for low, high in [(0.0, 0.25), (0.25, 1.0), (8.0, 12.0)]
+    )
+    along = PATH_LENGTH * time / duration
+    across = 0.85 * tunnel_half_width(along) * np.tanh(lane + 0.12 * wander + 0.04 * correction)
+    if common_start:
+        s = np.clip(time / (0.15 * duration), 0.0, 1.0)
+        across *= s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+    x = tunnel_center(along) + across + 1e-4 * tremor
+    return np.column_stack([x, along + 2e-6 * random.normal(size=len(time))])
+
+
+def _band_noise(
+    time: Floats,
+    low: float,
+    high: float,
+    random: Random,
+    n_waves: int = 32,
+) -> Floats:
+    """Stationary noise of unit variance with frequencies between ``low`` and ``high``, in Hz.
+
+    A sum of cosines with random frequencies and phases, which is exact at any times, evenly spaced or not
+    (spectral representation: M. Shinozuka, G. Deodatis, Applied Mechanics Reviews 44, 1991).
+    """
+    frequency = random.uniform(low, high, size=n_waves)
+    shift = random.uniform(0.0, 2.0 * np.pi, size=n_waves)
+    return np.sqrt(2.0 / n_waves) * np.cos(2.0 * np.pi * np.outer(time, frequency) + shift).sum(axis=1)
+
+
+def _generator(random_state: Seed) -> Random:
+    if isinstance(random_state, np.random.Generator):
+        return random_state
+    return check_random_state(random_state)
+
+
+def _column(xi: ArrayLike) -> Floats:
+    x = np.asarray(xi, dtype=np.float64)
+    if x.ndim > 2 or (x.ndim == 2 and x.shape[1] != 1):
+        raise ValueError(f"xi has shape {x.shape}: eq. (14) has one input, (n,) or (n, 1).")
+    return x.reshape(-1)
+
+
+def _check_count(value: int, argument: str) -> None:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+        raise ValueError(f"{argument}={value!r} must be an integer of at least 1.")
