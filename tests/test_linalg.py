@@ -47,9 +47,7 @@ def test_symmetrize_is_symmetric_to_the_last_bit(d, generator):
 @pytest.mark.parametrize(("d", "rank"), [(1, 3), (2, 2), (9, 20)])
 def test_the_factor_of_a_root_is_that_of_cholesky(d, rank, generator):
     root = randn(5, d, rank, generator=generator)
-    torch.testing.assert_close(
-        scale_tril_from_root(root), torch.linalg.cholesky(root @ root.mT), rtol=1e-9, atol=1e-11
-    )
+    torch.testing.assert_close(scale_tril_from_root(root), torch.linalg.cholesky(root @ root.mT), rtol=1e-9, atol=1e-11)
 
 
 def test_the_factor_of_a_root_keeps_small_variances_that_a_product_would_lose():

@@ -1,1 +1,49 @@
-"""Learn how precise people are from demonstrations."""
+"""Learn how precise people are from demonstrations: covariance that depends on the input."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from torch_pbd.data import Demonstrations, load_demonstrations, save_demonstrations
+    from torch_pbd.estimators.cholesky import CholeskyCovRegressor
+    from torch_pbd.estimators.mixture import GMMBaseline
+    from torch_pbd.estimators.wishart import WishartProcessRegressor
+    from torch_pbd.persistence import load, save
+
+__version__ = "0.1.0"
+
+# Where each public name lives: torch and scikit-learn take seconds to import, so they wait for their first use.
+_HOMES = {
+    "CholeskyCovRegressor": "torch_pbd.estimators.cholesky",
+    "WishartProcessRegressor": "torch_pbd.estimators.wishart",
+    "GMMBaseline": "torch_pbd.estimators.mixture",
+    "Demonstrations": "torch_pbd.data",
+    "load_demonstrations": "torch_pbd.data",
+    "save_demonstrations": "torch_pbd.data",
+    "load": "torch_pbd.persistence",
+    "save": "torch_pbd.persistence",
+}
+_MODULES = ("data", "estimators", "gp", "kernels", "linalg", "metrics", "models", "optim", "plotting")
+
+__all__ = [
+    "CholeskyCovRegressor",
+    "Demonstrations",
+    "GMMBaseline",
+    "WishartProcessRegressor",
+    "load",
+    "load_demonstrations",
+    "save",
+    "save_demonstrations",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        return getattr(import_module(_HOMES[name]), name)
+    if name in _MODULES:
+        return import_module(f"torch_pbd.{name}")
+    raise AttributeError(f"module 'torch_pbd' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOMES, *_MODULES])

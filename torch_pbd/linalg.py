@@ -47,9 +47,7 @@ def scale_tril_from_root(root: Float[Tensor, "*b d r"]) -> Float[Tensor, "*b d d
     return (sign.unsqueeze(-1) * upper).mT
 
 
-def cholesky_with_jitter(
-    matrix: Float[Tensor, "*b n n"], *, name: str
-) -> tuple[Float[Tensor, "*b n n"], float]:
+def cholesky_with_jitter(matrix: Float[Tensor, "*b n n"], *, name: str) -> tuple[Float[Tensor, "*b n n"], float]:
     """Lower Cholesky factors, and the largest jitter any of them needed.
 
     The jitter is relative to the mean of a matrix's diagonal: none first, then 1e-14 to 1e-6 by factors of
@@ -86,9 +84,7 @@ def safe_cholesky(matrix: Float[Tensor, "*b n n"], *, name: str) -> Float[Tensor
     return cholesky_with_jitter(matrix, name=name)[0]
 
 
-def gaussian_log_density(
-    residual: Float[Tensor, "*b d"], scale_tril: Float[Tensor, "*b d d"]
-) -> Float[Tensor, "*b"]:
+def gaussian_log_density(residual: Float[Tensor, "*b d"], scale_tril: Float[Tensor, "*b d d"]) -> Float[Tensor, "*b"]:
     """Log density of N(0, scale_tril @ scale_tril.mT) at each residual."""
     whitened = torch.linalg.solve_triangular(scale_tril, residual.unsqueeze(-1), upper=False).squeeze(-1)
     log_det = scale_tril.diagonal(dim1=-2, dim2=-1).log().sum(-1)

@@ -186,7 +186,7 @@ def minimize_batch(
     objective : callable
         Given parameters of a problems and their indices in the batch, returns their a losses.
     start : Tensor of shape (b, p)
-        Where to start; the losses there must be finite.
+        Where to start. A problem whose loss there is not finite stays there.
     max_iter, tol, history_size
         As in :func:`minimize`.
 
@@ -198,10 +198,8 @@ def minimize_batch(
     x = start.detach().clone()
     rows = torch.arange(len(x), device=x.device)
     loss, gradient = _value_and_gradient(objective, x, rows)
-    if not torch.isfinite(loss).all():
-        raise ValueError("The optimization cannot start: a loss is not finite at the start.")
     memory = _CurvatureMemory(history_size)
-    active = gradient.abs().amax(-1) > tol
+    active = torch.isfinite(loss) & torch.isfinite(gradient).all(-1) & (gradient.abs().amax(-1) > tol)
     n_iter = 0
     while n_iter < max_iter and bool(active.any()):
         n_iter += 1
@@ -211,14 +209,8 @@ def minimize_batch(
         direction = torch.where(uphill[:, None], -gradient, direction)
         slope = torch.where(uphill, -gradient.square().sum(-1), slope)
         norm = direction.norm(dim=-1)
-        step = (
-            torch.where(norm > 1.0, 1.0 / norm, torch.ones_like(norm))
-            if n_iter == 1
-            else torch.ones_like(norm)
-        )
-        new_x, new_loss, new_gradient = _backtrack(
-            objective, x, loss, gradient, direction, slope, step, active
-        )
+        step = torch.where(norm > 1.0, 1.0 / norm, torch.ones_like(norm)) if n_iter == 1 else torch.ones_like(norm)
+        new_x, new_loss, new_gradient = _backtrack(objective, x, loss, gradient, direction, slope, step, active)
         memory.add(new_x - x, new_gradient - gradient)
         gain = loss - new_loss
         x, loss, gradient = new_x, new_loss, new_gradient

@@ -30,9 +30,7 @@ def test_keeps_what_it_was_given(rng):
     assert (len(demonstrations), demonstrations.n_outputs, demonstrations.is_aligned) == (4, 3, True)
     assert demonstrations.names == ("y0", "y1", "y2")
     assert (demonstrations.units, demonstrations.frame) == (("m", "m", "rad"), "base")
-    assert demonstrations == Demonstrations(
-        [time] * 4, list(positions), units=["m", "m", "rad"], frame="base"
-    )
+    assert demonstrations == Demonstrations([time] * 4, list(positions), units=["m", "m", "rad"], frame="base")
     np.testing.assert_array_equal(demonstrations.to_array(), positions)
     for k, (recorded_time, position) in enumerate(demonstrations):
         np.testing.assert_array_equal(recorded_time, time)
@@ -161,9 +159,7 @@ def test_number_of_points_is_checked(ragged, n):
 
 
 def test_repr_is_short(ragged, aligned):
-    assert repr(ragged) == (
-        "Demonstrations(n_demos=3, n_steps=5..8, outputs=('x', 'y'), time_unit='s', aligned=False)"
-    )
+    assert repr(ragged) == ("Demonstrations(n_demos=3, n_steps=5..8, outputs=('x', 'y'), time_unit='s', aligned=False)")
     assert "n_steps=7, " in repr(aligned)
 
 

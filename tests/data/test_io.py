@@ -25,9 +25,7 @@ def sets():
     return {
         "aligned": make_tunnel_demonstrations(3, rate=5.0, random_state=0),
         "ragged": ragged,
-        "extremes": Demonstrations(
-            [np.sort(EXTREMES)], [EXTREMES], units=["m/s"], frame="base", time_unit="1"
-        ),
+        "extremes": Demonstrations([np.sort(EXTREMES)], [EXTREMES], units=["m/s"], frame="base", time_unit="1"),
     }
 
 
@@ -67,9 +65,7 @@ def test_every_recording_loads_as_its_meta_says(recordings):
         assert aligned.to_array().shape == (meta["K"], 20, meta["d"])
 
 
-@pytest.mark.parametrize(
-    ("name", "unit", "time_unit"), [("kuka_cube_pick", "m", "s"), ("adroit_door_palm", "m", "s")]
-)
+@pytest.mark.parametrize(("name", "unit", "time_unit"), [("kuka_cube_pick", "m", "s"), ("adroit_door_palm", "m", "s")])
 def test_units_of_recordings_come_without_remarks(recordings, name, unit, time_unit):
     demonstrations = load_demonstrations(recordings / f"{name}.npz")
     assert set(demonstrations.units) == {unit}
@@ -237,9 +233,7 @@ def test_csv_that_cannot_be_read_is_refused_with_its_place(tmp_path, text, optio
         load_text(tmp_path, text, **options)
 
 
-@pytest.mark.parametrize(
-    "options", [{"decimal": "x"}, {"delimiter": ",", "decimal": ","}, {"delimiter": ", "}]
-)
+@pytest.mark.parametrize("options", [{"decimal": "x"}, {"delimiter": ",", "decimal": ","}, {"delimiter": ", "}])
 def test_marks_of_csv_are_checked(tmp_path, options):
     with pytest.raises(ValueError, match=r"decimal|delimiter"):
         load_text(tmp_path, CSV, **options)

@@ -42,9 +42,7 @@ def test_paper_draws_follow_the_law_and_are_independent(reading):
     X, y, groups = make_paper_simulation(n_inputs, n_demos, reading=reading, random_state=0)
     xi = np.linspace(-100, 100, n_inputs)
     np.testing.assert_array_equal(X.reshape(n_demos, n_inputs), np.tile(xi, (n_demos, 1)))
-    np.testing.assert_array_equal(
-        groups.reshape(n_demos, n_inputs), np.tile(np.arange(n_demos)[:, None], n_inputs)
-    )
+    np.testing.assert_array_equal(groups.reshape(n_demos, n_inputs), np.tile(np.arange(n_demos)[:, None], n_inputs))
     scale = np.sqrt(np.diagonal(paper_covariance(xi, reading), axis1=1, axis2=2))
     z = ((y.reshape(n_demos, n_inputs, 2) - paper_mean(xi)) / scale).reshape(n_demos, -1)
     # whitened draws are standard normal; 5 standard errors of 20 000 draws
@@ -63,12 +61,8 @@ def test_paper_arguments_are_checked():
         make_paper_simulation(n_demos=0)
 
 
-@pytest.mark.parametrize(
-    "make", [make_paper_simulation, lambda **seed: make_tunnel_demonstrations(**seed).stack()]
-)
-@pytest.mark.parametrize(
-    "seeded", [lambda: 3, lambda: np.random.default_rng(3), lambda: np.random.RandomState(3)]
-)
+@pytest.mark.parametrize("make", [make_paper_simulation, lambda **seed: make_tunnel_demonstrations(**seed).stack()])
+@pytest.mark.parametrize("seeded", [lambda: 3, lambda: np.random.default_rng(3), lambda: np.random.RandomState(3)])
 def test_draws_depend_on_their_seed_only(make, seeded):
     before = np.random.get_state()[1].copy()  # noqa: NPY002
     first, second = make(random_state=seeded()), make(random_state=seeded())
@@ -132,9 +126,7 @@ def test_variants_differ_in_what_they_say(variant):
     assert (len(set(lengths)) > 1) == (variant in {"unequal", "dropped"})
     even = np.ptp(steps) < 1e-9
     assert even == (variant not in {"dropped", "jitter"})
-    outside = [
-        (np.abs(x - tunnel_center(y)) > tunnel_half_width(y)).any() for x, y in (p.T for p in made.positions)
-    ]
+    outside = [(np.abs(x - tunnel_center(y)) > tunnel_half_width(y)).any() for x, y in (p.T for p in made.positions)]
     assert outside == [False] * 5 + [variant == "outlier"]
     for time, position in made:
         np.testing.assert_allclose(position[[0, -1], 1], [0, 0.6], atol=1e-3)

@@ -118,9 +118,7 @@ def _as_time(values: Any, argument: str) -> Floats:
     if array.ndim != 1:
         raise ValueError(f"{argument} has shape {array.shape}: times are 1-D, one for each sample.")
     if len(array) < MIN_SAMPLES:
-        raise ValueError(
-            f"{argument} has {len(array)} samples: a demonstration needs at least {MIN_SAMPLES}."
-        )
+        raise ValueError(f"{argument} has {len(array)} samples: a demonstration needs at least {MIN_SAMPLES}.")
     time = _frozen(array)
     if not np.isfinite(time).all():
         i = int(np.argmin(np.isfinite(time)))

@@ -30,9 +30,7 @@ def read_csv(
     """Read the format of `torch_pbd.data.load_demonstrations`, where the options are told."""
     check_choice(decimal, (".", ","), "decimal")
     if delimiter is not None and (len(delimiter) != 1 or delimiter == decimal):
-        raise ValueError(
-            f"delimiter={delimiter!r} must be one character, and not the decimal mark {decimal!r}."
-        )
+        raise ValueError(f"delimiter={delimiter!r} must be one character, and not the decimal mark {decimal!r}.")
     with path.open(encoding="utf-8-sig", newline="") as file:
         try:
             table = _open_table(path, file, delimiter, decimal, wanted=[*([demo] if demo else []), time])

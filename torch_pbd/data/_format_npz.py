@@ -116,9 +116,7 @@ def _count(path: Path, files: Sequence[str]) -> int:
         )
     missing = set(range(len(numbers))) - numbers
     if missing:
-        raise DataFormatError(
-            f"{path} has demonstration {max(numbers)} but no t_{min(missing)}, x_{min(missing)}."
-        )
+        raise DataFormatError(f"{path} has demonstration {max(numbers)} but no t_{min(missing)}, x_{min(missing)}.")
     return len(numbers)
 
 
@@ -127,9 +125,7 @@ def _units(meta: dict[str, Any]) -> Any:
     if isinstance(units, dict):
         missing = [name for name in meta.get("dims") or () if name not in units]
         if missing:
-            raise ValueError(
-                f"units in meta has no entry for output {missing[0]!r}; it has {preview([*units])}."
-            )
+            raise ValueError(f"units in meta has no entry for output {missing[0]!r}; it has {preview([*units])}.")
         return [units[name] for name in meta.get("dims") or ()]
     return units if units is not None else _without_remark(meta.get("unit"))
 

@@ -87,9 +87,7 @@ def dtw_path(a: ArrayLike, b: ArrayLike) -> NDArray[np.intp]:
             f"{first.shape} and {second.shape}."
         )
     if not first.size or not second.size:
-        raise ValueError(
-            f"dtw_path needs at least one sample in each curve; got {first.shape}, {second.shape}."
-        )
+        raise ValueError(f"dtw_path needs at least one sample in each curve; got {first.shape}, {second.shape}.")
     return _backtrack(_accumulated_cost(first, second))
 
 
@@ -116,8 +114,7 @@ def dtw_warps(curves: Floats) -> Floats:
     medoid = int(np.argmin([np.linalg.norm(flat - curve, axis=1).sum() for curve in flat]))
     grid = np.linspace(0.0, 1.0, curves.shape[1])
     matches = [
-        grid if k == medoid else _monotone_match(dtw_path(curves[medoid], curve))
-        for k, curve in enumerate(curves)
+        grid if k == medoid else _monotone_match(dtw_path(curves[medoid], curve)) for k, curve in enumerate(curves)
     ]
     common = np.mean(matches, axis=0)  # increases strictly, since the medoid's own match does
     return np.stack([np.interp(grid, common, match) for match in matches])

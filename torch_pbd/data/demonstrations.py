@@ -139,9 +139,7 @@ class Demonstrations:
     def __getitem__(self, index: int) -> Demonstration: ...
     @overload
     def __getitem__(self, index: slice | Sequence[int] | NDArray[Any]) -> "Demonstrations": ...
-    def __getitem__(
-        self, index: int | slice | Sequence[int] | NDArray[Any]
-    ) -> "Demonstration | Demonstrations":
+    def __getitem__(self, index: int | slice | Sequence[int] | NDArray[Any]) -> "Demonstration | Demonstrations":
         """One demonstration by its number; several by a slice, a list of numbers or a mask."""
         chosen = np.arange(len(self))[index]
         if chosen.ndim == 0:
@@ -266,9 +264,7 @@ class Demonstrations:
             raise ValueError(f"k has {wrong[0]}, but demonstrations are numbered 0 to {len(self) - 1}.")
         held_out[numbers] = True
         if held_out.all() or not held_out.any():
-            raise ValueError(
-                f"k leaves out {held_out.sum()} of {len(self)} demonstrations: both parts need some."
-            )
+            raise ValueError(f"k leaves out {held_out.sum()} of {len(self)} demonstrations: both parts need some.")
         return self[~held_out], self[held_out]
 
     def _labels(self) -> dict[str, Any]:

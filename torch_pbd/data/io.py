@@ -18,9 +18,7 @@ _READERS: dict[str, Callable[..., Demonstrations]] = {".npz": read_npz, ".csv": 
 _WRITERS: dict[str, Callable[[Demonstrations, BinaryIO], None]] = {".npz": write_npz, ".csv": write_csv}
 
 
-def load_demonstrations(
-    path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES, **options: Any
-) -> Demonstrations:
+def load_demonstrations(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES, **options: Any) -> Demonstrations:
     """Demonstrations from a file, in the format that its suffix says.
 
     ``.npz`` (no options): either ``t`` (T,) and ``x`` (K, T, d), where all demonstrations share one grid of
@@ -66,9 +64,7 @@ def load_demonstrations(
     known = list(inspect.signature(reader).parameters)[2:]
     unknown = [option for option in options if option not in known]
     if unknown:
-        raise TypeError(
-            f"{file.suffix} files have no option {unknown[0]!r}; they have: {', '.join(known) or 'none'}."
-        )
+        raise TypeError(f"{file.suffix} files have no option {unknown[0]!r}; they have: {', '.join(known) or 'none'}.")
     if not file.is_file():
         raise FileNotFoundError(f"{file} does not exist, or is not a file.")
     if file.stat().st_size > max_bytes:
@@ -116,9 +112,7 @@ def _known_suffix(file: Path) -> str:
 def _replacing(file: Path) -> Iterator[BinaryIO]:
     """A new file beside ``file`` that takes its place once it is complete."""
     if not file.parent.is_dir():
-        raise FileNotFoundError(
-            f"the folder {file.parent} does not exist: make it before saving {file.name}."
-        )
+        raise FileNotFoundError(f"the folder {file.parent} does not exist: make it before saving {file.name}.")
     draft = file.with_name(f".{file.name}.{os.getpid()}.tmp")
     try:
         with draft.open("wb") as handle:

@@ -62,9 +62,7 @@ def paper_covariance(xi: ArrayLike, reading: Reading = "bell") -> Floats:
     x = _column(xi)
     if (x <= -150.0).any():
         i = int(np.argmax(x <= -150.0))
-        raise ValueError(
-            f"xi is {x[i]} at index {i}: eq. (14) has a variance of xi + 150, so xi must be above -150."
-        )
+        raise ValueError(f"xi is {x[i]} at index {i}: eq. (14) has a variance of xi + 150, so xi must be above -150.")
     exponent = {"printed": -2.0 * x / 50.0, "bell": -((x / 50.0) ** 2), "bowl": (x / 50.0) ** 2}[reading]
     covariance = np.zeros((len(x), 2, 2))
     covariance[:, 0, 0] = 150.0 * np.exp(exponent)

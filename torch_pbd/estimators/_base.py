@@ -1,0 +1,271 @@
+"""What the covariance regressors share: the door between NumPy and torch, and all that follows a fit."""
+
+import sys
+import warnings
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.utils import check_random_state
+from sklearn.utils._tags import Tags
+from sklearn.utils.validation import check_is_fitted, validate_data
+from torch import Tensor
+
+from torch_pbd.estimators._scaling import Standardization
+from torch_pbd.estimators._validation import (
+    Floats,
+    as_plain_array,
+    check_inputs_vary,
+    check_number,
+    prior_covariance,
+)
+from torch_pbd.linalg import gaussian_log_density, safe_cholesky
+from torch_pbd.models.conditional import ConditionalNormal
+from torch_pbd.models.spec import module_from_spec, module_spec
+from torch_pbd.optim import FitReport, Progress
+
+_CHUNK = 1024  # rows predicted at a time: memory stays bounded however many are asked for
+
+
+class Uncertainty(NamedTuple):
+    """The two kinds of uncertainty of Section IV-C, at n inputs."""
+
+    type1: Floats
+    """(n,): missing data. 0 at training inputs, 1 where only the prior speaks."""
+    type2: Floats
+    """(n, d, d): variability of the data, with the prior taken out; squared units of y."""
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """What a subclass returns from its fit."""
+
+    module: ConditionalNormal
+    report: FitReport
+    jitter: float
+
+
+class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
+    """Base of the regressors whose covariance depends on the input; not for direct use."""
+
+    device: str | None
+    max_iter: int
+    tol: float
+    verbose: int
+    n_restarts: int
+    random_state: Any
+
+    def __sklearn_tags__(self) -> Tags:
+        tags = super().__sklearn_tags__()
+        tags.regressor_tags.poor_score = True  # score is a log-likelihood, not R^2
+        return tags
+
+    def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
+        """Learn mean and covariance.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_features)
+            Time, phase or position of each sample. Rows that repeat exactly are aligned demonstrations.
+        y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+            What was recorded there.
+
+        Returns
+        -------
+        self
+
+        Raises
+        ------
+        ValueError
+            If X, y or a parameter cannot be used; the message names it and says what to do.
+        """
+        self._check_parameters()
+        inputs, targets = self._validated(X, y, ensure_min_samples=2)
+        check_inputs_vary(inputs)
+        self._y_is_1d = targets.ndim == 1
+        self.n_outputs_ = 1 if targets.ndim == 1 else targets.shape[1]
+        with torch.inference_mode(False), torch.enable_grad():
+            fitted = self._fit(inputs, targets.reshape(len(inputs), -1))
+        self.module_ = fitted.module
+        report = fitted.report
+        self.n_iter_ = max(1, report.n_iter)
+        self.loss_ = report.loss
+        self.loss_curve_ = list(report.loss_curve)
+        self.converged_ = report.converged
+        self.jitter_ = fitted.jitter
+        if not report.converged:
+            warnings.warn(
+                f"{type(self).__name__} stopped early: {report.message}. The best point found is kept; "
+                f"raise max_iter (now {self.max_iter}) or tol (now {self.tol:g}).",
+                ConvergenceWarning,
+                stacklevel=2,
+            )
+        return self
+
+    @abstractmethod
+    def _fit(self, X: Floats, y: Floats) -> Fitted:
+        """Fit on validated arrays (n, e) and (n, d)."""
+
+    def _check_parameters(self) -> None:
+        """Check the parameters whose values do not depend on the data; subclasses check theirs too."""
+        check_number(self.max_iter, "max_iter", low=1, integer=True)
+        check_number(self.tol, "tol", low=0.0, strict=True)
+        check_number(self.n_restarts, "n_restarts", low=0, integer=True)
+        check_number(self.verbose, "verbose", low=0, integer=True)
+
+    def predict(self, X: ArrayLike, *, return_std: bool = False, return_cov: bool = False) -> Any:
+        """Mean of y at X, and with it the standard deviations or the covariances.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_features)
+        return_std : bool, default=False
+            Also return the standard deviation of each output, shaped like the mean.
+        return_cov : bool, default=False
+            Also return the covariances of the outputs (n_samples, n_outputs, n_outputs). Not those between
+            rows, which ``return_cov`` of scikit-learn's GaussianProcessRegressor are.
+
+        Returns
+        -------
+        mean : ndarray of shape (n_samples,) or (n_samples, n_outputs), as y was
+        std or covariance : ndarray, if asked for
+        """
+        if return_std and return_cov:
+            raise ValueError("At most one of return_std and return_cov can be True.")
+        mean, covariance = self._moments(X)
+        shaped = mean.ravel() if self._y_is_1d else mean
+        if return_cov:
+            return shaped, covariance
+        if return_std:
+            std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+            return shaped, std.ravel() if self._y_is_1d else std
+        return shaped
+
+    def predict_cov(self, X: ArrayLike) -> Floats:
+        """Covariances of the outputs at X: (n_samples, n_outputs, n_outputs), also for one output.
+
+        Symmetric to the last bit, positive definite, in squared units of y.
+        """
+        return self._moments(X)[1]
+
+    def predict_uncertainty(self, X: ArrayLike) -> Uncertainty:
+        """Both kinds of uncertainty at X, apart (Section IV-C)."""
+        x = self._query(X)
+        with torch.inference_mode():
+            parts = [(self.module_.type1(chunk), self.module_.type2(chunk)) for chunk in x.split(_CHUNK)]
+        type1, type2 = (torch.cat(part).cpu().numpy() for part in zip(*parts, strict=True))
+        return Uncertainty(type1, type2)
+
+    def log_likelihood(self, X: ArrayLike, y: ArrayLike) -> Floats:
+        """Log density of each row of y at X, in nats: (n_samples,)."""
+        mean, scale_tril, residual = self._scored(X, y)
+        with torch.inference_mode():
+            return gaussian_log_density(residual - mean, scale_tril).cpu().numpy()
+
+    def score(self, X: ArrayLike, y: ArrayLike) -> float:
+        """Mean log density of the rows of y at X, in nats: higher is better.
+
+        R^2, which scikit-learn's regressors score, does not see the covariance.
+        """
+        return float(self.log_likelihood(X, y).mean())
+
+    def sample_y(self, X: ArrayLike, n_samples: int = 1, random_state: Any = None) -> Floats:
+        """Draw y at X, independently for each row.
+
+        Returns
+        -------
+        ndarray of shape (n_samples_X, n_outputs, n_samples), or (n_samples_X, n_samples) if y was 1-D
+        """
+        check_number(n_samples, "n_samples", low=1, integer=True)
+        generator = check_random_state(random_state)
+        mean, scale_tril = (part.cpu().numpy() for part in self._apply(self.module_, self._query(X)))
+        normal = generator.standard_normal((*mean.shape, n_samples))
+        samples = mean[:, :, np.newaxis] + scale_tril @ normal
+        return samples[:, 0] if self._y_is_1d else samples
+
+    def _moments(self, X: ArrayLike) -> tuple[Floats, Floats]:
+        mean, covariance = self._apply(self.module_.moments, self._query(X))
+        return mean.cpu().numpy(), covariance.cpu().numpy()
+
+    def _validated(self, X: ArrayLike, y: ArrayLike, **options: Any) -> tuple[Floats, Floats]:
+        """X (n, e) and y (n,) or (n, d) in float64, checked by scikit-learn and by us."""
+        X, y = as_plain_array(X, "X"), as_plain_array(y, "y")
+        checked: Any = validate_data(self, X, y, dtype=np.float64, y_numeric=True, multi_output=True, **options)
+        return checked[0], np.asarray(checked[1], dtype=np.float64)
+
+    def _scored(self, X: ArrayLike, y: ArrayLike) -> tuple[Tensor, Tensor, Tensor]:
+        check_is_fitted(self)
+        inputs, targets = self._validated(X, y, reset=False)
+        targets = targets.reshape(len(inputs), -1)
+        if targets.shape[1] != self.n_outputs_:
+            raise ValueError(f"y has {targets.shape[1]} outputs, but the model was fitted with {self.n_outputs_}.")
+        mean, scale_tril = self._apply(self.module_, self._door(inputs))
+        return mean, scale_tril, self._door(targets)
+
+    def _query(self, X: ArrayLike) -> Tensor:
+        """Rows to predict at; none at all is allowed, though scikit-learn asks for one."""
+        check_is_fitted(self)
+        X = as_plain_array(X, "X")
+        if getattr(X, "shape", (1,))[0] == 0 and np.ndim(X) == 2:
+            X = validate_data(self, X, dtype=np.float64, reset=False, ensure_min_samples=0)
+        else:
+            X = validate_data(self, X, dtype=np.float64, reset=False)
+        return self._door(X)
+
+    def _apply(self, model: Any, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and covariance (or factor) of the model at x, a bounded number of rows at a time."""
+        prior = getattr(self, "prior", None)
+        with torch.inference_mode():
+            parts = []
+            for chunk in x.split(_CHUNK):
+                if callable(prior):
+                    covariance = prior_covariance(prior, chunk.cpu().numpy(), self.n_outputs_)
+                    parts.append(model(chunk, safe_cholesky(self._door(covariance), name="prior(X)")))
+                else:
+                    parts.append(model(chunk))
+            first, second = (torch.cat(part) for part in zip(*parts, strict=True))
+        return first, second
+
+    def _door(self, array: Any) -> Tensor:
+        return torch.tensor(array, dtype=torch.float64, device=self.device)
+
+    def _progress(self) -> Any:
+        """Callback that prints the loss, or None."""
+        if not self.verbose:
+            return None
+
+        def show(progress: Progress) -> None:
+            if progress.n_evaluations % max(1, 10 // self.verbose) in (0, 1):
+                print(
+                    f"{type(self).__name__}: evaluation {progress.n_evaluations:5d}  loss {progress.loss:14.6f}  "
+                    f"{progress.elapsed:7.2f} s",
+                    file=sys.stderr,
+                )
+
+        return show
+
+    def _assemble(self, core: Any, scaling: Standardization) -> ConditionalNormal:
+        parts = (scaling.x_shift, scaling.x_scale, scaling.y_shift, scaling.y_scale)
+        return ConditionalNormal(core, *map(self._door, parts)).requires_grad_(False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """State without tensors: arrays, and what the module is, for pickle, joblib and skops."""
+        state = dict(super().__getstate__())
+        if "module_" in state:
+            module = state.pop("module_")
+            state["_module_spec"] = module_spec(module)
+            state["_module_arrays"] = {k: v.cpu().numpy() for k, v in module.state_dict().items()}
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        state = dict(state)
+        arrays, spec = state.pop("_module_arrays", None), state.pop("_module_spec", None)
+        super().__setstate__(state)
+        if arrays is not None:
+            tensors = {name: self._door(array) for name, array in arrays.items()}
+            self.module_ = module_from_spec(spec, tensors).requires_grad_(False)

@@ -1,0 +1,210 @@
+"""What the two regressors on latent Gaussian processes (CD and WP) share."""
+
+import os
+import warnings
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torch_pbd.estimators._base import CovarianceRegressor, Fitted
+from torch_pbd.estimators._scaling import Standardization, distinct_rows
+from torch_pbd.estimators._validation import (
+    Floats,
+    check_choice,
+    check_length_scale,
+    check_number,
+    prior_covariance,
+)
+from torch_pbd.exceptions import DataRankWarning
+from torch_pbd.gp import (
+    EvidenceSearch,
+    LatentGP,
+    Observations,
+    condition,
+    fit_hyperparameters,
+    merge_observations,
+    spacing,
+)
+from torch_pbd.kernels import KERNELS
+from torch_pbd.linalg import safe_cholesky, scale_tril_from_root
+from torch_pbd.models.conditional import MeanAndCovariance
+from torch_pbd.models.training import TrainingSet, pooled_tril
+from torch_pbd.optim import FitReport
+
+# Length scales from here times the spacing of the inputs to this many ranges: shorter ones are "needles"
+# that explain each point by itself, and with longer ones the prior of a covariance would never take over.
+_SHORTEST, _LONGEST_MEAN, _LONGEST_COVARIANCE = 0.75, 10.0, 1.0
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A fit in standardized units."""
+
+    training: TrainingSet
+    scaling: Standardization
+    prior_tril: Tensor
+    """(d, d), or (n, d, d) at the training inputs where the prior is callable."""
+    length_scale: Tensor | None
+    """(e,), where the user gave it."""
+
+
+class LatentCovarianceRegressor(CovarianceRegressor):
+    """Base of CD and WP: mean by d Gaussian processes, covariance by more of them; not for direct use."""
+
+    aligned_objective: str
+    """Value of ``objective`` that works on empirical covariances."""
+
+    objective: str
+    prior: Any
+    kernel: Any
+    length_scale: Any
+    max_inputs: int
+    latent_prior: bool
+
+    def _check_parameters(self) -> None:
+        super()._check_parameters()
+        check_choice(self.objective, "objective", ("auto", self.aligned_objective, "likelihood"))
+        check_choice(self.kernel, "kernel", tuple(KERNELS))
+        check_number(self.max_inputs, "max_inputs", low=2, integer=True)
+        if isinstance(self.prior, str):
+            check_choice(self.prior, "prior", ("paper",))
+
+    def _fit(self, X: Floats, y: Floats) -> Fitted:
+        scaling = Standardization.of(X, y)
+        inputs, index = distinct_rows(X)
+        self._check_memory(len(inputs), y.shape[1])
+        training = TrainingSet(
+            self._door((X - scaling.x_shift) / scaling.x_scale),
+            self._door((y - scaling.y_shift) / scaling.y_scale),
+            self._door((inputs - scaling.x_shift) / scaling.x_scale),
+            self._door(index).long(),
+        )
+        aligned = self._works_on_empirical(inputs, np.bincount(index), y.shape[1])
+        length_scale = check_length_scale(self.length_scale, X.shape[1])
+        if not aligned:
+            training = training.merged(self.max_inputs)
+        problem = Problem(
+            training,
+            scaling,
+            self._prior_tril(training, scaling),
+            None if length_scale is None else self._door(length_scale / scaling.x_scale),
+        )
+        mean = self._fit_mean(training)
+        if aligned:
+            _warn_if_identical(training)
+            covariance, report, jitter = self._fit_empirical(problem)
+        else:
+            residual = training.y - mean(training.x).detach()
+            covariance, report, jitter = self._fit_likelihood(problem, residual)
+        return Fitted(self._assemble(MeanAndCovariance(mean, covariance), scaling), report, jitter)
+
+    @abstractmethod
+    def _fit_empirical(self, problem: Problem) -> tuple[Any, FitReport, float]:
+        """Covariance module from the empirical covariances of aligned data."""
+
+    @abstractmethod
+    def _fit_likelihood(self, problem: Problem, residual: Tensor) -> tuple[Any, FitReport, float]:
+        """Covariance module by maximum likelihood of the residuals (rows, d) from the mean."""
+
+    def _works_on_empirical(self, inputs: Floats, counts: Any, n_outputs: int) -> bool:
+        """Decide the objective; ``inputs`` are the distinct ones, with their counts."""
+        fewest = int(counts.min())
+        if self.objective == "likelihood" or (self.objective == "auto" and fewest < 2):
+            return False
+        if fewest < 2:
+            i = int(np.argmin(counts))
+            raise ValueError(
+                f"objective={self.objective!r} needs >= 2 demonstrations at each input, got 1 at X = "
+                f"{inputs[i].tolist()} ({int((counts < 2).sum())} of {len(inputs)} inputs have one row). "
+                "Align the demonstrations, record more, or use objective='likelihood'."
+            )
+        if fewest <= n_outputs:
+            warnings.warn(
+                f"y has {fewest} demonstrations at an input but {n_outputs} outputs: that empirical covariance "
+                f"is singular, and is shrunk towards the pooled covariance. {n_outputs + 1} or more "
+                "demonstrations determine it.",
+                DataRankWarning,
+                stacklevel=4,
+            )
+        return True
+
+    def _prior_tril(self, training: TrainingSet, scaling: Standardization) -> Tensor:
+        n_outputs = training.y.shape[1]
+        if self.prior is None:
+            return _default_prior_tril(training.y)
+        if isinstance(self.prior, str):  # "paper": the entries of the factor are in the units of y
+            return torch.diag(1.0 / self._door(scaling.y_scale))
+        X = scaling.x_shift + scaling.x_scale * training.inputs.cpu().numpy()
+        covariance = prior_covariance(self.prior, X, n_outputs)
+        scaled = covariance / scaling.y_scale[:, np.newaxis] / scaling.y_scale
+        return safe_cholesky(self._door(scaled), name="prior")
+
+    def _fit_mean(self, training: TrainingSet) -> LatentGP:
+        """Gaussian processes of the mean, from the means at the inputs, weighted by their counts."""
+        observations = Observations(training.inputs, training.means().mT.contiguous(), training.counts)
+        observations = merge_observations(observations, self.max_inputs)
+        search = self._search(observations, _LONGEST_MEAN)
+        hyperparameters, _, _ = fit_hyperparameters(observations, search)
+        return condition(observations, hyperparameters, self.kernel)[0]
+
+    def _search(
+        self,
+        observations: Observations,
+        longest: float,
+        length_scale: Tensor | None = None,
+        noise_scale: Tensor | None = None,
+    ) -> EvidenceSearch:
+        n_inputs, n_features = observations.inputs.shape
+        detail = max(spacing(observations.inputs), n_inputs ** (-1.0 / n_features))
+        bounds = (min(0.5, _SHORTEST * detail), longest)
+        return EvidenceSearch(
+            self.kernel, bounds, length_scale, noise_scale, self.n_restarts, max(100, self.max_iter), self.tol
+        )
+
+    def _default_length_scale(self, problem: Problem) -> Tensor:
+        """Length scales (1, e) where they are not learned: a fifth of the range of the inputs."""
+        n_features = problem.training.inputs.shape[1]
+        if problem.length_scale is not None:
+            return problem.length_scale[None]
+        return problem.training.inputs.new_full((1, n_features), 0.2 * n_features**0.5)
+
+    def _check_memory(self, n_distinct: int, n_outputs: int) -> None:
+        n_inputs = min(n_distinct, self.max_inputs)
+        n_together = min(32, (n_outputs + 1) ** 2) * (1 + self.n_restarts)
+        needed = 8.0 * n_inputs**2 * n_together * 6
+        available = 0.8 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        if needed > available:
+            raise ValueError(
+                f"max_inputs == {self.max_inputs} lets {n_inputs} distinct inputs into kernel matrices that need "
+                f"{needed / 2**30:.1f} GiB; this machine has {available / 2**30:.1f} GiB to give. Lower max_inputs."
+            )
+
+
+def residual_tril(residual: Tensor) -> Tensor:
+    """Factor of the covariance of all residuals, where the training of a likelihood starts."""
+    floor = 1e-6 * torch.eye(residual.shape[1]).to(residual)
+    return scale_tril_from_root(torch.cat([residual.mT / len(residual) ** 0.5, floor], dim=1))
+
+
+def _default_prior_tril(y: Tensor) -> Tensor:
+    """Factor of a wide prior: four times the covariance of all of y around its mean.
+
+    A thousandth of the unit matrix is mixed in: outputs that move together, or do not move at all, have
+    some freedom of their own where nothing is known.
+    """
+    centred = (0.999 / (len(y) - 1)) ** 0.5 * (y - y.mean(0)).mT
+    return 2.0 * scale_tril_from_root(torch.cat([centred, 0.001**0.5 * torch.eye(y.shape[1]).to(y)], dim=1))
+
+
+def _warn_if_identical(training: TrainingSet) -> None:
+    if float(pooled_tril(training).diagonal().max()) < 1e-9:
+        warnings.warn(
+            "The demonstrations are identical: their covariance is zero, and the smallest that can be told "
+            "from it is used.",
+            DataRankWarning,
+            stacklevel=5,
+        )

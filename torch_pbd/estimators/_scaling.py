@@ -1,0 +1,43 @@
+"""Standardization of inputs and outputs, and the rows that share an input."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torch_pbd.estimators._validation import CONSTANT, Floats
+
+
+@dataclass(frozen=True)
+class Standardization:
+    """Shift and scale of each column: inputs get a range of one, outputs a standard deviation of one."""
+
+    x_shift: Floats
+    x_scale: Floats
+    y_shift: Floats
+    y_scale: Floats
+
+    @classmethod
+    def of(cls, X: Floats, y: Floats) -> "Standardization":
+        """Standardization of the columns of X and y.
+
+        A constant output gets the largest scale of the others, so that it is precise beside them; a
+        constant input gets a scale of one.
+        """
+        low, high = X.min(axis=0), X.max(axis=0)
+        span = high - low
+        x_scale = np.where(span > CONSTANT * np.maximum(np.abs(low), np.abs(high)), span, 1.0)
+        y_shift = y.mean(axis=0)
+        y_scale = (y - y_shift).std(axis=0)
+        largest = np.abs(y).max(axis=0)
+        varies = y_scale > CONSTANT * largest
+        if not varies.all():
+            y_scale = np.where(varies, y_scale, y_scale[varies].max() if varies.any() else largest)
+            y_scale = np.where(y_scale > 0, y_scale, 1.0)
+        return cls(low + 0.5 * span, x_scale, y_shift, y_scale)
+
+
+def distinct_rows(X: Floats) -> tuple[Floats, NDArray[np.intp]]:
+    """Distinct rows of X in lexicographic order, and the index of each row's own among them."""
+    inputs, index = np.unique(X + 0.0, axis=0, return_inverse=True)  # + 0.0: minus zero is zero
+    return inputs, index.reshape(-1)

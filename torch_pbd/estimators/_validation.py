@@ -1,0 +1,181 @@
+"""Checks of what users pass to an estimator, before any work starts."""
+
+import warnings
+from collections.abc import Callable
+from numbers import Integral, Real
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sklearn.utils.validation import check_scalar
+
+from torch_pbd.exceptions import DataRankWarning
+
+Floats = NDArray[np.float64]
+Prior = float | ArrayLike | Callable[[Floats], ArrayLike] | str | None
+
+# A column whose spread is below this of its largest value differs only by rounding.
+CONSTANT = 1e-11
+# Eigenvalues of a prior below this of the largest cannot be told from zero.
+_SINGULAR = 1e-14
+
+
+def as_plain_array(values: Any, name: str) -> Any:
+    """``values`` with a torch tensor turned into an array, and refused where numbers would lose meaning.
+
+    Raises
+    ------
+    ValueError
+        If ``values`` holds text, or is of a float type too coarse for its spread: unix time in float32 has
+        steps of 128 s.
+    """
+    if hasattr(values, "detach"):
+        values = values.detach().cpu().numpy()
+    array = values if isinstance(values, np.ndarray) else np.asarray(values) if _is_nested(values) else None
+    if array is None:
+        return values
+    text = array.dtype.kind in "US" or (
+        array.dtype.kind == "O" and any(isinstance(entry, str | bytes) for entry in array.flat)
+    )
+    if text:
+        raise ValueError(
+            f"{name} holds text, which dtype='numeric' is not compatible with: convert it to numbers first."
+        )
+    if array.dtype in (np.float16, np.float32) and array.size:
+        _check_resolution(array, name)
+    return values
+
+
+def _is_nested(values: Any) -> bool:
+    return isinstance(values, list | tuple) and len(values) > 0
+
+
+def _check_resolution(array: NDArray[Any], name: str) -> None:
+    columns = array.reshape(len(array), -1).astype(np.float64)
+    if not np.isfinite(columns).all():
+        return  # said better by the check for finite values
+    step = np.finfo(array.dtype).eps * np.abs(columns).max(axis=0)
+    spread = np.ptp(columns, axis=0)
+    coarse = (step > 1e-3 * spread) & (spread > 0)
+    if coarse.any():
+        column = int(np.argmax(coarse))
+        raise ValueError(
+            f"{name} is {array.dtype} and column {column} is stored in steps of {step[column]:.3g} where its "
+            f"range is {spread[column]:.3g}: subtract an offset before storing it, or record it in float64."
+        )
+
+
+def check_inputs_vary(X: Floats) -> None:
+    """Check that X tells rows apart.
+
+    Raises
+    ------
+    ValueError
+        If all rows of X are equal.
+
+    Warns
+    -----
+    DataRankWarning
+        If a column of X is constant or a combination of others: its length scale is not determined.
+    """
+    spread = np.ptp(X, axis=0)
+    constant = spread <= CONSTANT * np.abs(X).max(axis=0)
+    if constant.all():
+        columns = "column 0" if X.shape[1] == 1 else f"columns 0 to {X.shape[1] - 1}"
+        raise ValueError(
+            f"X is constant: {columns} of X have the same value in all {len(X)} rows, so nothing can depend on X. "
+            "Give the time, phase or position of each row."
+        )
+    centred = (X - X.mean(axis=0)) / np.where(constant, 1.0, spread)
+    rank = np.linalg.matrix_rank(centred[:, ~constant], tol=1e-9 * np.sqrt(len(X)))
+    if constant.any() or rank < X.shape[1] - constant.sum():
+        what = f"column {int(np.argmax(constant))} is constant" if constant.any() else "its columns are collinear"
+        warnings.warn(
+            f"X has {X.shape[1]} columns but varies in {rank} directions only: {what}. The covariance is "
+            "learned along these directions; leave the column out.",
+            DataRankWarning,
+            stacklevel=3,
+        )
+
+
+def check_number(
+    value: Any, name: str, *, low: float, strict: bool = False, integer: bool = False, optional: bool = False
+) -> None:
+    """Check that a parameter is a number not below ``low`` (above it, if ``strict``)."""
+    if optional and value is None:
+        return
+    boundaries = "neither" if strict else "left"
+    kind = Integral if integer else Real
+    check_scalar(value, name, kind, min_val=low, include_boundaries=boundaries)
+    if not np.isfinite(value):
+        raise ValueError(f"{name} == {value}, must be finite.")
+
+
+def check_choice(value: Any, name: str, choices: tuple[str, ...]) -> None:
+    """Check that a parameter is one of some strings."""
+    if value not in choices:
+        raise ValueError(f"{name} == {value!r}, must be one of {', '.join(map(repr, choices))}.")
+
+
+def check_length_scale(value: Any, n_features: int) -> Floats | None:
+    """Length scales as an array (n_features,), or None where they are to be learned."""
+    if value is None:
+        return None
+    scales = np.asarray(value, dtype=np.float64)
+    if scales.shape not in [(), (n_features,)] or not (np.isfinite(scales).all() and (scales > 0).all()):
+        raise ValueError(
+            f"length_scale == {value!r}, must be None, a positive number, or {n_features} positive numbers: one "
+            "for each column of X, in its units."
+        )
+    return np.broadcast_to(scales, (n_features,)).copy()
+
+
+def prior_covariance(prior: Prior, X: Floats, n_outputs: int) -> Floats:
+    """Covariances (n, d, d) or (d, d) that a float, array or callable prior stands for.
+
+    Raises
+    ------
+    ValueError
+        If they are not of that shape, finite, symmetric and positive definite.
+    """
+    shape: tuple[int, ...] = (n_outputs, n_outputs)
+    if callable(prior):
+        covariance = np.array(prior(X.copy()), dtype=np.float64)
+        name, shape = "prior(X)", (len(X), *shape)
+    else:
+        covariance = np.array(prior, dtype=np.float64)
+        name = "prior"
+        if covariance.ndim == 0:
+            covariance = covariance * np.eye(n_outputs)
+    if covariance.shape != shape:
+        raise ValueError(
+            f"{name} has shape {covariance.shape}, must have shape {shape}: a covariance in squared units of y."
+        )
+    _check_positive_definite(covariance.reshape(-1, n_outputs, n_outputs), name)
+    return covariance
+
+
+def _check_positive_definite(covariances: Floats, name: str) -> None:
+    finite = np.isfinite(covariances).all(axis=(1, 2))
+    if not finite.all():
+        raise ValueError(f"{name} has an entry that is not finite, at index {int(np.argmin(finite))}.")
+    scale = np.abs(covariances).max(axis=(1, 2))
+    asymmetry = np.abs(covariances - covariances.transpose(0, 2, 1)).max(axis=(1, 2))
+    if (asymmetry > 1e-9 * scale).any():
+        i = int(np.argmax(asymmetry > 1e-9 * scale))
+        raise ValueError(f"{name} must be symmetric; at index {i} two entries differ by {asymmetry[i]:.3g}.")
+    # Units of outputs may be far apart: judge the correlations, not the covariances.
+    variance = np.diagonal(covariances, axis1=1, axis2=2)
+    smallest = np.linalg.eigvalsh(covariances)[:, 0]
+    bad = ~(variance > 0).all(axis=1)
+    if not bad.any():
+        deviation = np.sqrt(variance)
+        correlations = covariances / deviation[:, :, np.newaxis] / deviation[:, np.newaxis, :]
+        bad = np.linalg.eigvalsh(correlations)[:, 0] <= _SINGULAR
+    if bad.any():
+        i = int(np.argmax(bad))
+        raise ValueError(
+            f"{name} must be positive definite; its smallest eigenvalue is {smallest[i]:.3g}"
+            + (f" at index {i}." if len(covariances) > 1 else ".")
+            + " Far from data it is the covariance: give every direction some variance."
+        )

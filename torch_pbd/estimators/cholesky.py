@@ -1,0 +1,208 @@
+"""The Cholesky decomposition approach ("CD") of the paper, Section IV-D."""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_pbd.estimators._latent import (
+    _LONGEST_COVARIANCE,
+    LatentCovarianceRegressor,
+    Problem,
+    residual_tril,
+)
+from torch_pbd.estimators._validation import Prior, check_choice, check_number
+from torch_pbd.gp import LatentValues, Observations, condition, fit_hyperparameters, merge_observations
+from torch_pbd.kernels import KernelName
+from torch_pbd.linalg import tril_to_vector
+from torch_pbd.models.cholesky import CholeskyCovariance, deviation_tril, tril_deviation
+from torch_pbd.models.objectives import gaussian_nll, train
+from torch_pbd.models.training import empirical_tril, pooled_tril
+from torch_pbd.optim import FitReport
+
+# Prior standard deviation of the logarithm of a diagonal entry: a factor of e^2 either way is usual.
+_LOG_AMPLITUDE = 2.0
+
+
+class CholeskyCovRegressor(LatentCovarianceRegressor):
+    """Covariance by Gaussian processes on the entries of its Cholesky factor (the paper's "CD").
+
+    The mean of y is learned by one Gaussian process an output, the lower Cholesky factor of its covariance
+    by one an entry; far from data they return to the mean of y and to ``prior``.
+
+    Parameters
+    ----------
+    objective : {"auto", "empirical", "likelihood"}, default="auto"
+        "empirical": processes through the factors of the empirical covariances (aligned data: every row of
+        X at least twice), hyperparameters by marginal likelihood. "likelihood": eq. (12), the factor at the
+        inputs by L-BFGS, for data anywhere. "auto" takes the first where every input repeats.
+    noise_scale : float or None, default=None
+        Standard deviation, in units of y, of the error of the entries of the empirical factors; None learns
+        it, 0.0 interpolates them, which is what Table I of the paper does. Only for "empirical".
+    diagonal : {"log", "raw"}, default="log"
+        Whether the processes of the diagonal entries act on their logarithm, which keeps them from crossing
+        zero between inputs, or on the entries themselves, as in the paper.
+    bias_correction : bool, default=False
+        Divide the empirical factors by their expectation for normal data (Bartlett), which few
+        demonstrations make too small: six of two outputs by 5 and 16 %. Only for "empirical".
+    latent_prior : bool, default=True
+        Only for "likelihood". True maximizes the posterior density of the factor at the inputs, with
+        hyperparameters held. False is eq. (12) as printed, which trains them too and overfits: without
+        bound where inputs do not repeat.
+    kernel : {"squared_exponential", "matern32", "matern52"}, default="squared_exponential"
+    prior : None, float, array-like of shape (d, d), callable or "paper", default=None
+        Covariance far from data, in squared units of y. A float stands for that times the unit matrix; a
+        callable maps X (n, e) to (n, d, d). None learns a wide one: four times the covariance of all of y.
+        "paper" is a unit factor in the units of y.
+    length_scale : float, array-like of shape (n_features,) or None, default=None
+        Of the covariance's processes, in units of X. None learns it from aligned data, and else takes a
+        fifth of the range.
+    max_inputs : int, default=256
+        Where X has more distinct rows, neighbours are merged into this many: the cost of a fit is cubic in
+        it and linear in the rows.
+    max_iter : int, default=500
+    tol : float, default=1e-6
+    n_restarts : int, default=2
+        Starting points of each hyperparameter search beside the first.
+    random_state : int, RandomState instance or None, default=0
+        Not used: the fit is deterministic. It is here so that estimators can be exchanged.
+    device : str or None, default=None
+        Where the torch module lives.
+    verbose : int, default=0
+
+    Attributes
+    ----------
+    module_ : ConditionalNormal
+        The fitted torch module: maps x (n, e) to mean (n, d) and Cholesky factor (n, d, d), differentiably.
+    n_features_in_, n_outputs_ : int
+    loss_ : float
+        "empirical": negative log marginal likelihood of the factors' entries, in nats. "likelihood": negative
+        log posterior density (or likelihood) of the latent values, in nats per row. Both of standardized y.
+    loss_curve_ : list of float
+    n_iter_ : int
+    converged_ : bool
+    jitter_ : float
+        Largest jitter that a kernel matrix needed, relative to its diagonal.
+
+    References
+    ----------
+    Umlauft, Fanger, Hirche, "Bayesian Uncertainty Modeling for Programming by Demonstration", ICRA 2017,
+    Section IV-D.
+
+    Examples
+    --------
+    >>> from torch_pbd import CholeskyCovRegressor
+    >>> from torch_pbd.data import make_paper_simulation
+    >>> X, y, _ = make_paper_simulation(random_state=0)
+    >>> model = CholeskyCovRegressor().fit(X, y)
+    >>> mean, covariance = model.predict(X[:3], return_cov=True)
+    >>> mean.shape, covariance.shape
+    ((3, 2), (3, 2, 2))
+    """
+
+    aligned_objective = "empirical"
+
+    def __init__(
+        self,
+        *,
+        objective: str = "auto",
+        noise_scale: float | None = None,
+        diagonal: str = "log",
+        bias_correction: bool = False,
+        latent_prior: bool = True,
+        kernel: KernelName = "squared_exponential",
+        prior: Prior = None,
+        length_scale: float | list[float] | None = None,
+        max_inputs: int = 256,
+        max_iter: int = 500,
+        tol: float = 1e-6,
+        n_restarts: int = 2,
+        random_state: Any = 0,
+        device: str | None = None,
+        verbose: int = 0,
+    ) -> None:
+        self.objective = objective
+        self.noise_scale = noise_scale
+        self.diagonal = diagonal
+        self.bias_correction = bias_correction
+        self.latent_prior = latent_prior
+        self.kernel = kernel
+        self.prior = prior
+        self.length_scale = length_scale
+        self.max_inputs = max_inputs
+        self.max_iter = max_iter
+        self.tol = tol
+        self.n_restarts = n_restarts
+        self.random_state = random_state
+        self.device = device
+        self.verbose = verbose
+
+    def _check_parameters(self) -> None:
+        super()._check_parameters()
+        check_number(self.noise_scale, "noise_scale", low=0.0, optional=True)
+        check_choice(self.diagonal, "diagonal", ("log", "raw"))
+
+    def _fit_empirical(self, problem: Problem) -> tuple[CholeskyCovariance, FitReport, float]:
+        training, log_diagonal = problem.training, self.diagonal == "log"
+        scale_tril = empirical_tril(training, bias_correction=self.bias_correction)
+        deviation = tril_deviation(scale_tril, problem.prior_tril, log_diagonal=log_diagonal)
+        degrees = training.counts - 1.0
+        weights = degrees / degrees.mean()
+
+        def observed(values: Tensor) -> Observations:
+            whole = Observations(training.inputs, values.mT.contiguous(), weights)
+            return whole if self.noise_scale == 0 else merge_observations(whole, self.max_inputs)
+
+        observations = observed(deviation)
+        search = self._search(observations, _LONGEST_COVARIANCE, problem.length_scale, self._entry_noise(problem))
+        hyperparameters, _, report = fit_hyperparameters(observations, search)
+        values = observed(tril_to_vector(scale_tril)).targets
+        latent, jitter = condition(observations, hyperparameters, self.kernel, values)
+        prior = problem.prior_tril if problem.prior_tril.ndim == 2 else problem.prior_tril[0]
+        return CholeskyCovariance(latent, prior, log_diagonal=log_diagonal), report, jitter
+
+    def _entry_noise(self, problem: Problem) -> Tensor | None:
+        """Noise of each entry of the factor, in standardized units; of a logarithm, relative."""
+        if self.noise_scale is None:
+            return None
+        row, column = torch.tril_indices(*problem.prior_tril.shape[-2:])
+        noise = self.noise_scale / self._door(problem.scaling.y_scale)[row]
+        if self.diagonal == "log":
+            typical = pooled_tril(problem.training).diagonal().clamp_min(1e-6)[row]
+            noise = torch.where(row == column, noise / typical, noise)
+        return noise
+
+    def _fit_likelihood(self, problem: Problem, residual: Tensor) -> tuple[CholeskyCovariance, FitReport, float]:
+        training, log_diagonal = problem.training, self.diagonal == "log"
+        start = tril_deviation(residual_tril(residual), problem.prior_tril, log_diagonal=log_diagonal)
+        prior = problem.prior_tril.reshape(-1, *problem.prior_tril.shape[-2:])
+        row, column = torch.tril_indices(*prior.shape[-2:])
+        amplitude = prior.square().sum(-1).mean(0).sqrt()[row]
+        if log_diagonal:
+            amplitude = torch.where(row == column, _LOG_AMPLITUDE, amplitude)
+        latent = LatentValues(
+            training.inputs,
+            start.expand(len(training.inputs), -1).mT.contiguous(),
+            amplitude,
+            self._default_length_scale(problem),
+            kernel=self.kernel,
+            train_hyperparameters=not self.latent_prior,
+        )
+        scatter_root, n_rows = training.scatter_root(residual), len(residual)
+
+        def loss(deviation: Tensor) -> Tensor:
+            root = deviation_tril(deviation, problem.prior_tril, log_diagonal=log_diagonal)
+            return gaussian_nll(root, scatter_root, training.counts) / n_rows
+
+        report = train(
+            loss,
+            latent,
+            prior_weight=1.0 / n_rows if self.latent_prior else 0.0,
+            max_iter=self.max_iter,
+            tol=self.tol,
+            callback=self._progress(),
+        )
+        with torch.no_grad():
+            scale_tril = deviation_tril(latent(), problem.prior_tril, log_diagonal=log_diagonal)
+        gp = latent.interpolate(tril_to_vector(scale_tril).mT.contiguous())
+        return CholeskyCovariance(gp, prior[0], log_diagonal=log_diagonal), report, latent.jitter

@@ -1,0 +1,159 @@
+"""Gaussian mixture regression: the baseline of the paper, and what many use today."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from sklearn.cluster import KMeans
+from sklearn.neighbors import NearestNeighbors
+from sklearn.utils import check_random_state
+
+from torch_pbd.estimators._base import CovarianceRegressor, Fitted
+from torch_pbd.estimators._scaling import Standardization, distinct_rows
+from torch_pbd.estimators._validation import Floats, check_choice, check_number
+from torch_pbd.models.mixture import GaussianMixture, expectation_maximization, refine
+from torch_pbd.optim import FitReport
+
+# An output's residual scale is not taken below this of its whole spread.
+_SMALLEST_RESIDUAL = 1e-6
+
+
+class GMMBaseline(CovarianceRegressor):
+    """Gaussian mixture over [x, y] and Gaussian mixture regression.
+
+    The mean and covariance of y given x are those of the mixture's conditional density, with the spread
+    between components in the covariance. A mixture has no prior to return to: far from data it repeats its
+    nearest component, and its mean goes on in a straight line.
+
+    Parameters
+    ----------
+    n_components : int, default=5
+    solver : {"em", "lbfgs"}, default="em"
+        "em": expectation maximization from k-means. "lbfgs": the same, then L-BFGS on the likelihood.
+    reg_covar : float, default=1e-6
+        Added to the variances of every component, relative: to the variance of each input, and to the
+        variance of each output between neighbouring inputs. An absolute one would destroy small variances.
+    max_iter : int, default=1000
+    tol : float, default=1e-7
+        Stop when the mean log-likelihood rises by less, in nats per row.
+    n_restarts : int, default=2
+        k-means starts beside the first; the likeliest mixture is kept.
+    random_state : int, RandomState instance or None, default=0
+        Seed of k-means.
+    device : str or None, default=None
+        Where the torch module lives.
+    verbose : int, default=0
+
+    Attributes
+    ----------
+    module_ : ConditionalNormal
+        The fitted torch module: maps x (n, e) to mean (n, d) and Cholesky factor (n, d, d), differentiably.
+    n_features_in_, n_outputs_ : int
+    loss_ : float
+        Negative mean log-likelihood of the rows [x, y], standardized, in nats.
+    loss_curve_ : list of float
+    n_iter_ : int
+    converged_ : bool
+    jitter_ : float
+        ``reg_covar``.
+
+    Notes
+    -----
+    ``predict_uncertainty`` gives a ``type1`` from the density of the inputs, since a mixture's variance does
+    not grow where data are missing (Section IV-C); ``type2`` is its whole covariance.
+
+    References
+    ----------
+    Calinon, "A tutorial on task-parameterized movement learning and retrieval", Intelligent Service
+    Robotics 9, 2016.
+    """
+
+    def __init__(
+        self,
+        *,
+        n_components: int = 5,
+        solver: str = "em",
+        reg_covar: float = 1e-6,
+        max_iter: int = 1000,
+        tol: float = 1e-7,
+        n_restarts: int = 2,
+        random_state: Any = 0,
+        device: str | None = None,
+        verbose: int = 0,
+    ) -> None:
+        self.n_components = n_components
+        self.solver = solver
+        self.reg_covar = reg_covar
+        self.max_iter = max_iter
+        self.tol = tol
+        self.n_restarts = n_restarts
+        self.random_state = random_state
+        self.device = device
+        self.verbose = verbose
+
+    def _check_parameters(self) -> None:
+        super()._check_parameters()
+        check_number(self.n_components, "n_components", low=1, integer=True)
+        check_choice(self.solver, "solver", ("em", "lbfgs"))
+        check_number(self.reg_covar, "reg_covar", low=0.0, strict=True)
+
+    def _fit(self, X: Floats, y: Floats) -> Fitted:
+        joint = np.hstack([X, y])
+        n_distinct = len(distinct_rows(joint)[0])
+        if n_distinct < self.n_components:
+            raise ValueError(
+                f"n_components == {self.n_components}, must not be above the number of distinct samples, which is "
+                f"{n_distinct} of n_samples = {len(X)}."
+            )
+        scaling = _by_residual(X, y)
+        data = self._door(np.hstack([(X - scaling.x_shift) / scaling.x_scale, (y - scaling.y_shift) / scaling.y_scale]))
+        spread = joint.std(axis=0)
+        points = (joint - joint.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
+        generator = check_random_state(self.random_state)
+        runs = [self._expectation_maximization(data, points, X.shape[1], generator) for _ in range(1 + self.n_restarts)]
+        mixture, report = min(runs, key=lambda run: run[1].loss)
+        if self.solver == "lbfgs":
+            report = refine(
+                mixture,
+                data,
+                reg_covar=self.reg_covar,
+                max_iter=self.max_iter,
+                tol=self.tol,
+                callback=self._progress(),
+            )
+        return Fitted(self._assemble(mixture, scaling), report, float(self.reg_covar))
+
+    def _expectation_maximization(
+        self, data: torch.Tensor, points: Floats, n_features: int, generator: np.random.RandomState
+    ) -> tuple[GaussianMixture, FitReport]:
+        """One run from k-means on ``points``, the rows with unit variance."""
+        kmeans = KMeans(self.n_components, n_init=1, random_state=generator.randint(2**31 - 1))
+        labels: NDArray[np.intp] = kmeans.fit(points).labels_
+        responsibilities = self._door(np.eye(self.n_components)[labels])
+        return expectation_maximization(
+            data,
+            responsibilities,
+            n_features=n_features,
+            reg_covar=self.reg_covar,
+            tol=self.tol,
+            max_iter=self.max_iter,
+        )
+
+
+def _by_residual(X: Floats, y: Floats) -> Standardization:
+    """Standardization of inputs by their deviation, of outputs by that between neighbouring inputs.
+
+    So a regularization of the joint covariance is relative to what the covariance of y given x will be,
+    and not to how far y moves.
+    """
+    whole = Standardization.of(X, y)
+    x_scale = X.std(axis=0)
+    x_scale = np.where(x_scale > 0, x_scale, 1.0)
+    scaled = (X - whole.x_shift) / x_scale
+    # Of the same or the nearest input: the row itself may come first or second among equals.
+    neighbour = NearestNeighbors(n_neighbors=2).fit(scaled).kneighbors(scaled, return_distance=False)
+    other = np.where(neighbour[:, 0] == np.arange(len(X)), neighbour[:, 1], neighbour[:, 0])
+    residual = np.sqrt(0.5 * np.square((y - y[other]) / whole.y_scale).mean(axis=0))
+    y_scale = whole.y_scale * np.clip(residual, _SMALLEST_RESIDUAL, 1.0)
+    return Standardization(whole.x_shift, x_scale, whole.y_shift, y_scale)

@@ -1,0 +1,225 @@
+"""The Wishart process ("WP") of the paper, Section IV-A."""
+
+from typing import Any
+
+import torch
+from sklearn.utils import check_random_state
+from torch import Tensor
+
+from torch_pbd.estimators._latent import (
+    _LONGEST_COVARIANCE,
+    LatentCovarianceRegressor,
+    Problem,
+    residual_tril,
+)
+from torch_pbd.estimators._validation import Prior, check_choice, check_number
+from torch_pbd.gp import LatentValues, Observations, condition, fit_hyperparameters, merge_observations
+from torch_pbd.kernels import KernelName
+from torch_pbd.models.objectives import covariance_mse, gaussian_nll, train
+from torch_pbd.models.training import empirical_tril
+from torch_pbd.models.wishart import WishartCovariance, padded, wishart_root
+from torch_pbd.optim import FitReport
+
+_PAPER_MEAN = 8.0  # of all latent processes, in the paper's simulation
+_SPREAD = {"empirical": 0.01, "random": 0.5}  # of the random part of whitened values at the start
+
+
+class WishartProcessRegressor(LatentCovarianceRegressor):
+    """Covariance as a Wishart process, a sum of outer products of Gaussian process vectors ("WP").
+
+    The mean of y is learned by one Gaussian process an output, its covariance by ``df`` vectors of d
+    processes at their means, eq. (8); far from data they return to the mean of y and to ``prior``.
+
+    Parameters
+    ----------
+    objective : {"auto", "mse", "likelihood"}, default="auto"
+        "mse": eq. (9), the mean squared distance of the Cholesky factors to those of the empirical
+        covariances (aligned data: every row of X at least twice). "likelihood": eq. (11), for data anywhere.
+        "auto" takes the first where every input repeats.
+    df : int, "auto" or None, default=None
+        Number of vectors, the degrees of freedom nu; at least d. None or "auto" is d + 1.
+    start : {"empirical", "random"}, default="empirical"
+        "empirical": the vectors start at the columns of the empirical factors, where eq. (9) has its minimum,
+        zero; for "likelihood" at those of the pooled covariance. "random": at the prior means with noise, and
+        L-BFGS has all the way to go, as in the paper.
+    latent_prior : bool, default=True
+        Only for "likelihood". True maximizes the posterior density of the vectors at the inputs, with
+        hyperparameters held. False is eq. (11) as printed, which trains them too and overfits: without bound
+        where inputs do not repeat.
+    kernel : {"squared_exponential", "matern32", "matern52"}, default="squared_exponential"
+    prior : None, float, array-like of shape (d, d), callable or "paper", default=None
+        Covariance far from data, in squared units of y. A float stands for that times the unit matrix; a
+        callable maps X (n, e) to (n, d, d). None learns a wide one: four times the covariance of all of y.
+        It is spread over the means of d of the vectors. "paper" sets the means of all to 8 in units of y,
+        which gives a covariance of rank one far from data.
+    length_scale : float, array-like of shape (n_features,) or None, default=None
+        Of the vectors' processes, in units of X. None learns it for "mse" started at "empirical", and else
+        takes a fifth of the range.
+    max_inputs : int, default=256
+        Where X has more distinct rows, neighbours are merged into this many: the cost of a fit is cubic in
+        it and linear in the rows.
+    max_iter : int, default=1000
+    tol : float, default=1e-6
+    n_restarts : int, default=2
+        Starting points of each hyperparameter search beside the first.
+    random_state : int, RandomState instance or None, default=0
+        Seed of the start.
+    device : str or None, default=None
+        Where the torch module lives.
+    verbose : int, default=0
+
+    Attributes
+    ----------
+    module_ : ConditionalNormal
+        The fitted torch module: maps x (n, e) to mean (n, d) and Cholesky factor (n, d, d), differentiably.
+    df_ : int
+    n_features_in_, n_outputs_ : int
+    loss_ : float
+        "mse": eq. (9). "likelihood": negative log posterior density (or likelihood) of the latent values, in
+        nats per row. Both of standardized y.
+    loss_curve_ : list of float
+    n_iter_ : int
+    converged_ : bool
+    jitter_ : float
+        Largest jitter that a kernel matrix needed, relative to its diagonal.
+
+    References
+    ----------
+    Umlauft, Fanger, Hirche, "Bayesian Uncertainty Modeling for Programming by Demonstration", ICRA 2017,
+    Sections III-B and IV-A.
+    """
+
+    aligned_objective = "mse"
+
+    def __init__(
+        self,
+        *,
+        objective: str = "auto",
+        df: int | str | None = None,
+        start: str = "empirical",
+        latent_prior: bool = True,
+        kernel: KernelName = "squared_exponential",
+        prior: Prior = None,
+        length_scale: float | list[float] | None = None,
+        max_inputs: int = 256,
+        max_iter: int = 1000,
+        tol: float = 1e-6,
+        n_restarts: int = 2,
+        random_state: Any = 0,
+        device: str | None = None,
+        verbose: int = 0,
+    ) -> None:
+        self.objective = objective
+        self.df = df
+        self.start = start
+        self.latent_prior = latent_prior
+        self.kernel = kernel
+        self.prior = prior
+        self.length_scale = length_scale
+        self.max_inputs = max_inputs
+        self.max_iter = max_iter
+        self.tol = tol
+        self.n_restarts = n_restarts
+        self.random_state = random_state
+        self.device = device
+        self.verbose = verbose
+
+    def _check_parameters(self) -> None:
+        super()._check_parameters()
+        check_choice(self.start, "start", tuple(_SPREAD))
+        if self.df not in (None, "auto"):
+            check_number(self.df, "df", low=1, integer=True)
+
+    def _prior_root(self, problem: Problem) -> Tensor:
+        """L times the vectors' prior means: (d, df), or (n, d, df) where the prior is callable."""
+        n_outputs = problem.training.y.shape[1]
+        self.df_ = n_outputs + 1 if self.df in (None, "auto") else int(self.df)
+        if self.df_ < n_outputs:
+            raise ValueError(
+                f"df == {self.df_}, must be at least {n_outputs}, the number of outputs: the covariance of a "
+                "Wishart process with fewer vectors is singular."
+            )
+        if isinstance(self.prior, str):
+            return (_PAPER_MEAN * problem.prior_tril.diagonal())[:, None].repeat(1, self.df_)
+        return padded(problem.prior_tril, self.df_)
+
+    def _fit_empirical(self, problem: Problem) -> tuple[WishartCovariance, FitReport, float]:
+        prior_root = self._prior_root(problem)
+        target = empirical_tril(problem.training)
+        if self.start == "random":
+
+            def loss(deviation: Tensor, matrix: Tensor) -> Tensor:
+                return covariance_mse(wishart_root(deviation, prior_root, matrix), target)
+
+            return self._train(problem, prior_root, prior_root, loss, prior_weight=0.0)
+        inputs, matrix = problem.training.inputs, torch.eye(target.shape[-1]).to(target)
+
+        def observed(root: Tensor) -> Observations:
+            vectors = root.mT.flatten(1).mT.contiguous()
+            return merge_observations(Observations(inputs, vectors, torch.ones_like(inputs[:, 0])), self.max_inputs)
+
+        root = padded(target, self.df_)
+        observations = observed(root - prior_root)
+        interpolate = torch.zeros(len(observations.targets)).to(target)
+        search = self._search(observations, _LONGEST_COVARIANCE, problem.length_scale, interpolate)
+        hyperparameters, _, report = fit_hyperparameters(observations, search)
+        latent, jitter = condition(observations, hyperparameters, self.kernel, observed(root).targets)
+        with torch.no_grad():
+            mse = float(covariance_mse(wishart_root(latent(inputs), prior_root, matrix), target))
+        report = FitReport(mse, (mse,), report.n_iter, report.converged, report.message)
+        return WishartCovariance(latent, _constant(prior_root), matrix), report, jitter
+
+    def _fit_likelihood(self, problem: Problem, residual: Tensor) -> tuple[WishartCovariance, FitReport, float]:
+        prior_root = self._prior_root(problem)
+        training, n_rows = problem.training, len(residual)
+        scatter_root = training.scatter_root(residual)
+
+        def loss(deviation: Tensor, matrix: Tensor) -> Tensor:
+            root = wishart_root(deviation, prior_root, matrix)
+            return gaussian_nll(root, scatter_root, training.counts) / n_rows
+
+        start = padded(residual_tril(residual), self.df_) if self.start == "empirical" else prior_root
+        return self._train(problem, prior_root, start, loss, prior_weight=1.0 / n_rows if self.latent_prior else 0.0)
+
+    def _train(
+        self, problem: Problem, prior_root: Tensor, start: Tensor, loss: Any, *, prior_weight: float
+    ) -> tuple[WishartCovariance, FitReport, float]:
+        """Minimize ``loss(deviations, L)`` over the vectors at the inputs and L, by L-BFGS."""
+        inputs, n_outputs = problem.training.inputs, prior_root.shape[-2]
+        matrix = torch.eye(n_outputs).to(inputs).requires_grad_()
+        deviation = (start - prior_root).mT.flatten(-2).expand(len(inputs), -1).mT.contiguous()
+        prior = prior_root.reshape(-1, n_outputs, self.df_)
+        amplitude = prior.square().sum(-1).mean(0).sqrt().repeat(self.df_)
+        latent = LatentValues(
+            inputs,
+            deviation,
+            amplitude,
+            self._default_length_scale(problem),
+            kernel=self.kernel,
+            train_hyperparameters=not self.latent_prior,
+        )
+        # Vectors that start equal, or at zero, stay so by symmetry: tell them apart.
+        generator = check_random_state(self.random_state)
+        noise = self._door(generator.standard_normal(latent.whitened.shape))
+        if self.start == "empirical":
+            noise[: n_outputs * n_outputs] = 0.0
+        with torch.no_grad():
+            latent.whitened += _SPREAD[self.start] * noise
+        report = train(
+            lambda values: loss(values, matrix),
+            latent,
+            [matrix],
+            prior_weight=prior_weight,
+            max_iter=self.max_iter,
+            tol=self.tol,
+            callback=self._progress(),
+        )
+        with torch.no_grad():
+            values = wishart_root(latent(), prior_root, matrix).mT.flatten(1).mT.contiguous()
+        covariance = WishartCovariance(latent.interpolate(values), _constant(prior_root), matrix.detach().tril())
+        return covariance, report, latent.jitter
+
+
+def _constant(prior_root: Tensor) -> Tensor:
+    """The prior that is stored with the module; a callable one is handed in at every prediction."""
+    return prior_root if prior_root.ndim == 2 else prior_root[0]

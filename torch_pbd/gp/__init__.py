@@ -1,0 +1,25 @@
+"""Batches of independent Gaussian processes over the same inputs: eq. (3) to (6), and their evidence."""
+
+from torch_pbd.gp.evidence import (
+    EvidenceSearch,
+    Hyperparameters,
+    Observations,
+    fit_hyperparameters,
+    negative_log_evidence,
+)
+from torch_pbd.gp.latent import LatentGP, LatentValues, condition
+from torch_pbd.gp.neighbourhoods import merge_observations, neighbourhoods, spacing
+
+__all__ = [
+    "EvidenceSearch",
+    "Hyperparameters",
+    "LatentGP",
+    "LatentValues",
+    "Observations",
+    "condition",
+    "fit_hyperparameters",
+    "merge_observations",
+    "negative_log_evidence",
+    "neighbourhoods",
+    "spacing",
+]

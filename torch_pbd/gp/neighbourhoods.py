@@ -1,0 +1,57 @@
+"""Distances between training inputs, and the merging of neighbours where there are too many inputs."""
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from torch_pbd.gp.evidence import Observations
+
+
+def spacing(inputs: Float[Tensor, "n e"]) -> float:
+    """Distance to the nearest other input, the 90 % quantile over the inputs; the finest detail they show."""
+    if len(inputs) > 2000:
+        inputs = inputs[:: len(inputs) // 1000]
+    distance = torch.cdist(inputs, inputs, compute_mode="donot_use_mm_for_euclid_dist")
+    distance.fill_diagonal_(float("inf"))
+    return float(distance.amin(1).quantile(0.9))
+
+
+def neighbourhoods(inputs: Float[Tensor, "n e"], max_inputs: int) -> Int64[Tensor, " n"]:
+    """Index of the neighbourhood of each input; at most ``max_inputs`` of them, each for itself if they fit.
+
+    Neighbourhoods are split at the median of their widest dimension until there are enough, so they hold
+    about equally many inputs, and on a line they are runs of sorted inputs.
+    """
+    if len(inputs) <= max_inputs:
+        return torch.arange(len(inputs), device=inputs.device)
+    groups = [torch.arange(len(inputs), device=inputs.device)]
+    while 2 * len(groups) <= max_inputs:
+        halves = []
+        for group in groups:
+            members = inputs[group]
+            widest = (members.amax(0) - members.amin(0)).argmax()
+            order = group[members[:, widest].argsort(stable=True)]
+            halves += [half for half in order.tensor_split(2) if len(half)]
+        groups = halves
+    index = torch.empty(len(inputs), dtype=torch.long, device=inputs.device)
+    for number, group in enumerate(groups):
+        index[group] = number
+    return index
+
+
+def merge_observations(observations: Observations, max_inputs: int) -> Observations:
+    """At most ``max_inputs`` observations: neighbours become their mean, with their counts added up.
+
+    Exact where the process is straight across a neighbourhood. The cost of everything that follows is
+    bounded: cubic in ``max_inputs``, linear in the observations.
+    """
+    if len(observations.counts) <= max_inputs:
+        return observations
+    index = neighbourhoods(observations.inputs, max_inputs)
+    counts = observations.counts.new_zeros(int(index.max()) + 1).index_add_(0, index, observations.counts)
+
+    def mean(values: Tensor) -> Tensor:
+        total = values.new_zeros(len(counts), values.shape[1])
+        return total.index_add_(0, index, values * observations.counts[:, None]) / counts[:, None]
+
+    return Observations(mean(observations.inputs), mean(observations.targets.mT).mT.contiguous(), counts)

@@ -1,0 +1,57 @@
+"""Stationary correlation functions of inputs; an amplitude and a noise are the Gaussian process's matter."""
+
+from collections.abc import Callable
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+KernelName = Literal["squared_exponential", "matern32", "matern52"]
+
+# Beyond it every correlation here is zero in float64; keeps inf * 0 away from inputs at 1e300.
+_FARTHEST = 1e8
+
+
+def _squared_exponential(square_distance: Tensor) -> Tensor:
+    return torch.exp(-0.5 * square_distance)
+
+
+def _matern32(square_distance: Tensor) -> Tensor:
+    distance = (3.0 * square_distance).clamp_min(1e-30).sqrt()  # the root has no gradient at zero
+    return (1.0 + distance) * torch.exp(-distance)
+
+
+def _matern52(square_distance: Tensor) -> Tensor:
+    distance = (5.0 * square_distance).clamp_min(1e-30).sqrt()
+    return (1.0 + distance + distance.square() / 3.0) * torch.exp(-distance)
+
+
+KERNELS: dict[str, Callable[[Tensor], Tensor]] = {
+    "squared_exponential": _squared_exponential,
+    "matern32": _matern32,
+    "matern52": _matern52,
+}
+
+
+def correlation(
+    x: Float[Tensor, "n e"],
+    other: Float[Tensor, "m e"],
+    length_scale: Float[Tensor, "*b e"],
+    kernel: KernelName = "squared_exponential",
+) -> Float[Tensor, "*b n m"]:
+    """Correlation of the latent values at two sets of inputs: eq. (4) with an amplitude of one.
+
+    Parameters
+    ----------
+    x, other : Tensor of shapes (n, e) and (m, e)
+    length_scale : Tensor of shape (..., e)
+        One per input dimension (automatic relevance determination), in the units of ``x``: the diagonal
+        of the paper's Omega.
+    kernel : {"squared_exponential", "matern32", "matern52"}, default="squared_exponential"
+    """
+    square_distance = x.new_zeros(*length_scale.shape[:-1], len(x), len(other))
+    for dimension in range(x.shape[1]):
+        difference = x[:, None, dimension] - other[None, :, dimension]
+        square_distance = square_distance + (difference / length_scale[..., dimension, None, None]).square()
+    return KERNELS[kernel](square_distance.clamp_max(_FARTHEST))

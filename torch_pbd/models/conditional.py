@@ -1,0 +1,108 @@
+"""The fitted model: a normal distribution of y whose mean and covariance depend on x, in the data's units."""
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from torch_pbd.gp import LatentGP
+from torch_pbd.linalg import scale_tril_from_root, symmetrize
+from torch_pbd.models.cholesky import CholeskyCovariance
+from torch_pbd.models.floor import with_floor
+from torch_pbd.models.mixture import GaussianMixture
+from torch_pbd.models.wishart import WishartCovariance
+
+
+class MeanAndCovariance(nn.Module):
+    """Gaussian processes for the mean beside a model of the covariance's root, in standardized units."""
+
+    def __init__(self, mean: LatentGP, covariance: CholeskyCovariance | WishartCovariance) -> None:
+        super().__init__()
+        self.mean = mean
+        self.covariance = covariance
+
+    def forward(
+        self, x: Float[Tensor, "n e"], prior_tril: Float[Tensor, "n d d"] | None = None
+    ) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d r"]]:
+        """Mean, and a root of the covariance."""
+        return self.mean(x), self.covariance(x, prior_tril)
+
+    def variability(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d r"]:
+        """Root of the covariance with the prior taken out: Type II uncertainty."""
+        return self.covariance.variability(x)
+
+    def type1(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
+        """Type I uncertainty of the covariance's latent processes."""
+        return self.covariance.latent.type1(x)
+
+
+class ConditionalNormal(nn.Module):
+    """y given x is N(mean(x), covariance(x)), in the units of the data; differentiable in x.
+
+    Parameters
+    ----------
+    core : MeanAndCovariance or GaussianMixture
+        Maps standardized inputs (n, e) to a mean (n, d) and a root (n, d, r) of the covariance, and has
+        ``type1(x)``.
+    x_shift, x_scale : Tensor of shape (e,)
+        Standardized inputs are ``(x - x_shift) / x_scale``.
+    y_shift, y_scale : Tensor of shape (d,)
+        The same for the outputs.
+    """
+
+    x_shift: Tensor
+    x_scale: Tensor
+    y_shift: Tensor
+    y_scale: Tensor
+
+    def __init__(
+        self,
+        core: MeanAndCovariance | GaussianMixture,
+        x_shift: Float[Tensor, " e"],
+        x_scale: Float[Tensor, " e"],
+        y_shift: Float[Tensor, " d"],
+        y_scale: Float[Tensor, " d"],
+    ) -> None:
+        super().__init__()
+        self.core = core
+        self.register_buffer("x_shift", x_shift)
+        self.register_buffer("x_scale", x_scale)
+        self.register_buffer("y_shift", y_shift)
+        self.register_buffer("y_scale", y_scale)
+
+    def forward(
+        self, x: Float[Tensor, "n e"], prior_scale_tril: Float[Tensor, "n d d"] | None = None
+    ) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d d"]]:
+        """Mean, and lower Cholesky factor of the covariance.
+
+        ``prior_scale_tril`` replaces the prior the model was fitted with, where that depends on x.
+        """
+        mean, root = self._mean_and_root(x, prior_scale_tril)
+        return mean, scale_tril_from_root(root)
+
+    def moments(
+        self, x: Float[Tensor, "n e"], prior_scale_tril: Float[Tensor, "n d d"] | None = None
+    ) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d d"]]:
+        """Mean, and covariance, symmetric to the last bit."""
+        mean, root = self._mean_and_root(x, prior_scale_tril)
+        return mean, symmetrize(root @ root.mT)
+
+    def type1(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
+        """Type I uncertainty: 0 on data, 1 where only the prior speaks."""
+        return self.core.type1((x - self.x_shift) / self.x_scale)
+
+    def type2(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d d"]:
+        """Type II uncertainty: the variability of the data, without the prior; squared units of y."""
+        standardized = (x - self.x_shift) / self.x_scale
+        if isinstance(self.core, GaussianMixture):
+            root = self.core(standardized)[1]  # it has no prior
+        else:
+            root = self.core.variability(standardized)
+        root = self.y_scale[:, None] * with_floor(root)
+        return symmetrize(root @ root.mT)
+
+    def _mean_and_root(self, x: Tensor, prior_scale_tril: Tensor | None) -> tuple[Tensor, Tensor]:
+        standardized = (x - self.x_shift) / self.x_scale
+        if prior_scale_tril is None:
+            mean, root = self.core(standardized)
+        else:
+            mean, root = self.core(standardized, prior_scale_tril / self.y_scale[:, None])
+        return self.y_shift + self.y_scale * mean, self.y_scale[:, None] * with_floor(root)

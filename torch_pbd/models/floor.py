@@ -1,0 +1,15 @@
+"""The floor under every covariance: relative to the data, inside the losses as well as in predictions."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+VARIANCE_FLOOR = 1e-12
+"""Added to every variance, relative to one plus the sum of the variances; outputs have unit variance."""
+
+
+def with_floor(root: Float[Tensor, "*b d r"]) -> Float[Tensor, "*b d s"]:
+    """Root of a covariance with the floor added: positive definite, whatever ``root`` is."""
+    floor = (VARIANCE_FLOOR * (1.0 + root.square().sum((-2, -1)))).sqrt()
+    identity = torch.eye(root.shape[-2]).to(root)
+    return torch.cat([root, floor[..., None, None] * identity], dim=-1)

@@ -1,0 +1,67 @@
+"""A fitted model as plain data and tensors, and back: what files and pickles hold."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torch_pbd.gp import Hyperparameters, LatentGP
+from torch_pbd.models.cholesky import CholeskyCovariance
+from torch_pbd.models.conditional import ConditionalNormal, MeanAndCovariance
+from torch_pbd.models.mixture import GaussianMixture
+from torch_pbd.models.wishart import WishartCovariance
+
+
+def module_spec(module: ConditionalNormal) -> dict[str, Any]:
+    """All of the model that is not in its ``state_dict``: JSON-able."""
+    core = module.core
+    if isinstance(core, GaussianMixture):
+        return {"covariance": "mixture", "n_features": core.n_features}
+    spec: dict[str, Any] = {"mean_kernel": core.mean.kernel, "kernel": core.covariance.latent.kernel}
+    if isinstance(core.covariance, CholeskyCovariance):
+        return {"covariance": "cholesky", "log_diagonal": core.covariance.log_diagonal, **spec}
+    return {"covariance": "wishart", **spec}
+
+
+def module_from_spec(spec: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> ConditionalNormal:
+    """Model of which ``module_spec`` gave ``spec`` and ``state_dict`` the tensors.
+
+    Raises
+    ------
+    KeyError
+        If a tensor is missing.
+    ValueError
+        If the spec is of no model of this package.
+    """
+    parts = {name.removeprefix("core."): tensor for name, tensor in tensors.items()}
+    if spec["covariance"] == "mixture":
+        core: MeanAndCovariance | GaussianMixture = GaussianMixture(
+            parts["log_weight"],
+            parts["mean"],
+            torch.diag_embed(parts["log_diagonal"].exp()) + parts["strict_lower"],
+            spec["n_features"],
+        )
+    elif spec["covariance"] in ("cholesky", "wishart"):
+        latent = _latent("covariance.latent.", parts, spec["kernel"])
+        if spec["covariance"] == "cholesky":
+            prior_tril = parts["covariance.prior_tril"]
+            covariance: Any = CholeskyCovariance(latent, prior_tril, log_diagonal=spec["log_diagonal"])
+        else:
+            matrix = parts["covariance.scale_matrix_tril"]
+            covariance = WishartCovariance(latent, parts["covariance.prior_root"], matrix)
+        core = MeanAndCovariance(_latent("mean.", parts, spec["mean_kernel"]), covariance)
+    else:
+        raise ValueError(f"unknown covariance model {spec['covariance']!r}")
+    scaling = [tensors[name] for name in ("x_shift", "x_scale", "y_shift", "y_scale")]
+    module = ConditionalNormal(core, *scaling)
+    module.load_state_dict(tensors)
+    return module
+
+
+def _latent(prefix: str, parts: Mapping[str, Tensor], kernel: Any) -> LatentGP:
+    def part(name: str) -> Tensor:
+        return parts[prefix + name]
+
+    hyperparameters = Hyperparameters(part("length_scale"), part("amplitude"), part("noise_ratio"))
+    return LatentGP(part("inputs"), part("weight"), part("value_weight"), hyperparameters, part("counts"), kernel)

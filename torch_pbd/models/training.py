@@ -1,0 +1,116 @@
+"""Training rows with their distinct inputs found, and the statistics the models need of them."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from torch_pbd.gp import neighbourhoods
+from torch_pbd.linalg import scale_tril_from_root
+
+
+@dataclass(frozen=True)
+class TrainingSet:
+    """N rows at n distinct inputs, in standardized units.
+
+    ``inputs[index]`` are the inputs of the rows: exactly, or after :meth:`merged` their neighbourhoods'
+    centres.
+    """
+
+    x: Float[Tensor, "rows e"]
+    y: Float[Tensor, "rows d"]
+    inputs: Float[Tensor, "n e"]
+    index: Int64[Tensor, " rows"]
+
+    @property
+    def counts(self) -> Float[Tensor, " n"]:
+        """Rows at each distinct input."""
+        return torch.bincount(self.index, minlength=len(self.inputs)).to(self.y)
+
+    def means(self) -> Float[Tensor, "n d"]:
+        """Mean of y at each distinct input."""
+        return _sum_by(self.y, self.index, len(self.inputs)) / self.counts[:, None]
+
+    def merged(self, max_inputs: int) -> "TrainingSet":
+        """The same rows with at most ``max_inputs`` distinct inputs: neighbours are taken together."""
+        if len(self.inputs) <= max_inputs:
+            return self
+        index = neighbourhoods(self.inputs, max_inputs)[self.index]
+        n_inputs = int(index.max()) + 1
+        counts = torch.bincount(index, minlength=n_inputs).to(self.x)
+        return replace(self, inputs=_sum_by(self.x, index, n_inputs) / counts[:, None], index=index)
+
+    def scatter_root(self, residual: Float[Tensor, "rows d"]) -> Float[Tensor, "n d r"]:
+        """Root of the scatter at each input: ``root @ root.mT`` is the sum of ``w w'`` over its rows.
+
+        The rows of each input are laid side by side, and where they are more than d reduced to d by a QR
+        decomposition: no product is formed, and K <= d rows are no special case. Inputs of about as many
+        rows are treated together, so memory is linear in the rows.
+        """
+        counts = torch.bincount(self.index, minlength=len(self.inputs))
+        n_outputs = residual.shape[1]
+        result = residual.new_zeros(len(counts), n_outputs, min(n_outputs, int(counts.max())))
+        order = self.index.argsort(stable=True)
+        group = self.index[order]
+        position = torch.arange(len(order), device=order.device) - (counts.cumsum(0) - counts)[group]
+        size = counts.clamp_min(1).log2().ceil()
+        for exponent in size.unique():
+            members = (size == exponent).nonzero().squeeze(-1)
+            rows = size[group] == exponent
+            slot = torch.zeros_like(counts)
+            slot[members] = torch.arange(len(members), device=members.device)
+            root = residual.new_zeros(len(members), int(counts[members].max()), n_outputs)
+            root[slot[group[rows]], position[rows]] = residual[order[rows]]
+            root = scale_tril_from_root(root.mT) if root.shape[1] > n_outputs else root.mT
+            result[members, :, : root.shape[-1]] = root
+        return result
+
+
+def pooled_tril(training: TrainingSet) -> Float[Tensor, "d d"]:
+    """Factor of the covariance of y around its mean at each input, pooled over the inputs.
+
+    Where no input repeats there is nothing to pool: then of the covariance of all of y.
+    """
+    degrees = len(training.y) - len(training.inputs)
+    residual = training.y - training.means()[training.index]
+    if degrees < 1:
+        residual, degrees = training.y - training.y.mean(0), max(1, len(training.y) - 1)
+    return scale_tril_from_root(residual.mT) / degrees**0.5
+
+
+def empirical_tril(training: TrainingSet, *, bias_correction: bool = False) -> Float[Tensor, "n d d"]:
+    """Factor of the empirical covariance at each distinct input; its divisor is the count less one.
+
+    At an input with no more than d rows the scatter is singular. There it is shrunk towards the pooled
+    covariance as by an inverse-Wishart prior of d + 1 degrees of freedom.
+
+    Parameters
+    ----------
+    training : TrainingSet
+        With at least two rows at each input.
+    bias_correction : bool, default=False
+        Divide column i of each factor by its expectation for normal data (Bartlett),
+        ``sqrt(2 / (K - 1)) * gamma((K - i + 1) / 2) / gamma((K - i) / 2)``, i from 1.
+    """
+    n_outputs = training.y.shape[1]
+    root = training.scatter_root(training.y - training.means()[training.index])
+    degrees = training.counts - 1.0
+    lacking = degrees < n_outputs
+    if not bool(lacking.any()):
+        tril = scale_tril_from_root(root) / degrees.sqrt()[:, None, None]
+        return tril / _expected_diagonal(degrees, n_outputs)[:, None, :] if bias_correction else tril
+    prior_degrees = float(n_outputs + 1)
+    prior_root = prior_degrees**0.5 * pooled_tril(training) * lacking[:, None, None]
+    degrees = degrees + prior_degrees * lacking
+    return scale_tril_from_root(torch.cat([root, prior_root], dim=-1)) / degrees.sqrt()[:, None, None]
+
+
+def _expected_diagonal(degrees: Tensor, n_outputs: int) -> Tensor:
+    """Mean of each column of the factor of an empirical covariance over that of the true one."""
+    rest = degrees[:, None] - torch.arange(n_outputs).to(degrees)
+    return (torch.lgamma((rest + 1.0) / 2.0) - torch.lgamma(rest / 2.0)).exp() * (2.0 / degrees[:, None]).sqrt()
+
+
+def _sum_by(values: Tensor, index: Tensor, n_groups: int) -> Tensor:
+    return values.new_zeros(n_groups, values.shape[1]).index_add_(0, index, values)

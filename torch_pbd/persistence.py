@@ -1,0 +1,150 @@
+"""Save and load fitted estimators: one safetensors file whose header is JSON; nothing in it is ever executed."""
+
+import hashlib
+import json
+import os
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+from tempfile import NamedTemporaryFile
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save as to_bytes
+from sklearn.utils.validation import check_is_fitted
+
+from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.exceptions import ModelFileError
+
+FORMAT_VERSION = 1
+_CLASSES = {
+    "CholeskyCovRegressor": "torch_pbd.estimators.cholesky",
+    "WishartProcessRegressor": "torch_pbd.estimators.wishart",
+    "GMMBaseline": "torch_pbd.estimators.mixture",
+}
+_KEY = "torch_pbd"
+
+
+def save(estimator: CovarianceRegressor, path: str | os.PathLike[str]) -> None:
+    """Save a fitted estimator to one file, which is there whole or not at all.
+
+    Parameters
+    ----------
+    estimator : fitted covariance regressor
+    path : path-like
+        File to write; by custom it ends in ``.safetensors``. Its folder must exist.
+
+    Raises
+    ------
+    sklearn.exceptions.NotFittedError
+        If the estimator is not fitted.
+    TypeError
+        If it is not one of this package, or a parameter (a callable prior, a random state object) cannot
+        be written as JSON.
+    """
+    name = type(estimator).__name__
+    if name not in _CLASSES:
+        raise TypeError(f"estimator is a {name}; can save {', '.join(_CLASSES)}. In a pipeline, save that step.")
+    check_is_fitted(estimator)
+    state = estimator.__getstate__()
+    arrays = {key: np.ascontiguousarray(value) for key, value in state.pop("_module_arrays").items()}
+    header = {
+        "format_version": FORMAT_VERSION,
+        "class": name,
+        "params": {key: _encode(value, key) for key, value in estimator.get_params(deep=False).items()},
+        "module": state.pop("_module_spec"),
+        "fitted": {
+            key: _encode(value, key) for key, value in state.items() if key not in estimator.get_params(deep=False)
+        },
+        "versions": {package: version(package) for package in ("torch", "scikit-learn", "numpy")},
+        "sha256": _digest(arrays),
+    }
+    _write_whole(Path(path), to_bytes(arrays, metadata={_KEY: json.dumps(header)}))
+
+
+def load(path: str | os.PathLike[str]) -> CovarianceRegressor:
+    """Load an estimator that :func:`save` wrote: it predicts the same to the last bit.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ModelFileError
+        If it is damaged, of a newer format, or no model of this package.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"no model file at {path}")
+    try:
+        with safe_open(path, framework="numpy") as file:
+            header = json.loads((file.metadata() or {})[_KEY])
+            arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a dict
+    except (SafetensorError, KeyError, ValueError, OSError) as error:
+        raise ModelFileError(f"{path} is not a model of torch_pbd, or is damaged ({error}).") from error
+    if not isinstance(header, dict) or header.get("format_version") != FORMAT_VERSION:
+        found = header.get("format_version") if isinstance(header, dict) else None
+        raise ModelFileError(f"{path} has format version {found}; this torch_pbd reads {FORMAT_VERSION}. Upgrade it.")
+    if header.get("class") not in _CLASSES:
+        raise ModelFileError(f"{path} holds a {header.get('class')!r}; known are {', '.join(_CLASSES)}.")
+    if header.get("sha256") != _digest(arrays):
+        raise ModelFileError(f"{path} is damaged: its arrays do not match their checksum.")
+    try:
+        estimator_class = getattr(import_module(_CLASSES[header["class"]]), header["class"])
+        estimator: CovarianceRegressor = estimator_class(**_decode(header["params"]))
+        state = {**estimator.__dict__, **_decode(header["fitted"])}
+        estimator.__setstate__({**state, "_module_spec": header["module"], "_module_arrays": arrays})
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise ModelFileError(f"{path} does not describe a whole {header['class']} ({error}).") from error
+    return estimator
+
+
+def _digest(arrays: dict[str, NDArray[Any]]) -> str:
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        digest.update(f"{name} {arrays[name].dtype} {arrays[name].shape} ".encode())
+        digest.update(arrays[name].tobytes())
+    return digest.hexdigest()
+
+
+def _encode(value: Any, name: str) -> Any:
+    """JSON of a value; arrays are marked."""
+    if isinstance(value, np.ndarray):
+        return {
+            "array": _encode(value.tolist(), name),
+            "dtype": "object" if value.dtype == object else str(value.dtype),
+        }
+    if isinstance(value, np.generic):
+        return _encode(value.item(), name)
+    if isinstance(value, list | tuple):
+        return [_encode(entry, name) for entry in value]
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise TypeError(
+        f"{name} is a {type(value).__name__}, which a model file cannot hold; pickle the estimator, or fit it with "
+        f"{name} given as numbers."
+    )
+
+
+def _decode(value: Any) -> Any:
+    if isinstance(value, dict):
+        if set(value) == {"array", "dtype"}:
+            return np.array(value["array"], dtype=value["dtype"])
+        return {key: _decode(entry) for key, entry in value.items()}
+    return value
+
+
+def _write_whole(path: Path, content: bytes) -> None:
+    """Write beside the file and put it in its place: a reader sees the old one or the new one."""
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"cannot save to {path}: its folder does not exist.")
+    with NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
+        try:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+            os.replace(file.name, path)  # noqa: PTH105 - the temporary file has only a name
+        except BaseException:
+            Path(file.name).unlink(missing_ok=True)
+            raise
