@@ -183,13 +183,15 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         """
         check_number(n_samples, "n_samples", low=1, integer=True)
         generator = check_random_state(random_state)
-        mean, scale_tril = (part.cpu().numpy() for part in self._apply(self.module_, self._query(X)))
+        x = self._query(X)
+        mean, scale_tril = (part.cpu().numpy() for part in self._apply(self.module_, x))
         normal = generator.standard_normal((*mean.shape, n_samples))
         samples = mean[:, :, np.newaxis] + scale_tril @ normal
         return samples[:, 0] if self._y_is_1d else samples
 
     def _moments(self, X: ArrayLike) -> tuple[Floats, Floats]:
-        mean, covariance = self._apply(self.module_.moments, self._query(X))
+        x = self._query(X)
+        mean, covariance = self._apply(self.module_.moments, x)
         return mean.cpu().numpy(), covariance.cpu().numpy()
 
     def _validated(self, X: ArrayLike, y: ArrayLike, **options: Any) -> tuple[Floats, Floats]:

@@ -37,7 +37,7 @@ from torch_pbd.optim import FitReport
 
 # Length scales from here times the spacing of the inputs to this many ranges: shorter ones are "needles"
 # that explain each point by itself, and with longer ones the prior of a covariance would never take over.
-_SHORTEST, _LONGEST_MEAN, _LONGEST_COVARIANCE = 0.75, 10.0, 1.0
+_SHORTEST, _LONGEST_MEAN, _LONGEST_COVARIANCE = 0.75, 10.0, 0.35
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         detail = max(spacing(observations.inputs), n_inputs ** (-1.0 / n_features))
         bounds = (min(0.5, _SHORTEST * detail), longest)
         return EvidenceSearch(
-            self.kernel, bounds, length_scale, noise_scale, self.n_restarts, max(100, self.max_iter), self.tol
+            self.kernel, bounds, length_scale, noise_scale, self.n_restarts, max_iter=max(100, self.max_iter)
         )
 
     def _default_length_scale(self, problem: Problem) -> Tensor:

@@ -20,6 +20,10 @@ from torch_pbd.models.objectives import gaussian_nll, train
 from torch_pbd.models.training import empirical_tril, pooled_tril
 from torch_pbd.optim import FitReport
 
+# Logarithms of the empirical diagonal are taken of no less than this of its root mean square over the inputs:
+# an exact zero at one input, as where all recordings start at the origin, would else dominate its neighbours.
+_LEAST_DIAGONAL = 1e-3
+
 # Prior standard deviation of the logarithm of a diagonal entry: a factor of e^2 either way is usual.
 _LOG_AMPLITUDE = 2.0
 
@@ -39,9 +43,11 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
     noise_scale : float or None, default=None
         Standard deviation, in units of y, of the error of the entries of the empirical factors; None learns
         it, 0.0 interpolates them, which is what Table I of the paper does. Only for "empirical".
-    diagonal : {"log", "raw"}, default="log"
-        Whether the processes of the diagonal entries act on their logarithm, which keeps them from crossing
-        zero between inputs, or on the entries themselves, as in the paper.
+    diagonal : {"auto", "raw", "log"}, default="auto"
+        Whether the processes of the diagonal entries act on the entries themselves, as in the paper, or on
+        their logarithm, which keeps them from crossing zero between inputs. "auto" takes "raw" for
+        "empirical", where observed entries are positive, and "log" for "likelihood", where nothing else
+        tells an entry from its negative.
     bias_correction : bool, default=False
         Divide the empirical factors by their expectation for normal data (Bartlett), which few
         demonstrations make too small: six of two outputs by 5 and 16 %. Only for "empirical".
@@ -62,6 +68,7 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
         it and linear in the rows.
     max_iter : int, default=500
     tol : float, default=1e-6
+        Stop when no gradient entry, or the fall of the loss, is above it; in nats per row.
     n_restarts : int, default=2
         Starting points of each hyperparameter search beside the first.
     random_state : int, RandomState instance or None, default=0
@@ -107,7 +114,7 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
         *,
         objective: str = "auto",
         noise_scale: float | None = None,
-        diagonal: str = "log",
+        diagonal: str = "auto",
         bias_correction: bool = False,
         latent_prior: bool = True,
         kernel: KernelName = "squared_exponential",
@@ -140,12 +147,13 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
     def _check_parameters(self) -> None:
         super()._check_parameters()
         check_number(self.noise_scale, "noise_scale", low=0.0, optional=True)
-        check_choice(self.diagonal, "diagonal", ("log", "raw"))
+        check_choice(self.diagonal, "diagonal", ("auto", "raw", "log"))
 
     def _fit_empirical(self, problem: Problem) -> tuple[CholeskyCovariance, FitReport, float]:
         training, log_diagonal = problem.training, self.diagonal == "log"
         scale_tril = empirical_tril(training, bias_correction=self.bias_correction)
-        deviation = tril_deviation(scale_tril, problem.prior_tril, log_diagonal=log_diagonal)
+        linked = _with_least_diagonal(scale_tril) if log_diagonal else scale_tril
+        deviation = tril_deviation(linked, problem.prior_tril, log_diagonal=log_diagonal)
         degrees = training.counts - 1.0
         weights = degrees / degrees.mean()
 
@@ -173,7 +181,7 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
         return noise
 
     def _fit_likelihood(self, problem: Problem, residual: Tensor) -> tuple[CholeskyCovariance, FitReport, float]:
-        training, log_diagonal = problem.training, self.diagonal == "log"
+        training, log_diagonal = problem.training, self.diagonal != "raw"
         start = tril_deviation(residual_tril(residual), problem.prior_tril, log_diagonal=log_diagonal)
         prior = problem.prior_tril.reshape(-1, *problem.prior_tril.shape[-2:])
         row, column = torch.tril_indices(*prior.shape[-2:])
@@ -206,3 +214,9 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
             scale_tril = deviation_tril(latent(), problem.prior_tril, log_diagonal=log_diagonal)
         gp = latent.interpolate(tril_to_vector(scale_tril).mT.contiguous())
         return CholeskyCovariance(gp, prior[0], log_diagonal=log_diagonal), report, latent.jitter
+
+
+def _with_least_diagonal(scale_tril: Tensor) -> Tensor:
+    diagonal = scale_tril.diagonal(dim1=-2, dim2=-1)
+    least = _LEAST_DIAGONAL * diagonal.square().mean(0).sqrt()
+    return scale_tril.tril(-1) + torch.diag_embed(torch.maximum(diagonal, least))

@@ -59,7 +59,8 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         Where X has more distinct rows, neighbours are merged into this many: the cost of a fit is cubic in
         it and linear in the rows.
     max_iter : int, default=1000
-    tol : float, default=1e-6
+    tol : float, default=1e-4
+        Stop when no gradient entry, or the fall of the loss, is above it (1e-4 of it, for "mse").
     n_restarts : int, default=2
         Starting points of each hyperparameter search beside the first.
     random_state : int, RandomState instance or None, default=0
@@ -103,7 +104,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         length_scale: float | list[float] | None = None,
         max_inputs: int = 256,
         max_iter: int = 1000,
-        tol: float = 1e-6,
+        tol: float = 1e-4,
         n_restarts: int = 2,
         random_state: Any = 0,
         device: str | None = None,
@@ -151,7 +152,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
             def loss(deviation: Tensor, matrix: Tensor) -> Tensor:
                 return covariance_mse(wishart_root(deviation, prior_root, matrix), target)
 
-            return self._train(problem, prior_root, prior_root, loss, prior_weight=0.0)
+            return self._train(problem, prior_root, prior_root, loss, prior_weight=0.0, tol=1e-4 * self.tol)
         inputs, matrix = problem.training.inputs, torch.eye(target.shape[-1]).to(target)
 
         def observed(root: Tensor) -> Observations:
@@ -179,14 +180,16 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
             return gaussian_nll(root, scatter_root, training.counts) / n_rows
 
         start = padded(residual_tril(residual), self.df_) if self.start == "empirical" else prior_root
-        return self._train(problem, prior_root, start, loss, prior_weight=1.0 / n_rows if self.latent_prior else 0.0)
+        prior_weight = 1.0 / n_rows if self.latent_prior else 0.0
+        return self._train(problem, prior_root, start, loss, prior_weight=prior_weight, tol=self.tol)
 
     def _train(
-        self, problem: Problem, prior_root: Tensor, start: Tensor, loss: Any, *, prior_weight: float
+        self, problem: Problem, prior_root: Tensor, start: Tensor, loss: Any, *, prior_weight: float, tol: float
     ) -> tuple[WishartCovariance, FitReport, float]:
         """Minimize ``loss(deviations, L)`` over the vectors at the inputs and L, by L-BFGS."""
         inputs, n_outputs = problem.training.inputs, prior_root.shape[-2]
-        matrix = torch.eye(n_outputs).to(inputs).requires_grad_()
+        # A free L would grow while the whitened values shrink, and so escape their prior.
+        matrix = torch.eye(n_outputs).to(inputs).requires_grad_(prior_weight == 0.0)
         deviation = (start - prior_root).mT.flatten(-2).expand(len(inputs), -1).mT.contiguous()
         prior = prior_root.reshape(-1, n_outputs, self.df_)
         amplitude = prior.square().sum(-1).mean(0).sqrt().repeat(self.df_)
@@ -208,10 +211,10 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         report = train(
             lambda values: loss(values, matrix),
             latent,
-            [matrix],
+            [matrix] if matrix.requires_grad else [],
             prior_weight=prior_weight,
             max_iter=self.max_iter,
-            tol=self.tol,
+            tol=tol,
             callback=self._progress(),
         )
         with torch.no_grad():
