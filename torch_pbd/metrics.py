@@ -13,7 +13,7 @@ from typing import Any, Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import gammaincinv  # type: ignore[import-untyped]
+from scipy.special import gammaincinv
 from sklearn.pipeline import Pipeline
 
 _Floats = NDArray[np.floating[Any]]

@@ -6,13 +6,15 @@ from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from sklearn.utils.validation import check_scalar
 
 from torch_pbd.exceptions import DataRankWarning
 
 Floats = NDArray[np.float64]
-Prior = float | ArrayLike | Callable[[Floats], ArrayLike] | str | None
+Prior = (
+    float | list[list[float]] | Callable[[Any], Any] | str | None
+)  # or any array-like; the type is what YAML can say
 
 # A column whose spread is below this of its largest value differs only by rounding.
 CONSTANT = 1e-11

@@ -18,9 +18,10 @@ from torch_pbd.kernels import KernelName, correlation
 from torch_pbd.optim import FitReport, minimize_batch
 
 MIN_NOISE_RATIO, MAX_NOISE_RATIO = 1e-10, 1e5
-"""Bounds of a learned noise variance over the variance of the process."""
+"""Bounds of a learned noise variance over the variance of the process; a fixed noise may be far lower."""
 
 _BLOCK = 32  # processes fitted together: bounds the memory
+_HOPEFUL = 0.5  # nats for each input that polishing may be worth
 
 # Below 1e-3 the evidence is nearly flat in the ratio: no optimum is lost between these.
 _LOG10_RATIOS = (-10.0, -8.0, -6.0, -4.0, -3.0, -2.5, -2.0, -1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 4.0)
@@ -137,9 +138,17 @@ class _Coordinates:
         bounds = [] if search.length_scale is not None else [(smallest, largest)] * n_features
         self.n_length_scales = len(bounds)
         if search.noise_scale is None or bool((search.noise_scale > 0).all()):
-            bounds.append((math.log(MIN_NOISE_RATIO), math.log(MAX_NOISE_RATIO)))
+            bounds.append((math.log(self._lowest_ratio()), math.log(MAX_NOISE_RATIO)))
         table = torch.tensor(bounds).reshape(-1, 2).to(observations.inputs)
         self.low, self.width = table[:, 0], table[:, 1] - table[:, 0]
+
+    def _lowest_ratio(self) -> float:
+        """That of a fixed noise must leave room for amplitudes a hundred times the targets."""
+        if self.search.noise_scale is None:
+            return MIN_NOISE_RATIO
+        largest = float(self.observations.targets.square().mean(1).max())
+        lowest = float(self.search.noise_scale.min()) ** 2 / max(1e4 * largest, 1e-200)
+        return min(MIN_NOISE_RATIO, max(lowest, 1e-40))
 
     def decode(self, z: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         """Length scales, noise ratio, and the squared amplitude where a fixed noise decides it."""
@@ -168,11 +177,11 @@ class _Coordinates:
         return _evidence(quadratic, log_det, variance, chosen.counts) / len(chosen.counts)
 
     @torch.no_grad()
-    def best_of(self, z: Float[Tensor, "s b p"], rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Lowest negative log evidence of each process over s points, and which of them has it."""
-        loss = self.loss(z.flatten(0, 1), rows).reshape(z.shape[:2]) * len(self.observations.counts)
-        lowest = loss.nan_to_num(nan=math.inf).min(0)
-        return lowest.values, lowest.indices
+    def losses(self, z: Float[Tensor, "s b p"]) -> Float[Tensor, "s b"]:
+        """Negative log evidence of each process at s points, in nats; infinite where it has none."""
+        rows = torch.arange(z.shape[1], device=z.device).repeat(len(z))
+        loss = self.loss(z.flatten(0, 1), rows).reshape(z.shape[:2])
+        return loss.nan_to_num(nan=math.inf) * len(self.observations.counts)
 
     @torch.no_grad()
     def hyperparameters(self, z: Tensor) -> Hyperparameters:
@@ -198,6 +207,9 @@ def _grid(coordinates: _Coordinates, n_starts: int) -> Tensor:
     scales = torch.logspace(math.log10(low), math.log10(high), n_scales).to(weight)
     learned = len(coordinates.low) > coordinates.n_length_scales
     ratios = 10.0 ** weight.new_tensor(_LOG10_RATIOS) if learned else weight.new_zeros(1)
+    if learned and search.noise_scale is not None:
+        lower = torch.arange(float(coordinates.low[-1]) / math.log(10), _LOG10_RATIOS[0] - 0.5).to(weight)
+        ratios = torch.cat([10.0**lower, ratios])
     losses = []
     for scale in scales:
         length_scale = scale.expand(observations.inputs.shape[1])
@@ -215,7 +227,7 @@ def _grid(coordinates: _Coordinates, n_starts: int) -> Tensor:
         losses.append(loss.where(sound, torch.full_like(loss, math.inf)))
     table = torch.stack(losses, dim=2).flatten(1)  # (b, ratios * scales)
     starts, offset = [], 0
-    for band in table.tensor_split(n_starts, dim=1):
+    for band in table.tensor_split(min(n_starts, table.shape[1]), dim=1):
         best = band.argmin(1) + offset
         starts.append(coordinates.encode(scales[best % len(scales)], ratios[best // len(scales)]))
         offset += band.shape[1]
@@ -237,10 +249,14 @@ def fit_hyperparameters(
 
     Raises
     ------
+    ValueError
+        If the noise is held at zero for some processes and above zero for others.
     NotPositiveDefiniteError
         If there is no start from which the evidence can be computed, as for a length scale held at many
         times the spacing of inputs without noise.
     """
+    if search.noise_scale is not None and len((search.noise_scale > 0).unique()) > 1:
+        raise ValueError("noise_scale is zero for some processes and not for others: fit these in two searches.")
     blocks = []
     for rows in torch.arange(len(observations.targets)).split(_BLOCK):
         noise_scale = None if search.noise_scale is None else search.noise_scale[rows]
@@ -265,17 +281,21 @@ def _fit_block(observations: Observations, search: EvidenceSearch) -> tuple[Hype
     n_starts, n_processes, n_searched = starts.shape
     columns = torch.arange(n_processes, device=starts.device)
     rows = columns.repeat(n_starts)
-    first, _ = coordinates.best_of(starts, rows)
+    losses = coordinates.losses(starts)
+    first = losses.amin(0)
+    # A start far worse than another for each input is not polished: its optimum would have to be a spike.
+    hopeful = (losses <= first + _HOPEFUL * len(observations.counts)).flatten()
     z, n_iter, converged = starts.flatten(0, 1), 0, True
     if n_searched:
-        z, batch = minimize_batch(
-            lambda chosen, index: coordinates.loss(chosen, rows[index]),
-            z,
+        z[hopeful], batch = minimize_batch(
+            lambda chosen, index: coordinates.loss(chosen, rows[hopeful][index]),
+            z[hopeful],
             max_iter=search.max_iter,
             tol=search.tol,
         )
         n_iter, converged = batch.n_iter, batch.converged
-    loss, best = coordinates.best_of(z.reshape(starts.shape), rows)
+    losses = coordinates.losses(z.reshape(starts.shape))
+    loss, best = losses.min(0)
     if not torch.isfinite(loss).all():
         raise NotPositiveDefiniteError(
             "The kernel matrix is singular wherever the hyperparameters were searched. Allow for noise "

@@ -1,0 +1,83 @@
+import numpy as np
+import pytest
+import torch
+from sklearn.gaussian_process.kernels import RBF, Matern
+
+from torch_pbd.kernels import KERNELS, correlation
+
+ORACLES = {
+    "squared_exponential": RBF,
+    "matern32": lambda length_scale: Matern(length_scale, nu=1.5),
+    "matern52": lambda length_scale: Matern(length_scale, nu=2.5),
+}
+
+
+def tensor(array):
+    return torch.tensor(array, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("length_scale", [[0.3], [0.3, 2.0]])
+def test_correlation_is_that_of_scikit_learn(kernel, length_scale, rng):
+    x, other = rng.normal(size=(20, len(length_scale))), rng.normal(size=(15, len(length_scale)))
+    found = correlation(tensor(x), tensor(other), tensor(length_scale), kernel)
+    # Entries down to 1e-300, whose exponents carry the rounding of distances.
+    np.testing.assert_allclose(found, ORACLES[kernel](length_scale)(x, other), rtol=1e-9, atol=1e-200)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_each_length_scale_of_a_batch_is_on_its_own(kernel, generator):
+    x = torch.randn(6, 2, dtype=torch.float64, generator=generator)
+    length_scale = tensor([[[0.3, 2.0], [1.0, 1.0]], [[5.0, 0.1], [0.2, 0.2]], [[1.0, 3.0], [2.0, 1.0]]])
+    batch = correlation(x, x, length_scale, kernel)
+    assert batch.shape == (3, 2, 6, 6)
+    for i in range(3):
+        for j in range(2):
+            assert torch.equal(batch[i, j], correlation(x, x, length_scale[i, j], kernel))
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_correlation_does_not_depend_on_the_unit_or_the_origin_of_x(kernel, generator):
+    x = torch.randn(7, 2, dtype=torch.float64, generator=generator)
+    length_scale, unit, origin = tensor([0.5, 1.5]), tensor([1000.0, 0.1]), tensor([3.0, -7.0])
+    moved = correlation(unit * x + origin, unit * x + origin, unit * length_scale, kernel)
+    # Adding the origin rounds the third input at 1e-15 of it.
+    torch.testing.assert_close(moved, correlation(x, x, length_scale, kernel), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("e", [1, 2])
+def test_correlation_is_differentiable_where_points_coincide(kernel, e, generator):
+    other = torch.randn(4, e, dtype=torch.float64, generator=generator)
+    x = torch.cat([other[:2], torch.randn(2, e, dtype=torch.float64, generator=generator)]).requires_grad_()
+    length_scale = (0.5 + torch.rand(3, e, dtype=torch.float64, generator=generator)).requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda x, length_scale: correlation(x, other, length_scale, kernel), (x, length_scale)
+    )
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_a_point_has_correlation_one_with_itself_and_the_gradient_there_is_zero(kernel):
+    x = tensor([[0.3, -2.0]]).requires_grad_()
+    value = correlation(x, x.detach(), tensor([0.1, 10.0]), kernel)
+    (gradient,) = torch.autograd.grad(value.sum(), x)
+    assert value.item() == pytest.approx(1.0, rel=1e-14)
+    assert gradient.tolist() == [[0.0, 0.0]]
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("far", [1e5, 1e200, 1e300])
+def test_far_inputs_have_a_correlation_and_a_gradient_of_exactly_zero(kernel, far):
+    x = tensor([[far], [-far]]).requires_grad_()
+    length_scale = tensor([0.5]).requires_grad_()
+    value = correlation(x, tensor([[0.0], [1.0]]), length_scale, kernel)
+    gradients = torch.autograd.grad(value.sum(), (x, length_scale))
+    assert (value == 0).all()
+    assert all((gradient == 0).all() for gradient in gradients)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_dtype_is_that_of_the_inputs(kernel, dtype):
+    x = torch.zeros(3, 1, dtype=dtype)
+    assert correlation(x, x, torch.ones(1, dtype=dtype), kernel).dtype == dtype

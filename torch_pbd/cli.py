@@ -1,0 +1,188 @@
+"""The command line: ``torch-pbd demo``, ``fit`` and ``compare``; torch loads only once there is work."""
+
+import difflib
+import os
+import sys
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import torch_pbd
+from torch_pbd.config import COMMANDS, existing_file, parse
+from torch_pbd.exceptions import ConfigError
+
+_ERROR, _USAGE, _INTERRUPTED = 1, 2, 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code: 0, 1 (failed), 2 (cannot be used), 130 (interrupted)."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_help())
+        return 0
+    if arguments[0] == "--version":
+        print(torch_pbd.__version__)
+        return 0
+    command = arguments[0]
+    if command not in COMMANDS:
+        close = difflib.get_close_matches(command, COMMANDS, n=1)
+        meant = f" Did you mean {close[0]!r}?" if close else f" Known are {', '.join(COMMANDS)}."
+        return _complain(f"there is no command {command!r}.{meant}", _USAGE)
+    try:
+        return _run(command, arguments[1:])
+    except ConfigError as error:
+        return _complain(str(error), _USAGE)
+    except (ValueError, TypeError, OSError) as error:
+        if isinstance(error, BrokenPipeError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 0
+        return _complain(str(error), _ERROR)
+    except KeyboardInterrupt:
+        return _complain("interrupted; the results folder may be incomplete", _INTERRUPTED)
+
+
+def _run(command: str, arguments: Sequence[str]) -> int:
+    options, config = parse(command, arguments)
+    import matplotlib as mpl
+    import torch
+
+    from torch_pbd.experiments.run_folder import RunFolder
+
+    mpl.use("Agg")
+    torch.set_num_threads(1)  # the matrices are small: threads would only wait for each other
+    if getattr(options, "data", None) is not None:
+        options.data = existing_file(options.data)
+    folder = RunFolder(options.output, {"command": command})
+    (folder.path / "config.yaml").write_text(config, encoding="utf-8")
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        warnings.showwarning = _Notes()
+        print({"demo": _demo, "fit": _fit, "compare": _compare}[command](options, folder))
+    print(f"\nresults: {folder.path}")
+    return 0
+
+
+def _demo(options: Any, folder: Any) -> str:
+    from torch_pbd import CholeskyCovRegressor, GMMBaseline, WishartProcessRegressor
+    from torch_pbd.experiments.demo import run_demo
+
+    models = {
+        "CD": CholeskyCovRegressor(),
+        "WP": WishartProcessRegressor(),
+        "GMM 5": GMMBaseline(n_components=5),
+    }
+    print(f"{options.n_demos} made demonstrations of the tunnel task; the truth is that of 300 more\n")
+    return run_demo(models, folder, n_demos=options.n_demos, seed=options.seed) + "\n\n" + _LEGEND
+
+
+def _fit(options: Any, folder: Any) -> str:
+    from torch_pbd.experiments.recordings import write_fitted
+
+    demonstrations = _demonstrations(options)
+    X, y, _ = demonstrations.stack(options.input)
+    model = options.model.fit(X, y)
+    name = type(model).__name__
+    model_path, figure_path = write_fitted(model, demonstrations, folder, name, options.input)
+    row = {
+        "n_iter": model.n_iter_,
+        "loss": model.loss_,
+        "converged": model.converged_,
+        "jitter": model.jitter_,
+        "LL": model.score(X, y),
+    }
+    folder.write_metrics([{"model": name} | row])
+    settled = "converged" if model.converged_ else "did not converge"
+    return (
+        f"{name} {settled} after {model.n_iter_} iterations; log-likelihood {row['LL']:.3f} nats per sample of the "
+        f"data it was fitted to\nmodel:   {model_path}\nfigure:  {figure_path}"
+    )
+
+
+def _compare(options: Any, folder: Any) -> str:
+    if options.data is not None:
+        from torch_pbd.experiments.recordings import run_recordings
+
+        demonstrations = _demonstrations(options)
+        table = run_recordings(
+            options.models,
+            demonstrations,
+            folder,
+            input=options.input,
+            max_folds=options.max_folds,
+            n_jobs=options.n_jobs,
+        )
+        return f"{table}\n\n{_LEGEND}"
+    from torch_pbd.experiments.simulation import run_simulation
+
+    print(f"eq. (14): {options.n_inputs} inputs x {options.n_draws} draws, medians over {options.n_seeds} seeds\n")
+    return run_simulation(
+        options.models,
+        folder,
+        readings=options.readings,
+        n_seeds=options.n_seeds,
+        n_inputs=options.n_inputs,
+        n_demos=options.n_draws,
+        max_folds=options.max_folds,
+        n_jobs=options.n_jobs,
+    )
+
+
+def _demonstrations(options: Any) -> Any:
+    from torch_pbd.data import load_demonstrations
+    from torch_pbd.experiments.recordings import describe, prepare
+
+    recorded = load_demonstrations(options.data)
+    print(describe(recorded, options.data.name))
+    if len(recorded) == 1:
+        warnings.warn(
+            "There is one demonstration: what varies between demonstrations cannot be told from how one moves.",
+            stacklevel=2,
+        )
+    prepared = prepare(recorded, options.align, options.n_steps)
+    if prepared is not recorded:
+        print(describe(prepared, f"after align={options.align}"))
+    print()
+    return prepared
+
+
+class _Notes:
+    """Shows each warning once, as one line on the standard error."""
+
+    def __init__(self) -> None:
+        self._shown: set[str] = set()
+
+    def __call__(self, message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+        if str(message) not in self._shown:
+            self._shown.add(str(message))
+            print(f"note ({category.__name__}): {message}", file=sys.stderr)
+
+
+_LEGEND = """MSE: squared distance of Cholesky factors to the empirical covariances, units of the data (Table I)
+error to truth: relative Frobenius error of the covariance; held-out LL: log-likelihood of left-out
+demonstrations, nats per sample, its mean +- standard error and its median over the folds; 95 % holds: share of
+left-out samples in the 95 % ellipse; least eig.: smallest eigenvalue of the predicted correlations"""
+
+
+def _help() -> str:
+    width = max(map(len, COMMANDS))
+    lines = [f"  {name:<{width}}  {text}" for name, text in COMMANDS.items()]
+    return "\n".join(
+        [
+            "torch-pbd: learn how precise people are from demonstrations",
+            "",
+            "usage: torch-pbd COMMAND [--config FILE] [--option value ...]",
+            "",
+            *lines,
+            "",
+            "Options of a command: torch-pbd COMMAND --help. As YAML: torch-pbd COMMAND --print_config.",
+        ]
+    )
+
+
+def _complain(message: str, code: int) -> int:
+    print(f"torch-pbd: {message}", file=sys.stderr)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,168 @@
+"""Command lines and YAML files to objects; what cannot be used is one line that says where and why.
+
+Importing this module, and showing help, loads neither torch nor scikit-learn.
+"""
+
+import difflib
+import re
+from argparse import ArgumentError
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from jsonargparse import ActionConfigFile, ArgumentParser, Namespace, set_loader  # type: ignore[attr-defined]
+
+from torch_pbd.exceptions import ConfigError
+
+COMMANDS = {
+    "demo": "learn from six made demonstrations of the tunnel task; the main job, no data needed",
+    "fit": "fit one model to a file of demonstrations",
+    "compare": "compare models: on the paper's simulation (Table I, Figures 1 to 3), or on a file",
+}
+
+_MODEL_HELP = "an estimator's name, or class_path and init_args; its options: --model.help NAME"
+_MODELS = {
+    "CD": {"class_path": "CholeskyCovRegressor"},
+    "WP": {"class_path": "WishartProcessRegressor"},
+    "GMM 5": {"class_path": "GMMBaseline", "init_args": {"n_components": 5}},
+    "GMM 8": {"class_path": "GMMBaseline", "init_args": {"n_components": 8}},
+}
+_Reading = Literal["bell", "printed", "bowl"]
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """YAML without surprises: numbers like 1e-3 are numbers, and a key twice is an error."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if key.value in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key {key.value!r} is there twice", key.start_mark
+                )
+            seen.add(key.value)
+        return super().construct_mapping(node, deep=deep)
+
+
+_StrictLoader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$"),
+    list("-+0123456789."),
+)
+
+
+def _load_yaml(text: str) -> Any:
+    return yaml.load(text, _StrictLoader)
+
+
+def parse(command: str, arguments: Sequence[str]) -> tuple[Namespace, str]:
+    """Arguments of a command as objects, and the YAML that gives them again.
+
+    Raises
+    ------
+    ConfigError
+        If an argument or a key of a file cannot be used.
+    SystemExit
+        After ``--help`` and ``--print_config`` are answered.
+    """
+    set_loader("yaml", _load_yaml, exceptions=(yaml.YAMLError,))
+    parser = _parser(command, only_help=any(argument in ("-h", "--help") for argument in arguments))
+    try:
+        values = parser.parse_args(list(arguments))
+        text = parser.dump(values, skip_none=False)
+        objects = parser.instantiate(values)
+    except (ArgumentError, TypeError, ValueError, OSError) as error:
+        raise ConfigError(_one_line(str(error), parser)) from error
+    del objects["config"]
+    return objects, text
+
+
+def _parser(command: str, *, only_help: bool) -> ArgumentParser:
+    parser = ArgumentParser(
+        prog=f"torch-pbd {command}", description=COMMANDS[command].capitalize() + ".", exit_on_error=False
+    )
+    parser.add_argument("--config", action=ActionConfigFile, help="YAML file with any of these options")
+    parser.add_argument("--output", type=str, default=f"runs/{command}", help="folder of the results")
+    model_type, models_type = (Any, Any) if only_help else _model_types()
+    if command == "demo":
+        parser.add_argument("--n_demos", type=int, default=6, help="demonstrations to learn from, at least 3")
+        parser.add_argument("--seed", type=int, default=0, help="seed of the demonstrations")
+        return parser
+    if command == "fit":
+        parser.add_argument("--data", type=str, required=True, help="file of demonstrations, .npz or .csv")
+        parser.add_argument(
+            "--model", type=model_type, default={"class_path": "CholeskyCovRegressor"}, help=_MODEL_HELP
+        )
+    else:
+        parser.add_argument("--data", type=str | None, default=None, help="file of demonstrations; none: simulation")
+        parser.add_argument("--models", type=models_type, default=_MODELS, help="name: model, several; " + _MODEL_HELP)
+        parser.add_argument("--max_folds", type=int, default=10, help="demonstrations to leave out, one by one")
+        parser.add_argument("--n_jobs", type=int | None, default=None, help="fits at the same time; -1: all cores")
+        _add_simulation_arguments(parser)
+    parser.add_argument(
+        "--align",
+        type=Literal["auto", "none", "phase", "dtw"],
+        default="auto",
+        help="auto: by phase where sampling times differ",
+    )
+    parser.add_argument("--input", type=Literal["time", "phase"], default="time", help="what the covariance depends on")
+    parser.add_argument("--n_steps", type=int | None, default=None, help="resample to so many points")
+    return parser
+
+
+def _add_simulation_arguments(parser: ArgumentParser) -> None:
+    parser.add_argument(
+        "--readings", type=list[_Reading], default=["bell", "printed", "bowl"], help="of eq. (14), which is ambiguous"
+    )
+    parser.add_argument("--n_seeds", type=int, default=10, help="simulations to take the median of")
+    parser.add_argument("--n_inputs", type=int, default=10, help="inputs of the simulation")
+    parser.add_argument("--n_draws", type=int, default=50, help="draws at each input of the simulation")
+
+
+def _model_types() -> tuple[Any, Any]:
+    """Types of one model and of several by name; loads torch."""
+    import torch_pbd.estimators.cholesky
+    import torch_pbd.estimators.mixture
+    import torch_pbd.estimators.wishart  # noqa: F401 - short class names are those of imported classes
+    from torch_pbd.estimators._base import CovarianceRegressor
+
+    return CovarianceRegressor, dict[str, CovarianceRegressor]
+
+
+def _one_line(message: str, parser: ArgumentParser) -> str:
+    """The message without jsonargparse's tree of attempts, with a suggestion for an unknown name."""
+    lines = [line.strip(" -") for line in message.splitlines()]
+    dull = ("Does not validate", "Subtypes:", "Errors:", "Expected a <class 'NoneType'>", "Given value")
+    text = " ".join(line for line in lines if line and not line.startswith(dull))
+    unknown = re.search(r"(?:unrecognized arguments: --|[Kk]ey ['\"]|Option ['\"])([\w.]+)", text)
+    names = _known_names(parser)
+    if unknown and unknown.group(1) not in names:
+        close = difflib.get_close_matches(unknown.group(1).split(".")[-1], names, n=1)
+        text += f" Did you mean {close[0]!r}?" if close else ""
+    return text
+
+
+def _known_names(parser: ArgumentParser) -> list[str]:
+    import inspect
+
+    models, _ = _model_types()
+    names = [action.dest for action in parser._actions]
+    for model in models.__subclasses__() + [
+        leaf for child in models.__subclasses__() for leaf in child.__subclasses__()
+    ]:
+        names += [model.__name__, *inspect.signature(model).parameters]
+    return names
+
+
+def existing_file(path: str) -> Path:
+    """Path of a file that is there.
+
+    Raises
+    ------
+    ConfigError
+        If it is not.
+    """
+    if not Path(path).is_file():
+        raise ConfigError(f"data: there is no file {path!r}; give one with --data FILE.")
+    return Path(path)

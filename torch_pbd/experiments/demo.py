@@ -1,0 +1,68 @@
+"""The main job without arguments: six made demonstrations of the tunnel task, and what the models learn."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+
+from torch_pbd.data import Demonstrations, make_tunnel_demonstrations, tunnel_center, tunnel_half_width
+from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.experiments.comparison import compare_models
+from torch_pbd.experiments.recordings import score_row, write_fitted
+from torch_pbd.experiments.run_folder import RunFolder, format_table
+from torch_pbd.metrics import mahalanobis_coverage
+from torch_pbd.plotting import MODEL, plot_covariance_ellipses, plot_demonstrations
+
+_N_FRESH = 300  # demonstrations that stand for the truth
+_RATE = 25.0  # Hz; the movement has nothing of use above a few
+
+
+def run_demo(models: Mapping[str, CovarianceRegressor], folder: RunFolder, *, n_demos: int = 6, seed: int = 0) -> str:
+    """Fit the models to made demonstrations, judge them by 300 fresh ones; returns the table as text."""
+    demonstrations = make_tunnel_demonstrations(n_demos, rate=_RATE, random_state=seed)
+    fresh = make_tunnel_demonstrations(_N_FRESH, rate=_RATE, random_state=seed + 1).to_array()
+    true_covariance = np.einsum("kti,ktj->tij", *(2 * [fresh - fresh.mean(axis=0)])) / (_N_FRESH - 1)
+    X, y, groups = demonstrations.stack()
+    scores = compare_models(models, X, y, groups, truth=lambda _: true_covariance)
+    rows = []
+    for score in scores:
+        model = models[score.model].fit(X, y)
+        rows.append(score_row(score) | {"95 % of fresh": _coverage(model, demonstrations, fresh)})
+        write_fitted(model, demonstrations, folder, score.model, "time")
+    folder.write_metrics(rows)
+    figure = _tunnel_figure(models, demonstrations)
+    folder.write_figure(figure, "tunnel")
+    plt.close(figure)
+    return format_table(rows)
+
+
+def _coverage(model: CovarianceRegressor, demonstrations: Demonstrations, fresh: Any) -> float:
+    mean, covariance = model.predict(demonstrations.times[0][:, np.newaxis], return_cov=True)
+    return float(np.mean([mahalanobis_coverage(mean, covariance, demo, level=0.95) for demo in fresh]))
+
+
+def _tunnel_figure(models: Mapping[str, CovarianceRegressor], demonstrations: Demonstrations) -> Figure:
+    """What each model learned, in the tunnel: the paper's Figure 6."""
+    figure, axes = plt.subplots(
+        1, len(models), figsize=(3.6 * len(models), 6), layout="constrained", sharey=True, squeeze=False
+    )
+    along = np.linspace(0.0, 0.6, 200)
+    duration = demonstrations.times[0][-1]
+    query = np.linspace(0.0, duration, 13)[:, np.newaxis]
+    for ax, (name, model) in zip(axes[0], models.items(), strict=True):
+        for side in (-1.0, 1.0):
+            wall = tunnel_center(along) + side * tunnel_half_width(along)
+            ax.plot(wall, along, color="black", lw=1.5, label="wall" if side > 0 else None)
+        plot_demonstrations(demonstrations, [0, 1], ax)
+        mean, covariance = model.predict(query, return_cov=True)
+        # The spread along y is of micrometres: the ellipses show as lines across the path.
+        plot_covariance_ellipses(mean, covariance, ax, label="model: 2 sd, every 0.8 s")
+        path = model.predict(np.linspace(0.0, duration, 200)[:, np.newaxis])
+        ax.plot(path[:, 0], path[:, 1], color=MODEL, lw=1.5, label="model: mean")
+        ax.set_title(name)
+    for ax in axes[0, 1:]:
+        ax.set_ylabel("")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=9)
+    return figure

@@ -1,0 +1,176 @@
+"""Figures of demonstrations and of what a model learned from them; each takes data and an Axes."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.lines import Line2D
+from numpy.typing import ArrayLike, NDArray
+
+from torch_pbd.data import Demonstrations
+from torch_pbd.estimators._base import CovarianceRegressor
+
+Floats = NDArray[np.float64]
+
+# Okabe and Ito's colours, which colour-blind readers tell apart.
+DATA, EMPIRICAL, MODEL, PRIOR, TRUTH = "#999999", "#E69F00", "#0072B2", "#CC79A7", "#009E73"
+
+
+def plot_demonstrations(
+    demonstrations: Demonstrations, outputs: Sequence[int], ax: Axes, *, label: str | None = "demonstrations"
+) -> list[Line2D]:
+    """Draw every demonstration: one output over time, or two outputs against each other.
+
+    Parameters
+    ----------
+    demonstrations : Demonstrations
+    outputs : sequence of one or two int
+        Indices of the outputs.
+    ax : matplotlib.axes.Axes
+    label : str or None, default="demonstrations"
+        In the legend, once.
+
+    Returns
+    -------
+    list of Line2D, one a demonstration
+    """
+    lines: list[Line2D] = []
+    for time, position in demonstrations:
+        columns = position[:, list(outputs)].T
+        across, up = (time, columns[0]) if len(outputs) == 1 else columns
+        lines += ax.plot(across, up, color=DATA, lw=0.7, alpha=0.8, label=None if lines else label, zorder=1)
+    if len(outputs) == 1:
+        ax.set_xlabel(_axis_label("time" if demonstrations.time_unit != "1" else "phase", demonstrations.time_unit))
+        ax.set_ylabel(output_label(demonstrations, outputs[0]))
+    else:
+        ax.set_xlabel(output_label(demonstrations, outputs[0]))
+        ax.set_ylabel(output_label(demonstrations, outputs[1]))
+    return lines
+
+
+def plot_std_band(
+    x: ArrayLike,
+    mean: ArrayLike,
+    std: ArrayLike,
+    ax: Axes,
+    *,
+    n_std: float = 2.0,
+    color: str = MODEL,
+    label: str | None = None,
+) -> tuple[Line2D, PolyCollection]:
+    """Draw a mean (n,) over x (n,) with a band of ``n_std`` standard deviations (n,) on either side."""
+    across, middle, half = (np.asarray(values, dtype=np.float64).ravel() for values in (x, mean, std))
+    (line,) = ax.plot(across, middle, color=color, lw=1.5, label=label, zorder=3)
+    band = ax.fill_between(
+        across, middle - n_std * half, middle + n_std * half, color=color, alpha=0.22, lw=0, zorder=2
+    )
+    return line, band
+
+
+def plot_covariance_ellipses(
+    mean: ArrayLike,
+    covariance: ArrayLike,
+    ax: Axes,
+    *,
+    n_std: float = 2.0,
+    color: str = MODEL,
+    label: str | None = None,
+    linestyle: str = "-",
+) -> LineCollection:
+    """Draw the ``n_std`` ellipses of covariances (n, 2, 2) around means (n, 2)."""
+    centres, matrices = np.asarray(mean, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
+    angle = np.linspace(0.0, 2.0 * np.pi, 73)
+    circle = np.stack([np.cos(angle), np.sin(angle)])
+    values, axes = np.linalg.eigh(matrices)
+    roots = axes * np.sqrt(np.clip(values, 0.0, None))[:, np.newaxis, :]
+    curves = centres[:, np.newaxis, :] + n_std * (roots @ circle).transpose(0, 2, 1)
+    ellipses = LineCollection(list(curves), colors=color, linewidths=1.1, linestyles=linestyle, label=label, zorder=3)
+    ax.add_collection(ellipses)
+    ax.autoscale_view()
+    return ellipses
+
+
+def plot_model_bands(
+    model: CovarianceRegressor,
+    X: ArrayLike,
+    y: ArrayLike,
+    axes: Sequence[Axes],
+    *,
+    beyond: float = 0.25,
+    true_std: Any = None,
+) -> None:
+    """Draw what a model of one input learned, over the data and beyond their range: one Axes an output.
+
+    The empirical mean and two standard deviations at repeated inputs are drawn beside it.
+
+    Parameters
+    ----------
+    model : fitted covariance regressor
+    X : array-like of shape (n_samples, 1)
+    y : array-like of shape (n_samples, n_outputs)
+    axes : sequence of n_outputs matplotlib Axes
+    beyond : float, default=0.25
+        How far to draw on either side, in ranges of X.
+    true_std : callable, default=None
+        Maps x (n, 1) to (mean, std), both (n, n_outputs), where the truth is known.
+    """
+    inputs, targets = np.asarray(X, dtype=np.float64), np.asarray(y, dtype=np.float64)
+    targets = targets.reshape(len(targets), -1)
+    low, high = inputs.min(), inputs.max()
+    query = np.linspace(low - beyond * (high - low), high + beyond * (high - low), 401)[:, np.newaxis]
+    mean, covariance = model.predict(query, return_cov=True)
+    mean = mean.reshape(len(query), -1)
+    std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    position, empirical_mean, empirical_std = _empirical_bands(inputs[:, 0], targets)
+    for output, ax in enumerate(axes):
+        plot_std_band(query, mean[:, output], std[:, output], ax, label="model: mean, 2 sd")
+        if true_std is not None:
+            centre, deviation = true_std(query)
+            for sign in (-2.0, 2.0):
+                edge = centre[:, output] + sign * deviation[:, output]
+                ax.plot(query, edge, "--", color=TRUTH, lw=1.1, label="truth: 2 sd" if sign > 0 else None, zorder=3)
+        if len(position):
+            _draw_empirical(position, empirical_mean[:, output], empirical_std[:, output], ax)
+        for edge in (low, high):
+            ax.axvline(edge, color=DATA, lw=0.8, ls=":", label="end of the data" if edge == low else None)
+
+
+def _draw_empirical(position: Floats, mean: Floats, std: Floats, ax: Axes) -> None:
+    """Error bars at a few inputs, lines at many."""
+    if len(position) <= 30:
+        ax.errorbar(
+            position, mean, 2.0 * std, fmt=".", ms=4, color=EMPIRICAL, capsize=2, lw=1.2, zorder=4,
+            label="empirical: mean, 2 sd",
+        )  # fmt: skip
+        return
+    for sign in (-2.0, 2.0):
+        ax.plot(
+            position,
+            mean + sign * std,
+            color=EMPIRICAL,
+            lw=1.0,
+            zorder=4,
+            label="empirical: 2 sd" if sign > 0 else None,
+        )
+
+
+def _empirical_bands(position: Floats, targets: Floats) -> tuple[Floats, Floats, Floats]:
+    """Mean and standard deviation at the inputs that repeat."""
+    distinct, index, counts = np.unique(position, return_inverse=True, return_counts=True)
+    means = np.stack([np.bincount(index, column) / counts for column in targets.T], axis=1)
+    squares = np.stack([np.bincount(index, column) for column in ((targets - means[index]) ** 2).T], axis=1)
+    repeated = counts > 1
+    std = np.sqrt(squares[repeated] / (counts[repeated, np.newaxis] - 1))
+    return distinct[repeated], means[repeated], std
+
+
+def output_label(demonstrations: Demonstrations, output: int) -> str:
+    """Name of an output with its unit, for an axis."""
+    units = demonstrations.units
+    return _axis_label(demonstrations.names[output], units[output] if units is not None else "")
+
+
+def _axis_label(name: str, unit: str) -> str:
+    return f"{name} [{unit}]" if unit and unit != "1" else name
