@@ -38,9 +38,11 @@ class Observations:
 
 @dataclass(frozen=True)
 class Hyperparameters:
-    """Of b processes: length scales, amplitude, and the noise variance over the squared amplitude."""
+    """Of b processes: length scales (one row where all share them), amplitude, and the noise variance over
+    the squared amplitude.
+    """
 
-    length_scale: Float[Tensor, "b e"]
+    length_scale: Float[Tensor, "g e"]
     amplitude: Float[Tensor, " b"]
     noise_ratio: Float[Tensor, " b"]
 
@@ -190,6 +192,8 @@ class _Coordinates:
         if variance is None:
             quadratic, _ = _quadratic_and_log_det(self.observations, length_scale, noise_ratio, self.search.kernel)
             variance = _best_variance(quadratic, len(self.observations.counts))
+            crude = self.observations.targets.square().mean(1).clamp_min(1e-200)
+            variance = torch.where(variance.isnan(), crude, variance)
         return Hyperparameters(length_scale, variance.sqrt(), noise_ratio)
 
 
@@ -208,8 +212,8 @@ def _grid(coordinates: _Coordinates, n_starts: int) -> Tensor:
     learned = len(coordinates.low) > coordinates.n_length_scales
     ratios = 10.0 ** weight.new_tensor(_LOG10_RATIOS) if learned else weight.new_zeros(1)
     if learned and search.noise_scale is not None:
-        lower = torch.arange(float(coordinates.low[-1]) / math.log(10), _LOG10_RATIOS[0] - 0.5).to(weight)
-        ratios = torch.cat([10.0**lower, ratios])
+        lower = range(math.ceil(float(coordinates.low[-1]) / math.log(10)), int(_LOG10_RATIOS[0]))
+        ratios = torch.cat([10.0 ** weight.new_tensor(lower), ratios])
     losses = []
     for scale in scales:
         length_scale = scale.expand(observations.inputs.shape[1])
@@ -294,8 +298,9 @@ def _fit_block(observations: Observations, search: EvidenceSearch) -> tuple[Hype
             tol=search.tol,
         )
         n_iter, converged = batch.n_iter, batch.converged
-    losses = coordinates.losses(z.reshape(starts.shape))
-    loss, best = losses.min(0)
+        # Not evaluated again: at the edge of being singular another batch could round to another answer.
+        losses = losses.flatten().masked_scatter(hopeful, batch.loss * len(observations.counts))
+    loss, best = losses.reshape(n_starts, n_processes).min(0)
     if not torch.isfinite(loss).all():
         raise NotPositiveDefiniteError(
             "The kernel matrix is singular wherever the hyperparameters were searched. Allow for noise "

@@ -186,21 +186,25 @@ class LatentValues(nn.Module):
         if self.train_hyperparameters:
             return cholesky_with_jitter(gram, name="the kernel matrix of the training inputs")
         eigenvalue, eigenvector = torch.linalg.eigh(gram)
-        matters = (eigenvalue > _RANK_TOLERANCE * eigenvalue[..., -1:]).any(0)
-        return (eigenvector * eigenvalue.clamp_min(1e-300).sqrt().unsqueeze(-2))[..., matters], 0.0
+        matters = eigenvalue > _RANK_TOLERANCE * eigenvalue[..., -1:]
+        root = eigenvalue.where(matters, 0.0).sqrt()
+        return (eigenvector * root.unsqueeze(-2))[..., matters.any(0)], 0.0
 
     def _solved(self, deviation: Tensor) -> Tensor:
         """Whitened values whose deviations, over the amplitude, come nearest to these."""
         deviation = deviation.unsqueeze(-1)
         if self.train_hyperparameters:
             return torch.linalg.solve_triangular(self.basis, deviation, upper=False).squeeze(-1).contiguous()
-        square = self.basis.square().sum(-2).unsqueeze(-1)  # the columns are orthogonal
-        return (self.basis.mT @ deviation / square).squeeze(-1).contiguous()
+        return (self.basis.mT @ deviation / self._square()).squeeze(-1).contiguous()
 
     def _weight(self, whitened: Tensor) -> Tensor:
         """Inverse of the kernel matrix times the deviations, over the amplitude, of whitened values."""
         if self.train_hyperparameters:
             solved = torch.linalg.solve_triangular(self.basis.mT, whitened.unsqueeze(-1), upper=True)
             return solved.squeeze(-1).contiguous()
-        scaled = whitened.unsqueeze(-1) / self.basis.square().sum(-2).unsqueeze(-1)
-        return (self.basis @ scaled).squeeze(-1).contiguous()
+        return (self.basis @ (whitened.unsqueeze(-1) / self._square())).squeeze(-1).contiguous()
+
+    def _square(self) -> Tensor:
+        """Of each column of the basis, which are orthogonal; one for those that do not matter and are zero."""
+        square = self.basis.square().sum(-2).unsqueeze(-1)
+        return square.where(square > 0, 1.0)
