@@ -70,7 +70,7 @@ def parse(command: str, arguments: Sequence[str]) -> tuple[Namespace, str]:
     parser = _parser(command, only_help=any(argument in ("-h", "--help") for argument in arguments))
     try:
         values = parser.parse_args(list(arguments))
-        text = parser.dump(values, skip_none=False)
+        text = parser.dump(values)
         objects = parser.instantiate(values)
     except (ArgumentError, TypeError, ValueError, OSError) as error:
         raise ConfigError(_one_line(str(error), parser)) from error
@@ -135,11 +135,12 @@ def _one_line(message: str, parser: ArgumentParser) -> str:
     lines = [line.strip(" -") for line in message.splitlines()]
     dull = ("Does not validate", "Subtypes:", "Errors:", "Expected a <class 'NoneType'>", "Given value")
     text = " ".join(line for line in lines if line and not line.startswith(dull))
-    unknown = re.search(r"(?:unrecognized arguments: --|[Kk]ey ['\"]|Option ['\"])([\w.]+)", text)
     names = _known_names(parser)
-    if unknown and unknown.group(1) not in names:
-        close = difflib.get_close_matches(unknown.group(1).split(".")[-1], names, n=1)
-        text += f" Did you mean {close[0]!r}?" if close else ""
+    mentioned = re.findall(r"(?:arguments: --|[Kk]ey ['\"]|Option ['\"]|path string: )([\w.]+)", text)
+    for unknown in (name.split(".")[-1] for name in mentioned):
+        close = difflib.get_close_matches(unknown, names, n=1)
+        if unknown not in names and close:
+            return f"{text} Did you mean {close[0]!r}?"
     return text
 
 

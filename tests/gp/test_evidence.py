@@ -198,9 +198,7 @@ def test_targets_that_are_all_zero_give_finite_hyperparameters_and_zeros(noise_s
     x, y = noisy("sine", 10, rng, n_processes=2)
     y[0] = 0.0
     fixed = None if noise_scale is None else torch.full((2,), noise_scale).double()
-    found, loss, _ = fit_hyperparameters(
-        once(x, y), EvidenceSearch(length_scale_bounds=(0.1, 1.0), noise_scale=fixed)
-    )
+    found, loss, _ = fit_hyperparameters(once(x, y), EvidenceSearch(length_scale_bounds=(0.1, 1.0), noise_scale=fixed))
     for value in (found.length_scale, found.amplitude, found.noise_ratio, loss):
         assert value.isfinite().all()
     gp, _ = condition(once(x, y), found)

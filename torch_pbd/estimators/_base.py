@@ -88,9 +88,11 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         inputs, targets = self._validated(X, y, ensure_min_samples=2)
         check_inputs_vary(inputs)
         self._y_is_1d = targets.ndim == 1
-        self.n_outputs_ = 1 if targets.ndim == 1 else targets.shape[1]
+        self.n_outputs_ = 1 if self._y_is_1d else targets.shape[1]
+        targets = targets.reshape(len(inputs), -1)
+        order = np.lexsort(np.hstack([inputs, targets]).T)  # so that no result depends on that of the rows
         with torch.inference_mode(False), torch.enable_grad():
-            fitted = self._fit(inputs, targets.reshape(len(inputs), -1))
+            fitted = self._fit(inputs[order], targets[order])
         self.module_ = fitted.module
         report = fitted.report
         self.n_iter_ = max(1, report.n_iter)
@@ -234,7 +236,8 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         return first, second
 
     def _door(self, array: Any) -> Tensor:
-        return torch.tensor(array, dtype=torch.float64, device=self.device)
+        """Copy of an array; contiguous, since torch takes no negative strides."""
+        return torch.tensor(np.asarray(array, order="C"), dtype=torch.float64, device=self.device)
 
     def _progress(self) -> Any:
         """Callback that prints the loss, or None."""
@@ -269,5 +272,6 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         arrays, spec = state.pop("_module_arrays", None), state.pop("_module_spec", None)
         super().__setstate__(state)
         if arrays is not None:
-            tensors = {name: self._door(array) for name, array in arrays.items()}
-            self.module_ = module_from_spec(spec, tensors).requires_grad_(False)
+            with torch.inference_mode(False):  # else autograd would refuse the module
+                tensors = {name: self._door(array) for name, array in arrays.items()}
+                self.module_ = module_from_spec(spec, tensors).requires_grad_(False)

@@ -13,7 +13,7 @@ from torch_pbd.exceptions import DataRankWarning
 
 Floats = NDArray[np.float64]
 Prior = (
-    float | list[list[float]] | Callable[[Any], Any] | str | None
+    float | list[list[float]] | str | Callable[[Any], Any] | None
 )  # or any array-like; the type is what YAML can say
 
 # A column whose spread is below this of its largest value differs only by rounding.

@@ -173,7 +173,7 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
         """Noise of each entry of the factor, in standardized units; of a logarithm, relative."""
         if self.noise_scale is None:
             return None
-        row, column = torch.tril_indices(*problem.prior_tril.shape[-2:])
+        row, column = torch.tril_indices(*problem.prior_tril.shape[-2:], device=problem.prior_tril.device)
         noise = self.noise_scale / self._door(problem.scaling.y_scale)[row]
         if self.diagonal == "log":
             typical = pooled_tril(problem.training).diagonal().clamp_min(1e-6)[row]
@@ -182,9 +182,10 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
 
     def _fit_likelihood(self, problem: Problem, residual: Tensor) -> tuple[CholeskyCovariance, FitReport, float]:
         training, log_diagonal = problem.training, self.diagonal != "raw"
-        start = tril_deviation(residual_tril(residual), problem.prior_tril, log_diagonal=log_diagonal)
+        pooled = residual_tril(residual).expand_as(problem.prior_tril)
+        start = tril_deviation(pooled, problem.prior_tril, log_diagonal=log_diagonal)
         prior = problem.prior_tril.reshape(-1, *problem.prior_tril.shape[-2:])
-        row, column = torch.tril_indices(*prior.shape[-2:])
+        row, column = torch.tril_indices(*prior.shape[-2:], device=prior.device)
         amplitude = prior.square().sum(-1).mean(0).sqrt()[row]
         if log_diagonal:
             amplitude = torch.where(row == column, _LOG_AMPLITUDE, amplitude)

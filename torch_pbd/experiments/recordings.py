@@ -64,14 +64,14 @@ def figure_of(model: CovarianceRegressor, demonstrations: Demonstrations, name: 
         axes[output].set_ylabel(output_label(demonstrations, output))
         if input == "phase":
             axes[output].set_xlabel("phase")
-    axes[0].legend(fontsize=8)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=9)
     if in_plane:
         plot_demonstrations(demonstrations, [0, 1], axes[n_outputs])
         query = np.linspace(X.min(), X.max(), 15)[:, np.newaxis]
         mean, covariance = model.predict(query, return_cov=True)
-        plot_covariance_ellipses(mean, covariance, axes[n_outputs], color=MODEL, label="model: 2 sd")
+        plot_covariance_ellipses(mean, covariance, axes[n_outputs], color=MODEL)
         axes[n_outputs].set_aspect("equal", adjustable="box")
-        axes[n_outputs].legend(fontsize=8)
+        axes[n_outputs].set_title("2 sd ellipses", fontsize=10)
     for ax in axes[n_panels:]:
         ax.set_visible(False)
     figure.suptitle(name)

@@ -17,7 +17,8 @@ from torch_pbd.plotting import EMPIRICAL, MODEL, TRUTH, plot_covariance_ellipses
 
 # Table I: mean squared error on Cholesky entries, and seconds on "a standard laptop in Matlab".
 PAPER_TABLE_1 = {"CD": (3.54e-13, 0.167), "WP": (0.0206, 8.64), "GMM 8": (1.05, 0.515), "GMM 5": (7.71, 0.237)}
-_BEYOND = 0.2  # of the range of 200: eq. (14) has a covariance above xi = -150 only
+_BEYOND = 0.5  # of the range, so that the prior is seen
+_LEAST_XI = -149.0  # eq. (14) has a covariance above xi = -150 only
 
 
 def table1(
@@ -74,15 +75,15 @@ def figure_of(
     model: CovarianceRegressor, X: NDArray[np.float64], y: NDArray[np.float64], name: str, reading: Reading
 ) -> Figure:
     """One of Figures 1 to 3: the outputs over xi, and the covariances at the inputs, beyond the data too."""
-    figure, axes = plt.subplots(1, 3, figsize=(13, 4.2), layout="constrained")
+    figure, axes = plt.subplots(1, 3, figsize=(13, 4.6), layout="constrained")
 
     def truth(xi: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        return paper_mean(xi), np.sqrt(np.diagonal(paper_covariance(xi, reading=reading), axis1=1, axis2=2))
+        variance = np.diagonal(paper_covariance(xi.clip(_LEAST_XI), reading=reading), axis1=1, axis2=2)
+        return paper_mean(xi), np.where(xi > _LEAST_XI, np.sqrt(variance), np.nan)
 
     plot_model_bands(model, X, y, axes[:2], beyond=_BEYOND, true_std=truth)
     for output, ax in enumerate(axes[:2]):
         ax.set(xlabel="input xi", ylabel=f"output y{output + 1}")
-    axes[0].legend(fontsize=8, loc="lower right")
     inputs, empirical = empirical_covariances(X, y)
     mean, covariance = model.predict(inputs, return_cov=True)
     plot_covariance_ellipses(paper_mean(inputs), paper_covariance(inputs, reading=reading), axes[2], color=TRUTH,
@@ -92,7 +93,8 @@ def figure_of(
         plot_covariance_ellipses(centres, empirical, axes[2], color=EMPIRICAL, label="empirical")
     plot_covariance_ellipses(mean, covariance, axes[2], color=MODEL, label="model")
     axes[2].set(xlabel="output y1", ylabel="output y2", title="2 sd ellipses at the inputs")
-    axes[2].legend(fontsize=8)
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=9)
     figure.suptitle(f'{name} on eq. (14), reading "{reading}"')
     return figure
 

@@ -131,7 +131,10 @@ def _best_variance(quadratic: Tensor, n_inputs: int) -> Tensor:
 
 
 class _Coordinates:
-    """Unbounded coordinates of the hyperparameters that are searched; the rest are fixed or closed-form."""
+    """Unbounded coordinates of the hyperparameters that are searched; the rest are fixed or closed-form.
+
+    A cosine folds each onto its bounds: unlike a sigmoid it reaches them, so an optimum there is found.
+    """
 
     def __init__(self, observations: Observations, search: EvidenceSearch) -> None:
         self.observations, self.search = observations, search
@@ -154,7 +157,7 @@ class _Coordinates:
 
     def decode(self, z: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         """Length scales, noise ratio, and the squared amplitude where a fixed noise decides it."""
-        logs = self.low + self.width * torch.sigmoid(z)
+        logs = self.low + self.width * (0.5 - 0.5 * torch.cos(z))
         fixed = self.search.length_scale
         length_scale = logs[:, : self.n_length_scales].exp() if fixed is None else fixed.expand(len(z), -1)
         if logs.shape[1] == self.n_length_scales:
@@ -168,7 +171,8 @@ class _Coordinates:
         logs = length_scale.log()[:, None].expand(-1, self.n_length_scales)
         if len(self.low) > self.n_length_scales:
             logs = torch.cat([logs, noise_ratio.log()[:, None]], dim=1)
-        return torch.logit((logs - self.low) / self.width.clamp_min(1e-9), eps=0.01)
+        share = (logs - self.low) / self.width.clamp_min(1e-9)
+        return torch.acos(1.0 - 2.0 * share.clamp(0.01, 0.99))
 
     def loss(self, z: Float[Tensor, "a p"], rows: Int64[Tensor, " a"]) -> Float[Tensor, " a"]:
         """Negative log evidence for a observation."""

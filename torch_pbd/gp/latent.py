@@ -81,7 +81,7 @@ class LatentGP(nn.Module):
         has their squared amplitudes for weights.
         """
         reduced = self._reduced(x, torch.zeros_like(self.noise_ratio))
-        share = self.amplitude.square().clamp_min(1e-200)
+        share = self.amplitude.square().clamp_min(torch.finfo(self.amplitude.dtype).tiny)
         if len(reduced) == 1:
             return reduced[0]
         return (share / share.sum()) @ reduced

@@ -34,6 +34,7 @@ def module_from_spec(spec: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
     ValueError
         If the spec is of no model of this package.
     """
+    tensors = {name: tensor.clone() for name, tensor in tensors.items()}
     parts = {name.removeprefix("core."): tensor for name, tensor in tensors.items()}
     if spec["covariance"] == "mixture":
         core: MeanAndCovariance | GaussianMixture = GaussianMixture(

@@ -1,0 +1,30 @@
+import json
+
+import pytest
+
+from torch_pbd.experiments.run_folder import RunFolder, format_table, slug
+
+
+def test_a_table_lines_up_and_shows_what_is_not_known_as_a_dash():
+    rows = [{"model": "CD", "MSE": 1.5e-13, "LL": -3.25}, {"model": "GMM 5", "MSE": float("nan"), "LL": 12345.0}]
+    lines = format_table(rows).splitlines()
+    assert lines[0] == "model       MSE        LL"
+    assert lines[2:] == ["CD     1.50e-13     -3.25", "GMM 5         -  1.23e+04"]
+    assert len({len(line) for line in lines}) == 1
+
+
+def test_a_folder_says_what_was_run(tmp_path):
+    RunFolder(tmp_path / "runs" / "new", {"command": "fit"})
+    environment = json.loads((tmp_path / "runs" / "new" / "env.json").read_text())
+    assert environment["settings"] == {"command": "fit"}
+    assert {"torch", "scikit-learn"} <= set(environment["packages"])
+
+
+def test_a_folder_that_is_a_file_fails_before_the_work(tmp_path):
+    (tmp_path / "taken").write_text("")
+    with pytest.raises(FileExistsError, match="taken"):
+        RunFolder(tmp_path / "taken", {})
+
+
+def test_names_of_models_become_names_of_files():
+    assert slug("Figure 2, CD") == "figure_2__cd"

@@ -1,0 +1,190 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import multivariate_normal
+from sklearn.gaussian_process.kernels import RBF
+
+from torch_pbd.gp import LatentValues
+from torch_pbd.models.cholesky import deviation_tril
+from torch_pbd.models.floor import VARIANCE_FLOOR, with_floor
+from torch_pbd.models.objectives import covariance_mse, gaussian_nll, train
+from torch_pbd.models.training import TrainingSet
+from torch_pbd.models.wishart import padded, wishart_root
+
+COUNTS = {"aligned": [7] * 5, "ragged": [1, 2, 3, 10, 1], "not aligned": [1] * 12}
+
+
+def tensor(array):
+    return torch.tensor(array, dtype=torch.float64)
+
+
+def training_set(counts, d, rng):
+    index = rng.permutation(np.repeat(np.arange(len(counts)), counts))
+    inputs = np.linspace(0, 1, len(counts))[:, None]
+    return TrainingSet(
+        tensor(inputs[index]), tensor(rng.normal(size=(len(index), d))), tensor(inputs), tensor(index).long()
+    )
+
+
+@pytest.mark.parametrize("counts", COUNTS.values(), ids=COUNTS)
+@pytest.mark.parametrize("d", [1, 2, 9])
+def test_likelihood_is_the_sum_over_all_rows_of_scipy(counts, d, rng):
+    training = training_set(counts, d, rng)
+    root = rng.normal(size=(len(counts), d, 3 * d))
+    residual = training.y.numpy()
+    expected = -sum(
+        multivariate_normal(cov=root[i] @ root[i].T).logpdf(w)
+        for i, w in zip(training.index.tolist(), residual, strict=True)
+    )
+    found = gaussian_nll(tensor(root), training.scatter_root(training.y), training.counts)
+    # The floor of 1e-12 of the trace weighs in with its ratio to the smallest eigenvalue.
+    assert found.item() == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("d", [1, 2, 9])
+def test_mean_squared_error_is_that_of_the_vectorized_factors_of_numpy(d, rng):
+    root, other = rng.normal(size=(2, 6, d, d + 3))
+    inferred, empirical = (np.linalg.cholesky(factor @ factor.swapaxes(-1, -2)) for factor in (root, other))
+    row, column = np.tril_indices(d)
+    expected = np.mean(np.linalg.norm((inferred - empirical)[:, row, column], axis=1) ** 2)
+    assert covariance_mse(tensor(root), tensor(empirical)).item() == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("d", [1, 2, 9])
+def test_the_floor_is_relative_to_the_variances_and_positive_without_any(d, rng):
+    for root in (rng.normal(size=(3, d, d)), np.zeros((3, d, d))):
+        floored = with_floor(tensor(1e6 * root))
+        added = (floored @ floored.mT).numpy() - 1e12 * root @ root.swapaxes(-1, -2)
+        expected = VARIANCE_FLOOR * (1 + 1e12 * np.square(root).sum((1, 2)))
+        # Seen beside numbers of 1e12, which are rounded at 1e-3.
+        np.testing.assert_allclose(added, expected[:, None, None] * np.eye(d), rtol=1e-9, atol=0.05 * root.max())
+
+
+LOSSES = ["likelihood", "mse"]
+
+
+def loss_of(objective, training, d, rng):
+    if objective == "likelihood":
+        scatter_root = training.scatter_root(training.y)
+        return lambda root: gaussian_nll(root, scatter_root, training.counts)
+    empirical = tensor(rng.normal(size=(len(training.inputs), d, d))).tril()
+    return lambda root: covariance_mse(root, empirical)
+
+
+@pytest.mark.parametrize("objective", LOSSES)
+@pytest.mark.parametrize("d", [1, 2])
+def test_objectives_of_a_wishart_process_are_differentiable(objective, d, rng):
+    training = training_set([1, 2, 5], d, rng)
+    loss = loss_of(objective, training, d, rng)
+    prior_root = padded(2.0 * torch.eye(d).double(), d + 1)
+    deviation = tensor(rng.normal(size=(3, (d + 1) * d))).requires_grad_()
+    matrix = tensor(np.eye(d) + 0.3 * rng.normal(size=(d, d))).requires_grad_()
+    assert torch.autograd.gradcheck(lambda u, m: loss(wishart_root(u, prior_root, m)), (deviation, matrix))
+
+
+@pytest.mark.parametrize("objective", LOSSES)
+@pytest.mark.parametrize("log_diagonal", [False, True])
+@pytest.mark.parametrize("d", [1, 2])
+def test_objectives_of_a_cholesky_factor_are_differentiable(objective, log_diagonal, d, rng):
+    training = training_set([1, 2, 5], d, rng)
+    loss = loss_of(objective, training, d, rng)
+    prior_tril = 2.0 * torch.eye(d).double()
+    deviation = tensor(0.5 * rng.normal(size=(3, d * (d + 1) // 2))).requires_grad_()
+    assert torch.autograd.gradcheck(lambda u: loss(deviation_tril(u, prior_tril, log_diagonal=log_diagonal)), deviation)
+
+
+@pytest.mark.parametrize("objective", LOSSES)
+@pytest.mark.parametrize("d", [1, 2, 9])
+def test_the_literal_start_of_the_paper_has_a_finite_gradient(objective, d, rng):
+    """All vectors of the Wishart process at eight: a covariance of rank one."""
+    training = training_set([1, 2, 15], d, rng)
+    loss = loss_of(objective, training, d, rng)
+    deviation = torch.zeros(3, (d + 1) * d, dtype=torch.float64).requires_grad_()
+    matrix = torch.eye(d).double().requires_grad_()
+    value = loss(wishart_root(deviation, torch.full((d, d + 1), 8.0).double(), matrix))
+    assert value.isfinite()
+    from_deviation, from_matrix = torch.autograd.grad(value, (deviation, matrix))
+    assert from_deviation.isfinite().all()
+    assert from_deviation.abs().max() > 0
+    assert (from_matrix == 0).all()  # it multiplies the deviations, and the prior is held
+
+
+@pytest.mark.parametrize("objective", LOSSES)
+@pytest.mark.parametrize("scale", [0.0, 1e-200, 1e100])
+def test_objectives_and_gradients_are_finite_at_covariances_of_any_size(objective, scale, rng):
+    training = training_set([1, 2, 5], 2, rng)
+    root = tensor(scale * rng.normal(size=(3, 2, 2))).requires_grad_()
+    value = loss_of(objective, training, 2, rng)(root)
+    assert value.isfinite()
+    assert torch.autograd.grad(value, root)[0].isfinite().all()
+
+
+@pytest.mark.parametrize("d", [1, 2, 9])
+def test_a_covariance_that_collapses_has_a_likelihood_that_is_bounded(d):
+    """Two rows that the mean interpolates: without the floor the best covariance is zero."""
+    none = torch.zeros(2, d, 1, dtype=torch.float64)
+    lowest = 2 * 0.5 * d * math.log(2 * math.pi * VARIANCE_FLOOR)
+    losses = []
+    for scale in (1.0, 1e-3, 1e-9, 1e-100, 0.0):
+        losses.append(gaussian_nll(scale * torch.eye(d).double().expand(2, d, d), none, torch.ones(2).double()).item())
+    assert losses == sorted(losses, reverse=True)
+    assert losses[-1] == pytest.approx(lowest, rel=1e-9)
+
+
+def test_training_on_two_rows_ends_at_the_bound():
+    latent = LatentValues(tensor([[0.0], [1.0]]), torch.zeros(1, 2).double(), tensor([1.0]), tensor([[0.1]]))
+    none, counts = torch.zeros(2, 1, 1).double(), torch.ones(2).double()
+    prior_tril = torch.ones(1, 1).double()
+
+    def loss(deviation):
+        return gaussian_nll(deviation_tril(deviation, prior_tril, log_diagonal=True), none, counts)
+
+    report = train(loss, latent, prior_weight=0.0, max_iter=200, tol=1e-8)
+    lowest = math.log(2 * math.pi * VARIANCE_FLOOR)
+    assert report.converged
+    assert lowest <= report.loss < lowest + 1e-3
+
+
+@pytest.mark.parametrize("train_hyperparameters", [False, True])
+def test_the_posterior_mode_under_gaussian_noise_is_the_mean_of_a_gaussian_process(train_hyperparameters, rng):
+    x, y, noise_scale, amplitude = np.linspace(0, 1, 8)[:, None], rng.normal(size=(8, 2)), 0.3, np.array([1.5, 0.7])
+    latent = LatentValues(
+        tensor(x),
+        torch.zeros(2, 8).double(),
+        tensor(amplitude),
+        tensor([[0.2]]),
+        train_hyperparameters=train_hyperparameters,
+    )
+    latent.log_amplitude.requires_grad_(False)
+    latent.log_length_scale.requires_grad_(False)
+    report = train(
+        lambda deviation: 0.5 * (deviation - tensor(y)).square().sum() / noise_scale**2,
+        latent,
+        prior_weight=1.0,
+        max_iter=500,
+        tol=1e-10,
+    )
+    assert report.converged
+    for row in range(2):
+        gram = amplitude[row] ** 2 * RBF(0.2)(x)
+        expected = gram @ np.linalg.solve(gram + noise_scale**2 * np.eye(8), y[:, row])
+        # L-BFGS stops where the loss no longer falls in its twelfth digit: half as many for the place.
+        np.testing.assert_allclose(latent().detach()[:, row], expected, rtol=0, atol=1e-5)
+
+
+def test_training_moves_the_other_parameters_too(rng):
+    latent = LatentValues(tensor([[0.0]]), torch.zeros(1, 1).double(), tensor([1.0]), tensor([[1.0]]))
+    other = torch.zeros(1, dtype=torch.float64, requires_grad=True)
+    train(
+        lambda u: (u - 2).square().sum() + (other - 3).square().sum(),
+        latent,
+        [other],
+        prior_weight=0.0,
+        max_iter=50,
+        tol=1e-9,
+    )
+    # A parabola to 1e-11 of its height is at the root of that from its bottom.
+    assert latent().item() == pytest.approx(2.0, abs=1e-5)
+    assert other.item() == pytest.approx(3.0, abs=1e-5)

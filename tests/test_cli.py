@@ -1,0 +1,143 @@
+import csv
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import torch_pbd
+from torch_pbd.cli import main
+from torch_pbd.data import Demonstrations, make_tunnel_demonstrations
+
+
+@pytest.fixture
+def recording(tmp_path):
+    path = tmp_path / "recording.csv"
+    torch_pbd.save_demonstrations(make_tunnel_demonstrations(5, rate=4.0, random_state=0), path)
+    return path
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["fit", "--help"], ["compare", "--help"], ["demo", "--help"]])
+def test_help_does_not_wait_for_torch(arguments):
+    program = (
+        "import sys\nfrom torch_pbd.cli import main\n"
+        f"try:\n    main({arguments!r})\nexcept SystemExit:\n    pass\n"
+        "assert not {'torch', 'sklearn', 'matplotlib'} & set(sys.modules)"
+    )
+    shown = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert "torch-pbd" in shown.stdout
+
+
+def test_fit_leaves_a_folder_from_which_the_run_can_be_repeated(recording, tmp_path, capsys):
+    first, second = tmp_path / "first", tmp_path / "second"
+    arguments = ["fit", "--data", str(recording), "--model", "CholeskyCovRegressor", "--model.length_scale", "2e0"]
+    assert main([*arguments, "--output", str(first)]) == 0
+    assert "5 demonstrations of 41 samples, 2 outputs (x, y), aligned" in capsys.readouterr().out
+    assert main(["fit", "--config", str(first / "config.yaml"), "--output", str(second)]) == 0
+    models = [torch_pbd.load(folder / "model" / "choleskycovregressor.safetensors") for folder in (first, second)]
+    assert models[0].length_scale == 2.0
+    query = np.linspace(0.0, 10.0, 7)[:, None]
+    np.testing.assert_array_equal(models[0].predict_cov(query), models[1].predict_cov(query))
+    assert (first / "figures" / "choleskycovregressor.png").stat().st_size > 10_000
+    assert json.loads((first / "env.json").read_text())["torch_pbd"] == torch_pbd.__version__
+
+
+def test_compare_reports_every_model_and_every_fold(recording, tmp_path, capsys):
+    config = tmp_path / "compare.yaml"
+    config.write_text(
+        f"data: {recording}\nmax_folds: 3\noutput: {tmp_path / 'out'}\nmodels:\n"
+        "  mine: {class_path: CholeskyCovRegressor, init_args: {noise_scale: 1e-4}}\n"
+        "  mixture: {class_path: torch_pbd.GMMBaseline, init_args: {n_components: 2}}\n"
+    )
+    assert main(["compare", "--config", str(config)]) == 0
+    assert "held-out LL" in capsys.readouterr().out
+    with (tmp_path / "out" / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["model"] for row in rows] == ["mine", "mixture"]
+    folds = [float(rows[0][f"LL {i}"]) for i in (1, 2, 3)]
+    assert float(rows[0]["held-out LL"]) == pytest.approx(np.mean(folds))
+    assert torch_pbd.load(tmp_path / "out" / "model" / "mine.safetensors").noise_scale == 1e-4
+
+
+def test_compare_without_data_is_table_1(tmp_path, capsys):
+    arguments = ["--readings", "[printed]", "--n_seeds", "1", "--n_draws", "10", "--max_folds", "1"]
+    models = '{"CD": {"class_path": "CholeskyCovRegressor", "init_args": {"noise_scale": 0.0, "prior": "paper"}}}'
+    assert main(["compare", *arguments, "--models", models, "--output", str(tmp_path)]) == 0
+    row = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("printed"))
+    assert float(row.split()[2]) <= 1e-12
+    assert row.split()[3] == "3.54e-13"  # the paper's, beside ours
+    assert (tmp_path / "figures" / "cd.png").is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["comparre"], "no command 'comparre'. Did you mean 'compare'"),
+        (["fit"], "data"),
+        (["fit", "--data", "missing.npz"], "no file 'missing.npz'"),
+        (["fit", "--data", "x.npz", "--modle", "GMMBaseline"], "Did you mean 'model'"),
+        (["fit", "--data", "x.npz", "--model", "CholeskyCovRegresor"], "Did you mean 'CholeskyCovRegressor'"),
+        (
+            ["fit", "--data", "x.npz", "--model", "GMMBaseline", "--model.n_component", "3"],
+            "Did you mean 'n_components'",
+        ),
+        (["fit", "--data", "x.npz", "--model", "GMMBaseline", "--model.tol", "soon"], "soon"),
+    ],
+)
+def test_what_cannot_be_used_is_one_line_and_exit_code_2(arguments, message, capsys):
+    assert main(arguments) == 2
+    shown = capsys.readouterr()
+    assert message in shown.err
+    assert shown.err.count("\n") == 1
+    assert shown.out == ""
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("data: a.npz\ndata: b.npz\n", "twice"),
+        ("data: a.npz\nouptut: x\n", "Did you mean 'output'"),
+        ("data: [\n", "config"),
+        ("data: !!python/object/apply:os.system ['true']\n", "config"),
+    ],
+)
+def test_a_config_that_cannot_be_used_is_one_line_and_exit_code_2(text, message, tmp_path, capsys):
+    config = tmp_path / "config.yaml"
+    config.write_text(text)
+    assert main(["fit", "--config", str(config)]) == 2
+    shown = capsys.readouterr().err
+    assert message in shown
+    assert shown.count("\n") == 1
+
+
+def test_a_failed_fit_is_one_line_and_exit_code_1(tmp_path, capsys):
+    path = tmp_path / "one.npz"
+    torch_pbd.save_demonstrations(Demonstrations(np.arange(9.0), np.random.default_rng(0).normal(size=(1, 9, 1))), path)
+    model = ["--model", "WishartProcessRegressor", "--model.objective", "mse"]
+    assert main(["fit", "--data", str(path), *model, "--output", str(tmp_path / "out")]) == 1
+    notes, complaint = capsys.readouterr().err.strip().splitlines()
+    assert "one demonstration" in notes
+    assert "needs >= 2 demonstrations" in complaint
+
+
+@pytest.mark.slow
+def test_the_demo_runs(tmp_path, capsys):
+    assert main(["demo", "--output", str(tmp_path)]) == 0
+    shown = capsys.readouterr()
+    assert shown.err == ""
+    assert "95 % of fresh" in shown.out
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == {"cd.png", "wp.png", "gmm_5.png", "tunnel.png"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["letter_G", "pen_a", "kuka_cube_pick", "snooker_skilled", "adroit_door_palm"])
+def test_recordings_are_compared_without_a_warning(name, recordings, tmp_path, capsys):
+    assert (
+        main(["compare", "--data", str(recordings / f"{name}.npz"), "--max_folds", "2", "--output", str(tmp_path)]) == 0
+    )
+    assert capsys.readouterr().err == ""
+    with (tmp_path / "metrics.csv").open() as file:
+        for row in csv.DictReader(file):
+            assert float(row["least eig."]) > 0
+            assert np.isfinite(float(row["held-out LL"]))
