@@ -179,7 +179,7 @@ def minimize_batch(
     Each problem has its own curvature pairs, its own step and its own end: a joint L-BFGS over all of them
     would share one line search and one memory between problems that have nothing to do with each other.
     Steps are accepted by the Armijo rule, so the loss never rises; a value that is not finite counts as
-    too far.
+    too far. Where the slope along a step has hardly changed, the next step starts four times as long.
 
     Parameters
     ----------
@@ -200,6 +200,7 @@ def minimize_batch(
     loss, gradient = _value_and_gradient(objective, x, rows)
     memory = _CurvatureMemory(history_size)
     active = torch.isfinite(loss) & torch.isfinite(gradient).all(-1) & (gradient.abs().amax(-1) > tol)
+    first_step = 1.0 / gradient.norm(dim=-1).clamp_min(1.0)
     n_iter = 0
     while n_iter < max_iter and bool(active.any()):
         n_iter += 1
@@ -208,13 +209,13 @@ def minimize_batch(
         uphill = ~(slope < 0)
         direction = torch.where(uphill[:, None], -gradient, direction)
         slope = torch.where(uphill, -gradient.square().sum(-1), slope)
-        norm = direction.norm(dim=-1)
-        step = torch.where(norm > 1.0, 1.0 / norm, torch.ones_like(norm)) if n_iter == 1 else torch.ones_like(norm)
-        new_x, new_loss, new_gradient = _backtrack(objective, x, loss, gradient, direction, slope, step, active)
+        new_x, new_loss, new_gradient = _backtrack(objective, x, loss, gradient, direction, slope, first_step, active)
         memory.add(new_x - x, new_gradient - gradient)
+        short = active & ((direction * new_gradient).sum(-1) < 0.9 * slope)
+        first_step = torch.where(short & (n_iter > 1), 4.0 * first_step, torch.ones_like(first_step))
         gain = loss - new_loss
         x, loss, gradient = new_x, new_loss, new_gradient
-        settled = gain <= tol * 1e-2 * loss.abs().clamp_min(1.0)
+        settled = (gain <= tol * 1e-2 * loss.abs().clamp_min(1.0)) & ~short
         active = active & (gradient.abs().amax(-1) > tol) & ~settled
     return x, BatchReport(loss, n_iter, not bool(active.any()))
 

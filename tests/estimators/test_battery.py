@@ -1,5 +1,7 @@
 """Laws that every covariance regressor keeps, whatever its objective."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 import torch
@@ -95,22 +97,25 @@ def dyadic(d=2):
     return np.round(X * 2.0**20) / 2.0**20, np.round(y * 2.0**20) / 2.0**20
 
 
+@cache
+def fitted_to_dyadic(name):
+    return fit(new(name), *dyadic())
+
+
 @pytest.mark.parametrize(
     ("factor", "shift", "x_factor", "x_shift"),
     [
-        ([2.0**30, 2.0**30], 0.0, 1.0, 0.0),
         ([2.0**-30, 2.0**30], 0.0, 1.0, 0.0),
         ([1.0, 1.0], 2.0**20, 1.0, 0.0),
-        ([1.0, 1.0], 0.0, 2.0**-30, 0.0),
         ([1.0, 1.0], 0.0, 2.0**30, 2.0**50),
     ],
-    ids=["units", "mixed units", "offset", "input units", "input offset"],
+    ids=["units", "offset", "input"],
 )
 @pytest.mark.parametrize("name", VARIANTS)
 def test_units_and_origins_that_are_exact_in_binary_change_nothing(name, factor, shift, x_factor, x_shift):
     X, y = dyadic()
     x = np.round(queries(1)[:40] * 2.0**20) / 2.0**20
-    mean, covariance = fit(new(name), X, y).predict(x, return_cov=True)
+    mean, covariance = fitted_to_dyadic(name).predict(x, return_cov=True)
     factor = np.array(factor)
     changed = fit(new(name), X * x_factor + x_shift, y * factor + shift)
     mean2, covariance2 = changed.predict(x * x_factor + x_shift, return_cov=True)
@@ -118,15 +123,14 @@ def test_units_and_origins_that_are_exact_in_binary_change_nothing(name, factor,
     assert relative(covariance2 / factor / factor[:, np.newaxis], covariance).max() < 1e-12
 
 
-@pytest.mark.parametrize("factor", [1e3, 1e-9, [1e9, 1e-9]], ids=["mm", "tiny", "mixed"])
 @pytest.mark.parametrize(("name", "d", "e", "aligned"), STEADY)
-def test_y_in_other_units_gives_the_same_model_in_other_units(name, d, e, aligned, factor):
+def test_y_in_other_units_gives_the_same_model_in_other_units(name, d, e, aligned):
     X, y = demonstrations(d, e, aligned)
-    factor = np.broadcast_to(factor, d)
+    factor = np.array([1e3, 1e-9])
     mean, covariance = fitted(name, d, e, aligned).predict(X, return_cov=True)
     mean2, covariance2 = fit(new(name), X, y * factor).predict(X, return_cov=True)
     np.testing.assert_allclose(mean2 / factor, mean, rtol=1e-6, atol=1e-9)
-    assert relative(covariance2 / factor / factor[:, np.newaxis], covariance).max() < 2e-6
+    assert relative(covariance2 / factor / factor[:, np.newaxis], covariance).max() < 1e-6
 
 
 @pytest.mark.parametrize(("name", "d", "e", "aligned"), [case for case in STEADY if "likelihood" not in case[0]])
@@ -149,14 +153,15 @@ def test_units_and_origin_of_x_change_nothing(name, factor, shift):
     assert relative(covariance2, covariance).max() < 1e-6
 
 
-WIDE = {"float": 50.0, "array": [[40.0, 12.0], [12.0, 60.0]]}
+WIDE = [[40.0, 12.0], [12.0, 60.0]]
+PRIORS = [(name, aligned, WIDE) for name, _, _, aligned in PLAIN if name in LATENT]
+PRIORS += [(name, True, 50.0) for name in LATENT]
 
 
-@pytest.mark.parametrize("prior", WIDE)
-@pytest.mark.parametrize(("name", "aligned"), [(name, aligned) for name, _, _, aligned in PLAIN if name in LATENT])
+@pytest.mark.parametrize(("name", "aligned", "prior"), PRIORS)
 def test_far_from_data_the_covariance_is_the_prior(name, aligned, prior):
-    model = fit(new(name, prior=WIDE[prior]), *demonstrations(aligned=aligned))
-    covariance = WIDE[prior] * np.eye(2) if prior == "float" else np.array(WIDE[prior])
+    model = fit(new(name, prior=prior), *demonstrations(aligned=aligned))
+    covariance = prior * np.eye(2) if prior == 50.0 else np.array(prior)
     X = queries(1)[-3:]
     np.testing.assert_allclose(model.predict_cov(X), np.broadcast_to(covariance, (3, 2, 2)), rtol=1e-10)
     mean = demonstrations(aligned=aligned)[1].mean(0)

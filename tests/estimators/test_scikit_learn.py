@@ -122,9 +122,9 @@ def test_random_state_decides_what_is_drawn(name):
     drawn = model.sample_y(X, 2, random_state=1)
     np.testing.assert_array_equal(drawn, model.sample_y(X, 2, random_state=np.random.RandomState(1)))
     assert (drawn != model.sample_y(X, 2, random_state=2)).any()
-    state = np.random.get_state()[1].copy()
+    before = random_states()
     model.sample_y(X, random_state=0)
-    np.testing.assert_array_equal(state, np.random.get_state()[1])
+    assert random_states() == before
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -277,9 +277,10 @@ def test_selection_over_left_out_demonstrations_in_two_processes(name):
     search.fit(X, y, groups=groups)
     scores = cross_val_score(search.best_estimator_, X, y, cv=folds, groups=groups, n_jobs=2, error_score="raise")
     assert np.isfinite(scores).all()
-    assert scores.mean() == pytest.approx(search.best_score_, rel=1e-12)  # two processes, the same numbers
+    assert scores.mean() == pytest.approx(search.best_score_, rel=1e-12)
+    # Here torch has one thread, there as many as the workers leave it: sums in another order.
     serial = cross_val_score(search.best_estimator_, X, y, cv=folds, groups=groups, scoring=log_likelihood_scorer)
-    np.testing.assert_allclose(serial, scores, rtol=1e-12)
+    np.testing.assert_allclose(serial, scores, rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["cholesky-likelihood", "wishart-likelihood", "mixture", "mixture-lbfgs"])

@@ -108,7 +108,7 @@ def predictions(model, X):
 
 def random_states():
     """What a fit must leave alone: generators, threads, types, modes."""
-    algorithm, keys, *rest = np.random.get_state()
+    algorithm, keys, *rest = np.random.get_state()  # noqa: NPY002 - the one to leave alone
     return (
         (algorithm, keys.tobytes(), *rest),
         torch.get_rng_state().numpy().tobytes(),

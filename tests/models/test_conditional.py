@@ -78,6 +78,9 @@ def test_the_moments_are_those_of_the_core_in_the_units_of_the_data(kind, rng):
     model, x = model_of(kind, 2, rng), queries(rng)
     standardized = (x.numpy() - [3.0, -1.0]) / [10.0, 0.5]
     core_mean, core_root = (part.detach().numpy() for part in model.core(tensor(standardized)))
+    np.testing.assert_allclose(
+        model.type1(x).detach(), model.core.type1(tensor(standardized)).detach(), rtol=1e-9, atol=1e-12
+    )
     mean, covariance = (part.detach().numpy() for part in model.moments(x))
     shift, scale = model.y_shift.numpy(), model.y_scale.numpy()
     np.testing.assert_allclose(mean, shift + scale * core_mean, rtol=1e-9)

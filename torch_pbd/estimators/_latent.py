@@ -159,7 +159,11 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         noise_scale: Tensor | None = None,
     ) -> EvidenceSearch:
         n_inputs, n_features = observations.inputs.shape
-        detail = max(spacing(observations.inputs), n_inputs ** (-1.0 / n_features))
+        if noise_scale is not None and not bool((noise_scale > 0).any()):
+            # Interpolated: longer than where inputs come closest, and the process swings between the others.
+            detail = spacing(observations.inputs, 0.1)
+        else:
+            detail = max(spacing(observations.inputs), n_inputs ** (-1.0 / n_features))
         bounds = (min(0.5, _SHORTEST * detail), longest)
         return EvidenceSearch(
             self.kernel, bounds, length_scale, noise_scale, self.n_restarts, max_iter=max(100, self.max_iter)

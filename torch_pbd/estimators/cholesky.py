@@ -66,8 +66,8 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
     max_inputs : int, default=256
         Where X has more distinct rows, neighbours are merged into this many: the cost of a fit is cubic in
         it and linear in the rows.
-    max_iter : int, default=500
-    tol : float, default=1e-6
+    max_iter : int, default=1000
+    tol : float, default=1e-4
         Stop when no gradient entry, or the fall of the loss, is above it; in nats per row.
     n_restarts : int, default=2
         Starting points of each hyperparameter search beside the first.
@@ -121,8 +121,8 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
         prior: Prior = None,
         length_scale: float | list[float] | None = None,
         max_inputs: int = 256,
-        max_iter: int = 500,
-        tol: float = 1e-6,
+        max_iter: int = 1000,
+        tol: float = 1e-4,
         n_restarts: int = 2,
         random_state: Any = 0,
         device: str | None = None,

@@ -7,13 +7,13 @@ from torch import Tensor
 from torch_pbd.gp.evidence import Observations
 
 
-def spacing(inputs: Float[Tensor, "n e"]) -> float:
-    """Distance to the nearest other input, the 90 % quantile over the inputs; the finest detail they show."""
+def spacing(inputs: Float[Tensor, "n e"], quantile: float = 0.9) -> float:
+    """Distance to the nearest other input, a quantile over the inputs; the finest detail they show."""
     if len(inputs) > 2000:
         inputs = inputs[:: len(inputs) // 1000]
     distance = torch.cdist(inputs, inputs, compute_mode="donot_use_mm_for_euclid_dist")
     distance.fill_diagonal_(float("inf"))
-    return float(distance.amin(1).quantile(0.9))
+    return float(distance.amin(1).quantile(quantile))
 
 
 def neighbourhoods(inputs: Float[Tensor, "n e"], max_inputs: int) -> Int64[Tensor, " n"]:

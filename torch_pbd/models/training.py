@@ -91,19 +91,21 @@ def empirical_tril(training: TrainingSet, *, bias_correction: bool = False) -> F
         With at least two rows at each input.
     bias_correction : bool, default=False
         Divide column i of each factor by its expectation for normal data (Bartlett),
-        ``sqrt(2 / (K - 1)) * gamma((K - i + 1) / 2) / gamma((K - i) / 2)``, i from 1.
+        ``sqrt(2 / (K - 1)) * gamma((K - i + 1) / 2) / gamma((K - i) / 2)``, i from 1; not where it was shrunk.
     """
     n_outputs = training.y.shape[1]
     root = training.scatter_root(training.y - training.means()[training.index])
     degrees = training.counts - 1.0
     lacking = degrees < n_outputs
-    if not bool(lacking.any()):
-        tril = scale_tril_from_root(root) / degrees.sqrt()[:, None, None]
-        return tril / _expected_diagonal(degrees, n_outputs)[:, None, :] if bias_correction else tril
     prior_degrees = float(n_outputs + 1)
-    prior_root = prior_degrees**0.5 * pooled_tril(training) * lacking[:, None, None]
-    degrees = degrees + prior_degrees * lacking
-    return scale_tril_from_root(torch.cat([root, prior_root], dim=-1)) / degrees.sqrt()[:, None, None]
+    if bool(lacking.any()):
+        prior_root = prior_degrees**0.5 * pooled_tril(training) * lacking[:, None, None]
+        root = torch.cat([root, prior_root], dim=-1)
+    scale_tril = scale_tril_from_root(root) / (degrees + prior_degrees * lacking).sqrt()[:, None, None]
+    if not bias_correction:
+        return scale_tril
+    expected = _expected_diagonal(degrees.clamp_min(n_outputs), n_outputs)
+    return scale_tril / torch.where(lacking[:, None], 1.0, expected)[:, None, :]
 
 
 def _expected_diagonal(degrees: Tensor, n_outputs: int) -> Tensor:

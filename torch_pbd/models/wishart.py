@@ -38,7 +38,8 @@ class WishartCovariance(nn.Module):
     latent : LatentGP
         df * d processes: deviations of the vectors u_i from their prior means.
     prior_root : Tensor of shape (d, df)
-        L times the prior means of the vectors; its square is the covariance far from data.
+        L times the prior means of the vectors; its square is the covariance far from data, and stays so while
+        L is trained: L multiplies the deviations.
     scale_matrix_tril : Tensor of shape (d, d)
         The paper's L, lower factor of the scale matrix V.
     """
