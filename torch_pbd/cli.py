@@ -128,7 +128,7 @@ def _compare(options: Any, folder: Any) -> str:
 
 
 def _demonstrations(options: Any) -> Any:
-    from torch_pbd.data import load_demonstrations
+    from torch_pbd.data import check_unimodal, load_demonstrations
     from torch_pbd.experiments.recordings import describe, prepare
 
     recorded = load_demonstrations(options.data)
@@ -138,6 +138,7 @@ def _demonstrations(options: Any) -> Any:
             "There is one demonstration: what varies between demonstrations cannot be told from how one moves.",
             stacklevel=2,
         )
+    check_unimodal(recorded)
     prepared = prepare(recorded, options.align, options.n_steps)
     if prepared is not recorded:
         print(describe(prepared, f"after align={options.align}"))

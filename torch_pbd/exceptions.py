@@ -13,6 +13,10 @@ class DataRankWarning(UserWarning):
     """The data leave directions of the covariance undetermined; a documented fallback was used."""
 
 
+class UnimodalityWarning(UserWarning):
+    """The demonstrations follow more than one way, or one of them is far from the others."""
+
+
 class DataFormatError(ValueError):
     """A file of demonstrations cannot be read as what its suffix says."""
 

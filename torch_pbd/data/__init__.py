@@ -10,9 +10,11 @@ from torch_pbd.data.synthetic import (
     tunnel_center,
     tunnel_half_width,
 )
+from torch_pbd.data.unimodality import check_unimodal
 
 __all__ = [
     "Demonstrations",
+    "check_unimodal",
     "load_demonstrations",
     "make_paper_simulation",
     "make_tunnel_demonstrations",

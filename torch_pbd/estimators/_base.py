@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
+from scipy.sparse import issparse  # type: ignore[import-untyped]
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_random_state
@@ -22,6 +23,7 @@ from torch_pbd.estimators._validation import (
     as_plain_array,
     check_inputs_vary,
     check_number,
+    check_squares,
     prior_covariance,
 )
 from torch_pbd.linalg import gaussian_log_density, safe_cholesky
@@ -86,6 +88,8 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         """
         self._check_parameters()
         inputs, targets = self._validated(X, y, ensure_min_samples=2)
+        check_squares(inputs, "X")
+        check_squares(targets, "y")
         check_inputs_vary(inputs)
         self._y_is_1d = targets.ndim == 1
         self.n_outputs_ = 1 if self._y_is_1d else targets.shape[1]
@@ -119,6 +123,8 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         check_number(self.tol, "tol", low=0.0, strict=True)
         check_number(self.n_restarts, "n_restarts", low=0, integer=True)
         check_number(self.verbose, "verbose", low=0, integer=True)
+        if problem := self._device_problem():
+            raise ValueError(f"device == {self.device!r} cannot be used here: {problem}. None is the CPU.")
 
     def predict(self, X: ArrayLike, *, return_std: bool = False, return_cov: bool = False) -> Any:
         """Mean of y at X, and with it the standard deviations or the covariances.
@@ -198,6 +204,8 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
 
     def _validated(self, X: ArrayLike, y: ArrayLike, **options: Any) -> tuple[Floats, Floats]:
         """X (n, e) and y (n,) or (n, d) in float64, checked by scikit-learn and by us."""
+        if issparse(y):
+            raise TypeError("Sparse data was passed for y, but dense data is required. Use '.toarray()'.")
         X, y = as_plain_array(X, "X"), as_plain_array(y, "y")
         checked: Any = validate_data(self, X, y, dtype=np.float64, y_numeric=True, multi_output=True, **options)
         return checked[0], np.asarray(checked[1], dtype=np.float64)
@@ -239,6 +247,14 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         """Copy of an array; contiguous, since torch takes no negative strides."""
         return torch.tensor(np.asarray(array, order="C"), dtype=torch.float64, device=self.device)
 
+    def _device_problem(self) -> str:
+        """Why no tensor can be put on the device; empty if it can."""
+        try:
+            self._door(0.0)
+        except (AssertionError, RuntimeError, TypeError) as error:  # torch's, by build and by device
+            return str(error).partition("\n")[0].rstrip(".")
+        return ""
+
     def _progress(self) -> Any:
         """Callback that prints the loss, or None."""
         if not self.verbose:
@@ -272,6 +288,14 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         arrays, spec = state.pop("_module_arrays", None), state.pop("_module_spec", None)
         super().__setstate__(state)
         if arrays is not None:
+            if problem := self._device_problem():
+                warnings.warn(
+                    f"The model was fitted on device {self.device!r}, which this machine lacks ({problem}): it is now "
+                    "on the CPU.",
+                    UserWarning,
+                    stacklevel=2,
+                )
+                self.device = None
             with torch.inference_mode(False):  # else autograd would refuse the module
                 tensors = {name: self._door(array) for name, array in arrays.items()}
                 self.module_ = module_from_spec(spec, tensors).requires_grad_(False)

@@ -86,6 +86,7 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         aligned = self._works_on_empirical(inputs, np.bincount(index), y.shape[1])
         length_scale = check_length_scale(self.length_scale, X.shape[1])
         if not aligned:
+            _warn_if_few(len(y), y.shape[1])
             training = training.merged(self.max_inputs)
         problem = Problem(
             training,
@@ -94,8 +95,8 @@ class LatentCovarianceRegressor(CovarianceRegressor):
             None if length_scale is None else self._door(length_scale / scaling.x_scale),
         )
         mean = self._fit_mean(training)
+        _warn_if_identical(training)
         if aligned:
-            _warn_if_identical(training)
             covariance, report, jitter = self._fit_empirical(problem)
         else:
             residual = training.y - mean(training.x).detach()
@@ -204,11 +205,21 @@ def _default_prior_tril(y: Tensor) -> Tensor:
     return 2.0 * scale_tril_from_root(torch.cat([centred, 0.001**0.5 * torch.eye(y.shape[1]).to(y)], dim=1))
 
 
+def _warn_if_few(n_rows: int, n_outputs: int) -> None:
+    if n_rows <= n_outputs:
+        warnings.warn(
+            f"y has {n_rows} rows but {n_outputs} outputs: they leave directions of the covariance undetermined, "
+            "which the prior decides. Record more.",
+            DataRankWarning,
+            stacklevel=4,
+        )
+
+
 def _warn_if_identical(training: TrainingSet) -> None:
     if float(pooled_tril(training).diagonal().max()) < 1e-9:
         warnings.warn(
             "The demonstrations are identical: their covariance is zero, and the smallest that can be told "
             "from it is used.",
             DataRankWarning,
-            stacklevel=5,
+            stacklevel=4,
         )

@@ -20,6 +20,8 @@ Prior = (
 CONSTANT = 1e-11
 # Eigenvalues of a prior below this of the largest cannot be told from zero.
 _SINGULAR = 1e-14
+# Of a value, so that its square, and a thousand of them added up, is a number.
+_LARGEST = 1e140
 
 
 def as_plain_array(values: Any, name: str) -> Any:
@@ -32,27 +34,39 @@ def as_plain_array(values: Any, name: str) -> Any:
         steps of 128 s.
     """
     if hasattr(values, "detach"):
-        values = values.detach().cpu().numpy()
-    array = values if isinstance(values, np.ndarray) else np.asarray(values) if _is_nested(values) else None
-    if array is None:
-        return values
-    text = array.dtype.kind in "US" or (
-        array.dtype.kind == "O" and any(isinstance(entry, str | bytes) for entry in array.flat)
-    )
-    if text:
-        raise ValueError(
-            f"{name} holds text, which dtype='numeric' is not compatible with: convert it to numbers first."
+        values = _from_tensor(values, name)
+    for label, part in _parts(values):
+        text = part.dtype.kind in "US" or (
+            part.dtype.kind == "O" and any(isinstance(entry, str | bytes) for entry in part.flat)
         )
-    if array.dtype in (np.float16, np.float32) and array.size:
-        _check_resolution(array, name)
+        if text:
+            raise ValueError(
+                f"{name} holds text, which dtype='numeric' is not compatible with: convert it to numbers first."
+            )
+        if part.dtype in (np.float16, np.float32) and part.size:
+            _check_resolution(part, name, label)
     return values
 
 
-def _is_nested(values: Any) -> bool:
-    return isinstance(values, list | tuple) and len(values) > 0
+def _from_tensor(values: Any, name: str) -> Any:
+    try:
+        return values.detach().cpu().numpy()
+    except TypeError as error:  # bfloat16 and smaller
+        raise ValueError(f"{name} is a tensor of {values.dtype}, which is too coarse: record it in float64.") from error
 
 
-def _check_resolution(array: NDArray[Any], name: str) -> None:
+def _parts(values: Any) -> list[tuple[Any, NDArray[Any]]]:
+    """Arrays that ``values`` consists of: the columns of a data frame, with their names; or itself."""
+    if hasattr(values, "columns"):
+        return [(label, np.asarray(values[label])) for label in values.columns]
+    if isinstance(values, np.ndarray):
+        return [(None, values)]
+    if hasattr(values, "__array__") or (isinstance(values, list | tuple) and values):
+        return [(None, np.asarray(values))]
+    return []
+
+
+def _check_resolution(array: NDArray[Any], name: str, label: Any) -> None:
     columns = array.reshape(len(array), -1).astype(np.float64)
     if not np.isfinite(columns).all():
         return  # said better by the check for finite values
@@ -62,8 +76,21 @@ def _check_resolution(array: NDArray[Any], name: str) -> None:
     if coarse.any():
         column = int(np.argmax(coarse))
         raise ValueError(
-            f"{name} is {array.dtype} and column {column} is stored in steps of {step[column]:.3g} where its "
-            f"range is {spread[column]:.3g}: subtract an offset before storing it, or record it in float64."
+            f"{name} is {array.dtype} and column {column if label is None else label} is stored in steps of "
+            f"{step[column]:.3g} where its range is {spread[column]:.3g}: subtract an offset before storing it, or "
+            "record it in float64."
+        )
+
+
+def check_squares(array: Floats, name: str) -> None:
+    """Check that variances of the columns of ``array`` are numbers that float64 holds."""
+    largest = np.abs(array.reshape(len(array), -1)).max(axis=0)
+    beyond = (largest > _LARGEST) | ((largest > 0) & (largest < 1.0 / _LARGEST))
+    if beyond.any():
+        column = int(np.argmax(beyond))
+        raise ValueError(
+            f"{name} has values of {largest[column]:.3g} in column {column}, whose squares are beyond what float64 "
+            f"holds: use units in which they are between {1.0 / _LARGEST:g} and {_LARGEST:g}."
         )
 
 
@@ -123,7 +150,7 @@ def check_length_scale(value: Any, n_features: int) -> Floats | None:
     """Length scales as an array (n_features,), or None where they are to be learned."""
     if value is None:
         return None
-    scales = np.asarray(value, dtype=np.float64)
+    scales = _as_floats(value, "length_scale")
     if scales.shape not in [(), (n_features,)] or not (np.isfinite(scales).all() and (scales > 0).all()):
         raise ValueError(
             f"length_scale == {value!r}, must be None, a positive number, or {n_features} positive numbers: one "
@@ -142,10 +169,10 @@ def prior_covariance(prior: Prior, X: Floats, n_outputs: int) -> Floats:
     """
     shape: tuple[int, ...] = (n_outputs, n_outputs)
     if callable(prior):
-        covariance = np.array(prior(X.copy()), dtype=np.float64)
+        covariance = _as_floats(prior(X.copy()), "prior(X)")
         name, shape = "prior(X)", (len(X), *shape)
     else:
-        covariance = np.array(prior, dtype=np.float64)
+        covariance = _as_floats(prior, "prior")
         name = "prior"
         if covariance.ndim == 0:
             covariance = covariance * np.eye(n_outputs)
@@ -155,6 +182,13 @@ def prior_covariance(prior: Prior, X: Floats, n_outputs: int) -> Floats:
         )
     _check_positive_definite(covariance.reshape(-1, n_outputs, n_outputs), name)
     return covariance
+
+
+def _as_floats(value: Any, name: str) -> Floats:
+    try:
+        return np.array(as_plain_array(value, name), dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} == {value!r}, must be numbers ({error}).") from error
 
 
 def _check_positive_definite(covariances: Floats, name: str) -> None:

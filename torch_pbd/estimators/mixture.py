@@ -1,5 +1,6 @@
 """Gaussian mixture regression: the baseline of the paper, and what many use today."""
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from sklearn.utils import check_random_state
 from torch_pbd.estimators._base import CovarianceRegressor, Fitted
 from torch_pbd.estimators._scaling import Standardization, distinct_rows
 from torch_pbd.estimators._validation import Floats, check_choice, check_number
+from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.models.mixture import GaussianMixture, expectation_maximization, refine
 from torch_pbd.optim import FitReport
 
@@ -105,6 +107,12 @@ class GMMBaseline(CovarianceRegressor):
             raise ValueError(
                 f"n_components == {self.n_components}, must not be above the number of distinct samples, which is "
                 f"{n_distinct} of n_samples = {len(X)}."
+            )
+        if not (np.ptp(y, axis=0) > 0).any():
+            warnings.warn(
+                "y is constant: its covariance is zero, and the smallest that can be told from it is used.",
+                DataRankWarning,
+                stacklevel=3,
             )
         scaling = _by_residual(X, y)
         data = self._door(np.hstack([(X - scaling.x_shift) / scaling.x_scale, (y - scaling.y_shift) / scaling.y_scale]))

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from torch_pbd.data import make_paper_simulation, paper_covariance, paper_mean
 from torch_pbd.data.synthetic import Reading
 from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.estimators.mixture import GMMBaseline
 from torch_pbd.experiments.comparison import Score, compare_models, empirical_covariances
+from torch_pbd.experiments.reference import ScikitLearnGMR
 from torch_pbd.experiments.run_folder import RunFolder, format_table, slug
 from torch_pbd.plotting import EMPIRICAL, MODEL, TRUTH, plot_covariance_ellipses, plot_model_bands
 
@@ -33,9 +35,11 @@ def table1(
 ) -> list[dict[str, Any]]:
     """Table I for each reading of eq. (14): medians over the seeds 0 to ``n_seeds - 1``.
 
-    A model whose name is one of the paper's (CD, WP, GMM 5, GMM 8) has the paper's figure beside it.
+    A model whose name is one of the paper's (CD, WP, GMM 5, GMM 8) has the paper's figure beside it. Beside each
+    mixture is scikit-learn's with as many components, from starts of its own.
     """
     rows = []
+    models = _with_references(models)
     for reading in readings:
         scores: dict[str, list[Score]] = {name: [] for name in models}
         for seed in range(n_seeds):
@@ -52,6 +56,15 @@ def table1(
                 scores[score.model].append(score)
         rows += [_row(reading, name, several) for name, several in scores.items()]
     return rows
+
+
+def _with_references(models: Mapping[str, CovarianceRegressor]) -> dict[str, Any]:
+    contenders: dict[str, Any] = {}
+    for name, model in models.items():
+        contenders[name] = model
+        if isinstance(model, GMMBaseline):
+            contenders[f"{name}, scikit-learn"] = ScikitLearnGMR(model.n_components)
+    return contenders
 
 
 def _row(reading: str, name: str, scores: Sequence[Score]) -> dict[str, Any]:
