@@ -95,3 +95,15 @@ def test_a_batch_steps_back_from_values_that_are_not_finite():
     start = torch.tensor([[1e-3], [50.0]], dtype=torch.float64)
     found, _ = minimize_batch(lambda x, _: (x - x.log()).squeeze(-1), start, tol=1e-9)
     torch.testing.assert_close(found, torch.ones(2, 1, dtype=torch.float64), rtol=1e-6, atol=0)
+
+
+def test_a_batch_on_a_plateau_ends_and_does_not_creep_on():
+    evaluations = []
+
+    def objective(x, rows):
+        evaluations.append(len(rows))
+        return -torch.exp(-1e-12 * x.square().sum(-1)) + 1e-9 * x.sum(-1)  # nearly flat, and no minimum
+
+    _, report = minimize_batch(objective, torch.ones(3, 2, dtype=torch.float64), max_iter=1000, tol=1e-12)
+    assert report.n_iter < 100
+    assert len(evaluations) < 300

@@ -156,6 +156,9 @@ def minimize(
     return FitReport(point.curve[-1], tuple(point.curve), n_iter, converged, message)
 
 
+_LONGEST_STEP = 1e3  # in steps of L-BFGS
+
+
 @dataclass(frozen=True)
 class BatchReport:
     """How the optimizations of a batch ended, each for itself."""
@@ -211,7 +214,8 @@ def minimize_batch(
         slope = torch.where(uphill, -gradient.square().sum(-1), slope)
         new_x, new_loss, new_gradient = _backtrack(objective, x, loss, gradient, direction, slope, first_step, active)
         memory.add(new_x - x, new_gradient - gradient)
-        short = active & ((direction * new_gradient).sum(-1) < 0.9 * slope)
+        still_steep = (direction * new_gradient).sum(-1) < 0.9 * slope
+        short = active & still_steep & (new_loss < loss) & (first_step < _LONGEST_STEP)
         first_step = torch.where(short & (n_iter > 1), 4.0 * first_step, torch.ones_like(first_step))
         gain = loss - new_loss
         x, loss, gradient = new_x, new_loss, new_gradient

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
-from scipy.sparse import issparse  # type: ignore[import-untyped]
+from scipy.sparse import issparse
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_random_state
@@ -292,7 +292,6 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
                 warnings.warn(
                     f"The model was fitted on device {self.device!r}, which this machine lacks ({problem}): it is now "
                     "on the CPU.",
-                    UserWarning,
                     stacklevel=2,
                 )
                 self.device = None
