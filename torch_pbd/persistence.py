@@ -6,7 +6,7 @@ import os
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from tempfile import NamedTemporaryFile
+from secrets import token_hex
 from typing import Any
 
 import numpy as np
@@ -59,13 +59,15 @@ def save(estimator: CovarianceRegressor, path: str | os.PathLike[str]) -> None:
             key: _encode(value, key) for key, value in state.items() if key not in estimator.get_params(deep=False)
         },
         "versions": {package: version(package) for package in ("torch", "scikit-learn", "numpy")},
-        "sha256": _digest(arrays),
     }
+    header["sha256"] = _digest(header, arrays)
     _write_whole(Path(path), to_bytes(arrays, metadata={_KEY: json.dumps(header)}))
 
 
 def load(path: str | os.PathLike[str]) -> CovarianceRegressor:
     """Load an estimator that :func:`save` wrote: it predicts the same to the last bit.
+
+    One that was fitted on a device which this machine lacks is put on the CPU, with a warning.
 
     Raises
     ------
@@ -81,27 +83,37 @@ def load(path: str | os.PathLike[str]) -> CovarianceRegressor:
         with safe_open(path, framework="numpy") as file:
             header = json.loads((file.metadata() or {})[_KEY])
             arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a dict
-    except (SafetensorError, KeyError, ValueError, OSError) as error:
+    except (SafetensorError, KeyError, ValueError, OSError, RecursionError) as error:
         raise ModelFileError(f"{path} is not a model of torch_pbd, or is damaged ({error}).") from error
     if not isinstance(header, dict) or header.get("format_version") != FORMAT_VERSION:
         found = header.get("format_version") if isinstance(header, dict) else None
         raise ModelFileError(f"{path} has format version {found}; this torch_pbd reads {FORMAT_VERSION}. Upgrade it.")
-    if header.get("class") not in _CLASSES:
+    if header.get("class") not in list(_CLASSES):  # a list asks for no hash
         raise ModelFileError(f"{path} holds a {header.get('class')!r}; known are {', '.join(_CLASSES)}.")
-    if header.get("sha256") != _digest(arrays):
-        raise ModelFileError(f"{path} is damaged: its arrays do not match their checksum.")
+    if header.pop("sha256", None) != _digest(header, arrays):
+        raise ModelFileError(f"{path} is damaged: it does not match its checksum.")
     try:
         estimator_class = getattr(import_module(_CLASSES[header["class"]]), header["class"])
         estimator: CovarianceRegressor = estimator_class(**_decode(header["params"]))
         state = {**estimator.__dict__, **_decode(header["fitted"])}
         estimator.__setstate__({**state, "_module_spec": header["module"], "_module_arrays": arrays})
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        _try_out(estimator)
+    except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ModelFileError(f"{path} does not describe a whole {header['class']} ({error}).") from error
     return estimator
 
 
-def _digest(arrays: dict[str, NDArray[Any]]) -> str:
-    digest = hashlib.sha256()
+def _try_out(estimator: CovarianceRegressor) -> None:
+    """Raise what a model of parts that do not fit together raises."""
+    mean, scale_tril = estimator.module_(estimator._door(np.zeros((1, estimator.n_features_in_))))
+    if mean.shape != (1, estimator.n_outputs_) or scale_tril.shape != (*mean.shape, estimator.n_outputs_):
+        raise ValueError(f"it is for {estimator.n_outputs_} outputs, its arrays for {mean.shape[-1]}")
+    if not isinstance(estimator._y_is_1d, bool):
+        raise ValueError("it does not say how y was shaped")
+
+
+def _digest(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> str:
+    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name in sorted(arrays):
         digest.update(f"{name} {arrays[name].dtype} {arrays[name].shape} ".encode())
         digest.update(arrays[name].tobytes())
@@ -139,12 +151,13 @@ def _write_whole(path: Path, content: bytes) -> None:
     """Write beside the file and put it in its place: a reader sees the old one or the new one."""
     if not path.parent.is_dir():
         raise FileNotFoundError(f"cannot save to {path}: its folder does not exist.")
-    with NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
-        try:
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.{token_hex(4)}")
+    try:
+        with temporary.open("xb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-            os.replace(file.name, path)  # noqa: PTH105 - the temporary file has only a name
-        except BaseException:
-            Path(file.name).unlink(missing_ok=True)
-            raise
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise

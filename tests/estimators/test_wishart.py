@@ -1,0 +1,84 @@
+import numpy as np
+import pytest
+
+from estimators.zoo import assert_covariances, demonstrations, fit, fitted, new, queries
+from torch_pbd import WishartProcessRegressor
+from torch_pbd.data import make_paper_simulation
+from torch_pbd.metrics import covariance_mse
+
+
+def empirical_covariances(X, y):
+    inputs, index = np.unique(X, axis=0, return_inverse=True)
+    return inputs, np.stack([np.cov(y[index.ravel() == i].T) for i in range(len(inputs))])
+
+
+@pytest.mark.parametrize("reading", ["bell", "printed", "bowl"])
+def test_table_1(reading):
+    errors = []
+    for seed in range(10):
+        X, y, _ = make_paper_simulation(reading=reading, random_state=seed)
+        inputs, empirical = empirical_covariances(X, y)
+        model = fit(WishartProcessRegressor(objective="mse"), X, y)
+        errors.append(covariance_mse(model.predict_cov(inputs), empirical, on="cholesky"))
+    assert np.median(errors) <= 1e-3
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_random_start_stays_finite(seed):
+    X, y, _ = make_paper_simulation(random_state=seed)
+    model = fit(WishartProcessRegressor(start="random", random_state=seed), X, y)
+    assert np.isfinite(model.loss_curve_).all()
+    assert model.loss_ < 1e-3 * model.loss_curve_[0]
+    assert_covariances(model.predict_cov(np.linspace(-300.0, 300.0, 50)[:, np.newaxis]), 50, 2)
+
+
+def test_random_state_is_the_seed_of_the_start():
+    X, y = demonstrations()
+    x = queries(1)
+    one, same, other = (fit(new("wishart-random", random_state=seed), X, y).predict_cov(x) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one, same)
+    assert (one != other).any()
+
+
+@pytest.mark.parametrize("df", [2, 3, 5, 8])
+@pytest.mark.parametrize("objective", ["mse", "likelihood"])
+def test_any_number_of_vectors_from_the_number_of_outputs_on(df, objective):
+    X, y = demonstrations()
+    model = fit(WishartProcessRegressor(df=df, objective=objective, prior=[[40.0, 12.0], [12.0, 60.0]]), X, y)
+    assert model.df_ == df
+    covariance = model.predict_cov(queries(1))
+    assert_covariances(covariance, 45, 2)
+    np.testing.assert_allclose(covariance[-1], [[40.0, 12.0], [12.0, 60.0]], rtol=1e-10)
+
+
+@pytest.mark.parametrize("d", [1, 2, 9])
+def test_df_is_one_more_than_the_outputs_unless_given(d):
+    X, y = demonstrations(d)
+    assert fitted("wishart", d).df_ == d + 1
+    assert fit(WishartProcessRegressor(df="auto"), X, y).df_ == d + 1
+
+
+def test_the_prior_of_the_paper_has_rank_one():
+    """All vectors' means at 8, so V = L L' times 64 nu in every entry; only the floor is added."""
+    model = fit(WishartProcessRegressor(prior="paper"), *demonstrations())
+    far = model.predict_cov(queries(1)[-1:])[0]
+    np.testing.assert_allclose(far, np.full((2, 2), 3 * 64.0), rtol=1e-9)
+    assert_covariances(far[np.newaxis], 1, 2)
+
+
+def test_auto_is_mse_where_every_input_repeats_and_likelihood_elsewhere():
+    x = queries(1)
+    for aligned, objective in [(True, "mse"), (False, "likelihood")]:
+        X, y = demonstrations(aligned=aligned)
+        auto, chosen = (fit(new("wishart", objective=name), X, y) for name in ("auto", objective))
+        np.testing.assert_array_equal(auto.predict_cov(x), chosen.predict_cov(x))
+
+
+def test_the_loss_of_mse_is_equation_9_in_standardized_units():
+    X, y = demonstrations()
+    model = fitted("wishart-random")
+    inputs, empirical = empirical_covariances(X, y)
+    scale = y.std(0)
+    units = scale[:, np.newaxis] * scale
+    expected = covariance_mse(model.predict_cov(inputs) / units, empirical / units)
+    assert model.loss_ == pytest.approx(expected, rel=1e-6, abs=1e-12)
