@@ -106,3 +106,12 @@ def test_log_density_is_that_of_scipy(d, generator):
     factor = torch.linalg.cholesky(covariance).expand(7, d, d)
     expected = multivariate_normal(cov=covariance.numpy()).logpdf(residual.numpy())
     np.testing.assert_allclose(gaussian_log_density(residual, factor), expected.ravel(), rtol=1e-9)
+
+
+def test_the_gradient_through_a_jittered_factor_is_finite():
+    """Of the log determinant, by Jacobi's formula: the inverse of the matrix that was factorized."""
+    matrix = torch.ones(2, 2, dtype=torch.float64).requires_grad_()
+    factor, jitter = cholesky_with_jitter(matrix[None], name="matrix")
+    (gradient,) = torch.autograd.grad(2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(), matrix)
+    inverse = torch.linalg.inv(matrix.detach() + jitter * torch.eye(2).to(matrix))
+    torch.testing.assert_close(gradient, inverse, rtol=0.1, atol=0.0)  # the condition number is 1e14

@@ -61,22 +61,23 @@ def cholesky_with_jitter(matrix: Float[Tensor, "*b n n"], *, name: str) -> tuple
     if not torch.isfinite(matrix).all():
         raise NotPositiveDefiniteError(f"{name} has entries that are not finite.")
     factor, info = torch.linalg.cholesky_ex(matrix)
-    identity = torch.eye(matrix.shape[-1]).to(matrix)
-    scale = matrix.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None].abs()
-    jitter, exponent = 0.0, -14
-    while bool((info > 0).any()):
-        jitter = 10.0**exponent
-        if jitter > 1.01 * MAX_JITTER:
-            raise NotPositiveDefiniteError(
-                f"{name} is not positive definite, even with {MAX_JITTER:g} of its mean diagonal added. "
-                "Look for inputs that nearly coincide, a length_scale far above the range of the inputs, "
-                "or a noise_scale of zero on noisy data."
-            )
-        failed = (info > 0)[..., None, None]
-        retried, retried_info = torch.linalg.cholesky_ex(matrix + jitter * scale * identity)
-        factor, info = torch.where(failed, retried, factor), torch.where(info > 0, retried_info, info)
-        exponent += 1
-    return factor, jitter
+    failed = info > 0
+    if not bool(failed.any()):
+        return factor, 0.0
+    # The gradient of a factorization that failed is NaN: find the jitter first, then factorize once.
+    scale = matrix.detach().diagonal(dim1=-2, dim2=-1).mean(-1).abs()
+    jitter = torch.zeros_like(scale)
+    for exponent in range(-14, round(math.log10(MAX_JITTER)) + 1):
+        jitter = torch.where(failed, 10.0**exponent, jitter)
+        regular = matrix + torch.diag_embed((jitter * scale).unsqueeze(-1).expand(matrix.shape[:-1]))
+        failed = failed & (torch.linalg.cholesky_ex(regular.detach()).info > 0)
+        if not bool(failed.any()):
+            return torch.linalg.cholesky_ex(regular).L, float(jitter.max())
+    raise NotPositiveDefiniteError(
+        f"{name} is not positive definite, even with {MAX_JITTER:g} of its mean diagonal added. "
+        "Look for inputs that nearly coincide, a length_scale far above the range of the inputs, "
+        "or a noise_scale of zero on noisy data."
+    )
 
 
 def safe_cholesky(matrix: Float[Tensor, "*b n n"], *, name: str) -> Float[Tensor, "*b n n"]:

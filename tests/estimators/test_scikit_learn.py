@@ -127,13 +127,7 @@ def test_random_state_decides_what_is_drawn(name):
     assert random_states() == before
 
 
-# TODO: drop the mark when gp.evidence makes its bounds and its grid in the dtype of the inputs.
-FLOAT32_BOUNDS = pytest.mark.xfail(
-    strict=False, reason="bounds of the evidence search are rounded to the default dtype"
-)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, pytest.param(torch.float64, marks=FLOAT32_BOUNDS)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("name", VARIANTS)
 def test_the_default_dtype_does_not_matter(name, dtype):
     previous = torch.get_default_dtype()

@@ -144,7 +144,7 @@ class _Coordinates:
         self.n_length_scales = len(bounds)
         if search.noise_scale is None or bool((search.noise_scale > 0).all()):
             bounds.append((math.log(self._lowest_ratio()), math.log(MAX_NOISE_RATIO)))
-        table = torch.tensor(bounds).reshape(-1, 2).to(observations.inputs)
+        table = observations.inputs.new_tensor(bounds).reshape(-1, 2)
         self.low, self.width = table[:, 0], table[:, 1] - table[:, 0]
 
     def _lowest_ratio(self) -> float:
@@ -212,7 +212,7 @@ def _grid(coordinates: _Coordinates, n_starts: int) -> Tensor:
     weight = observations.counts.sqrt()
     low, high = search.length_scale_bounds
     n_scales = 20 if search.length_scale is None else 1
-    scales = torch.logspace(math.log10(low), math.log10(high), n_scales).to(weight)
+    scales = torch.logspace(math.log10(low), math.log10(high), n_scales, dtype=weight.dtype, device=weight.device)
     learned = len(coordinates.low) > coordinates.n_length_scales
     ratios = 10.0 ** weight.new_tensor(_LOG10_RATIOS) if learned else weight.new_zeros(1)
     if learned and search.noise_scale is not None:

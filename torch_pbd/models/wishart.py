@@ -17,7 +17,7 @@ def wishart_root(
     ``deviation`` holds the df vectors' deviations from their prior means one after the other.
     """
     n_outputs, df = prior_root.shape[-2:]
-    vectors = deviation.reshape(-1, df, n_outputs).mT
+    vectors = deviation.reshape(len(deviation), df, n_outputs).mT
     return prior_root + scale_matrix_tril.tril() @ vectors
 
 
@@ -64,4 +64,5 @@ class WishartCovariance(nn.Module):
 
     def variability(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d r"]:
         """Root of the covariance with the prior taken out (Type II): zero far from data."""
-        return self.latent.values(x).reshape(len(x), self.prior_root.shape[1], -1).mT
+        n_outputs, df = self.prior_root.shape
+        return self.latent.values(x).reshape(len(x), df, n_outputs).mT
