@@ -2,13 +2,12 @@
 
 from torch_pbd.gp.evidence import (
     EvidenceSearch,
-    Hyperparameters,
-    Observations,
     fit_hyperparameters,
     negative_log_evidence,
 )
 from torch_pbd.gp.latent import LatentGP, LatentValues, condition
 from torch_pbd.gp.neighbourhoods import merge_observations, neighbourhoods, spacing
+from torch_pbd.gp.observations import Hyperparameters, Observations
 
 __all__ = [
     "EvidenceSearch",

@@ -14,6 +14,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from torch_pbd.exceptions import NotPositiveDefiniteError
+from torch_pbd.gp.observations import Hyperparameters, Observations
 from torch_pbd.kernels import KernelName, correlation
 from torch_pbd.optim import FitReport, minimize_batch
 
@@ -25,26 +26,6 @@ _HOPEFUL = 0.5  # nats for each input that polishing may be worth
 
 # Below 1e-3 the evidence is nearly flat in the ratio: no optimum is lost between these.
 _LOG10_RATIOS = (-10.0, -8.0, -6.0, -4.0, -3.0, -2.5, -2.0, -1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 4.0)
-
-
-@dataclass(frozen=True)
-class Observations:
-    """Targets of b processes at n distinct inputs, the mean of ``counts`` observations each."""
-
-    inputs: Float[Tensor, "n e"]
-    targets: Float[Tensor, "b n"]
-    counts: Float[Tensor, " n"]
-
-
-@dataclass(frozen=True)
-class Hyperparameters:
-    """Of b processes: length scales (one row where all share them), amplitude, and the noise variance over
-    the squared amplitude.
-    """
-
-    length_scale: Float[Tensor, "g e"]
-    amplitude: Float[Tensor, " b"]
-    noise_ratio: Float[Tensor, " b"]
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torch_pbd.gp.evidence import Hyperparameters, Observations
+from torch_pbd.gp.observations import Hyperparameters, Observations
 from torch_pbd.kernels import KernelName, correlation
 from torch_pbd.linalg import cholesky_with_jitter, safe_cholesky
 

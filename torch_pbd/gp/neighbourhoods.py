@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from torch_pbd.gp.evidence import Observations
+from torch_pbd.gp.observations import Observations
 
 
 def spacing(inputs: Float[Tensor, "n e"], quantile: float = 0.9) -> float:
