@@ -26,9 +26,9 @@ from estimators.zoo import (
 from torch_pbd import CholeskyCovRegressor, GMMBaseline, WishartProcessRegressor
 from torch_pbd.metrics import relative_frobenius_error
 
-# A likelihood that shrinks without bound, or is flat in a direction: its optimizer turns the last bit of the
-# data into digits, so only what is exact in floating point can be asked of it.
-SENSITIVE = [("cholesky-eq12", False), ("wishart-eq11", False), ("wishart-likelihood", False)]
+# A likelihood that shrinks without bound, or is flat in a direction: its optimizer turns the last digits that a
+# large constant leaves of the data into more, so the law of the constant is not asked of it.
+SENSITIVE = [("cholesky-eq12", False), ("wishart-eq11", False)]
 STEADY = [case for case in PLAIN if (case[0], case[3]) not in SENSITIVE]
 INTERPOLATING = ["cholesky-interpolating", "wishart", "wishart-random"]
 
@@ -128,7 +128,7 @@ def test_units_and_origins_that_are_exact_in_binary_change_nothing(name, factor,
     assert relative(covariance2 / factor / factor[:, np.newaxis], covariance).max() < 1e-12
 
 
-@pytest.mark.parametrize(("name", "d", "e", "aligned"), STEADY)
+@pytest.mark.parametrize(("name", "d", "e", "aligned"), PLAIN)
 def test_y_in_other_units_gives_the_same_model_in_other_units(name, d, e, aligned):
     X, y = demonstrations(d, e, aligned)
     factor = np.array([1e3, 1e-9])

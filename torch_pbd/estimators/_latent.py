@@ -78,9 +78,9 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         inputs, index = distinct_rows(X)
         self._check_memory(len(inputs), y.shape[1])
         training = TrainingSet(
-            self._door((X - scaling.x_shift) / scaling.x_scale),
-            self._door((y - scaling.y_shift) / scaling.y_scale),
-            self._door((inputs - scaling.x_shift) / scaling.x_scale),
+            self._door(scaling.inputs(X)),
+            self._door(scaling.outputs(y)),
+            self._door(scaling.inputs(inputs)),
             self._door(index).long(),
         )
         aligned = self._works_on_empirical(inputs, np.bincount(index), y.shape[1])

@@ -7,6 +7,10 @@ from numpy.typing import NDArray
 
 from torch_pbd.estimators._validation import CONSTANT, Floats
 
+# Standardized numbers keep this many decimals, so that other units are the same numbers: an optimizer with flat
+# directions would turn a difference in the last bit into digits.
+_DECIMALS = 10
+
 
 @dataclass(frozen=True)
 class Standardization:
@@ -35,6 +39,14 @@ class Standardization:
             y_scale = np.where(varies, y_scale, y_scale[varies].max() if varies.any() else largest)
             y_scale = np.where(y_scale > 0, y_scale, 1.0)
         return cls(low + 0.5 * span, x_scale, y_shift, y_scale)
+
+    def inputs(self, X: Floats) -> Floats:
+        """Inputs standardized."""
+        return np.asarray(np.round((X - self.x_shift) / self.x_scale, _DECIMALS))
+
+    def outputs(self, y: Floats) -> Floats:
+        """Outputs standardized."""
+        return np.asarray(np.round((y - self.y_shift) / self.y_scale, _DECIMALS))
 
 
 def distinct_rows(X: Floats) -> tuple[Floats, NDArray[np.intp]]:

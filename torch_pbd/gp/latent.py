@@ -84,7 +84,7 @@ class LatentGP(nn.Module):
         share = self.amplitude.square().clamp_min(torch.finfo(self.amplitude.dtype).tiny)
         if len(reduced) == 1:
             return reduced[0]
-        return (share / share.sum()) @ reduced
+        return ((share / share.sum()) @ reduced).clamp(max=1.0)
 
     def _reduced(self, x: Tensor, noise_ratio: Tensor) -> Tensor:
         """Eq. (6) over the squared amplitude: (b, m), or (1, m) where no noise tells the processes apart."""
