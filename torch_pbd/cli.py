@@ -103,6 +103,8 @@ def _compare(options: Any, folder: Any) -> str:
         from torch_pbd.experiments.recordings import run_recordings
 
         demonstrations = _demonstrations(options)
+        if len(demonstrations) < 2:
+            raise ConfigError("data: there is one demonstration; to compare models, at least two are needed.")
         table = run_recordings(
             options.models,
             demonstrations,

@@ -161,3 +161,13 @@ def test_a_given_length_scale_is_that_of_the_covariance():
     module = model.module_
     learned = module.core.covariance.latent.length_scale * module.x_scale
     torch.testing.assert_close(learned, torch.tensor([[0.3, 2.0]], dtype=torch.float64).expand(len(learned), -1))
+
+
+def test_a_length_scale_that_lets_the_covariance_overshoot_is_warned_of():
+    t = np.tile(np.linspace(0.0, 1.0, 12), 20)[:, np.newaxis]
+    y = (1.2 + np.sin(12.0 * t)) * np.repeat(np.random.default_rng(0).normal(size=20), 12)[:, np.newaxis]
+    with pytest.warns(UserWarning, match="length_scale is so long"):
+        fit(CholeskyCovRegressor(noise_scale=0.0, length_scale=0.5), t, y)
+    model = fit(CholeskyCovRegressor(noise_scale=0.0, length_scale=0.15), t, y)
+    beside = model.predict_cov(np.linspace(-0.5, 0.0, 50)[:, np.newaxis])
+    assert beside.max() < 1.5 * model.predict_cov([[-100.0]]).max()

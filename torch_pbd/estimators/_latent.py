@@ -37,6 +37,7 @@ from torch_pbd.optim import FitReport
 
 # Length scales from here times the spacing of the inputs to this many ranges: shorter ones are "needles"
 # that explain each point by itself, and with longer ones the prior of a covariance would never take over.
+_STRETCHED = 10.0  # an amplitude of so many times the values
 _SHORTEST, _LONGEST_MEAN, _LONGEST_COVARIANCE = 0.75, 10.0, 0.35
 
 
@@ -75,15 +76,16 @@ class LatentCovarianceRegressor(CovarianceRegressor):
 
     def _fit(self, X: Floats, y: Floats) -> Fitted:
         scaling = Standardization.of(X, y)
-        inputs, index = distinct_rows(X)
+        standardized = scaling.inputs(X)
+        inputs, index = distinct_rows(standardized)
         self._check_memory(len(inputs), y.shape[1])
         training = TrainingSet(
-            self._door(scaling.inputs(X)),
+            self._door(standardized),
             self._door(scaling.outputs(y)),
-            self._door(scaling.inputs(inputs)),
+            self._door(inputs),
             self._door(index).long(),
         )
-        aligned = self._works_on_empirical(inputs, np.bincount(index), y.shape[1])
+        aligned = self._works_on_empirical(scaling.x_shift + scaling.x_scale * inputs, np.bincount(index), y.shape[1])
         length_scale = check_length_scale(self.length_scale, X.shape[1])
         if not aligned:
             _warn_if_few(len(y), y.shape[1])
@@ -165,7 +167,7 @@ class LatentCovarianceRegressor(CovarianceRegressor):
             detail = spacing(observations.inputs, 0.1)
         else:
             detail = max(spacing(observations.inputs), n_inputs ** (-1.0 / n_features))
-        bounds = (min(0.5, _SHORTEST * detail), longest)
+        bounds = (min(0.5, max(1e-6, _SHORTEST * detail)), longest)  # inputs may coincide but for rounding
         return EvidenceSearch(
             self.kernel, bounds, length_scale, noise_scale, self.n_restarts, max_iter=max(100, self.max_iter)
         )
@@ -222,4 +224,15 @@ def _warn_if_identical(training: TrainingSet) -> None:
             "from it is used.",
             DataRankWarning,
             stacklevel=4,
+        )
+
+
+def warn_if_stretched(amplitude: Tensor, targets: Tensor, *, given: bool) -> None:
+    """Warn where a length scale that the user gave is too long for what changes over the inputs."""
+    if given and bool((amplitude > _STRETCHED * targets.square().mean(1).sqrt().clamp_min(1e-12)).any()):
+        warnings.warn(
+            "length_scale is so long that the covariance follows the data only as the difference of large numbers: "
+            "beside the data it will overshoot the prior. Give a shorter one, or None to learn it.",
+            UserWarning,
+            stacklevel=5,
         )

@@ -10,6 +10,7 @@ from torch_pbd.estimators._latent import (
     LatentCovarianceRegressor,
     Problem,
     residual_tril,
+    warn_if_stretched,
 )
 from torch_pbd.estimators._validation import Prior, check_choice, check_number
 from torch_pbd.gp import LatentValues, Observations, condition, fit_hyperparameters, merge_observations
@@ -164,6 +165,7 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
         observations = observed(deviation)
         search = self._search(observations, _LONGEST_COVARIANCE, problem.length_scale, self._entry_noise(problem))
         hyperparameters, _, report = fit_hyperparameters(observations, search)
+        warn_if_stretched(hyperparameters.amplitude, observations.targets, given=problem.length_scale is not None)
         values = observed(tril_to_vector(scale_tril)).targets
         latent, jitter = condition(observations, hyperparameters, self.kernel, values)
         prior = problem.prior_tril if problem.prior_tril.ndim == 2 else problem.prior_tril[0]

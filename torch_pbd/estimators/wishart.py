@@ -11,6 +11,7 @@ from torch_pbd.estimators._latent import (
     LatentCovarianceRegressor,
     Problem,
     residual_tril,
+    warn_if_stretched,
 )
 from torch_pbd.estimators._validation import Prior, check_choice, check_number
 from torch_pbd.gp import LatentValues, Observations, condition, fit_hyperparameters, merge_observations
@@ -164,6 +165,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         interpolate = torch.zeros(len(observations.targets)).to(target)
         search = self._search(observations, _LONGEST_COVARIANCE, problem.length_scale, interpolate)
         hyperparameters, _, report = fit_hyperparameters(observations, search)
+        warn_if_stretched(hyperparameters.amplitude, observations.targets, given=problem.length_scale is not None)
         latent, jitter = condition(observations, hyperparameters, self.kernel, observed(root).targets)
         with torch.no_grad():
             mse = float(covariance_mse(wishart_root(latent(inputs), prior_root, matrix), target))
