@@ -51,6 +51,7 @@ def test_it_is_a_regressor_whose_parameters_come_back(name):
     assert type(estimator)(**estimator.get_params()).get_params() == estimator.get_params()
 
 
+@pytest.mark.filterwarnings("ignore:length_scale is so long")  # the one given here is, and it does not matter
 @pytest.mark.parametrize("name", VARIANTS)
 def test_a_fit_edits_no_parameter(name):
     length_scale = [0.5]
