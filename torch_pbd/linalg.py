@@ -1,6 +1,8 @@
 """Algebra of symmetric positive definite matrices, batched: ``...`` dimensions come first."""
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -90,3 +92,49 @@ def gaussian_log_density(residual: Float[Tensor, "*b d"], scale_tril: Float[Tens
     whitened = torch.linalg.solve_triangular(scale_tril, residual.unsqueeze(-1), upper=False).squeeze(-1)
     log_det = scale_tril.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     return -0.5 * whitened.square().sum(-1) - log_det - 0.5 * residual.shape[-1] * math.log(2 * math.pi)
+
+
+_EQUAL = 1e-9  # eigenvalues closer than this times the largest count as equal
+
+
+class _SpectralMap(torch.autograd.Function):
+    """Function of a symmetric matrix whose gradient survives equal eigenvalues, which that of eigh does not."""
+
+    @staticmethod
+    def forward(ctx: Any, matrix: Tensor, function: Callable[[Tensor], Tensor]) -> Tensor:
+        eigenvalues, axes = torch.linalg.eigh(matrix)
+        with torch.enable_grad():
+            leaf = eigenvalues.detach().requires_grad_(ctx.needs_input_grad[0])
+            mapped = function(leaf)
+            slope = torch.autograd.grad(mapped.sum(), leaf)[0] if ctx.needs_input_grad[0] else leaf
+        mapped = mapped.detach()
+        ctx.save_for_backward(eigenvalues, axes, mapped, slope)
+        return symmetrize(axes * mapped.unsqueeze(-2) @ axes.mT)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        eigenvalues, axes, mapped, slope = ctx.saved_tensors
+        gap = eigenvalues.unsqueeze(-1) - eigenvalues.unsqueeze(-2)
+        equal = gap.abs() <= _EQUAL * eigenvalues.abs().amax(-1)[..., None, None]
+        rise = mapped.unsqueeze(-1) - mapped.unsqueeze(-2)
+        mean_slope = 0.5 * (slope.unsqueeze(-1) + slope.unsqueeze(-2))
+        divided = torch.where(equal, mean_slope, rise / torch.where(equal, 1.0, gap))
+        return axes @ (divided * (axes.mT @ symmetrize(gradients[0]) @ axes)) @ axes.mT, None
+
+
+def spectral_map(matrix: Float[Tensor, "*b d d"], function: Callable[[Tensor], Tensor]) -> Float[Tensor, "*b d d"]:
+    """``Q diag(function(eigenvalues)) Q'`` of symmetric matrices, symmetric to the last bit.
+
+    Continuous in the matrix wherever ``function`` is in the eigenvalue, though the axes Q jump where eigenvalues
+    cross. Its gradient is by divided differences (Daleckii and Krein), finite at equal eigenvalues; where
+    ``function`` has a kink it is one-sided, that which autograd gives ``function``.
+
+    Parameters
+    ----------
+    matrix : Tensor of shape (..., d, d)
+        Symmetric; only the symmetric part is used.
+    function : callable
+        Maps eigenvalues (..., d) elementwise, differentiable by autograd.
+    """
+    result: Tensor = _SpectralMap.apply(symmetrize(matrix), function)
+    return result

@@ -1,0 +1,66 @@
+"""From covariance to control: movement primitives, stiffness, the simulated robot, and what is stable."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from torch_pbd.control.controller import DMPController
+    from torch_pbd.control.damping import damping_from_stiffness
+    from torch_pbd.control.dmp import DMP
+    from torch_pbd.control.environment import Tunnel
+    from torch_pbd.control.passivity import EnergyTank, RateLimit
+    from torch_pbd.control.plant import AdmittancePlant
+    from torch_pbd.control.position_loop import PositionLoop
+    from torch_pbd.control.realtime import RealTimeAdmittance
+    from torch_pbd.control.rollout import Rollout
+    from torch_pbd.control.schedule import Schedule
+    from torch_pbd.control.sensor import ForceSensor
+    from torch_pbd.control.stability import StabilityReport, certify
+    from torch_pbd.control.stiffness import StiffnessLaw
+
+# Where each name lives: the controller of the control loop must load without torch.
+_HOMES = {
+    "AdmittancePlant": "plant",
+    "DMP": "dmp",
+    "DMPController": "controller",
+    "EnergyTank": "passivity",
+    "ForceSensor": "sensor",
+    "PositionLoop": "position_loop",
+    "RateLimit": "passivity",
+    "RealTimeAdmittance": "realtime",
+    "Rollout": "rollout",
+    "Schedule": "schedule",
+    "StabilityReport": "stability",
+    "StiffnessLaw": "stiffness",
+    "Tunnel": "environment",
+    "certify": "stability",
+    "damping_from_stiffness": "damping",
+}
+
+__all__ = [
+    "DMP",
+    "AdmittancePlant",
+    "DMPController",
+    "EnergyTank",
+    "ForceSensor",
+    "PositionLoop",
+    "RateLimit",
+    "RealTimeAdmittance",
+    "Rollout",
+    "Schedule",
+    "StabilityReport",
+    "StiffnessLaw",
+    "Tunnel",
+    "certify",
+    "damping_from_stiffness",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        return getattr(import_module(f"torch_pbd.control.{_HOMES[name]}"), name)
+    raise AttributeError(f"module 'torch_pbd.control' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOMES])
