@@ -8,7 +8,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small: th
 
 from jaxtyping import install_import_hook
 
-TORCH_FLOORS = ["linalg", "kernels", "optim", "gp", "models"]
+TORCH_CONTROL = [
+    "damping", "dmp", "environment", "matrices", "passivity", "plant", "sensor", "stability", "stiffness",
+    "rollout", "position_loop", "ticks", "transitions",
+]  # fmt: skip
+TORCH_FLOORS = ["linalg", "kernels", "optim", "gp", "models", *(f"control.{part}" for part in TORCH_CONTROL)]
 install_import_hook([f"torch_pbd.{floor}" for floor in TORCH_FLOORS], "beartype.beartype")
 
 import numpy as np  # noqa: E402 - the hook must come first

@@ -1,0 +1,231 @@
+import doctest
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.signal
+import torch
+
+from torch_pbd.control import sensor as module
+from torch_pbd.control.sensor import ForceSensor, apply_deadband, tare
+
+DT = 1e-3
+EVERYTHING = ForceSensor(0.3, 0.05, 0.02, 5.0, cutoff=125.0, delay_steps=3, deadband=0.1)
+
+
+def forces(rng, *shape, scale=3.0):
+    return torch.tensor(scale * rng.normal(size=shape))
+
+
+@pytest.mark.parametrize("d", [1, 2, 9])
+def test_an_ideal_sensor_reads_the_force(d, rng):
+    force = forces(rng, 4, 20, d)
+    reading = ForceSensor().measure(force, DT)
+    assert torch.equal(reading.force, force)
+    assert not reading.saturated.any()
+    assert reading.saturated.shape == (4, 20)
+
+
+@pytest.mark.parametrize("cutoff", [0.4883, 125.0, 3000.0])
+def test_the_step_response_is_the_exponential(cutoff):
+    force = torch.full((200, 2), 10.0).double()
+    reading = ForceSensor(cutoff=cutoff).measure(force, DT).force
+    time = torch.arange(200).double() * DT
+    expected = -10.0 * torch.expm1(-2 * math.pi * cutoff * time)
+    torch.testing.assert_close(reading, expected[:, None].expand(200, 2), rtol=1e-12, atol=0)
+
+
+def test_the_filter_is_that_of_scipy(rng):
+    force = forces(rng, 3, 300, 2)
+    system = ([1.0], [1 / (2 * np.pi * 31.25), 1.0])
+    numerator, denominator, _ = scipy.signal.cont2discrete(system, DT, method="zoh")
+    expected = scipy.signal.lfilter(numerator.ravel(), denominator, force.numpy(), axis=-2)
+    reading = ForceSensor(cutoff=31.25).measure(force, DT).force
+    np.testing.assert_allclose(reading, expected, rtol=1e-9, atol=1e-12)
+
+
+def test_the_stages_come_in_their_order(rng):
+    # each changes what the others do: bias before clip, noise behind the filter, deadband last
+    force = forces(rng, 300, 2, scale=6.0)
+    seeds = [torch.Generator().manual_seed(5) for _ in range(2)]
+    reading = EVERYTHING.measure(force, DT, seeds[0])
+    decay, level, expected, clipped = np.exp(-2 * np.pi * 125.0 * DT), np.full(2, 0.3), [], []
+    for tick in force.numpy():
+        noisy = level + 0.05 * torch.randn(2, generator=seeds[1], dtype=torch.float64).numpy()
+        level = decay * level + (1 - decay) * (tick + 0.3)
+        rounded = 0.02 * np.round(np.clip(noisy, -5.0, 5.0) / 0.02)
+        expected.append(np.sign(rounded) * np.maximum(np.abs(rounded) - 0.1, 0.0))
+        clipped.append((np.abs(noisy) >= 5.0).any())
+    np.testing.assert_allclose(reading.force[3:], expected[:-3], rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(reading.saturated[3:], clipped[:-3])
+    assert 5 < sum(clipped) < 200  # else the test above shows nothing
+    torch.testing.assert_close(reading.force[:3], torch.full((3, 2), 0.2, dtype=torch.float64), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_recording_is_read_as_tick_by_tick(dtype, rng):
+    force = forces(rng, 3, 50, 6).to(dtype)
+    before = torch.get_rng_state()
+    reading = EVERYTHING.measure(force, DT, torch.Generator().manual_seed(1))
+    reader = EVERYTHING.start(force[:, 7], DT, torch.Generator().manual_seed(1))
+    for t in range(50):
+        tick = reader(force[:, t])
+        assert torch.equal(tick.force, reading.force[:, t])
+        assert torch.equal(tick.saturated, reading.saturated[:, t])
+    assert reading.force.dtype == dtype
+    assert torch.equal(before, torch.get_rng_state())
+
+
+def test_a_sensor_starts_at_rest():
+    sensor = ForceSensor(bias=[0.5, -2.0], cutoff=10.0, delay_steps=2, range=2.0)
+    reader = sensor.start(torch.zeros(2), DT)
+    for _ in range(9):
+        force, saturated = reader(torch.zeros(2))
+        assert force.tolist() == [0.5, -2.0]
+        assert saturated
+        force.zero_()  # a caller may: the readings to come are not touched by it
+
+
+@pytest.mark.parametrize("delay", [0, 1, 7])
+def test_a_delay_shifts_readings_and_flags(delay, rng):
+    force = forces(rng, 2, 40, 3)
+    prompt = ForceSensor(0.4, range=3.0).measure(force, DT)
+    late = ForceSensor(0.4, range=3.0, delay_steps=delay).measure(force, DT)
+    assert torch.equal(late.force[:, delay:], prompt.force[:, : 40 - delay])
+    assert torch.equal(late.saturated[:, delay:], prompt.saturated[:, : 40 - delay])
+    assert (late.force[:, :delay] == 0.4).all()
+    assert prompt.saturated.any()
+
+
+def test_quantization_errs_by_half_a_step_at_most(rng):
+    force = forces(rng, 50, 100)
+    error = ForceSensor(resolution=0.025).measure(force, DT).force - force
+    assert 0.0124 < error.abs().max() <= 0.0125 * (1 + 1e-9)
+    steps = (force + error) / 0.025
+    torch.testing.assert_close(steps, steps.round(), rtol=0, atol=1e-9)
+
+
+def test_saturation_clips_and_flags_the_tick():
+    force = torch.tensor([[9.9, -9.9], [0.0, 10.0], [-1e30, 3.0], [1.0, 2.0]])
+    reading = ForceSensor(range=10.0).measure(force, DT)
+    assert reading.saturated.tolist() == [False, True, True, False]
+    assert torch.equal(reading.force, force.clamp(-10.0, 10.0))
+    boundless = ForceSensor(range=math.inf).measure(force, DT)
+    assert torch.equal(boundless.force, force)
+    assert not boundless.saturated.any()
+
+
+def test_noise_is_white_of_its_scale(generator):
+    sensor = ForceSensor(noise_scale=0.1, cutoff=1.0)  # behind the filter, so not lowered by it
+    noise = sensor.measure(torch.zeros(400, 50).double(), DT, generator).force
+    n = noise.numel()
+    assert abs(noise.mean()) < 5 * 0.1 / math.sqrt(n)
+    assert abs(noise.std() / 0.1 - 1) < 5 / math.sqrt(2 * n)
+    for other in (noise.roll(1, dims=0), noise.roll(1, dims=1)):
+        assert abs((noise * other).mean()) < 5 * 0.1**2 / math.sqrt(n)
+
+
+def test_a_deadband_is_continuous_and_zero_within():
+    force = torch.linspace(-2.0, 2.0, 4001, dtype=torch.float64)[None, :]
+    reading = ForceSensor(deadband=0.5).measure(force, DT).force
+    expected = force.sign() * (force.abs() - 0.5).clamp_min(0.0)
+    torch.testing.assert_close(reading, expected, rtol=0, atol=1e-15)
+    assert reading.diff(dim=1).max() < 0.001 + 1e-12
+
+
+def test_a_tare_takes_the_bias_away(generator):
+    sensor = ForceSensor([0.5, -0.3], noise_scale=0.05, resolution=0.02)
+    bias = tare(sensor.measure(torch.zeros(3, 500, 2).double(), DT, generator).force)
+    standard_error = math.hypot(0.05, 0.02 / math.sqrt(12)) / math.sqrt(500)
+    true = torch.tensor([0.5, -0.3]).double()
+    assert (bias - true).abs().max() < 5 * standard_error
+    reading = sensor.measure(torch.zeros(1, 2).double(), DT, generator).force
+    assert (apply_deadband(reading - bias[0], 0.3) == 0).all()
+
+
+@pytest.mark.parametrize("sensor", [replace(EVERYTHING, noise_scale=0.0, resolution=0.0), ForceSensor()])
+def test_gradients_flow_to_the_force(sensor, rng):
+    force = forces(rng, 12, 2, scale=1.0).requires_grad_()
+    assert torch.autograd.gradcheck(lambda f: sensor.measure(f, DT).force, force)
+
+
+def test_the_gradient_is_the_impulse_response(rng):
+    force = forces(rng, 30, 1).requires_grad_()
+    reading = ForceSensor(cutoff=80.0, delay_steps=2, noise_scale=1.0).measure(force, DT, torch.Generator())
+    (gradient,) = torch.autograd.grad(reading.force[-1].sum(), force)
+    decay = math.exp(-2 * math.pi * 80.0 * DT)
+    age = 26 - torch.arange(30).double()  # two ticks of delay, and one of the filter
+    expected = torch.where(age >= 0, (1 - decay) * decay ** age.clamp_min(0), 0.0)
+    torch.testing.assert_close(gradient[:, 0], expected, rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_lost_sample_is_nan_once_and_the_filter_holds(value, rng):
+    sensor = ForceSensor(0.2, cutoff=50.0, delay_steps=2)
+    force = forces(rng, 30, 2)
+    kept = force[[*range(10), *range(11, 30)]]
+    force[10, 1] = value
+    reading = sensor.measure(force, DT).force
+    assert reading.isnan().nonzero().tolist() == [[12, 1]]
+    assert torch.equal(reading[13:, 1], sensor.measure(kept, DT).force[12:, 1])
+
+
+@pytest.mark.parametrize("cutoff", [500.0, 125.0, 31.25, 7.813])
+def test_a_jr3_is_late_by_one_over_its_cutoff(cutoff):
+    sensor = replace(ForceSensor.jr3(cutoff), bias=0.0, noise_scale=0.0, resolution=0.0)
+    ramp = torch.arange(500).double()[:, None] * DT
+    lag = (ramp - sensor.measure(ramp, DT).force)[-1].item()
+    assert abs(lag - 1 / cutoff) < 0.5001 * DT
+    assert ForceSensor.jr3() == ForceSensor.jr3(500.0, rate=1000.0)
+    assert sensor.range == 200.0
+
+
+@pytest.mark.parametrize(
+    ("parameters", "words"),
+    [
+        ({"bias": math.nan}, "bias=nan must be finite"),
+        ({"bias": [0.0, math.inf]}, "bias=inf must be finite"),
+        ({"noise_scale": -0.1}, "noise_scale=-0.1 must be finite and not negative"),
+        ({"resolution": -1.0}, "resolution=-1.0 must be"),
+        ({"resolution": 300.0}, "resolution=300.0 N is coarser than range=200.0 N"),
+        ({"range": 0.0}, "range=0.0 must be above 0"),
+        ({"range": math.nan}, "range=nan must be above 0"),
+        ({"cutoff": 0.0}, "cutoff=0.0 must be finite and above 0, in Hz; None"),
+        ({"cutoff": math.inf}, "cutoff=inf"),
+        ({"delay_steps": -1}, "delay_steps=-1 must be an integer"),
+        ({"delay_steps": True}, "delay_steps=True"),
+        ({"deadband": math.nan}, "deadband=nan must be"),
+    ],
+)
+def test_parameters_are_checked(parameters, words):
+    with pytest.raises(ValueError, match=re.escape(words)):
+        ForceSensor(**parameters)
+
+
+def test_what_cannot_be_read_is_refused(rng):
+    force = forces(rng, 5, 2)
+    for dt in (0.0, -1.0, math.nan):
+        with pytest.raises(ValueError, match="dt="):
+            ForceSensor().measure(force, dt)
+    with pytest.raises(ValueError, match="bias has 3 values, but the force has 2 axes"):
+        ForceSensor(bias=[0.0, 1.0, 2.0]).start(force[0], DT)
+    with pytest.raises(ValueError, match=r"noise_scale=0\.05 needs a generator"):
+        ForceSensor.jr3().start(force[0], DT)
+    with pytest.raises(ValueError, match="at least one tick"):
+        ForceSensor().measure(force[:0], DT)
+    for other in (force[0, :1], force[0].float(), force):
+        with pytest.raises(ValueError, match="was started for"):
+            ForceSensor().start(force[0], DT)(other)
+    with pytest.raises(ValueError, match="cutoff=0"):
+        ForceSensor.jr3(0.0)
+    force[3, 1] = math.nan
+    with pytest.raises(ValueError, match=re.escape("nan at index (3, 1)")):
+        tare(force)
+    with pytest.raises(ValueError, match="at least one"):
+        tare(force[:0])
+
+
+def test_example_of_the_docstring():
+    assert doctest.testmod(module) == (0, 4)

@@ -1,0 +1,193 @@
+"""The simulated robot under admittance control: eq. (15) with a mass, tick by tick."""
+
+from typing import Any, final, get_args
+
+import torch
+from torch import Tensor
+
+from torch_pbd.control.environment import Tunnel
+from torch_pbd.control.matrices import as_semidefinite, check_mass, check_positive
+from torch_pbd.control.passivity import EnergyTank, RateLimit
+from torch_pbd.control.position_loop import PositionLoop
+from torch_pbd.control.rollout import Rollout
+from torch_pbd.control.sensor import ForceSensor
+from torch_pbd.control.ticks import Task, closed_loop, open_loop
+from torch_pbd.control.transitions import Integrator
+
+
+@final
+class AdmittancePlant:
+    """A mass on a spring and a damper that a desired motion drags along, in d axes, batched over rollouts.
+
+    ``M a = f + K (x_d - x) + D (v_d - v)``, eq. (15) as admittance: the robot moves as the measured force and
+    the impedance ask. All inputs are held over a tick (zero-order hold) and the desired position stands still
+    in it; states are those at the start of ticks.
+
+    Parameters
+    ----------
+    mass : float or Tensor of shape (d, d), default=1.0
+        Virtual mass in kg; a matrix must be symmetric and positive definite.
+    integrator : {"exact", "semi_implicit_euler", "rk4", "trapezoid"}, default="exact"
+        "exact" solves the tick, whatever its length; the others are for comparison.
+    feed_forward : bool, default=False
+        Add ``M a_d``, which eq. (15) lacks: the deviation then moves as if the desired position stood still.
+    sensor : ForceSensor, default=None
+        What the admittance measures of the external force; None measures it as it is.
+    position_loop : PositionLoop, default=None
+        How the robot follows the admittance; None follows at once.
+    environment : Tunnel, default=None
+        Walls, whose force adds to the external one.
+    substeps : int, default=1
+        Times a tick that walls are evaluated. A wall of 1e5 N/m needs about 4 at 1 kHz. The sensor is read once
+        a tick: with one, and with a position loop, as on a real robot, it must be 1.
+    stiffness_filter : RateLimit or EnergyTank, default=None
+        Holds back what would feed energy into the robot.
+
+    Raises
+    ------
+    ValueError
+        If a parameter is not as described.
+
+    Examples
+    --------
+    >>> import torch
+    >>> from torch_pbd.control import AdmittancePlant, damping_from_stiffness
+    >>> still, push = torch.zeros(2000, 1).double(), torch.full((2000, 1), 5.0).double()
+    >>> stiffness = torch.full((2000, 1, 1), 50.0).double()
+    >>> run = AdmittancePlant().simulate(still, still, stiffness, damping_from_stiffness(stiffness), push, dt=0.001)
+    >>> round(float(run.position[-1]), 4)  # 5 N on 50 N/m
+    0.1
+    """
+
+    def __init__(
+        self,
+        mass: float | Tensor = 1.0,
+        integrator: Integrator = "exact",
+        *,
+        feed_forward: bool = False,
+        sensor: ForceSensor | None = None,
+        position_loop: PositionLoop | None = None,
+        environment: Tunnel | None = None,
+        substeps: int = 1,
+        stiffness_filter: RateLimit | EnergyTank | None = None,
+    ) -> None:
+        check_mass(mass)
+        if integrator not in get_args(Integrator):
+            raise ValueError(
+                f"integrator == {integrator!r}, must be one of {', '.join(map(repr, get_args(Integrator)))}."
+            )
+        if not isinstance(substeps, int) or substeps < 1:
+            raise ValueError(f"substeps == {substeps!r}, must be an integer of at least 1.")
+        if substeps > 1 and (sensor is not None or position_loop is not None):
+            raise ValueError(
+                f"substeps == {substeps}, must be 1 with a sensor or a position loop: they act once a tick. "
+                "Shorten dt instead."
+            )
+        self.mass = mass
+        self.integrator: Integrator = integrator
+        self.feed_forward = feed_forward
+        self.sensor = sensor
+        self.position_loop = position_loop
+        self.environment = environment
+        self.substeps = substeps
+        self.stiffness_filter = stiffness_filter
+
+    def simulate(
+        self,
+        position_desired: Tensor,
+        velocity_desired: Tensor,
+        stiffness: Tensor,
+        damping: Tensor,
+        force: Tensor | None = None,
+        *,
+        dt: float,
+        position0: Tensor | None = None,
+        velocity0: Tensor | None = None,
+        acceleration_desired: Tensor | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Rollout:
+        """Run T ticks of ``dt`` seconds.
+
+        Parameters
+        ----------
+        position_desired, velocity_desired : Tensor of shape (..., T, d)
+            In m and m/s.
+        stiffness, damping : Tensor of shape (..., T, d, d)
+            In N/m and N s/m, symmetric and positive semidefinite; they need not commute.
+        force : Tensor of shape (..., T, d), default=None
+            External force in N, held over each tick; None is none. Leading dimensions are those of the batch,
+            and broadcast.
+        dt : float
+            In s.
+        position0, velocity0 : Tensor of shape (..., d), default=None
+            State at the start; None is the desired one.
+        acceleration_desired : Tensor of shape (..., T, d), default=None
+            In m/s^2, for ``feed_forward``; None takes the differences of ``velocity_desired``.
+        generator : torch.Generator, default=None
+            For the noise of the sensor.
+
+        Returns
+        -------
+        Rollout
+            With the state at the start of each tick; differentiable in all inputs.
+
+        Raises
+        ------
+        ValueError
+            If shapes disagree, a value is not finite, or a matrix is not positive semidefinite.
+        """
+        force = torch.zeros_like(position_desired) if force is None else force
+        motion = {"position_desired": position_desired, "velocity_desired": velocity_desired, "force": force}
+        _check_inputs(motion, stiffness, damping, dt)
+        start = position_desired[..., 0, :] if position0 is None else position0
+        speed = velocity_desired[..., 0, :] if velocity0 is None else velocity0
+        lead = [value.shape[:-2] for value in (*motion.values(), stiffness[..., 0], damping[..., 0])]
+        batch = torch.broadcast_shapes(*lead, start.shape[:-1], speed.shape[:-1])
+        mass = self._mass_matrix(stiffness)
+        inertial = torch.zeros_like(position_desired)
+        if self.feed_forward:
+            inertial = _accelerations(velocity_desired, acceleration_desired, dt) @ mass.mT
+        task = Task(position_desired, velocity_desired, inertial, stiffness, damping, force, mass, dt)
+        state = start.expand(*batch, -1), speed.expand(*batch, -1)
+        hooks = (self.sensor, self.position_loop, self.environment, self.stiffness_filter)
+        if all(hook is None for hook in hooks):
+            position, velocity = open_loop(task, state, self.integrator)
+            record: dict[str, Any] = {"position": position, "velocity": velocity, "commanded_position": position}
+            record |= {"force": force.expand_as(position), "stiffness": stiffness, "damping": damping}
+        else:
+            record = closed_loop(task, state, self, generator)
+        time = torch.arange(force.shape[-2], dtype=force.dtype, device=force.device) * dt
+        return Rollout(time, desired_position=position_desired, **record)
+
+    def _mass_matrix(self, like: Tensor) -> Tensor:
+        if isinstance(self.mass, Tensor) and self.mass.ndim:
+            return self.mass.to(like)
+        return float(self.mass) * torch.eye(like.shape[-1]).to(like)
+
+
+def _accelerations(velocity: Tensor, acceleration: Tensor | None, dt: float) -> Tensor:
+    """Those given, or those that take the velocity of each tick to that of the next."""
+    if acceleration is not None:
+        return acceleration
+    difference = velocity.diff(dim=-2) / dt
+    return torch.cat([difference, torch.zeros_like(velocity[..., :1, :])], dim=-2)
+
+
+def _check_inputs(motion: dict[str, Tensor], stiffness: Tensor, damping: Tensor, dt: float) -> None:
+    check_positive("dt", dt, "s")
+    expected = motion["position_desired"].shape[-2:]
+    for name, value in motion.items():
+        if value.ndim < 2 or value.shape[-2:] != expected or not value.numel():
+            raise ValueError(
+                f"{name} has shape {tuple(value.shape)}, must have shape (..., T, d), with T >= 1 and d those of "
+                f"position_desired, {tuple(motion['position_desired'].shape)}."
+            )
+        finite = torch.isfinite(value).all(-1).reshape(-1, expected[0]).all(0)
+        if not bool(finite.all()):
+            raise ValueError(f"{name} has a value that is not finite, at tick {int((~finite).nonzero()[0])}.")
+    for name, value in {"stiffness": stiffness, "damping": damping}.items():
+        if value.shape[-3:] != (*expected, expected[-1]):
+            raise ValueError(
+                f"{name} has shape {tuple(value.shape)}, must have shape (..., T, d, d) with T, d = {tuple(expected)}."
+            )
+        as_semidefinite(value, name)

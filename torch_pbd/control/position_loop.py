@@ -1,0 +1,66 @@
+"""The robot's inner position loop: what it makes of a commanded position."""
+
+import math
+from dataclasses import dataclass
+from typing import final
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torch_pbd.control.matrices import check_positive
+
+
+@final
+@dataclass(frozen=True)
+class PositionLoop:
+    """A critically damped loop of second order behind a delay of whole ticks.
+
+    ``x'' = w^2 (x_commanded - x) - 2 w x'`` with ``w = 2 pi bandwidth``: it follows a ramp 2 / w late.
+
+    Parameters
+    ----------
+    bandwidth : float, default=20.0
+        In Hz.
+    delay_steps : int, default=1
+        Ticks between a command and its effect, at least 0.
+    """
+
+    bandwidth: float = 20.0
+    delay_steps: int = 1
+
+    def __post_init__(self) -> None:
+        check_positive("bandwidth", self.bandwidth, "Hz")
+        if not isinstance(self.delay_steps, int) or self.delay_steps < 0:
+            raise ValueError(f"delay_steps == {self.delay_steps!r}, must be an integer of at least 0.")
+
+    def lag(self, dt: float) -> float:
+        """How late the loop follows a ramp, in s: ``2 / w``, the delay, and half a tick of hold."""
+        return 1.0 / (math.pi * self.bandwidth) + (self.delay_steps + 0.5) * dt
+
+    def transition(self, dt: float, like: Tensor) -> Float[Tensor, "2 3"]:
+        """Exact map of ``[position, velocity, command]`` to the position and velocity a tick later."""
+        w = 2.0 * math.pi * self.bandwidth
+        decay = math.exp(-w * dt)
+        rows = [
+            [(1.0 + w * dt) * decay, dt * decay, 1.0 - (1.0 + w * dt) * decay],
+            [-w * w * dt * decay, (1.0 - w * dt) * decay, w * w * dt * decay],
+        ]
+        return torch.tensor(rows, dtype=like.dtype, device=like.device)
+
+    def start(self, position: Float[Tensor, "*b d"], velocity: Float[Tensor, "*b d"], dt: float) -> "_Following":
+        """State of a loop at rest with its commands: the robot is at ``position``."""
+        return _Following(self.transition(dt, position), position, velocity, [position] * self.delay_steps)
+
+
+class _Following:
+    """Position and velocity of the robot; called with a command, it moves on by a tick."""
+
+    def __init__(self, transition: Tensor, position: Tensor, velocity: Tensor, waiting: list[Tensor]) -> None:
+        self.position, self.velocity = position, velocity
+        self._transition, self._waiting = transition, list(waiting)
+
+    def __call__(self, command: Tensor) -> None:
+        self._waiting.append(command)
+        state = torch.stack([self.position, self.velocity, self._waiting.pop(0)], dim=-1)
+        self.position, self.velocity = (state @ self._transition.mT).unbind(-1)

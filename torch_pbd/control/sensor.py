@@ -1,0 +1,286 @@
+"""A force-torque sensor between the simulated hand and the controller: what is read is not what is felt."""
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from numbers import Integral, Real
+from typing import NamedTuple, final
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+class Reading(NamedTuple):
+    """What the sensor says: ``force`` (..., d) in N, and ``saturated`` (...), whether any axis was clipped."""
+
+    force: Tensor
+    saturated: Tensor
+
+
+@final
+@dataclass(frozen=True)
+class ForceSensor:
+    """Model of a 6-axis force-torque sensor; works for any number of axes, all treated alike.
+
+    In this order: the true force plus ``bias``, low-pass, noise, saturation, quantization, delay, deadband. The
+    default is an ideal sensor of 200 N. The force is held over each tick and a reading is taken at its start
+    (control.md, section 4), so a filtered reading knows the forces before its tick only, and an unfiltered one
+    that of its own tick too. Before the first tick the force was zero and the filter had settled at the bias.
+
+    A force that is not finite is a lost sample: its reading is NaN (after the delay), never zero, and the filter
+    holds through it. What to do about it is the controller's to decide.
+
+    Parameters
+    ----------
+    bias : float or sequence of d float, default=0.0
+        Constant error [N].
+    noise_scale : float, default=0.0
+        Standard deviation of white noise on the reading [N]; it is added behind the filter, which does not
+        lower it.
+    resolution : float, default=0.0
+        Quantization step [N]; 0 for none. A step that does not divide ``range`` may round a clipped reading to
+        half a step beyond it.
+    range : float, default=200.0
+        Force at which an axis saturates, either sign [N]; ``math.inf`` for never.
+    cutoff : float or None, default=None
+        Corner frequency of the first-order low-pass [Hz], discretized exactly; None for none.
+    delay_steps : int, default=0
+        Ticks by which the reading is late, beside the filter.
+    deadband : float, default=0.0
+        Readings up to it are zero, those above are nearer to zero by it [N]: continuous. It acts on the bias too:
+        to remove that, read without a deadband, subtract what :func:`tare` says, then :func:`apply_deadband`.
+
+    Raises
+    ------
+    ValueError
+        If a parameter is not what is written above.
+
+    Examples
+    --------
+    >>> import torch
+    >>> from torch_pbd.control import ForceSensor
+    >>> reading = ForceSensor(resolution=0.5, range=10.0).measure(torch.tensor([[1.2, -3.0], [0.0, 25.0]]), dt=1e-3)
+    >>> reading.force.tolist(), reading.saturated.tolist()
+    ([[1.0, -3.0], [0.0, 10.0]], [False, True])
+    """
+
+    bias: float | Sequence[float] = 0.0
+    noise_scale: float = 0.0
+    resolution: float = 0.0
+    range: float = 200.0
+    cutoff: float | None = None
+    delay_steps: int = 0
+    deadband: float = 0.0
+
+    def __post_init__(self) -> None:
+        if isinstance(self.bias, Sequence) and not isinstance(self.bias, str):
+            object.__setattr__(self, "bias", tuple(self.bias))  # a list would be neither frozen nor hashable
+        for value in self.bias if isinstance(self.bias, tuple) else [self.bias]:
+            _check_number("bias", value, -math.inf, "finite, in N")
+        for name in ("noise_scale", "resolution", "deadband"):
+            _check_number(name, getattr(self, name), 0.0, "finite and not negative, in N; 0 for none")
+        if self.range != math.inf:
+            _check_number("range", self.range, math.ulp(0.0), "above 0, in N; math.inf for a sensor without limit")
+        if self.resolution > self.range:
+            raise ValueError(f"resolution={self.resolution} N is coarser than range={self.range} N: make it smaller.")
+        if self.cutoff is not None:
+            _check_number("cutoff", self.cutoff, math.ulp(0.0), "finite and above 0, in Hz; None for no filter")
+        if not isinstance(self.delay_steps, Integral) or isinstance(self.delay_steps, bool) or self.delay_steps < 0:
+            raise ValueError(f"delay_steps={self.delay_steps!r} must be an integer of at least 0: a number of ticks.")
+
+    @classmethod
+    def jr3(cls, cutoff: float = 500.0, rate: float = 1000.0) -> "ForceSensor":
+        """A sensor like the paper's JR3. The figures are plausible ones, not from a data sheet or a measurement.
+
+        A range of 200 N in 2^13 steps, noise of 0.05 N, a bias of 0.3 N on each axis (0.2 to 0.5 N of drift are
+        usual), and a delay of about ``1 / cutoff`` in all, rounded to ticks; what the first-order filter lacks of it
+        is ``delay_steps``.
+
+        Parameters
+        ----------
+        cutoff : float, default=500.0
+            The JR3's digital filters have 500, 125, 31.25, 7.813, 1.953 and 0.4883 Hz.
+        rate : float, default=1000.0
+            Ticks a second at which it will be read: the delay is a number of ticks.
+
+        Raises
+        ------
+        ValueError
+            If ``cutoff`` or ``rate`` is not finite and above zero.
+        """
+        _check_number("cutoff", cutoff, math.ulp(0.0), "finite and above 0, in Hz")
+        _check_number("rate", rate, math.ulp(0.0), "finite and above 0, in Hz")
+        lag = -1.0 / math.expm1(-2.0 * math.pi * cutoff / rate)  # of the sampled filter on slow forces, in ticks
+        delay_steps = max(0, round(rate / cutoff - lag))
+        return cls(0.3, noise_scale=0.05, resolution=200.0 / 2**13, cutoff=cutoff, delay_steps=delay_steps)
+
+    def start(self, like: Float[Tensor, "*b d"], dt: float, generator: torch.Generator | None = None) -> "ForceReader":
+        """A sensor at rest, to be called with the true force once a tick.
+
+        Parameters
+        ----------
+        like : Tensor of shape (..., d)
+            Tells shape, dtype and device of the forces to come; its values do not matter.
+        dt : float
+            Length of a tick [s].
+        generator : torch.Generator or None, default=None
+            Source of the noise.
+
+        Raises
+        ------
+        ValueError
+            If ``dt`` is not above zero, ``bias`` has not one value for each axis, or there is noise but no
+            generator.
+        """
+        _check_number("dt", dt, math.ulp(0.0), "finite and above 0: the length of a tick in s")
+        if not like.is_floating_point() or like.ndim == 0:
+            raise ValueError(f"like is {like.dtype} of shape {tuple(like.shape)}: forces are floats (..., d).")
+        if isinstance(self.bias, tuple) and len(self.bias) != like.shape[-1]:
+            raise ValueError(
+                f"bias has {len(self.bias)} values, but the force has {like.shape[-1]} axes: give one for each axis, "
+                "or one number for all."
+            )
+        if self.noise_scale > 0 and generator is None:
+            raise ValueError(
+                f"noise_scale={self.noise_scale} needs a generator: pass torch.Generator().manual_seed(...), or set "
+                "noise_scale=0."
+            )
+        return ForceReader(self, like, dt, generator)
+
+    def measure(self, force: Float[Tensor, "*b t d"], dt: float, generator: torch.Generator | None = None) -> Reading:
+        """Readings of a recorded force: equal to the bit to calling the reader once a tick.
+
+        Parameters
+        ----------
+        force : Tensor of shape (..., T, d)
+            True force at each tick [N].
+        dt : float
+            Length of a tick [s].
+        generator : torch.Generator or None, default=None
+            Source of the noise.
+
+        Returns
+        -------
+        Reading
+            ``force`` (..., T, d) and ``saturated`` (..., T).
+
+        Raises
+        ------
+        ValueError
+            If the recording has no tick, or as by :meth:`start`.
+        """
+        if force.ndim < 2 or force.shape[-2] == 0:
+            raise ValueError(
+                f"force has shape {tuple(force.shape)}: a recording is (..., T, d) with at least one tick."
+            )
+        reader = self.start(force[..., 0, :], dt, generator)
+        readings = [reader(tick) for tick in force.unbind(-2)]
+        return Reading(
+            torch.stack([reading.force for reading in readings], dim=-2),
+            torch.stack([reading.saturated for reading in readings], dim=-1),
+        )
+
+
+@final
+class ForceReader:
+    """A sensor in use: made by :meth:`ForceSensor.start`, called with the true force once a tick.
+
+    It keeps the state of the filter and the readings still under way, and nothing else.
+    """
+
+    def __init__(
+        self, sensor: ForceSensor, like: Float[Tensor, "*b d"], dt: float, generator: torch.Generator | None
+    ) -> None:
+        self._sensor = sensor
+        self._generator = generator
+        self._bias = torch.zeros_like(like) + like.new_tensor(sensor.bias)
+        self._gain = None if sensor.cutoff is None else -math.expm1(-2.0 * math.pi * sensor.cutoff * dt)
+        self._filtered = self._bias
+        # Each its own: whoever subtracts a bias in place must not change the next one.
+        self._under_way = deque(self._convert(self._bias) for _ in range(sensor.delay_steps))
+
+    def __call__(self, force: Float[Tensor, "*b d"]) -> Reading:
+        """The reading at this tick.
+
+        Parameters
+        ----------
+        force : Tensor of shape (..., d)
+            True force, held over this tick [N].
+
+        Raises
+        ------
+        ValueError
+            If the force has not the shape and dtype that the sensor was started with.
+        """
+        if force.shape != self._bias.shape or force.dtype != self._bias.dtype:
+            raise ValueError(
+                f"force is {force.dtype} of shape {tuple(force.shape)}, but the sensor was started for "
+                f"{self._bias.dtype} of shape {tuple(self._bias.shape)}: start another one."
+            )
+        lost = ~torch.isfinite(force)
+        level = self._low_pass(torch.where(lost, self._filtered, force + self._bias))
+        reading = self._convert(level + self._noise())
+        self._under_way.append(Reading(reading.force.masked_fill(lost, math.nan), reading.saturated))
+        return self._under_way.popleft()
+
+    def _low_pass(self, level: Tensor) -> Tensor:
+        """State of ``dx/dt = 2 pi cutoff (level - x)`` at the start of the tick, and step it over the tick."""
+        if self._gain is None:
+            return level
+        before = self._filtered
+        self._filtered = torch.lerp(before, level, self._gain)
+        return before
+
+    def _noise(self) -> Tensor | float:
+        generator, scale = self._generator, self._sensor.noise_scale
+        if generator is None or scale == 0:
+            return 0.0
+        # Drawn where the generator lives: the same seed is the same noise on every device.
+        noise = torch.randn(self._bias.shape, generator=generator, dtype=self._bias.dtype, device=generator.device)
+        return scale * noise.to(self._bias.device)
+
+    def _convert(self, level: Tensor) -> Reading:
+        """Clip, round, and take the deadband off, which may come before the delay: it has no memory."""
+        sensor = self._sensor
+        saturated = (level.abs() >= sensor.range).any(-1)
+        level = level.clamp(-sensor.range, sensor.range)
+        if sensor.resolution > 0:
+            level = sensor.resolution * torch.round(level / sensor.resolution)
+        return Reading(apply_deadband(level, sensor.deadband), saturated)
+
+
+def apply_deadband(force: Float[Tensor, "*b d"], deadband: float) -> Float[Tensor, "*b d"]:
+    """Zero up to ``deadband`` [N] on each axis, and nearer to zero by it above: continuous."""
+    return force - force.clamp(-deadband, deadband)
+
+
+def tare(readings: Float[Tensor, "*b n d"]) -> Float[Tensor, "*b d"]:
+    """The bias of a sensor from readings at rest: their mean, to be subtracted from later readings.
+
+    Parameters
+    ----------
+    readings : Tensor of shape (..., n, d)
+        Readings while nothing touches the sensor [N], taken without a deadband, which would hide the bias. The
+        standard error of the result is the noise over sqrt(n).
+
+    Raises
+    ------
+    ValueError
+        If there is no reading, or one is not finite.
+    """
+    if readings.ndim < 2 or readings.shape[-2] == 0:
+        raise ValueError(
+            f"readings has shape {tuple(readings.shape)}: a tare needs (..., n, d) with at least one of n."
+        )
+    lost = ~torch.isfinite(readings)
+    if bool(lost.any()):
+        index = tuple(lost.nonzero()[0].tolist())
+        raise ValueError(f"readings is {readings[index].item()} at index {index}: drop lost samples before the tare.")
+    return readings.mean(-2)
+
+
+def _check_number(name: str, value: object, least: float, must: str) -> None:
+    if not isinstance(value, Real) or not math.isfinite(value) or value < least:
+        raise ValueError(f"{name}={value!r} must be {must}.")
