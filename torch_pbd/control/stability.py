@@ -1,0 +1,280 @@
+"""What is guaranteed of a stiffness schedule, and what is not: each statement by its name, checked.
+
+With the deviation y from the desired motion, ``M y'' + D y' + K y = f``: a rise of K feeds energy in.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, final
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torch_pbd.control.coupling import stiffest_environment
+from torch_pbd.control.matrices import check_mass, check_positive
+from torch_pbd.control.position_loop import PositionLoop
+from torch_pbd.control.transitions import admittance_rate, transition
+from torch_pbd.linalg import spectral_map, symmetrize
+
+MAX_GAIN = 2.0
+"""Gain of a schedule above which its report warns."""
+
+_MAX_PAIRS = 400  # knots between which the gain is computed
+_GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
+
+
+@final
+@dataclass(frozen=True)
+class StabilityReport:
+    """What :func:`certify` found of a schedule at one mass and speed; ``print`` it.
+
+    Attributes
+    ----------
+    damping_ratio : float
+        Smallest over the schedule and its axes.
+    stiffness_ratio : float
+        Largest over smallest stiffness R, of all axes and times.
+    required_damping_ratio : float
+        ``(R^(1/4) - R^(-1/4)) / 2``: from here on any schedule within these limits is exponentially stable.
+    stable_at_any_schedule : bool
+        That the damping is ``2 zeta (M K)^1/2`` with one such zeta. Numerical evidence for R from 2 to 100, no
+        proof (control by a common quadratic Lyapunov function).
+    alpha : float
+        Constant of the certificate, 1/s.
+    margin : float
+        Of the certificate, N/m/s: smallest eigenvalue of ``2 alpha K - K' - alpha D'``. Not negative: V of
+        Kronander and Billard never grows without a force, and the robot is passive with respect to the force
+        and ``v + alpha y``. Exact for gains that are linear between the knots of the schedule. Negative says
+        that this certificate does not hold, not that the schedule is unstable.
+    margin_time : float
+        Where the margin is smallest, s.
+    max_speed : float
+        Largest replay speed at which the certificate holds; 1 is the speed of the schedule that was checked.
+    gain : float
+        Largest growth of ``sqrt(v'Mv + y'Ky)`` over any part of the schedule from any state, gains held between
+        knots: not conservative. 1 is no growth.
+    environment_stiffness : float
+        Stiffest spring, N/m, that the robot can press on in the softest phase without vibrating, behind its
+        position loop.
+    speed, mass : float, float or tuple
+        What was asked for.
+    """
+
+    damping_ratio: float
+    stiffness_ratio: float
+    required_damping_ratio: float
+    stable_at_any_schedule: bool
+    alpha: float
+    margin: float
+    margin_time: float
+    max_speed: float
+    gain: float
+    environment_stiffness: float
+    speed: float
+    mass: Any
+
+    @property
+    def certified(self) -> bool:
+        """Whether the certificate holds for this very schedule and speed."""
+        return self.margin >= 0.0
+
+    @property
+    def stable(self) -> bool:
+        """Whether one of the two guarantees holds."""
+        return self.certified or self.stable_at_any_schedule
+
+    def __str__(self) -> str:
+        any_schedule = "holds" if self.stable_at_any_schedule else "does not hold"
+        certificate = "holds" if self.certified else "DOES NOT HOLD"
+        warning = "" if self.gain <= MAX_GAIN else f"  <- above {MAX_GAIN:g}: disturbances grow on the way"
+        speed = "any" if math.isinf(self.max_speed) else f"{self.max_speed:.3g} x"
+        verdict = "guaranteed" if self.stable else "NOT GUARANTEED: slow down, damp more, or use a filter"
+        mass = f"{self.mass:g} kg" if isinstance(self.mass, int | float) else "a mass matrix"
+        return "\n".join(
+            [
+                f"stability at {mass}, replay speed {self.speed:g}: {verdict}",
+                f"  any-schedule rule        {any_schedule}: damping ratio {self.damping_ratio:.3g}, required "
+                f"{self.required_damping_ratio:.3g} for stiffness ratio {self.stiffness_ratio:.3g}",
+                f"  certificate of this one  {certificate}: margin {self.margin:.4g} N/m/s at t = "
+                f"{self.margin_time:.3g} s, alpha {self.alpha:.3g} /s",
+                f"  replay speed limit       {speed}",
+                f"  gain from any state      {self.gain:.3g}{warning}",
+                f"  stiffest environment     {self.environment_stiffness:.3g} N/m in the softest phase",
+            ]
+        )
+
+
+def certify(
+    schedule: Any,
+    *,
+    mass: Any = 1.0,
+    speed: float = 1.0,
+    position_loop: PositionLoop | None = None,
+    force_cutoff: float | None = 500.0,
+    dt: float = 0.001,
+) -> StabilityReport:
+    """Check the stability of a schedule.
+
+    Parameters
+    ----------
+    schedule : Schedule
+        Or anything with ``time`` (n,), ``stiffness`` and ``damping`` (n, d, d).
+    mass : float or array_like of shape (d, d), default=1.0
+        Virtual mass of the admittance, kg.
+    speed : float, default=1.0
+        Replay speed: 2 is twice as fast.
+    position_loop : PositionLoop, default=None
+        For the stiffest environment; None is 20 Hz behind one tick.
+    force_cutoff : float, default=500.0
+        Of the force sensor's low-pass, Hz; None is none.
+    dt : float, default=0.001
+        Tick of the controller, s.
+
+    Returns
+    -------
+    StabilityReport
+
+    Raises
+    ------
+    ValueError
+        If the mass or speed is not positive, or a stiffness is not positive definite.
+
+    References
+    ----------
+    K. Kronander, A. Billard, "Stability considerations for variable impedance control", IEEE Transactions on
+    Robotics 32, 2016. Its conditions are linear in time between knots where K and D are, so that holding at the
+    ends of every interval is holding throughout; and they are convex in alpha, which is found by golden section.
+    """
+    check_positive("speed", speed)
+    time, stiffness, damping = map(_door, (schedule.time, schedule.stiffness, schedule.damping))
+    inertia = _door(mass)
+    check_mass(inertia)
+    inertia = inertia if inertia.ndim else inertia * torch.eye(stiffness.shape[-1]).to(stiffness)
+    if float(torch.linalg.eigvalsh(stiffness).min()) <= 0.0:
+        raise ValueError("stiffness must be positive definite to be certified: a free axis never returns.")
+    knots = _Knots.of(time / speed, stiffness, damping, inertia)
+    alpha, margin, worst = knots.certificate()
+    ratio, required, lawful, smallest = _damping_rule(stiffness, damping, inertia)
+    loop = PositionLoop() if position_loop is None else position_loop
+    return StabilityReport(
+        damping_ratio=smallest,
+        stiffness_ratio=ratio,
+        required_damping_ratio=required,
+        stable_at_any_schedule=lawful and smallest >= required,
+        alpha=alpha,
+        margin=margin,
+        margin_time=float(time[worst]),
+        max_speed=knots.max_speed(),
+        gain=_gain(time / speed, stiffness, damping, inertia),
+        environment_stiffness=stiffest_environment(stiffness, damping, inertia, loop, force_cutoff, dt),
+        speed=float(speed),
+        mass=mass,
+    )
+
+
+def _door(values: Any) -> Tensor:
+    """Copy in float64; arrays of a schedule are read-only, which torch must not alias."""
+    return values.detach().double() if isinstance(values, Tensor) else torch.tensor(values, dtype=torch.float64)
+
+
+@dataclass(frozen=True)
+class _Knots:
+    """Gains at both ends of every interval (2, n - 1, d, d), their rates (n - 1, d, d), and the largest alpha."""
+
+    stiffness: Tensor
+    stiffness_rate: Tensor
+    damping_rate: Tensor
+    alpha_max: float
+
+    @classmethod
+    def of(cls, time: Tensor, stiffness: Tensor, damping: Tensor, mass: Tensor) -> "_Knots":
+        step = time.diff()[:, None, None]
+        inverse = torch.linalg.inv(torch.linalg.cholesky(mass))
+        alpha_max = float(torch.linalg.eigvalsh(symmetrize(inverse @ damping @ inverse.mT)).min())
+        ends = torch.stack([stiffness[:-1], stiffness[1:]])
+        return cls(ends, stiffness.diff(dim=0) / step, damping.diff(dim=0) / step, alpha_max)
+
+    def certificate(self) -> tuple[float, float, int]:
+        """Alpha with the largest margin, that margin, and the interval where it is smallest."""
+
+        def excess(alpha: float) -> Tensor:
+            matrix = self.stiffness_rate + alpha * self.damping_rate - 2.0 * alpha * self.stiffness
+            return torch.linalg.eigvalsh(matrix)[..., -1]
+
+        if self.alpha_max <= 0.0:  # no damping somewhere: no alpha will do
+            values = excess(0.0)
+            alpha, margin = 0.0, min(-float(values.max()), -math.ulp(0.0))
+        else:
+            alpha = _minimize_convex(lambda a: float(excess(a).max()), 1e-9 * self.alpha_max, self.alpha_max)
+            values = excess(alpha)
+            margin = -float(values.max())
+        return alpha, margin, int(values.amax(0).argmax())
+
+    def max_speed(self) -> float:
+        """Largest factor on the rates for which some alpha has no negative margin."""
+        if self.alpha_max <= 0.0:
+            return 0.0
+        root = spectral_map(self.stiffness, torch.rsqrt)
+
+        def needed(inverse_alpha: float) -> float:
+            rate = root @ (inverse_alpha * self.stiffness_rate + self.damping_rate) @ root
+            return 0.5 * float(torch.linalg.eigvalsh(symmetrize(rate))[..., -1].max())
+
+        slowest = 1.0 / self.alpha_max
+        best = needed(_minimize_convex(needed, slowest, 1e3 * slowest))
+        return 1.0 / best if best > 1e-12 else math.inf
+
+
+def _minimize_convex(function: Callable[[float], float], low: float, high: float, n_steps: int = 45) -> float:
+    """Where a convex function of one variable is smallest, by golden section; the ends are tried too."""
+    first, last = low, high
+    left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+    at_left, at_right = function(left), function(right)
+    for _ in range(n_steps):
+        if at_left <= at_right:
+            high, right, at_right = right, left, at_left
+            left = high - _GOLDEN * (high - low)
+            at_left = function(left)
+        else:
+            low, left, at_left = left, right, at_right
+            right = low + _GOLDEN * (high - low)
+            at_right = function(right)
+    return min((first, last, left, right), key=function)
+
+
+def _damping_rule(stiffness: Tensor, damping: Tensor, mass: Tensor) -> tuple[float, float, bool, float]:
+    """Stiffness ratio, damping ratio it requires, whether one ratio makes the damping, and the smallest ratio."""
+    inverse = spectral_map(mass, torch.rsqrt)
+    stiff, damp = (symmetrize(inverse @ gain @ inverse) for gain in (stiffness, damping))
+    eigenvalues = torch.linalg.eigvalsh(stiff)
+    ratio = float(eigenvalues.max() / eigenvalues.min())
+    root = spectral_map(stiff, lambda value: value.pow(-0.25))
+    ratios = torch.linalg.eigvalsh(symmetrize(root @ damp @ root)) / 2.0
+    smallest, largest = float(ratios.min()), float(ratios.max())
+    required = (ratio**0.25 - ratio**-0.25) / 2.0
+    return ratio, required, largest - smallest <= 1e-6 * largest, smallest
+
+
+def _gain(
+    time: Float[Tensor, " n"], stiffness: Float[Tensor, "n d d"], damping: Float[Tensor, "n d d"], mass: Tensor
+) -> float:
+    """Largest ``||P_j^1/2 Phi(j, i) P_i^-1/2||`` over i <= j, with P = diag(K, M) and the exact maps Phi."""
+    d = stiffness.shape[-1]
+    rate = admittance_rate(stiffness[:-1], damping[:-1], mass)[..., : 2 * d, : 2 * d]
+    maps = transition(rate * time.diff()[:, None, None], 1.0)
+    stride = -(-len(maps) // _MAX_PAIRS)
+    energy = torch.zeros_like(maps[:1]).repeat(len(time), 1, 1)
+    energy[:, :d, :d], energy[:, d:, d:] = stiffness, mass
+    root, inverse = spectral_map(energy, torch.sqrt), spectral_map(energy, torch.rsqrt)
+    since = maps.new_zeros(0, 2 * d, 2 * d)
+    largest = 1.0
+    for tick, each in enumerate(maps):
+        if tick % stride == 0:
+            since = torch.cat([since, inverse[tick : tick + 1]])
+        since = each @ since
+        if (tick + 1) % stride == 0 or tick + 1 == len(maps):
+            grown = root[tick + 1] @ since
+            largest = max(largest, float(torch.linalg.eigvalsh(grown.mT @ grown)[:, -1].max()) ** 0.5)
+    return largest
