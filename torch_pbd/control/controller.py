@@ -1,0 +1,369 @@
+"""The controller as an estimator: demonstrations in, a stiffness schedule out (Section V)."""
+
+from typing import Any, Literal, Self, get_args
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from sklearn.base import BaseEstimator, clone
+from sklearn.utils.validation import check_array, check_is_fitted, has_fit_parameter
+
+from torch_pbd.control.damping import damping_from_stiffness
+from torch_pbd.control.dmp import DMP, Gate
+from torch_pbd.control.forcing import ForcingProcess
+from torch_pbd.control.impedance import Gains, Impedance, OnUnknown
+from torch_pbd.control.matrices import check_finite, check_positive
+from torch_pbd.control.plant import AdmittancePlant
+from torch_pbd.control.recorded import as_demonstrations, provenance
+from torch_pbd.control.reproduction import Phase, Reproduction
+from torch_pbd.control.rollout import Rollout
+from torch_pbd.control.schedule import Schedule
+from torch_pbd.control.smoothing import Movements, automatic_cutoff, movements_like_noise, smooth
+from torch_pbd.control.stiffness import StiffnessLaw
+from torch_pbd.data import Demonstrations, check_unimodal
+from torch_pbd.estimators.cholesky import CholeskyCovRegressor
+
+Floats = NDArray[np.float64]
+PhaseInput = Literal["time", "log_s", "s"]
+Variability = Literal["position", "forcing"]
+
+
+class DMPController(BaseEstimator):
+    """Learn a movement and its variability from demonstrations, and how stiffly to follow it.
+
+    The mean movement is reproduced by a dynamic movement primitive, eq. (16) to (18), whose forcing is the mean of
+    a Gaussian process; a covariance regressor learns the variability; its principal axes get their stiffness
+    by eq. (19) and (20), and their damping from it.
+
+    Demonstrations may be of any lengths and sampling times: each is smoothed at its true times, and stretched
+    linearly to the median duration.
+
+    Parameters
+    ----------
+    covariance : covariance regressor, default=None
+        Cloned before it is fitted; None is ``CholeskyCovRegressor()``, the paper's.
+    alpha, beta, gamma, tau : float, default=25.0, None, 0.7, 1.0
+        Of the movement primitive, see :class:`~torch_pbd.control.DMP`; the paper's are 1, 1, 0.7, 1.
+    gate : {"time", "phase", "none"}, default="time"
+        How the forcing ends after the movement, so that it comes to rest at the goal; "none" is the paper's.
+    phase_input : {"time", "log_s", "s"}, default="time"
+        What the regressors see: movement time, or the phase s of eq. (17) or its logarithm, which is time in
+        other units. "s" is the paper's; scripts/benchmarks/phase_input.py compares them.
+    variability : {"position", "forcing"}, default="position"
+        Covariance of what becomes stiffness: of positions, in their units; or of the forcing, which the paper
+        takes: second derivatives, in units of acceleration times s^2.
+    goal : {"common", "each"}, default="common"
+        Goal in eq. (18): the mean end of all demonstrations, or that of each.
+    cutoff : float, "auto" or None, default="auto"
+        Of the smoothing before derivatives are taken, in Hz (1 / unit of time): amplitudes are halved there. "auto"
+        is 4 Hz, or 40 cycles a movement where times are not in seconds; None does not smooth.
+    n_steps : int, default=100
+        Points of a movement at which forcing and variability are learned.
+    stiffness_law : StiffnessLaw, default=None
+        None is ``StiffnessLaw()``: 50 to 1000 N/m between the 10 % and 90 % quantiles of the standard deviations
+        along the movement.
+    mass : float, default=1.0
+        Virtual mass of the admittance, kg.
+    damping_ratio : float or "paper", default=1.0
+        See :func:`~torch_pbd.control.damping_from_stiffness`.
+    on_unknown : {"soft", "prior", "raise"}, default="soft"
+        Where data are missing (Type I uncertainty u): "soft" takes the share u of the way to the least
+        stiffness; "prior" trusts the covariance there, which is the regressor's prior; "raise" raises where u
+        is above 0.5. Separate from variability (Type II), which people showed.
+
+    Attributes
+    ----------
+    covariance_ : fitted covariance regressor
+        Its input is what ``phase_input`` says, its output what ``variability`` says.
+    dmp_ : DMP
+    law_ : StiffnessLaw
+        With its bounds fixed to this movement.
+    duration_ : float
+        Of the movement: the median of the demonstrations'.
+    start_, goal_ : ndarray of shape (d,)
+    cutoff_ : float or None
+    noise_scale_ : ndarray of shape (d,)
+        Root mean square of what the smoothing took away.
+    noise_share_ : ndarray of shape (d,)
+        Share of the variance that is left over from such noise, were it white; above about 0.3, lower the cutoff.
+    n_outputs_, n_demos_ : int
+
+    Examples
+    --------
+    >>> from torch_pbd import DMPController
+    >>> from torch_pbd.data import make_tunnel_demonstrations
+    >>> controller = DMPController().fit(make_tunnel_demonstrations(random_state=0))
+    >>> schedule = controller.schedule(rate=100.0)
+    >>> schedule.stiffness.shape
+    (1001, 2, 2)
+    """
+
+    def __init__(
+        self,
+        covariance: Any = None,
+        *,
+        alpha: float = 25.0,
+        beta: float | None = None,
+        gamma: float = 0.7,
+        tau: float = 1.0,
+        gate: Gate = "time",
+        phase_input: PhaseInput = "time",
+        variability: Variability = "position",
+        goal: Literal["common", "each"] = "common",
+        cutoff: float | Literal["auto"] | None = "auto",
+        n_steps: int = 100,
+        stiffness_law: StiffnessLaw | None = None,
+        mass: float = 1.0,
+        damping_ratio: float | Literal["paper"] = 1.0,
+        on_unknown: OnUnknown = "soft",
+    ) -> None:
+        self.covariance = covariance
+        self.alpha = alpha
+        self.beta = beta
+        self.gamma = gamma
+        self.tau = tau
+        self.gate = gate
+        self.phase_input = phase_input
+        self.variability = variability
+        self.goal = goal
+        self.cutoff = cutoff
+        self.n_steps = n_steps
+        self.stiffness_law = stiffness_law
+        self.mass = mass
+        self.damping_ratio = damping_ratio
+        self.on_unknown = on_unknown
+
+    def fit(
+        self, X: Demonstrations | ArrayLike, y: ArrayLike | None = None, *, groups: ArrayLike | None = None
+    ) -> Self:
+        """Learn from demonstrations.
+
+        Parameters
+        ----------
+        X : Demonstrations, or array-like of shape (n_samples, 1)
+            Or the times of samples, which increase within each demonstration.
+        y : array-like of shape (n_samples, n_outputs), default=None
+            Positions at these times.
+        groups : array-like of shape (n_samples,), default=None
+            Demonstration of each sample.
+
+        Returns
+        -------
+        self
+
+        Raises
+        ------
+        ValueError
+            If there are fewer than two demonstrations, too few samples in one, or a parameter cannot be used.
+        """
+        self._check_parameters()
+        demonstrations = X if isinstance(X, Demonstrations) else as_demonstrations(X, y, groups)
+        if len(demonstrations) < 2:
+            raise ValueError(
+                "DMPController needs >= 2 demonstrations, got 1: what varies between demonstrations cannot be learned "
+                "from one. Record more, or give groups that tell the samples of several apart."
+            )
+        check_unimodal(demonstrations)
+        self.names_, self.frame_ = demonstrations.names, demonstrations.frame
+        units = demonstrations.units
+        self.units_ = units[0] if units is not None and len(set(units)) == 1 else None
+        self.time_unit_ = demonstrations.time_unit
+        self.n_demos_, self.n_outputs_ = len(demonstrations), demonstrations.n_outputs
+        self.cutoff_ = automatic_cutoff(demonstrations) if self.cutoff == "auto" else self.cutoff
+        movements = smooth(demonstrations, self.cutoff_, self.n_steps)
+        self.duration_ = float(movements.time[-1])
+        self.dmp_ = DMP(self.alpha, self.beta, self.gamma, self.tau, duration=self.duration_, gate=self.gate)
+        self._phase = Phase(self.dmp_, self.phase_input)
+        self.start_ = movements.position[:, 0].mean(axis=0)
+        self.goal_ = movements.position[:, -1].mean(axis=0)
+        inputs, forcing = self._phase(movements.time), self._forcing(movements)
+        process = ForcingProcess(inputs, forcing.mean(axis=0), self.n_demos_)
+        velocity = movements.velocity[:, 0].mean(axis=0)
+        self.reproduction_ = Reproduction.learn(self.dmp_, self.start_, velocity, self.goal_, process, self._phase)
+        varying = movements.position if self.variability == "position" else forcing
+        self._fit_covariance(inputs, varying)
+        self.noise_scale_ = movements.noise_scale
+        self.noise_share_ = self._noise_share(demonstrations, varying)
+        law = StiffnessLaw() if self.stiffness_law is None else self.stiffness_law
+        self.law_ = law.fitted(self.covariance_.predict_cov(self._phase(np.linspace(0.0, self.duration_, 1001))))
+        self._impedance = Impedance(self.law_, self.mass, self.damping_ratio, self.on_unknown)
+        return self
+
+    def predict(self, X: ArrayLike) -> Floats:
+        """Reproduced position (n, d) at times X (n, 1): from 0; after the end it goes to the goal and stays."""
+        return self.reproduction_.motion(self._times(X))[0]
+
+    def predict_stiffness(self, X: ArrayLike) -> Floats:
+        """Stiffness (n, d, d) in N/m (force per unit of position) at times X (n, 1)."""
+        return self._gains_at(self._times(X)).stiffness
+
+    def predict_damping(self, X: ArrayLike) -> Floats:
+        """Damping (n, d, d) in N s/m at times X (n, 1)."""
+        return self._gains_at(self._times(X)).damping
+
+    def schedule(self, rate: float = 1000.0, *, settle: float = 0.0) -> Schedule:
+        """Motion and gains at ``rate`` per unit of time, for a robot.
+
+        Parameters
+        ----------
+        rate : float, default=1000.0
+            In Hz.
+        settle : float, default=0.0
+            How long to go on after the movement, in s: with a gate it then comes to rest at the goal.
+
+        Returns
+        -------
+        Schedule
+            From 0 to ``duration_ + settle``.
+        """
+        check_is_fitted(self)
+        time = np.arange(self._n_ticks(rate, settle)) / rate
+        position, velocity = self.reproduction_.motion(time)
+        gains = self._gains_at(time)
+        return Schedule(
+            time,
+            position,
+            velocity,
+            gains.stiffness,
+            gains.damping,
+            gains.covariance,
+            gains.type1,
+            names=self.names_,
+            units=self.units_,
+            frame=self.frame_,
+            stiffness_limits=(self.law_.stiffness_min, self.law_.stiffness_max),
+            covariance_of=self.variability,
+            provenance=provenance(self),
+        )
+
+    def simulate(
+        self, plant: AdmittancePlant | None = None, force: ArrayLike | None = None, rate: float = 1000.0
+    ) -> Rollout:
+        """Run the schedule on a simulated robot that external forces push.
+
+        Parameters
+        ----------
+        plant : AdmittancePlant, default=None
+            None is ``AdmittancePlant(mass)`` with the mass of this controller.
+        force : array-like of shape (T, d), default=None
+            External force in N at the schedule's ticks; None is none.
+        rate : float, default=1000.0
+            Of the ticks, Hz.
+
+        Returns
+        -------
+        Rollout
+            NumPy arrays.
+
+        Raises
+        ------
+        ValueError
+            If the force has not one row for each tick.
+        """
+        schedule = self.schedule(rate)
+        push = np.zeros_like(schedule.position) if force is None else np.array(force, dtype=np.float64)
+        if push.shape != schedule.position.shape:
+            raise ValueError(
+                f"force has shape {push.shape}, must have shape {schedule.position.shape}: one row in N for each tick "
+                f"of schedule(rate={rate:g})."
+            )
+        robot = AdmittancePlant(self.mass) if plant is None else plant
+        parts = (schedule.position, schedule.velocity, schedule.stiffness, schedule.damping, push)
+        return robot.simulate(*map(_tensor, parts), dt=1.0 / rate).numpy()
+
+    def reproduce(
+        self,
+        rate: float = 1000.0,
+        *,
+        settle: float = 0.0,
+        goal: ArrayLike | None = None,
+        start: ArrayLike | None = None,
+        speed: ArrayLike | None = None,
+    ) -> tuple[Floats, Floats, Floats]:
+        """Time (n,), position and velocity (n, d) of the movement to other goals, from other starts, at other speeds.
+
+        Parameters
+        ----------
+        rate, settle : float
+            As for :meth:`schedule`; the number of ticks is that of the movement at speed 1, or that of ``speed``.
+        goal : array-like of shape (d,) or (n, d), default=None
+            Goal, at each tick if it changes at run time; None is ``goal_``.
+        start : array-like of shape (d,), default=None
+            None is ``start_``.
+        speed : array-like of shape (n,), default=None
+            How fast movement time passes at each tick; it should change smoothly.
+        """
+        check_is_fitted(self)
+        n_ticks = self._n_ticks(rate, settle) if speed is None else len(np.asarray(speed))
+        return self.reproduction_.roll_out(n_ticks, 1.0 / rate, goal=goal, start=start, speed=speed)
+
+    def _check_parameters(self) -> None:
+        choices = {
+            "phase_input": PhaseInput,
+            "variability": Variability,
+            "on_unknown": OnUnknown,
+            "goal": Literal["common", "each"],
+        }
+        for name, kind in choices.items():
+            if getattr(self, name) not in get_args(kind):
+                listed = ", ".join(map(repr, get_args(kind)))
+                raise ValueError(f"{name} == {getattr(self, name)!r}, must be one of {listed}.")
+        if isinstance(self.n_steps, bool) or not isinstance(self.n_steps, int | np.integer) or self.n_steps < 5:
+            raise ValueError(f"n_steps == {self.n_steps!r}, must be an integer of at least 5.")
+        if self.cutoff not in ("auto", None):
+            check_positive("cutoff", self.cutoff)
+        # Before any work: what DMP and damping say of theirs.
+        DMP(self.alpha, self.beta, self.gamma, self.tau, gate=self.gate)
+        damping_from_stiffness(np.eye(1), self.mass, self.damping_ratio)
+
+    def _forcing(self, movements: Movements) -> Floats:
+        """Forcing (K, n, d) of the movements: eq. (18)."""
+        goal = movements.position[:, -1:] if self.goal == "each" else self.goal_
+        parts = (
+            movements.position,
+            movements.velocity,
+            movements.acceleration,
+            np.broadcast_to(goal, movements.position.shape),
+        )
+        return self.dmp_.forcing(*map(_tensor, parts)).numpy()
+
+    def _fit_covariance(self, inputs: Floats, varying: Floats) -> None:
+        regressor = CholeskyCovRegressor() if self.covariance is None else self.covariance
+        self.covariance_ = clone(regressor)
+        n_demos, _, n_outputs = varying.shape
+        groups = {"groups": np.repeat(np.arange(n_demos), len(inputs))}
+        told = groups if has_fit_parameter(self.covariance_, "groups") else {}
+        self.covariance_.fit(np.tile(inputs, (n_demos, 1)), varying.reshape(-1, n_outputs), **told)
+
+    def _noise_share(self, demonstrations: Demonstrations, varying: Floats) -> Floats:
+        noise = smooth(movements_like_noise(demonstrations, self.noise_scale_), self.cutoff_, self.n_steps)
+        left = noise.position if self.variability == "position" else self._forcing(noise)
+        variance = varying.var(axis=0, ddof=1).mean(axis=0)
+        share = left.var(axis=0, ddof=1).mean(axis=0) / np.where(variance > 0.0, variance, np.inf)
+        return np.minimum(share, 1.0)
+
+    def _gains_at(self, time: Floats) -> Gains:
+        inputs = self._phase(time)
+        covariance, unknown = self.covariance_.predict_cov(inputs), self.covariance_.predict_uncertainty(inputs).type1
+        return self._impedance(covariance, unknown, time)
+
+    def _times(self, X: ArrayLike) -> Floats:
+        check_is_fitted(self)
+        times = check_array(X, dtype=np.float64, ensure_min_samples=0)
+        if times.shape[1] != 1:
+            raise ValueError(f"X has {times.shape[1]} features, but DMPController is expecting 1 feature: the time.")
+        return times[:, 0]
+
+    def _n_ticks(self, rate: float, settle: float) -> int:
+        check_positive("rate", rate)
+        check_finite("settle", settle)
+        if settle < 0.0:
+            raise ValueError(f"settle == {settle:g}, must not be negative.")
+        n_ticks = int(np.floor((self.duration_ + settle) * rate * (1.0 + 1e-12))) + 1
+        if n_ticks < 2:
+            raise ValueError(f"rate == {rate:g} gives {n_ticks} tick in {self.duration_:g}, must give at least 2.")
+        return n_ticks
+
+
+def _tensor(values: ArrayLike) -> torch.Tensor:
+    return torch.tensor(np.asarray(values, dtype=np.float64, order="C"))

@@ -1,0 +1,224 @@
+"""Dynamic movement primitives: eq. (16) to (18)."""
+
+from collections.abc import Callable
+from typing import Literal, final, get_args
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torch_pbd.control.matrices import check_positive
+
+Gate = Literal["time", "phase", "none"]
+
+
+@final
+class DMP:
+    """A spring-damper towards a goal, and a forcing term over a phase that encodes the movement.
+
+    ``tau z' = alpha (beta (goal - x) - z) + gate f(s)``, ``tau x' = z``, ``tau s' = -gamma s`` with s(0) = 1. The
+    forcing of a demonstration, eq. (18), drives it along that demonstration again.
+
+    As printed, eq. (16) does not stop at the goal: f of a movement that ends with a velocity v_end holds the rest
+    point at ``goal + tau v_end / beta``. A gate takes the forcing to zero after ``duration``; it is 1 before,
+    where eq. (18) is therefore the inverse of eq. (16) with every gate. Being linear and, with
+    ``beta = alpha / 4``, critically damped, the system answers a change of the goal without overshoot: the
+    motion is the unchanged one plus a step response that rises from 0 to 1 without passing it.
+
+    Parameters
+    ----------
+    alpha : float, default=25.0
+        Positive. The natural frequency is ``sqrt(alpha beta) / tau``.
+    beta : float, default=None
+        Positive; None is ``alpha / 4``, critical damping. The damping ratio is ``sqrt(alpha / beta) / 2``: the
+        paper's alpha = beta = 1 gives 0.5, and overshoots.
+    gamma : float, default=0.7
+        Decay of the phase, positive.
+    tau : float, default=1.0
+        Time constant in s; twice the tau is half the speed.
+    duration : float, default=None
+        When the movement ends and the gate begins to close, in s, for this tau; None is never.
+    gate : {"time", "phase", "none"}, default="time"
+        "time": closes over ``0.1 duration`` along a minimum-jerk curve. "phase": as the phase decays after
+        ``duration``, s / s(duration). "none": the paper's.
+
+    Raises
+    ------
+    ValueError
+        If a parameter is not as described.
+
+    References
+    ----------
+    A. Ijspeert, J. Nakanishi, H. Hoffmann, P. Pastor, S. Schaal, "Dynamical movement primitives: learning
+    attractor models for motor behaviors", Neural Computation 25, 2013.
+
+    Examples
+    --------
+    >>> import torch
+    >>> dmp = DMP(duration=1.0)
+    >>> position, velocity = dmp.rollout(torch.zeros(3001, 1).double(), 0.001, goal=torch.ones(1).double())
+    >>> bool((position.diff(dim=0) >= 0.0).all() and position.max() <= 1.0), round(float(position[-1]), 4)
+    (True, 1.0)
+    """
+
+    def __init__(
+        self,
+        alpha: float = 25.0,
+        beta: float | None = None,
+        gamma: float = 0.7,
+        tau: float = 1.0,
+        *,
+        duration: float | None = None,
+        gate: Gate = "time",
+    ) -> None:
+        check_positive("alpha", alpha)
+        beta = alpha / 4.0 if beta is None else beta
+        named = {"beta": beta, "gamma": gamma, "tau": tau}
+        if duration is not None:
+            named["duration"] = duration
+        for name, value in named.items():
+            check_positive(name, value)
+        if gate not in get_args(Gate):
+            raise ValueError(f"gate == {gate!r}, must be one of {', '.join(map(repr, get_args(Gate)))}.")
+        self.alpha, self.beta, self.gamma, self.tau = alpha, beta, gamma, tau
+        self.duration, self.gate = duration, gate
+
+    def __repr__(self) -> str:
+        return (
+            f"DMP(alpha={self.alpha:g}, beta={self.beta:g}, gamma={self.gamma:g}, tau={self.tau:g}, "
+            f"duration={self.duration}, gate={self.gate!r})"
+        )
+
+    def phase(self, time: Tensor) -> Tensor:
+        """Phase s of eq. (17) at ``time`` in s: its solution ``exp(-gamma time / tau)``, never integrated."""
+        return torch.exp(-self.gamma * time / self.tau)
+
+    def gate_at(self, time: Tensor) -> Tensor:
+        """What the forcing is multiplied by at ``time`` in s: 1 up to ``duration``."""
+        if self.gate == "none" or self.duration is None:
+            return torch.ones_like(time)
+        if self.gate == "phase":
+            return self.phase((time - self.duration).clamp_min(0.0))
+        u = ((time - self.duration) / (0.1 * self.duration)).clamp(0.0, 1.0)
+        return 1.0 - u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
+
+    def forcing(
+        self,
+        position: Float[Tensor, "*b d"],
+        velocity: Float[Tensor, "*b d"],
+        acceleration: Float[Tensor, "*b d"],
+        goal: Float[Tensor, "*g d"],
+    ) -> Float[Tensor, "*b d"]:
+        """Forcing that makes the primitive move like this: eq. (18), in the units of position."""
+        spring = self.beta * (goal - position) - self.tau * velocity
+        return self.tau**2 * acceleration - self.alpha * spring
+
+    def rollout(
+        self,
+        forcing: Float[Tensor, "*b t d"] | Callable[[Tensor], Tensor],
+        dt: float,
+        *,
+        goal: Tensor,
+        position0: Float[Tensor, "*s d"] | None = None,
+        velocity0: Float[Tensor, "*s d"] | None = None,
+        speed: Float[Tensor, " t"] | None = None,
+        n_steps: int | None = None,
+        integrator: Literal["exact", "rk4"] = "exact",
+    ) -> tuple[Float[Tensor, "*o t d"], Float[Tensor, "*o t d"]]:
+        """Position and velocity at ticks of ``dt`` seconds.
+
+        Parameters
+        ----------
+        forcing : Tensor of shape (..., T, d), or callable
+            At the ticks, before the gate; "exact" solves for forcing that is linear between ticks (first-order
+            hold). A callable maps movement times (m,) in s to (..., m, d), and needs ``n_steps``.
+        dt : float
+            In s.
+        goal : Tensor of shape (d,), (..., 1, d) or (..., T, d)
+            One goal, or the goal held over each tick: it may change at run time.
+        position0, velocity0 : Tensor of shape (..., d), default=None
+            State at the start; None is the origin, at rest.
+        speed : Tensor of shape (T,), default=None
+            How fast movement time passes at each tick, linear between: 0.5 takes twice as long. The path is the
+            same at every speed, so the duration changes at run time without overshoot; a speed that jumps makes
+            the velocity jump. ``velocity0`` is that at speed[0].
+        n_steps : int, default=None
+            T, where ``forcing`` is a callable.
+        integrator : {"exact", "rk4"}, default="exact"
+            "rk4" is Runge and Kutta's, of order 4 where ``forcing`` is a smooth callable.
+
+        Raises
+        ------
+        ValueError
+            If a shape is wrong, or a speed is negative.
+        """
+        n_ticks = n_steps if callable(forcing) else forcing.shape[-2]
+        if n_ticks is None or n_ticks < 1:
+            raise ValueError(f"n_steps == {n_steps}, must be at least 1 where forcing is a callable.")
+        time, passing = _movement_time(n_ticks, dt, speed, goal)
+        at_ticks = (forcing(time) if callable(forcing) else forcing) * self.gate_at(time)[:, None]
+        goals = goal if goal.ndim > 1 else goal[None]
+        shape = torch.broadcast_shapes(at_ticks.shape, goals.shape)
+        at_ticks, goals = at_ticks.expand(shape), goals.expand(shape)
+        zero = at_ticks.new_zeros(())
+        position = (zero if position0 is None else position0).expand(*shape[:-2], shape[-1])
+        scaled = self.tau * (zero if velocity0 is None else velocity0).expand_as(position) / passing[0].clamp_min(1e-12)
+        state = torch.stack([position, scaled], dim=-1)
+        if integrator == "exact":
+            trace = self._exact(at_ticks, goals, time.diff(), state)
+        else:
+            midway = 0.5 * (at_ticks[..., 1:, :] + at_ticks[..., :-1, :])
+            if callable(forcing):
+                halfway = 0.5 * (time[1:] + time[:-1])
+                midway = forcing(halfway) * self.gate_at(halfway)[:, None]
+            trace = self._runge_kutta(at_ticks, midway, goals, time.diff(), state)
+        return trace[..., 0], trace[..., 1] / self.tau * passing[:, None]
+
+    def _rate(self, like: Tensor) -> Tensor:
+        """Matrix of ``[x, z]' = rate @ [x, z, goal, forcing]``."""
+        alpha, beta, tau = self.alpha, self.beta, self.tau
+        rows = [[0.0, 1.0, 0.0, 0.0], [-alpha * beta, -alpha, alpha * beta, 1.0]]
+        return torch.tensor(rows, dtype=like.dtype, device=like.device) / tau
+
+    def _exact(self, forcing: Tensor, goals: Tensor, steps: Tensor, state: Tensor) -> Tensor:
+        """Exact for forcing that is linear between ticks and goals held over them."""
+        lengths, index = steps.unique(return_inverse=True)  # mostly one
+        rate = state.new_zeros(len(lengths), 5, 5)
+        rate[:, :2, :4] = self._rate(state) * lengths[:, None, None]
+        rate[:, 3, 4] = 1.0  # the forcing rises by the last component
+        maps = torch.linalg.matrix_exp(rate)[:, :2]
+        states = [state]
+        for tick, kind in enumerate(index.tolist()):
+            rise = forcing[..., tick + 1, :] - forcing[..., tick, :]
+            inputs = torch.stack([goals[..., tick, :], forcing[..., tick, :], rise], dim=-1)
+            state = torch.cat([state, inputs], dim=-1) @ maps[kind].mT
+            states.append(state)
+        return torch.stack(states, dim=-3)
+
+    def _runge_kutta(self, forcing: Tensor, midway: Tensor, goals: Tensor, steps: Tensor, state: Tensor) -> Tensor:
+        rate = self._rate(state).mT
+
+        def slope(now: Tensor, force: Tensor, tick: int) -> Tensor:
+            return torch.cat([now, torch.stack([goals[..., tick, :], force], dim=-1)], dim=-1) @ rate
+
+        states = [state]
+        for tick, step in enumerate(steps.tolist()):
+            k1 = slope(state, forcing[..., tick, :], tick)
+            k2 = slope(state + 0.5 * step * k1, midway[..., tick, :], tick)
+            k3 = slope(state + 0.5 * step * k2, midway[..., tick, :], tick)
+            k4 = slope(state + step * k3, forcing[..., tick + 1, :], tick)
+            state = state + step / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+            states.append(state)
+        return torch.stack(states, dim=-3)
+
+
+def _movement_time(n_ticks: int, dt: float, speed: Tensor | None, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Movement time at the ticks, and how fast it passes there."""
+    check_positive("dt", dt, "s")
+    if speed is None:
+        return torch.arange(n_ticks).to(like) * dt, like.new_ones(n_ticks)
+    if speed.shape != (n_ticks,) or bool((speed < 0.0).any()):
+        raise ValueError(f"speed has shape {tuple(speed.shape)}, must be {n_ticks} numbers, none negative.")
+    passing = speed.to(like)
+    steps = 0.5 * (passing[1:] + passing[:-1]) * dt
+    return torch.cat([steps.new_zeros(1), steps.cumsum(0)]), passing

@@ -1,0 +1,114 @@
+"""The mean movement of demonstrations as a movement primitive drives it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicHermiteSpline
+from torch import Tensor
+
+from torch_pbd.control.dmp import DMP
+from torch_pbd.control.forcing import ForcingProcess
+
+Floats = NDArray[np.float64]
+
+_TICKS = 4000  # within the duration
+_SETTLE = 20.0  # time constants after the end at which the movement is at rest
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """A movement primitive with its forcing, and the motion that follows from them.
+
+    Parameters
+    ----------
+    dmp : DMP
+        With a duration.
+    start, velocity, goal : ndarray of shape (d,)
+        Where the movement starts, how fast, and where it ends.
+    time : ndarray of shape (m,)
+        Of the duration.
+    forcing : ndarray of shape (m, d)
+        Linear between these times; after the last it is held, under the gate.
+    """
+
+    dmp: DMP
+    start: Floats
+    velocity: Floats
+    goal: Floats
+    time: Floats
+    forcing: Floats
+
+    @classmethod
+    def learn(
+        cls, dmp: DMP, start: Floats, velocity: Floats, goal: Floats, process: ForcingProcess, phase: "Phase"
+    ) -> "Reproduction":
+        """Tabulate the learned forcing over the duration of the primitive."""
+        assert dmp.duration is not None
+        time = np.linspace(0.0, dmp.duration, _TICKS + 1)
+        return cls(dmp, start, velocity, goal, time, process.predict(phase(time)))
+
+    def forcing_at(self, time: Tensor) -> Tensor:
+        """Forcing (m, d), before the gate, at times (m,)."""
+        columns = [np.interp(time.numpy(), self.time, column) for column in self.forcing.T]
+        return torch.tensor(np.stack(columns, axis=1))
+
+    def motion(self, time: Floats) -> tuple[Floats, Floats]:
+        """Position and velocity (n, d) at any times (n,): at rest at the start before 0, and long after the end.
+
+        The primitive is solved exactly at 4000 ticks in the duration, and interpolated by cubics between.
+        """
+        step = float(self.time[1])
+        settled = _SETTLE * 2.0 * self.dmp.tau / self.dmp.alpha + 0.1 * self.time[-1]
+        n_ticks = len(self.time) + int(settled / step)
+        if time.size:
+            n_ticks = max(2, min(n_ticks, int(time.max() / step) + 2))
+        ticks, position, velocity = self.roll_out(n_ticks, step)
+        within = np.clip(time, 0.0, ticks[-1])
+        curve = CubicHermiteSpline(ticks, position, velocity, axis=0)
+        moving = ((time >= 0.0) & (time <= ticks[-1]))[:, np.newaxis]
+        return curve(within), np.where(moving, curve(within, 1), 0.0)
+
+    def roll_out(
+        self,
+        n_ticks: int,
+        dt: float,
+        *,
+        goal: ArrayLike | None = None,
+        start: ArrayLike | None = None,
+        speed: ArrayLike | None = None,
+    ) -> tuple[Floats, Floats, Floats]:
+        """Time (n,), position and velocity (n, d); see :meth:`DMPController.reproduce`."""
+        pace = None if speed is None else np.asarray(speed, dtype=np.float64)
+        position, velocity = self.dmp.rollout(
+            self.forcing_at,
+            dt,
+            goal=_tensor(self.goal if goal is None else goal),
+            position0=_tensor(self.start if start is None else start),
+            velocity0=_tensor(self.velocity * (1.0 if pace is None else pace[0])),
+            speed=None if pace is None else _tensor(pace),
+            n_steps=n_ticks,
+        )
+        ticks: Floats = np.arange(n_ticks, dtype=np.float64) * dt
+        return ticks, position.numpy(), velocity.numpy()
+
+
+@dataclass(frozen=True)
+class Phase:
+    """Movement time as the regressors see it: a column of the phase, its logarithm, or the time itself."""
+
+    dmp: DMP
+    kind: str
+
+    def __call__(self, time: Floats) -> Floats:
+        """Inputs (n, 1) at times (n,)."""
+        if self.kind == "time":
+            return time[:, np.newaxis]
+        if self.kind == "log_s":
+            return (-self.dmp.gamma * time / self.dmp.tau)[:, np.newaxis]
+        return self.dmp.phase(_tensor(time)).numpy()[:, np.newaxis]
+
+
+def _tensor(values: ArrayLike) -> Tensor:
+    return torch.tensor(np.asarray(values, dtype=np.float64, order="C"))
