@@ -256,7 +256,7 @@ def test_what_a_file_cannot_hold_is_an_error_that_says_so(tmp_path):
         torch_pbd.save(LinearRegression().fit(X, y), path)
     with pytest.raises(TypeError, match=r"estimator is a Pipeline.*In a pipeline, save that step"):
         torch_pbd.save(make_pipeline(new("mixture")).fit(X, y), path)
-    with pytest.raises(FileNotFoundError, match="its folder does not exist"):
+    with pytest.raises(FileNotFoundError, match="nowhere does not exist"):
         torch_pbd.save(fitted("mixture"), tmp_path / "nowhere" / "model")
     assert list(tmp_path.iterdir()) == []
 

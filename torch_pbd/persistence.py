@@ -6,7 +6,6 @@ import os
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
-from secrets import token_hex
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.exceptions import ModelFileError
+from torch_pbd.files import replacing
 
 FORMAT_VERSION = 1
 _CLASSES = {
@@ -61,7 +61,8 @@ def save(estimator: CovarianceRegressor, path: str | os.PathLike[str]) -> None:
         "versions": {package: version(package) for package in ("torch", "scikit-learn", "numpy")},
     }
     header["sha256"] = _digest(header, arrays)
-    _write_whole(Path(path), to_bytes(arrays, metadata={_KEY: json.dumps(header)}))
+    with replacing(Path(path)) as file:
+        file.write(to_bytes(arrays, metadata={_KEY: json.dumps(header)}))
 
 
 def load(path: str | os.PathLike[str]) -> CovarianceRegressor:
@@ -145,19 +146,3 @@ def _decode(value: Any) -> Any:
             return np.array(value["array"], dtype=value["dtype"])
         return {key: _decode(entry) for key, entry in value.items()}
     return value
-
-
-def _write_whole(path: Path, content: bytes) -> None:
-    """Write beside the file and put it in its place: a reader sees the old one or the new one."""
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"cannot save to {path}: its folder does not exist.")
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.{token_hex(4)}")
-    try:
-        with temporary.open("xb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise

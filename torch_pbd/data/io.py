@@ -2,8 +2,7 @@
 
 import inspect
 import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -11,6 +10,7 @@ from torch_pbd.data._format_csv import read_csv, write_csv
 from torch_pbd.data._format_npz import read_npz, write_npz
 from torch_pbd.data.demonstrations import Demonstrations
 from torch_pbd.exceptions import DataFormatError
+from torch_pbd.files import replacing
 
 MAX_BYTES = 512 * 2**20
 
@@ -95,7 +95,7 @@ def save_demonstrations(demonstrations: Demonstrations, path: str | os.PathLike[
     """
     file = Path(path)
     write = _WRITERS[_known_suffix(file)]
-    with _replacing(file) as handle:
+    with replacing(file) as handle:
         write(demonstrations, handle)
 
 
@@ -106,17 +106,3 @@ def _known_suffix(file: Path) -> str:
             f"{file} has the suffix {file.suffix!r}; known formats of demonstrations: {', '.join(_READERS)}."
         )
     return suffix
-
-
-@contextmanager
-def _replacing(file: Path) -> Iterator[BinaryIO]:
-    """A new file beside ``file`` that takes its place once it is complete."""
-    if not file.parent.is_dir():
-        raise FileNotFoundError(f"the folder {file.parent} does not exist: make it before saving {file.name}.")
-    draft = file.with_name(f".{file.name}.{os.getpid()}.tmp")
-    try:
-        with draft.open("wb") as handle:
-            yield handle
-        draft.replace(file)
-    finally:
-        draft.unlink(missing_ok=True)
