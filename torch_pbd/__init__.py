@@ -4,6 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from torch_pbd.control.controller import DMPController
     from torch_pbd.data import Demonstrations, load_demonstrations, save_demonstrations
     from torch_pbd.estimators.cholesky import CholeskyCovRegressor
     from torch_pbd.estimators.mixture import GMMBaseline
@@ -17,16 +18,18 @@ _HOMES = {
     "CholeskyCovRegressor": "torch_pbd.estimators.cholesky",
     "WishartProcessRegressor": "torch_pbd.estimators.wishart",
     "GMMBaseline": "torch_pbd.estimators.mixture",
+    "DMPController": "torch_pbd.control.controller",
     "Demonstrations": "torch_pbd.data",
     "load_demonstrations": "torch_pbd.data",
     "save_demonstrations": "torch_pbd.data",
     "load": "torch_pbd.persistence",
     "save": "torch_pbd.persistence",
 }
-_MODULES = ("data", "estimators", "gp", "kernels", "linalg", "metrics", "models", "optim", "plotting")
+_MODULES = ("control", "data", "estimators", "gp", "kernels", "linalg", "metrics", "models", "optim", "plotting")
 
 __all__ = [
     "CholeskyCovRegressor",
+    "DMPController",
     "Demonstrations",
     "GMMBaseline",
     "WishartProcessRegressor",

@@ -1,4 +1,4 @@
-"""The command line: ``torch-pbd demo``, ``fit`` and ``compare``; torch loads only once there is work."""
+"""The command line: ``torch-pbd demo``, ``fit``, ``experiment``, ``compare``; torch loads once there is work."""
 
 import difflib
 import os
@@ -57,7 +57,7 @@ def _run(command: str, arguments: Sequence[str]) -> int:
     with warnings.catch_warnings():
         warnings.simplefilter("default")
         warnings.showwarning = _Notes()
-        print({"demo": _demo, "fit": _fit, "compare": _compare}[command](options, folder))
+        print({"demo": _demo, "fit": _fit, "experiment": _experiment, "compare": _compare}[command](options, folder))
     print(f"\nresults: {folder.path}")
     return 0
 
@@ -96,6 +96,24 @@ def _fit(options: Any, folder: Any) -> str:
         f"{name} {settled} after {model.n_iter_} iterations; log-likelihood {row['LL']:.3f} nats per sample of the "
         f"data it was fitted to\nmodel:   {model_path}\nfigure:  {figure_path}"
     )
+
+
+def _experiment(options: Any, folder: Any) -> str:
+    from torch_pbd.data import load_demonstrations, make_tunnel_demonstrations
+    from torch_pbd.experiments.recordings import describe
+    from torch_pbd.experiments.robot import run_robot
+
+    if options.data is None:
+        demonstrations = make_tunnel_demonstrations(
+            options.n_demos, random_state=options.seed, common_start=options.common_start
+        )
+        print(describe(demonstrations, "tunnel task"))
+    else:
+        demonstrations = load_demonstrations(options.data)
+        print(describe(demonstrations, options.data.name))
+    print(f"pushes of {options.push:g} N along {demonstrations.names[0]}, at 20 % and 80 % of the movement\n")
+    made = options.data is None
+    return run_robot(options.controllers, demonstrations, folder, peak=options.push, rate=options.rate, in_tunnel=made)
 
 
 def _compare(options: Any, folder: Any) -> str:

@@ -18,6 +18,7 @@ from torch_pbd.exceptions import ConfigError
 COMMANDS = {
     "demo": "learn from six made demonstrations of the tunnel task; the main job, no data needed",
     "fit": "fit one model to a file of demonstrations",
+    "experiment": "learn a skill, reproduce it on a simulated robot and push it (Figures 5 to 8)",
     "compare": "compare models: on the paper's simulation (Table I, Figures 1 to 3), or on a file",
 }
 
@@ -28,6 +29,7 @@ _MODELS = {
     "GMM 5": {"class_path": "GMMBaseline", "init_args": {"n_components": 5}},
     "GMM 8": {"class_path": "GMMBaseline", "init_args": {"n_components": 8}},
 }
+_CONTROLLERS = {"recommended": {"class_path": "DMPController"}}
 _Reading = Literal["bell", "printed", "bowl"]
 
 
@@ -89,7 +91,9 @@ def _parser(command: str, *, only_help: bool) -> ArgumentParser:
         parser.add_argument("--n_demos", type=int, default=6, help="demonstrations to learn from, at least 3")
         parser.add_argument("--seed", type=int, default=0, help="seed of the demonstrations")
         return parser
-    if command == "fit":
+    if command == "experiment":
+        _add_experiment_arguments(parser, Any if only_help else _controllers_type())
+    elif command == "fit":
         parser.add_argument("--data", type=str, required=True, help="file of demonstrations, .npz or .csv")
         parser.add_argument(
             "--model", type=model_type, default={"class_path": "CholeskyCovRegressor"}, help=_MODEL_HELP
@@ -100,6 +104,8 @@ def _parser(command: str, *, only_help: bool) -> ArgumentParser:
         parser.add_argument("--max_folds", type=int, default=10, help="demonstrations to leave out, one by one")
         parser.add_argument("--n_jobs", type=int | None, default=None, help="fits at the same time; -1: all cores")
         _add_simulation_arguments(parser)
+    if command == "experiment":
+        return parser
     parser.add_argument(
         "--align",
         type=Literal["auto", "none", "phase", "dtw"],
@@ -109,6 +115,23 @@ def _parser(command: str, *, only_help: bool) -> ArgumentParser:
     parser.add_argument("--input", type=Literal["time", "phase"], default="time", help="what the covariance depends on")
     parser.add_argument("--n_steps", type=int | None, default=None, help="resample to so many points")
     return parser
+
+
+def _add_experiment_arguments(parser: ArgumentParser, controllers_type: Any) -> None:
+    parser.add_argument(
+        "--data", type=str | None, default=None, help="file of demonstrations; none: made ones of the tunnel task"
+    )
+    parser.add_argument("--n_demos", type=int, default=6, help="demonstrations to make")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the demonstrations")
+    parser.add_argument("--common_start", type=bool, default=False, help="made demonstrations start at one point")
+    parser.add_argument(
+        "--controllers",
+        type=controllers_type,
+        default=_CONTROLLERS,
+        help="name: DMPController with its class_path and init_args, several",
+    )
+    parser.add_argument("--push", type=float, default=5.0, help="peak of the two pushes along the first output, N")
+    parser.add_argument("--rate", type=float, default=1000.0, help="ticks of the controller, Hz")
 
 
 def _add_simulation_arguments(parser: ArgumentParser) -> None:
@@ -128,6 +151,14 @@ def _model_types() -> tuple[Any, Any]:
     from torch_pbd.estimators._base import CovarianceRegressor
 
     return CovarianceRegressor, dict[str, CovarianceRegressor]
+
+
+def _controllers_type() -> Any:
+    """Type of controllers by name; loads torch."""
+    _model_types()  # the covariance of a controller is one of these
+    from torch_pbd.control.controller import DMPController
+
+    return dict[str, DMPController]
 
 
 def _one_line(message: str, parser: ArgumentParser) -> str:

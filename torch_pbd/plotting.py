@@ -9,6 +9,8 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike, NDArray
 
+from torch_pbd.control.rollout import Rollout
+from torch_pbd.control.schedule import Schedule
 from torch_pbd.data import Demonstrations
 from torch_pbd.estimators._base import CovarianceRegressor
 
@@ -16,6 +18,9 @@ Floats = NDArray[np.float64]
 
 # Okabe and Ito's colours, which colour-blind readers tell apart.
 DATA, EMPIRICAL, MODEL, PRIOR, TRUTH = "#999999", "#E69F00", "#0072B2", "#CC79A7", "#009E73"
+_LONGEST_UNIT = 8
+SERIES = (MODEL, EMPIRICAL, TRUTH, PRIOR, "#56B4E9", "#D55E00", "#000000")
+LINES = ("-", "--", ":", "-.")
 
 
 def plot_demonstrations(
@@ -164,6 +169,73 @@ def _empirical_bands(position: Floats, targets: Floats) -> tuple[Floats, Floats,
     repeated = counts > 1
     std = np.sqrt(squares[repeated] / (counts[repeated, np.newaxis] - 1))
     return distinct[repeated], means[repeated], std
+
+
+def plot_stiffness(schedule: Schedule, ax: Axes) -> list[Line2D]:
+    """Draw the stiffness of each output over time, the diagonal of the matrix, within its limits.
+
+    Parameters
+    ----------
+    schedule : Schedule
+    ax : matplotlib.axes.Axes
+
+    Returns
+    -------
+    list of Line2D, one an output
+    """
+    lines: list[Line2D] = []
+    for output, name in enumerate(schedule_names(schedule)):
+        color, dashes = SERIES[output % len(SERIES)], LINES[output // len(SERIES) % len(LINES)]
+        gain = schedule.stiffness[:, output, output]
+        lines += ax.plot(schedule.time, gain, color=color, ls=dashes, lw=1.5, label=name)
+    if schedule.stiffness_limits is not None:
+        for limit in schedule.stiffness_limits:
+            ax.axhline(limit, color=DATA, lw=0.8, ls=":")
+    ax.set_xlabel("time [s]")
+    ax.set_ylabel(f"stiffness [N/{short_unit(schedule.units)}]")
+    return lines
+
+
+def plot_pushes(rollout: Rollout, schedule: Schedule, output: int, axes: Sequence[Axes]) -> None:
+    """Draw what pushes did to one output: deviation, external force and stiffness over time, the paper's Figure 8.
+
+    Parameters
+    ----------
+    rollout : Rollout
+        One run, as NumPy arrays.
+    schedule : Schedule
+        That the run followed.
+    output : int
+    axes : sequence of three matplotlib Axes, one above the other
+    """
+    unit, scale = readable_unit(schedule.units)
+    name = schedule_names(schedule)[output]
+    above, middle, below = axes
+    above.plot(rollout.time, scale * rollout.deviation[:, output], color=MODEL, lw=1.5)
+    above.set_ylabel(f"{name} - desired [{unit}]")
+    middle.plot(rollout.time, rollout.force[:, output], color=EMPIRICAL, lw=1.5)
+    middle.set_ylabel("external force [N]")
+    below.plot(rollout.time, rollout.stiffness[:, output, output], color=TRUTH, lw=1.5)
+    below.set_ylabel(f"stiffness [N/{short_unit(schedule.units)}]")
+    below.set_xlabel("time [s]")
+    for ax in axes:
+        ax.axhline(0.0, color=DATA, lw=0.8)
+        ax.margins(x=0.0)
+
+
+def readable_unit(unit: str | None) -> tuple[str, float]:
+    """Unit of a deviation, and what to multiply it by: metres are shown in millimetres."""
+    return ("mm", 1000.0) if unit == "m" else (short_unit(unit), 1.0)
+
+
+def short_unit(unit: str | None) -> str:
+    """Unit for a label or a column; "unit" where there is none, or only a description."""
+    return unit if unit and len(unit) <= _LONGEST_UNIT else "unit"
+
+
+def schedule_names(schedule: Schedule) -> Sequence[str]:
+    """Names of the outputs of a schedule."""
+    return schedule.names or [f"y{i}" for i in range(schedule.position.shape[1])]
 
 
 def output_label(demonstrations: Demonstrations, output: int) -> str:

@@ -1,6 +1,6 @@
 """The controller as an estimator: demonstrations in, a stiffness schedule out (Section V)."""
 
-from typing import Any, Literal, Self, get_args
+from typing import Literal, Self, get_args
 
 import numpy as np
 import torch
@@ -10,17 +10,17 @@ from sklearn.utils.validation import check_array, check_is_fitted, has_fit_param
 
 from torch_pbd.control.damping import damping_from_stiffness
 from torch_pbd.control.dmp import DMP, Gate
-from torch_pbd.control.forcing import ForcingProcess
 from torch_pbd.control.impedance import Gains, Impedance, OnUnknown
 from torch_pbd.control.matrices import check_finite, check_positive
 from torch_pbd.control.plant import AdmittancePlant
 from torch_pbd.control.recorded import as_demonstrations, provenance
-from torch_pbd.control.reproduction import Phase, Reproduction
+from torch_pbd.control.reproduction import Reproduction
 from torch_pbd.control.rollout import Rollout
 from torch_pbd.control.schedule import Schedule
-from torch_pbd.control.smoothing import Movements, automatic_cutoff, movements_like_noise, smooth
+from torch_pbd.control.smoothing import Movements, automatic_cutoff, noise_like, smooth, variance_share
 from torch_pbd.control.stiffness import StiffnessLaw
 from torch_pbd.data import Demonstrations, check_unimodal
+from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.estimators.cholesky import CholeskyCovRegressor
 
 Floats = NDArray[np.float64]
@@ -86,6 +86,8 @@ class DMPController(BaseEstimator):
         Root mean square of what the smoothing took away.
     noise_share_ : ndarray of shape (d,)
         Share of the variance that is left over from such noise, were it white; above about 0.3, lower the cutoff.
+    reproduction_error_ : float
+        Root mean square distance of the reproduced path from the mean of the smoothed demonstrations.
     n_outputs_, n_demos_ : int
 
     Examples
@@ -100,7 +102,7 @@ class DMPController(BaseEstimator):
 
     def __init__(
         self,
-        covariance: Any = None,
+        covariance: CovarianceRegressor | None = None,
         *,
         alpha: float = 25.0,
         beta: float | None = None,
@@ -173,19 +175,16 @@ class DMPController(BaseEstimator):
         movements = smooth(demonstrations, self.cutoff_, self.n_steps)
         self.duration_ = float(movements.time[-1])
         self.dmp_ = DMP(self.alpha, self.beta, self.gamma, self.tau, duration=self.duration_, gate=self.gate)
-        self._phase = Phase(self.dmp_, self.phase_input)
-        self.start_ = movements.position[:, 0].mean(axis=0)
-        self.goal_ = movements.position[:, -1].mean(axis=0)
-        inputs, forcing = self._phase(movements.time), self._forcing(movements)
-        process = ForcingProcess(inputs, forcing.mean(axis=0), self.n_demos_)
-        velocity = movements.velocity[:, 0].mean(axis=0)
-        self.reproduction_ = Reproduction.learn(self.dmp_, self.start_, velocity, self.goal_, process, self._phase)
-        varying = movements.position if self.variability == "position" else forcing
-        self._fit_covariance(inputs, varying)
+        self.reproduction_ = Reproduction.learn(self.dmp_, movements, self.phase_input, own_goals=self.goal == "each")
+        self.start_, self.goal_ = self.reproduction_.start, self.reproduction_.goal
+        self.reproduction_error_ = self.reproduction_.check_against(movements)
+        varying = self.varying(movements)
+        self._fit_covariance(self.phase(movements.time), varying)
         self.noise_scale_ = movements.noise_scale
-        self.noise_share_ = self._noise_share(demonstrations, varying)
+        noise = smooth(noise_like(demonstrations, movements.noise_scale), self.cutoff_, self.n_steps)
+        self.noise_share_ = variance_share(self.varying(noise), varying)
         law = StiffnessLaw() if self.stiffness_law is None else self.stiffness_law
-        self.law_ = law.fitted(self.covariance_.predict_cov(self._phase(np.linspace(0.0, self.duration_, 1001))))
+        self.law_ = law.fitted(self.covariance_.predict_cov(self.phase(np.linspace(0.0, self.duration_, 1001))))
         self._impedance = Impedance(self.law_, self.mass, self.damping_ratio, self.on_unknown)
         return self
 
@@ -316,17 +315,6 @@ class DMPController(BaseEstimator):
         DMP(self.alpha, self.beta, self.gamma, self.tau, gate=self.gate)
         damping_from_stiffness(np.eye(1), self.mass, self.damping_ratio)
 
-    def _forcing(self, movements: Movements) -> Floats:
-        """Forcing (K, n, d) of the movements: eq. (18)."""
-        goal = movements.position[:, -1:] if self.goal == "each" else self.goal_
-        parts = (
-            movements.position,
-            movements.velocity,
-            movements.acceleration,
-            np.broadcast_to(goal, movements.position.shape),
-        )
-        return self.dmp_.forcing(*map(_tensor, parts)).numpy()
-
     def _fit_covariance(self, inputs: Floats, varying: Floats) -> None:
         regressor = CholeskyCovRegressor() if self.covariance is None else self.covariance
         self.covariance_ = clone(regressor)
@@ -335,15 +323,17 @@ class DMPController(BaseEstimator):
         told = groups if has_fit_parameter(self.covariance_, "groups") else {}
         self.covariance_.fit(np.tile(inputs, (n_demos, 1)), varying.reshape(-1, n_outputs), **told)
 
-    def _noise_share(self, demonstrations: Demonstrations, varying: Floats) -> Floats:
-        noise = smooth(movements_like_noise(demonstrations, self.noise_scale_), self.cutoff_, self.n_steps)
-        left = noise.position if self.variability == "position" else self._forcing(noise)
-        variance = varying.var(axis=0, ddof=1).mean(axis=0)
-        share = left.var(axis=0, ddof=1).mean(axis=0) / np.where(variance > 0.0, variance, np.inf)
-        return np.minimum(share, 1.0)
+    def phase(self, time: ArrayLike) -> Floats:
+        """Inputs (n, 1) of ``covariance_`` at times (n,): what ``phase_input`` says."""
+        check_is_fitted(self)
+        return self.reproduction_.phase(np.asarray(time, dtype=np.float64))
+
+    def varying(self, movements: Movements) -> Floats:
+        """What ``variability`` is of, (K, n, d), in smoothed movements of the same task."""
+        return movements.position if self.variability == "position" else self.reproduction_.forcing_of(movements)
 
     def _gains_at(self, time: Floats) -> Gains:
-        inputs = self._phase(time)
+        inputs = self.phase(time)
         covariance, unknown = self.covariance_.predict_cov(inputs), self.covariance_.predict_uncertainty(inputs).type1
         return self._impedance(covariance, unknown, time)
 

@@ -155,15 +155,21 @@ class DMP:
         n_ticks = n_steps if callable(forcing) else forcing.shape[-2]
         if n_ticks is None or n_ticks < 1:
             raise ValueError(f"n_steps == {n_steps}, must be at least 1 where forcing is a callable.")
+        if integrator not in ("exact", "rk4"):
+            raise ValueError(f"integrator == {integrator!r}, must be 'exact' or 'rk4'.")
         time, passing = _movement_time(n_ticks, dt, speed, goal)
         at_ticks = (forcing(time) if callable(forcing) else forcing) * self.gate_at(time)[:, None]
         goals = goal if goal.ndim > 1 else goal[None]
-        shape = torch.broadcast_shapes(at_ticks.shape, goals.shape)
+        zero = at_ticks.new_zeros(at_ticks.shape[-1])
+        position, velocity = (zero if start is None else start for start in (position0, velocity0))
+        shape = _run_shape(
+            at_ticks, {"goal": goals, "position0": position[..., None, :], "velocity0": velocity[..., None, :]}
+        )
         at_ticks, goals = at_ticks.expand(shape), goals.expand(shape)
-        zero = at_ticks.new_zeros(())
-        position = (zero if position0 is None else position0).expand(*shape[:-2], shape[-1])
-        scaled = self.tau * (zero if velocity0 is None else velocity0).expand_as(position) / passing[0].clamp_min(1e-12)
-        state = torch.stack([position, scaled], dim=-1)
+        if passing[0] == 0.0 and bool((velocity != 0.0).any()):
+            raise ValueError("velocity0 must be 0 where speed[0] is 0: no movement time passes there.")
+        scaled = self.tau * velocity / passing[0].clamp_min(1e-12)
+        state = torch.stack([start.expand(*shape[:-2], shape[-1]) for start in (position, scaled)], dim=-1)
         if integrator == "exact":
             trace = self._exact(at_ticks, goals, time.diff(), state)
         else:
@@ -212,13 +218,27 @@ class DMP:
         return torch.stack(states, dim=-3)
 
 
+def _run_shape(forcing: Tensor, others: dict[str, Tensor]) -> torch.Size:
+    """Shape (..., T, d) of a rollout: T and d are those of the forcing, the batch is that of all."""
+    shape = forcing.shape
+    n_ticks, d = shape[-2:]
+    for name, value in others.items():
+        if value.shape[-1] != d or value.shape[-2] not in (1, n_ticks):
+            raise ValueError(
+                f"{name} is of {value.shape[-1]} outputs and {value.shape[-2]} ticks, must be of {d} outputs, as "
+                f"forcing is, and one or {n_ticks} ticks."
+            )
+        shape = torch.broadcast_shapes(shape, value.shape)
+    return shape
+
+
 def _movement_time(n_ticks: int, dt: float, speed: Tensor | None, like: Tensor) -> tuple[Tensor, Tensor]:
     """Movement time at the ticks, and how fast it passes there."""
     check_positive("dt", dt, "s")
     if speed is None:
         return torch.arange(n_ticks).to(like) * dt, like.new_ones(n_ticks)
-    if speed.shape != (n_ticks,) or bool((speed < 0.0).any()):
-        raise ValueError(f"speed has shape {tuple(speed.shape)}, must be {n_ticks} numbers, none negative.")
+    if speed.shape != (n_ticks,) or not bool((torch.isfinite(speed) & (speed >= 0.0)).all()):
+        raise ValueError(f"speed has shape {tuple(speed.shape)}, must be {n_ticks} finite numbers, none negative.")
     passing = speed.to(like)
     steps = 0.5 * (passing[1:] + passing[:-1]) * dt
     return torch.cat([steps.new_zeros(1), steps.cumsum(0)]), passing

@@ -23,7 +23,7 @@ def check_mass(mass: float | Tensor) -> None:
         check_positive("mass", float(mass), "kg")
         return
     as_semidefinite(mass, "mass")
-    smallest = float(torch.linalg.eigvalsh(mass).min())
+    smallest = float(torch.linalg.eigvalsh(mass.detach()).min())
     if smallest <= 0.0:
         raise ValueError(f"mass must be positive definite; its smallest eigenvalue is {smallest:.3g} kg.")
 

@@ -183,7 +183,8 @@ class _Tank:
         share = deviation.new_ones(deviation.shape[:-1])
         if last is None:
             self.tank_energy = torch.full_like(share, self._tank.energy)
-            self._gains = Gains(stiffness, damping, share)
+            batch = (*share.shape, -1, -1)
+            self._gains = Gains(stiffness.expand(batch), damping.expand(batch), share)
             return self._gains
         asked = 0.5 * _quadratic(stiffness - last.stiffness, deviation)
         lacking = asked > self.tank_energy

@@ -138,10 +138,14 @@ class AdmittancePlant:
         """
         force = torch.zeros_like(position_desired) if force is None else force
         motion = {"position_desired": position_desired, "velocity_desired": velocity_desired, "force": force}
+        if acceleration_desired is not None:
+            motion["acceleration_desired"] = acceleration_desired
         _check_inputs(motion, stiffness, damping, dt)
+        _check_start(position_desired.shape[-1], position0=position0, velocity0=velocity0)
+        stiffness, damping = torch.broadcast_tensors(stiffness, damping)
         start = position_desired[..., 0, :] if position0 is None else position0
         speed = velocity_desired[..., 0, :] if velocity0 is None else velocity0
-        lead = [value.shape[:-2] for value in (*motion.values(), stiffness[..., 0], damping[..., 0])]
+        lead = [value.shape[:-2] for value in (*motion.values(), stiffness[..., 0])]
         batch = torch.broadcast_shapes(*lead, start.shape[:-1], speed.shape[:-1])
         mass = self._mass_matrix(stiffness)
         inertial = torch.zeros_like(position_desired)
@@ -161,6 +165,10 @@ class AdmittancePlant:
 
     def _mass_matrix(self, like: Tensor) -> Tensor:
         if isinstance(self.mass, Tensor) and self.mass.ndim:
+            if self.mass.shape != like.shape[-2:]:
+                raise ValueError(
+                    f"mass has shape {tuple(self.mass.shape)}, must be a number or have shape {tuple(like.shape[-2:])}."
+                )
             return self.mass.to(like)
         return float(self.mass) * torch.eye(like.shape[-1]).to(like)
 
@@ -191,3 +199,9 @@ def _check_inputs(motion: dict[str, Tensor], stiffness: Tensor, damping: Tensor,
                 f"{name} has shape {tuple(value.shape)}, must have shape (..., T, d, d) with T, d = {tuple(expected)}."
             )
         as_semidefinite(value, name)
+
+
+def _check_start(d: int, **starts: Tensor | None) -> None:
+    for name, value in starts.items():
+        if value is not None and (value.shape[-1:] != (d,) or not bool(torch.isfinite(value).all())):
+            raise ValueError(f"{name} has shape {tuple(value.shape)}, must have shape (..., {d}), all of it finite.")

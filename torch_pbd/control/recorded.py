@@ -1,6 +1,7 @@
 """What a controller is fitted to, and what it writes of itself."""
 
 from dataclasses import asdict, is_dataclass
+from importlib.metadata import version
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,6 @@ from numpy.typing import ArrayLike
 from sklearn.base import BaseEstimator
 from sklearn.utils.validation import check_X_y
 
-from torch_pbd import __version__
 from torch_pbd.data import Demonstrations
 
 
@@ -47,7 +47,7 @@ def provenance(controller: Any) -> dict[str, Any]:
         "cutoff": controller.cutoff_,
         "sigma_low": controller.law_.sigma_low,
         "sigma_high": controller.law_.sigma_high,
-        "torch_pbd": __version__,
+        "torch_pbd": version("torch_pbd"),
     }
 
 

@@ -1,6 +1,7 @@
 """The mean movement of demonstrations as a movement primitive drives it."""
 
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -10,10 +11,12 @@ from torch import Tensor
 
 from torch_pbd.control.dmp import DMP
 from torch_pbd.control.forcing import ForcingProcess
+from torch_pbd.control.smoothing import Movements
 
 Floats = NDArray[np.float64]
 
 _TICKS = 4000  # within the duration
+_FAR = 0.02  # of the extent of a movement
 _SETTLE = 20.0  # time constants after the end at which the movement is at rest
 
 
@@ -24,7 +27,11 @@ class Reproduction:
     Parameters
     ----------
     dmp : DMP
-        With a duration.
+        With the duration of the movement.
+    phase : Phase
+        What the forcing was learned over.
+    own_goals : bool
+        Whether eq. (18) takes the end of each movement for its goal, or the common goal.
     start, velocity, goal : ndarray of shape (d,)
         Where the movement starts, how fast, and where it ends.
     time : ndarray of shape (m,)
@@ -34,6 +41,8 @@ class Reproduction:
     """
 
     dmp: DMP
+    phase: "Phase"
+    own_goals: bool
     start: Floats
     velocity: Floats
     goal: Floats
@@ -41,13 +50,43 @@ class Reproduction:
     forcing: Floats
 
     @classmethod
-    def learn(
-        cls, dmp: DMP, start: Floats, velocity: Floats, goal: Floats, process: ForcingProcess, phase: "Phase"
-    ) -> "Reproduction":
-        """Tabulate the learned forcing over the duration of the primitive."""
-        assert dmp.duration is not None
-        time = np.linspace(0.0, dmp.duration, _TICKS + 1)
-        return cls(dmp, start, velocity, goal, time, process.predict(phase(time)))
+    def learn(cls, dmp: DMP, movements: Movements, phase_input: str, *, own_goals: bool) -> "Reproduction":
+        """Fit the forcing of the mean movement, and tabulate it over the duration."""
+        phase, position = Phase(dmp, phase_input), movements.position
+        start, velocity = position[:, 0].mean(axis=0), movements.velocity[:, 0].mean(axis=0)
+        goal = position[:, -1].mean(axis=0)
+        time = np.linspace(0.0, movements.time[-1], _TICKS + 1)
+        known = cls(dmp, phase, own_goals, start, velocity, goal, time, np.zeros((len(time), len(goal))))
+        process = ForcingProcess(phase(movements.time), known.forcing_of(movements).mean(axis=0), n_demos=len(position))
+        return replace(known, forcing=process.predict(phase(time)))
+
+    def forcing_of(self, movements: Movements) -> Floats:
+        """Forcing (K, n, d) that would reproduce each movement: eq. (18)."""
+        goal = movements.position[:, -1:] if self.own_goals else self.goal
+        goals = np.broadcast_to(goal, movements.position.shape)
+        parts = (movements.position, movements.velocity, movements.acceleration, goals)
+        forcing: Floats = self.dmp.forcing(*map(_tensor, parts)).numpy()
+        return forcing
+
+    def check_against(self, movements: Movements) -> float:
+        """Root mean square distance of the motion from the mean of the movements.
+
+        Warns
+        -----
+        UserWarning
+            If it is more than 2 % of the extent of the mean.
+        """
+        mean = movements.position.mean(axis=0)
+        distance = np.linalg.norm(self.motion(movements.time)[0] - mean, axis=1)
+        error, extent = float(np.sqrt(np.mean(distance**2))), float(np.linalg.norm(np.ptp(mean, axis=0)))
+        if error > _FAR * extent:
+            remedy = "phase_input='time'" if self.phase.kind == "s" else "more n_steps, or a lower cutoff"
+            warnings.warn(
+                f"The reproduced movement is {error:.3g} off the mean of the demonstrations, {error / extent:.1%} of "
+                f"its extent: try {remedy}.",
+                stacklevel=3,
+            )
+        return error
 
     def forcing_at(self, time: Tensor) -> Tensor:
         """Forcing (m, d), before the gate, at times (m,)."""

@@ -105,8 +105,15 @@ def automatic_cutoff(demonstrations: Demonstrations) -> float:
     return CUTOFF_CYCLES / float(np.median([time[-1] - time[0] for time in demonstrations.times]))
 
 
-def movements_like_noise(demonstrations: Demonstrations, noise_scale: Floats) -> Demonstrations:
+def noise_like(demonstrations: Demonstrations, noise_scale: Floats) -> Demonstrations:
     """White noise of that scale at the sampling times of the demonstrations: what smoothing makes of it is noise."""
     random = np.random.default_rng(0)
     noise = [random.normal(size=(n, demonstrations.n_outputs)) * noise_scale for n in demonstrations.n_steps]
     return Demonstrations(demonstrations.times, noise, time_unit=demonstrations.time_unit)
+
+
+def variance_share(part: Floats, whole: Floats) -> Floats:
+    """Variance between demonstrations of one set of movements (K, n, d) over that of another, (d,), at most 1."""
+    variance = whole.var(axis=0, ddof=1).mean(axis=0)
+    share = part.var(axis=0, ddof=1).mean(axis=0) / np.where(variance > 0.0, variance, np.inf)
+    return np.minimum(share, 1.0)

@@ -51,7 +51,7 @@ class StabilityReport:
     margin_time : float
         Where the margin is smallest, s.
     max_speed : float
-        Largest replay speed at which the certificate holds; 1 is the speed of the schedule that was checked.
+        Largest replay speed at which the certificate holds; 1 is the schedule's own.
     gain : float
         Largest growth of ``sqrt(v'Mv + y'Ky)`` over any part of the schedule from any state, gains held between
         knots: not conservative. 1 is no growth.
@@ -166,7 +166,7 @@ def certify(
         alpha=alpha,
         margin=margin,
         margin_time=float(time[worst]),
-        max_speed=knots.max_speed(),
+        max_speed=speed * knots.max_speed(),
         gain=_gain(time / speed, stiffness, damping, inertia),
         environment_stiffness=stiffest_environment(stiffness, damping, inertia, loop, force_cutoff, dt),
         speed=float(speed),

@@ -1,7 +1,7 @@
 """The loop over ticks behind :class:`~torch_pbd.control.AdmittancePlant`, with and without what acts in it."""
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -38,6 +38,7 @@ class Task:
         return self.position.shape[-2]
 
 
+@runtime_checkable
 class Hooks(Protocol):
     """What acts within the loop; None where there is no such thing."""
 

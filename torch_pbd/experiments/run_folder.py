@@ -71,7 +71,7 @@ class RunFolder:
 
 def slug(name: str) -> str:
     """Name of a file for the name of a model."""
-    return "".join(letter if letter.isalnum() else "_" for letter in name).strip("_").lower()
+    return "_".join("".join(letter if letter.isalnum() else " " for letter in name).lower().split())
 
 
 def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -92,5 +92,7 @@ def _cell(value: Any) -> str:
     if isinstance(value, float):
         if value != value:
             return "-"
+        if 1000 <= abs(value) < 1e5:
+            return f"{value:.0f}"
         return f"{value:.2f}" if 0.1 <= abs(value) < 1000 else f"{value:.2e}" if value else "0"
     return str(value)
