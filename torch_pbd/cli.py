@@ -102,6 +102,7 @@ def _experiment(options: Any, folder: Any) -> str:
     from torch_pbd.data import load_demonstrations, make_tunnel_demonstrations
     from torch_pbd.experiments.recordings import describe
     from torch_pbd.experiments.robot import run_robot
+    from torch_pbd.experiments.robot_figures import framework_figure
 
     if options.data is None:
         demonstrations = make_tunnel_demonstrations(
@@ -112,6 +113,7 @@ def _experiment(options: Any, folder: Any) -> str:
         demonstrations = load_demonstrations(options.data)
         print(describe(demonstrations, options.data.name))
     print(f"pushes of {options.push:g} N along {demonstrations.names[0]}, at 20 % and 80 % of the movement\n")
+    folder.write_figure(framework_figure(), "figure5_framework")
     made = options.data is None
     return run_robot(options.controllers, demonstrations, folder, peak=options.push, rate=options.rate, in_tunnel=made)
 

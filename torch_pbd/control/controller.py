@@ -27,6 +27,8 @@ Floats = NDArray[np.float64]
 PhaseInput = Literal["time", "log_s", "s"]
 Variability = Literal["position", "forcing"]
 
+_RESOLUTION = 1e-5  # of the extent of a movement: smaller standard deviations count as none
+
 
 class DMPController(BaseEstimator):
     """Learn a movement and its variability from demonstrations, and how stiffly to follow it.
@@ -184,7 +186,9 @@ class DMPController(BaseEstimator):
         noise = smooth(noise_like(demonstrations, movements.noise_scale), self.cutoff_, self.n_steps)
         self.noise_share_ = variance_share(self.varying(noise), varying)
         law = StiffnessLaw() if self.stiffness_law is None else self.stiffness_law
-        self.law_ = law.fitted(self.covariance_.predict_cov(self.phase(np.linspace(0.0, self.duration_, 1001))))
+        along = self.covariance_.predict_cov(self.phase(np.linspace(0.0, self.duration_, 1001)))
+        extent = float(np.linalg.norm(np.ptp(varying, axis=(0, 1))))
+        self.law_ = law.fitted(along, resolution=_RESOLUTION * extent)
         self._impedance = Impedance(self.law_, self.mass, self.damping_ratio, self.on_unknown)
         return self
 
@@ -298,6 +302,7 @@ class DMPController(BaseEstimator):
 
     def _check_parameters(self) -> None:
         choices = {
+            "gate": Gate,
             "phase_input": PhaseInput,
             "variability": Variability,
             "on_unknown": OnUnknown,

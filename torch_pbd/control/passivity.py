@@ -55,8 +55,8 @@ class RateLimit:
     ``V = 1/2 (v + a y)' M (v + a y) + 1/2 y' (K + a D - a^2 M) y`` does not grow from one tick to the next
     without an external force, whatever the schedule asks for: the discrete form, for gains held over a tick, of
     the conditions of K. Kronander and A. Billard, "Stability considerations for variable impedance control",
-    IEEE Transactions on Robotics 32, 2016. It needs no measurement. The robot is passive with respect to the
-    force and ``v + a y``.
+    IEEE Transactions on Robotics 32, 2016. It needs no measurement. The robot is passive with respect to ``v + a y``
+    and a force that is held over each tick.
 
     Parameters
     ----------
@@ -108,12 +108,22 @@ class _RateLimited:
         return self._gains
 
     def _largest_share(self, last: Gains, rise: Tensor) -> Tensor:
-        """Largest s in [0, 1] with ``A' (P + s dP) A <= P``, A the tick that was, dP the step of the function."""
+        """Largest s in [0, 1] for which the tick that was pays for the step s dP of the function.
+
+        Whatever its state x at the start and its force f: ``E' (P + s dP) E <= P + W`` with E the map of (x, f) to
+        the state at the end, and W twice the work of f on ``v + a y``, by the equation of motion integrated.
+        """
         d = rise.shape[-1]
-        tick = transition(admittance_rate(last.stiffness, last.damping, self._mass), self._dt)[..., : 2 * d, : 2 * d]
+        end = transition(admittance_rate(last.stiffness, last.damping, self._mass), self._dt)[..., : 2 * d, :]
+        start = torch.eye(3 * d).to(end)
+        moved = end - start[: 2 * d]
+        pull = self._dt * start[2 * d :] - self._mass @ moved[..., d:, :] - last.damping @ moved[..., :d, :]
+        port = moved[..., :d, :] + self._alpha * torch.linalg.solve(last.stiffness, pull)
         function = lyapunov_matrix(last.stiffness, last.damping, self._mass, self._alpha)
-        factor = torch.linalg.cholesky(symmetrize(function - tick.mT @ function @ tick))
-        half = torch.linalg.solve_triangular(factor, tick[..., :d, :].mT, upper=False)
+        work = torch.nn.functional.pad(port, (0, 0, 2 * d, 0))
+        paid = torch.nn.functional.pad(function, (0, d, 0, d)) + work + work.mT - end.mT @ function @ end
+        factor = torch.linalg.cholesky(symmetrize(paid))
+        half = torch.linalg.solve_triangular(factor, end[..., :d, :].mT, upper=False)
         needed = torch.linalg.eigvalsh(symmetrize(half @ rise @ half.mT))[..., -1]
         return torch.where(needed > 1.0, (1.0 - _MARGIN) / needed.clamp_min(1.0), 1.0)
 

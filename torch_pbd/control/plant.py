@@ -30,7 +30,8 @@ class AdmittancePlant:
     integrator : {"exact", "semi_implicit_euler", "rk4", "trapezoid"}, default="exact"
         "exact" solves the tick, whatever its length; the others are for comparison.
     feed_forward : bool, default=False
-        Add ``M a_d``, which eq. (15) lacks: the deviation then moves as if the desired position stood still.
+        Add ``M a_d``, which eq. (15) lacks: the robot then follows but for half a tick's motion, the mean lag of
+        a desired position that stands still in each tick.
     sensor : ForceSensor, default=None
         What the admittance measures of the external force; None measures it as it is.
     position_loop : PositionLoop, default=None

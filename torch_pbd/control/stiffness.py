@@ -95,13 +95,14 @@ class StiffnessLaw:
         low, high = self._resolved(matrix)
         return spectral_map(matrix, lambda variance: self._of_scale(variance.clamp_min(0.0), low, high))
 
-    def fitted(self, covariance: Float[Tensor, "*b d d"] | Any) -> "StiffnessLaw":
+    def fitted(self, covariance: Float[Tensor, "*b d d"] | Any, *, resolution: float = 0.0) -> "StiffnessLaw":
         """The same law with its bounds fixed, as standard deviations, to those of ``covariance`` (..., d, d).
 
+        Quantiles take standard deviations below ``resolution``, which cannot be told from zero, for that.
         With bounds="quantile" and covariances that do not vary at all, every axis counts as precise, and a
         warning says so.
         """
-        low, high = self._resolved(as_semidefinite(covariance, "covariance"))
+        low, high = self._resolved(as_semidefinite(covariance, "covariance"), resolution)
         return replace(self, sigma_low=low, sigma_high=high, bounds="sigma")
 
     def lipschitz(self) -> float:
@@ -133,13 +134,21 @@ class StiffnessLaw:
         low, high = self._given_bounds()
         return (math.sqrt(low), math.sqrt(high)) if self.bounds == "variance" else (low, high)
 
-    def _resolved(self, covariance: Tensor) -> tuple[float, float]:
+    def _resolved(self, covariance: Tensor, resolution: float = 0.0) -> tuple[float, float]:
         """Bounds as standard deviations."""
         if self.bounds != "quantile":
             return self._scales()
         if not covariance.numel():
             raise ValueError("bounds == 'quantile' needs at least one covariance to take the quantiles of; got none.")
-        scales = torch.linalg.eigvalsh(covariance.detach()).clamp_min(0.0).sqrt().flatten().sort().values
+        scales = (
+            torch.linalg.eigvalsh(covariance.detach())
+            .clamp_min(0.0)
+            .sqrt()
+            .clamp_min(resolution)
+            .flatten()
+            .sort()
+            .values
+        )
         low, high = (_quantile(scales, share) for share in self._given_bounds())
         if high <= low * (1.0 + 1e-9):
             warnings.warn(

@@ -1,4 +1,4 @@
-"""The main job without arguments: six made demonstrations of the tunnel task, and what the models learn."""
+"""The main job without arguments: six made demonstrations of the tunnel task, what the models learn, the robot."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -7,10 +7,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 
+from torch_pbd.control.controller import DMPController
 from torch_pbd.data import Demonstrations, make_tunnel_demonstrations, tunnel_center, tunnel_half_width
 from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.experiments.comparison import compare_models
 from torch_pbd.experiments.recordings import score_row, write_fitted
+from torch_pbd.experiments.robot import run_robot
 from torch_pbd.experiments.run_folder import RunFolder, format_table
 from torch_pbd.metrics import mahalanobis_coverage
 from torch_pbd.plotting import MODEL, plot_covariance_ellipses, plot_demonstrations
@@ -20,7 +22,10 @@ _RATE = 25.0  # Hz; the movement has nothing of use above a few
 
 
 def run_demo(models: Mapping[str, CovarianceRegressor], folder: RunFolder, *, n_demos: int = 6, seed: int = 0) -> str:
-    """Fit the models to made demonstrations, judge them by 300 fresh ones; returns the table as text."""
+    """Fit the models, judge them by 300 fresh demonstrations, and push a robot that the first of them controls.
+
+    Returns the tables and the stability report as text.
+    """
     demonstrations = make_tunnel_demonstrations(n_demos, rate=_RATE, random_state=seed)
     fresh = make_tunnel_demonstrations(_N_FRESH, rate=_RATE, random_state=seed + 1).to_array()
     true_covariance = np.einsum("kti,ktj->tij", *(2 * [fresh - fresh.mean(axis=0)])) / (_N_FRESH - 1)
@@ -31,11 +36,14 @@ def run_demo(models: Mapping[str, CovarianceRegressor], folder: RunFolder, *, n_
         model = models[score.model].fit(X, y)
         rows.append(score_row(score) | {"95 % of fresh": _coverage(model, demonstrations, fresh)})
         write_fitted(model, demonstrations, folder, score.model, "time")
-    folder.write_metrics(rows)
     figure = _tunnel_figure(models, demonstrations)
     folder.write_figure(figure, "tunnel")
     plt.close(figure)
-    return format_table(rows)
+    folder.write_metrics(rows)
+    name, model = next(iter(models.items()))
+    title = "A robot under its control, pushed with 5 N along x at 2 s and 8 s: displacement, and stiffness in N/m"
+    pushed = run_robot({name: DMPController(model)}, demonstrations, folder, in_tunnel=True, metrics="pushes")
+    return "\n\n".join([format_table(rows), title, pushed])
 
 
 def _coverage(model: CovarianceRegressor, demonstrations: Demonstrations, fresh: Any) -> float:

@@ -47,9 +47,9 @@ class RunFolder:
         }
         (self.path / "env.json").write_text(json.dumps(environment, indent=2) + "\n", encoding="utf-8")
 
-    def write_metrics(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Write ``metrics.csv``, the columns those of the first row."""
-        with (self.path / "metrics.csv").open("w", newline="", encoding="utf-8") as file:
+    def write_metrics(self, rows: Sequence[Mapping[str, Any]], name: str = "metrics") -> None:
+        """Write ``<name>.csv``, the columns those of the first row."""
+        with (self.path / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, fieldnames=list(rows[0]))
             writer.writeheader()
             writer.writerows(rows)
