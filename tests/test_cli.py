@@ -2,12 +2,14 @@ import csv
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import torch_pbd
 from torch_pbd.cli import main
+from torch_pbd.control import Schedule
 from torch_pbd.data import Demonstrations, make_tunnel_demonstrations
 
 
@@ -18,7 +20,9 @@ def recording(tmp_path):
     return path
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["fit", "--help"], ["compare", "--help"], ["demo", "--help"]])
+@pytest.mark.parametrize(
+    "arguments", [["--help"], ["fit", "--help"], ["compare", "--help"], ["demo", "--help"], ["experiment", "--help"]]
+)
 def test_help_does_not_wait_for_torch(arguments):
     program = (
         "import sys\nfrom torch_pbd.cli import main\n"
@@ -121,13 +125,63 @@ def test_a_failed_fit_is_one_line_and_exit_code_1(tmp_path, capsys):
     assert "needs >= 2 demonstrations" in complaint
 
 
+def test_the_experiment_of_the_paper_gives_figure_8(tmp_path, capsys):
+    config = Path(__file__).parents[1] / "configs" / "paper" / "robot.yaml"
+    assert main(["experiment", "--config", str(config), "--rate", "200", "--output", str(tmp_path)]) == 0
+    assert "Did" not in capsys.readouterr().err
+    with (tmp_path / "metrics.csv").open() as file:
+        rows = {row["controller"]: row for row in csv.DictReader(file)}
+    ratio = {name: float(row["ratio"]) for name, row in rows.items()}
+    assert ratio["Table II as printed"] < 1.2  # all variability is above its bounds: soft throughout
+    assert 15.0 <= ratio["Table II as variances, over time"] <= 25.0
+    for name in ("Table II as variances, over time", "recommended"):
+        assert float(rows[name]["K x early"]) == pytest.approx(50.0)
+        assert float(rows[name]["K x late"]) > 800.0
+        assert float(rows[name]["K y early"]) > 999.0
+    assert (tmp_path / "figures" / "figure5_framework.png").is_file()
+
+
+def test_an_experiment_on_a_file_takes_its_covariance_from_the_config(recording, tmp_path, capsys):
+    config = tmp_path / "robot.yaml"
+    config.write_text(
+        "controllers:\n  mine:\n    class_path: DMPController\n    init_args:\n      mass: 2.0\n"
+        "      covariance: {class_path: GMMBaseline, init_args: {n_components: 2}}\n"
+        "      stiffness_law: {stiffness_max: 4e2}\n"
+    )
+    arguments = ["--data", str(recording), "--rate", "100", "--output", str(tmp_path / "out")]
+    assert main(["experiment", "--config", str(config), *arguments]) == 0
+    assert "stability at 2 kg" in capsys.readouterr().out
+    schedule = Schedule.load(tmp_path / "out" / "schedule" / "mine.npz")
+    assert schedule.stiffness_limits == (50.0, 400.0)
+    assert "GMMBaseline" in schedule.provenance["covariance"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["kuka_cube_pick", "letter_G"])
+def test_recorded_skills_are_pushed(name, recordings, tmp_path, capsys):
+    config = Path(__file__).parents[1] / "configs" / "robot.yaml"
+    data = ["--data", str(recordings / f"{name}.npz")]
+    assert main(["experiment", "--config", str(config), *data, "--output", str(tmp_path)]) == 0
+    assert capsys.readouterr().err == ""
+    with (tmp_path / "metrics.csv").open() as file:
+        for row in csv.DictReader(file):
+            assert row["stable"] == "yes"
+            assert 50.0 <= float(row["K x early"]) <= 1000.0
+
+
 @pytest.mark.slow
 def test_the_demo_runs(tmp_path, capsys):
     assert main(["demo", "--output", str(tmp_path)]) == 0
     shown = capsys.readouterr()
     assert shown.err == ""
     assert "95 % of fresh" in shown.out
-    assert {path.name for path in (tmp_path / "figures").iterdir()} == {"cd.png", "wp.png", "gmm_5.png", "tunnel.png"}
+    robot = {"cd_figure6_task.png", "cd_figure7_variability.png", "cd_figure8_pushes.png"}
+    figures = {path.name for path in (tmp_path / "figures").iterdir()}
+    assert figures == {"cd.png", "wp.png", "gmm_5.png", "tunnel.png"} | robot
+    assert Schedule.load(tmp_path / "schedule" / "cd.npz").duration == 10.0
+    with (tmp_path / "pushes.csv").open() as file:
+        (row,) = csv.DictReader(file)
+    assert float(row["early [mm]"]) > 5.0 * float(row["late [mm]"])
 
 
 @pytest.mark.slow

@@ -6,10 +6,10 @@ from torch_pbd.experiments.run_folder import RunFolder, format_table, slug
 
 
 def test_a_table_lines_up_and_shows_what_is_not_known_as_a_dash():
-    rows = [{"model": "CD", "MSE": 1.5e-13, "LL": -3.25}, {"model": "GMM 5", "MSE": float("nan"), "LL": 12345.0}]
+    rows = [{"model": "CD", "MSE": 1.5e-13, "LL": -3.25}, {"model": "GMM 5", "MSE": float("nan"), "LL": 123456.0}]
     lines = format_table(rows).splitlines()
     assert lines[0] == "model       MSE        LL"
-    assert lines[2:] == ["CD     1.50e-13     -3.25", "GMM 5         -  1.23e+04"]
+    assert lines[2:] == ["CD     1.50e-13     -3.25", "GMM 5         -  1.23e+05"]
     assert len({len(line) for line in lines}) == 1
 
 
@@ -27,4 +27,4 @@ def test_a_folder_that_is_a_file_fails_before_the_work(tmp_path):
 
 
 def test_names_of_models_become_names_of_files():
-    assert slug("Figure 2, CD") == "figure_2__cd"
+    assert slug("Figure 2, CD") == "figure_2_cd"
