@@ -1,5 +1,6 @@
 """The loop over ticks behind :class:`~torch_pbd.control.AdmittancePlant`, with and without what acts in it."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -51,29 +52,34 @@ class Hooks(Protocol):
 
 
 def open_loop(task: Task, state: State, integrator: Integrator) -> State:
-    """Positions and velocities (..., T, d) where force and gains are known beforehand.
-
-    The transitions are computed in blocks; each tick is then one product of matrices.
-    """
+    """Positions and velocities (..., T, d) where force and gains are known beforehand."""
     push = (task.damping @ task.velocity.unsqueeze(-1)).squeeze(-1) + task.inertial_force
     total = task.force + push
     deviation, velocity = state[0] - task.position[..., 0, :], state[1]
     d = deviation.shape[-1]
     states = []
+    for tick, each in enumerate(_maps(task, task.dt, integrator)):
+        states.append(torch.cat([deviation, velocity], dim=-1))
+        deviation, velocity = _moved(each, deviation, velocity, total[..., tick, :].expand_as(deviation))
+        if tick + 1 < task.n_ticks:
+            deviation = deviation - (task.position[..., tick + 1, :] - task.position[..., tick, :])
+    trace = torch.stack(states, dim=-2)
+    return trace[..., :d] + task.position, trace[..., d:]
+
+
+def _maps(task: Task, dt: float, integrator: Integrator) -> Iterator[Tensor]:
+    """Map of each tick of the task's own gains over ``dt``, (..., 2 d, 3 d), computed in blocks."""
     batch = max(1, task.stiffness[..., 0, 0, 0].numel())
     block = max(1, _MATRICES_AT_ONCE // batch)
     for first in range(0, task.n_ticks, block):
         ticks = slice(first, first + block)
-        rate = admittance_rate(task.stiffness[..., ticks, :, :], task.damping[..., ticks, :, :], task.mass)
-        maps = transition(rate, task.dt, integrator)[..., : 2 * d, :]
-        for tick, each in enumerate(maps.unbind(-3), start=first):
-            states.append(torch.cat([deviation, velocity], dim=-1))
-            held = total[..., tick, :].expand_as(deviation)
-            deviation, velocity = _moved(each, deviation, velocity, held)
-            if tick + 1 < task.n_ticks:
-                deviation = deviation - (task.position[..., tick + 1, :] - task.position[..., tick, :])
-    trace = torch.stack(states, dim=-2)
-    return trace[..., :d] + task.position, trace[..., d:]
+        yield from _tick_map(
+            task.stiffness[..., ticks, :, :], task.damping[..., ticks, :, :], task.mass, dt, integrator
+        ).unbind(-3)
+
+
+def _tick_map(stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float, integrator: Integrator) -> Tensor:
+    return transition(admittance_rate(stiffness, damping, mass), dt, integrator)[..., : 2 * stiffness.shape[-1], :]
 
 
 def _moved(each: Float[Tensor, "*b m n"], deviation: Tensor, velocity: Tensor, force: Tensor) -> State:
@@ -104,6 +110,8 @@ class _Loop:
         self._filter: ActiveFilter | None = None
         if wanted is not None:
             self._filter = wanted.start(task.stiffness, task.damping, task.mass, task.dt)
+        self._part = task.dt / hooks.substeps
+        self._maps = _maps(task, self._part, hooks.integrator)
         self._trace: dict[str, list[Tensor]] = {}
 
     def run(self, tick: int) -> None:
@@ -149,8 +157,10 @@ class _Loop:
     def _move(self, stiffness: Tensor, damping: Tensor, measured: Tensor, push: Tensor, tick: int) -> None:
         """Move over the tick; the walls are evaluated anew in each of its parts."""
         hooks, task = self._hooks, self._task
-        rate = admittance_rate(stiffness, damping, task.mass)
-        each = transition(rate, task.dt / hooks.substeps, hooks.integrator)[..., : 2 * push.shape[-1], :]
+        if self._filter is None:
+            each = next(self._maps)
+        else:
+            each = _tick_map(stiffness, damping, task.mass, self._part, hooks.integrator)
         force = measured
         for part in range(hooks.substeps):
             before = self._deviation, self._velocity
