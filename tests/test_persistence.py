@@ -15,6 +15,9 @@ from sklearn.linear_model import LinearRegression
 from sklearn.pipeline import make_pipeline
 
 import torch_pbd
+from torch_pbd import DMPController, GMMBaseline
+from torch_pbd.control import StiffnessLaw
+from torch_pbd.data import make_tunnel_demonstrations
 from torch_pbd.exceptions import ModelFileError
 from torch_pbd.persistence import _digest
 
@@ -306,3 +309,31 @@ def test_a_model_from_a_device_that_is_missing_here_is_put_on_the_cpu(copied, tm
         loaded = copied(model, tmp_path / "model")
     assert loaded.device is None
     assert_same_model(loaded, fitted("cholesky"), queries(1))
+
+
+@pytest.mark.parametrize("regressor", [None, GMMBaseline(n_components=2, random_state=0)])
+def test_a_controller_plans_the_same_from_its_file(regressor, tmp_path):
+    law = StiffnessLaw(20.0, 400.0, smooth=True)
+    recorded = make_tunnel_demonstrations(5, rate=20.0, random_state=0, variant="unequal")
+    controller = DMPController(regressor, variability="forcing", stiffness_law=law, goal="each").fit(recorded)
+    torch_pbd.save(controller, tmp_path / "skill")
+    again = torch_pbd.load(tmp_path / "skill")
+    assert again.schedule(20.0, settle=1.0) == controller.schedule(20.0, settle=1.0)
+    assert again.get_params(deep=False).keys() == controller.get_params(deep=False).keys()
+    assert again.stiffness_law == law
+    np.testing.assert_array_equal(again.noise_share_, controller.noise_share_)
+    np.testing.assert_array_equal(again.reproduce(50.0)[1], controller.reproduce(50.0)[1])
+    again.fit(recorded)  # parameters, too, are as they were
+    assert again.schedule(20.0) == controller.schedule(20.0)
+
+
+def test_a_controllers_file_with_parts_that_do_not_fit_is_refused(tmp_path):
+    recorded = make_tunnel_demonstrations(5, rate=20.0, random_state=0)
+    path = tmp_path / "skill"
+    torch_pbd.save(DMPController(GMMBaseline(n_components=2, random_state=0)).fit(recorded), path)
+    header, arrays = header_and_arrays(path.read_bytes(), tmp_path)
+    with pytest.raises(ModelFileError, match="not all for 2 outputs"):
+        torch_pbd.load(written(path, header, arrays | {"goal": np.zeros(3)}))
+    del arrays["forcing"]
+    with pytest.raises(ModelFileError, match="does not describe a whole DMPController"):
+        torch_pbd.load(written(path, header, arrays))

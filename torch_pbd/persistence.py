@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+from dataclasses import asdict
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -14,6 +15,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save as to_bytes
 from sklearn.utils.validation import check_is_fitted
 
+from torch_pbd.control.controller import DMPController
+from torch_pbd.control.stiffness import StiffnessLaw
+from torch_pbd.control.storage import controller_state, restore_controller
 from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.exceptions import ModelFileError
 from torch_pbd.files import replacing
@@ -23,16 +27,18 @@ _CLASSES = {
     "CholeskyCovRegressor": "torch_pbd.estimators.cholesky",
     "WishartProcessRegressor": "torch_pbd.estimators.wishart",
     "GMMBaseline": "torch_pbd.estimators.mixture",
+    "DMPController": "torch_pbd.control.controller",
 }
+_PART = "covariance_."  # before the names of the arrays of a controller's regressor
 _KEY = "torch_pbd"
 
 
-def save(estimator: CovarianceRegressor, path: str | os.PathLike[str]) -> None:
+def save(estimator: CovarianceRegressor | DMPController, path: str | os.PathLike[str]) -> None:
     """Save a fitted estimator to one file, which is there whole or not at all.
 
     Parameters
     ----------
-    estimator : fitted covariance regressor
+    estimator : fitted covariance regressor or DMPController
     path : path-like
         File to write; by custom it ends in ``.safetensors``. Its folder must exist.
 
@@ -48,16 +54,10 @@ def save(estimator: CovarianceRegressor, path: str | os.PathLike[str]) -> None:
     if name not in _CLASSES:
         raise TypeError(f"estimator is a {name}; can save {', '.join(_CLASSES)}. In a pipeline, save that step.")
     check_is_fitted(estimator)
-    state = estimator.__getstate__()
-    arrays = {key: np.ascontiguousarray(value) for key, value in state.pop("_module_arrays").items()}
+    description, arrays = _described(estimator)
     header = {
         "format_version": FORMAT_VERSION,
-        "class": name,
-        "params": {key: _encode(value, key) for key, value in estimator.get_params(deep=False).items()},
-        "module": state.pop("_module_spec"),
-        "fitted": {
-            key: _encode(value, key) for key, value in state.items() if key not in estimator.get_params(deep=False)
-        },
+        **description,
         "versions": {package: version(package) for package in ("torch", "scikit-learn", "numpy")},
     }
     header["sha256"] = _digest(header, arrays)
@@ -65,7 +65,28 @@ def save(estimator: CovarianceRegressor, path: str | os.PathLike[str]) -> None:
         file.write(to_bytes(arrays, metadata={_KEY: json.dumps(header)}))
 
 
-def load(path: str | os.PathLike[str]) -> CovarianceRegressor:
+def _described(estimator: Any) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Class, parameters and what was learned, as JSON; and the arrays."""
+    parameters = estimator.get_params(deep=False)
+    description: dict[str, Any] = {
+        "class": type(estimator).__name__,
+        "params": {key: _encode(value, key) for key, value in parameters.items()},
+    }
+    if isinstance(estimator, DMPController):
+        values, arrays = controller_state(estimator)
+        regressor, parts = _described(estimator.covariance_)
+        learned = {key: _encode(value, key) for key, value in values.items()}
+        description |= {"fitted": learned, "covariance_": regressor}
+        arrays |= {_PART + key: value for key, value in parts.items()}
+    else:
+        state = estimator.__getstate__()
+        arrays = state.pop("_module_arrays")
+        description["module"] = state.pop("_module_spec")
+        description["fitted"] = {key: _encode(value, key) for key, value in state.items() if key not in parameters}
+    return description, {key: np.ascontiguousarray(value) for key, value in arrays.items()}
+
+
+def load(path: str | os.PathLike[str]) -> Any:
     """Load an estimator that :func:`save` wrote: it predicts the same to the last bit.
 
     One that was fitted on a device which this machine lacks is put on the CPU, with a warning.
@@ -94,14 +115,28 @@ def load(path: str | os.PathLike[str]) -> CovarianceRegressor:
     if header.pop("sha256", None) != _digest(header, arrays):
         raise ModelFileError(f"{path} is damaged: it does not match its checksum.")
     try:
-        estimator_class = getattr(import_module(_CLASSES[header["class"]]), header["class"])
-        estimator: CovarianceRegressor = estimator_class(**_decode(header["params"]))
-        state = {**estimator.__dict__, **_decode(header["fitted"])}
-        estimator.__setstate__({**state, "_module_spec": header["module"], "_module_arrays": arrays})
-        _try_out(estimator)
+        return _restored(header, arrays)
     except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ModelFileError(f"{path} does not describe a whole {header['class']} ({error}).") from error
+
+
+def _restored(description: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Any:
+    """The estimator that :func:`_described` told of."""
+    estimator = _unfitted(description)
+    if isinstance(estimator, DMPController):
+        parts = {key.removeprefix(_PART): value for key, value in arrays.items() if key.startswith(_PART)}
+        regressor = _restored(description["covariance_"], parts)
+        restore_controller(estimator, regressor, _decode(description["fitted"]), arrays)
+        return estimator
+    state = {**estimator.__dict__, **_decode(description["fitted"])}
+    estimator.__setstate__({**state, "_module_spec": description["module"], "_module_arrays": arrays})
+    _try_out(estimator)
     return estimator
+
+
+def _unfitted(description: dict[str, Any]) -> Any:
+    name = description["class"]
+    return getattr(import_module(_CLASSES[name]), name)(**_decode(description["params"]))
 
 
 def _try_out(estimator: CovarianceRegressor) -> None:
@@ -132,6 +167,11 @@ def _encode(value: Any, name: str) -> Any:
         return _encode(value.item(), name)
     if isinstance(value, list | tuple):
         return [_encode(entry, name) for entry in value]
+    if type(value).__name__ in _CLASSES:
+        parameters = value.get_params(deep=False).items()
+        return {"class": type(value).__name__, "params": {key: _encode(entry, key) for key, entry in parameters}}
+    if isinstance(value, StiffnessLaw):
+        return {"stiffness_law": asdict(value)}
     if value is None or isinstance(value, bool | int | float | str):
         return value
     raise TypeError(
@@ -144,5 +184,9 @@ def _decode(value: Any) -> Any:
     if isinstance(value, dict):
         if set(value) == {"array", "dtype"}:
             return np.array(value["array"], dtype=value["dtype"])
+        if set(value) == {"class", "params"}:
+            return _unfitted(value)
+        if set(value) == {"stiffness_law"}:
+            return StiffnessLaw(**value["stiffness_law"])
         return {key: _decode(entry) for key, entry in value.items()}
     return value

@@ -1,0 +1,57 @@
+"""A fitted controller as plain values and arrays, and back, for model files."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torch_pbd.control.controller import DMPController
+from torch_pbd.control.dmp import DMP
+from torch_pbd.control.impedance import Impedance
+from torch_pbd.control.reproduction import Phase, Reproduction
+
+Arrays = dict[str, NDArray[np.float64]]
+
+_PLAIN = (
+    "names_", "frame_", "units_", "time_unit_", "n_demos_", "n_outputs_", "cutoff_", "duration_", "reproduction_error_",
+)  # fmt: skip
+_ARRAYS = ("noise_scale_", "noise_share_")
+_MOTION = ("start", "velocity", "goal", "forcing")
+
+
+def controller_state(controller: DMPController) -> tuple[dict[str, Any], Arrays]:
+    """What a fit learned, but for the covariance: values that JSON can hold, and arrays."""
+    values = {name: getattr(controller, name) for name in _PLAIN} | {"law_": controller.law_}
+    arrays = {name: getattr(controller, name) for name in _ARRAYS}
+    arrays |= {name: getattr(controller.reproduction_, name) for name in _MOTION}
+    return values, arrays
+
+
+def restore_controller(controller: DMPController, covariance: Any, values: dict[str, Any], arrays: Arrays) -> None:
+    """Make an unfitted controller the fitted one that :func:`controller_state` told of.
+
+    Raises
+    ------
+    KeyError, ValueError
+        If a part is missing or does not fit the others.
+    """
+    for name in _PLAIN:
+        setattr(controller, name, values[name])
+    for name in _ARRAYS:
+        setattr(controller, name, arrays[name])
+    controller.names_ = tuple(controller.names_)
+    n_outputs = controller.n_outputs_
+    if covariance.n_outputs_ != n_outputs or any(arrays[name].shape[-1:] != (n_outputs,) for name in _MOTION):
+        raise ValueError(f"its parts are not all for {n_outputs} outputs")
+    dmp = DMP(
+        controller.alpha, controller.beta, controller.gamma, controller.tau,
+        duration=controller.duration_, gate=controller.gate,
+    )  # fmt: skip
+    controller.covariance_, controller.dmp_ = covariance, dmp
+    time = np.linspace(0.0, controller.duration_, len(arrays["forcing"]))
+    motion = {name: arrays[name] for name in _MOTION}
+    phase = Phase(dmp, controller.phase_input)
+    controller.reproduction_ = Reproduction(dmp, phase, controller.goal == "each", time=time, **motion)
+    controller.start_, controller.goal_ = motion["start"], motion["goal"]
+    controller.law_ = values["law_"]
+    controller._impedance = Impedance(controller.law_, controller.mass, controller.damping_ratio, controller.on_unknown)
