@@ -94,9 +94,6 @@ def gaussian_log_density(residual: Float[Tensor, "*b d"], scale_tril: Float[Tens
     return -0.5 * whitened.square().sum(-1) - log_det - 0.5 * residual.shape[-1] * math.log(2 * math.pi)
 
 
-_EQUAL = 1e-9  # eigenvalues closer than this times the largest count as equal
-
-
 class _SpectralMap(torch.autograd.Function):
     """Function of a symmetric matrix whose gradient survives equal eigenvalues, which that of eigh does not."""
 
@@ -113,9 +110,13 @@ class _SpectralMap(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        if torch.is_grad_enabled():  # the axes are constants here: a second derivative would be wrong in silence
+            raise RuntimeError("spectral_map has no second derivatives: call autograd without create_graph=True.")
         eigenvalues, axes, mapped, slope = ctx.saved_tensors
         gap = eigenvalues.unsqueeze(-1) - eigenvalues.unsqueeze(-2)
-        equal = gap.abs() <= _EQUAL * eigenvalues.abs().amax(-1)[..., None, None]
+        # Of closer ones the difference has lost half its digits, and the mean slope is at least as good.
+        nearest = torch.finfo(gap.dtype).eps ** 0.5 * eigenvalues.abs().amax(-1)
+        equal = gap.abs() <= nearest[..., None, None]
         rise = mapped.unsqueeze(-1) - mapped.unsqueeze(-2)
         mean_slope = 0.5 * (slope.unsqueeze(-1) + slope.unsqueeze(-2))
         divided = torch.where(equal, mean_slope, rise / torch.where(equal, 1.0, gap))

@@ -52,8 +52,7 @@ def main():
                     figures.append(errors(DMPController(**options).fit(shown), truth, n_steps))
                 stiffness, scale, rate = (float(value) for value in np.median(figures, axis=0))
                 rows.append(
-                    options
-                    | {"mean |dK| [N/m]": stiffness, "mean |d log sd|": scale, "max |dK/dt| [N/m/s]": rate}
+                    options | {"mean |dK| [N/m]": stiffness, "mean |d log sd|": scale, "max |dK/dt| [N/m/s]": rate}
                 )
     print(f"tunnel task, 6 demonstrations against 300, medians over {n_seeds} seeds\n")
     print(format_table(rows))

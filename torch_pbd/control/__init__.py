@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from torch_pbd.control.passivity import EnergyTank, RateLimit
     from torch_pbd.control.plant import AdmittancePlant
     from torch_pbd.control.position_loop import PositionLoop
-    from torch_pbd.control.realtime import RealTimeAdmittance
+    from torch_pbd.control.realtime import RealTimeAdmittance, TickStatus
     from torch_pbd.control.rollout import Rollout
     from torch_pbd.control.schedule import Schedule
     from torch_pbd.control.sensor import ForceSensor
@@ -32,6 +32,7 @@ _HOMES = {
     "Schedule": "schedule",
     "StabilityReport": "stability",
     "StiffnessLaw": "stiffness",
+    "TickStatus": "realtime",
     "Tunnel": "environment",
     "certify": "stability",
     "damping_from_stiffness": "damping",
@@ -50,6 +51,7 @@ __all__ = [
     "Schedule",
     "StabilityReport",
     "StiffnessLaw",
+    "TickStatus",
     "Tunnel",
     "certify",
     "damping_from_stiffness",

@@ -1,0 +1,36 @@
+"""What the arguments of the real-time controller must be."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torch_pbd.control.realtime.steps import Vector
+
+Numbers = Sequence[float] | NDArray[np.float64]
+
+
+def number(name: str, value: float, unit: str, *, zero: bool = False) -> float:
+    """A finite number above 0, or from 0 on."""
+    real = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+    if not (real and 0.0 <= value < math.inf and (value or zero)):
+        least = "of at least 0" if zero else "above 0"
+        raise ValueError(f"{name}={value!r} must be a finite number {least}, in {unit}.")
+    return float(value)
+
+
+def limit(name: str, value: float | None, unit: str) -> float:
+    """A number above 0; none at all is infinite."""
+    return math.inf if value is None else number(name, value, f"{unit}, or None")
+
+
+def vector(name: str, values: Numbers, d: int) -> Vector:
+    """Finite floats, d of them."""
+    try:
+        vector = tuple(map(float, values))
+    except (TypeError, ValueError):
+        vector = ()
+    if len(vector) != d or not all(map(math.isfinite, vector)):
+        raise ValueError(f"{name}={values!r} must be {d} finite numbers, one for each axis of the schedule.")
+    return vector
