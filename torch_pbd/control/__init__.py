@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from torch_pbd.control.controller import DMPController
-    from torch_pbd.control.damping import damping_from_stiffness
+    from torch_pbd.control.damping import damping_from_stiffness, required_damping_ratio
     from torch_pbd.control.dmp import DMP
     from torch_pbd.control.environment import Tunnel
     from torch_pbd.control.passivity import EnergyTank, RateLimit
@@ -36,6 +36,7 @@ _HOMES = {
     "Tunnel": "environment",
     "certify": "stability",
     "damping_from_stiffness": "damping",
+    "required_damping_ratio": "damping",
 }
 
 __all__ = [
@@ -55,6 +56,7 @@ __all__ = [
     "Tunnel",
     "certify",
     "damping_from_stiffness",
+    "required_damping_ratio",
 ]
 
 

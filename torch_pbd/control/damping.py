@@ -28,8 +28,8 @@ def damping_from_stiffness(
     mass : float or Tensor of shape (..., d, d), default=1.0
         In kg; a matrix must be symmetric and positive definite.
     damping_ratio : float or "paper", default=1.0
-        1 is critical. With one mass, any schedule of stiffness is stable for a ratio of at least
-        ``(R^(1/4) - R^(-1/4)) / 2``, R the ratio of the largest to the smallest stiffness: 1 up to R = 33.9.
+        1 is critical, and makes any schedule stable whose largest stiffness is below 33.9 times its smallest; see
+        :func:`required_damping_ratio`.
         "paper" is ``K^1/2`` whatever the mass: a ratio of ``1 / (2 sqrt(m))``, critical at 0.25 kg only.
 
     Raises
@@ -52,6 +52,44 @@ def damping_from_stiffness(
     root = spectral_map(mass.to(matrix), torch.sqrt)
     inverse = spectral_map(mass.to(matrix), torch.rsqrt)
     return symmetrize(2.0 * damping_ratio * root @ spectral_map(inverse @ matrix @ inverse, _root) @ root)
+
+
+def required_damping_ratio(stiffness_ratio: float) -> float:
+    """Damping ratio from which a robot is exponentially stable under any schedule of stiffness whatever.
+
+    For damping ``2 zeta (m K)^1/2`` of the stiffness in effect, however fast K changes and its axes turn, as long as
+    its eigenvalues stay between ``k`` and ``stiffness_ratio * k``; and for any ticks over which both are held.
+
+    ``(R^(1/4) - R^(-1/4)) / 2`` up to R = 194: 0.82 for R = 20, and critical damping does up to 33.9. Above 194
+    more is needed than this, and from 1154 on the proof gives no ratio: infinity.
+
+    Parameters
+    ----------
+    stiffness_ratio : float
+        R, the largest stiffness over the smallest, of all axes and times; at least 1.
+
+    Raises
+    ------
+    ValueError
+        If it is below 1.
+
+    Notes
+    -----
+    With the frequency w, ``w^2 = k R^(1/2) / m``, the function ``V = w^2 |y|^2 + 2 b w y'v + |v|^2``, 0 < b < 1, does
+    not depend on axes. Along an axis of stiffness ``m w^2 s^2``, ``R^(-1/4) <= s <= R^(1/4)``, its derivative is a
+    quadratic form, negative definite if and only if ``(u - 2 b zeta)^2 < 4 (1 - b^2)`` with ``u = s + 1 / s``, which
+    lies between 2 and ``R^(1/4) + R^(-1/4)``. The b that serves the most of these is ``zeta / (1 + zeta^2)^(1/2)`` up
+    to ``zeta = 3^(1/2)``, and ``2 zeta / (1 + zeta^2)``, where u = 2 is the limit, above.
+    """
+    check_finite("stiffness_ratio", stiffness_ratio)
+    if stiffness_ratio < 1.0:
+        raise ValueError(f"stiffness_ratio == {stiffness_ratio:g}, must be at least 1: largest over smallest.")
+    root = stiffness_ratio**0.25
+    largest = root + 1.0 / root
+    if largest <= 4.0:
+        return (root - 1.0 / root) / 2.0
+    share = (largest - 2.0) / 4.0
+    return math.sqrt((1.0 + share) / (1.0 - share)) if share < 1.0 else math.inf
 
 
 def _root(eigenvalue: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torch_pbd.control.coupling import stiffest_environment
+from torch_pbd.control.damping import required_damping_ratio
 from torch_pbd.control.matrices import check_mass, check_positive
 from torch_pbd.control.position_loop import PositionLoop
 from torch_pbd.control.transitions import admittance_rate, transition
@@ -37,10 +38,11 @@ class StabilityReport:
     stiffness_ratio : float
         Largest over smallest stiffness R, of all axes and times.
     required_damping_ratio : float
-        ``(R^(1/4) - R^(-1/4)) / 2``: from here on any schedule within these limits is exponentially stable.
+        From here on any schedule within these limits is exponentially stable:
+        :func:`~torch_pbd.control.required_damping_ratio`.
     stable_at_any_schedule : bool
-        That the damping is ``2 zeta (M K)^1/2`` with one such zeta. Numerical evidence for R from 2 to 100, no
-        proof (control by a common quadratic Lyapunov function).
+        That the damping is ``2 zeta (M K)^1/2`` with one such zeta at every knot; a controller must take it from
+        the stiffness in effect, or hold both between knots.
     alpha : float
         Constant of the certificate, 1/s.
     margin : float
@@ -253,8 +255,7 @@ def _damping_rule(stiffness: Tensor, damping: Tensor, mass: Tensor) -> tuple[flo
     root = spectral_map(stiff, lambda value: value.pow(-0.25))
     ratios = torch.linalg.eigvalsh(symmetrize(root @ damp @ root)) / 2.0
     smallest, largest = float(ratios.min()), float(ratios.max())
-    required = (ratio**0.25 - ratio**-0.25) / 2.0
-    return ratio, required, largest - smallest <= 1e-6 * largest, smallest
+    return ratio, required_damping_ratio(ratio), largest - smallest <= 1e-6 * largest, smallest
 
 
 def _gain(
