@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import scipy.linalg
 import torch
 from scipy.stats import multivariate_normal
 
@@ -9,6 +10,7 @@ from torch_pbd.linalg import (
     gaussian_log_density,
     safe_cholesky,
     scale_tril_from_root,
+    spectral_map,
     symmetrize,
     tril_to_vector,
     vector_to_tril,
@@ -115,3 +117,46 @@ def test_the_gradient_through_a_jittered_factor_is_finite():
     (gradient,) = torch.autograd.grad(2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(), matrix)
     inverse = torch.linalg.inv(matrix.detach() + jitter * torch.eye(2).to(matrix))
     torch.testing.assert_close(gradient, inverse, rtol=0.1, atol=0.0)  # the condition number is 1e14
+
+
+def with_eigenvalues(values, generator, dtype=torch.float64):
+    """Symmetric matrix of these eigenvalues and random axes."""
+    axes = torch.linalg.qr(randn(len(values), len(values), generator=generator)).Q
+    return symmetrize(axes * torch.tensor(values, dtype=torch.float64) @ axes.mT).to(dtype)
+
+
+@pytest.mark.parametrize("d", [1, 2, 9])
+def test_spectral_maps_are_the_matrix_functions_of_scipy(d, generator):
+    root = randn(3, 4, d, d + 2, generator=generator)
+    matrix = root @ root.mT / d
+    for function, expected in {torch.exp: scipy.linalg.expm, torch.sqrt: scipy.linalg.sqrtm}.items():
+        result = spectral_map(matrix, function)
+        assert torch.equal(result, result.mT)
+        for each, reference in zip(result.flatten(0, 1), matrix.flatten(0, 1), strict=True):
+            reference = expected(reference.numpy())
+            np.testing.assert_allclose(each, reference, rtol=1e-9, atol=1e-11 * abs(reference).max())
+
+
+@pytest.mark.parametrize("values", [[1.0, 2.0, 5.0], [0.6, 0.0, 0.6], [3.0, 3.0, 3.0], [2.0], [0.0, 0.0]])
+def test_gradients_of_spectral_maps_survive_equal_eigenvalues(values, generator):
+    for matrix in (with_eigenvalues(values, generator), torch.diag(torch.tensor(values, dtype=torch.float64))):
+        assert torch.autograd.gradcheck(lambda m: spectral_map(m, torch.exp), matrix.requires_grad_())
+
+
+@pytest.mark.parametrize(("dtype", "rtol"), [(torch.float64, 1e-7), (torch.float32, 1e-3)])
+@pytest.mark.parametrize("gap", [0.0, 1e-14, 1e-9, 3e-8, 1e-6, 1e-4, 1e-2])
+def test_gradients_of_nearly_equal_eigenvalues_are_the_frechet_derivative(gap, dtype, rtol, generator):
+    """Half the digits of the type are left: a quotient of tiny differences, or a mean slope, must keep them."""
+    matrix = with_eigenvalues([1.0, 1.0 + gap, 2.0], generator, dtype).requires_grad_()
+    weight = randn(3, 3, generator=generator).to(dtype)
+    (gradient,) = torch.autograd.grad((weight * spectral_map(matrix, torch.exp)).sum(), matrix)
+    expected = scipy.linalg.expm_frechet(
+        matrix.detach().double().numpy(), symmetrize(weight).double().numpy(), compute_expm=False
+    )
+    np.testing.assert_allclose(gradient, expected, rtol=0, atol=rtol * abs(expected).max())
+
+
+def test_second_derivatives_of_spectral_maps_are_an_error_and_not_silently_wrong():
+    matrix = torch.eye(2, dtype=torch.float64).requires_grad_()
+    with pytest.raises(RuntimeError, match="no second derivatives"):
+        torch.autograd.grad(spectral_map(matrix, torch.exp).sum(), matrix, create_graph=True)
