@@ -1,0 +1,126 @@
+"""Damping from stiffness: one damping ratio in every mode of mass and stiffness."""
+
+import math
+import re
+
+import numpy as np
+import pytest
+import scipy.linalg
+import torch
+
+from torch_pbd.control.damping import damping_from_stiffness, required_damping_ratio
+
+
+def definite(*batch, d, generator, low=50.0, high=1000.0):
+    """Symmetric matrices of random axes, eigenvalues log-uniform between ``low`` and ``high``."""
+    axes = torch.linalg.qr(torch.randn(*batch, d, d, dtype=torch.float64, generator=generator)).Q
+    share = torch.rand(*batch, d, dtype=torch.float64, generator=generator)
+    matrix = axes * (low * (high / low) ** share).unsqueeze(-2) @ axes.mT
+    return 0.5 * (matrix + matrix.mT)
+
+
+@pytest.mark.parametrize("d", [1, 2, 9])
+def test_with_one_mass_it_is_the_root_of_mass_times_stiffness(d, generator):
+    stiffness = definite(4, d=d, generator=generator)
+    expected = [2.0 * 0.7 * scipy.linalg.sqrtm(3.0 * each.numpy()) for each in stiffness]
+    for mass in (3.0, 3.0 * torch.eye(d).double()):
+        damping = damping_from_stiffness(stiffness, mass, 0.7)
+        assert torch.equal(damping, damping.mT)
+        np.testing.assert_allclose(damping, expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_array_equal(damping_from_stiffness(stiffness.numpy(), 3.0, 0.7), damping_from_stiffness(
+        stiffness, 3.0, 0.7
+    ))  # fmt: skip
+
+
+@pytest.mark.parametrize("ratio", [0.1, 0.7, 1.5])
+@pytest.mark.parametrize("d", [2, 3])
+def test_every_mode_of_an_uneven_mass_has_the_damping_ratio(d, ratio, generator):
+    """The roots of ``det(s^2 M + s D + K)`` are ``-zeta w +- w sqrt(zeta^2 - 1)`` for each ``K x = w^2 M x``."""
+    stiffness = definite(d=d, generator=generator)
+    mass = definite(d=d, generator=generator, low=0.5, high=20.0)
+    damping = damping_from_stiffness(stiffness, mass, ratio)
+    frequency = np.sqrt(scipy.linalg.eigh(stiffness.numpy(), mass.numpy(), eigvals_only=True))
+    spread = np.sqrt(complex(ratio**2 - 1.0))
+    expected = np.concatenate([frequency * (-ratio + spread), frequency * (-ratio - spread)])
+    inverse = np.linalg.inv(mass.numpy())
+    companion = np.block([[np.zeros((d, d)), np.eye(d)], [-inverse @ stiffness.numpy(), -inverse @ damping.numpy()]])
+    roots = np.linalg.eigvals(companion)
+    order = [abs(roots - each).argmin() for each in expected]
+    assert sorted(order) == list(range(2 * d))
+    np.testing.assert_allclose(roots[order], expected, rtol=1e-9)
+
+
+def test_the_papers_damping_is_the_root_of_the_stiffness_whatever_the_mass(generator):
+    stiffness = definite(4, d=2, generator=generator)
+    paper = damping_from_stiffness(stiffness, 4.0, "paper")
+    for each, matrix in zip(paper, stiffness, strict=True):
+        np.testing.assert_allclose(each, scipy.linalg.sqrtm(matrix.numpy()), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(paper, damping_from_stiffness(stiffness, 4.0, 0.25), rtol=1e-9, atol=1e-11)
+
+
+def test_it_is_differentiable_in_stiffness_and_mass(generator):
+    stiffness = definite(2, d=2, generator=generator, low=1.0, high=5.0).requires_grad_()
+    mass = definite(d=2, generator=generator, low=0.5, high=2.0).requires_grad_()
+
+    def symmetric(matrix):
+        return matrix.tril() + matrix.tril(-1).mT
+
+    assert torch.autograd.gradcheck(
+        lambda k, m: damping_from_stiffness(symmetric(k), symmetric(m), 0.7), (stiffness, mass)
+    )
+    assert torch.autograd.gradcheck(lambda k: damping_from_stiffness(symmetric(k), 2.0, "paper"), stiffness)
+
+
+@pytest.mark.parametrize("mass", [2.0, torch.diag(torch.tensor([2.0, 1.0]).double())])
+def test_a_free_axis_is_undamped_and_has_a_finite_gradient(mass):
+    stiffness = torch.diag(torch.tensor([0.0, 100.0]).double()).requires_grad_()
+    damping = damping_from_stiffness(stiffness, mass)
+    assert damping[0].abs().max() == 0.0
+    damping.sum().backward()
+    assert torch.isfinite(stiffness.grad).all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"mass": 0.0}, "mass == 0 kg, must be positive"),
+        ({"mass": math.nan}, "mass == nan"),
+        ({"mass": torch.diag(torch.tensor([1.0, 0.0]))}, "mass must be positive definite"),
+        ({"mass": torch.tensor([[1.0, 0.5], [0.0, 1.0]])}, "mass must be symmetric"),
+        ({"damping_ratio": -0.1}, "damping_ratio == -0.1"),
+        ({"damping_ratio": math.inf}, "damping_ratio == inf"),
+        ({"stiffness": -np.eye(2)}, "stiffness must be positive semidefinite; at index 0"),
+        ({"stiffness": np.full((3, 2, 2), np.nan)}, "stiffness has an entry that is not finite, at index 0"),
+    ],
+)
+def test_what_makes_no_damping_is_refused(arguments, words):
+    with pytest.raises(ValueError, match=re.escape(words)):
+        damping_from_stiffness(**{"stiffness": np.eye(2), **arguments})
+
+
+@pytest.mark.parametrize("ratio", [1.01, 2.0, 20.0, 33.9, 100.0, 193.0, 195.0, 500.0, 1100.0])
+def test_the_required_ratio_is_where_a_common_function_begins_to_fall_everywhere(ratio):
+    """Its derivative is searched for its sign over all weights b and all stiffnesses, not only at the ends."""
+    weight = np.linspace(0.0, 1.0, 4001)[1:-1, None, None]
+    scale = np.geomspace(ratio**-0.25, ratio**0.25, 201)[None, :, None]
+
+    def falls(zeta):
+        # dV/dt of V = y^2 + 2 b y v + v^2 with y'' = -s^2 y - 2 zeta s y', at the angles of (y, v).
+        diagonal = -2.0 * weight * scale**2, 2.0 * weight - 4.0 * zeta * scale
+        off = 1.0 - 2.0 * weight * zeta * scale - scale**2
+        negative = (diagonal[1] < 0.0) & (diagonal[0] * diagonal[1] > off**2)
+        return bool(negative.all(axis=1).any())
+
+    required = required_damping_ratio(ratio)
+    assert falls(1.002 * required)
+    assert not falls(0.998 * required)
+    assert falls(3.0 * required)
+
+
+def test_the_required_ratio_of_the_paper_and_of_critical_damping():
+    assert required_damping_ratio(20.0) == pytest.approx(0.8209, abs=1e-4)
+    assert required_damping_ratio(33.97) == pytest.approx(1.0, abs=1e-4)
+    assert required_damping_ratio(1.0) == 0.0
+    assert required_damping_ratio(1160.0) == math.inf
+    with pytest.raises(ValueError, match=r"stiffness_ratio == 0\.5, must be at least 1"):
+        required_damping_ratio(0.5)

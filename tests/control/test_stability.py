@@ -1,0 +1,342 @@
+"""What is guaranteed of a schedule, against brute force: nothing that is called stable may grow."""
+
+import doctest
+import math
+import re
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import scipy.linalg
+import torch
+
+from torch_pbd.control import stability as module
+from torch_pbd.control.damping import damping_from_stiffness
+from torch_pbd.control.plant import AdmittancePlant
+from torch_pbd.control.stability import _Knots, certify
+from torch_pbd.control.transitions import admittance_rate, transition
+
+N_KNOTS = 12
+
+
+def symmetric(matrix):
+    return 0.5 * (matrix + matrix.mT)
+
+
+def turned(eigenvalues, angle):
+    """Matrices (..., d, d) of ``eigenvalues`` (..., d), d = 1 or 2, along axes at ``angle`` (...)."""
+    if eigenvalues.shape[-1] == 1:
+        return eigenvalues.unsqueeze(-1)
+    axes = torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()], dim=-1).unflatten(-1, (2, 2))
+    return symmetric(axes * eigenvalues.unsqueeze(-2) @ axes.mT)
+
+
+def periodic_schedules(n_schedules, d, generator):
+    """Time (n, T), stiffness and damping (n, T, d, d), mass (n, 1, d, d); the last knot is the first.
+
+    Periods from 0.3 to 8 natural ones, damping ratios from 0.01 to 1.5, stiffness ratios up to 30, axes that turn.
+    """
+
+    def uniform(*shape):
+        return torch.rand(*shape, dtype=torch.float64, generator=generator)
+
+    mass = turned(0.3 * 30.0 ** uniform(n_schedules, 1, d), 3.0 * uniform(n_schedules, 1))
+    around = 2.0 * torch.pi * torch.linspace(0, 1, N_KNOTS + 1).double()[:, None]
+    waves = torch.sin(around + 6.3 * uniform(n_schedules, 1, d)) + 0.4 * torch.sin(2.0 * around + uniform(1))
+    depth = 0.5 * math.log(30.0) * uniform(n_schedules, 1, 1) ** 2
+    half_turns = torch.floor(3.0 * uniform(n_schedules, 1))
+    stiffness = turned(300.0 * torch.exp(depth * waves), half_turns * around[:, 0] / 2.0)
+    stiffness[:, -1] = stiffness[:, 0]
+    ratio = 0.01 * 150.0 ** uniform(n_schedules, 1, 1, 1)
+    damping = ratio * damping_from_stiffness(stiffness, mass)
+    natural = 2.0 * torch.pi * (torch.linalg.det(mass)[:, 0] / 300.0**d) ** (0.5 / d)
+    period = natural * 0.3 * (8.0 / 0.3) ** uniform(n_schedules)
+    return period[:, None] * torch.linspace(0, 1, N_KNOTS + 1).double(), stiffness, damping, mass
+
+
+def maps_between_knots(time, stiffness, damping, mass, n_steps=120):
+    """Transitions (n, T - 1, 2 d, 2 d) of gains that are linear between knots, by Runge and Kutta's method."""
+
+    def rate(share):
+        gains = (torch.lerp(each[:, :-1], each[:, 1:], share) for each in (stiffness, damping))
+        return admittance_rate(*gains, mass)[..., : 2 * d, : 2 * d]
+
+    d = stiffness.shape[-1]
+    step = time.diff()[..., None, None] / n_steps
+    state = torch.eye(2 * d).double().expand(*stiffness[:, 1:].shape[:2], -1, -1)
+    for k in range(n_steps):
+        first, middle, last = (rate((k + part) / n_steps) for part in (0.0, 0.5, 1.0))
+        k1 = first @ state
+        k2 = middle @ (state + 0.5 * step * k1)
+        k3 = middle @ (state + 0.5 * step * k2)
+        state = state + step / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + last @ (state + step * k3))
+    return state
+
+
+@pytest.mark.parametrize("d", [1, 2])
+def test_none_of_a_thousand_certified_schedules_grows(d, generator):
+    """500 for each d: the growth over a period by the largest eigenvalue of its map, and V at every knot."""
+    time, stiffness, damping, mass = periodic_schedules(500, d, generator)
+    found = [_Knots.of(*each).certificate() for each in zip(time, stiffness, damping, mass[:, 0], strict=True)]
+    alpha, margin = torch.tensor([each[:2] for each in found], dtype=torch.float64).unbind(-1)
+    maps = maps_between_knots(time, stiffness, damping, mass)
+    over_period = torch.eye(2 * d).double()
+    for each in maps.unbind(1):
+        over_period = each @ over_period
+    growth = torch.linalg.eigvals(over_period).abs().amax(-1)
+    certified = margin >= 0.0
+    assert growth[certified].max() <= 1.0 + 1e-9
+    assert 150 < certified.sum() < 350
+    assert (growth > 1.01).sum() > 20  # the search can find growth
+    alpha = alpha[:, None, None, None]
+    rows = [[stiffness + alpha * damping, alpha * mass], [alpha * mass, mass]]
+    function = torch.cat([torch.cat([each.expand_as(stiffness) for each in row], dim=-1) for row in rows], dim=-2)
+    factor = torch.linalg.cholesky(function[certified])
+    carried = torch.linalg.solve_triangular(
+        factor[:, :-1].mT, factor[:, 1:].mT @ maps[certified], upper=True, left=False
+    )
+    assert torch.linalg.matrix_norm(carried, ord=2).max() <= 1.0 + 1e-9
+
+
+def unstable(n=801, duration=8.0):
+    time = torch.linspace(0.0, duration, n).double()
+    stiffness = (525.0 + 475.0 * torch.sin(14.2 * time))[:, None, None]
+    return SimpleNamespace(
+        time=time, stiffness=stiffness, damping=damping_from_stiffness(stiffness, damping_ratio="paper")
+    )
+
+
+def test_the_unstable_example_is_flagged():
+    report = certify(unstable(), mass=10.0)
+    assert not report.certified
+    assert not report.stable
+    assert report.gain == pytest.approx(183.0, rel=0.02)  # of energy, 7000 in 8 s from rest and more from elsewhere
+    assert report.damping_ratio == pytest.approx(0.5 / math.sqrt(10.0), rel=1e-9)
+    assert report.max_speed < 1.0
+    for words in ("NOT GUARANTEED", "DOES NOT HOLD", "disturbances grow"):
+        assert words in str(report)
+    calm = certify(unstable(), mass=10.0, speed=0.5 * report.max_speed)
+    assert calm.certified
+    assert "margin" in str(calm)
+    assert "NOT" not in str(calm)
+
+
+def rotating(n=60, d=2, turns=1.0, mass=1.0, ratio=0.7):
+    """A schedule whose knots are unevenly spaced."""
+    time = torch.linspace(0.0, 1.5, n).double() ** 1.3
+    share = 0.5 + 0.5 * torch.sin(2.0 * time[:, None] + torch.arange(d))
+    stiffness = turned(50.0 * 20.0**share, turns * time)
+    return SimpleNamespace(time=time, stiffness=stiffness, damping=damping_from_stiffness(stiffness, mass, ratio))
+
+
+UNEVEN = torch.tensor([[2.0, 0.5], [0.5, 0.7]]).double()
+
+
+def margin_at(schedule, alpha, speed=1.0):
+    """Smallest eigenvalue of ``2 a K - K' - a D'``, where it is smallest, in numpy."""
+    step = (np.diff(schedule.time) / speed)[:, None, None]
+    stiffness, damping = schedule.stiffness.numpy(), schedule.damping.numpy()
+    rise = (np.diff(stiffness, axis=0) + alpha * np.diff(damping, axis=0)) / step
+    ends = np.stack([2.0 * alpha * stiffness[:-1] - rise, 2.0 * alpha * stiffness[1:] - rise])
+    return np.linalg.eigvalsh(ends)[..., 0].min()
+
+
+@pytest.mark.parametrize(
+    ("schedule", "mass"), [(rotating(d=1), 3.0), (rotating(mass=UNEVEN), UNEVEN), (unstable(), 10.0)]
+)
+def test_the_margin_is_the_best_over_all_alpha(schedule, mass):
+    report = certify(schedule, mass=mass)
+    matrix = mass * np.eye(schedule.stiffness.shape[-1]) if isinstance(mass, float) else mass.numpy()
+    largest = min(scipy.linalg.eigh(each, matrix, eigvals_only=True)[0] for each in schedule.damping.numpy())
+    grid = np.linspace(1e-6, 1.0, 2001) * largest
+    margins = [margin_at(schedule, alpha) for alpha in grid]
+    assert 0.0 < report.alpha <= largest * (1.0 + 1e-12)
+    assert report.margin == pytest.approx(margin_at(schedule, report.alpha), rel=1e-9, abs=1e-9)
+    assert max(margins) <= report.margin + 1e-9 * abs(report.margin)
+    resolution = abs(np.diff(margins)).max()
+    assert report.margin <= max(margins) + resolution
+    assert any(math.isclose(report.margin_time, each) for each in schedule.time)
+
+
+@pytest.mark.parametrize(
+    ("schedule", "mass"), [(rotating(d=1), 3.0), (rotating(mass=UNEVEN), UNEVEN), (unstable(), 10.0)]
+)
+@pytest.mark.parametrize("checked_at", [1.0, 2.5])
+def test_the_largest_speed_is_the_last_that_is_certified(schedule, mass, checked_at):
+    fastest = certify(schedule, mass=mass, speed=checked_at).max_speed
+    assert certify(schedule, mass=mass, speed=0.999 * fastest).margin >= 0.0
+    assert certify(schedule, mass=mass, speed=1.001 * fastest).margin < 0.0
+
+
+def test_constant_and_falling_gains_may_be_replayed_at_any_speed():
+    constant = rotating()
+    constant.stiffness, constant.damping = (
+        each[:1].expand(60, 2, 2) for each in (constant.stiffness, constant.damping)
+    )
+    report = certify(constant)
+    assert report.max_speed == math.inf
+    assert report.certified
+    assert report.gain == pytest.approx(1.0, rel=1e-9)
+    assert "any x" not in str(report)
+    falling = SimpleNamespace(time=constant.time, stiffness=rotating(d=1).stiffness.sort(dim=0, descending=True).values)
+    falling.damping = damping_from_stiffness(falling.stiffness)
+    assert certify(falling).max_speed == math.inf
+
+
+def test_without_damping_nothing_is_certified():
+    schedule = rotating()
+    schedule.damping = torch.zeros(60, 2, 2).double()
+    report = certify(schedule)
+    assert not report.certified
+    assert report.max_speed == 0.0
+    assert not report.stable
+
+
+def brute_gain(schedule, mass):
+    """Over all pairs of knots, by numpy's singular values."""
+    d, largest = len(mass), 1.0
+    inverse = np.linalg.inv(mass)
+    gains = list(zip(schedule.stiffness.numpy(), schedule.damping.numpy(), strict=True))
+    roots = [scipy.linalg.block_diag(scipy.linalg.sqrtm(stiffness), scipy.linalg.sqrtm(mass)) for stiffness, _ in gains]
+    steps = np.diff(schedule.time)
+    for first in range(len(gains)):
+        since = np.linalg.inv(roots[first])
+        for last in range(first, len(steps)):
+            stiffness, damping = gains[last]
+            free = np.block([[np.zeros((d, d)), np.eye(d)], [-inverse @ stiffness, -inverse @ damping]])
+            since = scipy.linalg.expm(free * steps[last]) @ since
+            largest = max(largest, np.linalg.norm(roots[last + 1] @ since, 2))
+    return largest
+
+
+def test_the_gain_is_the_largest_over_all_pairs_of_knots(monkeypatch):
+    schedule = rotating(n=30, turns=4.0, mass=UNEVEN, ratio=0.1)
+    expected = brute_gain(schedule, UNEVEN.numpy())
+    assert certify(schedule, mass=UNEVEN).gain == pytest.approx(expected, rel=1e-9)
+    assert expected > 1.1
+    monkeypatch.setattr(module, "_MAX_PAIRS", 10)  # of longer schedules, every so many knots
+    thinned = certify(schedule, mass=UNEVEN).gain
+    assert 0.9 * expected < thinned <= expected * (1.0 + 1e-9)
+
+
+def required(ratio):
+    """Damping ratio from which on every schedule of this stiffness ratio is stable."""
+    return (ratio**0.25 - ratio**-0.25) / 2.0
+
+
+@pytest.mark.parametrize("ratio", [2.0, 4.0, 10.0, 20.0, 50.0, 100.0])
+def test_one_function_falls_in_every_tick_at_the_required_damping(ratio, generator):
+    """``w^2 |y|^2 + 2 b w y'v + |v|^2`` with ``b = zeta / sqrt(1 + zeta^2)``, w the mean frequency: any k, any tick.
+
+    No axis is distinguished, so it holds for every turn of the axes too; it touches zero at both ends of the range.
+    """
+    zeta, frequency = required(ratio), 7.0
+    b = zeta / math.sqrt(1.0 + zeta**2)
+    function = torch.tensor([[frequency**2, b * frequency], [b * frequency, 1.0]]).double()
+    share, length = torch.rand(2, 20_000, dtype=torch.float64, generator=generator)
+    share[:2000] = share[:2000].round()  # the ends
+    stiffness = (frequency**2 * ratio ** (share - 0.5))[:, None, None]
+    tick = 1e-4 * 1e4 ** length[:, None, None] / frequency
+    factor = torch.linalg.cholesky(function)
+    for damping_ratio, falls in {zeta: True, 0.95 * zeta: False}.items():
+        damping = damping_from_stiffness(stiffness, 1.0, damping_ratio)
+        rate = admittance_rate(stiffness, damping, torch.eye(1).double())[..., :2, :2]
+        carried = factor.mT @ transition(rate * tick, 1.0) @ torch.linalg.inv(factor.mT)
+        assert (torch.linalg.matrix_norm(carried, ord=2).max() <= 1.0 + 1e-12) == falls
+
+
+def test_any_schedule_at_the_required_damping_dies_out(generator):
+    """300 schedules of stiffness that jumps and turns at every tick, from 0.1 to 100 ms."""
+    zeta, frequency = required(20.0), math.sqrt(50.0 * math.sqrt(20.0) / 3.0)
+    b = zeta / math.sqrt(1.0 + zeta**2)
+    draws = torch.rand(300, 400, 4, dtype=torch.float64, generator=generator)
+    share = torch.where(draws[:200, :, :2] < 0.5, 0.0, 1.0)
+    share = torch.cat([share, draws[200:, :, :2]])
+    stiffness = turned(50.0 * 20.0**share, 6.3 * draws[..., 2])
+    damping = damping_from_stiffness(stiffness, 3.0, zeta)
+    rate = admittance_rate(stiffness, damping, 3.0 * torch.eye(2).double())[..., :4, :4]
+    maps = transition(rate * (1e-4 * 1e3 ** draws[..., 3])[..., None, None], 1.0)
+    state = torch.randn(300, 4, 1, dtype=torch.float64, generator=generator)
+    before = torch.full((300,), math.inf).double()
+    for each in maps.unbind(1):
+        position, velocity = frequency * state[:, :2, 0], state[:, 2:, 0]
+        function = (position.square() + 2.0 * b * position * velocity + velocity.square()).sum(-1)
+        assert (function <= before * (1.0 + 1e-12)).all()
+        before, state = function, each @ state
+
+
+@pytest.mark.parametrize("mass", [1.0, 4.0, UNEVEN])
+def test_the_rule_is_the_required_damping_ratio(mass):
+    for ratio, holds in {1.001: True, 0.999: False}.items():
+        schedule = rotating(mass=mass)
+        matrix = mass if isinstance(mass, torch.Tensor) else mass * torch.eye(2).double()
+        values = [scipy.linalg.eigh(each, matrix, eigvals_only=True) for each in schedule.stiffness]
+        spread = np.max(values) / np.min(values)
+        schedule.damping = damping_from_stiffness(schedule.stiffness, mass, ratio * required(spread))
+        report = certify(schedule, mass=mass)
+        assert report.stiffness_ratio == pytest.approx(spread, rel=1e-9)
+        assert report.required_damping_ratio == pytest.approx(required(spread), rel=1e-9)
+        assert report.damping_ratio == pytest.approx(ratio * required(spread), rel=1e-9)
+        assert report.stable_at_any_schedule == holds
+    schedule.damping = schedule.damping * 2.0
+    assert certify(schedule, mass=mass).stable_at_any_schedule
+    schedule.damping[30] *= 1.01  # more, but not by one ratio
+    assert not certify(schedule, mass=mass).stable_at_any_schedule
+    assert required(33.97) == pytest.approx(1.0, abs=1e-4)
+
+
+@pytest.mark.parametrize(("ratio", "limit"), [(4.0, 0.226), (20.0, 0.532), (100.0, 0.941)])
+def test_below_the_sharp_limit_there_is_a_schedule_that_grows(ratio, limit):
+    """The stiffness that gains most radius per angle in the plane of position and velocity, chosen at every tick."""
+    lowest = 50.0
+    frequency, dt = math.sqrt(lowest * math.sqrt(ratio)), 1e-3
+    choices = lowest * ratio ** np.linspace(0.0, 1.0, 200)
+    for share, grows in {0.95: True, 1.05: False}.items():
+        zeta = share * limit
+        damping = 2.0 * zeta * np.sqrt(choices)
+        maps = [scipy.linalg.expm(dt * np.array([[0, 1], [-k, -d]])) for k, d in zip(choices, damping, strict=True)]
+        state, chosen = np.array([1.0, 0.0]), []
+        for _ in range(6000):
+            y, v = state[0], state[1] / frequency
+            pull = -(choices / frequency**2 * y + damping / frequency * v)
+            gained, turned_by = y * v + v * pull, v * v - y * pull
+            chosen.append(int(np.argmax(gained / turned_by)))
+            state = maps[chosen[-1]] @ state
+        stiffness = torch.tensor(choices[chosen])[:, None, None]
+        still = torch.zeros(6000, 1).double()
+        run = AdmittancePlant().simulate(
+            still, still, stiffness, damping_from_stiffness(stiffness, 1.0, zeta), dt=dt,
+            position0=torch.ones(1).double(),
+        )  # fmt: skip
+        radius = torch.hypot(run.position, run.velocity / frequency)[:, 0]
+        assert radius[-1].item() == pytest.approx(np.hypot(state[0], state[1] / frequency), rel=0.05)
+        later = radius[4000:].max() / radius[:2000].max()
+        assert later > 1.2 if grows else later < 0.8
+
+
+@pytest.mark.parametrize(
+    ("changes", "arguments", "words"),
+    [
+        ({}, {"speed": 0.0}, "speed == 0"),
+        ({}, {"speed": math.nan}, "speed == nan"),
+        ({}, {"mass": -1.0}, "mass == -1 kg"),
+        ({"stiffness": torch.zeros(60, 2, 2).double()}, {}, "stiffness must be positive definite"),
+    ],
+)
+def test_what_cannot_be_certified_is_refused(changes, arguments, words):
+    schedule = SimpleNamespace(**{**vars(rotating()), **changes})
+    with pytest.raises(ValueError, match=re.escape(words)):
+        certify(schedule, **arguments)
+
+
+def test_read_only_arrays_are_certified_and_left_alone():
+    schedule = rotating()
+    arrays = SimpleNamespace(**{name: value.numpy().copy() for name, value in vars(schedule).items()})
+    for array in vars(arrays).values():
+        array.setflags(write=False)
+    mine, theirs = certify(arrays, mass=UNEVEN.numpy()), certify(schedule, mass=UNEVEN)
+    assert (mine.margin, mine.gain, mine.max_speed) == (theirs.margin, theirs.gain, theirs.max_speed)
+
+
+def test_example_of_the_docstring():
+    assert doctest.testmod(module).failed == 0
