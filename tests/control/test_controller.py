@@ -115,6 +115,17 @@ def test_times_positions_and_groups_are_the_same_as_demonstrations(tunnel, contr
         DMPController().fit(X, y)
 
 
+def test_times_count_as_those_of_the_demonstrations(tunnel, controller):
+    query = np.linspace(0.0, 10.0, 11)[:, None]
+    later = Demonstrations([time + 1.7e9 for time in tunnel.times], tunnel.positions, names=tunnel.names, units="m")
+    shifted = DMPController().fit(later)
+    np.testing.assert_allclose(shifted.predict(query + 1.7e9), controller.predict(query), atol=1e-5)
+    np.testing.assert_allclose(shifted.predict_stiffness(query + 1.7e9), controller.predict_stiffness(query), rtol=1e-2)
+    assert shifted.schedule(10.0).time[0] == 0.0
+    apart = Demonstrations([time + 20.0 * k for k, time in enumerate(tunnel.times)], tunnel.positions)
+    np.testing.assert_allclose(DMPController().fit(apart).predict(query), controller.predict(query), atol=1e-9)
+
+
 @pytest.mark.parametrize("variant", ["unequal", "dropped", "jitter"])
 def test_unaligned_demonstrations_give_about_the_same(variant, controller):
     other = DMPController().fit(make_tunnel_demonstrations(random_state=0, variant=variant))
@@ -252,5 +263,5 @@ def test_recorded_skills_are_learned(name, recordings):
     aligned = recorded if recorded.is_aligned else recorded.align("phase", n=200)
     share = (aligned.times[0] - aligned.times[0][0]) / np.ptp(aligned.times[0])
     mean = aligned.to_array().mean(axis=0)
-    error = fitted.predict(share[:, None] * fitted.duration_) - mean
+    error = fitted.predict(fitted.start_time_ + share[:, None] * fitted.duration_) - mean
     assert np.sqrt(np.mean(error**2)) < 0.05 * np.ptp(mean, axis=0).max()

@@ -1,19 +1,27 @@
 """The controller as an estimator: demonstrations in, a stiffness schedule out (Section V)."""
 
-from typing import Literal, Self, get_args
+from typing import Literal, Self
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, clone
-from sklearn.utils.validation import check_array, check_is_fitted, has_fit_parameter
+from sklearn.utils.validation import check_is_fitted, has_fit_parameter
 
-from torch_pbd.control.damping import damping_from_stiffness
+from torch_pbd.control.arguments import (
+    Goals,
+    PhaseInput,
+    Variability,
+    as_demonstrations,
+    as_force,
+    as_times,
+    check_parameters,
+    count_ticks,
+)
 from torch_pbd.control.dmp import DMP, Gate
 from torch_pbd.control.impedance import Gains, Impedance, OnUnknown
-from torch_pbd.control.matrices import check_finite, check_positive
 from torch_pbd.control.plant import AdmittancePlant
-from torch_pbd.control.recorded import as_demonstrations, provenance
+from torch_pbd.control.provenance import provenance
 from torch_pbd.control.reproduction import Reproduction
 from torch_pbd.control.rollout import Rollout
 from torch_pbd.control.schedule import Schedule
@@ -24,8 +32,6 @@ from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.estimators.cholesky import CholeskyCovRegressor
 
 Floats = NDArray[np.float64]
-PhaseInput = Literal["time", "log_s", "s"]
-Variability = Literal["position", "forcing"]
 
 _RESOLUTION = 1e-5  # of the extent of a movement: smaller standard deviations count as none
 
@@ -82,6 +88,8 @@ class DMPController(BaseEstimator):
         With its bounds fixed to this movement.
     duration_ : float
         Of the movement: the median of the demonstrations'.
+    start_time_ : float
+        Time at which all demonstrations start; 0, the start of the movement, where they differ.
     start_, goal_ : ndarray of shape (d,)
     cutoff_ : float or None
     noise_scale_ : ndarray of shape (d,)
@@ -113,7 +121,7 @@ class DMPController(BaseEstimator):
         gate: Gate = "time",
         phase_input: PhaseInput = "time",
         variability: Variability = "position",
-        goal: Literal["common", "each"] = "common",
+        goal: Goals = "common",
         cutoff: float | Literal["auto"] | None = "auto",
         n_steps: int = 100,
         stiffness_law: StiffnessLaw | None = None,
@@ -160,7 +168,7 @@ class DMPController(BaseEstimator):
         ValueError
             If there are fewer than two demonstrations, too few samples in one, or a parameter cannot be used.
         """
-        self._check_parameters()
+        check_parameters(self)
         demonstrations = X if isinstance(X, Demonstrations) else as_demonstrations(X, y, groups)
         if len(demonstrations) < 2:
             raise ValueError(
@@ -176,6 +184,8 @@ class DMPController(BaseEstimator):
         self.cutoff_ = automatic_cutoff(demonstrations) if self.cutoff == "auto" else self.cutoff
         movements = smooth(demonstrations, self.cutoff_, self.n_steps)
         self.duration_ = float(movements.time[-1])
+        starts = {float(time[0]) for time in demonstrations.times}
+        self.start_time_ = starts.pop() if len(starts) == 1 else 0.0
         self.dmp_ = DMP(self.alpha, self.beta, self.gamma, self.tau, duration=self.duration_, gate=self.gate)
         self.reproduction_ = Reproduction.learn(self.dmp_, movements, self.phase_input, own_goals=self.goal == "each")
         self.start_, self.goal_ = self.reproduction_.start, self.reproduction_.goal
@@ -193,16 +203,19 @@ class DMPController(BaseEstimator):
         return self
 
     def predict(self, X: ArrayLike) -> Floats:
-        """Reproduced position (n, d) at times X (n, 1): from 0; after the end it goes to the goal and stays."""
-        return self.reproduction_.motion(self._times(X))[0]
+        """Reproduced position (n, d) at times X (n, 1), which count as those of the demonstrations do.
+
+        From ``start_time_``; the movement is over ``duration_`` later, and then stays at the goal.
+        """
+        return self.reproduction_.motion(self._movement_time(X))[0]
 
     def predict_stiffness(self, X: ArrayLike) -> Floats:
         """Stiffness (n, d, d) in N/m (force per unit of position) at times X (n, 1)."""
-        return self._gains_at(self._times(X)).stiffness
+        return self._gains_at(self._movement_time(X)).stiffness
 
     def predict_damping(self, X: ArrayLike) -> Floats:
         """Damping (n, d, d) in N s/m at times X (n, 1)."""
-        return self._gains_at(self._times(X)).damping
+        return self._gains_at(self._movement_time(X)).damping
 
     def schedule(self, rate: float = 1000.0, *, settle: float = 0.0) -> Schedule:
         """Motion and gains at ``rate`` per unit of time, for a robot.
@@ -217,10 +230,10 @@ class DMPController(BaseEstimator):
         Returns
         -------
         Schedule
-            From 0 to ``duration_ + settle``.
+            From 0, the start of the movement, to ``duration_ + settle``.
         """
         check_is_fitted(self)
-        time = np.arange(self._n_ticks(rate, settle)) / rate
+        time = np.arange(count_ticks(self.duration_, rate, settle)) / rate
         position, velocity = self.reproduction_.motion(time)
         gains = self._gains_at(time)
         return Schedule(
@@ -264,12 +277,7 @@ class DMPController(BaseEstimator):
             If the force has not one row for each tick.
         """
         schedule = self.schedule(rate)
-        push = np.zeros_like(schedule.position) if force is None else np.array(force, dtype=np.float64)
-        if push.shape != schedule.position.shape:
-            raise ValueError(
-                f"force has shape {push.shape}, must have shape {schedule.position.shape}: one row in N for each tick "
-                f"of schedule(rate={rate:g})."
-            )
+        push = as_force(force, schedule.position.shape, rate)
         robot = AdmittancePlant(self.mass) if plant is None else plant
         parts = (schedule.position, schedule.velocity, schedule.stiffness, schedule.damping, push)
         return robot.simulate(*map(_tensor, parts), dt=1.0 / rate).numpy()
@@ -297,28 +305,8 @@ class DMPController(BaseEstimator):
             How fast movement time passes at each tick; it should change smoothly.
         """
         check_is_fitted(self)
-        n_ticks = self._n_ticks(rate, settle) if speed is None else len(np.asarray(speed))
+        n_ticks = count_ticks(self.duration_, rate, settle) if speed is None else len(np.asarray(speed))
         return self.reproduction_.roll_out(n_ticks, 1.0 / rate, goal=goal, start=start, speed=speed)
-
-    def _check_parameters(self) -> None:
-        choices = {
-            "gate": Gate,
-            "phase_input": PhaseInput,
-            "variability": Variability,
-            "on_unknown": OnUnknown,
-            "goal": Literal["common", "each"],
-        }
-        for name, kind in choices.items():
-            if getattr(self, name) not in get_args(kind):
-                listed = ", ".join(map(repr, get_args(kind)))
-                raise ValueError(f"{name} == {getattr(self, name)!r}, must be one of {listed}.")
-        if isinstance(self.n_steps, bool) or not isinstance(self.n_steps, int | np.integer) or self.n_steps < 5:
-            raise ValueError(f"n_steps == {self.n_steps!r}, must be an integer of at least 5.")
-        if self.cutoff not in ("auto", None):
-            check_positive("cutoff", self.cutoff)
-        # Before any work: what DMP and damping say of theirs.
-        DMP(self.alpha, self.beta, self.gamma, self.tau, gate=self.gate)
-        damping_from_stiffness(np.eye(1), self.mass, self.damping_ratio)
 
     def _fit_covariance(self, inputs: Floats, varying: Floats) -> None:
         regressor = CholeskyCovRegressor() if self.covariance is None else self.covariance
@@ -329,7 +317,7 @@ class DMPController(BaseEstimator):
         self.covariance_.fit(np.tile(inputs, (n_demos, 1)), varying.reshape(-1, n_outputs), **told)
 
     def phase(self, time: ArrayLike) -> Floats:
-        """Inputs (n, 1) of ``covariance_`` at times (n,): what ``phase_input`` says."""
+        """Inputs (n, 1) of ``covariance_`` at movement times (n,), which start at 0: what ``phase_input`` says."""
         check_is_fitted(self)
         return self.reproduction_.phase(np.asarray(time, dtype=np.float64))
 
@@ -337,27 +325,14 @@ class DMPController(BaseEstimator):
         """What ``variability`` is of, (K, n, d), in smoothed movements of the same task."""
         return movements.position if self.variability == "position" else self.reproduction_.forcing_of(movements)
 
+    def _movement_time(self, X: ArrayLike) -> Floats:
+        check_is_fitted(self)
+        return as_times(X) - self.start_time_
+
     def _gains_at(self, time: Floats) -> Gains:
         inputs = self.phase(time)
         covariance, unknown = self.covariance_.predict_cov(inputs), self.covariance_.predict_uncertainty(inputs).type1
         return self._impedance(covariance, unknown, time)
-
-    def _times(self, X: ArrayLike) -> Floats:
-        check_is_fitted(self)
-        times = check_array(X, dtype=np.float64, ensure_min_samples=0)
-        if times.shape[1] != 1:
-            raise ValueError(f"X has {times.shape[1]} features, but DMPController is expecting 1 feature: the time.")
-        return times[:, 0]
-
-    def _n_ticks(self, rate: float, settle: float) -> int:
-        check_positive("rate", rate)
-        check_finite("settle", settle)
-        if settle < 0.0:
-            raise ValueError(f"settle == {settle:g}, must not be negative.")
-        n_ticks = int(np.floor((self.duration_ + settle) * rate * (1.0 + 1e-12))) + 1
-        if n_ticks < 2:
-            raise ValueError(f"rate == {rate:g} gives {n_ticks} tick in {self.duration_:g}, must give at least 2.")
-        return n_ticks
 
 
 def _tensor(values: ArrayLike) -> torch.Tensor:

@@ -13,7 +13,8 @@ from torch_pbd.control.reproduction import Phase, Reproduction
 Arrays = dict[str, NDArray[np.float64]]
 
 _PLAIN = (
-    "names_", "frame_", "units_", "time_unit_", "n_demos_", "n_outputs_", "cutoff_", "duration_", "reproduction_error_",
+    "names_", "frame_", "units_", "time_unit_", "n_demos_", "n_outputs_", "cutoff_", "duration_", "start_time_",
+    "reproduction_error_",
 )  # fmt: skip
 _ARRAYS = ("noise_scale_", "noise_share_")
 _MOTION = ("start", "velocity", "goal", "forcing")

@@ -129,6 +129,6 @@ def _path_error(controller: DMPController, demonstrations: Demonstrations) -> fl
     """Root mean square distance of the reproduction from the mean of the demonstrations, by phase."""
     aligned = demonstrations if demonstrations.is_aligned else demonstrations.align("phase")
     grid = aligned.times[0]
-    time = (grid - grid[0]) / (grid[-1] - grid[0]) * controller.duration_
+    time = controller.start_time_ + (grid - grid[0]) / (grid[-1] - grid[0]) * controller.duration_
     error = controller.predict(time[:, np.newaxis]) - aligned.to_array().mean(axis=0)
     return float(np.sqrt((error**2).sum(axis=1).mean()))

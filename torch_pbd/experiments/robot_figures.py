@@ -76,14 +76,14 @@ def task_figure(
         plot_demonstrations(demonstrations, [0], ax)
     else:
         plot_demonstrations(demonstrations, [0, 1], ax)
-    time = np.linspace(0.0, controller.duration_, 400)[:, np.newaxis]
+    time = controller.start_time_ + np.linspace(0.0, controller.duration_, 400)[:, np.newaxis]
     path = controller.predict(time)
     across, up = (time[:, 0], path[:, 0]) if path.shape[1] == 1 else path[:, :2].T
     ax.plot(across, up, color=MODEL, lw=1.8, label="reproduction", zorder=4)
     if controller.variability == "position" and path.shape[1] > 1:
         some = np.linspace(0.0, controller.duration_, _N_ELLIPSES)
         covariance = controller.covariance_.predict_cov(controller.phase(some))[:, :2, :2]
-        centres = controller.predict(some[:, np.newaxis])[:, :2]
+        centres = controller.predict(controller.start_time_ + some[:, np.newaxis])[:, :2]
         plot_covariance_ellipses(centres, covariance, ax, color=EMPIRICAL, label="inferred: 2 sd")
     ax.set_title(name, fontsize=10)
     if not in_tunnel and path.shape[1] > 1:

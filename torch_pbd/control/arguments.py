@@ -1,0 +1,99 @@
+"""What the arguments of a controller must be."""
+
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sklearn.utils.validation import check_array, check_X_y
+
+from torch_pbd.control.damping import damping_from_stiffness
+from torch_pbd.control.dmp import DMP, Gate
+from torch_pbd.control.impedance import OnUnknown
+from torch_pbd.control.matrices import check_finite, check_positive
+from torch_pbd.data import Demonstrations
+
+Floats = NDArray[np.float64]
+PhaseInput = Literal["time", "log_s", "s"]
+Variability = Literal["position", "forcing"]
+Goals = Literal["common", "each"]
+
+_CHOICES = {"gate": Gate, "phase_input": PhaseInput, "variability": Variability, "on_unknown": OnUnknown, "goal": Goals}
+
+
+def check_parameters(controller: Any) -> None:
+    """Check the parameters of a DMPController, before any work.
+
+    Raises
+    ------
+    ValueError
+        If one cannot be used.
+    """
+    for name, kind in _CHOICES.items():
+        if getattr(controller, name) not in get_args(kind):
+            listed = ", ".join(map(repr, get_args(kind)))
+            raise ValueError(f"{name} == {getattr(controller, name)!r}, must be one of {listed}.")
+    n_steps = controller.n_steps
+    if isinstance(n_steps, bool) or not isinstance(n_steps, int | np.integer) or n_steps < 5:
+        raise ValueError(f"n_steps == {n_steps!r}, must be an integer of at least 5.")
+    if controller.cutoff not in ("auto", None):
+        check_positive("cutoff", controller.cutoff)
+    # What the primitive and the damping say of theirs.
+    DMP(controller.alpha, controller.beta, controller.gamma, controller.tau)
+    damping_from_stiffness(np.eye(1), controller.mass, controller.damping_ratio)
+
+
+def as_demonstrations(X: ArrayLike, y: ArrayLike | None, groups: ArrayLike | None) -> Demonstrations:
+    """Demonstrations of samples X (n, 1), y (n, d) whose groups (n,) tell them apart.
+
+    Raises
+    ------
+    ValueError
+        If shapes disagree, or times do not increase within a demonstration.
+    """
+    if y is None:
+        raise ValueError("y is None: give Demonstrations, or times X (n, 1), positions y (n, d) and groups (n,).")
+    times, positions = check_X_y(X, y, dtype=np.float64, multi_output=True, y_numeric=True)
+    if times.shape[1] != 1:
+        raise ValueError(f"X has {times.shape[1]} columns, must have 1: the time of each sample.")
+    labels = np.zeros(len(times), dtype=int) if groups is None else np.asarray(groups)
+    if labels.shape != (len(times),):
+        raise ValueError(f"groups has shape {labels.shape}, must have shape ({len(times)},): one for each row of X.")
+    if groups is None and (np.diff(times[:, 0]) <= 0.0).any():
+        row = int(np.argmax(np.diff(times[:, 0]) <= 0.0)) + 1
+        raise ValueError(
+            f"X does not increase at row {row}: if another demonstration starts there, give groups, the number of the "
+            "demonstration of each row."
+        )
+    members = [labels == label for label in dict.fromkeys(labels.tolist())]
+    return Demonstrations([times[m, 0] for m in members], [positions[m] for m in members])
+
+
+def as_times(X: ArrayLike) -> Floats:
+    """Times (n,) of a column X (n, 1), which may be empty."""
+    times = check_array(X, dtype=np.float64, ensure_min_samples=0)
+    if times.shape[1] != 1:
+        raise ValueError(f"X has {times.shape[1]} features, but DMPController is expecting 1 feature: the time.")
+    return np.asarray(times[:, 0])
+
+
+def as_force(force: ArrayLike | None, shape: tuple[int, ...], rate: float) -> Floats:
+    """External force of that shape; None is none."""
+    push = np.zeros(shape) if force is None else np.array(force, dtype=np.float64)
+    if push.shape != shape:
+        raise ValueError(
+            f"force has shape {push.shape}, must have shape {shape}: one row in N for each tick of "
+            f"schedule(rate={rate:g})."
+        )
+    return push
+
+
+def count_ticks(duration: float, rate: float, settle: float) -> int:
+    """Ticks of a schedule that ends ``settle`` after the movement."""
+    check_positive("rate", rate)
+    check_finite("settle", settle)
+    if settle < 0.0:
+        raise ValueError(f"settle == {settle:g}, must not be negative.")
+    n_ticks = int(np.floor((duration + settle) * rate * (1.0 + 1e-12))) + 1
+    if n_ticks < 2:
+        raise ValueError(f"rate == {rate:g} gives {n_ticks} tick in {duration:g}, must give at least 2.")
+    return n_ticks
