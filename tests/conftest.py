@@ -9,7 +9,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small: th
 from jaxtyping import install_import_hook
 
 TORCH_CONTROL = [
-    "damping", "dmp", "environment", "matrices", "passivity", "plant", "sensor", "stability", "stiffness",
+    "coupling", "damping", "dmp", "environment", "matrices", "passivity", "plant", "sensor", "stability", "stiffness",
     "rollout", "position_loop", "ticks", "transitions",
 ]  # fmt: skip
 TORCH_FLOORS = ["linalg", "kernels", "optim", "gp", "models", *(f"control.{part}" for part in TORCH_CONTROL)]

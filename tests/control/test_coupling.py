@@ -53,8 +53,8 @@ def test_a_softer_environment_is_stable_and_a_stiffer_is_not(mass, ratio, loop, 
     stiffness, damping = gains([50.0], mass=mass, ratio=ratio)
     limit = stiffest_environment(stiffness, damping, mass * torch.eye(1).double(), loop, cutoff, DT)
     first, last = amplitudes(stiffness[0], damping[0], mass, loop, cutoff, [0.9 * limit, 1.1 * limit])
-    assert last[0] < 0.5 * first[0]
-    assert last[1] > 2.0 * first[1]
+    assert last[0] < 0.8 * first[0]
+    assert last[1] > 1.25 * first[1]
 
 
 @pytest.mark.parametrize(

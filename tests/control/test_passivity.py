@@ -56,7 +56,7 @@ def schedules(n_schedules, n_ticks, generator):
     return stiffness, ratio * damping_from_stiffness(stiffness, MASS)
 
 
-def random_run(stiffness_filter, dt, generator, *, moving=True, pushed=True, n_schedules=250, n_ticks=120):
+def random_run(stiffness_filter, dt, generator, *, moving=True, pushed=True, n_schedules=250, n_ticks=80):
     """A batch of runs, and the desired velocity (n, T, 2) it was given."""
     stiffness, damping = schedules(n_schedules, n_ticks, generator)
     shape = stiffness.shape[:-1]
@@ -84,7 +84,7 @@ def test_without_a_filter_the_papers_damping_feeds_a_heavy_robot():
 
 
 @pytest.mark.parametrize("stiffness_filter", [RateLimit(), EnergyTank()], ids=["rate limit", "tank"])
-@pytest.mark.parametrize("dt", [8e-3, pytest.param(1e-3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dt", [1.6e-2, pytest.param(1e-3, marks=pytest.mark.slow)])
 def test_with_either_filter_the_heavy_robot_comes_to_rest(stiffness_filter, dt):
     given = unstable(dt)
     unfiltered = energy(AdmittancePlant(10.0).simulate(**given), 10.0 * torch.eye(1).double())
@@ -123,7 +123,7 @@ def test_half_of_what_is_dissipated_settles_and_all_of_it_need_not():
     stored = {}
     for efficiency in (0.5, 0.9999):
         tank = EnergyTank(energy=0.1, efficiency=efficiency)
-        run = AdmittancePlant(10.0, stiffness_filter=tank).simulate(**unstable(2e-2, duration=16.0))
+        run = AdmittancePlant(10.0, stiffness_filter=tank).simulate(**unstable(4e-2, duration=16.0))
         stored[efficiency] = (energy(run, mass)[-1] / energy(run, mass)[0]).item()
     assert stored[0.5] < 1e-3
     assert stored[0.9999] > 0.9
@@ -137,7 +137,7 @@ def function_of(run, alpha):
 @pytest.mark.parametrize(("dt", "share_of_limit"), [(1e-3, None), (1e-2, 0.95), (5e-2, None), (0.1, 0.95)])
 def test_the_rate_limits_function_never_grows_without_a_force(dt, share_of_limit, generator):
     seed = generator.get_state()
-    damping = schedules(250, 120, generator)[1]
+    damping = schedules(250, 80, generator)[1]
     root = torch.linalg.inv(torch.linalg.cholesky(MASS))
     limit = float(torch.linalg.eigvalsh(root @ damping @ root.mT).min())
     alpha = None if share_of_limit is None else share_of_limit * limit

@@ -285,7 +285,7 @@ def test_the_rule_is_the_required_damping_ratio(mass):
     assert not certify(schedule, mass=mass).stable_at_any_schedule
 
 
-@pytest.mark.parametrize(("ratio", "limit"), [(4.0, 0.226), (20.0, 0.532), (100.0, 0.941)])
+@pytest.mark.parametrize(("ratio", "limit"), [(4.0, 0.226), (20.0, 0.532)])
 def test_below_the_sharp_limit_there_is_a_schedule_that_grows(ratio, limit):
     """The stiffness that gains most radius per angle in the plane of position and velocity, chosen at every tick."""
     lowest = 50.0
