@@ -10,7 +10,6 @@ import numpy as np
 import torch
 
 from torch_pbd.control import DMPController, StiffnessLaw
-from torch_pbd.control.smoothing import smooth
 from torch_pbd.data import make_tunnel_demonstrations
 from torch_pbd.experiments.run_folder import format_table
 
@@ -19,7 +18,7 @@ RATE = 50.0  # Hz
 
 def errors(controller, truth, n_steps):
     """Mean |dK|, mean |d log sd| and max |dK/dt| across the tunnel."""
-    movements = smooth(truth, controller.cutoff_, n_steps)
+    movements = controller.smooth(truth, n_steps)
     values = controller.varying(movements)
     residual = values - values.mean(axis=0)
     covariance = np.einsum("kti,ktj->tij", residual, residual) / (len(residual) - 1)

@@ -6,7 +6,7 @@ import torch
 from sklearn.base import clone
 
 from torch_pbd import CholeskyCovRegressor, Demonstrations, DMPController, GMMBaseline
-from torch_pbd.control import AdmittancePlant, Schedule, StiffnessLaw
+from torch_pbd.control import AdmittancePlant, ForceSensor, Schedule, StiffnessLaw
 from torch_pbd.data import make_tunnel_demonstrations
 from torch_pbd.exceptions import DataRankWarning, UnimodalityWarning
 
@@ -168,8 +168,31 @@ def test_two_fits_are_equal_and_leave_the_callers_state_alone(tunnel, controller
     assert again.schedule(20.0) == controller.schedule(20.0)
 
 
+def test_millimetres_and_milliseconds_plan_and_move_as_metres_and_seconds(tunnel, controller):
+    milli = [1e3 * position for position in tunnel.positions]
+    other = DMPController().fit(Demonstrations([1e3 * t for t in tunnel.times], milli, units="mm", time_unit="ms"))
+    assert (other.schedule(50.0).units, other.schedule(50.0).duration) == ("m", pytest.approx(10.0))
+    force = np.zeros((501, 2))
+    force[80:120, 0] = 5.0
+    mine, theirs = (fitted.simulate(force=force, rate=50.0) for fitted in (other, controller))
+    np.testing.assert_allclose(mine.position, theirs.position, rtol=1e-4, atol=1e-5)
+    X = np.linspace(0.0, 10.0, 21)[:, None]
+    np.testing.assert_allclose(other.predict(1e3 * X), 1e3 * controller.predict(X), rtol=1e-5, atol=1e-3)
+    np.testing.assert_allclose(other.predict_stiffness(1e3 * X), controller.predict_stiffness(X), rtol=1e-3)
+
+
+def test_phases_need_a_duration(tunnel, controller):
+    phases = Demonstrations([time / 10.0 for time in tunnel.times], tunnel.positions, time_unit="1")
+    with pytest.warns(UserWarning, match=r"in '1', not in s: the movement is taken to last 1 s\. Give duration"):
+        assert DMPController().fit(phases).schedule(100.0).duration == 1.0
+    timed = DMPController(duration=10.0, cutoff=4.0).fit(phases)
+    plan = timed.schedule(50.0)
+    np.testing.assert_allclose(plan.velocity, controller.schedule(50.0).velocity, atol=1e-6)
+    np.testing.assert_allclose(timed.predict([[0.5]]), controller.predict([[5.0]]), atol=1e-7)
+
+
 @pytest.mark.parametrize("factor", [1e3, 1e-3])
-def test_millimetres_give_the_stiffness_of_metres(tunnel, controller, factor):
+def test_other_units_without_a_name_give_the_same_stiffness(tunnel, controller, factor):
     scaled = Demonstrations(tunnel.times, [factor * position for position in tunnel.positions])
     other = DMPController().fit(scaled)
     X = np.linspace(0.0, 10.0, 21)[:, None]
@@ -198,6 +221,15 @@ def test_goal_and_speed_change_at_run_time_without_overshoot(controller):
     slow = np.full(len(time), 0.5)
     path = controller.reproduce(200.0, speed=slow)[1]
     np.testing.assert_allclose(path[::2], plain[: len(path[::2])], atol=1e-6)  # forcing is linear between ticks
+
+
+def test_a_plant_of_another_mass_is_told_of_and_a_noisy_sensor_is_seeded(controller):
+    with pytest.warns(UserWarning, match=r"mass is 2\.0, but damping_ratio was met for mass=1 kg"):
+        controller.simulate(AdmittancePlant(2.0), rate=50.0)
+    noisy = AdmittancePlant(sensor=ForceSensor.jr3())
+    runs = [controller.simulate(noisy, rate=50.0, random_state=seed).position for seed in (0, 0, 1)]
+    np.testing.assert_array_equal(runs[0], runs[1])
+    assert np.abs(runs[0] - runs[2]).max() > 0.0
 
 
 def test_simulation_follows_the_schedule_and_takes_any_plant(controller):
@@ -255,7 +287,7 @@ def test_recorded_skills_are_learned(name, recordings):
     from torch_pbd import load_demonstrations
 
     recorded = load_demonstrations(recordings / f"{name}.npz")
-    fitted = DMPController().fit(recorded)
+    fitted = DMPController(duration=None if recorded.time_unit == "s" else 2.0).fit(recorded)
     schedule = fitted.schedule(200.0 / fitted.duration_)
     eigenvalues = np.linalg.eigvalsh(schedule.stiffness)
     assert 50.0 - 1e-6 <= eigenvalues.min() < 200.0
@@ -263,5 +295,6 @@ def test_recorded_skills_are_learned(name, recordings):
     aligned = recorded if recorded.is_aligned else recorded.align("phase", n=200)
     share = (aligned.times[0] - aligned.times[0][0]) / np.ptp(aligned.times[0])
     mean = aligned.to_array().mean(axis=0)
-    error = fitted.predict(fitted.start_time_ + share[:, None] * fitted.duration_) - mean
+    own = fitted.start_time_ + share * fitted.duration_ / fitted.time_scale_
+    error = fitted.predict(own[:, None]) - mean
     assert np.sqrt(np.mean(error**2)) < 0.05 * np.ptp(mean, axis=0).max()

@@ -2,8 +2,15 @@ import numpy as np
 import pytest
 from scipy.signal import butter, filtfilt
 
-from torch_pbd.control.smoothing import automatic_cutoff, noise_like, smooth, variance_share
+from torch_pbd.control import smoothing
+from torch_pbd.control.smoothing import automatic_cutoff, noise_like, variance_share
 from torch_pbd.data import Demonstrations, make_tunnel_demonstrations
+
+
+def smooth(demonstrations, cutoff, n_steps):
+    """Stretched to their own median duration."""
+    duration = float(np.median([time[-1] - time[0] for time in demonstrations.times]))
+    return smoothing.smooth(demonstrations, cutoff, n_steps, duration)
 
 
 def two(time, position, **labels):
@@ -96,9 +103,18 @@ def test_the_shortest_demonstrations_have_an_acceleration(n_samples):
 
 
 def test_the_automatic_cutoff_knows_seconds_from_phases():
-    time, values = np.linspace(0.0, 10.0, 50), np.zeros((2, 50, 1))
-    assert automatic_cutoff(Demonstrations(time, values)) == 4.0
-    assert automatic_cutoff(Demonstrations(time / 10.0, values, time_unit="1")) == 40.0
+    assert automatic_cutoff(10.0, knows_seconds=True) == 4.0
+    assert automatic_cutoff(2.0, knows_seconds=False) == 20.0
+
+
+def test_a_duration_slows_movement_and_cutoff_together(rng):
+    time = np.arange(0.0, 1.0, 0.002)
+    recorded = two(time, rng.normal(size=len(time)).cumsum())
+    fast, slow = (smoothing.smooth(recorded, cutoff, 50, lasting) for cutoff, lasting in [(8.0, 1.0), (2.0, 4.0)])
+    np.testing.assert_allclose(slow.time, 4.0 * fast.time / fast.time[-1])
+    ratio = fast.time[-1] / 4.0
+    np.testing.assert_allclose(slow.velocity, ratio * fast.velocity, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(slow.acceleration, ratio**2 * fast.acceleration, rtol=1e-6, atol=1e-6)
 
 
 def test_noise_is_told_from_movement():

@@ -21,7 +21,7 @@ def test_pushes_are_two_pulses_of_the_peak_and_0_8_s():
 def test_the_table_has_what_the_run_shows():
     recorded = make_tunnel_demonstrations(random_state=0, rate=50.0)
     run = run_controller(DMPController(), recorded, rate=200.0)
-    row = push_row("mine", run, recorded)
+    row = push_row("mine", run)
     deviation = np.abs(run.rollout.deviation[:, 0])
     assert row["early [mm]"] == pytest.approx(1e3 * deviation[:1000].max())
     assert row["ratio"] == pytest.approx(row["early [mm]"] / row["late [mm]"])

@@ -37,6 +37,8 @@ def check_parameters(controller: Any) -> None:
         raise ValueError(f"n_steps == {n_steps!r}, must be an integer of at least 5.")
     if controller.cutoff not in ("auto", None):
         check_positive("cutoff", controller.cutoff)
+    if controller.duration is not None:
+        check_positive("duration", controller.duration, "s")
     # What the primitive and the damping say of theirs.
     DMP(controller.alpha, controller.beta, controller.gamma, controller.tau)
     damping_from_stiffness(np.eye(1), controller.mass, controller.damping_ratio)

@@ -1,11 +1,13 @@
 """The controller as an estimator: demonstrations in, a stiffness schedule out (Section V)."""
 
-from typing import Literal, Self
+import warnings
+from typing import Any, Literal, Self
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator, clone
+from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted, has_fit_parameter
 
 from torch_pbd.control.arguments import (
@@ -27,6 +29,7 @@ from torch_pbd.control.rollout import Rollout
 from torch_pbd.control.schedule import Schedule
 from torch_pbd.control.smoothing import Movements, automatic_cutoff, noise_like, smooth, variance_share
 from torch_pbd.control.stiffness import StiffnessLaw
+from torch_pbd.control.units import common_start, duration_of, in_metres, in_seconds, robot_unit
 from torch_pbd.data import Demonstrations, check_unimodal
 from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.estimators.cholesky import CholeskyCovRegressor
@@ -63,8 +66,10 @@ class DMPController(BaseEstimator):
     goal : {"common", "each"}, default="common"
         Goal in eq. (18): the mean end of all demonstrations, or that of each.
     cutoff : float, "auto" or None, default="auto"
-        Of the smoothing before derivatives are taken, in Hz (1 / unit of time): amplitudes are halved there. "auto"
-        is 4 Hz, or 40 cycles a movement where times are not in seconds; None does not smooth.
+        Of the smoothing before derivatives are taken, in Hz: amplitudes are halved there. "auto" is 4 Hz, or 40
+        cycles a movement where times are not in units of time; None does not smooth.
+    duration : float, default=None
+        Of the movement, in s; None is the median of the demonstrations. Needed where their times are phases.
     n_steps : int, default=100
         Points of a movement at which forcing and variability are learned.
     stiffness_law : StiffnessLaw, default=None
@@ -87,9 +92,9 @@ class DMPController(BaseEstimator):
     law_ : StiffnessLaw
         With its bounds fixed to this movement.
     duration_ : float
-        Of the movement: the median of the demonstrations'.
-    start_time_ : float
-        Time at which all demonstrations start; 0, the start of the movement, where they differ.
+        Of the movement, in s.
+    start_time_, time_scale_ : float
+        Time at which all demonstrations start, 0 where they differ; seconds of movement in one unit of their time.
     start_, goal_ : ndarray of shape (d,)
     cutoff_ : float or None
     noise_scale_ : ndarray of shape (d,)
@@ -123,6 +128,7 @@ class DMPController(BaseEstimator):
         variability: Variability = "position",
         goal: Goals = "common",
         cutoff: float | Literal["auto"] | None = "auto",
+        duration: float | None = None,
         n_steps: int = 100,
         stiffness_law: StiffnessLaw | None = None,
         mass: float = 1.0,
@@ -139,6 +145,7 @@ class DMPController(BaseEstimator):
         self.variability = variability
         self.goal = goal
         self.cutoff = cutoff
+        self.duration = duration
         self.n_steps = n_steps
         self.stiffness_law = stiffness_law
         self.mass = mass
@@ -177,15 +184,14 @@ class DMPController(BaseEstimator):
             )
         check_unimodal(demonstrations)
         self.names_, self.frame_ = demonstrations.names, demonstrations.frame
-        units = demonstrations.units
-        self.units_ = units[0] if units is not None and len(set(units)) == 1 else None
-        self.time_unit_ = demonstrations.time_unit
+        self.units_, self.time_unit_ = demonstrations.units, demonstrations.time_unit
         self.n_demos_, self.n_outputs_ = len(demonstrations), demonstrations.n_outputs
-        self.cutoff_ = automatic_cutoff(demonstrations) if self.cutoff == "auto" else self.cutoff
-        movements = smooth(demonstrations, self.cutoff_, self.n_steps)
-        self.duration_ = float(movements.time[-1])
-        starts = {float(time[0]) for time in demonstrations.times}
-        self.start_time_ = starts.pop() if len(starts) == 1 else 0.0
+        self.duration_, self.time_scale_ = duration_of(demonstrations, self.duration)
+        self.start_time_ = common_start(demonstrations)
+        knows_seconds = in_seconds(demonstrations.time_unit) is not None
+        automatic = automatic_cutoff(self.duration_, knows_seconds=knows_seconds)
+        self.cutoff_ = automatic if self.cutoff == "auto" else self.cutoff
+        movements = self.smooth(demonstrations)
         self.dmp_ = DMP(self.alpha, self.beta, self.gamma, self.tau, duration=self.duration_, gate=self.gate)
         self.reproduction_ = Reproduction.learn(self.dmp_, movements, self.phase_input, own_goals=self.goal == "each")
         self.start_, self.goal_ = self.reproduction_.start, self.reproduction_.goal
@@ -193,7 +199,7 @@ class DMPController(BaseEstimator):
         varying = self.varying(movements)
         self._fit_covariance(self.phase(movements.time), varying)
         self.noise_scale_ = movements.noise_scale
-        noise = smooth(noise_like(demonstrations, movements.noise_scale), self.cutoff_, self.n_steps)
+        noise = self.smooth(noise_like(demonstrations, movements.noise_scale))
         self.noise_share_ = variance_share(self.varying(noise), varying)
         law = StiffnessLaw() if self.stiffness_law is None else self.stiffness_law
         along = self.covariance_.predict_cov(self.phase(np.linspace(0.0, self.duration_, 1001)))
@@ -218,7 +224,7 @@ class DMPController(BaseEstimator):
         return self._gains_at(self._movement_time(X)).damping
 
     def schedule(self, rate: float = 1000.0, *, settle: float = 0.0) -> Schedule:
-        """Motion and gains at ``rate`` per unit of time, for a robot.
+        """Motion and gains at ``rate``, for a robot: in s and m, if the demonstrations tell units of length.
 
         Parameters
         ----------
@@ -235,17 +241,17 @@ class DMPController(BaseEstimator):
         check_is_fitted(self)
         time = np.arange(count_ticks(self.duration_, rate, settle)) / rate
         position, velocity = self.reproduction_.motion(time)
-        gains = self._gains_at(time)
+        gains, metres = self._gains_at(time), in_metres(self.units_)
         return Schedule(
             time,
-            position,
-            velocity,
+            metres * position,
+            metres * velocity,
             gains.stiffness,
             gains.damping,
-            gains.covariance,
+            metres**2 * gains.covariance,
             gains.type1,
             names=self.names_,
-            units=self.units_,
+            units=robot_unit(self.units_),
             frame=self.frame_,
             stiffness_limits=(self.law_.stiffness_min, self.law_.stiffness_max),
             covariance_of=self.variability,
@@ -253,7 +259,12 @@ class DMPController(BaseEstimator):
         )
 
     def simulate(
-        self, plant: AdmittancePlant | None = None, force: ArrayLike | None = None, rate: float = 1000.0
+        self,
+        plant: AdmittancePlant | None = None,
+        force: ArrayLike | None = None,
+        rate: float = 1000.0,
+        *,
+        random_state: Any = None,
     ) -> Rollout:
         """Run the schedule on a simulated robot that external forces push.
 
@@ -265,11 +276,18 @@ class DMPController(BaseEstimator):
             External force in N at the schedule's ticks; None is none.
         rate : float, default=1000.0
             Of the ticks, Hz.
+        random_state : int, RandomState or None, default=None
+            Of the noise of the plant's sensor.
 
         Returns
         -------
         Rollout
             NumPy arrays.
+
+        Warns
+        -----
+        UserWarning
+            If the plant's mass is not that which the damping was computed for.
 
         Raises
         ------
@@ -280,7 +298,14 @@ class DMPController(BaseEstimator):
         push = as_force(force, schedule.position.shape, rate)
         robot = AdmittancePlant(self.mass) if plant is None else plant
         parts = (schedule.position, schedule.velocity, schedule.stiffness, schedule.damping, push)
-        return robot.simulate(*map(_tensor, parts), dt=1.0 / rate).numpy()
+        if np.ndim(robot.mass) or float(robot.mass) != float(self.mass):
+            warnings.warn(
+                f"The plant's mass is {robot.mass}, but damping_ratio was met for mass={self.mass:g} kg: give both the same.",
+                stacklevel=2,
+            )
+        seed = int(check_random_state(random_state).randint(2**31 - 1))
+        generator = torch.Generator().manual_seed(seed)
+        return robot.simulate(*map(_tensor, parts), dt=1.0 / rate, generator=generator).numpy()
 
     def reproduce(
         self,
@@ -321,13 +346,17 @@ class DMPController(BaseEstimator):
         check_is_fitted(self)
         return self.reproduction_.phase(np.asarray(time, dtype=np.float64))
 
+    def smooth(self, demonstrations: Demonstrations, n_steps: int | None = None) -> Movements:
+        """Demonstrations of this task as the controller sees them, smoothed and stretched to ``duration_``."""
+        return smooth(demonstrations, self.cutoff_, n_steps or self.n_steps, self.duration_)
+
     def varying(self, movements: Movements) -> Floats:
         """What ``variability`` is of, (K, n, d), in smoothed movements of the same task."""
         return movements.position if self.variability == "position" else self.reproduction_.forcing_of(movements)
 
     def _movement_time(self, X: ArrayLike) -> Floats:
         check_is_fitted(self)
-        return as_times(X) - self.start_time_
+        return self.time_scale_ * (as_times(X) - self.start_time_)
 
     def _gains_at(self, time: Floats) -> Gains:
         inputs = self.phase(time)

@@ -11,10 +11,10 @@ from torch_pbd.data import Demonstrations
 Floats = NDArray[np.float64]
 
 CUTOFF_HZ = 4.0
-"""Cutoff for times in seconds: hands move below it, and tremor (8 to 12 Hz) and encoders' steps are above."""
+"""Cutoff where times are told: hands move below it, and tremor (8 to 12 Hz) and encoders' steps are above."""
 
 CUTOFF_CYCLES = 40.0
-"""Cutoff for other times, in cycles a movement."""
+"""Cutoff of movements whose own duration is not known, as over phases, in cycles a movement."""
 
 _LEAST_SAMPLES = {True: 5, False: 3}
 
@@ -26,7 +26,7 @@ class Movements:
     Attributes
     ----------
     time : ndarray of shape (n,)
-        From 0 to the duration, the median of the demonstrations': each is stretched to it linearly.
+        From 0 to the duration, s; each demonstration is stretched to it linearly.
     position, velocity, acceleration : ndarray of shape (K, n, d)
     noise_scale : ndarray of shape (d,)
         Root mean square of what the smoothing took away, in the units of position.
@@ -39,7 +39,7 @@ class Movements:
     noise_scale: Floats
 
 
-def smooth(demonstrations: Demonstrations, cutoff: float | None, n_steps: int) -> Movements:
+def smooth(demonstrations: Demonstrations, cutoff: float | None, n_steps: int, duration: float) -> Movements:
     """Smooth each demonstration, and sample all at ``n_steps`` common movement times.
 
     With a cutoff each output is the cubic smoothing spline whose weight halves the amplitude at the cutoff: at
@@ -52,8 +52,10 @@ def smooth(demonstrations: Demonstrations, cutoff: float | None, n_steps: int) -
     ----------
     demonstrations : Demonstrations
     cutoff : float or None
-        In cycles per unit of time.
+        In Hz of movement time.
     n_steps : int
+    duration : float
+        Of the movement, s: each demonstration is stretched to it, and a cutoff with the median of them.
 
     Raises
     ------
@@ -69,12 +71,12 @@ def smooth(demonstrations: Demonstrations, cutoff: float | None, n_steps: int) -
                 "record it at a higher rate."
             )
     durations = [time[-1] - time[0] for time in demonstrations.times]
-    duration = float(np.median(durations))
+    own_cutoff = None if cutoff is None else cutoff * duration / float(np.median(durations))
     grid = np.linspace(0.0, duration, n_steps)
     motions, removed = [], []
     for (time, position), lasting in zip(demonstrations, durations, strict=True):
         stretch = lasting / duration
-        spline = _spline(time - time[0], position, cutoff)
+        spline = _spline(time - time[0], position, own_cutoff)
         own = np.clip(grid * stretch, 0.0, lasting)
         motions.append([spline(own, order) * stretch**order for order in range(3)])
         removed.append(position - spline(time - time[0]))
@@ -98,11 +100,9 @@ def _spline(time: Floats, position: Floats, cutoff: float | None) -> BSpline:
     return BSpline(smoothed.t * unit, smoothed.c * scale + offset, smoothed.k)
 
 
-def automatic_cutoff(demonstrations: Demonstrations) -> float:
-    """4 Hz where times are in seconds, else 40 cycles a movement."""
-    if demonstrations.time_unit == "s":
-        return CUTOFF_HZ
-    return CUTOFF_CYCLES / float(np.median([time[-1] - time[0] for time in demonstrations.times]))
+def automatic_cutoff(duration: float, *, knows_seconds: bool) -> float:
+    """4 Hz where the recordings tell seconds, else 40 cycles a movement of ``duration`` s."""
+    return CUTOFF_HZ if knows_seconds else CUTOFF_CYCLES / duration
 
 
 def noise_like(demonstrations: Demonstrations, noise_scale: Floats) -> Demonstrations:

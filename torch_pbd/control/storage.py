@@ -14,7 +14,7 @@ Arrays = dict[str, NDArray[np.float64]]
 
 _PLAIN = (
     "names_", "frame_", "units_", "time_unit_", "n_demos_", "n_outputs_", "cutoff_", "duration_", "start_time_",
-    "reproduction_error_",
+    "time_scale_",     "reproduction_error_",
 )  # fmt: skip
 _ARRAYS = ("noise_scale_", "noise_share_")
 _MOTION = ("start", "velocity", "goal", "forcing")
@@ -41,6 +41,7 @@ def restore_controller(controller: DMPController, covariance: Any, values: dict[
     for name in _ARRAYS:
         setattr(controller, name, arrays[name])
     controller.names_ = tuple(controller.names_)
+    controller.units_ = None if controller.units_ is None else tuple(controller.units_)
     n_outputs = controller.n_outputs_
     if covariance.n_outputs_ != n_outputs or any(arrays[name].shape[-1:] != (n_outputs,) for name in _MOTION):
         raise ValueError(f"its parts are not all for {n_outputs} outputs")

@@ -13,6 +13,7 @@ from torch_pbd.control.controller import DMPController
 from torch_pbd.control.rollout import Rollout
 from torch_pbd.control.schedule import Schedule
 from torch_pbd.control.stability import StabilityReport
+from torch_pbd.control.units import in_metres
 from torch_pbd.data import Demonstrations
 from torch_pbd.experiments.robot_figures import pushes_figure, task_figure, variability_figure
 from torch_pbd.experiments.run_folder import RunFolder, format_table, slug
@@ -55,7 +56,7 @@ def run_controller(
     return Run(fitted, schedule, rollout, schedule.certify(mass=fitted.mass))
 
 
-def push_row(name: str, run: Run, demonstrations: Demonstrations) -> dict[str, Any]:
+def push_row(name: str, run: Run) -> dict[str, Any]:
     """Row of the table: displacement and stiffness at the two pushes."""
     unit, scale = readable_unit(run.schedule.units)
     time, stiffness = run.schedule.time, run.schedule.stiffness
@@ -69,7 +70,7 @@ def push_row(name: str, run: Run, demonstrations: Demonstrations) -> dict[str, A
     for output, label in list(enumerate(names))[:2]:
         row |= {f"K {label} early": float(stiffness[early, output, output])}
         row |= {f"K {label} late": float(stiffness[late, output, output])}
-    row |= {f"path error [{unit}]": scale * _path_error(run.controller, demonstrations)}
+    row |= {f"path error [{unit}]": scale * in_metres(run.controller.units_) * run.controller.reproduction_error_}
     return row
 
 
@@ -100,7 +101,7 @@ def run_robot(
     rows, reports = [], []
     for name, controller in controllers.items():
         run = run_controller(controller, demonstrations, peak=peak, rate=rate)
-        rows.append(push_row(name, run, demonstrations) | _guarantees(run))
+        rows.append(push_row(name, run) | _guarantees(run))
         reports.append(f"{name}\n{run.report}")
         _write(run, name, demonstrations, folder, in_tunnel=in_tunnel)
     folder.write_metrics(rows, metrics)
@@ -118,17 +119,8 @@ def _write(run: Run, name: str, demonstrations: Demonstrations, folder: RunFolde
     for title, figure in figures.items():
         folder.write_figure(figure, f"{slug(name)}_{title}")
         plt.close(figure)
-    folder.write_model(run.controller.covariance_, slug(name))
+    folder.write_model(run.controller, slug(name))
     target = folder.path / "schedule"
     target.mkdir(exist_ok=True)
     run.schedule.save(target / f"{slug(name)}.npz")
     run.schedule.resample(100.0).save(target / f"{slug(name)}_100hz.csv")
-
-
-def _path_error(controller: DMPController, demonstrations: Demonstrations) -> float:
-    """Root mean square distance of the reproduction from the mean of the demonstrations, by phase."""
-    aligned = demonstrations if demonstrations.is_aligned else demonstrations.align("phase")
-    grid = aligned.times[0]
-    time = controller.start_time_ + (grid - grid[0]) / (grid[-1] - grid[0]) * controller.duration_
-    error = controller.predict(time[:, np.newaxis]) - aligned.to_array().mean(axis=0)
-    return float(np.sqrt((error**2).sum(axis=1).mean()))

@@ -9,7 +9,6 @@ from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 from torch_pbd.control.controller import DMPController
 from torch_pbd.control.rollout import Rollout
 from torch_pbd.control.schedule import Schedule
-from torch_pbd.control.smoothing import smooth
 from torch_pbd.data import Demonstrations, tunnel_center, tunnel_half_width
 from torch_pbd.plotting import (
     DATA,
@@ -76,14 +75,14 @@ def task_figure(
         plot_demonstrations(demonstrations, [0], ax)
     else:
         plot_demonstrations(demonstrations, [0, 1], ax)
-    time = controller.start_time_ + np.linspace(0.0, controller.duration_, 400)[:, np.newaxis]
-    path = controller.predict(time)
-    across, up = (time[:, 0], path[:, 0]) if path.shape[1] == 1 else path[:, :2].T
+    time = np.linspace(0.0, controller.duration_, 400)
+    path = controller.reproduction_.motion(time)[0]
+    across, up = (time, path[:, 0]) if path.shape[1] == 1 else path[:, :2].T
     ax.plot(across, up, color=MODEL, lw=1.8, label="reproduction", zorder=4)
     if controller.variability == "position" and path.shape[1] > 1:
         some = np.linspace(0.0, controller.duration_, _N_ELLIPSES)
         covariance = controller.covariance_.predict_cov(controller.phase(some))[:, :2, :2]
-        centres = controller.predict(controller.start_time_ + some[:, np.newaxis])[:, :2]
+        centres = controller.reproduction_.motion(some)[0][:, :2]
         plot_covariance_ellipses(centres, covariance, ax, color=EMPIRICAL, label="inferred: 2 sd")
     ax.set_title(name, fontsize=10)
     if not in_tunnel and path.shape[1] > 1:
@@ -94,7 +93,7 @@ def task_figure(
 
 def variability_figure(controller: DMPController, demonstrations: Demonstrations, name: str) -> Figure:
     """Empirical and inferred standard deviations of what the covariance is of, and the stiffness: Figure 7."""
-    movements = smooth(demonstrations, controller.cutoff_, 200)
+    movements = controller.smooth(demonstrations, 200)
     varying = controller.varying(movements)
     n_shown = min(demonstrations.n_outputs, _MAX_OUTPUTS)
     figure, axes = plt.subplots(n_shown + 1, 1, figsize=(6.4, 1.9 * (n_shown + 1)), layout="constrained", sharex=True)

@@ -12,6 +12,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 import torch_pbd
+from torch_pbd.control.controller import DMPController
 from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.persistence import save
 
@@ -61,7 +62,7 @@ class RunFolder:
         figure.savefig(target, dpi=150)
         return target
 
-    def write_model(self, model: CovarianceRegressor, name: str) -> Path:
+    def write_model(self, model: CovarianceRegressor | DMPController, name: str) -> Path:
         """Write ``model/<name>.safetensors``."""
         target = self.path / "model" / f"{name}.safetensors"
         target.parent.mkdir(exist_ok=True)
