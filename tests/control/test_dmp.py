@@ -1,6 +1,5 @@
 """Dynamic movement primitives: round trip, integration against scipy, and laws of a linear system."""
 
-import doctest
 import math
 import re
 
@@ -10,7 +9,6 @@ import scipy.integrate
 import scipy.signal
 import torch
 
-from torch_pbd.control import dmp as module
 from torch_pbd.control.dmp import DMP
 
 PAPER = {"alpha": 1.0, "beta": 1.0}
@@ -280,7 +278,3 @@ def test_arguments_of_a_rollout_are_checked(arguments, words):
     given.pop("forcing", None)
     with pytest.raises(ValueError, match=re.escape(words)):
         DMP().rollout(forcing, given.pop("dt"), **given)
-
-
-def test_example_of_the_docstring():
-    assert doctest.testmod(module).failed == 0

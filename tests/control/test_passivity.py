@@ -263,3 +263,9 @@ def test_a_filtered_tick_is_the_transition_of_the_gains_it_reports(generator):
     step = torch.nn.functional.pad(run.desired_position.diff(dim=1), (0, 2))
     expected = torch.cat([run.deviation, run.velocity], dim=-1)[:, 1:]
     torch.testing.assert_close(after - step, expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("options", [{"integrator": "rk4"}, {"substeps": 2}])
+def test_filters_need_exact_whole_ticks(options):
+    with pytest.raises(ValueError, match="integrator='exact' and substeps=1 only"):
+        AdmittancePlant(stiffness_filter=EnergyTank(), **options)

@@ -1,6 +1,5 @@
 """The simulated robot against scipy and closed forms: exactness, orders, laws of a linear system, what acts in it."""
 
-import doctest
 import math
 import re
 
@@ -10,7 +9,6 @@ import scipy.linalg
 import scipy.signal
 import torch
 
-from torch_pbd.control import plant as module
 from torch_pbd.control.damping import damping_from_stiffness
 from torch_pbd.control.environment import Tunnel
 from torch_pbd.control.passivity import EnergyTank
@@ -338,7 +336,3 @@ def test_as_arrays_it_is_the_same_run():
     np.testing.assert_array_equal(arrays.interventions, arrays.time[arrays.filter_share < 1.0])
     assert arrays.saturated is None
     assert len(AdmittancePlant().simulate(**GIVEN, dt=0.01).interventions) == 0
-
-
-def test_example_of_the_docstring():
-    assert doctest.testmod(module).failed == 0

@@ -1,4 +1,3 @@
-import doctest
 import math
 import re
 from dataclasses import replace
@@ -8,7 +7,6 @@ import pytest
 import scipy.signal
 import torch
 
-from torch_pbd.control import sensor as module
 from torch_pbd.control.sensor import ForceSensor, apply_deadband, tare
 
 DT = 1e-3
@@ -225,7 +223,3 @@ def test_what_cannot_be_read_is_refused(rng):
         tare(force)
     with pytest.raises(ValueError, match="at least one"):
         tare(force[:0])
-
-
-def test_example_of_the_docstring():
-    assert doctest.testmod(module) == (0, 4)

@@ -1,6 +1,5 @@
 """Stiffness from covariance: values of eq. (20), laws of a spectral function, gradients, and what is refused."""
 
-import doctest
 import math
 import re
 
@@ -8,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from torch_pbd.control import stiffness as module
 from torch_pbd.control.stiffness import StiffnessLaw
 
 LAW = StiffnessLaw(sigma_low=0.01, sigma_high=0.03, bounds="sigma")
@@ -213,7 +211,3 @@ def test_rounding_errors_are_no_errors():
 def test_parameters_are_checked(parameters, words):
     with pytest.raises(ValueError, match=re.escape(words)):
         StiffnessLaw(**parameters)
-
-
-def test_example_of_the_docstring():
-    assert doctest.testmod(module).failed == 0

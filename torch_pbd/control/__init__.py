@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from torch_pbd.control.rollout import Rollout
     from torch_pbd.control.schedule import Schedule
     from torch_pbd.control.sensor import ForceSensor
-    from torch_pbd.control.stability import StabilityReport, certify
+    from torch_pbd.control.stability import certify
+    from torch_pbd.control.stability_report import StabilityReport
     from torch_pbd.control.stiffness import StiffnessLaw
 
 # Where each name lives: the controller of the control loop must load without torch.
@@ -30,7 +31,7 @@ _HOMES = {
     "RealTimeAdmittance": "realtime",
     "Rollout": "rollout",
     "Schedule": "schedule",
-    "StabilityReport": "stability",
+    "StabilityReport": "stability_report",
     "StiffnessLaw": "stiffness",
     "TickStatus": "realtime",
     "Tunnel": "environment",

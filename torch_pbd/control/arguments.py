@@ -9,7 +9,7 @@ from sklearn.utils.validation import check_array, check_X_y
 from torch_pbd.control.damping import damping_from_stiffness
 from torch_pbd.control.dmp import DMP, Gate
 from torch_pbd.control.impedance import OnUnknown
-from torch_pbd.control.matrices import check_finite, check_positive
+from torch_pbd.control.matrices import check_count, check_finite, check_positive
 from torch_pbd.data import Demonstrations
 
 Floats = NDArray[np.float64]
@@ -32,9 +32,7 @@ def check_parameters(controller: Any) -> None:
         if getattr(controller, name) not in get_args(kind):
             listed = ", ".join(map(repr, get_args(kind)))
             raise ValueError(f"{name} == {getattr(controller, name)!r}, must be one of {listed}.")
-    n_steps = controller.n_steps
-    if isinstance(n_steps, bool) or not isinstance(n_steps, int | np.integer) or n_steps < 5:
-        raise ValueError(f"n_steps == {n_steps!r}, must be an integer of at least 5.")
+    check_count("n_steps", controller.n_steps, 5)
     if controller.cutoff not in ("auto", None):
         check_positive("cutoff", controller.cutoff)
     if controller.duration is not None:

@@ -300,7 +300,8 @@ class DMPController(BaseEstimator):
         parts = (schedule.position, schedule.velocity, schedule.stiffness, schedule.damping, push)
         if np.ndim(robot.mass) or float(robot.mass) != float(self.mass):
             warnings.warn(
-                f"The plant's mass is {robot.mass}, but damping_ratio was met for mass={self.mass:g} kg: give both the same.",
+                f"The plant's mass is {robot.mass}, but damping_ratio was met for mass={self.mass:g} kg: give both the "
+                "same.",
                 stacklevel=2,
             )
         seed = int(check_random_state(random_state).randint(2**31 - 1))

@@ -57,7 +57,7 @@ class DMP:
     >>> import torch
     >>> dmp = DMP(duration=1.0)
     >>> position, velocity = dmp.rollout(torch.zeros(3001, 1).double(), 0.001, goal=torch.ones(1).double())
-    >>> bool((position.diff(dim=0) >= 0.0).all() and position.max() <= 1.0), round(float(position[-1]), 4)
+    >>> bool((position.diff(dim=0) > -1e-12).all() and position.max() < 1.0 + 1e-12), round(float(position[-1]), 4)
     (True, 1.0)
     """
 
@@ -157,7 +157,7 @@ class DMP:
             raise ValueError(f"n_steps == {n_steps}, must be at least 1 where forcing is a callable.")
         if integrator not in ("exact", "rk4"):
             raise ValueError(f"integrator == {integrator!r}, must be 'exact' or 'rk4'.")
-        time, passing = _movement_time(n_ticks, dt, speed, goal)
+        time, steps, passing = _movement_time(n_ticks, dt, speed, goal)
         at_ticks = (forcing(time) if callable(forcing) else forcing) * self.gate_at(time)[:, None]
         goals = goal if goal.ndim > 1 else goal[None]
         zero = at_ticks.new_zeros(at_ticks.shape[-1])
@@ -171,13 +171,13 @@ class DMP:
         scaled = self.tau * velocity / passing[0].clamp_min(1e-12)
         state = torch.stack([start.expand(*shape[:-2], shape[-1]) for start in (position, scaled)], dim=-1)
         if integrator == "exact":
-            trace = self._exact(at_ticks, goals, time.diff(), state)
+            trace = self._exact(at_ticks, goals, steps, state)
         else:
             midway = 0.5 * (at_ticks[..., 1:, :] + at_ticks[..., :-1, :])
             if callable(forcing):
                 halfway = 0.5 * (time[1:] + time[:-1])
                 midway = forcing(halfway) * self.gate_at(halfway)[:, None]
-            trace = self._runge_kutta(at_ticks, midway, goals, time.diff(), state)
+            trace = self._runge_kutta(at_ticks, midway, goals, steps, state)
         return trace[..., 0], trace[..., 1] / self.tau * passing[:, None]
 
     def _rate(self, like: Tensor) -> Tensor:
@@ -232,13 +232,13 @@ def _run_shape(forcing: Tensor, others: dict[str, Tensor]) -> torch.Size:
     return shape
 
 
-def _movement_time(n_ticks: int, dt: float, speed: Tensor | None, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Movement time at the ticks, and how fast it passes there."""
+def _movement_time(n_ticks: int, dt: float, speed: Tensor | None, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Movement time at the ticks, from each to the next, and how fast it passes at them."""
     check_positive("dt", dt, "s")
     if speed is None:
-        return torch.arange(n_ticks).to(like) * dt, like.new_ones(n_ticks)
+        return torch.arange(n_ticks).to(like) * dt, like.new_full((n_ticks - 1,), dt), like.new_ones(n_ticks)
     if speed.shape != (n_ticks,) or not bool((torch.isfinite(speed) & (speed >= 0.0)).all()):
         raise ValueError(f"speed has shape {tuple(speed.shape)}, must be {n_ticks} finite numbers, none negative.")
     passing = speed.to(like)
     steps = 0.5 * (passing[1:] + passing[:-1]) * dt
-    return torch.cat([steps.new_zeros(1), steps.cumsum(0)]), passing
+    return torch.cat([steps.new_zeros(1), steps.cumsum(0)]), steps, passing

@@ -1,7 +1,7 @@
 """Checks of the matrices and numbers that control is given."""
 
 import math
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any
 
 import torch
@@ -11,7 +11,7 @@ from torch import Tensor
 _NEGATIVE = 1e-9
 
 
-def check_mass(mass: float | Tensor) -> None:
+def check_mass(mass: Any) -> None:
     """Check that a mass is a positive number, or symmetric positive definite matrices (..., d, d), in kg.
 
     Raises
@@ -26,6 +26,16 @@ def check_mass(mass: float | Tensor) -> None:
     smallest = float(torch.linalg.eigvalsh(mass.detach()).min())
     if smallest <= 0.0:
         raise ValueError(f"mass must be positive definite; its smallest eigenvalue is {smallest:.3g} kg.")
+
+
+def as_mass(mass: Any) -> float | Tensor:
+    """A mass that :func:`check_mass` passes: a number, or a tensor that an array is copied to in float64."""
+    if isinstance(mass, Real):
+        check_mass(mass)
+        return float(mass)
+    value = mass if isinstance(mass, Tensor) else torch.tensor(mass, dtype=torch.float64)
+    check_mass(value)
+    return value
 
 
 def as_semidefinite(value: Any, name: str) -> Tensor:
@@ -72,3 +82,9 @@ def check_positive(name: str, value: Any, unit: str = "") -> None:
     check_finite(name, value)
     if value <= 0.0:
         raise ValueError(f"{name} == {value:g}{unit and ' ' + unit}, must be positive.")
+
+
+def check_count(name: str, value: Any, least: int) -> None:
+    """Check that a parameter is an integer not below ``least``."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or int(value) < least:
+        raise ValueError(f"{name} == {value!r}, must be an integer of at least {least}.")

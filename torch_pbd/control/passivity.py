@@ -55,8 +55,8 @@ class RateLimit:
     ``V = 1/2 (v + a y)' M (v + a y) + 1/2 y' (K + a D - a^2 M) y`` does not grow from one tick to the next
     without an external force, whatever the schedule asks for: the discrete form, for gains held over a tick, of
     the conditions of K. Kronander and A. Billard, "Stability considerations for variable impedance control",
-    IEEE Transactions on Robotics 32, 2016. It needs no measurement. The robot is passive with respect to ``v + a y``
-    and a force that is held over each tick.
+    IEEE Transactions on Robotics 32, 2016. It needs no measurement. The admittance is passive with respect to
+    ``v + a y`` and a force that is held over each tick; behind a position loop that lags, a robot need not be.
 
     Parameters
     ----------
@@ -149,9 +149,10 @@ class EnergyTank:
     A rise at deviation y puts ``1/2 y' (K_new - K) y`` into the spring: it comes out of the tank, and where the
     tank has less, only that share of the rise is made; the stiffness may always fall. With the energy H of
     spring and mass, T of the tank and the work W of external force and desired motion,
-    ``H + T - W <= H_0 + T_0`` at every tick, to rounding. After F. Ferraguti, C. Secchi, C. Fantuzzi, "A
-    tank-based approach to impedance control with variable stiffness", ICRA 2013, made exact for gains that
-    switch at ticks.
+    ``H + T - W <= H_0 + T_0`` at every tick, to rounding. What a falling stiffness takes out of the spring goes into
+    the tank whole. As for :class:`RateLimit`, this is of the admittance, not of a robot that lags behind it. After
+    F. Ferraguti, C. Secchi, C. Fantuzzi, "A tank-based approach to impedance control with variable stiffness",
+    ICRA 2013, made exact for gains that switch at ticks.
 
     Parameters
     ----------

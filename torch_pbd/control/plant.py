@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torch_pbd.control.environment import Tunnel
-from torch_pbd.control.matrices import as_semidefinite, check_mass, check_positive
+from torch_pbd.control.matrices import as_mass, as_semidefinite, check_count, check_positive
 from torch_pbd.control.passivity import EnergyTank, RateLimit
 from torch_pbd.control.position_loop import PositionLoop
 from torch_pbd.control.rollout import Rollout
@@ -72,19 +72,22 @@ class AdmittancePlant:
         substeps: int = 1,
         stiffness_filter: RateLimit | EnergyTank | None = None,
     ) -> None:
-        check_mass(mass)
         if integrator not in get_args(Integrator):
             raise ValueError(
                 f"integrator == {integrator!r}, must be one of {', '.join(map(repr, get_args(Integrator)))}."
             )
-        if not isinstance(substeps, int) or substeps < 1:
-            raise ValueError(f"substeps == {substeps!r}, must be an integer of at least 1.")
+        check_count("substeps", substeps, 1)
         if substeps > 1 and (sensor is not None or position_loop is not None):
             raise ValueError(
                 f"substeps == {substeps}, must be 1 with a sensor or a position loop: they act once a tick. "
                 "Shorten dt instead."
             )
-        self.mass = mass
+        if stiffness_filter is not None and (integrator != "exact" or substeps > 1):
+            raise ValueError(
+                f"stiffness_filter keeps its invariant with integrator='exact' and substeps=1 only; got {integrator!r} "
+                f"and {substeps}."
+            )
+        self.mass = as_mass(mass)
         self.integrator: Integrator = integrator
         self.feed_forward = feed_forward
         self.sensor = sensor
@@ -158,7 +161,9 @@ class AdmittancePlant:
         if all(hook is None for hook in hooks):
             position, velocity = open_loop(task, state, self.integrator)
             record: dict[str, Any] = {"position": position, "velocity": velocity, "commanded_position": position}
-            record |= {"force": force.expand_as(position), "stiffness": stiffness, "damping": damping}
+            gains = (*batch, *stiffness.shape[-3:])
+            record |= {"stiffness": stiffness.expand(gains), "damping": damping.expand(gains)}
+            record |= {"force": force.expand_as(position)}
         else:
             record = closed_loop(task, state, self, generator)
         time = torch.arange(force.shape[-2], dtype=force.dtype, device=force.device) * dt
@@ -171,7 +176,7 @@ class AdmittancePlant:
                     f"mass has shape {tuple(self.mass.shape)}, must be a number or have shape {tuple(like.shape[-2:])}."
                 )
             return self.mass.to(like)
-        return float(self.mass) * torch.eye(like.shape[-1]).to(like)
+        return self.mass * torch.eye(like.shape[-1]).to(like)
 
 
 def _accelerations(velocity: Tensor, acceleration: Tensor | None, dt: float) -> Tensor:
@@ -184,6 +189,9 @@ def _accelerations(velocity: Tensor, acceleration: Tensor | None, dt: float) -> 
 
 def _check_inputs(motion: dict[str, Tensor], stiffness: Tensor, damping: Tensor, dt: float) -> None:
     check_positive("dt", dt, "s")
+    kinds = {(value.dtype, value.device) for value in (*motion.values(), stiffness, damping)}
+    if len(kinds) > 1:
+        raise ValueError(f"the inputs are of several dtypes or devices, {sorted(map(str, kinds))}: bring them to one.")
     expected = motion["position_desired"].shape[-2:]
     for name, value in motion.items():
         if value.ndim < 2 or value.shape[-2:] != expected or not value.numel():

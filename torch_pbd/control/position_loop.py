@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torch_pbd.control.matrices import check_positive
+from torch_pbd.control.matrices import check_count, check_positive
 
 
 @final
@@ -31,8 +31,7 @@ class PositionLoop:
 
     def __post_init__(self) -> None:
         check_positive("bandwidth", self.bandwidth, "Hz")
-        if not isinstance(self.delay_steps, int) or self.delay_steps < 0:
-            raise ValueError(f"delay_steps == {self.delay_steps!r}, must be an integer of at least 0.")
+        check_count("delay_steps", self.delay_steps, 0)
 
     def lag(self, dt: float) -> float:
         """How late the loop follows a ramp, in s: ``2 / w``, the delay, and half a tick of hold."""

@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -98,16 +99,17 @@ class Reproduction:
 
         The primitive is solved exactly at 4000 ticks in the duration, and interpolated by cubics between.
         """
-        step = float(self.time[1])
-        settled = _SETTLE * 2.0 * self.dmp.tau / self.dmp.alpha + 0.1 * self.time[-1]
-        n_ticks = len(self.time) + int(settled / step)
-        if time.size:
-            n_ticks = max(2, min(n_ticks, int(time.max() / step) + 2))
-        ticks, position, velocity = self.roll_out(n_ticks, step)
-        within = np.clip(time, 0.0, ticks[-1])
-        curve = CubicHermiteSpline(ticks, position, velocity, axis=0)
-        moving = ((time >= 0.0) & (time <= ticks[-1]))[:, np.newaxis]
+        curve, end = self._settled_motion, self._settled_motion.x[-1]
+        within = np.clip(time, 0.0, end)
+        moving = ((time >= 0.0) & (time <= end))[:, np.newaxis]
         return curve(within), np.where(moving, curve(within, 1), 0.0)
+
+    @cached_property
+    def _settled_motion(self) -> CubicHermiteSpline:
+        step, dmp = float(self.time[1]), self.dmp
+        slowest = max(2.0 * dmp.tau / dmp.alpha, dmp.tau / dmp.gamma if dmp.gate == "phase" else 0.0)
+        n_ticks = len(self.time) + int((_SETTLE * slowest + 0.1 * self.time[-1]) / step)
+        return CubicHermiteSpline(*self.roll_out(n_ticks, step), axis=0)
 
     def roll_out(
         self,

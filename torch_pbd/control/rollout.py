@@ -55,7 +55,9 @@ class Rollout:
 
     @property
     def interventions(self) -> Any:
-        """Times (n,) of a single run at which a filter held the stiffness back."""
+        """Times (n,) of a single run at which a filter held the stiffness back; of a batch, see ``filter_share``."""
         if self.filter_share is None:
             return self.time[:0]
+        if self.filter_share.ndim > 1:
+            raise ValueError(f"interventions are of one run; this is a batch of {tuple(self.filter_share.shape[:-1])}.")
         return self.time[self.filter_share < 1.0]

@@ -22,7 +22,7 @@ from torch_pbd.control.schedule_checks import (
 from torch_pbd.control.schedule_files import read_schedule, write_schedule
 
 if TYPE_CHECKING:
-    from torch_pbd.control.stability import StabilityReport
+    from torch_pbd.control.stability_report import StabilityReport
 
 
 @final

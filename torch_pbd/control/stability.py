@@ -6,7 +6,7 @@ With the deviation y from the desired motion, ``M y'' + D y' + K y = f``: a rise
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, final
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -15,97 +15,14 @@ from torch import Tensor
 from torch_pbd.control.coupling import stiffest_environment
 from torch_pbd.control.damping import required_damping_ratio
 from torch_pbd.control.matrices import check_mass, check_positive
+from torch_pbd.control.passivity import lyapunov_matrix
 from torch_pbd.control.position_loop import PositionLoop
+from torch_pbd.control.stability_report import StabilityReport
 from torch_pbd.control.transitions import admittance_rate, transition
 from torch_pbd.linalg import spectral_map, symmetrize
 
-MAX_GAIN = 2.0
-"""Gain of a schedule above which its report warns."""
-
-_MAX_PAIRS = 400  # knots between which the gain is computed
+_MAX_KNOTS = 400  # at which parts begin and end that the gain is of; as many again where the stiffness rises most
 _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
-
-
-@final
-@dataclass(frozen=True)
-class StabilityReport:
-    """What :func:`certify` found of a schedule at one mass and speed; ``print`` it.
-
-    Attributes
-    ----------
-    damping_ratio : float
-        Smallest over the schedule and its axes.
-    stiffness_ratio : float
-        Largest over smallest stiffness R, of all axes and times.
-    required_damping_ratio : float
-        From here on any schedule within these limits is exponentially stable:
-        :func:`~torch_pbd.control.required_damping_ratio`.
-    stable_at_any_schedule : bool
-        That the damping is ``2 zeta (M K)^1/2`` with one such zeta at every knot; a controller must take it from
-        the stiffness in effect, or hold both between knots.
-    alpha : float
-        Constant of the certificate, 1/s.
-    margin : float
-        Of the certificate, N/m/s: smallest eigenvalue of ``2 alpha K - K' - alpha D'``. Not negative: V of
-        Kronander and Billard never grows without a force, and the robot is passive with respect to the force
-        and ``v + alpha y``. Exact for gains that are linear between the knots of the schedule. Negative says
-        that this certificate does not hold, not that the schedule is unstable.
-    margin_time : float
-        Where the margin is smallest, s.
-    max_speed : float
-        Largest replay speed at which the certificate holds; 1 is the schedule's own.
-    gain : float
-        Largest growth of ``sqrt(v'Mv + y'Ky)`` over any part of the schedule from any state, gains held between
-        knots: not conservative. 1 is no growth.
-    environment_stiffness : float
-        Stiffest spring, N/m, that the robot can press on in the softest phase without vibrating, behind its
-        position loop.
-    speed, mass : float, float or tuple
-        What was asked for.
-    """
-
-    damping_ratio: float
-    stiffness_ratio: float
-    required_damping_ratio: float
-    stable_at_any_schedule: bool
-    alpha: float
-    margin: float
-    margin_time: float
-    max_speed: float
-    gain: float
-    environment_stiffness: float
-    speed: float
-    mass: Any
-
-    @property
-    def certified(self) -> bool:
-        """Whether the certificate holds for this very schedule and speed."""
-        return self.margin >= 0.0
-
-    @property
-    def stable(self) -> bool:
-        """Whether one of the two guarantees holds."""
-        return self.certified or self.stable_at_any_schedule
-
-    def __str__(self) -> str:
-        any_schedule = "holds" if self.stable_at_any_schedule else "does not hold"
-        certificate = "holds" if self.certified else "DOES NOT HOLD"
-        warning = "" if self.gain <= MAX_GAIN else f"  <- above {MAX_GAIN:g}: disturbances grow on the way"
-        speed = "any" if math.isinf(self.max_speed) else f"{self.max_speed:.3g} x"
-        verdict = "guaranteed" if self.stable else "NOT GUARANTEED: slow down, damp more, or use a filter"
-        mass = f"{self.mass:g} kg" if isinstance(self.mass, int | float) else "a mass matrix"
-        return "\n".join(
-            [
-                f"stability at {mass}, replay speed {self.speed:g}: {verdict}",
-                f"  any-schedule rule        {any_schedule}: damping ratio {self.damping_ratio:.3g}, required "
-                f"{self.required_damping_ratio:.3g} for stiffness ratio {self.stiffness_ratio:.3g}",
-                f"  certificate of this one  {certificate}: margin {self.margin:.4g} N/m/s at t = "
-                f"{self.margin_time:.3g} s, alpha {self.alpha:.3g} /s",
-                f"  replay speed limit       {speed}",
-                f"  gain from any state      {self.gain:.3g}{warning}",
-                f"  stiffest environment     {self.environment_stiffness:.3g} N/m in the softest phase",
-            ]
-        )
 
 
 def certify(
@@ -150,6 +67,9 @@ def certify(
     ends of every interval is holding throughout; and they are convex in alpha, which is found by golden section.
     """
     check_positive("speed", speed)
+    check_positive("dt", dt, "s")
+    if force_cutoff is not None:
+        check_positive("force_cutoff", force_cutoff, "Hz")
     time, stiffness, damping = map(_door, (schedule.time, schedule.stiffness, schedule.damping))
     inertia = _door(mass)
     check_mass(inertia)
@@ -164,15 +84,16 @@ def certify(
         damping_ratio=smallest,
         stiffness_ratio=ratio,
         required_damping_ratio=required,
-        stable_at_any_schedule=lawful and smallest >= required,
+        stable_at_any_schedule=lawful and smallest > required,
         alpha=alpha,
         margin=margin,
         margin_time=float(time[worst]),
+        held_growth=_held_growth(time / speed, stiffness, damping, inertia, alpha),
         max_speed=speed * knots.max_speed(),
         gain=_gain(time / speed, stiffness, damping, inertia),
         environment_stiffness=stiffest_environment(stiffness, damping, inertia, loop, force_cutoff, dt),
         speed=float(speed),
-        mass=mass,
+        mass=float(_door(mass)) if not _door(mass).ndim else tuple(map(tuple, inertia.tolist())),
     )
 
 
@@ -261,21 +182,50 @@ def _damping_rule(stiffness: Tensor, damping: Tensor, mass: Tensor) -> tuple[flo
 def _gain(
     time: Float[Tensor, " n"], stiffness: Float[Tensor, "n d d"], damping: Float[Tensor, "n d d"], mass: Tensor
 ) -> float:
-    """Largest ``||P_j^1/2 Phi(j, i) P_i^-1/2||`` over i <= j, with P = diag(K, M) and the exact maps Phi."""
+    """Largest ``||P_j^1/2 Phi(j, i) P_i^-1/2||`` over chosen i < j, with P = diag(K, M) and the exact maps Phi."""
     d = stiffness.shape[-1]
     rate = admittance_rate(stiffness[:-1], damping[:-1], mass)[..., : 2 * d, : 2 * d]
     maps = transition(rate * time.diff()[:, None, None], 1.0)
-    stride = -(-len(maps) // _MAX_PAIRS)
+    begins, ends = _chosen_knots(stiffness)
     energy = torch.zeros_like(maps[:1]).repeat(len(time), 1, 1)
     energy[:, :d, :d], energy[:, d:, d:] = stiffness, mass
     root, inverse = spectral_map(energy, torch.sqrt), spectral_map(energy, torch.rsqrt)
     since = maps.new_zeros(0, 2 * d, 2 * d)
     largest = 1.0
     for tick, each in enumerate(maps):
-        if tick % stride == 0:
+        if tick in begins:
             since = torch.cat([since, inverse[tick : tick + 1]])
         since = each @ since
-        if (tick + 1) % stride == 0 or tick + 1 == len(maps):
+        if tick + 1 in ends:
             grown = root[tick + 1] @ since
             largest = max(largest, float(torch.linalg.eigvalsh(grown.mT @ grown)[:, -1].max()) ** 0.5)
     return largest
+
+
+def _chosen_knots(stiffness: Tensor) -> tuple[set[int], set[int]]:
+    """Knots to begin and to end at: evenly spaced ones, and those before and after the steepest rises."""
+    n_knots = len(stiffness)
+    root = spectral_map(stiffness[:-1], torch.rsqrt)
+    rise = torch.linalg.eigvalsh(symmetrize(root @ stiffness.diff(dim=0) @ root))[:, -1]
+    steepest = rise.topk(min(_MAX_KNOTS, n_knots - 1)).indices.tolist()
+    even = set(torch.linspace(0, n_knots - 1, min(_MAX_KNOTS, n_knots)).round().long().tolist())
+    return even | set(steepest), even | {knot + 1 for knot in steepest}
+
+
+def _held_growth(
+    time: Float[Tensor, " n"],
+    stiffness: Float[Tensor, "n d d"],
+    damping: Float[Tensor, "n d d"],
+    mass: Tensor,
+    alpha: float,
+) -> float:
+    """Largest eigenvalue of ``A' P_next A`` relative to P: A the exact map of an interval with its gains held."""
+    if alpha <= 0.0:
+        return math.nan
+    d = stiffness.shape[-1]
+    rate = admittance_rate(stiffness[:-1], damping[:-1], mass)[..., : 2 * d, : 2 * d]
+    maps = transition(rate * time.diff()[:, None, None], 1.0)
+    function = lyapunov_matrix(stiffness, damping, mass, alpha)
+    inverse = torch.linalg.inv(torch.linalg.cholesky(function[:-1]))
+    grown = inverse @ maps.mT @ function[1:] @ maps @ inverse.mT
+    return float(torch.linalg.eigvalsh(symmetrize(grown)).max())

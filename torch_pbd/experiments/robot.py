@@ -12,7 +12,7 @@ from sklearn.base import clone
 from torch_pbd.control.controller import DMPController
 from torch_pbd.control.rollout import Rollout
 from torch_pbd.control.schedule import Schedule
-from torch_pbd.control.stability import StabilityReport
+from torch_pbd.control.stability_report import StabilityReport
 from torch_pbd.control.units import in_metres
 from torch_pbd.data import Demonstrations
 from torch_pbd.experiments.robot_figures import pushes_figure, task_figure, variability_figure

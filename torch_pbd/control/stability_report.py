@@ -1,0 +1,104 @@
+"""What is known of the stability of a schedule, and how it is told."""
+
+import math
+from dataclasses import dataclass
+from typing import final
+
+MAX_GAIN = 2.0
+"""Gain of a schedule above which its report warns."""
+
+
+@final
+@dataclass(frozen=True)
+class StabilityReport:
+    """What :func:`certify` found of a schedule at one mass and speed; ``print`` it.
+
+    All but the last figure are of the admittance itself. A lag between it and the robot, by a position loop or a
+    filter of the force, is in ``environment_stiffness`` only.
+
+    Attributes
+    ----------
+    damping_ratio : float
+        Smallest over the schedule and its axes.
+    stiffness_ratio : float
+        Largest over smallest stiffness R, of all axes and times.
+    required_damping_ratio : float
+        From here on any schedule within these limits is exponentially stable:
+        :func:`~torch_pbd.control.required_damping_ratio`.
+    stable_at_any_schedule : bool
+        That the damping is ``2 zeta (M K)^1/2`` with one such zeta at every knot; between them both may be held,
+        or linear.
+    alpha : float
+        Constant of the certificate, 1/s.
+    margin : float
+        Of the certificate, N/m/s: smallest eigenvalue of ``2 alpha K - K' - alpha D'``. Not negative: V of
+        Kronander and Billard never grows without a force, and the admittance is passive with respect to the force
+        and ``v + alpha y``. Exact for gains that are linear between the knots of the schedule. Negative says
+        that this certificate does not hold, not that the schedule is unstable.
+    held_growth : float
+        Largest growth of that V over an interval in which the gains are held instead, as at the ticks of a
+        controller: 1 is none. NaN without an alpha.
+    margin_time : float
+        Where the margin is smallest, s.
+    max_speed : float
+        Largest replay speed at which the certificate holds; 1 is the schedule's own. Where the rule holds, any
+        speed is stable.
+    gain : float
+        Largest growth of ``sqrt(v'Mv + y'Ky)`` over a part of the schedule from any state, gains held between
+        knots: not conservative. 1 is no growth. Of schedules with more than 400 knots, parts that begin and end
+        at 400 of them, evenly spaced, and at the 400 at which the stiffness rises most.
+    environment_stiffness : float
+        Stiffest spring, N/m, that the robot can press on in the softest phase without vibrating, behind its
+        position loop.
+    speed, mass : float, float or tuple of rows
+        What was asked for.
+    """
+
+    damping_ratio: float
+    stiffness_ratio: float
+    required_damping_ratio: float
+    stable_at_any_schedule: bool
+    alpha: float
+    margin: float
+    margin_time: float
+    held_growth: float
+    max_speed: float
+    gain: float
+    environment_stiffness: float
+    speed: float
+    mass: float | tuple[tuple[float, ...], ...]
+
+    @property
+    def certified(self) -> bool:
+        """Whether the certificate holds for this very schedule and speed."""
+        return self.margin >= 0.0
+
+    @property
+    def stable(self) -> bool:
+        """Whether one of the two guarantees holds."""
+        return self.certified or self.stable_at_any_schedule
+
+    def __str__(self) -> str:
+        any_schedule = "holds" if self.stable_at_any_schedule else "does not hold"
+        certificate = "holds" if self.certified else "DOES NOT HOLD"
+        warning = "" if self.gain <= MAX_GAIN else f"  <- above {MAX_GAIN:g}: disturbances grow on the way"
+        speed = "any" if math.isinf(self.max_speed) else f"{self.max_speed:.3g} x"
+        if self.stable_at_any_schedule and math.isfinite(self.max_speed):
+            speed = f"any, by the rule; by the certificate {speed}"
+        held = (
+            "" if self.held_growth <= 1.0 + 1e-9 else f" (held between knots, V grows by {self.held_growth - 1.0:.2g})"
+        )
+        verdict = "guaranteed" if self.stable else "NOT GUARANTEED: slow down, damp more, or use a filter"
+        mass = f"{self.mass:g} kg" if isinstance(self.mass, float) else "a mass matrix"
+        return "\n".join(
+            [
+                f"stability of the admittance at {mass}, replay speed {self.speed:g}: {verdict}",
+                f"  any-schedule rule        {any_schedule}: damping ratio {self.damping_ratio:.3g}, required "
+                f"{self.required_damping_ratio:.3g} for stiffness ratio {self.stiffness_ratio:.3g}",
+                f"  certificate of this one  {certificate}: margin {self.margin:.4g} N/m/s at t = "
+                f"{self.margin_time:.3g} s, alpha {self.alpha:.3g} /s{held}",
+                f"  replay speed limit       {speed}",
+                f"  gain from any state      {self.gain:.3g}{warning}",
+                f"  stiffest environment     {self.environment_stiffness:.3g} N/m in the softest phase",
+            ]
+        )
