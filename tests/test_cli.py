@@ -87,6 +87,14 @@ def test_compare_without_data_is_table_1(tmp_path, capsys):
             "Did you mean 'n_components'",
         ),
         (["fit", "--data", "x.npz", "--model", "GMMBaseline", "--model.tol", "soon"], "soon"),
+        (
+            [
+                "experiment",
+                "--controllers",
+                '{"mine": {"class_path": "DMPController", "init_args": {"gatee": "none"}}}',
+            ],
+            "Did you mean 'gate'",
+        ),
     ],
 )
 def test_what_cannot_be_used_is_one_line_and_exit_code_2(arguments, message, capsys):

@@ -178,12 +178,13 @@ def _one_line(message: str, parser: ArgumentParser) -> str:
 def _known_names(parser: ArgumentParser) -> list[str]:
     import inspect
 
+    from torch_pbd.control import DMPController, StiffnessLaw
+
     models, _ = _model_types()
     names = [action.dest for action in parser._actions]
-    for model in models.__subclasses__() + [
-        leaf for child in models.__subclasses__() for leaf in child.__subclasses__()
-    ]:
-        names += [model.__name__, *inspect.signature(model).parameters]
+    leaves = [leaf for child in models.__subclasses__() for leaf in child.__subclasses__()]
+    for known in (*models.__subclasses__(), *leaves, DMPController, StiffnessLaw):
+        names += [known.__name__, *inspect.signature(known).parameters]
     return names
 
 

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import mpmath
 import numpy as np
 import pytest
+from scipy.interpolate import CubicHermiteSpline
 from scipy.linalg import expm
 
 from torch_pbd.control.realtime import RealTimeAdmittance, TickStatus, steps
@@ -172,10 +173,32 @@ def test_slower_rows_are_interpolated():
     controller = RealTimeAdmittance(schedule, mass=MASS, soft_start=0.0)
     controller.start(0.0, at=0.1237)
     controller.tick(0.001, [0.0, 0.0])
-    for name, used in USED.items():
+    for name in ("stiffness", "damping"):
         told = getattr(schedule, name)
         between = 0.6 * told[12] + 0.4 * told[13]  # 0.124 s is the nearest millisecond
-        np.testing.assert_allclose(getattr(controller, used), between, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(getattr(controller, name), between, rtol=1e-9, atol=1e-12)
+    motion = CubicHermiteSpline(schedule.time, schedule.position, schedule.velocity)
+    np.testing.assert_allclose(controller.desired_position, motion(0.124), rtol=1e-9)
+    np.testing.assert_allclose(controller.desired_velocity, motion(0.124, 1), rtol=1e-9)
+
+
+def test_bias_and_deadband_keep_a_drifting_sensor_from_moving_the_robot():
+    still = one_axis(deadband=0.2)
+    still.start(0.0, force_bias=[0.5])
+    for i in range(1, 1000):
+        still.tick(i / 1000, [0.5 + 0.19 * math.sin(i)])
+    assert still.position == (0.0,)
+    pushed, plain = one_axis(deadband=0.2), one_axis()
+    pushed.start(0.0, force_bias=[0.5])
+    plain.start(0.0)
+    for i in range(1, 1000):
+        pushed.tick(i / 1000, [-2.7])  # 3.2 N less the deadband
+        plain.tick(i / 1000, [-3.0])
+    np.testing.assert_allclose(pushed.position, plain.position, rtol=1e-12)
+    with pytest.raises(ValueError, match=r"force_bias=.* must be 1 finite numbers"):
+        still.start(0.0, force_bias=[math.nan])
+    with pytest.raises(ValueError, match=r"deadband=-1\.0 must be a finite number of at least 0"):
+        one_axis(deadband=-1.0)
 
 
 def test_after_the_end_the_last_row_holds_without_velocity():

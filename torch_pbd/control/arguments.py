@@ -10,6 +10,7 @@ from torch_pbd.control.damping import damping_from_stiffness
 from torch_pbd.control.dmp import DMP, Gate
 from torch_pbd.control.impedance import OnUnknown
 from torch_pbd.control.matrices import check_count, check_finite, check_positive
+from torch_pbd.control.sampling import count_intervals
 from torch_pbd.data import Demonstrations
 
 Floats = NDArray[np.float64]
@@ -93,7 +94,7 @@ def count_ticks(duration: float, rate: float, settle: float) -> int:
     check_finite("settle", settle)
     if settle < 0.0:
         raise ValueError(f"settle == {settle:g}, must not be negative.")
-    n_ticks = int(np.floor((duration + settle) * rate * (1.0 + 1e-12))) + 1
+    n_ticks = count_intervals(duration + settle, rate) + 1
     if n_ticks < 2:
         raise ValueError(f"rate == {rate:g} gives {n_ticks} tick in {duration:g}, must give at least 2.")
     return n_ticks

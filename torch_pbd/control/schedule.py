@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Self, final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from torch_pbd.control.sampling import Between, count_intervals
 from torch_pbd.control.schedule_checks import (
     ARRAY_DIMS,
     LABELS,
@@ -166,12 +167,9 @@ class Schedule:
         grid = self._ticks(rate) if rate is not None else as_floats(times, "times", 1)
         first, last = self.time[0], self.time[-1]
         require((grid >= first) & (grid <= last), grid, "times", f"it must be within {first!s} and {last!s} s.")
-        row = np.clip(np.searchsorted(self.time, grid, side="right") - 1, 0, len(self) - 2)
-        step = self.time[row + 1] - self.time[row]
-        share = (grid - self.time[row]) / step
-        position, velocity = _hermite(self.position, self.velocity, row, step, share)
-        rows = self._arrays()
-        rows |= {name: _blend(array[row], array[row + 1], share) for name, array in rows.items()}
+        between = Between(self.time, grid)
+        position, velocity = between.hermite(self.position, self.velocity)
+        rows: dict[str, Any] = {name: between.linear(array) for name, array in self._arrays().items()}
         rows |= {"time": grid, "position": position, "velocity": velocity}
         return Schedule(**rows, **self._labels())
 
@@ -190,7 +188,7 @@ class Schedule:
         ValueError
             If ``speed`` is not positive, or none of the guarantees of the report holds at it with ``mass``.
         """
-        check_positive(speed, "speed")
+        check_positive("speed", speed)
         report = None if mass is None else self.certify(mass=mass, speed=speed)
         if report is not None and not report.stable:
             raise ValueError(
@@ -260,30 +258,13 @@ class Schedule:
         return {**{name: getattr(self, name) for name in LABELS}, "provenance": dict(self.provenance)}
 
     def _ticks(self, rate: float) -> Floats:
-        check_positive(rate, "rate")
-        n_ticks = int(self.duration * rate + 1e-6)  # 10 s at 1 kHz are 10001 rows, rounded up or down
+        check_positive("rate", rate)
+        n_ticks = count_intervals(self.duration, rate)
         if n_ticks < 1:
             raise ValueError(
                 f"rate={rate:g} Hz has one row in {self.duration:g} s: take {1 / self.duration:g} or more."
             )
         return np.minimum(self.time[0] + np.arange(n_ticks + 1) / rate, self.time[-1])
-
-
-def _blend(start: Floats, end: Floats, share: Floats) -> Floats:
-    """Straight line from start to end, exact at both and where they agree, which (1 - s) a + s b is not."""
-    share = share.reshape(-1, *[1] * (start.ndim - 1))
-    return np.where(share < 0.5, start + share * (end - start), end - (1.0 - share) * (end - start))
-
-
-def _hermite(position: Floats, velocity: Floats, row: Any, step: Floats, share: Floats) -> tuple[Floats, Floats]:
-    """Cubic through the ends of each interval with their velocities, and its derivative."""
-    s, h = share[:, np.newaxis], step[:, np.newaxis]
-    start, end = velocity[row], velocity[row + 1]
-    cubic = _blend(position[row], position[row + 1], share**2 * (3.0 - 2.0 * share))
-    bend = h * s * (1.0 - s) * ((1.0 - s) * start - s * end)
-    secant = (position[row + 1] - position[row]) / h
-    slope = _blend(start, end, share) + 3.0 * s * (1.0 - s) * (2.0 * secant - start - end)
-    return cubic + bend, slope
 
 
 def _diagonal(matrices: Floats) -> Floats:

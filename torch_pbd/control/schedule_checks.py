@@ -37,7 +37,7 @@ def checked_fields(fields: Mapping[str, Any]) -> dict[str, Any]:
     return {**copies, **labels}
 
 
-def check_positive(value: Any, name: str) -> None:
+def check_positive(name: str, value: Any) -> None:
     """Refuse what is not a positive number."""
     if (
         isinstance(value, bool)

@@ -8,12 +8,12 @@ from typing import final
 import numpy as np
 
 from torch_pbd.control.realtime.checks import Numbers, limit, number, vector
+from torch_pbd.control.realtime.limits import limited
 from torch_pbd.control.realtime.status import TickStatus
-from torch_pbd.control.realtime.steps import Floats, Vector, braked, drift, softened
+from torch_pbd.control.realtime.steps import Floats, Vector, braked, softened
 from torch_pbd.control.realtime.table import ScheduleLike, ScheduleTable
 
 _FINE = TickStatus(0)
-_Limited = tuple[Vector, Vector, TickStatus]
 
 
 @final
@@ -22,8 +22,8 @@ class RealTimeAdmittance:
 
     A tick is solved exactly over the time that really passed, with force and schedule held over it: irregular and
     late ticks add no energy where the stiffness is constant. (Where it rises, see `certify`.) The schedule is copied
-    to a table of rows ``1 / rate`` apart, linear between its own rows. A tick takes the row nearest to its beginning,
-    and after the end of the schedule the last one, with no velocity.
+    to a table of rows ``1 / rate`` apart; between its own rows it is what `Schedule.resample` says. A tick takes the
+    row nearest to its beginning, and after the end of the schedule the last one, with no velocity.
 
     Where damping shares the axes of stiffness in every row, as ``2 zeta sqrt(m K)`` does, each axis is solved in
     closed form with Python floats, in microseconds. Otherwise a tick takes a matrix exponential by NumPy, some
@@ -42,6 +42,9 @@ class RealTimeAdmittance:
         Longest tick in s; over a longer one the motion is held, while the schedule goes on.
     force_limit : float, default=200.0
         Range of the sensor, in N, as the length of the vector.
+    deadband : float, default=0.0
+        Forces up to it on an axis, in N, count as none, and larger ones by so much less: what is left of a sensor's
+        drift and noise does not move the robot.
     spring_limit : float, default=None
         Most that the spring ``K (x_d - x)`` may pull at the start of a tick, in N; None takes ``force_limit``.
         Farther off, K is scaled by ``spring_limit / sqrt(k_max e'K e)``, e = x_d - x, k_max the largest eigenvalue:
@@ -99,6 +102,7 @@ class RealTimeAdmittance:
         rate: float = 1000.0,
         max_step: float = 0.01,
         force_limit: float = 200.0,
+        deadband: float = 0.0,
         spring_limit: float | None = None,
         velocity_limit: float | None = None,
         acceleration_limit: float | None = None,
@@ -111,6 +115,7 @@ class RealTimeAdmittance:
         if self._max_step * number("rate", rate, "1/s") <= 1.0:
             raise ValueError(f"max_step={max_step} s is no longer than a tick at rate={rate}: raise it, to some ticks.")
         self._push_limit = number("force_limit", force_limit, "N") / self._mass
+        self._deadband = number("deadband", deadband, "N, or 0", zero=True) / self._mass
         pull_limit = force_limit if spring_limit is None else spring_limit
         self._pull_limit = number("spring_limit", pull_limit, "N, or None") / self._mass
         self._speed_limit = limit("velocity_limit", velocity_limit, "units/s")
@@ -127,7 +132,13 @@ class RealTimeAdmittance:
         self._begin(math.nan, self._table.row(0)[: self._table.n_axes], (0.0,) * self._table.n_axes, 0.0)
 
     def start(
-        self, now: float, position: Numbers | None = None, velocity: Numbers | None = None, *, at: float = 0.0
+        self,
+        now: float,
+        position: Numbers | None = None,
+        velocity: Numbers | None = None,
+        *,
+        at: float = 0.0,
+        force_bias: Numbers | None = None,
     ) -> None:
         """Begin, or begin again: faults, forces and motion are forgotten.
 
@@ -139,6 +150,10 @@ class RealTimeAdmittance:
             Where the robot is and how it moves; None takes it to be where the schedule is, at rest.
         at : float, default=0.0
             Where in the schedule to begin, in s; ``schedule_time`` goes on after a stop.
+
+        force_bias : sequence of d floats, default=None
+            What the sensor reads at rest, in N: the mean of some readings while nothing touches it. It is taken off
+            every force; None is none. A bias of 0.5 N moves a robot of 50 N/m by 10 mm.
 
         Raises
         ------
@@ -154,8 +169,10 @@ class RealTimeAdmittance:
         moving = vector("velocity", (0.0,) * d if velocity is None else velocity, d)
         if math.hypot(*moving) > self._speed_limit:
             raise ValueError(f"velocity={moving} is beyond velocity_limit={self._speed_limit}: slow the robot first.")
+        bias = vector("force_bias", (0.0,) * d if force_bias is None else force_bias, d)
         self._take_turn()
         self._begin(float(now), here, moving, float(at))
+        self._bias = bias
         self._turn.release()
 
     def tick(self, now: float, force: Numbers) -> TickStatus:
@@ -222,15 +239,19 @@ class RealTimeAdmittance:
         self._distance = tuple(map(sub, self._row, position))  # stops at the end of position
         self._soft_end = now + self._soft_start if any(self._distance) else -math.inf
         self._push: Vector = (0.0,) * len(position)
+        self._bias = self._push
         self._n_lost, self._is_stopped, self.faults = 0, False, _FINE
 
     def _tick(self, now: float, force: Numbers) -> TickStatus:
         try:
-            now, push = float(now), tuple([float(component) / self._mass for component in force])
+            pairs = zip(force, self._bias, strict=True)
+            now, push = float(now), tuple([(float(component) - bias) / self._mass for component, bias in pairs])
         except (TypeError, ValueError, OverflowError):
             push = ()
         if len(push) != len(self.position):
             raise ValueError(f"tick takes a time and {len(self.position)} numbers in N; got {now!r} and {force!r}.")
+        if self._deadband:
+            push = tuple([part - max(-self._deadband, min(self._deadband, part)) for part in push])
         step, status = now - self._last, _FINE
         if math.hypot(*push) <= self._push_limit:
             self._push, self._n_lost = push, 0
@@ -277,22 +298,8 @@ class RealTimeAdmittance:
         position, velocity, self._scale = table.advance(row, self._push, *here, step, self._pull_limit)
         status = _FINE if self._scale == 1.0 else TickStatus.SPRING_LIMITED
         if self._is_limited:
-            position, velocity, status = self._limited(position, velocity, step, status)
+            limits = self._speed_limit, self._acceleration_limit
+            position, velocity, reached = limited(position, velocity, *here, step, *limits)
+            status |= reached
         self._row, self.position, self.velocity = row, position, velocity
         return status
-
-    def _limited(self, position: Vector, velocity: Vector, step: float, status: TickStatus) -> _Limited:
-        """Shorten the change of velocity, then the velocity: the second never undoes the first."""
-        change, most, reached = math.dist(velocity, self.velocity), self._acceleration_limit * step, status
-        if change > most:
-            velocity = tuple(v + most / change * (w - v) for v, w in zip(self.velocity, velocity, strict=True))
-            reached |= TickStatus.ACCELERATION_LIMITED
-        speed = math.hypot(*velocity)
-        if speed > self._speed_limit:
-            velocity = tuple(self._speed_limit / speed * component for component in velocity)
-            reached |= TickStatus.VELOCITY_LIMITED
-        elif math.dist(position, self.position) > self._speed_limit * step:
-            reached |= TickStatus.VELOCITY_LIMITED
-        if reached is not status:
-            position = drift(self.position, self.velocity, velocity, step)
-        return position, velocity, reached

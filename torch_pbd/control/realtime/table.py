@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torch_pbd.control.realtime.steps import Floats, Vector, advance_coupled, advance_modal, advance_plane
+from torch_pbd.control.sampling import Between
 
 Advance = Callable[[Vector, Vector, Vector, Vector, float, float], tuple[Vector, Vector, float]]
 
@@ -58,7 +59,9 @@ class ScheduleTable(NamedTuple):
         if n_rows > _MAX_ROWS:
             raise ValueError(f"rate={rate} makes {n_rows} rows of the schedule, more than {_MAX_ROWS}: lower it.")
         grid = np.append(np.arange(n_rows - 1) / rate, time[-1] - time[0])
-        position, velocity, stiffness, damping = (_interpolated(grid, time - time[0], value) for value in values)
+        between = Between(time - time[0], grid)
+        position, velocity = between.hermite(*values[:2])
+        stiffness, damping = map(between.linear, values[2:])
         velocity[-1] = 0.0
         advance, gains = _gains(stiffness / mass, damping / mass)
         rows = np.concatenate([part.reshape(n_rows, -1) for part in (position, velocity, *gains)], axis=1)
@@ -78,11 +81,6 @@ class ScheduleTable(NamedTuple):
     def row(self, index: int) -> Vector:
         """One row, unpacked."""
         return self.layout.unpack_from(self.packed, index * self.layout.size)
-
-
-def _interpolated(grid: Floats, time: Floats, values: Floats) -> Floats:
-    columns = values.reshape(len(time), -1).T
-    return np.stack([np.interp(grid, time, column) for column in columns], axis=-1).reshape(-1, *values.shape[1:])
 
 
 def _gains(stiffness: Floats, damping: Floats) -> tuple[Advance, list[Floats]]:

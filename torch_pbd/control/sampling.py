@@ -1,0 +1,42 @@
+"""Rows of a schedule between its own: how many at a rate, and what motion and gains are there."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+_ROUNDING = 1e-6  # of a tick: 10 s at 1 kHz are 10001 rows, however 10 * 1000 is rounded
+
+
+def count_intervals(duration: float, rate: float) -> int:
+    """Whole ticks of ``1 / rate`` within a duration; the rows are one more."""
+    return int(duration * rate + _ROUNDING)
+
+
+def blend(start: Floats, end: Floats, share: Floats) -> Floats:
+    """Straight line from start to end, exact at both and where they agree, which (1 - s) a + s b is not."""
+    share = share.reshape(-1, *[1] * (start.ndim - 1))
+    return np.where(share < 0.5, start + share * (end - start), end - (1.0 - share) * (end - start))
+
+
+class Between:
+    """Where times (m,) lie between the rows of a schedule at ``knots`` (n,), n >= 2."""
+
+    def __init__(self, knots: Floats, times: Floats) -> None:
+        self._row = np.clip(np.searchsorted(knots, times, side="right") - 1, 0, len(knots) - 2)
+        self._step = knots[self._row + 1] - knots[self._row]
+        self._share = (times - knots[self._row]) / self._step
+
+    def linear(self, values: Floats) -> Floats:
+        """Values (n, ...) on straight lines, (m, ...)."""
+        return blend(values[self._row], values[self._row + 1], self._share)
+
+    def hermite(self, position: Floats, velocity: Floats) -> tuple[Floats, Floats]:
+        """Cubic through positions (n, d) with these velocities (n, d), and its derivative."""
+        row, s, h = self._row, self._share[:, np.newaxis], self._step[:, np.newaxis]
+        start, end = velocity[row], velocity[row + 1]
+        cubic = blend(position[row], position[row + 1], self._share**2 * (3.0 - 2.0 * self._share))
+        bend = h * s * (1.0 - s) * ((1.0 - s) * start - s * end)
+        secant = (position[row + 1] - position[row]) / h
+        slope = blend(start, end, self._share) + 3.0 * s * (1.0 - s) * (2.0 * secant - start - end)
+        return cubic + bend, slope
