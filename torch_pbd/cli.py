@@ -112,7 +112,8 @@ def _experiment(options: Any, folder: Any) -> str:
     else:
         demonstrations = load_demonstrations(options.data)
         print(describe(demonstrations, options.data.name))
-    print(f"pushes of {options.push:g} N along {demonstrations.names[0]}, at 20 % and 80 % of the movement\n")
+    where = f"along {demonstrations.names[0]}, at 20 % and 80 % of the movement; K is the stiffness there, N/m"
+    print(f"pushes of {options.push:g} N {where}\n")
     folder.write_figure(framework_figure(), "figure5_framework")
     made = options.data is None
     return run_robot(options.controllers, demonstrations, folder, peak=options.push, rate=options.rate, in_tunnel=made)

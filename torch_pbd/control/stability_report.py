@@ -85,9 +85,8 @@ class StabilityReport:
         speed = "any" if math.isinf(self.max_speed) else f"{self.max_speed:.3g} x"
         if self.stable_at_any_schedule and math.isfinite(self.max_speed):
             speed = f"any, by the rule; by the certificate {speed}"
-        held = (
-            "" if self.held_growth <= 1.0 + 1e-9 else f" (held between knots, V grows by {self.held_growth - 1.0:.2g})"
-        )
+        grows = self.certified and self.held_growth > 1.0 + 1e-9
+        held = f"; held between knots, V grows by {self.held_growth - 1.0:.2g}" if grows else ""
         verdict = "guaranteed" if self.stable else "NOT GUARANTEED: slow down, damp more, or use a filter"
         mass = f"{self.mass:g} kg" if isinstance(self.mass, float) else "a mass matrix"
         return "\n".join(
