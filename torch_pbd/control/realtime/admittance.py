@@ -129,6 +129,7 @@ class RealTimeAdmittance:
         self._soft_start = number("soft_start", soft_start, "s, or 0", zero=True)
         self._table = ScheduleTable.of(schedule, self._mass, float(rate))
         self._turn = threading.Lock()
+        self._bias: Vector = ()
         self._begin(math.nan, self._table.row(0)[: self._table.n_axes], (0.0,) * self._table.n_axes, 0.0)
 
     def start(
@@ -169,7 +170,7 @@ class RealTimeAdmittance:
         moving = vector("velocity", (0.0,) * d if velocity is None else velocity, d)
         if math.hypot(*moving) > self._speed_limit:
             raise ValueError(f"velocity={moving} is beyond velocity_limit={self._speed_limit}: slow the robot first.")
-        bias = vector("force_bias", (0.0,) * d if force_bias is None else force_bias, d)
+        bias = () if force_bias is None else vector("force_bias", force_bias, d)
         self._take_turn()
         self._begin(float(now), here, moving, float(at))
         self._bias = bias
@@ -239,13 +240,14 @@ class RealTimeAdmittance:
         self._distance = tuple(map(sub, self._row, position))  # stops at the end of position
         self._soft_end = now + self._soft_start if any(self._distance) else -math.inf
         self._push: Vector = (0.0,) * len(position)
-        self._bias = self._push
+        self._bias = ()
         self._n_lost, self._is_stopped, self.faults = 0, False, _FINE
 
     def _tick(self, now: float, force: Numbers) -> TickStatus:
         try:
-            pairs = zip(force, self._bias, strict=True)
-            now, push = float(now), tuple([(float(component) - bias) / self._mass for component, bias in pairs])
+            if self._bias:
+                force = [float(component) - bias for component, bias in zip(force, self._bias, strict=True)]
+            now, push = float(now), tuple([float(component) / self._mass for component in force])
         except (TypeError, ValueError, OverflowError):
             push = ()
         if len(push) != len(self.position):
