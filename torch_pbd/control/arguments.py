@@ -77,17 +77,6 @@ def as_times(X: ArrayLike) -> Floats:
     return np.asarray(times[:, 0])
 
 
-def as_force(force: ArrayLike | None, shape: tuple[int, ...], rate: float) -> Floats:
-    """External force of that shape; None is none."""
-    push = np.zeros(shape) if force is None else np.array(force, dtype=np.float64)
-    if push.shape != shape:
-        raise ValueError(
-            f"force has shape {push.shape}, must have shape {shape}: one row in N for each tick of "
-            f"schedule(rate={rate:g})."
-        )
-    return push
-
-
 def count_ticks(duration: float, rate: float, settle: float) -> int:
     """Ticks of a schedule that ends ``settle`` after the movement."""
     check_positive("rate", rate)

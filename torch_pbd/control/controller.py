@@ -4,18 +4,15 @@ import warnings
 from typing import Any, Literal, Self
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
-from sklearn.base import BaseEstimator, clone
-from sklearn.utils import check_random_state
-from sklearn.utils.validation import check_is_fitted, has_fit_parameter
+from sklearn.base import BaseEstimator
+from sklearn.utils.validation import check_is_fitted
 
 from torch_pbd.control.arguments import (
     Goals,
     PhaseInput,
     Variability,
     as_demonstrations,
-    as_force,
     as_times,
     check_parameters,
     count_ticks,
@@ -27,16 +24,15 @@ from torch_pbd.control.provenance import provenance
 from torch_pbd.control.reproduction import Reproduction
 from torch_pbd.control.rollout import Rollout
 from torch_pbd.control.schedule import Schedule
+from torch_pbd.control.simulation import simulate_schedule
 from torch_pbd.control.smoothing import Movements, automatic_cutoff, noise_like, smooth, variance_share
 from torch_pbd.control.stiffness import StiffnessLaw
 from torch_pbd.control.units import common_start, duration_of, in_metres, in_seconds, robot_unit
+from torch_pbd.control.variability import fit_covariance, fit_law
 from torch_pbd.data import Demonstrations, check_unimodal
 from torch_pbd.estimators._base import CovarianceRegressor
-from torch_pbd.estimators.cholesky import CholeskyCovRegressor
 
 Floats = NDArray[np.float64]
-
-_RESOLUTION = 1e-5  # of the extent of a movement: smaller standard deviations count as none
 
 
 class DMPController(BaseEstimator):
@@ -88,30 +84,24 @@ class DMPController(BaseEstimator):
     ----------
     covariance_ : fitted covariance regressor
         Its input is what ``phase_input`` says, its output what ``variability`` says.
-    dmp_ : DMP
-    law_ : StiffnessLaw
-        With its bounds fixed to this movement.
-    duration_ : float
-        Of the movement, in s.
-    start_time_, time_scale_ : float
-        Time at which all demonstrations start, 0 where they differ; seconds of movement in one unit of their time.
+    dmp_, law_ : DMP, StiffnessLaw
+        With the duration, and the bounds, of this movement.
+    duration_, start_time_, time_scale_ : float
+        Of the movement, in s; time at which all demonstrations start, 0 where they differ; seconds of movement in
+        one unit of their time.
     start_, goal_ : ndarray of shape (d,)
-    cutoff_ : float or None
-    noise_scale_ : ndarray of shape (d,)
-        Root mean square of what the smoothing took away.
-    noise_share_ : ndarray of shape (d,)
-        Share of the variance that is left over from such noise, were it white; above about 0.3, lower the cutoff.
-    reproduction_error_ : float
-        Root mean square distance of the reproduced path from the mean of the smoothed demonstrations.
+    noise_scale_, noise_share_ : ndarray of shape (d,)
+        Root mean square of what the smoothing took away, and the share of the variance that is left over from such
+        noise, were it white: above about 0.3, lower the cutoff.
+    cutoff_, reproduction_error_ : float
+        Hz; root mean square distance of the reproduced path from the mean of the smoothed demonstrations.
     n_outputs_, n_demos_ : int
 
     Examples
     --------
-    >>> from torch_pbd import DMPController
     >>> from torch_pbd.data import make_tunnel_demonstrations
     >>> controller = DMPController().fit(make_tunnel_demonstrations(random_state=0))
-    >>> schedule = controller.schedule(rate=100.0)
-    >>> schedule.stiffness.shape
+    >>> controller.schedule(rate=100.0).stiffness.shape
     (1001, 2, 2)
     """
 
@@ -197,14 +187,12 @@ class DMPController(BaseEstimator):
         self.start_, self.goal_ = self.reproduction_.start, self.reproduction_.goal
         self.reproduction_error_ = self.reproduction_.check_against(movements)
         varying = self.varying(movements)
-        self._fit_covariance(self.phase(movements.time), varying)
+        self.covariance_ = fit_covariance(self.covariance, self.phase(movements.time), varying)
         self.noise_scale_ = movements.noise_scale
         noise = self.smooth(noise_like(demonstrations, movements.noise_scale))
         self.noise_share_ = variance_share(self.varying(noise), varying)
-        law = StiffnessLaw() if self.stiffness_law is None else self.stiffness_law
         along = self.covariance_.predict_cov(self.phase(np.linspace(0.0, self.duration_, 1001)))
-        extent = float(np.linalg.norm(np.ptp(varying, axis=(0, 1))))
-        self.law_ = law.fitted(along, resolution=_RESOLUTION * extent)
+        self.law_ = fit_law(self.stiffness_law, along, varying)
         self._impedance = Impedance(self.law_, self.mass, self.damping_ratio, self.on_unknown)
         return self
 
@@ -295,18 +283,14 @@ class DMPController(BaseEstimator):
             If the force has not one row for each tick.
         """
         schedule = self.schedule(rate)
-        push = as_force(force, schedule.position.shape, rate)
         robot = AdmittancePlant(self.mass) if plant is None else plant
-        parts = (schedule.position, schedule.velocity, schedule.stiffness, schedule.damping, push)
         if np.ndim(robot.mass) or float(robot.mass) != float(self.mass):
             warnings.warn(
                 f"The plant's mass is {robot.mass}, but damping_ratio was met for mass={self.mass:g} kg: give both the "
                 "same.",
                 stacklevel=2,
             )
-        seed = int(check_random_state(random_state).randint(2**31 - 1))
-        generator = torch.Generator().manual_seed(seed)
-        return robot.simulate(*map(_tensor, parts), dt=1.0 / rate, generator=generator).numpy()
+        return simulate_schedule(schedule, robot, force, rate, random_state)
 
     def reproduce(
         self,
@@ -334,14 +318,6 @@ class DMPController(BaseEstimator):
         n_ticks = count_ticks(self.duration_, rate, settle) if speed is None else len(np.asarray(speed))
         return self.reproduction_.roll_out(n_ticks, 1.0 / rate, goal=goal, start=start, speed=speed)
 
-    def _fit_covariance(self, inputs: Floats, varying: Floats) -> None:
-        regressor = CholeskyCovRegressor() if self.covariance is None else self.covariance
-        self.covariance_ = clone(regressor)
-        n_demos, _, n_outputs = varying.shape
-        groups = {"groups": np.repeat(np.arange(n_demos), len(inputs))}
-        told = groups if has_fit_parameter(self.covariance_, "groups") else {}
-        self.covariance_.fit(np.tile(inputs, (n_demos, 1)), varying.reshape(-1, n_outputs), **told)
-
     def phase(self, time: ArrayLike) -> Floats:
         """Inputs (n, 1) of ``covariance_`` at movement times (n,), which start at 0: what ``phase_input`` says."""
         check_is_fitted(self)
@@ -363,7 +339,3 @@ class DMPController(BaseEstimator):
         inputs = self.phase(time)
         covariance, unknown = self.covariance_.predict_cov(inputs), self.covariance_.predict_uncertainty(inputs).type1
         return self._impedance(covariance, unknown, time)
-
-
-def _tensor(values: ArrayLike) -> torch.Tensor:
-    return torch.tensor(np.asarray(values, dtype=np.float64, order="C"))

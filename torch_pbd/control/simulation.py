@@ -1,0 +1,38 @@
+"""A schedule on a simulated robot."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from sklearn.utils import check_random_state
+
+from torch_pbd.control.plant import AdmittancePlant
+from torch_pbd.control.rollout import Rollout
+from torch_pbd.control.schedule import Schedule
+
+
+def simulate_schedule(
+    schedule: Schedule, robot: AdmittancePlant, force: ArrayLike | None, rate: float, random_state: Any
+) -> Rollout:
+    """Run a schedule whose rows are ticks of ``1 / rate`` s under an external force (T, d) in N.
+
+    Raises
+    ------
+    ValueError
+        If the force has not one row for each tick.
+    """
+    shape = schedule.position.shape
+    push = np.zeros(shape) if force is None else np.array(force, dtype=np.float64)
+    if push.shape != shape:
+        raise ValueError(
+            f"force has shape {push.shape}, must have shape {shape}: one row in N for each tick of "
+            f"schedule(rate={rate:g})."
+        )
+    parts = (schedule.position, schedule.velocity, schedule.stiffness, schedule.damping, push)
+    generator = torch.Generator().manual_seed(int(check_random_state(random_state).randint(2**31 - 1)))
+    return robot.simulate(*map(_tensor, parts), dt=1.0 / rate, generator=generator).numpy()
+
+
+def _tensor(values: NDArray[np.float64]) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)

@@ -1,0 +1,29 @@
+"""What demonstrations vary by, learned: the covariance over the phase, and the bounds of the stiffness law."""
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.base import clone
+from sklearn.utils.validation import has_fit_parameter
+
+from torch_pbd.control.stiffness import StiffnessLaw
+from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.estimators.cholesky import CholeskyCovRegressor
+
+Floats = NDArray[np.float64]
+
+_RESOLUTION = 1e-5  # of the extent of a movement: smaller standard deviations count as none
+
+
+def fit_covariance(regressor: CovarianceRegressor | None, inputs: Floats, varying: Floats) -> CovarianceRegressor:
+    """Fit a clone of the regressor to what varies (K, n, d) at common inputs (n, 1); it is told the demonstrations."""
+    fitted: CovarianceRegressor = clone(CholeskyCovRegressor() if regressor is None else regressor)
+    n_demos, n_steps, n_outputs = varying.shape
+    groups = {"groups": np.repeat(np.arange(n_demos), n_steps)}
+    told = groups if has_fit_parameter(fitted, "groups") else {}
+    return fitted.fit(np.tile(inputs, (n_demos, 1)), varying.reshape(-1, n_outputs), **told)
+
+
+def fit_law(law: StiffnessLaw | None, covariance: Floats, varying: Floats) -> StiffnessLaw:
+    """Fix the bounds of a law to covariances (m, d, d) along a movement, of what varies (K, n, d)."""
+    extent = float(np.linalg.norm(np.ptp(varying, axis=(0, 1))))
+    return (StiffnessLaw() if law is None else law).fitted(covariance, resolution=_RESOLUTION * extent)
