@@ -13,6 +13,11 @@ def test_a_table_lines_up_and_shows_what_is_not_known_as_a_dash():
     assert len({len(line) for line in lines}) == 1
 
 
+def test_a_column_of_which_nothing_is_known_is_left_out():
+    rows = [{"model": "CD", "truth": float("nan"), "LL": 1.0}, {"model": "WP", "truth": float("nan"), "LL": 2.0}]
+    assert "truth" not in format_table(rows)
+
+
 def test_a_folder_says_what_was_run(tmp_path):
     RunFolder(tmp_path / "runs" / "new", {"command": "fit"})
     environment = json.loads((tmp_path / "runs" / "new" / "env.json").read_text())

@@ -8,11 +8,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from torch_pbd.control.controller import DMPController
-from torch_pbd.data import Demonstrations, make_tunnel_demonstrations, tunnel_center, tunnel_half_width
+from torch_pbd.data import Demonstrations, make_tunnel_demonstrations
 from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.experiments.comparison import compare_models
 from torch_pbd.experiments.recordings import score_row, write_fitted
 from torch_pbd.experiments.robot import run_robot
+from torch_pbd.experiments.robot_figures import draw_tunnel
 from torch_pbd.experiments.run_folder import RunFolder, format_table
 from torch_pbd.metrics import mahalanobis_coverage
 from torch_pbd.plotting import MODEL, plot_covariance_ellipses, plot_demonstrations
@@ -56,13 +57,10 @@ def _tunnel_figure(models: Mapping[str, CovarianceRegressor], demonstrations: De
     figure, axes = plt.subplots(
         1, len(models), figsize=(3.6 * len(models), 6), layout="constrained", sharey=True, squeeze=False
     )
-    along = np.linspace(0.0, 0.6, 200)
     duration = demonstrations.times[0][-1]
     query = np.linspace(0.0, duration, 13)[:, np.newaxis]
     for ax, (name, model) in zip(axes[0], models.items(), strict=True):
-        for side in (-1.0, 1.0):
-            wall = tunnel_center(along) + side * tunnel_half_width(along)
-            ax.plot(wall, along, color="black", lw=1.5, label="wall" if side > 0 else None)
+        draw_tunnel(ax)
         plot_demonstrations(demonstrations, [0, 1], ax)
         mean, covariance = model.predict(query, return_cov=True)
         # The spread along y is of micrometres: the ellipses show as lines across the path.

@@ -39,9 +39,14 @@ def describe(demonstrations: Demonstrations, source: str) -> str:
     length = str(steps[0]) if len(set(steps)) == 1 else f"{min(steps)} to {max(steps)}"
     aligned = "aligned" if demonstrations.is_aligned else "not aligned"
     return (
-        f"{source}: {len(demonstrations)} demonstrations of {length} samples, {demonstrations.n_outputs} outputs "
+        f"{source}: {_counted(len(demonstrations), 'demonstration')} of {length} samples, "
+        f"{_counted(demonstrations.n_outputs, 'output')} "
         f"({', '.join(demonstrations.names)}), {aligned}"
     )
+
+
+def _counted(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def figure_of(model: CovarianceRegressor, demonstrations: Demonstrations, name: str, input: Input = "time") -> Figure:

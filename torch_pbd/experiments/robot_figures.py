@@ -67,10 +67,7 @@ def task_figure(
     """Demonstrations, reproduction and, of positions, the inferred variability as ellipses: Figure 6."""
     figure, ax = plt.subplots(figsize=(5.2, 6.0), layout="constrained")
     if in_tunnel:
-        along = np.linspace(0.0, 0.6, 200)
-        for side in (-1.0, 1.0):
-            wall = tunnel_center(along) + side * tunnel_half_width(along)
-            ax.plot(wall, along, color="black", lw=1.5, label="wall" if side > 0 else None)
+        draw_tunnel(ax)
     if demonstrations.n_outputs == 1:
         plot_demonstrations(demonstrations, [0], ax)
     else:
@@ -89,6 +86,14 @@ def task_figure(
         ax.set_aspect("equal", adjustable="datalim")
     figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=9)
     return figure
+
+
+def draw_tunnel(ax: Axes) -> None:
+    """Draw the walls of the tunnel task."""
+    along = np.linspace(0.0, 0.6, 200)
+    for side in (-1.0, 1.0):
+        wall = tunnel_center(along) + side * tunnel_half_width(along)
+        ax.plot(wall, along, color="black", lw=1.5, label="wall" if side > 0 else None)
 
 
 def variability_figure(controller: DMPController, demonstrations: Demonstrations, name: str) -> Figure:

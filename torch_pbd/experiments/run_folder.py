@@ -76,8 +76,11 @@ def slug(name: str) -> str:
 
 
 def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Text table of rows with the same keys; numbers to three digits, what is not known as a dash."""
-    header = list(rows[0])
+    """Text table of rows with the same keys; numbers to three digits, what is not known as a dash.
+
+    A column of which nothing is known is left out.
+    """
+    header = [column for column in rows[0] if any(row[column] == row[column] for row in rows)]
     cells = [[_cell(row[column]) for column in header] for row in rows]
     widths = [max(len(column), *(len(line[i]) for line in cells)) for i, column in enumerate(header)]
     is_text = [isinstance(rows[0][column], str) for column in header]
