@@ -158,7 +158,7 @@ def test_an_experiment_on_a_file_takes_its_covariance_from_the_config(recording,
     )
     arguments = ["--data", str(recording), "--rate", "100", "--output", str(tmp_path / "out")]
     assert main(["experiment", "--config", str(config), *arguments]) == 0
-    assert "stability at 2 kg" in capsys.readouterr().out
+    assert "stability of the admittance at 2 kg" in capsys.readouterr().out
     schedule = Schedule.load(tmp_path / "out" / "schedule" / "mine.npz")
     assert schedule.stiffness_limits == (50.0, 400.0)
     assert "GMMBaseline" in schedule.provenance["covariance"]

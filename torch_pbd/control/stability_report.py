@@ -98,6 +98,6 @@ class StabilityReport:
                 f"{self.margin_time:.3g} s, alpha {self.alpha:.3g} /s{held}",
                 f"  replay speed limit       {speed}",
                 f"  gain from any state      {self.gain:.3g}{warning}",
-                f"  stiffest environment     {self.environment_stiffness:.3g} N/m in the softest phase",
+                f"  stiffest environment     {self.environment_stiffness:.4g} N/m in the softest phase",
             ]
         )
