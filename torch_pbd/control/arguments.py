@@ -11,7 +11,7 @@ from torch_pbd.control.dmp import DMP, Gate
 from torch_pbd.control.impedance import OnUnknown
 from torch_pbd.control.matrices import check_count, check_finite, check_positive
 from torch_pbd.control.sampling import count_intervals
-from torch_pbd.data import Demonstrations
+from torch_pbd.data import Demonstrations, check_unimodal
 
 Floats = NDArray[np.float64]
 PhaseInput = Literal["time", "log_s", "s"]
@@ -43,14 +43,30 @@ def check_parameters(controller: Any) -> None:
     damping_from_stiffness(np.eye(1), controller.mass, controller.damping_ratio)
 
 
-def as_demonstrations(X: ArrayLike, y: ArrayLike | None, groups: ArrayLike | None) -> Demonstrations:
-    """Demonstrations of samples X (n, 1), y (n, d) whose groups (n,) tell them apart.
+def as_demonstrations(X: Demonstrations | ArrayLike, y: ArrayLike | None, groups: ArrayLike | None) -> Demonstrations:
+    """Two demonstrations or more: as they are, or of samples X (n, 1), y (n, d) whose groups (n,) tell them apart.
 
     Raises
     ------
     ValueError
-        If shapes disagree, or times do not increase within a demonstration.
+        If there is one only, shapes disagree, or times do not increase within a demonstration.
+
+    Warns
+    -----
+    UnimodalityWarning
+        If they follow more than one way.
     """
+    demonstrations = X if isinstance(X, Demonstrations) else _grouped(X, y, groups)
+    if len(demonstrations) < 2:
+        raise ValueError(
+            "DMPController needs >= 2 demonstrations, got 1: what varies between demonstrations cannot be learned "
+            "from one. Record more, or give groups that tell the samples of several apart."
+        )
+    check_unimodal(demonstrations)
+    return demonstrations
+
+
+def _grouped(X: ArrayLike, y: ArrayLike | None, groups: ArrayLike | None) -> Demonstrations:
     if y is None:
         raise ValueError("y is None: give Demonstrations, or times X (n, 1), positions y (n, d) and groups (n,).")
     times, positions = check_X_y(X, y, dtype=np.float64, multi_output=True, y_numeric=True)

@@ -1,6 +1,5 @@
 """The controller as an estimator: demonstrations in, a stiffness schedule out (Section V)."""
 
-import warnings
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -20,16 +19,16 @@ from torch_pbd.control.arguments import (
 from torch_pbd.control.dmp import DMP, Gate
 from torch_pbd.control.impedance import Gains, Impedance, OnUnknown
 from torch_pbd.control.plant import AdmittancePlant
-from torch_pbd.control.provenance import provenance
+from torch_pbd.control.provenance import schedule_labels
 from torch_pbd.control.reproduction import Reproduction
 from torch_pbd.control.rollout import Rollout
 from torch_pbd.control.schedule import Schedule
 from torch_pbd.control.simulation import simulate_schedule
 from torch_pbd.control.smoothing import Movements, automatic_cutoff, noise_like, smooth, variance_share
 from torch_pbd.control.stiffness import StiffnessLaw
-from torch_pbd.control.units import common_start, duration_of, in_metres, in_seconds, robot_unit
+from torch_pbd.control.units import common_start, duration_of, in_metres, in_seconds
 from torch_pbd.control.variability import fit_covariance, fit_law
-from torch_pbd.data import Demonstrations, check_unimodal
+from torch_pbd.data import Demonstrations
 from torch_pbd.estimators._base import CovarianceRegressor
 
 Floats = NDArray[np.float64]
@@ -166,13 +165,7 @@ class DMPController(BaseEstimator):
             If there are fewer than two demonstrations, too few samples in one, or a parameter cannot be used.
         """
         check_parameters(self)
-        demonstrations = X if isinstance(X, Demonstrations) else as_demonstrations(X, y, groups)
-        if len(demonstrations) < 2:
-            raise ValueError(
-                "DMPController needs >= 2 demonstrations, got 1: what varies between demonstrations cannot be learned "
-                "from one. Record more, or give groups that tell the samples of several apart."
-            )
-        check_unimodal(demonstrations)
+        demonstrations = as_demonstrations(X, y, groups)
         self.names_, self.frame_ = demonstrations.names, demonstrations.frame
         self.units_, self.time_unit_ = demonstrations.units, demonstrations.time_unit
         self.n_demos_, self.n_outputs_ = len(demonstrations), demonstrations.n_outputs
@@ -238,12 +231,7 @@ class DMPController(BaseEstimator):
             gains.damping,
             metres**2 * gains.covariance,
             gains.type1,
-            names=self.names_,
-            units=robot_unit(self.units_),
-            frame=self.frame_,
-            stiffness_limits=(self.law_.stiffness_min, self.law_.stiffness_max),
-            covariance_of=self.variability,
-            provenance=provenance(self),
+            **schedule_labels(self),
         )
 
     def simulate(
@@ -284,13 +272,7 @@ class DMPController(BaseEstimator):
         """
         schedule = self.schedule(rate)
         robot = AdmittancePlant(self.mass) if plant is None else plant
-        if np.ndim(robot.mass) or float(robot.mass) != float(self.mass):
-            warnings.warn(
-                f"The plant's mass is {robot.mass}, but damping_ratio was met for mass={self.mass:g} kg: give both the "
-                "same.",
-                stacklevel=2,
-            )
-        return simulate_schedule(schedule, robot, force, rate, random_state)
+        return simulate_schedule(schedule, robot, force, rate, random_state, mass=self.mass)
 
     def reproduce(
         self,

@@ -1,4 +1,4 @@
-"""What a schedule says of where it came from."""
+"""What a schedule says of itself, and of where it came from."""
 
 from dataclasses import asdict, is_dataclass
 from importlib.metadata import version
@@ -7,9 +7,23 @@ from typing import Any
 import numpy as np
 from sklearn.base import BaseEstimator
 
+from torch_pbd.control.units import robot_unit
 
-def provenance(controller: Any) -> dict[str, Any]:
-    """What a schedule came from, as JSON: parameters, the covariance model, bounds, version."""
+
+def schedule_labels(controller: Any) -> dict[str, Any]:
+    """Names, units, limits of the schedules of a fitted controller, and what they come from, as JSON can hold it."""
+    return {
+        "names": controller.names_,
+        "units": robot_unit(controller.units_),
+        "frame": controller.frame_,
+        "stiffness_limits": (controller.law_.stiffness_min, controller.law_.stiffness_max),
+        "covariance_of": controller.variability,
+        "provenance": _provenance(controller),
+    }
+
+
+def _provenance(controller: Any) -> dict[str, Any]:
+    """Parameters, the covariance model, bounds, version."""
     return {
         "controller": _plain(controller),
         "covariance": _plain(controller.covariance_),

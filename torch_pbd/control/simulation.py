@@ -1,5 +1,6 @@
 """A schedule on a simulated robot."""
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,20 @@ from torch_pbd.control.schedule import Schedule
 
 
 def simulate_schedule(
-    schedule: Schedule, robot: AdmittancePlant, force: ArrayLike | None, rate: float, random_state: Any
+    schedule: Schedule,
+    robot: AdmittancePlant,
+    force: ArrayLike | None,
+    rate: float,
+    random_state: Any,
+    *,
+    mass: float,
 ) -> Rollout:
     """Run a schedule whose rows are ticks of ``1 / rate`` s under an external force (T, d) in N.
+
+    Warns
+    -----
+    UserWarning
+        If the robot's mass is not that which the schedule's damping was computed for.
 
     Raises
     ------
@@ -28,6 +40,11 @@ def simulate_schedule(
         raise ValueError(
             f"force has shape {push.shape}, must have shape {shape}: one row in N for each tick of "
             f"schedule(rate={rate:g})."
+        )
+    if np.ndim(robot.mass) or float(robot.mass) != float(mass):
+        warnings.warn(
+            f"The plant's mass is {robot.mass}, but damping_ratio was met for mass={mass:g} kg: give both the same.",
+            stacklevel=3,
         )
     parts = (schedule.position, schedule.velocity, schedule.stiffness, schedule.damping, push)
     generator = torch.Generator().manual_seed(int(check_random_state(random_state).randint(2**31 - 1)))
