@@ -241,7 +241,8 @@ def schedule_names(schedule: Schedule) -> Sequence[str]:
 def output_label(demonstrations: Demonstrations, output: int) -> str:
     """Name of an output with its unit, for an axis."""
     units = demonstrations.units
-    return _axis_label(demonstrations.names[output], units[output] if units is not None else "")
+    unit = units[output] if units is not None else ""
+    return _axis_label(demonstrations.names[output], unit if len(unit) <= _LONGEST_UNIT else "")
 
 
 def _axis_label(name: str, unit: str) -> str:

@@ -6,7 +6,7 @@ import torch
 from sklearn.base import clone
 
 from torch_pbd import CholeskyCovRegressor, Demonstrations, DMPController, GMMBaseline
-from torch_pbd.control import AdmittancePlant, ForceSensor, Schedule, StiffnessLaw
+from torch_pbd.control import AdmittancePlant, ForceSensor, RealTimeAdmittance, Schedule, StiffnessLaw
 from torch_pbd.data import make_tunnel_demonstrations
 from torch_pbd.exceptions import DataRankWarning, UnimodalityWarning
 
@@ -230,6 +230,47 @@ def test_a_plant_of_another_mass_is_told_of_and_a_noisy_sensor_is_seeded(control
     runs = [controller.simulate(noisy, rate=50.0, random_state=seed).position for seed in (0, 0, 1)]
     np.testing.assert_array_equal(runs[0], runs[1])
     assert np.abs(runs[0] - runs[2]).max() > 0.0
+
+
+def test_the_mass_goes_with_the_schedule(tunnel, tmp_path):
+    heavy = DMPController(mass=4.0).fit(tunnel)
+    heavy.schedule(50.0).save(tmp_path / "heavy.json")
+    schedule = Schedule.load(tmp_path / "heavy.json")
+    assert schedule.mass == 4.0
+    assert schedule.certify().mass == 4.0
+    assert schedule.certify().damping_ratio == pytest.approx(1.0, abs=1e-6)
+    mine, told = (RealTimeAdmittance(schedule, rate=50.0, max_step=0.1, **mass) for mass in ({}, {"mass": 4.0}))
+    for each in (mine, told):
+        each.start(0.0)
+        for tick in range(1, 100):
+            each.tick(0.02 * tick, [1.0, 0.0])
+    assert mine.position == told.position
+
+
+def test_a_cutoff_that_takes_the_movement_away_is_told_of(tunnel):
+    with pytest.warns(UserWarning, match="off the mean of the demonstrations.*try a higher cutoff"):
+        blurred = DMPController(cutoff=0.05).fit(tunnel)
+    assert blurred.reproduction_error_ > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("options", "message"), [({"goal": [np.nan, 0.0]}, "goal has a value"), ({"speed": np.inf}, "speed has a value")]
+)
+def test_what_cannot_be_reproduced_is_refused(controller, options, message):
+    with pytest.raises(ValueError, match=message):
+        controller.reproduce(50.0, **options)
+
+
+def test_one_speed_is_that_of_all_ticks(controller):
+    slow = controller.reproduce(50.0, speed=0.5)[1]
+    np.testing.assert_array_equal(slow, controller.reproduce(50.0, speed=np.full(501, 0.5))[1])
+
+
+def test_demonstrations_that_stand_still_are_precise():
+    still = Demonstrations(np.arange(100) * 0.02, np.full((6, 100, 2), 0.3))
+    with pytest.warns(DataRankWarning, match="identical"), pytest.warns(UserWarning, match="do not vary"):
+        fitted = DMPController().fit(still)
+    np.testing.assert_allclose(fitted.predict_stiffness([[1.0]]), 1000.0 * np.eye(2)[None], rtol=1e-9)
 
 
 def test_simulation_follows_the_schedule_and_takes_any_plant(controller):

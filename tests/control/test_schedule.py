@@ -376,8 +376,8 @@ def test_npz_and_csv_can_be_read_by_others(tmp_path, schedule):
             np.testing.assert_array_equal(archive[name], getattr(schedule, name))
         assert json.loads(str(archive["header"]))["names"] == ["x", "y"]
     schedule.save(tmp_path / "schedule.csv")
-    table = np.genfromtxt(tmp_path / "schedule.csv", delimiter=",", skip_header=10)
-    titles = (tmp_path / "schedule.csv").read_text().splitlines()[9].replace('"', "")
+    table = np.genfromtxt(tmp_path / "schedule.csv", delimiter=",", skip_header=11)
+    titles = (tmp_path / "schedule.csv").read_text().splitlines()[10].replace('"', "")
     assert titles.startswith("time,position[x],position[y],velocity[x],velocity[y],stiffness[x,x],stiffness[x,y],")
     np.testing.assert_array_equal(table[:, 5:8], schedule.stiffness[:, [0, 0, 1], [0, 1, 1]])
     np.testing.assert_array_equal(table[:, -1], schedule.type1)
@@ -438,7 +438,7 @@ def rewritten(path, change):
         (lambda header, _: header.update(version=2), "it has version 2, this torch_pbd reads 1: upgrade it"),
         (lambda header, _: header.update(format="other"), "its format is 'other', not 'torch_pbd.schedule'"),
         (lambda header, _: header.pop("frame"), "its header has no 'frame'"),
-        (lambda header, _: header.update(mass=1.0), "its header has an unknown 'mass'"),
+        (lambda header, _: header.update(colour=1.0), "its header has an unknown 'colour'"),
         (lambda header, _: header.update(names=["x", "x"]), "names is ['x', 'x'], it must be 2 different strings"),
         (lambda header, _: header.update(provenance=None), "provenance is None, it must be a mapping"),
         (lambda header, _: header.update(stiffness_limits=[1, 2]), "the eigenvalue of stiffness is"),
@@ -533,7 +533,7 @@ def test_an_edited_csv_loads_once_its_checksum_is_deleted(tmp_path, schedule):
     schedule.save(path)
     text = path.read_text()
     assert load_bytes(path, ("\ufeff" + text.replace("\n", "\r\n")).encode()) == schedule  # a spreadsheet's line ends
-    row = text.splitlines()[12]
+    row = text.splitlines()[13]
     cells = row.split(",")
     cells[5] = "123.0"
     edited = text.replace(row, ",".join(cells))
@@ -551,12 +551,12 @@ def test_an_edited_csv_loads_once_its_checksum_is_deleted(tmp_path, schedule):
         ("# units:", "# names:", "line 4 must be '# key: value' with a new key"),
         ("null", "NaN", "it holds NaN: all numbers must be finite"),
         ('["x", "y"]', '["x"]', "names is ['x'], but there are 2 columns of positions"),
-        ("position[y]", "position[z]", "line 10 must name the columns time,position[x],position[y],velocity[x]"),
-        ("\n0.9,", "\n0.9,1,", "line 12 has 16 cells, but there are 15 columns"),
-        ("\n0.9,", "\nnan,", "line 12, column 'time': 'nan' is not a finite number"),
-        ("\n0.9,", "\n1e999,", "line 12, column 'time': '1e999' is not a finite number"),
-        ("\n0.9,", "\n1_0,", "line 12, column 'time': '1_0' is not a finite number"),
-        ("\n0.9,", "\n,", "line 12, column 'time': '' is not a finite number"),
+        ("position[y]", "position[z]", "line 11 must name the columns time,position[x],position[y],velocity[x]"),
+        ("\n0.9,", "\n0.9,1,", "line 13 has 16 cells, but there are 15 columns"),
+        ("\n0.9,", "\nnan,", "line 13, column 'time': 'nan' is not a finite number"),
+        ("\n0.9,", "\n1e999,", "line 13, column 'time': '1e999' is not a finite number"),
+        ("\n0.9,", "\n1_0,", "line 13, column 'time': '1_0' is not a finite number"),
+        ("\n0.9,", "\n,", "line 13, column 'time': '' is not a finite number"),
     ],
 )
 def test_csv_that_cannot_be_read_is_refused_with_its_place(tmp_path, rng, old, new, message):

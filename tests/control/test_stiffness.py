@@ -51,14 +51,12 @@ def test_read_as_variances_the_papers_bounds_are_their_roots(generator):
     assert variance.diagonal(dim1=-2, dim2=-1).std() > 100.0
 
 
-@pytest.mark.parametrize(("low", "high"), [(None, None), (0.0, 1.0), (0.25, 0.6)])
-def test_quantiles_are_those_of_numpy_over_all_axes(low, high, generator):
+def test_quantiles_are_those_of_numpy_over_all_axes(generator):
     covariance = covariances(5, 7, d=3, generator=generator)
-    law = StiffnessLaw(sigma_low=low, sigma_high=high)
+    law = StiffnessLaw()
     scales = np.sqrt(np.linalg.eigvalsh(covariance.numpy()))
-    shares = [0.1 if low is None else low, 0.9 if high is None else high]
     fitted = law.fitted(covariance)
-    np.testing.assert_allclose([fitted.sigma_low, fitted.sigma_high], np.quantile(scales, shares), rtol=1e-9)
+    np.testing.assert_allclose([fitted.sigma_low, fitted.sigma_high], np.quantile(scales, [0.1, 0.9]), rtol=1e-9)
     torch.testing.assert_close(law(covariance), fitted(covariance), rtol=1e-12, atol=0)
 
 
@@ -141,9 +139,11 @@ def test_gradients_are_finite_at_kinks_at_zero_and_where_all_axes_are_soft(law, 
 @pytest.mark.parametrize("bounds", ["sigma", "variance", "quantile"])
 def test_in_millimetres_the_stiffness_is_the_same(bounds, generator):
     covariance = covariances(20, d=2, generator=generator)
-    factor = {"sigma": 1e3, "variance": 1e6, "quantile": 1.0}[bounds]
-    law = StiffnessLaw(sigma_low=0.01, sigma_high=0.9, bounds=bounds)
-    larger = StiffnessLaw(sigma_low=0.01 * factor, sigma_high=min(0.9 * factor, 0.9e6), bounds=bounds)
+    law = larger = StiffnessLaw()
+    if bounds != "quantile":
+        factor = {"sigma": 1e3, "variance": 1e6}[bounds]
+        law = StiffnessLaw(sigma_low=0.01, sigma_high=0.9, bounds=bounds)
+        larger = StiffnessLaw(sigma_low=0.01 * factor, sigma_high=0.9 * factor, bounds=bounds)
     torch.testing.assert_close(larger(1e6 * covariance), law(covariance), rtol=1e-9, atol=1e-8)
 
 
@@ -201,8 +201,8 @@ def test_rounding_errors_are_no_errors():
         ({"stiffness_min": 0.0}, "stiffness_min == 0"),
         ({"stiffness_min": 2000.0}, "0 < stiffness_min <= stiffness_max"),
         ({"stiffness_max": math.nan}, "stiffness_max == nan"),
-        ({"sigma_low": 0.9, "sigma_high": 0.1}, "sigma_low == 0.9 and sigma_high == 0.1"),
-        ({"sigma_high": 1.5}, "<= 1, shares"),
+        ({"bounds": "sigma", "sigma_low": 0.9, "sigma_high": 0.1}, "sigma_low == 0.9 and sigma_high == 0.1"),
+        ({"sigma_low": 0.01, "sigma_high": 0.03}, "are standard deviations: give bounds='sigma' with them"),
         ({"bounds": "sigma", "sigma_low": 0.1}, "needs sigma_low and sigma_high"),
         ({"bounds": "variance", "sigma_low": -1e-3, "sigma_high": 1.0}, "0 <= sigma_low < sigma_high"),
         ({"bounds": "sigma", "sigma_low": 0.1, "sigma_high": math.inf}, "sigma_high == inf"),

@@ -11,6 +11,7 @@ from torch_pbd.control.dmp import DMP, Gate
 from torch_pbd.control.impedance import OnUnknown
 from torch_pbd.control.matrices import check_count, check_finite, check_positive
 from torch_pbd.control.sampling import count_intervals
+from torch_pbd.control.stiffness import StiffnessLaw
 from torch_pbd.data import Demonstrations, check_unimodal
 
 Floats = NDArray[np.float64]
@@ -36,6 +37,9 @@ def check_parameters(controller: Any) -> None:
     check_count("n_steps", controller.n_steps, 5)
     if controller.cutoff not in ("auto", None):
         check_positive("cutoff", controller.cutoff)
+    law = controller.stiffness_law
+    if law is not None and not isinstance(law, StiffnessLaw):
+        raise ValueError(f"stiffness_law == {law!r}, must be a StiffnessLaw or None.")
     if controller.duration is not None:
         check_positive("duration", controller.duration, "s")
     # What the primitive and the damping say of theirs.

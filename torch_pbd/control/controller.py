@@ -61,8 +61,8 @@ class DMPController(BaseEstimator):
     goal : {"common", "each"}, default="common"
         Goal in eq. (18): the mean end of all demonstrations, or that of each.
     cutoff : float, "auto" or None, default="auto"
-        Of the smoothing before derivatives are taken, in Hz: amplitudes are halved there. "auto" is 4 Hz, or 40
-        cycles a movement where times are not in units of time; None does not smooth.
+        Of the smoothing before derivatives are taken, in Hz: amplitudes are halved there. "auto" is 40 cycles a
+        movement, and not below 4 Hz; None does not smooth.
     duration : float, default=None
         Of the movement, in s; None is the median of the demonstrations. Needed where their times are phases.
     n_steps : int, default=100
@@ -90,10 +90,10 @@ class DMPController(BaseEstimator):
         one unit of their time.
     start_, goal_ : ndarray of shape (d,)
     noise_scale_, noise_share_ : ndarray of shape (d,)
-        Root mean square of what the smoothing took away, and the share of the variance that is left over from such
-        noise, were it white: above about 0.3, lower the cutoff.
+        Root mean square of what the smoothing took away; and, were that white noise, the share of the variance
+        that its rest behind the smoothing makes.
     cutoff_, reproduction_error_ : float
-        Hz; root mean square distance of the reproduced path from the mean of the smoothed demonstrations.
+        Hz; root mean square distance of the reproduced path from the mean of the demonstrations as recorded.
     n_outputs_, n_demos_ : int
 
     Examples
@@ -149,7 +149,7 @@ class DMPController(BaseEstimator):
         Parameters
         ----------
         X : Demonstrations, or array-like of shape (n_samples, 1)
-            Or the times of samples, which increase within each demonstration.
+            Or the times of samples, in s, which increase within each demonstration; for phases, give ``duration``.
         y : array-like of shape (n_samples, n_outputs), default=None
             Positions at these times.
         groups : array-like of shape (n_samples,), default=None
@@ -212,7 +212,8 @@ class DMPController(BaseEstimator):
         rate : float, default=1000.0
             In Hz.
         settle : float, default=0.0
-            How long to go on after the movement, in s: with a gate it then comes to rest at the goal.
+            How long to go on after the movement, in s: with a gate it then comes to rest at the goal. Of what comes
+            after it nothing was shown, so that on_unknown="soft" makes the robot compliant there.
 
         Returns
         -------
@@ -293,11 +294,15 @@ class DMPController(BaseEstimator):
             Goal, at each tick if it changes at run time; None is ``goal_``.
         start : array-like of shape (d,), default=None
             None is ``start_``.
-        speed : array-like of shape (n,), default=None
-            How fast movement time passes at each tick; it should change smoothly.
+        speed : float or array-like of shape (n,), default=None
+            How fast movement time passes, at each tick if it changes; it should change smoothly.
         """
         check_is_fitted(self)
-        n_ticks = count_ticks(self.duration_, rate, settle) if speed is None else len(np.asarray(speed))
+        n_ticks = count_ticks(self.duration_, rate, settle)
+        if speed is not None:
+            paces = np.asarray(speed, dtype=np.float64)
+            n_ticks = len(paces) if paces.ndim else n_ticks
+            speed = np.broadcast_to(paces, n_ticks)
         return self.reproduction_.roll_out(n_ticks, 1.0 / rate, goal=goal, start=start, speed=speed)
 
     def phase(self, time: ArrayLike) -> Floats:

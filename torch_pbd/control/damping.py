@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torch_pbd.control.matrices import as_semidefinite, check_finite, check_mass
+from torch_pbd.control.matrices import as_mass, as_semidefinite, check_finite
 from torch_pbd.linalg import spectral_map, symmetrize
 
 
@@ -45,10 +45,9 @@ def damping_from_stiffness(
     check_finite("damping_ratio", damping_ratio)
     if damping_ratio < 0.0:
         raise ValueError(f"damping_ratio == {damping_ratio:g}, must not be negative: the motion would gain energy.")
+    mass = as_mass(mass)
     if not isinstance(mass, Tensor) or mass.ndim == 0:
-        check_mass(mass)
         return 2.0 * damping_ratio * mass**0.5 * spectral_map(matrix, _root)
-    check_mass(mass)
     root = spectral_map(mass.to(matrix), torch.sqrt)
     inverse = spectral_map(mass.to(matrix), torch.rsqrt)
     return symmetrize(2.0 * damping_ratio * root @ spectral_map(inverse @ matrix @ inverse, _root) @ root)

@@ -18,6 +18,7 @@ def schedule_labels(controller: Any) -> dict[str, Any]:
         "frame": controller.frame_,
         "stiffness_limits": (controller.law_.stiffness_min, controller.law_.stiffness_max),
         "covariance_of": controller.variability,
+        "mass": float(controller.mass),
         "provenance": _provenance(controller),
     }
 

@@ -17,7 +17,7 @@ from torch_pbd.control.smoothing import Movements
 Floats = NDArray[np.float64]
 
 _TICKS = 4000  # within the duration
-_FAR = 0.02  # of the extent of a movement
+_FAR = 0.01  # of the extent of a movement
 _SETTLE = 20.0  # time constants after the end at which the movement is at rest
 
 
@@ -70,18 +70,20 @@ class Reproduction:
         return forcing
 
     def check_against(self, movements: Movements) -> float:
-        """Root mean square distance of the motion from the mean of the movements.
+        """Root mean square distance of the motion from the mean of the movements as they were recorded.
 
         Warns
         -----
         UserWarning
-            If it is more than 2 % of the extent of the mean.
+            If it is more than 1 % of the extent of all movements.
         """
-        mean = movements.position.mean(axis=0)
+        mean = movements.recorded_mean
         distance = np.linalg.norm(self.motion(movements.time)[0] - mean, axis=1)
-        error, extent = float(np.sqrt(np.mean(distance**2))), float(np.linalg.norm(np.ptp(mean, axis=0)))
-        if error > _FAR * extent:
-            remedy = "phase_input='time'" if self.phase.kind == "s" else "more n_steps, or a lower cutoff"
+        error = float(np.sqrt(np.mean(distance**2)))
+        extent = float(np.linalg.norm(np.ptp(movements.position, axis=(0, 1))))
+        rounding = 1e-9 * float(np.abs(mean).max())
+        if error > _FAR * extent + rounding:
+            remedy = "phase_input='time'" if self.phase.kind == "s" else "a higher cutoff, or more n_steps"
             warnings.warn(
                 f"The reproduced movement is {error:.3g} off the mean of the demonstrations, {error / extent:.1%} of "
                 f"its extent: try {remedy}.",
@@ -122,6 +124,9 @@ class Reproduction:
     ) -> tuple[Floats, Floats, Floats]:
         """Time (n,), position and velocity (n, d); see :meth:`DMPController.reproduce`."""
         pace = None if speed is None else np.asarray(speed, dtype=np.float64)
+        for name, value in (("goal", goal), ("start", start), ("speed", speed)):
+            if value is not None and not np.isfinite(np.asarray(value, dtype=np.float64)).all():
+                raise ValueError(f"{name} has a value that is not finite: {value!r}.")
         position, velocity = self.dmp.rollout(
             self.forcing_at,
             dt,

@@ -83,6 +83,8 @@ class Schedule:
         Least and largest eigenvalue that the stiffness may have, in N/m.
     covariance_of : {"position", "forcing"}, default="position"
         What the covariance is of: a forcing is that of eq. (18).
+    mass : float, default=None
+        Virtual mass of the admittance that the damping was computed for, kg.
     provenance : mapping, default={}
         Whatever JSON can hold about where the schedule comes from.
 
@@ -105,6 +107,7 @@ class Schedule:
     frame: str | None = None
     stiffness_limits: tuple[float, float] | None = None
     covariance_of: str = "position"
+    mass: float | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -197,11 +200,11 @@ class Schedule:
             )
         return replace(self, time=self.time / speed, velocity=self.velocity * speed)
 
-    def certify(self, *, mass: Any, **options: Any) -> "StabilityReport":
-        """`torch_pbd.control.certify` of this schedule, whose options it takes."""
+    def certify(self, *, mass: Any = None, **options: Any) -> "StabilityReport":
+        """`torch_pbd.control.certify` of this schedule, whose options it takes; no mass is its own, or 1 kg."""
         from torch_pbd.control.stability import certify  # here: it needs torch, a schedule does not
 
-        return certify(self, mass=mass, **options)
+        return certify(self, mass=(self.mass or 1.0) if mass is None else mass, **options)
 
     def diagonal(self) -> tuple["Schedule", DiagonalLoss]:
         """With diagonal stiffness and damping, for controllers that take no other, and what that loses.

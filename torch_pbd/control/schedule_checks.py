@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 ARRAY_DIMS = {"time": 1, "position": 2, "velocity": 2, "stiffness": 3, "damping": 3, "covariance": 3, "type1": 1}
 """Every array of a schedule with its number of axes: (n,), (n, d) or (n, d, d)."""
 
-LABELS = ("names", "units", "frame", "stiffness_limits", "covariance_of", "provenance")
+LABELS = ("names", "units", "frame", "stiffness_limits", "covariance_of", "mass", "provenance")
 
 ROUNDING = 1e-9
 """Relative: what is smaller counts as rounding of the caller's arithmetic."""
@@ -90,6 +90,8 @@ def _checked_labels(labels: Labels, n_outputs: int) -> dict[str, Any]:
             raise ValueError(f"{name} is {labels[name]!r}, it must be a string or None.")
     if labels["covariance_of"] not in ("position", "forcing"):
         raise ValueError(f"covariance_of is {labels['covariance_of']!r}, it must be 'position' or 'forcing'.")
+    if labels["mass"] is not None:
+        check_positive("mass", labels["mass"])
     if not isinstance(labels["provenance"], Mapping):
         raise ValueError(f"provenance is {labels['provenance']!r}, it must be a mapping.")
     return {

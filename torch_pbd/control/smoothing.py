@@ -7,14 +7,15 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline, make_interp_spline, make_smoothing_spline
 
 from torch_pbd.data import Demonstrations
+from torch_pbd.data.alignment import interpolate
 
 Floats = NDArray[np.float64]
 
 CUTOFF_HZ = 4.0
-"""Cutoff where times are told: hands move below it, and tremor (8 to 12 Hz) and encoders' steps are above."""
+"""Cutoff of slow movements: hands move below it, and tremor (8 to 12 Hz) and encoders' steps are above."""
 
 CUTOFF_CYCLES = 40.0
-"""Cutoff of movements whose own duration is not known, as over phases, in cycles a movement."""
+"""Least cutoff of any movement, in cycles a movement: fast ones have detail above 4 Hz."""
 
 _LEAST_SAMPLES = {True: 5, False: 3}
 
@@ -28,6 +29,8 @@ class Movements:
     time : ndarray of shape (n,)
         From 0 to the duration, s; each demonstration is stretched to it linearly.
     position, velocity, acceleration : ndarray of shape (K, n, d)
+    recorded_mean : ndarray of shape (n, d)
+        Mean position as it was recorded, not smoothed.
     noise_scale : ndarray of shape (d,)
         Root mean square of what the smoothing took away, in the units of position.
     """
@@ -36,6 +39,7 @@ class Movements:
     position: Floats
     velocity: Floats
     acceleration: Floats
+    recorded_mean: Floats
     noise_scale: Floats
 
 
@@ -73,16 +77,17 @@ def smooth(demonstrations: Demonstrations, cutoff: float | None, n_steps: int, d
     durations = [time[-1] - time[0] for time in demonstrations.times]
     own_cutoff = None if cutoff is None else cutoff * duration / float(np.median(durations))
     grid = np.linspace(0.0, duration, n_steps)
-    motions, removed = [], []
+    motions, removed, recorded = [], [], []
     for (time, position), lasting in zip(demonstrations, durations, strict=True):
         stretch = lasting / duration
         spline = _spline(time - time[0], position, own_cutoff)
         own = np.clip(grid * stretch, 0.0, lasting)
         motions.append([spline(own, order) * stretch**order for order in range(3)])
         removed.append(position - spline(time - time[0]))
+        recorded.append(interpolate(time - time[0], position, own))
     position, velocity, acceleration = (np.stack(parts) for parts in zip(*motions, strict=True))
     noise_scale = np.sqrt(np.mean(np.concatenate(removed) ** 2, axis=0))
-    return Movements(grid, position, velocity, acceleration, noise_scale)
+    return Movements(grid, position, velocity, acceleration, np.mean(recorded, axis=0), noise_scale)
 
 
 def _spline(time: Floats, position: Floats, cutoff: float | None) -> BSpline:
@@ -101,8 +106,8 @@ def _spline(time: Floats, position: Floats, cutoff: float | None) -> BSpline:
 
 
 def automatic_cutoff(duration: float, *, knows_seconds: bool) -> float:
-    """4 Hz where the recordings tell seconds, else 40 cycles a movement of ``duration`` s."""
-    return CUTOFF_HZ if knows_seconds else CUTOFF_CYCLES / duration
+    """40 cycles a movement of ``duration`` s; where the recordings tell seconds, not below 4 Hz."""
+    return max(CUTOFF_HZ if knows_seconds else 0.0, CUTOFF_CYCLES / duration)
 
 
 def noise_like(demonstrations: Demonstrations, noise_scale: Floats) -> Demonstrations:

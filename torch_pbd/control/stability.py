@@ -74,6 +74,8 @@ def certify(
     inertia = _door(mass)
     check_mass(inertia)
     inertia = inertia if inertia.ndim else inertia * torch.eye(stiffness.shape[-1]).to(stiffness)
+    if inertia.shape != stiffness.shape[1:]:
+        raise ValueError(f"mass has shape {tuple(inertia.shape)}, must be a number or {tuple(stiffness.shape[1:])}.")
     if float(torch.linalg.eigvalsh(stiffness).min()) <= 0.0:
         raise ValueError("stiffness must be positive definite to be certified: a free axis never returns.")
     knots = _Knots.of(time / speed, stiffness, damping, inertia)

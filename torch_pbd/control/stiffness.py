@@ -31,12 +31,12 @@ class StiffnessLaw:
     stiffness_min, stiffness_max : float, default=50.0, 1000.0
         In N/m, 0 < stiffness_min <= stiffness_max. The paper's, Table II.
     sigma_low, sigma_high : float, default=None
-        Bounds of the standard deviation in its units, 0 <= sigma_low < sigma_high; None takes them from the
-        covariances of each call, or once for all by :meth:`fitted`.
+        Bounds of the standard deviation in its units, 0 <= sigma_low < sigma_high. With bounds="quantile" they are
+        taken from the covariances of each call, or once for all by :meth:`fitted`.
     bounds : {"quantile", "sigma", "variance"}, default="quantile"
         What the two bounds are. "sigma": standard deviations, eq. (20) as printed. "variance": variances, whose
-        roots are taken; the paper's 3.5e-4 and 1.2e-3 give its Figure 8 only so. "quantile": shares of the
-        standard deviations along all axes of all covariances given, 0.1 and 0.9 if None.
+        roots are taken; the paper's 3.5e-4 and 1.2e-3 give its Figure 8 only so. "quantile": the 10 % and 90 %
+        quantiles of the standard deviations along all axes of all covariances given; leave the two None.
     smooth : bool, default=False
         Replace the straight line by ``3 u^2 - 2 u^3``: the stiffness then has a continuous derivative.
 
@@ -70,16 +70,20 @@ class StiffnessLaw:
                 f"stiffness_min == {self.stiffness_min:g} and stiffness_max == {self.stiffness_max:g} N/m, must be "
                 "0 < stiffness_min <= stiffness_max."
             )
+        given = [value for value in (self.sigma_low, self.sigma_high) if value is not None]
+        if self.bounds == "quantile" and given:
+            raise ValueError(
+                f"sigma_low == {self.sigma_low} and sigma_high == {self.sigma_high} are standard deviations: give "
+                "bounds='sigma' with them (or 'variance'). bounds='quantile' takes its own from the covariances."
+            )
         if self.bounds != "quantile" and (self.sigma_low is None or self.sigma_high is None):
             raise ValueError(
                 f"bounds == {self.bounds!r} needs sigma_low and sigma_high, got {self.sigma_low}, {self.sigma_high}. "
                 "Give both, or let bounds='quantile' take them from the covariances."
             )
-        low, high = self._given_bounds()
-        if not 0.0 <= low < high or (self.bounds == "quantile" and high > 1.0):
-            limit = " <= 1, shares" if self.bounds == "quantile" else ""
+        if given and not 0.0 <= given[0] < given[1]:
             raise ValueError(
-                f"sigma_low == {low:g} and sigma_high == {high:g}, must be 0 <= sigma_low < sigma_high{limit}."
+                f"sigma_low == {given[0]:g} and sigma_high == {given[1]:g}, must be 0 <= sigma_low < sigma_high."
             )
 
     def __call__(self, covariance: Float[Tensor, "*b d d"] | Any) -> Float[Tensor, "*b d d"]:
@@ -124,13 +128,10 @@ class StiffnessLaw:
             share = share * share * (3.0 - 2.0 * share)
         return self.stiffness_max - (self.stiffness_max - self.stiffness_min) * share
 
-    def _given_bounds(self) -> tuple[float, float]:
-        low = _QUANTILES[0] if self.sigma_low is None else self.sigma_low
-        high = _QUANTILES[1] if self.sigma_high is None else self.sigma_high
-        return low, high
-
     def _scales(self) -> tuple[float, float]:
-        low, high = self._given_bounds()
+        assert self.sigma_low is not None
+        assert self.sigma_high is not None
+        low, high = self.sigma_low, self.sigma_high
         return (math.sqrt(low), math.sqrt(high)) if self.bounds == "variance" else (low, high)
 
     def _resolved(self, covariance: Tensor, resolution: float = 0.0) -> tuple[float, float]:
@@ -148,7 +149,7 @@ class StiffnessLaw:
             .sort()
             .values
         )
-        low, high = (_quantile(scales, share) for share in self._given_bounds())
+        low, high = (_quantile(scales, share) for share in _QUANTILES)
         if high <= low * (1.0 + 1e-9):
             warnings.warn(
                 f"The covariances do not vary: their standard deviations have quantiles {low:.3g} and {high:.3g}. "

@@ -12,6 +12,7 @@ from torch_pbd.estimators.cholesky import CholeskyCovRegressor
 Floats = NDArray[np.float64]
 
 _RESOLUTION = 1e-5  # of the extent of a movement: smaller standard deviations count as none
+_ROUNDING = 1e-9  # of the largest position
 
 
 def fit_covariance(regressor: CovarianceRegressor | None, inputs: Floats, varying: Floats) -> CovarianceRegressor:
@@ -25,5 +26,7 @@ def fit_covariance(regressor: CovarianceRegressor | None, inputs: Floats, varyin
 
 def fit_law(law: StiffnessLaw | None, covariance: Floats, varying: Floats) -> StiffnessLaw:
     """Fix the bounds of a law to covariances (m, d, d) along a movement, of what varies (K, n, d)."""
-    extent = float(np.linalg.norm(np.ptp(varying, axis=(0, 1))))
+    extent, largest = float(np.linalg.norm(np.ptp(varying, axis=(0, 1)))), float(np.abs(varying).max())
+    if extent <= _ROUNDING * largest:  # nothing moves: the regressor's own floor is in units of the position
+        extent = largest
     return (StiffnessLaw() if law is None else law).fitted(covariance, resolution=_RESOLUTION * extent)

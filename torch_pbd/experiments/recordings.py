@@ -75,7 +75,7 @@ def figure_of(model: CovarianceRegressor, demonstrations: Demonstrations, name: 
         query = np.linspace(X.min(), X.max(), 15)[:, np.newaxis]
         mean, covariance = model.predict(query, return_cov=True)
         plot_covariance_ellipses(mean, covariance, axes[n_outputs], color=MODEL)
-        axes[n_outputs].set_aspect("equal", adjustable="box")
+        axes[n_outputs].set_aspect("equal", adjustable="datalim")
         axes[n_outputs].set_title("2 sd ellipses", fontsize=10)
     for ax in axes[n_panels:]:
         ax.set_visible(False)

@@ -33,6 +33,7 @@ class Run:
     controller: DMPController
     schedule: Schedule
     rollout: Rollout
+    unpushed: Rollout
     report: StabilityReport
 
 
@@ -53,15 +54,15 @@ def run_controller(
     schedule = fitted.schedule(rate)
     force = push_profile(schedule.time, fitted.duration_, peak, fitted.n_outputs_)
     rollout = fitted.simulate(force=force, rate=rate)
-    return Run(fitted, schedule, rollout, schedule.certify(mass=fitted.mass))
+    return Run(fitted, schedule, rollout, fitted.simulate(rate=rate), schedule.certify(mass=fitted.mass))
 
 
 def push_row(name: str, run: Run) -> dict[str, Any]:
-    """Row of the table: displacement and stiffness at the two pushes."""
+    """Row of the table: displacement by the two pushes, against the run without them, and stiffness there."""
     unit, scale = readable_unit(run.schedule.units)
     time, stiffness = run.schedule.time, run.schedule.stiffness
     early, late = (int(np.searchsorted(time, centre * run.controller.duration_)) for centre in _PUSHES)
-    deviation = np.abs(run.rollout.deviation[:, 0])
+    deviation = np.abs(run.rollout.position - run.unpushed.position)[:, 0]
     half = len(time) // 2
     first, second = scale * deviation[:half].max(), scale * deviation[half:].max()
     names = schedule_names(run.schedule)

@@ -106,8 +106,14 @@ def variability_figure(controller: DMPController, demonstrations: Demonstrations
     centre = varying.mean(axis=0)
     deviation, inferred = varying.std(axis=0, ddof=1), np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     for output, ax in enumerate(axes[:-1]):
-        lines = ax.plot(movements.time, varying[:, :, output].T, color=DATA, lw=0.7, alpha=0.8, zorder=1)
-        lines[0].set_label("demonstrations")
+        if controller.variability == "position":
+            for number, (time, position) in enumerate(demonstrations):
+                own = (time - time[0]) / (time[-1] - time[0]) * controller.duration_
+                label = None if number else "demonstrations"
+                ax.plot(own, position[:, output], color=DATA, lw=0.7, alpha=0.8, zorder=1, label=label)
+        else:
+            lines = ax.plot(movements.time, varying[:, :, output].T, color=DATA, lw=0.7, alpha=0.8, zorder=1)
+            lines[0].set_label("demonstrations")
         plot_std_band(movements.time, centre[:, output], inferred[:, output], ax, label="mean, inferred 2 sd")
         for sign in (-2.0, 2.0):
             edge = centre[:, output] + sign * deviation[:, output]

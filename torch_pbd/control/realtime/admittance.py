@@ -34,8 +34,8 @@ class RealTimeAdmittance:
     ----------
     schedule : Schedule
         ``position`` and ``velocity`` (n, d), ``stiffness`` and ``damping`` (n, d, d) at ``time`` (n,), in s.
-    mass : float, default=1.0
-        Virtual mass in kg, the same in all directions.
+    mass : float, default=None
+        Virtual mass in kg, the same in all directions; None takes the schedule's ``mass``, or 1 kg if it has none.
     rate : float, default=1000.0
         Rows of the table in 1/s: the rate of the loop.
     max_step : float, default=0.01
@@ -98,7 +98,7 @@ class RealTimeAdmittance:
         self,
         schedule: ScheduleLike,
         *,
-        mass: float = 1.0,
+        mass: float | None = None,
         rate: float = 1000.0,
         max_step: float = 0.01,
         force_limit: float = 200.0,
@@ -110,6 +110,7 @@ class RealTimeAdmittance:
         stop_deceleration: float = 5.0,
         soft_start: float = 1.0,
     ) -> None:
+        mass = (getattr(schedule, "mass", None) or 1.0) if mass is None else mass
         self._mass = number("mass", mass, "kg; it is the same in all directions, matrices are not supported")
         self._max_step = number("max_step", max_step, "s")
         if self._max_step * number("rate", rate, "1/s") <= 1.0:
