@@ -2,13 +2,15 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from torch_pbd import CholeskyCovRegressor, Demonstrations
+from torch_pbd import CholeskyCovRegressor, Demonstrations, DMPController
 from torch_pbd.data import make_paper_simulation
 from torch_pbd.plotting import (
     plot_covariance_ellipses,
     plot_demonstrations,
     plot_model_bands,
+    plot_pushes,
     plot_std_band,
+    plot_stiffness,
 )
 
 
@@ -64,4 +66,20 @@ def test_a_model_is_drawn_beyond_the_data_beside_the_empirical_deviations():
         at_end = y[X[:, 0] == 100.0, output]
         centre, half = at_end.mean(), 2.0 * at_end.std(ddof=1)
         np.testing.assert_allclose(bars[-1][:, 1], [centre - half, centre + half], rtol=1e-9)
+    plt.close(figure)
+
+
+def test_pushes_and_stiffness_are_drawn_in_readable_units(rng):
+    recorded = Demonstrations(np.linspace(0.0, 2.0, 50), rng.normal(size=(4, 50, 2)).cumsum(axis=1), units="m")
+    controller = DMPController().fit(recorded)
+    schedule, run = controller.schedule(100.0), controller.simulate(rate=100.0)
+    figure, axes = plt.subplots(4, 1)
+    plot_pushes(run, schedule, 1, axes[:3], unpushed=run)
+    drawn, dashed = axes[0].get_lines()[:2]
+    np.testing.assert_allclose(drawn.get_ydata(), 1e3 * run.deviation[:, 1])
+    np.testing.assert_allclose(dashed.get_ydata(), drawn.get_ydata())
+    assert axes[0].get_ylabel() == "y1 - desired [mm]"
+    lines = plot_stiffness(schedule, axes[3])
+    np.testing.assert_allclose(lines[1].get_ydata(), schedule.stiffness[:, 1, 1])
+    assert axes[3].get_ylabel() == "stiffness [N/m]"
     plt.close(figure)

@@ -196,7 +196,9 @@ def plot_stiffness(schedule: Schedule, ax: Axes) -> list[Line2D]:
     return lines
 
 
-def plot_pushes(rollout: Rollout, schedule: Schedule, output: int, axes: Sequence[Axes]) -> None:
+def plot_pushes(
+    rollout: Rollout, schedule: Schedule, output: int, axes: Sequence[Axes], *, unpushed: Rollout | None = None
+) -> None:
     """Draw what pushes did to one output: deviation, external force and stiffness over time, the paper's Figure 8.
 
     Parameters
@@ -207,11 +209,18 @@ def plot_pushes(rollout: Rollout, schedule: Schedule, output: int, axes: Sequenc
         That the run followed.
     output : int
     axes : sequence of three matplotlib Axes, one above the other
+    unpushed : Rollout, default=None
+        The same run without pushes, drawn dashed: how far the robot lags behind by itself.
     """
     unit, scale = readable_unit(schedule.units)
     name = schedule_names(schedule)[output]
     above, middle, below = axes
-    above.plot(rollout.time, scale * rollout.deviation[:, output], color=MODEL, lw=1.5)
+    above.plot(rollout.time, scale * rollout.deviation[:, output], color=MODEL, lw=1.5, label="pushed")
+    if unpushed is not None:
+        above.plot(
+            unpushed.time, scale * unpushed.deviation[:, output], "--", color=TRUTH, lw=1.1, label="without pushes"
+        )
+        above.legend(fontsize=8)
     above.set_ylabel(f"{name} - desired [{unit}]")
     middle.plot(rollout.time, rollout.force[:, output], color=EMPIRICAL, lw=1.5)
     middle.set_ylabel("external force [N]")

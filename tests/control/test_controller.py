@@ -1,6 +1,7 @@
 import pickle
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from sklearn.base import clone
@@ -111,6 +112,7 @@ def test_times_positions_and_groups_are_the_same_as_demonstrations(tunnel, contr
     stacked = DMPController().fit(X, y, groups=np.array([f"hand {k}" for k in groups]))
     query = np.linspace(0.0, 10.0, 11)[:, None]
     np.testing.assert_array_equal(stacked.predict_stiffness(query), controller.predict_stiffness(query))
+    assert DMPController().fit(X, pd.DataFrame(y, columns=["across", "along"]), groups=groups).names_[1] == "along"
     with pytest.raises(ValueError, match=r"X does not increase at row 1001.*groups"):
         DMPController().fit(X, y)
 

@@ -86,7 +86,8 @@ def _grouped(X: ArrayLike, y: ArrayLike | None, groups: ArrayLike | None) -> Dem
             "demonstration of each row."
         )
     members = [labels == label for label in dict.fromkeys(labels.tolist())]
-    return Demonstrations([times[m, 0] for m in members], [positions[m] for m in members])
+    names = [str(name) for name in y.columns] if hasattr(y, "columns") else None
+    return Demonstrations([times[m, 0] for m in members], [positions[m] for m in members], names=names)
 
 
 def as_times(X: ArrayLike) -> Floats:

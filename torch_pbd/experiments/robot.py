@@ -103,7 +103,7 @@ def run_robot(
     for name, controller in controllers.items():
         run = run_controller(controller, demonstrations, peak=peak, rate=rate)
         rows.append(push_row(name, run) | _guarantees(run))
-        reports.append(f"{name}\n{run.report}")
+        reports.append(f"{name}: a movement of {run.schedule.duration:.3g} s\n{run.report}")
         _write(run, name, demonstrations, folder, in_tunnel=in_tunnel)
     folder.write_metrics(rows, metrics)
     (folder.path / "stability.txt").write_text("\n\n".join(reports) + "\n", encoding="utf-8")
@@ -115,7 +115,7 @@ def _write(run: Run, name: str, demonstrations: Demonstrations, folder: RunFolde
     figures = {
         "figure6_task": task_figure(run.controller, demonstrations, name, in_tunnel=in_tunnel),
         "figure7_variability": variability_figure(run.controller, demonstrations, name),
-        "figure8_pushes": pushes_figure(run.rollout, run.schedule, name),
+        "figure8_pushes": pushes_figure(run.rollout, run.unpushed, run.schedule, name),
     }
     for title, figure in figures.items():
         folder.write_figure(figure, f"{slug(name)}_{title}")

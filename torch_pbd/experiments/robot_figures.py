@@ -58,7 +58,7 @@ def _box(ax: Axes, text: str, centre: tuple[float, float]) -> None:
         corner, *_BOX, boxstyle="round,pad=0,rounding_size=0.06", fc="white", ec=MODEL, lw=1.4, zorder=3
     )
     ax.add_patch(box)
-    ax.text(*centre, text, ha="center", va="center", fontsize=9, zorder=4)
+    ax.text(*centre, text, ha="center", va="center", fontsize=8, zorder=4)
 
 
 def task_figure(
@@ -127,9 +127,9 @@ def variability_figure(controller: DMPController, demonstrations: Demonstrations
     return figure
 
 
-def pushes_figure(rollout: Rollout, schedule: Schedule, name: str) -> Figure:
+def pushes_figure(rollout: Rollout, unpushed: Rollout, schedule: Schedule, name: str) -> Figure:
     """Deviation, force and stiffness along the first output over time: Figure 8."""
     figure, axes = plt.subplots(3, 1, figsize=(6.4, 6.0), layout="constrained", sharex=True)
-    plot_pushes(rollout, schedule, 0, axes)
+    plot_pushes(rollout, schedule, 0, axes, unpushed=unpushed)
     axes[0].set_title(name, fontsize=10)
     return figure
