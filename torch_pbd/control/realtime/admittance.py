@@ -55,8 +55,9 @@ class RealTimeAdmittance:
         Ticks on end for which the last good force stands in for one that is not finite, before the robot stops.
     stop_deceleration : float, default=5.0
         Of that stop, in units/s^2; never more than ``acceleration_limit``.
-    soft_start : float, default=1.0
-        Time in s in which the desired position moves from the robot's at ``start`` to the schedule's, by minimum jerk.
+    soft_start, approach_speed : float, default=1.0, 0.5
+        Time in s in which the desired position moves from the robot's at ``start`` to the schedule's, by minimum jerk;
+        longer where it would move away from the schedule faster than this, in units/s. A soft_start of 0 does neither.
 
     Attributes
     ----------
@@ -109,6 +110,7 @@ class RealTimeAdmittance:
         hold_ticks: int = 10,
         stop_deceleration: float = 5.0,
         soft_start: float = 1.0,
+        approach_speed: float = 0.5,
     ) -> None:
         mass = (getattr(schedule, "mass", None) or 1.0) if mass is None else mass
         self._mass = number("mass", mass, "kg; it is the same in all directions, matrices are not supported")
@@ -128,6 +130,7 @@ class RealTimeAdmittance:
             raise ValueError(f"hold_ticks={hold_ticks!r} must be an integer of at least 0: a number of ticks.")
         self._hold_ticks = hold_ticks
         self._soft_start = number("soft_start", soft_start, "s, or 0", zero=True)
+        self._approach_speed = number("approach_speed", approach_speed, "units/s")
         self._table = ScheduleTable.of(schedule, self._mass, float(rate))
         self._turn = threading.Lock()
         self._bias: Vector = ()
@@ -239,7 +242,9 @@ class RealTimeAdmittance:
         self._index, self._scale = self._table.index_at(at), 1.0
         self._row = self._table.row(self._index)
         self._distance = tuple(map(sub, self._row, position))  # stops at the end of position
-        self._soft_end = now + self._soft_start if any(self._distance) else -math.inf
+        # The steepest slope of a minimum jerk is 15/8 of its mean.
+        self._blend = max(self._soft_start, 1.875 * math.hypot(*self._distance) / self._approach_speed)
+        self._soft_end = now + self._blend if any(self._distance) and self._soft_start else -math.inf
         self._push: Vector = (0.0,) * len(position)
         self._bias = ()
         self._n_lost, self._is_stopped, self.faults = 0, False, _FINE
@@ -297,7 +302,7 @@ class RealTimeAdmittance:
         self._index = table.index_at(self._last - self._origin)
         row = table.row(self._index)
         if self._last < self._soft_end:
-            row = softened(row, self._distance, (self._last - self._begun) / self._soft_start, self._soft_start)
+            row = softened(row, self._distance, (self._last - self._begun) / self._blend, self._blend)
         position, velocity, self._scale = table.advance(row, self._push, *here, step, self._pull_limit)
         status = _FINE if self._scale == 1.0 else TickStatus.SPRING_LIMITED
         if self._is_limited:
