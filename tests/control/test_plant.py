@@ -336,3 +336,14 @@ def test_as_arrays_it_is_the_same_run():
     np.testing.assert_array_equal(arrays.interventions, arrays.time[arrays.filter_share < 1.0])
     assert arrays.saturated is None
     assert len(AdmittancePlant().simulate(**GIVEN, dt=0.01).interventions) == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "part"), [("sensor", 3), ("position_loop", 20.0), ("environment", "wall"), ("stiffness_filter", 5)]
+)
+def test_parts_of_other_kinds_are_refused_at_once(name, part):
+    unchecked = getattr(
+        AdmittancePlant.__init__, "__wrapped__", AdmittancePlant.__init__
+    )  # beartype would refuse first
+    with pytest.raises(ValueError, match=rf"{name} == .* has no method"):
+        unchecked(AdmittancePlant.__new__(AdmittancePlant), **{name: part})

@@ -77,6 +77,15 @@ class AdmittancePlant:
                 f"integrator == {integrator!r}, must be one of {', '.join(map(repr, get_args(Integrator)))}."
             )
         check_count("substeps", substeps, 1)
+        parts = {
+            "sensor": (sensor, "start"),
+            "position_loop": (position_loop, "start"),
+            "environment": (environment, "force"),
+            "stiffness_filter": (stiffness_filter, "start"),
+        }
+        for name, (part, method) in parts.items():
+            if part is not None and not callable(getattr(part, method, None)):
+                raise ValueError(f"{name} == {part!r} has no method {method!r}; see the docstring for what it may be.")
         if substeps > 1 and (sensor is not None or position_loop is not None):
             raise ValueError(
                 f"substeps == {substeps}, must be 1 with a sensor or a position loop: they act once a tick. "
