@@ -183,6 +183,12 @@ def test_millimetres_and_milliseconds_plan_and_move_as_metres_and_seconds(tunnel
     np.testing.assert_allclose(other.predict_stiffness(1e3 * X), controller.predict_stiffness(X), rtol=1e-3)
 
 
+def test_outputs_in_different_units_are_told_of(tunnel):
+    mixed = Demonstrations(tunnel.times, [position * [1e3, 1.0] for position in tunnel.positions], units=["mm", "m"])
+    with pytest.warns(UserWarning, match="in different units, mm, m: their principal axes mix them"):
+        DMPController().fit(mixed)
+
+
 def test_phases_need_a_duration(tunnel, controller):
     phases = Demonstrations([time / 10.0 for time in tunnel.times], tunnel.positions, time_unit="1")
     with pytest.warns(UserWarning, match=r"in '1', not in s: the movement is taken to last 1 s\. Give duration"):

@@ -1,5 +1,6 @@
 """What the arguments of a controller must be."""
 
+import warnings
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -59,6 +60,8 @@ def as_demonstrations(X: Demonstrations | ArrayLike, y: ArrayLike | None, groups
     -----
     UnimodalityWarning
         If they follow more than one way.
+    UserWarning
+        If their outputs are in different units, which no turned axis of stiffness can have.
     """
     demonstrations = X if isinstance(X, Demonstrations) else _grouped(X, y, groups)
     if len(demonstrations) < 2:
@@ -67,6 +70,13 @@ def as_demonstrations(X: Demonstrations | ArrayLike, y: ArrayLike | None, groups
             "from one. Record more, or give groups that tell the samples of several apart."
         )
     check_unimodal(demonstrations)
+    units = demonstrations.units
+    if units is not None and len(set(units)) > 1:
+        warnings.warn(
+            f"The outputs are in different units, {', '.join(units)}: their principal axes mix them, and nothing is "
+            "converted to m. Bring them to one unit, or control them apart.",
+            stacklevel=3,
+        )
     return demonstrations
 
 
