@@ -7,6 +7,7 @@ if TYPE_CHECKING:
     from torch_pbd.control.controller import DMPController
     from torch_pbd.data import Demonstrations, load_demonstrations, save_demonstrations
     from torch_pbd.estimators.cholesky import CholeskyCovRegressor
+    from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
     from torch_pbd.estimators.mixture import GMMBaseline
     from torch_pbd.estimators.wishart import WishartProcessRegressor
     from torch_pbd.persistence import load, save
@@ -17,6 +18,7 @@ __version__ = "0.1.0"
 _HOMES = {
     "CholeskyCovRegressor": "torch_pbd.estimators.cholesky",
     "WishartProcessRegressor": "torch_pbd.estimators.wishart",
+    "HeteroscedasticGPRegressor": "torch_pbd.estimators.heteroscedastic",
     "GMMBaseline": "torch_pbd.estimators.mixture",
     "DMPController": "torch_pbd.control.controller",
     "Demonstrations": "torch_pbd.data",
@@ -32,6 +34,7 @@ __all__ = [
     "DMPController",
     "Demonstrations",
     "GMMBaseline",
+    "HeteroscedasticGPRegressor",
     "WishartProcessRegressor",
     "load",
     "load_demonstrations",

@@ -1,5 +1,6 @@
 """Stationary correlation functions of inputs; an amplitude and a noise are the Gaussian process's matter."""
 
+import math
 from collections.abc import Callable
 from typing import Literal
 
@@ -39,6 +40,7 @@ def correlation(
     other: Float[Tensor, "m e"],
     length_scale: Float[Tensor, "*b e"],
     kernel: KernelName = "squared_exponential",
+    period: Float[Tensor, " e"] | None = None,
 ) -> Float[Tensor, "*b n m"]:
     """Correlation of the latent values at two sets of inputs: eq. (4) with an amplitude of one.
 
@@ -49,9 +51,16 @@ def correlation(
         One per input dimension (automatic relevance determination), in the units of ``x``: the diagonal
         of the paper's Omega.
     kernel : {"squared_exponential", "matern32", "matern52"}, default="squared_exponential"
+    period : Tensor of shape (e,), default=None
+        Where it is finite the input is a phase on a circle of that circumference, and distances are chords
+        of it, which agree with the inputs' own where these are close: with the squared exponential this is
+        the periodic kernel of MacKay (Rasmussen and Williams, eq. (4.31)).
     """
     square_distance = x.new_zeros(*length_scale.shape[:-1], len(x), len(other))
     for dimension in range(x.shape[1]):
         difference = x[:, None, dimension] - other[None, :, dimension]
+        if period is not None and bool(torch.isfinite(period[dimension])):
+            radius = period[dimension] / math.pi
+            difference = radius * torch.sin(difference / radius)
         square_distance = square_distance + (difference / length_scale[..., dimension, None, None]).square()
     return KERNELS[kernel](square_distance.clamp_max(_FARTHEST))

@@ -94,6 +94,24 @@ def gaussian_log_density(residual: Float[Tensor, "*b d"], scale_tril: Float[Tens
     return -0.5 * whitened.square().sum(-1) - log_det - 0.5 * residual.shape[-1] * math.log(2 * math.pi)
 
 
+def student_log_density(
+    residual: Float[Tensor, "*b d"], scale_tril: Float[Tensor, "*b d d"], degrees: Float[Tensor, "*b"]
+) -> Float[Tensor, "*b"]:
+    """Log density of the multivariate Student's t whose covariance is ``scale_tril @ scale_tril.mT``.
+
+    ``degrees`` are above two; where they are many it is the normal density.
+    """
+    size = residual.shape[-1]
+    whitened = torch.linalg.solve_triangular(scale_tril, residual.unsqueeze(-1), upper=False).squeeze(-1)
+    square = whitened.square().sum(-1)
+    log_det = scale_tril.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    # Beyond it the gamma functions lose more digits than the two densities differ by.
+    capped = degrees.clamp_max(1e7)
+    constant = torch.lgamma(0.5 * (capped + size)) - torch.lgamma(0.5 * capped)
+    constant = constant - 0.5 * size * (math.pi * (capped - 2.0)).log()
+    return constant - log_det - 0.5 * (capped + size) * torch.log1p(square / (capped - 2.0))
+
+
 class _SpectralMap(torch.autograd.Function):
     """Function of a symmetric matrix whose gradient survives equal eigenvalues, which that of eigh does not."""
 

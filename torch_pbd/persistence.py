@@ -26,6 +26,7 @@ FORMAT_VERSION = 1
 _CLASSES = {
     "CholeskyCovRegressor": "torch_pbd.estimators.cholesky",
     "WishartProcessRegressor": "torch_pbd.estimators.wishart",
+    "HeteroscedasticGPRegressor": "torch_pbd.estimators.heteroscedastic",
     "GMMBaseline": "torch_pbd.estimators.mixture",
     "DMPController": "torch_pbd.control.controller",
 }

@@ -21,12 +21,13 @@ from torch_pbd.estimators._scaling import Standardization
 from torch_pbd.estimators._validation import (
     Floats,
     as_plain_array,
+    check_groups,
     check_inputs_vary,
     check_number,
     check_squares,
     prior_covariance,
 )
-from torch_pbd.linalg import gaussian_log_density, safe_cholesky
+from torch_pbd.linalg import gaussian_log_density, safe_cholesky, student_log_density
 from torch_pbd.models.conditional import ConditionalNormal
 from torch_pbd.models.spec import module_from_spec, module_spec
 from torch_pbd.optim import FitReport, Progress
@@ -86,6 +87,10 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         ValueError
             If X, y or a parameter cannot be used; the message names it and says what to do.
         """
+        return self._learn(X, y)
+
+    def _learn(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None = None) -> Self:
+        """Check everything, fit, and keep what was learned."""
         self._check_parameters()
         inputs, targets = self._validated(X, y, ensure_min_samples=2)
         check_squares(inputs, "X")
@@ -95,8 +100,9 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         self.n_outputs_ = 1 if self._y_is_1d else targets.shape[1]
         targets = targets.reshape(len(inputs), -1)
         order = np.lexsort(np.hstack([inputs, targets]).T)  # so that no result depends on that of the rows
+        told = {} if groups is None else {"groups": check_groups(groups, len(inputs))[order]}
         with torch.inference_mode(False), torch.enable_grad():
-            fitted = self._fit(inputs[order], targets[order])
+            fitted = self._fit(inputs[order], targets[order], **told)
         self.module_ = fitted.module
         report = fitted.report
         self.n_iter_ = max(1, report.n_iter)
@@ -114,8 +120,8 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         return self
 
     @abstractmethod
-    def _fit(self, X: Floats, y: Floats) -> Fitted:
-        """Fit on validated arrays (n, e) and (n, d)."""
+    def _fit(self, X: Floats, y: Floats, **told: Any) -> Fitted:
+        """Fit on validated arrays (n, e) and (n, d); ``told`` may hold the demonstrations' numbers (n,)."""
 
     def _check_parameters(self) -> None:
         """Check the parameters whose values do not depend on the data; subclasses check theirs too."""
@@ -171,9 +177,12 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
 
     def log_likelihood(self, X: ArrayLike, y: ArrayLike) -> Floats:
         """Log density of each row of y at X, in nats: (n_samples,)."""
-        mean, scale_tril, residual = self._scored(X, y)
+        x, mean, scale_tril, targets = self._scored(X, y)
         with torch.inference_mode():
-            return gaussian_log_density(residual - mean, scale_tril).cpu().numpy()
+            degrees = self._degrees(x)
+            if degrees is None:
+                return gaussian_log_density(targets - mean, scale_tril).cpu().numpy()
+            return student_log_density(targets - mean, scale_tril, degrees).cpu().numpy()
 
     def score(self, X: ArrayLike, y: ArrayLike) -> float:
         """Mean log density of the rows of y at X, in nats: higher is better.
@@ -194,6 +203,11 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         x = self._query(X)
         mean, scale_tril = (part.cpu().numpy() for part in self._apply(self.module_, x))
         normal = generator.standard_normal((*mean.shape, n_samples))
+        degrees = self._degrees(x)
+        if degrees is not None:
+            each = degrees.cpu().numpy()[:, np.newaxis]
+            squares = generator.gamma(0.5 * each, 2.0, size=(len(x), n_samples))
+            normal *= np.sqrt((each - 2.0) / squares)[:, np.newaxis]
         samples = mean[:, :, np.newaxis] + scale_tril @ normal
         return samples[:, 0] if self._y_is_1d else samples
 
@@ -210,14 +224,20 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         checked: Any = validate_data(self, X, y, dtype=np.float64, y_numeric=True, multi_output=True, **options)
         return checked[0], np.asarray(checked[1], dtype=np.float64)
 
-    def _scored(self, X: ArrayLike, y: ArrayLike) -> tuple[Tensor, Tensor, Tensor]:
+    def _scored(self, X: ArrayLike, y: ArrayLike) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         check_is_fitted(self)
         inputs, targets = self._validated(X, y, reset=False)
         targets = targets.reshape(len(inputs), -1)
         if targets.shape[1] != self.n_outputs_:
             raise ValueError(f"y has {targets.shape[1]} outputs, but the model was fitted with {self.n_outputs_}.")
-        mean, scale_tril = self._apply(self.module_, self._door(inputs))
-        return mean, scale_tril, self._door(targets)
+        x = self._door(inputs)
+        return x, *self._apply(self.module_, x), self._door(targets)
+
+    def _degrees(self, x: Tensor) -> Tensor | None:
+        """Degrees of freedom of the predictive density at x; None where it is normal."""
+        with torch.inference_mode():
+            parts = [self.module_.degrees(chunk) for chunk in x.split(_CHUNK)]
+        return None if parts[0] is None else torch.cat(parts)
 
     def _query(self, X: ArrayLike) -> Tensor:
         """Rows to predict at; none at all is allowed, though scikit-learn asks for one."""

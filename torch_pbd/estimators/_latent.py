@@ -74,7 +74,7 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         if isinstance(self.prior, str):
             check_choice(self.prior, "prior", ("paper",))
 
-    def _fit(self, X: Floats, y: Floats) -> Fitted:
+    def _fit(self, X: Floats, y: Floats, **told: Any) -> Fitted:
         scaling = Standardization.of(X, y)
         standardized = scaling.inputs(X)
         inputs, index = distinct_rows(standardized)
@@ -88,7 +88,7 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         aligned = self._works_on_empirical(scaling.x_shift + scaling.x_scale * inputs, np.bincount(index), y.shape[1])
         length_scale = check_length_scale(self.length_scale, X.shape[1])
         if not aligned:
-            _warn_if_few(len(y), y.shape[1])
+            warn_if_few(len(y), y.shape[1])
             training = training.merged(self.max_inputs)
         problem = Problem(
             training,
@@ -97,7 +97,7 @@ class LatentCovarianceRegressor(CovarianceRegressor):
             None if length_scale is None else self._door(length_scale / scaling.x_scale),
         )
         mean = self._fit_mean(training)
-        _warn_if_identical(training)
+        warn_if_identical(training)
         if aligned:
             covariance, report, jitter = self._fit_empirical(problem)
         else:
@@ -138,7 +138,7 @@ class LatentCovarianceRegressor(CovarianceRegressor):
     def _prior_tril(self, training: TrainingSet, scaling: Standardization) -> Tensor:
         n_outputs = training.y.shape[1]
         if self.prior is None:
-            return _default_prior_tril(training.y)
+            return default_prior_tril(training.y)
         if isinstance(self.prior, str):  # "paper": the entries of the factor are in the units of y
             return torch.diag(1.0 / self._door(scaling.y_scale))
         X = scaling.x_shift + scaling.x_scale * training.inputs.cpu().numpy()
@@ -197,7 +197,7 @@ def residual_tril(residual: Tensor) -> Tensor:
     return scale_tril_from_root(torch.cat([residual.mT / len(residual) ** 0.5, floor], dim=1))
 
 
-def _default_prior_tril(y: Tensor) -> Tensor:
+def default_prior_tril(y: Tensor) -> Tensor:
     """Factor of a wide prior: four times the covariance of all of y around its mean.
 
     A thousandth of the unit matrix is mixed in: outputs that move together, or do not move at all, have
@@ -207,7 +207,7 @@ def _default_prior_tril(y: Tensor) -> Tensor:
     return 2.0 * scale_tril_from_root(torch.cat([centred, 0.001**0.5 * torch.eye(y.shape[1]).to(y)], dim=1))
 
 
-def _warn_if_few(n_rows: int, n_outputs: int) -> None:
+def warn_if_few(n_rows: int, n_outputs: int) -> None:
     if n_rows <= n_outputs:
         warnings.warn(
             f"y has {n_rows} rows but {n_outputs} outputs: they leave directions of the covariance undetermined, "
@@ -217,7 +217,7 @@ def _warn_if_few(n_rows: int, n_outputs: int) -> None:
         )
 
 
-def _warn_if_identical(training: TrainingSet) -> None:
+def warn_if_identical(training: TrainingSet) -> None:
     if float(pooled_tril(training).diagonal().max()) < 1e-9:
         warnings.warn(
             "The demonstrations are identical: their covariance is zero, and the smallest that can be told "

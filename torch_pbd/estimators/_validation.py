@@ -127,6 +127,26 @@ def check_inputs_vary(X: Floats) -> None:
         )
 
 
+def check_groups(groups: Any, n_samples: int) -> NDArray[np.intp]:
+    """Number of each row's demonstration, from labels of any kind.
+
+    Raises
+    ------
+    ValueError
+        If there is not one label a row, or one is missing.
+    """
+    labels = np.asarray(groups)
+    if labels.shape != (n_samples,):
+        raise ValueError(
+            f"groups has shape {labels.shape}, must have shape ({n_samples},): the demonstration of each row of X."
+        )
+    if labels.dtype.kind == "f" and not np.isfinite(labels).all():
+        raise ValueError(f"groups has a label that is not finite, at index {int(np.argmin(np.isfinite(labels)))}.")
+    if labels.dtype.kind == "O":
+        labels = np.array([str(label) for label in labels])
+    return np.unique(labels, return_inverse=True)[1].reshape(-1)
+
+
 def check_number(
     value: Any, name: str, *, low: float, strict: bool = False, integer: bool = False, optional: bool = False
 ) -> None:
@@ -157,6 +177,21 @@ def check_length_scale(value: Any, n_features: int) -> Floats | None:
             "for each column of X, in its units."
         )
     return np.broadcast_to(scales, (n_features,)).copy()
+
+
+def check_period(value: Any, kernel: str, n_features: int) -> Floats | None:
+    """Periods as an array (n_features,), infinite where an input does not repeat, or None for no input."""
+    if value is None:
+        if kernel == "periodic":
+            raise ValueError("kernel == 'periodic' needs a period, in units of X, such as period=1.0 for a phase.")
+        return None
+    periods = _as_floats(value, "period")
+    if periods.shape not in [(), (n_features,)] or not (periods > 0).all():
+        raise ValueError(
+            f"period == {value!r}, must be None, a positive number, or {n_features} positive numbers (or inf): one "
+            "for each column of X, in its units."
+        )
+    return np.broadcast_to(periods, (n_features,)).copy()
 
 
 def prior_covariance(prior: Prior, X: Floats, n_outputs: int) -> Floats:

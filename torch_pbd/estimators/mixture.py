@@ -100,7 +100,7 @@ class GMMBaseline(CovarianceRegressor):
         check_choice(self.solver, "solver", ("em", "lbfgs"))
         check_number(self.reg_covar, "reg_covar", low=0.0, strict=True)
 
-    def _fit(self, X: Floats, y: Floats) -> Fitted:
+    def _fit(self, X: Floats, y: Floats, **told: Any) -> Fitted:
         joint = np.hstack([X, y])
         n_distinct = len(distinct_rows(joint)[0])
         if n_distinct < self.n_components:

@@ -7,6 +7,7 @@ from torch_pbd.gp import LatentGP
 from torch_pbd.linalg import scale_tril_from_root, symmetrize
 from torch_pbd.models.cholesky import CholeskyCovariance
 from torch_pbd.models.floor import with_floor
+from torch_pbd.models.heteroscedastic import HeteroscedasticModel
 from torch_pbd.models.mixture import GaussianMixture
 from torch_pbd.models.wishart import WishartCovariance
 
@@ -39,7 +40,7 @@ class ConditionalNormal(nn.Module):
 
     Parameters
     ----------
-    core : MeanAndCovariance or GaussianMixture
+    core : MeanAndCovariance, HeteroscedasticModel or GaussianMixture
         Maps standardized inputs (n, e) to a mean (n, d) and a root (n, d, r) of the covariance, and has
         ``type1(x)``.
     x_shift, x_scale : Tensor of shape (e,)
@@ -55,7 +56,7 @@ class ConditionalNormal(nn.Module):
 
     def __init__(
         self,
-        core: MeanAndCovariance | GaussianMixture,
+        core: MeanAndCovariance | HeteroscedasticModel | GaussianMixture,
         x_shift: Float[Tensor, " e"],
         x_scale: Float[Tensor, " e"],
         y_shift: Float[Tensor, " d"],
@@ -84,6 +85,20 @@ class ConditionalNormal(nn.Module):
         """Mean, and covariance, symmetric to the last bit."""
         mean, root = self._mean_and_root(x, prior_scale_tril)
         return mean, symmetrize(root @ root.mT)
+
+    def degrees(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"] | None:
+        """Degrees of freedom of the predictive Student's t; None where the density is normal everywhere."""
+        if not isinstance(self.core, HeteroscedasticModel):
+            return None
+        return self.core.degrees((x - self.x_shift) / self.x_scale)
+
+    def draw_covariance(self, x: Float[Tensor, "n e"], normal: list[Float[Tensor, " p"]]) -> Float[Tensor, "n d d"]:
+        """One posterior draw of the covariance function at x, made of standard normal numbers."""
+        if not isinstance(self.core, HeteroscedasticModel):
+            raise TypeError("only the heteroscedastic model knows the posterior of its covariance")
+        root = self.core.draw((x - self.x_shift) / self.x_scale, normal)
+        root = self.y_scale[:, None] * with_floor(root)
+        return symmetrize(root @ root.mT)
 
     def type1(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
         """Type I uncertainty: 0 on data, 1 where only the prior speaks."""

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch_pbd.gp import Hyperparameters, LatentGP
 from torch_pbd.models.cholesky import CholeskyCovariance
 from torch_pbd.models.conditional import ConditionalNormal, MeanAndCovariance
+from torch_pbd.models.heteroscedastic import HeteroscedasticModel
 from torch_pbd.models.mixture import GaussianMixture
 from torch_pbd.models.wishart import WishartCovariance
 
@@ -18,6 +19,8 @@ def module_spec(module: ConditionalNormal) -> dict[str, Any]:
     core = module.core
     if isinstance(core, GaussianMixture):
         return {"covariance": "mixture", "n_features": core.n_features}
+    if isinstance(core, HeteroscedasticModel):
+        return {"covariance": "heteroscedastic", **core.spec()}
     spec: dict[str, Any] = {"mean_kernel": core.mean.kernel, "kernel": core.covariance.latent.kernel}
     if isinstance(core.covariance, CholeskyCovariance):
         return {"covariance": "cholesky", "log_diagonal": core.covariance.log_diagonal, **spec}
@@ -37,12 +40,15 @@ def module_from_spec(spec: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
     tensors = {name: tensor.clone() for name, tensor in tensors.items()}
     parts = {name.removeprefix("core."): tensor for name, tensor in tensors.items()}
     if spec["covariance"] == "mixture":
-        core: MeanAndCovariance | GaussianMixture = GaussianMixture(
+        core: MeanAndCovariance | HeteroscedasticModel | GaussianMixture = GaussianMixture(
             parts["log_weight"],
             parts["mean"],
             torch.diag_embed(parts["log_diagonal"].exp()) + parts["strict_lower"],
             spec["n_features"],
         )
+    elif spec["covariance"] == "heteroscedastic":
+        scaling_names = ("x_shift", "x_scale", "y_shift", "y_scale")
+        core = HeteroscedasticModel.restored(dict(spec), {k: v for k, v in parts.items() if k not in scaling_names})
     elif spec["covariance"] in ("cholesky", "wishart"):
         latent = _latent("covariance.latent.", parts, spec["kernel"])
         if spec["covariance"] == "cholesky":

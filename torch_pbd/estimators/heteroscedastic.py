@@ -1,0 +1,309 @@
+"""The recommended regressor: covariance by latent Gaussian processes that are integrated out."""
+
+import warnings
+from typing import Any, Literal, Self
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from sklearn.utils import check_random_state
+
+from torch_pbd.data import Demonstrations, check_unimodal
+from torch_pbd.estimators._base import CovarianceRegressor, Fitted
+from torch_pbd.estimators._latent import default_prior_tril, warn_if_few, warn_if_identical
+from torch_pbd.estimators._scaling import Standardization, distinct_rows
+from torch_pbd.estimators._validation import (
+    Floats,
+    Prior,
+    check_choice,
+    check_length_scale,
+    check_number,
+    check_period,
+    prior_covariance,
+)
+from torch_pbd.gp.inducing import FeatureMap, inducing_inputs
+from torch_pbd.kernels import KERNELS, KernelName
+from torch_pbd.linalg import safe_cholesky
+from torch_pbd.models.heteroscedastic import (
+    Families,
+    HeteroscedasticFit,
+    HeteroscedasticModel,
+    ProcessFamily,
+    SearchOptions,
+    fit_heteroscedastic,
+)
+from torch_pbd.models.training import TrainingSet
+from torch_pbd.optim import FitReport
+
+# Prior medians of length scale (in ranges of the input) and amplitude, and prior deviation of the constant. Means
+# are of outputs with unit variance, log variances and coefficients of residuals with a pooled unit covariance.
+_MEAN = (0.3, 1.2, 0.0)
+_LOG_VARIANCE = (0.5, 1.0, 2.0)
+_COEFFICIENT = (0.5, 0.3, 1.0)
+
+# Inducing inputs of a process by default, and of all coefficients of the last output together.
+_N_INDUCING, _N_INDUCING_MORE, _N_TOGETHER = 48, 100, 400
+
+
+class HeteroscedasticGPRegressor(CovarianceRegressor):
+    """Mean and covariance by Gaussian processes, honest about what few demonstrations leave open.
+
+    The covariance is a lower factor whose diagonal entries are exponentials of Gaussian processes of the input,
+    and whose other entries are such processes; the mean is d more. Their values are integrated out, and
+    their length scales and amplitudes are those of the highest evidence. The mean is refitted under the
+    covariance learned, by generalized least squares.
+
+    What is predicted is Student's t. Its covariance contains the variability, the error of its estimate and
+    that of the mean, and far from data it is ``prior``.
+
+    Parameters
+    ----------
+    kernel : {"squared_exponential", "matern32", "matern52", "periodic"}, default="squared_exponential"
+        Of all processes. "periodic" is the squared exponential of the chord on a circle.
+    period : float or array-like of shape (n_features,), default=None
+        Circumference of that circle in units of X, such as 1.0 for a phase; ``inf`` for inputs that do not
+        repeat. Needed for "periodic", and allowed with the other kernels.
+    prior : None, float, array-like of shape (d, d) or callable, default=None
+        Covariance far from data, in squared units of y. A float stands for that times the unit matrix; a
+        callable maps X (n, e) to (n, d, d). None learns a wide one: four times the covariance of all of y.
+    length_scale : float, array-like of shape (n_features,) or None, default=None
+        Of the covariance's processes, in units of X; None learns it.
+    shared_length_scale : bool, default=False
+        One length scale for the log variances of all outputs, and one for all outputs' means, instead of one
+        for each.
+    n_inducing : int or None, default=None
+        Inputs on which the processes rest. None takes all distinct inputs up to 48 (100 for several
+        columns), fewer for more than eight outputs, and centres of neighbourhoods of more.
+    max_inputs : int, default=512
+        Where X has more distinct rows, neighbours are merged into this many.
+    max_iter : int, default=100
+        Largest number of L-BFGS iterations of a search for hyperparameters.
+    tol : float, default=1e-3
+        Stop such a search when no gradient entry is above it, in nats.
+    n_restarts : int, default=0
+        Starts of the first searches beside the best of a small grid.
+    random_state : int, RandomState instance or None, default=0
+        Not used: the fit is deterministic. It is here so that estimators can be exchanged.
+    device : str or None, default=None
+        Where the torch module lives.
+    verbose : int, default=0
+
+    Attributes
+    ----------
+    module_ : ConditionalNormal
+        The fitted torch module: maps x (n, e) to mean (n, d) and Cholesky factor (n, d, d), differentiably.
+    effective_share_ : float
+        Independent samples that a sample of a demonstration counts for; 1.0 without ``groups``.
+    n_features_in_, n_outputs_ : int
+    loss_ : float
+        Negative log evidence of the covariance's processes at the end, in nats, but for a constant.
+    loss_curve_ : list of float
+        The same after each turn of mean and covariance. Each is of residuals from its own mean.
+    n_iter_ : int
+        Most iterations of one search.
+    converged_ : bool
+    jitter_ : float
+        Jitter of the kernel matrices, relative to their diagonal.
+
+    Notes
+    -----
+    Rows that repeat an input enter as count, mean and scatter: after that the cost of a fit is in the number n
+    of distinct inputs (at most ``max_inputs``), inducing inputs m and outputs d: n d m^2 + d (d m)^2 n + d (d m)^3
+    for each evaluation of the evidence.
+
+    With ``groups`` the correlation of a demonstration's residuals is estimated and enters the likelihood:
+    neighbouring samples of a smooth demonstration are nearly copies. It is taken for exponential, whatever
+    its shape, with the integral of the one estimated: demonstrations are smoother than that, but a model that
+    trusts their smoothness takes it for signal.
+
+    The factor depends on the order of the outputs, and with it, slightly, the fit.
+
+    References
+    ----------
+    Umlauft, Fanger, Hirche, "Bayesian Uncertainty Modeling for Programming by Demonstration", ICRA 2017, for the
+    problem and the two kinds of uncertainty. Pourahmadi, "Joint mean-covariance models", Biometrika 86, 1999, for
+    regressions of outputs on those before them.
+
+    Examples
+    --------
+    >>> from torch_pbd import HeteroscedasticGPRegressor
+    >>> from torch_pbd.data import make_paper_simulation
+    >>> X, y, groups = make_paper_simulation(random_state=0)
+    >>> model = HeteroscedasticGPRegressor().fit(X, y, groups=groups)
+    >>> mean, covariance = model.predict(X[:3], return_cov=True)
+    >>> mean.shape, covariance.shape
+    ((3, 2), (3, 2, 2))
+    >>> model.sample_cov(X[:3], n_samples=5, random_state=0).shape
+    (3, 2, 2, 5)
+    """
+
+    def __init__(
+        self,
+        *,
+        kernel: KernelName | Literal["periodic"] = "squared_exponential",
+        period: float | list[float] | None = None,
+        prior: Prior = None,
+        length_scale: float | list[float] | None = None,
+        shared_length_scale: bool = False,
+        n_inducing: int | None = None,
+        max_inputs: int = 512,
+        max_iter: int = 100,
+        tol: float = 1e-3,
+        n_restarts: int = 0,
+        random_state: Any = 0,
+        device: str | None = None,
+        verbose: int = 0,
+    ) -> None:
+        self.kernel = kernel
+        self.period = period
+        self.prior = prior
+        self.length_scale = length_scale
+        self.shared_length_scale = shared_length_scale
+        self.n_inducing = n_inducing
+        self.max_inputs = max_inputs
+        self.max_iter = max_iter
+        self.tol = tol
+        self.n_restarts = n_restarts
+        self.random_state = random_state
+        self.device = device
+        self.verbose = verbose
+
+    def fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None = None) -> Self:
+        """Learn mean and covariance.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_features)
+            Time, phase or position of each sample.
+        y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+            What was recorded there.
+        groups : array-like of shape (n_samples,), default=None
+            Demonstration of each sample. Without it rows count as independent, which makes recorded
+            demonstrations look more certain than they are.
+
+        Returns
+        -------
+        self
+
+        Raises
+        ------
+        ValueError
+            If X, y, groups or a parameter cannot be used; the message names it and says what to do.
+
+        Warns
+        -----
+        UnimodalityWarning
+            If demonstrations (of one input) seem to follow several ways.
+        """
+        return self._learn(X, y, groups)
+
+    def predict_cov(self, X: ArrayLike, *, missing_knowledge: bool = True) -> Floats:
+        """Covariances of the outputs at X: (n_samples, n_outputs, n_outputs), also for one output.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_features)
+        missing_knowledge : bool, default=True
+            False gives the variability alone, type2 of :meth:`predict_uncertainty`: no prior, and neither
+            the error of the mean nor that of the covariance.
+        """
+        return super().predict_cov(X) if missing_knowledge else self.predict_uncertainty(X).type2
+
+    def sample_cov(self, X: ArrayLike, n_samples: int = 1, random_state: Any = None) -> Floats:
+        """Draw covariance functions from their posterior, at X.
+
+        A draw is one function: its values at different inputs belong together. It is of the variability, with
+        the prior's share in it where data are missing; the spread of the draws is what is not known.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples_X, n_features)
+        n_samples : int, default=1
+        random_state : int, RandomState instance or None, default=None
+
+        Returns
+        -------
+        ndarray of shape (n_samples_X, n_outputs, n_outputs, n_samples)
+        """
+        check_number(n_samples, "n_samples", low=1, integer=True)
+        generator = check_random_state(random_state)
+        x = self._query(X)
+        core: Any = self.module_.core
+        draws = []
+        with torch.inference_mode():
+            for _ in range(n_samples):
+                normal = [self._door(generator.standard_normal(size)) for size in core.draw_sizes()]
+                draws.append(self.module_.draw_covariance(x, normal).cpu().numpy())
+        return np.stack(draws, axis=-1)
+
+    def _check_parameters(self) -> None:
+        super()._check_parameters()
+        check_choice(self.kernel, "kernel", (*KERNELS, "periodic"))
+        check_number(self.n_inducing, "n_inducing", low=2, integer=True, optional=True)
+        check_number(self.max_inputs, "max_inputs", low=2, integer=True)
+        if not isinstance(self.shared_length_scale, bool | np.bool_):
+            raise ValueError(f"shared_length_scale == {self.shared_length_scale!r}, must be True or False.")
+
+    def _fit(self, X: Floats, y: Floats, **told: Any) -> Fitted:
+        length_scale = check_length_scale(self.length_scale, X.shape[1])
+        period = check_period(self.period, self.kernel, X.shape[1])
+        groups = told.get("groups")
+        if groups is not None and X.shape[1] == 1:
+            _check_ways(X[:, 0], y, groups)
+        scaling = Standardization.of(X, y)
+        standardized = scaling.inputs(X)
+        inputs, index = distinct_rows(standardized)
+        prior_tril = self._prior_tril(X, y, scaling)
+        training = TrainingSet(
+            self._door(standardized), self._door(scaling.outputs(y)), self._door(inputs), self._door(index).long()
+        ).merged(self.max_inputs)
+        warn_if_few(len(y), y.shape[1])
+        warn_if_identical(training)
+        kernel: KernelName = "squared_exponential" if self.kernel == "periodic" else self.kernel  # type: ignore[assignment]
+        circle = None if period is None else self._door(period / scaling.x_scale)
+        inducing = inducing_inputs(training.inputs, self._n_inducing(X.shape[1], y.shape[1]))
+        features = FeatureMap(inducing, kernel, circle)
+        held = None if length_scale is None else self._door(length_scale / scaling.x_scale)
+        families = Families(
+            ProcessFamily(features, *_MEAN, shared=self.shared_length_scale),
+            ProcessFamily(features, *_LOG_VARIANCE, held, self.shared_length_scale),
+            ProcessFamily(features, *_COEFFICIENT, held),
+        )
+        options = SearchOptions(self.max_iter, self.tol, self.n_restarts)
+        group = None if groups is None else self._door(groups).long()
+        fit = fit_heteroscedastic(training, group, families, options)
+        self.effective_share_ = fit.correlation.effective_share
+        module = HeteroscedasticModel(fit, prior_tril)
+        return Fitted(self._assemble(module, scaling), _report(fit, options), features.jitter)
+
+    def _prior_tril(self, X: Floats, y: Floats, scaling: Standardization) -> torch.Tensor:
+        if self.prior is None:
+            return default_prior_tril(self._door(scaling.outputs(y)))
+        covariance = prior_covariance(self.prior, X, y.shape[1]) / scaling.y_scale[:, np.newaxis] / scaling.y_scale
+        tril = safe_cholesky(self._door(covariance), name="prior")
+        return tril if tril.ndim == 2 else tril[0]  # a callable is asked again at every prediction
+
+    def _n_inducing(self, n_features: int, n_outputs: int) -> int:
+        if self.n_inducing is not None:
+            return self.n_inducing
+        most = _N_INDUCING if n_features == 1 else _N_INDUCING_MORE
+        return min(most, max(12, _N_TOGETHER // n_outputs))
+
+
+def _report(fit: HeteroscedasticFit, options: SearchOptions) -> FitReport:
+    losses = tuple(-value for value in fit.log_evidence)
+    converged = all(report.converged for report in options.reports)
+    message = "converged" if converged else f"stopped at max_iter={options.max_iter} iterations of a search"
+    return FitReport(losses[-1], losses, max(report.n_iter for report in options.reports), converged, message)
+
+
+def _check_ways(x: Floats, y: Floats, groups: Any) -> None:
+    """Warn once where demonstrations follow several ways; those that cannot be put in order are left out."""
+    times, positions = [], []
+    for group in range(int(groups.max()) + 1):
+        time, first = np.unique(x[groups == group], return_index=True)
+        if len(time) > 1:
+            times.append(time)
+            positions.append(y[groups == group][first])
+    if len(times) > 1:
+        check_unimodal(Demonstrations(times, positions))

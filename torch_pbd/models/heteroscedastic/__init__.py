@@ -1,0 +1,14 @@
+"""Mean and covariance by latent Gaussian processes that are integrated out: the recommended model."""
+
+from torch_pbd.models.heteroscedastic.fit import Families, HeteroscedasticFit, fit_heteroscedastic
+from torch_pbd.models.heteroscedastic.module import HeteroscedasticModel
+from torch_pbd.models.heteroscedastic.processes import ProcessFamily, SearchOptions
+
+__all__ = [
+    "Families",
+    "HeteroscedasticFit",
+    "HeteroscedasticModel",
+    "ProcessFamily",
+    "SearchOptions",
+    "fit_heteroscedastic",
+]

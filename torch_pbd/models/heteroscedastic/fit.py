@@ -1,0 +1,119 @@
+"""Fit of mean and covariance, by turns."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from torch_pbd.linalg import scale_tril_from_root
+from torch_pbd.models.heteroscedastic.correlation import (
+    INDEPENDENT,
+    DemonstrationCorrelation,
+    demonstration_correlation,
+    occurrences_of,
+)
+from torch_pbd.models.heteroscedastic.covariance import fit_covariance
+from torch_pbd.models.heteroscedastic.latent import LatentCovariance
+from torch_pbd.models.heteroscedastic.mean import LatentMean, fit_mean
+from torch_pbd.models.heteroscedastic.processes import ProcessFamily, SearchOptions
+from torch_pbd.models.training import TrainingSet
+
+# Rows at an input whose mean is all their own still tell this share of a variance, or nothing would.
+_LEAST_SHARE = 0.1
+_START_DEVIATION = 0.7  # of the noise, in standard deviations of y
+# Of y's standard deviation: an output that is constant, or a copy of another, has this deviation of its own.
+_LEAST_DEVIATION = 1e-6
+
+
+@dataclass(frozen=True)
+class Families:
+    """Of the processes of the mean, the log variances and the coefficients."""
+
+    mean: ProcessFamily
+    log_variance: ProcessFamily
+    coefficients: ProcessFamily
+
+
+@dataclass(frozen=True)
+class HeteroscedasticFit:
+    """Posterior of mean and covariance of standardized outputs."""
+
+    mean: LatentMean
+    covariance: LatentCovariance
+    """Of residuals multiplied by the inverse of ``pooled_tril``."""
+    pooled_tril: Float[Tensor, "d d"]
+    correlation: DemonstrationCorrelation
+    log_evidence: tuple[float, ...]
+    """Of the covariance, at the end of each turn, in nats."""
+
+
+def fit_heteroscedastic(
+    training: TrainingSet,
+    group: Int64[Tensor, " rows"] | None,
+    families: Families,
+    options: SearchOptions,
+    *,
+    n_turns: int = 3,
+) -> HeteroscedasticFit:
+    """Mean under the noise learned so far, then covariance of the residuals from it, ``n_turns`` times.
+
+    ``group`` tells the demonstrations apart. What the first turns leave of each, whitened, tells how far
+    its samples are correlated, which the later ones take into account.
+    """
+    n_outputs = training.y.shape[1]
+    mean, covariance, evidences = None, None, []
+    correlation = INDEPENDENT
+    pooled = _START_DEVIATION * torch.eye(n_outputs).to(training.y)
+    for turn in range(n_turns):
+        inputs, counts = training.inputs, training.counts
+        occurrences = None if group is None else occurrences_of(training.index, group, len(inputs))
+        tril = pooled.expand(len(inputs), -1, -1)
+        if covariance is not None:
+            tril = pooled @ covariance.at(inputs).tril()
+        whitener = None if occurrences is None else correlation.whitener(inputs, occurrences, squares=False)
+        theta = None if mean is None else mean.theta
+        mean = fit_mean(families.mean, inputs, training.means(), counts, tril, whitener, theta, options)
+        residual, share = _residual(training, mean, tril)
+        if turn == 0:
+            pooled = _pooled_tril(residual, share)
+        normal = torch.linalg.solve_triangular(pooled, residual.mT, upper=False).mT
+        root = training.scatter_root(normal)
+        degrees = torch.zeros_like(counts).index_add_(0, training.index, share)
+        whitener = None if occurrences is None else correlation.whitener(inputs, occurrences, squares=True)
+        both = (families.log_variance, families.coefficients)
+        covariance, evidence = fit_covariance(both, inputs, root @ root.mT, degrees, whitener, covariance, options)
+        evidences.append(evidence)
+        if group is not None and turn < n_turns - 1:
+            tril = covariance.at(inputs).tril()[training.index]
+            independent = torch.linalg.solve_triangular(tril, normal.unsqueeze(2), upper=False).squeeze(2)
+            correlation = demonstration_correlation(training.x, independent, group)
+            if correlation.matters:
+                training = training.merged(_n_inputs(training, group))
+    assert mean is not None and covariance is not None
+    return HeteroscedasticFit(mean, covariance, pooled, correlation, tuple(evidences))
+
+
+def _residual(training: TrainingSet, mean: LatentMean, tril: Tensor) -> tuple[Tensor, Tensor]:
+    """Residuals of the rows, and the share of a degree of freedom that fitting the mean has left to each."""
+    expected, error = mean.at(training.inputs)
+    if torch.equal(training.inputs[training.index], training.x):
+        expected = expected[training.index]
+    else:  # the inputs are the centres of neighbourhoods
+        expected = mean.at(training.x)[0]
+    precise = torch.cholesky_solve(error, tril)
+    leverage = precise.diagonal(dim1=-2, dim2=-1).mean(-1)
+    return training.y - expected, (1.0 - leverage).clamp_min(_LEAST_SHARE)[training.index]
+
+
+def _pooled_tril(residual: Tensor, share: Tensor) -> Tensor:
+    root = residual.mT / share.sum().sqrt()
+    floor = _LEAST_DEVIATION * torch.eye(residual.shape[1]).to(residual)
+    return scale_tril_from_root(torch.cat([root, floor], dim=1))
+
+
+def _n_inputs(training: TrainingSet, group: Tensor) -> int:
+    """Inputs to tell apart where demonstrations are correlated: so many that each holds about a row of each
+    demonstration, and enough to tell a covariance by themselves."""
+    rows = max(len(group.unique()), training.y.shape[1] + 3)
+    return max(8, len(training.x) // rows)

@@ -1,0 +1,161 @@
+"""The fitted model as a module: everything that predicts is in its buffers."""
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from torch_pbd.gp.inducing import FeatureMap
+from torch_pbd.linalg import safe_cholesky, symmetrize
+from torch_pbd.models.heteroscedastic.fit import HeteroscedasticFit
+from torch_pbd.models.heteroscedastic.latent import FactorMoments, LatentCovariance
+from torch_pbd.models.heteroscedastic.linear import Weights
+from torch_pbd.models.heteroscedastic.mean import LatentMean
+from torch_pbd.models.heteroscedastic.processes import ProcessFamily
+
+# Far from data a log variance may be anything: of its variance no more than this enters an expectation.
+_MOST_LOG_VARIANCE = 2.0
+_LEAST_DEGREES = 3.0  # below two, Student's t has no covariance
+# Longest length scale, in ranges of the input, by which distance from the data is judged: with longer ones the
+# prior would take over only far outside.
+_REACH = 0.2
+
+
+class HeteroscedasticModel(nn.Module):
+    """Predictive density in standardized units: Student's t, its moments from the latent processes.
+
+    Parameters
+    ----------
+    fit : HeteroscedasticFit
+    prior_tril : Tensor of shape (d, d)
+        Factor of the covariance far from data.
+    """
+
+    def __init__(self, fit: HeteroscedasticFit, prior_tril: Float[Tensor, "d d"]) -> None:
+        super().__init__()
+        mean, covariance = fit.mean, fit.covariance
+        families = (mean.family, covariance.log_variance_family, covariance.coefficient_family)
+        for name, family in zip(("mean", "log_variance", "coefficient"), families, strict=True):
+            if family.fixed_length_scale is not None:
+                self.register_buffer(f"{name}_length_scale", family.fixed_length_scale)
+        features = mean.family.features
+        tensors = {
+            "inducing": features.inducing,
+            "mean_theta": mean.theta,
+            "mean_weights": mean.weights.mean,
+            "mean_root": mean.weights.root,
+            "log_variance_theta": covariance.log_variance_theta,
+            "log_variance_weights": covariance.log_variance.mean,
+            "log_variance_root": covariance.log_variance.root,
+            "coefficient_theta": covariance.coefficient_theta,
+            "pooled_tril": fit.pooled_tril,
+            "prior_tril": prior_tril,
+        }
+        for i, weights in enumerate(covariance.coefficients, start=1):
+            tensors[f"coefficient_weights_{i}"] = weights.mean
+            tensors[f"coefficient_root_{i}"] = weights.root
+        if features.period is not None:
+            tensors["period"] = features.period
+        for name, tensor in tensors.items():
+            self.register_buffer(name, tensor.detach().clone().contiguous())
+        self.kernel = features.kernel
+        self.medians = [(family.length_scale, family.amplitude, family.constant) for family in families]
+
+    def spec(self) -> dict[str, Any]:
+        """All of the model that is not in its buffers: JSON-able."""
+        return {"kernel": self.kernel, "medians": [list(row) for row in self.medians]}
+
+    @classmethod
+    def restored(cls, spec: dict[str, Any], tensors: dict[str, Tensor]) -> "HeteroscedasticModel":
+        """Model of a spec and of the buffers' tensors."""
+        model = cls.__new__(cls)
+        nn.Module.__init__(model)
+        for name, tensor in tensors.items():
+            model.register_buffer(name, tensor)
+        model.kernel = spec["kernel"]
+        model.medians = [(float(a), float(b), float(c)) for a, b, c in spec["medians"]]
+        return model
+
+    def forward(
+        self, x: Float[Tensor, "n e"], prior_tril: Float[Tensor, "n d d"] | None = None
+    ) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d r"]]:
+        """Mean, and a root of the predictive covariance: of the variability, of the error of its estimate and
+        of the mean's, and of the prior with the share that missing data leave it."""
+        prior = self.prior_tril if prior_tril is None else prior_tril
+        mean, error = self.mean_process.at(x)
+        # Where the data leave nothing to err about, rounding must not make it negative.
+        least = 1e-12 * torch.diag_embed(1e-30 + error.diagonal(dim1=-2, dim2=-1))
+        error_root = safe_cholesky(symmetrize(error) + least, name="the covariance of the mean's error")
+        missing = self.type1(x)[:, None, None]
+        known = (1.0 - missing).sqrt() * torch.cat([self._root(self._moments(x)), error_root], dim=-1)
+        return mean, torch.cat([known, missing.sqrt() * prior.expand(len(x), -1, -1)], dim=-1)
+
+    def variability(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d d"]:
+        """Root of the covariance at the means of the latent processes, without prior and without errors."""
+        return (1.0 - self.type1(x)).sqrt()[:, None, None] * (self.pooled_tril @ self._moments(x).tril())
+
+    def degrees(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
+        """Degrees of freedom of the predictive density; infinite (a normal distribution) where only the prior
+        speaks.
+
+        A variance known from as many squares has a logarithm of variance trigamma(degrees / 2), which is that
+        of the latent processes; the average is over the outputs.
+        """
+        variance = self._moments(x).log_variance_variance
+        degrees = ((1.0 + (1.0 + 2.0 * variance).sqrt()) / variance).mean(-1)
+        return degrees.clamp_min(_LEAST_DEGREES) / (1.0 - self.type1(x)).clamp_min(1e-12)
+
+    def type1(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
+        """Type I uncertainty: eq. (6) without noise over the prior variance, of a process with the amplitude-
+        weighted mean of the log variances' length scales, as far as that does not reach too far."""
+        family, theta = self.covariance_process.log_variance_family, self.log_variance_theta
+        weight = family.amplitude_of(theta).square()
+        scales = family.length_scale_of(theta).log()
+        scale = ((weight / weight.sum()) @ scales).exp().clamp_max(_REACH * x.shape[1] ** 0.5)
+        return (1.0 - family.features(x, scale[None])[0].square().sum(-1)).clamp(0.0, 1.0)
+
+    def draw(self, x: Float[Tensor, "n e"], normal: list[Float[Tensor, " p"]]) -> Float[Tensor, "n d d"]:
+        """Root of one posterior draw of the covariance function at x, with the prior's share in it."""
+        missing = self.type1(x)[:, None, None]
+        root = self.pooled_tril @ self.covariance_process.draw(x, normal)
+        return torch.cat([(1.0 - missing).sqrt() * root, missing.sqrt() * self.prior_tril.expand(len(x), -1, -1)], -1)
+
+    def draw_sizes(self) -> list[int]:
+        """Sizes of the standard normal vectors that :meth:`draw` takes."""
+        rows, size = self.log_variance_weights.shape
+        return [size] * rows + [len(w.mean) for w in self.covariance_process.coefficients]
+
+    @property
+    def mean_process(self) -> LatentMean:
+        """The mean's processes."""
+        return LatentMean(self._family(0), self.mean_theta, Weights(self.mean_weights, self.mean_root))
+
+    @property
+    def covariance_process(self) -> LatentCovariance:
+        """The covariance's processes, of residuals multiplied by the inverse of ``pooled_tril``."""
+        count = len(self.coefficient_theta)
+        coefficients = [
+            Weights(getattr(self, f"coefficient_weights_{i}"), getattr(self, f"coefficient_root_{i}"))
+            for i in range(1, count + 1)
+        ]
+        log_variance = Weights(self.log_variance_weights, self.log_variance_root)
+        return LatentCovariance(
+            self._family(1),
+            self._family(2),
+            self.log_variance_theta,
+            log_variance,
+            self.coefficient_theta,
+            coefficients,
+        )
+
+    def _family(self, number: int) -> ProcessFamily:
+        features = FeatureMap(self.inducing, self.kernel, getattr(self, "period", None))
+        name = ("mean", "log_variance", "coefficient")[number]
+        return ProcessFamily(features, *self.medians[number], getattr(self, f"{name}_length_scale", None))
+
+    def _moments(self, x: Tensor) -> FactorMoments:
+        return self.covariance_process.at(x)
+
+    def _root(self, moments: FactorMoments) -> Tensor:
+        return self.pooled_tril @ moments.expected_root(_MOST_LOG_VARIANCE)
