@@ -151,11 +151,12 @@ def run(jobs: list[Job], keys: list[Row], fields: Iterable[str], path: Path, n_j
             delayed(attempt)(score, *arguments) for score, arguments in jobs
         )
         for key, result in zip(keys, results, strict=True):
+            part = next(iter(key.items()))
+            if not rows or part not in rows[-1].items():
+                print(f"{path.stem}: {part[0]} {part[1]}, {len(rows)} of {len(jobs)} fits done", flush=True)
             rows.append(key | result)
             writer.writerow(rows[-1])
             file.flush()
-            print(f"\r{path.stem}: {len(rows)} of {len(jobs)}", end="", flush=True)
-    print()
     return rows
 
 

@@ -1,7 +1,8 @@
 """Contenders of covariance.py that libraries provide, each with the settings its documentation recommends."""
 
 import math
-import warnings
+from contextlib import redirect_stdout
+from io import StringIO
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from covariance_peers import (
     distinct,
     empirical_moments,
     log_normal,
+    repeats,
     site_sums,
 )
 from scipy.special import logsumexp
@@ -89,7 +91,7 @@ class SklearnFactors(Peer):
 
     def _fit(self, x: Floats, y: Floats, groups: Groups | None) -> None:
         self._mean = self._mean_process(x, y)
-        moments = empirical_moments(x, y, y - self._mean.predict(x))
+        moments = empirical_moments(x, y, y if repeats(x) else y - self._mean.predict(x))
         self._entries = np.tril_indices(y.shape[1])
         self._least = 1e-3 * np.sqrt(np.diagonal(moments.covariance.mean(axis=0)))
         factors = np.linalg.cholesky(moments.covariance)
@@ -188,8 +190,7 @@ class HetGP(Peer):
         self._models = []
         for column in y.T:
             model = hetGP()
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
+            with redirect_stdout(StringIO()):  # it prints where it takes the homoscedastic model
                 model.mle(x, column.copy(), covtype="Matern5_2")
             self._models.append(model)
 
