@@ -93,7 +93,7 @@ def test_mixture_regression_is_that_of_gmr(rng):
     gmr = pytest.importorskip("gmr")
     x = rng.uniform(-3.0, 5.0, size=(200, 1))
     y = np.hstack([np.sin(x), x**2]) + 0.3 * rng.normal(size=(200, 2))
-    model = libraries.MixtureRegression(3).fit(x, y)
+    model = libraries.MixtureRegression(3, own_density=True).fit(x, y)
     weights, means, covariances = model.mixture_
     mixture = gmr.GMM(3, weights, means, covariances)
     shift, scale = model._shift, model._scale  # of the mixture, inside of the peer's own

@@ -23,12 +23,19 @@ from sklearn.mixture import GaussianMixture
 
 
 class MixtureRegression(Peer):
-    """scikit-learn's mixture over [x, y], best of five starts; its own conditional density, a mixture."""
+    """scikit-learn's mixture over [x, y], best of five starts, and the mean and covariance of y given x.
 
-    gaussian = False
+    Parameters
+    ----------
+    n_components : int
+    own_density : bool
+        Score by the conditional density, a mixture; False: by the normal with its mean and covariance, as Gaussian
+        mixture regression does. Neither is the better one everywhere.
+    """
 
-    def __init__(self, n_components: int) -> None:
+    def __init__(self, n_components: int, own_density: bool = False) -> None:
         self.n_components = n_components
+        self.gaussian = not own_density
 
     def _fit(self, x: Floats, y: Floats, groups: Groups | None) -> None:
         joint = np.hstack([x, y])
@@ -50,6 +57,8 @@ class MixtureRegression(Peer):
         return mean, np.einsum("nk,kij->nij", share, within) + np.einsum("nk,nki,nkj->nij", share, apart, apart)
 
     def _log_density(self, x: Floats, y: Floats) -> Floats:
+        if self.gaussian:
+            return super()._log_density(x, y)
         log_share, means, within = self._conditional(x)
         return logsumexp(log_share + log_normal(y[:, np.newaxis] - means, within), axis=1)
 

@@ -65,6 +65,7 @@ METHODS: dict[str, Method] = {
     "sklearn GMR 5": Method(lambda: MixtureRegression(5)),
     "sklearn GMR 8": Method(lambda: MixtureRegression(8)),
     "gmr 8": Method(lambda: GmrMixture(8), "gmr"),
+    "gmr 8 as a mixture": Method(lambda: GmrMixture(8, own_density=True), "gmr"),
     "sklearn GP factors": Method(SklearnFactors),
     "gpytorch GP factors": Method(GPyTorchFactors, "gpytorch"),
     "ProMP": Method(MovementPrimitive, "movement_primitives"),
