@@ -159,7 +159,11 @@ class VariationalFactors(Peer):
 
 
 class MovementPrimitive(Peer):
-    """ProMP of movement_primitives with its 10 weights an output, by its own EM; its noise is in the covariance."""
+    """ProMP of movement_primitives with its 10 weights an output, by its own EM.
+
+    The covariance has noise, too: the library's estimate, or what the 10 weights leave of the curves if that is
+    more (the estimate is divided by the norm of the weights as well, so it comes out too small).
+    """
 
     def _fit(self, x: Floats, y: Floats, groups: Groups | None) -> None:
         from movement_primitives.promp import ProMP
@@ -175,7 +179,10 @@ class MovementPrimitive(Peer):
             times.append(x[rows, 0])
             curves.append(y[rows])
         self._promp = ProMP(y.shape[1])
-        self._promp.imitate(times, curves)
+        pairs = list(zip(times, curves, strict=True))
+        left = [y - self._promp.trajectory_from_weights(t.copy(), self._promp.weights(t.copy(), y)) for t, y in pairs]
+        self._promp.imitate([t.copy() for t in times], curves)
+        self._noise = np.diag(np.maximum(np.square(np.concatenate(left)).mean(axis=0), self._promp.variance))
 
     def _moments(self, x: Floats) -> tuple[Floats, Floats]:
         d = self._promp.n_dims
@@ -186,8 +193,7 @@ class MovementPrimitive(Peer):
             steps = np.arange(len(part))
             covariance = self._promp.cov_trajectory(time.copy()).reshape(d, len(time), d, len(time))
             covariances.append(covariance[:, steps, :, steps])
-        noise = self._promp.variance * np.eye(d)
-        return np.concatenate(means), np.concatenate(covariances) + noise
+        return np.concatenate(means), np.concatenate(covariances) + self._noise
 
 
 class HetGP(Peer):
