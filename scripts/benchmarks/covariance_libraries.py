@@ -21,6 +21,8 @@ from covariance_peers import (
 from scipy.special import logsumexp
 from sklearn.mixture import GaussianMixture
 
+_SINGULAR = 1e-10  # eigenvalue of a component, of rows of unit variance
+
 
 class MixtureRegression(Peer):
     """scikit-learn's mixture over [x, y], best of five starts, and the mean and covariance of y given x.
@@ -88,8 +90,10 @@ class GmrMixture(MixtureRegression):
             try:
                 with np.errstate(all="ignore"):
                     mixture.from_samples(joint, **options)
-                    np.linalg.cholesky(mixture.covariances)
+                    singular = np.linalg.eigvalsh(mixture.covariances).min() < _SINGULAR
             except (np.linalg.LinAlgError, ValueError):
+                continue
+            if singular and not shrinkage:
                 continue
             return mixture.priors, mixture.means, mixture.covariances
         raise np.linalg.LinAlgError("a component is singular, with gmr's shrinkage too")
