@@ -1,8 +1,8 @@
 """What the covariance regressors share: the door between NumPy and torch, and all that follows a fit."""
 
-import sys
 import warnings
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Self
 
@@ -17,6 +17,7 @@ from sklearn.utils._tags import Tags
 from sklearn.utils.validation import check_is_fitted, validate_data
 from torch import Tensor
 
+from torch_pbd.estimators._progress import printed_progress
 from torch_pbd.estimators._scaling import Standardization
 from torch_pbd.estimators._validation import (
     Floats,
@@ -236,8 +237,8 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
     def _degrees(self, x: Tensor) -> Tensor | None:
         """Degrees of freedom of the predictive density at x; None where it is normal."""
         with torch.inference_mode():
-            parts = [self.module_.degrees(chunk) for chunk in x.split(_CHUNK)]
-        return None if parts[0] is None else torch.cat(parts)
+            parts = [degrees for chunk in x.split(_CHUNK) if (degrees := self.module_.degrees(chunk)) is not None]
+        return torch.cat(parts) if parts else None
 
     def _query(self, X: ArrayLike) -> Tensor:
         """Rows to predict at; none at all is allowed, though scikit-learn asks for one."""
@@ -275,20 +276,9 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
             return str(error).partition("\n")[0].rstrip(".")
         return ""
 
-    def _progress(self) -> Any:
+    def _progress(self) -> Callable[[Progress], None] | None:
         """Callback that prints the loss, or None."""
-        if not self.verbose:
-            return None
-
-        def show(progress: Progress) -> None:
-            if progress.n_evaluations % max(1, 10 // self.verbose) in (0, 1):
-                print(
-                    f"{type(self).__name__}: evaluation {progress.n_evaluations:5d}  loss {progress.loss:14.6f}  "
-                    f"{progress.elapsed:7.2f} s",
-                    file=sys.stderr,
-                )
-
-        return show
+        return printed_progress(type(self).__name__, self.verbose) if self.verbose else None
 
     def _assemble(self, core: Any, scaling: Standardization) -> ConditionalNormal:
         parts = (scaling.x_shift, scaling.x_scale, scaling.y_shift, scaling.y_scale)

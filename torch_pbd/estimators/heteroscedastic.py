@@ -1,6 +1,5 @@
 """The recommended regressor: covariance by latent Gaussian processes that are integrated out."""
 
-import warnings
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -41,8 +40,9 @@ _MEAN = (0.3, 1.2, 0.0)
 _LOG_VARIANCE = (0.5, 1.0, 2.0)
 _COEFFICIENT = (0.5, 0.3, 1.0)
 
-# Inducing inputs of a process by default, and of all coefficients of the last output together.
-_N_INDUCING, _N_INDUCING_MORE, _N_TOGETHER = 48, 100, 400
+# Inducing inputs by default of a process of the mean and of the covariance, for one column of X and for more; and
+# at most of all outputs together.
+_N_INDUCING, _N_INDUCING_MORE, _N_TOGETHER = (128, 128), (128, 100), (800, 400)
 
 
 class HeteroscedasticGPRegressor(CovarianceRegressor):
@@ -259,17 +259,18 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         ).merged(self.max_inputs)
         warn_if_few(len(y), y.shape[1])
         warn_if_identical(training)
-        kernel: KernelName = "squared_exponential" if self.kernel == "periodic" else self.kernel  # type: ignore[assignment]
+        kernel: KernelName = "squared_exponential" if self.kernel == "periodic" else self.kernel
         circle = None if period is None else self._door(period / scaling.x_scale)
-        inducing = inducing_inputs(training.inputs, self._n_inducing(X.shape[1], y.shape[1]))
-        features = FeatureMap(inducing, kernel, circle)
+        sizes = self._n_inducing(X.shape[1], y.shape[1])
+        chosen = [inducing_inputs(training.inputs, size) for size in sizes]
+        of_mean, features = (FeatureMap(z, kernel, circle, len(z) == len(inputs)) for z in chosen)
         held = None if length_scale is None else self._door(length_scale / scaling.x_scale)
         families = Families(
-            ProcessFamily(features, *_MEAN, shared=self.shared_length_scale),
+            ProcessFamily(of_mean, *_MEAN, shared=self.shared_length_scale),
             ProcessFamily(features, *_LOG_VARIANCE, held, self.shared_length_scale),
             ProcessFamily(features, *_COEFFICIENT, held),
         )
-        options = SearchOptions(self.max_iter, self.tol, self.n_restarts)
+        options = SearchOptions(self.max_iter, self.tol, self.n_restarts, self._progress())
         group = None if groups is None else self._door(groups).long()
         fit = fit_heteroscedastic(training, group, families, options)
         self.effective_share_ = fit.correlation.effective_share
@@ -283,11 +284,13 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         tril = safe_cholesky(self._door(covariance), name="prior")
         return tril if tril.ndim == 2 else tril[0]  # a callable is asked again at every prediction
 
-    def _n_inducing(self, n_features: int, n_outputs: int) -> int:
+    def _n_inducing(self, n_features: int, n_outputs: int) -> tuple[int, int]:
+        """Inducing inputs of the mean's processes and of the covariance's."""
         if self.n_inducing is not None:
-            return self.n_inducing
+            return self.n_inducing, self.n_inducing
         most = _N_INDUCING if n_features == 1 else _N_INDUCING_MORE
-        return min(most, max(12, _N_TOGETHER // n_outputs))
+        mean, covariance = (max(12, together // n_outputs) for together in _N_TOGETHER)
+        return min(most[0], mean), min(most[1], covariance)
 
 
 def _report(fit: HeteroscedasticFit, options: SearchOptions) -> FitReport:

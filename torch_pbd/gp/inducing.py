@@ -14,6 +14,10 @@ from torch_pbd.linalg import safe_cholesky
 # process of unit variance cannot be told from noise.
 JITTER = 1e-10
 
+_SHORTEST = 1e-3
+_EXACT_RESOLUTION = 0.75  # spacings of the inputs: shorter "needles" explain each input by itself
+_RESOLUTION = 1.5  # spacings: at this length scale features carry 0.999 of the variance between inducing inputs
+
 
 @dataclass(frozen=True)
 class FeatureMap:
@@ -26,6 +30,8 @@ class FeatureMap:
     inducing: Float[Tensor, "m e"]
     kernel: KernelName = "squared_exponential"
     period: Float[Tensor, " e"] | None = None
+    exact: bool = False
+    """Whether the inducing inputs are all the training inputs."""
 
     def __call__(self, x: Float[Tensor, "n e"], length_scale: Float[Tensor, "*b e"]) -> Float[Tensor, "*b n m"]:
         """Features at x: their inner products are the kernel, wherever the inducing inputs resolve it."""
@@ -43,8 +49,9 @@ class FeatureMap:
     def shortest_length_scale(self) -> float:
         """Length scale below which the inducing inputs no longer resolve what is between them."""
         if len(self.inducing) < 2:
-            return 1e-3
-        return max(1e-3, min(0.5, 0.75 * spacing(self.inducing)))
+            return _SHORTEST
+        share = _EXACT_RESOLUTION if self.exact else _RESOLUTION
+        return max(_SHORTEST, min(0.5, share * spacing(self.inducing)))
 
 
 def inducing_inputs(inputs: Float[Tensor, "n e"], n_inducing: int) -> Float[Tensor, "m e"]:

@@ -26,13 +26,9 @@ class DemonstrationCorrelation:
     """
 
     decay: float
-    """Distance over which the correlation of squared residuals falls by e, of standardized inputs."""
+    """Distance over which the correlation of squared residuals falls by e, of standardized inputs; 0 if none does."""
     effective_share: float
     """Independent samples that a sample counts for."""
-
-    @property
-    def matters(self) -> bool:
-        return self.decay > 0
 
     def whitener(
         self, inputs: Float[Tensor, "n e"], occurrences: Float[Tensor, "g n"], *, squares: bool
@@ -41,7 +37,7 @@ class DemonstrationCorrelation:
 
         ``occurrences`` are the rows of each of g demonstrations at each input. None if it is the unit matrix.
         """
-        if not self.matters:
+        if self.decay == 0.0:
             return None
         distance = torch.cdist(inputs, inputs, compute_mode="donot_use_mm_for_euclid_dist")
         correlation = torch.exp(-distance / (self.decay if squares else 2.0 * self.decay))
@@ -63,57 +59,60 @@ def demonstration_correlation(
     different demonstrations, up to the distance where it first is not positive; the decay is that of the
     exponential with the same sum over all pairs of samples.
     """
-    names = group.unique()
-    if len(names) < 2:
-        return INDEPENDENT
-    products, pairs, n_samples = [], [], 0
     limit = math.sqrt(x.shape[1])
-    edges = torch.linspace(0.0, limit, _N_BINS + 1).to(x)[1:-1]
-    for name in names:
+    scaled = whitened / whitened.square().mean(0).clamp_min(1e-300).sqrt()
+    tables = []
+    n_samples = 0
+    for name in group.unique():
         rows = (group == name).nonzero().squeeze(-1)
         rows = rows[:: max(1, math.ceil(len(rows) / _MAX_SAMPLES))]
+        tables.append(_products_by_distance(x[rows], scaled[rows], limit))
         n_samples += len(rows)
-        i, j = torch.triu_indices(len(rows), len(rows), offset=1, device=x.device)
-        distance = (x[rows[i]] - x[rows[j]]).norm(dim=-1)
-        near = distance <= limit
-        bin_of = torch.bucketize(distance[near], edges)
-        product = (whitened[rows[i]] * whitened[rows[j]])[near]
-        products.append(x.new_zeros(_N_BINS, product.shape[1]).index_add_(0, bin_of, product))
-        pairs.append(torch.bincount(bin_of, minlength=_N_BINS).to(x))
-    pair_counts = torch.stack(pairs)
-    own = torch.stack(products) / pair_counts.clamp_min(1.0).unsqueeze(-1) / whitened.square().mean(0).clamp_min(1e-300)
-    present = (pair_counts > 0).sum(0).to(x)
+    if len(tables) < 2:
+        return INDEPENDENT
+    products, pairs = (torch.stack(part) for part in zip(*tables, strict=True))
+    total = pairs.sum(0)
+    sum_of_squares = float((_squared_autocorrelation(products, pairs) * total).sum())
+    share = 1.0 / (1.0 + 2.0 * sum_of_squares / n_samples)
+    if share > _INDEPENDENT:
+        return INDEPENDENT
+    centre = (torch.arange(_N_BINS).to(x) + 0.5) * limit / _N_BINS
+    return DemonstrationCorrelation(_decay_of(sum_of_squares, centre, total), share)
+
+
+def _products_by_distance(x: Tensor, values: Tensor, limit: float) -> tuple[Tensor, Tensor]:
+    """Sums of the products of pairs of one demonstration (bins, d), and the number of pairs (bins,)."""
+    i, j = torch.triu_indices(len(x), len(x), offset=1, device=x.device)
+    distance = (x[i] - x[j]).norm(dim=-1)
+    near = distance <= limit
+    edges = torch.linspace(0.0, limit, _N_BINS + 1).to(x)[1:-1]
+    number = torch.bucketize(distance[near], edges)
+    products = x.new_zeros(_N_BINS, values.shape[1]).index_add_(0, number, (values[i] * values[j])[near])
+    return products, torch.bincount(number, minlength=_N_BINS).to(x)
+
+
+def _squared_autocorrelation(products: Float[Tensor, "g k d"], pairs: Float[Tensor, "g k"]) -> Float[Tensor, " k"]:
+    """Its mean over the outputs in each bin of distance; zero from where it first is not positive."""
+    own = products / pairs.clamp_min(1.0).unsqueeze(-1)
+    present = (pairs > 0).sum(0).to(products)
     cross = own.sum(0).square() - own.square().sum(0)
     square = (cross / (present * (present - 1.0)).clamp_min(1.0).unsqueeze(-1)).mean(1).clamp(max=1.0)
-    known = present > 1
-    negative = known & (square <= 0)
-    end = int(negative.nonzero()[0]) if bool(negative.any()) else _N_BINS
-    square = torch.where(known, square, 0.0)
-    square[end:] = 0.0
-    total = pair_counts.sum(0)
-    excess = 2.0 * float((square * total).sum()) / n_samples
-    share = 1.0 / (1.0 + excess)
-    if share > _INDEPENDENT:
-        return DemonstrationCorrelation(0.0, 1.0)
-    centre = (torch.arange(_N_BINS).to(x) + 0.5) * limit / _N_BINS
-    return DemonstrationCorrelation(_decay_of(excess * n_samples / 2.0, centre, total), share)
+    ended = ((present > 1) & (square <= 0)).cumsum(0) > 0
+    return torch.where((present > 1) & ~ended, square, 0.0)
 
 
-def _decay_of(excess: float, distance: Tensor, pairs: Tensor) -> float:
-    """Decay whose exponential sums to ``excess`` over the pairs, by bisection."""
+def _decay_of(target: float, distance: Tensor, pairs: Tensor) -> float:
+    """Decay whose exponential sums to the target over the pairs, by bisection."""
     low, high = 1e-4, 1e2
     for _ in range(60):
         middle = math.sqrt(low * high)
-        low, high = (middle, high) if float((pairs * torch.exp(-distance / middle)).sum()) < excess else (low, middle)
+        too_short = float((pairs * torch.exp(-distance / middle)).sum()) < target
+        low, high = (middle, high) if too_short else (low, middle)
     return math.sqrt(low * high)
 
 
-def occurrences_of(
-    index: Int64[Tensor, " rows"], group: Int64[Tensor, " rows"] | None, n_inputs: int
-) -> Float[Tensor, "g n"] | None:
-    """Rows of each demonstration at each distinct input; None where demonstrations are not told."""
-    if group is None:
-        return None
+def occurrences_of(index: Int64[Tensor, " rows"], group: Int64[Tensor, " rows"], n_inputs: int) -> Float[Tensor, "g n"]:
+    """Rows of each demonstration at each distinct input."""
     names, number = group.unique(return_inverse=True)
     flat = torch.bincount(number * n_inputs + index, minlength=len(names) * n_inputs)
     return flat.reshape(len(names), n_inputs).to(torch.float64)

@@ -1,5 +1,6 @@
 """Fit of mean and covariance, by turns."""
 
+import time
 from dataclasses import dataclass
 
 import torch
@@ -17,11 +18,11 @@ from torch_pbd.models.heteroscedastic.covariance import fit_covariance
 from torch_pbd.models.heteroscedastic.latent import LatentCovariance
 from torch_pbd.models.heteroscedastic.mean import LatentMean, fit_mean
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily, SearchOptions
-from torch_pbd.models.training import TrainingSet
+from torch_pbd.models.training import TrainingSet, pooled_tril
 
 # Rows at an input whose mean is all their own still tell this share of a variance, or nothing would.
 _LEAST_SHARE = 0.1
-_START_DEVIATION = 0.7  # of the noise, in standard deviations of y
+_ROWS_TOGETHER = 8  # neighbours whose differences tell the noise that the first mean is fitted under
 # Of y's standard deviation: an output that is constant, or a copy of another, has this deviation of its own.
 _LEAST_DEVIATION = 1e-6
 
@@ -61,37 +62,68 @@ def fit_heteroscedastic(
     ``group`` tells the demonstrations apart. What the first turns leave of each, whitened, tells how far
     its samples are correlated, which the later ones take into account.
     """
-    n_outputs = training.y.shape[1]
-    mean, covariance, evidences = None, None, []
-    correlation = INDEPENDENT
-    pooled = _START_DEVIATION * torch.eye(n_outputs).to(training.y)
+    mean: LatentMean | None = None
+    covariance: LatentCovariance | None = None
+    correlation, evidences = INDEPENDENT, []
+    pooled = _start_tril(training)
+    started = time.perf_counter()
     for turn in range(n_turns):
-        inputs, counts = training.inputs, training.counts
-        occurrences = None if group is None else occurrences_of(training.index, group, len(inputs))
-        tril = pooled.expand(len(inputs), -1, -1)
-        if covariance is not None:
-            tril = pooled @ covariance.at(inputs).tril()
-        whitener = None if occurrences is None else correlation.whitener(inputs, occurrences, squares=False)
+        noise = _Noise.of(training, group, correlation)
+        tril = _tril_at(training.inputs, pooled, covariance)
         theta = None if mean is None else mean.theta
-        mean = fit_mean(families.mean, inputs, training.means(), counts, tril, whitener, theta, options)
+        means = (training.means(), training.counts)
+        mean = fit_mean(families.mean, training.inputs, *means, tril, noise.of_means, theta, options)
         residual, share = _residual(training, mean, tril)
         if turn == 0:
             pooled = _pooled_tril(residual, share)
         normal = torch.linalg.solve_triangular(pooled, residual.mT, upper=False).mT
         root = training.scatter_root(normal)
-        degrees = torch.zeros_like(counts).index_add_(0, training.index, share)
-        whitener = None if occurrences is None else correlation.whitener(inputs, occurrences, squares=True)
+        degrees = torch.zeros_like(training.counts).index_add_(0, training.index, share)
         both = (families.log_variance, families.coefficients)
-        covariance, evidence = fit_covariance(both, inputs, root @ root.mT, degrees, whitener, covariance, options)
+        covariance, evidence = fit_covariance(
+            both, training.inputs, root @ root.mT, degrees, noise.of_squares, covariance, options
+        )
         evidences.append(evidence)
+        options.report(len(evidences), -evidence, time.perf_counter() - started)
         if group is not None and turn < n_turns - 1:
-            tril = covariance.at(inputs).tril()[training.index]
+            tril = covariance.at(training.inputs).tril()[training.index]
             independent = torch.linalg.solve_triangular(tril, normal.unsqueeze(2), upper=False).squeeze(2)
             correlation = demonstration_correlation(training.x, independent, group)
-            if correlation.matters:
+            if correlation.decay > 0:
                 training = training.merged(_n_inputs(training, group))
-    assert mean is not None and covariance is not None
+    assert mean is not None
+    assert covariance is not None
     return HeteroscedasticFit(mean, covariance, pooled, correlation, tuple(evidences))
+
+
+@dataclass(frozen=True)
+class _Noise:
+    """What makes means, and mean squares, at the inputs independent; None where they are."""
+
+    of_means: Tensor | None = None
+    of_squares: Tensor | None = None
+
+    @classmethod
+    def of(cls, training: TrainingSet, group: Tensor | None, correlation: DemonstrationCorrelation) -> "_Noise":
+        if group is None:
+            return cls()
+        occurrences = occurrences_of(training.index, group, len(training.inputs))
+        first, second = (correlation.whitener(training.inputs, occurrences, squares=which) for which in (False, True))
+        return cls(first, second)
+
+
+def _tril_at(inputs: Tensor, pooled: Tensor, covariance: LatentCovariance | None) -> Tensor:
+    if covariance is None:
+        return pooled.expand(len(inputs), -1, -1)
+    return pooled @ covariance.at(inputs).tril()
+
+
+def _start_tril(training: TrainingSet) -> Tensor:
+    """Factor of the covariance within inputs, or within neighbourhoods where they do not repeat."""
+    repeated = 2 * len(training.inputs) <= len(training.x)
+    whole = training if repeated else training.merged(max(2, len(training.x) // _ROWS_TOGETHER))
+    floor = 1e-3 * torch.eye(training.y.shape[1]).to(training.y)
+    return scale_tril_from_root(torch.cat([pooled_tril(whole), floor], dim=1))
 
 
 def _residual(training: TrainingSet, mean: LatentMean, tril: Tensor) -> tuple[Tensor, Tensor]:
@@ -114,6 +146,7 @@ def _pooled_tril(residual: Tensor, share: Tensor) -> Tensor:
 
 def _n_inputs(training: TrainingSet, group: Tensor) -> int:
     """Inputs to tell apart where demonstrations are correlated: so many that each holds about a row of each
-    demonstration, and enough to tell a covariance by themselves."""
+    demonstration, and enough to tell a covariance by themselves.
+    """
     rows = max(len(group.unique()), training.y.shape[1] + 3)
     return max(8, len(training.x) // rows)

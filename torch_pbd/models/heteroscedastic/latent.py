@@ -52,7 +52,8 @@ class LatentCovariance:
 
     def draw(self, x: Float[Tensor, "n e"], normal: Sequence[Float[Tensor, " p"]]) -> Float[Tensor, "n d d"]:
         """Factor at x of one function of the posterior, made of standard normal numbers for each output's
-        log variance and then for each output's coefficients."""
+        log variance and then for each output's coefficients.
+        """
         n_outputs = len(self.log_variance.mean)
         features = self.log_variance_family.design(x, self.log_variance_theta)
         diagonal = []

@@ -40,7 +40,7 @@ def fit_log_variance(squares: Squares, features: Float[Tensor, "b n p"]) -> tupl
     """
     if squares.whitener is None:
         return _fit_independent(squares, features)
-    return _fit_correlated(squares, features)
+    return _fit_correlated(squares, features, squares.whitener)
 
 
 def _fit_independent(squares: Squares, features: Tensor) -> tuple[Weights, Tensor]:
@@ -60,7 +60,7 @@ def _fit_independent(squares: Squares, features: Tensor) -> tuple[Weights, Tenso
     return Weights(mean, root), log_det - 0.5 * (deviance + mean.square().sum(-1))
 
 
-def _fit_correlated(squares: Squares, features: Tensor) -> tuple[Weights, Tensor]:
+def _fit_correlated(squares: Squares, features: Tensor, whitener: Tensor) -> tuple[Weights, Tensor]:
     """Closed form: the log of a mean square is the log variance plus the log of a chi-squared number.
 
     That has a known mean and variance, and along a demonstration the correlation that the whitener takes
@@ -69,8 +69,8 @@ def _fit_correlated(squares: Squares, features: Tensor) -> tuple[Weights, Tensor
     half = 0.5 * squares.degrees
     response = squares.log_mean() - torch.digamma(half) + half.log()
     weight = torch.polygamma(1, half).rsqrt().unsqueeze(-1)
-    design = squares.whitener @ (weight * features)
-    response = (squares.whitener @ (weight * response.unsqueeze(-1))).squeeze(-1)
+    design = whitener @ (weight * features)
+    response = (whitener @ (weight * response.unsqueeze(-1))).squeeze(-1)
     return weights_posterior(design, response), log_evidence(design, response)
 
 

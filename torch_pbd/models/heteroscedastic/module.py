@@ -7,6 +7,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from torch_pbd.gp.inducing import FeatureMap
+from torch_pbd.gp.neighbourhoods import spacing
+from torch_pbd.kernels import KernelName
 from torch_pbd.linalg import safe_cholesky, symmetrize
 from torch_pbd.models.heteroscedastic.fit import HeteroscedasticFit
 from torch_pbd.models.heteroscedastic.latent import FactorMoments, LatentCovariance
@@ -32,6 +34,18 @@ class HeteroscedasticModel(nn.Module):
         Factor of the covariance far from data.
     """
 
+    inducing: Tensor
+    mean_inducing: Tensor
+    mean_theta: Tensor
+    mean_weights: Tensor
+    mean_root: Tensor
+    log_variance_theta: Tensor
+    log_variance_weights: Tensor
+    log_variance_root: Tensor
+    coefficient_theta: Tensor
+    pooled_tril: Tensor
+    prior_tril: Tensor
+
     def __init__(self, fit: HeteroscedasticFit, prior_tril: Float[Tensor, "d d"]) -> None:
         super().__init__()
         mean, covariance = fit.mean, fit.covariance
@@ -41,7 +55,8 @@ class HeteroscedasticModel(nn.Module):
                 self.register_buffer(f"{name}_length_scale", family.fixed_length_scale)
         features = mean.family.features
         tensors = {
-            "inducing": features.inducing,
+            "inducing": covariance.log_variance_family.features.inducing,
+            "mean_inducing": features.inducing,
             "mean_theta": mean.theta,
             "mean_weights": mean.weights.mean,
             "mean_root": mean.weights.root,
@@ -59,12 +74,13 @@ class HeteroscedasticModel(nn.Module):
             tensors["period"] = features.period
         for name, tensor in tensors.items():
             self.register_buffer(name, tensor.detach().clone().contiguous())
-        self.kernel = features.kernel
+        self.kernel: KernelName = features.kernel
+        self.exact = [family.features.exact for family in families]
         self.medians = [(family.length_scale, family.amplitude, family.constant) for family in families]
 
     def spec(self) -> dict[str, Any]:
         """All of the model that is not in its buffers: JSON-able."""
-        return {"kernel": self.kernel, "medians": [list(row) for row in self.medians]}
+        return {"kernel": self.kernel, "exact": self.exact, "medians": [list(row) for row in self.medians]}
 
     @classmethod
     def restored(cls, spec: dict[str, Any], tensors: dict[str, Tensor]) -> "HeteroscedasticModel":
@@ -73,7 +89,7 @@ class HeteroscedasticModel(nn.Module):
         nn.Module.__init__(model)
         for name, tensor in tensors.items():
             model.register_buffer(name, tensor)
-        model.kernel = spec["kernel"]
+        model.kernel, model.exact = spec["kernel"], [bool(exact) for exact in spec["exact"]]
         model.medians = [(float(a), float(b), float(c)) for a, b, c in spec["medians"]]
         return model
 
@@ -81,7 +97,8 @@ class HeteroscedasticModel(nn.Module):
         self, x: Float[Tensor, "n e"], prior_tril: Float[Tensor, "n d d"] | None = None
     ) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d r"]]:
         """Mean, and a root of the predictive covariance: of the variability, of the error of its estimate and
-        of the mean's, and of the prior with the share that missing data leave it."""
+        of the mean's, and of the prior with the share that missing data leave it.
+        """
         prior = self.prior_tril if prior_tril is None else prior_tril
         mean, error = self.mean_process.at(x)
         # Where the data leave nothing to err about, rounding must not make it negative.
@@ -108,11 +125,17 @@ class HeteroscedasticModel(nn.Module):
 
     def type1(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
         """Type I uncertainty: eq. (6) without noise over the prior variance, of a process with the amplitude-
-        weighted mean of the log variances' length scales, as far as that does not reach too far."""
+        weighted mean of the log variances' length scales, as far as that does not reach too far.
+        """
         family, theta = self.covariance_process.log_variance_family, self.log_variance_theta
         weight = family.amplitude_of(theta).square()
         scales = family.length_scale_of(theta).log()
-        scale = ((weight / weight.sum()) @ scales).exp().clamp_max(_REACH * x.shape[1] ** 0.5)
+        scale = (
+            ((weight / weight.sum()) @ scales)
+            .exp()
+            .clamp_max(_REACH * x.shape[1] ** 0.5)
+            .clamp_min(2.0 * spacing(self.inducing))
+        )
         return (1.0 - family.features(x, scale[None])[0].square().sum(-1)).clamp(0.0, 1.0)
 
     def draw(self, x: Float[Tensor, "n e"], normal: list[Float[Tensor, " p"]]) -> Float[Tensor, "n d d"]:
@@ -150,7 +173,8 @@ class HeteroscedasticModel(nn.Module):
         )
 
     def _family(self, number: int) -> ProcessFamily:
-        features = FeatureMap(self.inducing, self.kernel, getattr(self, "period", None))
+        inducing = self.inducing if number else self.mean_inducing
+        features = FeatureMap(inducing, self.kernel, getattr(self, "period", None), self.exact[number])
         name = ("mean", "log_variance", "coefficient")[number]
         return ProcessFamily(features, *self.medians[number], getattr(self, f"{name}_length_scale", None))
 

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from torch_pbd.gp.inducing import FeatureMap
-from torch_pbd.optim import BatchReport, minimize_batch
+from torch_pbd.optim import BatchReport, Progress, minimize_batch
 
 _WIDEST = 4.0  # amplitudes stay within a factor of exp(4) of their prior median
 _SPREAD_LENGTH_SCALE, _SPREAD_AMPLITUDE = 1.0, 1.5  # prior deviations of the logarithms
@@ -24,7 +24,14 @@ class SearchOptions:
     """In nats."""
     n_restarts: int = 0
     """Starts beside the best point of the grid, where no earlier search gives one."""
+    callback: Callable[[Progress], None] | None = None
+    """Called at the end of each turn of mean and covariance."""
     reports: list[BatchReport] = field(default_factory=list)
+
+    def report(self, turn: int, loss: float, elapsed: float) -> None:
+        """Tell the callback."""
+        if self.callback is not None:
+            self.callback(Progress(turn, loss, elapsed))
 
 
 @dataclass(frozen=True)
