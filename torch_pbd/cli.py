@@ -63,10 +63,16 @@ def _run(command: str, arguments: Sequence[str]) -> int:
 
 
 def _demo(options: Any, folder: Any) -> str:
-    from torch_pbd import CholeskyCovRegressor, GMMBaseline, WishartProcessRegressor
+    from torch_pbd import (
+        CholeskyCovRegressor,
+        GMMBaseline,
+        HeteroscedasticGPRegressor,
+        WishartProcessRegressor,
+    )
     from torch_pbd.experiments.demo import run_demo
 
     models = {
+        "HGP": HeteroscedasticGPRegressor(),
         "CD": CholeskyCovRegressor(),
         "WP": WishartProcessRegressor(),
         "GMM 5": GMMBaseline(n_components=5),
@@ -76,11 +82,12 @@ def _demo(options: Any, folder: Any) -> str:
 
 
 def _fit(options: Any, folder: Any) -> str:
+    from torch_pbd.estimators._groups import fit_by_demonstration
     from torch_pbd.experiments.recordings import write_fitted
 
     demonstrations = _demonstrations(options)
-    X, y, _ = demonstrations.stack(options.input)
-    model = options.model.fit(X, y)
+    X, y, groups = demonstrations.stack(options.input)
+    model = fit_by_demonstration(options.model, X, y, groups)
     name = type(model).__name__
     model_path, figure_path = write_fitted(model, demonstrations, folder, name, options.input)
     row = {

@@ -24,6 +24,7 @@ COMMANDS = {
 
 _MODEL_HELP = "an estimator's name, or class_path and init_args; its options: --model.help NAME"
 _MODELS = {
+    "HGP": {"class_path": "HeteroscedasticGPRegressor"},
     "CD": {"class_path": "CholeskyCovRegressor"},
     "WP": {"class_path": "WishartProcessRegressor"},
     "GMM 5": {"class_path": "GMMBaseline", "init_args": {"n_components": 5}},
@@ -96,7 +97,7 @@ def _parser(command: str, *, only_help: bool) -> ArgumentParser:
     elif command == "fit":
         parser.add_argument("--data", type=str, required=True, help="file of demonstrations, .npz or .csv")
         parser.add_argument(
-            "--model", type=model_type, default={"class_path": "CholeskyCovRegressor"}, help=_MODEL_HELP
+            "--model", type=model_type, default={"class_path": "HeteroscedasticGPRegressor"}, help=_MODEL_HELP
         )
     else:
         parser.add_argument("--data", type=str | None, default=None, help="file of demonstrations; none: simulation")

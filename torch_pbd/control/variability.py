@@ -3,10 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import clone
-from sklearn.utils.validation import has_fit_parameter
 
 from torch_pbd.control.stiffness import StiffnessLaw
 from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.estimators._groups import fit_by_demonstration
 from torch_pbd.estimators.cholesky import CholeskyCovRegressor
 
 Floats = NDArray[np.float64]
@@ -19,9 +19,8 @@ def fit_covariance(regressor: CovarianceRegressor | None, inputs: Floats, varyin
     """Fit a clone of the regressor to what varies (K, n, d) at common inputs (n, 1); it is told the demonstrations."""
     fitted: CovarianceRegressor = clone(CholeskyCovRegressor() if regressor is None else regressor)
     n_demos, n_steps, n_outputs = varying.shape
-    groups = {"groups": np.repeat(np.arange(n_demos), n_steps)}
-    told = groups if has_fit_parameter(fitted, "groups") else {}
-    return fitted.fit(np.tile(inputs, (n_demos, 1)), varying.reshape(-1, n_outputs), **told)
+    groups = np.repeat(np.arange(n_demos), n_steps)
+    return fit_by_demonstration(fitted, np.tile(inputs, (n_demos, 1)), varying.reshape(-1, n_outputs), groups)
 
 
 def fit_law(law: StiffnessLaw | None, covariance: Floats, varying: Floats) -> StiffnessLaw:

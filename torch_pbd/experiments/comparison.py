@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sklearn.base import clone
 
 from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.estimators._groups import fit_by_demonstration
 from torch_pbd.metrics import covariance_mse, mahalanobis_coverage, relative_frobenius_error
 
 Floats = NDArray[np.float64]
@@ -92,10 +93,10 @@ def compare_models(
     scores = []
     for name, model in models.items():
         start = time.perf_counter()
-        fitted = clone(model).fit(X, y)
+        fitted = fit_by_demonstration(clone(model), X, y, groups)
         seconds = time.perf_counter() - start
         covariance = fitted.predict_cov(inputs)
-        folds = Parallel(n_jobs=n_jobs)(delayed(_score_fold)(clone(model), X, y, groups == k) for k in left_out)
+        folds = Parallel(n_jobs=n_jobs)(delayed(_score_fold)(clone(model), X, y, groups, k) for k in left_out)
         scores.append(
             Score(
                 model=name,
@@ -123,8 +124,11 @@ def empirical_covariances(X: Floats, y: Floats) -> tuple[Floats, Floats | None]:
     return inputs, covariances
 
 
-def _score_fold(model: CovarianceRegressor, X: Floats, y: Floats, left_out: NDArray[np.bool_]) -> tuple[float, float]:
-    model.fit(X[~left_out], y[~left_out])
+def _score_fold(
+    model: CovarianceRegressor, X: Floats, y: Floats, groups: NDArray[np.intp], demonstration: int
+) -> tuple[float, float]:
+    left_out = groups == demonstration
+    fit_by_demonstration(model, X[~left_out], y[~left_out], groups[~left_out])
     mean, covariance = model.predict(X[left_out], return_cov=True)
     coverage = mahalanobis_coverage(mean.reshape(len(mean), -1), covariance, y[left_out], level=0.95)
     return model.score(X[left_out], y[left_out]), float(coverage)

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from torch_pbd.control.controller import DMPController
 from torch_pbd.data import Demonstrations, make_tunnel_demonstrations
 from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.estimators._groups import fit_by_demonstration
 from torch_pbd.experiments.comparison import compare_models
 from torch_pbd.experiments.recordings import score_row, write_fitted
 from torch_pbd.experiments.robot import run_robot
@@ -34,7 +35,7 @@ def run_demo(models: Mapping[str, CovarianceRegressor], folder: RunFolder, *, n_
     scores = compare_models(models, X, y, groups, truth=lambda _: true_covariance)
     rows = []
     for score in scores:
-        model = models[score.model].fit(X, y)
+        model = fit_by_demonstration(models[score.model], X, y, groups)
         rows.append(score_row(score) | {"95 % of fresh": _coverage(model, demonstrations, fresh)})
         write_fitted(model, demonstrations, folder, score.model, "time")
     figure = _tunnel_figure(models, demonstrations)

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from torch_pbd.data import Demonstrations
 from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.estimators._groups import fit_by_demonstration
 from torch_pbd.experiments.comparison import Score, compare_models
 from torch_pbd.experiments.run_folder import RunFolder, format_table, slug
 from torch_pbd.plotting import MODEL, output_label, plot_covariance_ellipses, plot_demonstrations, plot_model_bands
@@ -115,7 +116,7 @@ def run_recordings(
     folds = {f"LL {i + 1}": [s.fold_log_likelihood[i] for s in scores] for i in range(rows[0]["folds"])}
     folder.write_metrics([row | {key: values[j] for key, values in folds.items()} for j, row in enumerate(rows)])
     for name, model in models.items():
-        write_fitted(model.fit(X, y), demonstrations, folder, name, input)
+        write_fitted(fit_by_demonstration(model, X, y, groups), demonstrations, folder, name, input)
     return format_table(rows)
 
 
