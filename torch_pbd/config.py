@@ -147,6 +147,7 @@ def _add_simulation_arguments(parser: ArgumentParser) -> None:
 def _model_types() -> tuple[Any, Any]:
     """Types of one model and of several by name; loads torch."""
     import torch_pbd.estimators.cholesky
+    import torch_pbd.estimators.heteroscedastic
     import torch_pbd.estimators.mixture
     import torch_pbd.estimators.wishart  # noqa: F401 - short class names are those of imported classes
     from torch_pbd.estimators._base import CovarianceRegressor

@@ -40,9 +40,9 @@ _MEAN = (0.3, 1.2, 0.0)
 _LOG_VARIANCE = (0.5, 1.0, 2.0)
 _COEFFICIENT = (0.5, 0.3, 1.0)
 
-# Inducing inputs by default of a process of the mean and of the covariance, for one column of X and for more; and
-# at most of all outputs together.
-_N_INDUCING, _N_INDUCING_MORE, _N_TOGETHER = (128, 128), (128, 100), (800, 400)
+# Inducing inputs by default, for one column of X and for several, and where these do not resolve what is learned;
+# and at most of all outputs together, for the mean and for the covariance.
+_N_INDUCING, _N_INDUCING_SEVERAL, _N_INDUCING_MOST, _N_TOGETHER = 48, 128, 128, (800, 400)
 
 
 class HeteroscedasticGPRegressor(CovarianceRegressor):
@@ -72,8 +72,9 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         One length scale for the log variances of all outputs, and one for all outputs' means, instead of one
         for each.
     n_inducing : int or None, default=None
-        Inputs on which the processes rest. None takes all distinct inputs up to 48 (100 for several
-        columns), fewer for more than eight outputs, and centres of neighbourhoods of more.
+        Inputs on which the processes rest. None takes all distinct inputs up to 48 and of more the centres of as
+        many neighbourhoods; if the length scales that are found come near their distances, 128; at once for
+        several columns of X. All outputs together have at most 400 (the mean 800).
     max_inputs : int, default=512
         Where X has more distinct rows, neighbours are merged into this many.
     max_iter : int, default=100
@@ -261,18 +262,20 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         warn_if_identical(training)
         kernel: KernelName = "squared_exponential" if self.kernel == "periodic" else self.kernel
         circle = None if period is None else self._door(period / scaling.x_scale)
-        sizes = self._n_inducing(X.shape[1], y.shape[1])
-        chosen = [inducing_inputs(training.inputs, size) for size in sizes]
-        of_mean, features = (FeatureMap(z, kernel, circle, len(z) == len(inputs)) for z in chosen)
         held = None if length_scale is None else self._door(length_scale / scaling.x_scale)
-        families = Families(
-            ProcessFamily(of_mean, *_MEAN, shared=self.shared_length_scale),
-            ProcessFamily(features, *_LOG_VARIANCE, held, self.shared_length_scale),
-            ProcessFamily(features, *_COEFFICIENT, held),
-        )
-        options = SearchOptions(self.max_iter, self.tol, self.n_restarts, self._progress())
         group = None if groups is None else self._door(groups).long()
-        fit = fit_heteroscedastic(training, group, families, options)
+        options = SearchOptions(self.max_iter, self.tol, self.n_restarts, self._progress())
+        for sizes in dict.fromkeys(self._n_inducing(X.shape[1], y.shape[1])):
+            chosen = [inducing_inputs(training.inputs, size) for size in sizes]
+            of_mean, features = (FeatureMap(z, kernel, circle, len(z) == len(inputs)) for z in chosen)
+            families = Families(
+                ProcessFamily(of_mean, *_MEAN, shared=self.shared_length_scale),
+                ProcessFamily(features, *_LOG_VARIANCE, held, self.shared_length_scale),
+                ProcessFamily(features, *_COEFFICIENT, held),
+            )
+            fit = fit_heteroscedastic(training, group, families, options)
+            if fit.resolved:
+                break
         self.effective_share_ = fit.correlation.effective_share
         module = HeteroscedasticModel(fit, prior_tril)
         return Fitted(self._assemble(module, scaling), _report(fit, options), features.jitter)
@@ -284,13 +287,13 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         tril = safe_cholesky(self._door(covariance), name="prior")
         return tril if tril.ndim == 2 else tril[0]  # a callable is asked again at every prediction
 
-    def _n_inducing(self, n_features: int, n_outputs: int) -> tuple[int, int]:
-        """Inducing inputs of the mean's processes and of the covariance's."""
+    def _n_inducing(self, n_features: int, n_outputs: int) -> list[tuple[int, int]]:
+        """Inducing inputs of the mean's processes and of the covariance's, to be tried one after another."""
         if self.n_inducing is not None:
-            return self.n_inducing, self.n_inducing
-        most = _N_INDUCING if n_features == 1 else _N_INDUCING_MORE
-        mean, covariance = (max(12, together // n_outputs) for together in _N_TOGETHER)
-        return min(most[0], mean), min(most[1], covariance)
+            return [(self.n_inducing, self.n_inducing)]
+        together = [max(12, most // n_outputs) for most in _N_TOGETHER]
+        few = _N_INDUCING if n_features == 1 else _N_INDUCING_SEVERAL
+        return [(min(size, together[0]), min(size, together[1])) for size in (few, _N_INDUCING_MOST)]
 
 
 def _report(fit: HeteroscedasticFit, options: SearchOptions) -> FitReport:

@@ -48,6 +48,16 @@ class HeteroscedasticFit:
     log_evidence: tuple[float, ...]
     """Of the covariance, at the end of each turn, in nats."""
 
+    @property
+    def resolved(self) -> bool:
+        """Whether the inducing inputs resolve all length scales with room to spare, or are all the inputs."""
+        covariance = self.covariance
+        return (
+            self.mean.family.resolved(self.mean.theta)
+            and covariance.log_variance_family.resolved(covariance.log_variance_theta)
+            and covariance.coefficient_family.resolved(covariance.coefficient_theta)
+        )
+
 
 def fit_heteroscedastic(
     training: TrainingSet,

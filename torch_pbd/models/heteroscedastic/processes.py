@@ -11,6 +11,7 @@ from torch import Tensor
 from torch_pbd.gp.inducing import FeatureMap
 from torch_pbd.optim import BatchReport, Progress, minimize_batch
 
+_CLEAR = 3.0  # times the shortest length scale
 _WIDEST = 4.0  # amplitudes stay within a factor of exp(4) of their prior median
 _SPREAD_LENGTH_SCALE, _SPREAD_AMPLITUDE = 1.0, 1.5  # prior deviations of the logarithms
 
@@ -79,6 +80,11 @@ class ProcessFamily:
             return self.fixed_length_scale.expand(len(theta), -1)
         least = math.log(self.features.shortest_length_scale())
         return torch.logaddexp(theta[:, :-1], torch.full_like(theta[:, :-1], least)).exp()
+
+    def resolved(self, theta: Float[Tensor, "b q"]) -> bool:
+        """Whether length scales stay clear of the shortest that the inducing inputs resolve."""
+        least = _CLEAR * self.features.shortest_length_scale()
+        return self.features.exact or bool((self.length_scale_of(theta) > least).all())
 
     def amplitude_of(self, theta: Float[Tensor, "b q"]) -> Float[Tensor, " b"]:
         """Amplitude, within a wide range."""
