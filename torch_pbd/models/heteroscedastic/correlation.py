@@ -30,21 +30,52 @@ class DemonstrationCorrelation:
     effective_share: float
     """Independent samples that a sample counts for."""
 
-    def whitener(
-        self, inputs: Float[Tensor, "n e"], occurrences: Float[Tensor, "g n"], *, squares: bool
-    ) -> Float[Tensor, "n n"] | None:
-        """Matrix that makes the means (or mean squares) at the inputs independent and of unit variance.
+    def matrix(self, inputs: Float[Tensor, "n e"], occurrences: Float[Tensor, "g n"], *, squares: bool) -> Tensor:
+        """Covariance of the means (or mean squares) at n inputs, were they of independent rows of unit variance.
 
-        ``occurrences`` are the rows of each of g demonstrations at each input. None if it is the unit matrix.
+        ``occurrences`` are the rows of each of g demonstrations at each input: those of one demonstration at one
+        input are copies, so a diagonal entry is the number of rows that count for one.
         """
-        if self.decay == 0.0:
-            return None
         distance = torch.cdist(inputs, inputs, compute_mode="donot_use_mm_for_euclid_dist")
         correlation = torch.exp(-distance / (self.decay if squares else 2.0 * self.decay))
         counts = occurrences.sum(0)
-        shared = occurrences.mT @ occurrences / (counts[:, None] * counts).sqrt()
-        factor = safe_cholesky(correlation * shared, name="the correlation of the demonstrations")
-        return torch.linalg.solve_triangular(factor, torch.eye(len(counts)).to(factor), upper=False)
+        return correlation * (occurrences.mT @ occurrences) / (counts[:, None] * counts).sqrt()
+
+
+@dataclass(frozen=True)
+class NoiseCorrelation:
+    """What makes means and mean squares at n inputs independent; None where they are."""
+
+    of_means: Float[Tensor, "n n"] | None = None
+    of_squares: Float[Tensor, "n n"] | None = None
+    copies: Float[Tensor, " n"] | None = None
+    """Rows at each input that count for one."""
+
+    @classmethod
+    def of(
+        cls,
+        correlation: DemonstrationCorrelation,
+        inputs: Float[Tensor, "n e"],
+        index: Int64[Tensor, " rows"],
+        group: Int64[Tensor, " rows"] | None,
+    ) -> "NoiseCorrelation":
+        """Of rows of demonstrations ``group``, at ``inputs[index]``."""
+        if group is None or correlation.decay == 0.0:
+            return cls()
+        occurrences = _occurrences(index, group, len(inputs)).to(inputs)
+        of_means, of_squares = (correlation.matrix(inputs, occurrences, squares=squares) for squares in (False, True))
+        return cls(_whitener(of_means), _whitener(of_squares), of_squares.diagonal())
+
+
+def _whitener(matrix: Tensor) -> Tensor:
+    factor = safe_cholesky(matrix, name="the correlation of the demonstrations")
+    return torch.linalg.solve_triangular(factor, torch.eye(len(factor)).to(factor), upper=False)
+
+
+def _occurrences(index: Tensor, group: Tensor, n_inputs: int) -> Tensor:
+    """Rows of each demonstration at each distinct input."""
+    names, number = group.unique(return_inverse=True)
+    return torch.bincount(number * n_inputs + index, minlength=len(names) * n_inputs).reshape(len(names), n_inputs)
 
 
 INDEPENDENT = DemonstrationCorrelation(0.0, 1.0)
@@ -61,19 +92,22 @@ def demonstration_correlation(
     """
     limit = math.sqrt(x.shape[1])
     scaled = whitened / whitened.square().mean(0).clamp_min(1e-300).sqrt()
-    tables = []
-    n_samples = 0
-    for name in group.unique():
-        rows = (group == name).nonzero().squeeze(-1)
-        rows = rows[:: max(1, math.ceil(len(rows) / _MAX_SAMPLES))]
-        tables.append(_products_by_distance(x[rows], scaled[rows], limit))
-        n_samples += len(rows)
+    order = group.argsort(stable=True)
+    tables, n_chosen = [], 0
+    for rows in order.split(torch.bincount(group).tolist()):
+        if len(rows) < 2:
+            continue
+        along = rows[x[rows, 0].argsort(stable=True)]
+        chosen = along[:: math.ceil(len(along) / _MAX_SAMPLES)]
+        tables.append(_products_by_distance(x[chosen], scaled[chosen], limit))
+        n_chosen += len(chosen)
     if len(tables) < 2:
         return INDEPENDENT
     products, pairs = (torch.stack(part) for part in zip(*tables, strict=True))
     total = pairs.sum(0)
     sum_of_squares = float((_squared_autocorrelation(products, pairs) * total).sum())
-    share = 1.0 / (1.0 + 2.0 * sum_of_squares / n_samples)
+    # Of n samples all pairs but those of a sample with itself; were some left out, there are as many more of each.
+    share = 1.0 / (1.0 + 2.0 * sum_of_squares / n_chosen * len(x) / n_chosen)
     if share > _INDEPENDENT:
         return INDEPENDENT
     centre = (torch.arange(_N_BINS).to(x) + 0.5) * limit / _N_BINS
@@ -85,7 +119,7 @@ def _products_by_distance(x: Tensor, values: Tensor, limit: float) -> tuple[Tens
     i, j = torch.triu_indices(len(x), len(x), offset=1, device=x.device)
     distance = (x[i] - x[j]).norm(dim=-1)
     near = distance <= limit
-    edges = torch.linspace(0.0, limit, _N_BINS + 1).to(x)[1:-1]
+    edges = limit * torch.arange(1, _N_BINS).to(x) / _N_BINS + 1e-9
     number = torch.bucketize(distance[near], edges)
     products = x.new_zeros(_N_BINS, values.shape[1]).index_add_(0, number, (values[i] * values[j])[near])
     return products, torch.bincount(number, minlength=_N_BINS).to(x)
@@ -109,10 +143,3 @@ def _decay_of(target: float, distance: Tensor, pairs: Tensor) -> float:
         too_short = float((pairs * torch.exp(-distance / middle)).sum()) < target
         low, high = (middle, high) if too_short else (low, middle)
     return math.sqrt(low * high)
-
-
-def occurrences_of(index: Int64[Tensor, " rows"], group: Int64[Tensor, " rows"], n_inputs: int) -> Float[Tensor, "g n"]:
-    """Rows of each demonstration at each distinct input."""
-    names, number = group.unique(return_inverse=True)
-    flat = torch.bincount(number * n_inputs + index, minlength=len(names) * n_inputs)
-    return flat.reshape(len(names), n_inputs).to(torch.float64)

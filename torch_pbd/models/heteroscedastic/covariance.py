@@ -4,8 +4,9 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from torch_pbd.models.heteroscedastic.correlation import NoiseCorrelation
 from torch_pbd.models.heteroscedastic.latent import LatentCovariance
-from torch_pbd.models.heteroscedastic.linear import Weights
+from torch_pbd.models.heteroscedastic.linear import Weights, divergence_from_prior
 from torch_pbd.models.heteroscedastic.log_variance import Squares, fit_log_variance
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily, SearchOptions, search
 from torch_pbd.models.heteroscedastic.regression import Regression
@@ -20,8 +21,8 @@ def fit_covariance(
     families: tuple[ProcessFamily, ProcessFamily],
     inputs: Float[Tensor, "n e"],
     scatter: Float[Tensor, "n d d"],
-    counts: Float[Tensor, " n"],
-    whitener: Float[Tensor, "n n"] | None,
+    degrees: Float[Tensor, "d n"],
+    noise: NoiseCorrelation,
     previous: LatentCovariance | None,
     options: SearchOptions,
 ) -> tuple[LatentCovariance, float]:
@@ -36,19 +37,19 @@ def fit_covariance(
         Of the log variances and of the coefficients.
     scatter : Tensor of shape (n, d, d)
         Sum of the outer products of the residuals at each input, whose pooled covariance is the unit matrix.
-    counts : Tensor of shape (n,)
-        Their degrees of freedom.
-    whitener : Tensor of shape (n, n) or None
-        Makes scatters at different inputs independent.
+    degrees : Tensor of shape (d, n)
+        Their degrees of freedom; of each output given those before it.
+    noise : NoiseCorrelation
+        Of scatters at different inputs.
     previous : LatentCovariance or None
         Where to start.
     """
     variance_family, coefficient_family = families
     n_outputs, n_features = scatter.shape[1], inputs.shape[1]
     fit = previous
-    regressions = [] if fit is None else _regressions(scatter, fit.at(inputs).tril(), counts, whitener)
+    regressions = [] if fit is None else _regressions(scatter, fit.at(inputs).tril(), noise)
     for sweep in range(_SWEEPS if n_outputs > 1 else 1):
-        squares = _squares(scatter, counts, whitener, regressions, fit, inputs)
+        squares = _squares(scatter, degrees, noise, regressions, fit, inputs)
 
         def variance_evidence(theta: Tensor, rows: Int64[Tensor, " a"], squares: Squares = squares) -> Tensor:
             return fit_log_variance(squares.rows(rows), variance_family.design(inputs, theta))[1]
@@ -62,13 +63,13 @@ def fit_covariance(
         tril = torch.exp(0.5 * mean[0])[:, None, None]
         regressions, thetas, coefficients, total = [], [], [], float(evidence.sum())
         for i in range(1, n_outputs):
-            known = Regression.of(scatter[:, : i + 1, : i + 1], tril, counts, whitener)
+            known = Regression.of(scatter[:, : i + 1, : i + 1], tril, noise.of_squares)
             own = None if fit is None else fit.coefficient_theta[i - 1 : i]
             if own is None or sweep < _SEARCHES:
                 own = _search_coefficients(coefficient_family, known, precision[i], inputs, own, options)
             row_features = coefficient_family.design(inputs, own)
-            total += float(known.evidence(row_features, precision[i]))
             coefficients.append(known.fit(row_features[0], precision[i]))
+            total -= divergence_from_prior(coefficients[-1])
             thetas.append(own)
             regressions.append(known)
             row = row_features[0] @ coefficients[-1].mean.reshape(i, -1).mT
@@ -97,40 +98,37 @@ def _search_coefficients(
 
 def _squares(
     scatter: Tensor,
-    counts: Tensor,
-    whitener: Tensor | None,
+    degrees: Tensor,
+    noise: NoiseCorrelation,
     regressions: list[Regression],
     fit: LatentCovariance | None,
     inputs: Tensor,
 ) -> Squares:
     """Squared residuals of each output from its regression on those before it.
 
-    Where samples of a demonstration are correlated and there are enough of them at each input, from the
-    regression at each input by itself: an error of the processes of its coefficients, as smooth as the
+    Where samples of a demonstration are correlated and there are enough of them at an input, from the
+    regression at that input by itself: an error of the processes of its coefficients, as smooth as the
     demonstrations, would else count as residual.
     """
-    totals, degrees = [scatter[:, 0, 0]], [counts]
+    totals, kept = [scatter[:, 0, 0]], [degrees[0]]
     for i in range(1, scatter.shape[1]):
-        if not regressions:
-            totals.append(scatter[:, i, i])
-            degrees.append(counts)
-            continue
-        known = regressions[i - 1]
-        if whitener is not None and float((counts - i).min()) >= _ENOUGH_DEGREES:
-            totals.append(known.local_squares())
-            degrees.append(counts - i)
-            continue
-        assert fit is not None
-        features = fit.coefficient_family.design(inputs, fit.coefficient_theta[i - 1 : i])[0]
-        explained, unknown = known.squares(features, fit.coefficients[i - 1])
-        totals.append(explained + unknown)
-        degrees.append(counts)
-    return Squares(torch.stack(totals), torch.stack(degrees), whitener)
+        total, left = scatter[:, i, i], degrees[i]
+        if regressions and fit is not None:
+            known = regressions[i - 1]
+            features = fit.coefficient_family.design(inputs, fit.coefficient_theta[i - 1 : i])[0]
+            total = sum(known.squares(features, fit.coefficients[i - 1]), torch.zeros_like(total))
+            if noise.copies is not None:
+                local = degrees[i] - i * noise.copies
+                enough = local >= _ENOUGH_DEGREES * noise.copies
+                total, left = torch.where(enough, known.local_squares(), total), torch.where(enough, local, left)
+        totals.append(total)
+        kept.append(left)
+    return Squares(torch.stack(totals), torch.stack(kept), noise)
 
 
-def _regressions(scatter: Tensor, tril: Tensor, counts: Tensor, whitener: Tensor | None) -> list[Regression]:
+def _regressions(scatter: Tensor, tril: Tensor, noise: NoiseCorrelation) -> list[Regression]:
     return [
-        Regression.of(scatter[:, : i + 1, : i + 1], tril[:, :i, :i], counts, whitener)
+        Regression.of(scatter[:, : i + 1, : i + 1], tril[:, :i, :i], noise.of_squares)
         for i in range(1, scatter.shape[1])
     ]
 

@@ -11,8 +11,8 @@ from torch_pbd.linalg import scale_tril_from_root
 from torch_pbd.models.heteroscedastic.correlation import (
     INDEPENDENT,
     DemonstrationCorrelation,
+    NoiseCorrelation,
     demonstration_correlation,
-    occurrences_of,
 )
 from torch_pbd.models.heteroscedastic.covariance import fit_covariance
 from torch_pbd.models.heteroscedastic.latent import LatentCovariance
@@ -23,6 +23,7 @@ from torch_pbd.models.training import TrainingSet, pooled_tril
 # Rows at an input whose mean is all their own still tell this share of a variance, or nothing would.
 _LEAST_SHARE = 0.1
 _ROWS_TOGETHER = 8  # neighbours whose differences tell the noise that the first mean is fitted under
+_FIRST_SAMPLES = 10.0  # of a demonstration: what counts of it before its correlation is known
 # Of y's standard deviation: an output that is constant, or a copy of another, has this deviation of its own.
 _LEAST_DEVIATION = 1e-6
 
@@ -78,7 +79,7 @@ def fit_heteroscedastic(
     pooled = _start_tril(training)
     started = time.perf_counter()
     for turn in range(n_turns):
-        noise = _Noise.of(training, group, correlation)
+        noise = NoiseCorrelation.of(correlation, training.inputs, training.index, group)
         tril = _tril_at(training.inputs, pooled, covariance)
         theta = None if mean is None else mean.theta
         means = (training.means(), training.counts)
@@ -86,12 +87,13 @@ def fit_heteroscedastic(
         residual, share = _residual(training, mean, tril)
         if turn == 0:
             pooled = _pooled_tril(residual, share)
-        normal = torch.linalg.solve_triangular(pooled, residual.mT, upper=False).mT
-        root = training.scatter_root(normal)
-        degrees = torch.zeros_like(training.counts).index_add_(0, training.index, share)
+        normal, scatter, degrees = _scatter(training, residual, share, pooled)
+        part = 1.0 if turn else _first_part(training, group)
+        # What the first turn took for independent is no place to start from where it is not.
+        start = None if correlation.decay > 0 and turn == 1 else covariance
         both = (families.log_variance, families.coefficients)
         covariance, evidence = fit_covariance(
-            both, training.inputs, root @ root.mT, degrees, noise.of_squares, covariance, options
+            both, training.inputs, part * scatter, part * degrees, noise, start, options
         )
         evidences.append(evidence)
         options.report(len(evidences), -evidence, time.perf_counter() - started)
@@ -104,22 +106,6 @@ def fit_heteroscedastic(
     assert mean is not None
     assert covariance is not None
     return HeteroscedasticFit(mean, covariance, pooled, correlation, tuple(evidences))
-
-
-@dataclass(frozen=True)
-class _Noise:
-    """What makes means, and mean squares, at the inputs independent; None where they are."""
-
-    of_means: Tensor | None = None
-    of_squares: Tensor | None = None
-
-    @classmethod
-    def of(cls, training: TrainingSet, group: Tensor | None, correlation: DemonstrationCorrelation) -> "_Noise":
-        if group is None:
-            return cls()
-        occurrences = occurrences_of(training.index, group, len(training.inputs))
-        first, second = (correlation.whitener(training.inputs, occurrences, squares=which) for which in (False, True))
-        return cls(first, second)
 
 
 def _tril_at(inputs: Tensor, pooled: Tensor, covariance: LatentCovariance | None) -> Tensor:
@@ -136,22 +122,39 @@ def _start_tril(training: TrainingSet) -> Tensor:
     return scale_tril_from_root(torch.cat([pooled_tril(whole), floor], dim=1))
 
 
+def _scatter(training: TrainingSet, residual: Tensor, share: Tensor, pooled: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Residuals of pooled unit covariance (rows, d); their scatter and degrees of freedom at each input."""
+    normal = torch.linalg.solve_triangular(pooled, residual.mT, upper=False).mT
+    root = training.scatter_root(normal)
+    degrees = torch.zeros_like(training.means()).index_add_(0, training.index, share)
+    return normal, root @ root.mT, degrees.mT
+
+
+def _first_part(training: TrainingSet, group: Tensor | None) -> float:
+    """Share of the rows that count before it is known how far those of a demonstration are correlated."""
+    if group is None:
+        return 1.0
+    return min(1.0, _FIRST_SAMPLES * len(group.unique()) / len(group))
+
+
 def _residual(training: TrainingSet, mean: LatentMean, tril: Tensor) -> tuple[Tensor, Tensor]:
-    """Residuals of the rows, and the share of a degree of freedom that fitting the mean has left to each."""
+    """Residuals of the rows, and the shares (rows, d) of a degree of freedom that fitting the mean has left.
+
+    Of output i the share is that of its part which the outputs before it do not tell.
+    """
     expected, error = mean.at(training.inputs)
     if torch.equal(training.inputs[training.index], training.x):
         expected = expected[training.index]
     else:  # the inputs are the centres of neighbourhoods
-        expected = mean.at(training.x)[0]
-    precise = torch.cholesky_solve(error, tril)
-    leverage = precise.diagonal(dim1=-2, dim2=-1).mean(-1)
-    return training.y - expected, (1.0 - leverage).clamp_min(_LEAST_SHARE)[training.index]
+        expected = mean.expected(training.x)
+    half = torch.linalg.solve_triangular(tril, error, upper=False)
+    leverage = torch.linalg.solve_triangular(tril, half.mT, upper=False).diagonal(dim1=-2, dim2=-1)
+    return training.y - expected, (1.0 - leverage).clamp(_LEAST_SHARE, 1.0)[training.index]
 
 
 def _pooled_tril(residual: Tensor, share: Tensor) -> Tensor:
-    root = residual.mT / share.sum().sqrt()
-    floor = _LEAST_DEVIATION * torch.eye(residual.shape[1]).to(residual)
-    return scale_tril_from_root(torch.cat([root, floor], dim=1))
+    floor = _LEAST_DEVIATION * share.sum(0).sqrt() * torch.eye(residual.shape[1]).to(residual)
+    return scale_tril_from_root(torch.cat([residual.mT, floor], dim=1)) / share.sum(0).sqrt()
 
 
 def _n_inputs(training: TrainingSet, group: Tensor) -> int:

@@ -32,6 +32,14 @@ def log_evidence(design: Float[Tensor, "*b n p"], response: Float[Tensor, "*b n"
     return 0.5 * projected.square().sum((-2, -1)) - log_det
 
 
+def divergence_from_prior(weights: Weights) -> float:
+    """Kullback-Leibler divergence of the weights' distribution from standard normal numbers, in nats."""
+    size = weights.mean.numel()
+    trace = float(weights.root.square().sum())
+    log_det = 2.0 * float(weights.root.diagonal(dim1=-2, dim2=-1).log().sum())
+    return 0.5 * (trace + float(weights.mean.square().sum()) - size - log_det)
+
+
 def weights_root(design: Float[Tensor, "*b n p"]) -> Float[Tensor, "*b p p"]:
     """Root of the weights' covariance, which does not depend on the response."""
     return _inverse_transposed(_precision_factor(design))

@@ -1,11 +1,13 @@
 """Logarithms of conditional variances as Gaussian processes, their latent values integrated out."""
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torch_pbd.models.heteroscedastic.correlation import NoiseCorrelation
 from torch_pbd.models.heteroscedastic.linear import Weights, log_evidence, weights_posterior, weights_root
 
 _MAX_ITER, _TOL = 60, 1e-8
@@ -20,8 +22,7 @@ class Squares:
 
     total: Float[Tensor, "b n"]
     degrees: Float[Tensor, "b n"]
-    whitener: Float[Tensor, "n n"] | None = None
-    """Makes mean squares at the inputs independent of each other; None where they are."""
+    noise: NoiseCorrelation
 
     def rows(self, index: Tensor) -> "Squares":
         """Those of some of the outputs."""
@@ -36,11 +37,11 @@ def fit_log_variance(squares: Squares, features: Float[Tensor, "b n p"]) -> tupl
     """Posterior of the weights of ``log_variance = features @ weights``, and the log evidence, in nats.
 
     The weights are standard normal numbers a priori; the last feature is a constant. The evidence is
-    differentiable in the features, but for a constant that does not depend on them.
+    differentiable in the features.
     """
-    if squares.whitener is None:
+    if squares.noise.of_squares is None or squares.noise.copies is None:
         return _fit_independent(squares, features)
-    return _fit_correlated(squares, features, squares.whitener)
+    return _fit_correlated(squares, features, squares.noise.of_squares, squares.noise.copies)
 
 
 def _fit_independent(squares: Squares, features: Tensor) -> tuple[Weights, Tensor]:
@@ -57,21 +58,23 @@ def _fit_independent(squares: Squares, features: Tensor) -> tuple[Weights, Tenso
     deviance = _deviance((features @ mean.unsqueeze(-1)).squeeze(-1) - target, squares.degrees)[0].square().sum(-1)
     # The traces of the Fisher information and of the divergence from the prior add up to a constant.
     log_det = root.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    return Weights(mean, root), log_det - 0.5 * (deviance + mean.square().sum(-1))
+    saturated = (squares.degrees * (squares.log_mean() + 1.0 + math.log(2.0 * math.pi))).sum(-1)
+    return Weights(mean, root), log_det - 0.5 * (deviance + mean.square().sum(-1) + saturated)
 
 
-def _fit_correlated(squares: Squares, features: Tensor, whitener: Tensor) -> tuple[Weights, Tensor]:
+def _fit_correlated(squares: Squares, features: Tensor, whitener: Tensor, copies: Tensor) -> tuple[Weights, Tensor]:
     """Closed form: the log of a mean square is the log variance plus the log of a chi-squared number.
 
     That has a known mean and variance, and along a demonstration the correlation that the whitener takes
     out; it is treated as normal, which the smooth noise of demonstrations needs more than its exact shape.
     """
-    half = 0.5 * squares.degrees
+    half = 0.5 * squares.degrees / copies
     response = squares.log_mean() - torch.digamma(half) + half.log()
-    weight = torch.polygamma(1, half).rsqrt().unsqueeze(-1)
+    weight = (copies / torch.polygamma(1, half)).sqrt().unsqueeze(-1)  # the whitener takes the copies out again
     design = whitener @ (weight * features)
     response = (whitener @ (weight * response.unsqueeze(-1))).squeeze(-1)
-    return weights_posterior(design, response), log_evidence(design, response)
+    constant = weight.squeeze(-1).log().sum(-1) - 0.5 * response.square().sum(-1)
+    return weights_posterior(design, response), log_evidence(design, response) + constant
 
 
 def _constant(squares: Squares, features: Tensor) -> Tensor:

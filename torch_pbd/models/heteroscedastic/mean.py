@@ -9,6 +9,8 @@ from torch import Tensor
 from torch_pbd.models.heteroscedastic.linear import Weights, log_evidence, weights_posterior
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily, SearchOptions, search
 
+_CHUNK = 4096
+
 
 @dataclass(frozen=True)
 class LatentMean:
@@ -26,6 +28,13 @@ class LatentMean:
         root = torch.einsum("dnp,dpr->ndr", features, self.weights.root.reshape(n_outputs, size, -1))
         unexplained = torch.diag_embed(self.family.unexplained(features, self.theta).mT)
         return mean, root @ root.mT + unexplained
+
+    def expected(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d"]:
+        """Expected mean at x alone, a bounded number of rows at a time."""
+        weights = self.weights.mean.reshape(len(self.theta), -1)
+        return torch.cat(
+            [torch.einsum("dnp,dp->nd", self.family.design(part, self.theta), weights) for part in x.split(_CHUNK)]
+        )
 
 
 def fit_mean(

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch_pbd.linalg import safe_cholesky, symmetrize
 from torch_pbd.models.heteroscedastic.linear import Weights, log_evidence, weights_posterior
 
-# Of the covariance of a sample, which is one in every direction: keeps K <= d demonstrations regular.
+# Beside the scatter of standardized samples, which is one in every direction: keeps K <= d demonstrations regular.
 _RIDGE = 1e-8
 
 
@@ -32,7 +32,6 @@ class Regression:
         cls,
         scatter: Float[Tensor, "n j j"],
         tril: Float[Tensor, "n i i"],
-        counts: Float[Tensor, " n"],
         whitener: Float[Tensor, "n n"] | None,
     ) -> "Regression":
         """Regression of the last output of a scatter; ``tril`` is the factor of the others' covariance."""
@@ -41,7 +40,7 @@ class Regression:
         standardizing = eye.repeat(len(scatter), 1, 1)
         standardizing[:, :size, :size] = torch.linalg.solve_triangular(tril, eye[:size, :size], upper=False)
         scatter = symmetrize(standardizing @ scatter @ standardizing.mT)
-        before = scatter[:, :-1, :-1] + _RIDGE * counts[:, None, None] * eye[:size, :size]
+        before = scatter[:, :-1, :-1] + _RIDGE * eye[:size, :size]
         root = safe_cholesky(before, name="the scatter of the outputs")
         response = torch.linalg.solve_triangular(root, scatter[:, :-1, -1:], upper=False).squeeze(-1)
         return cls(root, response, scatter, whitener)
