@@ -12,7 +12,7 @@ from torch_pbd.linalg import safe_cholesky
 
 # Kernel matrices of smooth kernels have a condition number beyond float64: what this takes away from a
 # process of unit variance cannot be told from noise.
-JITTER = 1e-10
+JITTER = 1e-13
 
 _SHORTEST = 1e-3
 _EXACT_RESOLUTION = 0.75  # spacings of the inputs: shorter "needles" explain each input by itself

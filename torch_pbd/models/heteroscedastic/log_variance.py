@@ -57,7 +57,7 @@ def _fit_independent(squares: Squares, features: Tensor) -> tuple[Weights, Tenso
         mean = _maximize(features, target, squares.degrees, _constant(squares, features))
     deviance = _deviance((features @ mean.unsqueeze(-1)).squeeze(-1) - target, squares.degrees)[0].square().sum(-1)
     # The traces of the Fisher information and of the divergence from the prior add up to a constant.
-    log_det = root.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    log_det = root.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
     saturated = (squares.degrees * (squares.log_mean() + 1.0 + math.log(2.0 * math.pi))).sum(-1)
     return Weights(mean, root), log_det - 0.5 * (deviance + mean.square().sum(-1) + saturated)
 
