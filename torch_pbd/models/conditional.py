@@ -92,7 +92,7 @@ class ConditionalNormal(nn.Module):
             return None
         return self.core.degrees((x - self.x_shift) / self.x_scale)
 
-    def draw_covariance(self, x: Float[Tensor, "n e"], normal: list[Float[Tensor, " p"]]) -> Float[Tensor, "n d d"]:
+    def draw_covariance(self, x: Float[Tensor, "n e"], normal: list[Float[Tensor, " _"]]) -> Float[Tensor, "n d d"]:
         """One posterior draw of the covariance function at x, made of standard normal numbers."""
         if not isinstance(self.core, HeteroscedasticModel):
             raise TypeError("only the heteroscedastic model knows the posterior of its covariance")
