@@ -138,7 +138,7 @@ class HeteroscedasticModel(nn.Module):
         )
         return (1.0 - family.features(x, scale[None])[0].square().sum(-1)).clamp(0.0, 1.0)
 
-    def draw(self, x: Float[Tensor, "n e"], normal: list[Float[Tensor, " _"]]) -> Float[Tensor, "n d d"]:
+    def draw(self, x: Float[Tensor, "n e"], normal: list[Float[Tensor, " _"]]) -> Float[Tensor, "n d r"]:
         """Root of one posterior draw of the covariance function at x, with the prior's share in it."""
         missing = self.type1(x)[:, None, None]
         root = self.pooled_tril @ self.covariance_process.draw(x, normal)
