@@ -7,7 +7,7 @@ from scipy.stats import multivariate_normal
 from torch_pbd.models.heteroscedastic.linear import Weights
 from torch_pbd.models.heteroscedastic.regression import Regression
 
-# A ridge of 1e-8 of the unit covariance of the standardized outputs keeps the scatter regular: results agree to a little more than that.
+# A ridge of 1e-8 of the standardized outputs' unit covariance keeps the scatter regular, and moves results by as much.
 RTOL = 1e-6
 
 
