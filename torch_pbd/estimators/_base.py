@@ -252,17 +252,18 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
 
     def _apply(self, model: Any, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and covariance (or factor) of the model at x, a bounded number of rows at a time."""
-        prior = getattr(self, "prior", None)
         with torch.inference_mode():
-            parts = []
-            for chunk in x.split(_CHUNK):
-                if callable(prior):
-                    covariance = prior_covariance(prior, chunk.cpu().numpy(), self.n_outputs_)
-                    parts.append(model(chunk, safe_cholesky(self._door(covariance), name="prior(X)")))
-                else:
-                    parts.append(model(chunk))
+            parts = [model(chunk, *self._prior_tril_at(chunk)) for chunk in x.split(_CHUNK)]
             first, second = (torch.cat(part) for part in zip(*parts, strict=True))
         return first, second
+
+    def _prior_tril_at(self, x: Tensor) -> tuple[Tensor, ...]:
+        """Factor of the prior at x, where it depends on x; else nothing, as the module has it."""
+        prior = getattr(self, "prior", None)
+        if not callable(prior):
+            return ()
+        covariance = prior_covariance(prior, x.cpu().numpy(), self.n_outputs_)
+        return (safe_cholesky(self._door(covariance), name="prior(X)"),)
 
     def _door(self, array: Any) -> Tensor:
         """Copy of an array; contiguous, since torch takes no negative strides."""

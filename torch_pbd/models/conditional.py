@@ -92,11 +92,17 @@ class ConditionalNormal(nn.Module):
             return None
         return self.core.degrees((x - self.x_shift) / self.x_scale)
 
-    def draw_covariance(self, x: Float[Tensor, "n e"], normal: list[Float[Tensor, " _"]]) -> Float[Tensor, "n d d"]:
+    def draw_covariance(
+        self,
+        x: Float[Tensor, "n e"],
+        normal: list[Float[Tensor, " _"]],
+        prior_scale_tril: Float[Tensor, "n d d"] | None = None,
+    ) -> Float[Tensor, "n d d"]:
         """One posterior draw of the covariance function at x, made of standard normal numbers."""
         if not isinstance(self.core, HeteroscedasticModel):
             raise TypeError("only the heteroscedastic model knows the posterior of its covariance")
-        root = self.core.draw((x - self.x_shift) / self.x_scale, normal)
+        prior_tril = None if prior_scale_tril is None else prior_scale_tril / self.y_scale[:, None]
+        root = self.core.draw((x - self.x_shift) / self.x_scale, normal, prior_tril)
         root = self.y_scale[:, None] * with_floor(root)
         return symmetrize(root @ root.mT)
 

@@ -138,11 +138,17 @@ class HeteroscedasticModel(nn.Module):
         )
         return (1.0 - family.features(x, scale[None])[0].square().sum(-1)).clamp(0.0, 1.0)
 
-    def draw(self, x: Float[Tensor, "n e"], normal: list[Float[Tensor, " _"]]) -> Float[Tensor, "n d r"]:
+    def draw(
+        self,
+        x: Float[Tensor, "n e"],
+        normal: list[Float[Tensor, " _"]],
+        prior_tril: Float[Tensor, "n d d"] | None = None,
+    ) -> Float[Tensor, "n d r"]:
         """Root of one posterior draw of the covariance function at x, with the prior's share in it."""
         missing = self.type1(x)[:, None, None]
         root = self.pooled_tril @ self.covariance_process.draw(x, normal)
-        prior = _root_of_share(missing) * self.prior_tril.expand(len(x), -1, -1)
+        prior = self.prior_tril.expand(len(x), -1, -1) if prior_tril is None else prior_tril
+        prior = _root_of_share(missing) * prior
         return torch.cat([_root_of_share(1.0 - missing) * root, prior], -1)
 
     def draw_sizes(self) -> list[int]:
