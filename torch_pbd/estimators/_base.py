@@ -185,12 +185,19 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
                 return gaussian_log_density(targets - mean, scale_tril).cpu().numpy()
             return student_log_density(targets - mean, scale_tril, degrees).cpu().numpy()
 
-    def score(self, X: ArrayLike, y: ArrayLike) -> float:
+    def score(self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None) -> float:
         """Mean log density of the rows of y at X, in nats: higher is better.
 
         R^2, which scikit-learn's regressors score, does not see the covariance.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_features)
+        y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+        sample_weight : array-like of shape (n_samples,), default=None
+            Of the rows in the mean. A pipeline asks for it where metadata are routed.
         """
-        return float(self.log_likelihood(X, y).mean())
+        return float(np.average(self.log_likelihood(X, y), weights=sample_weight))
 
     def sample_y(self, X: ArrayLike, n_samples: int = 1, random_state: Any = None) -> Floats:
         """Draw y at X, independently for each row.
