@@ -298,6 +298,9 @@ def test_log_likelihood_is_that_of_scipy(name, d, e, aligned):
     ]
     np.testing.assert_allclose(model.log_likelihood(X[:20], y[:20])[sound], expected, rtol=1e-8, atol=1e-8)
     assert model.score(X, y) == pytest.approx(model.log_likelihood(X, y).mean(), rel=1e-14)
+    weight = np.arange(len(X))
+    expected = weight @ model.log_likelihood(X, y) / weight.sum()
+    assert model.score(X, y, sample_weight=weight) == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize(("name", "d", "e", "aligned"), PLAIN)
