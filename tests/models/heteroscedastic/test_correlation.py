@@ -5,8 +5,8 @@ import torch
 from torch_pbd.models.heteroscedastic.correlation import (
     INDEPENDENT,
     DemonstrationCorrelation,
+    NoiseCorrelation,
     demonstration_correlation,
-    occurrences_of,
 )
 
 
@@ -58,29 +58,38 @@ def test_neither_order_nor_names_nor_units_matter():
         assert found.effective_share == pytest.approx(expected.effective_share, rel=1e-9)
 
 
-def test_occurrences_are_counted_for_each_demonstration():
-    index, group = torch.tensor([0, 2, 2, 1, 0, 2]), torch.tensor([5, 5, 5, 9, 9, 9])
-    assert occurrences_of(index, group, 4).tolist() == [[1.0, 0.0, 2.0, 0.0], [1.0, 1.0, 1.0, 0.0]]
+def test_of_long_demonstrations_every_third_sample_tells_the_same():
+    """Of a thousand samples 334 are looked at, and the sum over all pairs is that many times as large."""
+    x, values, group = curves(0.1, 0, n_demos=6, n_steps=1000)
+    whole = demonstration_correlation(x, values, group)
+    kept = (torch.arange(1000) % 3 == 0).repeat(6)
+    part = demonstration_correlation(x[kept], values[kept], group[kept])
+    assert whole.decay == pytest.approx(part.decay, rel=1e-9)
+    assert 1.0 / whole.effective_share - 1.0 == pytest.approx((1.0 / part.effective_share - 1.0) * 1000 / 334, rel=1e-9)
 
 
-@pytest.mark.parametrize("squares", [False, True])
-def test_the_whitener_takes_out_the_correlation_of_means_of_rows(squares, rng):
+def test_the_whiteners_take_out_the_correlation_of_means_of_rows(rng):
     """Covariance of all rows by definition, averaged at the inputs: of mixed counts, and demonstrations that miss
     some inputs and repeat others.
     """
     x = np.sort(rng.uniform(-0.5, 0.5, size=6))
     index = np.concatenate([np.arange(6), rng.integers(6, size=20)])
     group = np.concatenate([np.arange(6) % 4, rng.integers(4, size=20)])
-    decay = 0.2 if squares else 0.4
-    rows = np.exp(-np.abs(np.subtract.outer(x[index], x[index])) / decay) * (group[:, np.newaxis] == group)
+    arguments = (torch.tensor(x)[:, None], torch.tensor(index), torch.tensor(group))
+    noise = NoiseCorrelation.of(DemonstrationCorrelation(0.2, 0.1), *arguments)
     average = (np.arange(6)[:, np.newaxis] == index) / np.sqrt(np.bincount(index))[:, np.newaxis]
-    covariance = torch.tensor(average @ rows @ average.T)
-    occurrences = occurrences_of(torch.tensor(index), torch.tensor(group), 6)
-    whitener = DemonstrationCorrelation(0.2, 0.1).whitener(torch.tensor(x)[:, None], occurrences, squares=squares)
-    eye = torch.eye(6, dtype=torch.float64)
-    torch.testing.assert_close(whitener @ covariance @ whitener.mT, eye, rtol=0, atol=1e-10)
+    distance = np.abs(np.subtract.outer(x[index], x[index]))
+    for whitener, decay in ((noise.of_means, 0.4), (noise.of_squares, 0.2)):
+        rows = np.exp(-distance / decay) * (group[:, np.newaxis] == group)
+        covariance = average @ rows @ average.T
+        whitened = whitener.numpy() @ covariance @ whitener.numpy().T
+        np.testing.assert_allclose(whitened, np.eye(6), rtol=0, atol=1e-10)
+        np.testing.assert_allclose(noise.copies, np.diag(covariance), rtol=1e-12)
+    assert noise.copies.max() > 1.0  # some demonstration repeats an input
 
 
-def test_independent_samples_have_no_whitener():
-    occurrences = torch.ones(2, 3, dtype=torch.float64)
-    assert INDEPENDENT.whitener(torch.zeros(3, 1).double(), occurrences, squares=True) is None
+@pytest.mark.parametrize("correlation", [INDEPENDENT, DemonstrationCorrelation(0.2, 0.1)])
+def test_without_correlation_or_groups_there_is_nothing_to_take_out(correlation):
+    group = None if correlation.decay else torch.tensor([0, 0, 1])
+    noise = NoiseCorrelation.of(correlation, torch.zeros(3, 1).double(), torch.arange(3), group)
+    assert noise == NoiseCorrelation(None, None, None)

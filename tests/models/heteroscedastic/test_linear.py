@@ -4,8 +4,14 @@ import torch
 from scipy.stats import multivariate_normal
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import DotProduct
+from torch.distributions import MultivariateNormal, kl_divergence
 
-from torch_pbd.models.heteroscedastic.linear import log_evidence, weights_posterior, weights_root
+from torch_pbd.models.heteroscedastic.linear import (
+    divergence_from_prior,
+    log_evidence,
+    weights_posterior,
+    weights_root,
+)
 
 SIZES = [(12, 3), (3, 12), (1, 1)]  # rows and features
 
@@ -36,3 +42,10 @@ def test_gradient_of_the_log_evidence(generator):
     design = torch.randn(2, 7, 3, dtype=torch.float64, generator=generator).requires_grad_()
     response = torch.randn(2, 7, dtype=torch.float64, generator=generator).requires_grad_()
     assert torch.autograd.gradcheck(log_evidence, (design, response))
+
+
+def test_divergence_from_the_prior_is_that_of_torch(rng):
+    weights = weights_posterior(torch.tensor(rng.normal(size=(9, 4))), torch.tensor(rng.normal(size=9)))
+    prior = MultivariateNormal(torch.zeros(4, dtype=torch.float64), torch.eye(4, dtype=torch.float64))
+    expected = kl_divergence(MultivariateNormal(weights.mean, weights.root @ weights.root.mT), prior)
+    assert divergence_from_prior(weights) == pytest.approx(float(expected), rel=1e-9)
