@@ -72,10 +72,10 @@ def test_the_papers_simulation_is_learned():
     assert 0.0 < np.median(gaps) <= 0.04
 
 
-@pytest.mark.slow
 def test_inputs_that_never_repeat_are_learned_as_well():
+    """Median of five seeds. Of twelve it is .013, the worst .024; of the first three .0161, too few to judge by."""
     found = []
-    for seed in range(3):
+    for seed in range(5):
         rng = np.random.default_rng(seed)
         X = rng.uniform(-100.0, 100.0, size=(500, 1))
         found.append(kl(HeteroscedasticGPRegressor().fit(X, draws(X, "printed", rng))))
