@@ -143,8 +143,18 @@ def check_groups(groups: Any, n_samples: int) -> NDArray[np.intp]:
     if labels.dtype.kind == "f" and not np.isfinite(labels).all():
         raise ValueError(f"groups has a label that is not finite, at index {int(np.argmin(np.isfinite(labels)))}.")
     if labels.dtype.kind == "O":
-        labels = np.array([str(label) for label in labels])
+        _check_labels(labels)
     return np.unique(labels, return_inverse=True)[1].reshape(-1)
+
+
+def _check_labels(labels: NDArray[Any]) -> None:
+    for i, label in enumerate(labels):
+        if label is None or label != label:
+            raise ValueError(f"groups has no label at index {i}: say of every row which demonstration it is of.")
+    kinds = {type(label) for label in labels}
+    if len(kinds) > 1:
+        names = ", ".join(sorted(kind.__name__ for kind in kinds))
+        raise ValueError(f"groups has labels of several types ({names}): use one, so that 1 and '1' are not mixed up.")
 
 
 def check_number(

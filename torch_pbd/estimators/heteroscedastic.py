@@ -1,5 +1,6 @@
 """The recommended regressor: covariance by latent Gaussian processes that are integrated out."""
 
+import warnings
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -20,6 +21,7 @@ from torch_pbd.estimators._validation import (
     check_period,
     prior_covariance,
 )
+from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.gp.inducing import FeatureMap, inducing_inputs
 from torch_pbd.kernels import KERNELS, KernelName
 from torch_pbd.linalg import safe_cholesky
@@ -33,6 +35,8 @@ from torch_pbd.models.heteroscedastic import (
 )
 from torch_pbd.models.training import TrainingSet
 from torch_pbd.optim import FitReport
+
+_COVERED = 0.5  # of the range of the input, by a demonstration that is compared with others
 
 # Prior medians of length scale (in ranges of the input) and amplitude, and prior deviation of the constant. Means
 # are of outputs with unit variance, log variances and coefficients of residuals with a pooled unit covariance.
@@ -76,7 +80,8 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         many neighbourhoods; if the length scales that are found come near their distances, 128; at once for
         several columns of X. All outputs together have at most 400 (the mean 800).
     max_inputs : int, default=512
-        Where X has more distinct rows, neighbours are merged into this many.
+        Where X has more distinct rows, neighbours are merged into this many; into fewer where samples of a
+        demonstration turn out correlated, so that each input has rows of about all demonstrations.
     max_iter : int, default=100
         Largest number of L-BFGS iterations of a search for hyperparameters.
     tol : float, default=1e-3
@@ -117,7 +122,8 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
     its shape, with the integral of the one estimated: demonstrations are smoother than that, but a model that
     trusts their smoothness takes it for signal.
 
-    The factor depends on the order of the outputs, and with it, slightly, the fit.
+    The factor depends on the order of the outputs, and with it the fit: with six demonstrations a variance may
+    change by 20 %.
 
     References
     ----------
@@ -213,8 +219,9 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
     def sample_cov(self, X: ArrayLike, n_samples: int = 1, random_state: Any = None) -> Floats:
         """Draw covariance functions from their posterior, at X.
 
-        A draw is one function: its values at different inputs belong together. It is of the variability, with
-        the prior's share in it where data are missing; the spread of the draws is what is not known.
+        A draw is one function: its values at different inputs belong together. Where there are data, the spread of
+        the draws is what few demonstrations leave open; where data are missing each draw is the prior, which is
+        one matrix.
 
         Parameters
         ----------
@@ -249,17 +256,18 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         length_scale = check_length_scale(self.length_scale, X.shape[1])
         period = check_period(self.period, self.kernel, X.shape[1])
         groups = told.get("groups")
-        if groups is not None and X.shape[1] == 1:
-            _check_ways(X[:, 0], y, groups)
+        if groups is not None:
+            _check_demonstrations(X, y, groups)
         scaling = Standardization.of(X, y)
         standardized = scaling.inputs(X)
         inputs, index = distinct_rows(standardized)
         prior_tril = self._prior_tril(X, y, scaling)
         training = TrainingSet(
             self._door(standardized), self._door(scaling.outputs(y)), self._door(inputs), self._door(index).long()
-        ).merged(self.max_inputs)
+        )
         warn_if_few(len(y), y.shape[1])
         warn_if_identical(training)
+        training = training.merged(self.max_inputs)
         kernel: KernelName = "squared_exponential" if self.kernel == "periodic" else self.kernel
         circle = None if period is None else self._door(period / scaling.x_scale)
         held = None if length_scale is None else self._door(length_scale / scaling.x_scale)
@@ -303,13 +311,25 @@ def _report(fit: HeteroscedasticFit, options: SearchOptions) -> FitReport:
     return FitReport(losses[-1], losses, max(report.n_iter for report in options.reports), converged, message)
 
 
-def _check_ways(x: Floats, y: Floats, groups: Any) -> None:
-    """Warn once where demonstrations follow several ways; those that cannot be put in order are left out."""
+def _check_demonstrations(X: Floats, y: Floats, groups: Any) -> None:
+    """Warn where demonstrations are too few to tell their correlation, or seem to follow several ways.
+
+    The ways are looked for along one input, among demonstrations that cover most of it.
+    """
+    counts = np.bincount(groups)
+    if len(counts) < 2:
+        warnings.warn(
+            "groups has one demonstration: how far its samples repeat each other cannot be told from it, and they "
+            "count as independent. What is predicted is its noise, not how demonstrations differ.",
+            DataRankWarning,
+            stacklevel=5,
+        )
+    if X.shape[1] > 1 or len(counts) < 2 or counts.min() < 2:
+        return
     times, positions = [], []
-    for group in range(int(groups.max()) + 1):
-        time, first = np.unique(x[groups == group], return_index=True)
-        if len(time) > 1:
-            times.append(time)
-            positions.append(y[groups == group][first])
-    if len(times) > 1:
+    for rows in np.split(np.argsort(groups, kind="stable"), np.cumsum(counts)[:-1]):
+        time, first = np.unique(X[rows, 0], return_index=True)
+        times.append(time)
+        positions.append(y[rows][first])
+    if min(len(time) for time in times) > 1 and min(np.ptp(time) for time in times) > _COVERED * np.ptp(X):
         check_unimodal(Demonstrations(times, positions))

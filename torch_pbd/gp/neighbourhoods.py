@@ -1,5 +1,7 @@
 """Distances between training inputs, and the merging of neighbours where there are too many inputs."""
 
+import heapq
+
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
@@ -19,22 +21,22 @@ def spacing(inputs: Float[Tensor, "n e"], quantile: float = 0.9) -> float:
 def neighbourhoods(inputs: Float[Tensor, "n e"], max_inputs: int) -> Int64[Tensor, " n"]:
     """Index of the neighbourhood of each input; at most ``max_inputs`` of them, each for itself if they fit.
 
-    Neighbourhoods are split at the median of their widest dimension until there are enough, so they hold
-    about equally many inputs, and on a line they are runs of sorted inputs.
+    The largest neighbourhood is split at the median of its widest dimension until there are enough, so they
+    hold about equally many inputs (up to a factor of two), and on a line they are runs of sorted inputs.
     """
+    everything = torch.arange(len(inputs), device=inputs.device)
     if len(inputs) <= max_inputs:
-        return torch.arange(len(inputs), device=inputs.device)
-    groups = [torch.arange(len(inputs), device=inputs.device)]
-    while 2 * len(groups) <= max_inputs:
-        halves = []
-        for group in groups:
-            members = inputs[group]
-            widest = (members.amax(0) - members.amin(0)).argmax()
-            order = group[members[:, widest].argsort(stable=True)]
-            halves += [half for half in order.tensor_split(2) if len(half)]
-        groups = halves
+        return everything
+    groups = [(-len(inputs), "", everything)]  # the second tells the way through the halves, and is never equal
+    for _ in range(1, max_inputs):
+        _, way, group = heapq.heappop(groups)
+        members = inputs[group]
+        widest = (members.amax(0) - members.amin(0)).argmax()
+        low, high = group[members[:, widest].argsort(stable=True)].tensor_split(2)
+        heapq.heappush(groups, (-len(low), way + "0", low))
+        heapq.heappush(groups, (-len(high), way + "1", high))
     index = torch.empty(len(inputs), dtype=torch.long, device=inputs.device)
-    for number, group in enumerate(groups):
+    for number, (_, _, group) in enumerate(sorted(groups, key=lambda entry: entry[1])):
         index[group] = number
     return index
 

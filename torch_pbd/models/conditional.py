@@ -36,7 +36,9 @@ class MeanAndCovariance(nn.Module):
 
 
 class ConditionalNormal(nn.Module):
-    """y given x is N(mean(x), covariance(x)), in the units of the data; differentiable in x.
+    """Mean and covariance of y given x, in the units of the data; differentiable in x.
+
+    The density is normal, or Student's t with these moments where the core has ``degrees``.
 
     Parameters
     ----------
@@ -95,14 +97,14 @@ class ConditionalNormal(nn.Module):
     def draw_covariance(
         self,
         x: Float[Tensor, "n e"],
-        normal: list[Float[Tensor, " _"]],
+        normal: list[Tensor],
         prior_scale_tril: Float[Tensor, "n d d"] | None = None,
     ) -> Float[Tensor, "n d d"]:
         """One posterior draw of the covariance function at x, made of standard normal numbers."""
         if not isinstance(self.core, HeteroscedasticModel):
             raise TypeError("only the heteroscedastic model knows the posterior of its covariance")
-        prior_tril = None if prior_scale_tril is None else prior_scale_tril / self.y_scale[:, None]
-        root = self.core.draw((x - self.x_shift) / self.x_scale, normal, prior_tril)
+        prior = None if prior_scale_tril is None else prior_scale_tril / self.y_scale[:, None]
+        root = self.core.draw((x - self.x_shift) / self.x_scale, normal, prior)
         root = self.y_scale[:, None] * with_floor(root)
         return symmetrize(root @ root.mT)
 

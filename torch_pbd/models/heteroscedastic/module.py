@@ -1,5 +1,6 @@
 """The fitted model as a module: everything that predicts is in its buffers."""
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -19,9 +20,9 @@ from torch_pbd.models.heteroscedastic.processes import ProcessFamily
 # Far from data a log variance may be anything: of its variance no more than this enters an expectation.
 _MOST_LOG_VARIANCE = 2.0
 _LEAST_DEGREES = 3.0  # below two, Student's t has no covariance
-# Longest length scale, in ranges of the input, by which distance from the data is judged: with longer ones the
-# prior would take over only far outside.
-_REACH = 0.2
+# Longest length scale by which distance from the data is judged, in ranges of the input times the number of inputs;
+# but two spacings of the inducing inputs at least.
+_REACH = 0.1
 
 
 class HeteroscedasticModel(nn.Module):
@@ -116,40 +117,35 @@ class HeteroscedasticModel(nn.Module):
         """Degrees of freedom of the predictive density; infinite (a normal distribution) where only the prior
         speaks.
 
-        A variance known from as many squares has a logarithm of variance trigamma(degrees / 2), which is that
-        of the latent processes; the average is over the outputs.
+        A variance known from as many squares has a logarithm of variance trigamma(degrees / 2); here it is the mean
+        of those of the log variances, and ``trigamma(z)`` is taken for ``1 / z + 1 / (2 z^2)``.
         """
-        variance = self._moments(x).log_variance_variance
-        degrees = ((1.0 + (1.0 + 2.0 * variance).sqrt()) / variance).mean(-1)
+        variance = self._moments(x).log_variance_variance.mean(-1)
+        degrees = (1.0 + (1.0 + 2.0 * variance).sqrt()) / variance
         return degrees.clamp_min(_LEAST_DEGREES) / (1.0 - self.type1(x)).clamp_min(1e-12)
 
     def type1(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
-        """Type I uncertainty: eq. (6) without noise over the prior variance, of a process with the amplitude-
-        weighted mean of the log variances' length scales, as far as that does not reach too far.
+        """Type I uncertainty: eq. (6) without noise over the prior variance, 0 at the inducing inputs.
+
+        Of a process with the length scale of the log variances (their mean, weighted by squared amplitudes), as far
+        as that does not reach too far: a smooth process without noise claims to know what is two of its length
+        scales away, in gaps and beyond the data.
         """
         family, theta = self.covariance_process.log_variance_family, self.log_variance_theta
         weight = family.amplitude_of(theta).square()
-        scales = family.length_scale_of(theta).log()
-        scale = (
-            ((weight / weight.sum()) @ scales)
-            .exp()
-            .clamp_max(_REACH * x.shape[1] ** 0.5)
-            .clamp_min(2.0 * spacing(self.inducing))
-        )
-        return (1.0 - family.features(x, scale[None])[0].square().sum(-1)).clamp(0.0, 1.0)
+        scale = ((weight / weight.sum()) @ family.length_scale_of(theta).log()).exp()
+        scale = scale.clamp_max(_REACH * x.shape[1]).clamp_min(2.0 * spacing(self.inducing))
+        features = replace(family.features, kernel="squared_exponential")
+        return (1.0 - features(x, scale[None])[0].square().sum(-1)).clamp(0.0, 1.0)
 
     def draw(
-        self,
-        x: Float[Tensor, "n e"],
-        normal: list[Float[Tensor, " _"]],
-        prior_tril: Float[Tensor, "n d d"] | None = None,
+        self, x: Float[Tensor, "n e"], normal: list[Tensor], prior_tril: Float[Tensor, "n d d"] | None = None
     ) -> Float[Tensor, "n d r"]:
         """Root of one posterior draw of the covariance function at x, with the prior's share in it."""
+        prior = self.prior_tril.expand(len(x), -1, -1) if prior_tril is None else prior_tril
         missing = self.type1(x)[:, None, None]
         root = self.pooled_tril @ self.covariance_process.draw(x, normal)
-        prior = self.prior_tril.expand(len(x), -1, -1) if prior_tril is None else prior_tril
-        prior = _root_of_share(missing) * prior
-        return torch.cat([_root_of_share(1.0 - missing) * root, prior], -1)
+        return torch.cat([_root_of_share(1.0 - missing) * root, _root_of_share(missing) * prior], dim=-1)
 
     def draw_sizes(self) -> list[int]:
         """Sizes of the standard normal vectors that :meth:`draw` takes."""

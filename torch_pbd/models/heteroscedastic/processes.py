@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from torch_pbd.exceptions import NotPositiveDefiniteError
 from torch_pbd.gp.inducing import FeatureMap
 from torch_pbd.optim import BatchReport, Progress, minimize_batch
 
@@ -98,7 +99,9 @@ class ProcessFamily:
     def starts(self, like: Tensor, n_features: int) -> Float[Tensor, "s q"]:
         """Where a search begins: short and long, weak and strong."""
         grid = [
-            [math.log(scale)] * n_features + [amplitude] for scale in (0.12, 0.35, 1.0) for amplitude in (-1.0, 0.5)
+            [math.log(scale)] * n_features + [amplitude]
+            for scale in (0.04, 0.12, 0.35, 1.0)
+            for amplitude in (-1.0, 0.5)
         ]
         return like.new_tensor(grid)
 
@@ -130,7 +133,10 @@ def search(
     every = torch.arange(n_processes, device=like.device)
 
     def loss(theta: Tensor, rows: Tensor) -> Tensor:
-        return -evidence(theta, rows) - family.log_prior(theta)
+        try:
+            return -evidence(theta, rows) - family.log_prior(theta)
+        except (NotPositiveDefiniteError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
+            return math.nan * theta.sum(-1)  # too far, for the optimizer
 
     def joint_loss(theta: Tensor, _: Tensor) -> Tensor:
         return torch.stack([loss(_spread_out(row, n_features), every).sum() for row in theta])
