@@ -197,7 +197,8 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         sample_weight : array-like of shape (n_samples,), default=None
             Of the rows in the mean. A pipeline asks for it where metadata are routed.
         """
-        return float(np.average(self.log_likelihood(X, y), weights=sample_weight))
+        weights = None if sample_weight is None else np.asarray(sample_weight, dtype=np.float64)
+        return float(np.average(self.log_likelihood(X, y), weights=weights))
 
     def sample_y(self, X: ArrayLike, n_samples: int = 1, random_state: Any = None) -> Floats:
         """Draw y at X, independently for each row.
