@@ -284,6 +284,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
             fit = fit_heteroscedastic(training, group, families, options)
             if fit.resolved:
                 break
+        _warn_if_unresolved(held, features)
         self.effective_share_ = fit.correlation.effective_share
         module = HeteroscedasticModel(fit, prior_tril)
         return Fitted(self._assemble(module, scaling), _report(fit, options), features.jitter)
@@ -333,3 +334,15 @@ def _check_demonstrations(X: Floats, y: Floats, groups: Any) -> None:
         positions.append(y[rows][first])
     if min(len(time) for time in times) > 1 and min(np.ptp(time) for time in times) > _COVERED * np.ptp(X):
         check_unimodal(Demonstrations(times, positions))
+
+
+def _warn_if_unresolved(length_scale: torch.Tensor | None, features: FeatureMap) -> None:
+    """Warn where a length scale that the user gave is shorter than the inputs can tell."""
+    least = features.shortest_length_scale()
+    if length_scale is not None and bool((length_scale < least).any()):
+        warnings.warn(
+            f"length_scale is below {least:.3g} of the range of X, which is what the inputs (or n_inducing of them) "
+            "resolve: between them the covariance says nothing. Give a longer one, or None to learn it.",
+            UserWarning,
+            stacklevel=5,
+        )
