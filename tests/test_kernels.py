@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 import torch
-from sklearn.gaussian_process.kernels import RBF, Matern
+from sklearn.gaussian_process.kernels import RBF, ExpSineSquared, Matern
 
 from torch_pbd.kernels import KERNELS, correlation
 
@@ -81,3 +81,36 @@ def test_far_inputs_have_a_correlation_and_a_gradient_of_exactly_zero(kernel, fa
 def test_the_dtype_is_that_of_the_inputs(kernel, dtype):
     x = torch.zeros(3, 1, dtype=dtype)
     assert correlation(x, x, torch.ones(1, dtype=dtype), kernel).dtype == dtype
+
+
+def test_on_a_circle_the_squared_exponential_is_the_periodic_kernel_of_scikit_learn(rng):
+    """Whose length scale is of the angle's chord: ``2 pi / period`` times ours, which is in units of x."""
+    x, other = rng.uniform(-5.0, 5.0, size=(20, 1)), rng.uniform(-5.0, 5.0, size=(15, 1))
+    for period, length_scale in [(1.0, 0.1), (2.5, 1.0)]:
+        expected = ExpSineSquared(2.0 * np.pi * length_scale / period, period)(x, other)
+        found = correlation(tensor(x), tensor(other), tensor([length_scale]), period=tensor([period]))
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-200)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_a_period_repeats_its_own_input_only_and_is_not_seen_by_neighbours(kernel, rng):
+    x, other = rng.uniform(-0.5, 0.5, size=(8, 2)), rng.uniform(-0.5, 0.5, size=(6, 2))
+    length_scale, period = tensor([0.3, 0.7]), tensor([2.0, np.inf])
+    found = correlation(tensor(x), tensor(other), length_scale, kernel, period)
+    turned = correlation(tensor(x) + tensor([4.0, 0.0]), tensor(other), length_scale, kernel, period)
+    torch.testing.assert_close(turned, found, rtol=1e-9, atol=1e-12)
+    # The chord of an arc r is r (1 - (pi r / period)^2 / 6 + ...): wide circles are straight.
+    straight = correlation(tensor(x), tensor(other), length_scale, kernel)
+    wide = correlation(tensor(x), tensor(other), length_scale, kernel, tensor([1e4, np.inf]))
+    torch.testing.assert_close(wide, straight, rtol=1e-6, atol=0)
+    matrix = correlation(tensor(x), tensor(x), length_scale, kernel, period)
+    assert torch.linalg.eigvalsh(matrix).min() > 0
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_correlation_on_a_circle_is_differentiable(kernel, generator):
+    other = torch.randn(4, 2, dtype=torch.float64, generator=generator)
+    x = torch.cat([other[:2], 1.5 + other[2:]]).requires_grad_()
+    length_scale = torch.tensor([[0.5, 1.0]], dtype=torch.float64, requires_grad=True)
+    period = tensor([1.0, np.inf])
+    assert torch.autograd.gradcheck(lambda x, scale: correlation(x, other, scale, kernel, period), (x, length_scale))

@@ -8,7 +8,7 @@ import torch
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
 
-from torch_pbd import CholeskyCovRegressor, GMMBaseline, WishartProcessRegressor
+from torch_pbd import CholeskyCovRegressor, GMMBaseline, HeteroscedasticGPRegressor, WishartProcessRegressor
 
 PAPER = {"objective": "likelihood", "latent_prior": False}
 VARIANTS = {
@@ -22,17 +22,21 @@ VARIANTS = {
     "wishart-random": WishartProcessRegressor(start="random", max_iter=300),
     "wishart-likelihood": WishartProcessRegressor(objective="likelihood"),
     "wishart-eq11": WishartProcessRegressor(**PAPER, max_iter=50),
+    "heteroscedastic": HeteroscedasticGPRegressor(),
+    "heteroscedastic-matern": HeteroscedasticGPRegressor(kernel="matern52", shared_length_scale=True),
     "mixture": GMMBaseline(n_components=3),
     "mixture-lbfgs": GMMBaseline(n_components=3, solver="lbfgs"),
 }
-DEFAULTS = ["cholesky", "wishart", "mixture"]
+DEFAULTS = ["cholesky", "wishart", "heteroscedastic", "mixture"]
 LATENT = [name for name in VARIANTS if not name.startswith("mixture")]  # those that return to a prior
-UNALIGNED = [name for name in VARIANTS if "likelihood" in name or "eq" in name or "mixture" in name]
+UNALIGNED = [
+    name for name in VARIANTS if any(part in name for part in ("likelihood", "eq", "heteroscedastic", "mixture"))
+]
 # Name, outputs d, inputs e, whether the inputs repeat.
 CASES = [(name, d, e, True) for name in VARIANTS for d, e in [(1, 1), (2, 1), (2, 2)]]
 CASES += [(name, d, e, False) for name in UNALIGNED for d, e in [(1, 1), (2, 1), (1, 2)]]
 CASES += [(name, 9, 1, True) for name in (*DEFAULTS, "cholesky-interpolating", "cholesky-likelihood", "wishart-random")]
-CASES += [(name, 9, 1, False) for name in ("cholesky-likelihood", "wishart-likelihood", "mixture")]
+CASES += [(name, 9, 1, False) for name in ("cholesky-likelihood", "wishart-likelihood", "heteroscedastic", "mixture")]
 PLAIN = [(name, 2, 1, True) for name in VARIANTS] + [(name, 2, 1, False) for name in UNALIGNED]
 
 

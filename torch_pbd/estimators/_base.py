@@ -185,12 +185,20 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
                 return gaussian_log_density(targets - mean, scale_tril).cpu().numpy()
             return student_log_density(targets - mean, scale_tril, degrees).cpu().numpy()
 
-    def score(self, X: ArrayLike, y: ArrayLike) -> float:
+    def score(self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None) -> float:
         """Mean log density of the rows of y at X, in nats: higher is better.
 
         R^2, which scikit-learn's regressors score, does not see the covariance.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_features)
+        y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+        sample_weight : array-like of shape (n_samples,), default=None
+            Of the rows in the mean. A pipeline asks for it where metadata are routed.
         """
-        return float(self.log_likelihood(X, y).mean())
+        weights = None if sample_weight is None else np.asarray(sample_weight, dtype=np.float64)
+        return float(np.average(self.log_likelihood(X, y), weights=weights))
 
     def sample_y(self, X: ArrayLike, n_samples: int = 1, random_state: Any = None) -> Floats:
         """Draw y at X, independently for each row.
@@ -252,17 +260,18 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
 
     def _apply(self, model: Any, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and covariance (or factor) of the model at x, a bounded number of rows at a time."""
-        prior = getattr(self, "prior", None)
         with torch.inference_mode():
-            parts = []
-            for chunk in x.split(_CHUNK):
-                if callable(prior):
-                    covariance = prior_covariance(prior, chunk.cpu().numpy(), self.n_outputs_)
-                    parts.append(model(chunk, safe_cholesky(self._door(covariance), name="prior(X)")))
-                else:
-                    parts.append(model(chunk))
+            parts = [model(chunk, *self._prior_tril_at(chunk)) for chunk in x.split(_CHUNK)]
             first, second = (torch.cat(part) for part in zip(*parts, strict=True))
         return first, second
+
+    def _prior_tril_at(self, x: Tensor) -> tuple[Tensor, ...]:
+        """Factor of the prior at x, where it depends on x; else nothing, as the module has it."""
+        prior = getattr(self, "prior", None)
+        if not callable(prior):
+            return ()
+        covariance = prior_covariance(prior, x.cpu().numpy(), self.n_outputs_)
+        return (safe_cholesky(self._door(covariance), name="prior(X)"),)
 
     def _door(self, array: Any) -> Tensor:
         """Copy of an array; contiguous, since torch takes no negative strides."""

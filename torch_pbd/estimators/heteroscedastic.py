@@ -237,15 +237,11 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         generator = check_random_state(random_state)
         x = self._query(X)
         core: Any = self.module_.core
-        given = None
-        if callable(self.prior):
-            covariance = prior_covariance(self.prior, x.cpu().numpy(), self.n_outputs_)
-            given = safe_cholesky(self._door(covariance), name="prior(X)")
-        draws = []
+        draws, prior_tril = [], self._prior_tril_at(x)
         with torch.inference_mode():
             for _ in range(n_samples):
                 normal = [self._door(generator.standard_normal(size)) for size in core.draw_sizes()]
-                draws.append(self.module_.draw_covariance(x, normal, given).cpu().numpy())
+                draws.append(self.module_.draw_covariance(x, normal, *prior_tril).cpu().numpy())
         return np.stack(draws, axis=-1)
 
     def _check_parameters(self) -> None:

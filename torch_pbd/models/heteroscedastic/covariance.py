@@ -7,7 +7,7 @@ from torch import Tensor
 from torch_pbd.models.heteroscedastic.correlation import NoiseCorrelation
 from torch_pbd.models.heteroscedastic.latent import LatentCovariance
 from torch_pbd.models.heteroscedastic.linear import Weights, divergence_from_prior
-from torch_pbd.models.heteroscedastic.log_variance import Squares, fit_log_variance
+from torch_pbd.models.heteroscedastic.log_variance import LEAST_SQUARE, Squares, fit_log_variance
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily, SearchOptions, search
 from torch_pbd.models.heteroscedastic.regression import Regression
 
@@ -46,6 +46,9 @@ def fit_covariance(
     """
     variance_family, coefficient_family = families
     n_outputs, n_features = scatter.shape[1], inputs.shape[1]
+    # An output that is constant is noise of the least variance too where later ones are regressed on it: to zeros
+    # any coefficient would fit, and its uncertainty would count as their variance.
+    scatter = scatter + LEAST_SQUARE * torch.diag_embed(degrees.mT)
     fit = previous
     regressions = [] if fit is None else _regressions(scatter, fit.at(inputs).tril(), noise)
     for sweep in range(_SWEEPS if n_outputs > 1 else 1):

@@ -26,6 +26,7 @@ _ROWS_TOGETHER = 8  # neighbours whose differences tell the noise that the first
 _FIRST_SAMPLES = 10.0  # of a demonstration: what counts of it before its correlation is known
 # Of y's standard deviation: an output that is constant, or a copy of another, has this deviation of its own.
 _LEAST_DEVIATION = 1e-6
+_LEAST_OWN = 1e-4  # of an output's deviation, as long as the mean is fitted
 
 
 @dataclass(frozen=True)
@@ -109,9 +110,14 @@ def fit_heteroscedastic(
 
 
 def _tril_at(inputs: Tensor, pooled: Tensor, covariance: LatentCovariance | None) -> Tensor:
+    """Factor of the noise of the means. A little is each output's own: of exact copies the equations would else
+    have digits for their difference alone.
+    """
     if covariance is None:
         return pooled.expand(len(inputs), -1, -1)
-    return pooled @ covariance.at(inputs).tril()
+    tril = pooled @ covariance.at(inputs).tril()
+    own = (_LEAST_OWN * tril.norm(dim=-1)).clamp_min(_LEAST_DEVIATION)
+    return scale_tril_from_root(torch.cat([tril, torch.diag_embed(own)], dim=-1))
 
 
 def _start_tril(training: TrainingSet) -> Tensor:

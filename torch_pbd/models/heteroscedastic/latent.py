@@ -50,7 +50,7 @@ class LatentCovariance:
             below_variance = torch.stack([below_variance[:, 0], *variances], dim=1)
         return FactorMoments(mean, variance, below, below_variance)
 
-    def draw(self, x: Float[Tensor, "n e"], normal: Sequence[Float[Tensor, " p"]]) -> Float[Tensor, "n d d"]:
+    def draw(self, x: Float[Tensor, "n e"], normal: Sequence[Float[Tensor, " _"]]) -> Float[Tensor, "n d d"]:
         """Factor at x of one function of the posterior, made of standard normal numbers for each output's
         log variance and then for each output's coefficients.
         """

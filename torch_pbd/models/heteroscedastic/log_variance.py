@@ -13,7 +13,7 @@ from torch_pbd.models.heteroscedastic.linear import Weights, log_evidence, weigh
 _MAX_ITER, _TOL = 60, 1e-8
 _LARGEST_STEP = 3.0  # in the logarithm of a variance
 # Of the pooled variance: an exact zero, as where all recordings start at the origin, has no logarithm.
-_LEAST = 1e-6
+LEAST_SQUARE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Squares:
 
     def log_mean(self) -> Float[Tensor, "b n"]:
         """Logarithm of the mean square."""
-        return (self.total / self.degrees).clamp_min(_LEAST).log()
+        return (self.total / self.degrees).clamp_min(LEAST_SQUARE).log()
 
 
 def fit_log_variance(squares: Squares, features: Float[Tensor, "b n p"]) -> tuple[Weights, Float[Tensor, " b"]]:
@@ -80,7 +80,7 @@ def _fit_correlated(squares: Squares, features: Tensor, whitener: Tensor, copies
 def _constant(squares: Squares, features: Tensor) -> Tensor:
     """Weights of the pooled variance everywhere."""
     weights = torch.zeros_like(features[:, 0, :])
-    pooled = (squares.total.sum(-1) / squares.degrees.sum(-1)).clamp_min(_LEAST).log()
+    pooled = (squares.total.sum(-1) / squares.degrees.sum(-1)).clamp_min(LEAST_SQUARE).log()
     weights[:, -1] = pooled / features[:, 0, -1]
     return weights
 

@@ -106,12 +106,12 @@ class HeteroscedasticModel(nn.Module):
         least = 1e-12 * torch.diag_embed(1e-30 + error.diagonal(dim1=-2, dim2=-1))
         error_root = safe_cholesky(symmetrize(error) + least, name="the covariance of the mean's error")
         missing = self.type1(x)[:, None, None]
-        known = (1.0 - missing).sqrt() * torch.cat([self._root(self._moments(x)), error_root], dim=-1)
-        return mean, torch.cat([known, missing.sqrt() * prior.expand(len(x), -1, -1)], dim=-1)
+        known = _root_of_share(1.0 - missing) * torch.cat([self._root(self._moments(x)), error_root], dim=-1)
+        return mean, torch.cat([known, _root_of_share(missing) * prior.expand(len(x), -1, -1)], dim=-1)
 
     def variability(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d d"]:
         """Root of the covariance at the means of the latent processes, without prior and without errors."""
-        return (1.0 - self.type1(x)).sqrt()[:, None, None] * (self.pooled_tril @ self._moments(x).tril())
+        return _root_of_share(1.0 - self.type1(x))[:, None, None] * (self.pooled_tril @ self._moments(x).tril())
 
     def degrees(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
         """Degrees of freedom of the predictive density; infinite (a normal distribution) where only the prior
@@ -145,7 +145,7 @@ class HeteroscedasticModel(nn.Module):
         prior = self.prior_tril.expand(len(x), -1, -1) if prior_tril is None else prior_tril
         missing = self.type1(x)[:, None, None]
         root = self.pooled_tril @ self.covariance_process.draw(x, normal)
-        return torch.cat([(1.0 - missing).sqrt() * root, missing.sqrt() * prior], dim=-1)
+        return torch.cat([_root_of_share(1.0 - missing) * root, _root_of_share(missing) * prior], dim=-1)
 
     def draw_sizes(self) -> list[int]:
         """Sizes of the standard normal vectors that :meth:`draw` takes."""
@@ -186,3 +186,9 @@ class HeteroscedasticModel(nn.Module):
 
     def _root(self, moments: FactorMoments) -> Tensor:
         return self.pooled_tril @ moments.expected_root(_MOST_LOG_VARIANCE)
+
+
+def _root_of_share(share: Tensor) -> Tensor:
+    """Square root whose gradient at zero, where the share has a minimum, is zero and not infinite."""
+    positive = share > 0
+    return torch.where(positive, share.where(positive, 1.0).sqrt(), 0.0)

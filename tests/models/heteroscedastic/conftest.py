@@ -1,0 +1,17 @@
+import pytest
+import torch
+
+from torch_pbd.gp.inducing import FeatureMap
+from torch_pbd.models.heteroscedastic import ProcessFamily
+
+
+@pytest.fixture
+def inputs():
+    """Nine of them, not evenly spaced, over a range of one."""
+    return torch.linspace(0.0, 1.0, 9, dtype=torch.float64)[:, None] ** 1.3 - 0.5
+
+
+@pytest.fixture
+def family(inputs):
+    """Processes with the inputs as inducing ones, and a constant."""
+    return ProcessFamily(FeatureMap(inputs, "matern52", exact=True), 0.5, 1.0, 2.0)

@@ -1,0 +1,66 @@
+import numpy as np
+import pytest
+import torch
+from scipy.linalg import block_diag
+
+from torch_pbd.gp.inducing import FeatureMap
+from torch_pbd.kernels import correlation
+from torch_pbd.models.heteroscedastic import ProcessFamily, SearchOptions
+from torch_pbd.models.heteroscedastic.mean import fit_mean
+
+
+def prior_gram(family, theta, x, other):
+    """Kernel matrix of all outputs at inputs, one output after another."""
+    amplitude, length_scale = family.amplitude_of(theta), family.length_scale_of(theta)
+    blocks = correlation(x, other, length_scale, family.features.kernel).numpy()
+    return block_diag(*(float(a) ** 2 * block for a, block in zip(amplitude, blocks, strict=True)))
+
+
+@pytest.mark.parametrize("whitened", [False, True])
+@pytest.mark.parametrize("d", [1, 3])
+def test_the_mean_is_a_dense_regression_of_all_outputs_under_their_noise(d, whitened, inputs, rng):
+    """Kernel matrix over outputs and inputs, noise of blocks that differ between inputs: generalized least squares."""
+    n = len(inputs)
+    family = ProcessFamily(FeatureMap(inputs, "matern32", exact=True), 0.3, 1.2, 0.0)
+    tril = np.tril(rng.normal(size=(n, d, d)), -1) + np.eye(d) * rng.uniform(0.2, 1.5, size=(n, 1, d))
+    counts = rng.integers(1, 6, size=n).astype(float)
+    along = np.exp(-np.abs((inputs - inputs.T).numpy()) / 0.2) if whitened else np.eye(n)
+    whitener = torch.tensor(np.linalg.inv(np.linalg.cholesky(along))) if whitened else None
+    roots = block_diag(*(tril / np.sqrt(counts)[:, np.newaxis, np.newaxis]))
+    noise = roots @ np.kron(along, np.eye(d)) @ roots.T
+    means = np.sin(3.0 * inputs.numpy() + np.arange(d)) + 0.3 * rng.normal(size=(n, d))
+    arguments = (inputs, torch.tensor(means), torch.tensor(counts), torch.tensor(tril), whitener, None)
+    found = fit_mean(family, *arguments, SearchOptions())
+    order = np.arange(n * d).reshape(d, n).T.ravel()  # input by input instead of output by output
+    x = torch.tensor(rng.uniform(-0.8, 0.8, size=(5, 1)))
+    theta = found.theta.detach()
+    gram = prior_gram(family, theta, inputs, inputs)[np.ix_(order, order)]
+    cross = prior_gram(family, theta, inputs, x)[order]
+    gain = np.linalg.solve(gram + noise, cross).T
+    expected = (gain @ means.ravel()).reshape(d, 5).T
+    covariance = (prior_gram(family, theta, x, x) - gain @ cross).reshape(d, 5, d, 5)
+    mean, error = found.at(x)
+    # The kernel matrix of the inducing inputs has a jitter of 1e-10, over noise of 1e-2.
+    np.testing.assert_allclose(mean, expected, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(error, np.stack([covariance[:, t, :, t] for t in range(5)]), rtol=0, atol=1e-7)
+
+
+def test_away_from_the_inducing_inputs_the_error_is_the_whole_prior_variance(inputs):
+    family = ProcessFamily(FeatureMap(inputs[::3]), 0.3, 1.2, 0.0)
+    tril = 0.1 * torch.eye(2, dtype=torch.float64).expand(9, 2, 2)
+    means = torch.cat([torch.sin(4.0 * inputs), torch.cos(9.0 * inputs)], dim=1)
+    found = fit_mean(family, inputs, means, torch.full((9,), 4.0).double(), tril, None, None, SearchOptions())
+    mean, error = found.at(torch.tensor([[50.0]], dtype=torch.float64))
+    assert torch.equal(mean, torch.zeros(1, 2).double())
+    torch.testing.assert_close(error[0], torch.diag(family.amplitude_of(found.theta).square()), rtol=1e-12, atol=0)
+
+
+def test_hyperparameters_of_an_output_do_not_depend_on_the_others(inputs, rng):
+    family = ProcessFamily(FeatureMap(inputs, exact=True), 0.3, 1.2, 0.0)
+    means = torch.tensor(np.sin(3.0 * inputs.numpy() + np.arange(2)) + 0.1 * rng.normal(size=(9, 2)))
+    tril = 0.2 * torch.eye(2, dtype=torch.float64).expand(9, 2, 2)
+    counts = torch.ones(9, dtype=torch.float64)
+    both = fit_mean(family, inputs, means, counts, tril, None, None, SearchOptions())
+    for i in (0, 1):
+        alone = fit_mean(family, inputs, means[:, [i]], counts, tril[:, :1, :1], None, None, SearchOptions())
+        torch.testing.assert_close(alone.theta[0], both.theta[i], rtol=0, atol=1e-6)

@@ -1,0 +1,101 @@
+import numpy as np
+import pytest
+import torch
+from scipy.linalg import block_diag
+from scipy.stats import multivariate_normal
+
+from torch_pbd.models.heteroscedastic.linear import Weights
+from torch_pbd.models.heteroscedastic.regression import Regression
+
+# A ridge of 1e-8 beside the standardized outputs' scatter keeps it regular, and moves results by as much.
+RTOL = 1e-6
+
+
+class Rows:
+    """Residuals of i + 1 outputs at n inputs, and the factor of the covariance of all but the last."""
+
+    def __init__(self, rng, n=3, i=2, k=8, whitener=None):
+        factor = np.tril(rng.normal(size=(n, i + 1, i + 1)), -1) + np.eye(i + 1) * rng.uniform(0.5, 2.0, (n, 1, i + 1))
+        normal = rng.normal(size=(n, k, i + 1))
+        self.residual = normal @ factor.transpose(0, 2, 1)
+        self.tril, self.before = factor[:, :-1, :-1], normal[..., :-1]
+        self.last = self.residual[..., -1]
+        scatter = torch.tensor(self.residual.transpose(0, 2, 1) @ self.residual)
+        self.regression = Regression.of(scatter, torch.tensor(self.tril), whitener)
+
+
+@pytest.mark.parametrize("i", [1, 2, 8])
+def test_free_coefficients_are_those_of_least_squares_at_each_input(i, rng):
+    rows = Rows(rng, i=i, k=12)
+    precision = torch.tensor([0.5, 2.0, 30.0], dtype=torch.float64)
+    features = 1e4 * torch.eye(3, dtype=torch.float64)  # one weight for each input, hardly held to zero
+    weights = rows.regression.fit(features, precision)
+    coefficients = (features @ weights.mean.reshape(i, 3).mT).numpy()
+    covariance = (weights.root @ weights.root.mT).numpy().reshape(i, 3, i, 3) * 1e8
+    for t in range(3):
+        expected = np.linalg.lstsq(rows.before[t], rows.last[t])[0]
+        np.testing.assert_allclose(coefficients[t], expected, rtol=RTOL, atol=RTOL)
+        inverse = np.linalg.inv(rows.before[t].T @ rows.before[t]) / float(precision[t])
+        np.testing.assert_allclose(covariance[:, t, :, t], inverse, rtol=1e-5, atol=1e-5 * inverse.max())
+
+
+@pytest.mark.parametrize("whitened", [False, True])
+def test_log_evidence_is_the_density_of_the_rows_but_for_what_no_features_change(whitened, rng):
+    """With a whitener the mean of one row a time: the roots' rows stand for the directions at an input."""
+    correlation = np.exp(-np.abs(np.subtract.outer(range(3), range(3))) / 2.0)
+    whitener = torch.tensor(np.linalg.inv(np.linalg.cholesky(correlation))) if whitened else None
+    rows = Rows(rng, whitener=whitener)
+    precision = np.array([0.5, 2.0, 5.0])
+    features = rng.normal(size=(4, 3, 5)) * np.geomspace(0.1, 3.0, 4)[:, np.newaxis, np.newaxis]
+    root = rows.regression.root.numpy()
+    if whitened:
+        before, response = root.transpose(0, 2, 1), rows.regression.response.numpy()
+        deviation = np.repeat(precision**-0.5, 2)
+        noise = deviation[:, np.newaxis] * np.kron(correlation, np.eye(2)) * deviation
+    else:
+        before, response, noise = rows.before, rows.last, np.diag(np.repeat(1.0 / precision, 8))
+    expected = []
+    for phi in features:
+        one = block_diag(*before) @ np.kron(phi, np.eye(2))
+        expected.append(multivariate_normal(cov=noise + one @ one.T).logpdf(response.ravel()))
+    found = rows.regression.evidence(torch.tensor(features), torch.tensor(precision)).numpy()
+    np.testing.assert_allclose(np.diff(found), np.diff(expected), rtol=RTOL, atol=RTOL)
+
+
+def test_squares_are_those_of_the_rows_and_what_the_error_of_the_coefficients_adds(rng):
+    rows = Rows(rng)
+    features = rng.normal(size=(3, 4))
+    mean, root = rng.normal(size=8), np.triu(rng.normal(size=(8, 8)))
+    explained, unknown = rows.regression.squares(
+        torch.tensor(features), Weights(torch.tensor(mean), torch.tensor(root))
+    )
+    for t in range(3):
+        spread = np.kron(np.eye(2), features[t])  # coefficients from weights
+        residual = rows.last[t] - rows.before[t] @ (spread @ mean)
+        assert float(explained[t]) == pytest.approx(residual @ residual, rel=RTOL)
+        covariance = spread @ root @ root.T @ spread.T
+        trace = sum(row @ covariance @ row for row in rows.before[t])
+        assert float(unknown[t]) == pytest.approx(trace, rel=RTOL)
+
+
+@pytest.mark.parametrize(("i", "k"), [(1, 5), (2, 8), (8, 20)])
+def test_local_squares_are_the_residual_sum_of_squares(i, k, rng):
+    rows = Rows(rng, i=i, k=k)
+    expected = [np.sum((y - z @ np.linalg.lstsq(z, y)[0]) ** 2) for z, y in zip(rows.before, rows.last, strict=True)]
+    np.testing.assert_allclose(rows.regression.local_squares(), expected, rtol=RTOL)
+
+
+@pytest.mark.parametrize(("i", "k"), [(2, 2), (4, 2), (8, 1)])
+def test_fewer_rows_than_outputs_leave_no_squares_and_do_not_fail(i, k, rng):
+    rows = Rows(rng, i=i, k=k)
+    size = (rows.last**2).sum(1)
+    local = rows.regression.local_squares().numpy()
+    assert (local >= 0.0).all()
+    assert (local < 1e-4 * size).all()
+    features = torch.ones(3, 1, dtype=torch.float64)
+    precision = torch.ones(3, dtype=torch.float64)
+    weights = rows.regression.fit(features, precision)
+    # A ridge regression: what the rows do not tell stays at the prior.
+    gram = sum(z.T @ z for z in rows.before) + np.eye(i)
+    cross = sum(z.T @ y for z, y in zip(rows.before, rows.last, strict=True))
+    np.testing.assert_allclose(weights.mean, np.linalg.solve(gram, cross), rtol=1e-5, atol=1e-5)
