@@ -99,7 +99,8 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
     module_ : ConditionalNormal
         The fitted torch module: maps x (n, e) to mean (n, d) and Cholesky factor (n, d, d), differentiably.
     effective_share_ : float
-        Independent samples that a sample of a demonstration counts for; 1.0 without ``groups``.
+        Independent samples that a sample of a demonstration counts for, mean over the outputs; 1.0 without
+        ``groups``.
     n_features_in_, n_outputs_ : int
     loss_ : float
         Negative log evidence of the covariance's processes at the end, in nats, but for a constant.
@@ -285,7 +286,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
             if fit.resolved:
                 break
         _warn_if_unresolved(held, features)
-        self.effective_share_ = fit.correlation.effective_share
+        self.effective_share_ = 1.0 if fit.correlation is None else float(fit.correlation.share.mean())
         module = HeteroscedasticModel(fit, prior_tril)
         return Fitted(self._assemble(module, scaling), _report(fit, options), features.jitter)
 

@@ -25,60 +25,73 @@ class DemonstrationCorrelation:
     its spectrum falls slowly, and so keeps a model from taking what is smoother than noise for signal.
     """
 
-    decay: float
+    decay: Float[Tensor, " d"]
     """Distance over which the correlation of squared residuals falls by e, of standardized inputs; 0 if none does."""
-    effective_share: float
-    """Independent samples that a sample counts for."""
+    share: Float[Tensor, " d"]
+    """Independent samples that a sample of each output counts for."""
 
-    def matrix(self, inputs: Float[Tensor, "n e"], occurrences: Float[Tensor, "g n"], *, squares: bool) -> Tensor:
+    @property
+    def matters(self) -> bool:
+        """Whether samples of any output are correlated."""
+        return bool((self.decay > 0).any())
+
+    def matrix(
+        self, inputs: Float[Tensor, "n e"], occurrences: Float[Tensor, "g n"], *, squares: bool
+    ) -> Float[Tensor, "d n n"]:
         """Covariance of the means (or mean squares) at n inputs, were they of independent rows of unit variance.
 
         ``occurrences`` are the rows of each of g demonstrations at each input: those of one demonstration at one
         input are copies, so a diagonal entry is the number of rows that count for one.
         """
         distance = torch.cdist(inputs, inputs, compute_mode="donot_use_mm_for_euclid_dist")
-        correlation = torch.exp(-distance / (self.decay if squares else 2.0 * self.decay))
+        decay = self.decay[:, None, None].clamp_min(1e-300)
+        correlation = torch.exp(-distance / (decay if squares else 2.0 * decay))
         counts = occurrences.sum(0)
-        return correlation * (occurrences.mT @ occurrences) / (counts[:, None] * counts).sqrt()
+        shared = occurrences.mT @ occurrences / (counts[:, None] * counts).sqrt()
+        return torch.where(self.decay[:, None, None] > 0, correlation * shared, torch.eye(len(inputs)).to(inputs))
 
 
 @dataclass(frozen=True)
 class NoiseCorrelation:
-    """What makes means and mean squares at n inputs independent; None where they are."""
+    """What makes means and mean squares of each output at n inputs independent; None where all are."""
 
-    of_means: Float[Tensor, "n n"] | None = None
-    of_squares: Float[Tensor, "n n"] | None = None
-    copies: Float[Tensor, " n"] | None = None
+    of_means: Float[Tensor, "d n n"] | None = None
+    of_squares: Float[Tensor, "d n n"] | None = None
+    copies: Float[Tensor, "d n"] | None = None
     """Rows at each input that count for one."""
 
     @classmethod
     def of(
         cls,
-        correlation: DemonstrationCorrelation,
+        correlation: DemonstrationCorrelation | None,
         inputs: Float[Tensor, "n e"],
         index: Int64[Tensor, " rows"],
         group: Int64[Tensor, " rows"] | None,
     ) -> "NoiseCorrelation":
         """Of rows of demonstrations ``group``, at ``inputs[index]``."""
-        if group is None or correlation.decay == 0.0:
+        if group is None or correlation is None or not correlation.matters:
             return cls()
         occurrences = _occurrences(index, group, len(inputs)).to(inputs)
         of_means, of_squares = (correlation.matrix(inputs, occurrences, squares=squares) for squares in (False, True))
-        return cls(_whitener(of_means), _whitener(of_squares), of_squares.diagonal())
+        return cls(_whitener(of_means), _whitener(of_squares), of_squares.diagonal(dim1=1, dim2=2))
+
+    def rows(self, index: Tensor) -> "NoiseCorrelation":
+        """Those of some of the outputs."""
+        return NoiseCorrelation(*(None if part is None else part[index] for part in self._parts()))
+
+    def _parts(self) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
+        return self.of_means, self.of_squares, self.copies
 
 
 def _whitener(matrix: Tensor) -> Tensor:
     factor = safe_cholesky(matrix, name="the correlation of the demonstrations")
-    return torch.linalg.solve_triangular(factor, torch.eye(len(factor)).to(factor), upper=False)
+    return torch.linalg.solve_triangular(factor, torch.eye(factor.shape[-1]).to(factor).expand_as(factor), upper=False)
 
 
 def _occurrences(index: Tensor, group: Tensor, n_inputs: int) -> Tensor:
     """Rows of each demonstration at each distinct input."""
     names, number = group.unique(return_inverse=True)
     return torch.bincount(number * n_inputs + index, minlength=len(names) * n_inputs).reshape(len(names), n_inputs)
-
-
-INDEPENDENT = DemonstrationCorrelation(0.0, 1.0)
 
 
 def demonstration_correlation(
@@ -101,17 +114,18 @@ def demonstration_correlation(
         chosen = along[:: math.ceil(len(along) / _MAX_SAMPLES)]
         tables.append(_products_by_distance(x[chosen], scaled[chosen], limit))
         n_chosen += len(chosen)
+    independent = torch.ones_like(whitened[0])
     if len(tables) < 2:
-        return INDEPENDENT
+        return DemonstrationCorrelation(0.0 * independent, independent)
     products, pairs = (torch.stack(part) for part in zip(*tables, strict=True))
     total = pairs.sum(0)
-    sum_of_squares = float((_squared_autocorrelation(products, pairs) * total).sum())
+    sum_of_squares = (_squared_autocorrelation(products, pairs) * total[:, None]).sum(0)
     # Of n samples all pairs but those of a sample with itself; were some left out, there are as many more of each.
     share = 1.0 / (1.0 + 2.0 * sum_of_squares / n_chosen * len(x) / n_chosen)
-    if share > _INDEPENDENT:
-        return INDEPENDENT
     centre = (torch.arange(_N_BINS).to(x) + 0.5) * limit / _N_BINS
-    return DemonstrationCorrelation(_decay_of(sum_of_squares, centre, total), share)
+    decay = x.new_tensor([_decay_of(float(target), centre, total) for target in sum_of_squares])
+    correlated = share <= _INDEPENDENT
+    return DemonstrationCorrelation(torch.where(correlated, decay, 0.0), torch.where(correlated, share, 1.0))
 
 
 def _products_by_distance(x: Tensor, values: Tensor, limit: float) -> tuple[Tensor, Tensor]:
@@ -125,12 +139,12 @@ def _products_by_distance(x: Tensor, values: Tensor, limit: float) -> tuple[Tens
     return products, torch.bincount(number, minlength=_N_BINS).to(x)
 
 
-def _squared_autocorrelation(products: Float[Tensor, "g k d"], pairs: Float[Tensor, "g k"]) -> Float[Tensor, " k"]:
-    """Its mean over the outputs in each bin of distance; zero from where it first is not positive."""
+def _squared_autocorrelation(products: Float[Tensor, "g k d"], pairs: Float[Tensor, "g k"]) -> Float[Tensor, "k d"]:
+    """In each bin of distance, of each output; zero from where it first is not positive."""
     own = products / pairs.clamp_min(1.0).unsqueeze(-1)
-    present = (pairs > 0).sum(0).to(products)
+    present = (pairs > 0).sum(0).to(products)[:, None]
     cross = own.sum(0).square() - own.square().sum(0)
-    square = (cross / (present * (present - 1.0)).clamp_min(1.0).unsqueeze(-1)).mean(1).clamp(max=1.0)
+    square = (cross / (present * (present - 1.0)).clamp_min(1.0)).clamp(max=1.0)
     ended = ((present > 1) & (square <= 0)).cumsum(0) > 0
     return torch.where((present > 1) & ~ended, square, 0.0)
 

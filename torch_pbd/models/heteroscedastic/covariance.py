@@ -66,7 +66,7 @@ def fit_covariance(
         tril = torch.exp(0.5 * mean[0])[:, None, None]
         regressions, thetas, coefficients, total = [], [], [], float(evidence.sum())
         for i in range(1, n_outputs):
-            known = Regression.of(scatter[:, : i + 1, : i + 1], tril, noise.of_squares)
+            known = Regression.of(scatter[:, : i + 1, : i + 1], tril, _of_output(noise.of_squares, i))
             own = None if fit is None else fit.coefficient_theta[i - 1 : i]
             if own is None or sweep < _SEARCHES:
                 own = _search_coefficients(coefficient_family, known, precision[i], inputs, own, options)
@@ -121,8 +121,8 @@ def _squares(
             features = fit.coefficient_family.design(inputs, fit.coefficient_theta[i - 1 : i])[0]
             total = sum(known.squares(features, fit.coefficients[i - 1]), torch.zeros_like(total))
             if noise.copies is not None:
-                local = degrees[i] - i * noise.copies
-                enough = local >= _ENOUGH_DEGREES * noise.copies
+                local = degrees[i] - i * noise.copies[i]
+                enough = local >= _ENOUGH_DEGREES * noise.copies[i]
                 total, left = torch.where(enough, known.local_squares(), total), torch.where(enough, local, left)
         totals.append(total)
         kept.append(left)
@@ -131,7 +131,7 @@ def _squares(
 
 def _regressions(scatter: Tensor, tril: Tensor, noise: NoiseCorrelation) -> list[Regression]:
     return [
-        Regression.of(scatter[:, : i + 1, : i + 1], tril[:, :i, :i], noise.of_squares)
+        Regression.of(scatter[:, : i + 1, : i + 1], tril[:, :i, :i], _of_output(noise.of_squares, i))
         for i in range(1, scatter.shape[1])
     ]
 
@@ -140,3 +140,7 @@ def _with_row(tril: Tensor, row: Tensor, diagonal: Tensor) -> Tensor:
     above = torch.nn.functional.pad(tril, (0, 1))
     below = torch.cat([row, diagonal[:, None]], dim=1)
     return torch.cat([above, below.unsqueeze(1)], dim=1)
+
+
+def _of_output(whiteners: Tensor | None, output: int) -> Tensor | None:
+    return None if whiteners is None else whiteners[output]

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from torch_pbd.linalg import scale_tril_from_root
 from torch_pbd.models.heteroscedastic.correlation import (
-    INDEPENDENT,
     DemonstrationCorrelation,
     NoiseCorrelation,
     demonstration_correlation,
@@ -46,7 +45,7 @@ class HeteroscedasticFit:
     covariance: LatentCovariance
     """Of residuals multiplied by the inverse of ``pooled_tril``."""
     pooled_tril: Float[Tensor, "d d"]
-    correlation: DemonstrationCorrelation
+    correlation: DemonstrationCorrelation | None
     log_evidence: tuple[float, ...]
     """Of the covariance, at the end of each turn, in nats."""
 
@@ -76,7 +75,8 @@ def fit_heteroscedastic(
     """
     mean: LatentMean | None = None
     covariance: LatentCovariance | None = None
-    correlation, evidences = INDEPENDENT, []
+    correlation: DemonstrationCorrelation | None = None
+    evidences: list[float] = []
     pooled = _start_tril(training)
     started = time.perf_counter()
     for turn in range(n_turns):
@@ -91,7 +91,7 @@ def fit_heteroscedastic(
         normal, scatter, degrees = _scatter(training, residual, share, pooled)
         part = 1.0 if turn else _first_part(training, group)
         # What the first turn took for independent is no place to start from where it is not.
-        start = None if correlation.decay > 0 and turn == 1 else covariance
+        start = None if turn == 1 and correlation is not None and correlation.matters else covariance
         both = (families.log_variance, families.coefficients)
         covariance, evidence = fit_covariance(
             both, training.inputs, part * scatter, part * degrees, noise, start, options
@@ -102,7 +102,7 @@ def fit_heteroscedastic(
             tril = covariance.at(training.inputs).tril()[training.index]
             independent = torch.linalg.solve_triangular(tril, normal.unsqueeze(2), upper=False).squeeze(2)
             correlation = demonstration_correlation(training.x, independent, group)
-            if correlation.decay > 0:
+            if correlation.matters:
                 training = training.merged(_n_inputs(training, group))
     assert mean is not None
     assert covariance is not None

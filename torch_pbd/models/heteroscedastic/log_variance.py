@@ -26,7 +26,7 @@ class Squares:
 
     def rows(self, index: Tensor) -> "Squares":
         """Those of some of the outputs."""
-        return replace(self, total=self.total[index], degrees=self.degrees[index])
+        return replace(self, total=self.total[index], degrees=self.degrees[index], noise=self.noise.rows(index))
 
     def log_mean(self) -> Float[Tensor, "b n"]:
         """Logarithm of the mean square."""

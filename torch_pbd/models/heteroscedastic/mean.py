@@ -43,7 +43,7 @@ def fit_mean(
     means: Float[Tensor, "n d"],
     counts: Float[Tensor, " n"],
     noise_tril: Float[Tensor, "n d d"],
-    whitener: Float[Tensor, "n n"] | None,
+    whitener: Float[Tensor, "d n n"] | None,
     start: Float[Tensor, "d q"] | None,
     options: SearchOptions,
 ) -> LatentMean:
@@ -56,7 +56,8 @@ def fit_mean(
     response = _whiten(whitener, (scale * means.mT).unsqueeze(-1)).squeeze(-1)
 
     def evidence(theta: Tensor, rows: Int64[Tensor, " a"]) -> Tensor:
-        design = _whiten(whitener, scale[rows].unsqueeze(-1) * family.design(inputs, theta))
+        chosen = None if whitener is None else whitener[rows]
+        design = _whiten(chosen, scale[rows].unsqueeze(-1) * family.design(inputs, theta))
         return log_evidence(design, response[rows])
 
     theta = search(family, evidence, start, (means.shape[1], inputs.shape[1]), means, options)
@@ -67,8 +68,8 @@ def fit_mean(
     design = torch.einsum("nij,jnp->nijp", whitening, features).flatten(2)
     response = (whitening @ means.unsqueeze(-1)).squeeze(-1)
     if whitener is not None:
-        design = torch.einsum("mn,niq->miq", whitener, design)
-        response = whitener @ response
+        design = torch.einsum("imn,niq->miq", whitener, design)
+        response = torch.einsum("imn,ni->mi", whitener, response)
     return LatentMean(family, theta, weights_posterior(design.flatten(0, 1), response.flatten()))
 
 
