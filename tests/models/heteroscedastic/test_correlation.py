@@ -3,11 +3,15 @@ import pytest
 import torch
 
 from torch_pbd.models.heteroscedastic.correlation import (
-    INDEPENDENT,
     DemonstrationCorrelation,
     NoiseCorrelation,
     demonstration_correlation,
 )
+
+
+def known(*decays):
+    decay = torch.tensor(decays, dtype=torch.float64)
+    return DemonstrationCorrelation(decay, torch.where(decay > 0, 0.1, 1.0).double())
 
 
 def curves(decay, seed, *, n_demos=20, n_steps=100, d=2):
@@ -27,10 +31,10 @@ def curves(decay, seed, *, n_demos=20, n_steps=100, d=2):
 def test_the_decay_of_curves_of_known_correlation_is_found(decay):
     """The median of 20 seeds within a fifth; the share is that of the sum of its squares over all pairs."""
     found = [demonstration_correlation(*curves(decay, seed)) for seed in range(20)]
-    assert np.median([each.decay for each in found]) == pytest.approx(decay, rel=0.2)
+    assert np.median([each.decay.numpy() for each in found]) == pytest.approx(decay, rel=0.2)
     x = np.linspace(-0.5, 0.5, 100)
     total = np.triu(np.exp(-np.abs(np.subtract.outer(x, x)) / decay), 1).sum()
-    share = np.median([each.effective_share for each in found])
+    share = np.median([each.share.numpy() for each in found])
     assert share == pytest.approx(1.0 / (1.0 + 2.0 * total / 100.0), rel=0.2)
 
 
@@ -38,11 +42,24 @@ def test_the_decay_of_curves_of_known_correlation_is_found(decay):
 def test_independent_draws_are_taken_for_independent_exactly(n_demos, n_steps, d):
     for seed in range(20):
         rows = curves(0.0, seed, n_demos=n_demos, n_steps=n_steps, d=d)
-        assert demonstration_correlation(*rows) == DemonstrationCorrelation(0.0, 1.0)
+        found = demonstration_correlation(*rows)
+        assert not found.matters
+        assert found.share.tolist() == [1.0] * d
 
 
 def test_of_one_demonstration_nothing_is_learned():
-    assert demonstration_correlation(*curves(0.1, 0, n_demos=1)) == INDEPENDENT
+    found = demonstration_correlation(*curves(0.1, 0, n_demos=1))
+    assert (found.decay.tolist(), found.share.tolist()) == ([0.0, 0.0], [1.0, 1.0])
+
+
+def test_each_output_has_its_own():
+    """A smooth output beside one of independent samples: neither changes what is found of the other."""
+    x, smooth, group = curves(0.1, 0)
+    _, rough, _ = curves(0.0, 1)
+    found = demonstration_correlation(x, torch.stack([smooth[:, 0], rough[:, 0]], dim=1), group)
+    alone = demonstration_correlation(x, smooth[:, :1], group)
+    assert found.decay[0] == pytest.approx(float(alone.decay[0]), rel=1e-9)
+    assert (float(found.decay[1]), float(found.share[1])) == (0.0, 1.0)
 
 
 def test_neither_order_nor_names_nor_units_matter():
@@ -54,8 +71,8 @@ def test_neither_order_nor_names_nor_units_matter():
         demonstration_correlation(x, values, (7 * group + 3) % 20),
         demonstration_correlation(x, values * torch.tensor([1e-6, 1e3]).double(), group),
     ):
-        assert found.decay == pytest.approx(expected.decay, rel=1e-9)
-        assert found.effective_share == pytest.approx(expected.effective_share, rel=1e-9)
+        torch.testing.assert_close(found.decay, expected.decay, rtol=1e-9, atol=0)
+        torch.testing.assert_close(found.share, expected.share, rtol=1e-9, atol=0)
 
 
 def test_of_long_demonstrations_every_third_sample_tells_the_same():
@@ -65,8 +82,8 @@ def test_of_long_demonstrations_every_third_sample_tells_the_same():
     kept = (torch.arange(1000) % 3 == 0).repeat(6)
     part = demonstration_correlation(x[kept], values[kept], group[kept])
     # The variance that residuals are divided by is of all samples here, and there of a third.
-    assert whole.decay == pytest.approx(part.decay, rel=1e-2)
-    assert 1.0 / whole.effective_share - 1.0 == pytest.approx((1.0 / part.effective_share - 1.0) * 1000 / 334, rel=1e-2)
+    torch.testing.assert_close(whole.decay, part.decay, rtol=1e-2, atol=0)
+    torch.testing.assert_close(1.0 / whole.share - 1.0, (1.0 / part.share - 1.0) * 1000 / 334, rtol=1e-2, atol=0)
 
 
 def test_the_whiteners_take_out_the_correlation_of_means_of_rows(rng):
@@ -77,20 +94,22 @@ def test_the_whiteners_take_out_the_correlation_of_means_of_rows(rng):
     index = np.concatenate([np.arange(6), rng.integers(6, size=20)])
     group = np.concatenate([np.arange(6) % 4, rng.integers(4, size=20)])
     arguments = (torch.tensor(x)[:, None], torch.tensor(index), torch.tensor(group))
-    noise = NoiseCorrelation.of(DemonstrationCorrelation(0.2, 0.1), *arguments)
+    noise = NoiseCorrelation.of(known(0.2, 0.0), *arguments)
     average = (np.arange(6)[:, np.newaxis] == index) / np.sqrt(np.bincount(index))[:, np.newaxis]
     distance = np.abs(np.subtract.outer(x[index], x[index]))
     for whitener, decay in ((noise.of_means, 0.4), (noise.of_squares, 0.2)):
         rows = np.exp(-distance / decay) * (group[:, np.newaxis] == group)
         covariance = average @ rows @ average.T
-        whitened = whitener.numpy() @ covariance @ whitener.numpy().T
+        whitened = whitener[0].numpy() @ covariance @ whitener[0].numpy().T
         np.testing.assert_allclose(whitened, np.eye(6), rtol=0, atol=1e-10)
-        np.testing.assert_allclose(noise.copies, np.diag(covariance), rtol=1e-12)
-    assert noise.copies.max() > 1.0  # some demonstration repeats an input
+        np.testing.assert_allclose(noise.copies[0], np.diag(covariance), rtol=1e-12)
+        np.testing.assert_array_equal(whitener[1], np.eye(6))  # of the output whose samples are independent
+    assert noise.copies[0].max() > 1.0  # some demonstration repeats an input
+    assert torch.equal(noise.rows(torch.tensor([1])).of_squares, noise.of_squares[1:])
 
 
-@pytest.mark.parametrize("correlation", [INDEPENDENT, DemonstrationCorrelation(0.2, 0.1)])
+@pytest.mark.parametrize("correlation", [None, known(0.0, 0.0), known(0.2, 0.0)])
 def test_without_correlation_or_groups_there_is_nothing_to_take_out(correlation):
-    group = None if correlation.decay else torch.tensor([0, 0, 1])
+    group = None if correlation is not None and correlation.matters else torch.tensor([0, 0, 1])
     noise = NoiseCorrelation.of(correlation, torch.zeros(3, 1).double(), torch.arange(3), group)
     assert noise == NoiseCorrelation(None, None, None)

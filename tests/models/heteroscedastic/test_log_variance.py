@@ -158,7 +158,9 @@ def test_correlated_squares_are_a_gaussian_process_regression_of_their_logarithm
     correlation = np.exp(-np.abs((inputs - inputs.T).numpy()) / 0.2)
     matrix = np.sqrt(copies)[:, np.newaxis] * correlation * np.sqrt(copies)
     whitener = np.linalg.inv(np.linalg.cholesky(matrix))
-    squares = squares_at(9, rng, noise=NoiseCorrelation(None, torch.tensor(whitener), torch.tensor(copies)))
+    squares = squares_at(
+        9, rng, noise=NoiseCorrelation(None, *(torch.tensor(np.stack([part, part])) for part in (whitener, copies)))
+    )
     features = family.design(inputs, torch.tensor([[-1.0, 0.5], [0.3, -0.5]], dtype=torch.float64))
     weights, evidence = fit_log_variance(squares, features)
     for i in range(2):
@@ -180,7 +182,7 @@ def test_correlated_squares_are_a_gaussian_process_regression_of_their_logarithm
 @pytest.mark.parametrize("degrees", [1.0, 2.5, 9.0])
 def test_correlated_squares_have_no_bias(degrees, rng):
     """A logarithm of a chi-squared number over its degrees is below zero in the mean."""
-    noise = NoiseCorrelation(None, torch.eye(4, dtype=torch.float64), torch.ones(4, dtype=torch.float64))
+    noise = NoiseCorrelation(None, torch.eye(4).double()[None], torch.ones(1, 4).double())
     squares = squares_at(4, rng, degrees, 20_000, noise)
     truth = np.sin(np.linspace(0.0, 4.0, 4))
     weights, _ = fit_log_variance(squares, 1e3 * torch.eye(4, dtype=torch.float64).expand(20_000, 4, 4))

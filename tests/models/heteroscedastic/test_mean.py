@@ -25,7 +25,7 @@ def test_the_mean_is_a_dense_regression_of_all_outputs_under_their_noise(d, whit
     tril = np.tril(rng.normal(size=(n, d, d)), -1) + np.eye(d) * rng.uniform(0.2, 1.5, size=(n, 1, d))
     counts = rng.integers(1, 6, size=n).astype(float)
     along = np.exp(-np.abs((inputs - inputs.T).numpy()) / 0.2) if whitened else np.eye(n)
-    whitener = torch.tensor(np.linalg.inv(np.linalg.cholesky(along))) if whitened else None
+    whitener = torch.tensor(np.linalg.inv(np.linalg.cholesky(along))).expand(d, n, n) if whitened else None
     roots = block_diag(*(tril / np.sqrt(counts)[:, np.newaxis, np.newaxis]))
     noise = roots @ np.kron(along, np.eye(d)) @ roots.T
     means = np.sin(3.0 * inputs.numpy() + np.arange(d)) + 0.3 * rng.normal(size=(n, d))
