@@ -23,7 +23,6 @@ VARIANTS = {
     "wishart-likelihood": WishartProcessRegressor(objective="likelihood"),
     "wishart-eq11": WishartProcessRegressor(**PAPER, max_iter=50),
     "heteroscedastic": HeteroscedasticGPRegressor(),
-    "heteroscedastic-matern": HeteroscedasticGPRegressor(kernel="matern52", shared_length_scale=True),
     "mixture": GMMBaseline(n_components=3),
     "mixture-lbfgs": GMMBaseline(n_components=3, solver="lbfgs"),
 }

@@ -3,8 +3,7 @@
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -17,12 +16,13 @@ from sklearn.utils._tags import Tags
 from sklearn.utils.validation import check_is_fitted, validate_data
 from torch import Tensor
 
+from torch_pbd.estimators._demonstrations import check_groups
 from torch_pbd.estimators._progress import printed_progress
+from torch_pbd.estimators._results import Fitted, Uncertainty
 from torch_pbd.estimators._scaling import Standardization
 from torch_pbd.estimators._validation import (
     Floats,
     as_plain_array,
-    check_groups,
     check_inputs_vary,
     check_number,
     check_squares,
@@ -31,27 +31,9 @@ from torch_pbd.estimators._validation import (
 from torch_pbd.linalg import gaussian_log_density, safe_cholesky, student_log_density
 from torch_pbd.models.conditional import ConditionalNormal
 from torch_pbd.models.spec import module_from_spec, module_spec
-from torch_pbd.optim import FitReport, Progress
+from torch_pbd.optim import Progress
 
 _CHUNK = 1024  # rows predicted at a time: memory stays bounded however many are asked for
-
-
-class Uncertainty(NamedTuple):
-    """The two kinds of uncertainty of Section IV-C, at n inputs."""
-
-    type1: Floats
-    """(n,): missing data. 0 at training inputs, 1 where only the prior speaks."""
-    type2: Floats
-    """(n, d, d): variability of the data, with the prior taken out; squared units of y."""
-
-
-@dataclass(frozen=True)
-class Fitted:
-    """What a subclass returns from its fit."""
-
-    module: ConditionalNormal
-    report: FitReport
-    jitter: float
 
 
 class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):

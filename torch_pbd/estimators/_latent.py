@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_pbd.estimators._base import CovarianceRegressor, Fitted
+from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.estimators._results import Fitted
 from torch_pbd.estimators._scaling import Standardization, distinct_rows
 from torch_pbd.estimators._validation import (
     Floats,

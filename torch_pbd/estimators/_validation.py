@@ -127,36 +127,6 @@ def check_inputs_vary(X: Floats) -> None:
         )
 
 
-def check_groups(groups: Any, n_samples: int) -> NDArray[np.intp]:
-    """Number of each row's demonstration, from labels of any kind.
-
-    Raises
-    ------
-    ValueError
-        If there is not one label a row, or one is missing.
-    """
-    labels = np.asarray(groups)
-    if labels.shape != (n_samples,):
-        raise ValueError(
-            f"groups has shape {labels.shape}, must have shape ({n_samples},): the demonstration of each row of X."
-        )
-    if labels.dtype.kind == "f" and not np.isfinite(labels).all():
-        raise ValueError(f"groups has a label that is not finite, at index {int(np.argmin(np.isfinite(labels)))}.")
-    if labels.dtype.kind == "O":
-        _check_labels(labels)
-    return np.unique(labels, return_inverse=True)[1].reshape(-1)
-
-
-def _check_labels(labels: NDArray[Any]) -> None:
-    for i, label in enumerate(labels):
-        if label is None or label != label:
-            raise ValueError(f"groups has no label at index {i}: say of every row which demonstration it is of.")
-    kinds = {type(label) for label in labels}
-    if len(kinds) > 1:
-        names = ", ".join(sorted(kind.__name__ for kind in kinds))
-        raise ValueError(f"groups has labels of several types ({names}): use one, so that 1 and '1' are not mixed up.")
-
-
 def check_number(
     value: Any, name: str, *, low: float, strict: bool = False, integer: bool = False, optional: bool = False
 ) -> None:

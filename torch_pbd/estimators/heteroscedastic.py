@@ -8,9 +8,10 @@ import torch
 from numpy.typing import ArrayLike
 from sklearn.utils import check_random_state
 
-from torch_pbd.data import Demonstrations, check_unimodal
-from torch_pbd.estimators._base import CovarianceRegressor, Fitted
+from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.estimators._demonstrations import check_demonstrations
 from torch_pbd.estimators._latent import default_prior_tril, warn_if_few, warn_if_identical
+from torch_pbd.estimators._results import Fitted
 from torch_pbd.estimators._scaling import Standardization, distinct_rows
 from torch_pbd.estimators._validation import (
     Floats,
@@ -21,7 +22,6 @@ from torch_pbd.estimators._validation import (
     check_period,
     prior_covariance,
 )
-from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.gp.inducing import FeatureMap, inducing_inputs
 from torch_pbd.kernels import KERNELS, KernelName
 from torch_pbd.linalg import safe_cholesky
@@ -35,8 +35,6 @@ from torch_pbd.models.heteroscedastic import (
 )
 from torch_pbd.models.training import TrainingSet
 from torch_pbd.optim import FitReport
-
-_COVERED = 0.5  # of the range of the input, by a demonstration that is compared with others
 
 # Prior medians of length scale (in ranges of the input) and amplitude, and prior deviation of the constant. Means
 # are of outputs with unit variance, log variances and coefficients of residuals with a pooled unit covariance.
@@ -258,7 +256,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         period = check_period(self.period, self.kernel, X.shape[1])
         groups = told.get("groups")
         if groups is not None:
-            _check_demonstrations(X, y, groups)
+            check_demonstrations(X, y, groups)
         scaling = Standardization.of(X, y)
         standardized = scaling.inputs(X)
         inputs, index = distinct_rows(standardized)
@@ -311,30 +309,6 @@ def _report(fit: HeteroscedasticFit, options: SearchOptions) -> FitReport:
     converged = all(report.converged for report in options.reports)
     message = "converged" if converged else f"stopped at max_iter={options.max_iter} iterations of a search"
     return FitReport(losses[-1], losses, max(report.n_iter for report in options.reports), converged, message)
-
-
-def _check_demonstrations(X: Floats, y: Floats, groups: Any) -> None:
-    """Warn where demonstrations are too few to tell their correlation, or seem to follow several ways.
-
-    The ways are looked for along one input, among demonstrations that cover most of it.
-    """
-    counts = np.bincount(groups)
-    if len(counts) < 2:
-        warnings.warn(
-            "groups has one demonstration: how far its samples repeat each other cannot be told from it, and they "
-            "count as independent. What is predicted is its noise, not how demonstrations differ.",
-            DataRankWarning,
-            stacklevel=5,
-        )
-    if X.shape[1] > 1 or len(counts) < 2 or counts.min() < 2:
-        return
-    times, positions = [], []
-    for rows in np.split(np.argsort(groups, kind="stable"), np.cumsum(counts)[:-1]):
-        time, first = np.unique(X[rows, 0], return_index=True)
-        times.append(time)
-        positions.append(y[rows][first])
-    if min(len(time) for time in times) > 1 and min(np.ptp(time) for time in times) > _COVERED * np.ptp(X):
-        check_unimodal(Demonstrations(times, positions))
 
 
 def _warn_if_unresolved(length_scale: torch.Tensor | None, features: FeatureMap) -> None:

@@ -10,7 +10,8 @@ from sklearn.cluster import KMeans
 from sklearn.neighbors import NearestNeighbors
 from sklearn.utils import check_random_state
 
-from torch_pbd.estimators._base import CovarianceRegressor, Fitted
+from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.estimators._results import Fitted
 from torch_pbd.estimators._scaling import Standardization, distinct_rows
 from torch_pbd.estimators._validation import Floats, check_choice, check_number
 from torch_pbd.exceptions import DataRankWarning

@@ -1,0 +1,67 @@
+"""Which rows are of one demonstration: their labels, and what is amiss with the demonstrations."""
+
+import warnings
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torch_pbd.data import Demonstrations, check_unimodal
+from torch_pbd.estimators._validation import Floats
+from torch_pbd.exceptions import DataRankWarning
+
+_COVERED = 0.5  # of the range of the input, by a demonstration that is compared with others
+
+
+def check_groups(groups: Any, n_samples: int) -> NDArray[np.intp]:
+    """Number of each row's demonstration, from labels of any kind.
+
+    Raises
+    ------
+    ValueError
+        If there is not one label a row, or one is missing.
+    """
+    labels = np.asarray(groups)
+    if labels.shape != (n_samples,):
+        raise ValueError(
+            f"groups has shape {labels.shape}, must have shape ({n_samples},): the demonstration of each row of X."
+        )
+    if labels.dtype.kind == "f" and not np.isfinite(labels).all():
+        raise ValueError(f"groups has a label that is not finite, at index {int(np.argmin(np.isfinite(labels)))}.")
+    if labels.dtype.kind == "O":
+        _check_labels(labels)
+    return np.unique(labels, return_inverse=True)[1].reshape(-1)
+
+
+def _check_labels(labels: NDArray[Any]) -> None:
+    for i, label in enumerate(labels):
+        if label is None or label != label:
+            raise ValueError(f"groups has no label at index {i}: say of every row which demonstration it is of.")
+    kinds = {type(label) for label in labels}
+    if len(kinds) > 1:
+        names = ", ".join(sorted(kind.__name__ for kind in kinds))
+        raise ValueError(f"groups has labels of several types ({names}): use one, so that 1 and '1' are not mixed up.")
+
+
+def check_demonstrations(X: Floats, y: Floats, groups: Any) -> None:
+    """Warn where demonstrations are too few to tell their correlation, or seem to follow several ways.
+
+    The ways are looked for along one input, among demonstrations that cover most of it.
+    """
+    counts = np.bincount(groups)
+    if len(counts) < 2:
+        warnings.warn(
+            "groups has one demonstration: how far its samples repeat each other cannot be told from it, and they "
+            "count as independent. What is predicted is its noise, not how demonstrations differ.",
+            DataRankWarning,
+            stacklevel=5,
+        )
+    if X.shape[1] > 1 or len(counts) < 2 or counts.min() < 2:
+        return
+    times, positions = [], []
+    for rows in np.split(np.argsort(groups, kind="stable"), np.cumsum(counts)[:-1]):
+        time, first = np.unique(X[rows, 0], return_index=True)
+        times.append(time)
+        positions.append(y[rows][first])
+    if min(len(time) for time in times) > 1 and min(np.ptp(time) for time in times) > _COVERED * np.ptp(X):
+        check_unimodal(Demonstrations(times, positions))
