@@ -28,7 +28,7 @@ Job = tuple[Callable[..., Row], tuple[Any, ...]]
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 N_DRAWS = 20_000
-PEN_SIZES, PEN_SPLITS = (6, 10, 20), 4
+PEN_SIZES, PEN_SPLITS = (6, 10, 20), 12
 
 MADE = ("task", "seed", "method", "kl_cov", "kl_all", "gap", "holds_90", "outside_low", "outside_high")
 RECORDED = ("set", "fold", "method", "log_likelihood", "holds_90", "holds_95")
@@ -189,6 +189,20 @@ def run_pen(recording: Recording, methods: list[str], folder: Path, n_jobs: int)
     return run([(score_pen, (recording, *cell)) for cell in cells], keys, PEN, folder / "pen.csv", n_jobs)
 
 
+def read(folders: list[Path], name: str, n_keys: int) -> list[Row]:
+    """Rows of CSV files that runs have written; one of a later folder replaces that of an earlier."""
+    found: dict[tuple[str, ...], Row] = {}
+    for path in (folder / name for folder in folders):
+        if not path.is_file():
+            continue
+        with path.open(newline="", encoding="utf-8") as file:
+            for row in csv.DictReader(file):
+                texts = {*tuple(row)[:n_keys], "note"}
+                numbers = {key: float(value) for key, value in row.items() if key not in texts and value}
+                found[tuple(row.values())[:n_keys]] = {key: row[key] for key in row if key in texts} | numbers
+    return list(found.values())
+
+
 def recordings_of(folder: Path, sets: list[str] | None) -> list[Recording]:
     """Recordings of a folder; none, and a line that says so, where there is no such folder."""
     if sets == []:
@@ -208,6 +222,9 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--max-folds", type=int, default=15, help="demonstrations left out, a set (default: 15)")
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the recordings (default: %(default)s)")
     parser.add_argument("--jobs", type=int, default=1, help="fits at the same time, each on one thread (default: 1)")
+    parser.add_argument(
+        "--table-of", type=Path, nargs="+", help="run nothing: the table of what runs have written into these folders"
+    )
     parser.add_argument("--out", type=Path, default=Path("covariance_benchmark"), help="folder of what is written")
     return parser.parse_args(arguments)
 
@@ -215,14 +232,23 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
 def main(arguments: list[str] | None = None) -> None:
     options = parse(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
+    if options.table_of:
+        parts = [read(options.table_of, f"{name}.csv", 3) for name in ("made", "recorded", "pen")]
+        write_table(options.out, *parts)
+        return
     methods = available(options.methods)
     recordings = recordings_of(options.data, options.sets)
     made = run_made(options.tasks, methods, options.seeds, options.out, options.jobs) if options.tasks else []
     quick = [method for method in methods if not METHODS[method].made_data_only]
     recorded = run_recorded(recordings, quick, options.max_folds, options.out, options.jobs) if recordings else []
     pen = [row for r in recordings if r.name == "pen_a" for row in run_pen(r, quick, options.out, options.jobs)]
+    write_table(options.out, made, recorded, pen)
+
+
+def write_table(folder: Path, made: list[Row], recorded: list[Row], pen: list[Row]) -> None:
+    """Write and print the tables."""
     text = report(made, recorded, pen)
-    (options.out / "table.md").write_text(text, encoding="utf-8")
+    (folder / "table.md").write_text(text, encoding="utf-8")
     print(f"\n{text}")
 
 
