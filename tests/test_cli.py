@@ -183,10 +183,10 @@ def test_the_demo_runs(tmp_path, capsys):
     shown = capsys.readouterr()
     assert shown.err == ""
     assert "95 % of fresh" in shown.out
-    robot = {"cd_figure6_task.png", "cd_figure7_variability.png", "cd_figure8_pushes.png"}
+    robot = {"hgp_figure6_task.png", "hgp_figure7_variability.png", "hgp_figure8_pushes.png"}
     figures = {path.name for path in (tmp_path / "figures").iterdir()}
-    assert figures == {"cd.png", "wp.png", "gmm_5.png", "tunnel.png"} | robot
-    assert Schedule.load(tmp_path / "schedule" / "cd.npz").duration == 10.0
+    assert figures == {"hgp.png", "cd.png", "wp.png", "gmm_5.png", "tunnel.png"} | robot
+    assert Schedule.load(tmp_path / "schedule" / "hgp.npz").duration == 10.0
     with (tmp_path / "pushes.csv").open() as file:
         (row,) = csv.DictReader(file)
     assert float(row["early [mm]"]) > 5.0 * float(row["late [mm]"])

@@ -98,7 +98,7 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
                 f"{type(self).__name__} stopped early: {report.message}. The best point found is kept; "
                 f"raise max_iter (now {self.max_iter}) or tol (now {self.tol:g}).",
                 ConvergenceWarning,
-                stacklevel=2,
+                stacklevel=3,
             )
         return self
 

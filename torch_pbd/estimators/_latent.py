@@ -132,7 +132,7 @@ class LatentCovarianceRegressor(CovarianceRegressor):
                 f"is singular, and is shrunk towards the pooled covariance. {n_outputs + 1} or more "
                 "demonstrations determine it.",
                 DataRankWarning,
-                stacklevel=4,
+                stacklevel=5,
             )
         return True
 
@@ -214,7 +214,7 @@ def warn_if_few(n_rows: int, n_outputs: int) -> None:
             f"y has {n_rows} rows but {n_outputs} outputs: they leave directions of the covariance undetermined, "
             "which the prior decides. Record more.",
             DataRankWarning,
-            stacklevel=4,
+            stacklevel=5,
         )
 
 
@@ -224,7 +224,7 @@ def warn_if_identical(training: TrainingSet) -> None:
             "The demonstrations are identical: their covariance is zero, and the smallest that can be told "
             "from it is used.",
             DataRankWarning,
-            stacklevel=4,
+            stacklevel=5,
         )
 
 
@@ -235,5 +235,5 @@ def warn_if_stretched(amplitude: Tensor, targets: Tensor, *, given: bool) -> Non
             "length_scale is so long that the covariance follows the data only as the difference of large numbers: "
             "beside the data it will overshoot the prior. Give a shorter one, or None to learn it.",
             UserWarning,
-            stacklevel=5,
+            stacklevel=6,
         )

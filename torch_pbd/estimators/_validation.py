@@ -123,7 +123,7 @@ def check_inputs_vary(X: Floats) -> None:
             f"X has {X.shape[1]} columns but varies in {rank} directions only: {what}. The covariance is "
             "learned along these directions; leave the column out.",
             DataRankWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
 
 

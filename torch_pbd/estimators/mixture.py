@@ -113,7 +113,7 @@ class GMMBaseline(CovarianceRegressor):
             warnings.warn(
                 "y is constant: its covariance is zero, and the smallest that can be told from it is used.",
                 DataRankWarning,
-                stacklevel=3,
+                stacklevel=4,
             )
         scaling = _by_residual(X, y)
         data = self._door(np.hstack([(X - scaling.x_shift) / scaling.x_scale, (y - scaling.y_shift) / scaling.y_scale]))
