@@ -40,7 +40,7 @@ def test_the_mean_is_a_dense_regression_of_all_outputs_under_their_noise(d, whit
     expected = (gain @ means.ravel()).reshape(d, 5).T
     covariance = (prior_gram(family, theta, x, x) - gain @ cross).reshape(d, 5, d, 5)
     mean, error = found.at(x)
-    # The kernel matrix of the inducing inputs has a jitter of 1e-10, over noise of 1e-2.
+    # The kernel matrix of the inducing inputs has a jitter of 1e-13, over noise of 1e-2.
     np.testing.assert_allclose(mean, expected, rtol=0, atol=1e-7)
     np.testing.assert_allclose(error, np.stack([covariance[:, t, :, t] for t in range(5)]), rtol=0, atol=1e-7)
 
