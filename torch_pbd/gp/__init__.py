@@ -5,7 +5,8 @@ from torch_pbd.gp.evidence import (
     fit_hyperparameters,
     negative_log_evidence,
 )
-from torch_pbd.gp.latent import LatentGP, LatentValues, condition
+from torch_pbd.gp.latent import LatentGP, condition
+from torch_pbd.gp.latent_values import LatentValues
 from torch_pbd.gp.neighbourhoods import merge_observations, neighbourhoods, spacing
 from torch_pbd.gp.observations import Hyperparameters, Observations
 

@@ -1,0 +1,107 @@
+"""Values of latent Gaussian processes at the training inputs, to be trained: the paper's U, whitened."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from torch_pbd.gp.latent import LatentGP
+from torch_pbd.gp.observations import Hyperparameters
+from torch_pbd.kernels import KernelName, correlation
+from torch_pbd.linalg import cholesky_with_jitter
+
+# Directions of a kernel matrix with less than this of its largest eigenvalue carry no trained values.
+_RANK_TOLERANCE = 1e-11
+
+
+class LatentValues(nn.Module):
+    """Values of b latent processes at n inputs, to be trained: the paper's U, whitened.
+
+    The deviations from the prior mean are ``amplitude * basis @ whitened`` with ``basis @ basis.mT`` the
+    kernel matrix; a priori the whitened values are independent standard normal numbers, which is what
+    makes them easy to train. While the hyperparameters are held, the basis is that of the eigenvectors
+    which matter: far fewer than inputs for a smooth kernel.
+
+    Parameters
+    ----------
+    inputs : Tensor of shape (n, e)
+    deviation : Tensor of shape (b, n)
+        Where training starts.
+    amplitude : Tensor of shape (b,)
+    length_scale : Tensor of shape (1, e) or (b, e)
+    kernel : KernelName
+    train_hyperparameters : bool
+        Whether amplitude and length scale, then one for each process, are trained with the values.
+    """
+
+    inputs: Tensor
+    basis: Tensor
+
+    def __init__(
+        self,
+        inputs: Float[Tensor, "n e"],
+        deviation: Float[Tensor, "b n"],
+        amplitude: Float[Tensor, " b"],
+        length_scale: Float[Tensor, "g e"],
+        *,
+        kernel: KernelName = "squared_exponential",
+        train_hyperparameters: bool = False,
+    ) -> None:
+        super().__init__()
+        self.kernel, self.train_hyperparameters = kernel, train_hyperparameters
+        if train_hyperparameters:
+            length_scale = length_scale.expand(len(amplitude), -1)
+        self.register_buffer("inputs", inputs)
+        self.log_amplitude = nn.Parameter(amplitude.log(), requires_grad=train_hyperparameters)
+        self.log_length_scale = nn.Parameter(length_scale.log(), requires_grad=train_hyperparameters)
+        basis, self.jitter = self._basis()
+        self.register_buffer("basis", basis.detach())
+        self.whitened = nn.Parameter(self._solved(deviation / amplitude[:, None]))
+
+    def forward(self) -> Float[Tensor, "n b"]:
+        """Deviations from the prior mean at the training inputs."""
+        basis = self._basis()[0] if self.train_hyperparameters else self.basis
+        deviation = (basis @ self.whitened.unsqueeze(-1)).squeeze(-1)
+        return (self.log_amplitude.exp()[:, None] * deviation).mT
+
+    def trained(self) -> list[Tensor]:
+        """The parameters an optimizer may change."""
+        return [parameter for parameter in self.parameters() if parameter.requires_grad]
+
+    @torch.no_grad()
+    def interpolate(self, values: Float[Tensor, "b n"]) -> LatentGP:
+        """The Gaussian processes through the present deviations, and without a prior through ``values``."""
+        self.basis, self.jitter = self._basis()
+        amplitude = self.log_amplitude.exp()
+        hyperparameters = Hyperparameters(self.log_length_scale.exp(), amplitude.clone(), torch.zeros_like(amplitude))
+        weight = amplitude[:, None] * self._weight(self.whitened)
+        counts = torch.ones_like(self.inputs[:, 0])
+        value_weight = self._weight(self._solved(values))
+        return LatentGP(self.inputs, weight, value_weight, hyperparameters, counts, self.kernel)
+
+    def _basis(self) -> tuple[Tensor, float]:
+        gram = correlation(self.inputs, self.inputs, self.log_length_scale.exp(), self.kernel)
+        if self.train_hyperparameters:
+            return cholesky_with_jitter(gram, name="the kernel matrix of the training inputs")
+        eigenvalue, eigenvector = torch.linalg.eigh(gram)
+        matters = eigenvalue > _RANK_TOLERANCE * eigenvalue[..., -1:]
+        root = eigenvalue.where(matters, 0.0).sqrt()
+        return (eigenvector * root.unsqueeze(-2))[..., matters.any(0)], 0.0
+
+    def _solved(self, deviation: Tensor) -> Tensor:
+        """Whitened values whose deviations, over the amplitude, come nearest to these."""
+        deviation = deviation.unsqueeze(-1)
+        if self.train_hyperparameters:
+            return torch.linalg.solve_triangular(self.basis, deviation, upper=False).squeeze(-1).contiguous()
+        return (self.basis.mT @ deviation / self._square()).squeeze(-1).contiguous()
+
+    def _weight(self, whitened: Tensor) -> Tensor:
+        """Inverse of the kernel matrix times the deviations, over the amplitude, of whitened values."""
+        if self.train_hyperparameters:
+            solved = torch.linalg.solve_triangular(self.basis.mT, whitened.unsqueeze(-1), upper=True)
+            return solved.squeeze(-1).contiguous()
+        return (self.basis @ (whitened.unsqueeze(-1) / self._square())).squeeze(-1).contiguous()
+
+    def _square(self) -> Tensor:
+        """Of each column of the basis, which are orthogonal; one for those that do not matter and are zero."""
+        square = self.basis.square().sum(-2).unsqueeze(-1)
+        return square.where(square > 0, 1.0)
