@@ -4,7 +4,7 @@ import pytest
 import torch
 from scipy.optimize import rosen
 
-from torch_pbd.optim import minimize, minimize_batch
+from torch_pbd.optim import by_autograd, minimize, minimize_batch
 
 
 def parameter(*values):
@@ -79,25 +79,25 @@ def test_a_batch_finds_what_each_problem_alone_finds(generator):
     def objective(x, rows):
         return rosenbrock(x - target[rows] + 1.0)
 
-    found, report = minimize_batch(objective, start, max_iter=300, tol=1e-9)
+    found, report = minimize_batch(by_autograd(objective), start, max_iter=300, tol=1e-9)
     assert report.converged
     torch.testing.assert_close(found, target, rtol=1e-6, atol=1e-6)
 
 
 def test_the_problems_of_a_batch_do_not_disturb_each_other(generator):
     start = torch.randn(5, 3, dtype=torch.float64, generator=generator)
-    together, _ = minimize_batch(lambda x, _: rosenbrock(x), start, max_iter=40)
-    alone = [minimize_batch(lambda x, _: rosenbrock(x), row[None], max_iter=40)[0] for row in start]
+    together, _ = minimize_batch(by_autograd(lambda x, _: rosenbrock(x)), start, max_iter=40)
+    alone = [minimize_batch(by_autograd(lambda x, _: rosenbrock(x)), row[None], max_iter=40)[0] for row in start]
     torch.testing.assert_close(together, torch.cat(alone), rtol=1e-6, atol=1e-6)
 
 
 def test_a_batch_steps_back_from_values_that_are_not_finite():
     start = torch.tensor([[1e-3], [50.0]], dtype=torch.float64)
-    found, _ = minimize_batch(lambda x, _: (x - x.log()).squeeze(-1), start, tol=1e-9)
+    found, _ = minimize_batch(by_autograd(lambda x, _: (x - x.log()).squeeze(-1)), start, tol=1e-9)
     torch.testing.assert_close(found, torch.ones(2, 1, dtype=torch.float64), rtol=1e-6, atol=0)
 
 
 def test_a_batch_ends_where_steps_no_longer_lower_the_rounded_loss():
     start = torch.ones(3, 2, dtype=torch.float64)
-    _, report = minimize_batch(lambda x, _: 1e8 + 1e-9 * x.sum(-1), start, max_iter=1000, tol=1e-12)
+    _, report = minimize_batch(by_autograd(lambda x, _: 1e8 + 1e-9 * x.sum(-1)), start, max_iter=1000, tol=1e-12)
     assert report.n_iter < 50

@@ -28,6 +28,15 @@ def _matern52(square_distance: Tensor) -> Tensor:
     return (1.0 + distance + distance.square() / 3.0) * torch.exp(-distance)
 
 
+def _matern32_slope(square_distance: Tensor) -> Tensor:
+    return -1.5 * torch.exp(-(3.0 * square_distance).sqrt())
+
+
+def _matern52_slope(square_distance: Tensor) -> Tensor:
+    distance = (5.0 * square_distance).sqrt()
+    return (-5.0 / 6.0) * (1.0 + distance) * torch.exp(-distance)
+
+
 KERNELS: dict[str, Callable[[Tensor], Tensor]] = {
     "squared_exponential": _squared_exponential,
     "matern32": _matern32,
@@ -64,3 +73,15 @@ def correlation(
             difference = radius * torch.sin(difference / radius)
         square_distance = square_distance + (difference / length_scale[..., dimension, None, None]).square()
     return KERNELS[kernel](square_distance.clamp_max(_FARTHEST))
+
+
+def value_and_slope(
+    square_distance: Float[Tensor, "*b n m"], kernel: KernelName = "squared_exponential"
+) -> tuple[Float[Tensor, "*b n m"], Float[Tensor, "*b n m"]]:
+    """Correlation at squared distances in length scales, and its derivative by them."""
+    square_distance = square_distance.clamp_max(_FARTHEST)
+    value = KERNELS[kernel](square_distance)
+    if kernel == "squared_exponential":
+        return value, -0.5 * value
+    slope = _matern32_slope if kernel == "matern32" else _matern52_slope
+    return value, slope(square_distance)

@@ -27,7 +27,7 @@ from torch_pbd.gp import (
     Observations,
     condition,
     fit_hyperparameters,
-    merge_observations,
+    resolved_length_scale,
     spacing,
 )
 from torch_pbd.kernels import KERNELS
@@ -36,8 +36,7 @@ from torch_pbd.models.conditional import MeanAndCovariance
 from torch_pbd.models.training import TrainingSet, pooled_tril
 from torch_pbd.optim import FitReport
 
-# Length scales from here times the spacing of the inputs to this many ranges: shorter ones are "needles"
-# that explain each point by itself, and with longer ones the prior of a covariance would never take over.
+# Length scales up to this many ranges: with longer ones the prior of a covariance would never take over.
 _STRETCHED = 10.0  # an amplitude of so many times the values
 _SHORTEST, _LONGEST_MEAN, _LONGEST_COVARIANCE = 0.75, 10.0, 0.35
 
@@ -97,18 +96,18 @@ class LatentCovarianceRegressor(CovarianceRegressor):
             self._prior_tril(training, scaling),
             None if length_scale is None else self._door(length_scale / scaling.x_scale),
         )
-        mean = self._fit_mean(training)
         warn_if_identical(training)
         if aligned:
-            covariance, report, jitter = self._fit_empirical(problem)
+            mean, covariance, report, jitter = self._fit_empirical(problem)
         else:
+            mean = self._fit_mean(training)
             residual = training.y - mean(training.x).detach()
             covariance, report, jitter = self._fit_likelihood(problem, residual)
         return Fitted(self._assemble(MeanAndCovariance(mean, covariance), scaling), report, jitter)
 
     @abstractmethod
-    def _fit_empirical(self, problem: Problem) -> tuple[Any, FitReport, float]:
-        """Covariance module from the empirical covariances of aligned data."""
+    def _fit_empirical(self, problem: Problem) -> tuple[LatentGP, Any, FitReport, float]:
+        """Mean, and covariance module from the empirical covariances of aligned data."""
 
     @abstractmethod
     def _fit_likelihood(self, problem: Problem, residual: Tensor) -> tuple[Any, FitReport, float]:
@@ -148,12 +147,16 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         return safe_cholesky(self._door(scaled), name="prior")
 
     def _fit_mean(self, training: TrainingSet) -> LatentGP:
-        """Gaussian processes of the mean, from the means at the inputs, weighted by their counts."""
-        observations = Observations(training.inputs, training.means().mT.contiguous(), training.counts)
-        observations = merge_observations(observations, self.max_inputs)
-        search = self._search(observations, _LONGEST_MEAN)
-        hyperparameters, _, _ = fit_hyperparameters(observations, search)
-        return condition(observations, hyperparameters, self.kernel)[0]
+        """Gaussian processes of the mean, by themselves."""
+        observations, search = self._mean_job(training)
+        hyperparameters = fit_hyperparameters(observations, search)[0]
+        return condition(observations, hyperparameters, self.kernel, max_inputs=self.max_inputs)[0]
+
+    def _mean_job(self, training: TrainingSet) -> tuple[Observations, EvidenceSearch]:
+        """Means at the inputs, weighted by their counts, and the search for their hyperparameters."""
+        weights = training.counts / training.counts.mean()
+        observations = Observations(training.inputs, training.means().mT.contiguous(), weights)
+        return observations, self._search(observations, _LONGEST_MEAN)
 
     def _search(
         self,
@@ -162,15 +165,18 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         length_scale: Tensor | None = None,
         noise_scale: Tensor | None = None,
     ) -> EvidenceSearch:
-        n_inputs, n_features = observations.inputs.shape
+        shortest = resolved_length_scale(observations.inputs)
         if noise_scale is not None and not bool((noise_scale > 0).any()):
             # Interpolated: longer than where inputs come closest, and the process swings between the others.
-            detail = spacing(observations.inputs, 0.1)
-        else:
-            detail = max(spacing(observations.inputs), n_inputs ** (-1.0 / n_features))
-        bounds = (min(0.5, max(1e-6, _SHORTEST * detail)), longest)  # inputs may coincide but for rounding
+            shortest = min(0.5, max(1e-6, _SHORTEST * spacing(observations.inputs, 0.1)))
         return EvidenceSearch(
-            self.kernel, bounds, length_scale, noise_scale, self.n_restarts, max_iter=max(100, self.max_iter)
+            self.kernel,
+            (shortest, longest),
+            length_scale,
+            noise_scale,
+            self.max_inputs,
+            self.n_restarts,
+            max_iter=max(100, self.max_iter),
         )
 
     def _default_length_scale(self, problem: Problem) -> Tensor:

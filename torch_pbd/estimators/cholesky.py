@@ -13,7 +13,7 @@ from torch_pbd.estimators._latent import (
     warn_if_stretched,
 )
 from torch_pbd.estimators._validation import Prior, check_choice, check_number
-from torch_pbd.gp import LatentValues, Observations, condition, fit_hyperparameters, merge_observations
+from torch_pbd.gp import LatentGP, LatentValues, Observations, condition, fit_together
 from torch_pbd.kernels import KernelName
 from torch_pbd.linalg import tril_to_vector
 from torch_pbd.models.cholesky import CholeskyCovariance, deviation_tril, tril_deviation
@@ -150,26 +150,23 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
         check_number(self.noise_scale, "noise_scale", low=0.0, optional=True)
         check_choice(self.diagonal, "diagonal", ("auto", "raw", "log"))
 
-    def _fit_empirical(self, problem: Problem) -> tuple[CholeskyCovariance, FitReport, float]:
+    def _fit_empirical(self, problem: Problem) -> tuple[LatentGP, CholeskyCovariance, FitReport, float]:
         training, log_diagonal = problem.training, self.diagonal == "log"
         scale_tril = empirical_tril(training, bias_correction=self.bias_correction)
         linked = _with_least_diagonal(scale_tril) if log_diagonal else scale_tril
         deviation = tril_deviation(linked, problem.prior_tril, log_diagonal=log_diagonal)
         degrees = training.counts - 1.0
-        weights = degrees / degrees.mean()
-
-        def observed(values: Tensor) -> Observations:
-            whole = Observations(training.inputs, values.mT.contiguous(), weights)
-            return whole if self.noise_scale == 0 else merge_observations(whole, self.max_inputs)
-
-        observations = observed(deviation)
-        search = self._search(observations, _LONGEST_COVARIANCE, problem.length_scale, self._entry_noise(problem))
-        hyperparameters, _, report = fit_hyperparameters(observations, search)
-        warn_if_stretched(hyperparameters.amplitude, observations.targets, given=problem.length_scale is not None)
-        values = observed(tril_to_vector(scale_tril)).targets
-        latent, jitter = condition(observations, hyperparameters, self.kernel, values)
+        observations = Observations(training.inputs, deviation.mT.contiguous(), degrees / degrees.mean())
+        noise_scale = self._entry_noise(problem)
+        search = self._search(observations, _LONGEST_COVARIANCE, problem.length_scale, noise_scale)
+        mean_job = self._mean_job(training)
+        (of_mean, *_), (of_entries, _, report) = fit_together([mean_job, (observations, search)])
+        warn_if_stretched(of_entries.amplitude, observations.targets, given=problem.length_scale is not None)
+        mean, _ = condition(mean_job[0], of_mean, self.kernel, max_inputs=self.max_inputs)
+        values = tril_to_vector(scale_tril).mT.contiguous()
+        latent, jitter = condition(observations, of_entries, self.kernel, values, max_inputs=self.max_inputs)
         prior = problem.prior_tril if problem.prior_tril.ndim == 2 else problem.prior_tril[0]
-        return CholeskyCovariance(latent, prior, log_diagonal=log_diagonal), report, jitter
+        return mean, CholeskyCovariance(latent, prior, log_diagonal=log_diagonal), report, jitter
 
     def _entry_noise(self, problem: Problem) -> Tensor | None:
         """Noise of each entry of the factor, in standardized units; of a logarithm, relative."""

@@ -14,7 +14,7 @@ from torch_pbd.estimators._latent import (
     warn_if_stretched,
 )
 from torch_pbd.estimators._validation import Prior, check_choice, check_number
-from torch_pbd.gp import LatentValues, Observations, condition, fit_hyperparameters, merge_observations
+from torch_pbd.gp import LatentGP, LatentValues, Observations, condition, fit_hyperparameters, merge_observations
 from torch_pbd.kernels import KernelName
 from torch_pbd.models.objectives import covariance_mse, gaussian_nll, train
 from torch_pbd.models.training import empirical_tril
@@ -145,7 +145,8 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
             return (_PAPER_MEAN * problem.prior_tril.diagonal())[:, None].repeat(1, self.df_)
         return padded(problem.prior_tril, self.df_)
 
-    def _fit_empirical(self, problem: Problem) -> tuple[WishartCovariance, FitReport, float]:
+    def _fit_empirical(self, problem: Problem) -> tuple[LatentGP, WishartCovariance, FitReport, float]:
+        mean = self._fit_mean(problem.training)
         prior_root = self._prior_root(problem)
         target = empirical_tril(problem.training)
         if self.start == "random":
@@ -153,7 +154,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
             def loss(deviation: Tensor, matrix: Tensor) -> Tensor:
                 return covariance_mse(wishart_root(deviation, prior_root, matrix), target)
 
-            return self._train(problem, prior_root, prior_root, loss, prior_weight=0.0, tol=1e-4 * self.tol)
+            return mean, *self._train(problem, prior_root, prior_root, loss, prior_weight=0.0, tol=1e-4 * self.tol)
         inputs, matrix = problem.training.inputs, torch.eye(target.shape[-1]).to(target)
 
         def observed(root: Tensor) -> Observations:
@@ -170,7 +171,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         with torch.no_grad():
             mse = float(covariance_mse(wishart_root(latent(inputs), prior_root, matrix), target))
         report = FitReport(mse, (mse,), report.n_iter, report.converged, report.message)
-        return WishartCovariance(latent, _constant(prior_root), matrix), report, jitter
+        return mean, WishartCovariance(latent, _constant(prior_root), matrix), report, jitter
 
     def _fit_likelihood(self, problem: Problem, residual: Tensor) -> tuple[WishartCovariance, FitReport, float]:
         prior_root = self._prior_root(problem)

@@ -1,14 +1,12 @@
 """Batches of independent Gaussian processes over the same inputs: eq. (3) to (6), and their evidence."""
 
-from torch_pbd.gp.evidence import (
-    EvidenceSearch,
-    fit_hyperparameters,
-    negative_log_evidence,
-)
+from torch_pbd.gp.evidence import negative_log_evidence
+from torch_pbd.gp.grid import EvidenceSearch
 from torch_pbd.gp.latent import LatentGP, condition
 from torch_pbd.gp.latent_values import LatentValues
-from torch_pbd.gp.neighbourhoods import merge_observations, neighbourhoods, spacing
+from torch_pbd.gp.neighbourhoods import merge_observations, neighbourhoods, resolved_length_scale, spacing
 from torch_pbd.gp.observations import Hyperparameters, Observations
+from torch_pbd.gp.search import fit_hyperparameters, fit_together
 
 __all__ = [
     "EvidenceSearch",
@@ -18,8 +16,10 @@ __all__ = [
     "Observations",
     "condition",
     "fit_hyperparameters",
+    "fit_together",
     "merge_observations",
     "negative_log_evidence",
     "neighbourhoods",
+    "resolved_length_scale",
     "spacing",
 ]

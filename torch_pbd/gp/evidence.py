@@ -1,294 +1,170 @@
-"""Hyperparameters of Gaussian processes by their evidence: a grid, then L-BFGS from its best points.
+"""Evidence of Gaussian processes, and its gradient in closed form.
 
-Several observations of one input enter as their mean and their count: the noise of a mean is the noise
-over the root of the count. Targets are those from which the prior mean is subtracted; the range of the
-inputs is about one in every dimension.
+Several observations of one input enter as their mean and their count: the noise of a mean is the noise over the
+root of the count. Targets are those from which the prior mean is subtracted.
 """
 
 import math
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from torch_pbd.exceptions import NotPositiveDefiniteError
 from torch_pbd.gp.observations import Hyperparameters, Observations
-from torch_pbd.kernels import KernelName, correlation
-from torch_pbd.optim import FitReport, minimize_batch
-
-MIN_NOISE_RATIO, MAX_NOISE_RATIO = 1e-10, 1e5
-"""Bounds of a learned noise variance over the variance of the process; a fixed noise may be far lower."""
-
-_BLOCK = 32  # processes fitted together: bounds the memory
-_HOPEFUL = 0.5  # nats for each input that polishing may be worth
-
-# Below 1e-3 the evidence is nearly flat in the ratio: no optimum is lost between these.
-_LOG10_RATIOS = (-10.0, -8.0, -6.0, -4.0, -3.0, -2.5, -2.0, -1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 4.0)
-
-
-@dataclass(frozen=True)
-class EvidenceSearch:
-    """What :func:`fit_hyperparameters` looks for, and where.
-
-    Parameters
-    ----------
-    kernel : KernelName
-    length_scale_bounds : (float, float)
-        Smallest and largest length scale, in units of the range of the inputs. A lower bound at the spacing
-        of the inputs keeps out "needles", which explain every point by itself and nothing between.
-    length_scale : Tensor of shape (e,) or None
-        Held there if given.
-    noise_scale : Tensor of shape (b,) or None
-        Standard deviation of the noise of one observation, held there if given; learned if None.
-    n_restarts : int
-        Starting points beside the first: the best of each of ``1 + n_restarts`` bands of a grid.
-    max_iter, tol
-        Of the L-BFGS that polishes the grid's points.
-    """
-
-    kernel: KernelName = "squared_exponential"
-    length_scale_bounds: tuple[float, float] = (1e-3, 1e1)
-    length_scale: Tensor | None = None
-    noise_scale: Tensor | None = None
-    n_restarts: int = 2
-    max_iter: int = 100
-    tol: float = 1e-6
-
-
-class _Evidence(torch.autograd.Function):
-    """y' A^-1 y and log|A| with their gradients in closed form; NaN where A is not positive definite."""
-
-    @staticmethod
-    def forward(ctx: Any, matrix: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
-        factor, info = torch.linalg.cholesky_ex(matrix)
-        failed = info > 0
-        factor = torch.where(failed[:, None, None], torch.eye(matrix.shape[-1]).to(matrix), factor)
-        solved = torch.cholesky_solve(targets.unsqueeze(-1), factor).squeeze(-1)
-        ctx.save_for_backward(factor, solved)
-        log_det = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        nan = torch.full_like(log_det, math.nan)
-        return torch.where(failed, nan, (targets * solved).sum(-1)), torch.where(failed, nan, log_det)
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor]:
-        factor, solved = ctx.saved_tensors
-        from_quadratic, from_log_det = (gradient[:, None, None] for gradient in gradients)
-        outer = solved.unsqueeze(-1) * solved.unsqueeze(-2)
-        matrix = from_log_det * torch.cholesky_inverse(factor) - from_quadratic * outer
-        return matrix, 2.0 * from_quadratic.squeeze(-1) * solved
+from torch_pbd.gp.projection import Projection, project
+from torch_pbd.kernels import KernelName, correlation, value_and_slope
 
 
 def negative_log_evidence(
     observations: Observations, hyperparameters: Hyperparameters, kernel: KernelName = "squared_exponential"
 ) -> Float[Tensor, " b"]:
-    """Negative log marginal likelihood of each process, in nats (Rasmussen and Williams, eq. (2.30))."""
-    quadratic, log_det = _quadratic_and_log_det(
-        observations, hyperparameters.length_scale, hyperparameters.noise_ratio, kernel
-    )
-    return _evidence(quadratic, log_det, hyperparameters.amplitude.square(), observations.counts)
+    """Negative log marginal likelihood of each process, in nats (Rasmussen and Williams, eq. (2.30)).
+
+    Differentiable by autograd; NaN where the covariance is not positive definite.
+    """
+    whole = project(observations)
+    covariance = whole.covariance(
+        correlation(whole.nodes, whole.nodes, hyperparameters.length_scale, kernel)
+    ) + torch.diag_embed(hyperparameters.noise_ratio[:, None].expand(-1, whole.n_inputs))
+    factor, info = torch.linalg.cholesky_ex(covariance)
+    whitened = torch.linalg.solve_triangular(factor, whole.targets.unsqueeze(-1), upper=False).squeeze(-1)
+    log_det = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    loss = negative_log_density(whitened.square().sum(-1), log_det, hyperparameters.amplitude.square(), whole)
+    return torch.where(info == 0, loss, math.nan)
 
 
-def _quadratic_and_log_det(
-    observations: Observations, length_scale: Tensor, noise_ratio: Tensor, kernel: KernelName
-) -> tuple[Tensor, Tensor]:
-    """Of the covariance over the squared amplitude, rows scaled so that the noise is the same for all."""
-    weight = observations.counts.sqrt()
-    gram = correlation(observations.inputs, observations.inputs, length_scale, kernel)
-    gram = weight[:, None] * gram * weight + noise_ratio[:, None, None] * torch.eye(len(weight)).to(weight)
-    result: tuple[Tensor, Tensor] = _Evidence.apply(gram, observations.targets * weight)
-    return result
+def negative_log_density(quadratic: Tensor, log_det: Tensor, variance: Tensor, of: Projection) -> Tensor:
+    """In nats, from the quadratic form and the log determinant of the covariance over the squared amplitude."""
+    constant = of.n_inputs * math.log(2.0 * math.pi) - of.sum_log_counts
+    return 0.5 * (quadratic / variance + log_det + of.n_inputs * variance.log() + constant)
 
 
-def _evidence(quadratic: Tensor, log_det: Tensor, variance: Tensor, counts: Tensor) -> Tensor:
-    constant = len(counts) * math.log(2 * math.pi) - counts.log().sum()
-    return 0.5 * (quadratic / variance + log_det + len(counts) * variance.log() + constant)
-
-
-def _best_variance(quadratic: Tensor, n_inputs: int) -> Tensor:
+def best_variance(quadratic: Tensor, n_inputs: int) -> Tensor:
     """Squared amplitude that maximizes the evidence, given the rest; tiny for targets that are all zero."""
     return (quadratic / n_inputs).clamp_min(1e-200)
 
 
-class _Coordinates:
-    """Unbounded coordinates of the hyperparameters that are searched; the rest are fixed or closed-form.
+class Gradient(NamedTuple):
+    """Of the negative log evidence by logarithms."""
 
-    A cosine folds each onto its bounds: unlike a sigmoid it reaches them, so an optimum there is found.
+    log_length_scale: Float[Tensor, "a e"]
+    log_noise_ratio: Float[Tensor, " a"]
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Negative log evidence of b processes as a function of length scales and noise ratio alone.
+
+    The squared amplitude is the best one, or where ``noise_scale`` (b,) is given that which the noise ratio
+    leaves.
     """
 
-    def __init__(self, observations: Observations, search: EvidenceSearch) -> None:
-        self.observations, self.search = observations, search
-        n_features = observations.inputs.shape[1]
-        smallest, largest = (math.log(bound) for bound in search.length_scale_bounds)
-        bounds = [] if search.length_scale is not None else [(smallest, largest)] * n_features
-        self.n_length_scales = len(bounds)
-        if search.noise_scale is None or bool((search.noise_scale > 0).all()):
-            bounds.append((math.log(self._lowest_ratio()), math.log(MAX_NOISE_RATIO)))
-        table = observations.inputs.new_tensor(bounds).reshape(-1, 2)
-        self.low, self.width = table[:, 0], table[:, 1] - table[:, 0]
+    projection: Projection
+    kernel: KernelName
+    noise_scale: Float[Tensor, " b"] | None
+    square_difference: Float[Tensor, "e mm"]
+    """Of the nodes, in each dimension."""
 
-    def _lowest_ratio(self) -> float:
-        """That of a fixed noise must leave room for amplitudes a hundred times the targets."""
-        if self.search.noise_scale is None:
-            return MIN_NOISE_RATIO
-        largest = float(self.observations.targets.square().mean(1).max())
-        lowest = float(self.search.noise_scale.min()) ** 2 / max(1e4 * largest, 1e-200)
-        return min(MIN_NOISE_RATIO, max(lowest, 1e-40))
+    @classmethod
+    def of(cls, projection: Projection, kernel: KernelName, noise_scale: Tensor | None) -> "Evidence":
+        """Evidence of observations; a ``noise_scale`` of zero is no noise, and leaves the amplitude free."""
+        nodes = projection.nodes.mT
+        difference = (nodes[:, :, None] - nodes[:, None, :]).square().flatten(1)
+        held = noise_scale if noise_scale is not None and bool((noise_scale > 0).all()) else None
+        return cls(projection, kernel, held, difference)
 
-    def decode(self, z: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Length scales, noise ratio, and the squared amplitude where a fixed noise decides it."""
-        logs = self.low + self.width * (0.5 - 0.5 * torch.cos(z))
-        fixed = self.search.length_scale
-        length_scale = logs[:, : self.n_length_scales].exp() if fixed is None else fixed.expand(len(z), -1)
-        if logs.shape[1] == self.n_length_scales:
-            return length_scale, z.new_zeros(len(z)), None
-        noise_ratio = logs[:, -1].exp()
-        if self.search.noise_scale is None:
-            return length_scale, noise_ratio, None
-        return length_scale, noise_ratio, self.search.noise_scale[rows].square() / noise_ratio
+    def __call__(
+        self, length_scale: Float[Tensor, "a e"], noise_ratio: Float[Tensor, " a"], rows: Int64[Tensor, " a"]
+    ) -> tuple[Float[Tensor, " a"], Gradient]:
+        """In nats, for a of the processes, with its gradient; both NaN where there is none.
 
-    def encode(self, length_scale: Tensor, noise_ratio: Tensor) -> Tensor:
-        logs = length_scale.log()[:, None].expand(-1, self.n_length_scales)
-        if len(self.low) > self.n_length_scales:
-            logs = torch.cat([logs, noise_ratio.log()[:, None]], dim=1)
-        share = (logs - self.low) / self.width.clamp_min(1e-9)
-        return torch.acos(1.0 - 2.0 * share.clamp(0.01, 0.99))
+        With M = A^-1 - alpha alpha' / variance and alpha = A^-1 y, a change of the covariance A over the squared
+        amplitude changes it by tr(M dA) / 2: the best amplitude changes nothing to first order.
+        """
+        data = self.projection.of(rows)
+        n_nodes, inverse_square = len(data.nodes), length_scale.square().reciprocal()
+        square_distance = (inverse_square @ self.square_difference).reshape(-1, n_nodes, n_nodes)
+        correlation, slope = value_and_slope(square_distance, self.kernel)
+        covariance = data.covariance(correlation)
+        covariance.diagonal(dim1=-2, dim2=-1).add_(noise_ratio[:, None])
+        factor, info = torch.linalg.cholesky_ex(covariance)
+        inverse = torch.cholesky_inverse(factor)
+        alpha = (inverse @ data.targets.unsqueeze(-1)).squeeze(-1)
+        n_outside = data.n_inputs - data.targets.shape[1]
+        outside = data.remainder / noise_ratio if n_outside else torch.zeros_like(noise_ratio)
+        quadratic = (data.targets * alpha).sum(-1) + outside
+        log_det = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        if n_outside:
+            log_det = log_det + n_outside * noise_ratio.log()
+        variance = self.variance(quadratic, noise_ratio, rows)
+        loss = negative_log_density(quadratic, log_det, variance, data)
+        if bool(info.any()):
+            loss = torch.where(info == 0, loss, math.nan)
+        matrix = inverse - (alpha / variance[:, None]).unsqueeze(-1) * alpha.unsqueeze(-2)
+        # The squared distance is inversely proportional to the square of the length scale.
+        by_distance = (data.pulled_back(matrix) * slope).flatten(1)
+        by_length = -(by_distance @ self.square_difference.mT) * inverse_square
+        by_ratio = 0.5 * (noise_ratio * matrix.diagonal(dim1=-2, dim2=-1).sum(-1) + n_outside - outside / variance)
+        if self.noise_scale is not None:  # the variance is inversely proportional to the ratio
+            by_ratio = by_ratio + 0.5 * (quadratic / variance - data.n_inputs)
+        return loss, Gradient(by_length, by_ratio)
 
-    def loss(self, z: Float[Tensor, "a p"], rows: Int64[Tensor, " a"]) -> Float[Tensor, " a"]:
-        """Negative log evidence for a observation."""
-        length_scale, noise_ratio, variance = self.decode(z, rows)
-        chosen = replace(self.observations, targets=self.observations.targets[rows])
-        quadratic, log_det = _quadratic_and_log_det(chosen, length_scale, noise_ratio, self.search.kernel)
-        variance = _best_variance(quadratic, len(chosen.counts)) if variance is None else variance
-        return _evidence(quadratic, log_det, variance, chosen.counts) / len(chosen.counts)
+    def variance(self, quadratic: Tensor, noise_ratio: Tensor, rows: Tensor | slice) -> Tensor:
+        """Squared amplitude of the processes ``rows``."""
+        if self.noise_scale is None:
+            return best_variance(quadratic, self.projection.n_inputs)
+        return self.noise_scale[rows].square() / noise_ratio
 
-    @torch.no_grad()
-    def losses(self, z: Float[Tensor, "s b p"]) -> Float[Tensor, "s b"]:
-        """Negative log evidence of each process at s points, in nats; infinite where it has none."""
-        rows = torch.arange(z.shape[1], device=z.device).repeat(len(z))
-        loss = self.loss(z.flatten(0, 1), rows).reshape(z.shape[:2])
-        return loss.nan_to_num(nan=math.inf) * len(self.observations.counts)
+    def table(self, length_scales: Float[Tensor, "s e"], noise_ratios: Float[Tensor, " q"]) -> Float[Tensor, "b s q"]:
+        """In nats, of all processes at all pairs; infinite where the covariance is near singular.
 
-    @torch.no_grad()
-    def hyperparameters(self, z: Tensor) -> Hyperparameters:
-        rows = torch.arange(len(z), device=z.device)
-        length_scale, noise_ratio, variance = self.decode(z, rows)
-        if variance is None:
-            quadratic, _ = _quadratic_and_log_det(self.observations, length_scale, noise_ratio, self.search.kernel)
-            variance = _best_variance(quadratic, len(self.observations.counts))
-            crude = self.observations.targets.square().mean(1).clamp_min(1e-200)
-            variance = torch.where(variance.isnan(), crude, variance)
-        return Hyperparameters(length_scale, variance.sqrt(), noise_ratio)
+        One eigendecomposition of a length scale serves all processes and all noise ratios.
+        """
+        data, n_nodes = self.projection, len(self.projection.nodes)
+        square_distance = (length_scales.square().reciprocal() @ self.square_difference).reshape(-1, n_nodes, n_nodes)
+        correlation, _ = value_and_slope(square_distance, self.kernel)
+        eigenvalue, eigenvector = torch.linalg.eigh(data.covariance(correlation))
+        square = (data.targets @ eigenvector).square()  # (s, b, r)
+        spectrum = eigenvalue.clamp_min(0.0).unsqueeze(1) + noise_ratios[:, None]  # (s, q, r)
+        rounding = 10 * n_nodes * torch.finfo(spectrum.dtype).eps
+        sound = eigenvalue[:, :1] + noise_ratios > rounding * spectrum[..., -1]
+        quadratic = square @ (1.0 / spectrum.clamp_min(1e-300)).mT  # (s, b, q)
+        log_det = spectrum.clamp_min(1e-300).log().sum(-1).unsqueeze(1)
+        if n_outside := data.n_inputs - data.targets.shape[1]:
+            quadratic = quadratic + data.remainder[:, None] / noise_ratios
+            log_det = log_det + n_outside * noise_ratios.log()
+        variance = best_variance(quadratic, data.n_inputs)
+        if self.noise_scale is not None:
+            variance = (self.noise_scale.square()[:, None] / noise_ratios).expand_as(quadratic)
+        loss = negative_log_density(quadratic, log_det, variance, data)
+        return loss.where(sound.unsqueeze(1), math.inf).transpose(0, 1)
 
+    def residual(self, length_scale: Float[Tensor, "b e"], noise_ratio: Float[Tensor, " b"]) -> Float[Tensor, "b n"]:
+        """What each process leaves of its weighted observations on a line, sorted by input."""
+        basis, weighted = self.projection.basis, self.projection.weighted
+        assert basis is not None
+        assert weighted is not None
+        rows = torch.arange(len(noise_ratio), device=noise_ratio.device)
+        left = noise_ratio[:, None] * self._solved(length_scale, noise_ratio, rows)
+        return weighted - (self.projection.targets - left) @ basis.mT
 
-def _grid(coordinates: _Coordinates, n_starts: int) -> Tensor:
-    """The best point of each process in each of ``n_starts`` bands of a grid: (n_starts, b, p).
+    def best_variance_at(self, length_scale: Tensor, noise_ratio: Tensor, rows: Tensor) -> Float[Tensor, " a"]:
+        """Squared amplitude; that of the targets themselves where the covariance is singular."""
+        data = self.projection.of(rows)
+        quadratic = (data.targets * self._solved(length_scale, noise_ratio, rows)).sum(-1)
+        if data.n_inputs > data.targets.shape[1]:
+            quadratic = quadratic + data.remainder / noise_ratio
+        variance = self.variance(quadratic, noise_ratio, rows)
+        crude = data.targets.square().mean(1).clamp_min(1e-200)
+        return torch.where(variance.isnan(), crude, variance)
 
-    The bands are of the noise ratio (of the length scale, where the noise is fixed): the evidence often
-    has one optimum where the data are signal and one where they are noise, with a plateau between. One
-    eigendecomposition serves all processes and all noise ratios of a length scale.
-    """
-    observations, search = coordinates.observations, coordinates.search
-    weight = observations.counts.sqrt()
-    low, high = search.length_scale_bounds
-    n_scales = 20 if search.length_scale is None else 1
-    scales = torch.logspace(math.log10(low), math.log10(high), n_scales, dtype=weight.dtype, device=weight.device)
-    learned = len(coordinates.low) > coordinates.n_length_scales
-    ratios = 10.0 ** weight.new_tensor(_LOG10_RATIOS) if learned else weight.new_zeros(1)
-    if learned and search.noise_scale is not None:
-        lower = range(math.ceil(float(coordinates.low[-1]) / math.log(10)), int(_LOG10_RATIOS[0]))
-        ratios = torch.cat([10.0 ** weight.new_tensor(lower), ratios])
-    losses = []
-    for scale in scales:
-        length_scale = scale.expand(observations.inputs.shape[1])
-        length_scale = length_scale if search.length_scale is None else search.length_scale
-        gram = weight[:, None] * correlation(observations.inputs, observations.inputs, length_scale, search.kernel)
-        eigenvalue, eigenvector = torch.linalg.eigh(gram * weight)
-        square = ((observations.targets * weight) @ eigenvector).square()
-        spectrum = eigenvalue + ratios[:, None]  # (ratios, n)
-        sound = spectrum[:, 0] > 10 * len(weight) * torch.finfo(weight.dtype).eps * spectrum[:, -1]
-        quadratic = square @ (1.0 / spectrum.clamp_min(1e-300)).T
-        variance = _best_variance(quadratic, len(weight))
-        if learned and search.noise_scale is not None:
-            variance = search.noise_scale.square()[:, None] / ratios
-        loss = _evidence(quadratic, spectrum.clamp_min(1e-300).log().sum(-1), variance, observations.counts)
-        losses.append(loss.where(sound, torch.full_like(loss, math.inf)))
-    table = torch.stack(losses, dim=2).flatten(1)  # (b, ratios * scales)
-    starts, offset = [], 0
-    for band in table.tensor_split(min(n_starts, table.shape[1]), dim=1):
-        best = band.argmin(1) + offset
-        starts.append(coordinates.encode(scales[best % len(scales)], ratios[best // len(scales)]))
-        offset += band.shape[1]
-    return torch.stack(starts)
-
-
-def fit_hyperparameters(
-    observations: Observations, search: EvidenceSearch
-) -> tuple[Hyperparameters, Float[Tensor, " b"], FitReport]:
-    """Hyperparameters that maximize each process's evidence: a grid, then L-BFGS from its best points.
-
-    Returns
-    -------
-    Hyperparameters
-    loss : Tensor of shape (b,)
-        Negative log evidence of each process, in nats.
-    report : FitReport
-        Of their sum; its curve has two points, the grid's best and the end.
-
-    Raises
-    ------
-    ValueError
-        If the noise is held at zero for some processes and above zero for others.
-    NotPositiveDefiniteError
-        If there is no start from which the evidence can be computed, as for a length scale held at many
-        times the spacing of inputs without noise.
-    """
-    if search.noise_scale is not None and len((search.noise_scale > 0).unique()) > 1:
-        raise ValueError("noise_scale is zero for some processes and not for others: fit these in two searches.")
-    blocks = []
-    for rows in torch.arange(len(observations.targets)).split(_BLOCK):
-        noise_scale = None if search.noise_scale is None else search.noise_scale[rows]
-        block = replace(observations, targets=observations.targets[rows])
-        blocks.append(_fit_block(block, replace(search, noise_scale=noise_scale)))
-    found, losses, firsts, n_iters, ends = zip(*blocks, strict=True)
-    hyperparameters = Hyperparameters(
-        torch.cat([part.length_scale for part in found]),
-        torch.cat([part.amplitude for part in found]),
-        torch.cat([part.noise_ratio for part in found]),
-    )
-    loss, converged = torch.cat(losses), all(ends)
-    curve = (float(torch.cat(firsts).sum()), float(loss.sum()))
-    message = "converged" if converged else f"stopped at max_iter={search.max_iter} iterations"
-    return hyperparameters, loss, FitReport(curve[-1], curve, max(n_iters), converged, message)
-
-
-def _fit_block(observations: Observations, search: EvidenceSearch) -> tuple[Hyperparameters, Tensor, Tensor, int, bool]:
-    """Hyperparameters, loss, loss of the grid's best points, iterations, and whether all converged."""
-    coordinates = _Coordinates(observations, search)
-    starts = _grid(coordinates, 1 + search.n_restarts)
-    n_starts, n_processes, n_searched = starts.shape
-    columns = torch.arange(n_processes, device=starts.device)
-    rows = columns.repeat(n_starts)
-    losses = coordinates.losses(starts)
-    first = losses.amin(0)
-    # A start far worse than another for each input is not polished: its optimum would have to be a spike.
-    hopeful = (losses <= first + _HOPEFUL * len(observations.counts)).flatten()
-    z, n_iter, converged = starts.flatten(0, 1), 0, True
-    if n_searched:
-        z[hopeful], batch = minimize_batch(
-            lambda chosen, index: coordinates.loss(chosen, rows[hopeful][index]),
-            z[hopeful],
-            max_iter=search.max_iter,
-            tol=search.tol,
-        )
-        n_iter, converged = batch.n_iter, batch.converged
-        # Not evaluated again: at the edge of being singular another batch could round to another answer.
-        losses = losses.flatten().masked_scatter(hopeful, batch.loss * len(observations.counts))
-    loss, best = losses.reshape(n_starts, n_processes).min(0)
-    if not torch.isfinite(loss).all():
-        raise NotPositiveDefiniteError(
-            "The kernel matrix is singular wherever the hyperparameters were searched. Allow for noise "
-            "(noise_scale=None), or give a shorter length_scale."
-        )
-    return coordinates.hyperparameters(z.reshape(starts.shape)[best, columns]), loss, first, n_iter, converged
+    def _solved(self, length_scale: Tensor, noise_ratio: Tensor, rows: Tensor) -> Float[Tensor, "a r"]:
+        """Inverse of the covariance over the squared amplitude times the targets; NaN where it is singular."""
+        data = self.projection.of(rows)
+        covariance = data.covariance(correlation(data.nodes, data.nodes, length_scale, self.kernel))
+        covariance.diagonal(dim1=-2, dim2=-1).add_(noise_ratio[:, None])
+        factor, info = torch.linalg.cholesky_ex(covariance)
+        solved = torch.cholesky_solve(data.targets.unsqueeze(-1), factor).squeeze(-1)
+        return torch.where(info[:, None] == 0, solved, math.nan)

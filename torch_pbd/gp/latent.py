@@ -1,10 +1,13 @@
 """Latent Gaussian processes: prediction from observed values, eq. (5) and (6)."""
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from torch_pbd.gp.observations import Hyperparameters, Observations
+from torch_pbd.gp.projection import projected
 from torch_pbd.kernels import KernelName, correlation
 from torch_pbd.linalg import cholesky_with_jitter, safe_cholesky
 
@@ -15,6 +18,7 @@ class LatentGP(nn.Module):
     Parameters
     ----------
     inputs : Tensor of shape (n, e)
+        Training inputs, or nodes that stand for them.
     weight : Tensor of shape (b, n)
         What eq. (5) multiplies the correlations with the inputs by: the inverse of the matrix there, times
         the squared amplitude and the observed deviations from the prior mean.
@@ -25,6 +29,8 @@ class LatentGP(nn.Module):
     counts : Tensor of shape (n,)
         Observations behind each value; they divide the noise variance.
     kernel : KernelName
+    root : Tensor of shape (r, n), default=None
+        Where the inputs are nodes: what was observed are r combinations of the values there.
     """
 
     inputs: Tensor
@@ -33,6 +39,7 @@ class LatentGP(nn.Module):
     amplitude: Tensor
     noise_ratio: Tensor
     counts: Tensor
+    root: Tensor | None
 
     def __init__(
         self,
@@ -42,6 +49,7 @@ class LatentGP(nn.Module):
         hyperparameters: Hyperparameters,
         counts: Float[Tensor, " n"],
         kernel: KernelName = "squared_exponential",
+        root: Float[Tensor, "r n"] | None = None,
     ) -> None:
         super().__init__()
         self.kernel = kernel
@@ -52,6 +60,7 @@ class LatentGP(nn.Module):
         self.register_buffer("amplitude", hyperparameters.amplitude)
         self.register_buffer("noise_ratio", hyperparameters.noise_ratio)
         self.register_buffer("counts", counts)
+        self.register_buffer("root", root)
 
     def forward(self, x: Float[Tensor, "m e"]) -> Float[Tensor, "m b"]:
         """Mean at x less the prior mean: eq. (5)."""
@@ -86,10 +95,13 @@ class LatentGP(nn.Module):
     def _reduced(self, x: Tensor, noise_ratio: Tensor) -> Tensor:
         """Eq. (6) over the squared amplitude: (b, m), or (1, m) where no noise tells the processes apart."""
         gram = correlation(self.inputs, self.inputs, self.length_scale, self.kernel)
-        if bool((noise_ratio > 0).any()):
-            gram = gram + torch.diag_embed(noise_ratio[:, None] / self.counts)
-        factor = safe_cholesky(gram, name="the kernel matrix of the training inputs")
         cross = correlation(self.inputs, x, self.length_scale, self.kernel)
+        noise = noise_ratio[:, None].expand(-1, len(self.inputs)) / self.counts
+        if self.root is not None:
+            gram, cross = self.root @ gram @ self.root.mT, self.root @ cross
+        if bool((noise_ratio > 0).any()):
+            gram = gram + torch.diag_embed(noise)
+        factor = safe_cholesky(gram, name="the kernel matrix of the training inputs")
         whitened = torch.linalg.solve_triangular(factor, cross, upper=False)
         return (1.0 - whitened.square().sum(-2)).clamp(0.0, 1.0)
 
@@ -99,15 +111,22 @@ def condition(
     hyperparameters: Hyperparameters,
     kernel: KernelName = "squared_exponential",
     values: Float[Tensor, "b n"] | None = None,
+    *,
+    max_inputs: int | None = None,
 ) -> tuple[LatentGP, float]:
     """Gaussian processes conditioned on noisy observations, and the relative jitter that needed.
 
-    ``values`` are those whose prior mean is zero, if they are others than the targets.
+    ``values`` are those whose prior mean is zero, if they are others than the targets. Where fewer nodes than inputs
+    carry the processes to rounding, they are the inputs of what is returned; else neighbours are merged beyond
+    ``max_inputs``.
     """
-    gram = correlation(observations.inputs, observations.inputs, hyperparameters.length_scale, kernel)
-    gram = gram + torch.diag_embed(hyperparameters.noise_ratio[:, None] / observations.counts)
-    factor, jitter = cholesky_with_jitter(gram, name="the kernel matrix of the training inputs")
     values = observations.targets if values is None else values
-    weight, value_weight = torch.cholesky_solve(torch.stack([observations.targets, values], dim=-1), factor).unbind(-1)
-    gp = LatentGP(observations.inputs, weight, value_weight.contiguous(), hyperparameters, observations.counts, kernel)
-    return gp, jitter
+    both = replace(observations, targets=torch.cat([observations.targets, values]))
+    data = projected(both, hyperparameters.length_scale, hyperparameters.noise_ratio, kernel, max_inputs)
+    gram = data.covariance(correlation(data.nodes, data.nodes, hyperparameters.length_scale, kernel))
+    gram = gram + hyperparameters.noise_ratio[:, None, None] * torch.eye(gram.shape[-1]).to(gram)
+    factor, jitter = cholesky_with_jitter(gram, name="the kernel matrix of the training inputs")
+    targets = data.targets.reshape(2, -1, gram.shape[-1]).permute(1, 2, 0)
+    weight, value_weight = data.lowered(torch.cholesky_solve(targets, factor)).unbind(-1)
+    parts = (weight.contiguous(), value_weight.contiguous(), hyperparameters, data.counts, kernel, data.root)
+    return LatentGP(data.nodes, *parts), jitter

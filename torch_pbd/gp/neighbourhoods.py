@@ -8,9 +8,21 @@ from torch import Tensor
 
 from torch_pbd.gp.observations import Observations
 
+_SHORTEST = 0.75  # spacings of the inputs: shorter "needles" explain each point by itself
+
+
+def resolved_length_scale(inputs: Float[Tensor, "n e"]) -> float:
+    """Shortest length scale that the inputs, of a range of about one, tell from noise."""
+    n_inputs, n_features = inputs.shape
+    detail = max(spacing(inputs), n_inputs ** (-1.0 / n_features))
+    return min(0.5, max(1e-6, _SHORTEST * detail))  # inputs may coincide but for rounding
+
 
 def spacing(inputs: Float[Tensor, "n e"], quantile: float = 0.9) -> float:
     """Distance to the nearest other input, a quantile over the inputs; the finest detail they show."""
+    if inputs.shape[1] == 1 and len(inputs) > 1:
+        gap = torch.nn.functional.pad(inputs[:, 0].sort().values.diff(), (1, 1), value=float("inf"))
+        return float(torch.minimum(gap[1:], gap[:-1]).quantile(quantile))
     if len(inputs) > 2000:
         inputs = inputs[:: len(inputs) // 1000]
     distance = torch.cdist(inputs, inputs, compute_mode="donot_use_mm_for_euclid_dist")
@@ -22,11 +34,15 @@ def neighbourhoods(inputs: Float[Tensor, "n e"], max_inputs: int) -> Int64[Tenso
     """Index of the neighbourhood of each input; at most ``max_inputs`` of them, each for itself if they fit.
 
     The largest neighbourhood is split at the median of its widest dimension until there are enough, so they
-    hold about equally many inputs (up to a factor of two), and on a line they are runs of sorted inputs.
+    hold about equally many inputs (up to a factor of two). On a line they are runs of sorted inputs, of equal numbers
+    up to one.
     """
     everything = torch.arange(len(inputs), device=inputs.device)
     if len(inputs) <= max_inputs:
         return everything
+    if inputs.shape[1] == 1:
+        runs = everything * max_inputs // len(inputs)
+        return torch.empty_like(runs).index_copy(0, inputs[:, 0].argsort(stable=True), runs)
     groups = [(-len(inputs), "", everything)]  # the second tells the way through the halves, and is never equal
     for _ in range(1, max_inputs):
         _, way, group = heapq.heappop(groups)

@@ -71,4 +71,6 @@ def _latent(prefix: str, parts: Mapping[str, Tensor], kernel: Any) -> LatentGP:
         return parts[prefix + name]
 
     hyperparameters = Hyperparameters(part("length_scale"), part("amplitude"), part("noise_ratio"))
-    return LatentGP(part("inputs"), part("weight"), part("value_weight"), hyperparameters, part("counts"), kernel)
+    weights = (part("weight"), part("value_weight"))
+    root = parts.get(prefix + "root")
+    return LatentGP(part("inputs"), *weights, hyperparameters, part("counts"), kernel, root)

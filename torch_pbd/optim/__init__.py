@@ -1,6 +1,6 @@
 """L-BFGS that never loses its best point: for one objective, and for many small ones side by side."""
 
-from torch_pbd.optim.batch import BatchReport, minimize_batch
+from torch_pbd.optim.batch import BatchReport, by_autograd, minimize_batch
 from torch_pbd.optim.lbfgs import FitReport, Progress, minimize
 
-__all__ = ["BatchReport", "FitReport", "Progress", "minimize", "minimize_batch"]
+__all__ = ["BatchReport", "FitReport", "Progress", "by_autograd", "minimize", "minimize_batch"]

@@ -7,7 +7,14 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-_LONGEST_STEP = 1e3  # in steps of L-BFGS
+_LONGEST_STEP = 1e3  # in steps of BFGS
+_DIFFERENCE = 1e-4  # of parameters, for the first Hessian
+_LEAST_CURVATURE = 1e-3  # of a Hessian's largest: a flatter direction gets no longer step
+_FIRST_REACH = 1.0  # of the first step, in any parameter
+
+ValueAndGradient = Callable[
+    [Float[Tensor, "a p"], Int64[Tensor, " a"]], tuple[Float[Tensor, " a"], Float[Tensor, "a p"]]
+]
 
 
 @dataclass(frozen=True)
@@ -15,34 +22,56 @@ class BatchReport:
     """How the optimizations of a batch ended, each for itself."""
 
     loss: Float[Tensor, " b"]
+    start_loss: Float[Tensor, " b"]
     n_iter: int
     converged: bool
     """All of them."""
 
 
-def minimize_batch(
+def by_autograd(
     objective: Callable[[Float[Tensor, "a p"], Int64[Tensor, " a"]], Float[Tensor, " a"]],
+) -> ValueAndGradient:
+    """Value and gradient of losses (a,) of unrelated problems."""
+
+    def value_and_gradient(x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+        with torch.enable_grad():
+            leaf = x.detach().requires_grad_()
+            loss = objective(leaf, rows)
+            (gradient,) = torch.autograd.grad(loss.sum(), leaf)
+        return loss.detach(), gradient
+
+    return value_and_gradient
+
+
+def minimize_batch(
+    objective: ValueAndGradient,
     start: Float[Tensor, "b p"],
     *,
     max_iter: int = 100,
     tol: float = 1e-6,
-    history_size: int = 10,
 ) -> tuple[Float[Tensor, "b p"], BatchReport]:
-    """Minimize b unrelated objectives of p parameters by L-BFGS, their evaluations in one batch.
+    """Minimize b unrelated objectives of few parameters by BFGS, their evaluations in one batch.
 
-    Each problem has its own curvature pairs, its own step and its own end: a joint L-BFGS over all of them
-    would share one line search and one memory between problems that have nothing to do with each other.
+    Each problem has its own inverse Hessian, its own step and its own end: a joint L-BFGS over all of them
+    would share one line search and one memory between problems that have nothing to do with each other, and with a
+    handful of parameters the whole matrix costs less than a limited memory of it. The first Hessian is found by
+    differences of the gradient, in one batch too, with the absolute values of its eigenvalues. Parameters are
+    expected to be of order one.
     Steps are accepted by the Armijo rule, so the loss never rises; a value that is not finite counts as
     too far. Where the slope along a step has hardly changed, the next step starts four times as long.
 
     Parameters
     ----------
     objective : callable
-        Given parameters of a problems and their indices in the batch, returns their a losses.
+        Given parameters (a, p) of a problems and their indices in the batch, returns their losses (a,) and
+        gradients (a, p); see :func:`by_autograd`.
     start : Tensor of shape (b, p)
         Where to start. A problem whose loss there is not finite stays there.
-    max_iter, tol, history_size
-        As in :func:`minimize`.
+    max_iter : int, default=100
+        Largest number of iterations.
+    tol : float, default=1e-6
+        A problem ends when its gradient, summed over its absolute entries, is below it, or when its last step
+        gained and its next promises less than a hundredth of it.
 
     Returns
     -------
@@ -51,99 +80,98 @@ def minimize_batch(
     """
     x = start.detach().clone()
     rows = torch.arange(len(x), device=x.device)
-    loss, gradient = _value_and_gradient(objective, x, rows)
-    memory = _CurvatureMemory(history_size)
-    active = torch.isfinite(loss) & torch.isfinite(gradient).all(-1) & (gradient.abs().amax(-1) > tol)
-    first_step = 1.0 / gradient.norm(dim=-1).clamp_min(1.0)
-    n_iter = 0
-    while n_iter < max_iter and bool(active.any()):
+    loss, gradient = objective(x, rows)
+    first_loss = loss
+    # Problems that have ended are not carried along: ``rows`` are those still active.
+    ended_x, ended_loss = x.clone(), loss.clone()
+    size = gradient.abs().sum(-1)  # of no parameters it is zero, and there is nothing to do
+    alive = torch.isfinite(loss + size) & (size > tol)
+    rows, x, loss, gradient = rows[alive], x[alive], loss[alive], gradient[alive]
+    inverse = _first_inverse(objective, rows, x, gradient)
+    step, n_iter = torch.ones_like(loss), 0
+    while n_iter < max_iter and len(rows):
         n_iter += 1
-        direction = memory.direction(gradient)
+        direction = -(inverse @ gradient.unsqueeze(-1)).squeeze(-1)
         slope = (direction * gradient).sum(-1)
-        uphill = ~(slope < 0)
-        direction = torch.where(uphill[:, None], -gradient, direction)
-        slope = torch.where(uphill, -gradient.square().sum(-1), slope)
-        new_x, new_loss, new_gradient = _backtrack(objective, x, loss, gradient, direction, slope, first_step, active)
-        memory.add(new_x - x, new_gradient - gradient)
+        new_x, new_loss, new_gradient = _backtrack(objective, rows, x, loss, gradient, direction, slope, step)
+        inverse = _updated(inverse, new_x - x, new_gradient - gradient)
         still_steep = (direction * new_gradient).sum(-1) < 0.9 * slope
-        short = active & still_steep & (new_loss < loss) & (first_step < _LONGEST_STEP)
-        first_step = torch.where(short & (n_iter > 1), 4.0 * first_step, torch.ones_like(first_step))
+        short = still_steep & (new_loss < loss) & (step < _LONGEST_STEP)
+        step = torch.where(short & (n_iter > 1), 4.0 * step, 1.0)
         gain = loss - new_loss
         x, loss, gradient = new_x, new_loss, new_gradient
-        settled = (gain <= tol * 1e-2 * loss.abs().clamp_min(1.0)) & ~short
-        active = active & (gradient.abs().amax(-1) > tol) & ~settled
-    return x, BatchReport(loss, n_iter, not bool(active.any()))
+        ended_x[rows], ended_loss[rows] = x, loss
+        promise = 0.5 * (gradient * (inverse @ gradient.unsqueeze(-1)).squeeze(-1)).sum(-1)
+        rounding = torch.finfo(loss.dtype).eps * loss.abs()
+        settled = (gain.maximum(promise) <= 1e-2 * tol + rounding) & ~short
+        alive = (gradient.abs().sum(-1) > tol) & ~settled
+        if not bool(alive.all()):
+            rows, x, loss, gradient = rows[alive], x[alive], loss[alive], gradient[alive]
+            inverse, step = inverse[alive], step[alive]
+    return ended_x, BatchReport(ended_loss, first_loss, n_iter, len(rows) == 0)
 
 
-class _CurvatureMemory:
-    """Pairs of steps and gradient changes, for each problem of a batch; the two-loop recursion on them."""
-
-    def __init__(self, size: int) -> None:
-        self._size = size
-        self._pairs: list[tuple[Tensor, Tensor, Tensor]] = []
-
-    def add(self, step: Tensor, change: Tensor) -> None:
-        curvature = (step * change).sum(-1)
-        usable = curvature > 1e-10 * step.norm(dim=-1) * change.norm(dim=-1)
-        inverse = torch.where(usable, 1.0 / curvature.where(usable, torch.ones_like(curvature)), 0.0)
-        self._pairs = [*self._pairs, (step, change, inverse)][-self._size :]
-
-    def direction(self, gradient: Tensor) -> Tensor:
-        vector = -gradient
-        scale = torch.ones_like(gradient[:, 0])
-        projections = []
-        for step, change, inverse in reversed(self._pairs):
-            projection = inverse * (step * vector).sum(-1)
-            vector = vector - projection[:, None] * change
-            projections.append(projection)
-        for step, change, inverse in self._pairs:
-            fitted = (step * change).sum(-1) / change.square().sum(-1).clamp_min(1e-300)
-            scale = torch.where(inverse > 0, fitted, scale)
-        vector = scale[:, None] * vector
-        for (step, change, inverse), projection in zip(self._pairs, reversed(projections), strict=True):
-            vector = vector + (projection - inverse * (change * vector).sum(-1))[:, None] * step
-        return vector
+def _first_inverse(objective: ValueAndGradient, rows: Tensor, x: Tensor, gradient: Tensor) -> Tensor:
+    """Inverse Hessians by differences, of positive eigenvalues; where there is none, of a step of one."""
+    size = x.shape[-1]
+    if len(x) == 0:
+        return x.new_zeros(0, size, size)
+    eye = torch.eye(size).to(x)
+    _, shifted = objective((x + _DIFFERENCE * eye[:, None]).flatten(0, 1), rows.repeat(size))
+    hessian = (shifted.reshape(size, *x.shape) - gradient).transpose(0, 1) / _DIFFERENCE
+    sound = torch.isfinite(hessian).all(-1).all(-1)[:, None, None]
+    hessian = torch.where(sound, 0.5 * (hessian + hessian.mT), gradient.norm(dim=-1)[:, None, None] * eye)
+    curvature, axes = torch.linalg.eigh(hessian)
+    curvature = curvature.abs()
+    curvature = curvature.maximum(_LEAST_CURVATURE * curvature.amax(-1, keepdim=True)).clamp_min(1e-300)
+    inverse = (axes / curvature.unsqueeze(-2)) @ axes.mT
+    reach = (inverse @ gradient.unsqueeze(-1)).abs().amax((-2, -1))
+    return inverse * (_FIRST_REACH / reach.clamp_min(_FIRST_REACH))[:, None, None]
 
 
-def _value_and_gradient(
-    objective: Callable[[Tensor, Tensor], Tensor], x: Tensor, rows: Tensor
-) -> tuple[Tensor, Tensor]:
-    with torch.enable_grad():
-        leaf = x.detach().requires_grad_()
-        loss = objective(leaf, rows)
-        (gradient,) = torch.autograd.grad(loss.sum(), leaf)
-    return loss.detach(), gradient
+def _updated(inverse: Tensor, step: Tensor, change: Tensor) -> Tensor:
+    """Inverse Hessians after a step and the change of the gradient along it; as they were where it tells nothing."""
+    curvature = (step * change).sum(-1)
+    usable = curvature > 1e-10 * step.norm(dim=-1) * change.norm(dim=-1)
+    share = torch.where(usable, 1.0 / curvature.where(usable, 1.0), 0.0)[:, None, None]
+    off = torch.eye(step.shape[-1]).to(step) - share * step.unsqueeze(-1) * change.unsqueeze(-2)
+    return off @ inverse @ off.mT + share * step.unsqueeze(-1) * step.unsqueeze(-2)
 
 
 def _backtrack(
-    objective: Callable[[Tensor, Tensor], Tensor],
+    objective: ValueAndGradient,
+    rows: Tensor,
     x: Tensor,
     loss: Tensor,
     gradient: Tensor,
     direction: Tensor,
     slope: Tensor,
     step: Tensor,
-    active: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Shorten each active problem's step until its loss falls enough; the others stay where they are."""
+    """Shorten each problem's step until its loss falls enough; where none does it stays where it is."""
+    trial = x + step[:, None] * direction
+    value, trial_gradient = objective(trial, rows)
+    accepted = _accepted(value, trial_gradient, loss, step, slope)
+    if bool(accepted.all()):
+        return trial, value, trial_gradient
     new_x, new_loss, new_gradient = x.clone(), loss.clone(), gradient.clone()
-    rows = active.nonzero().squeeze(-1)
+    left = torch.arange(len(rows), device=rows.device)
     for _ in range(25):
-        if len(rows) == 0:
-            break
-        trial = x[rows] + step[rows, None] * direction[rows]
-        value, trial_gradient = _value_and_gradient(objective, trial, rows)
+        done = left[accepted]
+        new_x[done], new_loss[done], new_gradient[done] = trial[accepted], value[accepted], trial_gradient[accepted]
         finite = torch.isfinite(value) & torch.isfinite(trial_gradient).all(-1)
-        accepted = finite & (value <= loss[rows] + 1e-4 * step[rows] * slope[rows])
-        done = rows[accepted]
-        new_x[done], new_loss[done], new_gradient[done] = (
-            trial[accepted],
-            value[accepted],
-            trial_gradient[accepted],
-        )
         # The minimum of the parabola through both values and the slope, kept within a tenth and a half.
-        parabola = -0.5 * step[rows] * slope[rows] / ((value - loss[rows]) / step[rows] - slope[rows])
-        shorter = torch.where(finite, parabola, 0.1 * step[rows])
-        step = step.index_copy(0, rows, shorter.clamp(0.1 * step[rows], 0.5 * step[rows]))
-        rows = rows[~accepted]
+        parabola = -0.5 * step[left] * slope[left] / ((value - loss[left]) / step[left] - slope[left])
+        shorter = torch.where(finite, parabola, 0.1 * step[left])
+        step = step.index_copy(0, left, shorter.clamp(0.1 * step[left], 0.5 * step[left]))
+        left = left[~accepted]
+        if len(left) == 0:
+            break
+        trial = x[left] + step[left, None] * direction[left]
+        value, trial_gradient = objective(trial, rows[left])
+        accepted = _accepted(value, trial_gradient, loss[left], step[left], slope[left])
     return new_x, new_loss, new_gradient
+
+
+def _accepted(value: Tensor, gradient: Tensor, loss: Tensor, step: Tensor, slope: Tensor) -> Tensor:
+    return (value <= loss + 1e-4 * step * slope) & torch.isfinite(gradient.sum(-1) + value)

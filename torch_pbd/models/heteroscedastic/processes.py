@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torch_pbd.exceptions import NotPositiveDefiniteError
 from torch_pbd.gp.inducing import FeatureMap
-from torch_pbd.optim import BatchReport, Progress, minimize_batch
+from torch_pbd.optim import BatchReport, Progress, by_autograd, minimize_batch
 
 _CLEAR = 3.0  # times the shortest length scale
 _WIDEST = 4.0  # amplitudes stay within a factor of exp(4) of their prior median
@@ -146,11 +146,11 @@ def search(
     for candidate in candidates:
         if family.shared:
             together = torch.cat([candidate[0, :n_features], candidate[:, -1]])[None]
-            end, report = minimize_batch(joint_loss, together, max_iter=options.max_iter, tol=options.tol)
+            end, report = minimize_batch(by_autograd(joint_loss), together, max_iter=options.max_iter, tol=options.tol)
             ends.append(_spread_out(end[0], n_features))
             losses.append(report.loss.expand(n_processes))
         else:
-            end, report = minimize_batch(loss, candidate, max_iter=options.max_iter, tol=options.tol)
+            end, report = minimize_batch(by_autograd(loss), candidate, max_iter=options.max_iter, tol=options.tol)
             ends.append(end)
             losses.append(report.loss)
         options.reports.append(report)
