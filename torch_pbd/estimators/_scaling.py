@@ -51,5 +51,9 @@ class Standardization:
 
 def distinct_rows(X: Floats) -> tuple[Floats, NDArray[np.intp]]:
     """Distinct rows of X in lexicographic order, and the index of each row's own among them."""
-    inputs, index = np.unique(X + 0.0, axis=0, return_inverse=True)  # + 0.0: minus zero is zero
+    X = X + 0.0  # minus zero is zero
+    if X.shape[1] == 1:  # many times as fast as along an axis
+        values, index = np.unique(X[:, 0], return_inverse=True)
+        return values[:, np.newaxis], index
+    inputs, index = np.unique(X, axis=0, return_inverse=True)
     return inputs, index.reshape(-1)

@@ -17,10 +17,11 @@ MIN_NOISE_RATIO, MAX_NOISE_RATIO = 1e-10, 1e5
 """Bounds of a learned noise variance over the variance of the process; a fixed noise may be far lower."""
 
 _ENTRIES = 1 << 20  # of the matrices that are treated together: they stay near the cache, and memory is bounded
-_GRID_STEP = 1.6  # largest ratio of neighbouring length scales of the grid
+# Largest ratio of neighbouring length scales of the grid, and where a decomposition costs nearly nothing.
+_GRID_STEP, _FINE_STEP, _SMALL = 1.6, 1.25, 24
 
-# Below 1e-3 the evidence is nearly flat in the ratio: no optimum is lost between these.
-_LOG10_RATIOS = (-10.0, -8.0, -6.0, -4.0, -3.0, -2.5, -2.0, -1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 4.0)
+# Where the evidence is nearly flat in the ratio no optimum is lost between coarser steps.
+_LOG10_RATIOS = (-10.0, -8.0, -6.0, -5.0, -4.0, *(0.25 * step for step in range(-14, 7)), 2.0, 3.0, 4.0)
 
 _LAGS = 3
 _NOT_WHITE = 21.1  # 0.9999 quantile of the chi-squared distribution of three degrees of freedom
@@ -45,7 +46,8 @@ class EvidenceSearch:
     n_restarts : int
         Valleys of the grid to descend into beside the deepest.
     max_iter, tol
-        Of the optimization that polishes the grid's points.
+        Of the optimization that polishes the grid's points; the tolerance in nats, as in
+        :func:`~torch_pbd.optim.minimize_batch`.
     """
 
     kernel: KernelName = "squared_exponential"
@@ -55,7 +57,7 @@ class EvidenceSearch:
     max_inputs: int | None = None
     n_restarts: int = 2
     max_iter: int = 100
-    tol: float = 1e-4
+    tol: float = 0.02
 
 
 class Coordinates:
@@ -95,11 +97,11 @@ class Coordinates:
         return torch.acos(1.0 - 2.0 * share.clamp(0.01, 0.99))
 
     def loss(self, z: Float[Tensor, "a p"], rows: Int64[Tensor, " a"]) -> tuple[Tensor, Tensor]:
-        """Negative log evidence for an observation, and its gradient."""
+        """Negative log evidence in nats, and its gradient."""
         loss, gradient = self.evidence(*self.decode(z, rows), rows)
         parts = [gradient.log_length_scale] * (self.fixed is None) + [gradient.log_noise_ratio[:, None]] * self.noisy
         by_z = torch.cat([*parts, z[:, :0]], dim=1) * self.half_width[rows] * torch.sin(z)
-        return loss / self.evidence.projection.n_inputs, by_z / self.evidence.projection.n_inputs
+        return loss, by_z
 
 
 class EvidenceGrid:
@@ -145,7 +147,8 @@ class EvidenceGrid:
         self.evidence = Evidence.of(projection, self._search.kernel, self._search.noise_scale)
         n_features, fixed = projection.nodes.shape[1], self._search.length_scale
         if fixed is None:
-            n_steps = math.ceil(math.log(longest / self.shortest) / math.log(_GRID_STEP) - 1e-9)
+            step = _FINE_STEP if len(projection.nodes) <= _SMALL else _GRID_STEP
+            n_steps = math.ceil(math.log(longest / self.shortest) / math.log(step) - 1e-9)
             new = torch.logspace(math.log10(self.shortest), math.log10(longest), n_steps + 1).to(self._scales)
             new = new[:-1] if len(self._scales) else new
             each = new[:, None].expand(-1, n_features)

@@ -115,9 +115,7 @@ def _descend(grid: EvidenceGrid, search: EvidenceSearch) -> tuple[Tensor, Tensor
         ends.append(end)
         reports.append(report)
     first, final = (
-        torch.full_like(loss, math.inf).index_put(
-            (process, valley), n_inputs * torch.cat(values).nan_to_num(nan=math.inf)
-        )
+        torch.full_like(loss, math.inf).index_put((process, valley), torch.cat(values).nan_to_num(nan=math.inf))
         for values in zip(*((report.start_loss, report.loss) for report in reports), strict=True)
     )
     if not bool(torch.isfinite(final.amin(1)).all()):
