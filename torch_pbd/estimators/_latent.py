@@ -26,7 +26,7 @@ from torch_pbd.gp import (
     LatentGP,
     Observations,
     condition,
-    fit_hyperparameters,
+    fit_together,
     resolved_length_scale,
     spacing,
 )
@@ -149,8 +149,8 @@ class LatentCovarianceRegressor(CovarianceRegressor):
     def _fit_mean(self, training: TrainingSet) -> LatentGP:
         """Gaussian processes of the mean, by themselves."""
         observations, search = self._mean_job(training)
-        hyperparameters = fit_hyperparameters(observations, search)[0]
-        return condition(observations, hyperparameters, self.kernel, max_inputs=self.max_inputs)[0]
+        (found,) = fit_together([(observations, search)])
+        return condition(observations, found.hyperparameters, self.kernel, basis=found.basis)[0]
 
     def _mean_job(self, training: TrainingSet) -> tuple[Observations, EvidenceSearch]:
         """Means at the inputs, weighted by their counts, and the search for their hyperparameters."""

@@ -160,13 +160,15 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
         noise_scale = self._entry_noise(problem)
         search = self._search(observations, _LONGEST_COVARIANCE, problem.length_scale, noise_scale)
         mean_job = self._mean_job(training)
-        (of_mean, *_), (of_entries, _, report) = fit_together([mean_job, (observations, search)])
-        warn_if_stretched(of_entries.amplitude, observations.targets, given=problem.length_scale is not None)
-        mean, _ = condition(mean_job[0], of_mean, self.kernel, max_inputs=self.max_inputs)
+        of_mean, of_entries = fit_together([mean_job, (observations, search)])
+        amplitude = of_entries.hyperparameters.amplitude
+        warn_if_stretched(amplitude, observations.targets, given=problem.length_scale is not None)
+        mean, _ = condition(mean_job[0], of_mean.hyperparameters, self.kernel, basis=of_mean.basis)
         values = tril_to_vector(scale_tril).mT.contiguous()
-        latent, jitter = condition(observations, of_entries, self.kernel, values, max_inputs=self.max_inputs)
+        found = (of_entries.hyperparameters, self.kernel, values)
+        latent, jitter = condition(observations, *found, basis=of_entries.basis)
         prior = problem.prior_tril if problem.prior_tril.ndim == 2 else problem.prior_tril[0]
-        return mean, CholeskyCovariance(latent, prior, log_diagonal=log_diagonal), report, jitter
+        return mean, CholeskyCovariance(latent, prior, log_diagonal=log_diagonal), of_entries.report, jitter
 
     def _entry_noise(self, problem: Problem) -> Tensor | None:
         """Noise of each entry of the factor, in standardized units; of a logarithm, relative."""

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from torch_pbd.gp.observations import Hyperparameters, Observations
-from torch_pbd.gp.projection import Projection, project
+from torch_pbd.gp.projection import FULL, Basis, Projection
 from torch_pbd.kernels import KernelName, correlation, value_and_slope
 
 
@@ -24,10 +24,10 @@ def negative_log_evidence(
 
     Differentiable by autograd; NaN where the covariance is not positive definite.
     """
-    whole = project(observations)
-    covariance = whole.covariance(
-        correlation(whole.nodes, whole.nodes, hyperparameters.length_scale, kernel)
-    ) + torch.diag_embed(hyperparameters.noise_ratio[:, None].expand(-1, whole.n_inputs))
+    basis = Basis.of(observations, FULL)
+    whole = basis.project(observations.targets)
+    covariance = basis.covariance(correlation(basis.nodes, basis.nodes, hyperparameters.length_scale, kernel))
+    covariance = covariance + torch.diag_embed(hyperparameters.noise_ratio[:, None].expand(-1, whole.n_inputs))
     factor, info = torch.linalg.cholesky_ex(covariance)
     whitened = torch.linalg.solve_triangular(factor, whole.targets.unsqueeze(-1), upper=False).squeeze(-1)
     log_det = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
@@ -70,7 +70,7 @@ class Evidence:
     @classmethod
     def of(cls, projection: Projection, kernel: KernelName, noise_scale: Tensor | None) -> "Evidence":
         """Evidence of observations; a ``noise_scale`` of zero is no noise, and leaves the amplitude free."""
-        nodes = projection.nodes.mT
+        nodes = projection.basis.nodes.mT
         difference = (nodes[:, :, None] - nodes[:, None, :]).square().flatten(1)
         held = noise_scale if noise_scale is not None and bool((noise_scale > 0).all()) else None
         return cls(projection, kernel, held, difference)
@@ -83,33 +83,36 @@ class Evidence:
         With M = A^-1 - alpha alpha' / variance and alpha = A^-1 y, a change of the covariance A over the squared
         amplitude changes it by tr(M dA) / 2: the best amplitude changes nothing to first order.
         """
-        data = self.projection.of(rows)
-        n_nodes, inverse_square = len(data.nodes), length_scale.square().reciprocal()
+        data, basis = self.projection, self.projection.basis
+        n_nodes, inverse_square = len(basis.nodes), length_scale.square().reciprocal()
         square_distance = (inverse_square @ self.square_difference).reshape(-1, n_nodes, n_nodes)
         correlation, slope = value_and_slope(square_distance, self.kernel)
-        covariance = data.covariance(correlation)
+        covariance = basis.covariance(correlation)
         covariance.diagonal(dim1=-2, dim2=-1).add_(noise_ratio[:, None])
         factor, info = torch.linalg.cholesky_ex(covariance)
         inverse = torch.cholesky_inverse(factor)
-        alpha = (inverse @ data.targets.unsqueeze(-1)).squeeze(-1)
-        n_outside = data.n_inputs - data.targets.shape[1]
-        outside = data.remainder / noise_ratio if n_outside else torch.zeros_like(noise_ratio)
-        quadratic = (data.targets * alpha).sum(-1) + outside
+        targets = data.targets[rows].unsqueeze(-1)
+        alpha = inverse @ targets
+        quadratic = (targets * alpha).sum((-2, -1))
         log_det = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        if n_outside:
-            log_det = log_det + n_outside * noise_ratio.log()
+        if data.n_outside:
+            outside = data.remainder[rows] / noise_ratio
+            quadratic = quadratic + outside
+            log_det = log_det + data.n_outside * noise_ratio.log()
         variance = self.variance(quadratic, noise_ratio, rows)
         loss = negative_log_density(quadratic, log_det, variance, data)
         if bool(info.any()):
             loss = torch.where(info == 0, loss, math.nan)
-        matrix = inverse - (alpha / variance[:, None]).unsqueeze(-1) * alpha.unsqueeze(-2)
+        matrix = inverse - (alpha / variance[:, None, None]) @ alpha.mT
         # The squared distance is inversely proportional to the square of the length scale.
-        by_distance = (data.pulled_back(matrix) * slope).flatten(1)
-        by_length = -(by_distance @ self.square_difference.mT) * inverse_square
-        by_ratio = 0.5 * (noise_ratio * matrix.diagonal(dim1=-2, dim2=-1).sum(-1) + n_outside - outside / variance)
+        by_distance = (basis.pulled_back(matrix) * slope).flatten(1)
+        by_length = (by_distance @ self.square_difference.mT) * -inverse_square
+        by_ratio = noise_ratio * matrix.diagonal(dim1=-2, dim2=-1).sum(-1)
+        if data.n_outside:
+            by_ratio = by_ratio + (data.n_outside - outside / variance)
         if self.noise_scale is not None:  # the variance is inversely proportional to the ratio
-            by_ratio = by_ratio + 0.5 * (quadratic / variance - data.n_inputs)
-        return loss, Gradient(by_length, by_ratio)
+            by_ratio = by_ratio + (quadratic / variance - data.n_inputs)
+        return loss, Gradient(by_length, 0.5 * by_ratio)
 
     def variance(self, quadratic: Tensor, noise_ratio: Tensor, rows: Tensor | slice) -> Tensor:
         """Squared amplitude of the processes ``rows``."""
@@ -122,19 +125,19 @@ class Evidence:
 
         One eigendecomposition of a length scale serves all processes and all noise ratios.
         """
-        data, n_nodes = self.projection, len(self.projection.nodes)
+        data, n_nodes = self.projection, len(self.projection.basis.nodes)
         square_distance = (length_scales.square().reciprocal() @ self.square_difference).reshape(-1, n_nodes, n_nodes)
         correlation, _ = value_and_slope(square_distance, self.kernel)
-        eigenvalue, eigenvector = torch.linalg.eigh(data.covariance(correlation))
+        eigenvalue, eigenvector = torch.linalg.eigh(data.basis.covariance(correlation))
         square = (data.targets @ eigenvector).square()  # (s, b, r)
         spectrum = eigenvalue.clamp_min(0.0).unsqueeze(1) + noise_ratios[:, None]  # (s, q, r)
         rounding = 10 * n_nodes * torch.finfo(spectrum.dtype).eps
         sound = eigenvalue[:, :1] + noise_ratios > rounding * spectrum[..., -1]
         quadratic = square @ (1.0 / spectrum.clamp_min(1e-300)).mT  # (s, b, q)
         log_det = spectrum.clamp_min(1e-300).log().sum(-1).unsqueeze(1)
-        if n_outside := data.n_inputs - data.targets.shape[1]:
+        if data.n_outside:
             quadratic = quadratic + data.remainder[:, None] / noise_ratios
-            log_det = log_det + n_outside * noise_ratios.log()
+            log_det = log_det + data.n_outside * noise_ratios.log()
         variance = best_variance(quadratic, data.n_inputs)
         if self.noise_scale is not None:
             variance = (self.noise_scale.square()[:, None] / noise_ratios).expand_as(quadratic)
@@ -142,29 +145,27 @@ class Evidence:
         return loss.where(sound.unsqueeze(1), math.inf).transpose(0, 1)
 
     def residual(self, length_scale: Float[Tensor, "b e"], noise_ratio: Float[Tensor, " b"]) -> Float[Tensor, "b n"]:
-        """What each process leaves of its weighted observations on a line, sorted by input."""
-        basis, weighted = self.projection.basis, self.projection.weighted
-        assert basis is not None
-        assert weighted is not None
-        rows = torch.arange(len(noise_ratio), device=noise_ratio.device)
-        left = noise_ratio[:, None] * self._solved(length_scale, noise_ratio, rows)
-        return weighted - (self.projection.targets - left) @ basis.mT
+        """What each process leaves of its weighted observations."""
+        data, orthogonal = self.projection, self.projection.basis.orthogonal
+        assert orthogonal is not None
+        left = noise_ratio[:, None] * self._solved(length_scale, noise_ratio)
+        return data.weighted - (data.targets - left) @ orthogonal.mT
 
-    def best_variance_at(self, length_scale: Tensor, noise_ratio: Tensor, rows: Tensor) -> Float[Tensor, " a"]:
-        """Squared amplitude; that of the targets themselves where the covariance is singular."""
-        data = self.projection.of(rows)
-        quadratic = (data.targets * self._solved(length_scale, noise_ratio, rows)).sum(-1)
-        if data.n_inputs > data.targets.shape[1]:
+    def best_variance_at(self, length_scale: Float[Tensor, "b e"], noise_ratio: Float[Tensor, " b"]) -> Tensor:
+        """Squared amplitude (b,); that of the targets themselves where the covariance is singular."""
+        data = self.projection
+        quadratic = (data.targets * self._solved(length_scale, noise_ratio)).sum(-1)
+        if data.n_outside:
             quadratic = quadratic + data.remainder / noise_ratio
-        variance = self.variance(quadratic, noise_ratio, rows)
+        variance = self.variance(quadratic, noise_ratio, slice(None))
         crude = data.targets.square().mean(1).clamp_min(1e-200)
         return torch.where(variance.isnan(), crude, variance)
 
-    def _solved(self, length_scale: Tensor, noise_ratio: Tensor, rows: Tensor) -> Float[Tensor, "a r"]:
+    def _solved(self, length_scale: Tensor, noise_ratio: Tensor) -> Float[Tensor, "b r"]:
         """Inverse of the covariance over the squared amplitude times the targets; NaN where it is singular."""
-        data = self.projection.of(rows)
-        covariance = data.covariance(correlation(data.nodes, data.nodes, length_scale, self.kernel))
+        basis = self.projection.basis
+        covariance = basis.covariance(correlation(basis.nodes, basis.nodes, length_scale, self.kernel))
         covariance.diagonal(dim1=-2, dim2=-1).add_(noise_ratio[:, None])
         factor, info = torch.linalg.cholesky_ex(covariance)
-        solved = torch.cholesky_solve(data.targets.unsqueeze(-1), factor).squeeze(-1)
+        solved = torch.cholesky_solve(self.projection.targets.unsqueeze(-1), factor).squeeze(-1)
         return torch.where(info[:, None] == 0, solved, math.nan)

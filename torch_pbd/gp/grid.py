@@ -10,7 +10,7 @@ from torch.nn.functional import max_pool2d
 
 from torch_pbd.gp.evidence import Evidence
 from torch_pbd.gp.observations import Observations
-from torch_pbd.gp.projection import Projection, project, resolutions
+from torch_pbd.gp.projection import Basis, Projection, resolutions
 from torch_pbd.kernels import KernelName
 
 MIN_NOISE_RATIO, MAX_NOISE_RATIO = 1e-10, 1e5
@@ -18,11 +18,13 @@ MIN_NOISE_RATIO, MAX_NOISE_RATIO = 1e-10, 1e5
 
 _ENTRIES = 1 << 20  # of the matrices that are treated together: they stay near the cache, and memory is bounded
 # Largest ratio of neighbouring length scales of the grid, and where a decomposition costs nearly nothing.
-_GRID_STEP, _FINE_STEP, _SMALL = 1.6, 1.25, 24
+_GRID_STEP, _FINE_STEP, _SMALL = 1.3, 1.25, 24
 
 # Where the evidence is nearly flat in the ratio no optimum is lost between coarser steps.
 _LOG10_RATIOS = (-10.0, -8.0, -6.0, -5.0, -4.0, *(0.25 * step for step in range(-14, 7)), 2.0, 3.0, 4.0)
 
+# Points that a local minimum of the grid is the lowest of: of fewer, points along one valley would be several.
+_AROUND = (5, 7)
 _LAGS = 3
 _NOT_WHITE = 21.1  # 0.9999 quantile of the chi-squared distribution of three degrees of freedom
 
@@ -73,7 +75,7 @@ class Coordinates:
         bounds: list[tuple[float, Float[Tensor, " b"] | float]],
     ) -> None:
         self.evidence, self.fixed = evidence, length_scale
-        n_length_scales = evidence.projection.nodes.shape[1] if length_scale is None else 0
+        n_length_scales = evidence.projection.basis.nodes.shape[1] if length_scale is None else 0
         self.noisy = len(bounds) > n_length_scales
         like = evidence.projection.targets[:, 0]
         low = [math.log(lowest) + 0.0 * like for lowest, _ in bounds]
@@ -143,11 +145,11 @@ class EvidenceGrid:
         """Add the length scales that the next level carries."""
         longest = self.shortest if self._level >= 0 else max(self._shortest, float(self._longest.max()))
         self._level += 1
-        projection = project(self._observations, self._levels[self._level])
+        projection = Basis.of(self._observations, self._levels[self._level]).project(self._observations.targets)
         self.evidence = Evidence.of(projection, self._search.kernel, self._search.noise_scale)
-        n_features, fixed = projection.nodes.shape[1], self._search.length_scale
+        n_features, fixed = projection.basis.nodes.shape[1], self._search.length_scale
         if fixed is None:
-            step = _FINE_STEP if len(projection.nodes) <= _SMALL else _GRID_STEP
+            step = _FINE_STEP if len(projection.basis.nodes) <= _SMALL else _GRID_STEP
             n_steps = math.ceil(math.log(longest / self.shortest) / math.log(step) - 1e-9)
             new = torch.logspace(math.log10(self.shortest), math.log10(longest), n_steps + 1).to(self._scales)
             new = new[:-1] if len(self._scales) else new
@@ -176,7 +178,7 @@ class EvidenceGrid:
         The evidence often has one optimum where the data are signal and one where they are noise, with a plateau
         between. Where there are fewer than ``most`` the loss is infinite.
         """
-        surrounding = -max_pool2d(-self._table, 3, stride=1, padding=1)
+        surrounding = -max_pool2d(-self._table, _AROUND, stride=1, padding=(_AROUND[0] // 2, _AROUND[1] // 2))
         minima = torch.where(self._table <= surrounding, self._table, math.inf).flatten(1)
         loss, place = minima.topk(min(most, minima.shape[1]), dim=1, largest=False)
         scale = self._scales[place // len(self._ratios)].unsqueeze(-1)
@@ -195,6 +197,7 @@ class EvidenceGrid:
         if bool((scale == 0).any()):
             return True
         residual = self.evidence.residual(self._scales[scale][:, None], self._ratios[ratio])
+        residual = residual[:, self._observations.inputs[:, 0].argsort()]
         total = residual.square().sum(1).clamp_min(1e-300)
         products = [(residual[:, lag:] * residual[:, :-lag]).sum(1) / total for lag in range(1, _LAGS + 1)]
         return bool((residual.shape[1] * torch.stack(products).square().sum(0) > _NOT_WHITE).any())
@@ -214,4 +217,4 @@ def _noise_ratios(observations: Observations, noise_scale: Tensor | None) -> Ten
 
 def together(projection: Projection) -> int:
     """How many covariances are treated at a time."""
-    return max(1, _ENTRIES // len(projection.nodes) ** 2)
+    return max(1, _ENTRIES // len(projection.basis.nodes) ** 2)

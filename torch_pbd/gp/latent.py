@@ -1,13 +1,11 @@
 """Latent Gaussian processes: prediction from observed values, eq. (5) and (6)."""
 
-from dataclasses import replace
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from torch_pbd.gp.observations import Hyperparameters, Observations
-from torch_pbd.gp.projection import projected
+from torch_pbd.gp.projection import Basis, basis_for
 from torch_pbd.kernels import KernelName, correlation
 from torch_pbd.linalg import cholesky_with_jitter, safe_cholesky
 
@@ -112,21 +110,22 @@ def condition(
     kernel: KernelName = "squared_exponential",
     values: Float[Tensor, "b n"] | None = None,
     *,
-    max_inputs: int | None = None,
+    basis: Basis | None = None,
 ) -> tuple[LatentGP, float]:
     """Gaussian processes conditioned on noisy observations, and the relative jitter that needed.
 
-    ``values`` are those whose prior mean is zero, if they are others than the targets. Where fewer nodes than inputs
-    carry the processes to rounding, they are the inputs of what is returned; else neighbours are merged beyond
-    ``max_inputs``.
+    ``values`` are those whose prior mean is zero, if they are others than the targets. Of a ``basis`` that carries
+    the processes (by default the smallest), the nodes are the inputs of what is returned.
     """
     values = observations.targets if values is None else values
-    both = replace(observations, targets=torch.cat([observations.targets, values]))
-    data = projected(both, hyperparameters.length_scale, hyperparameters.noise_ratio, kernel, max_inputs)
-    gram = data.covariance(correlation(data.nodes, data.nodes, hyperparameters.length_scale, kernel))
+    if basis is None:
+        basis = basis_for(observations, hyperparameters.length_scale, hyperparameters.noise_ratio, kernel)
+    targets = basis.project(torch.cat([observations.targets, values])).targets
+    gram = basis.covariance(correlation(basis.nodes, basis.nodes, hyperparameters.length_scale, kernel))
     gram = gram + hyperparameters.noise_ratio[:, None, None] * torch.eye(gram.shape[-1]).to(gram)
     factor, jitter = cholesky_with_jitter(gram, name="the kernel matrix of the training inputs")
-    targets = data.targets.reshape(2, -1, gram.shape[-1]).permute(1, 2, 0)
-    weight, value_weight = data.lowered(torch.cholesky_solve(targets, factor)).unbind(-1)
-    parts = (weight.contiguous(), value_weight.contiguous(), hyperparameters, data.counts, kernel, data.root)
-    return LatentGP(data.nodes, *parts), jitter
+    solved = torch.cholesky_solve(targets.reshape(2, -1, gram.shape[-1]).permute(1, 2, 0), factor)
+    weight, value_weight = basis.lowered(solved).unbind(-1)
+    root = None if basis.root is None else basis.root.clone()
+    parts = (weight.contiguous(), value_weight.contiguous(), hyperparameters, basis.counts.clone(), kernel, root)
+    return LatentGP(basis.nodes.clone(), *parts), jitter

@@ -4,65 +4,16 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 from torch import Tensor
 
 from torch_pbd.gp.neighbourhoods import merge_observations, resolved_length_scale
 from torch_pbd.gp.observations import Observations
 from torch_pbd.kernels import KernelName
 
-_N_NODES = (48, 88, 168)
+_N_NODES = (32, 48, 88, 168)
 _WORTH = 1.5  # inputs for each node, below which nothing is gained
 _LEAST_NOISE_RATIO = 0.999e-10  # what the nodes cannot tell is treated as noise, so there must be some
-
-
-@dataclass(frozen=True)
-class Projection:
-    """Weighted observations of b processes in r coordinates, in which their noise is white.
-
-    With W the counts, the observations ``W^1/2 y`` have the covariance ``W^1/2 C W^1/2 + ratio * I`` over the squared
-    amplitude. On a line the squared exponential C is ``B C_nodes B'`` to rounding, B the polynomial interpolation
-    from Chebyshev nodes, which does not depend on the length scale. With ``W^1/2 B = Q root`` the observations are
-    ``targets = Q' W^1/2 y``, of covariance ``root C_nodes root' + ratio * I``, and a remainder that is noise alone.
-    Where the nodes are the inputs the root is ``W^1/2``; where they are centres of neighbourhoods B is the
-    membership, and the remainder what the members differ by.
-    """
-
-    nodes: Float[Tensor, "m e"]
-    counts: Float[Tensor, " m"]
-    """Of the root's diagonal, the square, where the nodes are the inputs; else ones."""
-    root: Float[Tensor, "r m"] | None
-    targets: Float[Tensor, "b r"]
-    remainder: Float[Tensor, " b"]
-    """Squared norm of what is outside the nodes' span."""
-    n_inputs: int
-    sum_log_counts: float
-    basis: Float[Tensor, "n r"] | None = None
-    """Q, sorted by input."""
-    weighted: Float[Tensor, "b n"] | None = None
-    """``W^1/2 y``, sorted by input."""
-
-    def of(self, rows: Int64[Tensor, " a"]) -> "Projection":
-        """The same of some of the processes."""
-        return replace(self, targets=self.targets[rows], remainder=self.remainder[rows], weighted=None)
-
-    def covariance(self, correlation: Float[Tensor, "*b m m"]) -> Float[Tensor, "*b r r"]:
-        """Of the targets over the squared amplitude, without noise, from the correlation of the nodes."""
-        if self.root is not None:
-            return self.root @ correlation @ self.root.mT
-        weight = self.counts.sqrt()
-        return weight[:, None] * correlation * weight
-
-    def pulled_back(self, matrix: Float[Tensor, "*b r r"]) -> Float[Tensor, "*b m m"]:
-        """``root' matrix root``: the gradient by the correlation of the nodes, given that by the covariance."""
-        if self.root is not None:
-            return self.root.mT @ matrix @ self.root
-        weight = self.counts.sqrt()
-        return weight[:, None] * matrix * weight
-
-    def lowered(self, values: Float[Tensor, "*b r q"]) -> Float[Tensor, "*b m q"]:
-        """``root' values``: weights of the correlations with the nodes."""
-        return self.root.mT @ values if self.root is not None else self.counts.sqrt()[:, None] * values
 
 
 @dataclass(frozen=True)
@@ -77,12 +28,16 @@ class Resolution:
     """What it carries."""
 
 
+FULL = Resolution(None, None, 0.0)
+"""All inputs."""
+
+
 def resolutions(
     observations: Observations, kernel: KernelName, *, noisy: bool, max_inputs: int | None = None
 ) -> list[Resolution]:
     """Those to try, the coarsest first."""
     n_inputs, n_features = observations.inputs.shape
-    finest = Resolution(None, None, 0.0)
+    finest = FULL
     if noisy and max_inputs is not None and n_inputs > max_inputs:
         centres = merge_observations(replace(observations, targets=observations.targets[:0]), max_inputs).inputs
         finest = Resolution(None, max_inputs, resolved_length_scale(centres))
@@ -93,42 +48,104 @@ def resolutions(
     return [*(Resolution(size, None, extent * _shortest(size)) for size in sizes), finest]
 
 
-def project(observations: Observations, resolution: Resolution | None = None) -> Projection:
-    """Observations at a resolution; by None in full."""
-    weight = observations.counts.sqrt()
-    sum_log_counts = float(observations.counts.log().sum())
-    weighted = observations.targets * weight
-    n_inputs = len(weight)
-    if resolution is None or resolution.n_nodes is None:
-        merged = observations
-        if resolution is not None and resolution.max_inputs is not None:
-            merged = merge_observations(observations, resolution.max_inputs)
-        targets = merged.targets * merged.counts.sqrt()
-        remainder = (weighted.square().sum(1) - targets.square().sum(1)).clamp_min(0.0)
-        remainder = remainder if len(merged.counts) < n_inputs else torch.zeros_like(remainder)
-        return Projection(merged.inputs, merged.counts, None, targets, remainder, n_inputs, sum_log_counts)
-    nodes, interpolation = _interpolation(observations.inputs[:, 0], resolution.n_nodes)
-    orthogonal, root = torch.linalg.qr(weight[:, None] * interpolation)
-    targets = weighted @ orthogonal
-    remainder = (weighted - targets @ orthogonal.mT).square().sum(1)
-    order = observations.inputs[:, 0].argsort()
-    ones = torch.ones_like(nodes)
-    whole = (n_inputs, sum_log_counts, orthogonal[order], weighted[:, order])
-    return Projection(nodes[:, None], ones, root, targets, remainder, *whole)
+@dataclass(frozen=True)
+class Basis:
+    """Coordinates r of weighted observations at n inputs, in which what a process says of them is told by m nodes.
+
+    With W the counts, the observations ``W^1/2 y`` have the covariance ``W^1/2 C W^1/2 + ratio * I`` over the squared
+    amplitude. On a line the squared exponential C is ``B C_nodes B'`` to rounding, B the polynomial interpolation
+    from Chebyshev nodes, which does not depend on the length scale. With ``W^1/2 B = Q root`` the coordinates
+    ``Q' W^1/2 y`` have the covariance ``root C_nodes root' + ratio * I``, and the remainder is noise alone.
+    Where the nodes are the inputs the root is ``W^1/2``; where they are centres of neighbourhoods B is the
+    membership, and the remainder what the members differ by.
+    """
+
+    nodes: Float[Tensor, "m e"]
+    counts: Float[Tensor, " m"]
+    """Square of the root's diagonal, where it is diagonal; else ones."""
+    root: Float[Tensor, "r m"] | None
+    orthogonal: Float[Tensor, "n r"] | None
+    """Q; None where it is the membership."""
+    observations: Observations
+    """Whose inputs and counts these are; without targets."""
+    resolution: Resolution
+
+    @classmethod
+    def of(cls, observations: Observations, resolution: Resolution) -> "Basis":
+        """Basis of the inputs and counts of observations."""
+        bare = replace(observations, targets=observations.targets[:0])
+        if resolution.n_nodes is None:
+            merged = bare if resolution.max_inputs is None else merge_observations(bare, resolution.max_inputs)
+            return cls(merged.inputs, merged.counts, None, None, bare, resolution)
+        nodes, interpolation = _interpolation(observations.inputs[:, 0], resolution.n_nodes)
+        orthogonal, root = torch.linalg.qr(observations.counts.sqrt()[:, None] * interpolation)
+        return cls(nodes[:, None], torch.ones_like(nodes), root, orthogonal, bare, resolution)
+
+    def project(self, targets: Float[Tensor, "b n"]) -> "Projection":
+        """Coordinates of targets."""
+        data = self.observations
+        weighted = targets * data.counts.sqrt()
+        if self.orthogonal is not None:
+            inside = weighted @ self.orthogonal
+            remainder = (weighted - inside @ self.orthogonal.mT).square().sum(1)
+        elif self.resolution.max_inputs is not None:
+            inside = merge_observations(replace(data, targets=targets), self.resolution.max_inputs).targets
+            inside = inside * self.counts.sqrt()
+            remainder = (weighted.square().sum(1) - inside.square().sum(1)).clamp_min(0.0)
+        else:
+            inside, remainder = weighted, torch.zeros_like(weighted[:, 0])
+        return Projection(self, inside, remainder, weighted, len(data.counts), float(data.counts.log().sum()))
+
+    def covariance(self, correlation: Float[Tensor, "*b m m"]) -> Float[Tensor, "*b r r"]:
+        """Of the coordinates over the squared amplitude, without noise, from the correlation of the nodes."""
+        if self.root is not None:
+            return self.root @ correlation @ self.root.mT
+        weight = self.counts.sqrt()
+        return correlation * (weight[:, None] * weight)
+
+    def pulled_back(self, matrix: Float[Tensor, "*b r r"]) -> Float[Tensor, "*b m m"]:
+        """``root' matrix root``: the gradient by the correlation of the nodes, given that by the covariance."""
+        if self.root is not None:
+            return self.root.mT @ matrix @ self.root
+        return self.covariance(matrix)
+
+    def lowered(self, values: Float[Tensor, "*b r q"]) -> Float[Tensor, "*b m q"]:
+        """``root' values``: weights of the correlations with the nodes."""
+        return self.root.mT @ values if self.root is not None else self.counts.sqrt()[:, None] * values
 
 
-def projected(
+@dataclass(frozen=True)
+class Projection:
+    """Observations of b processes in the coordinates of a basis."""
+
+    basis: Basis
+    targets: Float[Tensor, "b r"]
+    remainder: Float[Tensor, " b"]
+    """Squared norm of what is outside the basis."""
+    weighted: Float[Tensor, "b n"]
+    """The observations times the roots of their counts."""
+    n_inputs: int
+    sum_log_counts: float
+
+    @property
+    def n_outside(self) -> int:
+        """Dimensions that are noise alone."""
+        return self.n_inputs - self.targets.shape[1]
+
+
+def basis_for(
     observations: Observations,
     length_scale: Tensor,
     noise_ratio: Tensor,
     kernel: KernelName,
     max_inputs: int | None = None,
-) -> Projection:
-    """Observations at the coarsest resolution that carries the length scales."""
+) -> Basis:
+    """The coarsest basis that carries the length scales."""
     noisy = bool((noise_ratio >= _LEAST_NOISE_RATIO).all())
     levels = resolutions(observations, kernel, noisy=noisy, max_inputs=max_inputs)
     shortest = 1.0001 * float(length_scale.min())  # a search ends at the bound but for rounding
-    return project(observations, next((r for r in levels if shortest >= r.shortest_length_scale), levels[-1]))
+    level = next((level for level in levels if shortest >= level.shortest_length_scale), levels[-1])
+    return Basis.of(observations, level)
 
 
 def _shortest(n_nodes: int) -> float:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -11,6 +12,7 @@ from torch import Tensor
 from torch_pbd.exceptions import NotPositiveDefiniteError
 from torch_pbd.gp.grid import EvidenceGrid, EvidenceSearch, together
 from torch_pbd.gp.observations import Hyperparameters, Observations
+from torch_pbd.gp.projection import Basis
 from torch_pbd.optim import BatchReport, FitReport, minimize_batch
 
 _HOPEFUL = 0.5  # nats for each input that polishing may be worth
@@ -37,12 +39,21 @@ def fit_hyperparameters(
         If there is no start from which the evidence can be computed, as for a length scale held at many
         times the spacing of inputs without noise.
     """
-    return fit_together([(observations, search)])[0]
+    return fit_together([(observations, search)])[0][:3]
 
 
-def fit_together(
-    jobs: Sequence[tuple[Observations, EvidenceSearch]],
-) -> list[tuple[Hyperparameters, Float[Tensor, " b"], FitReport]]:
+class Found(NamedTuple):
+    """What a search found."""
+
+    hyperparameters: Hyperparameters
+    loss: Float[Tensor, " b"]
+    """Negative log evidence, in nats."""
+    report: FitReport
+    basis: Basis
+    """Carries the processes."""
+
+
+def fit_together(jobs: Sequence[tuple[Observations, EvidenceSearch]]) -> list[Found]:
     """What :func:`fit_hyperparameters` finds for each job, in one search where inputs and counts are the same.
 
     A search of few processes costs little more than one of many: what is common is done once, and evaluations are
@@ -66,7 +77,7 @@ def _searchable_together(job: tuple[Observations, EvidenceSearch], other: tuple[
     )
 
 
-def _fit_group(jobs: list[tuple[Observations, EvidenceSearch]]) -> list[tuple[Hyperparameters, Tensor, FitReport]]:
+def _fit_group(jobs: list[tuple[Observations, EvidenceSearch]]) -> list[Found]:
     search = jobs[0][1]
     if search.noise_scale is not None and len((search.noise_scale > 0).unique()) > 1:
         raise ValueError("noise_scale is zero for some processes and not for others: fit these in two searches.")
@@ -80,8 +91,7 @@ def _fit_group(jobs: list[tuple[Observations, EvidenceSearch]]) -> list[tuple[Hy
             if grid.finest or bool((length_scale > 1.02 * grid.shortest).all()):
                 break
             grid.refine()  # a process ends where its level does: the next one may take it further
-        every = torch.arange(len(length_scale), device=length_scale.device)
-        amplitude = grid.evidence.best_variance_at(length_scale, noise_ratio, every).sqrt()
+        amplitude = grid.evidence.best_variance_at(length_scale, noise_ratio).sqrt()
     message = "converged" if end.converged else f"stopped at max_iter={search.max_iter} iterations"
     results = []
     # Copies, made outside of the inference mode: autograd would refuse its tensors.
@@ -91,7 +101,7 @@ def _fit_group(jobs: list[tuple[Observations, EvidenceSearch]]) -> list[tuple[Hy
         scale, size, ratio, first, loss = (part.clone() for part in parts)
         curve = (float(first.sum()), float(loss.sum()))
         report = FitReport(curve[-1], curve, end.n_iter, end.converged, message)
-        results.append((Hyperparameters(scale, size, ratio), loss, report))
+        results.append(Found(Hyperparameters(scale, size, ratio), loss, report, grid.evidence.projection.basis))
     return results
 
 

@@ -58,7 +58,8 @@ def minimize_batch(
     differences of the gradient, in one batch too, with the absolute values of its eigenvalues. Parameters are
     expected to be of order one.
     Steps are accepted by the Armijo rule, so the loss never rises; a value that is not finite counts as
-    too far. Where the slope along a step has hardly changed, the next step starts four times as long.
+    too far. Where the slope along a step has not fallen, which tells no Hessian, the next step starts four times as
+    long.
 
     Parameters
     ----------
@@ -95,8 +96,8 @@ def minimize_batch(
         slope = (direction * gradient).sum(-1)
         new_x, new_loss, new_gradient = _backtrack(objective, rows, x, loss, gradient, direction, slope, step)
         inverse = _updated(inverse, new_x - x, new_gradient - gradient)
-        still_steep = (direction * new_gradient).sum(-1) < 0.9 * slope
-        short = still_steep & (new_loss < loss) & (step < _LONGEST_STEP)
+        steeper = (direction * new_gradient).sum(-1) <= 0.999 * slope
+        short = steeper & (new_loss < loss) & (step < _LONGEST_STEP)
         step = torch.where(short & (n_iter > 1), 4.0 * step, 1.0)
         gain = loss - new_loss
         x, loss, gradient = new_x, new_loss, new_gradient
