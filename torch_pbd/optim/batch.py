@@ -82,33 +82,36 @@ def minimize_batch(
     x = start.detach().clone()
     rows = torch.arange(len(x), device=x.device)
     loss, gradient = objective(x, rows)
-    first_loss = loss
-    # Problems that have ended are not carried along: ``rows`` are those still active.
-    ended_x, ended_loss = x.clone(), loss.clone()
+    ended_x, ended_loss, first_loss = x.clone(), loss.clone(), loss
     size = gradient.abs().sum(-1)  # of no parameters it is zero, and there is nothing to do
     alive = torch.isfinite(loss + size) & (size > tol)
+    # Problems that have ended are not carried along: ``rows`` are those still active.
     rows, x, loss, gradient = rows[alive], x[alive], loss[alive], gradient[alive]
     inverse = _first_inverse(objective, rows, x, gradient)
+    downhill = inverse @ gradient.unsqueeze(-1)  # the step, but for its sign
+    decrement = (gradient * downhill.squeeze(-1)).sum(-1)
     step, n_iter = torch.ones_like(loss), 0
     while n_iter < max_iter and len(rows):
         n_iter += 1
-        direction = -(inverse @ gradient.unsqueeze(-1)).squeeze(-1)
-        slope = (direction * gradient).sum(-1)
-        new_x, new_loss, new_gradient = _backtrack(objective, rows, x, loss, gradient, direction, slope, step)
-        inverse = _updated(inverse, new_x - x, new_gradient - gradient)
-        steeper = (direction * new_gradient).sum(-1) <= 0.999 * slope
-        short = steeper & (new_loss < loss) & (step < _LONGEST_STEP)
-        step = torch.where(short & (n_iter > 1), 4.0 * step, 1.0)
+        new_x, new_loss, new_gradient = _backtrack(
+            objective, rows, x, loss, gradient, downhill.squeeze(-1), decrement, step
+        )
+        change = (new_gradient - gradient).unsqueeze(-1)
+        # Where the slope along a step has not fallen the curvature is not that of a minimum.
+        convex = (change * downhill).sum((-2, -1)) < -1e-3 * decrement
+        inverse = _updated(inverse, (new_x - x).unsqueeze(-1), change, convex)
         gain = loss - new_loss
+        short = ~convex & (gain > 0) & (step < _LONGEST_STEP)
+        step = torch.where(short & (n_iter > 1), 4.0 * step, 1.0)
         x, loss, gradient = new_x, new_loss, new_gradient
-        ended_x[rows], ended_loss[rows] = x, loss
-        promise = 0.5 * (gradient * (inverse @ gradient.unsqueeze(-1)).squeeze(-1)).sum(-1)
-        rounding = torch.finfo(loss.dtype).eps * loss.abs()
-        settled = (gain.maximum(promise) <= 1e-2 * tol + rounding) & ~short
-        alive = (gradient.abs().sum(-1) > tol) & ~settled
-        if not bool(alive.all()):
-            rows, x, loss, gradient = rows[alive], x[alive], loss[alive], gradient[alive]
-            inverse, step = inverse[alive], step[alive]
+        downhill = inverse @ gradient.unsqueeze(-1)
+        decrement = (gradient * downhill.squeeze(-1)).sum(-1)
+        enough = 1e-2 * tol + torch.finfo(loss.dtype).eps * loss.abs()
+        ended = ((gain <= enough) & (0.5 * decrement <= enough) & ~short) | (gradient.abs().sum(-1) <= tol)
+        if bool(ended.any()) or n_iter == max_iter:
+            ended_x[rows], ended_loss[rows] = x, loss
+            state = (rows, x, loss, gradient, inverse, downhill, decrement, step)
+            rows, x, loss, gradient, inverse, downhill, decrement, step = (part[~ended] for part in state)
     return ended_x, BatchReport(ended_loss, first_loss, n_iter, len(rows) == 0)
 
 
@@ -130,13 +133,15 @@ def _first_inverse(objective: ValueAndGradient, rows: Tensor, x: Tensor, gradien
     return inverse * (_FIRST_REACH / reach.clamp_min(_FIRST_REACH))[:, None, None]
 
 
-def _updated(inverse: Tensor, step: Tensor, change: Tensor) -> Tensor:
-    """Inverse Hessians after a step and the change of the gradient along it; as they were where it tells nothing."""
-    curvature = (step * change).sum(-1)
-    usable = curvature > 1e-10 * step.norm(dim=-1) * change.norm(dim=-1)
-    share = torch.where(usable, 1.0 / curvature.where(usable, 1.0), 0.0)[:, None, None]
-    off = torch.eye(step.shape[-1]).to(step) - share * step.unsqueeze(-1) * change.unsqueeze(-2)
-    return off @ inverse @ off.mT + share * step.unsqueeze(-1) * step.unsqueeze(-2)
+def _updated(inverse: Tensor, step: Tensor, change: Tensor, convex: Tensor) -> Tensor:
+    """Inverse Hessians after a step (b, p, 1) and the change of the gradient along it, where it was convex."""
+    curvature = step.mT @ change
+    applied = inverse @ change
+    share = torch.where(convex[:, None, None], 1.0 / curvature, 0.0)
+    cross = applied @ step.mT
+    scale = 1.0 + share * (change.mT @ applied)
+    update = share * (scale * (step @ step.mT) - cross - cross.mT)
+    return inverse + update.where(convex[:, None, None], 0.0)
 
 
 def _backtrack(
@@ -145,14 +150,14 @@ def _backtrack(
     x: Tensor,
     loss: Tensor,
     gradient: Tensor,
-    direction: Tensor,
-    slope: Tensor,
+    downhill: Tensor,
+    decrement: Tensor,
     step: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Shorten each problem's step until its loss falls enough; where none does it stays where it is."""
-    trial = x + step[:, None] * direction
+    trial = x - step[:, None] * downhill
     value, trial_gradient = objective(trial, rows)
-    accepted = _accepted(value, trial_gradient, loss, step, slope)
+    accepted = _accepted(value, trial_gradient, loss, step * decrement)
     if bool(accepted.all()):
         return trial, value, trial_gradient
     new_x, new_loss, new_gradient = x.clone(), loss.clone(), gradient.clone()
@@ -160,19 +165,19 @@ def _backtrack(
     for _ in range(25):
         done = left[accepted]
         new_x[done], new_loss[done], new_gradient[done] = trial[accepted], value[accepted], trial_gradient[accepted]
-        finite = torch.isfinite(value) & torch.isfinite(trial_gradient).all(-1)
         # The minimum of the parabola through both values and the slope, kept within a tenth and a half.
-        parabola = -0.5 * step[left] * slope[left] / ((value - loss[left]) / step[left] - slope[left])
-        shorter = torch.where(finite, parabola, 0.1 * step[left])
+        parabola = 0.5 * step[left] * decrement[left] / ((value - loss[left]) / step[left] + decrement[left])
+        shorter = torch.where(torch.isfinite(value + trial_gradient.sum(-1)), parabola, 0.1 * step[left])
         step = step.index_copy(0, left, shorter.clamp(0.1 * step[left], 0.5 * step[left]))
         left = left[~accepted]
         if len(left) == 0:
             break
-        trial = x[left] + step[left, None] * direction[left]
+        trial = x[left] - step[left, None] * downhill[left]
         value, trial_gradient = objective(trial, rows[left])
-        accepted = _accepted(value, trial_gradient, loss[left], step[left], slope[left])
+        accepted = _accepted(value, trial_gradient, loss[left], step[left] * decrement[left])
     return new_x, new_loss, new_gradient
 
 
-def _accepted(value: Tensor, gradient: Tensor, loss: Tensor, step: Tensor, slope: Tensor) -> Tensor:
-    return (value <= loss + 1e-4 * step * slope) & torch.isfinite(gradient.sum(-1) + value)
+def _accepted(value: Tensor, gradient: Tensor, loss: Tensor, promised: Tensor) -> Tensor:
+    """Armijo's rule; a value that is not finite is not accepted."""
+    return (value <= loss - 1e-4 * promised) & torch.isfinite(value + gradient.sum(-1))
