@@ -114,7 +114,7 @@ class Evidence:
             by_ratio = by_ratio + (quadratic / variance - data.n_inputs)
         return loss, Gradient(by_length, 0.5 * by_ratio)
 
-    def variance(self, quadratic: Tensor, noise_ratio: Tensor, rows: Tensor | slice) -> Tensor:
+    def variance(self, quadratic: Tensor, noise_ratio: Tensor, rows: Tensor) -> Tensor:
         """Squared amplitude of the processes ``rows``."""
         if self.noise_scale is None:
             return best_variance(quadratic, self.projection.n_inputs)
@@ -148,24 +148,25 @@ class Evidence:
         """What each process leaves of its weighted observations."""
         data, orthogonal = self.projection, self.projection.basis.orthogonal
         assert orthogonal is not None
-        left = noise_ratio[:, None] * self._solved(length_scale, noise_ratio)
+        left = noise_ratio[:, None] * self._solved(length_scale, noise_ratio, slice(None))
         return data.weighted - (data.targets - left) @ orthogonal.mT
 
-    def best_variance_at(self, length_scale: Float[Tensor, "b e"], noise_ratio: Float[Tensor, " b"]) -> Tensor:
-        """Squared amplitude (b,); that of the targets themselves where the covariance is singular."""
-        data = self.projection
-        quadratic = (data.targets * self._solved(length_scale, noise_ratio)).sum(-1)
-        if data.n_outside:
-            quadratic = quadratic + data.remainder / noise_ratio
-        variance = self.variance(quadratic, noise_ratio, slice(None))
-        crude = data.targets.square().mean(1).clamp_min(1e-200)
-        return torch.where(variance.isnan(), crude, variance)
+    def best_variance_at(
+        self, length_scale: Float[Tensor, "a e"], noise_ratio: Float[Tensor, " a"], rows: Int64[Tensor, " a"]
+    ) -> Float[Tensor, " a"]:
+        """Squared amplitude; that of the targets themselves where the covariance is singular."""
+        targets = self.projection.targets[rows]
+        quadratic = (targets * self._solved(length_scale, noise_ratio, rows)).sum(-1)
+        if self.projection.n_outside:
+            quadratic = quadratic + self.projection.remainder[rows] / noise_ratio
+        variance = self.variance(quadratic, noise_ratio, rows)
+        return torch.where(variance.isnan(), targets.square().mean(1).clamp_min(1e-200), variance)
 
-    def _solved(self, length_scale: Tensor, noise_ratio: Tensor) -> Float[Tensor, "b r"]:
+    def _solved(self, length_scale: Tensor, noise_ratio: Tensor, rows: Tensor | slice) -> Float[Tensor, "a r"]:
         """Inverse of the covariance over the squared amplitude times the targets; NaN where it is singular."""
         basis = self.projection.basis
         covariance = basis.covariance(correlation(basis.nodes, basis.nodes, length_scale, self.kernel))
         covariance.diagonal(dim1=-2, dim2=-1).add_(noise_ratio[:, None])
         factor, info = torch.linalg.cholesky_ex(covariance)
-        solved = torch.cholesky_solve(self.projection.targets.unsqueeze(-1), factor).squeeze(-1)
+        solved = torch.cholesky_solve(self.projection.targets[rows].unsqueeze(-1), factor).squeeze(-1)
         return torch.where(info[:, None] == 0, solved, math.nan)

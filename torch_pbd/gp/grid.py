@@ -1,10 +1,10 @@
 """Where the evidence of Gaussian processes is searched: a grid, and the coordinates between its points."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
@@ -25,6 +25,7 @@ _LOG10_RATIOS = (-10.0, -8.0, -6.0, -5.0, -4.0, *(0.25 * step for step in range(
 
 # Points that a local minimum of the grid is the lowest of: of fewer, points along one valley would be several.
 _AROUND = (5, 7)
+_FEW = 2e7  # multiplications of a decomposition of all processes
 _LAGS = 3
 _NOT_WHITE = 21.1  # 0.9999 quantile of the chi-squared distribution of three degrees of freedom
 
@@ -126,10 +127,10 @@ class EvidenceGrid:
         self._levels = levels[: last + 1] if fixed is None else levels[last : last + 1]
         self._scales = observations.targets.new_zeros(0)
         self._table = observations.targets.new_zeros(len(observations.targets), 0, len(self._ratios))
-        self._level = -1
+        self.processes = torch.arange(len(observations.targets), device=observations.targets.device)
+        """Those that are still searched."""
+        self._level, self._bases = -1, list[tuple[float, Basis]]()
         self.refine()
-        while not self.finest and self._ends_too_long():
-            self.refine()
 
     @property
     def finest(self) -> bool:
@@ -141,11 +142,28 @@ class EvidenceGrid:
         """Shortest length scale of this level."""
         return max(self._shortest, self._levels[self._level].shortest_length_scale)
 
+    @property
+    def few(self) -> bool:
+        """Whether the next level is so cheap that there is nothing to gain by leaving processes behind."""
+        level = self._levels[self._level + 1]
+        n_nodes = level.n_nodes or level.max_inputs or len(self._observations.counts)
+        return len(self.processes) * n_nodes**3 <= _FEW
+
+    def keep(self, chosen: Bool[Tensor, " b"]) -> None:
+        """Leave the other processes behind."""
+        noise = self._search.noise_scale
+        self._observations = replace(self._observations, targets=self._observations.targets[chosen])
+        self._search = replace(self._search, noise_scale=None if noise is None else noise[chosen])
+        self._longest, self._table = self._longest[chosen], self._table[chosen]
+        self.processes = self.processes[chosen]
+
     def refine(self) -> None:
         """Add the length scales that the next level carries."""
         longest = self.shortest if self._level >= 0 else max(self._shortest, float(self._longest.max()))
         self._level += 1
-        projection = Basis.of(self._observations, self._levels[self._level]).project(self._observations.targets)
+        basis = Basis.of(self._observations, self._levels[self._level])
+        self._bases.append((self.shortest, basis))
+        projection = basis.project(self._observations.targets)
         self.evidence = Evidence.of(projection, self._search.kernel, self._search.noise_scale)
         n_features, fixed = projection.basis.nodes.shape[1], self._search.length_scale
         if fixed is None:
@@ -163,6 +181,11 @@ class EvidenceGrid:
         table = table.masked_fill((beyond & (fixed is None)).unsqueeze(-1), math.inf)
         self._scales = torch.cat([new, self._scales])
         self._table = torch.cat([table, self._table], dim=1)
+
+    def basis_for(self, length_scale: Float[Tensor, "b e"]) -> Basis:
+        """The smallest basis so far that carries length scales."""
+        shortest = 1.0001 * float(length_scale.min())  # a search ends at the bound but for rounding
+        return next((basis for least, basis in self._bases if shortest >= least), self._bases[-1][1])
 
     def coordinates(self) -> Coordinates:
         """Those of a search within the grid."""
@@ -190,17 +213,17 @@ class EvidenceGrid:
         )
         return length_scale, self._ratios[place % len(self._ratios)], loss
 
-    def _ends_too_long(self) -> bool:
-        """Whether length scales below those of the grid may be better for a process."""
+    def unsettled(self) -> Bool[Tensor, " b"]:
+        """For which processes length scales below those of the grid may be better."""
         best = self._table.flatten(1).argmin(1)
         scale, ratio = best // len(self._ratios), best % len(self._ratios)
-        if bool((scale == 0).any()):
-            return True
+        if self.finest:
+            return torch.zeros_like(best, dtype=torch.bool)
         residual = self.evidence.residual(self._scales[scale][:, None], self._ratios[ratio])
         residual = residual[:, self._observations.inputs[:, 0].argsort()]
         total = residual.square().sum(1).clamp_min(1e-300)
         products = [(residual[:, lag:] * residual[:, :-lag]).sum(1) / total for lag in range(1, _LAGS + 1)]
-        return bool((residual.shape[1] * torch.stack(products).square().sum(0) > _NOT_WHITE).any())
+        return (scale == 0) | (residual.shape[1] * torch.stack(products).square().sum(0) > _NOT_WHITE)
 
 
 def _noise_ratios(observations: Observations, noise_scale: Tensor | None) -> Tensor:

@@ -2,18 +2,18 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from torch_pbd.exceptions import NotPositiveDefiniteError
 from torch_pbd.gp.grid import EvidenceGrid, EvidenceSearch, together
 from torch_pbd.gp.observations import Hyperparameters, Observations
 from torch_pbd.gp.projection import Basis
-from torch_pbd.optim import BatchReport, FitReport, minimize_batch
+from torch_pbd.optim import FitReport, minimize_batch
 
 _HOPEFUL = 0.5  # nats for each input that polishing may be worth
 
@@ -50,7 +50,7 @@ class Found(NamedTuple):
     """Negative log evidence, in nats."""
     report: FitReport
     basis: Basis
-    """Carries the processes."""
+    """The smallest of the search that carries the processes."""
 
 
 def fit_together(jobs: Sequence[tuple[Observations, EvidenceSearch]]) -> list[Found]:
@@ -81,51 +81,83 @@ def _fit_group(jobs: list[tuple[Observations, EvidenceSearch]]) -> list[Found]:
     search = jobs[0][1]
     if search.noise_scale is not None and len((search.noise_scale > 0).unique()) > 1:
         raise ValueError("noise_scale is zero for some processes and not for others: fit these in two searches.")
-    sizes = [len(data.targets) for data, _ in jobs]
     with torch.inference_mode():
         targets = torch.cat([data.targets for data, _ in jobs])
         longest = torch.cat([its.length_scale_bounds[1] * torch.ones_like(data.targets[:, 0]) for data, its in jobs])
         grid = EvidenceGrid(replace(jobs[0][0], targets=targets), search, longest)
-        while True:
-            length_scale, noise_ratio, end = _descend(grid, search)
-            if grid.finest or bool((length_scale > 1.02 * grid.shortest).all()):
-                break
-            grid.refine()  # a process ends where its level does: the next one may take it further
-        amplitude = grid.evidence.best_variance_at(length_scale, noise_ratio).sqrt()
-    message = "converged" if end.converged else f"stopped at max_iter={search.max_iter} iterations"
-    results = []
+        ends = _descend_by_levels(grid, search)
+    message = "converged" if ends.converged else f"stopped at max_iter={search.max_iter} iterations"
     # Copies, made outside of the inference mode: autograd would refuse its tensors.
-    for parts in zip(
-        *(part.split(sizes) for part in (length_scale, amplitude, noise_ratio, end.start_loss, end.loss)), strict=True
-    ):
-        scale, size, ratio, first, loss = (part.clone() for part in parts)
+    sizes = [len(data.targets) for data, _ in jobs]
+    parts = (part.clone().split(sizes) for part in (ends.length_scale, ends.amplitude, ends.noise_ratio))
+    results = []
+    for *each, first, loss in zip(*parts, ends.start_loss.split(sizes), ends.loss.clone().split(sizes), strict=True):
         curve = (float(first.sum()), float(loss.sum()))
-        report = FitReport(curve[-1], curve, end.n_iter, end.converged, message)
-        results.append(Found(Hyperparameters(scale, size, ratio), loss, report, grid.evidence.projection.basis))
+        report = FitReport(curve[-1], curve, ends.n_iter, ends.converged, message)
+        results.append(Found(Hyperparameters(*each), loss, report, grid.basis_for(each[0])))
     return results
 
 
-def _descend(grid: EvidenceGrid, search: EvidenceSearch) -> tuple[Tensor, Tensor, BatchReport]:
-    """Length scales (b, e), noise ratios (b,), and how the descents ended."""
-    coordinates = grid.coordinates()
-    n_inputs = grid.evidence.projection.n_inputs
-    length_scale, noise_ratio, loss = grid.valleys(1 + search.n_restarts)
+@dataclass
+class _Ends:
+    """Where the descents of processes ended."""
+
+    length_scale: Float[Tensor, "b e"]
+    noise_ratio: Float[Tensor, " b"]
+    amplitude: Float[Tensor, " b"]
+    start_loss: Float[Tensor, " b"]
+    loss: Float[Tensor, " b"]
+    n_iter: int = 0
+    converged: bool = True
+
+    def put(self, rows: Tensor, other: "_Ends") -> None:
+        """Take the ends of some processes."""
+        for name in ("length_scale", "noise_ratio", "amplitude", "start_loss", "loss"):
+            getattr(self, name)[rows] = getattr(other, name)
+        self.n_iter = max(self.n_iter, other.n_iter)
+        self.converged = self.converged and other.converged
+
+
+def _descend_by_levels(grid: EvidenceGrid, search: EvidenceSearch) -> _Ends:
+    """A process stays at the first level that suffices for it, unless the next is so cheap that all may go on."""
+    blank = torch.zeros(len(grid.processes)).to(grid.evidence.projection.targets)
+    scales = blank[:, None].repeat(1, grid.evidence.projection.basis.nodes.shape[1])
+    ends = _Ends(scales, blank.clone(), blank.clone(), blank.clone(), blank.clone())
+    while True:
+        left = grid.unsettled()
+        if not bool(left.any()) or not grid.few:
+            rows = (~left).nonzero().squeeze(1)
+            found = _descend(grid, search, rows)
+            ends.put(grid.processes[rows], found)
+            if not grid.finest:  # a process that ends where its level does may be taken further by the next one
+                left[rows[found.length_scale.amin(1) < 1.02 * grid.shortest]] = True
+            if not bool(left.any()):
+                return ends
+            grid.keep(left)
+        grid.refine()
+
+
+def _descend(grid: EvidenceGrid, search: EvidenceSearch, chosen: Int64[Tensor, " a"]) -> _Ends:
+    """Polish the deepest valleys of some of a grid's processes."""
+    coordinates, n_inputs = grid.coordinates(), grid.evidence.projection.n_inputs
+    length_scale, noise_ratio, loss = (part[chosen] for part in grid.valleys(1 + search.n_restarts))
     # A start far worse than another for each input is not polished: its optimum would have to be a spike. One that the
     # grid takes for singular, by a strict rule, is tried where there is no other.
     hopeful = (loss <= loss[:, :1] + _HOPEFUL * n_inputs) & loss.isfinite()
     hopeful[:, 0] = True
-    process, valley = hopeful.nonzero().unbind(1)
-    starts = coordinates.encode(length_scale[process, valley], noise_ratio[process, valley], process)
-    ends, reports = [], []
-    size = together(grid.evidence.projection)
+    number, valley = hopeful.nonzero().unbind(1)
+    process = chosen[number]
+    starts = coordinates.encode(length_scale[number, valley], noise_ratio[number, valley], process)
+    size, found, reports = together(grid.evidence.projection), [], []
     for part, rows in zip(starts.split(size), process.split(size), strict=True):
         end, report = minimize_batch(
             lambda z, index, rows=rows: coordinates.loss(z, rows[index]), part, max_iter=search.max_iter, tol=search.tol
         )
-        ends.append(end)
+        found.append(end)
         reports.append(report)
+    never = torch.full_like(loss, math.inf)
     first, final = (
-        torch.full_like(loss, math.inf).index_put((process, valley), torch.cat(values).nan_to_num(nan=math.inf))
+        never.index_put((number, valley), torch.cat(values).nan_to_num(nan=math.inf))
         for values in zip(*((report.start_loss, report.loss) for report in reports), strict=True)
     )
     if not bool(torch.isfinite(final.amin(1)).all()):
@@ -134,10 +166,9 @@ def _descend(grid: EvidenceGrid, search: EvidenceSearch) -> tuple[Tensor, Tensor
             "(noise_scale=None), or give a shorter length_scale."
         )
     place = torch.zeros_like(loss, dtype=torch.long)
-    place[process, valley] = torch.arange(len(process), device=loss.device)
+    place[number, valley] = torch.arange(len(number), device=loss.device)
     best = final.argmin(1, keepdim=True)
-    every = torch.arange(len(loss), device=loss.device)
-    found = coordinates.decode(torch.cat(ends)[place.gather(1, best).squeeze(1)], every)
-    n_iter = max(report.n_iter for report in reports)
-    converged = all(report.converged for report in reports)
-    return *found, BatchReport(final.gather(1, best).squeeze(1), first.amin(1), n_iter, converged)
+    scale, ratio = coordinates.decode(torch.cat(found)[place.gather(1, best).squeeze(1)], chosen)
+    amplitude = grid.evidence.best_variance_at(scale, ratio, chosen).sqrt()
+    n_iter, converged = max(report.n_iter for report in reports), all(report.converged for report in reports)
+    return _Ends(scale, ratio, amplitude, first.amin(1), final.gather(1, best).squeeze(1), n_iter, converged)
