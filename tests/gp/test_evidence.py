@@ -127,6 +127,31 @@ def test_search_finds_an_evidence_as_high_as_scikit_learn_with_restarts(signal, 
     np.testing.assert_allclose(negative_log_evidence(once(x, y), found), loss, rtol=1e-9, atol=1e-9)
 
 
+def smooth_draw(length_scale, n, rng):
+    t = np.linspace(0, 1, n)[:, None]
+    return np.linalg.cholesky(RBF(length_scale)(t) + 1e-9 * np.eye(n)) @ rng.normal(size=n)
+
+
+@pytest.mark.parametrize("noise", [0.1, 0.01])
+def test_search_at_growing_resolution_misses_no_short_length_scale(noise, rng):
+    """At 150 inputs the search begins with 32 nodes, which carry a sixth of the range."""
+    n, t = 150, np.linspace(0, 1, 150)
+    signals = {
+        "slow": np.sin(6 * t),
+        "slow, with a faint wiggle": np.sin(3 * t) + 0.2 * np.sin(2 * np.pi * 25 * t),
+        "fast": np.sin(2 * np.pi * 15 * t),
+        "near the spacing": np.sin(3 * t) + 0.3 * np.sin(2 * np.pi * 45 * t),
+        "a draw": smooth_draw(0.05, n, rng),
+        "a short draw": smooth_draw(0.02, n, rng),
+    }
+    y = np.stack(list(signals.values())) + noise * rng.normal(size=(len(signals), n))
+    bounds = (0.75 / (n - 1), 10.0)
+    _, loss, _ = fit_hyperparameters(once(t[:, None], y), EvidenceSearch(length_scale_bounds=bounds))
+    kernel = amplitude_times(RBF(0.3, bounds)) + WHITE
+    expected = [best_of_scikit_learn(kernel, t[:, None], row, n_restarts=2) for row in y]
+    assert dict(zip(signals, loss.numpy() - expected < 1e-3, strict=True)) == dict.fromkeys(signals, True)
+
+
 @pytest.mark.parametrize("kernel", ["squared_exponential", "matern32", "matern52"])
 def test_search_with_a_length_scale_for_each_input_is_as_good_as_scikit_learn(kernel, rng):
     x = rng.uniform(size=(40, 2))
