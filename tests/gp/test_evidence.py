@@ -20,6 +20,7 @@ from torch_pbd.gp import (
     negative_log_evidence,
     spacing,
 )
+from torch_pbd.optim import minimize
 
 LENGTH_BOUNDS = (0.02, 10.0)
 SIGNALS = {
@@ -312,3 +313,19 @@ def test_a_bound_at_the_spacing_keeps_needles_out(noise_scale, rng):
     assert needles[0] >= 5
     assert needles[1] == 0
     assert variation[1] < 1.3 < variation[0]
+
+
+def test_lbfgs_on_the_evidence_reaches_the_optimum_of_the_search(rng):
+    x, y = noisy("sine", 40, rng, n_processes=3)
+    found, expected, _ = fit_hyperparameters(once(x, y), EvidenceSearch(length_scale_bounds=LENGTH_BOUNDS, tol=1e-6))
+    logs = torch.cat([found.length_scale, found.amplitude[:, None], found.noise_ratio[:, None]], dim=1).log()
+    for row in range(3):
+        z = (logs[row] + 0.3).requires_grad_()
+
+        def loss(z=z, row=row):
+            scale, amplitude, ratio = z.exp().split(1)
+            return negative_log_evidence(once(x, y[row]), Hyperparameters(scale[None], amplitude, ratio)).sum()
+
+        report = minimize(loss, [z], tol=1e-7)
+        assert report.loss == pytest.approx(expected[row].item(), abs=1e-6)
+        torch.testing.assert_close(z.detach(), logs[row], rtol=0, atol=1e-2)
