@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 _LONGEST_STEP = 1e3  # in steps of BFGS
@@ -26,6 +26,8 @@ class BatchReport:
     n_iter: int
     converged: bool
     """All of them."""
+    inverse_hessian: Float[Tensor, "b p p"]
+    """At the ends, as far as the steps told."""
 
 
 def by_autograd(
@@ -49,14 +51,14 @@ def minimize_batch(
     *,
     max_iter: int = 100,
     tol: float = 1e-6,
+    inverse_hessian: Float[Tensor, "b p p"] | None = None,
 ) -> tuple[Float[Tensor, "b p"], BatchReport]:
     """Minimize b unrelated objectives of few parameters by BFGS, their evaluations in one batch.
 
     Each problem has its own inverse Hessian, its own step and its own end: a joint L-BFGS over all of them
     would share one line search and one memory between problems that have nothing to do with each other, and with a
-    handful of parameters the whole matrix costs less than a limited memory of it. The first Hessian is found by
-    differences of the gradient, in one batch too, with the absolute values of its eigenvalues. Parameters are
-    expected to be of order one.
+    handful of parameters the whole matrix costs less than a limited memory of it. Parameters are expected to be of
+    order one.
     Steps are accepted by the Armijo rule, so the loss never rises; a value that is not finite counts as
     too far. Where the slope along a step has not fallen, which tells no Hessian, the next step starts four times as
     long.
@@ -73,6 +75,9 @@ def minimize_batch(
     tol : float, default=1e-6
         A problem ends when its gradient, summed over its absolute entries, is below it, or when its last step
         gained and its next promises less than a hundredth of it.
+    inverse_hessian : Tensor of shape (b, p, p), default=None
+        At the start, positive definite. None finds it by differences of the gradient, in one batch too, with the
+        absolute values of the Hessian's eigenvalues.
 
     Returns
     -------
@@ -82,44 +87,86 @@ def minimize_batch(
     x = start.detach().clone()
     rows = torch.arange(len(x), device=x.device)
     loss, gradient = objective(x, rows)
-    ended_x, ended_loss, first_loss = x.clone(), loss.clone(), loss
     size = gradient.abs().sum(-1)  # of no parameters it is zero, and there is nothing to do
     alive = torch.isfinite(loss + size) & (size > tol)
-    # Problems that have ended are not carried along: ``rows`` are those still active.
-    rows, x, loss, gradient = rows[alive], x[alive], loss[alive], gradient[alive]
-    inverse = _first_inverse(objective, rows, x, gradient)
-    downhill = inverse @ gradient.unsqueeze(-1)  # the step, but for its sign
-    decrement = (gradient * downhill.squeeze(-1)).sum(-1)
-    step, n_iter = torch.ones_like(loss), 0
-    while n_iter < max_iter and len(rows):
+    inverse = torch.eye(x.shape[1]).to(x).repeat(len(x), 1, 1)
+    if inverse_hessian is not None:
+        inverse = inverse_hessian.clone()
+    elif bool(alive.any()):
+        inverse[alive] = _first_inverse(objective, rows[alive], x[alive], gradient[alive])
+    every = _Problems.at(rows, x, loss, gradient, inverse, torch.ones_like(loss))
+    active = every.of(alive & (every.promise > _enough(loss, tol)))
+    n_iter = 0
+    while n_iter < max_iter and len(active.rows):
         n_iter += 1
-        new_x, new_loss, new_gradient = _backtrack(
-            objective, rows, x, loss, gradient, downhill.squeeze(-1), decrement, step
-        )
-        change = (new_gradient - gradient).unsqueeze(-1)
-        # Where the slope along a step has not fallen the curvature is not that of a minimum.
-        convex = (change * downhill).sum((-2, -1)) < -1e-3 * decrement
-        inverse = _updated(inverse, (new_x - x).unsqueeze(-1), change, convex)
-        gain = loss - new_loss
-        short = ~convex & (gain > 0) & (step < _LONGEST_STEP)
-        step = torch.where(short & (n_iter > 1), 4.0 * step, 1.0)
-        x, loss, gradient = new_x, new_loss, new_gradient
+        active, settled = _advance(objective, active, tol, first=n_iter == 1)
+        if bool(settled.any()) or n_iter == max_iter:  # problems that have ended are not carried along
+            every.put(active)
+            active = active.of(~settled)
+    return every.x, BatchReport(every.loss, loss, n_iter, len(active.rows) == 0, every.inverse)
+
+
+@dataclass
+class _Problems:
+    """Where optimizations are, and Newton's step from there."""
+
+    rows: Int64[Tensor, " a"]
+    x: Float[Tensor, "a p"]
+    loss: Float[Tensor, " a"]
+    gradient: Float[Tensor, "a p"]
+    inverse: Float[Tensor, "a p p"]
+    step: Float[Tensor, " a"]
+    """How many of Newton's are tried next."""
+    downhill: Float[Tensor, "a p 1"]
+    """Newton's step, but for its sign."""
+    promise: Float[Tensor, " a"]
+    """By how much it should lower the loss."""
+
+    @classmethod
+    def at(cls, rows: Tensor, x: Tensor, loss: Tensor, gradient: Tensor, inverse: Tensor, step: Tensor) -> "_Problems":
+        """Problems at these points."""
         downhill = inverse @ gradient.unsqueeze(-1)
-        decrement = (gradient * downhill.squeeze(-1)).sum(-1)
-        enough = 1e-2 * tol + torch.finfo(loss.dtype).eps * loss.abs()
-        ended = ((gain <= enough) & (0.5 * decrement <= enough) & ~short) | (gradient.abs().sum(-1) <= tol)
-        if bool(ended.any()) or n_iter == max_iter:
-            ended_x[rows], ended_loss[rows] = x, loss
-            state = (rows, x, loss, gradient, inverse, downhill, decrement, step)
-            rows, x, loss, gradient, inverse, downhill, decrement, step = (part[~ended] for part in state)
-    return ended_x, BatchReport(ended_loss, first_loss, n_iter, len(rows) == 0)
+        promise = 0.5 * (gradient * downhill.squeeze(-1)).sum(-1)
+        return cls(rows, x, loss, gradient, inverse, step, downhill, promise)
+
+    def of(self, chosen: Bool[Tensor, " a"]) -> "_Problems":
+        """Some of them."""
+        return self if bool(chosen.all()) else _Problems(*(part[chosen] for part in vars(self).values()))
+
+    def put(self, others: "_Problems") -> None:
+        """Take what became of some of them."""
+        self.x, self.loss, self.inverse = (
+            mine.index_copy(0, others.rows, its)
+            for mine, its in zip(
+                (self.x, self.loss, self.inverse), (others.x, others.loss, others.inverse), strict=True
+            )
+        )
+
+
+def _advance(
+    objective: ValueAndGradient, at: _Problems, tol: float, *, first: bool
+) -> tuple[_Problems, Bool[Tensor, " a"]]:
+    """One step of each problem, and which have ended."""
+    x, loss, gradient = _backtrack(objective, at)
+    change = (gradient - at.gradient).unsqueeze(-1)
+    # Where the slope along a step has not fallen the curvature is not that of a minimum.
+    convex = (change * at.downhill).sum((-2, -1)) < -2e-3 * at.promise
+    inverse = _updated(at.inverse, (x - at.x).unsqueeze(-1), change, convex)
+    gain = at.loss - loss
+    short = ~convex & (gain > 0) & (at.step < _LONGEST_STEP) & (not first)
+    new = _Problems.at(at.rows, x, loss, gradient, inverse, torch.where(short, 4.0 * at.step, 1.0))
+    settled = (gain.maximum(new.promise) <= _enough(loss, tol)) & ~short
+    return new, settled | (gradient.abs().sum(-1) <= tol)
+
+
+def _enough(loss: Tensor, tol: float) -> Tensor:
+    """Gain that is none."""
+    return 1e-2 * tol + torch.finfo(loss.dtype).eps * loss.abs()
 
 
 def _first_inverse(objective: ValueAndGradient, rows: Tensor, x: Tensor, gradient: Tensor) -> Tensor:
     """Inverse Hessians by differences, of positive eigenvalues; where there is none, of a step of one."""
     size = x.shape[-1]
-    if len(x) == 0:
-        return x.new_zeros(0, size, size)
     eye = torch.eye(size).to(x)
     _, shifted = objective((x + _DIFFERENCE * eye[:, None]).flatten(0, 1), rows.repeat(size))
     hessian = (shifted.reshape(size, *x.shape) - gradient).transpose(0, 1) / _DIFFERENCE
@@ -144,37 +191,30 @@ def _updated(inverse: Tensor, step: Tensor, change: Tensor, convex: Tensor) -> T
     return inverse + update.where(convex[:, None, None], 0.0)
 
 
-def _backtrack(
-    objective: ValueAndGradient,
-    rows: Tensor,
-    x: Tensor,
-    loss: Tensor,
-    gradient: Tensor,
-    downhill: Tensor,
-    decrement: Tensor,
-    step: Tensor,
-) -> tuple[Tensor, Tensor, Tensor]:
+def _backtrack(objective: ValueAndGradient, at: _Problems) -> tuple[Tensor, Tensor, Tensor]:
     """Shorten each problem's step until its loss falls enough; where none does it stays where it is."""
-    trial = x - step[:, None] * downhill
-    value, trial_gradient = objective(trial, rows)
-    accepted = _accepted(value, trial_gradient, loss, step * decrement)
+    downhill, slope, step = at.downhill.squeeze(-1), 2.0 * at.promise, at.step
+    trial = at.x - step[:, None] * downhill
+    value, gradient = objective(trial, at.rows)
+    accepted = _accepted(value, gradient, at.loss, step * slope)
     if bool(accepted.all()):
-        return trial, value, trial_gradient
-    new_x, new_loss, new_gradient = x.clone(), loss.clone(), gradient.clone()
-    left = torch.arange(len(rows), device=rows.device)
+        return trial, value, gradient
+    new_x, new_loss, new_gradient = at.x.clone(), at.loss.clone(), at.gradient.clone()
+    left = torch.arange(len(step), device=step.device)
     for _ in range(25):
         done = left[accepted]
-        new_x[done], new_loss[done], new_gradient[done] = trial[accepted], value[accepted], trial_gradient[accepted]
+        new_x[done], new_loss[done], new_gradient[done] = trial[accepted], value[accepted], gradient[accepted]
         # The minimum of the parabola through both values and the slope, kept within a tenth and a half.
-        parabola = 0.5 * step[left] * decrement[left] / ((value - loss[left]) / step[left] + decrement[left])
-        shorter = torch.where(torch.isfinite(value + trial_gradient.sum(-1)), parabola, 0.1 * step[left])
-        step = step.index_copy(0, left, shorter.clamp(0.1 * step[left], 0.5 * step[left]))
+        share = step[left]
+        parabola = 0.5 * share * slope[left] / ((value - at.loss[left]) / share + slope[left])
+        shorter = torch.where(torch.isfinite(value + gradient.sum(-1)), parabola, 0.1 * share)
+        step = step.index_copy(0, left, shorter.clamp(0.1 * share, 0.5 * share))
         left = left[~accepted]
         if len(left) == 0:
             break
-        trial = x[left] - step[left, None] * downhill[left]
-        value, trial_gradient = objective(trial, rows[left])
-        accepted = _accepted(value, trial_gradient, loss[left], step[left] * decrement[left])
+        trial = at.x[left] - step[left, None] * downhill[left]
+        value, gradient = objective(trial, at.rows[left])
+        accepted = _accepted(value, gradient, at.loss[left], step[left] * slope[left])
     return new_x, new_loss, new_gradient
 
 
