@@ -90,6 +90,9 @@ class Evidence:
         covariance = basis.covariance(correlation)
         covariance.diagonal(dim1=-2, dim2=-1).add_(noise_ratio[:, None])
         factor, info = torch.linalg.cholesky_ex(covariance)
+        failed = bool(info.any())
+        if failed:
+            factor = torch.where((info > 0)[:, None, None], torch.eye(factor.shape[-1]).to(factor), factor)
         inverse = torch.cholesky_inverse(factor)
         targets = data.targets[rows].unsqueeze(-1)
         alpha = inverse @ targets
@@ -101,7 +104,7 @@ class Evidence:
             log_det = log_det + data.n_outside * noise_ratio.log()
         variance = self.variance(quadratic, noise_ratio, rows)
         loss = negative_log_density(quadratic, log_det, variance, data)
-        if bool(info.any()):
+        if failed:
             loss = torch.where(info == 0, loss, math.nan)
         matrix = inverse - (alpha / variance[:, None, None]) @ alpha.mT
         # The squared distance is inversely proportional to the square of the length scale.

@@ -169,7 +169,8 @@ class EvidenceGrid:
         if fixed is None:
             step = _FINE_STEP if len(projection.basis.nodes) <= _SMALL else _GRID_STEP
             n_steps = math.ceil(math.log(longest / self.shortest) / math.log(step) - 1e-9)
-            new = torch.logspace(math.log10(self.shortest), math.log10(longest), n_steps + 1).to(self._scales)
+            new = torch.logspace(math.log10(self.shortest), math.log10(longest), n_steps + 1, dtype=self._scales.dtype)
+            new = new.to(self._scales.device)
             new = new[:-1] if len(self._scales) else new
             each = new[:, None].expand(-1, n_features)
         else:
@@ -199,11 +200,12 @@ class EvidenceGrid:
         """Length scales (b, v, e), noise ratios (b, v) and loss (b, v) of the deepest local minima, in nats.
 
         The evidence often has one optimum where the data are signal and one where they are noise, with a plateau
-        between. Where there are fewer than ``most`` the loss is infinite.
+        between. Where there are fewer than ``most`` the loss is infinite, and the length scale the shortest.
         """
         surrounding = -max_pool2d(-self._table, _AROUND, stride=1, padding=(_AROUND[0] // 2, _AROUND[1] // 2))
         minima = torch.where(self._table <= surrounding, self._table, math.inf).flatten(1)
         loss, place = minima.topk(min(most, minima.shape[1]), dim=1, largest=False)
+        place = torch.where(loss.isfinite(), place, 0)
         scale = self._scales[place // len(self._ratios)].unsqueeze(-1)
         fixed = self._search.length_scale
         length_scale = (
