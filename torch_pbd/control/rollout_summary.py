@@ -67,18 +67,20 @@ def quantiles_in(
 ) -> Iterator[Floats]:
     """Quantiles (L, n_quantiles) of the distances at each ``every``-th tick; all are noted in the tally."""
     n_rollouts = len(tally.last_above)
-    squares: Tensor | None = None
+    scratch = rows = torch.empty(0)
     for part in blocks:
-        values = part.values if away is None else part.values - away[:, part.ticks, np.newaxis]
-        if squares is None:
-            squares = values.new_empty(values.shape[1], n_rollouts)
-        squared = squares[: values.shape[1], part.columns]
+        values = part.values if away is None else part.values - away[:, part.ticks, None]
+        if not len(scratch):  # the first part is the largest
+            scratch, rows = torch.empty_like(values[0]), values.new_empty(values.shape[1], n_rollouts)
+        squared = scratch[: values.shape[1], : values.shape[2]]
         torch.mul(values[0], values[0], out=squared)
         for axis in values[1:]:
             squared.addcmul_(axis, axis)
-        tally.add(part.ticks, part.columns, squared)
+        tally.add(part, squared)
+        chosen = squared[-part.ticks.start % every :: every]
+        rows[: len(chosen), part.columns] = chosen
         if part.columns.stop == n_rollouts:
-            yield _quantiles(squares[-part.ticks.start % every : len(squared) : every], levels)
+            yield _quantiles(rows[: len(chosen)], levels)
 
 
 def _quantiles(squares: Tensor, levels: Floats) -> Floats:

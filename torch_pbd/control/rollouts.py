@@ -1,6 +1,7 @@
 """Many rollouts of one task under pushes, a block of ticks at a time: no trajectory is kept."""
 
 import math
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import final
@@ -23,7 +24,7 @@ class Pushes:
     Attributes
     ----------
     onset, duration : Tensor of shape (R,), s
-        From the first tick on.
+        From the first tick on; onsets do not decrease.
     peak : Tensor of shape (d, R), N
     """
 
@@ -40,18 +41,31 @@ class Pushes:
         """Those of some rollouts."""
         return Pushes(self.onset[columns], self.duration[columns], self.peak[:, columns])
 
-    def span(self) -> tuple[float, float]:
-        """When the first begins and the last ends."""
-        return float(self.onset.min()), float((self.onset + self.duration).max())
+
+class _Timing:
+    """Which rollouts are pushed when: they are in the order of the onsets, so that those of a block are neighbours."""
+
+    def __init__(self, pushes: Pushes) -> None:
+        end = pushes.onset + pushes.duration
+        self._onsets, self._ends = pushes.onset.tolist(), end.cummax(0).values.tolist()
+        self.first_end = float(end.min())
+
+    def pushed(self, start: float, stop: float) -> slice:
+        """Rollouts from the first that is pushed between these times to the last, and none that is not before these."""
+        return slice(bisect_right(self._ends, start), bisect_left(self._onsets, stop))
 
 
 @dataclass(frozen=True)
 class Deviations:
-    """Deviations (d, L, r) from the desired position at some ticks, of some rollouts."""
+    """Deviations (d, L, r) from the desired position at some ticks, of some rollouts.
+
+    ``over`` tells whether one of their pushes is over before the next ticks, or there are no more.
+    """
 
     ticks: slice
     columns: slice
     values: Tensor
+    over: bool
 
 
 def march(
@@ -67,7 +81,7 @@ def march(
     chunk = _CHUNK if task.position.device.type == "cpu" else n_rollouts
     chunks = [slice(first, min(first + chunk, n_rollouts)) for first in range(0, n_rollouts, chunk)]
     parts = [pushes.within(columns) for columns in chunks]
-    spans = [part.span() for part in parts]
+    timings = [_Timing(part) for part in parts]
     states = [(start[0][columns], start[1][columns]) for columns in chunks]
     acting = (hooks.sensor, hooks.position_loop, hooks.environment, hooks.stiffness_filter)
     runs: Sequence[_Linear | _Looped]
@@ -80,9 +94,12 @@ def march(
     for first in range(0, task.n_ticks, length):
         ticks = slice(first, min(first + length, task.n_ticks))
         times = task.dt * torch.arange(first, first + length).to(task.position)
-        for columns, run, part, (begin, end) in zip(chunks, runs, parts, spans, strict=True):
-            pushed = begin < task.dt * ticks.stop and end > task.dt * first
-            yield Deviations(ticks, columns, run.move(ticks, part.force(times) if pushed else None))
+        since, until = task.dt * first, task.dt * ticks.stop
+        for columns, run, part, timing in zip(chunks, runs, parts, timings, strict=True):
+            pushed = timing.pushed(since, until)
+            over = timing.first_end < until or ticks.stop == task.n_ticks
+            values = run.move(ticks, pushed, part.within(pushed).force(times))
+            yield Deviations(ticks, columns, values, over)
 
 
 class _Product:
@@ -91,22 +108,22 @@ class _Product:
     def __init__(self, task: Task, integrator: Integrator, chunk: int) -> None:
         d, length = task.position.shape[-1], block_length(task.position.shape[-1])
         self._responses, self._first = block_responses(task, integrator, length), -1
-        self._inputs = task.position.new_ones(2 * d + 1 + length * d, chunk)
+        self._inputs = task.position.new_ones(2 * d + 1, chunk)
         self._outputs = task.position.new_empty(length * d + 2 * d, chunk)
 
-    def __call__(self, first: int, state: Tensor, forces: Tensor | None) -> Tensor:
+    def __call__(self, first: int, state: Tensor, pushed: slice, forces: Tensor) -> Tensor:
         """Deviations (L d, r), axis by axis, in the block from a tick on, and then the state (2 d, r) after it."""
-        if first != self._first:
-            each, d = next(self._responses), len(state) // 2
-            self._response = torch.cat([each[:-1, :d].transpose(0, 1).flatten(0, 1), each[-1]])
-            self._first = first
         size, r = state.shape
+        if first != self._first:
+            each = next(self._responses)
+            response = torch.cat([each[:-1, : size // 2].transpose(0, 1).flatten(0, 1), each[-1]])
+            self._free, self._forced = response[:, : size + 1].contiguous(), response[:, size + 1 :].contiguous()
+            self._first = first
         self._inputs[:size, :r] = state
-        used = size + 1  # before the first push and after the last, most of the time, no columns of forces
-        if forces is not None:
-            self._inputs[used:, :r] = forces.flatten(0, 1)
-            used = len(self._inputs)
-        return torch.mm(self._response[:, :used], self._inputs[:used, :r], out=self._outputs[:, :r])
+        within = torch.mm(self._free, self._inputs[:, :r], out=self._outputs[:, :r])
+        if forces.numel():
+            within[:, pushed].addmm_(self._forced, forces.flatten(0, 1))
+        return within
 
 
 class _Linear:
@@ -116,10 +133,13 @@ class _Linear:
         self._state = torch.cat([start[0] - task.position[0], start[1]], dim=-1).mT.contiguous()
         self._product = product
 
-    def move(self, ticks: slice, forces: Tensor | None) -> Tensor:
-        """Deviations (d, L, r) at a block of ticks under forces (L, d, r), until the next call for any rollouts."""
+    def move(self, ticks: slice, pushed: slice, forces: Tensor) -> Tensor:
+        """Deviations (d, L, r) at a block of ticks, valid until another block is asked for of any rollouts.
+
+        Forces (L, d, p) act on some of them.
+        """
         size = len(self._state)
-        within = self._product(ticks.start, self._state, forces)
+        within = self._product(ticks.start, self._state, pushed, forces)
         self._state.copy_(within[-size:])
         return within[:-size].unflatten(0, (size // 2, -1))[:, : ticks.stop - ticks.start]
 
@@ -131,17 +151,18 @@ class _Looped:
         self._task, self._loop = task, Loop(task, start, hooks, generator)
         self._still = torch.zeros_like(start[0])
 
-    def move(self, ticks: slice, forces: Tensor | None) -> Tensor:
-        """Deviations (d, L, r) at a block of ticks under forces (L, d, r)."""
+    def move(self, ticks: slice, pushed: slice, forces: Tensor) -> Tensor:
+        """Deviations (d, L, r) at a block of ticks; forces (L, d, p) act on some of them."""
         deviations = []
         for tick in range(ticks.start, ticks.stop):
-            force = self._still if forces is None else forces[tick - ticks.start].mT
+            force = self._still.clone()
+            force[pushed] = forces[tick - ticks.start].mT
             deviations.append(self._loop.run(tick, force)["position"] - self._task.position[tick])
         return torch.stack(deviations).permute(2, 0, 1)
 
 
 class Tally:
-    """What is kept of each of R rollouts: peak of the deviation, when, and the last tick above a limit.
+    """What is kept of each of R rollouts: peak of the deviation, when, and the last tick above a limit after the push.
 
     The limit is ``threshold`` in m, or else ``share`` of the rollout's own peak.
     """
@@ -152,18 +173,20 @@ class Tally:
         self.squared_last = torch.zeros_like(zero)
         self._threshold, self._share = threshold, share
 
-    def add(self, ticks: slice, columns: slice, squared: Float[Tensor, "l r"]) -> None:
-        """Squared deviations at further ticks, of some rollouts."""
-        numbers = torch.arange(ticks.start, ticks.stop, dtype=squared.dtype, device=squared.device)[:, None]
+    def add(self, part: Deviations, squared: Float[Tensor, "l r"]) -> None:
+        """Squared deviations of a part."""
+        columns = part.columns
+        numbers = torch.arange(part.ticks.start, part.ticks.stop, dtype=squared.dtype, device=squared.device)[:, None]
         highest, peak, tick = squared.amax(0), self.squared_peak[columns], self.peak_tick[columns]
         higher = highest > peak
         if bool(higher.any()):
             when = torch.where(squared == highest, numbers, -1.0).amax(0)
             torch.where(higher, when, tick, out=tick)
             torch.maximum(peak, highest, out=peak)
-        # Of its own peak so far: what is counted before that peak is reached, the peak itself overrules.
-        limit = self._share**2 * peak if self._threshold is None else torch.full_like(peak, self._threshold**2)
-        if bool((highest > limit).any()):
-            last = self.last_above[columns]
-            torch.maximum(last, torch.where(squared > limit, numbers, -1.0).amax(0), out=last)
+        if part.over:
+            # Of its own peak so far: what is counted before that peak is reached, the peak itself overrules.
+            limit = self._share**2 * peak if self._threshold is None else torch.full_like(peak, self._threshold**2)
+            if bool((highest > limit).any()):
+                last = self.last_above[columns]
+                torch.maximum(last, torch.where(squared > limit, numbers, -1.0).amax(0), out=last)
         self.squared_last[columns] = squared[-1]
