@@ -10,7 +10,7 @@ from jaxtyping import install_import_hook
 
 TORCH_CONTROL = [
     "coupling", "damping", "dmp", "environment", "matrices", "passivity", "plant", "sensor", "stability", "stiffness",
-    "rollout", "position_loop", "ticks", "transitions",
+    "rollout", "rollouts", "position_loop", "ticks", "transitions",
 ]  # fmt: skip
 TORCH_FLOORS = ["linalg", "kernels", "optim", "gp", "models", *(f"control.{part}" for part in TORCH_CONTROL)]
 install_import_hook([f"torch_pbd.{floor}" for floor in TORCH_FLOORS], "beartype.beartype")

@@ -8,11 +8,13 @@ if TYPE_CHECKING:
     from torch_pbd.control.damping import damping_from_stiffness, required_damping_ratio
     from torch_pbd.control.dmp import DMP
     from torch_pbd.control.environment import Tunnel
+    from torch_pbd.control.monte_carlo import simulate_many
     from torch_pbd.control.passivity import EnergyTank, RateLimit
     from torch_pbd.control.plant import AdmittancePlant
     from torch_pbd.control.position_loop import PositionLoop
     from torch_pbd.control.realtime import RealTimeAdmittance, TickStatus
     from torch_pbd.control.rollout import Rollout
+    from torch_pbd.control.rollout_summary import RolloutSummary
     from torch_pbd.control.schedule import Schedule
     from torch_pbd.control.sensor import ForceSensor
     from torch_pbd.control.stability import certify
@@ -30,6 +32,7 @@ _HOMES = {
     "RateLimit": "passivity",
     "RealTimeAdmittance": "realtime",
     "Rollout": "rollout",
+    "RolloutSummary": "rollout_summary",
     "Schedule": "schedule",
     "StabilityReport": "stability_report",
     "StiffnessLaw": "stiffness",
@@ -38,6 +41,7 @@ _HOMES = {
     "certify": "stability",
     "damping_from_stiffness": "damping",
     "required_damping_ratio": "damping",
+    "simulate_many": "monte_carlo",
 }
 
 __all__ = [
@@ -50,6 +54,7 @@ __all__ = [
     "RateLimit",
     "RealTimeAdmittance",
     "Rollout",
+    "RolloutSummary",
     "Schedule",
     "StabilityReport",
     "StiffnessLaw",
@@ -58,6 +63,7 @@ __all__ = [
     "certify",
     "damping_from_stiffness",
     "required_damping_ratio",
+    "simulate_many",
 ]
 
 

@@ -14,6 +14,7 @@ from torch_pbd.control.matrices import check_count, check_finite, check_positive
 from torch_pbd.control.sampling import count_intervals
 from torch_pbd.control.stiffness import StiffnessLaw
 from torch_pbd.data import Demonstrations, check_unimodal
+from torch_pbd.memory import require_memory
 
 Floats = NDArray[np.float64]
 PhaseInput = Literal["time", "log_s", "s"]
@@ -118,3 +119,12 @@ def count_ticks(duration: float, rate: float, settle: float) -> int:
     if n_ticks < 2:
         raise ValueError(f"rate == {rate:g} gives {n_ticks} tick in {duration:g}, must give at least 2.")
     return n_ticks
+
+
+def check_memory(n_ticks: int, d: int) -> None:
+    """Refuse a schedule that does not fit in memory: its arrays, and twice as much while they are made."""
+    require_memory(
+        3 * 8 * n_ticks * (2 + 2 * d + 3 * d * d),
+        what=f"a schedule of {n_ticks} ticks of {d} axes",
+        remedy="Lower rate, and let the robot interpolate between its rows.",
+    )

@@ -13,6 +13,7 @@ from torch_pbd.control.arguments import (
     Variability,
     as_demonstrations,
     as_times,
+    check_memory,
     check_parameters,
     count_ticks,
 )
@@ -32,6 +33,8 @@ from torch_pbd.data import Demonstrations
 from torch_pbd.estimators._base import CovarianceRegressor
 
 Floats = NDArray[np.float64]
+
+_AT_ONCE = 2**14  # times whose gains are computed together
 
 
 class DMPController(BaseEstimator):
@@ -219,9 +222,16 @@ class DMPController(BaseEstimator):
         -------
         Schedule
             From 0, the start of the movement, to ``duration_ + settle``.
+
+        Raises
+        ------
+        ValueError
+            If there are less than two ticks, or they do not fit in memory.
         """
         check_is_fitted(self)
-        time = np.arange(count_ticks(self.duration_, rate, settle)) / rate
+        n_ticks = count_ticks(self.duration_, rate, settle)
+        check_memory(n_ticks, self.n_outputs_)
+        time = np.arange(n_ticks) / rate
         position, velocity = self.reproduction_.motion(time)
         gains, metres = self._gains_at(time), in_metres(self.units_)
         return Schedule(
@@ -323,6 +333,11 @@ class DMPController(BaseEstimator):
         return self.time_scale_ * (as_times(X) - self.start_time_)
 
     def _gains_at(self, time: Floats) -> Gains:
+        # In parts: a regressor may need a hundred times the memory of what it predicts.
+        parts = [self._gains_of(part) for part in np.split(time, range(_AT_ONCE, len(time), _AT_ONCE))]
+        return Gains(*map(np.concatenate, zip(*parts, strict=True)))
+
+    def _gains_of(self, time: Floats) -> Gains:
         inputs = self.phase(time)
         covariance, unknown = self.covariance_.predict_cov(inputs), self.covariance_.predict_uncertainty(inputs).type1
         return self._impedance(covariance, unknown, time)

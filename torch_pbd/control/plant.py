@@ -13,6 +13,7 @@ from torch_pbd.control.rollout import Rollout
 from torch_pbd.control.sensor import ForceSensor
 from torch_pbd.control.ticks import Task, closed_loop, open_loop
 from torch_pbd.control.transitions import Integrator
+from torch_pbd.memory import require_memory
 
 
 @final
@@ -147,36 +148,68 @@ class AdmittancePlant:
         Raises
         ------
         ValueError
-            If shapes disagree, a value is not finite, or a matrix is not positive semidefinite.
+            If shapes disagree, a value is not finite, a matrix is not positive semidefinite, or the rollouts do
+            not fit in memory.
         """
+        task = self.task(
+            position_desired, velocity_desired, stiffness, damping, dt=dt, acceleration_desired=acceleration_desired
+        )
         force = torch.zeros_like(position_desired) if force is None else force
-        motion = {"position_desired": position_desired, "velocity_desired": velocity_desired, "force": force}
-        if acceleration_desired is not None:
-            motion["acceleration_desired"] = acceleration_desired
-        _check_inputs(motion, stiffness, damping, dt)
+        _check_motion({"position_desired": position_desired, "force": force})
         _check_start(position_desired.shape[-1], position0=position0, velocity0=velocity0)
-        stiffness, damping = torch.broadcast_tensors(stiffness, damping)
+        stiffness, damping = task.stiffness, task.damping
         start = position_desired[..., 0, :] if position0 is None else position0
         speed = velocity_desired[..., 0, :] if velocity0 is None else velocity0
-        lead = [value.shape[:-2] for value in (*motion.values(), stiffness[..., 0])]
-        batch = torch.broadcast_shapes(*lead, start.shape[:-1], speed.shape[:-1])
-        mass = self._mass_matrix(stiffness)
-        inertial = torch.zeros_like(position_desired)
-        if self.feed_forward:
-            inertial = _accelerations(velocity_desired, acceleration_desired, dt) @ mass.mT
-        task = Task(position_desired, velocity_desired, inertial, stiffness, damping, force, mass, dt)
+        parts = (position_desired, velocity_desired, task.inertial_force, force, stiffness[..., 0])
+        batch = torch.broadcast_shapes(*(value.shape[:-2] for value in parts), start.shape[:-1], speed.shape[:-1])
+        self._check_memory(batch, task)
         state = start.expand(*batch, -1), speed.expand(*batch, -1)
         hooks = (self.sensor, self.position_loop, self.environment, self.stiffness_filter)
         if all(hook is None for hook in hooks):
-            position, velocity = open_loop(task, state, self.integrator)
+            position, velocity = open_loop(task, force, state, self.integrator)
             record: dict[str, Any] = {"position": position, "velocity": velocity, "commanded_position": position}
             gains = (*batch, *stiffness.shape[-3:])
             record |= {"stiffness": stiffness.expand(gains), "damping": damping.expand(gains)}
             record |= {"force": force.expand_as(position)}
         else:
-            record = closed_loop(task, state, self, generator)
+            record = closed_loop(task, force, state, self, generator)
         time = torch.arange(force.shape[-2], dtype=force.dtype, device=force.device) * dt
         return Rollout(time, desired_position=position_desired, **record)
+
+    def task(
+        self,
+        position_desired: Tensor,
+        velocity_desired: Tensor,
+        stiffness: Tensor,
+        damping: Tensor,
+        *,
+        dt: float,
+        acceleration_desired: Tensor | None = None,
+    ) -> Task:
+        """Arguments of :meth:`simulate` as this plant is to follow them, checked; it raises as that does."""
+        motion = {"position_desired": position_desired, "velocity_desired": velocity_desired}
+        if acceleration_desired is not None:
+            motion["acceleration_desired"] = acceleration_desired
+        check_positive("dt", dt, "s")
+        _check_motion(motion)
+        _check_gains(position_desired, stiffness=stiffness, damping=damping)
+        stiffness, damping = torch.broadcast_tensors(stiffness, damping)
+        mass = self._mass_matrix(stiffness)
+        inertial = torch.zeros_like(position_desired)
+        if self.feed_forward:
+            inertial = _accelerations(velocity_desired, acceleration_desired, dt) @ mass.mT
+        return Task(position_desired, velocity_desired, inertial, stiffness, damping, mass, dt)
+
+    def _check_memory(self, batch: torch.Size, task: Task) -> None:
+        """Measured: five motions are held, and where rollouts differ in their gains, twelve matrices."""
+        d = task.position.shape[-1]
+        of_each = 5 * d + (12 * d * d if task.stiffness.ndim > 3 or self.stiffness_filter is not None else 0)
+        if task.position.device.type == "cpu":  # elsewhere torch raises by itself
+            require_memory(
+                of_each * batch.numel() * task.n_ticks * task.position.element_size(),
+                what=f"a simulation of {batch.numel()} rollouts of {task.n_ticks} ticks",
+                remedy="Simulate fewer at a time, or take simulate_many, which keeps no trajectories.",
+            )
 
     def _mass_matrix(self, like: Tensor) -> Tensor:
         if isinstance(self.mass, Tensor) and self.mass.ndim:
@@ -196,27 +229,37 @@ def _accelerations(velocity: Tensor, acceleration: Tensor | None, dt: float) -> 
     return torch.cat([difference, torch.zeros_like(velocity[..., :1, :])], dim=-2)
 
 
-def _check_inputs(motion: dict[str, Tensor], stiffness: Tensor, damping: Tensor, dt: float) -> None:
-    check_positive("dt", dt, "s")
-    kinds = {(value.dtype, value.device) for value in (*motion.values(), stiffness, damping)}
-    if len(kinds) > 1:
-        raise ValueError(f"the inputs are of several dtypes or devices, {sorted(map(str, kinds))}: bring them to one.")
+def _check_motion(motion: dict[str, Tensor]) -> None:
+    """Check motions and forces (..., T, d), the first of which is the desired position."""
     expected = motion["position_desired"].shape[-2:]
+    _check_kinds(*motion.values())
     for name, value in motion.items():
         if value.ndim < 2 or value.shape[-2:] != expected or not value.numel():
             raise ValueError(
                 f"{name} has shape {tuple(value.shape)}, must have shape (..., T, d), with T >= 1 and d those of "
                 f"position_desired, {tuple(motion['position_desired'].shape)}."
             )
-        finite = torch.isfinite(value).all(-1).reshape(-1, expected[0]).all(0)
-        if not bool(finite.all()):
-            raise ValueError(f"{name} has a value that is not finite, at tick {int((~finite).nonzero()[0])}.")
-    for name, value in {"stiffness": stiffness, "damping": damping}.items():
+        if not bool(torch.isfinite(value.detach().sum())):  # or the sum overflows: look at each
+            finite = torch.isfinite(value).all(-1).reshape(-1, expected[0]).all(0)
+            if not bool(finite.all()):
+                raise ValueError(f"{name} has a value that is not finite, at tick {int((~finite).nonzero()[0])}.")
+
+
+def _check_gains(position: Tensor, **gains: Tensor) -> None:
+    expected = position.shape[-2:]
+    _check_kinds(position, *gains.values())
+    for name, value in gains.items():
         if value.shape[-3:] != (*expected, expected[-1]):
             raise ValueError(
                 f"{name} has shape {tuple(value.shape)}, must have shape (..., T, d, d) with T, d = {tuple(expected)}."
             )
         as_semidefinite(value, name)
+
+
+def _check_kinds(*values: Tensor) -> None:
+    kinds = {(value.dtype, value.device) for value in values}
+    if len(kinds) > 1:
+        raise ValueError(f"the inputs are of several dtypes or devices, {sorted(map(str, kinds))}: bring them to one.")
 
 
 def _check_start(d: int, **starts: Tensor | None) -> None:

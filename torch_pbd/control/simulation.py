@@ -41,14 +41,19 @@ def simulate_schedule(
             f"force has shape {push.shape}, must have shape {shape}: one row in N for each tick of "
             f"schedule(rate={rate:g})."
         )
-    if np.ndim(robot.mass) or float(robot.mass) != float(mass):
-        warnings.warn(
-            f"The plant's mass is {robot.mass}, but damping_ratio was met for mass={mass:g} kg: give both the same.",
-            stacklevel=3,
-        )
+    warn_of_mass(robot, mass, stacklevel=4)
     parts = (schedule.position, schedule.velocity, schedule.stiffness, schedule.damping, push)
     generator = torch.Generator().manual_seed(int(check_random_state(random_state).randint(2**31 - 1)))
     return robot.simulate(*map(_tensor, parts), dt=1.0 / rate, generator=generator).numpy()
+
+
+def warn_of_mass(robot: AdmittancePlant, mass: float, *, stacklevel: int) -> None:
+    """Warn where the robot's mass is not that which the damping of a schedule was computed for."""
+    if np.ndim(robot.mass) or float(robot.mass) != float(mass):
+        warnings.warn(
+            f"The plant's mass is {robot.mass}, but damping_ratio was met for mass={mass:g} kg: give both the same.",
+            stacklevel=stacklevel,
+        )
 
 
 def _tensor(values: NDArray[np.float64]) -> torch.Tensor:

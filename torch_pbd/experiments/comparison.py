@@ -11,7 +11,8 @@ from sklearn.base import clone
 
 from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.estimators._groups import fit_by_demonstration
-from torch_pbd.metrics import covariance_mse, mahalanobis_coverage, relative_frobenius_error
+from torch_pbd.experiments.sweep import left_out, score_fold
+from torch_pbd.metrics import covariance_mse, relative_frobenius_error
 
 Floats = NDArray[np.float64]
 Truth = Callable[[Floats], Floats]
@@ -86,29 +87,33 @@ def compare_models(
     list of Score, in the order of ``models``
     """
     inputs, empirical = empirical_covariances(X, y)
-    demos = np.unique(groups)
-    left_out = demos[np.unique(np.linspace(0, len(demos) - 1, min(max_folds, len(demos))).round().astype(int))]
-    if len(demos) < 2 or max_folds < 1:
-        left_out = demos[:0]
+    folds = left_out(groups, max_folds)
+    fits = {name: _timed_fit(clone(model), X, y, groups) for name, model in models.items()}
+    jobs = (delayed(score_fold)(clone(model), X, y, groups, fold) for model in models.values() for fold in folds)
+    results = iter(Parallel(n_jobs=n_jobs)(jobs))
     scores = []
-    for name, model in models.items():
-        start = time.perf_counter()
-        fitted = fit_by_demonstration(clone(model), X, y, groups)
-        seconds = time.perf_counter() - start
+    for name, (fitted, seconds) in fits.items():
         covariance = fitted.predict_cov(inputs)
-        folds = Parallel(n_jobs=n_jobs)(delayed(_score_fold)(clone(model), X, y, groups, k) for k in left_out)
+        held_out = [next(results) for _ in folds]
         scores.append(
             Score(
                 model=name,
                 cholesky_mse=float("nan") if empirical is None else covariance_mse(covariance, empirical),
                 frobenius=float("nan") if truth is None else relative_frobenius_error(covariance, truth(inputs)),
-                fold_log_likelihood=tuple(fold[0] for fold in folds),
-                fold_coverage=tuple(fold[1] for fold in folds),
+                fold_log_likelihood=tuple(row["log_likelihood"] for row in held_out),
+                fold_coverage=tuple(row["coverage"] for row in held_out),
                 fit_seconds=seconds,
                 smallest_eigenvalue=_smallest_eigenvalue(covariance),
             )
         )
     return scores
+
+
+def _timed_fit(
+    model: CovarianceRegressor, X: Floats, y: Floats, groups: NDArray[np.intp]
+) -> tuple[CovarianceRegressor, float]:
+    start = time.perf_counter()
+    return fit_by_demonstration(model, X, y, groups), time.perf_counter() - start
 
 
 def empirical_covariances(X: Floats, y: Floats) -> tuple[Floats, Floats | None]:
@@ -122,16 +127,6 @@ def empirical_covariances(X: Floats, y: Floats) -> tuple[Floats, Floats | None]:
     for i, rows in enumerate(np.split(y[order], np.cumsum(counts)[:-1])):
         covariances[i] = np.cov(rows.T)
     return inputs, covariances
-
-
-def _score_fold(
-    model: CovarianceRegressor, X: Floats, y: Floats, groups: NDArray[np.intp], demonstration: int
-) -> tuple[float, float]:
-    left_out = groups == demonstration
-    fit_by_demonstration(model, X[~left_out], y[~left_out], groups[~left_out])
-    mean, covariance = model.predict(X[left_out], return_cov=True)
-    coverage = mahalanobis_coverage(mean.reshape(len(mean), -1), covariance, y[left_out], level=0.95)
-    return model.score(X[left_out], y[left_out]), float(coverage)
 
 
 def _smallest_eigenvalue(covariance: Floats) -> float:

@@ -1,0 +1,252 @@
+"""Many rollouts against the simulation of each, NumPy's quantiles, and laws of a linear system."""
+
+import re
+
+import numpy as np
+import pytest
+import scipy.stats
+import torch
+
+import torch_pbd.control.monte_carlo
+import torch_pbd.control.rollouts
+import torch_pbd.memory
+from torch_pbd.control import (
+    AdmittancePlant,
+    EnergyTank,
+    ForceSensor,
+    PositionLoop,
+    RateLimit,
+    Schedule,
+    Tunnel,
+    simulate_many,
+)
+from torch_pbd.control.damping import damping_from_stiffness
+from torch_pbd.control.transitions import admittance_rate, transition
+
+RATE = 200.0
+
+
+def turning_schedule(n_ticks=301, d=2, mass=1.0, rate=RATE, start=0.0):
+    """A curve, with a stiffness whose axes turn, and critical damping."""
+    time = np.arange(n_ticks) / rate
+    spin = np.zeros((n_ticks, d, d))
+    for axis in range(d - 1):
+        spin[:, axis, axis + 1] = 2.0 * time / (1 + axis)
+    axes = torch.linalg.matrix_exp(torch.tensor(spin - spin.swapaxes(1, 2))).numpy()
+    eigenvalues = 500.0 + 400.0 * np.sin(3.0 * time[:, None] + np.arange(d))
+    stiffness = axes * eigenvalues[:, None] @ axes.swapaxes(1, 2)
+    stiffness = 0.5 * (stiffness + stiffness.swapaxes(1, 2))
+    damping = damping_from_stiffness(stiffness, mass).numpy()
+    turn = 2.0 * time[:, None] + np.arange(d)
+    covariance = np.broadcast_to(np.eye(d), stiffness.shape)
+    position, velocity = 0.1 * np.sin(turn), 0.2 * np.cos(turn)
+    return Schedule(time + start, position, velocity, stiffness, damping, covariance, 0.0 * time, mass=mass)
+
+
+def one_by_one(schedule, summary, plant):
+    """Distances (R, T) from the desired position, by AdmittancePlant.simulate, one rollout after the other."""
+    share = (schedule.time - summary.onset[:, None]) / summary.duration[:, None]
+    forces = np.sin(np.pi * share.clip(0.0, 1.0))[..., None] ** 2 * summary.push[:, None]
+    motion = [getattr(schedule, name) for name in ("position", "velocity", "stiffness", "damping")]
+    motion = [torch.tensor(each) for each in motion]
+    dt = schedule.duration / (len(schedule) - 1)
+    runs = [plant.simulate(*motion, torch.tensor(force), dt=dt).deviation.numpy() for force in forces]
+    return np.linalg.norm(runs, axis=-1)
+
+
+def check_against(distance, schedule, summary, rtol=1e-12):
+    np.testing.assert_allclose(
+        summary.deviation, np.quantile(distance, summary.quantiles, axis=0).T, rtol=rtol, atol=rtol * distance.max()
+    )
+    np.testing.assert_allclose(summary.peak_deviation, distance.max(axis=1), rtol=rtol)
+    np.testing.assert_array_equal(summary.peak_time, schedule.time[distance.argmax(axis=1)])
+    np.testing.assert_allclose(summary.final_deviation, distance[:, -1], rtol=rtol, atol=rtol * distance.max())
+
+
+@pytest.mark.parametrize("d", [1, 2, 3])
+@pytest.mark.parametrize("integrator", ["exact", "semi_implicit_euler"])
+def test_it_is_each_rollout_by_itself(d, integrator):
+    schedule, plant = turning_schedule(d=d, mass=0.7), AdmittancePlant(0.7, integrator)
+    options = {"plant": plant, "peak": (2.0, 9.0), "duration": (0.1, 0.5), "quantiles": (0.0, 0.3, 0.5, 1.0)}
+    summary = simulate_many(schedule, 12, **options, random_state=0)
+    check_against(one_by_one(schedule, summary, plant), schedule, summary)
+    (alone,) = one_by_one(schedule, simulate_many(schedule, 1, **options, random_state=1), plant)
+    np.testing.assert_allclose(
+        simulate_many(schedule, 1, **options, random_state=1).deviation[:, 0],
+        alone,
+        rtol=1e-12,
+        atol=1e-12 * max(alone),
+    )
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {"position_loop": PositionLoop()},
+        {"sensor": ForceSensor(bias=0.2, cutoff=30.0)},
+        {"stiffness_filter": EnergyTank()},
+        {"stiffness_filter": RateLimit()},
+        {"environment": Tunnel(2e3), "substeps": 2},
+    ],
+    ids=lambda parts: "-".join(parts),
+)
+def test_what_acts_in_the_loop_acts_in_each(parts, monkeypatch):
+    monkeypatch.setattr(torch_pbd.control.rollouts, "_CHUNK", 3)
+    schedule, plant = turning_schedule(n_ticks=101), AdmittancePlant(**parts)
+    summary = simulate_many(schedule, 5, plant=plant, duration=0.2, random_state=0)
+    check_against(one_by_one(schedule, summary, plant), schedule, summary, rtol=1e-11)
+
+
+def test_a_steady_push_is_composed_of_affine_maps():
+    """The state at the end by the product of the maps of all ticks, under no force and under others that stand."""
+    schedule, plant, dt = turning_schedule(), AdmittancePlant(), 1.0 / RATE
+    motion = [torch.tensor(getattr(schedule, name)) for name in ("position", "velocity", "stiffness", "damping")]
+    maps = transition(admittance_rate(*motion[2:], torch.eye(2).double()), dt).numpy()[:, :4]
+    forces = np.array([[0.0, 0.0], [4.0, -1.0], [0.5, 9.0]])
+    whole, moved = np.eye(4), np.zeros((3, 4))
+    for tick in range(len(schedule) - 1):
+        push = forces + schedule.damping[tick] @ schedule.velocity[tick]
+        step = schedule.position[tick + 1] - schedule.position[tick]
+        whole = maps[tick, :, :4] @ whole
+        moved = moved @ maps[tick, :, :4].T + push @ maps[tick, :, 4:].T - np.r_[step, 0.0, 0.0]
+    final = whole @ np.r_[0.0, 0.0, schedule.velocity[0]] + moved
+    run = plant.simulate(*motion, torch.tensor(forces)[:, None].expand(-1, len(schedule), -1), dt=dt)
+    np.testing.assert_allclose(run.deviation[:, -1], final[:, :2], rtol=1e-10)
+    np.testing.assert_allclose(run.velocity[:, -1], final[:, 2:], rtol=1e-10)
+    summary = simulate_many(schedule, 3, plant=plant, peak=0.0, random_state=0)
+    np.testing.assert_allclose(summary.final_deviation, np.linalg.norm(final[0, :2]), rtol=1e-10)
+
+
+def test_twice_the_push_is_twice_as_far():
+    """From where it would be without: the deviation of a linear system goes with the force."""
+    schedule = turning_schedule()
+    once, twice = (
+        simulate_many(schedule, 40, peak=peak, reference="undisturbed", random_state=3) for peak in (2.5, 5.0)
+    )
+    np.testing.assert_array_equal(2.0 * once.push, twice.push)
+    np.testing.assert_allclose(twice.deviation, 2.0 * once.deviation, rtol=1e-10, atol=1e-14)
+    np.testing.assert_allclose(twice.peak_deviation, 2.0 * once.peak_deviation, rtol=1e-10)
+    np.testing.assert_array_equal(twice.return_time, once.return_time)
+    # By a mass that gives way to a force F for t seconds: never further than without any spring
+    assert (twice.peak_deviation < 5.0 * 0.8**2 / 2.0).all()
+    assert (twice.deviation[0] == 0.0).all()
+
+
+def test_it_returns_when_it_stays_below_the_threshold():
+    schedule = turning_schedule()
+    for threshold in (None, 5e-3):
+        summary = simulate_many(schedule, 60, duration=0.3, threshold=threshold, random_state=1)
+        distance = one_by_one(schedule, summary, AdmittancePlant())
+        limit = 0.1 * distance.max(axis=1) if threshold is None else np.full(60, threshold)
+        for far, least, end, found in zip(
+            distance, limit, summary.onset + summary.duration, summary.return_time, strict=True
+        ):
+            above = np.flatnonzero(far > least)
+            last = above[-1] if len(above) else -1
+            expected = np.inf if last == len(far) - 1 else max(0.0, (last + 1) / RATE - end)
+            assert found == pytest.approx(expected, abs=1e-12)
+        assert np.isinf(summary.return_time).any() or threshold is None
+
+
+def test_pushes_are_drawn_from_what_is_documented():
+    summary = simulate_many(
+        turning_schedule(d=3), 4000, peak=(1.0, 4.0), duration=(0.2, 0.4), onset=(0.3, 0.9), every=300, random_state=0
+    )
+    strength = np.linalg.norm(summary.push, axis=1)
+    assert (np.diff(summary.onset) >= 0.0).all()
+    for values, low, high in ((strength, 1.0, 4.0), (summary.duration, 0.2, 0.4), (summary.onset, 0.3, 0.9)):
+        assert scipy.stats.kstest((values - low) / (high - low), "uniform").pvalue > 1e-3
+    for axis in (summary.push / strength[:, None]).T:  # on the sphere in 3-D, each coordinate is uniform
+        assert scipy.stats.kstest(0.5 * (axis + 1.0), "uniform").pvalue > 1e-3
+    assert abs(np.corrcoef(np.c_[strength, summary.duration, summary.onset].T) - np.eye(3)).max() < 0.06
+    assert len(summary.time) == len(summary.deviation) == 2
+
+
+def test_starts_are_spread():
+    summary = simulate_many(
+        turning_schedule(), 4000, peak=0.0, start_scale=0.01, reference="undisturbed", quantiles=(0.5,), random_state=0
+    )
+    assert summary.deviation[0, 0] == pytest.approx(0.01 * np.sqrt(2.0 * np.log(2.0)), rel=0.05)  # Rayleigh's median
+    assert summary.deviation[-1, 0] < 1e-3 * summary.deviation[0, 0]
+
+
+@pytest.mark.parametrize("plant", [None, AdmittancePlant(sensor=ForceSensor(noise_scale=0.5))], ids=["linear", "noisy"])
+def test_a_seed_is_a_result_to_the_last_bit(plant, monkeypatch):
+    monkeypatch.setattr(torch_pbd.control.rollouts, "_CHUNK", 7)
+    schedule = turning_schedule(n_ticks=60)
+    runs = [
+        simulate_many(schedule, 20, plant=plant, duration=0.1, reference="undisturbed", random_state=seed)
+        for seed in (0, np.random.RandomState(0), 1)
+    ]
+    for name in ("deviation", "peak_deviation", "return_time", "push"):
+        first, again, other = (getattr(run, name) for run in runs)
+        np.testing.assert_array_equal(first, again)
+        assert not np.array_equal(first, other)
+
+
+def test_chunks_make_no_difference(monkeypatch):
+    schedule = turning_schedule(n_ticks=101)
+    whole = simulate_many(schedule, 50, duration=0.1, random_state=0)
+    monkeypatch.setattr(torch_pbd.control.rollouts, "_CHUNK", 8)
+    parts = simulate_many(schedule, 50, duration=0.1, random_state=0)
+    for name in ("deviation", "peak_deviation", "peak_time", "return_time", "final_deviation"):
+        np.testing.assert_allclose(getattr(parts, name), getattr(whole, name), rtol=1e-12, atol=1e-15)
+
+
+def test_rows_of_quantiles_may_be_fewer():
+    schedule = turning_schedule(n_ticks=150)
+    dense, sparse = (simulate_many(schedule, 30, every=every, duration=0.2, random_state=0) for every in (1, 7))
+    np.testing.assert_array_equal(sparse.deviation, dense.deviation[::7])
+    np.testing.assert_array_equal(sparse.time, dense.time[::7])
+    np.testing.assert_array_equal(sparse.peak_deviation, dense.peak_deviation)
+
+
+def test_ticks_are_the_rows_of_the_schedule_or_at_a_rate():
+    schedule = turning_schedule(start=3.0)
+    coarse, fine = (simulate_many(schedule, 20, rate=rate, random_state=0) for rate in (None, 5.0 * RATE))
+    assert len(fine.time) == 5 * 300 + 1
+    np.testing.assert_array_equal(fine.onset, coarse.onset)  # pushes do not depend on the ticks
+    np.testing.assert_allclose(fine.peak_deviation, coarse.peak_deviation, rtol=0.1)
+    assert coarse.onset.min() >= 3.0
+    assert "n_rollouts=20" in repr(coarse)
+    rows = np.r_[0, np.arange(2, 301)]
+    uneven = Schedule(**{name: values[rows] for name, values in schedule._arrays().items()})
+    with pytest.raises(ValueError, match=re.escape("must be evenly spaced: give rate")):
+        simulate_many(uneven, 2)
+
+
+def test_a_plant_of_another_mass_is_told_of():
+    with pytest.warns(UserWarning, match=r"mass is 2\.0, but damping_ratio was met for mass=1 kg"):
+        simulate_many(turning_schedule(), 2, plant=AdmittancePlant(2.0))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"n_rollouts": 0}, "n_rollouts == 0, must be an integer of at least 1"),
+        ({"every": 0}, "every == 0"),
+        ({"peak": -1.0}, "peak == -1, must not be negative"),
+        ({"peak": (3.0, 1.0)}, "peak == (3.0, 1.0), must be the least and then the largest"),
+        ({"duration": 0.0}, "duration == 0.0 s, must be positive and at most 1.5 s"),
+        ({"duration": (0.1, 2.0)}, "duration == (0.1, 2.0) s"),
+        ({"onset": (-1.0, 1.0)}, "onset == (-1.0, 1.0) s, must lie in 0 to 1.5 s"),
+        ({"onset": (0.1, 0.2, 0.3)}, "onset == (0.1, 0.2, 0.3), must be two numbers"),
+        ({"start_scale": -0.1}, "start_scale == -0.1"),
+        ({"reference": "actual"}, "reference == 'actual', must be one of 'desired', 'undisturbed'"),
+        ({"threshold": 0.0}, "threshold == 0 m, must be positive"),
+        ({"quantiles": (0.5, 1.5)}, "quantiles == (0.5, 1.5)"),
+        ({"quantiles": ()}, "quantiles == ()"),
+    ],
+)
+def test_arguments_are_checked(arguments, words):
+    # Ends of uniform draws may be any: that the largest is too long is seen in the draws
+    with pytest.raises(ValueError, match=re.escape(words)):
+        simulate_many(turning_schedule(), **{"n_rollouts": 50, "random_state": 0, **arguments})
+
+
+def test_too_many_rollouts_are_refused_before_they_are_drawn(monkeypatch):
+    monkeypatch.setattr(torch_pbd.memory, "available_bytes", lambda: 2**20)
+    with pytest.raises(
+        ValueError, match=r"n_rollouts == 100000 needs about 0\.\d+ GiB of memory, but 0\.000781 GiB can be"
+    ):
+        simulate_many(turning_schedule(), 100_000)

@@ -1,0 +1,199 @@
+"""Campaigns: many fits and many simulations, each by itself, on all cores of a machine or of a cluster.
+
+Everything runs through joblib, whose ``parallel_config`` says where: processes here, or workers of dask.distributed::
+
+    client = distributed.Client("tcp://scheduler:8786")
+    with joblib.parallel_config("dask"):
+        rows = sweep(estimators, tasks)
+
+Every job has one thread, so that rows are the same to the last bit however many run at a time, on equal processors.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from itertools import product
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from joblib import Parallel, delayed
+from numpy.typing import NDArray
+from sklearn.base import clone
+from threadpoolctl import threadpool_limits
+
+from torch_pbd.control.monte_carlo import simulate_many
+from torch_pbd.control.schedule import Schedule
+from torch_pbd.data import Demonstrations
+from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.estimators._groups import fit_by_demonstration
+from torch_pbd.metrics import mahalanobis_coverage
+
+Floats = NDArray[np.float64]
+Row = dict[str, Any]
+
+
+def sweep(
+    estimators: Mapping[str, CovarianceRegressor],
+    tasks: Mapping[str, Demonstrations],
+    *,
+    input: Literal["time", "phase"] = "time",
+    max_folds: int | None = None,
+    n_jobs: int | None = None,
+) -> list[Row]:
+    """Leave one demonstration out, of every task, for every estimator: each is a job of its own.
+
+    Parameters
+    ----------
+    estimators : mapping of str to covariance regressor
+        Cloned, not changed. Where one draws at random, give it a ``random_state``.
+    tasks : mapping of str to Demonstrations
+        Two demonstrations or more of each.
+    input : {"time", "phase"}, default="time"
+        What the covariance depends on.
+    max_folds : int, default=None
+        Largest number of demonstrations to leave out of a task, spread evenly over all; None is each.
+    n_jobs : int, default=None
+        Jobs at the same time, as in scikit-learn.
+
+    Returns
+    -------
+    list of dict
+        By task, estimator and fold, in this order: "task", "model", "fold" (the demonstration left out),
+        "log_likelihood" (nats per sample), "coverage" (share of its samples in the 95 % ellipses), "fit_seconds" (of
+        the processor), and "error": empty, or what the job failed with; its numbers are then NaN.
+
+    Raises
+    ------
+    ValueError
+        If a task has one demonstration only.
+    """
+    stacked = {name: task.stack(input) for name, task in tasks.items()}
+    folds = {name: left_out(groups, max_folds) for name, (_, _, groups) in stacked.items()}
+    for name, numbers in folds.items():
+        if not len(numbers):
+            raise ValueError(f"task {name!r} has one demonstration: to leave one out, record two or more.")
+    jobs = [(task, model, int(fold)) for task in tasks for model in estimators for fold in folds[task]]
+    labels = [dict(zip(("task", "model", "fold"), job, strict=True)) for job in jobs]
+    calls = [(clone(estimators[model]), *stacked[task], fold) for task, model, fold in jobs]
+    return _run(score_fold, labels, calls, n_jobs, dict.fromkeys(("log_likelihood", "coverage", "fit_seconds"), np.nan))
+
+
+def push_campaign(
+    schedules: Mapping[str, Schedule], seeds: Sequence[int], *, n_jobs: int | None = None, **options: Any
+) -> list[Row]:
+    """Random pushes on several schedules, with several seeds: each a job of its own.
+
+    Parameters
+    ----------
+    schedules : mapping of str to Schedule
+    seeds : sequence of int
+        Of each schedule's pushes.
+    n_jobs : int, default=None
+        Jobs at the same time, as in scikit-learn.
+    **options
+        Of :func:`~torch_pbd.control.simulate_many`.
+
+    Returns
+    -------
+    list of dict
+        By schedule and seed: "schedule", "seed", "summary" (a RolloutSummary, None if the job failed) and "error".
+    """
+    jobs = list(product(schedules, seeds))
+    labels = [{"schedule": name, "seed": seed} for name, seed in jobs]
+    calls = [(schedules[name], options | {"random_state": seed}) for name, seed in jobs]
+    return _run(_pushed, labels, calls, n_jobs, {"summary": None})
+
+
+def left_out(groups: NDArray[np.intp], max_folds: int | None = None) -> NDArray[np.intp]:
+    """Demonstrations to leave out, one by one: all, or some of them spread evenly; none where there is one only."""
+    demos = np.unique(groups)
+    n_folds = len(demos) if max_folds is None else min(max_folds, len(demos))
+    if len(demos) < 2 or n_folds < 1:
+        return demos[:0]
+    return demos[np.unique(np.linspace(0, len(demos) - 1, n_folds).round().astype(int))]
+
+
+def score_fold(
+    model: CovarianceRegressor, X: Floats, y: Floats, groups: NDArray[np.intp], demonstration: int
+) -> dict[str, float]:
+    """Fit without a demonstration, and say how well it is foretold."""
+    left = groups == demonstration
+    start = time.thread_time()
+    fit_by_demonstration(model, X[~left], y[~left], groups[~left])
+    seconds = time.thread_time() - start
+    mean, covariance = model.predict(X[left], return_cov=True)
+    coverage = mahalanobis_coverage(mean.reshape(len(mean), -1), covariance, y[left], level=0.95)
+    return {"log_likelihood": model.score(X[left], y[left]), "coverage": float(coverage), "fit_seconds": seconds}
+
+
+def summarize(rows: Sequence[Row]) -> list[Row]:
+    """One row for each task and model of a sweep: means over the folds with their standard errors.
+
+    "against" is the mean difference of the log-likelihood to the first model, fold by fold, with its standard error:
+    folds differ more than models do, and that does not count here.
+    """
+    table = []
+    for task in dict.fromkeys(row["task"] for row in rows):
+        of_task = [row for row in rows if row["task"] == task]
+        models = list(dict.fromkeys(row["model"] for row in of_task))
+        values = {name: np.array([row["log_likelihood"] for row in of_task if row["model"] == name]) for name in models}
+        for name in models:
+            of_model = [row for row in of_task if row["model"] == name]
+            mean, error = _mean(values[name])
+            ahead, ahead_error = _mean(values[name] - values[models[0]]) if name != models[0] else (np.nan, np.nan)
+            table.append(
+                {
+                    "task": task,
+                    "model": name,
+                    "held-out LL": mean,
+                    "+-": error,
+                    f"against {models[0]}": ahead,
+                    "+- ": ahead_error,
+                    "95 % holds": _mean(np.array([row["coverage"] for row in of_model]))[0],
+                    "folds": len(of_model),
+                    "failed": sum(bool(row["error"]) for row in of_model),
+                    "fit [s]": _mean(np.array([row["fit_seconds"] for row in of_model]))[0],
+                }
+            )
+    return table
+
+
+def _mean(values: Floats) -> tuple[float, float]:
+    """Mean and its standard error over the folds that have a result."""
+    known = values[~np.isnan(values)]
+    mean = float(known.mean()) if len(known) else np.nan
+    return mean, float(known.std(ddof=1) / len(known) ** 0.5) if len(known) > 1 else np.nan
+
+
+def _pushed(schedule: Schedule, options: Mapping[str, Any]) -> Row:
+    return {"summary": simulate_many(schedule, **options)}
+
+
+def _run(
+    function: Callable[..., Row], labels: Sequence[Row], calls: Sequence[tuple[Any, ...]], n_jobs: int | None, none: Row
+) -> list[Row]:
+    """Rows of labels and what the calls gave, or ``none`` and the error where one failed."""
+    pairs = zip(labels, calls, strict=True)
+    results = Parallel(n_jobs=n_jobs)(delayed(_guarded)(function, arguments, none) for _, arguments in pairs)
+    return [label | result for label, result in zip(labels, results, strict=True)]
+
+
+def _guarded(function: Callable[..., Row], arguments: tuple[Any, ...], none: Row) -> Row:
+    with _one_thread():
+        try:
+            return function(*arguments) | {"error": ""}
+        except Exception as error:  # of whatever kind: the other jobs of the campaign go on, and the row says it
+            return none | {"error": f"{type(error).__name__}: {error}"}
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """One thread for torch and the libraries under NumPy: sums of several have another order, and other last bits."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with threadpool_limits(1):
+            yield
+    finally:
+        torch.set_num_threads(before)

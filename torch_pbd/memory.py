@@ -1,0 +1,75 @@
+"""Memory asked for before it is taken: an error that says what to do, where the system would end the process."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+_SHARE = 0.8  # of what there is: the rest is for what else runs
+_GIB = 2.0**30
+_CONTROL_GROUPS = Path("/proc/self/cgroup")
+_MOUNT = Path("/sys/fs/cgroup")
+
+
+def available_bytes() -> int:
+    """Memory of this machine in bytes, or the limit of the control group that the process runs in, if lower.
+
+    Containers and batch systems set such limits (cgroup v2 or v1). What other processes use is not taken off. Where
+    the system does not tell its memory, it is as if there were no end to it.
+    """
+    try:
+        physical = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        physical = 2**63 - 1
+    return min([physical, *_control_group_limits()])
+
+
+def require_memory(needed_bytes: float, *, what: str, remedy: str) -> None:
+    """Refuse work that this machine has not the memory for, before it is begun.
+
+    Parameters
+    ----------
+    needed_bytes : float
+        Estimate of the most that is held at one time.
+    what : str
+        What needs it; the message starts with it: "a schedule of 3600001 ticks".
+    remedy : str
+        What to do: "Lower rate."
+
+    Raises
+    ------
+    ValueError
+        If it is more than four fifths of :func:`available_bytes`.
+    """
+    usable = _SHARE * available_bytes()
+    if needed_bytes > usable:
+        raise ValueError(
+            f"{what} needs about {needed_bytes / _GIB:.3g} GiB of memory, but {usable / _GIB:.3g} GiB can be used "
+            f"here. {remedy}"
+        )
+
+
+def _control_group_limits() -> Iterator[int]:
+    """Limits of the process's memory group and of all above it, under either version of control groups."""
+    try:
+        lines = _CONTROL_GROUPS.read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return
+    for line in lines:
+        _, controllers, path = line.split(":", 2)
+        if controllers and "memory" not in controllers.split(","):
+            continue
+        mount, file = (_MOUNT / "memory", "memory.limit_in_bytes") if controllers else (_MOUNT, "memory.max")
+        group = mount / path.lstrip("/")
+        # A container may see its own group as the root, under the path that it has outside.
+        for folder in {group, *group.parents, mount}:
+            if folder.is_relative_to(mount):
+                yield from _limit(folder / file)
+
+
+def _limit(file: Path) -> Iterator[int]:
+    try:
+        text = file.read_text(encoding="utf-8").strip()
+    except OSError:
+        return
+    if text.isdigit():  # "max" is none
+        yield int(text)
