@@ -1,7 +1,12 @@
 """Covariance by Gaussian processes on the entries of its Cholesky factor (Section IV-D, "CD")."""
 
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import ClassVar
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from torch_pbd.gp import LatentGP
@@ -31,6 +36,62 @@ def _linked(scale_tril: Tensor, log_diagonal: bool) -> Tensor:
         return scale_tril
     diagonal = scale_tril.diagonal(dim1=-2, dim2=-1).clamp_min(1e-6)
     return scale_tril.tril(-1) + torch.diag_embed(diagonal.log())
+
+
+@dataclass(frozen=True)
+class CholeskyLink:
+    """Root of the covariance as a function of the latent deviations, and its derivatives.
+
+    Parameters
+    ----------
+    prior_tril : Tensor of shape (d, d) or (n, d, d)
+    log_diagonal : bool
+    """
+
+    prior_tril: Tensor
+    log_diagonal: bool
+
+    largest_block: ClassVar[int] = 2500
+    """Whitened values to solve for together: a step costs the cube of it, and few are taken."""
+
+    def root(self, deviation: Float[Tensor, "n p"]) -> Float[Tensor, "n d d"]:
+        """Lower triangular factors."""
+        return deviation_tril(deviation, self.prior_tril, log_diagonal=self.log_diagonal)
+
+    def pulled_back(self, root: Float[Tensor, "n d d"], gradient: Float[Tensor, "n d d"]) -> Float[Tensor, "n p"]:
+        """Gradient in the deviations of what has this one in the root."""
+        return tril_to_vector(gradient * self._slope(root))
+
+    def block_size(self, n_processes: int) -> int:
+        """Processes in the largest block of the information: the entries of the first column."""
+        return (math.isqrt(8 * n_processes + 1) - 1) // 2
+
+    def information(
+        self, root: Float[Tensor, "n d d"], inverse: Float[Tensor, "n d d"]
+    ) -> Iterator[tuple[Int64[Tensor, " m"], Float[Tensor, "n m m"]]]:
+        """Blocks of the expected Fisher information of one row: indices of the processes, and the block.
+
+        With D = B + B', B = L^-1 dL, it is 1/2 tr(D D) = sum_ij B_ij^2 + sum_i B_ii^2, and column j of B is made
+        of column j of dL alone: the columns of the factor know nothing of each other. ``inverse`` is of the factor
+        with the floor.
+        """
+        size = root.shape[-1]
+        # One or minus one, and less where the floor is what is left of a diagonal entry.
+        share = (root * inverse).diagonal(dim1=-2, dim2=-1)
+        slope = self._slope(root).diagonal(dim1=-2, dim2=-1)
+        for column in range(size):
+            below = torch.arange(column, size, device=root.device)
+            jacobian = share[:, column, None, None] * inverse[:, column:, column:]
+            jacobian[:, 0] *= 2.0**0.5
+            jacobian[:, :, 0] *= slope[:, column, None]
+            yield below * (below + 1) // 2 + column, jacobian.mT @ jacobian
+
+    def _slope(self, root: Tensor) -> Tensor:
+        """Derivative of each entry of the root in its own process."""
+        if not self.log_diagonal:
+            return torch.ones_like(root)
+        diagonal = torch.eye(root.shape[-1]).to(root)
+        return torch.where(diagonal > 0, root, 1.0)
 
 
 class CholeskyCovariance(nn.Module):
