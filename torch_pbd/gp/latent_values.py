@@ -6,7 +6,7 @@ from torch import Tensor, nn
 
 from torch_pbd.gp.latent import LatentGP
 from torch_pbd.gp.observations import Hyperparameters
-from torch_pbd.kernels import KernelName, correlation
+from torch_pbd.kernels import KERNELS, KernelName, correlation
 from torch_pbd.linalg import cholesky_with_jitter
 
 # Directions of a kernel matrix with less than this of its largest eigenvalue carry no trained values.
@@ -23,13 +23,16 @@ def pivoted_root(inputs: Float[Tensor, "n e"], length_scale: Float[Tensor, " e"]
     limit = min(len(inputs), _MAX_PIVOTS)
     columns = inputs.new_zeros(limit, len(inputs))
     rest = torch.ones_like(inputs[:, 0])
+    scaled = inputs / length_scale
     for rank in range(limit):
         pivot = int(rest.argmax())
-        if rest[pivot] <= 0.1 * _RANK_TOLERANCE:
+        largest = float(rest[pivot])
+        if largest <= 0.1 * _RANK_TOLERANCE:
             return columns[:rank].mT
-        column = correlation(inputs[pivot : pivot + 1], inputs, length_scale, kernel)[0]
-        columns[rank] = (column - columns[:rank, pivot] @ columns[:rank]) / rest[pivot].sqrt()
-        rest = (rest - columns[rank].square()).clamp_min(0.0)
+        column = KERNELS[kernel]((scaled - scaled[pivot]).square().sum(1))
+        column = column.addmv_(columns[:rank].mT, columns[:rank, pivot], alpha=-1.0).div_(largest**0.5)
+        columns[rank] = column
+        rest.addcmul_(column, column, value=-1.0)
         rest[pivot] = 0.0
     return columns.mT if limit == len(inputs) else None
 
@@ -104,18 +107,20 @@ class LatentValues(nn.Module):
         """Second derivatives in the whitened values of some processes, of ``1/2 sum_t u_t' weight_t u_t``.
 
         ``u_t`` are those processes' deviations at input t; ``k`` counts their whitened values one after the other.
+        Only the blocks on the diagonal and below are computed: above there are zeros.
         """
-        row, column = torch.tril_indices(len(members), len(members), device=members.device)
-        amplitude = self.log_amplitude.exp()[members]
-        pairs = (weight[:, row, column] * amplitude[row] * amplitude[column]).mT.unsqueeze(1)
-        left = self.basis if len(self.basis) == 1 else self.basis[members[row]]
-        right = self.basis[0] if len(self.basis) == 1 else self.basis[members[column]]
-        blocks = (left.mT * pairs) @ right
-        size, rank = len(members), self.basis.shape[-1]
-        matrix = blocks.new_empty(size, size, rank, rank)
-        matrix[column, row] = blocks.mT
-        matrix[row, column] = blocks
-        return matrix.transpose(1, 2).reshape(size * rank, size * rank)
+        amplitude = self.log_amplitude.detach().exp()[members]
+        weight = weight * (amplitude[:, None] * amplitude)
+        weight = weight.permute(1, 2, 0).contiguous()
+        basis = self.basis.expand(len(self.whitened), -1, -1)
+        rank, transposed = basis.shape[-1], self.basis.mT.contiguous()
+        matrix = weight.new_zeros(len(members), rank, len(members), rank)
+        for row in range(len(members)):
+            right = transposed if len(transposed) == 1 else transposed[members[: row + 1]]
+            left = weight[row, : row + 1].unsqueeze(1) * right
+            block = left.flatten(0, 1) @ basis[members[row]]
+            matrix[row, :, : row + 1] = block.reshape(row + 1, rank, rank).permute(2, 0, 1)
+        return matrix.reshape(len(members) * rank, -1)
 
     def trained(self) -> list[Tensor]:
         """The parameters an optimizer may change."""

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar
 
 import torch
@@ -11,6 +12,8 @@ from torch import Tensor, nn
 
 from torch_pbd.gp import LatentGP
 from torch_pbd.linalg import tril_to_vector, vector_to_tril
+
+LARGEST_LOGARITHM = 300.0  # of a diagonal entry: its square is still a number
 
 
 def tril_deviation(
@@ -27,7 +30,7 @@ def deviation_tril(
     linked = _linked(prior_tril, log_diagonal) + vector_to_tril(deviation)
     if not log_diagonal:
         return linked
-    diagonal = linked.diagonal(dim1=-2, dim2=-1).clamp_max(300.0)
+    diagonal = linked.diagonal(dim1=-2, dim2=-1).clamp_max(LARGEST_LOGARITHM)
     return linked.tril(-1) + torch.diag_embed(diagonal.exp())
 
 
@@ -55,12 +58,27 @@ class CholeskyLink:
     """Whitened values to solve for together: a step costs the cube of it, and few are taken."""
 
     def root(self, deviation: Float[Tensor, "n p"]) -> Float[Tensor, "n d d"]:
-        """Lower triangular factors."""
-        return deviation_tril(deviation, self.prior_tril, log_diagonal=self.log_diagonal)
+        """Lower triangular factors: :func:`deviation_tril` with what does not change kept."""
+        size = self.prior_tril.shape[-1]
+        linked, entries = self._prior
+        root = linked.expand(len(deviation), -1).index_add(1, entries, deviation)
+        if self.log_diagonal:
+            root[:, :: size + 1].clamp_max_(LARGEST_LOGARITHM).exp_()
+        return root.reshape(-1, size, size)
 
     def pulled_back(self, root: Float[Tensor, "n d d"], gradient: Float[Tensor, "n d d"]) -> Float[Tensor, "n p"]:
-        """Gradient in the deviations of what has this one in the root."""
-        return tril_to_vector(gradient * self._slope(root))
+        """Gradient in the deviations of what has this one in the root, whose diagonal it overwrites."""
+        if self.log_diagonal:
+            gradient.diagonal(dim1=-2, dim2=-1).mul_(root.diagonal(dim1=-2, dim2=-1))
+        return gradient.flatten(1)[:, self._prior[1]]
+
+    @cached_property
+    def _prior(self) -> tuple[Tensor, Tensor]:
+        """The prior's part of the root before the exponential, row by row, and places of the processes there."""
+        size = self.prior_tril.shape[-1]
+        row, column = torch.tril_indices(size, size, device=self.prior_tril.device)
+        linked = _linked(self.prior_tril, self.log_diagonal).reshape(-1, size * size)
+        return linked, row * size + column
 
     def block_size(self, n_processes: int) -> int:
         """Processes in the largest block of the information: the entries of the first column."""
@@ -76,22 +94,16 @@ class CholeskyLink:
         with the floor.
         """
         size = root.shape[-1]
+        diagonal = root.diagonal(dim1=-2, dim2=-1)
         # One or minus one, and less where the floor is what is left of a diagonal entry.
-        share = (root * inverse).diagonal(dim1=-2, dim2=-1)
-        slope = self._slope(root).diagonal(dim1=-2, dim2=-1)
+        share = diagonal * inverse.diagonal(dim1=-2, dim2=-1)
         for column in range(size):
             below = torch.arange(column, size, device=root.device)
             jacobian = share[:, column, None, None] * inverse[:, column:, column:]
             jacobian[:, 0] *= 2.0**0.5
-            jacobian[:, :, 0] *= slope[:, column, None]
+            if self.log_diagonal:
+                jacobian[:, :, 0] *= diagonal[:, column, None]
             yield below * (below + 1) // 2 + column, jacobian.mT @ jacobian
-
-    def _slope(self, root: Tensor) -> Tensor:
-        """Derivative of each entry of the root in its own process."""
-        if not self.log_diagonal:
-            return torch.ones_like(root)
-        diagonal = torch.eye(root.shape[-1]).to(root)
-        return torch.where(diagonal > 0, root, 1.0)
 
 
 class CholeskyCovariance(nn.Module):

@@ -50,8 +50,8 @@ class Covariances:
         self.root = link.root(deviation)
         # scale_tril_from_root without the orthogonal part
         upper = torch.linalg.qr(with_floor(self.root).mT, mode="r").R
-        sign = torch.where(upper.diagonal(dim1=-2, dim2=-1) < 0, -1.0, 1.0).to(upper)
-        self.scale_tril = (sign.unsqueeze(-1) * upper).mT
+        diagonal = upper.diagonal(dim1=-2, dim2=-1)
+        self.scale_tril = (upper * torch.ones_like(diagonal).copysign(diagonal).unsqueeze(-1)).mT
 
     @cached_property
     def inverse(self) -> Tensor:
@@ -81,11 +81,11 @@ class Cost(ABC):
     def value_and_gradient(self, point: Covariances) -> tuple[Float[Tensor, ""], Float[Tensor, "n b"]]:
         """Cost, and its gradient in the deviations."""
         value, residual = self._value_and_residual(point)
-        # D = S + S' + 2 floor <root, d root> C^-1 C^-T, S = C^-1 d root (C^-1 root)'.
-        pulled = point.inverse.mT @ self._in_change(residual, point)
-        of_floor = 2.0 * VARIANCE_FLOOR * (pulled * point.inverse.mT).sum((-2, -1), keepdim=True)
-        in_root = 2.0 * pulled @ (point.inverse @ point.root) + of_floor * point.root
-        return value, self.link.pulled_back(point.root, in_root)
+        # The covariance is root root' and a floor that grows with the trace of that.
+        in_covariance = point.inverse.mT @ self._in_change(residual, point) @ point.inverse
+        of_floor = VARIANCE_FLOOR * in_covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
+        in_covariance.diagonal(dim1=-2, dim2=-1).add_(of_floor.unsqueeze(-1))
+        return value, self.link.pulled_back(point.root, 2.0 * in_covariance @ point.root)
 
     @abstractmethod
     def _value_and_residual(self, point: Covariances) -> tuple[Tensor, Tensor]:
@@ -124,28 +124,30 @@ class Likelihood(Cost):
     ) -> None:
         self.link, self._scatter_root, self._weight = link, scatter_root, weight
         self._counts = counts[:, None, None]
+        size = scatter_root.shape[1]
+        self._identity = self._counts * torch.eye(size).to(scatter_root)
+        self._constant = 0.5 * size * math.log(2 * math.pi) * counts.sum()
         self.has_exact_curvature = isinstance(link, WishartLink)
 
     def _value_and_residual(self, point: Covariances) -> tuple[Tensor, Tensor]:
         whitened = torch.linalg.solve_triangular(point.scale_tril, self._scatter_root, upper=False)
-        log_diagonal = point.scale_tril.diagonal(dim1=-2, dim2=-1).log() + 0.5 * math.log(2 * math.pi)
-        value = 0.5 * whitened.square().sum() + (self._counts[..., 0] * log_diagonal).sum()
-        return self._weight * value, whitened
+        log_det = self._counts[:, 0, 0] @ point.scale_tril.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        return self._weight * (0.5 * whitened.square().sum() + log_det + self._constant), whitened
 
     def _in_change(self, residual: Tensor, point: Covariances) -> Tensor:
-        return 0.5 * self._weight * (self._counts * torch.eye(residual.shape[1]).to(residual) - residual @ residual.mT)
+        return torch.baddbmm(self._identity, residual, residual.mT, beta=0.5 * self._weight, alpha=-0.5 * self._weight)
 
     def curvature(self, point: Covariances, share: float) -> Iterator[tuple[Tensor, Tensor]]:
         """Expected Fisher information, and of a Wishart process a share of the observed one."""
         for members, information in self.link.information(point.root, point.inverse):
-            total = self._counts * information
+            total = information * (self._weight * self._counts)
             if share and isinstance(self.link, WishartLink):
                 whitened = point.inverse @ self._scatter_root
                 observed = self.link.observed_information(
                     point.root, point.inverse, whitened @ whitened.mT, self._counts
                 )
-                total = total.lerp(observed, share)
-            yield members, self._weight * total
+                total = total.lerp(self._weight * observed, share)
+            yield members, total
 
 
 class FactorDistance(Cost):

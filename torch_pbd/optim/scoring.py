@@ -81,10 +81,10 @@ def minimize_scoring(
     max_iter : int, default=100
         Largest number of steps.
     tol : float, default=1e-8
-        Stop when the fall that a step promises is below a hundredth of it, times the loss at the start where that
-        is above one: that step is still taken.
+        Stop after a step that promises a fall, or brings one, below a hundredth of it, times the loss at the start
+        where that is above one.
     relative_tol : float, default=0.0
-        Or when it is below this share of the loss. For sums of squares, whose smallest value is zero.
+        Or that promises one below this share of the loss. For sums of squares, whose smallest value is zero.
     callback : callable, optional
         Called with a :class:`Progress` after each improvement.
 
@@ -111,12 +111,14 @@ def minimize_scoring(
             message = "the gradient is not finite"
             break
         found, lowest = search.along(x, value, step, slope) if slope < 0 else (x, value)
-        # Of a fall below the rounding of the loss nothing can be seen.
-        if -0.5 * slope <= max(enough, relative_tol * abs(value), 1e-14 * max(1.0, abs(value))):
-            return found, FitReport(lowest, tuple(search.curve), n_iter, True, "converged")
-        if found is x:
+        if found is x and -0.5 * slope > max(enough, 1e-14 * max(1.0, abs(value))):
             message = "no step lowers the loss, though its slope says so"
             break
+        # Of a fall below the rounding of the loss nothing can be seen.
+        little = max(enough, relative_tol * abs(value), 1e-14 * max(1.0, abs(value)))
+        ended = -0.5 * slope <= little or value - lowest <= enough
         x, value = found, lowest
+        if ended:
+            return x, FitReport(value, tuple(search.curve), n_iter, True, "converged")
     message = message or f"stopped at max_iter={max_iter} iterations"
     return x, FitReport(value, tuple(search.curve), n_iter, False, message)
