@@ -81,8 +81,8 @@ def minimize_scoring(
     max_iter : int, default=100
         Largest number of steps.
     tol : float, default=1e-8
-        Stop after a step that promises a fall, or brings one, below a hundredth of it, times the loss at the start
-        where that is above one.
+        Stop after a step that promises a fall below a hundredth of it, or brings one below a tenth, times the loss at
+        the start where that is above one.
     relative_tol : float, default=0.0
         Or that promises one below this share of the loss. For sums of squares, whose smallest value is zero.
     callback : callable, optional
@@ -116,7 +116,7 @@ def minimize_scoring(
             break
         # Of a fall below the rounding of the loss nothing can be seen.
         little = max(enough, relative_tol * abs(value), 1e-14 * max(1.0, abs(value)))
-        ended = -0.5 * slope <= little or value - lowest <= enough
+        ended = -0.5 * slope <= little or value - lowest <= 10.0 * enough
         x, value = found, lowest
         if ended:
             return x, FitReport(value, tuple(search.curve), n_iter, True, "converged")
