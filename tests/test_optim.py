@@ -4,7 +4,7 @@ import pytest
 import torch
 from scipy.optimize import rosen
 
-from torch_pbd.optim import by_autograd, minimize, minimize_batch
+from torch_pbd.optim import by_autograd, minimize, minimize_batch, minimize_scoring
 
 
 def parameter(*values):
@@ -101,3 +101,90 @@ def test_a_batch_ends_where_steps_no_longer_lower_the_rounded_loss():
     start = torch.ones(3, 2, dtype=torch.float64)
     _, report = minimize_batch(by_autograd(lambda x, _: 1e8 + 1e-9 * x.sum(-1)), start, max_iter=1000, tol=1e-12)
     assert report.n_iter < 50
+
+
+def gauss_newton(residual):
+    """Half the square of a residual, and its Newton step with Gauss's matrix."""
+
+    def newton(x):
+        jacobian, value = torch.autograd.functional.jacobian(residual, x), residual(x)
+        gradient = jacobian.mT @ value
+        return gradient, -torch.linalg.solve(jacobian.mT @ jacobian, gradient)
+
+    return lambda x: 0.5 * residual(x).square().sum(), newton
+
+
+def test_scoring_takes_one_step_to_the_minimum_of_a_parabola(generator):
+    matrix, target = torch.randn(4, 4, dtype=torch.float64, generator=generator), torch.ones(4, dtype=torch.float64)
+    loss, newton = gauss_newton(lambda x: matrix @ (x - target))
+    x, report = minimize_scoring(loss, newton, torch.zeros(4, dtype=torch.float64))
+    torch.testing.assert_close(x, target, rtol=1e-9, atol=0)
+    assert report.converged
+    assert report.n_iter == 2  # the second finds nothing to gain
+    assert report.loss_curve[0] == 0.5 * (matrix @ target).square().sum().item()
+
+
+def test_scoring_finds_the_minimum_of_rosenbrock():
+    loss, newton = gauss_newton(lambda x: torch.stack([10 * (x[1] - x[0] ** 2), 1 - x[0]]))
+    seen = []
+    start = torch.tensor([-1.2, 1.0], dtype=torch.float64)
+    x, report = minimize_scoring(loss, newton, start, callback=lambda progress: seen.append(progress.loss))
+    torch.testing.assert_close(x, torch.ones(2, dtype=torch.float64), rtol=1e-6, atol=0)
+    assert report.converged
+    assert list(report.loss_curve) == sorted(report.loss_curve, reverse=True) == seen
+    assert report.loss == report.loss_curve[-1] == 0.5 * rosenbrock(x).item()
+
+
+def test_scoring_steps_back_from_values_that_are_not_finite():
+    """Steps of 30 times the gradient leave the domain of x - log x."""
+    start = torch.tensor([0.5], dtype=torch.float64)
+    x, report = minimize_scoring(
+        lambda x: (x - x.log()).sum(), lambda x: (1 - 1 / x, -30 * (1 - 1 / x) * x), start, tol=1e-12, max_iter=500
+    )
+    assert report.converged
+    torch.testing.assert_close(x, torch.ones(1, dtype=torch.float64), rtol=1e-6, atol=0)
+
+
+def test_scoring_lengthens_steps_where_the_loss_is_a_line():
+    """To where |x| bends it is 1000 of the steps given, of which 100 are allowed."""
+    start = torch.tensor([1000.0], dtype=torch.float64)
+    x, report = minimize_scoring(lambda x: (1 + x**2).sqrt().sum(), lambda x: (x / (1 + x**2).sqrt(), -x.sign()), start)
+    assert abs(x.item()) < 1.0
+    assert report.n_iter < 50
+
+
+def test_scoring_stays_where_no_step_lowers_the_loss():
+    start = torch.tensor([1.0], dtype=torch.float64)
+    x, report = minimize_scoring(lambda x: x.sum(), lambda x: (-torch.ones(1).double(), torch.ones(1).double()), start)
+    assert x is start
+    assert not report.converged
+    assert "no step lowers the loss" in report.message
+    assert report.loss == 1.0
+
+
+def test_scoring_stops_at_a_share_of_the_loss():
+    """Halving the distance at each step: of sums of squares a quarter is left."""
+    start = torch.tensor([1.0], dtype=torch.float64)
+
+    def newton(x):
+        return 2 * x, -0.5 * x
+
+    reports = [
+        minimize_scoring(lambda x: 1.0 + x.square().sum(), newton, start, tol=1e-12, relative_tol=share)[1]
+        for share in (1e-2, 1e-4, 0.0)
+    ]
+    assert reports[0].n_iter < reports[1].n_iter < reports[2].n_iter
+    assert all(report.converged for report in reports)
+
+
+def test_scoring_needs_a_finite_start():
+    start = torch.tensor([-1.0], dtype=torch.float64)
+    with pytest.raises(ValueError, match="cannot start"):
+        minimize_scoring(lambda x: x.log().sum(), lambda x: (1 / x, -x), start)
+
+
+def test_scoring_tells_that_it_stopped_early():
+    loss, newton = gauss_newton(lambda x: torch.stack([10 * (x[1] - x[0] ** 2), 1 - x[0]]))
+    _, report = minimize_scoring(loss, newton, torch.tensor([-1.2, 1.0], dtype=torch.float64), max_iter=1)
+    assert not report.converged
+    assert "max_iter=1" in report.message

@@ -171,3 +171,26 @@ def test_a_length_scale_that_lets_the_covariance_overshoot_is_warned_of():
     model = fit(CholeskyCovRegressor(noise_scale=0.0, length_scale=0.15), t, y)
     beside = model.predict_cov(np.linspace(-0.5, 0.0, 50)[:, np.newaxis])
     assert beside.max() < 1.5 * model.predict_cov([[-100.0]]).max()
+
+
+@pytest.mark.parametrize("aligned", [True, False])
+@pytest.mark.parametrize(("d", "diagonal"), [(1, "log"), (2, "log"), (2, "raw")])
+def test_both_solvers_of_the_likelihood_predict_the_same(d, diagonal, aligned):
+    X, y = demonstrations(d, aligned=aligned)
+    models = [
+        fit(CholeskyCovRegressor(objective="likelihood", diagonal=diagonal, solver=solver, tol=1e-11), X, y)
+        for solver in ("auto", "fisher", "lbfgs")
+    ]
+    covariances = [model.predict_cov(queries(1)) for model in models]
+    np.testing.assert_array_equal(covariances[0], covariances[1])
+    np.testing.assert_allclose(covariances[2], covariances[1], rtol=0, atol=1e-3 * covariances[1].max())
+    assert models[2].loss_ == pytest.approx(models[1].loss_, abs=1e-9)
+    assert models[1].converged_
+
+
+def test_the_solver_is_checked():
+    X, y = demonstrations(aligned=False)
+    with pytest.raises(ValueError, match="solver == 'newton', must be one of 'auto', 'fisher', 'lbfgs'"):
+        CholeskyCovRegressor(solver="newton").fit(X, y)
+    with pytest.raises(ValueError, match="solver == 'fisher' holds the hyperparameters, which latent_prior=False"):
+        CholeskyCovRegressor(solver="fisher", latent_prior=False).fit(X, y)

@@ -82,3 +82,37 @@ def test_the_loss_of_mse_is_equation_9_in_standardized_units():
     units = scale[:, np.newaxis] * scale
     expected = covariance_mse(model.predict_cov(inputs) / units, empirical / units)
     assert model.loss_ == pytest.approx(expected, rel=1e-6, abs=1e-12)
+
+
+@pytest.mark.parametrize("prior", [None, "paper"])
+@pytest.mark.parametrize("seed", range(5))
+def test_a_random_start_ends_at_the_empirical_covariances(prior, seed):
+    """Eq. (9) on the paper's problem, where its minimum is zero."""
+    X, y, _ = make_paper_simulation(random_state=seed)
+    inputs, empirical = empirical_covariances(X, y)
+    model = WishartProcessRegressor(objective="mse", start="random", prior=prior, random_state=seed).fit(X, y)
+    assert model.converged_
+    assert np.isfinite(model.loss_curve_).all()
+    assert covariance_mse(model.predict_cov(inputs), empirical, on="cholesky") <= 1e-10
+
+
+@pytest.mark.parametrize("objective", ["mse", "likelihood"])
+def test_both_solvers_predict_the_same(objective):
+    """Of one output; of more L-BFGS crawls along the valleys in which the vectors turn."""
+    X, y = demonstrations(1)
+    models = [
+        fit(WishartProcessRegressor(objective=objective, start="random", solver=solver, tol=1e-10), X, y)
+        for solver in ("auto", "fisher", "lbfgs")
+    ]
+    covariances = [model.predict_cov(X) for model in models]
+    np.testing.assert_array_equal(covariances[0], covariances[1])
+    np.testing.assert_allclose(covariances[2], covariances[1], rtol=1e-3)
+    assert models[2].loss_ == pytest.approx(models[1].loss_, abs=1e-8)
+
+
+def test_the_solver_is_checked():
+    X, y = demonstrations(aligned=False)
+    with pytest.raises(ValueError, match="solver == 'em', must be one of 'auto', 'fisher', 'lbfgs'"):
+        WishartProcessRegressor(solver="em").fit(X, y)
+    with pytest.raises(ValueError, match="solver == 'fisher' holds the hyperparameters, which latent_prior=False"):
+        WishartProcessRegressor(solver="fisher", latent_prior=False).fit(X, y)

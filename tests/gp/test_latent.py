@@ -199,6 +199,52 @@ def test_a_deviation_that_is_too_rough_starts_at_the_nearest_smooth_one(generato
     np.testing.assert_allclose((rough[0] - nearest) @ latent.basis[0], 0.0, atol=1e-12)
 
 
+@pytest.mark.parametrize("e", [1, 2])
+@pytest.mark.parametrize("kernel", ["squared_exponential", "matern32", "matern52"])
+def test_the_basis_is_an_orthogonal_root_of_the_kernel_matrix_of_any_rank(kernel, e, generator):
+    """By pivots where the rank is low or the inputs few, else by the eigenvectors of the whole matrix."""
+    for n_inputs in (1, 20, 200):
+        inputs = torch.rand(n_inputs, e, dtype=torch.float64, generator=generator) - 0.5
+        length_scale = torch.full((1, e), 0.3, dtype=torch.float64)
+        latent = LatentValues(
+            inputs, torch.zeros(2, n_inputs).double(), tensor([1.0, 2.0]), length_scale, kernel=kernel
+        )
+        basis, gram = latent.basis[0], correlation(inputs, inputs, length_scale[0], kernel)
+        torch.testing.assert_close(basis @ basis.mT, gram, rtol=0, atol=1e-8)
+        square = basis.mT @ basis
+        assert (square - torch.diag(square.diagonal())).abs().max() < 1e-12 * n_inputs
+        eigenvalues = torch.linalg.eigvalsh(gram).flip(0)
+        matter = int((eigenvalues > 1e-11 * eigenvalues[0]).sum())
+        assert abs(basis.shape[1] - matter) <= 1  # that on the edge may be rounded to either side
+        largest = square.diagonal().sort(descending=True).values[: matter - 1]
+        torch.testing.assert_close(largest, eigenvalues[: matter - 1], rtol=1e-3, atol=0)
+
+
+@pytest.mark.parametrize("length_scale", [[[0.2]], [[0.2], [0.05], [0.1]]])
+@pytest.mark.parametrize("members", [[0], [0, 1, 2], [2, 0]])
+def test_the_normal_matrix_is_the_hessian_of_autograd(length_scale, members, generator):
+    deviation = torch.randn(3, 30, dtype=torch.float64, generator=generator)
+    latent = LatentValues(GRID, deviation, tensor([2.0, 0.5, 1.0]), tensor(length_scale))
+    root = torch.randn(30, len(members), len(members), dtype=torch.float64, generator=generator)
+    shape = (len(members), latent.whitened.shape[1])
+
+    def square(flat):
+        whitened = latent.whitened.detach().index_copy(0, torch.tensor(members), flat.reshape(shape))
+        moved = latent(whitened)[:, members].unsqueeze(-1)
+        return 0.5 * (root.mT @ moved).square().sum()
+
+    hessian = torch.autograd.functional.hessian(square, torch.zeros(shape).double().flatten())
+    found = latent.normal_matrix(torch.tensor(members), root @ root.mT)
+    torch.testing.assert_close(found.tril(), hessian.tril(), rtol=1e-9, atol=1e-12 * float(hessian.abs().max()))
+
+
+def test_a_gradient_is_pulled_back_as_by_autograd(generator):
+    _, latent = smooth(tensor([[0.1]]), False)
+    weight = torch.randn(30, 2, dtype=torch.float64, generator=generator)
+    (expected,) = torch.autograd.grad((weight * latent()).sum(), latent.whitened)
+    torch.testing.assert_close(latent.pulled_back(weight), expected, rtol=1e-12, atol=1e-12)
+
+
 @pytest.mark.parametrize("train_hyperparameters", [False, True])
 def test_whitened_values_are_independent_and_standard_normal_a_priori(train_hyperparameters):
     """The covariance that follows for the deviations is that of the kernel."""

@@ -148,3 +148,19 @@ def test_merging_takes_the_rows_of_a_neighbourhood_together(rng):
 def test_inputs_that_fit_are_not_merged(rng):
     training = training_set([2, 2, 2], 1, rng)
     assert training.merged(3) is training
+
+
+@pytest.mark.parametrize("counts", [[700, 1, 999], [1] * 1700])
+def test_the_residual_is_that_of_all_rows_whatever_they_share(counts, rng):
+    """The mean is evaluated for a bounded number of inputs at a time, and once where rows repeat one."""
+    training, asked = training_set(counts, 2, rng), []
+
+    def mean(x):
+        asked.append(len(x))
+        return torch.cat([x.sin(), x.square()], dim=1)
+
+    expected = training.y - torch.cat([training.x.sin(), training.x.square()], dim=1)
+    torch.testing.assert_close(training.residual(mean), expected, rtol=0, atol=0)
+    assert sum(asked) == len(counts)
+    assert max(asked) <= 1024
+    torch.testing.assert_close(training.merged(2).residual(mean), expected, rtol=0, atol=0)

@@ -146,6 +146,16 @@ def check_choice(value: Any, name: str, choices: tuple[str, ...]) -> None:
         raise ValueError(f"{name} == {value!r}, must be one of {', '.join(map(repr, choices))}.")
 
 
+def check_solver(solver: str, *, latent_prior: bool) -> None:
+    """Check what latent values are trained with."""
+    check_choice(solver, "solver", ("auto", "fisher", "lbfgs"))
+    if solver == "fisher" and not latent_prior:
+        raise ValueError(
+            "solver == 'fisher' holds the hyperparameters, which latent_prior=False trains: use solver='auto' or "
+            "'lbfgs', or latent_prior=True."
+        )
+
+
 def check_length_scale(value: Any, n_features: int) -> Floats | None:
     """Length scales as an array (n_features,), or None where they are to be learned."""
     if value is None:

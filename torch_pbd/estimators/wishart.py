@@ -13,12 +13,13 @@ from torch_pbd.estimators._latent import (
     residual_tril,
     warn_if_stretched,
 )
-from torch_pbd.estimators._validation import Prior, check_choice, check_number
+from torch_pbd.estimators._validation import Prior, check_choice, check_number, check_solver
 from torch_pbd.gp import LatentGP, LatentValues, Observations, condition, fit_hyperparameters, merge_observations
 from torch_pbd.kernels import KernelName
 from torch_pbd.models.objectives import covariance_mse, gaussian_nll, train
+from torch_pbd.models.scoring import Cost, FactorDistance, Likelihood, Solver, train_by_scoring
 from torch_pbd.models.training import empirical_tril
-from torch_pbd.models.wishart import WishartCovariance, padded, wishart_root
+from torch_pbd.models.wishart import WishartCovariance, WishartLink, padded, wishart_root
 from torch_pbd.optim import FitReport
 
 _PAPER_MEAN = 8.0  # of all latent processes, in the paper's simulation
@@ -47,6 +48,12 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         Only for "likelihood". True maximizes the posterior density of the vectors at the inputs, with
         hyperparameters held. False is eq. (11) as printed, which trains them too and overfits: without bound
         where inputs do not repeat.
+    solver : {"auto", "fisher", "lbfgs"}, default="auto"
+        Of "likelihood" with ``latent_prior``, and of "mse" from a random start. "fisher" is Newton's method: with the
+        Fisher information, expected or, where it is positive definite, observed; for "mse" with Gauss and Newton's
+        matrix. "lbfgs" is torch's L-BFGS, slow in the valleys in which the vectors turn. "auto" takes "fisher", and
+        "lbfgs" where more than 600 numbers, the rank of the kernel matrix times d times ``df``, would have to be
+        solved for together. Without ``latent_prior`` it is L-BFGS always.
     kernel : {"squared_exponential", "matern32", "matern52"}, default="squared_exponential"
     prior : None, float, array-like of shape (d, d), callable or "paper", default=None
         Covariance far from data, in squared units of y. A float stands for that times the unit matrix; a
@@ -100,6 +107,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         df: int | str | None = None,
         start: str = "empirical",
         latent_prior: bool = True,
+        solver: Solver = "auto",
         kernel: KernelName = "squared_exponential",
         prior: Prior = None,
         length_scale: float | list[float] | None = None,
@@ -115,6 +123,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         self.df = df
         self.start = start
         self.latent_prior = latent_prior
+        self.solver = solver
         self.kernel = kernel
         self.prior = prior
         self.length_scale = length_scale
@@ -129,6 +138,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
     def _check_parameters(self) -> None:
         super()._check_parameters()
         check_choice(self.start, "start", tuple(_SPREAD))
+        check_solver(self.solver, latent_prior=self.latent_prior)
         if self.df not in (None, "auto"):
             check_number(self.df, "df", low=1, integer=True)
 
@@ -183,16 +193,23 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
             return gaussian_nll(root, scatter_root, training.counts) / n_rows
 
         start = padded(residual_tril(residual), self.df_) if self.start == "empirical" else prior_root
-        prior_weight = 1.0 / n_rows if self.latent_prior else 0.0
-        return self._train(problem, prior_root, start, loss, prior_weight=prior_weight, tol=self.tol)
+        if not self.latent_prior:
+            return self._train(problem, prior_root, start, loss, prior_weight=0.0, tol=self.tol)
+        cost = Likelihood(WishartLink(prior_root), scatter_root, training.counts, 1.0 / n_rows)
+        return self._train(problem, prior_root, start, cost, prior_weight=1.0 / n_rows, tol=self.tol)
 
     def _train(
         self, problem: Problem, prior_root: Tensor, start: Tensor, loss: Any, *, prior_weight: float, tol: float
     ) -> tuple[WishartCovariance, FitReport, float]:
-        """Minimize ``loss(deviations, L)`` over the vectors at the inputs and L, by L-BFGS."""
+        """Minimize a loss over the vectors at the inputs: with hyperparameters held a cost, L at I too.
+
+        Else it is ``loss(deviations, L)``, and trained are the hyperparameters and L.
+        """
         inputs, n_outputs = problem.training.inputs, prior_root.shape[-2]
+        if self.latent_prior and not isinstance(loss, Cost):  # eq. (9)
+            loss = FactorDistance(WishartLink(prior_root), empirical_tril(problem.training))
         # A free L would grow while the whitened values shrink, and so escape their prior.
-        matrix = torch.eye(n_outputs).to(inputs).requires_grad_(prior_weight == 0.0)
+        matrix = torch.eye(n_outputs).to(inputs).requires_grad_(not self.latent_prior)
         deviation = (start - prior_root).mT.flatten(-2).expand(len(inputs), -1).mT.contiguous()
         prior = prior_root.reshape(-1, n_outputs, self.df_)
         amplitude = prior.square().sum(-1).mean(0).sqrt().repeat(self.df_)
@@ -211,15 +228,11 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
             noise[: n_outputs * n_outputs] = 0.0
         with torch.no_grad():
             latent.whitened += _SPREAD[self.start] * noise
-        report = train(
-            lambda values: loss(values, matrix),
-            latent,
-            [matrix] if matrix.requires_grad else [],
-            prior_weight=prior_weight,
-            max_iter=self.max_iter,
-            tol=tol,
-            callback=self._progress(),
-        )
+        limits: Any = {"max_iter": self.max_iter, "tol": tol, "callback": self._progress()}
+        if isinstance(loss, Cost):
+            report = train_by_scoring(loss, latent, prior_weight=prior_weight, solver=self.solver, **limits)
+        else:
+            report = train(lambda values: loss(values, matrix), latent, [matrix], prior_weight=0.0, **limits)
         with torch.no_grad():
             values = wishart_root(latent(), prior_root, matrix).mT.flatten(1).mT.contiguous()
         covariance = WishartCovariance(latent.interpolate(values), _constant(prior_root), matrix.detach().tril())

@@ -89,23 +89,16 @@ class Evidence:
         correlation, slope = value_and_slope(square_distance, self.kernel)
         covariance = basis.covariance(correlation)
         covariance.diagonal(dim1=-2, dim2=-1).add_(noise_ratio[:, None])
-        factor, info = torch.linalg.cholesky_ex(covariance)
-        failed = bool(info.any())
-        if failed:
-            factor = torch.where((info > 0)[:, None, None], torch.eye(factor.shape[-1]).to(factor), factor)
-        inverse = torch.cholesky_inverse(factor)
+        inverse, log_det = _inverse_and_log_det(covariance)
         targets = data.targets[rows].unsqueeze(-1)
         alpha = inverse @ targets
         quadratic = (targets * alpha).sum((-2, -1))
-        log_det = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         if data.n_outside:
             outside = data.remainder[rows] / noise_ratio
             quadratic = quadratic + outside
             log_det = log_det + data.n_outside * noise_ratio.log()
         variance = self.variance(quadratic, noise_ratio, rows)
         loss = negative_log_density(quadratic, log_det, variance, data)
-        if failed:
-            loss = torch.where(info == 0, loss, math.nan)
         matrix = inverse - (alpha / variance[:, None, None]) @ alpha.mT
         # The squared distance is inversely proportional to the square of the length scale.
         by_distance = (basis.pulled_back(matrix) * slope).flatten(1)
@@ -173,3 +166,13 @@ class Evidence:
         factor, info = torch.linalg.cholesky_ex(covariance)
         solved = torch.cholesky_solve(self.projection.targets[rows].unsqueeze(-1), factor).squeeze(-1)
         return torch.where(info[:, None] == 0, solved, math.nan)
+
+
+def _inverse_and_log_det(matrix: Float[Tensor, "a r r"]) -> tuple[Tensor, Tensor]:
+    """Of positive definite matrices; the log determinant of others is NaN."""
+    factor, info = torch.linalg.cholesky_ex(matrix)
+    log_det = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    if bool(info.any()):
+        log_det = torch.where(info == 0, log_det, math.nan)
+        factor = torch.where((info > 0)[:, None, None], torch.eye(factor.shape[-1]).to(factor), factor)
+    return torch.cholesky_inverse(factor), log_det

@@ -1,16 +1,50 @@
 """Values of latent Gaussian processes at the training inputs, to be trained: the paper's U, whitened."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from torch_pbd.gp.latent import LatentGP
 from torch_pbd.gp.observations import Hyperparameters
-from torch_pbd.kernels import KernelName, correlation
+from torch_pbd.kernels import KERNELS, KernelName, correlation
 from torch_pbd.linalg import cholesky_with_jitter
 
 # Directions of a kernel matrix with less than this of its largest eigenvalue carry no trained values.
 _RANK_TOLERANCE = 1e-11
+_MAX_PIVOTS = 128
+
+
+def pivoted_root(inputs: Float[Tensor, "n e"], length_scale: Float[Tensor, " e"], kernel: KernelName) -> Tensor | None:
+    """Root (n, r) of the kernel matrix by Cholesky decomposition with pivots; None where r would be large.
+
+    Only r columns of the matrix are ever computed. What is left of the diagonal bounds the rest: it is below a
+    tenth of the eigenvalues that do not matter.
+    """
+    limit = min(len(inputs), _MAX_PIVOTS)
+    columns = inputs.new_zeros(limit, len(inputs))
+    rest = torch.ones_like(inputs[:, 0])
+    scaled = inputs / length_scale
+    for rank in range(limit):
+        pivot = int(rest.argmax())
+        largest = float(rest[pivot])
+        if largest <= 0.1 * _RANK_TOLERANCE:
+            return columns[:rank].mT
+        column = KERNELS[kernel]((scaled - scaled[pivot]).square().sum(1))
+        column = column.addmv_(columns[:rank].mT, columns[:rank, pivot], alpha=-1.0).div_(largest**0.5)
+        columns[rank] = column
+        rest.addcmul_(column, column, value=-1.0)
+        rest[pivot] = 0.0
+    return columns.mT if limit == len(inputs) else None
+
+
+def _orthogonal(root: Tensor) -> Tensor:
+    """Root of the same matrix with orthogonal columns, without those that do not matter.
+
+    Of each column, whose sign is arbitrary, the entry at the first input is not negative.
+    """
+    vectors, values, _ = torch.linalg.svd(root, full_matrices=False)
+    basis = (vectors * values)[:, values.square() > _RANK_TOLERANCE * values[0].square()]
+    return torch.where(basis[0] < 0, -basis, basis).contiguous()
 
 
 class LatentValues(nn.Module):
@@ -57,11 +91,36 @@ class LatentValues(nn.Module):
         self.register_buffer("basis", basis.detach())
         self.whitened = nn.Parameter(self._solved(deviation / amplitude[:, None]))
 
-    def forward(self) -> Float[Tensor, "n b"]:
-        """Deviations from the prior mean at the training inputs."""
+    def forward(self, whitened: Float[Tensor, "b r"] | None = None) -> Float[Tensor, "n b"]:
+        """Deviations from the prior mean at the training inputs; of other whitened values, if given."""
+        whitened = self.whitened if whitened is None else whitened
         basis = self._basis()[0] if self.train_hyperparameters else self.basis
-        deviation = (basis @ self.whitened.unsqueeze(-1)).squeeze(-1)
+        deviation = (basis @ whitened.unsqueeze(-1)).squeeze(-1)
         return (self.log_amplitude.exp()[:, None] * deviation).mT
+
+    def pulled_back(self, gradient: Float[Tensor, "n b"]) -> Float[Tensor, "b r"]:
+        """Gradient in the whitened values of what has this one in the deviations."""
+        scaled = self.log_amplitude.exp()[:, None] * gradient.mT
+        return (self.basis.mT @ scaled.unsqueeze(-1)).squeeze(-1)
+
+    def normal_matrix(self, members: Int64[Tensor, " m"], weight: Float[Tensor, "n m m"]) -> Float[Tensor, "k k"]:
+        """Second derivatives in the whitened values of some processes, of ``1/2 sum_t u_t' weight_t u_t``.
+
+        ``u_t`` are those processes' deviations at input t; ``k`` counts their whitened values one after the other.
+        Only the blocks on the diagonal and below are computed: above there are zeros.
+        """
+        amplitude = self.log_amplitude.detach().exp()[members]
+        weight = weight * (amplitude[:, None] * amplitude)
+        weight = weight.permute(1, 2, 0).contiguous()
+        basis = self.basis.expand(len(self.whitened), -1, -1)
+        rank, transposed = basis.shape[-1], self.basis.mT.contiguous()
+        matrix = weight.new_zeros(len(members), rank, len(members), rank)
+        for row in range(len(members)):
+            right = transposed if len(transposed) == 1 else transposed[members[: row + 1]]
+            left = weight[row, : row + 1].unsqueeze(1) * right
+            block = left.flatten(0, 1) @ basis[members[row]]
+            matrix[row, :, : row + 1] = block.reshape(row + 1, rank, rank).permute(2, 0, 1)
+        return matrix.reshape(len(members) * rank, -1)
 
     def trained(self) -> list[Tensor]:
         """The parameters an optimizer may change."""
@@ -70,7 +129,8 @@ class LatentValues(nn.Module):
     @torch.no_grad()
     def interpolate(self, values: Float[Tensor, "b n"]) -> LatentGP:
         """The Gaussian processes through the present deviations, and without a prior through ``values``."""
-        self.basis, self.jitter = self._basis()
+        if self.train_hyperparameters:
+            self.basis, self.jitter = self._basis()
         amplitude = self.log_amplitude.exp()
         hyperparameters = Hyperparameters(self.log_length_scale.exp(), amplitude.clone(), torch.zeros_like(amplitude))
         weight = amplitude[:, None] * self._weight(self.whitened)
@@ -79,7 +139,12 @@ class LatentValues(nn.Module):
         return LatentGP(self.inputs, weight, value_weight, hyperparameters, counts, self.kernel)
 
     def _basis(self) -> tuple[Tensor, float]:
-        gram = correlation(self.inputs, self.inputs, self.log_length_scale.exp(), self.kernel)
+        length_scale = self.log_length_scale.exp()
+        if not self.train_hyperparameters and len(length_scale) == 1:
+            root = pivoted_root(self.inputs, length_scale[0], self.kernel)
+            if root is not None:
+                return _orthogonal(root)[None], 0.0
+        gram = correlation(self.inputs, self.inputs, length_scale, self.kernel)
         if self.train_hyperparameters:
             return cholesky_with_jitter(gram, name="the kernel matrix of the training inputs")
         eigenvalue, eigenvector = torch.linalg.eigh(gram)

@@ -1,11 +1,19 @@
 """Covariance by Gaussian processes on the entries of its Cholesky factor (Section IV-D, "CD")."""
 
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from torch_pbd.gp import LatentGP
 from torch_pbd.linalg import tril_to_vector, vector_to_tril
+
+LARGEST_LOGARITHM = 300.0  # of a diagonal entry: its square is still a number
 
 
 def tril_deviation(
@@ -22,7 +30,7 @@ def deviation_tril(
     linked = _linked(prior_tril, log_diagonal) + vector_to_tril(deviation)
     if not log_diagonal:
         return linked
-    diagonal = linked.diagonal(dim1=-2, dim2=-1).clamp_max(300.0)
+    diagonal = linked.diagonal(dim1=-2, dim2=-1).clamp_max(LARGEST_LOGARITHM)
     return linked.tril(-1) + torch.diag_embed(diagonal.exp())
 
 
@@ -31,6 +39,71 @@ def _linked(scale_tril: Tensor, log_diagonal: bool) -> Tensor:
         return scale_tril
     diagonal = scale_tril.diagonal(dim1=-2, dim2=-1).clamp_min(1e-6)
     return scale_tril.tril(-1) + torch.diag_embed(diagonal.log())
+
+
+@dataclass(frozen=True)
+class CholeskyLink:
+    """Root of the covariance as a function of the latent deviations, and its derivatives.
+
+    Parameters
+    ----------
+    prior_tril : Tensor of shape (d, d) or (n, d, d)
+    log_diagonal : bool
+    """
+
+    prior_tril: Tensor
+    log_diagonal: bool
+
+    largest_block: ClassVar[int] = 2500
+    """Whitened values to solve for together: a step costs the cube of it, and few are taken."""
+
+    def root(self, deviation: Float[Tensor, "n p"]) -> Float[Tensor, "n d d"]:
+        """Lower triangular factors: :func:`deviation_tril` with what does not change kept."""
+        size = self.prior_tril.shape[-1]
+        linked, entries = self._prior
+        root = linked.expand(len(deviation), -1).index_add(1, entries, deviation)
+        if self.log_diagonal:
+            root[:, :: size + 1].clamp_max_(LARGEST_LOGARITHM).exp_()
+        return root.reshape(-1, size, size)
+
+    def pulled_back(self, root: Float[Tensor, "n d d"], gradient: Float[Tensor, "n d d"]) -> Float[Tensor, "n p"]:
+        """Gradient in the deviations of what has this one in the root, whose diagonal it overwrites."""
+        if self.log_diagonal:
+            gradient.diagonal(dim1=-2, dim2=-1).mul_(root.diagonal(dim1=-2, dim2=-1))
+        return gradient.flatten(1)[:, self._prior[1]]
+
+    @cached_property
+    def _prior(self) -> tuple[Tensor, Tensor]:
+        """The prior's part of the root before the exponential, row by row, and places of the processes there."""
+        size = self.prior_tril.shape[-1]
+        row, column = torch.tril_indices(size, size, device=self.prior_tril.device)
+        linked = _linked(self.prior_tril, self.log_diagonal).reshape(-1, size * size)
+        return linked, row * size + column
+
+    def block_size(self, n_processes: int) -> int:
+        """Processes in the largest block of the information: the entries of the first column."""
+        return (math.isqrt(8 * n_processes + 1) - 1) // 2
+
+    def information(
+        self, root: Float[Tensor, "n d d"], inverse: Float[Tensor, "n d d"]
+    ) -> Iterator[tuple[Int64[Tensor, " m"], Float[Tensor, "n m m"]]]:
+        """Blocks of the expected Fisher information of one row: indices of the processes, and the block.
+
+        With D = B + B', B = L^-1 dL, it is 1/2 tr(D D) = sum_ij B_ij^2 + sum_i B_ii^2, and column j of B is made
+        of column j of dL alone: the columns of the factor know nothing of each other. ``inverse`` is of the factor
+        with the floor.
+        """
+        size = root.shape[-1]
+        diagonal = root.diagonal(dim1=-2, dim2=-1)
+        # One or minus one, and less where the floor is what is left of a diagonal entry.
+        share = diagonal * inverse.diagonal(dim1=-2, dim2=-1)
+        for column in range(size):
+            below = torch.arange(column, size, device=root.device)
+            jacobian = share[:, column, None, None] * inverse[:, column:, column:]
+            jacobian[:, 0] *= 2.0**0.5
+            if self.log_diagonal:
+                jacobian[:, :, 0] *= diagonal[:, column, None]
+            yield below * (below + 1) // 2 + column, jacobian.mT @ jacobian
 
 
 class CholeskyCovariance(nn.Module):

@@ -1,5 +1,6 @@
 """Training rows with their distinct inputs found, and the statistics the models need of them."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -8,6 +9,8 @@ from torch import Tensor
 
 from torch_pbd.gp import neighbourhoods
 from torch_pbd.linalg import scale_tril_from_root
+
+_CHUNK = 1024  # inputs that a mean is evaluated at together
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,17 @@ class TrainingSet:
         n_inputs = int(index.max()) + 1
         counts = torch.bincount(index, minlength=n_inputs).to(self.x)
         return replace(self, inputs=_sum_by(self.x, index, n_inputs) / counts[:, None], index=index)
+
+    def residual(self, mean: Callable[[Tensor], Tensor]) -> Float[Tensor, "rows d"]:
+        """What y is above its mean at each row; ``mean`` maps inputs (m, e) to (m, d).
+
+        It is asked for a bounded number of inputs at a time, and where rows repeat an input for that alone.
+        """
+        repeated = torch.equal(self.inputs[self.index], self.x)
+        at = self.inputs if repeated else self.x
+        with torch.no_grad():
+            values = torch.cat([mean(chunk) for chunk in at.split(_CHUNK)])
+        return self.y - (values[self.index] if repeated else values)
 
     def scatter_root(self, residual: Float[Tensor, "rows d"]) -> Float[Tensor, "n d r"]:
         """Root of the scatter at each input: ``root @ root.mT`` is the sum of ``w w'`` over its rows.

@@ -1,7 +1,11 @@
 """Covariance as a Wishart process: a sum of outer products of Gaussian process vectors (Section IV-A)."""
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import ClassVar
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from torch_pbd.gp import LatentGP
@@ -28,6 +32,82 @@ def padded(prior_tril: Float[Tensor, "*m d d"], df: int) -> Float[Tensor, "*m d 
     """
     shape = (*prior_tril.shape[:-1], df - prior_tril.shape[-1])
     return torch.cat([prior_tril, prior_tril.new_zeros(shape)], dim=-1)
+
+
+@dataclass(frozen=True)
+class WishartLink:
+    """Root of the covariance as a function of the latent deviations, L held at I, and its derivatives.
+
+    Parameters
+    ----------
+    prior_root : Tensor of shape (d, df) or (n, d, df)
+    """
+
+    prior_root: Tensor
+
+    largest_block: ClassVar[int] = 600
+    """Whitened values to solve for together: a step costs the cube of it, and tens of them may be taken."""
+
+    def root(self, deviation: Float[Tensor, "n b"]) -> Float[Tensor, "n d df"]:
+        """Roots whose columns are the vectors."""
+        return self.prior_root + deviation.reshape(len(deviation), *self.prior_root.shape[:-3:-1]).mT
+
+    def pulled_back(self, root: Float[Tensor, "n d df"], gradient: Float[Tensor, "n d df"]) -> Float[Tensor, "n b"]:
+        """Gradient in the deviations of what has this one in the root."""
+        return gradient.mT.flatten(1)
+
+    def block_size(self, n_processes: int) -> int:
+        """Processes in the only block of the information: all."""
+        return n_processes
+
+    def information(
+        self, root: Float[Tensor, "n d df"], inverse: Float[Tensor, "n d d"]
+    ) -> Iterator[tuple[Int64[Tensor, " b"], Float[Tensor, "n b b"]]]:
+        """Expected Fisher information of one row, in one block: indices of the processes, and the block.
+
+        With D = S + S', S = C^-1 dU (C^-1 U)', it is 1/2 tr(D D) = tr(S' S) + tr(S S). ``inverse`` is that of C.
+        """
+        whitened = inverse @ root
+        cross = whitened.mT @ inverse
+        block = _block("njl,nik->njilk", whitened.mT @ whitened, inverse.mT @ inverse)
+        yield self._members(root), block + _block("njk,nli->njilk", cross, cross)
+
+    def observed_information(
+        self,
+        root: Float[Tensor, "n d df"],
+        inverse: Float[Tensor, "n d d"],
+        scatter: Float[Tensor, "n d d"],
+        counts: Float[Tensor, "n 1 1"],
+    ) -> Float[Tensor, "n b b"]:
+        """Second derivatives of the negative log likelihood of all rows; its expectation is the information.
+
+        They are tr((Z - n/2) D D) + tr((n - Z) B B'), B = C^-1 dU, where ``scatter`` is Z = C^-1 (sum w w') C^-T.
+        """
+        identity = torch.eye(root.shape[1]).to(root)
+        whitened, weight = inverse @ root, scatter - 0.5 * counts * identity
+        cross, weighted = whitened.mT @ inverse, whitened.mT @ weight @ inverse
+        square = _block("nki,njl->njilk", inverse.mT @ weight @ inverse, whitened.mT @ whitened)
+        square = square + _block("nlj,nik->njilk", whitened.mT @ weight @ whitened, inverse.mT @ inverse)
+        half = 0.5 * square + _block("nli,njk->njilk", weighted, cross)
+        bend = inverse.mT @ (counts * identity - scatter) @ inverse
+        each = torch.eye(root.shape[2]).to(root).expand(len(root), -1, -1)
+        return half + half.mT + _block("njl,nik->njilk", each, bend)
+
+    def jacobian(
+        self, root: Float[Tensor, "n d df"], scale_tril: Float[Tensor, "n d d"], inverse: Float[Tensor, "n d d"]
+    ) -> Iterator[tuple[Int64[Tensor, " b"], Float[Tensor, "n b d d"]]]:
+        """Derivatives of ``scale_tril`` in the deviations: C tril(D), half of D's diagonal, D as above."""
+        half = torch.einsum("nai,nbj->njiab", inverse, inverse @ root).flatten(1, 2)
+        lower = torch.ones_like(inverse[0]).tril() - 0.5 * torch.eye(root.shape[1]).to(root)
+        yield self._members(root), scale_tril.unsqueeze(1) @ ((half + half.mT) * lower)
+
+    def _members(self, root: Tensor) -> Tensor:
+        return torch.arange(root[0].numel(), device=root.device)
+
+
+def _block(equation: str, left: Tensor, right: Tensor) -> Tensor:
+    """Products of pairs of processes, those of vector j one after the other, as a matrix at each input."""
+    return torch.einsum(equation, left, right).flatten(3, 4).flatten(1, 2)
 
 
 class WishartCovariance(nn.Module):
