@@ -132,20 +132,26 @@ def test_twice_the_push_is_twice_as_far():
     assert (twice.deviation[0] == 0.0).all()
 
 
+def check_returns(schedule, summary, threshold):
+    distance = one_by_one(schedule, summary, AdmittancePlant())
+    limits = 0.1 * distance.max(axis=1) if threshold is None else np.full(len(distance), threshold)
+    ends = summary.onset + summary.duration
+    for far, limit, end, found in zip(distance, limits, ends, summary.return_time, strict=True):
+        above = np.flatnonzero(far > limit)
+        last = above[-1] if len(above) else -1
+        expected = np.inf if last == len(far) - 1 else max(0.0, (last + 1) / RATE - end)
+        assert found == pytest.approx(expected, abs=1e-12)
+
+
 def test_it_returns_when_it_stays_below_the_threshold():
     schedule = turning_schedule()
     for threshold in (None, 5e-3):
         summary = simulate_many(schedule, 60, duration=0.3, threshold=threshold, random_state=1)
-        distance = one_by_one(schedule, summary, AdmittancePlant())
-        limit = 0.1 * distance.max(axis=1) if threshold is None else np.full(60, threshold)
-        for far, least, end, found in zip(
-            distance, limit, summary.onset + summary.duration, summary.return_time, strict=True
-        ):
-            above = np.flatnonzero(far > least)
-            last = above[-1] if len(above) else -1
-            expected = np.inf if last == len(far) - 1 else max(0.0, (last + 1) / RATE - end)
-            assert found == pytest.approx(expected, abs=1e-12)
+        check_returns(schedule, summary, threshold)
         assert np.isinf(summary.return_time).any() or threshold is None
+    for seed in range(20):  # alone, some return within the ticks that are computed together with the end of the push
+        alone = simulate_many(schedule, 1, duration=0.3, threshold=7e-3, random_state=seed)
+        check_returns(schedule, alone, 7e-3)
 
 
 def test_pushes_are_drawn_from_what_is_documented():
