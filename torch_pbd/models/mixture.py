@@ -278,11 +278,10 @@ def _e_step(components: _Components, blocks: list[Tensor]) -> tuple[float, Float
         whitened = affine @ block
         log_joint = components.log_joint(whitened[:, :p])
         largest = log_joint.amax(0)
-        share = (log_joint - largest).exp_()
+        share = (log_joint - largest).exp()
         total = share.sum(0)
-        share /= total
         loss -= (largest + total.log()).sum()
-        moments += (share.unsqueeze(1) * whitened) @ whitened.mT
+        moments += ((share / total).unsqueeze(1) * whitened) @ whitened.mT
     return float(loss) / sum(block.shape[1] for block in blocks), moments
 
 
