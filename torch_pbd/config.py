@@ -32,7 +32,7 @@ _MODELS = {
     "GMM 5": {"class_path": "GMMBaseline", "init_args": {"n_components": 5}},
     "GMM 8": {"class_path": "GMMBaseline", "init_args": {"n_components": 8}},
 }
-GROUPS = ("imports", "fitting", "heteroscedastic", "prediction", "control", "growth")  # of the benchmark
+GROUPS = ("imports", "fitting", "likelihood", "heteroscedastic", "prediction", "control", "growth")  # of the benchmark
 _CONTROLLERS = {"recommended": {"class_path": "DMPController"}}
 _Reading = Literal["bell", "printed", "bowl"]
 

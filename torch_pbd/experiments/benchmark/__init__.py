@@ -9,7 +9,15 @@ from pathlib import Path
 import torch
 from threadpoolctl import threadpool_limits
 
-from torch_pbd.experiments.benchmark import control, fitting, growth, heteroscedastic, imports, prediction
+from torch_pbd.experiments.benchmark import (
+    control,
+    fitting,
+    growth,
+    heteroscedastic,
+    imports,
+    likelihood,
+    prediction,
+)
 from torch_pbd.experiments.benchmark.report import tables, write
 from torch_pbd.experiments.benchmark.rows import Findings, Plan
 from torch_pbd.experiments.run_folder import RunFolder
@@ -17,6 +25,7 @@ from torch_pbd.experiments.run_folder import RunFolder
 GROUPS: dict[str, Callable[[Plan], Findings]] = {
     "imports": imports.measure,
     "fitting": fitting.measure,
+    "likelihood": likelihood.measure,
     "heteroscedastic": heteroscedastic.measure,
     "prediction": prediction.measure,
     "control": control.measure,
