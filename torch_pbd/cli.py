@@ -1,4 +1,4 @@
-"""The command line: ``torch-pbd demo``, ``fit``, ``experiment``, ``compare``; torch loads once there is work."""
+"""The command line: ``torch-pbd demo``, ``fit`` and so on; torch loads once there is work."""
 
 import difflib
 import os
@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch_pbd
-from torch_pbd.config import COMMANDS, existing_file, parse
+from torch_pbd.config import COMMANDS, chosen_groups, existing_file, parse
 from torch_pbd.exceptions import ConfigError
 
 _ERROR, _USAGE, _INTERRUPTED = 1, 2, 130
@@ -52,12 +52,14 @@ def _run(command: str, arguments: Sequence[str]) -> int:
     torch.set_num_threads(1)  # the matrices are small: threads would only wait for each other
     if getattr(options, "data", None) is not None:
         options.data = existing_file(options.data)
+    if command == "benchmark":
+        options.groups = chosen_groups(options.groups)
     folder = RunFolder(options.output, {"command": command})
     (folder.path / "config.yaml").write_text(config, encoding="utf-8")
     with warnings.catch_warnings():
         warnings.simplefilter("default")
         warnings.showwarning = _Notes()
-        print({"demo": _demo, "fit": _fit, "experiment": _experiment, "compare": _compare}[command](options, folder))
+        print(_WORK[command](options, folder))
     print(f"\nresults: {folder.path}")
     return 0
 
@@ -155,6 +157,15 @@ def _compare(options: Any, folder: Any) -> str:
         max_folds=options.max_folds,
         n_jobs=options.n_jobs,
     )
+
+
+def _benchmark(options: Any, folder: Any) -> str:
+    from torch_pbd.experiments.benchmark import run_benchmark
+
+    return run_benchmark(folder, options.groups, n_repetitions=options.n_repetitions, quick=options.quick)
+
+
+_WORK = {"demo": _demo, "fit": _fit, "experiment": _experiment, "compare": _compare, "benchmark": _benchmark}
 
 
 def _demonstrations(options: Any) -> Any:

@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import yaml
 from jsonargparse import ActionConfigFile, ArgumentParser, Namespace, set_loader  # type: ignore[attr-defined]
+from jsonargparse.typing import PositiveInt
 
 from torch_pbd.exceptions import ConfigError
 
@@ -20,6 +21,7 @@ COMMANDS = {
     "fit": "fit one model to a file of demonstrations",
     "experiment": "learn a skill, reproduce it on a simulated robot and push it (Figures 5 to 8)",
     "compare": "compare models: on the paper's simulation (Table I, Figures 1 to 3), or on a file",
+    "benchmark": "time fits, predictions and ticks against other libraries; ratios, bars, growth",
 }
 
 _MODEL_HELP = "an estimator's name, or class_path and init_args; its options: --model.help NAME"
@@ -30,6 +32,7 @@ _MODELS = {
     "GMM 5": {"class_path": "GMMBaseline", "init_args": {"n_components": 5}},
     "GMM 8": {"class_path": "GMMBaseline", "init_args": {"n_components": 8}},
 }
+GROUPS = ("imports", "fitting", "likelihood", "heteroscedastic", "prediction", "control", "growth")  # of the benchmark
 _CONTROLLERS = {"recommended": {"class_path": "DMPController"}}
 _Reading = Literal["bell", "printed", "bowl"]
 
@@ -91,6 +94,11 @@ def _parser(command: str, *, only_help: bool) -> ArgumentParser:
     if command == "demo":
         parser.add_argument("--n_demos", type=int, default=6, help="demonstrations to learn from, at least 3")
         parser.add_argument("--seed", type=int, default=0, help="seed of the demonstrations")
+        return parser
+    if command == "benchmark":
+        parser.add_argument("--groups", type=str, default="all", help=f"comma-separated, of {', '.join(GROUPS)}")
+        parser.add_argument("--n_repetitions", type=PositiveInt, default=5, help="of each contender")
+        parser.add_argument("--quick", action="store_true", help="small sizes, once, to see that everything runs")
         return parser
     if command == "experiment":
         _add_experiment_arguments(parser, Any if only_help else _controllers_type())
@@ -187,6 +195,23 @@ def _known_names(parser: ArgumentParser) -> list[str]:
     leaves = [leaf for child in models.__subclasses__() for leaf in child.__subclasses__()]
     for known in (*models.__subclasses__(), *leaves, DMPController, StiffnessLaw):
         names += [known.__name__, *inspect.signature(known).parameters]
+    return names
+
+
+def chosen_groups(text: str) -> list[str]:
+    """Groups of the benchmark that a comma-separated list names.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such group.
+    """
+    names = list(GROUPS) if text == "all" else [name.strip() for name in text.split(",")]
+    for name in names:
+        if name not in GROUPS:
+            close = difflib.get_close_matches(name, GROUPS, n=1)
+            meant = f"Did you mean {close[0]!r}?" if close else f"Known are {', '.join(GROUPS)}, or all."
+            raise ConfigError(f"groups: there is no group {name!r}. {meant}")
     return names
 
 

@@ -2,6 +2,8 @@
 
 import math
 from collections.abc import Callable
+from functools import reduce
+from operator import add
 from typing import Literal
 
 import torch
@@ -65,13 +67,15 @@ def correlation(
         of it, which agree with the inputs' own where these are close: with the squared exponential this is
         the periodic kernel of MacKay (Rasmussen and Williams, eq. (4.31)).
     """
-    square_distance = x.new_zeros(*length_scale.shape[:-1], len(x), len(other))
-    for dimension in range(x.shape[1]):
-        difference = x[:, None, dimension] - other[None, :, dimension]
+
+    def square(dimension: int) -> Tensor:
+        difference = x[:, dimension : dimension + 1] - other[:, dimension]
         if period is not None and bool(torch.isfinite(period[dimension])):
             radius = period[dimension] / math.pi
             difference = radius * torch.sin(difference / radius)
-        square_distance = square_distance + (difference / length_scale[..., dimension, None, None]).square()
+        return (difference / length_scale[..., dimension, None, None]).square()
+
+    square_distance = reduce(add, map(square, range(x.shape[1])))
     return KERNELS[kernel](square_distance.clamp_max(_FARTHEST))
 
 

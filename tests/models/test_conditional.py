@@ -74,6 +74,17 @@ def test_the_covariance_is_the_square_of_the_factor(kind, d, rng):
 
 
 @pytest.mark.parametrize("kind", MODELS)
+def test_mean_and_covariance_can_be_had_alone(kind, rng):
+    model, x = model_of(kind, 3, rng), queries(rng)
+    mean, covariance = model.moments(x)
+    assert torch.equal(model.mean(x), mean)
+    assert torch.equal(model.covariance(x), covariance)
+    if kind in WITH_PRIOR:
+        prior = torch.stack([lower(3, rng) for _ in x])
+        assert torch.equal(model.covariance(x, prior), model.moments(x, prior)[1])
+
+
+@pytest.mark.parametrize("kind", MODELS)
 def test_the_moments_are_those_of_the_core_in_the_units_of_the_data(kind, rng):
     model, x = model_of(kind, 2, rng), queries(rng)
     standardized = (x.numpy() - [3.0, -1.0]) / [10.0, 0.5]

@@ -8,32 +8,31 @@ from typing import Any, Self
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
-from scipy.sparse import issparse
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_random_state
 from sklearn.utils._tags import Tags
-from sklearn.utils.validation import check_is_fitted, validate_data
+from sklearn.utils.validation import check_is_fitted
 from torch import Tensor
 
 from torch_pbd.estimators._demonstrations import check_groups
 from torch_pbd.estimators._progress import printed_progress
 from torch_pbd.estimators._results import Fitted, Uncertainty
+from torch_pbd.estimators._rows import by_chunks
 from torch_pbd.estimators._scaling import Standardization
 from torch_pbd.estimators._validation import (
     Floats,
-    as_plain_array,
     check_inputs_vary,
     check_number,
     check_squares,
+    checked_queries,
+    checked_rows,
     prior_covariance,
 )
 from torch_pbd.linalg import gaussian_log_density, safe_cholesky, student_log_density
 from torch_pbd.models.conditional import ConditionalNormal
 from torch_pbd.models.spec import module_from_spec, module_spec
 from torch_pbd.optim import Progress
-
-_CHUNK = 1024  # rows predicted at a time: memory stays bounded however many are asked for
 
 
 class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
@@ -75,7 +74,7 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
     def _learn(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None = None) -> Self:
         """Check everything, fit, and keep what was learned."""
         self._check_parameters()
-        inputs, targets = self._validated(X, y, ensure_min_samples=2)
+        inputs, targets = checked_rows(self, X, y, ensure_min_samples=2)
         check_squares(inputs, "X")
         check_squares(targets, "y")
         check_inputs_vary(inputs)
@@ -93,6 +92,7 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         self.loss_curve_ = list(report.loss_curve)
         self.converged_ = report.converged
         self.jitter_ = fitted.jitter
+        self._prepare()
         if not report.converged:
             warnings.warn(
                 f"{type(self).__name__} stopped early: {report.message}. The best point found is kept; "
@@ -105,6 +105,9 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
     @abstractmethod
     def _fit(self, X: Floats, y: Floats, **told: Any) -> Fitted:
         """Fit on validated arrays (n, e) and (n, d); ``told`` may hold the demonstrations' numbers (n,)."""
+
+    def _prepare(self) -> None:
+        """Work out what predictions need of the module alone."""
 
     def _check_parameters(self) -> None:
         """Check the parameters whose values do not depend on the data; subclasses check theirs too."""
@@ -134,29 +137,28 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         """
         if return_std and return_cov:
             raise ValueError("At most one of return_std and return_cov can be True.")
-        mean, covariance = self._moments(X)
+        inputs = checked_queries(self, X)
+        if not (return_std or return_cov):
+            mean = self._mean(inputs)
+            return mean.ravel() if self._y_is_1d else mean
+        mean, covariance = self._moments(inputs)
         shaped = mean.ravel() if self._y_is_1d else mean
         if return_cov:
             return shaped, covariance
-        if return_std:
-            std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-            return shaped, std.ravel() if self._y_is_1d else std
-        return shaped
+        std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+        return shaped, std.ravel() if self._y_is_1d else std
 
     def predict_cov(self, X: ArrayLike) -> Floats:
         """Covariances of the outputs at X: (n_samples, n_outputs, n_outputs), also for one output.
 
         Symmetric to the last bit, positive definite, in squared units of y.
         """
-        return self._moments(X)[1]
+        return self._covariance(checked_queries(self, X))
 
     def predict_uncertainty(self, X: ArrayLike) -> Uncertainty:
         """Both kinds of uncertainty at X, apart (Section IV-C)."""
-        x = self._query(X)
-        with torch.inference_mode():
-            parts = [(self.module_.type1(chunk), self.module_.type2(chunk)) for chunk in x.split(_CHUNK)]
-        type1, type2 = (torch.cat(part).cpu().numpy() for part in zip(*parts, strict=True))
-        return Uncertainty(type1, type2)
+        inputs = checked_queries(self, X)
+        return Uncertainty(*self._arrays(lambda x: (self.module_.type1(x), self.module_.type2(x)), inputs))
 
     def log_likelihood(self, X: ArrayLike, y: ArrayLike) -> Floats:
         """Log density of each row of y at X, in nats: (n_samples,)."""
@@ -192,7 +194,7 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         check_number(n_samples, "n_samples", low=1, integer=True)
         generator = check_random_state(random_state)
         x = self._query(X)
-        mean, scale_tril = (part.cpu().numpy() for part in self._apply(self.module_, x))
+        mean, scale_tril = (part.cpu().numpy() for part in self._tensors(self._mean_and_tril, x))
         normal = generator.standard_normal((*mean.shape, n_samples))
         degrees = self._degrees(x)
         if degrees is not None:
@@ -202,50 +204,42 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         samples = mean[:, :, np.newaxis] + scale_tril @ normal
         return samples[:, 0] if self._y_is_1d else samples
 
-    def _moments(self, X: ArrayLike) -> tuple[Floats, Floats]:
-        x = self._query(X)
-        mean, covariance = self._apply(self.module_.moments, x)
-        return mean.cpu().numpy(), covariance.cpu().numpy()
+    def _mean(self, X: Floats) -> Floats:
+        return self._arrays(lambda x: (self.module_.mean(x),), X)[0]
 
-    def _validated(self, X: ArrayLike, y: ArrayLike, **options: Any) -> tuple[Floats, Floats]:
-        """X (n, e) and y (n,) or (n, d) in float64, checked by scikit-learn and by us."""
-        if issparse(y):
-            raise TypeError("Sparse data was passed for y, but dense data is required. Use '.toarray()'.")
-        X, y = as_plain_array(X, "X"), as_plain_array(y, "y")
-        checked: Any = validate_data(self, X, y, dtype=np.float64, y_numeric=True, multi_output=True, **options)
-        return checked[0], np.asarray(checked[1], dtype=np.float64)
+    def _covariance(self, X: Floats) -> Floats:
+        return self._arrays(lambda x: (self.module_.covariance(x, *self._prior_tril_at(x)),), X)[0]
+
+    def _moments(self, X: Floats) -> tuple[Floats, ...]:
+        return self._arrays(lambda x: self.module_.moments(x, *self._prior_tril_at(x)), X)
 
     def _scored(self, X: ArrayLike, y: ArrayLike) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         check_is_fitted(self)
-        inputs, targets = self._validated(X, y, reset=False)
+        inputs, targets = checked_rows(self, X, y, reset=False)
         targets = targets.reshape(len(inputs), -1)
         if targets.shape[1] != self.n_outputs_:
             raise ValueError(f"y has {targets.shape[1]} outputs, but the model was fitted with {self.n_outputs_}.")
         x = self._door(inputs)
-        return x, *self._apply(self.module_, x), self._door(targets)
+        return x, *self._tensors(self._mean_and_tril, x), self._door(targets)
 
     def _degrees(self, x: Tensor) -> Tensor | None:
         """Degrees of freedom of the predictive density at x; None where it is normal."""
-        with torch.inference_mode():
-            parts = [degrees for chunk in x.split(_CHUNK) if (degrees := self.module_.degrees(chunk)) is not None]
-        return torch.cat(parts) if parts else None
+        if self.module_.degrees(x[:1]) is None:
+            return None
+        return self._tensors(lambda rows: (self.module_.degrees(rows),), x)[0]
 
     def _query(self, X: ArrayLike) -> Tensor:
-        """Rows to predict at; none at all is allowed, though scikit-learn asks for one."""
-        check_is_fitted(self)
-        X = as_plain_array(X, "X")
-        if getattr(X, "shape", (1,))[0] == 0 and np.ndim(X) == 2:
-            X = validate_data(self, X, dtype=np.float64, reset=False, ensure_min_samples=0)
-        else:
-            X = validate_data(self, X, dtype=np.float64, reset=False)
-        return self._door(X)
+        return self._door(checked_queries(self, X))
 
-    def _apply(self, model: Any, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and covariance (or factor) of the model at x, a bounded number of rows at a time."""
+    def _arrays(self, function: Callable[[Tensor], Any], X: Floats) -> tuple[Floats, ...]:
+        return tuple(part.cpu().numpy() for part in self._tensors(function, self._door(X)))
+
+    def _tensors(self, function: Callable[[Tensor], Any], x: Tensor) -> Any:
         with torch.inference_mode():
-            parts = [model(chunk, *self._prior_tril_at(chunk)) for chunk in x.split(_CHUNK)]
-            first, second = (torch.cat(part) for part in zip(*parts, strict=True))
-        return first, second
+            return by_chunks(function, x)
+
+    def _mean_and_tril(self, x: Tensor) -> tuple[Tensor, ...]:
+        return self.module_(x, *self._prior_tril_at(x))
 
     def _prior_tril_at(self, x: Tensor) -> tuple[Tensor, ...]:
         """Factor of the prior at x, where it depends on x; else nothing, as the module has it."""
@@ -299,3 +293,4 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
             with torch.inference_mode(False):  # else autograd would refuse the module
                 tensors = {name: self._door(array) for name, array in arrays.items()}
                 self.module_ = module_from_spec(spec, tensors).requires_grad_(False)
+            self._prepare()

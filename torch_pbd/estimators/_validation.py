@@ -1,13 +1,14 @@
 """Checks of what users pass to an estimator, before any work starts."""
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from sklearn.utils.validation import check_scalar
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import issparse
+from sklearn.utils.validation import check_is_fitted, check_scalar, validate_data
 
 from torch_pbd.exceptions import DataRankWarning
 
@@ -80,6 +81,42 @@ def _check_resolution(array: NDArray[Any], name: str, label: Any) -> None:
             f"{step[column]:.3g} where its range is {spread[column]:.3g}: subtract an offset before storing it, or "
             "record it in float64."
         )
+
+
+def checked_rows(estimator: Any, X: ArrayLike, y: ArrayLike, **options: Any) -> tuple[Floats, Floats]:
+    """X (n, e) and y (n,) or (n, d) in float64, checked by scikit-learn and by us."""
+    if issparse(y):
+        raise TypeError("Sparse data was passed for y, but dense data is required. Use '.toarray()'.")
+    X, y = as_plain_array(X, "X"), as_plain_array(y, "y")
+    checked: Any = validate_data(estimator, X, y, dtype=np.float64, y_numeric=True, multi_output=True, **options)
+    return checked[0], np.asarray(checked[1], dtype=np.float64)
+
+
+def checked_queries(estimator: Any, X: ArrayLike) -> Floats:
+    """Rows to predict at (n, e) in float64; none at all is allowed, though scikit-learn asks for one."""
+    if _is_plain(X, vars(estimator)):
+        return np.asarray(X)
+    check_is_fitted(estimator)
+    X = as_plain_array(X, "X")
+    least = 0 if getattr(X, "shape", (1,))[0] == 0 and np.ndim(X) == 2 else 1
+    return validate_data(estimator, X, dtype=np.float64, reset=False, ensure_min_samples=least)
+
+
+def _is_plain(X: Any, fitted: Mapping[str, Any]) -> bool:
+    """Whether scikit-learn's checks, which take longer than predicting a row, would give X back as it is.
+
+    ``fitted`` are the attributes of the estimator. One that was fitted to a data frame compares names.
+    """
+    return (
+        type(X) is np.ndarray
+        and X.dtype == np.float64
+        and X.ndim == 2
+        and len(X) > 0
+        and X.shape[1] == fitted.get("n_features_in_")
+        and "module_" in fitted
+        and "feature_names_in_" not in fitted
+        and bool(np.isfinite(X).all())
+    )
 
 
 def check_squares(array: Floats, name: str) -> None:

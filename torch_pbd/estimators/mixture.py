@@ -11,7 +11,9 @@ from sklearn.neighbors import NearestNeighbors
 from sklearn.utils import check_random_state
 
 from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.estimators._regression import MixtureRegression
 from torch_pbd.estimators._results import Fitted
+from torch_pbd.estimators._rows import by_chunks
 from torch_pbd.estimators._scaling import Standardization, distinct_rows
 from torch_pbd.estimators._validation import Floats, check_choice, check_number
 from torch_pbd.exceptions import DataRankWarning
@@ -71,6 +73,8 @@ class GMMBaseline(CovarianceRegressor):
     Calinon, "A tutorial on task-parameterized movement learning and retrieval", Intelligent Service
     Robotics 9, 2016.
     """
+
+    _regression: MixtureRegression | None = None
 
     def __init__(
         self,
@@ -132,6 +136,31 @@ class GMMBaseline(CovarianceRegressor):
                 callback=self._progress(),
             )
         return Fitted(self._assemble(mixture, scaling), report, float(self.reg_covar))
+
+    def _prepare(self) -> None:
+        if self.device is None:
+            self._regression = MixtureRegression.of(self.module_)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """As the base class gives it, without what follows from the module."""
+        state = super().__getstate__()
+        state.pop("_regression", None)
+        return state
+
+    def _mean(self, X: Floats) -> Floats:
+        regression = self._regression
+        if regression is None or not regression.is_of(self.module_):
+            return super()._mean(X)
+        return by_chunks(lambda rows: (regression.mean(rows),), X)[0]
+
+    def _covariance(self, X: Floats) -> Floats:
+        return self._moments(X)[1]
+
+    def _moments(self, X: Floats) -> tuple[Floats, ...]:
+        regression = self._regression
+        if regression is None or not regression.is_of(self.module_):
+            return super()._moments(X)
+        return by_chunks(regression.moments, X)
 
     def _expectation_maximization(
         self, data: torch.Tensor, points: Floats, n_features: int, generator: np.random.RandomState

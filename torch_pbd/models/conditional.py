@@ -1,5 +1,8 @@
 """The fitted model: a normal distribution of y whose mean and covariance depend on x, in the data's units."""
 
+from typing import Any
+
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
@@ -88,11 +91,30 @@ class ConditionalNormal(nn.Module):
         mean, root = self._mean_and_root(x, prior_scale_tril)
         return mean, symmetrize(root @ root.mT)
 
+    def mean(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d"]:
+        """Mean alone, without the work that a covariance takes."""
+        core, standardized = self.core, self._standardized(x)
+        if isinstance(core, MeanAndCovariance):
+            mean = core.mean(standardized)
+        elif isinstance(core, HeteroscedasticModel):
+            mean = core.mean_process.expected(standardized)
+        else:
+            mean = core(standardized)[0]
+        return self.y_shift + self.y_scale * mean
+
+    def covariance(
+        self, x: Float[Tensor, "n e"], prior_scale_tril: Float[Tensor, "n d d"] | None = None
+    ) -> Float[Tensor, "n d d"]:
+        """Covariance alone, symmetric to the last bit."""
+        if not isinstance(self.core, MeanAndCovariance):
+            return self.moments(x, prior_scale_tril)[1]
+        return self._square(self.core.covariance(*self._arguments(x, prior_scale_tril)))
+
     def degrees(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"] | None:
         """Degrees of freedom of the predictive Student's t; None where the density is normal everywhere."""
         if not isinstance(self.core, HeteroscedasticModel):
             return None
-        return self.core.degrees((x - self.x_shift) / self.x_scale)
+        return self.core.degrees(self._standardized(x))
 
     def draw_covariance(
         self,
@@ -104,28 +126,40 @@ class ConditionalNormal(nn.Module):
         if not isinstance(self.core, HeteroscedasticModel):
             raise TypeError("only the heteroscedastic model knows the posterior of its covariance")
         prior = None if prior_scale_tril is None else prior_scale_tril / self.y_scale[:, None]
-        root = self.core.draw((x - self.x_shift) / self.x_scale, normal, prior)
-        root = self.y_scale[:, None] * with_floor(root)
-        return symmetrize(root @ root.mT)
+        return self._square(self.core.draw(self._standardized(x), normal, prior))
 
     def type1(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
         """Type I uncertainty: 0 on data, 1 where only the prior speaks."""
-        return self.core.type1((x - self.x_shift) / self.x_scale)
+        return self.core.type1(self._standardized(x))
 
     def type2(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d d"]:
         """Type II uncertainty: the variability of the data, without the prior; squared units of y."""
-        standardized = (x - self.x_shift) / self.x_scale
+        standardized = self._standardized(x)
         if isinstance(self.core, GaussianMixture):
-            root = self.core(standardized)[1]  # it has no prior
-        else:
-            root = self.core.variability(standardized)
-        root = self.y_scale[:, None] * with_floor(root)
-        return symmetrize(root @ root.mT)
+            return self._square(self.core(standardized)[1])  # it has no prior
+        return self._square(self.core.variability(standardized))
 
     def _mean_and_root(self, x: Tensor, prior_scale_tril: Tensor | None) -> tuple[Tensor, Tensor]:
-        standardized = (x - self.x_shift) / self.x_scale
+        core: Any = self.core
+        if torch.compiler.is_compiling() and isinstance(core, HeteroscedasticModel):
+            core = torch.compiler.disable(core.forward)  # it looks at numbers on its way, which no graph can hold
+        mean, root = core(*self._arguments(x, prior_scale_tril))
+        return self.y_shift + self.y_scale * mean, self._in_units(root)
+
+    def _arguments(self, x: Tensor, prior_scale_tril: Tensor | None) -> tuple[Tensor, ...]:
+        """What the core takes: standardized inputs, and the prior where it is another than the core's."""
         if prior_scale_tril is None:
-            mean, root = self.core(standardized)
-        else:
-            mean, root = self.core(standardized, prior_scale_tril / self.y_scale[:, None])
-        return self.y_shift + self.y_scale * mean, self.y_scale[:, None] * with_floor(root)
+            return (self._standardized(x),)
+        return self._standardized(x), prior_scale_tril / self.y_scale[:, None]
+
+    def _standardized(self, x: Tensor) -> Tensor:
+        return (x - self.x_shift) / self.x_scale
+
+    def _square(self, root: Tensor) -> Tensor:
+        """Covariance of a root in standardized units, with the floor, in the units of the data."""
+        root = self._in_units(root)
+        return symmetrize(root @ root.mT)
+
+    def _in_units(self, root: Tensor) -> Tensor:
+        """Root of a covariance, with the floor, in the units of the data."""
+        return self.y_scale.unsqueeze(-1) * with_floor(root)

@@ -10,6 +10,5 @@ VARIANCE_FLOOR = 1e-12
 
 def with_floor(root: Float[Tensor, "*b d r"]) -> Float[Tensor, "*b d s"]:
     """Root of a covariance with the floor added: positive definite, whatever ``root`` is."""
-    floor = (VARIANCE_FLOOR * (1.0 + root.square().sum((-2, -1)))).sqrt()
-    identity = torch.eye(root.shape[-2]).to(root)
-    return torch.cat([root, floor[..., None, None] * identity], dim=-1)
+    floor = (VARIANCE_FLOOR * (1.0 + root.square().sum((-2, -1), keepdim=True))).sqrt()
+    return torch.cat([root, floor * torch.eye(root.shape[-2], dtype=root.dtype, device=root.device)], dim=-1)

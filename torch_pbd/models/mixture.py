@@ -277,10 +277,11 @@ def _e_step(components: _Components, blocks: list[Tensor]) -> tuple[float, Float
     for block in blocks:
         whitened = affine @ block
         log_joint = components.log_joint(whitened[:, :p])
-        log_prob = log_joint.logsumexp(0)
-        share = (log_joint - log_prob).exp()
-        loss -= log_prob.sum()
-        moments += (share.unsqueeze(1) * whitened) @ whitened.mT
+        largest = log_joint.amax(0)
+        share = (log_joint - largest).exp()
+        total = share.sum(0)
+        loss -= (largest + total.log()).sum()
+        moments += ((share / total).unsqueeze(1) * whitened) @ whitened.mT
     return float(loss) / sum(block.shape[1] for block in blocks), moments
 
 

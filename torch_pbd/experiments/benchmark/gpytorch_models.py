@@ -1,11 +1,12 @@
-"""Gaussian processes of gpytorch for covariance_libraries.py: an exact batch, and sampled variational factors."""
+"""What others make of gpytorch: an exact batch of Gaussian processes, and sampled variational factors."""
 
 import gpytorch
 import numpy as np
 import torch
-from covariance_peers import Floats
+from numpy.typing import NDArray
 from torch import Tensor
 
+Floats = NDArray[np.float64]
 _N_SAMPLES = 64
 
 

@@ -1,0 +1,21 @@
+"""Predicting many rows a bounded number at a time."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torch_pbd.estimators._validation import Floats
+
+_CHUNK = 1024
+
+
+def by_chunks(function: Callable[[Any], Any], x: Tensor | Floats) -> Any:
+    """What a function of rows gives for all rows of x; what it needs on the way is of a bounded number of them."""
+    if len(x) <= _CHUNK:
+        return function(x)
+    parts = zip(*(function(x[start : start + _CHUNK]) for start in range(0, len(x), _CHUNK)), strict=True)
+    joined: Any = torch.cat if isinstance(x, Tensor) else np.concatenate
+    return tuple(joined(part) for part in parts)

@@ -1,0 +1,97 @@
+"""Ticks of the real-time controller: their time, their memory, the error of their stiffness; and rollouts."""
+
+import numpy as np
+import torch
+
+from torch_pbd import DMPController, HeteroscedasticGPRegressor
+from torch_pbd.control import AdmittancePlant, RealTimeAdmittance
+from torch_pbd.data import make_tunnel_demonstrations
+from torch_pbd.experiments.benchmark.rows import Findings, Plan, Row
+from torch_pbd.experiments.benchmark.ticks import BLOCK, blocks, memory_kept
+from torch_pbd.experiments.benchmark.timing import alternate
+
+
+def measure(plan: Plan) -> Findings:
+    """CPU times of the thread, whose clock is read once in each."""
+    n_ticks = plan.size(1_000_000, 1000)
+    kept = memory_kept(n_ticks)
+    rows = [
+        *_ticks(plan),
+        Row(f"kept by {n_ticks:,} ticks", [float(kept)], "bytes", bar=("<=", 0.0)),
+        *_stiffness_error(plan),
+        *_rollouts(plan),
+    ]
+    return Findings("control", rows)
+
+
+def _ticks(plan: Plan) -> list[Row]:
+    n_blocks, n_ticks = plan.size(100, 2), plan.size(BLOCK, 200)
+    took = blocks(n_blocks, n_ticks, n_eager=plan.size(50, 20))
+    seconds = {name: np.array(values) * 1e-9 for name, values in took.items()}
+    parts = min(n_blocks, 10)
+
+    def quantile(name: str, share: float) -> list[float]:
+        return [float(np.quantile(part, share)) for part in np.array_split(seconds[name], parts)]
+
+    worst = float(np.quantile(seconds["tick"], 0.999))
+    what = f"a tick, d = 2, of {n_blocks * n_ticks:,}"
+    bare = "a bare loop of the same arithmetic"
+    return [
+        Row(f"{what}: median", quantile("tick", 0.5), bar=("<=", 5e-6)),
+        Row(f"{what}: 99.9th percentile", [worst], bar=("<=", 50e-6)),
+        Row(f"{what}: median", quantile("tick", 0.5), other=quantile("bare", 0.5), other_name=bare),
+        Row(f"{what}: 99.9th percentile", quantile("tick", 0.999), other=quantile("bare", 0.999), other_name=bare),
+        Row(
+            f"{what}: median",
+            quantile("tick", 0.5),
+            other=quantile("eager", 0.5),
+            other_name="a tick of eager torch",
+            bar=(">=", 40.0),
+        ),
+    ]
+
+
+def _stiffness_error(plan: Plan) -> list[Row]:
+    """Of the demo's schedule at 1 kHz, against the model asked at that very time, largest entry of the difference."""
+    rate = 1000.0 if not plan.quick else 50.0
+    demonstrations = make_tunnel_demonstrations(6, rate=25.0 if not plan.quick else 4.0, random_state=plan.seed)
+    controller = DMPController(HeteroscedasticGPRegressor()).fit(demonstrations)
+    schedule = controller.schedule(rate)
+    table = RealTimeAdmittance(schedule, rate=rate, max_step=10.0 / rate)._table.stiffness[:-1]
+    start = controller.start_time_
+
+    def error(after: float) -> list[float]:
+        time = start + schedule.time[:-1, np.newaxis] + after / rate
+        return [float(np.abs(table - controller.predict_stiffness(time)).max())]
+
+    along = np.linalg.eigvalsh(table)
+    note = f"K is {along.min():.0f} to {along.max():.0f} N/m along its axes, and held over a tick"
+    return [
+        Row("error of K at the table's times, demo", error(0.0), "N/m", bar=("<=", 0.01)),
+        Row("error of K half a tick later, demo", error(0.5), "N/m", note=note),
+        Row("error of K at the end of a tick, demo", error(1.0), "N/m", note="just before the next row"),
+    ]
+
+
+def rollout(n_rollouts: int, n_ticks: int) -> AdmittancePlant:
+    """Simulate robots under one schedule and forces of their own."""
+    generator = torch.Generator().manual_seed(0)
+    force = torch.randn(n_rollouts, n_ticks, 2, dtype=torch.float64, generator=generator)
+    still = torch.zeros(n_ticks, 2, dtype=torch.float64)
+    stiffness = torch.linspace(100.0, 900.0, n_ticks, dtype=torch.float64)[:, None, None] * torch.eye(2).double()
+    plant = AdmittancePlant(1.0)
+    damping = 2.0 * stiffness.sqrt()
+    motion = [part.expand(n_rollouts, *part.shape) for part in (still, still, stiffness, damping)]
+    plant.simulate(motion[0], motion[1], motion[2], motion[3], force, dt=1e-3)
+    return plant
+
+
+def _rollouts(plan: Plan) -> list[Row]:
+    rows = []
+    for n_rollouts in (1, 1000)[: plan.size(2, 1)]:
+        n_ticks = plan.size(1000, 50)
+        times = alternate({"ours": lambda n=n_rollouts, t=n_ticks: rollout(n, t)}, min(3, plan.n_repetitions))
+        steps = n_rollouts * n_ticks
+        note = f"{steps / np.median(times['ours']) / 1e6:.3g} million steps a second"
+        rows.append(Row(f"{n_rollouts} rollouts of {n_ticks} ticks", times["ours"], note=note))
+    return rows

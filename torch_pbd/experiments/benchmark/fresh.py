@@ -1,0 +1,53 @@
+"""Work in a fresh process: what it costs to import, and how much memory it needs."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from typing import Any
+
+# ru_maxrss is in KiB on Linux. Importing comes first: what is measured is above it.
+_MEASURED = """
+import json, resource, time, warnings
+warnings.simplefilter("ignore")
+import numpy as np, torch
+import torch_pbd
+torch.set_num_threads(1)
+{setup}
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+start = time.process_time()
+{work}
+seconds = time.process_time() - start
+peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+print(json.dumps({{"seconds": seconds, "above": (peak - before) / 1024, "peak": peak / 1024}}))
+"""
+
+
+def measured(setup: str, work: str) -> dict[str, float]:
+    """CPU seconds of ``work`` after ``setup``, its memory above what was used before, and the peak, in MiB."""
+    result: dict[str, Any] = json.loads(_run(_MEASURED.format(setup=setup, work=work)).splitlines()[-1])
+    return result
+
+
+def wall_seconds(program: str) -> float:
+    """Seconds that a fresh interpreter takes for a program, by the clock on the wall."""
+    start = time.perf_counter()
+    _run(program)
+    return time.perf_counter() - start
+
+
+def cpu_seconds(program: str) -> float:
+    """CPU seconds that a fresh interpreter takes for a program."""
+    before = os.times()
+    _run(program)
+    after = os.times()
+    return after.children_user + after.children_system - before.children_user - before.children_system
+
+
+def _run(program: str) -> str:
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, env=environment)
+    if done.returncode:
+        raise RuntimeError(f"a program of the benchmark failed: {done.stderr.strip().splitlines()[-1:]}")
+    return done.stdout
