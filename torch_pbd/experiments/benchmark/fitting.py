@@ -1,8 +1,6 @@
 """Time of fitting CD and WP, against Gaussian processes of scikit-learn and of gpytorch on the same factors."""
 
-from typing import Any
-
-import numpy as np
+import torch
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
@@ -13,6 +11,7 @@ from torch_pbd.experiments.benchmark.made import Floats, cholesky_entries, demon
 from torch_pbd.experiments.benchmark.rows import Bar, Findings, Plan, Row
 from torch_pbd.experiments.benchmark.timing import alternate
 from torch_pbd.experiments.comparison import empirical_covariances
+from torch_pbd.gp import EvidenceSearch, Observations, fit_hyperparameters, resolved_length_scale
 from torch_pbd.metrics import covariance_mse
 
 _SKLEARN = "scikit-learn, a process for each entry of the factor"
@@ -68,40 +67,33 @@ def _against_scikit_learn(plan: Plan, n_inputs: int, d: int, least: float) -> Ro
 
 
 def _evidence(plan: Plan, n_inputs: int) -> Row:
-    """Evidence of our hyperparameters in scikit-learn's own likelihood, less that of its best of six starts.
+    """Evidence that our search finds above that of scikit-learn's best of six starts, on the same problem.
 
-    Not quite the same problem: our processes are deviations from the prior's factor, those of scikit-learn from the
-    mean of the entries, so ours were not chosen for what they are judged by here.
+    Targets are the standardized entries of the factor; length scales are bounded alike, from what the inputs resolve to
+    ten ranges.
     """
     gaps = []
-    for seed in range(plan.seed, plan.seed + plan.size(3, 1)):
+    for seed in range(plan.seed, plan.seed + plan.size(5, 1)):
         X, y = demonstrations(n_inputs, 50, seed=seed)
         inputs, entries = cholesky_entries(X, y)
-        theirs = scikit_learn_entries(inputs, entries, plan.size(5, 1))
-        mine = _hyperparameters(CholeskyCovRegressor().fit(X, y))
-        for process, column, hyperparameters in zip(theirs, entries.T, mine, strict=True):
-            amplitude, length_scale, noise = hyperparameters
-            variance = np.square(amplitude / column.std())
-            theta = np.log([variance, length_scale, max(variance * noise, 1e-300)])
-            gaps.append(float(process.log_marginal_likelihood(theta) - process.log_marginal_likelihood_value_))
+        targets = torch.tensor((entries - entries.mean(axis=0)) / entries.std(axis=0)).mT.contiguous()
+        nodes = torch.tensor(inputs)
+        bounds = (resolved_length_scale(nodes), 10.0)
+        data = Observations(nodes, targets, torch.ones(n_inputs, dtype=torch.float64))
+        _, loss, _ = fit_hyperparameters(data, EvidenceSearch(length_scale_bounds=bounds))
+        kernel = ConstantKernel(1.0, (1e-6, 1e5)) * RBF(0.2, bounds) + WhiteKernel(0.1, (1e-9, 1e5))
+        for ours, column in zip(loss.tolist(), targets.numpy(), strict=True):
+            theirs = GaussianProcessRegressor(
+                kernel, alpha=0.0, n_restarts_optimizer=plan.size(5, 1), random_state=0
+            ).fit(inputs, column)
+            gaps.append(-ours - theirs.log_marginal_likelihood_value_)
     return Row(
-        f"lowest of evidence above scikit-learn's with 5 restarts, {n_inputs} inputs x 50",
+        f"evidence above scikit-learn's best of 6 starts, {n_inputs} inputs x 50, lowest of {len(gaps)}",
         [min(gaps)],
         "nats",
         bar=(">=", -0.2),
-        note="of our hyperparameters, in scikit-learn's likelihood; ours have another prior mean",
+        note=f"highest {max(gaps):+.2g}; of each entry of the factor",
     )
-
-
-def _hyperparameters(model: CholeskyCovRegressor) -> list[tuple[float, float, float]]:
-    """Amplitude in units of y, length scale in ranges, and relative noise variance of each entry's process."""
-    core: Any = model.module_.core
-    latent = core.covariance.latent
-    rows = np.tril_indices(model.n_outputs_)[0]
-    amplitude = latent.amplitude.numpy() * model.module_.y_scale.numpy()[rows]
-    length_scale = np.broadcast_to(latent.length_scale.numpy()[:, 0], amplitude.shape)
-    noise = np.broadcast_to(latent.noise_ratio.numpy(), amplitude.shape)
-    return list(zip(amplitude.tolist(), length_scale.tolist(), noise.tolist(), strict=True))
 
 
 def _against_gpytorch(plan: Plan, n_inputs: int, least: float) -> Row:
@@ -122,16 +114,20 @@ def _against_gpytorch(plan: Plan, n_inputs: int, least: float) -> Row:
 
 def _paper_problem(plan: Plan) -> list[Row]:
     X, y, _ = make_paper_simulation(10, 50, random_state=plan.seed)
-    times = alternate(
-        {"CD": lambda: CholeskyCovRegressor().fit(X, y), "WP": lambda: WishartProcessRegressor().fit(X, y)},
-        plan.n_repetitions,
-    )
+    models = {
+        "CD": CholeskyCovRegressor(),
+        "WP by eq. (9)": WishartProcessRegressor(),
+        "WP by eq. (9) from a random start": WishartProcessRegressor(start="random"),
+    }
+    times = alternate({name: lambda m=model: m.fit(X, y) for name, model in models.items()}, plan.n_repetitions)
     inputs, empirical = empirical_covariances(X, y)
     assert empirical is not None
-    error = float(covariance_mse(WishartProcessRegressor().fit(X, y).predict_cov(inputs), empirical))
-    bars: dict[str, Bar] = {"CD": ("<=", 0.02), "WP": ("<=", 0.3)}
-    rows = [Row(f"{name}, the paper's problem", times[name], bar=bar) for name, bar in bars.items()]
-    return [*rows, Row("WP by eq. (9), mean squared error of Table I", [error], "y^2", bar=("<=", 1e-10))]
+    bars: dict[str, Bar] = {"CD": ("<=", 0.02)}
+    rows = [Row(f"{name}, the paper's problem", times[name], bar=bars.get(name, ("<=", 0.3))) for name in models]
+    for name in list(models)[1:]:
+        error = float(covariance_mse(models[name].predict_cov(inputs), empirical))
+        rows.append(Row(f"{name}: mean squared error of Table I", [error], "y^2", bar=("<=", 1e-10)))
+    return rows
 
 
 def _many_inputs() -> Row:
