@@ -22,7 +22,12 @@ def spacing(inputs: Float[Tensor, "n e"], quantile: float = 0.9) -> float:
     """Distance to the nearest other input, a quantile over the inputs; the finest detail they show."""
     if inputs.shape[1] == 1 and len(inputs) > 1:
         gap = torch.nn.functional.pad(inputs[:, 0].sort().values.diff(), (1, 1), value=float("inf"))
-        return float(torch.minimum(gap[1:], gap[:-1]).quantile(quantile))
+        ordered = torch.minimum(gap[1:], gap[:-1]).sort().values
+        place = quantile * (len(ordered) - 1)
+        low, high = (
+            ordered[int(place) : int(place) + 2].tolist() if place < len(ordered) - 1 else [float(ordered[-1])] * 2
+        )
+        return float(low + (place - int(place)) * (high - low))
     if len(inputs) > 2000:
         inputs = inputs[:: len(inputs) // 1000]
     distance = torch.cdist(inputs, inputs, compute_mode="donot_use_mm_for_euclid_dist")

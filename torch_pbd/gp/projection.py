@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
@@ -100,8 +101,13 @@ class Basis:
         """Of the coordinates over the squared amplitude, without noise, from the correlation of the nodes."""
         if self.root is not None:
             return self.root @ correlation @ self.root.mT
+        return correlation * self._weights
+
+    @cached_property
+    def _weights(self) -> Float[Tensor, "m m"]:
+        """Of the entries of a covariance, where the root is diagonal."""
         weight = self.counts.sqrt()
-        return correlation * (weight[:, None] * weight)
+        return weight[:, None] * weight
 
     def pulled_back(self, matrix: Float[Tensor, "*b r r"]) -> Float[Tensor, "*b m m"]:
         """``root' matrix root``: the gradient by the correlation of the nodes, given that by the covariance."""

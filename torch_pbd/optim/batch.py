@@ -182,13 +182,11 @@ def _first_inverse(objective: ValueAndGradient, rows: Tensor, x: Tensor, gradien
 
 def _updated(inverse: Tensor, step: Tensor, change: Tensor, convex: Tensor) -> Tensor:
     """Inverse Hessians after a step (b, p, 1) and the change of the gradient along it, where it was convex."""
-    curvature = step.mT @ change
     applied = inverse @ change
-    share = torch.where(convex[:, None, None], 1.0 / curvature, 0.0)
-    cross = applied @ step.mT
-    scale = 1.0 + share * (change.mT @ applied)
-    update = share * (scale * (step @ step.mT) - cross - cross.mT)
-    return inverse + update.where(convex[:, None, None], 0.0)
+    share = torch.where(convex[:, None, None], 1.0 / (step.mT @ change), 0.0)  # the update is zero where it is
+    cross = applied @ (share * step.mT)
+    scale = share + share.square() * (change.mT @ applied)
+    return inverse + scale * step @ step.mT - cross - cross.mT
 
 
 def _backtrack(objective: ValueAndGradient, at: _Problems) -> tuple[Tensor, Tensor, Tensor]:
