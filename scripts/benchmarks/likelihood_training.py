@@ -19,8 +19,9 @@ from torch_pbd.gp import LatentValues
 from torch_pbd.kernels import correlation
 from torch_pbd.linalg import safe_cholesky, scale_tril_from_root
 from torch_pbd.models.cholesky import CholeskyLink, deviation_tril, tril_deviation
+from torch_pbd.models.costs import Likelihood
 from torch_pbd.models.objectives import gaussian_nll
-from torch_pbd.models.scoring import Likelihood, train_by_scoring
+from torch_pbd.models.scoring import train_by_scoring
 from torch_pbd.optim import Progress, minimize
 
 N_SEEDS, N_ROWS, LENGTH_SCALE = 5, 500, 0.2

@@ -6,9 +6,10 @@ from scipy.optimize import minimize as scipy_minimize
 from torch_pbd.gp import LatentValues
 from torch_pbd.linalg import scale_tril_from_root, tril_to_vector
 from torch_pbd.models.cholesky import CholeskyLink, tril_deviation
+from torch_pbd.models.costs import Covariances, FactorDistance, Likelihood
 from torch_pbd.models.floor import with_floor
 from torch_pbd.models.objectives import covariance_mse, gaussian_nll
-from torch_pbd.models.scoring import Covariances, FactorDistance, Likelihood, train_by_scoring
+from torch_pbd.models.scoring import train_by_scoring
 from torch_pbd.models.training import TrainingSet
 from torch_pbd.models.wishart import WishartLink, padded, wishart_root
 

@@ -17,8 +17,9 @@ from torch_pbd.gp import LatentGP, LatentValues, Observations, condition, fit_to
 from torch_pbd.kernels import KernelName
 from torch_pbd.linalg import tril_to_vector
 from torch_pbd.models.cholesky import CholeskyCovariance, CholeskyLink, tril_deviation
+from torch_pbd.models.costs import Likelihood
 from torch_pbd.models.objectives import train
-from torch_pbd.models.scoring import Likelihood, Solver, train_by_scoring
+from torch_pbd.models.scoring import Solver, train_by_scoring
 from torch_pbd.models.training import empirical_tril, pooled_tril
 from torch_pbd.optim import FitReport
 

@@ -16,8 +16,9 @@ from torch_pbd.estimators._latent import (
 from torch_pbd.estimators._validation import Prior, check_choice, check_number, check_solver
 from torch_pbd.gp import LatentGP, LatentValues, Observations, condition, fit_hyperparameters, merge_observations
 from torch_pbd.kernels import KernelName
+from torch_pbd.models.costs import Cost, FactorDistance, Likelihood
 from torch_pbd.models.objectives import covariance_mse, gaussian_nll, train
-from torch_pbd.models.scoring import Cost, FactorDistance, Likelihood, Solver, train_by_scoring
+from torch_pbd.models.scoring import Solver, train_by_scoring
 from torch_pbd.models.training import empirical_tril
 from torch_pbd.models.wishart import WishartCovariance, WishartLink, padded, wishart_root
 from torch_pbd.optim import FitReport
