@@ -1,6 +1,5 @@
 """What the two regressors on latent Gaussian processes (CD and WP) share."""
 
-import os
 import warnings
 from abc import abstractmethod
 from dataclasses import dataclass
@@ -32,6 +31,7 @@ from torch_pbd.gp import (
 )
 from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky, scale_tril_from_root
+from torch_pbd.memory import require_memory
 from torch_pbd.models.conditional import MeanAndCovariance
 from torch_pbd.models.training import TrainingSet, pooled_tril
 from torch_pbd.optim import FitReport
@@ -101,8 +101,7 @@ class LatentCovarianceRegressor(CovarianceRegressor):
             mean, covariance, report, jitter = self._fit_empirical(problem)
         else:
             mean = self._fit_mean(training)
-            residual = training.y - mean(training.x).detach()
-            covariance, report, jitter = self._fit_likelihood(problem, residual)
+            covariance, report, jitter = self._fit_likelihood(problem, training.residual(mean))
         return Fitted(self._assemble(MeanAndCovariance(mean, covariance), scaling), report, jitter)
 
     @abstractmethod
@@ -188,14 +187,12 @@ class LatentCovarianceRegressor(CovarianceRegressor):
 
     def _check_memory(self, n_distinct: int, n_outputs: int) -> None:
         n_inputs = min(n_distinct, self.max_inputs)
-        n_together = min(32, (n_outputs + 1) ** 2) * (1 + self.n_restarts)
-        needed = 8.0 * n_inputs**2 * n_together * 6
-        available = 0.8 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-        if needed > available:
-            raise ValueError(
-                f"max_inputs == {self.max_inputs} lets {n_inputs} distinct inputs into kernel matrices that need "
-                f"{needed / 2**30:.1f} GiB; this machine has {available / 2**30:.1f} GiB to give. Lower max_inputs."
-            )
+        n_processes = (n_outputs + 1) ** 2  # at most
+        require_memory(
+            8.0 * n_inputs**2 * n_processes * 4,
+            what=f"max_inputs == {self.max_inputs} lets {n_inputs} distinct inputs into kernel matrices, which",
+            remedy="Lower max_inputs.",
+        )
 
 
 def residual_tril(residual: Tensor) -> Tensor:

@@ -165,7 +165,8 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
             def loss(deviation: Tensor, matrix: Tensor) -> Tensor:
                 return covariance_mse(wishart_root(deviation, prior_root, matrix), target)
 
-            return mean, *self._train(problem, prior_root, prior_root, loss, prior_weight=0.0, tol=1e-4 * self.tol)
+            cost = FactorDistance(WishartLink(prior_root), target) if self.latent_prior else loss
+            return mean, *self._train(problem, prior_root, prior_root, cost, prior_weight=0.0, tol=1e-4 * self.tol)
         inputs, matrix = problem.training.inputs, torch.eye(target.shape[-1]).to(target)
 
         def observed(root: Tensor) -> Observations:
@@ -207,8 +208,6 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         Else it is ``loss(deviations, L)``, and trained are the hyperparameters and L.
         """
         inputs, n_outputs = problem.training.inputs, prior_root.shape[-2]
-        if self.latent_prior and not isinstance(loss, Cost):  # eq. (9)
-            loss = FactorDistance(WishartLink(prior_root), empirical_tril(problem.training))
         # A free L would grow while the whitened values shrink, and so escape their prior.
         matrix = torch.eye(n_outputs).to(inputs).requires_grad_(not self.latent_prior)
         deviation = (start - prior_root).mT.flatten(-2).expand(len(inputs), -1).mT.contiguous()
