@@ -339,7 +339,7 @@ def test_22_a_callable_prior_is_held_to_it_when_it_predicts_too():
 
     model = fit(new("cholesky", prior=prior), *demonstrations())
     with pytest.raises(ValueError, match=r"prior\(X\) must be positive definite; .* at index 1"):
-        model.predict([[0.0], [3.0]])
+        model.predict_cov([[0.0], [3.0]])
 
 
 @pytest.mark.parametrize(
