@@ -14,6 +14,7 @@ from torch_pbd.control.realtime.steps import Floats, Vector, braked, softened
 from torch_pbd.control.realtime.table import ScheduleLike, ScheduleTable
 
 _FINE = TickStatus(0)
+_SHARED = "this controller is in a tick already: two threads share it. Give each its own."
 
 
 @final
@@ -132,6 +133,9 @@ class RealTimeAdmittance:
         self._soft_start = number("soft_start", soft_start, "s, or 0", zero=True)
         self._approach_speed = number("approach_speed", approach_speed, "units/s")
         self._table = ScheduleTable.of(schedule, self._mass, float(rate))
+        table = self._table
+        self._packed, self._row_size, self._unpack = table.packed, table.layout.size, table.layout.unpack_from
+        self._rate, self._end, self._advance = table.rate, table.last, table.advance
         self._turn = threading.Lock()
         self._bias: Vector = ()
         self._begin(math.nan, self._table.row(0)[: self._table.n_axes], (0.0,) * self._table.n_axes, 0.0)
@@ -175,7 +179,8 @@ class RealTimeAdmittance:
         if math.hypot(*moving) > self._speed_limit:
             raise ValueError(f"velocity={moving} is beyond velocity_limit={self._speed_limit}: slow the robot first.")
         bias = () if force_bias is None else vector("force_bias", force_bias, d)
-        self._take_turn()
+        if not self._turn.acquire(False):
+            raise RuntimeError(_SHARED)
         self._begin(float(now), here, moving, float(at))
         self._bias = bias
         self._turn.release()
@@ -202,7 +207,8 @@ class RealTimeAdmittance:
         RuntimeError
             If ``start`` was not called, or another thread is in a tick.
         """
-        self._take_turn()
+        if not self._turn.acquire(False):
+            raise RuntimeError(_SHARED)
         try:
             return self._tick(now, force)
         finally:
@@ -232,10 +238,6 @@ class RealTimeAdmittance:
     def schedule_time(self) -> float:  # noqa: D102
         return self._last - self._origin
 
-    def _take_turn(self) -> None:
-        if not self._turn.acquire(False):
-            raise RuntimeError("this controller is in a tick already: two threads share it. Give each its own.")
-
     def _begin(self, now: float, position: Vector, velocity: Vector, at: float) -> None:
         self.position, self.velocity = position, velocity
         self._last, self._begun, self._origin = now, now, now - at
@@ -253,7 +255,8 @@ class RealTimeAdmittance:
         try:
             if self._bias:
                 force = [float(component) - bias for component, bias in zip(force, self._bias, strict=True)]
-            now, push = float(now), tuple([float(component) / self._mass for component in force])
+            mass = self._mass
+            now, push = float(now), tuple([float(component) / mass for component in force])
         except (TypeError, ValueError, OverflowError):
             push = ()
         if len(push) != len(self.position):
@@ -298,12 +301,13 @@ class RealTimeAdmittance:
         return TickStatus.CLOCK
 
     def _move(self, step: float) -> TickStatus:
-        table, here = self._table, (self.position, self.velocity)
-        self._index = table.index_at(self._last - self._origin)
-        row = table.row(self._index)
+        here = (self.position, self.velocity)
+        index = int((self._last - self._origin) * self._rate + 0.5)  # index_at and row of the table, without calls
+        self._index = index = index if index < self._end else self._end
+        row = self._unpack(self._packed, index * self._row_size)
         if self._last < self._soft_end:
             row = softened(row, self._distance, (self._last - self._begun) / self._blend, self._blend)
-        position, velocity, self._scale = table.advance(row, self._push, *here, step, self._pull_limit)
+        position, velocity, self._scale = self._advance(row, self._push, *here, step, self._pull_limit)
         status = _FINE if self._scale == 1.0 else TickStatus.SPRING_LIMITED
         if self._is_limited:
             limits = self._speed_limit, self._acceleration_limit

@@ -37,12 +37,10 @@ def wall_seconds(program: str) -> float:
     return time.perf_counter() - start
 
 
-def cpu_seconds(program: str) -> float:
-    """CPU seconds that a fresh interpreter takes for a program."""
-    before = os.times()
-    _run(program)
-    after = os.times()
-    return after.children_user + after.children_system - before.children_user - before.children_system
+def added_seconds(before: str, then: str) -> float:
+    """CPU seconds that ``then`` takes in a fresh interpreter after ``before``."""
+    clock = "start = time.process_time()"
+    return float(_run(f"import time\n{before}\n{clock}\n{then}\nprint(time.process_time() - start)"))
 
 
 def _run(program: str) -> str:

@@ -84,8 +84,8 @@ def bare(controller: RealTimeAdmittance, block: Iterable[Tick], took: list[int])
 def eager(n_ticks: int, took: list[int], *, n_inputs: int = 200) -> None:
     """What a tick costs that asks torch: a step of the primitive, 5 means at one phase, eigenvectors, K and D.
 
-    Of the five Gaussian processes (200 inputs) two are the forcing and three the factor of the covariance. Without
-    gradients, weights and all that does not change made before.
+    Of the five Gaussian processes (200 inputs) two are the forcing and three the factor of the covariance; nothing asks
+    for a gradient, and weights and all that does not change are made before.
     """
     clock, inputs = time.thread_time_ns, torch.linspace(0.0, 1.0, n_inputs, dtype=torch.float64)
     weights = torch.randn(n_inputs, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) / n_inputs
@@ -93,20 +93,19 @@ def eager(n_ticks: int, took: list[int], *, n_inputs: int = 200) -> None:
     position, scaled, goal = torch.zeros(3, 2, dtype=torch.float64).unbind()
     phase = torch.ones((), dtype=torch.float64)
     alpha, beta, gamma, step = 25.0, 6.25, 0.7, 1.0 / RATE
-    with torch.inference_mode():
-        for _ in range(n_ticks):
-            before = clock()
-            mean = torch.exp(-0.5 * ((phase - inputs) / 0.1).square()) @ weights
-            scaled = scaled + step * (alpha * (beta * (goal - position) - scaled) + mean[:2])
-            position = position + step * scaled
-            phase = phase - step * gamma * phase
-            factor = torch.zeros(2, 2, dtype=torch.float64)
-            factor[row, column] = mean[2:]
-            variance, axes = torch.linalg.eigh(factor @ factor.mT)
-            values = (1000.0 - 1e4 * variance.clamp_min(0.0).sqrt()).clamp(50.0, 1000.0)
-            stiffness = axes * values @ axes.mT
-            damping = axes * (2.0 * (MASS * values).sqrt()) @ axes.mT
-            took.append(clock() - before)
+    for _ in range(n_ticks):
+        before = clock()
+        mean = torch.exp(-0.5 * ((phase - inputs) / 0.1).square()) @ weights
+        scaled = scaled + step * (alpha * (beta * (goal - position) - scaled) + mean[:2])
+        position = position + step * scaled
+        phase = phase - step * gamma * phase
+        factor = torch.zeros(2, 2, dtype=torch.float64)
+        factor[row, column] = mean[2:]
+        variance, axes = torch.linalg.eigh(factor @ factor.mT)
+        values = (1000.0 - 1e4 * variance.clamp_min(0.0).sqrt()).clamp(50.0, 1000.0)
+        stiffness = axes * values @ axes.mT
+        damping = axes * (2.0 * (MASS * values).sqrt()) @ axes.mT
+        took.append(clock() - before)
     assert bool(torch.isfinite(stiffness).all() and torch.isfinite(damping).all())
 
 
@@ -123,6 +122,15 @@ def blocks(n_blocks: int, n_ticks: int, *, n_eager: int) -> dict[str, list[int]]
         eager(n_eager, took["eager"])
         ways.reverse()
     return took
+
+
+def clock_cost(n_readings: int = 20_000) -> float:
+    """Nanoseconds that one reading of the clock adds to each of these times."""
+    clock, took = time.thread_time_ns, []
+    for _ in range(n_readings):
+        before = clock()
+        took.append(clock() - before)
+    return float(np.median(took))
 
 
 def memory_kept(n_ticks: int) -> int:
