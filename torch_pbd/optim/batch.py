@@ -4,10 +4,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 from torch import Tensor
 
-_LONGEST_STEP = 1e3  # in steps of L-BFGS
+_LONGEST_STEP = 1e3  # in steps of BFGS
+
+Objective = Callable[[Tensor, Tensor], Tensor]
+ObjectiveWithGradient = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 @dataclass(frozen=True)
@@ -18,31 +21,66 @@ class BatchReport:
     n_iter: int
     converged: bool
     """All of them."""
+    inverse_hessian: Float[Tensor, "b p p"]
+    """At the ends, as far as the steps told."""
 
 
 def minimize_batch(
-    objective: Callable[[Float[Tensor, "a p"], Int64[Tensor, " a"]], Float[Tensor, " a"]],
+    objective: Objective,
     start: Float[Tensor, "b p"],
     *,
     max_iter: int = 100,
     tol: float = 1e-6,
-    history_size: int = 10,
 ) -> tuple[Float[Tensor, "b p"], BatchReport]:
-    """Minimize b unrelated objectives of p parameters by L-BFGS, their evaluations in one batch.
+    """Minimize b unrelated objectives of p parameters by BFGS, their evaluations in one batch.
 
-    Each problem has its own curvature pairs, its own step and its own end: a joint L-BFGS over all of them
-    would share one line search and one memory between problems that have nothing to do with each other.
+    As :func:`minimize_batch_with_gradient`, by autograd.
+
+    Parameters
+    ----------
+    objective : callable
+        Given parameters of a problems and their indices in the batch, returns their a losses.
+    """
+
+    def with_gradient(x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+        with torch.enable_grad():
+            leaf = x.requires_grad_()
+            loss = objective(leaf, rows)
+            (gradient,) = torch.autograd.grad(loss.sum(), leaf)
+        return loss.detach(), gradient
+
+    return minimize_batch_with_gradient(with_gradient, start, max_iter=max_iter, tol=tol)
+
+
+@torch.no_grad()
+def minimize_batch_with_gradient(
+    objective: ObjectiveWithGradient,
+    start: Float[Tensor, "b p"],
+    *,
+    max_iter: int = 100,
+    tol: float = 1e-6,
+    inverse_hessian: Float[Tensor, "b p p"] | None = None,
+) -> tuple[Float[Tensor, "b p"], BatchReport]:
+    """Minimize b unrelated objectives of p parameters by BFGS, their evaluations in one batch.
+
+    Each problem has its own inverse Hessian, its own step and its own end: a joint BFGS over all of them would
+    share one line search and one curvature between problems that have nothing to do with each other. The
+    matrices are p by p each, which is meant for few parameters.
     Steps are accepted by the Armijo rule, so the loss never rises; a value that is not finite counts as
     too far. Where the slope along a step has hardly changed, the next step starts four times as long.
 
     Parameters
     ----------
     objective : callable
-        Given parameters of a problems and their indices in the batch, returns their a losses.
+        Given parameters of a problems (a, p) and their indices in the batch (a,), returns their losses (a,) and
+        gradients (a, p).
     start : Tensor of shape (b, p)
         Where to start. A problem whose loss there is not finite stays there.
-    max_iter, tol, history_size
+    max_iter, tol
         As in :func:`minimize`.
+    inverse_hessian : Tensor of shape (b, p, p), default=None
+        At the start, positive definite. With it a problem ends where Newton's step promises no more
+        than a hundredth of ``tol``, instead of where a step has gained that share of the loss.
 
     Returns
     -------
@@ -51,72 +89,62 @@ def minimize_batch(
     """
     x = start.detach().clone()
     rows = torch.arange(len(x), device=x.device)
-    loss, gradient = _value_and_gradient(objective, x, rows)
-    memory = _CurvatureMemory(history_size)
+    loss, gradient = objective(x.clone(), rows)
+    known = inverse_hessian is not None
+    curvature = torch.eye(x.shape[1]).to(x).repeat(len(x), 1, 1) if inverse_hessian is None else inverse_hessian
+    direction, slope = _newton(curvature, gradient)
     active = torch.isfinite(loss) & torch.isfinite(gradient).all(-1) & (gradient.abs().amax(-1) > tol)
-    first_step = 1.0 / gradient.norm(dim=-1).clamp_min(1.0)
+    active = active & (slope < -2e-2 * tol) if known else active
+    first_step = 1.0 / direction.norm(dim=-1).clamp_min(1.0)
     n_iter = 0
     while n_iter < max_iter and bool(active.any()):
         n_iter += 1
-        direction = memory.direction(gradient)
-        slope = (direction * gradient).sum(-1)
         uphill = ~(slope < 0)
-        direction = torch.where(uphill[:, None], -gradient, direction)
-        slope = torch.where(uphill, -gradient.square().sum(-1), slope)
+        if bool(uphill.any()):
+            direction = torch.where(uphill[:, None], -gradient, direction)
+            slope = torch.where(uphill, -gradient.square().sum(-1), slope)
         new_x, new_loss, new_gradient = _backtrack(objective, x, loss, gradient, direction, slope, first_step, active)
-        memory.add(new_x - x, new_gradient - gradient)
-        still_steep = (direction * new_gradient).sum(-1) < 0.9 * slope
-        short = active & still_steep & (new_loss < loss) & (first_step < _LONGEST_STEP)
-        first_step = torch.where(short & (n_iter > 1), 4.0 * first_step, torch.ones_like(first_step))
+        curvature = _updated(curvature, new_x - x, new_gradient - gradient, scaled=n_iter == 1 and not known)
         gain = loss - new_loss
+        still_steep = (direction * new_gradient).sum(-1) < 0.9 * slope
+        short = active & still_steep & (gain > 0) & (first_step < _LONGEST_STEP)
+        first_step = torch.where(short & (n_iter > 1), 4.0 * first_step, 1.0)
         x, loss, gradient = new_x, new_loss, new_gradient
-        settled = (gain <= tol * 1e-2 * loss.abs().clamp_min(1.0)) & ~short
+        direction, slope = _newton(curvature, gradient)
+        stalled = (gain <= tol * 1e-2 * loss.abs().clamp_min(1.0)) & ~short
+        settled = (slope >= -2e-2 * tol) | (gain <= 1e-14 * loss.abs()) if known else stalled
         active = active & (gradient.abs().amax(-1) > tol) & ~settled
-    return x, BatchReport(loss, n_iter, not bool(active.any()))
+    return x, BatchReport(loss, n_iter, not bool(active.any()), curvature)
 
 
-class _CurvatureMemory:
-    """Pairs of steps and gradient changes, for each problem of a batch; the two-loop recursion on them."""
-
-    def __init__(self, size: int) -> None:
-        self._size = size
-        self._pairs: list[tuple[Tensor, Tensor, Tensor]] = []
-
-    def add(self, step: Tensor, change: Tensor) -> None:
-        curvature = (step * change).sum(-1)
-        usable = curvature > 1e-10 * step.norm(dim=-1) * change.norm(dim=-1)
-        inverse = torch.where(usable, 1.0 / curvature.where(usable, torch.ones_like(curvature)), 0.0)
-        self._pairs = [*self._pairs, (step, change, inverse)][-self._size :]
-
-    def direction(self, gradient: Tensor) -> Tensor:
-        vector = -gradient
-        scale = torch.ones_like(gradient[:, 0])
-        projections = []
-        for step, change, inverse in reversed(self._pairs):
-            projection = inverse * (step * vector).sum(-1)
-            vector = vector - projection[:, None] * change
-            projections.append(projection)
-        for step, change, inverse in self._pairs:
-            fitted = (step * change).sum(-1) / change.square().sum(-1).clamp_min(1e-300)
-            scale = torch.where(inverse > 0, fitted, scale)
-        vector = scale[:, None] * vector
-        for (step, change, inverse), projection in zip(self._pairs, reversed(projections), strict=True):
-            vector = vector + (projection - inverse * (change * vector).sum(-1))[:, None] * step
-        return vector
+def _newton(inverse_hessian: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
+    """Newton's step, and the slope along it: minus twice what it promises."""
+    direction = -(inverse_hessian @ gradient.unsqueeze(-1)).squeeze(-1)
+    return direction, (direction * gradient).sum(-1)
 
 
-def _value_and_gradient(
-    objective: Callable[[Tensor, Tensor], Tensor], x: Tensor, rows: Tensor
-) -> tuple[Tensor, Tensor]:
-    with torch.enable_grad():
-        leaf = x.detach().requires_grad_()
-        loss = objective(leaf, rows)
-        (gradient,) = torch.autograd.grad(loss.sum(), leaf)
-    return loss.detach(), gradient
+def _updated(
+    inverse_hessian: Float[Tensor, "b p p"], step: Float[Tensor, "b p"], change: Float[Tensor, "b p"], *, scaled: bool
+) -> Float[Tensor, "b p p"]:
+    """Inverse Hessians that map the changes of the gradients to the steps (Nocedal and Wright, eq. (6.17)).
+
+    Those of the start are ``scaled`` to the curvature along the first step (their eq. (6.20)).
+    """
+    curvature = (step * change).sum(-1)
+    length = change.norm(dim=-1)
+    usable = curvature > 1e-10 * step.norm(dim=-1) * length
+    curvature = curvature.where(usable, 1.0)
+    if scaled:
+        scale = torch.where(usable, curvature / length.square().where(usable, 1.0), 1.0)
+        inverse_hessian = scale[:, None, None] * inverse_hessian
+    mapped = (inverse_hessian @ change.unsqueeze(-1)).squeeze(-1)
+    along = (1.0 + (change * mapped).sum(-1) / curvature)[:, None] * step - mapped
+    correction = along.unsqueeze(2) * step.unsqueeze(1) - step.unsqueeze(2) * mapped.unsqueeze(1)
+    return inverse_hessian + (usable / curvature)[:, None, None] * correction
 
 
 def _backtrack(
-    objective: Callable[[Tensor, Tensor], Tensor],
+    objective: ObjectiveWithGradient,
     x: Tensor,
     loss: Tensor,
     gradient: Tensor,
@@ -129,21 +157,18 @@ def _backtrack(
     new_x, new_loss, new_gradient = x.clone(), loss.clone(), gradient.clone()
     rows = active.nonzero().squeeze(-1)
     for _ in range(25):
-        if len(rows) == 0:
-            break
-        trial = x[rows] + step[rows, None] * direction[rows]
-        value, trial_gradient = _value_and_gradient(objective, trial, rows)
+        share = step[rows]
+        trial = x[rows] + share[:, None] * direction[rows]
+        value, trial_gradient = objective(trial.clone(), rows)
         finite = torch.isfinite(value) & torch.isfinite(trial_gradient).all(-1)
-        accepted = finite & (value <= loss[rows] + 1e-4 * step[rows] * slope[rows])
+        accepted = finite & (value <= loss[rows] + 1e-4 * share * slope[rows])
         done = rows[accepted]
-        new_x[done], new_loss[done], new_gradient[done] = (
-            trial[accepted],
-            value[accepted],
-            trial_gradient[accepted],
-        )
+        new_x[done], new_loss[done], new_gradient[done] = trial[accepted], value[accepted], trial_gradient[accepted]
+        if len(done) == len(rows):
+            break
         # The minimum of the parabola through both values and the slope, kept within a tenth and a half.
-        parabola = -0.5 * step[rows] * slope[rows] / ((value - loss[rows]) / step[rows] - slope[rows])
-        shorter = torch.where(finite, parabola, 0.1 * step[rows])
-        step = step.index_copy(0, rows, shorter.clamp(0.1 * step[rows], 0.5 * step[rows]))
+        parabola = -0.5 * share * slope[rows] / ((value - loss[rows]) / share - slope[rows])
+        shorter = torch.where(finite, parabola, 0.1 * share).clamp(0.1 * share, 0.5 * share)
+        step = step.index_copy(0, rows, shorter)
         rows = rows[~accepted]
     return new_x, new_loss, new_gradient
