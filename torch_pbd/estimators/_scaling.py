@@ -51,5 +51,10 @@ class Standardization:
 
 def distinct_rows(X: Floats) -> tuple[Floats, NDArray[np.intp]]:
     """Distinct rows of X in lexicographic order, and the index of each row's own among them."""
-    inputs, index = np.unique(X + 0.0, axis=0, return_inverse=True)  # + 0.0: minus zero is zero
-    return inputs, index.reshape(-1)
+    X = X + 0.0  # minus zero is zero
+    order = np.lexsort(X.T[::-1])
+    ordered = X[order]
+    first = np.concatenate([[True], (ordered[1:] != ordered[:-1]).any(axis=1)])
+    index = np.empty(len(X), dtype=np.intp)
+    index[order] = first.cumsum() - 1
+    return ordered[first], index
