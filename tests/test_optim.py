@@ -79,7 +79,7 @@ def test_a_batch_finds_what_each_problem_alone_finds(generator):
     def objective(x, rows):
         return rosenbrock(x - target[rows] + 1.0)
 
-    found, report = minimize_batch(by_autograd(objective), start, max_iter=300, tol=1e-9)
+    found, report = minimize_batch(by_autograd(objective), start, max_iter=300, tol=1e-11)
     assert report.converged
     torch.testing.assert_close(found, target, rtol=1e-6, atol=1e-6)
 
@@ -188,3 +188,56 @@ def test_scoring_tells_that_it_stopped_early():
     _, report = minimize_scoring(loss, newton, torch.tensor([-1.2, 1.0], dtype=torch.float64), max_iter=1)
     assert not report.converged
     assert "max_iter=1" in report.message
+
+
+def quadratics(generator):
+    """Five problems with their Hessians and minima, and what returns losses and gradients."""
+    root = torch.randn(5, 3, 3, dtype=torch.float64, generator=generator)
+    hessian = root @ root.mT + 0.1 * torch.eye(3, dtype=torch.float64)
+    minimum = torch.randn(5, 3, dtype=torch.float64, generator=generator)
+
+    def objective(x, rows):
+        pulled = (hessian[rows] @ (x - minimum[rows]).unsqueeze(-1)).squeeze(-1)
+        return 0.5 * ((x - minimum[rows]) * pulled).sum(-1), pulled
+
+    return hessian, minimum, objective
+
+
+def test_a_batch_with_gradients_goes_the_way_of_autograd(generator):
+    _, minimum, objective = quadratics(generator)
+    start = torch.zeros(5, 3, dtype=torch.float64)
+    given, report = minimize_batch(objective, start, tol=1e-9)
+    found, other = minimize_batch(by_autograd(lambda x, rows: objective(x, rows)[0]), start, tol=1e-9)
+    torch.testing.assert_close(given, found, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(given, minimum, rtol=1e-6, atol=1e-6)
+    assert report.n_iter == other.n_iter
+    assert torch.equal(start, torch.zeros_like(start))
+
+
+def test_the_inverse_hessian_maps_the_last_change_of_the_gradient_to_the_last_step(generator):
+    """The secant equation, by which BFGS is defined; and it stays symmetric and positive definite."""
+    _, _, objective = quadratics(generator)
+    start = torch.zeros(5, 3, dtype=torch.float64)
+    rough = torch.eye(3, dtype=torch.float64).repeat(5, 1, 1)
+    before, after = (minimize_batch(objective, start, tol=1e-12, max_iter=k, inverse_hessian=rough) for k in (3, 4))
+    assert (before[0] - after[0]).abs().amax(1).min() > 1e-9
+    every = torch.arange(5)
+    change = objective(after[0], every)[1] - objective(before[0], every)[1]
+    inverse = after[1].inverse_hessian
+    step = (inverse @ change.unsqueeze(-1)).squeeze(-1)
+    torch.testing.assert_close(step, after[0] - before[0], rtol=1e-6, atol=1e-9)
+    torch.testing.assert_close(inverse, inverse.mT, rtol=1e-9, atol=1e-12)
+    assert (torch.linalg.eigvalsh(inverse) > 0).all()
+
+
+def test_with_its_inverse_hessian_a_quadratic_takes_newtons_step_and_at_the_end_none(generator):
+    hessian, minimum, objective = quadratics(generator)
+    inverse = torch.linalg.inv(hessian)
+    near = minimum + 0.3  # the first step is at most of length one
+    found, report = minimize_batch(objective, near, tol=1e-9, inverse_hessian=inverse)
+    assert report.n_iter == 1
+    torch.testing.assert_close(found, minimum, rtol=1e-9, atol=1e-9)
+    close = minimum + 1e-5
+    found, report = minimize_batch(objective, close, tol=1e-6, inverse_hessian=inverse)
+    assert (report.n_iter, report.converged) == (0, True)
+    assert torch.equal(found, close)

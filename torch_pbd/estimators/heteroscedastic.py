@@ -42,6 +42,8 @@ _MEAN = (0.3, 1.2, 0.0)
 _LOG_VARIANCE = (0.5, 1.0, 2.0)
 _COEFFICIENT = (0.5, 0.3, 1.0)
 
+_DRAWN = 65536  # matrices drawn at a time: memory stays bounded
+
 # Inducing inputs by default, for one column of X and for several, and where these do not resolve what is learned;
 # and at most of all outputs together, for the mean and for the covariance.
 _N_INDUCING, _N_INDUCING_SEVERAL, _N_INDUCING_MOST, _N_TOGETHER = 48, 128, 128, (800, 400)
@@ -81,9 +83,9 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         Where X has more distinct rows, neighbours are merged into this many; into fewer where samples of a
         demonstration turn out correlated, so that each input has rows of about all demonstrations.
     max_iter : int, default=100
-        Largest number of L-BFGS iterations of a search for hyperparameters.
+        Largest number of BFGS iterations of a search for hyperparameters.
     tol : float, default=1e-3
-        Stop such a search when no gradient entry is above it, in nats.
+        Stop such a search when no gradient entry is above it, or a step promises less than a hundredth of it, in nats.
     n_restarts : int, default=0
         Starts of the first searches beside the best of a small grid.
     random_state : int, RandomState instance or None, default=0
@@ -113,8 +115,9 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
     Notes
     -----
     Rows that repeat an input enter as count, mean and scatter: after that the cost of a fit is in the number n
-    of distinct inputs (at most ``max_inputs``), inducing inputs m and outputs d: n d m^2 + d (d m)^2 n + d (d m)^3
-    for each evaluation of the evidence.
+    of distinct inputs (at most ``max_inputs``), outputs d, and inducing inputs m, of which smooth processes take only
+    the r that carry something: n d r^2 + n (d r)^2 + d (d r)^3 for each evaluation of the evidence, and once a turn
+    the same with m.
 
     With ``groups`` the correlation of a demonstration's residuals is estimated and enters the likelihood:
     neighbouring samples of a smooth demonstration are nearly copies. It is taken for exponential, whatever
@@ -236,12 +239,15 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         generator = check_random_state(random_state)
         x = self._query(X)
         core: Any = self.module_.core
-        draws, prior_tril = [], self._prior_tril_at(x)
+        normal = [[self._door(generator.standard_normal(size)) for size in core.draw_sizes()] for _ in range(n_samples)]
+        drawn = [torch.stack(of_process) for of_process in zip(*normal, strict=True)]
+        result = np.empty((len(x), self.n_outputs_, self.n_outputs_, n_samples))
         with torch.inference_mode():
-            for _ in range(n_samples):
-                normal = [self._door(generator.standard_normal(size)) for size in core.draw_sizes()]
-                draws.append(self.module_.draw_covariance(x, normal, *prior_tril).cpu().numpy())
-        return np.stack(draws, axis=-1)
+            for rows in torch.arange(len(x)).split(max(1, _DRAWN // n_samples)):
+                chunk = x[rows]
+                draws = self.module_.draw_covariance(chunk, drawn, *self._prior_tril_at(chunk))
+                result[rows.numpy()] = draws.permute(1, 2, 3, 0).cpu().numpy()
+        return result
 
     def _check_parameters(self) -> None:
         super()._check_parameters()
@@ -272,7 +278,8 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         held = None if length_scale is None else self._door(length_scale / scaling.x_scale)
         group = None if groups is None else self._door(groups).long()
         options = SearchOptions(self.max_iter, self.tol, self.n_restarts, self._progress())
-        for sizes in dict.fromkeys(self._n_inducing(X.shape[1], y.shape[1])):
+        *tried, last = dict.fromkeys(self._n_inducing(X.shape[1], y.shape[1]))
+        for sizes in (*tried, last):
             chosen = [inducing_inputs(training.inputs, size) for size in sizes]
             of_mean, features = (FeatureMap(z, kernel, circle, len(z) == len(inputs)) for z in chosen)
             families = Families(
@@ -280,9 +287,10 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
                 ProcessFamily(features, *_LOG_VARIANCE, held, self.shared_length_scale),
                 ProcessFamily(features, *_COEFFICIENT, held),
             )
-            fit = fit_heteroscedastic(training, group, families, options)
-            if fit.resolved:
+            fit = fit_heteroscedastic(training, group, families, options, needs_resolution=sizes != last)
+            if fit is not None:
                 break
+        assert fit is not None
         _warn_if_unresolved(held, features)
         self.effective_share_ = 1.0 if fit.correlation is None else float(fit.correlation.share.mean())
         module = HeteroscedasticModel(fit, prior_tril)

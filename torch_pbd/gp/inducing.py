@@ -1,9 +1,11 @@
 """Gaussian processes of low rank: weights of standard normal numbers on features of inducing inputs."""
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from torch_pbd.gp.neighbourhoods import neighbourhoods, spacing
@@ -35,23 +37,71 @@ class FeatureMap:
 
     def __call__(self, x: Float[Tensor, "n e"], length_scale: Float[Tensor, "*b e"]) -> Float[Tensor, "*b n m"]:
         """Features at x: their inner products are the kernel, wherever the inducing inputs resolve it."""
+        return self.prepared(length_scale)(x)
+
+    def prepared(self, length_scale: Float[Tensor, "*b e"]) -> "PreparedFeatures":
+        """Features for these length scales, at any inputs."""
         gram = correlation(self.inducing, self.inducing, length_scale, self.kernel, self.period)
         gram = gram + JITTER * torch.eye(len(self.inducing)).to(gram)
         factor = safe_cholesky(gram, name="the kernel matrix of the inducing inputs")
-        cross = correlation(self.inducing, x, length_scale, self.kernel, self.period)
-        return torch.linalg.solve_triangular(factor, cross, upper=False).mT
+        return PreparedFeatures(self, length_scale, factor)
 
     @property
     def jitter(self) -> float:
         """Added to the diagonal of the kernel matrix, which is one."""
         return JITTER
 
+    def square_differences(self, x: Float[Tensor, "n e"], other: Float[Tensor, "m e"]) -> Float[Tensor, "e n m"]:
+        """Squares of the differences in each dimension; along a circle of the chords."""
+        difference = x.mT.unsqueeze(2) - other.mT.unsqueeze(1)
+        if self.period is not None:
+            radius = self.period[:, None, None] / math.pi
+            difference = torch.where(radius.isfinite(), radius * torch.sin(difference / radius), difference)
+        return difference.square()
+
+    @cached_property
+    def farthest_first(self) -> Int64[Tensor, " m"]:
+        """Order of the inducing inputs in which each is the farthest from those before it, begun at the middle."""
+        distance = self.square_differences(self.inducing, self.inducing).sum(0)
+        number = int(distance.sum(0).argmin())
+        nearest = torch.full_like(distance[0], math.inf)
+        order = []
+        for _ in range(len(distance)):
+            order.append(number)
+            nearest = torch.minimum(nearest, distance[number])
+            nearest[number] = -1.0
+            number = int(nearest.argmax())
+        return torch.tensor(order, device=distance.device)
+
     def shortest_length_scale(self) -> float:
         """Length scale below which the inducing inputs no longer resolve what is between them."""
+        return self._shortest
+
+    @cached_property
+    def _shortest(self) -> float:
         if len(self.inducing) < 2:
             return _SHORTEST
         share = _EXACT_RESOLUTION if self.exact else _RESOLUTION
         return max(_SHORTEST, min(0.5, share * spacing(self.inducing)))
+
+
+@dataclass(frozen=True)
+class PreparedFeatures:
+    """Features whose length scales are known, with what does not depend on the inputs computed."""
+
+    features: FeatureMap
+    length_scale: Float[Tensor, "*b e"]
+    factor: Float[Tensor, "*b m m"]
+    """Lower, of the kernel matrix of the inducing inputs."""
+
+    def __call__(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "*b n m"]:
+        """Features at x."""
+        return torch.linalg.solve_triangular(self.factor, self.cross(x).mT, upper=False).mT
+
+    def cross(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "*b n m"]:
+        """Kernel between x and the inducing inputs."""
+        features = self.features
+        return correlation(x, features.inducing, self.length_scale, features.kernel, features.period)
 
 
 def inducing_inputs(inputs: Float[Tensor, "n e"], n_inducing: int) -> Float[Tensor, "m e"]:

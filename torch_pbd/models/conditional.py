@@ -119,10 +119,10 @@ class ConditionalNormal(nn.Module):
     def draw_covariance(
         self,
         x: Float[Tensor, "n e"],
-        normal: list[Tensor],
+        normal: list[Float[Tensor, "*s _"]],
         prior_scale_tril: Float[Tensor, "n d d"] | None = None,
-    ) -> Float[Tensor, "n d d"]:
-        """One posterior draw of the covariance function at x, made of standard normal numbers."""
+    ) -> Float[Tensor, "*s n d d"]:
+        """Posterior draws of the covariance function at x, each made of standard normal numbers."""
         if not isinstance(self.core, HeteroscedasticModel):
             raise TypeError("only the heteroscedastic model knows the posterior of its covariance")
         prior = None if prior_scale_tril is None else prior_scale_tril / self.y_scale[:, None]

@@ -73,8 +73,8 @@ def minimize_batch(
     max_iter : int, default=100
         Largest number of iterations.
     tol : float, default=1e-6
-        A problem ends when its gradient, summed over its absolute entries, is below it, or when its last step
-        gained and its next promises less than a hundredth of it.
+        A problem ends when its gradient, summed over its absolute entries, is below it, when its next step promises
+        less than a hundredth of it, or when no step gained anything.
     inverse_hessian : Tensor of shape (b, p, p), default=None
         At the start, positive definite. None finds it by differences of the gradient, in one batch too, with the
         absolute values of the Hessian's eigenvalues.
@@ -155,7 +155,7 @@ def _advance(
     gain = at.loss - loss
     short = ~convex & (gain > 0) & (at.step < _LONGEST_STEP) & (not first)
     new = _Problems.at(at.rows, x, loss, gradient, inverse, torch.where(short, 4.0 * at.step, 1.0))
-    settled = (gain.maximum(new.promise) <= _enough(loss, tol)) & ~short
+    settled = ((new.promise <= _enough(loss, tol)) | (gain <= 0.0)) & ~short
     return new, settled | (gradient.abs().sum(-1) <= tol)
 
 

@@ -8,9 +8,15 @@ from scipy.stats import chi2, lognorm, multivariate_normal
 from torch.distributions import MultivariateNormal, kl_divergence
 
 from torch_pbd.models.heteroscedastic.correlation import NoiseCorrelation
-from torch_pbd.models.heteroscedastic.log_variance import Squares, fit_log_variance
+from torch_pbd.models.heteroscedastic.log_variance import Squares
+from torch_pbd.models.heteroscedastic.log_variance import fit_log_variance as fit
 
 INDEPENDENT = NoiseCorrelation()
+
+
+def fit_log_variance(squares, features):
+    found = fit(squares, features)
+    return found.weights, found.evidence
 
 
 def squares_at(n, rng, degrees=None, outputs=2, noise=INDEPENDENT):
@@ -58,13 +64,38 @@ def test_the_posterior_mean_maximizes_the_lower_bound(scale, family, inputs, rng
     torch.testing.assert_close(gradient, torch.zeros_like(gradient), rtol=0, atol=1e-5)
 
 
-def test_gradient_of_the_evidence_in_the_hyperparameters(family, inputs, rng):
-    """The mean is solved for without a graph: at the maximum its derivative does not enter (the envelope)."""
-    squares = squares_at(9, rng)
-    theta = torch.tensor([[-1.0, 0.3], [-0.4, -0.6]], dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda theta: fit_log_variance(squares, family.design(inputs, theta))[1], theta)
-    features = family.design(inputs, theta.detach()).requires_grad_()
-    assert torch.autograd.gradcheck(lambda features: fit_log_variance(squares, features)[1], features, atol=1e-4)
+class Evidence(torch.autograd.Function):
+    """The evidence with its closed-form gradient, for gradcheck."""
+
+    @staticmethod
+    def forward(ctx, features, squares):
+        found = fit(squares, features.detach())
+        ctx.save_for_backward(found.gradient())
+        return found.evidence
+
+    @staticmethod
+    def backward(ctx, upstream):
+        return upstream[:, None, None] * ctx.saved_tensors[0], None
+
+
+@pytest.mark.parametrize("correlated", [False, True])
+def test_gradient_of_the_evidence(correlated, family, inputs, rng):
+    """The mean is at its maximum: its derivative does not enter (the envelope)."""
+    copies = torch.tensor(rng.uniform(1.0, 3.0, size=(2, 9)))
+    whitener = torch.tensor(np.tril(rng.normal(size=(2, 9, 9)), -1) + np.eye(9))
+    squares = squares_at(9, rng, noise=NoiseCorrelation(None, whitener, copies) if correlated else INDEPENDENT)
+    theta = torch.tensor([[-1.0, 0.3], [-0.4, -0.6]], dtype=torch.float64)
+    features = family.design(inputs, theta).requires_grad_()
+    assert torch.autograd.gradcheck(lambda features: Evidence.apply(features, squares), features, atol=1e-4)
+
+
+@pytest.mark.parametrize("start", [-30.0, 0.0, 30.0])
+def test_the_posterior_does_not_depend_on_where_it_starts(start, family, inputs, rng):
+    squares = squares_at(9, rng, degrees=1.0)
+    features = family.design(inputs, torch.tensor([[-1.0, 0.5]] * 2, dtype=torch.float64))
+    expected, found = fit(squares, features), fit(squares, features, torch.full((2, 9), start).double())
+    torch.testing.assert_close(found.location, expected.location, rtol=0, atol=1e-7)
+    torch.testing.assert_close(found.evidence, expected.evidence, rtol=1e-12, atol=1e-12)
 
 
 def exact_posterior(features, total, degrees):

@@ -7,6 +7,11 @@ from torch_pbd.gp.inducing import FeatureMap
 from torch_pbd.kernels import correlation
 from torch_pbd.models.heteroscedastic import ProcessFamily, SearchOptions
 from torch_pbd.models.heteroscedastic.mean import fit_mean
+from torch_pbd.models.heteroscedastic.search import Search
+
+
+def search_of(family, d):
+    return Search(family, d, 1, SearchOptions())
 
 
 def prior_gram(family, theta, x, other):
@@ -29,8 +34,8 @@ def test_the_mean_is_a_dense_regression_of_all_outputs_under_their_noise(d, whit
     roots = block_diag(*(tril / np.sqrt(counts)[:, np.newaxis, np.newaxis]))
     noise = roots @ np.kron(along, np.eye(d)) @ roots.T
     means = np.sin(3.0 * inputs.numpy() + np.arange(d)) + 0.3 * rng.normal(size=(n, d))
-    arguments = (inputs, torch.tensor(means), torch.tensor(counts), torch.tensor(tril), whitener, None)
-    found = fit_mean(family, *arguments, SearchOptions())
+    arguments = (inputs, torch.tensor(means), torch.tensor(counts), torch.tensor(tril), whitener)
+    found = fit_mean(search_of(family, d), *arguments)
     order = np.arange(n * d).reshape(d, n).T.ravel()  # input by input instead of output by output
     x = torch.tensor(rng.uniform(-0.8, 0.8, size=(5, 1)))
     theta = found.theta.detach()
@@ -49,7 +54,7 @@ def test_away_from_the_inducing_inputs_the_error_is_the_whole_prior_variance(inp
     family = ProcessFamily(FeatureMap(inputs[::3]), 0.3, 1.2, 0.0)
     tril = 0.1 * torch.eye(2, dtype=torch.float64).expand(9, 2, 2)
     means = torch.cat([torch.sin(4.0 * inputs), torch.cos(9.0 * inputs)], dim=1)
-    found = fit_mean(family, inputs, means, torch.full((9,), 4.0).double(), tril, None, None, SearchOptions())
+    found = fit_mean(search_of(family, 2), inputs, means, torch.full((9,), 4.0).double(), tril, None)
     mean, error = found.at(torch.tensor([[50.0]], dtype=torch.float64))
     assert torch.equal(mean, torch.zeros(1, 2).double())
     torch.testing.assert_close(error[0], torch.diag(family.amplitude_of(found.theta).square()), rtol=1e-12, atol=0)
@@ -60,7 +65,7 @@ def test_hyperparameters_of_an_output_do_not_depend_on_the_others(inputs, rng):
     means = torch.tensor(np.sin(3.0 * inputs.numpy() + np.arange(2)) + 0.1 * rng.normal(size=(9, 2)))
     tril = 0.2 * torch.eye(2, dtype=torch.float64).expand(9, 2, 2)
     counts = torch.ones(9, dtype=torch.float64)
-    both = fit_mean(family, inputs, means, counts, tril, None, None, SearchOptions())
+    both = fit_mean(search_of(family, 2), inputs, means, counts, tril, None)
     for i in (0, 1):
-        alone = fit_mean(family, inputs, means[:, [i]], counts, tril[:, :1, :1], None, None, SearchOptions())
+        alone = fit_mean(search_of(family, 1), inputs, means[:, [i]], counts, tril[:, :1, :1], None)
         torch.testing.assert_close(alone.theta[0], both.theta[i], rtol=0, atol=1e-6)

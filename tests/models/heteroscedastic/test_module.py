@@ -1,4 +1,6 @@
+import copy
 import json
+import pickle
 
 import numpy as np
 import pytest
@@ -140,3 +142,65 @@ def test_a_draw_is_a_root_of_the_same_function_at_all_inputs(model):
     torch.testing.assert_close(model.draw(x[2:4], normal), whole[2:4], rtol=1e-9, atol=1e-9)
     covariance = whole[-1] @ whole[-1].mT
     torch.testing.assert_close(covariance, PRIOR**2 * torch.eye(2).double(), rtol=1e-12, atol=1e-14)
+
+
+def everything(model, x):
+    normal = [torch.full((size,), 0.3, dtype=torch.float64) for size in model.draw_sizes()]
+    return (*model(x), model.variability(x), model.degrees(x), model.type1(x), model.draw(x, normal))
+
+
+def test_several_draws_are_those_asked_for_one_by_one(model, generator):
+    normal = [torch.randn(3, size, dtype=torch.float64, generator=generator) for size in model.draw_sizes()]
+    together = model.draw(queries(), normal)
+    for k in range(3):
+        torch.testing.assert_close(
+            together[k], model.draw(queries(), [part[k] for part in normal]), rtol=1e-9, atol=1e-12
+        )
+
+
+def change_in_place(model):
+    model.log_variance_theta += 0.1
+
+
+def put_another(model):
+    model.log_variance_theta = model.log_variance_theta + 0.1
+
+
+def load(model):
+    state = {name: tensor.clone() for name, tensor in model.state_dict().items()}
+    state["log_variance_theta"] += 0.1
+    model.load_state_dict(state)
+
+
+@pytest.mark.parametrize("change", [change_in_place, put_another, load])
+@pytest.mark.parametrize("inference", [False, True])
+def test_a_buffer_that_changes_changes_what_is_predicted(change, inference):
+    """What was computed of the old one is not kept."""
+    model, x = fitted(), queries()
+    with torch.inference_mode(inference):
+        before = model(x)[1]
+    change(model)
+    anew = HeteroscedasticModel.restored(model.spec(), dict(model.state_dict()))
+    for mine, others in zip(everything(model, x), everything(anew, x), strict=True):
+        assert torch.equal(mine, others)
+    assert not torch.equal(before, model(x)[1])
+
+
+def test_predictions_in_inference_mode_leave_the_model_differentiable():
+    model = fitted()
+    x = queries()
+    with torch.inference_mode():
+        expected = model(x)[1]
+    x.requires_grad_()
+    found = model(x)[1]
+    torch.testing.assert_close(found.detach(), expected, rtol=1e-12, atol=1e-12)
+    found.square().sum().backward()
+    assert torch.isfinite(x.grad).all()
+
+
+def test_a_copy_and_a_pickle_predict_the_same(model):
+    x = queries()
+    expected = everything(model, x)
+    for other in (copy.deepcopy(model), pickle.loads(pickle.dumps(model))):
+        for mine, others in zip(everything(other, x), expected, strict=True):
+            assert torch.equal(mine, others)

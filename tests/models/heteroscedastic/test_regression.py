@@ -4,7 +4,6 @@ import torch
 from scipy.linalg import block_diag
 from scipy.stats import multivariate_normal
 
-from torch_pbd.models.heteroscedastic.linear import Weights
 from torch_pbd.models.heteroscedastic.regression import Regression
 
 # A ridge of 1e-8 beside the standardized outputs' scatter keeps it regular, and moves results by as much.
@@ -24,12 +23,17 @@ class Rows:
         self.regression = Regression.of(scatter, torch.tensor(self.tril), whitener)
 
 
+def fitted(regression, features, precision):
+    weights = regression.fit(features[None], precision).weights()
+    return type(weights)(weights.mean[0], weights.root[0])
+
+
 @pytest.mark.parametrize("i", [1, 2, 8])
 def test_free_coefficients_are_those_of_least_squares_at_each_input(i, rng):
     rows = Rows(rng, i=i, k=12)
     precision = torch.tensor([0.5, 2.0, 30.0], dtype=torch.float64)
     features = 1e4 * torch.eye(3, dtype=torch.float64)  # one weight for each input, hardly held to zero
-    weights = rows.regression.fit(features, precision)
+    weights = fitted(rows.regression, features, precision)
     coefficients = (features @ weights.mean.reshape(i, 3).mT).numpy()
     covariance = (weights.root @ weights.root.mT).numpy().reshape(i, 3, i, 3) * 1e8
     for t in range(3):
@@ -58,7 +62,7 @@ def test_log_evidence_is_the_density_of_the_rows_but_for_what_no_features_change
     for phi in features:
         one = block_diag(*before) @ np.kron(phi, np.eye(2))
         expected.append(multivariate_normal(cov=noise + one @ one.T).logpdf(response.ravel()))
-    found = rows.regression.evidence(torch.tensor(features), torch.tensor(precision)).numpy()
+    found = rows.regression.fit(torch.tensor(features), torch.tensor(precision)).value.numpy()
     np.testing.assert_allclose(np.diff(found), np.diff(expected), rtol=RTOL, atol=RTOL)
 
 
@@ -67,7 +71,7 @@ def test_squares_are_those_of_the_rows_and_what_the_error_of_the_coefficients_ad
     features = rng.normal(size=(3, 4))
     mean, root = rng.normal(size=8), np.triu(rng.normal(size=(8, 8)))
     explained, unknown = rows.regression.squares(
-        torch.tensor(features), Weights(torch.tensor(mean), torch.tensor(root))
+        torch.tensor(features), torch.tensor(mean), torch.tensor(root @ root.T)
     )
     for t in range(3):
         spread = np.kron(np.eye(2), features[t])  # coefficients from weights
@@ -94,8 +98,31 @@ def test_fewer_rows_than_outputs_leave_no_squares_and_do_not_fail(i, k, rng):
     assert (local < 1e-4 * size).all()
     features = torch.ones(3, 1, dtype=torch.float64)
     precision = torch.ones(3, dtype=torch.float64)
-    weights = rows.regression.fit(features, precision)
+    weights = fitted(rows.regression, features, precision)
     # A ridge regression: what the rows do not tell stays at the prior.
     gram = sum(z.T @ z for z in rows.before) + np.eye(i)
     cross = sum(z.T @ y for z, y in zip(rows.before, rows.last, strict=True))
     np.testing.assert_allclose(weights.mean, np.linalg.solve(gram, cross), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("whitened", [False, True])
+@pytest.mark.parametrize("i", [1, 3])
+def test_gradient_of_the_log_evidence_is_that_of_autograd(i, whitened, rng):
+    correlation = np.exp(-np.abs(np.subtract.outer(range(3), range(3))) / 2.0)
+    whitener = torch.tensor(np.linalg.inv(np.linalg.cholesky(correlation))) if whitened else None
+    known = Rows(rng, i=i, whitener=whitener).regression
+    precision = torch.tensor([0.5, 2.0, 5.0], dtype=torch.float64)
+    features = torch.tensor(rng.normal(size=(2, 3, 4))).requires_grad_()
+    (expected,) = torch.autograd.grad(known.fit(features, precision).value.sum(), features)
+    with torch.no_grad():
+        found = known.gradient(known.fit(features, precision), features, precision)
+    torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-8)
+
+
+def test_the_weights_are_those_of_the_design_whose_precision_is_too_large_to_form(rng):
+    """By blocks up to where these lose the prior's digits, and by QR beyond: the same within what is left."""
+    known = Rows(rng).regression
+    features = torch.tensor(rng.normal(size=(1, 3, 2)))
+    precision = torch.tensor([0.5, 2.0, 5.0], dtype=torch.float64)
+    by_blocks, by_design = (known.fit(scale * features, precision) for scale in (1e3, 1e5))
+    torch.testing.assert_close(by_blocks.mean / 1e2, by_design.mean, rtol=1e-5, atol=1e-10)

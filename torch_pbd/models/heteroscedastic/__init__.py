@@ -2,7 +2,8 @@
 
 from torch_pbd.models.heteroscedastic.fit import Families, HeteroscedasticFit, fit_heteroscedastic
 from torch_pbd.models.heteroscedastic.module import HeteroscedasticModel
-from torch_pbd.models.heteroscedastic.processes import ProcessFamily, SearchOptions
+from torch_pbd.models.heteroscedastic.processes import ProcessFamily
+from torch_pbd.models.heteroscedastic.search import SearchOptions
 
 __all__ = [
     "Families",

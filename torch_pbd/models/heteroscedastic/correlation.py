@@ -11,6 +11,7 @@ from torch_pbd.linalg import safe_cholesky
 
 _N_BINS = 50  # of the distance between samples, up to the range of the inputs
 _MAX_SAMPLES = 400  # of one demonstration; of longer ones a share
+_MAX_PAIRS = 100_000  # of samples that are compared at once: bounds the memory
 # Samples that count at least for half an independent one are taken for independent: so little correlation
 # cannot be told from none.
 _INDEPENDENT = 0.5
@@ -105,38 +106,59 @@ def demonstration_correlation(
     """
     limit = math.sqrt(x.shape[1])
     scaled = whitened / whitened.square().mean(0).clamp_min(1e-300).sqrt()
-    order = group.argsort(stable=True)
-    tables, n_chosen = [], 0
-    for rows in order.split(torch.bincount(group).tolist()):
-        if len(rows) < 2:
-            continue
-        along = rows[x[rows, 0].argsort(stable=True)]
-        chosen = along[:: math.ceil(len(along) / _MAX_SAMPLES)]
-        tables.append(_products_by_distance(x[chosen], scaled[chosen], limit))
-        n_chosen += len(chosen)
+    parts, n_chosen = [], 0
+    for rows in _chosen_rows(x, group):
+        parts += [_products_by_distance(x[some], scaled[some], limit) for some in rows.split(_together(rows))]
+        n_chosen += rows.numel()
     independent = torch.ones_like(whitened[0])
-    if len(tables) < 2:
+    if sum(len(pairs) for _, pairs in parts) < 2:
         return DemonstrationCorrelation(0.0 * independent, independent)
-    products, pairs = (torch.stack(part) for part in zip(*tables, strict=True))
+    products, pairs = (torch.cat(part) for part in zip(*parts, strict=True))
     total = pairs.sum(0)
     sum_of_squares = (_squared_autocorrelation(products, pairs) * total[:, None]).sum(0)
     # Of n samples all pairs but those of a sample with itself; were some left out, there are as many more of each.
     share = 1.0 / (1.0 + 2.0 * sum_of_squares / n_chosen * len(x) / n_chosen)
-    centre = (torch.arange(_N_BINS).to(x) + 0.5) * limit / _N_BINS
-    decay = x.new_tensor([_decay_of(float(target), centre, total) for target in sum_of_squares])
     correlated = share <= _INDEPENDENT
+    if not bool(correlated.any()):
+        return DemonstrationCorrelation(0.0 * independent, independent)
+    centre = (torch.arange(_N_BINS).to(x) + 0.5) * limit / _N_BINS
+    decay = _decay_of(sum_of_squares, centre, total)
     return DemonstrationCorrelation(torch.where(correlated, decay, 0.0), torch.where(correlated, share, 1.0))
 
 
-def _products_by_distance(x: Tensor, values: Tensor, limit: float) -> tuple[Tensor, Tensor]:
-    """Sums of the products of pairs of one demonstration (bins, d), and the number of pairs (bins,)."""
-    i, j = torch.triu_indices(len(x), len(x), offset=1, device=x.device)
-    distance = (x[i] - x[j]).norm(dim=-1)
-    near = distance <= limit
+def _chosen_rows(x: Tensor, group: Tensor) -> list[Int64[Tensor, "g t"]]:
+    """Rows of each demonstration along the first input, those of as many rows together."""
+    counts = torch.bincount(group)
+    order = x[:, 0].argsort(stable=True)
+    order = order[group[order].argsort(stable=True)]
+    by_size: dict[int, list[Tensor]] = {}
+    for rows in order.split(counts.tolist()):
+        chosen = rows[:: math.ceil(len(rows) / _MAX_SAMPLES) or 1]
+        if len(rows) > 1:
+            by_size.setdefault(len(chosen), []).append(chosen)
+    return [torch.stack(same) for same in by_size.values()]
+
+
+def _together(rows: Tensor) -> int:
+    """Demonstrations whose pairs are taken at once."""
+    return max(1, _MAX_PAIRS // rows.shape[1] ** 2)
+
+
+def _products_by_distance(
+    x: Float[Tensor, "g t e"], values: Float[Tensor, "g t d"], limit: float
+) -> tuple[Float[Tensor, "g k d"], Float[Tensor, "g k"]]:
+    """Sums of the products of pairs of samples of each of g demonstrations, and the numbers of pairs, by distance."""
+    n_demos, n_outputs = len(x), values.shape[-1]
+    i, j = torch.triu_indices(x.shape[1], x.shape[1], offset=1, device=x.device)
+    distance = (x[:, i] - x[:, j]).norm(dim=-1)
     edges = limit * torch.arange(1, _N_BINS).to(x) / _N_BINS + 1e-9
-    number = torch.bucketize(distance[near], edges)
-    products = x.new_zeros(_N_BINS, values.shape[1]).index_add_(0, number, (values[i] * values[j])[near])
-    return products, torch.bincount(number, minlength=_N_BINS).to(x)
+    number = torch.bucketize(distance, edges)
+    number = torch.where(distance <= limit, number, _N_BINS)  # the last bin is of those that are too far apart
+    number = (number + (_N_BINS + 1) * torch.arange(n_demos, device=x.device)[:, None]).flatten()
+    size = n_demos * (_N_BINS + 1)
+    products = x.new_zeros(size, n_outputs).index_add_(0, number, (values[:, i] * values[:, j]).flatten(0, 1))
+    pairs = torch.bincount(number, minlength=size).to(x)
+    return products.reshape(n_demos, -1, n_outputs)[:, :-1], pairs.reshape(n_demos, -1)[:, :-1]
 
 
 def _squared_autocorrelation(products: Float[Tensor, "g k d"], pairs: Float[Tensor, "g k"]) -> Float[Tensor, "k d"]:
@@ -149,11 +171,11 @@ def _squared_autocorrelation(products: Float[Tensor, "g k d"], pairs: Float[Tens
     return torch.where((present > 1) & ~ended, square, 0.0)
 
 
-def _decay_of(target: float, distance: Tensor, pairs: Tensor) -> float:
-    """Decay whose exponential sums to the target over the pairs, by bisection."""
-    low, high = 1e-4, 1e2
+def _decay_of(target: Float[Tensor, " d"], distance: Float[Tensor, " k"], pairs: Float[Tensor, " k"]) -> Tensor:
+    """Decays (d,) whose exponentials sum to the targets over the pairs, by bisection."""
+    low, high = torch.full_like(target, 1e-4), torch.full_like(target, 1e2)
     for _ in range(60):
-        middle = math.sqrt(low * high)
-        too_short = float((pairs * torch.exp(-distance / middle)).sum()) < target
-        low, high = (middle, high) if too_short else (low, middle)
-    return math.sqrt(low * high)
+        middle = (low * high).sqrt()
+        too_short = torch.exp(-distance / middle[:, None]) @ pairs < target
+        low, high = torch.where(too_short, middle, low), torch.where(too_short, high, middle)
+    return (low * high).sqrt()

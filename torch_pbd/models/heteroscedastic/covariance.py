@@ -1,15 +1,19 @@
 """Fit of the covariance's latent processes to the scatter of the residuals."""
 
+from dataclasses import dataclass, field
+
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from torch_pbd.gp.fixed_features import FixedFeatures
 from torch_pbd.models.heteroscedastic.correlation import NoiseCorrelation
 from torch_pbd.models.heteroscedastic.latent import LatentCovariance
-from torch_pbd.models.heteroscedastic.linear import Weights, divergence_from_prior
-from torch_pbd.models.heteroscedastic.log_variance import LEAST_SQUARE, Squares, fit_log_variance
-from torch_pbd.models.heteroscedastic.processes import ProcessFamily, SearchOptions, search
+from torch_pbd.models.heteroscedastic.linear import LinearEvidence, Weights
+from torch_pbd.models.heteroscedastic.log_variance import LEAST_SQUARE, LogVariance, Squares, fit_log_variance
+from torch_pbd.models.heteroscedastic.processes import Design, ProcessFamily
 from torch_pbd.models.heteroscedastic.regression import Regression
+from torch_pbd.models.heteroscedastic.search import Gradient, Search, SearchOptions
 
 _SWEEPS = 3
 _SEARCHES = 2  # sweeps that look for the coefficients' hyperparameters too
@@ -17,14 +21,47 @@ _SEARCHES = 2  # sweeps that look for the coefficients' hyperparameters too
 _ENOUGH_DEGREES = 2.0
 
 
+@dataclass(frozen=True)
+class CovarianceSearches:
+    """Searches of the hyperparameters of the log variances, and of the coefficients of outputs 1, 2, ..."""
+
+    log_variance: Search
+    coefficients: list[Search]
+    coefficient_family: ProcessFamily
+
+    @classmethod
+    def of(
+        cls, families: tuple[ProcessFamily, ProcessFamily], n_outputs: int, n_features: int, options: SearchOptions
+    ) -> "CovarianceSearches":
+        """Searches that have not begun."""
+        return cls(
+            Search(families[0], n_outputs, n_features, options),
+            [Search(families[1], 1, n_features, options) for _ in range(1, n_outputs)],
+            families[1],
+        )
+
+
+@dataclass
+class _Sweep:
+    """What a sweep leaves to the next."""
+
+    location: Tensor | None = None
+    """Log variances (d, n)."""
+    precision: Tensor | None = None
+    """Expected inverses of the conditional variances (d, n)."""
+    regressions: list[Regression] = field(default_factory=list)
+    expected: list[Tensor] = field(default_factory=list)
+    """Squared residuals (n,) of outputs 1, 2, ... from their regressions."""
+    evidence: float = 0.0
+
+
 def fit_covariance(
-    families: tuple[ProcessFamily, ProcessFamily],
+    searches: CovarianceSearches,
     inputs: Float[Tensor, "n e"],
     scatter: Float[Tensor, "n d d"],
     degrees: Float[Tensor, "d n"],
     noise: NoiseCorrelation,
     previous: LatentCovariance | None,
-    options: SearchOptions,
 ) -> tuple[LatentCovariance, float]:
     """Posterior of the factor, and the log evidence in nats.
 
@@ -33,8 +70,8 @@ def fit_covariance(
 
     Parameters
     ----------
-    families : (ProcessFamily, ProcessFamily)
-        Of the log variances and of the coefficients.
+    searches : CovarianceSearches
+        Of processes on the same features.
     scatter : Tensor of shape (n, d, d)
         Sum of the outer products of the residuals at each input, whose pooled covariance is the unit matrix.
     degrees : Tensor of shape (d, n)
@@ -44,96 +81,130 @@ def fit_covariance(
     previous : LatentCovariance or None
         Where to start.
     """
-    variance_family, coefficient_family = families
-    n_outputs, n_features = scatter.shape[1], inputs.shape[1]
     # An output that is constant is noise of the least variance too where later ones are regressed on it: to zeros
     # any coefficient would fit, and its uncertainty would count as their variance.
     scatter = scatter + LEAST_SQUARE * torch.diag_embed(degrees.mT)
-    fit = previous
-    regressions = [] if fit is None else _regressions(scatter, fit.at(inputs).tril(), noise)
-    for sweep in range(_SWEEPS if n_outputs > 1 else 1):
-        squares = _squares(scatter, degrees, noise, regressions, fit, inputs)
-
-        def variance_evidence(theta: Tensor, rows: Int64[Tensor, " a"], squares: Squares = squares) -> Tensor:
-            return fit_log_variance(squares.rows(rows), variance_family.design(inputs, theta))[1]
-
-        start = None if fit is None else fit.log_variance_theta
-        theta = search(variance_family, variance_evidence, start, (n_outputs, n_features), scatter, options)
-        features = variance_family.design(inputs, theta)
-        log_variance, evidence = fit_log_variance(squares, features)
-        mean = (features @ log_variance.mean.unsqueeze(-1)).squeeze(-1)
-        precision = torch.exp(-mean + 0.5 * (features @ log_variance.root).square().sum(-1))
-        tril = torch.exp(0.5 * mean[0])[:, None, None]
-        regressions, thetas, coefficients, total = [], [], [], float(evidence.sum())
-        for i in range(1, n_outputs):
-            known = Regression.of(scatter[:, : i + 1, : i + 1], tril, _of_output(noise.of_squares, i))
-            own = None if fit is None else fit.coefficient_theta[i - 1 : i]
-            if own is None or sweep < _SEARCHES:
-                own = _search_coefficients(coefficient_family, known, precision[i], inputs, own, options)
-            row_features = coefficient_family.design(inputs, own)
-            coefficients.append(known.fit(row_features[0], precision[i]))
-            total -= divergence_from_prior(coefficients[-1])
-            thetas.append(own)
-            regressions.append(known)
-            row = row_features[0] @ coefficients[-1].mean.reshape(i, -1).mT
-            tril = _with_row(tril, row, torch.exp(0.5 * mean[i]))
-        coefficient_theta = torch.cat(thetas) if thetas else theta[:0]
-        fit = LatentCovariance(
-            variance_family, coefficient_family, theta, Weights(*log_variance), coefficient_theta, coefficients
-        )
-    assert fit is not None
-    return fit, total
+    fixed = FixedFeatures(searches.log_variance.family.features, inputs)
+    last = _Sweep() if previous is None else _from_previous(previous, inputs, scatter, noise)
+    for sweep in range(_SWEEPS if scatter.shape[1] > 1 else 1):
+        squares = _squares(scatter, degrees, noise, last)
+        log_variance = _fit_log_variance(searches.log_variance, fixed, squares, last.location)
+        precision = torch.exp(-log_variance.location + 0.5 * log_variance.variance)
+        last = _Sweep(log_variance.location, precision, evidence=float(log_variance.evidence.sum()))
+        _fit_coefficients(searches.coefficients, fixed, scatter, noise, last, anew=sweep < _SEARCHES)
+    return _posterior(searches, inputs, squares, last), last.evidence
 
 
-def _search_coefficients(
-    family: ProcessFamily,
-    known: Regression,
-    precision: Tensor,
-    inputs: Tensor,
-    start: Tensor | None,
-    options: SearchOptions,
-) -> Tensor:
-    def evidence(theta: Tensor, rows: Int64[Tensor, " a"]) -> Tensor:
-        return known.evidence(family.design(inputs, theta), precision)
-
-    return search(family, evidence, start, (1, inputs.shape[1]), inputs, options)
+def _from_previous(previous: LatentCovariance, inputs: Tensor, scatter: Tensor, noise: NoiseCorrelation) -> _Sweep:
+    moments = previous.at(inputs)
+    tril = moments.tril()
+    regressions, expected = [], []
+    for i, weights in enumerate(previous.coefficients, start=1):
+        known = Regression.of(scatter[:, : i + 1, : i + 1], tril[:, :i, :i], _of_output(noise.of_squares, i))
+        features = previous.coefficient_family.design(inputs, previous.coefficient_theta[i - 1 : i])[0]
+        regressions.append(known)
+        expected.append(_sum(known.squares(features, weights.mean, weights.root @ weights.root.mT)))
+    return _Sweep(moments.log_variance.mT, None, regressions, expected)
 
 
-def _squares(
-    scatter: Tensor,
-    degrees: Tensor,
-    noise: NoiseCorrelation,
-    regressions: list[Regression],
-    fit: LatentCovariance | None,
-    inputs: Tensor,
-) -> Squares:
+def _fit_log_variance(search: Search, fixed: FixedFeatures, squares: Squares, near: Tensor | None) -> LogVariance:
+    """Posterior of the log variances, which are ``near`` those given."""
+    information = 0.5 * squares.degrees.sum(-1)
+    near = (squares.log_pooled.expand_as(squares.total) if near is None else near).clone()
+    latest: list[tuple[Tensor, LogVariance]] = []
+
+    def evidence(theta: Tensor, rows: Int64[Tensor, " a"]) -> tuple[Tensor, Gradient]:
+        design = Design.of(search.family, fixed, theta, information[rows])
+        found = fit_log_variance(squares.rows(rows), design.values, near[rows])
+        if len(rows) <= len(near):
+            near[rows] = found.location  # where the next evaluation starts
+        latest[:] = [(theta, found)]
+        return found.evidence, lambda: design.pull(found.gradient())
+
+    theta = search.run(evidence, squares.total)
+    if torch.equal(theta, latest[0][0]):
+        return latest[0][1]
+    return fit_log_variance(squares, Design.of(search.family, fixed, theta, information).values, near)
+
+
+def _fit_coefficients(
+    searches: list[Search], fixed: FixedFeatures, scatter: Tensor, noise: NoiseCorrelation, state: _Sweep, *, anew: bool
+) -> None:
+    """One output after another, as each is regressed on those before it; ``anew`` searches their hyperparameters."""
+    assert state.location is not None
+    assert state.precision is not None
+    deviation = torch.exp(0.5 * state.location)
+    tril = deviation[0][:, None, None]
+    for i, search in enumerate(searches, start=1):
+        known = Regression.of(scatter[:, : i + 1, : i + 1], tril, _of_output(noise.of_squares, i))
+        precision = state.precision[i]
+        design, linear = _fit_row(search, fixed, known, precision, anew=anew or search.theta is None)
+        features = design.values[0]
+        state.evidence -= float(linear.divergence_from_prior())
+        state.regressions.append(known)
+        state.expected.append(_sum(known.squares(features, linear.mean[0], linear.covariance[0])))
+        tril = _with_row(tril, features @ linear.mean.reshape(i, -1).mT, deviation[i])
+
+
+def _fit_row(
+    search: Search, fixed: FixedFeatures, known: Regression, precision: Tensor, *, anew: bool
+) -> tuple[Design, LinearEvidence]:
+    """Features and posterior of the weights of the coefficients of one output."""
+    information = (precision * known.before.diagonal(dim1=1, dim2=2).sum(-1)).sum()
+
+    def fit(theta: Tensor) -> tuple[Design, LinearEvidence]:
+        design = Design.of(search.family, fixed, theta, information.expand(len(theta)))
+        return design, known.fit(design.values, precision)
+
+    latest: list[tuple[Design, LinearEvidence]] = []
+
+    def evidence(theta: Tensor, _: Int64[Tensor, " a"]) -> tuple[Tensor, Gradient]:
+        design, linear = fit(theta)
+        latest[:] = [(design, linear)]
+        return linear.value, lambda: design.pull(known.gradient(linear, design.values, precision))
+
+    if anew:
+        search.run(evidence, precision)
+    assert search.theta is not None
+    return latest[0] if latest and torch.equal(latest[0][0].theta, search.theta) else fit(search.theta)
+
+
+def _squares(scatter: Tensor, degrees: Tensor, noise: NoiseCorrelation, last: _Sweep) -> Squares:
     """Squared residuals of each output from its regression on those before it.
 
     Where samples of a demonstration are correlated and there are enough of them at an input, from the
     regression at that input by itself: an error of the processes of its coefficients, as smooth as the
     demonstrations, would else count as residual.
     """
-    totals, kept = [scatter[:, 0, 0]], [degrees[0]]
-    for i in range(1, scatter.shape[1]):
-        total, left = scatter[:, i, i], degrees[i]
-        if regressions and fit is not None:
-            known = regressions[i - 1]
-            features = fit.coefficient_family.design(inputs, fit.coefficient_theta[i - 1 : i])[0]
-            total = sum(known.squares(features, fit.coefficients[i - 1]), torch.zeros_like(total))
-            if noise.copies is not None:
-                local = degrees[i] - i * noise.copies[i]
-                enough = local >= _ENOUGH_DEGREES * noise.copies[i]
-                total, left = torch.where(enough, known.local_squares(), total), torch.where(enough, local, left)
-        totals.append(total)
-        kept.append(left)
+    totals, kept = list(scatter.diagonal(dim1=1, dim2=2).mT), list(degrees)
+    for i, (known, total) in enumerate(zip(last.regressions, last.expected, strict=True), start=1):
+        if noise.copies is not None:
+            local = degrees[i] - i * noise.copies[i]
+            enough = local >= _ENOUGH_DEGREES * noise.copies[i]
+            total, kept[i] = torch.where(enough, known.local_squares(), total), torch.where(enough, local, degrees[i])
+        totals[i] = total
     return Squares(torch.stack(totals), torch.stack(kept), noise)
 
 
-def _regressions(scatter: Tensor, tril: Tensor, noise: NoiseCorrelation) -> list[Regression]:
-    return [
-        Regression.of(scatter[:, : i + 1, : i + 1], tril[:, :i, :i], _of_output(noise.of_squares, i))
-        for i in range(1, scatter.shape[1])
-    ]
+def _posterior(searches: CovarianceSearches, inputs: Tensor, squares: Squares, last: _Sweep) -> LatentCovariance:
+    """Of the weights of all features."""
+    theta = searches.log_variance.theta
+    assert theta is not None
+    assert last.precision is not None
+    family = searches.log_variance.family
+    log_variance = fit_log_variance(squares, family.design(inputs, theta), last.location).weights
+    coefficients, coefficient_theta = [], theta[:0]
+    if last.regressions:
+        coefficient_theta = torch.cat([search.theta for search in searches.coefficients if search.theta is not None])
+        features = searches.coefficient_family.design(inputs, coefficient_theta)
+        for known, own, precision in zip(last.regressions, features, last.precision[1:], strict=True):
+            weights = known.fit(own[None], precision).weights()
+            coefficients.append(Weights(weights.mean[0], weights.root[0]))
+    return LatentCovariance(family, searches.coefficient_family, theta, log_variance, coefficient_theta, coefficients)
+
+
+def _sum(parts: tuple[Tensor, Tensor]) -> Tensor:
+    return parts[0] + parts[1]
 
 
 def _with_row(tril: Tensor, row: Tensor, diagonal: Tensor) -> Tensor:

@@ -13,14 +13,16 @@ from torch_pbd.models.heteroscedastic.correlation import (
     NoiseCorrelation,
     demonstration_correlation,
 )
-from torch_pbd.models.heteroscedastic.covariance import fit_covariance
+from torch_pbd.models.heteroscedastic.covariance import CovarianceSearches, fit_covariance
 from torch_pbd.models.heteroscedastic.latent import LatentCovariance
 from torch_pbd.models.heteroscedastic.mean import LatentMean, fit_mean
-from torch_pbd.models.heteroscedastic.processes import ProcessFamily, SearchOptions
+from torch_pbd.models.heteroscedastic.processes import ProcessFamily
+from torch_pbd.models.heteroscedastic.search import Search, SearchOptions
 from torch_pbd.models.training import TrainingSet, pooled_tril
 
 # Rows at an input whose mean is all their own still tell this share of a variance, or nothing would.
 _LEAST_SHARE = 0.1
+_SLACK = 10.0  # of searches in all turns but the last
 _ROWS_TOGETHER = 8  # neighbours whose differences tell the noise that the first mean is fitted under
 _FIRST_SAMPLES = 10.0  # of a demonstration: what counts of it before its correlation is known
 # Of y's standard deviation: an output that is constant, or a copy of another, has this deviation of its own.
@@ -49,16 +51,6 @@ class HeteroscedasticFit:
     log_evidence: tuple[float, ...]
     """Of the covariance, at the end of each turn, in nats."""
 
-    @property
-    def resolved(self) -> bool:
-        """Whether the inducing inputs resolve all length scales with room to spare, or are all the inputs."""
-        covariance = self.covariance
-        return (
-            self.mean.family.resolved(self.mean.theta)
-            and covariance.log_variance_family.resolved(covariance.log_variance_theta)
-            and covariance.coefficient_family.resolved(covariance.coefficient_theta)
-        )
-
 
 def fit_heteroscedastic(
     training: TrainingSet,
@@ -67,41 +59,46 @@ def fit_heteroscedastic(
     options: SearchOptions,
     *,
     n_turns: int = 3,
-) -> HeteroscedasticFit:
+    needs_resolution: bool = False,
+) -> HeteroscedasticFit | None:
     """Mean under the noise learned so far, then covariance of the residuals from it, ``n_turns`` times.
 
     ``group`` tells the demonstrations apart. What the first turns leave of each, whitened, tells how far
     its samples are correlated, which the later ones take into account.
+
+    With ``needs_resolution`` the fit is given up, and None, at the end of the first turn in which the inducing inputs
+    do not resolve a length scale with room to spare, unless they are all the inputs.
     """
     mean: LatentMean | None = None
     covariance: LatentCovariance | None = None
     correlation: DemonstrationCorrelation | None = None
     evidences: list[float] = []
     pooled = _start_tril(training)
+    size = (training.y.shape[1], training.x.shape[1])
+    mean_search, both = Search(families.mean, *size, options), (families.log_variance, families.coefficients)
+    searches = CovarianceSearches.of(both, *size, options)
     started = time.perf_counter()
     for turn in range(n_turns):
+        options.slack = _SLACK if turn < n_turns - 1 else 1.0
         noise = NoiseCorrelation.of(correlation, training.inputs, training.index, group)
         tril = _tril_at(training.inputs, pooled, covariance)
-        theta = None if mean is None else mean.theta
-        means = (training.means(), training.counts)
-        mean = fit_mean(families.mean, training.inputs, *means, tril, noise.of_means, theta, options)
+        mean = fit_mean(mean_search, training.inputs, training.means(), training.counts, tril, noise.of_means)
         residual, share = _residual(training, mean, tril)
-        if turn == 0:
-            pooled = _pooled_tril(residual, share)
+        pooled = pooled if turn else _pooled_tril(residual, share)
         normal, scatter, degrees = _scatter(training, residual, share, pooled)
         part = 1.0 if turn else _first_part(training, group)
         # What the first turn took for independent is no place to start from where it is not.
-        start = None if turn == 1 and correlation is not None and correlation.matters else covariance
-        both = (families.log_variance, families.coefficients)
+        if turn == 1 and correlation is not None and correlation.matters:
+            covariance, searches = None, CovarianceSearches.of(both, *size, options)
         covariance, evidence = fit_covariance(
-            both, training.inputs, part * scatter, part * degrees, noise, start, options
+            searches, training.inputs, part * scatter, part * degrees, noise, covariance
         )
+        if needs_resolution and not (families.mean.resolved(mean.theta) and covariance.resolved):
+            return None
         evidences.append(evidence)
         options.report(len(evidences), -evidence, time.perf_counter() - started)
         if group is not None and turn < n_turns - 1:
-            tril = covariance.at(training.inputs).tril()[training.index]
-            independent = torch.linalg.solve_triangular(tril, normal.unsqueeze(2), upper=False).squeeze(2)
-            correlation = demonstration_correlation(training.x, independent, group)
+            correlation = demonstration_correlation(training.x, _whitened(training, normal, covariance), group)
             if correlation.matters:
                 training = training.merged(_n_inputs(training, group))
     assert mean is not None
@@ -134,6 +131,12 @@ def _scatter(training: TrainingSet, residual: Tensor, share: Tensor, pooled: Ten
     root = training.scatter_root(normal)
     degrees = torch.zeros_like(training.means()).index_add_(0, training.index, share)
     return normal, root @ root.mT, degrees.mT
+
+
+def _whitened(training: TrainingSet, normal: Tensor, covariance: LatentCovariance) -> Tensor:
+    """Residuals (rows, d) of unit covariance at each input."""
+    tril = covariance.at(training.inputs).tril()[training.index]
+    return torch.linalg.solve_triangular(tril, normal.unsqueeze(2), upper=False).squeeze(2)
 
 
 def _first_part(training: TrainingSet, group: Tensor | None) -> float:

@@ -1,5 +1,7 @@
 """The Gaussian linear model whose weights are standard normal numbers a priori."""
 
+from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -8,7 +10,7 @@ from torch import Tensor
 
 from torch_pbd.linalg import safe_cholesky
 
-_LARGEST_PRECISION = 1e9
+LARGEST_PRECISION = 1e9
 
 
 class Weights(NamedTuple):
@@ -19,31 +21,61 @@ class Weights(NamedTuple):
     """Upper triangular; the covariance is ``root @ root.mT``."""
 
 
+@dataclass(frozen=True)
+class LinearEvidence:
+    """Log density of ``response = design @ weights + noise`` with the weights integrated out, in nats.
+
+    But for what no design changes. The noise is independent and of variance one.
+    """
+
+    value: Float[Tensor, "*b"]
+    mean: Float[Tensor, "*b p"]
+    """Of the weights' posterior."""
+    factor: Float[Tensor, "*b p p"]
+    """Upper triangular; ``factor.mT @ factor`` is the precision of the weights' posterior."""
+
+    @classmethod
+    def of(cls, design: Float[Tensor, "*b n p"], response: Float[Tensor, "*b n"]) -> "LinearEvidence":
+        """Evidence of b designs."""
+        factor, projected = _triangular(design, response)
+        return cls.of_factor(factor, projected)
+
+    @classmethod
+    def of_factor(cls, factor: Float[Tensor, "*b p p"], projected: Float[Tensor, "*b p"]) -> "LinearEvidence":
+        """Evidence of b designs, where ``factor @ mean = projected``."""
+        mean = torch.linalg.solve_triangular(factor, projected.unsqueeze(-1), upper=True).squeeze(-1)
+        log_det = factor.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
+        return cls(0.5 * projected.square().sum(-1) - log_det, mean, factor)
+
+    @cached_property
+    def covariance(self) -> Float[Tensor, "*b p p"]:
+        """Of the weights' posterior."""
+        return torch.cholesky_inverse(self.factor, upper=True)
+
+    def gradient(self, design: Float[Tensor, "*b n p"], response: Float[Tensor, "*b n"]) -> Float[Tensor, "*b n p"]:
+        """Of the value in the design D: with P = I + D'D and P m = D'y it is (y - D m) m' - D inv(P)."""
+        residual = response.unsqueeze(-1) - design @ self.mean.unsqueeze(-1)
+        return residual * self.mean.unsqueeze(-2) - design @ self.covariance
+
+    def weights(self) -> Weights:
+        """The posterior."""
+        return Weights(self.mean, inverse(self.factor))
+
+    def divergence_from_prior(self) -> Float[Tensor, "*b"]:
+        """Kullback-Leibler divergence of the weights' posterior from standard normal numbers, in nats."""
+        trace = self.covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
+        log_det = 2.0 * self.factor.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
+        return 0.5 * (trace + self.mean.square().sum(-1) - self.mean.shape[-1] + log_det)
+
+
 def weights_posterior(design: Float[Tensor, "*b n p"], response: Float[Tensor, "*b n"]) -> Weights:
     """Weights given ``response = design @ weights + noise``, the noise independent and of variance one."""
-    factor, projected = _triangular(design, response)
-    mean = torch.linalg.solve_triangular(factor, projected.unsqueeze(-1), upper=True).squeeze(-1)
-    return Weights(mean, _inverse(factor))
+    return LinearEvidence.of(design, response).weights()
 
 
-def log_evidence(design: Float[Tensor, "*b n p"], response: Float[Tensor, "*b n"]) -> Float[Tensor, "*b"]:
-    """Log density of the response with the weights integrated out, but for what no design changes, in nats."""
-    factor, projected = _triangular(design, response)
-    log_det = factor.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
-    return 0.5 * projected.square().sum(-1) - log_det
-
-
-def divergence_from_prior(weights: Weights) -> float:
-    """Kullback-Leibler divergence of the weights' distribution from standard normal numbers, in nats."""
-    size = weights.mean.numel()
-    trace = float(weights.root.square().sum())
-    log_det = 2.0 * float(weights.root.diagonal(dim1=-2, dim2=-1).abs().log().sum())
-    return 0.5 * (trace + float(weights.mean.square().sum()) - size - log_det)
-
-
-def weights_root(design: Float[Tensor, "*b n p"]) -> Float[Tensor, "*b p p"]:
-    """Root of the weights' covariance, which does not depend on the response."""
-    return _inverse(_triangular(design, torch.zeros_like(design[..., 0]))[0])
+def weights_factor(design: Float[Tensor, "*b n p"]) -> Float[Tensor, "*b p p"]:
+    """Upper factor of the precision of the weights, which does not depend on the response."""
+    return _triangular(design, torch.zeros_like(design[..., 0]))[0]
 
 
 def _triangular(design: Tensor, response: Tensor) -> tuple[Tensor, Tensor]:
@@ -53,7 +85,7 @@ def _triangular(design: Tensor, response: Tensor) -> tuple[Tensor, Tensor]:
     squares, cannot be formed in floating point; then by a QR decomposition, which is slower.
     """
     precision = design.mT @ design + torch.eye(design.shape[-1]).to(design)
-    if float(precision.diagonal(dim1=-2, dim2=-1).detach().amax()) < _LARGEST_PRECISION:
+    if float(precision.diagonal(dim1=-2, dim2=-1).detach().amax()) < LARGEST_PRECISION:
         lower = safe_cholesky(precision, name="the precision of the latent weights")
         projected = torch.linalg.solve_triangular(lower, design.mT @ response.unsqueeze(-1), upper=False)
         return lower.mT, projected.squeeze(-1)
@@ -62,5 +94,6 @@ def _triangular(design: Tensor, response: Tensor) -> tuple[Tensor, Tensor]:
     return upper, (orthogonal[..., : design.shape[-2], :].mT @ response.unsqueeze(-1)).squeeze(-1)
 
 
-def _inverse(upper: Tensor) -> Tensor:
+def inverse(upper: Float[Tensor, "*b p p"]) -> Float[Tensor, "*b p p"]:
+    """Inverse of upper triangular matrices."""
     return torch.linalg.solve_triangular(upper, torch.eye(upper.shape[-1]).to(upper).expand_as(upper), upper=True)

@@ -1,17 +1,22 @@
 """Logarithms of conditional variances as Gaussian processes, their latent values integrated out."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torch_pbd.linalg import safe_cholesky
 from torch_pbd.models.heteroscedastic.correlation import NoiseCorrelation
-from torch_pbd.models.heteroscedastic.linear import Weights, log_evidence, weights_posterior, weights_root
+from torch_pbd.models.heteroscedastic.linear import LinearEvidence, Weights, inverse, weights_factor
 
-_MAX_ITER, _TOL = 60, 1e-8
-_LARGEST_STEP = 3.0  # in the logarithm of a variance
+# Newton's steps (in the logarithm of a variance) end at this one: that after it is about its square.
+_MAX_ITER, _TOL = 60, 1e-5
+_FAR = 1.0  # steps above this are not of the Newton method but safer ones
+_LEAST_RESIDUAL = -40.0
 # Of the pooled variance: an exact zero, as where all recordings start at the origin, has no logarithm.
 LEAST_SQUARE = 1e-6
 
@@ -26,109 +31,190 @@ class Squares:
 
     def rows(self, index: Tensor) -> "Squares":
         """Those of some of the outputs."""
+        if len(index) == len(self.total) and torch.equal(index, torch.arange(len(index), device=index.device)):
+            return self  # with what is known of it
         return replace(self, total=self.total[index], degrees=self.degrees[index], noise=self.noise.rows(index))
 
+    @cached_property
     def log_mean(self) -> Float[Tensor, "b n"]:
         """Logarithm of the mean square."""
         return (self.total / self.degrees).clamp_min(LEAST_SQUARE).log()
 
+    @cached_property
+    def log_pooled(self) -> Float[Tensor, "b 1"]:
+        """Logarithm of the pooled variance of each output."""
+        return (self.total.sum(-1, keepdim=True) / self.degrees.sum(-1, keepdim=True)).clamp_min(LEAST_SQUARE).log()
 
-def fit_log_variance(squares: Squares, features: Float[Tensor, "b n p"]) -> tuple[Weights, Float[Tensor, " b"]]:
-    """Posterior of the weights of ``log_variance = features @ weights``, and the log evidence, in nats.
+    @cached_property
+    def logarithms(self) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b n"], Float[Tensor, "b n n"]]:
+        """Inverse deviations of the logarithms of mean squares, these without bias and whitened, and what whitens.
 
-    The weights are standard normal numbers a priori; the last feature is a constant. The evidence is
-    differentiable in the features.
+        That of a chi-squared number over its degrees is below zero in the mean.
+        """
+        assert self.noise.of_squares is not None
+        assert self.noise.copies is not None
+        half = 0.5 * self.degrees / self.noise.copies
+        unbiased = self.log_mean - torch.digamma(half) + half.log()
+        weight = (self.noise.copies / torch.polygamma(1, half)).sqrt()  # the whitener takes the copies out again
+        whitener = self.noise.of_squares * weight.unsqueeze(-2)
+        return weight, (whitener @ unbiased.unsqueeze(-1)).squeeze(-1), whitener
+
+
+@dataclass(frozen=True)
+class LogVariance:
+    """Posterior of ``log_variance = features @ weights``, the weights standard normal numbers a priori.
+
+    The last feature is a constant.
+    """
+
+    evidence: Float[Tensor, " b"]
+    """Log evidence of the features, in nats."""
+    weights_mean: Float[Tensor, "b p"]
+    factor: Float[Tensor, "b p p"]
+    """Upper triangular; ``factor.mT @ factor`` is the precision of the weights."""
+    location: Float[Tensor, "b n"]
+    """Expected log variances."""
+    variance: Float[Tensor, "b n"]
+    """Of the log variances."""
+    gradient: Callable[[], Float[Tensor, "b n p"]]
+    """Computes that of the evidence in the features."""
+
+    @property
+    def weights(self) -> Weights:
+        """Posterior of the weights."""
+        return Weights(self.weights_mean, inverse(self.factor))
+
+
+def fit_log_variance(
+    squares: Squares, features: Float[Tensor, "b n p"], start: Float[Tensor, "b n"] | None = None
+) -> LogVariance:
+    """Posterior and log evidence.
+
+    Parameters
+    ----------
+    squares : Squares
+    features : Tensor of shape (b, n, p)
+    start : Tensor of shape (b, n), default=None
+        Log variances that are near the posterior's. None starts at the pooled variance.
     """
     if squares.noise.of_squares is None or squares.noise.copies is None:
-        return _fit_independent(squares, features)
-    return _fit_correlated(squares, features, squares.noise.of_squares, squares.noise.copies)
+        return _fit_independent(squares, features, squares.log_pooled if start is None else start)
+    return _fit_correlated(squares, features)
 
 
-def _fit_independent(squares: Squares, features: Tensor) -> tuple[Weights, Tensor]:
+def _fit_independent(squares: Squares, features: Tensor, start: Tensor) -> LogVariance:
     """Variational approximation by a normal distribution; the evidence is its lower bound.
 
-    Its covariance is the inverse of the Fisher information, which for a log variance does not depend on its
-    value. Its mean maximizes the bound, in which E[1 / variance] = exp(-mean + variance of the log / 2) is
-    exact, and so need not be differentiated through.
+    Its precision P is one plus the Fisher information, F' diag(h) F of the features F and half the degrees h, which
+    for a log variance does not depend on its value. Its mean m maximizes the bound, in which
+    E[1 / variance] = exp(-mean + variance of the log / 2) is exact. With the target t, the log mean square plus half
+    the variance of the log, and x = F m - t the bound is -log|P| / 2 - sum of h (x + exp(-x)) - m'm / 2 and a
+    constant: the traces of the Fisher information and of the divergence from the prior add up to one.
+
+    Gradient in F, where r = h (1 - exp(-x)) is that of the sum in x and A = F inv(P): -diag(h) A from log|P|; -r m'
+    from F m, the mean itself being at its maximum; and from t, half the diagonal of F inv(P) F',
+    diag(r) A - diag(h) F Q with Q = A' diag(r) A.
     """
-    root = weights_root((0.5 * squares.degrees).sqrt().unsqueeze(-1) * features)
-    target = squares.log_mean() + 0.5 * (features @ root).square().sum(-1)
-    with torch.no_grad():
-        mean = _maximize(features, target, squares.degrees, _constant(squares, features))
-    deviance = _deviance((features @ mean.unsqueeze(-1)).squeeze(-1) - target, squares.degrees)[0].square().sum(-1)
-    # The traces of the Fisher information and of the divergence from the prior add up to a constant.
-    log_det = root.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
-    saturated = (squares.degrees * (squares.log_mean() + 1.0 + math.log(2.0 * math.pi))).sum(-1)
-    return Weights(mean, root), log_det - 0.5 * (deviance + mean.square().sum(-1) + saturated)
+    half = 0.5 * squares.degrees
+    factor = weights_factor(half.sqrt().unsqueeze(-1) * features)
+    spread = features @ torch.cholesky_inverse(factor, upper=True)
+    variance = (spread * features).sum(-1)
+    log_mean = squares.log_mean
+    target = log_mean + 0.5 * variance
+    mean, location = _maximize(features, target, half, squares.log_pooled, start)
+    residual = location - target
+    decay = torch.exp(-residual)
+    deviance = 2.0 * (half * (residual + decay - 1.0)).sum(-1)
+    log_det = -factor.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
+    saturated = (squares.degrees * (log_mean + 1.0 + math.log(2.0 * math.pi))).sum(-1)
+    evidence = log_det - 0.5 * (deviance + mean.square().sum(-1) + saturated)
+
+    def gradient() -> Tensor:
+        slope = (half * (1.0 - decay)).unsqueeze(-1)
+        pulled = features @ (spread.mT @ (slope * spread))
+        return (slope - half.unsqueeze(-1)) * spread - half.unsqueeze(-1) * pulled - slope * mean.unsqueeze(-2)
+
+    return LogVariance(evidence, mean, factor, location, variance, gradient)
 
 
-def _fit_correlated(squares: Squares, features: Tensor, whitener: Tensor, copies: Tensor) -> tuple[Weights, Tensor]:
+def _fit_correlated(squares: Squares, features: Tensor) -> LogVariance:
     """Closed form: the log of a mean square is the log variance plus the log of a chi-squared number.
 
     That has a known mean and variance, and along a demonstration the correlation that the whitener takes
     out; it is treated as normal, which the smooth noise of demonstrations needs more than its exact shape.
     """
-    half = 0.5 * squares.degrees / copies
-    response = squares.log_mean() - torch.digamma(half) + half.log()
-    weight = (copies / torch.polygamma(1, half)).sqrt().unsqueeze(-1)  # the whitener takes the copies out again
-    design = whitener @ (weight * features)
-    response = (whitener @ (weight * response.unsqueeze(-1))).squeeze(-1)
-    constant = weight.squeeze(-1).log().sum(-1) - 0.5 * response.square().sum(-1)
-    return weights_posterior(design, response), log_evidence(design, response) + constant
+    weight, response, whitener = squares.logarithms
+    design = whitener @ features
+    linear = LinearEvidence.of(design, response)
+    evidence = linear.value + weight.log().sum(-1) - 0.5 * response.square().sum(-1)
+    location = (features @ linear.mean.unsqueeze(-1)).squeeze(-1)
+    variance = ((features @ linear.covariance) * features).sum(-1)
+
+    def gradient() -> Tensor:
+        return whitener.mT @ linear.gradient(design, response)
+
+    return LogVariance(evidence, linear.mean, linear.factor, location, variance, gradient)
 
 
-def _constant(squares: Squares, features: Tensor) -> Tensor:
-    """Weights of the pooled variance everywhere."""
-    weights = torch.zeros_like(features[:, 0, :])
-    pooled = (squares.total.sum(-1) / squares.degrees.sum(-1)).clamp_min(LEAST_SQUARE).log()
-    weights[:, -1] = pooled / features[:, 0, -1]
-    return weights
+def _maximize(features: Tensor, target: Tensor, half: Tensor, pooled: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean of the weights that minimizes sum of h (x + exp(-x)) + m'm / 2, x = F m - t, and F m.
 
-
-def _maximize(features: Tensor, target: Tensor, degrees: Tensor, mean: Tensor) -> Tensor:
-    """Gauss-Newton steps, each halved until the bound does not fall."""
-    value, residual, jacobian = _objective(features, target, degrees, mean)
-    eye = torch.eye(mean.shape[-1]).to(mean)
+    By iterated least squares: with the curvature w of the sum the next mean solves
+    (1 + F' diag(w) F) m = F' (w F m - slope). The first takes F m from the ``start``; if that was no better
+    than the ``pooled`` variance everywhere, it starts there again.
+    """
+    mean, location = _least_squares(features, target, half, start, far=False)
+    value = _loss(location - target, half, mean)
+    from_pooled = pooled / features[:, 0, -1:]
+    lost = ~(value <= _loss(pooled - target, half, from_pooled))
+    if bool(lost.any()):
+        constant = torch.zeros_like(mean)
+        constant[:, -1:] = from_pooled
+        mean = torch.where(lost[:, None], constant, mean)
+        location = torch.where(lost[:, None], pooled, location)
+        value = _loss(location - target, half, mean)
+    far = bool(lost.any())
     for _ in range(_MAX_ITER):
-        gradient = jacobian.mT @ residual.unsqueeze(-1) + mean.unsqueeze(-1)
-        step = -torch.linalg.solve(jacobian.mT @ jacobian + eye, gradient).squeeze(-1)
-        change = (features @ step.unsqueeze(-1)).abs().amax((-2, -1))
-        share = (_LARGEST_STEP / change.clamp_min(1e-300)).clamp_max(1.0)
+        new_mean, new_location = _least_squares(features, target, half, location, far=far)
+        step, change = new_mean - mean, new_location - location
+        share = torch.ones_like(value)
         for _ in range(20):
-            trial = mean + share[:, None] * step
-            tried = _objective(features, target, degrees, trial)
-            worse = ~(tried[0] <= value + 1e-12 * value.abs())
+            new_value = _loss(new_location - target, half, new_mean)
+            worse = ~(new_value <= value + 1e-12 * value.abs())
             if not bool(worse.any()):
                 break
             share = torch.where(worse, 0.5 * share, share)
+            new_mean, new_location = mean + share[:, None] * step, location + share[:, None] * change
         better = ~worse
-        mean = torch.where(better[:, None], trial, mean)
-        value = torch.where(better, tried[0], value)
-        residual = torch.where(better[:, None], tried[1], residual)
-        jacobian = torch.where(better[:, None, None], tried[2], jacobian)
-        if float((share * change).where(better, 0.0).max()) < _TOL:
+        mean = torch.where(better[:, None], new_mean, mean)
+        location = torch.where(better[:, None], new_location, location)
+        value = torch.where(better, new_value, value)
+        largest = float((share * change.abs().amax(-1)).where(better, 0.0).max())
+        if largest < _TOL and not far:
             break
-    return mean
+        far = largest > _FAR
+    return mean, location
 
 
-def _objective(features: Tensor, target: Tensor, degrees: Tensor, mean: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Half the sum of squares to be minimized, the residuals (b, n) and their Jacobian (b, n, p)."""
-    residual, slope = _deviance((features @ mean.unsqueeze(-1)).squeeze(-1) - target, degrees)
-    value = 0.5 * residual.square().sum(-1) + 0.5 * mean.square().sum(-1)
-    return value, residual, slope.unsqueeze(-1) * features
-
-
-def _deviance(x: Tensor, degrees: Tensor) -> tuple[Tensor, Tensor]:
-    """Signed root of ``degrees * (x + exp(-x) - 1)``, and its derivative.
-
-    x is the log variance less that which fits best; the square is minus twice the log likelihood of normal
-    residuals, less its maximum.
+def _least_squares(
+    features: Tensor, target: Tensor, half: Tensor, location: Tensor, *, far: bool
+) -> tuple[Tensor, Tensor]:
+    """Next mean and log variances. Far from the end with more curvature where they are above the target: that of the
+    parabola with the minimum there, which bounds the sum from above and keeps a step from going beyond.
     """
-    x = x.clamp_min(-40.0)
-    near = x.abs() < 1e-3
-    away = x.where(~near, 1.0)
-    root = (away + torch.expm1(-away)).sqrt() * away.sign()
-    value = torch.where(near, x * (1.0 - x / 6.0 + x.square() / 36.0) / 2.0**0.5, root)
-    slope = torch.where(near, (1.0 - x / 3.0 + x.square() / 12.0) / 2.0**0.5, -torch.expm1(-away) / (2.0 * root))
-    scale = degrees.sqrt()
-    return scale * value, scale * slope
+    residual = (location - target).clamp_min(_LEAST_RESIDUAL)
+    decay = torch.exp(-residual)
+    slope = half * (1.0 - decay)
+    weight = half * decay
+    if far:
+        above = residual > 1e-3
+        weight = torch.where(above, slope / residual.where(above, 1.0), weight)
+    precision = features.mT @ (weight.unsqueeze(-1) * features) + torch.eye(features.shape[-1]).to(features)
+    factor = safe_cholesky(precision, name="the precision of the log variances")
+    projected = features.mT @ (weight * location - slope).unsqueeze(-1)
+    mean = torch.cholesky_solve(projected, factor)
+    return mean.squeeze(-1), (features @ mean).squeeze(-1)
+
+
+def _loss(residual: Tensor, half: Tensor, mean: Tensor) -> Tensor:
+    return (half * (residual + torch.exp(-residual.clamp_min(_LEAST_RESIDUAL)))).sum(-1) + 0.5 * mean.square().sum(-1)

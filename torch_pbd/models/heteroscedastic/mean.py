@@ -1,15 +1,18 @@
 """Mean by generalized least squares: Gaussian processes under noise whose covariance depends on the input."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from torch_pbd.models.heteroscedastic.linear import Weights, log_evidence, weights_posterior
-from torch_pbd.models.heteroscedastic.processes import ProcessFamily, SearchOptions, search
+from torch_pbd.gp.fixed_features import FixedFeatures
+from torch_pbd.models.heteroscedastic.linear import LinearEvidence, Weights, weights_posterior
+from torch_pbd.models.heteroscedastic.processes import Design, Processes, ProcessFamily
+from torch_pbd.models.heteroscedastic.search import Gradient, Search
 
-_CHUNK = 4096
+_CHUNK = 1024
 
 
 @dataclass(frozen=True)
@@ -20,47 +23,66 @@ class LatentMean:
     theta: Float[Tensor, "d q"]
     weights: Weights
 
+    @cached_property
+    def processes(self) -> Processes:
+        """Of all outputs."""
+        return self.family.prepared(self.theta)
+
     def at(self, x: Float[Tensor, "n e"]) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d d"]]:
         """Expected mean at x, and the covariance of its error between the outputs."""
-        features = self.family.design(x, self.theta)
+        return self.of_features(self.processes.features(x))
+
+    def of_features(self, values: Float[Tensor, "d n m"]) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d d"]]:
+        """The same, from the features of unit variance there."""
+        features = self.family.scaled(values, self.processes.amplitude)
         n_outputs, _, size = features.shape
-        mean = torch.einsum("dnp,dp->nd", features, self.weights.mean.reshape(n_outputs, size))
-        root = torch.einsum("dnp,dpr->ndr", features, self.weights.root.reshape(n_outputs, size, -1))
-        unexplained = torch.diag_embed(self.family.unexplained(features, self.theta).mT)
+        mean = (features @ self.weights.mean.reshape(n_outputs, size, 1)).squeeze(-1).mT
+        root = (features @ self.weights.root.reshape(n_outputs, size, -1)).transpose(0, 1)
+        unexplained = torch.diag_embed(self.processes.unexplained(features).mT)
         return mean, root @ root.mT + unexplained
 
     def expected(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d"]:
         """Expected mean at x alone, a bounded number of rows at a time."""
-        weights = self.weights.mean.reshape(len(self.theta), -1)
-        return torch.cat(
-            [torch.einsum("dnp,dp->nd", self.family.design(part, self.theta), weights) for part in x.split(_CHUNK)]
-        )
+        processes = self.processes
+        weights = processes.amplitude[:, None] * self.weights.mean.reshape(len(self.theta), -1)
+        # Of the kernel with the inducing inputs, from those of the features: no equations are solved for each row.
+        weights = torch.linalg.solve_triangular(processes.features.factor.mT, weights.unsqueeze(-1), upper=True)
+        return torch.cat([(processes.features.cross(part) @ weights).squeeze(-1).mT for part in x.split(_CHUNK)])
 
 
 def fit_mean(
-    family: ProcessFamily,
+    search: Search,
     inputs: Float[Tensor, "n e"],
     means: Float[Tensor, "n d"],
     counts: Float[Tensor, " n"],
     noise_tril: Float[Tensor, "n d d"],
     whitener: Float[Tensor, "d n n"] | None,
-    start: Float[Tensor, "d q"] | None,
-    options: SearchOptions,
 ) -> LatentMean:
     """Posterior given means of ``counts`` rows, whose noise has the factor ``noise_tril``.
 
     Hyperparameters are chosen for each output by its own evidence, as if the others did not tell of its
     noise; the posterior is that of all outputs together.
     """
-    scale = (counts.sqrt()[:, None] / noise_tril.square().sum(-1).sqrt()).mT
-    response = _whiten(whitener, (scale * means.mT).unsqueeze(-1)).squeeze(-1)
+    scale = (counts.sqrt()[:, None] / noise_tril.square().sum(-1).sqrt()).mT.unsqueeze(-1)
+    noise_whitener = scale if whitener is None else whitener * scale.mT
+    response = _times(whitener, scale * means.mT.unsqueeze(-1)).squeeze(-1)
+    information = noise_whitener.square().sum((-2, -1))
+    family = search.family
+    fixed = FixedFeatures(family.features, inputs)
 
-    def evidence(theta: Tensor, rows: Int64[Tensor, " a"]) -> Tensor:
+    def evidence(theta: Tensor, rows: Int64[Tensor, " a"]) -> tuple[Tensor, Gradient]:
         chosen = None if whitener is None else whitener[rows]
-        design = _whiten(chosen, scale[rows].unsqueeze(-1) * family.design(inputs, theta))
-        return log_evidence(design, response[rows])
+        design = Design.of(family, fixed, theta, information[rows])
+        whitened = _times(chosen, scale[rows] * design.values)
+        linear = LinearEvidence.of(whitened, response[rows])
 
-    theta = search(family, evidence, start, (means.shape[1], inputs.shape[1]), means, options)
+        def gradient() -> Tensor:
+            of_whitened = linear.gradient(whitened, response[rows])
+            return design.pull(scale[rows] * _times(None if chosen is None else chosen.mT, of_whitened))
+
+        return linear.value, gradient
+
+    theta = search.run(evidence, means)
     features = family.design(inputs, theta)
     eye = torch.eye(means.shape[1]).to(means)
     whitening = torch.linalg.solve_triangular(noise_tril, eye.expand_as(noise_tril), upper=False)
@@ -73,5 +95,5 @@ def fit_mean(
     return LatentMean(family, theta, weights_posterior(design.flatten(0, 1), response.flatten()))
 
 
-def _whiten(whitener: Tensor | None, values: Tensor) -> Tensor:
-    return values if whitener is None else whitener @ values
+def _times(matrix: Tensor | None, values: Tensor) -> Tensor:
+    return values if matrix is None else matrix @ values

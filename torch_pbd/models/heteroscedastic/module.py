@@ -1,6 +1,5 @@
 """The fitted model as a module: everything that predicts is in its buffers."""
 
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -8,21 +7,18 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from torch_pbd.gp.inducing import FeatureMap
-from torch_pbd.gp.neighbourhoods import spacing
 from torch_pbd.kernels import KernelName
 from torch_pbd.linalg import safe_cholesky, symmetrize
 from torch_pbd.models.heteroscedastic.fit import HeteroscedasticFit
-from torch_pbd.models.heteroscedastic.latent import FactorMoments, LatentCovariance
+from torch_pbd.models.heteroscedastic.latent import LatentCovariance
 from torch_pbd.models.heteroscedastic.linear import Weights
 from torch_pbd.models.heteroscedastic.mean import LatentMean
+from torch_pbd.models.heteroscedastic.prepared import Prepared
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
 
 # Far from data a log variance may be anything: of its variance no more than this enters an expectation.
 _MOST_LOG_VARIANCE = 2.0
 _LEAST_DEGREES = 3.0  # below two, Student's t has no covariance
-# Longest length scale by which distance from the data is judged, in ranges of the input times the number of inputs;
-# but two spacings of the inducing inputs at least.
-_REACH = 0.1
 
 
 class HeteroscedasticModel(nn.Module):
@@ -46,6 +42,7 @@ class HeteroscedasticModel(nn.Module):
     coefficient_theta: Tensor
     pooled_tril: Tensor
     prior_tril: Tensor
+    _kept: Prepared | None = None
 
     def __init__(self, fit: HeteroscedasticFit, prior_tril: Float[Tensor, "d d"]) -> None:
         super().__init__()
@@ -101,17 +98,22 @@ class HeteroscedasticModel(nn.Module):
         of the mean's, and of the prior with the share that missing data leave it.
         """
         prior = self.prior_tril if prior_tril is None else prior_tril
-        mean, error = self.mean_process.at(x)
+        prepared = self._prepared()
+        of_mean, *of_covariance, of_nearness = prepared.features(x)
+        mean, error = prepared.mean.of_features(of_mean)
         # Where the data leave nothing to err about, rounding must not make it negative.
         least = 1e-12 * torch.diag_embed(1e-30 + error.diagonal(dim1=-2, dim2=-1))
         error_root = safe_cholesky(symmetrize(error) + least, name="the covariance of the mean's error")
-        missing = self.type1(x)[:, None, None]
-        known = _root_of_share(1.0 - missing) * torch.cat([self._root(self._moments(x)), error_root], dim=-1)
+        missing = _missing(of_nearness)[:, None, None]
+        root = self.pooled_tril @ prepared.covariance.of_features(*of_covariance).expected_root(_MOST_LOG_VARIANCE)
+        known = _root_of_share(1.0 - missing) * torch.cat([root, error_root], dim=-1)
         return mean, torch.cat([known, _root_of_share(missing) * prior.expand(len(x), -1, -1)], dim=-1)
 
     def variability(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d d"]:
         """Root of the covariance at the means of the latent processes, without prior and without errors."""
-        return _root_of_share(1.0 - self.type1(x))[:, None, None] * (self.pooled_tril @ self._moments(x).tril())
+        return _root_of_share(1.0 - self.type1(x))[:, None, None] * (
+            self.pooled_tril @ self.covariance_process.at(x).tril()
+        )
 
     def degrees(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
         """Degrees of freedom of the predictive density; infinite (a normal distribution) where only the prior
@@ -120,32 +122,28 @@ class HeteroscedasticModel(nn.Module):
         A variance known from as many squares has a logarithm of variance trigamma(degrees / 2); here it is the mean
         of those of the log variances, and ``trigamma(z)`` is taken for ``1 / z + 1 / (2 z^2)``.
         """
-        variance = self._moments(x).log_variance_variance.mean(-1)
+        prepared = self._prepared()
+        _, of_log_variance, _, of_nearness = prepared.features(x)
+        variance = prepared.covariance.log_variance_of(of_log_variance)[1].mean(-1)
         degrees = (1.0 + (1.0 + 2.0 * variance).sqrt()) / variance
-        return degrees.clamp_min(_LEAST_DEGREES) / (1.0 - self.type1(x)).clamp_min(1e-12)
+        return degrees.clamp_min(_LEAST_DEGREES) / (1.0 - _missing(of_nearness)).clamp_min(1e-12)
 
     def type1(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
-        """Type I uncertainty: eq. (6) without noise over the prior variance, 0 at the inducing inputs.
-
-        Of a process with the length scale of the log variances (their mean, weighted by squared amplitudes), as far
-        as that does not reach too far: a smooth process without noise claims to know what is two of its length
-        scales away, in gaps and beyond the data.
-        """
-        family, theta = self.covariance_process.log_variance_family, self.log_variance_theta
-        weight = family.amplitude_of(theta).square()
-        scale = ((weight / weight.sum()) @ family.length_scale_of(theta).log()).exp()
-        scale = scale.clamp_max(_REACH * x.shape[1]).clamp_min(2.0 * spacing(self.inducing))
-        features = replace(family.features, kernel="squared_exponential")
-        return (1.0 - features(x, scale[None])[0].square().sum(-1)).clamp(0.0, 1.0)
+        """Type I uncertainty: eq. (6) without noise over the prior variance, 0 at the inducing inputs."""
+        return _missing(self._prepared().nearness(x))
 
     def draw(
-        self, x: Float[Tensor, "n e"], normal: list[Tensor], prior_tril: Float[Tensor, "n d d"] | None = None
-    ) -> Float[Tensor, "n d r"]:
-        """Root of one posterior draw of the covariance function at x, with the prior's share in it."""
-        prior = self.prior_tril.expand(len(x), -1, -1) if prior_tril is None else prior_tril
+        self,
+        x: Float[Tensor, "n e"],
+        normal: list[Float[Tensor, "*s _"]],
+        prior_tril: Float[Tensor, "n d d"] | None = None,
+    ) -> Float[Tensor, "*s n d r"]:
+        """Roots of posterior draws of the covariance function at x, with the prior's share in them."""
+        prior = self.prior_tril if prior_tril is None else prior_tril
         missing = self.type1(x)[:, None, None]
         root = self.pooled_tril @ self.covariance_process.draw(x, normal)
-        return torch.cat([_root_of_share(1.0 - missing) * root, _root_of_share(missing) * prior], dim=-1)
+        share = (_root_of_share(missing) * prior).expand_as(root)
+        return torch.cat([_root_of_share(1.0 - missing) * root, share], dim=-1)
 
     def draw_sizes(self) -> list[int]:
         """Sizes of the standard normal vectors that :meth:`draw` takes."""
@@ -155,25 +153,45 @@ class HeteroscedasticModel(nn.Module):
     @property
     def mean_process(self) -> LatentMean:
         """The mean's processes."""
-        return LatentMean(self._family(0), self.mean_theta, Weights(self.mean_weights, self.mean_root))
+        return self._prepared().mean
 
     @property
     def covariance_process(self) -> LatentCovariance:
         """The covariance's processes, of residuals multiplied by the inverse of ``pooled_tril``."""
-        count = len(self.coefficient_theta)
+        return self._prepared().covariance
+
+    def _prepared(self) -> Prepared:
+        """Processes of the buffers, with what does not depend on x computed; anew where a buffer is another."""
+        buffers = tuple(self._buffers.values())
+        if any(buffer is None or buffer.is_inference() or buffer.requires_grad for buffer in buffers):
+            return self._prepare(buffers)
+        kept = self._kept
+        if kept is None or not kept.is_of(buffers):
+            # Else, asked for in inference mode, these would be of no use to autograd later.
+            with torch.inference_mode(False), torch.no_grad():
+                kept = self._prepare(buffers)
+                self._kept = kept
+        return kept
+
+    def _prepare(self, buffers: tuple[Tensor | None, ...]) -> Prepared:
+        mean = LatentMean(self._family(0), self.mean_theta, Weights(self.mean_weights, self.mean_root))
         coefficients = [
             Weights(getattr(self, f"coefficient_weights_{i}"), getattr(self, f"coefficient_root_{i}"))
-            for i in range(1, count + 1)
+            for i in range(1, len(self.coefficient_theta) + 1)
         ]
-        log_variance = Weights(self.log_variance_weights, self.log_variance_root)
-        return LatentCovariance(
+        covariance = LatentCovariance(
             self._family(1),
             self._family(2),
             self.log_variance_theta,
-            log_variance,
+            Weights(self.log_variance_weights, self.log_variance_root),
             self.coefficient_theta,
             coefficients,
         )
+        return Prepared.of(buffers, mean, covariance)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """State for copies and pickle: without what is computed from the buffers."""
+        return {**self.__dict__, "_kept": None}
 
     def _family(self, number: int) -> ProcessFamily:
         inducing = self.inducing if number else self.mean_inducing
@@ -181,11 +199,10 @@ class HeteroscedasticModel(nn.Module):
         name = ("mean", "log_variance", "coefficient")[number]
         return ProcessFamily(features, *self.medians[number], getattr(self, f"{name}_length_scale", None))
 
-    def _moments(self, x: Tensor) -> FactorMoments:
-        return self.covariance_process.at(x)
 
-    def _root(self, moments: FactorMoments) -> Tensor:
-        return self.pooled_tril @ moments.expected_root(_MOST_LOG_VARIANCE)
+def _missing(features: Tensor) -> Tensor:
+    """Share of the variance that features of one process of unit variance (1, n, m) do not carry."""
+    return (1.0 - features[0].square().sum(-1)).clamp(0.0, 1.0)
 
 
 def _root_of_share(share: Tensor) -> Tensor:

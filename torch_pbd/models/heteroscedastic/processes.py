@@ -1,39 +1,19 @@
-"""Families of latent processes, and the search for their hyperparameters."""
+"""Families of latent processes, and their features."""
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 from torch import Tensor
 
-from torch_pbd.exceptions import NotPositiveDefiniteError
-from torch_pbd.gp.inducing import FeatureMap
-from torch_pbd.optim import BatchReport, Progress, by_autograd, minimize_batch
+from torch_pbd.gp.fixed_features import FeaturesAt, FixedFeatures
+from torch_pbd.gp.inducing import FeatureMap, PreparedFeatures
 
 _CLEAR = 3.0  # times the shortest length scale
 _WIDEST = 4.0  # amplitudes stay within a factor of exp(4) of their prior median
 _SPREAD_LENGTH_SCALE, _SPREAD_AMPLITUDE = 1.0, 1.5  # prior deviations of the logarithms
-
-
-@dataclass
-class SearchOptions:
-    """How hyperparameters are searched, and how the searches ended."""
-
-    max_iter: int = 30
-    tol: float = 1e-3
-    """In nats."""
-    n_restarts: int = 0
-    """Starts beside the best point of the grid, where no earlier search gives one."""
-    callback: Callable[[Progress], None] | None = None
-    """Called at the end of each turn of mean and covariance."""
-    reports: list[BatchReport] = field(default_factory=list)
-
-    def report(self, turn: int, loss: float, elapsed: float) -> None:
-        """Tell the callback."""
-        if self.callback is not None:
-            self.callback(Progress(turn, loss, elapsed))
+_NEGLIGIBLE = 1e-8  # nats of the log evidence, that features which are left out may be worth
 
 
 @dataclass(frozen=True)
@@ -65,15 +45,18 @@ class ProcessFamily:
 
     def design(self, x: Float[Tensor, "n e"], theta: Float[Tensor, "b q"]) -> Float[Tensor, "b n p"]:
         """Features at x, of which a process is the sum weighted by standard normal numbers."""
-        features = self.amplitude_of(theta)[:, None, None] * self.features(x, self.length_scale_of(theta))
+        return self.prepared(theta)(x)
+
+    def prepared(self, theta: Float[Tensor, "b q"]) -> "Processes":
+        """Processes with these hyperparameters."""
+        return Processes(self, self.amplitude_of(theta), self.features.prepared(self.length_scale_of(theta)))
+
+    def scaled(self, features: Float[Tensor, "b n m"], amplitude: Float[Tensor, " b"]) -> Float[Tensor, "b n p"]:
+        """Features times the amplitudes, and the constant."""
+        features = amplitude[:, None, None] * features
         if self.constant == 0.0:
             return features
-        return torch.cat([features, self.constant * torch.ones_like(features[..., :1])], dim=-1)
-
-    def unexplained(self, design: Float[Tensor, "b n p"], theta: Float[Tensor, "b q"]) -> Float[Tensor, "b n"]:
-        """Prior variance that the features at x do not carry: none at the inducing inputs, all far from them."""
-        carried = design[..., : len(self.features.inducing)].square().sum(-1)
-        return (self.amplitude_of(theta).square().unsqueeze(-1) - carried).clamp_min(0.0)
+        return torch.nn.functional.pad(features, (0, 1), value=self.constant)
 
     def length_scale_of(self, theta: Float[Tensor, "b q"]) -> Float[Tensor, "b e"]:
         """Length scales, never below what the inducing inputs resolve."""
@@ -91,10 +74,12 @@ class ProcessFamily:
         """Amplitude, within a wide range."""
         return self.amplitude * (_WIDEST * torch.tanh(theta[:, -1] / _WIDEST)).exp()
 
-    def log_prior(self, theta: Float[Tensor, "b q"]) -> Float[Tensor, " b"]:
-        """Log density of hyperparameters, but for a constant."""
-        scales = (theta[:, :-1] - math.log(self.length_scale)) / _SPREAD_LENGTH_SCALE
-        return -0.5 * (scales.square().sum(-1) + (theta[:, -1] / _SPREAD_AMPLITUDE).square())
+    def log_prior(self, theta: Float[Tensor, "b q"]) -> tuple[Float[Tensor, " b"], Float[Tensor, "b q"]]:
+        """Log density of hyperparameters, but for a constant, and its gradient."""
+        median = theta.new_tensor([math.log(self.length_scale)] * (theta.shape[1] - 1) + [0.0])
+        spread = theta.new_tensor([_SPREAD_LENGTH_SCALE] * (theta.shape[1] - 1) + [_SPREAD_AMPLITUDE])
+        deviation = (theta - median) / spread
+        return -0.5 * deviation.square().sum(-1), -deviation / spread
 
     def starts(self, like: Tensor, n_features: int) -> Float[Tensor, "s q"]:
         """Where a search begins: short and long, weak and strong."""
@@ -106,77 +91,59 @@ class ProcessFamily:
         return like.new_tensor(grid)
 
 
-def search(
-    family: ProcessFamily,
-    evidence: Callable[[Float[Tensor, "a q"], Int64[Tensor, " a"]], Float[Tensor, " a"]],
-    start: Float[Tensor, "b q"] | None,
-    size: tuple[int, int],
-    like: Tensor,
-    options: SearchOptions,
-) -> Float[Tensor, "b q"]:
-    """Hyperparameters of the highest evidence times prior, by L-BFGS: for each of b processes by itself.
+@dataclass(frozen=True)
+class Processes:
+    """Processes of a family whose hyperparameters are known, with what does not depend on the inputs computed."""
 
-    Parameters
-    ----------
-    evidence : callable
-        Log evidence of hyperparameters of some of the processes, given which ones.
-    start : Tensor of shape (b, q) or None
-        Without one the best points of a small grid.
-    size : (int, int)
-        Numbers of processes and of inputs' dimensions.
-    like : Tensor
-        Of the dtype and on the device to work on.
-    options : SearchOptions
-        Its reports are added to.
-    """
-    n_processes, n_features = size
-    every = torch.arange(n_processes, device=like.device)
+    family: ProcessFamily
+    amplitude: Float[Tensor, " b"]
+    features: PreparedFeatures
 
-    def loss(theta: Tensor, rows: Tensor) -> Tensor:
-        try:
-            return -evidence(theta, rows) - family.log_prior(theta)
-        except (NotPositiveDefiniteError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
-            return math.nan * theta.sum(-1)  # too far, for the optimizer
+    def __call__(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "b n p"]:
+        """Features at x, of which a process is the sum weighted by standard normal numbers."""
+        return self.family.scaled(self.features(x), self.amplitude)
 
-    def joint_loss(theta: Tensor, _: Tensor) -> Tensor:
-        return torch.stack([loss(_spread_out(row, n_features), every).sum() for row in theta])
-
-    candidates = [start] if start is not None else _best_of_grid(family, loss, every, n_features, like, options)
-    ends, losses = [], []
-    for candidate in candidates:
-        if family.shared:
-            together = torch.cat([candidate[0, :n_features], candidate[:, -1]])[None]
-            end, report = minimize_batch(by_autograd(joint_loss), together, max_iter=options.max_iter, tol=options.tol)
-            ends.append(_spread_out(end[0], n_features))
-            losses.append(report.loss.expand(n_processes))
-        else:
-            end, report = minimize_batch(by_autograd(loss), candidate, max_iter=options.max_iter, tol=options.tol)
-            ends.append(end)
-            losses.append(report.loss)
-        options.reports.append(report)
-    best = torch.stack(losses).nan_to_num(nan=math.inf).argmin(0)
-    return torch.stack(ends)[best, every]
+    def unexplained(self, design: Float[Tensor, "b n p"]) -> Float[Tensor, "b n"]:
+        """Prior variance that the features at x do not carry: none at the inducing inputs, all far from them."""
+        carried = design[..., : self.features.factor.shape[-1]].square().sum(-1)
+        return (self.amplitude.square().unsqueeze(-1) - carried).clamp_min(0.0)
 
 
-def _best_of_grid(
-    family: ProcessFamily,
-    loss: Callable[[Tensor, Tensor], Tensor],
-    every: Tensor,
-    n_features: int,
-    like: Tensor,
-    options: SearchOptions,
-) -> list[Tensor]:
-    points = family.starts(like, n_features)
-    with torch.no_grad():
-        table = torch.stack([loss(point.expand(len(every), -1), every) for point in points])
-    table = table.nan_to_num(nan=math.inf)
-    if family.shared:
-        table = table.sum(1, keepdim=True).expand_as(table)
-    order = table.argsort(0)[: 1 + options.n_restarts]
-    return [points[rank] for rank in order]
+@dataclass(frozen=True)
+class Design:
+    """Features of b processes at inputs that stay, as few as their information needs."""
 
+    family: ProcessFamily
+    theta: Float[Tensor, "b q"]
+    amplitude: Float[Tensor, " b"]
+    features: FeaturesAt
+    values: Float[Tensor, "b n p"]
 
-def _spread_out(together: Tensor, n_features: int) -> Tensor:
-    """Hyperparameters of each process from the length scales of all and the amplitude of each."""
-    amplitudes = together[n_features:, None]
-    return torch.cat([together[:n_features].expand(len(amplitudes), -1), amplitudes], dim=1)
+    @classmethod
+    def of(
+        cls,
+        family: ProcessFamily,
+        fixed: FixedFeatures,
+        theta: Float[Tensor, "b q"],
+        information: Float[Tensor, " b"],
+    ) -> "Design":
+        """Design whose log evidence is that of all features, but for what cannot be told.
+
+        Where features that carry a variance of at most v are left out, it changes by about half of v times the
+        ``information``, the sum of the precisions of what is observed.
+        """
+        amplitude = family.amplitude_of(theta)
+        features = fixed.at(family.length_scale_of(theta), 2.0 * _NEGLIGIBLE / (amplitude.square() * information))
+        return cls(family, theta, amplitude, features, family.scaled(features.values, amplitude))
+
+    def pull(self, gradient: Float[Tensor, "b n p"]) -> Float[Tensor, "b q"]:
+        """Gradient in the hyperparameters, from that in the values of a function of their inner products."""
+        family, size = self.family, self.features.values.shape[-1]
+        gradient = gradient[..., :size]
+        in_amplitude = (gradient * self.values[..., :size]).sum((-2, -1))
+        in_amplitude = in_amplitude * (1.0 - torch.tanh(self.theta[:, -1] / _WIDEST).square())
+        if family.fixed_length_scale is not None:
+            return torch.nn.functional.pad(in_amplitude[:, None], (self.theta.shape[1] - 1, 0))
+        in_scale = self.features.pull(self.amplitude[:, None, None] * gradient)
+        in_scale = in_scale * torch.sigmoid(self.theta[:, :-1] - math.log(family.features.shortest_length_scale()))
+        return torch.cat([in_scale, in_amplitude[:, None]], dim=1)

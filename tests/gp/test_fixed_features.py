@@ -1,0 +1,68 @@
+import pytest
+import torch
+
+from torch_pbd.gp.fixed_features import FixedFeatures
+from torch_pbd.gp.inducing import FeatureMap
+from torch_pbd.kernels import KERNELS
+
+
+def tensor(values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def maps(kernel, n_features, period, generator):
+    inducing = torch.rand(12, n_features, dtype=torch.float64, generator=generator)
+    x = torch.rand(7, n_features, dtype=torch.float64, generator=generator)
+    features = FeatureMap(inducing, kernel, None if period is None else tensor(period))
+    return features, FixedFeatures(features, x), x
+
+
+CASES = [(1, None), (2, None), (2, [1.3, torch.inf])]
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize(("n_features", "period"), CASES)
+def test_values_are_those_of_the_map_but_for_a_rotation(kernel, n_features, period, generator):
+    features, fixed, x = maps(kernel, n_features, period, generator)
+    length_scale = tensor([[0.1, 0.3], [0.2, 0.05]])[:, :n_features]
+    found, expected = fixed.at(length_scale, tensor([1e-12, 1e-12])).values, features(x, length_scale)
+    torch.testing.assert_close(found @ found.mT, expected @ expected.mT, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize(("n_features", "period"), CASES)
+def test_gradient_in_the_length_scales_is_that_of_autograd(kernel, n_features, period, generator):
+    """Of a function of the inner products; through the map's Cholesky factor by autograd."""
+    features, fixed, x = maps(kernel, n_features, period, generator)
+    log_scale = tensor([[0.1, 0.3], [0.2, 0.05]])[:, :n_features].log().requires_grad_()
+    weight = torch.randn(7, 7, dtype=torch.float64, generator=generator)
+
+    def of_products(values):
+        return (weight * (values @ values.mT).sin()).sum()
+
+    (expected,) = torch.autograd.grad(of_products(features(x, log_scale.exp())), log_scale)
+    at = fixed.at(log_scale.detach().exp(), tensor([1e-12, 1e-12]))
+    values = at.values.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(of_products(values), values)
+    torch.testing.assert_close(at.pull(gradient), expected, rtol=1e-6, atol=1e-6)
+
+
+def test_features_that_carry_next_to_nothing_are_left_out():
+    """The longer the length scale the more of them; what is left carries all but about what was allowed."""
+    inducing = torch.linspace(-0.5, 0.5, 60, dtype=torch.float64)[:, None]
+    x = torch.linspace(-0.5, 0.5, 200, dtype=torch.float64)[:, None]
+    fixed = FixedFeatures(FeatureMap(inducing), x)
+    sizes = []
+    for scale in (0.05, 0.2, 0.8):
+        values = fixed.at(tensor([[scale]]), tensor([1e-8])).values[0]
+        sizes.append(values.shape[1])
+        assert float((1.0 - values.square().sum(1)).max()) < 2e-7  # measured: 1.3e-7, between inducing inputs
+    assert sizes[0] > sizes[1] > sizes[2]
+    assert sizes[2] < 12
+
+
+def test_inducing_inputs_are_taken_farthest_first():
+    features = FeatureMap(tensor([[0.0], [0.1], [0.5], [0.9], [1.0]]))
+    assert features.farthest_first.tolist()[:3] in ([2, 0, 4], [2, 4, 0])
+    around = FeatureMap(tensor([[0.0], [0.5], [0.9]]), period=tensor([1.0]))  # 0.9 is next to 0.0
+    assert sorted(around.farthest_first.tolist()[:2])[1] == 1 or around.farthest_first.tolist()[1] == 1

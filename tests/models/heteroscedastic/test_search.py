@@ -1,0 +1,94 @@
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import minimize
+
+from torch_pbd.exceptions import NotPositiveDefiniteError
+from torch_pbd.gp.inducing import FeatureMap
+from torch_pbd.models.heteroscedastic import ProcessFamily, SearchOptions
+from torch_pbd.models.heteroscedastic.linear import LinearEvidence
+from torch_pbd.models.heteroscedastic.search import Search
+
+
+def tensor(values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def evidence_of(family, inputs, response):
+    def evidence(theta, rows):
+        theta = theta.clone().requires_grad_()
+        with torch.enable_grad():
+            value = LinearEvidence.of(5.0 * family.design(inputs, theta), 5.0 * response[rows]).value
+        return value.detach(), lambda: torch.autograd.grad(value, theta, torch.ones_like(value))[0]
+
+    return evidence
+
+
+def curves(inputs, rng):
+    """A fast one and a slow one, with noise of a fifth."""
+    x = inputs[:, 0].numpy()
+    return tensor(np.stack([np.sin(12.0 * x), np.sin(2.0 * x)]) + 0.2 * rng.normal(size=(2, len(x))))
+
+
+@pytest.fixture
+def many_inputs():
+    return torch.linspace(-0.5, 0.5, 40, dtype=torch.float64)[:, None]
+
+
+def test_the_search_ends_where_that_of_scipy_does(many_inputs, rng):
+    family = ProcessFamily(FeatureMap(many_inputs, exact=True), 0.3, 1.2, 0.0)
+    evidence = evidence_of(family, many_inputs, curves(many_inputs, rng))
+    theta = Search(family, 2, 1, SearchOptions(100, 1e-5)).run(evidence, many_inputs)
+    for i in (0, 1):
+
+        def loss(point, i=i):
+            point = tensor(point)[None]
+            return -float(evidence(point, torch.tensor([i]))[0] + family.log_prior(point)[0])
+
+        ends = [minimize(loss, start, method="Nelder-Mead") for start in ([-2.0, 0.0], [-0.5, 0.0], [0.5, 1.0])]
+        best = min(ends, key=lambda end: end.fun)
+        assert loss(theta[i].tolist()) < best.fun + 1e-4
+        np.testing.assert_allclose(theta[i], best.x, rtol=0, atol=1e-2)
+
+
+def test_a_shared_length_scale_is_that_of_the_joint_evidence(many_inputs, rng):
+    family = ProcessFamily(FeatureMap(many_inputs, exact=True), 0.3, 1.2, 0.0, shared=True)
+    evidence = evidence_of(family, many_inputs, curves(many_inputs, rng))
+    theta = Search(family, 2, 1, SearchOptions(100, 1e-5)).run(evidence, many_inputs)
+    assert theta[0, 0] == theta[1, 0]
+    assert theta[0, 1] != theta[1, 1]
+
+    def loss(point):
+        both = tensor([[point[0], point[1]], [point[0], point[2]]])
+        return -float((evidence(both, torch.arange(2))[0] + family.log_prior(both)[0]).sum())
+
+    best = minimize(loss, [-1.0, 0.0, 0.0], method="Nelder-Mead", options={"maxiter": 2000})
+    assert loss([theta[0, 0], theta[0, 1], theta[1, 1]]) < best.fun + 1e-4
+
+
+def test_the_next_run_starts_where_the_last_ended(many_inputs, rng):
+    """With the same evidence it is at the end with its first evaluation; with another it goes on from there."""
+    family = ProcessFamily(FeatureMap(many_inputs, exact=True), 0.3, 1.2, 0.0)
+    response = curves(many_inputs, rng)
+    search = Search(family, 2, 1, SearchOptions(100, 1e-5))
+    first = search.run(evidence_of(family, many_inputs, response), many_inputs)
+    assert torch.equal(search.run(evidence_of(family, many_inputs, response), many_inputs), first)
+    assert search.options.reports[-1].n_iter == 0
+    other = evidence_of(family, many_inputs, response + 0.05 * torch.randn(2, 40).double())
+    anew = Search(family, 2, 1, SearchOptions(100, 1e-5)).run(other, many_inputs)
+    torch.testing.assert_close(search.run(other, many_inputs), anew, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("n_restarts", [0, 2])
+def test_evidence_that_cannot_be_computed_is_gone_around(n_restarts, many_inputs, rng):
+    family = ProcessFamily(FeatureMap(many_inputs, exact=True), 0.3, 1.2, 0.0)
+    evidence = evidence_of(family, many_inputs, curves(many_inputs, rng))
+
+    def limited(theta, rows):
+        if (theta[:, -1] > 2.0).any():
+            raise NotPositiveDefiniteError("too large")
+        return evidence(theta, rows)
+
+    expected = Search(family, 2, 1, SearchOptions(100, 1e-5)).run(evidence, many_inputs)
+    found = Search(family, 2, 1, SearchOptions(100, 1e-5, n_restarts)).run(limited, many_inputs)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-3)

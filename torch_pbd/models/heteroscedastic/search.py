@@ -1,0 +1,150 @@
+"""Search for the hyperparameters of latent processes."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from torch_pbd.exceptions import NotPositiveDefiniteError
+from torch_pbd.models.heteroscedastic.processes import ProcessFamily
+from torch_pbd.optim import BatchReport, Progress, minimize_batch
+
+_SMALL = 10_000  # entries of all processes' features
+_DIFFERENCE = 1e-3  # of hyperparameters, whose gradients' differences tell the curvature at a start
+_LEAST_CURVATURE = 0.2  # about half of the prior's
+
+Gradient = Callable[[], Float[Tensor, "a q"]]
+Evidence = Callable[[Float[Tensor, "a q"], Int64[Tensor, " a"]], tuple[Float[Tensor, " a"], Gradient]]
+"""Log evidence of hyperparameters of some of the processes, given which ones; and what computes its gradients."""
+_Objective = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+
+
+@dataclass
+class SearchOptions:
+    """How hyperparameters are searched, and how the searches ended."""
+
+    max_iter: int = 30
+    tol: float = 1e-3
+    """In nats."""
+    n_restarts: int = 0
+    """Starts beside the best point of the grid, where no earlier search gives one."""
+    callback: Callable[[Progress], None] | None = None
+    """Called at the end of each turn of mean and covariance."""
+    slack: float = 1.0
+    """Times the tolerance, as long as better evidence is to come."""
+    reports: list[BatchReport] = field(default_factory=list)
+
+    def report(self, turn: int, loss: float, elapsed: float) -> None:
+        """Tell the callback."""
+        if self.callback is not None:
+            self.callback(Progress(turn, loss, elapsed))
+
+
+@dataclass
+class Search:
+    """Hyperparameters of the highest evidence times prior, by BFGS: for each of b processes by itself.
+
+    The first run takes the best points of a small grid, and the curvature there by differences; the next ones start
+    where the last ended, with its curvature.
+
+    Parameters
+    ----------
+    family : ProcessFamily
+    n_processes, n_features : int
+        b, and the inputs' dimensions.
+    options : SearchOptions
+        Its reports are added to.
+    """
+
+    family: ProcessFamily
+    n_processes: int
+    n_features: int
+    options: SearchOptions
+    theta: Float[Tensor, "b q"] | None = None
+    _end: tuple[Tensor, Tensor] | None = None
+    """Point and inverse Hessian that the last run ended with, of each problem."""
+
+    def run(self, evidence: Evidence, like: Tensor) -> Float[Tensor, "b q"]:
+        """Hyperparameters for this evidence; ``like`` has the dtype and the device to work on."""
+        every = torch.arange(self.n_processes, device=like.device)
+
+        def value(theta: Tensor, rows: Tensor) -> tuple[Tensor, Gradient]:
+            try:
+                return evidence(theta, rows)
+            except (NotPositiveDefiniteError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
+                return math.nan * theta.sum(-1), lambda: theta  # too far, for the optimizer
+
+        def loss(theta: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+            found, gradient = value(theta, rows)
+            prior, of_prior = self.family.log_prior(theta)
+            return -found - prior, -gradient() - of_prior
+
+        def joint_loss(points: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+            values, gradients = loss(self._spread_out(points), every.repeat(len(points)))
+            each = gradients.reshape(len(points), self.n_processes, -1)
+            together = torch.cat([each[..., :-1].sum(1), each[..., -1]], dim=1)
+            return values.reshape(len(points), -1).sum(1), together
+
+        objective = joint_loss if self.family.shared else loss
+        starts = self._starts(value, objective, every, like) if self._end is None else [self._end]
+        ends = []
+        for start, inverse_hessian in starts:
+            ends.append(
+                minimize_batch(
+                    objective,
+                    start,
+                    max_iter=self.options.max_iter,
+                    tol=self.options.slack * self.options.tol,
+                    inverse_hessian=inverse_hessian,
+                )
+            )
+            self.options.reports.append(ends[-1][1])
+        best = torch.stack([report.loss for _, report in ends]).nan_to_num(nan=math.inf).argmin(0)
+        row = torch.arange(len(best), device=like.device)
+        point = torch.stack([end for end, _ in ends])[best, row]
+        self._end = point, torch.stack([report.inverse_hessian for _, report in ends])[best, row]
+        self.theta = self._spread_out(point) if self.family.shared else point
+        return self.theta
+
+    def _starts(
+        self, value: Evidence, objective: _Objective, every: Tensor, like: Tensor
+    ) -> list[tuple[Tensor, Tensor]]:
+        """Best points of the grid for each problem, and inverse Hessians there.
+
+        Those of one length scale are tried together, as they take as many features; all, where calls cost more.
+        """
+        points = self.family.starts(like, self.n_features)
+        small = like.numel() * len(self.family.features.inducing) < _SMALL
+        parts = [
+            value(pair.repeat_interleave(len(every), dim=0), every.repeat(len(pair)))[0].reshape(-1, len(every))
+            for pair in points.split(len(points) if small else 2)
+        ]
+        table = -torch.cat(parts) - self.family.log_prior(points)[0][:, None]
+        table = table.nan_to_num(nan=math.inf)
+        if self.family.shared:
+            table = table.sum(1, keepdim=True)
+        starts = [points[rank] for rank in table.argsort(0)[: 1 + self.options.n_restarts]]
+        if self.family.shared:
+            starts = [torch.cat([start[:, :-1], start[:, -1:].expand(-1, len(every))], dim=1) for start in starts]
+        return [(start, _inverse_hessian(objective, start)) for start in starts]
+
+    def _spread_out(self, together: Float[Tensor, "s r"]) -> Float[Tensor, "sb q"]:
+        """Hyperparameters of each process from the length scales of all and the amplitude of each."""
+        scales = together[:, None, : self.n_features].expand(-1, self.n_processes, -1)
+        return torch.cat([scales, together[:, self.n_features :, None]], dim=2).flatten(0, 1)
+
+
+def _inverse_hessian(objective: _Objective, start: Float[Tensor, "b p"]) -> Float[Tensor, "b p p"]:
+    """By differences of gradients; of directions with less or negative curvature as if they had its size."""
+    n_problems, size = start.shape
+    steps = torch.cat([start.new_zeros(1, size), _DIFFERENCE * torch.eye(size).to(start)])
+    points = (start + steps[:, None]).flatten(0, 1)
+    rows = torch.arange(n_problems, device=start.device).repeat(size + 1)
+    _, gradients = objective(points, rows)
+    gradients = gradients.reshape(size + 1, n_problems, size)
+    hessian = ((gradients[1:] - gradients[0]) / _DIFFERENCE).transpose(0, 1)
+    curvature, axes = torch.linalg.eigh(0.5 * (hessian + hessian.mT).nan_to_num())
+    return axes @ torch.diag_embed(1.0 / curvature.abs().clamp_min(_LEAST_CURVATURE)) @ axes.mT
