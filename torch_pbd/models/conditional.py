@@ -94,12 +94,7 @@ class ConditionalNormal(nn.Module):
     def mean(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d"]:
         """Mean alone, without the work that a covariance takes."""
         core, standardized = self.core, self._standardized(x)
-        if isinstance(core, MeanAndCovariance):
-            mean = core.mean(standardized)
-        elif isinstance(core, HeteroscedasticModel):
-            mean = core.mean_process.expected(standardized)
-        else:
-            mean = core(standardized)[0]
+        mean = core(standardized)[0] if isinstance(core, GaussianMixture) else core.mean(standardized)
         return self.y_shift + self.y_scale * mean
 
     def covariance(

@@ -36,10 +36,15 @@ class LatentMean:
         """The same, from the features of unit variance there."""
         features = self.family.scaled(values, self.processes.amplitude)
         n_outputs, _, size = features.shape
-        mean = (features @ self.weights.mean.reshape(n_outputs, size, 1)).squeeze(-1).mT
+        mean = self.expectation(values)
         root = (features @ self.weights.root.reshape(n_outputs, size, -1)).transpose(0, 1)
         unexplained = torch.diag_embed(self.processes.unexplained(features).mT)
         return mean, root @ root.mT + unexplained
+
+    def expectation(self, values: Float[Tensor, "d n m"]) -> Float[Tensor, "n d"]:
+        """Expected mean, from the features of unit variance."""
+        features = self.family.scaled(values, self.processes.amplitude)
+        return (features @ self.weights.mean.reshape(len(features), -1, 1)).squeeze(-1).mT
 
     def expected(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d"]:
         """Expected mean at x alone, a bounded number of rows at a time."""

@@ -109,6 +109,11 @@ class HeteroscedasticModel(nn.Module):
         known = _root_of_share(1.0 - missing) * torch.cat([root, error_root], dim=-1)
         return mean, torch.cat([known, _root_of_share(missing) * prior.expand(len(x), -1, -1)], dim=-1)
 
+    def mean(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d"]:
+        """Mean alone, equal to the bit."""
+        prepared = self._prepared()
+        return prepared.mean.expectation(prepared.features(x)[0])
+
     def variability(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d d"]:
         """Root of the covariance at the means of the latent processes, without prior and without errors."""
         return _root_of_share(1.0 - self.type1(x))[:, None, None] * (
