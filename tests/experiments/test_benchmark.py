@@ -1,6 +1,7 @@
 """``torch-pbd benchmark``: what it measures is that of a machine; here is what it makes of it."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from torch_pbd.cli import main
 from torch_pbd.config import GROUPS as NAMES
 from torch_pbd.experiments.benchmark import GROUPS, made, prediction, report
 from torch_pbd.experiments.benchmark import ticks as ticking
+from torch_pbd.experiments.benchmark.fresh import measured
 from torch_pbd.experiments.benchmark.growth import exponent
 from torch_pbd.experiments.benchmark.rows import Findings, Growth, Plan, Row
 from torch_pbd.experiments.benchmark.timing import alternate, ratios
@@ -138,6 +140,14 @@ def test_the_mixture_of_gmr_is_ours(monkeypatch):
     np.testing.assert_allclose(covariance[0] / np.outer(scale, scale), theirs.covariance, rtol=1e-9)
     batch, _ = contenders[1]["ours"]()
     np.testing.assert_allclose(batch[0], mean[0], rtol=1e-12)
+
+
+def test_memory_is_what_work_takes_above_its_setup():
+    if not Path("/proc/self/clear_refs").exists():
+        pytest.skip("the peak of a process can be told on Linux only")
+    setup = "data = np.ones((300, 1 << 17)); data = data[:1].copy()"  # 300 MiB that are given back
+    found = measured(setup, "more = np.ones((100, 1 << 17)); del more")
+    assert 95.0 < found["above"] < 130.0
 
 
 def test_the_command_line_knows_the_groups():

@@ -158,7 +158,8 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
     def predict_uncertainty(self, X: ArrayLike) -> Uncertainty:
         """Both kinds of uncertainty at X, apart (Section IV-C)."""
         inputs = checked_queries(self, X)
-        return Uncertainty(*self._arrays(lambda x: (self.module_.type1(x), self.module_.type2(x)), inputs))
+        type1 = self._arrays(lambda x: (self.module_.type1(x),), inputs)[0]
+        return Uncertainty(type1, self._variability(inputs))
 
     def log_likelihood(self, X: ArrayLike, y: ArrayLike) -> Floats:
         """Log density of each row of y at X, in nats: (n_samples,)."""
@@ -209,6 +210,9 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
 
     def _covariance(self, X: Floats) -> Floats:
         return self._arrays(lambda x: (self.module_.covariance(x, *self._prior_tril_at(x)),), X)[0]
+
+    def _variability(self, X: Floats) -> Floats:
+        return self._arrays(lambda x: (self.module_.type2(x),), X)[0]
 
     def _moments(self, X: Floats) -> tuple[Floats, ...]:
         return self._arrays(lambda x: self.module_.moments(x, *self._prior_tril_at(x)), X)

@@ -156,6 +156,9 @@ class GMMBaseline(CovarianceRegressor):
     def _covariance(self, X: Floats) -> Floats:
         return self._moments(X)[1]
 
+    def _variability(self, X: Floats) -> Floats:
+        return self._covariance(X)  # there is no prior in it
+
     def _moments(self, X: Floats) -> tuple[Floats, ...]:
         regression = self._regression
         if regression is None or not regression.is_of(self.module_):
