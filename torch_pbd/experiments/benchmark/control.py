@@ -1,14 +1,13 @@
 """Ticks of the real-time controller: their time, their memory, the error of their stiffness; and rollouts."""
 
 import numpy as np
-import torch
 
 from torch_pbd import DMPController, HeteroscedasticGPRegressor
-from torch_pbd.control import AdmittancePlant, RealTimeAdmittance
+from torch_pbd.control import RealTimeAdmittance
 from torch_pbd.data import make_tunnel_demonstrations
+from torch_pbd.experiments.benchmark import rollouts
 from torch_pbd.experiments.benchmark.rows import Findings, Plan, Row
 from torch_pbd.experiments.benchmark.ticks import BLOCK, blocks, clock_cost, memory_kept
-from torch_pbd.experiments.benchmark.timing import alternate
 
 
 def measure(plan: Plan) -> Findings:
@@ -19,7 +18,7 @@ def measure(plan: Plan) -> Findings:
         *_ticks(plan),
         Row(f"kept by {n_ticks:,} ticks", [float(kept)], "bytes", bar=("<=", 0.0)),
         *_stiffness_error(plan),
-        *_rollouts(plan),
+        *rollouts.measure(plan),
     ]
     return Findings("control", rows)
 
@@ -74,27 +73,3 @@ def _stiffness_error(plan: Plan) -> list[Row]:
         Row("error of K half a tick later, demo", error(0.5), "N/m", note=note),
         Row("error of K at the end of a tick, demo", error(1.0), "N/m", note="just before the next row"),
     ]
-
-
-def rollout(n_rollouts: int, n_ticks: int) -> AdmittancePlant:
-    """Simulate robots under one schedule and forces of their own."""
-    generator = torch.Generator().manual_seed(0)
-    force = torch.randn(n_rollouts, n_ticks, 2, dtype=torch.float64, generator=generator)
-    still = torch.zeros(n_ticks, 2, dtype=torch.float64)
-    stiffness = torch.linspace(100.0, 900.0, n_ticks, dtype=torch.float64)[:, None, None] * torch.eye(2).double()
-    plant = AdmittancePlant(1.0)
-    damping = 2.0 * stiffness.sqrt()
-    motion = [part.expand(n_rollouts, *part.shape) for part in (still, still, stiffness, damping)]
-    plant.simulate(motion[0], motion[1], motion[2], motion[3], force, dt=1e-3)
-    return plant
-
-
-def _rollouts(plan: Plan) -> list[Row]:
-    rows = []
-    for n_rollouts in (1, 1000)[: plan.size(2, 1)]:
-        n_ticks = plan.size(1000, 50)
-        times = alternate({"ours": lambda n=n_rollouts, t=n_ticks: rollout(n, t)}, min(3, plan.n_repetitions))
-        steps = n_rollouts * n_ticks
-        note = f"{steps / np.median(times['ours']) / 1e6:.3g} million steps a second"
-        rows.append(Row(f"{n_rollouts} rollouts of {n_ticks} ticks", times["ours"], note=note))
-    return rows

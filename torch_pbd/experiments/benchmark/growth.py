@@ -7,8 +7,8 @@ import numpy as np
 
 from torch_pbd import CholeskyCovRegressor, HeteroscedasticGPRegressor
 from torch_pbd.estimators._base import CovarianceRegressor
-from torch_pbd.experiments.benchmark.control import rollout
 from torch_pbd.experiments.benchmark.made import demonstrations
+from torch_pbd.experiments.benchmark.rollouts import pushed
 from torch_pbd.experiments.benchmark.rows import Findings, Growth, Plan
 from torch_pbd.experiments.benchmark.timing import alternate, median
 
@@ -38,10 +38,9 @@ def measure(plan: Plan) -> Findings:
     for axis, argument, sizes in _SIZES[: plan.size(4, 1)]:
         for name, model in _MODELS.items():
             findings.growth.append(_fits(plan, name, model, axis, argument, sizes[: plan.size(len(sizes), 2)]))
-    sizes = [10, 30, 100, 300, 1000, 3000][: plan.size(6, 2)]
-    n_ticks = plan.size(200, 20)
-    seconds = [alternate({"ours": lambda n=n: rollout(n, n_ticks)}, min(3, plan.n_repetitions))["ours"] for n in sizes]
-    findings.growth.append(_growth("rollouts", f"rollouts of {n_ticks} ticks", sizes, seconds))
+    sizes = [1, 10, 100, 1000, 10_000, 100_000][: plan.size(6, 2)]
+    seconds = [alternate({"ours": lambda n=n: pushed(n)}, min(3, plan.n_repetitions))["ours"] for n in sizes]
+    findings.growth.append(_growth("simulate_many", "rollouts of 1001 ticks", sizes, seconds))
     return findings
 
 

@@ -1,13 +1,8 @@
 """The benchmark of training on a likelihood: its three ways end at one optimum, preconditioned ones soon."""
 
-import sys
-from pathlib import Path
-
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "scripts" / "benchmarks"))
-
-import likelihood_training as benchmark
+from torch_pbd.experiments.benchmark import likelihood_training as benchmark
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -1,9 +1,8 @@
 """Training of a likelihood: Fisher scoring and preconditioned L-BFGS against L-BFGS in plain whitened values.
 
-``python scripts/benchmarks/likelihood_training.py`` maximizes one posterior density, that of the Cholesky factor's
-logarithmic diagonal at 500 inputs that do not repeat (eq. (12) under its prior, eq. (14), "bell"), three ways, and
-prints evaluations and process CPU time with one thread until the loss is within 1e-3 nats of the optimum, set-up
-included. The plain one is whitened by the dense Cholesky factor of the kernel matrix, its gradient by autograd.
+All maximize one posterior density, that of the Cholesky factor with a logarithmic diagonal at 500 inputs that do not
+repeat (eq. (12) under its prior, eq. (14), "bell"), to within 1e-3 nats of the optimum, set-up included. The plain one
+is whitened by the dense Cholesky factor of the kernel matrix, its gradient by autograd.
 """
 
 import time
@@ -21,10 +20,10 @@ from torch_pbd.linalg import safe_cholesky, scale_tril_from_root
 from torch_pbd.models.cholesky import CholeskyLink, deviation_tril, tril_deviation
 from torch_pbd.models.costs import Likelihood
 from torch_pbd.models.objectives import gaussian_nll
-from torch_pbd.models.scoring import train_by_scoring
+from torch_pbd.models.scoring import Solver, train_by_scoring
 from torch_pbd.optim import Progress, minimize
 
-N_SEEDS, N_ROWS, LENGTH_SCALE = 5, 500, 0.2
+N_ROWS, LENGTH_SCALE = 500, 0.2
 WITHIN = 1e-3  # nats of the optimum
 
 
@@ -59,7 +58,8 @@ class Watch:
         return next(((count, spent) for value, count, spent in self.seen if value <= loss), (0, float("nan")))
 
 
-def by_scoring(problem: Problem, solver: str, tol: float = 1e-11) -> Watch:
+def by_scoring(problem: Problem, solver: Solver, tol: float = 1e-11) -> Watch:
+    """Train by one of our solvers."""
     watch = Watch()
     n_rows = len(problem.counts)
     length_scale = torch.tensor([[LENGTH_SCALE]], dtype=torch.float64)
@@ -70,6 +70,7 @@ def by_scoring(problem: Problem, solver: str, tol: float = 1e-11) -> Watch:
 
 
 def plain(problem: Problem, tol: float = 1e-9) -> Watch:
+    """Train as one would write it first."""
     watch = Watch()
     n_rows = len(problem.counts)
     gram = correlation(problem.inputs, problem.inputs, torch.tensor([LENGTH_SCALE], dtype=torch.float64))
@@ -102,16 +103,3 @@ def run(seed: int, n_rows: int = N_ROWS) -> dict[str, tuple[int, float, float]]:
         name: (*watch.reached(optimum + WITHIN / n_rows), (watch.seen[-1][0] - optimum) * n_rows)
         for name, watch in watches.items()
     }
-
-
-if __name__ == "__main__":
-    torch.set_num_threads(1)
-    run(99)  # warm up
-    runs = [run(seed) for seed in range(N_SEEDS)]
-    print(f"{N_ROWS} rows of two outputs, to within {WITHIN:g} nats of the optimum; medians of {N_SEEDS} seeds")
-    print(f"{'':22}{'evaluations':>12}{'CPU [ms]':>10}{'times faster (lowest .. highest)':>36}{'end above [nats]':>18}")
-    for name in METHODS:
-        counts, seconds, above = np.array([result[name] for result in runs]).T
-        ratio = np.array([result["whitened L-BFGS"][1] for result in runs]) / seconds
-        faster = f"{np.median(ratio):.0f} ({ratio.min():.0f} .. {ratio.max():.0f})"
-        print(f"{name:22}{np.median(counts):12.0f}{1e3 * np.median(seconds):10.1f}{faster:>36}{np.median(above):18.1e}")
