@@ -61,7 +61,7 @@ def test_a_loaded_model_predicts_the_same_to_the_bit(name, tmp_path):
     X, y = demonstrations()
     np.testing.assert_array_equal(loaded.log_likelihood(X, y), model.log_likelihood(X, y))
     assert loaded.get_params() == model.get_params()
-    learned = {key: value for key, value in vars(model).items() if key != "module_"}
+    learned = {key: value for key, value in model.__getstate__().items() if not key.startswith("_module")}
     assert {key: vars(loaded)[key] for key in learned} == learned
 
 
