@@ -33,7 +33,7 @@ from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky, scale_tril_from_root
 from torch_pbd.memory import require_memory
 from torch_pbd.models.conditional import MeanAndCovariance
-from torch_pbd.models.training import TrainingSet, pooled_tril
+from torch_pbd.models.training import TrainingSet
 from torch_pbd.optim import FitReport
 
 # Length scales up to this many ranges: with longer ones the prior of a covariance would never take over.
@@ -222,7 +222,8 @@ def warn_if_few(n_rows: int, n_outputs: int) -> None:
 
 
 def warn_if_identical(training: TrainingSet) -> None:
-    if float(pooled_tril(training).diagonal().max()) < 1e-9:
+    residual = training.y - training.means()[training.index]
+    if float(residual.square().sum(0).max()) < 1e-18 * max(1, len(training.y) - len(training.inputs)):
         warnings.warn(
             "The demonstrations are identical: their covariance is zero, and the smallest that can be told "
             "from it is used.",

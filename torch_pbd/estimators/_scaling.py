@@ -49,10 +49,19 @@ class Standardization:
         return np.asarray(np.round((y - self.y_shift) / self.y_scale, _DECIMALS))
 
 
+def canonical_order(X: Floats, y: Floats) -> NDArray[np.intp]:
+    """Order of the rows that does not depend on the one they come in, so that no result does."""
+    order = y[:, -1].argsort()
+    ordered = y[order, -1]
+    if (ordered[1:] > ordered[:-1]).all():
+        return order
+    return np.lexsort(np.hstack([X, y]).T)  # where values repeat the other columns decide, which takes longer
+
+
 def distinct_rows(X: Floats) -> tuple[Floats, NDArray[np.intp]]:
     """Distinct rows of X in lexicographic order, and the index of each row's own among them."""
     X = X + 0.0  # minus zero is zero
-    order = X[:, 0].argsort(kind="stable") if X.shape[1] == 1 else np.lexsort(X.T[::-1])
+    order = X[:, 0].argsort() if X.shape[1] == 1 else np.lexsort(X.T[::-1])
     ordered = X[order]
     is_first = np.append(True, (ordered[1:] != ordered[:-1]).any(axis=1))
     index = np.empty(len(X), dtype=np.intp)

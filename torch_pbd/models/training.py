@@ -63,9 +63,10 @@ class TrainingSet:
         rows are treated together, so memory is linear in the rows.
         """
         counts = torch.bincount(self.index, minlength=len(self.inputs))
-        n_outputs = residual.shape[1]
+        n_outputs, order = residual.shape[1], self.index.argsort(stable=True)
+        if int(counts.min()) == int(counts.max()):
+            return _reduced(residual[order].reshape(len(counts), -1, n_outputs))
         result = residual.new_zeros(len(counts), n_outputs, min(n_outputs, int(counts.max())))
-        order = self.index.argsort(stable=True)
         group = self.index[order]
         position = torch.arange(len(order), device=order.device) - (counts.cumsum(0) - counts)[group]
         size = counts.clamp_min(1).log2().ceil()
@@ -76,9 +77,14 @@ class TrainingSet:
             slot[members] = torch.arange(len(members), device=members.device)
             root = residual.new_zeros(len(members), int(counts[members].max()), n_outputs)
             root[slot[group[rows]], position[rows]] = residual[order[rows]]
-            root = scale_tril_from_root(root.mT) if root.shape[1] > n_outputs else root.mT
+            root = _reduced(root)
             result[members, :, : root.shape[-1]] = root
         return result
+
+
+def _reduced(rows: Float[Tensor, "n k d"]) -> Float[Tensor, "n d r"]:
+    """Root of the scatter of k rows, of no more than d columns."""
+    return scale_tril_from_root(rows.mT) if rows.shape[1] > rows.shape[2] else rows.mT
 
 
 def pooled_tril(training: TrainingSet) -> Float[Tensor, "d d"]:
