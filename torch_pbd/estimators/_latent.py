@@ -222,8 +222,9 @@ def warn_if_few(n_rows: int, n_outputs: int) -> None:
 
 
 def warn_if_identical(training: TrainingSet) -> None:
-    residual = training.y - training.means()[training.index]
-    if float(residual.square().sum(0).max()) < 1e-18 * max(1, len(training.y) - len(training.inputs)):
+    repeated = len(training.y) - len(training.inputs)
+    mean = training.means()[training.index] if repeated else training.y.mean(0)
+    if float((training.y - mean).square().sum(0).max()) < 1e-18 * max(1, repeated or len(training.y) - 1):
         warnings.warn(
             "The demonstrations are identical: their covariance is zero, and the smallest that can be told "
             "from it is used.",

@@ -18,11 +18,16 @@ def measure(plan: Plan) -> Findings:
     """Whole fits, with default parameters."""
     findings = Findings("heteroscedastic")
     for aligned, most in ((True, 0.3), (False, 0.5))[: plan.size(2, 1)]:
-        X, y = _papers(plan, aligned=aligned)
-        work = {"ours": lambda X=X, y=y: HeteroscedasticGPRegressor().fit(X, y)}
-        times = alternate(work, plan.n_repetitions, warm_up=not plan.quick)
+        seconds = []
+        for seed in range(
+            plan.seed, plan.seed + plan.size(5, 1)
+        ):  # how many inducing inputs it takes is up to the data
+            X, y = _papers(plan, seed, aligned=aligned)
+            work = {"ours": lambda X=X, y=y: HeteroscedasticGPRegressor().fit(X, y)}
+            seconds += alternate(work, 1, warm_up=not plan.quick)["ours"]
         what = f"HGP, {'10 inputs x 50' if aligned else '500 inputs that never repeat'}"
-        findings.rows.append(Row(what, times["ours"], bar=("<=", most)))
+        note = f"{len(seconds)} draws of the data, the slowest {max(seconds):.2g} s"
+        findings.rows.append(Row(what, seconds, bar=("<=", most), note=note))
     findings.try_peer("gpytorch", lambda: findings.rows.extend(_against_gpytorch(plan)))
     _recordings(plan, findings)
     for n_rows, most in ((10_000, 3.0), (1_000_000, 10.0))[: plan.size(2, 0)]:
@@ -30,17 +35,17 @@ def measure(plan: Plan) -> Findings:
     return findings
 
 
-def _papers(plan: Plan, *, aligned: bool) -> tuple[Floats, Floats]:
+def _papers(plan: Plan, seed: int, *, aligned: bool) -> tuple[Floats, Floats]:
     """Eq. (14) as printed: 10 inputs x 50 draws, or 500 inputs of one draw each."""
     sizes = (plan.size(10, 5), plan.size(50, 20)) if aligned else (plan.size(500, 60), 1)
-    X, y, _ = make_paper_simulation(*sizes, reading="printed", random_state=plan.seed)
+    X, y, _ = make_paper_simulation(*sizes, reading="printed", random_state=seed)
     return X, y
 
 
 def _against_gpytorch(plan: Plan) -> list[Row]:
     from torch_pbd.experiments.benchmark.gpytorch_models import SampledFactors
 
-    X, y = _papers(plan, aligned=True)
+    X, y = _papers(plan, plan.seed, aligned=True)
     scale, shift = y.std(axis=0), y.mean(axis=0)
     kept: dict[str, Floats] = {}
 
