@@ -148,6 +148,10 @@ def growth_figure(growth: Sequence[Growth]) -> Figure:
         for number, one in enumerate(one for one in growth if one.axis == axis):
             _draw(ax, one, number)
         ax.set(xscale="log", yscale="log", xlabel=f"{axis} (1)")
+        sizes = next(one.sizes for one in growth if one.axis == axis)
+        if sizes[-1] <= 10 * sizes[0]:  # within a decade the labels of a logarithmic axis lie on each other
+            ax.set_xticks(sizes, [str(size) for size in sizes])
+            ax.set_xticks([], minor=True)
         ax.grid(alpha=0.3)
         ax.legend(fontsize=8)
     panels[0, 0].set_ylabel("CPU time (s)")
