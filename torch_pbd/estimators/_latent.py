@@ -36,8 +36,10 @@ from torch_pbd.models.conditional import MeanAndCovariance
 from torch_pbd.models.training import TrainingSet
 from torch_pbd.optim import FitReport
 
-# Length scales up to this many ranges: with longer ones the prior of a covariance would never take over.
+_LITTLE = 2.0**26  # bytes that are not asked for
 _STRETCHED = 10.0  # an amplitude of so many times the values
+# Spacings of the inputs that an interpolating process may be as short as, and ranges that others may be as long as: with
+# longer ones the prior of a covariance would never take over.
 _SHORTEST, _LONGEST_MEAN, _LONGEST_COVARIANCE = 0.75, 10.0, 0.35
 
 
@@ -188,8 +190,11 @@ class LatentCovarianceRegressor(CovarianceRegressor):
     def _check_memory(self, n_distinct: int, n_outputs: int) -> None:
         n_inputs = min(n_distinct, self.max_inputs)
         n_processes = (n_outputs + 1) ** 2  # at most
+        needed = 8.0 * n_inputs**2 * n_processes * 4
+        if needed < _LITTLE:  # to ask takes a millisecond
+            return
         require_memory(
-            8.0 * n_inputs**2 * n_processes * 4,
+            needed,
             what=f"max_inputs == {self.max_inputs} lets {n_inputs} distinct inputs into kernel matrices, which",
             remedy="Lower max_inputs.",
         )

@@ -18,7 +18,7 @@ MIN_NOISE_RATIO, MAX_NOISE_RATIO = 1e-10, 1e5
 
 _ENTRIES = 1 << 20  # of the matrices that are treated together: they stay near the cache, and memory is bounded
 # Largest ratio of neighbouring length scales of the grid, and where a decomposition costs nearly nothing.
-_GRID_STEP, _FINE_STEP, _SMALL = 1.3, 1.25, 24
+_GRID_STEP, _FINE_STEP, _SMALL = 1.4, 1.25, 24
 
 # Where the evidence is nearly flat in the ratio no optimum is lost between coarser steps.
 _LOG10_RATIOS = (-10.0, -8.0, -6.0, -5.0, -4.0, *(0.25 * step for step in range(-14, 7)), 2.0, 3.0, 4.0)
@@ -60,7 +60,7 @@ class EvidenceSearch:
     max_inputs: int | None = None
     n_restarts: int = 2
     max_iter: int = 100
-    tol: float = 0.02
+    tol: float = 0.005
 
 
 class Coordinates:

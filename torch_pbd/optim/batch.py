@@ -86,14 +86,9 @@ def minimize_batch(
     """
     x = start.detach().clone()
     rows = torch.arange(len(x), device=x.device)
-    loss, gradient = objective(x, rows)
+    loss, gradient, inverse = _start(objective, rows, x, inverse_hessian)
     size = gradient.abs().sum(-1)  # of no parameters it is zero, and there is nothing to do
     alive = torch.isfinite(loss + size) & (size > tol)
-    inverse = torch.eye(x.shape[1]).to(x).repeat(len(x), 1, 1)
-    if inverse_hessian is not None:
-        inverse = inverse_hessian.clone()
-    elif bool(alive.any()):
-        inverse[alive] = _first_inverse(objective, rows[alive], x[alive], gradient[alive])
     every = _Problems.at(rows, x, loss, gradient, inverse, torch.ones_like(loss))
     active = every.of(alive & (every.promise > _enough(loss, tol)))
     n_iter = 0
@@ -164,20 +159,31 @@ def _enough(loss: Tensor, tol: float) -> Tensor:
     return 1e-2 * tol + torch.finfo(loss.dtype).eps * loss.abs()
 
 
-def _first_inverse(objective: ValueAndGradient, rows: Tensor, x: Tensor, gradient: Tensor) -> Tensor:
-    """Inverse Hessians by differences, of positive eigenvalues; where there is none, of a step of one."""
+def _start(
+    objective: ValueAndGradient, rows: Tensor, x: Tensor, inverse_hessian: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Losses, gradients and inverse Hessians where problems start; given none, by differences of the gradient.
+
+    These get the absolute values of their eigenvalues; where they are not finite they are of a step of length one.
+    """
+    if inverse_hessian is not None:
+        return *objective(x, rows), inverse_hessian.clone()
     size = x.shape[-1]
     eye = torch.eye(size).to(x)
-    _, shifted = objective((x + _DIFFERENCE * eye[:, None]).flatten(0, 1), rows.repeat(size))
-    hessian = (shifted.reshape(size, *x.shape) - gradient).transpose(0, 1) / _DIFFERENCE
+    shifts = torch.cat([eye.new_zeros(1, size), _DIFFERENCE * eye])
+    losses, gradients = objective((x + shifts[:, None]).flatten(0, 1), rows.repeat(len(shifts)))
+    loss, (gradient, *shifted) = losses[: len(x)], gradients.split(len(x))
+    if not size:
+        return loss, gradient, x.new_zeros(len(x), 0, 0)
+    hessian = (torch.stack(shifted, dim=1) - gradient[:, None]) / _DIFFERENCE
     sound = torch.isfinite(hessian).all(-1).all(-1)[:, None, None]
-    hessian = torch.where(sound, 0.5 * (hessian + hessian.mT), gradient.norm(dim=-1)[:, None, None] * eye)
-    curvature, axes = torch.linalg.eigh(hessian)
+    length = gradient.norm(dim=-1).nan_to_num(nan=1.0).clamp_min(1e-300)[:, None, None]
+    curvature, axes = torch.linalg.eigh(torch.where(sound, 0.5 * (hessian + hessian.mT), length * eye))
     curvature = curvature.abs()
     curvature = curvature.maximum(_LEAST_CURVATURE * curvature.amax(-1, keepdim=True)).clamp_min(1e-300)
     inverse = (axes / curvature.unsqueeze(-2)) @ axes.mT
     reach = (inverse @ gradient.unsqueeze(-1)).abs().amax((-2, -1))
-    return inverse * (_FIRST_REACH / reach.clamp_min(_FIRST_REACH))[:, None, None]
+    return loss, gradient, inverse * (_FIRST_REACH / reach.clamp_min(_FIRST_REACH))[:, None, None]
 
 
 def _updated(inverse: Tensor, step: Tensor, change: Tensor, convex: Tensor) -> Tensor:
