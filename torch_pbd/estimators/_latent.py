@@ -38,8 +38,8 @@ from torch_pbd.optim import FitReport
 
 _LITTLE = 2.0**26  # bytes that are not asked for
 _STRETCHED = 10.0  # an amplitude of so many times the values
-# Spacings of the inputs that an interpolating process may be as short as, and ranges that others may be as long as: with
-# longer ones the prior of a covariance would never take over.
+# Spacings of the inputs that an interpolating process may be as short as, and ranges that others may be as long as:
+# with longer ones the prior of a covariance would never take over.
 _SHORTEST, _LONGEST_MEAN, _LONGEST_COVARIANCE = 0.75, 10.0, 0.35
 
 
