@@ -241,3 +241,10 @@ def test_with_its_inverse_hessian_a_quadratic_takes_newtons_step_and_at_the_end_
     found, report = minimize_batch(objective, close, tol=1e-6, inverse_hessian=inverse)
     assert (report.n_iter, report.converged) == (0, True)
     assert torch.equal(found, close)
+
+
+def test_a_batch_may_be_empty(generator):
+    _, _, objective = quadratics(generator)
+    found, report = minimize_batch(objective, torch.zeros(0, 3, dtype=torch.float64))
+    assert found.shape == (0, 3)
+    assert (report.n_iter, report.converged) == (0, True)

@@ -153,6 +153,18 @@ def test_search_at_growing_resolution_misses_no_short_length_scale(noise, rng):
     assert dict(zip(signals, loss.numpy() - expected < 1e-3, strict=True)) == dict.fromkeys(signals, True)
 
 
+@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_of_many_processes_those_that_need_it_go_to_a_finer_level(share, rng):
+    """So many that not all of them are taken along; at a share of one no process stays at the coarsest level."""
+    n, b, t = 300, 12, np.linspace(0, 1, 300)
+    fast = np.arange(b) < share * b
+    y = np.where(fast[:, None], np.sin(2 * np.pi * 20 * t), np.sin(5 * t)) + 0.1 * rng.normal(size=(b, n))
+    bounds = (0.75 / (n - 1), 10.0)
+    found, loss, _ = fit_hyperparameters(once(t[:, None], y), EvidenceSearch(length_scale_bounds=bounds))
+    np.testing.assert_allclose(negative_log_evidence(once(t[:, None], y), found), loss, rtol=1e-9, atol=1e-8)
+    assert (found.length_scale[:, 0].numpy() < 0.05).tolist() == fast.tolist()
+
+
 @pytest.mark.parametrize("kernel", ["squared_exponential", "matern32", "matern52"])
 def test_search_with_a_length_scale_for_each_input_is_as_good_as_scikit_learn(kernel, rng):
     x = rng.uniform(size=(40, 2))

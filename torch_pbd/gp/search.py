@@ -127,10 +127,11 @@ def _descend_by_levels(grid: EvidenceGrid, search: EvidenceSearch) -> _Ends:
         left = grid.unsettled()
         if not bool(left.any()) or not grid.few:
             rows = (~left).nonzero().squeeze(1)
-            found = _descend(grid, search, rows)
-            ends.put(grid.processes[rows], found)
-            if not grid.finest:  # a process that ends where its level does may be taken further by the next one
-                left[rows[found.length_scale.amin(1) < 1.02 * grid.shortest]] = True
+            if len(rows):
+                found = _descend(grid, search, rows)
+                ends.put(grid.processes[rows], found)
+                if not grid.finest:  # a process that ends where its level does may be taken further by the next one
+                    left[rows[found.length_scale.amin(1) < 1.02 * grid.shortest]] = True
             if not bool(left.any()):
                 return ends
             grid.keep(left)

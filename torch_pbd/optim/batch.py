@@ -172,7 +172,7 @@ def _start(
     eye = torch.eye(size).to(x)
     shifts = torch.cat([eye.new_zeros(1, size), _DIFFERENCE * eye])
     losses, gradients = objective((x + shifts[:, None]).flatten(0, 1), rows.repeat(len(shifts)))
-    loss, (gradient, *shifted) = losses[: len(x)], gradients.split(len(x))
+    loss, (gradient, *shifted) = losses[: len(x)], gradients.reshape(len(shifts), *x.shape)
     if not size:
         return loss, gradient, x.new_zeros(len(x), 0, 0)
     hessian = (torch.stack(shifted, dim=1) - gradient[:, None]) / _DIFFERENCE
