@@ -36,6 +36,17 @@ def measured(setup: str, work: str) -> dict[str, float]:
     return result
 
 
+def measured_fit(model: str, data: str) -> tuple[float, str]:
+    """CPU seconds of fitting a new ``model`` to ``demonstrations(data)``, and a note of its memory."""
+    setup = (
+        "from torch_pbd import CholeskyCovRegressor, HeteroscedasticGPRegressor\n"
+        "from torch_pbd.experiments.benchmark.made import demonstrations\n"
+        f"X, y = demonstrations({data})\n{model}.fit(*demonstrations(20, 5))"
+    )
+    found = measured(setup, f"{model}.fit(X, y)")
+    return found["seconds"], f"{found['above']:.0f} MiB above the data"
+
+
 def wall_seconds(program: str) -> float:
     """Seconds that a fresh interpreter takes for a program, by the clock on the wall."""
     start = time.perf_counter()

@@ -4,7 +4,7 @@ import numpy as np
 
 from torch_pbd import HeteroscedasticGPRegressor
 from torch_pbd.data import load_demonstrations, make_paper_simulation, paper_covariance
-from torch_pbd.experiments.benchmark.fresh import measured
+from torch_pbd.experiments.benchmark.fresh import measured_fit
 from torch_pbd.experiments.benchmark.made import Floats
 from torch_pbd.experiments.benchmark.rows import Findings, Plan, Row
 from torch_pbd.experiments.benchmark.timing import alternate
@@ -86,12 +86,5 @@ def _recordings(plan: Plan, findings: Findings) -> None:
 
 
 def _many_rows(n_rows: int, most: float) -> Row:
-    setup = (
-        "from torch_pbd import HeteroscedasticGPRegressor\n"
-        "from torch_pbd.experiments.benchmark.made import demonstrations\n"
-        f"X, y = demonstrations({n_rows}, 1, aligned=False)\n"
-        "HeteroscedasticGPRegressor().fit(*demonstrations(20, 5))"
-    )
-    found = measured(setup, "HeteroscedasticGPRegressor().fit(X, y)")
-    note = f"{found['above']:.0f} MiB above the data"
-    return Row(f"HGP, {n_rows:,} inputs that never repeat", [found["seconds"]], bar=("<=", most), note=note)
+    seconds, note = measured_fit("HeteroscedasticGPRegressor()", f"{n_rows}, 1, aligned=False")
+    return Row(f"HGP, {n_rows:,} inputs that never repeat", [seconds], bar=("<=", most), note=note)
