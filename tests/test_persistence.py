@@ -16,10 +16,10 @@ from sklearn.pipeline import make_pipeline
 
 import torch_pbd
 from torch_pbd import DMPController, GMMBaseline
+from torch_pbd.checksummed import _digest
 from torch_pbd.control import StiffnessLaw
 from torch_pbd.data import make_tunnel_demonstrations
 from torch_pbd.exceptions import ModelFileError
-from torch_pbd.persistence import _digest
 
 
 @pytest.fixture(scope="module")

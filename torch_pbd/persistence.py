@@ -1,7 +1,5 @@
 """Save and load fitted estimators: one safetensors file whose header is JSON; nothing in it is ever executed."""
 
-import hashlib
-import json
 import os
 from dataclasses import asdict
 from importlib import import_module
@@ -11,16 +9,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save as to_bytes
 from sklearn.utils.validation import check_is_fitted
 
+from torch_pbd.checksummed import read_checksummed, write_checksummed
 from torch_pbd.control.controller import DMPController
 from torch_pbd.control.stiffness import StiffnessLaw
 from torch_pbd.control.storage import controller_state, restore_controller
 from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.exceptions import ModelFileError
-from torch_pbd.files import replacing
 
 FORMAT_VERSION = 1
 _CLASSES = {
@@ -61,9 +57,7 @@ def save(estimator: CovarianceRegressor | DMPController, path: str | os.PathLike
         **description,
         "versions": {package: version(package) for package in ("torch", "scikit-learn", "numpy")},
     }
-    header["sha256"] = _digest(header, arrays)
-    with replacing(Path(path)) as file:
-        file.write(to_bytes(arrays, metadata={_KEY: json.dumps(header)}))
+    write_checksummed(Path(path), _KEY, header, arrays)
 
 
 def _described(estimator: Any) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
@@ -100,21 +94,9 @@ def load(path: str | os.PathLike[str]) -> Any:
         If it is damaged, of a newer format, or no model of this package.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"no model file at {path}")
-    try:
-        with safe_open(path, framework="numpy") as file:
-            header = json.loads((file.metadata() or {})[_KEY])
-            arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a dict
-    except (SafetensorError, KeyError, ValueError, OSError, RecursionError) as error:
-        raise ModelFileError(f"{path} is not a model of torch_pbd, or is damaged ({error}).") from error
-    if not isinstance(header, dict) or header.get("format_version") != FORMAT_VERSION:
-        found = header.get("format_version") if isinstance(header, dict) else None
-        raise ModelFileError(f"{path} has format version {found}; this torch_pbd reads {FORMAT_VERSION}. Upgrade it.")
+    header, arrays = read_checksummed(path, _KEY, FORMAT_VERSION)
     if header.get("class") not in list(_CLASSES):  # a list asks for no hash
         raise ModelFileError(f"{path} holds a {header.get('class')!r}; known are {', '.join(_CLASSES)}.")
-    if header.pop("sha256", None) != _digest(header, arrays):
-        raise ModelFileError(f"{path} is damaged: it does not match its checksum.")
     try:
         return _restored(header, arrays)
     except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
@@ -147,14 +129,6 @@ def _try_out(estimator: CovarianceRegressor) -> None:
         raise ValueError(f"it is for {estimator.n_outputs_} outputs, its arrays for {mean.shape[-1]}")
     if not isinstance(estimator._y_is_1d, bool):
         raise ValueError("it does not say how y was shaped")
-
-
-def _digest(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> str:
-    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
-    for name in sorted(arrays):
-        digest.update(f"{name} {arrays[name].dtype} {arrays[name].shape} ".encode())
-        digest.update(arrays[name].tobytes())
-    return digest.hexdigest()
 
 
 def _encode(value: Any, name: str) -> Any:
