@@ -1,52 +1,100 @@
 """The command line: ``torch-pbd demo``, ``fit`` and so on; torch loads once there is work."""
 
-import difflib
 import os
+import signal
 import sys
+import threading
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 from typing import Any
 
-import torch_pbd
-from torch_pbd.config import COMMANDS, chosen_groups, existing_file, parse
-from torch_pbd.exceptions import ConfigError
+from torch_pbd.exceptions import ConfigError, FolderInUseError
 
-_ERROR, _USAGE, _INTERRUPTED = 1, 2, 130
+_ERROR, _USAGE, _IN_USE, _INTERRUPTED, _TERMINATED = 1, 2, 3, 130, 143
+_CHECKPOINT = "checkpoint"  # in the folder of results, while the work goes on
+
+
+class _Terminated(BaseException):
+    """SIGTERM, as KeyboardInterrupt is SIGINT."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit code: 0, 1 (failed), 2 (cannot be used), 130 (interrupted)."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    """Run one command.
+
+    Returns
+    -------
+    int
+        Exit code: 0; 1, it failed; 2, it cannot be used; 3, another run writes the folder; 130 and 143, interrupted and
+        terminated.
+    """
+    try:
+        with _signals():
+            code = _answer(list(sys.argv[1:] if arguments is None else arguments))
+            sys.stdout.flush()
+            return code
+    except ConfigError as error:
+        return _complain(str(error), _USAGE)
+    except FolderInUseError as error:
+        return _complain(f"{error} Wait for it, or take another with --output FOLDER.", _IN_USE)
+    except BrokenPipeError:  # whoever read the output has seen enough; the results are in the folder
+        with suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except (ValueError, TypeError, OSError, MemoryError) as error:
+        return _complain(str(error) or "the memory is not enough", _ERROR)
+    except KeyboardInterrupt as stop:
+        return _complain(f"interrupted{_remark(stop)}", _INTERRUPTED)
+    except _Terminated as stop:
+        return _complain(f"terminated{_remark(stop)}", _TERMINATED)
+
+
+@contextmanager
+def _signals() -> Iterator[None]:
+    """SIGINT and SIGTERM are exceptions, the first time; the next one ends the process at once."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    errors = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: _Terminated}
+
+    def handle(number: int, _: object) -> None:
+        for each in errors:
+            signal.signal(each, signal.SIG_DFL)
+        raise errors[signal.Signals(number)]
+
+    before = {number: signal.signal(number, handle) for number in errors}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _remark(stop: BaseException) -> str:
+    return f"; {stop.args[0]}" if stop.args else ""
+
+
+def _answer(arguments: Sequence[str]) -> int:
+    import torch_pbd
+    from torch_pbd.config import COMMANDS, nearest
+
     if not arguments or arguments[0] in ("-h", "--help"):
-        print(_help())
+        print(_help(COMMANDS))
         return 0
     if arguments[0] == "--version":
         print(torch_pbd.__version__)
         return 0
-    command = arguments[0]
-    if command not in COMMANDS:
-        close = difflib.get_close_matches(command, COMMANDS, n=1)
-        meant = f" Did you mean {close[0]!r}?" if close else f" Known are {', '.join(COMMANDS)}."
-        return _complain(f"there is no command {command!r}.{meant}", _USAGE)
-    try:
-        return _run(command, arguments[1:])
-    except ConfigError as error:
-        return _complain(str(error), _USAGE)
-    except (ValueError, TypeError, OSError) as error:
-        if isinstance(error, BrokenPipeError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return 0
-        return _complain(str(error), _ERROR)
-    except KeyboardInterrupt:
-        return _complain("interrupted; the results folder may be incomplete", _INTERRUPTED)
+    if arguments[0] not in COMMANDS:
+        raise ConfigError(f"there is no command {arguments[0]!r}. {nearest(arguments[0], COMMANDS)}")
+    return _run(arguments[0], arguments[1:])
 
 
 def _run(command: str, arguments: Sequence[str]) -> int:
+    from torch_pbd.config import chosen_groups, existing_file, parse
+
     options, config = parse(command, arguments)
     import matplotlib as mpl
     import torch
-
-    from torch_pbd.experiments.run_folder import RunFolder
 
     mpl.use("Agg")
     torch.set_num_threads(1)  # the matrices are small: threads would only wait for each other
@@ -54,14 +102,48 @@ def _run(command: str, arguments: Sequence[str]) -> int:
         options.data = existing_file(options.data)
     if command == "benchmark":
         options.groups = chosen_groups(options.groups)
-    folder = RunFolder(options.output, {"command": command})
-    (folder.path / "config.yaml").write_text(config, encoding="utf-8")
-    with warnings.catch_warnings():
+    with _run_folder(options.output, command) as folder, warnings.catch_warnings():
         warnings.simplefilter("default")
         warnings.showwarning = _Notes()
-        print(_WORK[command](options, folder))
+        try:
+            with _checkpoint(options, folder, command, config):
+                folder.write_text("config.yaml", config)
+                print(_WORK[command](options, folder))
+        except (KeyboardInterrupt, _Terminated) as stop:
+            if (folder.path / _CHECKPOINT).exists():
+                stop.args = (f"torch-pbd {command} --config {folder.path / 'config.yaml'} --resume goes on",)
+            raise
     print(f"\nresults: {folder.path}")
     return 0
+
+
+def _run_folder(path: str, command: str) -> Any:
+    from torch_pbd.experiments.run_folder import RunFolder
+
+    try:
+        return RunFolder(path, {"command": command})
+    except OSError as error:
+        reason = error.strerror or str(error)
+        where = f" ({error.filename})" if error.filename else ""
+        raise ConfigError(
+            f"output: {path!r} cannot be a folder of results: {reason}{where}. Give another with --output FOLDER."
+        ) from error
+
+
+def _checkpoint(options: Any, folder: Any, command: str, config: str) -> Any:
+    """What keeps the work's checkpoint, begun with the one that is there if asked to."""
+    from torch_pbd.config import RESUMABLE
+    from torch_pbd.experiments.resuming import checkpoint_of_run
+
+    if command not in RESUMABLE:
+        return nullcontext()
+    return checkpoint_of_run(
+        folder.path / _CHECKPOINT,
+        config,
+        options.data if hasattr(options, "data") else None,
+        resume=options.resume,
+        interval=options.checkpoint_interval,
+    )
 
 
 def _demo(options: Any, folder: Any) -> str:
@@ -205,9 +287,9 @@ demonstrations, nats per sample, its mean +- standard error and its median over 
 left-out samples in the 95 % ellipse; least eig.: smallest eigenvalue of the predicted correlations"""
 
 
-def _help() -> str:
-    width = max(map(len, COMMANDS))
-    lines = [f"  {name:<{width}}  {text}" for name, text in COMMANDS.items()]
+def _help(commands: Mapping[str, str]) -> str:
+    width = max(map(len, commands))
+    lines = [f"  {name:<{width}}  {text}" for name, text in commands.items()]
     return "\n".join(
         [
             "torch-pbd: learn how precise people are from demonstrations",
@@ -222,7 +304,8 @@ def _help() -> str:
 
 
 def _complain(message: str, code: int) -> int:
-    print(f"torch-pbd: {message}", file=sys.stderr)
+    with suppress(OSError):  # nobody may be listening
+        print(f"torch-pbd: {message}", file=sys.stderr)
     return code
 
 
