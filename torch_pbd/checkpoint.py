@@ -3,7 +3,7 @@
 import json
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +52,8 @@ def checkpointed(path: Path, work: Work, *, entries: Sequence[Entry] = (), inter
     except BaseException:
         journal.write()
         raise
-    path.unlink(missing_ok=True)
+    with suppress(OSError):  # of a folder in its place it has been told
+        path.unlink(missing_ok=True)
 
 
 def write_checkpoint(path: Path, work: Work, entries: Sequence[Entry]) -> None:

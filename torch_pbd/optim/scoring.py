@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -22,9 +22,13 @@ class _Search:
     """Where the optimization is; evaluates losses, counts, and tells the callback of each improvement."""
 
     def __init__(
-        self, loss: Callable[[Tensor], Tensor], callback: Callable[[Progress], None] | None, start: Tensor
+        self,
+        loss: Callable[[Tensor], Tensor],
+        callback: Callable[[Progress], None] | None,
+        start: Tensor,
+        carried: Sequence[Tensor],
     ) -> None:
-        self.loss, self.callback = loss, callback
+        self.loss, self.callback, self.carried = loss, callback, carried
         self.x, self.value = start, math.nan
         self.curve: list[float] = []
         self.n_iter = self.n_evaluations = 0
@@ -90,13 +94,16 @@ class _Search:
 
     def state(self, message: str) -> State:
         """As a journal keeps it."""
-        return self.report(message).state() | {"x": self.x.clone(), "n_evaluations": self.n_evaluations}
+        kept = {f"carried.{i}": tensor.clone() for i, tensor in enumerate(self.carried)}
+        return self.report(message).state() | {"x": self.x.clone(), "n_evaluations": self.n_evaluations} | kept
 
     def resume(self, state: State) -> FitReport:
         """Go on from :meth:`state`; the report it was at."""
         report = FitReport.of(state)
         self.x, self.value, self.curve = state["x"].to(self.x), report.loss, list(report.loss_curve)
         self.n_iter, self.n_evaluations = report.n_iter, state["n_evaluations"]
+        for i, tensor in enumerate(self.carried):
+            tensor.copy_(state[f"carried.{i}"])
         return report
 
 
@@ -109,6 +116,7 @@ def minimize_scoring(
     max_iter: int = 100,
     tol: float = 1e-8,
     relative_tol: float = 0.0,
+    carried: Sequence[Tensor] = (),
     callback: Callable[[Progress], None] | None = None,
 ) -> tuple[Tensor, FitReport]:
     """Minimize a loss whose gradient and curvature are known in closed form; never ends above the start.
@@ -132,6 +140,8 @@ def minimize_scoring(
         the start where that is above one.
     relative_tol : float, default=0.0
         Or that promises one below this share of the loss. For sums of squares, whose smallest value is zero.
+    carried : sequence of Tensor, default=()
+        What ``newton`` changes and its next call starts from: kept with the point in a journal.
     callback : callable, optional
         Called with a :class:`Progress` after each improvement.
 
@@ -147,7 +157,7 @@ def minimize_scoring(
         If the loss, its gradient or the step is not finite at the start.
     """
     record = Record("scoring", start)
-    search = _Search(loss, callback, start)
+    search = _Search(loss, callback, start, carried)
     if record.state:
         report = search.resume(record.state)
         if record.ended:
