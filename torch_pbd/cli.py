@@ -6,8 +6,8 @@ import sys
 import threading
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
-from typing import Any
+from contextlib import contextmanager, nullcontext
+from typing import Any, TextIO
 
 from torch_pbd.exceptions import ConfigError, FolderInUseError
 
@@ -30,17 +30,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     try:
         with _signals():
-            code = _answer(list(sys.argv[1:] if arguments is None else arguments))
-            sys.stdout.flush()
-            return code
+            return _answer(list(sys.argv[1:] if arguments is None else arguments))
     except ConfigError as error:
         return _complain(str(error), _USAGE)
     except FolderInUseError as error:
         return _complain(f"{error} Wait for it, or take another with --output FOLDER.", _IN_USE)
-    except BrokenPipeError:  # whoever read the output has seen enough; the results are in the folder
-        with suppress(OSError, ValueError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
     except (ValueError, TypeError, OSError, MemoryError) as error:
         return _complain(str(error) or "the memory is not enough", _ERROR)
     except KeyboardInterrupt as stop:
@@ -79,10 +73,10 @@ def _answer(arguments: Sequence[str]) -> int:
     from torch_pbd.config import COMMANDS, nearest
 
     if not arguments or arguments[0] in ("-h", "--help"):
-        print(_help(COMMANDS))
+        _say(_help(COMMANDS))
         return 0
     if arguments[0] == "--version":
-        print(torch_pbd.__version__)
+        _say(torch_pbd.__version__)
         return 0
     if arguments[0] not in COMMANDS:
         raise ConfigError(f"there is no command {arguments[0]!r}. {nearest(arguments[0], COMMANDS)}")
@@ -108,12 +102,12 @@ def _run(command: str, arguments: Sequence[str]) -> int:
         try:
             with _checkpoint(options, folder, command, config):
                 folder.write_text("config.yaml", config)
-                print(_WORK[command](options, folder))
+                _say(_WORK[command](options, folder))
         except (KeyboardInterrupt, _Terminated) as stop:
             if (folder.path / _CHECKPOINT).exists():
                 stop.args = (f"torch-pbd {command} --config {folder.path / 'config.yaml'} --resume goes on",)
             raise
-    print(f"\nresults: {folder.path}")
+    _say(f"\nresults: {folder.path}")
     return 0
 
 
@@ -161,7 +155,7 @@ def _demo(options: Any, folder: Any) -> str:
         "WP": WishartProcessRegressor(),
         "GMM 5": GMMBaseline(n_components=5),
     }
-    print(f"{options.n_demos} made demonstrations of the tunnel task; the truth is that of 300 more\n")
+    _say(f"{options.n_demos} made demonstrations of the tunnel task; the truth is that of 300 more\n")
     return run_demo(models, folder, n_demos=options.n_demos, seed=options.seed) + "\n\n" + _LEGEND
 
 
@@ -199,12 +193,12 @@ def _experiment(options: Any, folder: Any) -> str:
         demonstrations = make_tunnel_demonstrations(
             options.n_demos, random_state=options.seed, common_start=options.common_start
         )
-        print(describe(demonstrations, "tunnel task"))
+        _say(describe(demonstrations, "tunnel task"))
     else:
         demonstrations = load_demonstrations(options.data)
-        print(describe(demonstrations, options.data.name))
+        _say(describe(demonstrations, options.data.name))
     where = f"along {demonstrations.names[0]}, at 20 % and 80 % of the movement; K is the stiffness there, N/m"
-    print(f"pushes of {options.push:g} N {where}\n")
+    _say(f"pushes of {options.push:g} N {where}\n")
     folder.write_figure(framework_figure(), "figure5_framework")
     made = options.data is None
     return run_robot(options.controllers, demonstrations, folder, peak=options.push, rate=options.rate, in_tunnel=made)
@@ -228,7 +222,7 @@ def _compare(options: Any, folder: Any) -> str:
         return f"{table}\n\n{_LEGEND}"
     from torch_pbd.experiments.simulation import run_simulation
 
-    print(f"eq. (14): {options.n_inputs} inputs x {options.n_draws} draws, medians over {options.n_seeds} seeds\n")
+    _say(f"eq. (14): {options.n_inputs} inputs x {options.n_draws} draws, medians over {options.n_seeds} seeds\n")
     return run_simulation(
         options.models,
         folder,
@@ -255,7 +249,7 @@ def _demonstrations(options: Any) -> Any:
     from torch_pbd.experiments.recordings import describe, prepare
 
     recorded = load_demonstrations(options.data)
-    print(describe(recorded, options.data.name))
+    _say(describe(recorded, options.data.name))
     if len(recorded) == 1:
         warnings.warn(
             "There is one demonstration: what varies between demonstrations cannot be told from how one moves.",
@@ -264,8 +258,8 @@ def _demonstrations(options: Any) -> Any:
     check_unimodal(recorded)
     prepared = prepare(recorded, options.align, options.n_steps)
     if prepared is not recorded:
-        print(describe(prepared, f"after align={options.align}"))
-    print()
+        _say(describe(prepared, f"after align={options.align}"))
+    _say("")
     return prepared
 
 
@@ -278,7 +272,7 @@ class _Notes:
     def __call__(self, message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
         if str(message) not in self._shown:
             self._shown.add(str(message))
-            print(f"note ({category.__name__}): {message}", file=sys.stderr)
+            _say(f"note ({category.__name__}): {message}", sys.stderr)
 
 
 _LEGEND = """MSE: squared distance of Cholesky factors to the empirical covariances, units of the data (Table I)
@@ -304,9 +298,17 @@ def _help(commands: Mapping[str, str]) -> str:
 
 
 def _complain(message: str, code: int) -> int:
-    with suppress(OSError):  # nobody may be listening
-        print(f"torch-pbd: {message}", file=sys.stderr)
+    _say(f"torch-pbd: {message}", sys.stderr)
     return code
+
+
+def _say(text: str, stream: TextIO | None = None) -> None:
+    """Print; once nobody reads, as behind ``| head``, the work goes on without a word."""
+    stream = sys.stdout if stream is None else stream
+    try:
+        print(text, file=stream, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 if __name__ == "__main__":
