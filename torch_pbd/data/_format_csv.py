@@ -120,7 +120,8 @@ class _Table:
             names = [name for name in self.header if name not in taken]
         else:
             names = [outputs] if isinstance(outputs, str) else list(outputs)
-        missing = [name for name in names if name not in self.header]
+        known = set(self.header)
+        missing = [name for name in names if name not in known]
         if missing or not names:
             what = f"no column {missing[0]!r}" if missing else "no column of outputs"
             raise DataFormatError(f"{self.path}, line 1: {what} among {preview(self.header)}.")
@@ -128,8 +129,9 @@ class _Table:
 
     def recordings(self, demo: str | None, columns: Sequence[str]) -> list[list[list[float]]]:
         """Rows of ``columns``, time first, of each demonstration, in the order they first appear."""
-        indices = [self.header.index(name) for name in columns]
-        label_index = None if demo is None else self.header.index(demo)
+        places = {name: place for place, name in enumerate(self.header)}
+        indices = [places[name] for name in columns]
+        label_index = None if demo is None else places[demo]
         recorded: dict[str, list[list[float]]] = {}
         for line, cells in self._rows():
             label = "" if label_index is None else cells[label_index].strip()
