@@ -63,8 +63,9 @@ def decode_parameters(description: Any) -> Any:
     kind = getattr(import_module(CLASSES[name]), name)
     nested = {"covariance": _regressor, _LAW: decode_law} if name == "DMPController" else {}
     values = {key: nested.get(key, decode)(value) for key, value in parameters.items()}
-    if not isinstance(values.get("device"), str | None):
-        raise ValueError(f"device is {values['device']!r:.80}, it must be text or null")
+    device = values.get("device")
+    if not isinstance(device, str | None) or (device or "").startswith("meta"):  # which holds no numbers
+        raise ValueError(f"device is {device!r:.80}, it must be the name of one, or null")
     return kind(**values)
 
 

@@ -50,6 +50,7 @@ _HETEROSCEDASTIC_OPTIONAL = {
     "core.coefficient_length_scale": "e",
 }
 
+_LARGEST_LOGARITHM = 300.0
 _UNBOUNDED = {"core.period", "core.log_density_floor"}  # infinite for none
 _POSITIVE = ("x_scale", "y_scale", "length_scale", "counts", "period")
 _NOT_NEGATIVE = ("amplitude", "noise_ratio")
@@ -195,5 +196,7 @@ def _check_values(name: str, tensor: Tensor) -> None:
         raise ValueError(f"{name} must be positive")
     if last.endswith(_NOT_NEGATIVE) and not bool((tensor >= 0).all()):
         raise ValueError(f"{name} must not be negative")
+    if last == "log_diagonal" and not bool((tensor.abs() < _LARGEST_LOGARITHM).all()):
+        raise ValueError(f"{name} is of factors whose squares are no numbers")
     if last in _FACTORS and not bool((tensor.diagonal() > 0).all() and torch.equal(tensor, tensor.tril())):
         raise ValueError(f"{name} must be the lower factor of a positive definite matrix")
