@@ -15,6 +15,7 @@ import pytest
 import torch_pbd
 from torch_pbd import Demonstrations
 from torch_pbd.cli import main
+from torch_pbd.commands import WORK
 
 COMMAND = [sys.executable, "-m", "torch_pbd.cli"]
 GMM = ["--model", "GMMBaseline", "--model.n_components", "2"]
@@ -131,6 +132,6 @@ def test_memory_that_is_not_enough_is_one_line(data, tmp_path, monkeypatch, caps
     def too_much(*_):
         raise MemoryError
 
-    monkeypatch.setitem(main.__globals__["_WORK"], "fit", too_much)
+    monkeypatch.setitem(WORK, "fit", too_much)
     assert main(["fit", "--data", str(data), "--output", str(tmp_path)]) == 1
     assert capsys.readouterr().err == "torch-pbd: the memory is not enough\n"

@@ -2,8 +2,8 @@
 
 import sys
 from collections.abc import Callable
-from contextlib import suppress
 
+from torch_pbd.console import say
 from torch_pbd.optim import Progress
 
 
@@ -12,11 +12,7 @@ def printed_progress(name: str, verbose: int) -> Callable[[Progress], None]:
 
     def show(progress: Progress) -> None:
         if progress.n_evaluations < 5 or progress.n_evaluations % max(1, 10 // verbose) in (0, 1):
-            with suppress(BrokenPipeError):  # nobody reads it
-                print(
-                    f"{name}: evaluation {progress.n_evaluations:5d}  loss {progress.loss:14.6f}  "
-                    f"{progress.elapsed:7.2f} s",
-                    file=sys.stderr,
-                )
+            count, loss, elapsed = progress.n_evaluations, progress.loss, progress.elapsed
+            say(f"{name}: evaluation {count:5d}  loss {loss:14.6f}  {elapsed:7.2f} s", sys.stderr)
 
     return show

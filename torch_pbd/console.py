@@ -1,0 +1,27 @@
+"""What is said on a terminal, or to nobody."""
+
+import os
+import sys
+from typing import Any, TextIO
+
+
+def say(text: str, stream: TextIO | None = None) -> None:
+    """Print; once nobody reads, as behind ``| head``, the work goes on without a word."""
+    stream = sys.stdout if stream is None else stream
+    try:
+        print(text, file=stream, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+class Notes:
+    """Shows each warning once, as one line on the standard error."""
+
+    def __init__(self) -> None:
+        self._shown: set[str] = set()
+
+    def __call__(self, message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+        """As ``warnings.showwarning`` is called."""
+        if str(message) not in self._shown:
+            self._shown.add(str(message))
+            say(f"note ({category.__name__}): {message}", sys.stderr)
