@@ -159,6 +159,12 @@ def test_lies_about_sizes_and_types_are_refused_before_anything_is_allocated(con
         tracemalloc.stop()
 
 
+def test_a_header_of_safetensors_that_is_longer_than_any_of_ours_is_not_parsed(path):
+    path.write_bytes(outer(b"{}".ljust(4 * MAX_HEADER_BYTES + 8)))
+    with pytest.raises(ModelFileError, match="it declares a header of 16777224 bytes"):
+        read_checksummed(path, "kind", 1)
+
+
 def test_a_file_larger_than_the_memory_is_not_read(path, monkeypatch):
     monkeypatch.setattr("torch_pbd.memory.available_bytes", lambda: 1000)
     with pytest.raises(ModelFileError, match="GiB of memory"):
