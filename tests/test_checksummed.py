@@ -13,6 +13,7 @@ ARRAYS = {
     "weight": np.arange(12.0).reshape(3, 4),
     "scalar": np.array(0.5),
     "state": np.arange(5, dtype=np.uint8),
+    "generator": np.array([0, 2**32 - 1], dtype=np.uint32),
     "known": np.array([True, False]),
     "none": np.zeros((0, 3), dtype=np.float32),
 }
