@@ -13,6 +13,7 @@ ARRAYS = {
     "weight": np.arange(12.0).reshape(3, 4),
     "scalar": np.array(0.5),
     "state": np.arange(5, dtype=np.uint8),
+    "generator": np.array([0, 2**32 - 1], dtype=np.uint32),
     "known": np.array([True, False]),
     "none": np.zeros((0, 3), dtype=np.float32),
 }
@@ -157,6 +158,12 @@ def test_lies_about_sizes_and_types_are_refused_before_anything_is_allocated(con
         assert tracemalloc.get_traced_memory()[1] < 2**22
     finally:
         tracemalloc.stop()
+
+
+def test_a_header_of_safetensors_that_is_longer_than_any_of_ours_is_not_parsed(path):
+    path.write_bytes(outer(b"{}".ljust(4 * MAX_HEADER_BYTES + 8)))
+    with pytest.raises(ModelFileError, match="it declares a header of 16777224 bytes"):
+        read_checksummed(path, "kind", 1)
 
 
 def test_a_file_larger_than_the_memory_is_not_read(path, monkeypatch):

@@ -1,6 +1,8 @@
 """Memory that there is, as files of the system tell it, and what refuses to go beyond."""
 
+import json
 import os
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ import torch
 import torch_pbd.memory
 from torch_pbd.control import AdmittancePlant, DMPController, EnergyTank
 from torch_pbd.data import make_tunnel_demonstrations
-from torch_pbd.memory import available_bytes, require_memory
+from torch_pbd.memory import available_bytes, parsed_bytes, require_memory
 
 GIB = 2**30
 
@@ -93,3 +95,16 @@ def test_trajectories_that_do_not_fit_are_refused(monkeypatch):
     plant = AdmittancePlant(stiffness_filter=EnergyTank())
     with pytest.raises(ValueError, match=r"1000 rollouts of 50 ticks needs .* or take simulate_many"):
         plant.simulate(still, still, gains, gains, force, dt=0.01)
+
+
+@pytest.mark.parametrize("text", ["1000,", "0.12345678,", "[],", '{"a":1},', '"ab",', "[[1.5,2.5],[3.5,4.5]],"])
+def test_what_parsed_text_takes_is_not_underestimated(text):
+    content = f"[{100_000 * text}0]".encode()
+    tracemalloc.start()
+    try:
+        json.loads(content.decode())
+        taken = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert 0.2 < taken / parsed_bytes([content]) < 1.0
+    assert parsed_bytes([content[:1000], content[1000:]]) == parsed_bytes([content])

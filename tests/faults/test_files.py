@@ -18,7 +18,7 @@ import joblib
 import numpy as np
 import pytest
 import torch
-from file_kinds import CHECKED, KINDS, MODELS, called
+from file_kinds import CHECKED, KINDS, MODELS, called, load_all
 
 from torch_pbd.exceptions import DataFormatError, ModelFileError
 
@@ -284,6 +284,7 @@ def test_43_arrays_that_lie_about_their_size_are_refused_before_they_are_allocat
 
 
 def assert_refused_cheaply(kind, path, most=2**22):
+    load_all()
     tracemalloc.start()
     try:
         with pytest.raises(kind.error, match=str(path)):
@@ -319,13 +320,12 @@ HOSTILE = {
     "deeper": b'{"a":' * 100_000,
     "digits": b'{"version": ' + b"1" * 5000 + b"}",
     "lists": b"[" + b"[]," * 300_000 + b"[]]",
-    "twice": b'{"format": "torch_pbd.schedule", "format": "torch_pbd.schedule"}',
     "nan": b'{"format": NaN}',
     "spaces": b"# a: " + b" " * 200_000 + b"x\n" + b"# a",
-    "columns": b"# names: null\n" + b"position[0]," * 5000 + b"\n",
     "header": b"demo,time," + b",".join(b"%d" % i for i in range(10_000)) + b",\n",
     "twins": b"demo,time," + b"x," * 50_000 + b"\n",
     "wide": b"x" * 300_000 + b"\n",
+    "rows": b"demo,time,x\n" + b"".join(b"0,%d,1\n" % i for i in range(100_000)),
 }
 
 
@@ -333,7 +333,22 @@ HOSTILE = {
 @each_kind
 def test_43_text_that_is_costly_to_parse_is_refused(kind, hostile, tmp_path, monkeypatch):
     monkeypatch.setattr("torch_pbd.memory.available_bytes", lambda: 2**23)
-    assert_refused_cheaply(kind, kind.file(tmp_path, HOSTILE[hostile]), most=2**25)
+    assert_refused_cheaply(kind, kind.file(tmp_path, HOSTILE[hostile]), most=2**23)
+
+
+def test_43_a_schedule_of_thousands_of_outputs_in_name_only_is_refused(tmp_path):
+    kind = next(kind for kind in KINDS if (kind.name, kind.suffix) == ("schedule", ".csv"))
+    head, _, _ = kind.content.partition(b"\ntime,")
+    path = kind.file(tmp_path, head.replace(b'["x", "y"]', b"null") + b"\ntime" + b",position[0]" * 1500 + b"\n")
+    with pytest.raises(ModelFileError, match="names 1501 columns, of which 1500 are positions: they must be 3380252"):
+        kind.read(path)
+
+
+def test_43_entries_of_one_name_are_refused(tmp_path):
+    kind = next(kind for kind in KINDS if (kind.name, kind.suffix) == ("schedule", ".json"))
+    path = kind.file(tmp_path, b'{"version": 1, ' + kind.content[1:])
+    with pytest.raises(ModelFileError, match="two entries of one name, among version, format"):
+        kind.read(path)
 
 
 def test_43_a_description_of_demonstrations_that_is_no_text_is_refused(tmp_path):

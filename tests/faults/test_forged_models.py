@@ -9,7 +9,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from file_kinds import GOLDEN, MODELS
+from file_kinds import GOLDEN, MODELS, load_all
 from safetensors.numpy import save as to_bytes
 
 import torch_pbd
@@ -33,6 +33,7 @@ def forge(tmp_path, header, arrays):
 
 
 def assert_refused(path, words="", most=2**22):
+    load_all()
     tracemalloc.start()
     try:
         with pytest.raises(ModelFileError, match=rf"forged\.safetensors.*{words}"):
@@ -79,6 +80,17 @@ def test_43_a_model_under_the_name_of_another_class_is_refused(name, other, tmp_
     header, arrays = parts(name)
     if name != other:
         assert_refused(forge(tmp_path, {**header, "class": other}, arrays), f"does not describe a whole {other}")
+
+
+@pytest.mark.parametrize("other", MODELS[:-1])
+@pytest.mark.parametrize("name", MODELS[:-1])
+def test_43_a_model_with_parameters_of_another_class_is_refused(name, other, tmp_path):
+    header, arrays = parts(name)
+    learned = {**header["fitted"], **parts(other)[0]["fitted"]}
+    wanted = {key: learned[key] for key in parts(other)[0]["fitted"]}
+    if name != other:
+        forged = {**header, "class": other, "params": {}, "fitted": wanted}
+        assert_refused(forge(tmp_path, forged, arrays), "its model is of another class")
 
 
 BOMBS = [
@@ -238,6 +250,7 @@ def test_43_nesting_that_never_ends_is_refused(tmp_path):
 
 def test_43_parameters_of_a_fit_allocate_nothing_at_load(tmp_path):
     header, arrays = parts("GMMBaseline")
+    load_all()
     for name in ("n_components", "n_restarts", "max_iter"):
         tracemalloc.start()
         try:

@@ -1,3 +1,5 @@
+"""Files written whole: `torch_pbd.files`; the name `test_files` is that of the list of faults."""
+
 import os
 import stat
 
