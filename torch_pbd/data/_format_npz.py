@@ -13,11 +13,11 @@ from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
 from torch_pbd.data._checks import preview
-from torch_pbd.data.demonstrations import Demonstrations
+from torch_pbd.data.demonstrations import Demonstrations, Missing
 from torch_pbd.exceptions import DataFormatError
 
 
-def read_npz(path: Path, max_bytes: int) -> Demonstrations:
+def read_npz(path: Path, max_bytes: int, missing: Missing) -> Demonstrations:
     """Read the format of `torch_pbd.data.load_demonstrations`."""
     _check_archive(path, max_bytes)
     with np.load(path, allow_pickle=False) as archive:
@@ -39,6 +39,7 @@ def read_npz(path: Path, max_bytes: int) -> Demonstrations:
             units=_units(meta),
             frame=meta.get("frame"),
             time_unit=str(meta.get("time_unit") or _without_remark(meta.get("t_unit")) or "s"),
+            missing=missing,
         )
     except (ValueError, TypeError) as error:
         raise DataFormatError(f"{path}: {error}") from error
