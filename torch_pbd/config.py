@@ -4,17 +4,17 @@ Importing this module, and showing help, loads neither torch nor scikit-learn.
 """
 
 import difflib
-import re
-from argparse import ArgumentError
+from argparse import Namespace
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from jsonargparse import ActionConfigFile, ArgumentParser, Namespace, set_loader  # type: ignore[attr-defined]
-from jsonargparse.typing import PositiveFloat, PositiveInt
+from jsonargparse import ActionConfigFile, ArgumentParser  # type: ignore[attr-defined]
+from jsonargparse.typing import NonNegativeInt, PositiveFloat, PositiveInt, restricted_number_type
 
 from torch_pbd.exceptions import ConfigError
+from torch_pbd.options import Option, Options
 
 COMMANDS = {
     "demo": "learn from six made demonstrations of the tunnel task; the main job, no data needed",
@@ -35,32 +35,26 @@ _MODELS = {
 }
 GROUPS = ("imports", "fitting", "likelihood", "heteroscedastic", "prediction", "control", "growth")  # of the benchmark
 _CONTROLLERS = {"recommended": {"class_path": "DMPController"}}
+_NonzeroInt: Any = restricted_number_type("NonzeroInt", int, ("!=", 0))
+_OF_MODELS = ("fit", "experiment", "compare")
 _Reading = Literal["bell", "printed", "bowl"]
 
 
-class _StrictLoader(yaml.SafeLoader):
-    """YAML without surprises: numbers like 1e-3 are numbers, and a key twice is an error."""
+class _Parser(ArgumentParser):
+    """jsonargparse's parser, which shows help; values are held to the types of its options by `Options`."""
 
-    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        seen: set[str] = set()
-        for key, _ in node.value:
-            if key.value in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"the key {key.value!r} is there twice", key.start_mark
-                )
-            seen.add(key.value)
-        return super().construct_mapping(node, deep=deep)
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.options: dict[str, Option] = {}
+        super().__init__(*args, **kwargs)
 
-
-_StrictLoader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"^[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$"),
-    list("-+0123456789."),
-)
-
-
-def _load_yaml(text: str) -> Any:
-    return yaml.load(text, _StrictLoader)
+    def add_argument(self, *args: Any, **kwargs: Any) -> Any:
+        """Add an option, and remember what it takes."""
+        name = str(args[0]).removeprefix("--")
+        if kwargs.get("action") == "store_true":
+            self.options[name] = Option(bool, False, is_flag=True)
+        elif "action" not in kwargs:
+            self.options[name] = Option(kwargs["type"], kwargs.get("default"), kwargs.get("required", False))
+        return super().add_argument(*args, **kwargs)
 
 
 def parse(command: str, arguments: Sequence[str]) -> tuple[Namespace, str]:
@@ -73,23 +67,41 @@ def parse(command: str, arguments: Sequence[str]) -> tuple[Namespace, str]:
     SystemExit
         After ``--help`` and ``--print_config`` are answered.
     """
-    set_loader("yaml", _load_yaml, exceptions=(yaml.YAMLError,))
-    parser = _parser(command, only_help=any(argument in ("-h", "--help") for argument in arguments))
-    try:
-        values = parser.parse_args(list(arguments))
-        objects = parser.instantiate(values)
-        values.pop("resume", None)  # the same options begin the run and resume it
-        text = parser.dump(values, skip_validation=True)
-    except (ArgumentError, TypeError, ValueError, OSError) as error:
-        raise ConfigError(_one_line(str(error), parser)) from error
-    del objects["config"]
-    return objects, text
+    if any(argument in ("-h", "--help") for argument in arguments):
+        _parser(command, only_help=True).parse_args(["--help"])
+    parser = _parser(command, only_help=False)
+    options = Options(parser.options, _classes() if command in _OF_MODELS else {})
+    options.read(arguments)
+    if options.help_for is not None:
+        print(_class_help(*options.help_for), end="")
+        raise SystemExit(0)
+    if options.print_flags is not None:
+        shown = options.given() if "skip_default" in options.print_flags else options.complete()
+        print(_as_yaml(_without_nulls(shown) if "skip_unset" in options.print_flags else shown), end="")
+        raise SystemExit(0)
+    if (name := options.missing()) is not None:
+        raise ConfigError(f"{name} is missing: give --{name}, or {name}: in a file named by --config.")
+    # The same options begin a run and resume it.
+    written = {name: value for name, value in options.complete().items() if name != "resume"}
+    return Namespace(**options.objects()), _as_yaml(written)
 
 
-def _parser(command: str, *, only_help: bool) -> ArgumentParser:
-    parser = ArgumentParser(
-        prog=f"torch-pbd {command}", description=COMMANDS[command].capitalize() + ".", exit_on_error=False
-    )
+def _as_yaml(values: dict[str, Any]) -> str:
+    return yaml.safe_dump(values, allow_unicode=True, sort_keys=False, default_flow_style=False)
+
+
+def _without_nulls(value: Any) -> Any:
+    return {k: _without_nulls(v) for k, v in value.items() if v is not None} if isinstance(value, dict) else value
+
+
+def _class_help(known: type, key: str) -> str:
+    parser = ArgumentParser(prog="torch-pbd COMMAND", usage=f"options of {known.__name__}", add_help=False)
+    parser.add_class_arguments(known, key, as_group=False)
+    return parser.format_help()
+
+
+def _parser(command: str, *, only_help: bool) -> _Parser:
+    parser = _Parser(prog=f"torch-pbd {command}", description=COMMANDS[command].capitalize() + ".", exit_on_error=False)
     parser.add_argument("--config", action=ActionConfigFile, help="YAML file with any of these options")
     parser.add_argument("--output", type=str, default=f"runs/{command}", help="folder of the results")
     if command in RESUMABLE:
@@ -99,8 +111,8 @@ def _parser(command: str, *, only_help: bool) -> ArgumentParser:
         )
     model_type, models_type = (Any, Any) if only_help else _model_types()
     if command == "demo":
-        parser.add_argument("--n_demos", type=int, default=6, help="demonstrations to learn from, at least 3")
-        parser.add_argument("--seed", type=int, default=0, help="seed of the demonstrations")
+        parser.add_argument("--n_demos", type=PositiveInt, default=6, help="demonstrations to learn from, at least 3")
+        parser.add_argument("--seed", type=NonNegativeInt, default=0, help="seed of the demonstrations")
         return parser
     if command == "benchmark":
         parser.add_argument("--groups", type=str, default="all", help=f"comma-separated, of {', '.join(GROUPS)}")
@@ -117,8 +129,12 @@ def _parser(command: str, *, only_help: bool) -> ArgumentParser:
     else:
         parser.add_argument("--data", type=str | None, default=None, help="file of demonstrations; none: simulation")
         parser.add_argument("--models", type=models_type, default=_MODELS, help="name: model, several; " + _MODEL_HELP)
-        parser.add_argument("--max_folds", type=int, default=10, help="demonstrations to leave out, one by one")
-        parser.add_argument("--n_jobs", type=int | None, default=None, help="fits at the same time; -1: all cores")
+        parser.add_argument(
+            "--max_folds", type=NonNegativeInt, default=10, help="demonstrations to leave out, one by one"
+        )
+        parser.add_argument(
+            "--n_jobs", type=_NonzeroInt | None, default=None, help="fits at the same time; -1: all cores"
+        )
         _add_simulation_arguments(parser)
     if command == "experiment":
         return parser
@@ -129,7 +145,7 @@ def _parser(command: str, *, only_help: bool) -> ArgumentParser:
         help="auto: by phase where sampling times differ",
     )
     parser.add_argument("--input", type=Literal["time", "phase"], default="time", help="what the covariance depends on")
-    parser.add_argument("--n_steps", type=int | None, default=None, help="resample to so many points")
+    parser.add_argument("--n_steps", type=PositiveInt | None, default=None, help="resample to so many points")
     return parser
 
 
@@ -137,8 +153,8 @@ def _add_experiment_arguments(parser: ArgumentParser, controllers_type: Any) -> 
     parser.add_argument(
         "--data", type=str | None, default=None, help="file of demonstrations; none: made ones of the tunnel task"
     )
-    parser.add_argument("--n_demos", type=int, default=6, help="demonstrations to make")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the demonstrations")
+    parser.add_argument("--n_demos", type=PositiveInt, default=6, help="demonstrations to make")
+    parser.add_argument("--seed", type=NonNegativeInt, default=0, help="seed of the demonstrations")
     parser.add_argument("--common_start", type=bool, default=False, help="made demonstrations start at one point")
     parser.add_argument(
         "--controllers",
@@ -147,16 +163,16 @@ def _add_experiment_arguments(parser: ArgumentParser, controllers_type: Any) -> 
         help="name: DMPController with its class_path and init_args, several",
     )
     parser.add_argument("--push", type=float, default=5.0, help="peak of the two pushes along the first output, N")
-    parser.add_argument("--rate", type=float, default=1000.0, help="ticks of the controller, Hz")
+    parser.add_argument("--rate", type=PositiveFloat, default=1000.0, help="ticks of the controller, Hz")
 
 
 def _add_simulation_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--readings", type=list[_Reading], default=["bell", "printed", "bowl"], help="of eq. (14), which is ambiguous"
     )
-    parser.add_argument("--n_seeds", type=int, default=10, help="simulations to take the median of")
-    parser.add_argument("--n_inputs", type=int, default=10, help="inputs of the simulation")
-    parser.add_argument("--n_draws", type=int, default=50, help="draws at each input of the simulation")
+    parser.add_argument("--n_seeds", type=PositiveInt, default=10, help="simulations to take the median of")
+    parser.add_argument("--n_inputs", type=PositiveInt, default=10, help="inputs of the simulation")
+    parser.add_argument("--n_draws", type=PositiveInt, default=50, help="draws at each input of the simulation")
 
 
 def _model_types() -> tuple[Any, Any]:
@@ -178,31 +194,18 @@ def _controllers_type() -> Any:
     return dict[str, DMPController]
 
 
-def _one_line(message: str, parser: ArgumentParser) -> str:
-    """The message without jsonargparse's tree of attempts, with a suggestion for an unknown name."""
-    lines = [line.strip(" -") for line in message.splitlines()]
-    dull = ("Does not validate", "Subtypes:", "Errors:", "Expected a <class 'NoneType'>", "Given value")
-    text = " ".join(line for line in lines if line and not line.startswith(dull))
-    names = _known_names(parser)
-    mentioned = re.findall(r"(?:arguments: --|[Kk]ey ['\"]|Option ['\"]|path string: )([\w.]+)", text)
-    for unknown in (name.split(".")[-1] for name in mentioned):
-        close = difflib.get_close_matches(unknown, names, n=1)
-        if unknown not in names and close:
-            return f"{text} Did you mean {close[0]!r}?"
-    return text
+def _classes() -> dict[type, dict[str, type]]:
+    """The closed table: the classes that a configuration can name, by the type they are asked for as."""
+    from torch_pbd.control.controller import DMPController
+    from torch_pbd.control.stiffness import StiffnessLaw
+    from torch_pbd.estimators.cholesky import CholeskyCovRegressor
+    from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
+    from torch_pbd.estimators.mixture import GMMBaseline
+    from torch_pbd.estimators.wishart import WishartProcessRegressor
 
-
-def _known_names(parser: ArgumentParser) -> list[str]:
-    import inspect
-
-    from torch_pbd.control import DMPController, StiffnessLaw
-
-    models, _ = _model_types()
-    names = [action.dest for action in parser._actions]
-    leaves = [leaf for child in models.__subclasses__() for leaf in child.__subclasses__()]
-    for known in (*models.__subclasses__(), *leaves, DMPController, StiffnessLaw):
-        names += [known.__name__, *inspect.signature(known).parameters]
-    return names
+    models = (HeteroscedasticGPRegressor, CholeskyCovRegressor, WishartProcessRegressor, GMMBaseline)
+    tables = {_model_types()[0]: models, DMPController: (DMPController,), StiffnessLaw: (StiffnessLaw,)}
+    return {base: {known.__name__: known for known in table} for base, table in tables.items()}
 
 
 def chosen_groups(text: str) -> list[str]:

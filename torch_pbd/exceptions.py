@@ -13,6 +13,10 @@ class DataRankWarning(UserWarning):
     """The data leave directions of the covariance undetermined; a documented fallback was used."""
 
 
+class MissingDataWarning(UserWarning):
+    """Samples with missing values were dropped, as was asked for."""
+
+
 class UnimodalityWarning(UserWarning):
     """The demonstrations follow more than one way, or one of them is far from the others."""
 

@@ -6,28 +6,37 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torch_pbd.data._missing import drop_missing
 from torch_pbd.data.alignment import Floats
 
 MIN_SAMPLES = 2
 
 
-def as_recordings(times: Any, positions: Any) -> tuple[tuple[Floats, ...], tuple[Floats, ...]]:
+def as_recordings(times: Any, positions: Any, missing: str) -> tuple[tuple[Floats, ...], tuple[Floats, ...]]:
     """Read-only float64 copies: K times (T_k,) and K positions (T_k, d)."""
-    recordings = [_as_position(p, k) for k, p in enumerate(_as_list(positions, "positions"))]
+    check_choice(missing, ("raise", "drop"), "missing")
+    drop = missing == "drop"
+    recordings = [_position_array(p, k, drop) for k, p in enumerate(_as_list(positions, "positions"))]
     stamps = _as_list(times, "times")
-    if _as_numbers(stamps[0], "times[0]").ndim == 0:
-        time = _as_time(times, "times")
-        _check_shared_length(len(time), recordings)
-        grids = [time] * len(recordings)
+    shared = _as_numbers(stamps[0], "times[0]", drop).ndim == 0
+    if shared:
+        grids = [_time_array(times, "times", drop)]
+        _check_shared_length(len(grids[0]), recordings)
     elif len(stamps) != len(recordings):
         raise ValueError(
             f"times has {len(stamps)} arrays but positions has {len(recordings)} demonstrations: give one "
             "time array for each demonstration, or one 1-D array that all of them share."
         )
     else:
-        grids = [_as_time(time, f"times[{k}]") for k, time in enumerate(stamps)]
-    _check_consistent(grids, recordings)
-    return tuple(grids), tuple(recordings)
+        grids = [_time_array(time, f"times[{k}]", drop) for k, time in enumerate(stamps)]
+    _check_consistent(grids * len(recordings) if shared else grids, recordings)
+    kept: Sequence[NDArray[np.intp]] = [np.arange(len(position)) for position in recordings]
+    if drop:
+        grids, shared = grids * len(recordings) if shared else grids, False
+        grids, recordings, kept = drop_missing(grids, recordings, MIN_SAMPLES)
+    frozen = [_as_time(t, "times" if shared else f"times[{k}]", kept[k]) for k, t in enumerate(grids)]
+    times_ = frozen * len(recordings) if shared else frozen
+    return tuple(times_), tuple(_as_position(p, k, kept[k]) for k, p in enumerate(recordings))
 
 
 def as_labels(labels: str | Sequence[str], n_outputs: int, argument: str) -> tuple[str, ...]:
@@ -73,9 +82,13 @@ def _as_list(values: Any, argument: str) -> list[Any]:
     return entries
 
 
-def _as_numbers(values: Any, argument: str) -> NDArray[Any]:
+def _as_numbers(values: Any, argument: str, drop: bool) -> NDArray[Any]:
     if np.ma.is_masked(values):
-        raise ValueError(f"{argument} has masked entries: drop these samples or fill them in first.")
+        if not drop:
+            raise ValueError(
+                f"{argument} has masked entries: drop these samples (missing='drop') or fill them in first."
+            )
+        values = np.ma.filled(np.ma.asarray(values, dtype=np.float64), np.nan)
     try:
         array = np.asarray(values)
     except ValueError as error:
@@ -94,8 +107,8 @@ def _frozen(array: NDArray[Any]) -> Floats:
     return copy
 
 
-def _as_position(values: Any, k: int) -> Floats:
-    array = _as_numbers(values, f"positions[{k}]")
+def _position_array(values: Any, k: int, drop: bool) -> NDArray[Any]:
+    array = _as_numbers(values, f"positions[{k}]", drop)
     if array.ndim == 1:
         array = array[:, np.newaxis]
     if array.ndim != 2 or array.shape[1] == 0:
@@ -103,37 +116,46 @@ def _as_position(values: Any, k: int) -> Floats:
             f"positions[{k}] has shape {np.shape(values)}: a demonstration is (n_samples, n_outputs), or "
             "(n_samples,) for one output. One demonstration alone is written [positions]."
         )
-    position = _frozen(array)
-    if not np.isfinite(position).all():
-        i, j = np.argwhere(~np.isfinite(position))[0]
-        raise ValueError(
-            f"positions[{k}] is {position[i, j]} at sample {i}, output {j}: all values must be finite. "
-            "Drop or fill in the missing samples first."
-        )
-    return position
+    return array
 
 
-def _as_time(values: Any, argument: str) -> Floats:
-    array = _as_numbers(values, argument)
+def _time_array(values: Any, argument: str, drop: bool) -> NDArray[Any]:
+    array = _as_numbers(values, argument, drop)
     if array.ndim != 1:
         raise ValueError(f"{argument} has shape {array.shape}: times are 1-D, one for each sample.")
     if len(array) < MIN_SAMPLES:
         raise ValueError(f"{argument} has {len(array)} samples: a demonstration needs at least {MIN_SAMPLES}.")
+    return array
+
+
+def _as_position(array: NDArray[Any], k: int, numbers: NDArray[np.intp]) -> Floats:
+    position = _frozen(array)
+    if not np.isfinite(position).all():
+        i, j = np.argwhere(~np.isfinite(position))[0]
+        value = position[i, j]
+        remedy = "Drop the missing samples (missing='drop') or fill them in" if np.isnan(value) else "Correct the value"
+        raise ValueError(
+            f"positions[{k}] is {value} at sample {numbers[i]}, output {j}: all values must be finite. {remedy} first."
+        )
+    return position
+
+
+def _as_time(array: NDArray[Any], argument: str, numbers: NDArray[np.intp]) -> Floats:
     time = _frozen(array)
     if not np.isfinite(time).all():
         i = int(np.argmin(np.isfinite(time)))
-        raise ValueError(f"{argument} is {time[i]} at sample {i}: all times must be finite.")
-    _check_rising(time, array, argument)
+        raise ValueError(f"{argument} is {time[i]} at sample {numbers[i]}: all times must be finite.")
+    _check_rising(time, array, argument, numbers)
     return time
 
 
-def _check_rising(time: Floats, original: NDArray[Any], argument: str) -> None:
+def _check_rising(time: Floats, original: NDArray[Any], argument: str, numbers: NDArray[np.intp]) -> None:
     coarse = _coarseness(original)
     falls = np.flatnonzero(np.diff(time) <= 0)
     if len(falls):
         i = int(falls[0]) + 1
         raise ValueError(
-            f"{argument} must increase strictly, but sample {i} is at {time[i]!s} after {time[i - 1]!s}. "
+            f"{argument} must increase strictly, but sample {numbers[i]} is at {time[i]!s} after {time[i - 1]!s}. "
             f"Sort the samples by time and drop repeated ones.{coarse}"
         )
     if coarse:
@@ -154,7 +176,7 @@ def _coarseness(time: NDArray[Any]) -> str:
     )
 
 
-def _check_shared_length(n_samples: int, recordings: list[Floats]) -> None:
+def _check_shared_length(n_samples: int, recordings: list[NDArray[Any]]) -> None:
     lengths = [len(position) for position in recordings]
     if any(length != n_samples for length in lengths):
         alone = " One demonstration alone is written [positions]." if len(recordings) == n_samples else ""
@@ -165,7 +187,7 @@ def _check_shared_length(n_samples: int, recordings: list[Floats]) -> None:
         )
 
 
-def _check_consistent(grids: list[Floats], recordings: list[Floats]) -> None:
+def _check_consistent(grids: list[NDArray[Any]], recordings: list[NDArray[Any]]) -> None:
     n_outputs = recordings[0].shape[1]
     for k, (time, position) in enumerate(zip(grids, recordings, strict=True)):
         if len(time) != len(position):

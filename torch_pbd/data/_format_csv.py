@@ -2,16 +2,20 @@
 
 import csv
 import io
+from array import array
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from math import isfinite
+from math import inf, isfinite, isnan, nan
 from pathlib import Path
 from typing import BinaryIO, TextIO
 
+import numpy as np
+from numpy.typing import NDArray
+
 from torch_pbd.data._checks import check_choice, preview
-from torch_pbd.data.demonstrations import Demonstrations
+from torch_pbd.data.demonstrations import Demonstrations, Missing
 from torch_pbd.exceptions import DataFormatError
 from torch_pbd.memory import parsed_bytes, require_memory
 
@@ -22,6 +26,7 @@ _LONGEST_HEADER = 2**17
 def read_csv(
     path: Path,
     max_bytes: int,
+    missing: Missing,
     demo: str | None = "demo",
     time: str = "time",
     outputs: Sequence[str] | None = None,
@@ -38,19 +43,20 @@ def read_csv(
     _check_memory(path)
     with path.open(encoding="utf-8-sig", newline="") as file:
         try:
-            table = _open_table(path, file, delimiter, decimal, wanted=[*([demo] if demo else []), time])
+            table = _open_table(path, file, delimiter, decimal, missing, wanted=[*([demo] if demo else []), time])
             names = table.output_names(outputs, taken=[demo, time])
             recorded = table.recordings(demo, [time, *names])
         except UnicodeDecodeError as error:
             raise DataFormatError(f"{path} is not text in UTF-8: {error}.") from error
     try:
         return Demonstrations(
-            [[row[0] for row in rows] for rows in recorded],
-            [[row[1:] for row in rows] for rows in recorded],
+            [rows[:, 0] for rows in recorded],
+            [rows[:, 1:] for rows in recorded],
             names=names,
             units=units,
             frame=frame,
             time_unit=time_unit,
+            missing=missing,
         )
     except ValueError as error:
         raise DataFormatError(f"{path}: {error}") from error
@@ -79,7 +85,9 @@ def _check_memory(path: Path) -> None:
         raise DataFormatError(str(error)) from error
 
 
-def _open_table(path: Path, file: TextIO, delimiter: str | None, decimal: str, wanted: list[str]) -> "_Table":
+def _open_table(
+    path: Path, file: TextIO, delimiter: str | None, decimal: str, missing: Missing, wanted: list[str]
+) -> "_Table":
     """Read the header; the delimiter is the one that finds the columns wanted, and most columns."""
     first = file.readline(_LONGEST_HEADER)
     if len(first) == _LONGEST_HEADER:
@@ -92,16 +100,16 @@ def _open_table(path: Path, file: TextIO, delimiter: str | None, decimal: str, w
     except csv.Error as error:
         raise DataFormatError(f"{path}, line 1: {error}.") from error
     header = max(headers, key=lambda names: (set(wanted) <= set(names), len(names)))
-    missing = [name for name in wanted if name not in header]
-    if missing:
+    absent = [name for name in wanted if name not in header]
+    if absent:
         raise DataFormatError(
-            f"{path}, line 1: no column {missing[0]!r} among {preview(header)}. Name the columns by "
+            f"{path}, line 1: no column {absent[0]!r} among {preview(header)}. Name the columns by "
             "the options demo=, time= and outputs= (demo=None: one demonstration), or give the delimiter."
         )
     twice = [name for name, count in Counter(header).items() if count > 1]
     if twice:
         raise DataFormatError(f"{path}, line 1: there are two columns {twice[0]!r}.")
-    return _Table(path, file, header, candidates[headers.index(header)], decimal)
+    return _Table(path, file, header, candidates[headers.index(header)], decimal, missing)
 
 
 @dataclass(frozen=True)
@@ -113,6 +121,7 @@ class _Table:
     header: list[str]
     delimiter: str
     decimal: str
+    missing: Missing
 
     def output_names(self, outputs: Sequence[str] | None, taken: Sequence[str | None]) -> list[str]:
         """Columns of the outputs, in their order."""
@@ -127,47 +136,52 @@ class _Table:
             raise DataFormatError(f"{self.path}, line 1: {what} among {preview(self.header)}.")
         return names
 
-    def recordings(self, demo: str | None, columns: Sequence[str]) -> list[list[list[float]]]:
+    def recordings(self, demo: str | None, columns: Sequence[str]) -> list[NDArray[np.float64]]:
         """Rows of ``columns``, time first, of each demonstration, in the order they first appear."""
         places = {name: place for place, name in enumerate(self.header)}
         indices = [places[name] for name in columns]
         label_index = None if demo is None else places[demo]
-        recorded: dict[str, list[list[float]]] = {}
+        recorded: dict[str, array[float]] = {}
+        last: dict[str, float] = {}
         for line, cells in self._rows():
             label = "" if label_index is None else cells[label_index].strip()
             if label_index is not None and not label:
                 raise DataFormatError(f"{self.path}, line {line}, column {demo!r}: the cell is blank.")
             row = [self._number(cells[i], line, self.header[i]) for i in indices]
-            rows = recorded.setdefault(label, [])
-            if rows and row[0] <= rows[-1][0]:
+            before = last.get(label, -inf)
+            if row[0] <= before:
                 raise DataFormatError(
                     f"{self.path}, line {line}, column {columns[0]!r}: {row[0]!r} comes after "
-                    f"{rows[-1][0]!r} in demonstration {label!r}: times must increase strictly. Sort the "
+                    f"{before!r} in demonstration {label!r}: times must increase strictly. Sort the "
                     "lines by time and drop repeated ones."
                 )
-            rows.append(row)
-        return list(recorded.values())
+            recorded.setdefault(label, array("d")).extend(row)
+            last[label] = before if isnan(row[0]) else row[0]
+        return [np.array(values).reshape(-1, len(columns)) for values in recorded.values()]
 
     def _rows(self) -> Iterator[tuple[int, list[str]]]:
         reader = csv.reader(self.file, delimiter=self.delimiter)
         while True:
+            line = reader.line_num + 2  # of its beginning: a quoted cell may go on for several
             try:
                 cells = next(reader, None)
             except csv.Error as error:
-                raise DataFormatError(f"{self.path}, line {reader.line_num + 1}: {error}.") from error
+                raise DataFormatError(f"{self.path}, line {line}: {error}.") from error
             if cells is None:
                 return
             if not cells:
                 continue
             if len(cells) != len(self.header):
                 raise DataFormatError(
-                    f"{self.path}, line {reader.line_num + 1}: {len(cells)} cells under {len(self.header)} "
+                    f"{self.path}, line {line}: {len(cells)} cells under {len(self.header)} "
                     f"column names (delimiter {self.delimiter!r}, decimal mark {self.decimal!r})."
                 )
-            yield reader.line_num + 1, cells
+            yield line, cells
 
     def _number(self, cell: str, line: int, column: str) -> float:
         text = cell.strip()
+        if self.missing == "drop" and (not text or text.lower() in ("nan", "+nan", "-nan")):
+            return nan
         foreign = "_" if self.decimal == "." else "_."
         try:
             if any(mark in text for mark in foreign):
@@ -179,6 +193,6 @@ class _Table:
             what = f"{text!r} is not a finite number" if text else "the cell is blank"
             raise DataFormatError(
                 f"{self.path}, line {line}, column {column!r}: {what} (decimal mark {self.decimal!r}). "
-                "Drop the line, or fill the value in."
+                "Drop the line (missing='drop' does, where the cell is blank or nan), or fill the value in."
             )
         return value

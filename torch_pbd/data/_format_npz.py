@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from torch_pbd.archives import read_array, read_members
 from torch_pbd.data._checks import preview
-from torch_pbd.data.demonstrations import Demonstrations
+from torch_pbd.data.demonstrations import Demonstrations, Missing
 from torch_pbd.exceptions import DataFormatError
 from torch_pbd.memory import parsed_bytes, require_memory
 
 
-def read_npz(path: Path, max_bytes: int) -> Demonstrations:
+def read_npz(path: Path, max_bytes: int, missing: Missing) -> Demonstrations:
     """Read the format of `torch_pbd.data.load_demonstrations`."""
     try:
         members = read_members(path.read_bytes(), max_bytes, remedy=f"Raise max_bytes={max_bytes} to read it.")
@@ -40,6 +40,7 @@ def read_npz(path: Path, max_bytes: int) -> Demonstrations:
             units=_units(meta),
             frame=_text(meta, "frame"),
             time_unit=_text(meta, "time_unit") or _without_remark(_text(meta, "t_unit")) or "s",
+            missing=missing,
         )
     except (ValueError, TypeError) as error:
         raise DataFormatError(f"{path}: {error}") from error

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch_pbd.data._checks import as_labels, as_recordings, check_choice, check_n_steps, preview
 from torch_pbd.data.alignment import Floats, dtw_warps, interpolate, unit_phases
 
+Missing = Literal["raise", "drop"]
 MAX_DEFAULT_STEPS = 200
 """Most points `Demonstrations.align` takes of its own accord."""
 
@@ -41,11 +42,14 @@ class Demonstrations:
         Name of the coordinate frame.
     time_unit : str, default="s"
         Unit of ``times``; "1" for phase.
+    missing : {"raise", "drop"}, default="raise"
+        "drop" leaves out samples of which the time or a position is NaN or masked, and warns
+        (`MissingDataWarning`) of how many; each demonstration then has its own times. Infinity is an error.
 
     Raises
     ------
     ValueError
-        If there is no demonstration, if lengths or numbers of outputs disagree, if a demonstration has fewer
+        If there is no demonstration, if lengths or numbers of outputs disagree, if a demonstration has (left) fewer
         than two samples, if a value is not a finite real number, or if times do not increase strictly or are
         stored too coarsely to tell samples apart.
 
@@ -72,8 +76,9 @@ class Demonstrations:
         units: str | Sequence[str] | None = None,
         frame: str | None = None,
         time_unit: str = "s",
+        missing: Missing = "raise",
     ) -> None:
-        self._times, self._positions = as_recordings(times, positions)
+        self._times, self._positions = as_recordings(times, positions, missing)
         d = self.n_outputs
         self._names = as_labels([f"y{i}" for i in range(d)] if names is None else names, d, "names")
         if len(set(self._names)) < d:

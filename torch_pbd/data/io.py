@@ -8,17 +8,23 @@ from typing import Any, BinaryIO
 
 from torch_pbd.data._format_csv import read_csv, write_csv
 from torch_pbd.data._format_npz import read_npz, write_npz
-from torch_pbd.data.demonstrations import Demonstrations
+from torch_pbd.data.demonstrations import Demonstrations, Missing
 from torch_pbd.exceptions import DataFormatError
 from torch_pbd.files import replacing
+from torch_pbd.memory import require_memory
 
 MAX_BYTES = 512 * 2**20
+_COPIES = (
+    10  # of the bytes of a file, in memory while it is read; for CSV 4.5 measured, twice that with shorter numbers
+)
 
 _READERS: dict[str, Callable[..., Demonstrations]] = {".npz": read_npz, ".csv": read_csv}
 _WRITERS: dict[str, Callable[[Demonstrations, BinaryIO], None]] = {".npz": write_npz, ".csv": write_csv}
 
 
-def load_demonstrations(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES, **options: Any) -> Demonstrations:
+def load_demonstrations(
+    path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES, missing: Missing = "raise", **options: Any
+) -> Demonstrations:
     """Demonstrations from a file, in the format that its suffix says.
 
     ``.npz`` (no options): either ``t`` (T,) and ``x`` (K, T, d), where all demonstrations share one grid of
@@ -35,6 +41,8 @@ def load_demonstrations(path: str | os.PathLike[str], *, max_bytes: int = MAX_BY
     path : str or path-like
     max_bytes : int, default=512 MiB
         Larger files (.npz: unpacked) are refused before they are read.
+    missing : {"raise", "drop"}, default="raise"
+        "drop" leaves out samples with NaN (CSV: and blank cells), and warns of how many, as `Demonstrations` does.
     demo : str or None, default="demo"
         CSV: column that tells the demonstrations apart, by any text. None: the file is one demonstration.
     time : str, default="time"
@@ -53,7 +61,7 @@ def load_demonstrations(path: str | os.PathLike[str], *, max_bytes: int = MAX_BY
     FileNotFoundError
         If there is no such file.
     ValueError
-        If the suffix is not known.
+        If the suffix is not known, or this machine has too little memory for the file.
     TypeError
         If an option is not one of the format's.
     DataFormatError
@@ -61,7 +69,7 @@ def load_demonstrations(path: str | os.PathLike[str], *, max_bytes: int = MAX_BY
     """
     file = Path(path)
     reader = _READERS[_known_suffix(file)]
-    known = list(inspect.signature(reader).parameters)[2:]
+    known = list(inspect.signature(reader).parameters)[3:]
     unknown = [option for option in options if option not in known]
     if unknown:
         raise TypeError(f"{file.suffix} files have no option {unknown[0]!r}; they have: {', '.join(known) or 'none'}.")
@@ -71,7 +79,9 @@ def load_demonstrations(path: str | os.PathLike[str], *, max_bytes: int = MAX_BY
         raise DataFormatError(
             f"{file} has {file.stat().st_size} bytes, more than max_bytes={max_bytes}: raise it to read this."
         )
-    return reader(file, max_bytes, **options)
+    needed = _COPIES * file.stat().st_size
+    require_memory(needed, what=f"reading {file}", remedy="Split the file, or leave samples out.")
+    return reader(file, max_bytes, missing, **options)
 
 
 def save_demonstrations(demonstrations: Demonstrations, path: str | os.PathLike[str]) -> None:
