@@ -49,9 +49,16 @@ def checkpointed(path: Path, work: Work, *, entries: Sequence[Entry] = (), inter
     try:
         with recorded(journal):
             yield
-    except BaseException:
-        journal.write()
+    except BaseException as error:
+        if journal.entries or not isinstance(error, Exception):
+            journal.write()
+        else:  # refused before there was anything to go on from
+            _remove(path)
         raise
+    _remove(path)
+
+
+def _remove(path: Path) -> None:
     with suppress(OSError):  # of a folder in its place it has been told
         path.unlink(missing_ok=True)
 

@@ -70,7 +70,7 @@ def experiment(options: Any, folder: Any) -> str:
         )
         say(describe(demonstrations, "tunnel task"))
     else:
-        demonstrations = load_demonstrations(options.data)
+        demonstrations = load_demonstrations(options.data, missing=options.missing)
         say(describe(demonstrations, options.data.name))
     where = f"along {demonstrations.names[0]}, at 20 % and 80 % of the movement; K is the stiffness there, N/m"
     say(f"pushes of {options.push:g} N {where}\n")
@@ -125,7 +125,7 @@ def _demonstrations(options: Any) -> Any:
     from torch_pbd.data import check_unimodal, load_demonstrations
     from torch_pbd.experiments.recordings import describe, prepare
 
-    recorded = load_demonstrations(options.data)
+    recorded = load_demonstrations(options.data, missing=options.missing)
     say(describe(recorded, options.data.name))
     if len(recorded) == 1:
         warnings.warn(

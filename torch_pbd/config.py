@@ -136,6 +136,9 @@ def _parser(command: str, *, only_help: bool) -> _Parser:
             "--n_jobs", type=_NonzeroInt | None, default=None, help="fits at the same time; -1: all cores"
         )
         _add_simulation_arguments(parser)
+    parser.add_argument(
+        "--missing", type=Literal["raise", "drop"], default="raise", help="of the file's samples: refuse, or leave out"
+    )
     if command == "experiment":
         return parser
     parser.add_argument(
