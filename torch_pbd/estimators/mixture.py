@@ -126,6 +126,13 @@ class GMMBaseline(CovarianceRegressor):
                 DataRankWarning,
                 stacklevel=4,
             )
+        if n_distinct <= y.shape[1]:
+            warnings.warn(
+                f"y has {n_distinct} distinct rows but {y.shape[1]} outputs: they leave directions of the covariance "
+                "undetermined, which reg_covar decides. Record more.",
+                DataRankWarning,
+                stacklevel=4,
+            )
         scaling = _by_residual(X, y)
         data = self._door(np.hstack([(X - scaling.x_shift) / scaling.x_scale, (y - scaling.y_shift) / scaling.y_scale]))
         spread = joint.std(axis=0)
