@@ -4,6 +4,7 @@ import pytest
 import torch
 from scipy.optimize import rosen
 
+from torch_pbd.exceptions import NotPositiveDefiniteError
 from torch_pbd.optim import by_autograd, minimize, minimize_batch, minimize_scoring
 
 
@@ -248,3 +249,113 @@ def test_a_batch_may_be_empty(generator):
     found, report = minimize_batch(objective, torch.zeros(0, 3, dtype=torch.float64))
     assert found.shape == (0, 3)
     assert (report.n_iter, report.converged) == (0, True)
+
+
+RAISED = [
+    RuntimeError("a"),
+    torch.linalg.LinAlgError("b"),
+    NotPositiveDefiniteError("c"),
+    IndexError("d"),
+    ZeroDivisionError("e"),
+]
+
+
+@pytest.mark.parametrize("fault", [*RAISED, math.nan, -math.inf], ids=repr)
+@pytest.mark.parametrize("when", [2, 7, 8, 30])
+def test_whatever_an_evaluation_raises_the_best_point_is_left_and_the_reason_told(fault, when):
+    """At every call from then on; -inf is what a likelihood without a floor falls to."""
+    x, calls = parameter(-1.2, 1.0), []
+
+    def objective():
+        calls.append(1)
+        if len(calls) < when:
+            return rosenbrock(x)
+        if isinstance(fault, Exception):
+            raise fault
+        return rosenbrock(x) * 0.0 + fault
+
+    start = rosenbrock(x).item()
+    report = minimize(objective, [x])
+    assert not report.converged
+    assert (str(fault) if isinstance(fault, Exception) else "not finite") in report.message
+    assert report.loss == rosenbrock(x).item() == min(report.loss_curve) <= start
+    assert len(calls) <= when + 3
+    assert x.grad is None
+
+
+@pytest.mark.parametrize("fault", [TypeError("a mistake"), KeyboardInterrupt(), MemoryError()], ids=repr)
+def test_mistakes_and_interrupts_are_passed_on_and_the_best_point_is_left(fault):
+    x, seen = parameter(-1.2, 1.0), []
+
+    def objective():
+        if len(seen) == 9:
+            raise fault
+        seen.append((rosenbrock(x).item(), x.detach().clone()))
+        return rosenbrock(x)
+
+    with pytest.raises(type(fault)):
+        minimize(objective, [x])
+    assert torch.equal(x.detach(), min(seen, key=lambda pair: pair[0])[1])
+
+
+def test_a_wall_beside_the_minimum_never_ends_worse_than_the_start():
+    for wall in torch.linspace(0.05, 3.0, 60).double():
+        x = parameter(4.0)
+
+        def objective(x=x, wall=wall):
+            return (x.square() + 1e12 * (x < wall) * (wall - x)).sum()
+
+        report = minimize(objective, [x], tol=1e-10)
+        assert report.loss == objective().item() <= 16.0
+
+
+@pytest.mark.parametrize("fault", RAISED, ids=repr)
+def test_a_batch_loses_only_the_problem_that_raises(fault):
+    """One of three cannot be evaluated beyond a wall, one nowhere; the third does not notice."""
+
+    def objective(x, rows):
+        if bool(((rows == 0) & (x[:, 0] > 0.5)).any()) or bool((rows == 1).any()):
+            raise fault
+        return (x - torch.tensor([[1.0], [1.0], [1.0]]).double()[rows]).square().sum(-1)
+
+    start = torch.zeros(3, 1, dtype=torch.float64)
+    x, report = minimize_batch(by_autograd(objective), start)
+    assert 0.0 < x[0, 0] <= 0.5
+    assert x[1, 0] == 0.0
+    assert math.isnan(report.loss[1])
+    assert not report.converged
+    assert x[2, 0].item() == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("fault", [*RAISED, math.nan, -math.inf], ids=repr)
+def test_scoring_takes_what_raises_for_too_far_and_keeps_its_best_point(fault):
+    wall = 0.9
+
+    def loss(x):
+        if bool((x < wall).any()):
+            if isinstance(fault, Exception):
+                raise fault
+            return torch.tensor(fault)
+        return x.square().sum()
+
+    x, report = minimize_scoring(loss, lambda x: (2 * x, -x), torch.tensor([3.0, 2.0], dtype=torch.float64))
+    assert report.loss == x.square().sum().item() < 13.0
+    assert bool((x >= wall).all())
+
+
+@pytest.mark.parametrize("fault", RAISED, ids=repr)
+def test_scoring_ends_where_there_is_no_step_to_take(fault):
+    calls = []
+
+    def newton(x):
+        calls.append(1)
+        if len(calls) == 3:
+            raise fault
+        return 2 * x, -0.5 * x
+
+    x, report = minimize_scoring(lambda x: x.square().sum(), newton, torch.tensor([2.0], dtype=torch.float64))
+    assert not report.converged
+    assert str(fault) in report.message
+    assert report.loss == x.square().sum().item() < 4.0
+    with pytest.raises(ValueError, match="cannot start"):
+        minimize_scoring(lambda x: x.square().sum(), lambda _: [][calls[0]], torch.tensor([2.0], dtype=torch.float64))

@@ -1,52 +1,94 @@
 """The command line: ``torch-pbd demo``, ``fit`` and so on; torch loads once there is work."""
 
-import difflib
 import os
+import signal
 import sys
+import threading
 import warnings
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
+from typing import Any, TextIO
 
-import torch_pbd
-from torch_pbd.config import COMMANDS, chosen_groups, existing_file, parse
-from torch_pbd.exceptions import ConfigError
+from torch_pbd.exceptions import ConfigError, FolderInUseError
 
-_ERROR, _USAGE, _INTERRUPTED = 1, 2, 130
+_ERROR, _USAGE, _IN_USE, _INTERRUPTED, _TERMINATED = 1, 2, 3, 130, 143
+_CHECKPOINT = "checkpoint"  # in the folder of results, while the work goes on
+
+
+class _Terminated(BaseException):
+    """SIGTERM, as KeyboardInterrupt is SIGINT."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit code: 0, 1 (failed), 2 (cannot be used), 130 (interrupted)."""
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
-    if not arguments or arguments[0] in ("-h", "--help"):
-        print(_help())
-        return 0
-    if arguments[0] == "--version":
-        print(torch_pbd.__version__)
-        return 0
-    command = arguments[0]
-    if command not in COMMANDS:
-        close = difflib.get_close_matches(command, COMMANDS, n=1)
-        meant = f" Did you mean {close[0]!r}?" if close else f" Known are {', '.join(COMMANDS)}."
-        return _complain(f"there is no command {command!r}.{meant}", _USAGE)
+    """Run one command.
+
+    Returns
+    -------
+    int
+        Exit code: 0; 1, it failed; 2, it cannot be used; 3, another run writes the folder; 130 and 143, interrupted and
+        terminated.
+    """
     try:
-        return _run(command, arguments[1:])
+        with _signals():
+            return _answer(list(sys.argv[1:] if arguments is None else arguments))
     except ConfigError as error:
         return _complain(str(error), _USAGE)
-    except (ValueError, TypeError, OSError) as error:
-        if isinstance(error, BrokenPipeError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return 0
-        return _complain(str(error), _ERROR)
-    except KeyboardInterrupt:
-        return _complain("interrupted; the results folder may be incomplete", _INTERRUPTED)
+    except FolderInUseError as error:
+        return _complain(f"{error} Wait for it, or take another with --output FOLDER.", _IN_USE)
+    except (ValueError, TypeError, OSError, MemoryError) as error:
+        return _complain(str(error) or "the memory is not enough", _ERROR)
+    except KeyboardInterrupt as stop:
+        return _complain(f"interrupted{_remark(stop)}", _INTERRUPTED)
+    except _Terminated as stop:
+        return _complain(f"terminated{_remark(stop)}", _TERMINATED)
+
+
+@contextmanager
+def _signals() -> Iterator[None]:
+    """SIGINT and SIGTERM are exceptions, the first time; the next one ends the process at once."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    errors = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: _Terminated}
+
+    def handle(number: int, _: object) -> None:
+        for each in errors:
+            signal.signal(each, signal.SIG_DFL)
+        raise errors[signal.Signals(number)]
+
+    before = {number: signal.signal(number, handle) for number in errors}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _remark(stop: BaseException) -> str:
+    return f"; {stop.args[0]}" if stop.args else ""
+
+
+def _answer(arguments: Sequence[str]) -> int:
+    import torch_pbd
+    from torch_pbd.config import COMMANDS, nearest
+
+    if not arguments or arguments[0] in ("-h", "--help"):
+        _say(_help(COMMANDS))
+        return 0
+    if arguments[0] == "--version":
+        _say(torch_pbd.__version__)
+        return 0
+    if arguments[0] not in COMMANDS:
+        raise ConfigError(f"there is no command {arguments[0]!r}. {nearest(arguments[0], COMMANDS)}")
+    return _run(arguments[0], arguments[1:])
 
 
 def _run(command: str, arguments: Sequence[str]) -> int:
+    from torch_pbd.config import chosen_groups, existing_file, parse
+
     options, config = parse(command, arguments)
     import matplotlib as mpl
     import torch
-
-    from torch_pbd.experiments.run_folder import RunFolder
 
     mpl.use("Agg")
     torch.set_num_threads(1)  # the matrices are small: threads would only wait for each other
@@ -54,14 +96,48 @@ def _run(command: str, arguments: Sequence[str]) -> int:
         options.data = existing_file(options.data)
     if command == "benchmark":
         options.groups = chosen_groups(options.groups)
-    folder = RunFolder(options.output, {"command": command})
-    (folder.path / "config.yaml").write_text(config, encoding="utf-8")
-    with warnings.catch_warnings():
+    with _run_folder(options.output, command) as folder, warnings.catch_warnings():
         warnings.simplefilter("default")
         warnings.showwarning = _Notes()
-        print(_WORK[command](options, folder))
-    print(f"\nresults: {folder.path}")
+        try:
+            with _checkpoint(options, folder, command, config):
+                folder.write_text("config.yaml", config)
+                _say(_WORK[command](options, folder))
+        except (KeyboardInterrupt, _Terminated) as stop:
+            if (folder.path / _CHECKPOINT).exists():
+                stop.args = (f"torch-pbd {command} --config {folder.path / 'config.yaml'} --resume goes on",)
+            raise
+    _say(f"\nresults: {folder.path}")
     return 0
+
+
+def _run_folder(path: str, command: str) -> Any:
+    from torch_pbd.experiments.run_folder import RunFolder
+
+    try:
+        return RunFolder(path, {"command": command})
+    except OSError as error:
+        reason = error.strerror or str(error)
+        where = f" ({error.filename})" if error.filename else ""
+        raise ConfigError(
+            f"output: {path!r} cannot be a folder of results: {reason}{where}. Give another with --output FOLDER."
+        ) from error
+
+
+def _checkpoint(options: Any, folder: Any, command: str, config: str) -> Any:
+    """What keeps the work's checkpoint, begun with the one that is there if asked to."""
+    from torch_pbd.config import RESUMABLE
+    from torch_pbd.experiments.resuming import checkpoint_of_run
+
+    if command not in RESUMABLE:
+        return nullcontext()
+    return checkpoint_of_run(
+        folder.path / _CHECKPOINT,
+        config,
+        options.data if hasattr(options, "data") else None,
+        resume=options.resume,
+        interval=options.checkpoint_interval,
+    )
 
 
 def _demo(options: Any, folder: Any) -> str:
@@ -79,7 +155,7 @@ def _demo(options: Any, folder: Any) -> str:
         "WP": WishartProcessRegressor(),
         "GMM 5": GMMBaseline(n_components=5),
     }
-    print(f"{options.n_demos} made demonstrations of the tunnel task; the truth is that of 300 more\n")
+    _say(f"{options.n_demos} made demonstrations of the tunnel task; the truth is that of 300 more\n")
     return run_demo(models, folder, n_demos=options.n_demos, seed=options.seed) + "\n\n" + _LEGEND
 
 
@@ -117,12 +193,12 @@ def _experiment(options: Any, folder: Any) -> str:
         demonstrations = make_tunnel_demonstrations(
             options.n_demos, random_state=options.seed, common_start=options.common_start
         )
-        print(describe(demonstrations, "tunnel task"))
+        _say(describe(demonstrations, "tunnel task"))
     else:
         demonstrations = load_demonstrations(options.data)
-        print(describe(demonstrations, options.data.name))
+        _say(describe(demonstrations, options.data.name))
     where = f"along {demonstrations.names[0]}, at 20 % and 80 % of the movement; K is the stiffness there, N/m"
-    print(f"pushes of {options.push:g} N {where}\n")
+    _say(f"pushes of {options.push:g} N {where}\n")
     folder.write_figure(framework_figure(), "figure5_framework")
     made = options.data is None
     return run_robot(options.controllers, demonstrations, folder, peak=options.push, rate=options.rate, in_tunnel=made)
@@ -146,7 +222,7 @@ def _compare(options: Any, folder: Any) -> str:
         return f"{table}\n\n{_LEGEND}"
     from torch_pbd.experiments.simulation import run_simulation
 
-    print(f"eq. (14): {options.n_inputs} inputs x {options.n_draws} draws, medians over {options.n_seeds} seeds\n")
+    _say(f"eq. (14): {options.n_inputs} inputs x {options.n_draws} draws, medians over {options.n_seeds} seeds\n")
     return run_simulation(
         options.models,
         folder,
@@ -173,7 +249,7 @@ def _demonstrations(options: Any) -> Any:
     from torch_pbd.experiments.recordings import describe, prepare
 
     recorded = load_demonstrations(options.data)
-    print(describe(recorded, options.data.name))
+    _say(describe(recorded, options.data.name))
     if len(recorded) == 1:
         warnings.warn(
             "There is one demonstration: what varies between demonstrations cannot be told from how one moves.",
@@ -182,8 +258,8 @@ def _demonstrations(options: Any) -> Any:
     check_unimodal(recorded)
     prepared = prepare(recorded, options.align, options.n_steps)
     if prepared is not recorded:
-        print(describe(prepared, f"after align={options.align}"))
-    print()
+        _say(describe(prepared, f"after align={options.align}"))
+    _say("")
     return prepared
 
 
@@ -196,7 +272,7 @@ class _Notes:
     def __call__(self, message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
         if str(message) not in self._shown:
             self._shown.add(str(message))
-            print(f"note ({category.__name__}): {message}", file=sys.stderr)
+            _say(f"note ({category.__name__}): {message}", sys.stderr)
 
 
 _LEGEND = """MSE: squared distance of Cholesky factors to the empirical covariances, units of the data (Table I)
@@ -205,9 +281,9 @@ demonstrations, nats per sample, its mean +- standard error and its median over 
 left-out samples in the 95 % ellipse; least eig.: smallest eigenvalue of the predicted correlations"""
 
 
-def _help() -> str:
-    width = max(map(len, COMMANDS))
-    lines = [f"  {name:<{width}}  {text}" for name, text in COMMANDS.items()]
+def _help(commands: Mapping[str, str]) -> str:
+    width = max(map(len, commands))
+    lines = [f"  {name:<{width}}  {text}" for name, text in commands.items()]
     return "\n".join(
         [
             "torch-pbd: learn how precise people are from demonstrations",
@@ -222,8 +298,17 @@ def _help() -> str:
 
 
 def _complain(message: str, code: int) -> int:
-    print(f"torch-pbd: {message}", file=sys.stderr)
+    _say(f"torch-pbd: {message}", sys.stderr)
     return code
+
+
+def _say(text: str, stream: TextIO | None = None) -> None:
+    """Print; once nobody reads, as behind ``| head``, the work goes on without a word."""
+    stream = sys.stdout if stream is None else stream
+    try:
+        print(text, file=stream, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 if __name__ == "__main__":

@@ -6,13 +6,13 @@ Importing this module, and showing help, loads neither torch nor scikit-learn.
 import difflib
 import re
 from argparse import ArgumentError
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import yaml
 from jsonargparse import ActionConfigFile, ArgumentParser, Namespace, set_loader  # type: ignore[attr-defined]
-from jsonargparse.typing import PositiveInt
+from jsonargparse.typing import PositiveFloat, PositiveInt
 
 from torch_pbd.exceptions import ConfigError
 
@@ -23,6 +23,7 @@ COMMANDS = {
     "compare": "compare models: on the paper's simulation (Table I, Figures 1 to 3), or on a file",
     "benchmark": "time fits, predictions and ticks against other libraries; ratios, bars, growth",
 }
+RESUMABLE = ("demo", "fit", "experiment", "compare")
 
 _MODEL_HELP = "an estimator's name, or class_path and init_args; its options: --model.help NAME"
 _MODELS = {
@@ -76,8 +77,9 @@ def parse(command: str, arguments: Sequence[str]) -> tuple[Namespace, str]:
     parser = _parser(command, only_help=any(argument in ("-h", "--help") for argument in arguments))
     try:
         values = parser.parse_args(list(arguments))
-        text = parser.dump(values)
         objects = parser.instantiate(values)
+        values.pop("resume", None)  # the same options begin the run and resume it
+        text = parser.dump(values, skip_validation=True)
     except (ArgumentError, TypeError, ValueError, OSError) as error:
         raise ConfigError(_one_line(str(error), parser)) from error
     del objects["config"]
@@ -90,6 +92,11 @@ def _parser(command: str, *, only_help: bool) -> ArgumentParser:
     )
     parser.add_argument("--config", action=ActionConfigFile, help="YAML file with any of these options")
     parser.add_argument("--output", type=str, default=f"runs/{command}", help="folder of the results")
+    if command in RESUMABLE:
+        parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in the folder of results")
+        parser.add_argument(
+            "--checkpoint_interval", type=PositiveFloat, default=5.0, help="seconds between two checkpoints"
+        )
     model_type, models_type = (Any, Any) if only_help else _model_types()
     if command == "demo":
         parser.add_argument("--n_demos", type=int, default=6, help="demonstrations to learn from, at least 3")
@@ -209,10 +216,14 @@ def chosen_groups(text: str) -> list[str]:
     names = list(GROUPS) if text == "all" else [name.strip() for name in text.split(",")]
     for name in names:
         if name not in GROUPS:
-            close = difflib.get_close_matches(name, GROUPS, n=1)
-            meant = f"Did you mean {close[0]!r}?" if close else f"Known are {', '.join(GROUPS)}, or all."
-            raise ConfigError(f"groups: there is no group {name!r}. {meant}")
+            raise ConfigError(f"groups: there is no group {name!r}. {nearest(name, [*GROUPS, 'all'])}")
     return names
+
+
+def nearest(name: str, known: Collection[str]) -> str:
+    """Sentence with the known name that is meant, or all of them."""
+    close = difflib.get_close_matches(name, known, n=1)
+    return f"Did you mean {close[0]!r}?" if close else f"Known are {', '.join(known)}."
 
 
 def existing_file(path: str) -> Path:

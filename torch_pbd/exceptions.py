@@ -23,3 +23,7 @@ class DataFormatError(ValueError):
 
 class ConfigError(ValueError):
     """A configuration file or a command line cannot be used."""
+
+
+class FolderInUseError(RuntimeError):
+    """Another run writes the folder of results."""

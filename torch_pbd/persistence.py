@@ -1,37 +1,43 @@
 """Save and load fitted estimators: one safetensors file whose header is JSON; nothing in it is ever executed."""
 
-import hashlib
-import json
 import os
-from dataclasses import asdict
-from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save as to_bytes
 from sklearn.utils.validation import check_is_fitted
 
+from torch_pbd.checksummed import read_checksummed, write_checksummed
 from torch_pbd.control.controller import DMPController
-from torch_pbd.control.stiffness import StiffnessLaw
-from torch_pbd.control.storage import controller_state, restore_controller
+from torch_pbd.control.storage import check_controller, controller_state, restore_controller
 from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.exceptions import ModelFileError
-from torch_pbd.files import replacing
+from torch_pbd.learned import decode_learned, learned_names
+from torch_pbd.model_header import (
+    CLASSES,
+    REGRESSORS,
+    decode_law,
+    decode_parameters,
+    encode,
+    encode_law,
+    encode_parameters,
+    is_ours,
+)
+from torch_pbd.models.layout import check_layout
 
 FORMAT_VERSION = 1
-_CLASSES = {
-    "CholeskyCovRegressor": "torch_pbd.estimators.cholesky",
-    "WishartProcessRegressor": "torch_pbd.estimators.wishart",
-    "HeteroscedasticGPRegressor": "torch_pbd.estimators.heteroscedastic",
-    "GMMBaseline": "torch_pbd.estimators.mixture",
-    "DMPController": "torch_pbd.control.controller",
-}
-_PART = "covariance_."  # before the names of the arrays of a controller's regressor
 _KEY = "torch_pbd"
+_PART = "covariance_."  # before the names of the arrays of a controller's regressor
+_MODELS = {
+    "CholeskyCovRegressor": "cholesky",
+    "WishartProcessRegressor": "wishart",
+    "HeteroscedasticGPRegressor": "heteroscedastic",
+    "GMMBaseline": "mixture",
+}
+# What parts that do not fit together raise.
+_UNSOUND = (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError)
 
 
 def save(estimator: CovarianceRegressor | DMPController, path: str | os.PathLike[str]) -> None:
@@ -48,12 +54,14 @@ def save(estimator: CovarianceRegressor | DMPController, path: str | os.PathLike
     sklearn.exceptions.NotFittedError
         If the estimator is not fitted.
     TypeError
-        If it is not one of this package, or a parameter (a callable prior, a random state object) cannot
-        be written as JSON.
+        If it is not one of this package, has attributes that this package did not give it, or a parameter (a callable
+        prior, a random state object) cannot be written as JSON.
+    ValueError
+        If it is not sound, and could not be loaded again.
     """
-    name = type(estimator).__name__
-    if name not in _CLASSES:
-        raise TypeError(f"estimator is a {name}; can save {', '.join(_CLASSES)}. In a pipeline, save that step.")
+    if not is_ours(estimator):
+        name = type(estimator).__name__
+        raise TypeError(f"estimator is a {name}; can save {', '.join(CLASSES)}. In a pipeline, save that step.")
     check_is_fitted(estimator)
     description, arrays = _described(estimator)
     header = {
@@ -61,36 +69,17 @@ def save(estimator: CovarianceRegressor | DMPController, path: str | os.PathLike
         **description,
         "versions": {package: version(package) for package in ("torch", "scikit-learn", "numpy")},
     }
-    header["sha256"] = _digest(header, arrays)
-    with replacing(Path(path)) as file:
-        file.write(to_bytes(arrays, metadata={_KEY: json.dumps(header)}))
-
-
-def _described(estimator: Any) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Class, parameters and what was learned, as JSON; and the arrays."""
-    parameters = estimator.get_params(deep=False)
-    description: dict[str, Any] = {
-        "class": type(estimator).__name__,
-        "params": {key: _encode(value, key) for key, value in parameters.items()},
-    }
-    if isinstance(estimator, DMPController):
-        values, arrays = controller_state(estimator)
-        regressor, parts = _described(estimator.covariance_)
-        learned = {key: _encode(value, key) for key, value in values.items()}
-        description |= {"fitted": learned, "covariance_": regressor}
-        arrays |= {_PART + key: value for key, value in parts.items()}
-    else:
-        state = estimator.__getstate__()
-        arrays = state.pop("_module_arrays")
-        description["module"] = state.pop("_module_spec")
-        description["fitted"] = {key: _encode(value, key) for key, value in state.items() if key not in parameters}
-    return description, {key: np.ascontiguousarray(value) for key, value in arrays.items()}
+    write_checksummed(Path(path), _KEY, header, arrays)
 
 
 def load(path: str | os.PathLike[str]) -> Any:
     """Load an estimator that :func:`save` wrote: it predicts the same to the last bit.
 
     One that was fitted on a device which this machine lacks is put on the CPU, with a warning.
+
+    Nothing in the file is executed, and no more is allocated than a small multiple of its size, whoever made it: names
+    of classes, parameters, attributes and arrays are looked up in closed tables, and all shapes compared. What
+    well-formed numbers say is believed.
 
     Raises
     ------
@@ -100,94 +89,117 @@ def load(path: str | os.PathLike[str]) -> Any:
         If it is damaged, of a newer format, or no model of this package.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"no model file at {path}")
+    header, arrays = read_checksummed(path, _KEY, FORMAT_VERSION)
+    if header.get("class") not in list(CLASSES):  # a list asks for no hash
+        raise ModelFileError(f"{path} holds a {header.get('class')!r:.80}; known are {', '.join(CLASSES)}.")
     try:
-        with safe_open(path, framework="numpy") as file:
-            header = json.loads((file.metadata() or {})[_KEY])
-            arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - not a dict
-    except (SafetensorError, KeyError, ValueError, OSError, RecursionError) as error:
-        raise ModelFileError(f"{path} is not a model of torch_pbd, or is damaged ({error}).") from error
-    if not isinstance(header, dict) or header.get("format_version") != FORMAT_VERSION:
-        found = header.get("format_version") if isinstance(header, dict) else None
-        raise ModelFileError(f"{path} has format version {found}; this torch_pbd reads {FORMAT_VERSION}. Upgrade it.")
-    if header.get("class") not in list(_CLASSES):  # a list asks for no hash
-        raise ModelFileError(f"{path} holds a {header.get('class')!r}; known are {', '.join(_CLASSES)}.")
-    if header.pop("sha256", None) != _digest(header, arrays):
-        raise ModelFileError(f"{path} is damaged: it does not match its checksum.")
-    try:
+        if not isinstance(header.pop("versions", None), dict) or header.pop("format_version") != FORMAT_VERSION:
+            raise ValueError("it does not say what wrote it")
         return _restored(header, arrays)
-    except (AttributeError, KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise ModelFileError(f"{path} does not describe a whole {header['class']} ({error}).") from error
+    except _UNSOUND as error:
+        brief = f"{error!s:.500}"
+        raise ModelFileError(f"{path} does not describe a whole {header['class']} ({brief}).") from error
 
 
-def _restored(description: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> Any:
+def _described(estimator: Any) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Class, parameters and what was learned, as JSON; and the arrays. All of it sound."""
+    described = _described_controller if isinstance(estimator, DMPController) else _described_regressor
+    try:
+        return described(estimator)
+    except (ArithmeticError, ValueError) as error:
+        raise ValueError(f"the {type(estimator).__name__} cannot be saved, as it is not sound: {error}.") from error
+
+
+def _described_regressor(estimator: CovarianceRegressor) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    name, state = type(estimator).__name__, estimator.__getstate__()
+    arrays, spec = state.pop("_module_arrays"), state.pop("_module_spec")
+    check_layout(spec, estimator.module_.state_dict())
+    learned = {key: value for key, value in state.items() if key not in estimator.get_params(deep=False)}
+    strangers = set(learned) - learned_names(name)
+    if strangers:
+        raise TypeError(
+            f"estimator has an attribute {min(strangers)!r}, which a model file cannot hold: delete it, or pickle the "
+            "estimator."
+        )
+    fitted = {key: encode(value, key) for key, value in learned.items()}
+    _check_sizes(decode_learned(name, fitted), arrays)
+    description = {**encode_parameters(estimator), "module": spec, "fitted": fitted}
+    # One number is written as an array of one.
+    return description, {key: np.ascontiguousarray(value) for key, value in arrays.items()}
+
+
+def _described_controller(controller: DMPController) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    values, arrays = controller_state(controller)
+    law = values.pop("law_")
+    fitted = {key: encode(value, key) for key, value in values.items()}
+    check_controller(controller, {**decode_learned("DMPController", fitted), "law_": law}, arrays)
+    regressor, parts = _described(controller.covariance_)
+    arrays |= {_PART + key: value for key, value in parts.items()}
+    fitted["law_"] = encode_law(law)
+    return {**encode_parameters(controller), "fitted": fitted, "covariance_": regressor}, arrays
+
+
+def _restored(description: Any, arrays: dict[str, NDArray[Any]]) -> Any:
     """The estimator that :func:`_described` told of."""
-    estimator = _unfitted(description)
+    estimator = decode_parameters(description)
     if isinstance(estimator, DMPController):
-        parts = {key.removeprefix(_PART): value for key, value in arrays.items() if key.startswith(_PART)}
-        regressor = _restored(description["covariance_"], parts)
-        restore_controller(estimator, regressor, _decode(description["fitted"]), arrays)
-        return estimator
-    state = {**estimator.__dict__, **_decode(description["fitted"])}
-    estimator.__setstate__({**state, "_module_spec": description["module"], "_module_arrays": arrays})
-    _try_out(estimator)
+        _check_entries(description, {"class", "params", "fitted", "covariance_"})
+        _restore_controller(estimator, description, arrays)
+    else:
+        _check_entries(description, {"class", "params", "fitted", "module"})
+        _restore_regressor(estimator, description, arrays)
     return estimator
 
 
-def _unfitted(description: dict[str, Any]) -> Any:
-    name = description["class"]
-    return getattr(import_module(_CLASSES[name]), name)(**_decode(description["params"]))
+def _restore_controller(controller: Any, description: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+    of_regressor, fitted = description["covariance_"], description["fitted"]
+    if not isinstance(of_regressor, dict) or of_regressor.get("class") not in list(REGRESSORS):
+        raise ValueError("its covariance is no regressor")
+    parts = {key.removeprefix(_PART): value for key, value in arrays.items() if key.startswith(_PART)}
+    own = {key: value for key, value in arrays.items() if not key.startswith(_PART)}
+    regressor = _restored(of_regressor, parts)
+    values = decode_learned("DMPController", {key: value for key, value in fitted.items() if key != "law_"})
+    restore_controller(controller, regressor, {**values, "law_": decode_law(fitted["law_"])}, own)
+
+
+def _restore_regressor(estimator: Any, description: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+    name, spec = description["class"], description["module"]
+    if not isinstance(spec, dict) or spec.get("covariance") != _MODELS[name]:
+        raise ValueError("its model is of another class")
+    wrong = [key for key, array in arrays.items() if array.dtype != np.float64]
+    if wrong:
+        raise ValueError(f"{wrong[0]!r:.80} is of {arrays[wrong[0]].dtype}, it must be of float64")
+    learned = decode_learned(name, description["fitted"])
+    _check_sizes(learned, arrays)
+    estimator.__setstate__({**vars(estimator), **learned, "_module_spec": spec, "_module_arrays": arrays})
+    _try_out(estimator)
+
+
+def _check_entries(description: dict[str, Any], names: set[str]) -> None:
+    if set(description) != names:
+        raise ValueError(f"its header has {', '.join(description)!r:.200}, it must have {', '.join(sorted(names))}")
+
+
+def _check_sizes(learned: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+    """Compare what the attributes say of inputs and outputs with the arrays."""
+    n_features, n_outputs = learned["n_features_in_"], learned["n_outputs_"]
+    if arrays["x_shift"].shape != (n_features,) or arrays["y_shift"].shape != (n_outputs,):
+        raise ValueError(
+            f"it is for {n_features} inputs and {n_outputs} outputs, its arrays for {arrays['x_shift'].size} and "
+            f"{arrays['y_shift'].size}"
+        )
+    if learned["_y_is_1d"] and n_outputs != 1:
+        raise ValueError(f"it says that y was 1-D, and that there are {n_outputs} outputs")
+    if len(learned.get("feature_names_in_", arrays["x_shift"])) != n_features:
+        raise ValueError(f"it has not {n_features} names of inputs")
+    root = arrays.get("core.covariance.prior_root")
+    if root is not None and root.shape[-1] != learned["df_"]:
+        raise ValueError(f"df_ is {learned['df_']}, its arrays are for {root.shape[-1]}")
 
 
 def _try_out(estimator: CovarianceRegressor) -> None:
-    """Raise what a model of parts that do not fit together raises."""
-    mean, scale_tril = estimator.module_(estimator._door(np.zeros((1, estimator.n_features_in_))))
-    if mean.shape != (1, estimator.n_outputs_) or scale_tril.shape != (*mean.shape, estimator.n_outputs_):
-        raise ValueError(f"it is for {estimator.n_outputs_} outputs, its arrays for {mean.shape[-1]}")
-    if not isinstance(estimator._y_is_1d, bool):
-        raise ValueError("it does not say how y was shaped")
-
-
-def _digest(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> str:
-    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
-    for name in sorted(arrays):
-        digest.update(f"{name} {arrays[name].dtype} {arrays[name].shape} ".encode())
-        digest.update(arrays[name].tobytes())
-    return digest.hexdigest()
-
-
-def _encode(value: Any, name: str) -> Any:
-    """JSON of a value; arrays are marked."""
-    if isinstance(value, np.ndarray):
-        return {
-            "array": _encode(value.tolist(), name),
-            "dtype": "object" if value.dtype == object else str(value.dtype),
-        }
-    if isinstance(value, np.generic):
-        return _encode(value.item(), name)
-    if isinstance(value, list | tuple):
-        return [_encode(entry, name) for entry in value]
-    if type(value).__name__ in _CLASSES:
-        parameters = value.get_params(deep=False).items()
-        return {"class": type(value).__name__, "params": {key: _encode(entry, key) for key, entry in parameters}}
-    if isinstance(value, StiffnessLaw):
-        return {"stiffness_law": asdict(value)}
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    raise TypeError(
-        f"{name} is a {type(value).__name__}, which a model file cannot hold; pickle the estimator, or fit it with "
-        f"{name} given as numbers."
-    )
-
-
-def _decode(value: Any) -> Any:
-    if isinstance(value, dict):
-        if set(value) == {"array", "dtype"}:
-            return np.array(value["array"], dtype=value["dtype"])
-        if set(value) == {"class", "params"}:
-            return _unfitted(value)
-        if set(value) == {"stiffness_law"}:
-            return StiffnessLaw(**value["stiffness_law"])
-        return {key: _decode(entry) for key, entry in value.items()}
-    return value
+    """Raise what a model raises, or what can be said of it, that does not predict at the middle of its data."""
+    mean, scale_tril = estimator.module_(estimator.module_.x_shift[None])
+    sound = mean.isfinite().all() and scale_tril.isfinite().all() and (scale_tril.diagonal(dim1=-2, dim2=-1) > 0).all()
+    if not bool(sound):
+        raise ValueError("it predicts no mean and positive definite covariance at the middle of its data")

@@ -9,9 +9,6 @@ import io
 import json
 import math
 import re
-import struct
-import zipfile
-import zlib
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
@@ -20,9 +17,11 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from torch_pbd.archives import read_array, read_members
 from torch_pbd.control.schedule_checks import ARRAY_DIMS, LABELS, Arrays, Labels
 from torch_pbd.exceptions import ModelFileError
 from torch_pbd.files import replacing
+from torch_pbd.memory import parsed_bytes, require_memory
 
 FORMAT = "torch_pbd.schedule"
 VERSION = 1
@@ -33,21 +32,8 @@ Built = TypeVar("Built")
 # A decoder gives the header, and then, once that is known to be of a version that can be read, the arrays.
 Decoder = Callable[[bytes], Iterator[Any]]
 
-_NPY_START = re.compile(
-    rb"\x93NUMPY\x01\x00..\{'descr': '(<f8|<U\d+)', 'fortran_order': False, 'shape': \(([\d, ]*)\), \} *\n", re.DOTALL
-)
-
 # What parsers raise about bytes that are not what they claim to be (RecursionError is a RuntimeError).
-_DAMAGE = (
-    ValueError,
-    TypeError,
-    EOFError,
-    RuntimeError,
-    csv.Error,
-    struct.error,
-    zipfile.BadZipFile,
-    zlib.error,
-)
+_DAMAGE = (ArithmeticError, LookupError, MemoryError, RuntimeError, TypeError, ValueError, csv.Error)
 
 
 def write_schedule(path: Path, arrays: Arrays, labels: Labels) -> None:
@@ -127,11 +113,21 @@ def _digest(header: Labels, arrays: Arrays) -> str:
     return digest.hexdigest()
 
 
+def _require_parsed(content: bytes) -> None:
+    require_memory(parsed_bytes([content]), what="what it says", remedy="Save it as .npz.")
+
+
 def _parse_json(text: str) -> Any:
     def refuse(constant: str) -> None:
         raise ValueError(f"it holds {constant}: all numbers must be finite.")
 
-    return json.loads(text, parse_constant=refuse)
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        entries = dict(pairs)
+        if len(entries) < len(pairs):
+            raise ValueError(f"it holds an object with two entries of one name, among {', '.join(entries):.80}.")
+        return entries
+
+    return json.loads(text, parse_constant=refuse, object_pairs_hook=unique)
 
 
 def _encode_json(header: Labels, arrays: Arrays) -> bytes:
@@ -139,6 +135,7 @@ def _encode_json(header: Labels, arrays: Arrays) -> bytes:
 
 
 def _decode_json(content: bytes) -> Iterator[Any]:
+    _require_parsed(content)
     header = _parse_json(content.decode())
     lists = header.pop("arrays", {}) if isinstance(header, dict) else {}
     yield header
@@ -153,30 +150,16 @@ def _encode_npz(header: Labels, arrays: Arrays) -> bytes:
 
 
 def _decode_npz(content: bytes) -> Iterator[Any]:
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        infos = archive.infolist()
-        if sum(info.file_size for info in infos) > MAX_BYTES:
-            raise ValueError(f"it unpacks to more than {MAX_BYTES} bytes.")
-        if any(info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for info in infos):
-            raise ValueError("it is packed in a way that NumPy does not write.")
-        members = {info.filename.removesuffix(".npy"): archive.read(info) for info in infos}
+    members = read_members(content, MAX_BYTES, remedy="Resample the schedule at a lower rate.")
     yield _parse_json(str(_read_npy("header", members.pop("header", b""))))
     yield {name: _read_npy(name, member) for name, member in members.items()}
 
 
 def _read_npy(name: str, content: bytes) -> NDArray[Any]:
-    """An array of float64 or text, as NumPy writes it.
-
-    NumPy's own reader evaluates Python literals in the file, and allocates whatever shape it declares.
-    """
-    start = _NPY_START.match(content)
-    if start is None:
-        raise ValueError(f"{name} is not an array of float64, in C order, in version 1.0 of NumPy's format.")
-    dtype, shape = np.dtype(start[1].decode()), tuple(int(size) for size in start[2].split(b",") if size.strip())
-    n_bytes, found = math.prod(shape) * dtype.itemsize, len(content) - start.end()
-    if n_bytes != found:
-        raise ValueError(f"{name} declares shape {shape}, {n_bytes} bytes, but has {found}.")
-    return np.frombuffer(content, dtype, offset=start.end()).reshape(shape)
+    array = read_array(name, content)
+    if array.dtype.str != "<f8" and not (name == "header" and array.dtype.kind == "U" and not array.ndim):
+        raise ValueError(f"{name} is not an array of float64, it is of {array.dtype}.")
+    return array
 
 
 def _columns(names: Sequence[str] | None, n_outputs: int) -> list[tuple[str, str, tuple[int, ...]]]:
@@ -207,13 +190,14 @@ def _encode_csv(header: Labels, arrays: Arrays) -> bytes:
 
 
 def _decode_csv(content: bytes) -> Iterator[Any]:
+    _require_parsed(content)
     stream = io.StringIO(content.decode("utf-8-sig"), newline="")
     header: dict[str, Any] = {}
     first = ""
     for first in stream:
         if not first.startswith("#"):
             break
-        match = re.fullmatch(r"# (\w+): (.*?)\s*", first)
+        match = re.fullmatch(r"# (\w+): (.*)", first.rstrip())
         if match is None or match[1] in header:
             raise ValueError(f"line {len(header) + 1} must be '# key: value' with a new key, but is {first[:80]!r}.")
         header[match[1]] = _parse_json(match[2])
@@ -227,6 +211,12 @@ def _read_table(names: Any, lines: Iterator[str], n_lines_before: int) -> Arrays
     n_outputs = sum(title.startswith("position[") for title in titles)
     if names is not None and (not isinstance(names, list) or len(names) != n_outputs):
         raise ValueError(f"names is {names}, but there are {n_outputs} columns of positions.")
+    n_columns = 2 + 2 * n_outputs + 3 * n_outputs * (n_outputs + 1) // 2
+    if len(titles) != n_columns:
+        raise ValueError(
+            f"line {n_lines_before + 1} names {len(titles)} columns, of which {n_outputs} are positions: they must be "
+            f"{n_columns}."
+        )
     columns = _columns(names, n_outputs)
     expected = [title for title, _, _ in columns]
     if titles != expected:

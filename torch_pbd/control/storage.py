@@ -5,10 +5,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torch_pbd.control.arguments import check_parameters
 from torch_pbd.control.controller import DMPController
 from torch_pbd.control.dmp import DMP
 from torch_pbd.control.impedance import Impedance
 from torch_pbd.control.reproduction import Phase, Reproduction
+from torch_pbd.control.stiffness import StiffnessLaw
 
 Arrays = dict[str, NDArray[np.float64]]
 
@@ -28,23 +30,50 @@ def controller_state(controller: DMPController) -> tuple[dict[str, Any], Arrays]
     return values, arrays
 
 
+def check_controller(controller: DMPController, values: dict[str, Any], arrays: Arrays) -> None:
+    """Check that the parts of a fitted controller fit together, but for its regressor.
+
+    Raises
+    ------
+    ValueError
+        If a parameter cannot be used, or an array is missing, unknown, of another shape or not finite.
+    """
+    check_parameters(controller)
+    d = values["n_outputs_"]
+    if set(arrays) != {*_ARRAYS, *_MOTION}:
+        raise ValueError(f"its arrays are {', '.join(arrays)!r:.200}, they must be {', '.join((*_ARRAYS, *_MOTION))}")
+    for name, array in arrays.items():
+        rows = len(array) if name == "forcing" and array.ndim == 2 else 0
+        if array.shape != ((rows, d) if name == "forcing" else (d,)) or (name == "forcing" and rows < 2):
+            raise ValueError(f"its parts are not all for {d} outputs: {name} has shape {array.shape}")
+        if array.dtype != np.float64 or not np.isfinite(array).all():
+            raise ValueError(f"{name} is not of finite numbers in float64")
+    for name in ("names_", "units_"):
+        if values[name] is not None and len(values[name]) != d:
+            raise ValueError(f"{name} has {len(values[name])} entries, it must have {d}")
+    if not isinstance(values["law_"], StiffnessLaw) or values["law_"].bounds == "quantile":
+        raise ValueError("its stiffness law has no bounds")
+
+
 def restore_controller(controller: DMPController, covariance: Any, values: dict[str, Any], arrays: Arrays) -> None:
     """Make an unfitted controller the fitted one that :func:`controller_state` told of.
 
     Raises
     ------
-    KeyError, ValueError
+    ValueError
         If a part is missing or does not fit the others.
     """
+    check_controller(controller, values, arrays)
+    if covariance.n_outputs_ != values["n_outputs_"] or covariance.n_features_in_ != 1:
+        raise ValueError(
+            f"its parts are not all for {values['n_outputs_']} outputs, or its regressor sees more than time"
+        )
     for name in _PLAIN:
         setattr(controller, name, values[name])
     for name in _ARRAYS:
         setattr(controller, name, arrays[name])
     controller.names_ = tuple(controller.names_)
     controller.units_ = None if controller.units_ is None else tuple(controller.units_)
-    n_outputs = controller.n_outputs_
-    if covariance.n_outputs_ != n_outputs or any(arrays[name].shape[-1:] != (n_outputs,) for name in _MOTION):
-        raise ValueError(f"its parts are not all for {n_outputs} outputs")
     dmp = DMP(
         controller.alpha, controller.beta, controller.gamma, controller.tau,
         duration=controller.duration_, gate=controller.gate,

@@ -2,8 +2,10 @@
 
 import csv
 import io
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from math import isfinite
 from pathlib import Path
 from typing import BinaryIO, TextIO
@@ -11,8 +13,10 @@ from typing import BinaryIO, TextIO
 from torch_pbd.data._checks import check_choice, preview
 from torch_pbd.data.demonstrations import Demonstrations
 from torch_pbd.exceptions import DataFormatError
+from torch_pbd.memory import parsed_bytes, require_memory
 
 DELIMITERS = (",", ";", "\t")
+_LONGEST_HEADER = 2**17
 
 
 def read_csv(
@@ -31,6 +35,7 @@ def read_csv(
     check_choice(decimal, (".", ","), "decimal")
     if delimiter is not None and (len(delimiter) != 1 or delimiter == decimal):
         raise ValueError(f"delimiter={delimiter!r} must be one character, and not the decimal mark {decimal!r}.")
+    _check_memory(path)
     with path.open(encoding="utf-8-sig", newline="") as file:
         try:
             table = _open_table(path, file, delimiter, decimal, wanted=[*([demo] if demo else []), time])
@@ -65,11 +70,27 @@ def write_csv(demonstrations: Demonstrations, handle: BinaryIO) -> None:
     text.detach()
 
 
+def _check_memory(path: Path) -> None:
+    try:
+        with path.open("rb") as file:
+            needed = parsed_bytes(iter(partial(file.read, 2**20), b""))
+        require_memory(needed, what=f"{path}", remedy="Save it as .npz, or read it in parts.")
+    except ValueError as error:
+        raise DataFormatError(str(error)) from error
+
+
 def _open_table(path: Path, file: TextIO, delimiter: str | None, decimal: str, wanted: list[str]) -> "_Table":
     """Read the header; the delimiter is the one that finds the columns wanted, and most columns."""
-    first = file.readline()
+    first = file.readline(_LONGEST_HEADER)
+    if len(first) == _LONGEST_HEADER:
+        raise DataFormatError(
+            f"{path}, line 1: it is longer than {_LONGEST_HEADER} characters; it must name the columns."
+        )
     candidates = [delimiter] if delimiter else [mark for mark in DELIMITERS if mark != decimal]
-    headers = [[name.strip() for name in next(csv.reader([first], delimiter=c), [])] for c in candidates]
+    try:
+        headers = [[name.strip() for name in next(csv.reader([first], delimiter=c), [])] for c in candidates]
+    except csv.Error as error:
+        raise DataFormatError(f"{path}, line 1: {error}.") from error
     header = max(headers, key=lambda names: (set(wanted) <= set(names), len(names)))
     missing = [name for name in wanted if name not in header]
     if missing:
@@ -77,7 +98,7 @@ def _open_table(path: Path, file: TextIO, delimiter: str | None, decimal: str, w
             f"{path}, line 1: no column {missing[0]!r} among {preview(header)}. Name the columns by "
             "the options demo=, time= and outputs= (demo=None: one demonstration), or give the delimiter."
         )
-    twice = [name for name in header if header.count(name) > 1]
+    twice = [name for name, count in Counter(header).items() if count > 1]
     if twice:
         raise DataFormatError(f"{path}, line 1: there are two columns {twice[0]!r}.")
     return _Table(path, file, header, candidates[headers.index(header)], decimal)
@@ -99,7 +120,8 @@ class _Table:
             names = [name for name in self.header if name not in taken]
         else:
             names = [outputs] if isinstance(outputs, str) else list(outputs)
-        missing = [name for name in names if name not in self.header]
+        known = set(self.header)
+        missing = [name for name in names if name not in known]
         if missing or not names:
             what = f"no column {missing[0]!r}" if missing else "no column of outputs"
             raise DataFormatError(f"{self.path}, line 1: {what} among {preview(self.header)}.")
@@ -107,8 +129,9 @@ class _Table:
 
     def recordings(self, demo: str | None, columns: Sequence[str]) -> list[list[list[float]]]:
         """Rows of ``columns``, time first, of each demonstration, in the order they first appear."""
-        indices = [self.header.index(name) for name in columns]
-        label_index = None if demo is None else self.header.index(demo)
+        places = {name: place for place, name in enumerate(self.header)}
+        indices = [places[name] for name in columns]
+        label_index = None if demo is None else places[demo]
         recorded: dict[str, list[list[float]]] = {}
         for line, cells in self._rows():
             label = "" if label_index is None else cells[label_index].strip()

@@ -2,43 +2,44 @@
 
 import json
 import re
-import zipfile
-import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
+from torch_pbd.archives import read_array, read_members
 from torch_pbd.data._checks import preview
 from torch_pbd.data.demonstrations import Demonstrations
 from torch_pbd.exceptions import DataFormatError
+from torch_pbd.memory import parsed_bytes, require_memory
 
 
 def read_npz(path: Path, max_bytes: int) -> Demonstrations:
     """Read the format of `torch_pbd.data.load_demonstrations`."""
-    _check_archive(path, max_bytes)
-    with np.load(path, allow_pickle=False) as archive:
-        meta = _read_meta(path, archive)
-        if "t" in archive.files:
-            times: Any = _read(path, archive, "t")
-            positions: Any = _read(path, archive, "x")
-            if positions.ndim != 3:
-                raise DataFormatError(f"{path}: x has shape {positions.shape}, it must be (K, T, d).")
-        else:
-            n_demos = _count(path, archive.files)
-            times = [_read(path, archive, f"t_{k}") for k in range(n_demos)]
-            positions = [_read(path, archive, f"x_{k}") for k in range(n_demos)]
+    try:
+        members = read_members(path.read_bytes(), max_bytes, remedy=f"Raise max_bytes={max_bytes} to read it.")
+    except ValueError as error:
+        raise DataFormatError(f"{path}: {error}") from error
+    meta = _read_meta(path, members)
+    if "t" in members:
+        times: Any = _read(path, members, "t")
+        positions: Any = _read(path, members, "x")
+        if positions.ndim != 3:
+            raise DataFormatError(f"{path}: x has shape {positions.shape}, it must be (K, T, d).")
+    else:
+        n_demos = _count(path, members)
+        times = [_read(path, members, f"t_{k}") for k in range(n_demos)]
+        positions = [_read(path, members, f"x_{k}") for k in range(n_demos)]
     try:
         demonstrations = Demonstrations(
             times,
             positions,
             names=meta.get("dims"),
             units=_units(meta),
-            frame=meta.get("frame"),
-            time_unit=str(meta.get("time_unit") or _without_remark(meta.get("t_unit")) or "s"),
+            frame=_text(meta, "frame"),
+            time_unit=_text(meta, "time_unit") or _without_remark(_text(meta, "t_unit")) or "s",
         )
     except (ValueError, TypeError) as error:
         raise DataFormatError(f"{path}: {error}") from error
@@ -69,55 +70,50 @@ def write_npz(demonstrations: Demonstrations, handle: BinaryIO) -> None:
     np.savez_compressed(handle, **arrays)
 
 
-def _check_archive(path: Path, max_bytes: int) -> None:
+def _read(path: Path, members: Mapping[str, bytes], name: str) -> NDArray[Any]:
+    if name not in members:
+        raise DataFormatError(f"{path} has no array {name!r}; it has: {_listed(members)}.")
     try:
-        with zipfile.ZipFile(path) as archive:
-            n_bytes = sum(member.file_size for member in archive.infolist())
-    except zipfile.BadZipFile as error:
-        raise DataFormatError(f"{path} is not an .npz archive, or it is damaged: {error}.") from error
-    if n_bytes > max_bytes:
-        raise DataFormatError(
-            f"{path} unpacks to {n_bytes} bytes, more than max_bytes={max_bytes}: raise max_bytes to read it."
-        )
-
-
-def _read(path: Path, archive: NpzFile, name: str) -> NDArray[Any]:
-    if name not in archive.files:
-        raise DataFormatError(f"{path} has no array {name!r}; it has: {', '.join(archive.files) or 'none'}.")
-    try:
-        array: Any = archive[name]
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        return read_array(name, members[name])
+    except ValueError as error:
         raise DataFormatError(f"{path}: array {name!r} cannot be read: {error}") from error
-    if not isinstance(array, np.ndarray):
-        raise DataFormatError(f"{path}: {name!r} is not a NumPy array.")
-    return array
 
 
-def _read_meta(path: Path, archive: NpzFile) -> dict[str, Any]:
-    if "meta" not in archive.files:
+def _read_meta(path: Path, members: Mapping[str, bytes]) -> dict[str, Any]:
+    if "meta" not in members:
         return {}
-    text = _read(path, archive, "meta")
+    text = _read(path, members, "meta")
     try:
         if text.ndim:
             raise ValueError(f"it has shape {text.shape}")
+        require_memory(parsed_bytes([members["meta"]]), what="it", remedy="Leave out what is not read.")
         meta = json.loads(text.item())
         if not isinstance(meta, dict):
             raise TypeError(f"it is a {type(meta).__name__}")
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, RecursionError) as error:
         raise DataFormatError(f"{path}: meta must be a 0-d string with a JSON object: {error}") from error
     return meta
 
 
-def _count(path: Path, files: Sequence[str]) -> int:
+def _count(path: Path, files: Iterable[str]) -> int:
     numbers = {int(match[1]) for name in files if (match := re.fullmatch(r"[tx]_(\d+)", name))}
     if not numbers:
-        raise DataFormatError(
-            f"{path} has neither arrays t and x nor t_0, x_0, ...; it has: {', '.join(files) or 'none'}."
-        )
+        raise DataFormatError(f"{path} has neither arrays t and x nor t_0, x_0, ...; it has: {_listed(files)}.")
     missing = set(range(len(numbers))) - numbers
     if missing:
         raise DataFormatError(f"{path} has demonstration {max(numbers)} but no t_{min(missing)}, x_{min(missing)}.")
     return len(numbers)
+
+
+def _listed(names: Iterable[str]) -> str:
+    return f"{', '.join(names):.200}" or "none"
+
+
+def _text(meta: dict[str, Any], name: str) -> str | None:
+    value = meta.get(name)
+    if not isinstance(value, str | None):
+        raise ValueError(f"meta says {name} = {value!r:.80}, it must be text")
+    return value
 
 
 def _units(meta: dict[str, Any]) -> Any:

@@ -77,8 +77,9 @@ def load_demonstrations(path: str | os.PathLike[str], *, max_bytes: int = MAX_BY
 def save_demonstrations(demonstrations: Demonstrations, path: str | os.PathLike[str]) -> None:
     """Write demonstrations to ``path``, in the format that its suffix says (.npz or .csv).
 
-    All numbers come back to the last bit. A CSV file does not hold units and frame. The file appears complete
-    or not at all, and replaces one that is there.
+    All numbers come back to the last bit. A CSV file does not hold units and frame, nor a checksum: one that somebody
+    cuts or changes may be read as what it is not. An .npz file holds one of each array. The file appears complete or
+    not at all, and replaces one that is there.
 
     Parameters
     ----------

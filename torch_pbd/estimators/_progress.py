@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 
 from torch_pbd.optim import Progress
 
@@ -11,10 +12,11 @@ def printed_progress(name: str, verbose: int) -> Callable[[Progress], None]:
 
     def show(progress: Progress) -> None:
         if progress.n_evaluations < 5 or progress.n_evaluations % max(1, 10 // verbose) in (0, 1):
-            print(
-                f"{name}: evaluation {progress.n_evaluations:5d}  loss {progress.loss:14.6f}  "
-                f"{progress.elapsed:7.2f} s",
-                file=sys.stderr,
-            )
+            with suppress(BrokenPipeError):  # nobody reads it
+                print(
+                    f"{name}: evaluation {progress.n_evaluations:5d}  loss {progress.loss:14.6f}  "
+                    f"{progress.elapsed:7.2f} s",
+                    file=sys.stderr,
+                )
 
     return show

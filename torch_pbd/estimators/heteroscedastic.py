@@ -332,9 +332,9 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
 
 def _report(fit: HeteroscedasticFit, options: SearchOptions) -> FitReport:
     losses = tuple(-value for value in fit.log_evidence)
-    converged = all(report.converged for report in options.reports)
+    converged = all(converged for _, converged in options.ends)
     message = "converged" if converged else f"stopped at max_iter={options.max_iter} iterations of a search"
-    return FitReport(losses[-1], losses, max(report.n_iter for report in options.reports), converged, message)
+    return FitReport(losses[-1], losses, max(n_iter for n_iter, _ in options.ends), converged, message)
 
 
 def _warn_if_unresolved(length_scale: torch.Tensor | None, features: FeatureMap) -> None:

@@ -17,7 +17,8 @@ from torch_pbd.estimators._scaling import Standardization, distinct_rows
 from torch_pbd.estimators._validation import Floats, check_choice, check_number
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.memory import require_much
-from torch_pbd.models.mixture import GaussianMixture, expectation_maximization, refine
+from torch_pbd.models.mixture import GaussianMixture
+from torch_pbd.models.mixture_fit import expectation_maximization, refine
 from torch_pbd.optim import FitReport
 from torch_pbd.seeds import as_random_state
 

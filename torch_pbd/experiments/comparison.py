@@ -3,8 +3,11 @@
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
 
 import numpy as np
+import torch
 from joblib import Parallel, delayed
 from numpy.typing import NDArray
 from sklearn.base import clone
@@ -13,6 +16,7 @@ from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.estimators._groups import fit_by_demonstration
 from torch_pbd.experiments.sweep import left_out, score_fold
 from torch_pbd.metrics import covariance_mse, relative_frobenius_error
+from torch_pbd.optim import Record, recorded
 
 Floats = NDArray[np.float64]
 Truth = Callable[[Floats], Floats]
@@ -88,9 +92,9 @@ def compare_models(
     """
     inputs, empirical = empirical_covariances(X, y)
     folds = left_out(groups, max_folds)
-    fits = {name: _timed_fit(clone(model), X, y, groups) for name, model in models.items()}
-    jobs = (delayed(score_fold)(clone(model), X, y, groups, fold) for model in models.values() for fold in folds)
-    results = iter(Parallel(n_jobs=n_jobs)(jobs))
+    with recorded(None):  # a fit that goes on from a checkpoint takes no time
+        fits = {name: _timed_fit(clone(model), X, y, groups) for name, model in models.items()}
+    results = iter(_scored_folds(models, X, y, groups, folds, n_jobs))
     scores = []
     for name, (fitted, seconds) in fits.items():
         covariance = fitted.predict_cov(inputs)
@@ -107,6 +111,28 @@ def compare_models(
             )
         )
     return scores
+
+
+def _scored_folds(
+    models: Mapping[str, CovarianceRegressor],
+    X: Floats,
+    y: Floats,
+    groups: NDArray[np.intp],
+    folds: NDArray[np.intp],
+    n_jobs: int | None,
+) -> list[dict[str, Any]]:
+    """What :func:`score_fold` gives, by model and fold; folds that a checkpoint has are not fitted again."""
+    pairs = [(name, fold) for name in models for fold in folds]
+    data = torch.tensor(X), torch.tensor(y)
+    records = [Record(f"{name} without demonstration {fold}", *data) for name, fold in pairs]
+    rows = [record.state for record in records]
+    left = [i for i, record in enumerate(records) if not record.ended]
+    jobs = (delayed(score_fold)(clone(models[pairs[i][0]]), X, y, groups, pairs[i][1]) for i in left)
+    with recorded(None):
+        for i, row in zip(left, Parallel(n_jobs=n_jobs, return_as="generator")(jobs), strict=True):
+            rows[i] = row
+            records[i].keep(partial(dict, row), ended=True)
+    return rows
 
 
 def _timed_fit(

@@ -1,26 +1,39 @@
 """The folder a run writes: what was run, on what, and what came out."""
 
 import csv
+import io
 import json
+import os
 import platform
+import socket
 import sys
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, Self
 
+from filelock import FileLock, Timeout
 from matplotlib.figure import Figure
 
 import torch_pbd
 from torch_pbd.control.controller import DMPController
 from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.exceptions import FolderInUseError
+from torch_pbd.files import remove_drafts, replacing
 from torch_pbd.persistence import save
 
 _PACKAGES = ("torch", "scikit-learn", "numpy", "matplotlib")
+_PARTS = ("figures", "model")
 
 
 class RunFolder:
-    """Writes ``env.json`` at once, so that a folder that cannot be written fails before the work.
+    """A folder that one run at a time writes; a context manager, which gives it free again.
+
+    It is locked and ``env.json`` is written at once, so that a folder that cannot be written, or that another run
+    writes, fails before the work. Every file is there whole or as it was before. What a killed run left half written
+    is removed.
 
     Parameters
     ----------
@@ -31,6 +44,8 @@ class RunFolder:
 
     Raises
     ------
+    FolderInUseError
+        If another run, which the message names, writes it.
     OSError
         If the folder cannot be made or written.
     """
@@ -38,28 +53,53 @@ class RunFolder:
     def __init__(self, path: str | Path, settings: Mapping[str, Any]) -> None:
         self.path = Path(path)
         self.path.mkdir(parents=True, exist_ok=True)
-        environment = {
-            "torch_pbd": torch_pbd.__version__,
-            "python": platform.python_version(),
-            "platform": platform.platform(),
-            "packages": {package: version(package) for package in _PACKAGES},
-            "command": sys.argv,
-            "settings": dict(settings),
-        }
-        (self.path / "env.json").write_text(json.dumps(environment, indent=2) + "\n", encoding="utf-8")
+        # The operating system frees the lock of a process that is killed.
+        self._lock = FileLock(self.path / ".lock", timeout=0)
+        try:
+            self._lock.acquire()
+        except Timeout:
+            raise FolderInUseError(f"{self.path} is being written by {_owner(self.path)}.") from None
+        try:
+            for folder in (self.path, *(self.path / part for part in _PARTS if (self.path / part).exists())):
+                if not folder.is_dir() or not os.access(folder, os.W_OK):
+                    raise PermissionError(f"{folder} is no folder, or not writable")
+                remove_drafts(folder)
+            self.write_text("env.json", json.dumps(_environment(settings), indent=2) + "\n")
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let another run have the folder."""
+        self._lock.release()
+
+    def write_text(self, name: str, text: str) -> None:
+        """Write a file of text."""
+        with replacing(self.path / name) as file:
+            file.write(text.encode())
 
     def write_metrics(self, rows: Sequence[Mapping[str, Any]], name: str = "metrics") -> None:
         """Write ``<name>.csv``, the columns those of the first row."""
-        with (self.path / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, fieldnames=list(rows[0]))
-            writer.writeheader()
-            writer.writerows(rows)
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, fieldnames=list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+        self.write_text(f"{name}.csv", text.getvalue())
 
     def write_figure(self, figure: Figure, name: str) -> Path:
         """Write ``figures/<name>.png``."""
         target = self.path / "figures" / f"{name}.png"
         target.parent.mkdir(exist_ok=True)
-        figure.savefig(target, dpi=150)
+        with replacing(target) as file:
+            figure.savefig(file, format="png", dpi=150)
         return target
 
     def write_model(self, model: CovarianceRegressor | DMPController, name: str) -> Path:
@@ -68,6 +108,31 @@ class RunFolder:
         target.parent.mkdir(exist_ok=True)
         save(model, target)
         return target
+
+
+def _environment(settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        "torch_pbd": torch_pbd.__version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "packages": {package: version(package) for package in _PACKAGES},
+        "command": sys.argv,
+        "settings": dict(settings),
+        "process": {
+            "id": os.getpid(),
+            "host": socket.gethostname(),
+            "started": datetime.now(UTC).isoformat(" ", timespec="seconds"),
+        },
+    }
+
+
+def _owner(path: Path) -> str:
+    """The run that writes a folder, as its env.json says."""
+    try:
+        process = json.loads((path / "env.json").read_text(encoding="utf-8"))["process"]
+        return f"process {process['id']} on {process['host']}, since {process['started']}"
+    except (OSError, ValueError, KeyError, TypeError):  # it has just begun
+        return "another run"
 
 
 def slug(name: str) -> str:

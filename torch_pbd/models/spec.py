@@ -10,6 +10,7 @@ from torch_pbd.gp import Hyperparameters, LatentGP
 from torch_pbd.models.cholesky import CholeskyCovariance
 from torch_pbd.models.conditional import ConditionalNormal, MeanAndCovariance
 from torch_pbd.models.heteroscedastic import HeteroscedasticModel
+from torch_pbd.models.layout import check_layout
 from torch_pbd.models.mixture import GaussianMixture
 from torch_pbd.models.wishart import WishartCovariance
 
@@ -32,11 +33,10 @@ def module_from_spec(spec: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
 
     Raises
     ------
-    KeyError
-        If a tensor is missing.
     ValueError
-        If the spec is of no model of this package.
+        If the tensors are not those of such a model, or the spec is of no model of this package.
     """
+    check_layout(spec, tensors)
     tensors = {name: tensor.clone() for name, tensor in tensors.items()}
     parts = {name.removeprefix("core."): tensor for name, tensor in tensors.items()}
     if spec["covariance"] == "mixture":
@@ -49,7 +49,7 @@ def module_from_spec(spec: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
     elif spec["covariance"] == "heteroscedastic":
         scaling_names = ("x_shift", "x_scale", "y_shift", "y_scale")
         core = HeteroscedasticModel.restored(dict(spec), {k: v for k, v in parts.items() if k not in scaling_names})
-    elif spec["covariance"] in ("cholesky", "wishart"):
+    else:
         latent = _latent("covariance.latent.", parts, spec["kernel"])
         if spec["covariance"] == "cholesky":
             prior_tril = parts["covariance.prior_tril"]
@@ -58,8 +58,6 @@ def module_from_spec(spec: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
             matrix = parts["covariance.scale_matrix_tril"]
             covariance = WishartCovariance(latent, parts["covariance.prior_root"], matrix)
         core = MeanAndCovariance(_latent("mean.", parts, spec["mean_kernel"]), covariance)
-    else:
-        raise ValueError(f"unknown covariance model {spec['covariance']!r}")
     scaling = [tensors[name] for name in ("x_shift", "x_scale", "y_shift", "y_scale")]
     module = ConditionalNormal(core, *scaling)
     module.load_state_dict(tensors)

@@ -1,11 +1,15 @@
 """Many small unrelated optimizations side by side."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
+
+from torch_pbd.optim.journal import Record, State
+from torch_pbd.optim.lbfgs import FAILURES
 
 _LONGEST_STEP = 1e3  # in steps of BFGS
 _DIFFERENCE = 1e-4  # of parameters, for the first Hessian
@@ -25,7 +29,7 @@ class BatchReport:
     start_loss: Float[Tensor, " b"]
     n_iter: int
     converged: bool
-    """All of them."""
+    """All of them, from starts whose loss is finite."""
     inverse_hessian: Float[Tensor, "b p p"]
     """At the ends, as far as the steps told."""
 
@@ -67,7 +71,8 @@ def minimize_batch(
     ----------
     objective : callable
         Given parameters (a, p) of a problems and their indices in the batch, returns their losses (a,) and
-        gradients (a, p); see :func:`by_autograd`.
+        gradients (a, p); see :func:`by_autograd`. Problems at whose points it raises an ArithmeticError, ValueError,
+        RuntimeError or IndexError count as not finite there; which they are it is asked one by one.
     start : Tensor of shape (b, p)
         Where to start. A problem whose loss there is not finite stays there.
     max_iter : int, default=100
@@ -85,6 +90,10 @@ def minimize_batch(
     report : BatchReport
     """
     x = start.detach().clone()
+    record = Record("batch", x)
+    if record.ended:
+        return _recalled(record.state, x)
+    objective = _survived(objective)
     rows = torch.arange(len(x), device=x.device)
     loss, gradient, inverse = _start(objective, rows, x, inverse_hessian)
     size = gradient.abs().sum(-1)  # of no parameters it is zero, and there is nothing to do
@@ -98,7 +107,31 @@ def minimize_batch(
         if bool(settled.any()) or n_iter == max_iter:  # problems that have ended are not carried along
             every.put(active)
             active = active.of(~settled)
-    return every.x, BatchReport(every.loss, loss, n_iter, len(active.rows) == 0, every.inverse)
+    converged = len(active.rows) == 0 and bool(torch.isfinite(every.loss).all())
+    report = BatchReport(every.loss, loss, n_iter, converged, every.inverse)
+    record.keep(lambda: {"x": every.x, **vars(report)}, ended=True)
+    return every.x, report
+
+
+def _recalled(state: State, like: Tensor) -> tuple[Tensor, BatchReport]:
+    """Parameters and report that a journal kept."""
+    values: State = {key: value.to(like) if isinstance(value, Tensor) else value for key, value in state.items()}
+    return values.pop("x"), BatchReport(**values)
+
+
+def _survived(objective: ValueAndGradient) -> ValueAndGradient:
+    """The objective, with NaN for problems at whose points it raises; they are found one by one."""
+
+    def survived(x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+        try:
+            return objective(x, rows)
+        except FAILURES:
+            if len(rows) < 2:
+                return x.new_full((len(x),), math.nan), torch.full_like(x, math.nan)
+            each = [survived(x[i : i + 1], rows[i : i + 1]) for i in range(len(rows))]
+            return torch.cat([value for value, _ in each]), torch.cat([gradient for _, gradient in each])
+
+    return survived
 
 
 @dataclass

@@ -2,31 +2,50 @@
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
-from torch_pbd.optim.lbfgs import FitReport, Progress
+from torch_pbd.optim.journal import Record, State
+from torch_pbd.optim.lbfgs import FAILURES, FitReport, Progress
 
 _LEAST_SHARE = 1e-4  # of the fall that the slope promises, for a step to be taken
 _LINEAR_SHARE = 0.8  # with more of it the loss is a line rather than a parabola, and a longer step is tried
 _SHORTEST, _LONGEST = 1e-10, 1e3
 
+Newton = Callable[[Tensor], tuple[Tensor, Tensor]]
+"""Gradient and step at a point."""
+
 
 class _Search:
-    """Loss along a step: evaluates, counts, and tells the callback of each improvement."""
+    """Where the optimization is; evaluates losses, counts, and tells the callback of each improvement."""
 
-    def __init__(self, loss: Callable[[Tensor], Tensor], callback: Callable[[Progress], None] | None) -> None:
-        self.loss, self.callback = loss, callback
+    def __init__(
+        self,
+        loss: Callable[[Tensor], Tensor],
+        callback: Callable[[Progress], None] | None,
+        start: Tensor,
+        carried: Sequence[Tensor],
+    ) -> None:
+        self.loss, self.callback, self.carried = loss, callback, carried
+        self.x, self.value = start, math.nan
         self.curve: list[float] = []
-        self.n_evaluations = 0
+        self.n_iter = self.n_evaluations = 0
         self.started = time.perf_counter()
 
     def evaluate(self, x: Tensor) -> float:
+        """Loss at x; NaN where it is not finite, or raises what an evaluation at a bad point raises."""
         self.n_evaluations += 1
-        value = float(self.loss(x))
+        try:
+            value = float(self.loss(x))
+        except FAILURES as error:
+            if not self.curve:
+                raise ValueError(f"The optimization cannot start: {error}.") from error
+            return math.nan
         if not self.curve or value < self.curve[-1]:
+            if not math.isfinite(value):
+                return math.nan
             self.curve.append(value)
             if self.callback is not None:
                 self.callback(Progress(self.n_evaluations, value, time.perf_counter() - self.started))
@@ -53,16 +72,51 @@ class _Search:
             length *= 2.0
         return found, lowest
 
+    def step(self, newton: Newton, enough: float, relative_tol: float) -> str:
+        """One iteration; why it was the last, "" if it was not."""
+        self.n_iter += 1
+        value, (gradient, step) = self.value, newton(self.x)
+        slope = float((gradient * step).sum())
+        if not math.isfinite(slope) or not bool(torch.isfinite(step).all()):
+            raise ValueError(f"the gradient is not finite (loss {value}, slope {slope} along the step)")
+        found, lowest = self.along(self.x, value, step, slope) if slope < 0 else (self.x, value)
+        # Of a fall below the rounding of the loss nothing can be seen.
+        rounding = 1e-14 * max(1.0, abs(value))
+        if found is self.x and -0.5 * slope > max(enough, rounding):
+            return "no step lowers the loss, though its slope says so"
+        self.x, self.value = found, lowest
+        little = max(enough, relative_tol * abs(value), rounding)
+        return "converged" if -0.5 * slope <= little or value - lowest <= 10.0 * enough else ""
+
+    def report(self, message: str) -> FitReport:
+        """How it ended, or where it is."""
+        return FitReport(self.value, tuple(self.curve), self.n_iter, message == "converged", message)
+
+    def state(self, message: str) -> State:
+        """As a journal keeps it."""
+        kept = {f"carried.{i}": tensor.clone() for i, tensor in enumerate(self.carried)}
+        return self.report(message).state() | {"x": self.x.clone(), "n_evaluations": self.n_evaluations} | kept
+
+    def resume(self, state: State) -> FitReport:
+        """Go on from :meth:`state`; the report it was at."""
+        report = FitReport.of(state)
+        self.x, self.value, self.curve = state["x"].to(self.x), report.loss, list(report.loss_curve)
+        self.n_iter, self.n_evaluations = report.n_iter, state["n_evaluations"]
+        for i, tensor in enumerate(self.carried):
+            tensor.copy_(state[f"carried.{i}"])
+        return report
+
 
 @torch.no_grad()
 def minimize_scoring(
     loss: Callable[[Tensor], Tensor],
-    newton: Callable[[Tensor], tuple[Tensor, Tensor]],
+    newton: Newton,
     start: Tensor,
     *,
     max_iter: int = 100,
     tol: float = 1e-8,
     relative_tol: float = 0.0,
+    carried: Sequence[Tensor] = (),
     callback: Callable[[Progress], None] | None = None,
 ) -> tuple[Tensor, FitReport]:
     """Minimize a loss whose gradient and curvature are known in closed form; never ends above the start.
@@ -73,7 +127,8 @@ def minimize_scoring(
     Parameters
     ----------
     loss : callable
-        Maps a point to its loss, a scalar tensor; a value that is not finite counts as too far.
+        Maps a point to its loss, a scalar tensor; a value that is not finite counts as too far, and so does an
+        ArithmeticError, ValueError, RuntimeError or IndexError that it raises.
     newton : callable
         Maps a point to gradient and step there, both shaped like it. The step is minus the gradient, multiplied
         by the inverse of a positive definite matrix.
@@ -85,6 +140,8 @@ def minimize_scoring(
         the start where that is above one.
     relative_tol : float, default=0.0
         Or that promises one below this share of the loss. For sums of squares, whose smallest value is zero.
+    carried : sequence of Tensor, default=()
+        What ``newton`` changes and its next call starts from: kept with the point in a journal.
     callback : callable, optional
         Called with a :class:`Progress` after each improvement.
 
@@ -99,26 +156,27 @@ def minimize_scoring(
     ValueError
         If the loss, its gradient or the step is not finite at the start.
     """
-    search = _Search(loss, callback)
-    x, value, message = start, search.evaluate(start), ""
-    enough = 1e-2 * tol * max(1.0, abs(value))
-    for n_iter in range(1, max_iter + 1):
-        gradient, step = newton(x)
-        slope = float((gradient * step).sum())
-        if not math.isfinite(slope + value) or not bool(torch.isfinite(step).all()):
-            if n_iter == 1:
-                raise ValueError(f"The optimization cannot start: loss {value}, slope {slope} along the first step.")
-            message = "the gradient is not finite"
-            break
-        found, lowest = search.along(x, value, step, slope) if slope < 0 else (x, value)
-        if found is x and -0.5 * slope > max(enough, 1e-14 * max(1.0, abs(value))):
-            message = "no step lowers the loss, though its slope says so"
-            break
-        # Of a fall below the rounding of the loss nothing can be seen.
-        little = max(enough, relative_tol * abs(value), 1e-14 * max(1.0, abs(value)))
-        ended = -0.5 * slope <= little or value - lowest <= 10.0 * enough
-        x, value = found, lowest
-        if ended:
-            return x, FitReport(value, tuple(search.curve), n_iter, True, "converged")
+    record = Record("scoring", start)
+    search = _Search(loss, callback, start, carried)
+    if record.state:
+        report = search.resume(record.state)
+        if record.ended:
+            return search.x, report
+    else:
+        search.value = search.evaluate(start)
+        if not math.isfinite(search.value):
+            raise ValueError(f"The optimization cannot start: the loss is not finite (loss {search.value}).")
+    enough = 1e-2 * tol * max(1.0, abs(search.curve[0]))
+    message = ""
+    while not message and search.n_iter < max_iter:
+        try:
+            message = search.step(newton, enough, relative_tol)
+        except FAILURES as error:
+            if search.n_iter == 1:
+                raise ValueError(f"The optimization cannot start: {error}.") from error
+            message = str(error)
+        if not message:
+            record.keep(lambda: search.state(""))
     message = message or f"stopped at max_iter={max_iter} iterations"
-    return x, FitReport(value, tuple(search.curve), n_iter, False, message)
+    record.keep(lambda: search.state(message), ended=True)
+    return search.x, search.report(message)

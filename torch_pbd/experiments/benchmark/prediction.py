@@ -14,7 +14,7 @@ from torch_pbd.experiments.benchmark.fresh import measured
 from torch_pbd.experiments.benchmark.made import demonstrations
 from torch_pbd.experiments.benchmark.rows import Findings, Plan, Row
 from torch_pbd.experiments.benchmark.timing import alternate
-from torch_pbd.models.mixture import expectation_maximization
+from torch_pbd.models.mixture_fit import expectation_maximization
 
 
 def measure(plan: Plan) -> Findings:

@@ -111,19 +111,15 @@ def _fit_log_variance(search: Search, fixed: FixedFeatures, squares: Squares, ne
     """Posterior of the log variances, which are ``near`` those given."""
     information = 0.5 * squares.degrees.sum(-1)
     near = (squares.log_pooled.expand_as(squares.total) if near is None else near).clone()
-    latest: list[tuple[Tensor, LogVariance]] = []
 
     def evidence(theta: Tensor, rows: Int64[Tensor, " a"]) -> tuple[Tensor, Gradient]:
         design = Design.of(search.family, fixed, theta, information[rows])
         found = fit_log_variance(squares.rows(rows), design.values, near[rows])
         if len(rows) <= len(near):
             near[rows] = found.location  # where the next evaluation starts
-        latest[:] = [(theta, found)]
         return found.evidence, lambda: design.pull(found.gradient())
 
-    theta = search.run(evidence, squares.total)
-    if torch.equal(theta, latest[0][0]):
-        return latest[0][1]
+    theta = search.run(evidence, squares.total, [near])
     return fit_log_variance(squares, Design.of(search.family, fixed, theta, information).values, near)
 
 

@@ -1,7 +1,7 @@
 """Search for the hyperparameters of latent processes."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torch_pbd.exceptions import NotPositiveDefiniteError
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
-from torch_pbd.optim import BatchReport, Progress, minimize_batch
+from torch_pbd.optim import Progress, Record, State, minimize_batch, recorded
 
 _SMALL = 10_000  # entries of all processes' features
 _DIFFERENCE = 1e-3  # of hyperparameters, whose gradients' differences tell the curvature at a start
@@ -35,7 +35,8 @@ class SearchOptions:
     """Called at the end of each turn of mean and covariance."""
     slack: float = 1.0
     """Times the tolerance, as long as better evidence is to come."""
-    reports: list[BatchReport] = field(default_factory=list)
+    ends: list[tuple[int, bool]] = field(default_factory=list)
+    """Iterations of each search, and whether it converged."""
 
     def report(self, turn: int, loss: float, elapsed: float) -> None:
         """Tell the callback."""
@@ -67,8 +68,36 @@ class Search:
     _end: tuple[Tensor, Tensor] | None = None
     """Point and inverse Hessian that the last run ended with, of each problem."""
 
-    def run(self, evidence: Evidence, like: Tensor) -> Float[Tensor, "b q"]:
-        """Hyperparameters for this evidence; ``like`` has the dtype and the device to work on."""
+    def run(self, evidence: Evidence, like: Tensor, carried: Sequence[Tensor] = ()) -> Float[Tensor, "b q"]:
+        """Hyperparameters for this evidence.
+
+        Parameters
+        ----------
+        evidence : callable
+        like : Tensor
+            Has the dtype and the device to work on.
+        carried : sequence of Tensor, default=()
+            What evaluations change and later ones start from: kept with the end in a journal.
+        """
+        record = Record("evidence", like, *carried, *(self._end or ()))
+        if record.ended:
+            end = record.state
+            self._end = end["point"].to(like), end["inverse_hessian"].to(like)
+            for tensor, value in zip(carried, (end[f"carried.{i}"] for i in range(len(carried))), strict=True):
+                tensor.copy_(value)
+        else:
+            with recorded(None):  # an evaluation depends on those before it: a search is kept as a whole
+                self._end, end = self._search(evidence, like)
+            kept = {f"carried.{i}": tensor.clone() for i, tensor in enumerate(carried)}
+            point, inverse_hessian = self._end
+            end |= {"point": point, "inverse_hessian": inverse_hessian}
+            record.keep(lambda: end | kept, ended=True)
+        self.options.ends.append((end["n_iter"], end["converged"]))
+        self.theta = self._spread_out(self._end[0]) if self.family.shared else self._end[0]
+        return self.theta
+
+    def _search(self, evidence: Evidence, like: Tensor) -> tuple[tuple[Tensor, Tensor], State]:
+        """Best point and its inverse Hessian; iterations, and whether every search converged."""
         every = torch.arange(self.n_processes, device=like.device)
 
         def value(theta: Tensor, rows: Tensor) -> tuple[Tensor, Gradient]:
@@ -90,24 +119,22 @@ class Search:
 
         objective = joint_loss if self.family.shared else loss
         starts = self._starts(value, objective, every, like) if self._end is None else [self._end]
-        ends = []
-        for start, inverse_hessian in starts:
-            ends.append(
-                minimize_batch(
-                    objective,
-                    start,
-                    max_iter=self.options.max_iter,
-                    tol=self.options.slack * self.options.tol,
-                    inverse_hessian=inverse_hessian,
-                )
+        ends = [
+            minimize_batch(
+                objective,
+                start,
+                max_iter=self.options.max_iter,
+                tol=self.options.slack * self.options.tol,
+                inverse_hessian=inverse_hessian,
             )
-            self.options.reports.append(ends[-1][1])
-        best = torch.stack([report.loss for _, report in ends]).nan_to_num(nan=math.inf).argmin(0)
+            for start, inverse_hessian in starts
+        ]
+        points, reports = zip(*ends, strict=True)
+        best = torch.stack([report.loss for report in reports]).nan_to_num(nan=math.inf).argmin(0)
         row = torch.arange(len(best), device=like.device)
-        point = torch.stack([end for end, _ in ends])[best, row]
-        self._end = point, torch.stack([report.inverse_hessian for _, report in ends])[best, row]
-        self.theta = self._spread_out(point) if self.family.shared else point
-        return self.theta
+        found = (torch.stack(points)[best, row], torch.stack([report.inverse_hessian for report in reports])[best, row])
+        told = max(report.n_iter for report in reports), all(report.converged for report in reports)
+        return found, dict(zip(("n_iter", "converged"), told, strict=True))
 
     def _starts(
         self, value: Evidence, objective: _Objective, every: Tensor, like: Tensor

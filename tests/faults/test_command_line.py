@@ -1,0 +1,136 @@
+"""The command line where there is no display, nobody who reads, no folder to write.
+
+Numbers in the names are those of the list of faults that the project keeps.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import torch_pbd
+from torch_pbd import Demonstrations
+from torch_pbd.cli import main
+
+COMMAND = [sys.executable, "-m", "torch_pbd.cli"]
+GMM = ["--model", "GMMBaseline", "--model.n_components", "2"]
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    path = tmp_path_factory.mktemp("data") / "made.npz"
+    positions = np.random.default_rng(0).normal(size=(4, 20, 2)).cumsum(axis=1)
+    torch_pbd.save_demonstrations(Demonstrations(np.linspace(0.0, 2.0, 20), positions), path)
+    return path
+
+
+def refused(data, output, capsys):
+    """The one line that a run says whose folder cannot be written; before any work."""
+    assert main(["fit", "--data", str(data), *GMM, "--output", str(output)]) == 2
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert shown.err.count("\n") == 1
+    assert shown.err.startswith("torch-pbd: output: ")
+    assert repr(str(output)) in shown.err
+    assert "--output FOLDER" in shown.err
+    return shown.err
+
+
+def test_47_a_file_in_the_place_of_the_folder_is_told_before_the_work(data, tmp_path, capsys):
+    (tmp_path / "file").write_text("mine")
+    assert "File exists" in refused(data, tmp_path / "file", capsys)
+    assert "Not a directory" in refused(data, tmp_path / "file" / "below", capsys)
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+@pytest.mark.parametrize("part", ["model", "figures"])
+def test_47_so_is_one_in_the_place_of_a_folder_in_it(part, data, tmp_path, capsys):
+    (tmp_path / part).write_text("mine")
+    assert "no folder" in refused(data, tmp_path, capsys)
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="everything is writable for this user")
+def test_47_a_folder_that_may_not_be_written_is_told_before_the_work(data, tmp_path, capsys):
+    locked = tmp_path / "locked"
+    locked.mkdir(mode=0o500)
+    assert "Permission denied" in refused(data, locked, capsys)
+    assert "Permission denied" in refused(data, locked / "new", capsys)
+
+
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="no folder that nobody can write in")
+def test_47_nor_can_one_be_made_where_nobody_may(data, capsys):
+    refused(data, Path("/proc/self/nowhere/runs"), capsys)
+
+
+@pytest.mark.parametrize("name", ["with spaces", "überprüfung 軌跡", "-dash", "quote's"])
+def test_47_names_of_any_kind(name, data, tmp_path, capsys):
+    output = tmp_path / name / "run"
+    assert main(["fit", "--data", str(data), *GMM, "--output", str(output)]) == 0
+    assert f"results: {output}" in capsys.readouterr().out
+    assert main(["fit", "--config", str(output / "config.yaml")]) == 0
+    torch_pbd.load(output / "model" / "gmmbaseline.safetensors")
+
+
+def test_47_a_link_to_a_folder_is_that_folder(data, tmp_path):
+    (tmp_path / "there").mkdir()
+    (tmp_path / "link").symlink_to("there")
+    assert main(["fit", "--data", str(data), *GMM, "--output", str(tmp_path / "link")]) == 0
+    assert (tmp_path / "there" / "model" / "gmmbaseline.safetensors").is_file()
+    assert (tmp_path / "link").is_symlink()
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["fit"]])
+@pytest.mark.parametrize("closed", ["stdout", "stderr"])
+def test_48_nobody_who_reads_is_no_error(arguments, closed, data, tmp_path):
+    """As in ``torch-pbd ... | head -0``: no traceback, and the results are there."""
+    if arguments == ["fit"]:
+        arguments = ["fit", "--data", str(data), *GMM, "--output", str(tmp_path / "out")]
+        if closed == "stderr":
+            arguments += ["--resume"]  # which says that there is nothing to resume
+    reading, writing = os.pipe()
+    os.close(reading)
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | {closed: writing}
+    process = subprocess.Popen([*COMMAND, *arguments], text=True, **streams)
+    os.close(writing)
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 0
+    assert "Traceback" not in f"{out}{err}"
+    assert "Broken" not in f"{out}{err}"
+    if arguments[0] == "fit":
+        torch_pbd.load(tmp_path / "out" / "model" / "gmmbaseline.safetensors")
+
+
+def test_49_without_a_display_figures_are_drawn(data, tmp_path):
+    environment = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    arguments = ["fit", "--data", str(data), *GMM, "--output", str(tmp_path)]
+    command = [*COMMAND, *arguments]
+    done = subprocess.run(
+        command, env=environment | {"MPLBACKEND": "TkAgg"}, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "figures" / "gmmbaseline.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_38_a_signal_while_torch_is_loaded_is_one_line(number, data, monkeypatch, capsys):
+    def interrupted(*_):
+        signal.raise_signal(number)
+
+    monkeypatch.setattr("torch_pbd.config.parse", interrupted)
+    assert main(["fit", "--data", str(data)]) == {signal.SIGINT: 130, signal.SIGTERM: 143}[number]
+    shown = capsys.readouterr()
+    assert shown.err == {signal.SIGINT: "torch-pbd: interrupted\n", signal.SIGTERM: "torch-pbd: terminated\n"}[number]
+    assert shown.out == ""
+
+
+def test_memory_that_is_not_enough_is_one_line(data, tmp_path, monkeypatch, capsys):
+    def too_much(*_):
+        raise MemoryError
+
+    monkeypatch.setitem(main.__globals__["_WORK"], "fit", too_much)
+    assert main(["fit", "--data", str(data), "--output", str(tmp_path)]) == 1
+    assert capsys.readouterr().err == "torch-pbd: the memory is not enough\n"
