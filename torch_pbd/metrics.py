@@ -216,7 +216,7 @@ def _mean_log_likelihood(estimator: Any, X: ArrayLike, y: ArrayLike) -> float:
 
 
 def _check_level(level: Any) -> float:
-    if isinstance(level, bool) or not isinstance(level, Real) or not 0 < level < 1:
+    if isinstance(level, bool) or not isinstance(level, Real) or not 0 < float(level) < 1:
         raise ValueError(f"level is {level!r}: it must be between 0 and 1, both excluded.")
     return float(level)
 

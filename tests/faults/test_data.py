@@ -11,9 +11,13 @@ import pytest
 import scipy.sparse
 import torch
 from estimators.zoo import DEFAULTS, LATENT, VARIANTS, assert_covariances, demonstrations, fit, fitted, new
+from sklearn import config_context
 
-from torch_pbd import CholeskyCovRegressor, GMMBaseline, WishartProcessRegressor
-from torch_pbd.exceptions import DataRankWarning
+import torch_pbd.memory
+from torch_pbd import CholeskyCovRegressor, DMPController, GMMBaseline, WishartProcessRegressor
+from torch_pbd.data import make_tunnel_demonstrations
+from torch_pbd.estimators._rows import by_chunks
+from torch_pbd.exceptions import DataRankWarning, UnimodalityWarning
 
 EMPIRICAL = [CholeskyCovRegressor(objective="empirical"), WishartProcessRegressor(objective="mse")]
 LIKELIHOOD = ["cholesky-likelihood", "wishart-likelihood"]
@@ -40,13 +44,21 @@ def test_1_one_demonstration_has_no_empirical_covariance(estimator):
         estimator.fit(np.vstack([X, [[0.5]]]), np.vstack([y, [[0.0, 0.0]]]))
 
 
-@pytest.mark.parametrize("name", [*LIKELIHOOD, "cholesky", "wishart", "mixture"])
+@pytest.mark.parametrize("name", [*LIKELIHOOD, "cholesky", "wishart", "heteroscedastic", "mixture", "mixture-lbfgs"])
 def test_1_one_demonstration_is_enough_for_a_likelihood(name):
     model = fit(new(name), *demonstrations(n_demos=1))
     assert_covariances(model.predict_cov(NEAR), 31, 2)
 
 
-@pytest.mark.parametrize("name", ["cholesky", "cholesky-log", "wishart"])
+def test_1_groups_with_one_demonstration_are_told():
+    X, y = demonstrations(n_demos=1)
+    model = new("heteroscedastic")
+    with pytest.warns(DataRankWarning, match="groups has one demonstration: how far its samples repeat each other"):
+        model.fit(X, y, groups=np.zeros(len(X)))
+    assert_covariances(model.predict_cov(NEAR), 31, 2)
+
+
+@pytest.mark.parametrize("name", ["cholesky", "cholesky-log", "wishart", "wishart-random"])
 @pytest.mark.parametrize(("d", "n_demos"), [(5, 3), (2, 2), (9, 9)])
 def test_2_fewer_demonstrations_than_outputs_are_shrunk_and_told(name, d, n_demos):
     model = new(name)
@@ -59,7 +71,35 @@ def test_2_fewer_demonstrations_than_outputs_are_shrunk_and_told(name, d, n_demo
     assert np.linalg.eigvalsh(covariance)[:, 0].min() > 1e-3  # not the floor, 1e-12
 
 
+@pytest.mark.parametrize("name", ["heteroscedastic", "mixture"])
+def test_2_fewer_demonstrations_than_outputs_are_enough_where_inputs_are_pooled(name):
+    model = new(name)
+    assert warned(model, *demonstrations(5, n_demos=3)) == []
+    covariance = model.predict_cov(demonstrations(5)[0][:8])
+    assert_covariances(covariance, 8, 5)
+    assert np.linalg.eigvalsh(covariance)[:, 0].min() > 1e-3
+
+
 @pytest.mark.parametrize("name", LIKELIHOOD)
+def test_2_a_likelihood_of_fewer_demonstrations_than_outputs_is_told(name):
+    model = new(name)
+    messages = warned(model, *demonstrations(5, n_demos=3))
+    assert len(messages) == 1
+    assert "y has 3 demonstrations at an input but 5 outputs: the likelihood then takes for certain" in messages[0]
+    assert "6 or more demonstrations determine the covariance; objective='auto' shrinks it" in messages[0]
+    assert_covariances(model.predict_cov(demonstrations(5)[0][:8]), 8, 5)
+
+
+@pytest.mark.parametrize("name", ["mixture", "mixture-lbfgs"])
+def test_2_fewer_rows_than_outputs_are_told_by_a_mixture(name):
+    messages = warned(new(name, n_components=1), *demonstrations(3, n_inputs=3, n_demos=1))
+    assert messages == [
+        "y has 3 distinct rows but 3 outputs: they leave directions of the covariance undetermined, which reg_covar "
+        "decides. Record more."
+    ]
+
+
+@pytest.mark.parametrize("name", [*LIKELIHOOD, "heteroscedastic"])
 def test_2_fewer_rows_than_outputs_are_told(name):
     messages = warned(new(name), *demonstrations(3, n_inputs=3, n_demos=1))
     assert messages == [
@@ -114,6 +154,15 @@ def test_4_identical_demonstrations_are_told(name):
         assert np.diagonal(model.predict_cov(X), axis1=1, axis2=2).max() < 1e-9
 
 
+@pytest.mark.parametrize("name", ["mixture", "mixture-lbfgs"])
+def test_4_identical_demonstrations_are_no_special_case_of_a_mixture(name):
+    """It knows no demonstrations: between its components there is as much spread as if each row were one."""
+    X, y = demonstrations()
+    model = new(name)
+    assert warned(model, X, np.tile(y[:8], (12, 1))) == []
+    assert_covariances(model.predict_cov(NEAR), 31, 2)
+
+
 @pytest.mark.parametrize("name", ["cholesky", "wishart"])
 def test_4_demonstrations_that_start_at_one_point_are_no_special_case(name):
     X, y = demonstrations()
@@ -162,6 +211,14 @@ def test_7_unequal_lengths_are_refused_with_both(name):
         new(name).fit([[0.0], [1.0, 2.0]], y[:2])
 
 
+@pytest.mark.parametrize("name", ["heteroscedastic", "mixture", "mixture-lbfgs", "wishart-random"])
+def test_5_rows_in_another_order_are_the_same_model(name, rng):
+    X, y = demonstrations()
+    order = rng.permutation(len(X))
+    model = fit(new(name), X[order], y[order])
+    np.testing.assert_array_equal(model.predict_cov(NEAR), fitted(name).predict_cov(NEAR))
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("name", DEFAULTS)
 def test_8_what_is_not_finite_is_refused(name, value):
@@ -169,7 +226,14 @@ def test_8_what_is_not_finite_is_refused(name, value):
     for column in ("X", "y"):
         broken = {"X": X.copy(), "y": y.copy()}
         broken[column][17, -1] = value
-        with pytest.raises(ValueError, match=f"Input {column} contains (NaN|infinity)"):
+        last = broken[column].shape[1] - 1
+        place = rf"contains (NaN|infinity).*in row 17, column {last}: leave such rows out"
+        with pytest.raises(ValueError, match=f"Input {column} {place}"):
+            new(name).fit(**broken)
+        frames = {key: pd.DataFrame(part, columns=["a", "b"][: part.shape[1]]) for key, part in broken.items()}
+        with pytest.raises(ValueError, match=rf"Input {column} contains .*in row 17, column {'ab'[last]}:"):
+            new(name).fit(**frames)
+        with config_context(assume_finite=True), pytest.raises(ValueError, match=f"Input {column} contains"):
             new(name).fit(**broken)
         with pytest.raises(ValueError, match=f"Input {column} contains (NaN|infinity)"):
             fitted(name).log_likelihood(**broken)
@@ -218,7 +282,7 @@ def test_15_unix_time_in_float32_is_refused(name, form):
     fit(new(name), np.arange(96.0, dtype=np.float32)[:, np.newaxis], y)  # less an offset
 
 
-@pytest.mark.parametrize("name", ["cholesky", "wishart", "mixture"])
+@pytest.mark.parametrize("name", [*DEFAULTS, *LIKELIHOOD])
 def test_15_coordinates_with_large_offsets(name):
     X, y = demonstrations()
     model = fit(new(name), X + 1.7e9, y + np.array([5e5, 5.5e6]))  # unix time, UTM
@@ -234,6 +298,16 @@ def test_16_what_is_coarser_than_float32_is_refused(name):
         new(name).fit(torch.tensor(X, dtype=torch.bfloat16), y)
     with pytest.raises(ValueError, match="y is float16 and column 1 is stored in steps"):
         new(name).fit(X, (y + np.array([0.0, 2000.0])).astype(np.float16))
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_16_float32_is_computed_in_float64(name):
+    X, y = (part.astype(np.float32) for part in demonstrations())
+    single = fit(new(name), X, y)
+    double = fit(new(name), X.astype(np.float64), y.astype(np.float64))
+    np.testing.assert_array_equal(single.predict_cov(NEAR), double.predict_cov(NEAR))
+    mean, covariance = single.predict(NEAR.astype(np.float32), return_cov=True)
+    assert (mean.dtype, covariance.dtype) == (np.float64, np.float64)
 
 
 STRINGS = [
@@ -269,7 +343,7 @@ def test_17_what_is_no_number_is_refused(name):
         (None, y, ValueError, "Expected 2D array"),
         (X, None, ValueError, "requires y to be passed"),
         (np.full((96, 1), None), y, ValueError, "contains NaN"),
-        (np.full((96, 1), {}), y, TypeError, "argument must be .* a real number"),
+        (np.full((96, 1), {}), y, TypeError, "X holds what is no number, as entry 0: .* argument must be .* a real"),
     ]:
         with pytest.raises(error, match=message):
             new(name).fit(X_bad, y_bad)
@@ -299,11 +373,67 @@ def test_19_collinear_and_constant_inputs_are_told(name):
         assert_covariances(covariance, 7, 2)
 
 
+@pytest.mark.parametrize("name", ["cholesky", "wishart", "heteroscedastic"])
+def test_19_an_input_that_tells_nothing_has_a_bounded_length_scale(name, rng):
+    X, y = demonstrations(n_inputs=10)
+    noise = np.tile(rng.uniform(-1.0, 1.0, size=(10, 1)), (12, 1))
+    model = fit(new(name), np.hstack([X, noise]), y)
+    along = [np.column_stack([np.zeros(9), np.linspace(-1.0, 1.0, 9) * scale]) for scale in (1.0, 100.0)]
+    within, beyond = (model.predict_uncertainty(rows).type1 for rows in along)
+    assert np.isfinite(within).all()
+    assert beyond[[0, -1]].min() > 0.99  # a length scale without bound would know everything there
+
+
 @pytest.mark.parametrize("name", ["cholesky", "wishart-likelihood"])
 def test_20_memory_is_counted_before_it_is_taken(name):
     X, y = np.arange(50_000.0)[:, np.newaxis], np.zeros((50_000, 6))
     with pytest.raises(ValueError, match=r"max_inputs == 100000 lets 50000 distinct .* GiB.* Lower max_inputs"):
         new(name, max_inputs=100_000).fit(X, y)
+
+
+def test_20_memory_of_inducing_inputs_components_draws_and_predictions_is_counted(monkeypatch):
+    X = demonstrations()[0]
+    monkeypatch.setattr(torch_pbd.memory, "available_bytes", lambda: 2**27)
+    many = np.linspace(0.0, 1.0, 5000)[:, np.newaxis]
+    wide = np.hstack([np.sin(many), np.cos(many)])
+    for refused, words in [
+        (lambda: new("heteroscedastic", n_inducing=4000, max_inputs=4000).fit(many, wide), "n_inducing == 4000 .*lets"),
+        (lambda: new("mixture", n_components=2000).fit(many, wide), "n_components == 2000 for 5000 rows"),
+        (lambda: fitted("heteroscedastic").sample_cov(X[:8], 10**8), r"n_samples == 100000000 at 8 rows"),
+        (lambda: fitted("cholesky").sample_y(X[:8], 10**8), r"n_samples == 100000000 at 8 rows"),
+        (lambda: fitted("cholesky").predict_cov(np.zeros((3_000_000, 1))), "predicted for 3000000 rows"),
+        (lambda: fitted("mixture").predict_cov(np.zeros((3_000_000, 1))), "predicted for 3000000 rows"),
+    ]:
+        with pytest.raises(ValueError, match=rf"{words}.* needs about .* GiB of memory"):
+            refused()
+
+
+def test_20_what_predicts_many_rows_holds_few_at_a_time(monkeypatch):
+    seen = []
+    model, rows = fitted("mixture"), np.zeros((5000, 1))
+    monkeypatch.setattr(type(model), "_arrays", lambda self, function, X: by_chunks(function, X))
+    model._arrays(lambda part: (seen.append(len(part)), (part,))[1], rows)
+    assert sum(seen) == 5000
+    assert max(seen) <= 1024
+
+
+@pytest.mark.parametrize("name", DEFAULTS)
+def test_21_two_ways_are_a_warning_of_the_controller_whatever_learns_them(name):
+    two_ways = make_tunnel_demonstrations(12, 10.0, 5.0, random_state=0, variant="two_path")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        controller = DMPController(new(name), n_steps=20).fit(two_ways)
+    told = [warning for warning in caught if issubclass(warning.category, UnimodalityWarning)]
+    assert len(told) == 1
+    assert "seem to follow two ways" in str(told[0].message)
+    assert_covariances(controller.schedule(4.0).stiffness, 41, 2)
+
+
+def test_21_two_ways_are_a_warning_of_the_regressor_that_is_told_the_demonstrations():
+    X, y, groups = make_tunnel_demonstrations(12, 10.0, 5.0, random_state=0, variant="two_path").stack()
+    with pytest.warns(UnimodalityWarning, match="seem to follow two ways"):
+        model = new("heteroscedastic").fit(X, y, groups=groups)
+    assert_covariances(model.predict_cov(X[:5]), 5, 2)
 
 
 def test_more_components_than_samples_are_refused_with_both_numbers():

@@ -173,7 +173,7 @@ class DMPController(BaseEstimator):
         ValueError
             If there are fewer than two demonstrations, too few samples in one, or a parameter cannot be used.
         """
-        vars(self).pop("_impedance", None)  # a fit that fails leaves no mixture of two
+        self.__dict__.pop("_impedance", None)  # a fit that fails leaves no mixture of two
         check_parameters(self)
         demonstrations = as_demonstrations(X, y, groups)
         self.names_, self.frame_ = demonstrations.names, demonstrations.frame

@@ -116,7 +116,7 @@ def _rows_of(schedule: Any) -> tuple[Tensor, Tensor, Tensor]:
                 f"schedule.{name} has shape {tuple(gain.shape)}, must have shape (n, d, d) with n = {len(time)}, the "
                 "number of times."
             )
-    return time, *gains
+    return time, gains[0], gains[1]
 
 
 def _door(values: Any) -> Tensor:

@@ -75,7 +75,7 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
 
     def _learn(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None = None) -> Self:
         """Check everything, fit, and keep what was learned."""
-        vars(self).pop("module_", None)  # a fit that fails leaves no mixture of two
+        self.__dict__.pop("module_", None)  # a fit that fails leaves no mixture of two
         self._check_parameters()
         # Columns side by side: what is asked of each is many times as fast.
         inputs, targets = map(np.asfortranarray, checked_rows(self, X, y, ensure_min_samples=2))

@@ -116,6 +116,14 @@ class LatentCovarianceRegressor(CovarianceRegressor):
     def _works_on_empirical(self, inputs: Floats, counts: Any, n_outputs: int) -> bool:
         """Decide the objective; ``inputs`` are the distinct ones, with their counts."""
         fewest = int(counts.min())
+        if self.objective == "likelihood" and 2 <= fewest <= n_outputs:
+            warnings.warn(
+                f"y has {fewest} demonstrations at an input but {n_outputs} outputs: the likelihood then takes for "
+                f"certain what was only not seen to vary. {n_outputs + 1} or more demonstrations determine the "
+                "covariance; objective='auto' shrinks it.",
+                DataRankWarning,
+                stacklevel=5,
+            )
         if self.objective == "likelihood" or (self.objective == "auto" and fewest < 2):
             return False
         if fewest < 2:

@@ -272,7 +272,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         scaling = Standardization.of(X, y)
         standardized = scaling.inputs(X)
         inputs, index = distinct_rows(standardized)
-        self._check_memory(min(len(inputs), self.max_inputs), *X.shape[1:], y.shape[1])
+        self._check_memory(min(len(inputs), self.max_inputs), X.shape[1], y.shape[1])
         prior_tril = self._prior_tril(X, y, scaling)
         training = TrainingSet(
             self._door(standardized), self._door(scaling.outputs(y)), self._door(inputs), self._door(index).long()
