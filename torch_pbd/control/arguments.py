@@ -12,7 +12,7 @@ from sklearn.utils.validation import check_array, check_X_y
 
 from torch_pbd.arguments import as_floats
 from torch_pbd.control.damping import damping_from_stiffness
-from torch_pbd.control.dmp import DMP, Gate
+from torch_pbd.control.dmp import Gate
 from torch_pbd.control.impedance import OnUnknown
 from torch_pbd.control.matrices import check_count, check_finite, check_positive
 from torch_pbd.control.sampling import count_intervals
@@ -63,10 +63,15 @@ def check_parameters(controller: Any) -> None:
         raise ValueError(f"stiffness_law == {law!r}, must be a StiffnessLaw or None.")
     if controller.duration is not None:
         check_positive("duration", controller.duration, "s")
-    check_positive("mass", controller.mass, "kg")
-    # What the primitive and the damping say of theirs.
-    DMP(controller.alpha, controller.beta, controller.gamma, controller.tau)
-    damping_from_stiffness(np.eye(1), controller.mass, controller.damping_ratio)
+    for name, unit in (("mass", "kg"), ("alpha", ""), ("gamma", ""), ("tau", "s")):
+        check_positive(name, getattr(controller, name), unit)
+    if controller.beta is not None:
+        check_positive("beta", controller.beta)
+    ratio = controller.damping_ratio
+    if not (isinstance(ratio, str) and ratio == "paper"):
+        check_finite("damping_ratio", ratio)
+        ratio = float(ratio)
+    damping_from_stiffness(np.eye(1), float(controller.mass), ratio)  # what it says of its own
 
 
 def check_against_duration(controller: Any) -> None:
@@ -89,7 +94,8 @@ def check_against_duration(controller: Any) -> None:
     if resting > _SLOWEST:
         raise ValueError(
             f"alpha == {alpha:g} and gamma == {gamma:g} with tau == {tau:g} let the primitive rest only {resting:.3g} "
-            f"durations after the movement, must be at most {_SLOWEST:g}: raise alpha or lower tau."
+            f"durations (duration == {duration:.3g}) after the movement, must be at most {_SLOWEST:g}: raise alpha, or "
+            "lower tau."
         )
     decay = gamma * duration / tau
     if controller.phase_input != "time" and not _LEAST_DECAY <= decay <= _MOST_DECAY[controller.phase_input]:

@@ -186,7 +186,10 @@ class DMPController(BaseEstimator):
         self.cutoff_ = automatic if self.cutoff == "auto" else self.cutoff
         check_against_duration(self)
         movements = self.smooth(demonstrations)
-        self.dmp_ = DMP(self.alpha, self.beta, self.gamma, self.tau, duration=self.duration_, gate=self.gate)
+        beta = None if self.beta is None else float(self.beta)
+        self.dmp_ = DMP(
+            float(self.alpha), beta, float(self.gamma), float(self.tau), duration=self.duration_, gate=self.gate
+        )
         self.reproduction_ = Reproduction.learn(self.dmp_, movements, self.phase_input, own_goals=self.goal == "each")
         self.start_, self.goal_ = self.reproduction_.start, self.reproduction_.goal
         self.reproduction_error_ = self.reproduction_.check_against(movements)
@@ -197,7 +200,8 @@ class DMPController(BaseEstimator):
         self.noise_share_ = variance_share(self.varying(noise), varying)
         along = self.covariance_.predict_cov(self.phase(np.linspace(0.0, self.duration_, 1001)))
         self.law_ = fit_law(self.stiffness_law, along, varying)
-        self._impedance = Impedance(self.law_, self.mass, self.damping_ratio, self.on_unknown)
+        ratio = self.damping_ratio if self.damping_ratio == "paper" else float(self.damping_ratio)
+        self._impedance = Impedance(self.law_, float(self.mass), ratio, self.on_unknown)
         return self
 
     def predict(self, X: ArrayLike) -> Floats:
