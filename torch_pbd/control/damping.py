@@ -15,7 +15,7 @@ _MOST_RATIO = 1e6
 
 def damping_from_stiffness(
     stiffness: Float[Tensor, "*b d d"] | Any,
-    mass: float | Float[Tensor, "*m d d"] = 1.0,
+    mass: float | Float[Tensor, "*m d d"] | Any = 1.0,
     damping_ratio: float | Literal["paper"] = 1.0,
 ) -> Float[Tensor, "*b d d"]:
     """Damping in N s/m that gives every mode of mass and stiffness the same damping ratio.

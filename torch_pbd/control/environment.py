@@ -188,7 +188,7 @@ class Tunnel:
             n_contacts=(inside & ~before).sum(-1),
         )
 
-    def _contact(self, position: Tensor) -> tuple[Tensor, Tensor]:
+    def _contact(self, position: Tensor | Any) -> tuple[Tensor, Tensor]:
         """Depth along the normal, negative in the free corridor, and the normal.
 
         The wall is the zero of ``g = side (x - x_c(y)) - w(y)``, the depth ``g / |grad g|``, the normal

@@ -63,7 +63,7 @@ class AdmittancePlant:
 
     def __init__(
         self,
-        mass: float | Tensor = 1.0,
+        mass: float | Tensor | Any = 1.0,
         integrator: Integrator = "exact",
         *,
         feed_forward: bool = False,
@@ -167,6 +167,8 @@ class AdmittancePlant:
         self._check_memory(batch, task)
         state = start.expand(*batch, -1), speed.expand(*batch, -1)
         hooks = (self.sensor, self.position_loop, self.environment, self.stiffness_filter)
+        if generator is not None and not isinstance(generator, torch.Generator):
+            raise ValueError(f"generator == {generator!r}, must be a torch.Generator or None.")
         if all(hook is None for hook in hooks):
             position, velocity = open_loop(task, force, state, self.integrator)
             record: dict[str, Any] = {"position": position, "velocity": velocity, "commanded_position": position}

@@ -30,7 +30,7 @@ def certify(
     *,
     mass: Any = 1.0,
     speed: float = 1.0,
-    position_loop: PositionLoop | None = None,
+    position_loop: PositionLoop | Any = None,
     force_cutoff: float | None = 500.0,
     dt: float = 0.001,
 ) -> StabilityReport:

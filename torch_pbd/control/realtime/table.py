@@ -107,7 +107,9 @@ def _checked(schedule: ScheduleLike) -> list[Floats]:
     if missing:
         raise ValueError(f"schedule is a {type(schedule).__name__} without {', '.join(missing)}: give a Schedule.")
     position = as_floats(schedule.position, "schedule.position")
-    n, d = position.shape if position.ndim == 2 else (0, 0)
+    if position.ndim != 2 or not position.size:
+        raise ValueError(f"schedule.position has shape {position.shape}: it must be (n, d), n and d at least 1.")
+    n, d = position.shape
     shapes = {"time": (n,), "position": (n, d), "velocity": (n, d), "stiffness": (n, d, d), "damping": (n, d, d)}
     arrays = {name: np.array(as_floats(getattr(schedule, name), f"schedule.{name}")) for name in shapes}
     for name, array in arrays.items():
