@@ -6,6 +6,8 @@ from pathlib import Path
 
 _SHARE = 0.8  # of what there is: the rest is for what else runs
 _GIB = 2.0**30
+_LITTLE = 2.0**26
+_MOST = 2.0**100
 # Bytes that Python takes for what these marks begin or end: numbers and their places, lists, mappings, strings.
 _PARSED = {b",": 40.0, b";": 40.0, b"\t": 40.0, b"\n": 120.0, b"[": 80.0, b"{": 250.0, b'"': 30.0}
 _CONTROL_GROUPS = Path("/proc/self/cgroup")
@@ -44,10 +46,16 @@ def require_memory(needed_bytes: float, *, what: str, remedy: str) -> None:
     """
     usable = _SHARE * available_bytes()
     if needed_bytes > usable:
+        gib = f"{needed_bytes / _GIB:.3g}" if needed_bytes < _MOST else f"more than {_MOST / _GIB:.0e}"
         raise ValueError(
-            f"{what} needs about {needed_bytes / _GIB:.3g} GiB of memory, but {usable / _GIB:.3g} GiB can be used "
-            f"here. {remedy}"
+            f"{what} needs about {gib} GiB of memory, but {usable / _GIB:.3g} GiB can be used here. {remedy}"
         )
+
+
+def require_much(needed_bytes: float, *, what: str, remedy: str) -> None:
+    """The same, of which a need of up to 64 MiB is not even asked: to ask takes a millisecond."""
+    if needed_bytes > _LITTLE:
+        require_memory(needed_bytes, what=what, remedy=remedy)
 
 
 def parsed_bytes(text: Iterable[bytes]) -> float:

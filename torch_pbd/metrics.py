@@ -16,11 +16,14 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import gammaincinv
 from sklearn.pipeline import Pipeline
 
+from torch_pbd.arguments import as_floats
+
 _Floats = NDArray[np.floating[Any]]
 _Scorer = Callable[[Any, ArrayLike, ArrayLike], float]
 
 _ASYMMETRY = 1e-8  # largest difference of mirrored entries, relative to a matrix's largest entry
 _NEGATIVE = 1e-10  # an eigenvalue no further below zero is rounding, relative to the largest one
+_LARGEST = 1e140  # in size: squares, and their sums, are numbers
 _ZERO_PIVOT = 1e-14  # a pivot of a Cholesky factorization below it is rounding, relative to the diagonal
 
 
@@ -66,12 +69,11 @@ def covariance_mse(
 
 
 def relative_frobenius_error(estimated: ArrayLike, reference: ArrayLike) -> float:
-    """Mean over the rows of ||estimated - reference||_F / ||reference||_F; it has no unit.
+    """Mean over the rows of ||estimated - reference||_F / ||reference||_F, of symmetric matrices; it has no unit.
 
     Parameters
     ----------
     estimated, reference : array_like of shape (n, d, d)
-        Symmetric matrices.
 
     Raises
     ------
@@ -80,7 +82,7 @@ def relative_frobenius_error(estimated: ArrayLike, reference: ArrayLike) -> floa
     """
     estimated, reference = _matching(estimated, reference, names=("estimated", "reference"))
     norm = np.linalg.norm(reference, axis=(-2, -1))
-    if not norm.all():
+    if (norm <= np.finfo(np.float64).tiny).any():
         raise ValueError(f"reference[{int(np.argmin(norm))}] is zero: no error is relative to it.")
     return float(np.mean(np.linalg.norm(estimated - reference, axis=(-2, -1)) / norm))
 
@@ -196,7 +198,9 @@ def mahalanobis_coverage(
 
 def log_likelihood_scorer(estimator: Any, X: ArrayLike, y: ArrayLike) -> float:
     """``estimator.score(X, y)``, the mean log-likelihood in nats: what to select covariance models by."""
-    return float(estimator.score(X, y))
+    if hasattr(estimator, "score"):
+        return float(estimator.score(X, y))
+    raise TypeError(f"estimator is {estimator!r}, must be a fitted covariance regressor.")
 
 
 def _is_estimator(candidate: Any) -> bool:
@@ -207,26 +211,26 @@ def _mean_log_likelihood(estimator: Any, X: ArrayLike, y: ArrayLike) -> float:
     last = estimator[-1] if isinstance(estimator, Pipeline) else estimator
     if not hasattr(last, "log_likelihood"):
         raise TypeError(f"{type(last).__name__} has no log_likelihood(X, y): pass a covariance regressor.")
-    # A pipeline passes on score, which is the mean of log_likelihood, and not log_likelihood itself.
+    # A pipeline passes on score, its mean, and not log_likelihood itself.
     return float(np.mean(last.log_likelihood(X, y)) if last is estimator else estimator.score(X, y))
 
 
 def _check_level(level: Any) -> float:
-    if not 0 < level < 1:
-        raise ValueError(f"level is {level}: it must be between 0 and 1, both excluded.")
+    if isinstance(level, bool) or not isinstance(level, Real) or not 0 < float(level) < 1:
+        raise ValueError(f"level is {level!r}: it must be between 0 and 1, both excluded.")
     return float(level)
 
 
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
+    if not isinstance(value, str) or value not in choices:
         raise ValueError(f"{name} is {value!r}: it must be one of {', '.join(map(repr, choices))}.")
 
 
 def _finite(name: str, array: ArrayLike) -> _Floats:
-    array = np.asarray(array, dtype=np.float64)
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name} has entries that are not finite.")
-    return array
+    values = as_floats(array, name)
+    if not (np.abs(values) <= _LARGEST).all():
+        raise ValueError(f"{name} has entries that are not finite, or whose squares are not (above {_LARGEST:g}).")
+    return values
 
 
 def _covariances(name: str, array: ArrayLike) -> _Floats:
@@ -272,9 +276,12 @@ def _log_det(scale_tril: _Floats) -> _Floats:
 def _factor(name: str, matrices: _Floats) -> _Floats:
     """Cholesky factors of positive definite matrices."""
     try:
-        return np.linalg.cholesky(matrices)
-    except np.linalg.LinAlgError as error:
-        raise _not_positive(name, "definite", np.linalg.eigvalsh(matrices)) from error
+        factor = np.linalg.cholesky(matrices)
+    except np.linalg.LinAlgError:
+        factor = np.zeros_like(matrices)
+    if (np.diagonal(factor, axis1=1, axis2=2) < 1.0 / _LARGEST).any():
+        raise _not_positive(name, "definite", np.linalg.eigvalsh(matrices))
+    return factor
 
 
 def _semidefinite_factor(name: str, matrices: _Floats) -> _Floats:

@@ -1,6 +1,7 @@
 """Figures of demonstrations and of what a model learned from them; each takes data and an Axes."""
 
 from collections.abc import Sequence
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike, NDArray
 
+from torch_pbd.arguments import as_finite, check_kind, is_finite
 from torch_pbd.control.rollout import Rollout
 from torch_pbd.control.schedule import Schedule
 from torch_pbd.data import Demonstrations
@@ -41,6 +43,10 @@ def plot_demonstrations(
     -------
     list of Line2D, one a demonstration
     """
+    check_kind(demonstrations, "demonstrations", Demonstrations)
+    outputs = list(outputs) if isinstance(outputs, np.ndarray | range) and np.ndim(outputs) else outputs
+    _check_outputs(outputs, demonstrations.n_outputs)
+    _check_axes("ax", [ax], 1)
     lines: list[Line2D] = []
     for time, position in demonstrations:
         columns = position[:, list(outputs)].T
@@ -66,7 +72,13 @@ def plot_std_band(
     label: str | None = None,
 ) -> tuple[Line2D, PolyCollection]:
     """Draw a mean (n,) over x (n,) with a band of ``n_std`` standard deviations (n,) on either side."""
-    across, middle, half = (np.asarray(values, dtype=np.float64).ravel() for values in (x, mean, std))
+    _check_axes("ax", [ax], 1)
+    across, middle, half = (as_finite(*named).ravel() for named in ((x, "x"), (mean, "mean"), (std, "std")))
+    for name, values in (("mean", middle), ("std", half)):
+        if len(values) != len(across):
+            raise ValueError(f"{name} has {len(values)} values, must have {len(across)}: one for each of x.")
+    if (half < 0.0).any():
+        raise ValueError(f"std has a value of {half.min():g}, must not be negative: give standard deviations.")
     (line,) = ax.plot(across, middle, color=color, lw=1.5, label=label, zorder=3)
     band = ax.fill_between(
         across, middle - n_std * half, middle + n_std * half, color=color, alpha=0.22, lw=0, zorder=2
@@ -85,7 +97,18 @@ def plot_covariance_ellipses(
     linestyle: str = "-",
 ) -> LineCollection:
     """Draw the ``n_std`` ellipses of covariances (n, 2, 2) around means (n, 2)."""
-    centres, matrices = np.asarray(mean, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
+    _check_axes("ax", [ax], 1)
+    centres, matrices = as_finite(mean, "mean"), as_finite(covariance, "covariance")
+    if matrices.ndim != 3 or matrices.shape[1:] != (2, 2) or centres.shape != matrices.shape[:2]:
+        raise ValueError(
+            f"covariance has shape {matrices.shape} and mean {centres.shape}, must have (n, 2, 2) and (n, 2): take two "
+            "outputs."
+        )
+    scale = np.abs(matrices).max(axis=(1, 2))
+    if (np.abs(matrices - matrices.mT).max(axis=(1, 2)) > 1e-8 * scale).any():
+        raise ValueError("covariance must be symmetric: symmetrize it.")
+    if (np.linalg.eigvalsh(matrices)[:, 0] < -1e-8 * scale).any():
+        raise ValueError("covariance must be positive semidefinite: an ellipse has no negative axis.")
     angle = np.linspace(0.0, 2.0 * np.pi, 73)
     circle = np.stack([np.cos(angle), np.sin(angle)])
     values, axes = np.linalg.eigh(matrices)
@@ -121,8 +144,15 @@ def plot_model_bands(
     true_std : callable, default=None
         Maps x (n, 1) to (mean, std), both (n, n_outputs), where the truth is known.
     """
-    inputs, targets = np.asarray(X, dtype=np.float64), np.asarray(y, dtype=np.float64)
+    if not hasattr(model, "predict_cov"):
+        raise ValueError(f"model == {model!r}, must be a fitted covariance regressor.")
+    inputs, targets = as_finite(X, "X"), as_finite(y, "y")
+    if inputs.ndim != 2 or inputs.shape[1] != 1 or not targets.ndim or len(targets) != len(inputs):
+        raise ValueError(f"X has shape {inputs.shape} and y {targets.shape}, must have (n, 1) and (n, n_outputs).")
     targets = targets.reshape(len(targets), -1)
+    _check_axes("axes", axes, targets.shape[1])
+    if not isinstance(beyond, Real) or not is_finite(beyond):
+        raise ValueError(f"beyond == {beyond!r}, must be a finite number: how far to draw, in ranges of X.")
     low, high = inputs.min(), inputs.max()
     query = np.linspace(low - beyond * (high - low), high + beyond * (high - low), 401)[:, np.newaxis]
     mean, covariance = model.predict(query, return_cov=True)
@@ -183,6 +213,8 @@ def plot_stiffness(schedule: Schedule, ax: Axes) -> list[Line2D]:
     -------
     list of Line2D, one an output
     """
+    check_kind(schedule, "schedule", Schedule)
+    _check_axes("ax", [ax], 1)
     lines: list[Line2D] = []
     for output, name in enumerate(schedule_names(schedule)):
         color, dashes = SERIES[output % len(SERIES)], LINES[output // len(SERIES) % len(LINES)]
@@ -212,6 +244,10 @@ def plot_pushes(
     unpushed : Rollout, default=None
         The same run without pushes, drawn dashed: how far the robot lags behind by itself.
     """
+    check_kind(rollout, "rollout", Rollout)
+    check_kind(schedule, "schedule", Schedule)
+    _check_outputs([output], schedule.n_outputs)
+    _check_axes("axes", axes, 3)
     unit, scale = readable_unit(schedule.units)
     name = schedule_names(schedule)[output]
     above, middle, below = axes
@@ -230,6 +266,18 @@ def plot_pushes(
     for ax in axes:
         ax.axhline(0.0, color=DATA, lw=0.8)
         ax.margins(x=0.0)
+
+
+def _check_outputs(outputs: Any, n_outputs: int) -> None:
+    known = isinstance(outputs, Sequence) and all(isinstance(one, int | np.integer) for one in outputs)
+    if not known or len(outputs) not in (1, 2) or not all(0 <= one < n_outputs for one in outputs):
+        raise ValueError(f"outputs == {outputs!r}, must be one or two numbers from 0 to {n_outputs - 1}.")
+
+
+def _check_axes(name: str, axes: Any, least: int) -> None:
+    known = np.ndim(axes) == 1 and all(hasattr(ax, "plot") for ax in axes)
+    if not known or len(axes) < least:
+        raise ValueError(f"{name} == {axes!r}, must be {least} matplotlib Axes.")
 
 
 def readable_unit(unit: str | None) -> tuple[str, float]:

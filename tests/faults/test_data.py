@@ -10,11 +10,14 @@ import pandas as pd
 import pytest
 import scipy.sparse
 import torch
-from estimators.zoo import DEFAULTS, LATENT, VARIANTS, assert_covariances, demonstrations, fit, fitted, new, queries
-from sklearn.exceptions import NotFittedError
+from estimators.zoo import DEFAULTS, LATENT, VARIANTS, assert_covariances, demonstrations, fit, fitted, new
+from sklearn import config_context
 
-from torch_pbd import CholeskyCovRegressor, GMMBaseline, WishartProcessRegressor
-from torch_pbd.exceptions import DataRankWarning, NotPositiveDefiniteError
+import torch_pbd.memory
+from torch_pbd import CholeskyCovRegressor, DMPController, GMMBaseline, WishartProcessRegressor
+from torch_pbd.data import make_tunnel_demonstrations
+from torch_pbd.estimators._rows import by_chunks
+from torch_pbd.exceptions import DataRankWarning, UnimodalityWarning
 
 EMPIRICAL = [CholeskyCovRegressor(objective="empirical"), WishartProcessRegressor(objective="mse")]
 LIKELIHOOD = ["cholesky-likelihood", "wishart-likelihood"]
@@ -41,13 +44,21 @@ def test_1_one_demonstration_has_no_empirical_covariance(estimator):
         estimator.fit(np.vstack([X, [[0.5]]]), np.vstack([y, [[0.0, 0.0]]]))
 
 
-@pytest.mark.parametrize("name", [*LIKELIHOOD, "cholesky", "wishart", "mixture"])
+@pytest.mark.parametrize("name", [*LIKELIHOOD, "cholesky", "wishart", "heteroscedastic", "mixture", "mixture-lbfgs"])
 def test_1_one_demonstration_is_enough_for_a_likelihood(name):
     model = fit(new(name), *demonstrations(n_demos=1))
     assert_covariances(model.predict_cov(NEAR), 31, 2)
 
 
-@pytest.mark.parametrize("name", ["cholesky", "cholesky-log", "wishart"])
+def test_1_groups_with_one_demonstration_are_told():
+    X, y = demonstrations(n_demos=1)
+    model = new("heteroscedastic")
+    with pytest.warns(DataRankWarning, match="groups has one demonstration: how far its samples repeat each other"):
+        model.fit(X, y, groups=np.zeros(len(X)))
+    assert_covariances(model.predict_cov(NEAR), 31, 2)
+
+
+@pytest.mark.parametrize("name", ["cholesky", "cholesky-log", "wishart", "wishart-random"])
 @pytest.mark.parametrize(("d", "n_demos"), [(5, 3), (2, 2), (9, 9)])
 def test_2_fewer_demonstrations_than_outputs_are_shrunk_and_told(name, d, n_demos):
     model = new(name)
@@ -60,7 +71,35 @@ def test_2_fewer_demonstrations_than_outputs_are_shrunk_and_told(name, d, n_demo
     assert np.linalg.eigvalsh(covariance)[:, 0].min() > 1e-3  # not the floor, 1e-12
 
 
+@pytest.mark.parametrize("name", ["heteroscedastic", "mixture"])
+def test_2_fewer_demonstrations_than_outputs_are_enough_where_inputs_are_pooled(name):
+    model = new(name)
+    assert warned(model, *demonstrations(5, n_demos=3)) == []
+    covariance = model.predict_cov(demonstrations(5)[0][:8])
+    assert_covariances(covariance, 8, 5)
+    assert np.linalg.eigvalsh(covariance)[:, 0].min() > 1e-3
+
+
 @pytest.mark.parametrize("name", LIKELIHOOD)
+def test_2_a_likelihood_of_fewer_demonstrations_than_outputs_is_told(name):
+    model = new(name)
+    messages = warned(model, *demonstrations(5, n_demos=3))
+    assert len(messages) == 1
+    assert "y has 3 demonstrations at an input but 5 outputs: the likelihood then takes for certain" in messages[0]
+    assert "6 or more demonstrations determine the covariance; objective='auto' shrinks it" in messages[0]
+    assert_covariances(model.predict_cov(demonstrations(5)[0][:8]), 8, 5)
+
+
+@pytest.mark.parametrize("name", ["mixture", "mixture-lbfgs"])
+def test_2_fewer_rows_than_outputs_are_told_by_a_mixture(name):
+    messages = warned(new(name, n_components=1), *demonstrations(3, n_inputs=3, n_demos=1))
+    assert messages == [
+        "y has 3 distinct rows but 3 outputs: they leave directions of the covariance undetermined, which reg_covar "
+        "decides. Record more."
+    ]
+
+
+@pytest.mark.parametrize("name", [*LIKELIHOOD, "heteroscedastic"])
 def test_2_fewer_rows_than_outputs_are_told(name):
     messages = warned(new(name), *demonstrations(3, n_inputs=3, n_demos=1))
     assert messages == [
@@ -115,6 +154,15 @@ def test_4_identical_demonstrations_are_told(name):
         assert np.diagonal(model.predict_cov(X), axis1=1, axis2=2).max() < 1e-9
 
 
+@pytest.mark.parametrize("name", ["mixture", "mixture-lbfgs"])
+def test_4_identical_demonstrations_are_no_special_case_of_a_mixture(name):
+    """It knows no demonstrations: between its components there is as much spread as if each row were one."""
+    X, y = demonstrations()
+    model = new(name)
+    assert warned(model, X, np.tile(y[:8], (12, 1))) == []
+    assert_covariances(model.predict_cov(NEAR), 31, 2)
+
+
 @pytest.mark.parametrize("name", ["cholesky", "wishart"])
 def test_4_demonstrations_that_start_at_one_point_are_no_special_case(name):
     X, y = demonstrations()
@@ -163,6 +211,14 @@ def test_7_unequal_lengths_are_refused_with_both(name):
         new(name).fit([[0.0], [1.0, 2.0]], y[:2])
 
 
+@pytest.mark.parametrize("name", ["heteroscedastic", "mixture", "mixture-lbfgs", "wishart-random"])
+def test_5_rows_in_another_order_are_the_same_model(name, rng):
+    X, y = demonstrations()
+    order = rng.permutation(len(X))
+    model = fit(new(name), X[order], y[order])
+    np.testing.assert_array_equal(model.predict_cov(NEAR), fitted(name).predict_cov(NEAR))
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("name", DEFAULTS)
 def test_8_what_is_not_finite_is_refused(name, value):
@@ -170,7 +226,14 @@ def test_8_what_is_not_finite_is_refused(name, value):
     for column in ("X", "y"):
         broken = {"X": X.copy(), "y": y.copy()}
         broken[column][17, -1] = value
-        with pytest.raises(ValueError, match=f"Input {column} contains (NaN|infinity)"):
+        last = broken[column].shape[1] - 1
+        place = rf"contains (NaN|infinity).*in row 17, column {last}: leave such rows out"
+        with pytest.raises(ValueError, match=f"Input {column} {place}"):
+            new(name).fit(**broken)
+        frames = {key: pd.DataFrame(part, columns=["a", "b"][: part.shape[1]]) for key, part in broken.items()}
+        with pytest.raises(ValueError, match=rf"Input {column} contains .*in row 17, column {'ab'[last]}:"):
+            new(name).fit(**frames)
+        with config_context(assume_finite=True), pytest.raises(ValueError, match=f"Input {column} contains"):
             new(name).fit(**broken)
         with pytest.raises(ValueError, match=f"Input {column} contains (NaN|infinity)"):
             fitted(name).log_likelihood(**broken)
@@ -219,7 +282,7 @@ def test_15_unix_time_in_float32_is_refused(name, form):
     fit(new(name), np.arange(96.0, dtype=np.float32)[:, np.newaxis], y)  # less an offset
 
 
-@pytest.mark.parametrize("name", ["cholesky", "wishart", "mixture"])
+@pytest.mark.parametrize("name", [*DEFAULTS, *LIKELIHOOD])
 def test_15_coordinates_with_large_offsets(name):
     X, y = demonstrations()
     model = fit(new(name), X + 1.7e9, y + np.array([5e5, 5.5e6]))  # unix time, UTM
@@ -235,6 +298,16 @@ def test_16_what_is_coarser_than_float32_is_refused(name):
         new(name).fit(torch.tensor(X, dtype=torch.bfloat16), y)
     with pytest.raises(ValueError, match="y is float16 and column 1 is stored in steps"):
         new(name).fit(X, (y + np.array([0.0, 2000.0])).astype(np.float16))
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_16_float32_is_computed_in_float64(name):
+    X, y = (part.astype(np.float32) for part in demonstrations())
+    single = fit(new(name), X, y)
+    double = fit(new(name), X.astype(np.float64), y.astype(np.float64))
+    np.testing.assert_array_equal(single.predict_cov(NEAR), double.predict_cov(NEAR))
+    mean, covariance = single.predict(NEAR.astype(np.float32), return_cov=True)
+    assert (mean.dtype, covariance.dtype) == (np.float64, np.float64)
 
 
 STRINGS = [
@@ -270,7 +343,7 @@ def test_17_what_is_no_number_is_refused(name):
         (None, y, ValueError, "Expected 2D array"),
         (X, None, ValueError, "requires y to be passed"),
         (np.full((96, 1), None), y, ValueError, "contains NaN"),
-        (np.full((96, 1), {}), y, TypeError, "argument must be .* a real number"),
+        (np.full((96, 1), {}), y, TypeError, "X holds what is no number, as entry 0: .* argument must be .* a real"),
     ]:
         with pytest.raises(error, match=message):
             new(name).fit(X_bad, y_bad)
@@ -300,6 +373,17 @@ def test_19_collinear_and_constant_inputs_are_told(name):
         assert_covariances(covariance, 7, 2)
 
 
+@pytest.mark.parametrize("name", ["cholesky", "wishart", "heteroscedastic"])
+def test_19_an_input_that_tells_nothing_has_a_bounded_length_scale(name, rng):
+    X, y = demonstrations(n_inputs=10)
+    noise = np.tile(rng.uniform(-1.0, 1.0, size=(10, 1)), (12, 1))
+    model = fit(new(name), np.hstack([X, noise]), y)
+    along = [np.column_stack([np.zeros(9), np.linspace(-1.0, 1.0, 9) * scale]) for scale in (1.0, 100.0)]
+    within, beyond = (model.predict_uncertainty(rows).type1 for rows in along)
+    assert np.isfinite(within).all()
+    assert beyond[[0, -1]].min() > 0.99  # a length scale without bound would know everything there
+
+
 @pytest.mark.parametrize("name", ["cholesky", "wishart-likelihood"])
 def test_20_memory_is_counted_before_it_is_taken(name):
     X, y = np.arange(50_000.0)[:, np.newaxis], np.zeros((50_000, 6))
@@ -307,145 +391,49 @@ def test_20_memory_is_counted_before_it_is_taken(name):
         new(name, max_inputs=100_000).fit(X, y)
 
 
-@pytest.mark.parametrize(
-    ("prior", "message"),
-    [
-        (-1.0, r"prior must be positive definite; its smallest eigenvalue is -1"),
-        (0.0, r"its smallest eigenvalue is 0"),
-        ([[1.0, 2.0], [2.0, 1.0]], r"its smallest eigenvalue is -1.*give every direction some variance"),
-        (np.ones((2, 2)), r"prior must be positive definite"),
-        ([[1.0, 0.5], [0.4, 1.0]], r"prior must be symmetric; at index 0 two entries differ by 0\.1"),
-        ([1.0, 2.0], r"prior has shape \(2,\), must have shape \(2, 2\)"),
-        (np.eye(3), r"prior has shape \(3, 3\), must have shape \(2, 2\): a covariance in squared units of y"),
-        (np.nan, r"prior has an entry that is not finite"),
-        ("papr", r"prior == 'papr', must be one of 'paper'"),
-        ({}, r"prior == \{\}, must be numbers"),
-        (lambda X: np.eye(2), r"prior\(X\) has shape \(2, 2\), must have shape \(8, 2, 2\)"),
-        (lambda X: -np.ones((len(X), 2, 2)), r"prior\(X\) must be positive definite; .* at index 0"),
-        (lambda X: "wide", r"prior\(X\) == 'wide', must be numbers"),
-    ],
-    ids=lambda value: "callable" if callable(value) else str(value),
-)
-@pytest.mark.parametrize("name", ["cholesky", "cholesky-likelihood", "wishart", "wishart-likelihood"])
-def test_22_priors_that_are_no_covariance_are_refused_by_fit(name, prior, message):
-    estimator = new(name, prior=prior)  # not here, says scikit-learn
-    with pytest.raises(ValueError, match=message):
-        estimator.fit(*demonstrations())
+def test_20_memory_of_inducing_inputs_components_draws_and_predictions_is_counted(monkeypatch):
+    X = demonstrations()[0]
+    monkeypatch.setattr(torch_pbd.memory, "available_bytes", lambda: 2**27)
+    many = np.linspace(0.0, 1.0, 5000)[:, np.newaxis]
+    wide = np.hstack([np.sin(many), np.cos(many)])
+    for refused, words in [
+        (lambda: new("heteroscedastic", n_inducing=4000, max_inputs=4000).fit(many, wide), "n_inducing == 4000 .*lets"),
+        (lambda: new("mixture", n_components=2000).fit(many, wide), "n_components == 2000 for 5000 rows"),
+        (lambda: fitted("heteroscedastic").sample_cov(X[:8], 10**8), r"n_samples == 100000000 at 8 rows"),
+        (lambda: fitted("cholesky").sample_y(X[:8], 10**8), r"n_samples == 100000000 at 8 rows"),
+        (lambda: fitted("cholesky").predict_cov(np.zeros((3_000_000, 1))), "predicted for 3000000 rows"),
+        (lambda: fitted("mixture").predict_cov(np.zeros((3_000_000, 1))), "predicted for 3000000 rows"),
+    ]:
+        with pytest.raises(ValueError, match=rf"{words}.* needs about .* GiB of memory"):
+            refused()
 
 
-def test_22_a_callable_prior_is_held_to_it_when_it_predicts_too():
-    def prior(X):
-        return np.where(X[:, :, np.newaxis] < 2.0, 1.0, -1.0) * np.eye(2)
-
-    model = fit(new("cholesky", prior=prior), *demonstrations())
-    with pytest.raises(ValueError, match=r"prior\(X\) must be positive definite; .* at index 1"):
-        model.predict_cov([[0.0], [3.0]])
-
-
-@pytest.mark.parametrize(
-    ("df", "error", "message"),
-    [
-        (1, ValueError, "df == 1, must be at least 2, the number of outputs"),
-        (0, ValueError, "df == 0, must be >= 1"),
-        (2.5, TypeError, "df must be an instance of int"),
-        ("many", TypeError, "df must be an instance of int"),
-    ],
-)
-@pytest.mark.parametrize("objective", ["mse", "likelihood"])
-def test_23_fewer_vectors_than_outputs_are_refused(df, error, message, objective):
-    with pytest.raises(error, match=message):
-        WishartProcessRegressor(df=df, objective=objective).fit(*demonstrations())
-
-
-BAD_PARAMETERS = {
-    "max_iter": (0, ValueError),
-    "tol": (0.0, ValueError),
-    "n_restarts": (-1, ValueError),
-    "verbose": ("loud", TypeError),
-    "device": ("cuda:99", ValueError),
-    "objective": ("mle", ValueError),
-    "kernel": ("rbf", ValueError),
-    "length_scale": ([0.1, 0.2], ValueError),
-    "max_inputs": (1, ValueError),
-    "noise_scale": (-0.1, ValueError),
-    "diagonal": ("sqrt", ValueError),
-    "start": ("zero", ValueError),
-    "n_components": (0, ValueError),
-    "solver": ("adam", ValueError),
-    "reg_covar": (0.0, ValueError),
-}
-
-
-@pytest.mark.parametrize("parameter", BAD_PARAMETERS)
-@pytest.mark.parametrize("name", DEFAULTS)
-def test_parameters_out_of_range_are_refused_by_name(name, parameter):
-    value, error = BAD_PARAMETERS[parameter]
-    if parameter not in new(name).get_params():
-        pytest.skip(f"has no {parameter}")
-    with pytest.raises(error, match=f"{parameter} .*must be|{parameter} == .* cannot be used here"):
-        new(name, **{parameter: value}).fit(*demonstrations())
-
-
-@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf, "short", [0.1, 0.2]])
-def test_length_scales_that_are_none_are_refused(value):
-    with pytest.raises(ValueError, match=r"length_scale == .*must be"):
-        new("cholesky", length_scale=value).fit(*demonstrations())
-
-
-@pytest.mark.parametrize("name", VARIANTS)
-def test_24_far_away_everything_is_finite(name):
-    X = np.array([[1e6], [-1e6], [1e300], [-1e300], [np.finfo(float).max]])
-    model = fitted(name)
-    mean, covariance = model.predict(X, return_cov=True)
-    assert np.isfinite(mean).all()
-    assert_covariances(covariance, 5, 2)
-    if name in LATENT:
-        np.testing.assert_allclose(covariance, np.broadcast_to(covariance[:1], covariance.shape), rtol=1e-12)
+def test_20_what_predicts_many_rows_holds_few_at_a_time(monkeypatch):
+    seen = []
+    model, rows = fitted("mixture"), np.zeros((5000, 1))
+    monkeypatch.setattr(type(model), "_arrays", lambda self, function, X: by_chunks(function, X))
+    model._arrays(lambda part: (seen.append(len(part)), (part,))[1], rows)
+    assert sum(seen) == 5000
+    assert max(seen) <= 1024
 
 
 @pytest.mark.parametrize("name", DEFAULTS)
-def test_25_misuse_of_a_fitted_model_is_told(name):
-    X, y = demonstrations()
-    for method in ("predict", "predict_cov", "predict_uncertainty", "sample_y"):
-        with pytest.raises(NotFittedError, match="not fitted yet"):
-            getattr(new(name), method)(X)
-        with pytest.raises(ValueError, match=r"X has 2 features, but .* is expecting 1"):
-            getattr(fitted(name), method)(np.hstack([X, X]))
-    for method in ("score", "log_likelihood"):
-        with pytest.raises(NotFittedError):
-            getattr(new(name), method)(X, y)
-        with pytest.raises(ValueError, match="y has 1 outputs, but the model was fitted with 2"):
-            getattr(fitted(name), method)(X, y[:, 0])
-        with pytest.raises(ValueError, match="inconsistent numbers of samples"):
-            getattr(fitted(name), method)(X, y[:5])
-    with pytest.raises(ValueError, match="At most one of return_std and return_cov"):
-        fitted(name).predict(X, return_std=True, return_cov=True)
-    with pytest.raises(ValueError, match="n_samples == 0, must be >= 1"):
-        fitted(name).sample_y(X, 0)
+def test_21_two_ways_are_a_warning_of_the_controller_whatever_learns_them(name):
+    two_ways = make_tunnel_demonstrations(12, 10.0, 5.0, random_state=0, variant="two_path")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        controller = DMPController(new(name), n_steps=20).fit(two_ways)
+    told = [warning for warning in caught if issubclass(warning.category, UnimodalityWarning)]
+    assert len(told) == 1
+    assert "seem to follow two ways" in str(told[0].message)
+    assert_covariances(controller.schedule(4.0).stiffness, 41, 2)
 
 
-@pytest.mark.parametrize("name", VARIANTS)
-def test_27_the_floor_holds_where_an_entry_of_the_factor_crosses_zero(name):
-    X, y = demonstrations(1, n_inputs=9, n_demos=6)
-    y *= np.where(X > 0.0, 1.0, 1e-5)
-    model = fit(new(name), X, y)
-    assert_covariances(model.predict_cov(np.linspace(-1.5, 1.5, 2001)[:, np.newaxis]), 2001, 1)
-
-
-@pytest.mark.parametrize("name", VARIANTS)
-def test_28_inputs_that_nearly_coincide(name, rng):
-    """Kernel matrices far beyond a condition number of 1e16."""
-    X, y = demonstrations(n_inputs=6, n_demos=6)
-    close = np.vstack([X, X + 1e-10, X + 1e-8])
-    model = fit(new(name), close, np.vstack([y, y, y]) + 0.1 * rng.normal(size=(108, 2)))
-    assert 0.0 <= model.jitter_ <= 1e-6
-    assert_covariances(model.predict_cov(queries(1)), 45, 2)
-
-
-def test_28_a_length_scale_beyond_the_inputs_without_noise_says_what_to_do():
-    X, y = demonstrations(n_inputs=30, n_demos=4)
-    with pytest.raises(NotPositiveDefiniteError, match=r"noise_scale=None.*shorter length_scale"):
-        fit(CholeskyCovRegressor(noise_scale=0.0, length_scale=1e4), X, y)
+def test_21_two_ways_are_a_warning_of_the_regressor_that_is_told_the_demonstrations():
+    X, y, groups = make_tunnel_demonstrations(12, 10.0, 5.0, random_state=0, variant="two_path").stack()
+    with pytest.warns(UnimodalityWarning, match="seem to follow two ways"):
+        model = new("heteroscedastic").fit(X, y, groups=groups)
+    assert_covariances(model.predict_cov(X[:5]), 5, 2)
 
 
 def test_more_components_than_samples_are_refused_with_both_numbers():

@@ -12,13 +12,19 @@ from torch_pbd.control.arguments import (
     PhaseInput,
     Variability,
     as_demonstrations,
+    as_movement_times,
+    as_places,
+    as_speed,
     as_times,
+    check_against_duration,
     check_memory,
     check_parameters,
+    check_task,
     count_ticks,
 )
 from torch_pbd.control.dmp import DMP, Gate
 from torch_pbd.control.impedance import Gains, Impedance, OnUnknown
+from torch_pbd.control.matrices import check_count
 from torch_pbd.control.plant import AdmittancePlant
 from torch_pbd.control.provenance import schedule_labels
 from torch_pbd.control.reproduction import Reproduction
@@ -167,6 +173,7 @@ class DMPController(BaseEstimator):
         ValueError
             If there are fewer than two demonstrations, too few samples in one, or a parameter cannot be used.
         """
+        self.__dict__.pop("_impedance", None)  # a fit that fails leaves no mixture of two
         check_parameters(self)
         demonstrations = as_demonstrations(X, y, groups)
         self.names_, self.frame_ = demonstrations.names, demonstrations.frame
@@ -177,8 +184,12 @@ class DMPController(BaseEstimator):
         knows_seconds = in_seconds(demonstrations.time_unit) is not None
         automatic = automatic_cutoff(self.duration_, knows_seconds=knows_seconds)
         self.cutoff_ = automatic if self.cutoff == "auto" else self.cutoff
+        check_against_duration(self)
         movements = self.smooth(demonstrations)
-        self.dmp_ = DMP(self.alpha, self.beta, self.gamma, self.tau, duration=self.duration_, gate=self.gate)
+        beta = None if self.beta is None else float(self.beta)
+        self.dmp_ = DMP(
+            float(self.alpha), beta, float(self.gamma), float(self.tau), duration=self.duration_, gate=self.gate
+        )
         self.reproduction_ = Reproduction.learn(self.dmp_, movements, self.phase_input, own_goals=self.goal == "each")
         self.start_, self.goal_ = self.reproduction_.start, self.reproduction_.goal
         self.reproduction_error_ = self.reproduction_.check_against(movements)
@@ -189,7 +200,8 @@ class DMPController(BaseEstimator):
         self.noise_share_ = variance_share(self.varying(noise), varying)
         along = self.covariance_.predict_cov(self.phase(np.linspace(0.0, self.duration_, 1001)))
         self.law_ = fit_law(self.stiffness_law, along, varying)
-        self._impedance = Impedance(self.law_, self.mass, self.damping_ratio, self.on_unknown)
+        ratio = self.damping_ratio if self.damping_ratio == "paper" else float(self.damping_ratio)
+        self._impedance = Impedance(self.law_, float(self.mass), ratio, self.on_unknown)
         return self
 
     def predict(self, X: ArrayLike) -> Floats:
@@ -197,7 +209,8 @@ class DMPController(BaseEstimator):
 
         From ``start_time_``; the movement is over ``duration_`` later, and then stays at the goal.
         """
-        return self.reproduction_.motion(self._movement_time(X))[0]
+        time = self._movement_time(X)
+        return self.reproduction_.motion(time)[0]
 
     def predict_stiffness(self, X: ArrayLike) -> Floats:
         """Stiffness (n, d, d) in N/m (force per unit of position) at times X (n, 1)."""
@@ -310,23 +323,34 @@ class DMPController(BaseEstimator):
         check_is_fitted(self)
         n_ticks = count_ticks(self.duration_, rate, settle)
         if speed is not None:
-            paces = np.asarray(speed, dtype=np.float64)
+            paces = as_speed(speed)
             n_ticks = len(paces) if paces.ndim else n_ticks
             speed = np.broadcast_to(paces, n_ticks)
+        check_memory(n_ticks, self.n_outputs_)
+        goal = None if goal is None else as_places(goal, "goal", self.n_outputs_, n_ticks)
+        start = None if start is None else as_places(start, "start", self.n_outputs_)
         return self.reproduction_.roll_out(n_ticks, 1.0 / rate, goal=goal, start=start, speed=speed)
 
     def phase(self, time: ArrayLike) -> Floats:
         """Inputs (n, 1) of ``covariance_`` at movement times (n,), which start at 0: what ``phase_input`` says."""
-        check_is_fitted(self)
-        return self.reproduction_.phase(np.asarray(time, dtype=np.float64))
+        check_is_fitted(self, "reproduction_")
+        return self.reproduction_.phase(as_movement_times(time))
 
     def smooth(self, demonstrations: Demonstrations, n_steps: int | None = None) -> Movements:
         """Demonstrations of this task as the controller sees them, smoothed and stretched to ``duration_``."""
-        return smooth(demonstrations, self.cutoff_, n_steps or self.n_steps, self.duration_)
+        check_task(demonstrations, getattr(self, "n_outputs_", None))
+        if n_steps is not None:
+            check_count("n_steps", n_steps, 2)
+        return smooth(demonstrations, self.cutoff_, self.n_steps if n_steps is None else n_steps, self.duration_)
 
     def varying(self, movements: Movements) -> Floats:
         """What ``variability`` is of, (K, n, d), in smoothed movements of the same task."""
+        if not isinstance(movements, Movements):
+            raise ValueError(f"movements == {type(movements).__name__}, must be what smooth(demonstrations) returns.")
         return movements.position if self.variability == "position" else self.reproduction_.forcing_of(movements)
+
+    def __sklearn_is_fitted__(self) -> bool:
+        return "_impedance" in vars(self)
 
     def _movement_time(self, X: ArrayLike) -> Floats:
         check_is_fitted(self)

@@ -10,10 +10,12 @@ from torch import Tensor
 from torch_pbd.control.matrices import as_mass, as_semidefinite, check_finite
 from torch_pbd.linalg import spectral_map, symmetrize
 
+_MOST_RATIO = 1e6
+
 
 def damping_from_stiffness(
     stiffness: Float[Tensor, "*b d d"] | Any,
-    mass: float | Float[Tensor, "*m d d"] = 1.0,
+    mass: float | Float[Tensor, "*m d d"] | Any = 1.0,
     damping_ratio: float | Literal["paper"] = 1.0,
 ) -> Float[Tensor, "*b d d"]:
     """Damping in N s/m that gives every mode of mass and stiffness the same damping ratio.
@@ -45,6 +47,8 @@ def damping_from_stiffness(
     check_finite("damping_ratio", damping_ratio)
     if damping_ratio < 0.0:
         raise ValueError(f"damping_ratio == {damping_ratio:g}, must not be negative: the motion would gain energy.")
+    if damping_ratio > _MOST_RATIO:
+        raise ValueError(f"damping_ratio == {damping_ratio:g}, must be at most {_MOST_RATIO:g}; 1 is critical.")
     mass = as_mass(mass)
     if not isinstance(mass, Tensor) or mass.ndim == 0:
         return 2.0 * damping_ratio * mass**0.5 * spectral_map(matrix, _root)

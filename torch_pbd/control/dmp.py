@@ -1,13 +1,14 @@
 """Dynamic movement primitives: eq. (16) to (18)."""
 
 from collections.abc import Callable
-from typing import Literal, final, get_args
+from typing import Any, Literal, final, get_args
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torch_pbd.control.matrices import check_positive
+from torch_pbd.control.matrices import as_rows, as_tensor, check_count, check_positive
+from torch_pbd.memory import require_much
 
 Gate = Literal["time", "phase", "none"]
 
@@ -89,12 +90,13 @@ class DMP:
             f"duration={self.duration}, gate={self.gate!r})"
         )
 
-    def phase(self, time: Tensor) -> Tensor:
+    def phase(self, time: Tensor | Any) -> Tensor:
         """Phase s of eq. (17) at ``time`` in s: its solution ``exp(-gamma time / tau)``, never integrated."""
-        return torch.exp(-self.gamma * time / self.tau)
+        return torch.exp(-self.gamma * as_tensor(time, "time") / self.tau)
 
-    def gate_at(self, time: Tensor) -> Tensor:
+    def gate_at(self, time: Tensor | Any) -> Tensor:
         """What the forcing is multiplied by at ``time`` in s: 1 up to ``duration``."""
+        time = as_tensor(time, "time")
         if self.gate == "none" or self.duration is None:
             return torch.ones_like(time)
         if self.gate == "phase":
@@ -104,26 +106,40 @@ class DMP:
 
     def forcing(
         self,
-        position: Float[Tensor, "*b d"],
-        velocity: Float[Tensor, "*b d"],
-        acceleration: Float[Tensor, "*b d"],
-        goal: Float[Tensor, "*g d"],
+        position: Float[Tensor, "*b d"] | Any,
+        velocity: Float[Tensor, "*b d"] | Any,
+        acceleration: Float[Tensor, "*b d"] | Any,
+        goal: Float[Tensor, "*g d"] | Any,
     ) -> Float[Tensor, "*b d"]:
-        """Forcing that makes the primitive move like this: eq. (18), in the units of position."""
+        """Forcing that makes the primitive move like this: eq. (18), in the units of position.
+
+        Raises
+        ------
+        ValueError
+            If shapes disagree, or a value is not finite.
+        """
+        position, goal = as_rows(position, "position", 1), as_rows(goal, "goal", 1)
+        velocity, acceleration = as_rows(velocity, "velocity", 1), as_rows(acceleration, "acceleration", 1)
+        for name, value in (("velocity", velocity), ("acceleration", acceleration), ("goal", goal)):
+            if not _broadcasts(value, position) or (name != "goal" and value.shape != position.shape):
+                raise ValueError(
+                    f"{name} has shape {tuple(value.shape)}, but position has shape {tuple(position.shape)}: they must "
+                    "be of the same movements and outputs."
+                )
         spring = self.beta * (goal - position) - self.tau * velocity
         return self.tau**2 * acceleration - self.alpha * spring
 
     def rollout(
         self,
-        forcing: Float[Tensor, "*b t d"] | Callable[[Tensor], Tensor],
-        dt: float,
+        forcing: Float[Tensor, "*b t d"] | Callable[[Tensor], Tensor] | Any,
+        dt: float | Any,
         *,
-        goal: Tensor,
-        position0: Float[Tensor, "*s d"] | None = None,
-        velocity0: Float[Tensor, "*s d"] | None = None,
-        speed: Float[Tensor, " t"] | None = None,
-        n_steps: int | None = None,
-        integrator: Literal["exact", "rk4"] = "exact",
+        goal: Tensor | Any,
+        position0: Float[Tensor, "*s d"] | Any = None,
+        velocity0: Float[Tensor, "*s d"] | Any = None,
+        speed: Float[Tensor, " t"] | Any = None,
+        n_steps: int | Any = None,
+        integrator: Literal["exact", "rk4"] | Any = "exact",
     ) -> tuple[Float[Tensor, "*o t d"], Float[Tensor, "*o t d"]]:
         """Position and velocity at ticks of ``dt`` seconds.
 
@@ -150,15 +166,18 @@ class DMP:
         Raises
         ------
         ValueError
-            If a shape is wrong, or a speed is negative.
+            If a shape is wrong, a value is not finite, or a speed is negative.
         """
-        n_ticks = n_steps if callable(forcing) else forcing.shape[-2]
-        if n_ticks is None or n_ticks < 1:
-            raise ValueError(f"n_steps == {n_steps}, must be at least 1 where forcing is a callable.")
+        forcing, n_ticks = _checked_forcing(forcing, n_steps)
+        goal = as_rows(goal, "goal", 1)
+        position0, velocity0 = (
+            None if start is None else as_rows(start, name, 1)
+            for name, start in (("position0", position0), ("velocity0", velocity0))
+        )
         if integrator not in ("exact", "rk4"):
             raise ValueError(f"integrator == {integrator!r}, must be 'exact' or 'rk4'.")
         time, steps, passing = _movement_time(n_ticks, dt, speed, goal)
-        at_ticks = (forcing(time) if callable(forcing) else forcing) * self.gate_at(time)[:, None]
+        at_ticks = (_called(forcing, time) if callable(forcing) else forcing) * self.gate_at(time)[:, None]
         goals = goal if goal.ndim > 1 else goal[None]
         zero = at_ticks.new_zeros(at_ticks.shape[-1])
         position, velocity = (zero if start is None else start for start in (position0, velocity0))
@@ -176,7 +195,7 @@ class DMP:
             midway = 0.5 * (at_ticks[..., 1:, :] + at_ticks[..., :-1, :])
             if callable(forcing):
                 halfway = 0.5 * (time[1:] + time[:-1])
-                midway = forcing(halfway) * self.gate_at(halfway)[:, None]
+                midway = _called(forcing, halfway) * self.gate_at(halfway)[:, None]
             trace = self._runge_kutta(at_ticks, midway, goals, steps, state)
         return trace[..., 0], trace[..., 1] / self.tau * passing[:, None]
 
@@ -218,6 +237,31 @@ class DMP:
         return torch.stack(states, dim=-3)
 
 
+def _checked_forcing(forcing: Any, n_steps: Any) -> tuple[Any, int]:
+    """Forcing as it is to be asked for, and the number of ticks."""
+    if not callable(forcing):
+        rows = as_rows(forcing, "forcing", 2)
+        return rows, rows.shape[-2]
+    check_count("n_steps", n_steps, 1)
+    require_much(100.0 * n_steps, what=f"n_steps == {n_steps}", remedy="Take fewer.")
+    return forcing, n_steps
+
+
+def _called(forcing: Callable[[Tensor], Any], time: Tensor) -> Tensor:
+    """Forcing (..., m, d) at times (m,), of a callable."""
+    value = as_tensor(forcing(time), "forcing(time)")
+    if value.ndim < 2 or value.shape[-2] != len(time) or not bool(torch.isfinite(value.detach()).all()):
+        raise ValueError(
+            f"forcing(time) has shape {tuple(value.shape)}, must have shape (..., {len(time)}, d), all of it finite."
+        )
+    return value
+
+
+def _broadcasts(value: Tensor, other: Tensor) -> bool:
+    sizes = zip(reversed(value.shape), reversed(other.shape), strict=False)
+    return value.shape[-1] == other.shape[-1] and all(1 in pair or pair[0] == pair[1] for pair in sizes)
+
+
 def _run_shape(forcing: Tensor, others: dict[str, Tensor]) -> torch.Size:
     """Shape (..., T, d) of a rollout: T and d are those of the forcing, the batch is that of all."""
     shape = forcing.shape
@@ -232,11 +276,12 @@ def _run_shape(forcing: Tensor, others: dict[str, Tensor]) -> torch.Size:
     return shape
 
 
-def _movement_time(n_ticks: int, dt: float, speed: Tensor | None, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _movement_time(n_ticks: int, dt: float, speed: Any, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Movement time at the ticks, from each to the next, and how fast it passes at them."""
     check_positive("dt", dt, "s")
     if speed is None:
         return torch.arange(n_ticks).to(like) * dt, like.new_full((n_ticks - 1,), dt), like.new_ones(n_ticks)
+    speed = as_tensor(speed, "speed")
     if speed.shape != (n_ticks,) or not bool((torch.isfinite(speed) & (speed >= 0.0)).all()):
         raise ValueError(f"speed has shape {tuple(speed.shape)}, must be {n_ticks} finite numbers, none negative.")
     passing = speed.to(like)

@@ -3,11 +3,14 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import final
+from numbers import Real
+from typing import Any, final
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+
+from torch_pbd.control.matrices import as_tensor, check_flag, is_finite
 
 Curve = Callable[[Tensor], Tensor]
 
@@ -88,19 +91,23 @@ class Tunnel:
         center: Curve = tunnel_center,
         half_width: Curve = tunnel_half_width,
     ) -> None:
-        if not (math.isfinite(stiffness) and stiffness > 0):
+        if not (_is_number(stiffness) and stiffness > 0):
             raise ValueError(
-                f"stiffness={stiffness} must be finite and above 0, in N/m; virtual=True is no wall at all."
+                f"stiffness={stiffness!r} must be finite and above 0, in N/m; virtual=True is no wall at all."
             )
-        if damping is not None and not (math.isfinite(damping) and damping >= 0):
-            raise ValueError(f"damping={damping} must be finite and at least 0, in N s/m, or None.")
+        if damping is not None and not (_is_number(damping) and damping >= 0):
+            raise ValueError(f"damping={damping!r} must be finite and at least 0, in N s/m, or None.")
+        check_flag("virtual", virtual)
+        for name, curve in (("center", center), ("half_width", half_width)):
+            if not callable(curve):
+                raise ValueError(f"{name}={curve!r} must be a function of y, of torch operations.")
         self.stiffness = stiffness
         self.damping = math.sqrt(stiffness) if damping is None else damping
         self.virtual = virtual
         self.center = center
         self.half_width = half_width
 
-    def penetration(self, position: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b"]:
+    def penetration(self, position: Float[Tensor, "*b 2"] | Any) -> Float[Tensor, "*b"]:
         """Depth beyond the nearer wall [m], along its normal: ``(|x - x_c| - w) / sqrt(1 + slope^2)``, or 0.
 
         Parameters
@@ -110,11 +117,13 @@ class Tunnel:
         """
         return self._contact(position)[0].clamp_min(0.0)
 
-    def normal(self, position: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
+    def normal(self, position: Float[Tensor, "*b 2"] | Any) -> Float[Tensor, "*b 2"]:
         """Unit normal of the nearer wall, pointing into the corridor; on the centre line, that of the right wall."""
         return self._contact(position)[1]
 
-    def force(self, position: Float[Tensor, "*b 2"], velocity: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 2"]:
+    def force(
+        self, position: Float[Tensor, "*b 2"] | Any, velocity: Float[Tensor, "*b 2"] | Any
+    ) -> Float[Tensor, "*b 2"]:
         """Force of the wall on what is at ``position`` [N].
 
         Parameters
@@ -129,6 +138,7 @@ class Tunnel:
         ValueError
             If shapes differ or the last dimension is not 2.
         """
+        position, velocity = as_tensor(position, "position"), as_tensor(velocity, "velocity")
         depth, normal = self._contact(position)
         _check_same_shape(position, velocity)
         if self.virtual:
@@ -138,7 +148,7 @@ class Tunnel:
         return torch.where(depth <= 0.0, 0.0, press).unsqueeze(-1) * normal
 
     def report(
-        self, rollout_position: Float[Tensor, "*b t 2"], velocity: Float[Tensor, "*b t 2"], dt: float
+        self, rollout_position: Float[Tensor, "*b t 2"] | Any, velocity: Float[Tensor, "*b t 2"] | Any, dt: float
     ) -> "ContactReport":
         """How a rollout touched the walls.
 
@@ -156,8 +166,10 @@ class Tunnel:
         ValueError
             If shapes differ, there is no tick, a value is not finite, or ``dt`` is not above zero.
         """
-        if not (math.isfinite(dt) and dt > 0):
-            raise ValueError(f"dt={dt} must be finite and above 0: the length of a tick in s.")
+        if not (_is_number(dt) and dt > 0):
+            raise ValueError(f"dt={dt!r} must be finite and above 0: the length of a tick in s.")
+        rollout_position = as_tensor(rollout_position, "rollout_position")
+        velocity = as_tensor(velocity, "velocity")
         _check_same_shape(rollout_position, velocity)
         if rollout_position.ndim < 2 or rollout_position.shape[-2] == 0:
             raise ValueError(
@@ -176,12 +188,13 @@ class Tunnel:
             n_contacts=(inside & ~before).sum(-1),
         )
 
-    def _contact(self, position: Tensor) -> tuple[Tensor, Tensor]:
+    def _contact(self, position: Tensor | Any) -> tuple[Tensor, Tensor]:
         """Depth along the normal, negative in the free corridor, and the normal.
 
         The wall is the zero of ``g = side (x - x_c(y)) - w(y)``, the depth ``g / |grad g|``, the normal
         ``-grad g / |grad g|``.
         """
+        position = as_tensor(position, "position")
         if position.ndim == 0 or position.shape[-1] != 2:
             raise ValueError(f"position has shape {tuple(position.shape)}: the tunnel is in the plane, (..., 2).")
         x, y = position.unbind(-1)
@@ -225,6 +238,10 @@ class ContactReport:
             f"at most {1e3 * depth:.3g} mm deep, impulse {impulse:.3g} N s"
             for depth, time, impulse, count in rows
         )
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool) and is_finite(value)
 
 
 def _value(curve: Curve, y: Tensor, name: str) -> Tensor:

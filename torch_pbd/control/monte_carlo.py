@@ -7,18 +7,19 @@ from typing import Any, Literal, get_args
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from sklearn.utils import check_random_state
 from torch import Tensor
 
-from torch_pbd.control.matrices import check_count, check_positive
+from torch_pbd.arguments import as_floats, check_kind
+from torch_pbd.control.matrices import check_count, check_device, check_positive
 from torch_pbd.control.plant import AdmittancePlant
 from torch_pbd.control.random_pushes import Range, check_not_negative, draw_pushes
 from torch_pbd.control.rollout_summary import RolloutSummary, quantiles_in
 from torch_pbd.control.rollouts import Pushes, Tally, march
 from torch_pbd.control.schedule import Schedule
-from torch_pbd.control.simulation import warn_of_mass
+from torch_pbd.control.simulation import check_plant, warn_of_mass
 from torch_pbd.control.ticks import block_length
 from torch_pbd.memory import require_memory
+from torch_pbd.seeds import as_random_state
 
 Floats = NDArray[np.float64]
 Reference = Literal["desired", "undisturbed"]
@@ -106,12 +107,14 @@ def simulate_many(
     >>> summary.deviation.shape, bool((summary.peak_deviation > 0.0).all())
     ((10001, 3), True)
     """
+    check_kind(schedule, "schedule", Schedule)
+    check_device(device)
     check_count("n_rollouts", n_rollouts, 1)
     check_count("every", every, 1)
     levels = _check_choices(reference, threshold, quantiles)
     schedule = _evenly(schedule, rate)
     _check_memory(n_rollouts, schedule, len(levels))
-    robot, draw = _robot(schedule, plant), check_random_state(random_state)
+    robot, draw = _robot(schedule, plant), as_random_state(random_state)
     begin, lasting, push = draw_pushes(draw, (n_rollouts, schedule.n_outputs), schedule, peak, duration, onset)
     offset = check_not_negative("start_scale", start_scale) * draw.standard_normal(push.shape)
     seeds = iter(draw.randint(2**31 - 1, size=n_rollouts).tolist())  # at most so many sensors
@@ -152,8 +155,8 @@ def _check_choices(reference: str, threshold: float | None, quantiles: tuple[flo
     if reference not in get_args(Reference):
         raise ValueError(f"reference == {reference!r}, must be one of {', '.join(map(repr, get_args(Reference)))}.")
     if threshold is not None:
-        check_positive("threshold", threshold, "m")
-    levels = np.array(quantiles, dtype=np.float64)
+        check_positive("threshold", check_not_negative("threshold", threshold), "m")
+    levels = np.array(as_floats(quantiles, "quantiles"))
     if levels.ndim != 1 or not len(levels) or not ((levels >= 0.0) & (levels <= 1.0)).all():
         raise ValueError(f"quantiles == {quantiles!r}, must be one or more numbers from 0 to 1.")
     return levels
@@ -186,6 +189,7 @@ def _evenly(schedule: Schedule, rate: float | None) -> Schedule:
 def _robot(schedule: Schedule, plant: AdmittancePlant | None) -> AdmittancePlant:
     if plant is None:
         return AdmittancePlant(schedule.mass or 1.0)
+    check_plant(plant)
     if schedule.mass is not None:
         warn_of_mass(plant, schedule.mass, stacklevel=4)
     return plant

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torch_pbd.control.environment import Tunnel
-from torch_pbd.control.matrices import as_mass, as_semidefinite, check_count, check_positive
+from torch_pbd.control.matrices import as_mass, as_semidefinite, as_tensor, check_count, check_flag, check_positive
 from torch_pbd.control.passivity import EnergyTank, RateLimit
 from torch_pbd.control.position_loop import PositionLoop
 from torch_pbd.control.rollout import Rollout
@@ -63,7 +63,7 @@ class AdmittancePlant:
 
     def __init__(
         self,
-        mass: float | Tensor = 1.0,
+        mass: float | Tensor | Any = 1.0,
         integrator: Integrator = "exact",
         *,
         feed_forward: bool = False,
@@ -78,6 +78,7 @@ class AdmittancePlant:
                 f"integrator == {integrator!r}, must be one of {', '.join(map(repr, get_args(Integrator)))}."
             )
         check_count("substeps", substeps, 1)
+        check_flag("feed_forward", feed_forward)
         parts = {
             "sensor": (sensor, "start"),
             "position_loop": (position_loop, "start"),
@@ -108,17 +109,17 @@ class AdmittancePlant:
 
     def simulate(
         self,
-        position_desired: Tensor,
-        velocity_desired: Tensor,
-        stiffness: Tensor,
-        damping: Tensor,
-        force: Tensor | None = None,
+        position_desired: Tensor | Any,
+        velocity_desired: Tensor | Any,
+        stiffness: Tensor | Any,
+        damping: Tensor | Any,
+        force: Tensor | Any = None,
         *,
-        dt: float,
-        position0: Tensor | None = None,
-        velocity0: Tensor | None = None,
-        acceleration_desired: Tensor | None = None,
-        generator: torch.Generator | None = None,
+        dt: float | Any,
+        position0: Tensor | Any = None,
+        velocity0: Tensor | Any = None,
+        acceleration_desired: Tensor | Any = None,
+        generator: torch.Generator | Any = None,
     ) -> Rollout:
         """Run T ticks of ``dt`` seconds.
 
@@ -154,9 +155,10 @@ class AdmittancePlant:
         task = self.task(
             position_desired, velocity_desired, stiffness, damping, dt=dt, acceleration_desired=acceleration_desired
         )
-        force = torch.zeros_like(position_desired) if force is None else force
+        position_desired, velocity_desired = task.position, task.velocity
+        force = torch.zeros_like(position_desired) if force is None else as_tensor(force, "force")
         _check_motion({"position_desired": position_desired, "force": force})
-        _check_start(position_desired.shape[-1], position0=position0, velocity0=velocity0)
+        position0, velocity0 = _starts(position_desired, position0=position0, velocity0=velocity0)
         stiffness, damping = task.stiffness, task.damping
         start = position_desired[..., 0, :] if position0 is None else position0
         speed = velocity_desired[..., 0, :] if velocity0 is None else velocity0
@@ -165,6 +167,8 @@ class AdmittancePlant:
         self._check_memory(batch, task)
         state = start.expand(*batch, -1), speed.expand(*batch, -1)
         hooks = (self.sensor, self.position_loop, self.environment, self.stiffness_filter)
+        if generator is not None and not isinstance(generator, torch.Generator):
+            raise ValueError(f"generator == {generator!r}, must be a torch.Generator or None.")
         if all(hook is None for hook in hooks):
             position, velocity = open_loop(task, force, state, self.integrator)
             record: dict[str, Any] = {"position": position, "velocity": velocity, "commanded_position": position}
@@ -173,31 +177,35 @@ class AdmittancePlant:
             record |= {"force": force.expand_as(position)}
         else:
             record = closed_loop(task, force, state, self, generator)
+        _check_finished(record["position"], record["velocity"])
         time = torch.arange(force.shape[-2], dtype=force.dtype, device=force.device) * dt
         return Rollout(time, desired_position=position_desired, **record)
 
     def task(
         self,
-        position_desired: Tensor,
-        velocity_desired: Tensor,
-        stiffness: Tensor,
-        damping: Tensor,
+        position_desired: Tensor | Any,
+        velocity_desired: Tensor | Any,
+        stiffness: Tensor | Any,
+        damping: Tensor | Any,
         *,
-        dt: float,
-        acceleration_desired: Tensor | None = None,
+        dt: float | Any,
+        acceleration_desired: Tensor | Any = None,
     ) -> Task:
         """Arguments of :meth:`simulate` as this plant is to follow them, checked; it raises as that does."""
         motion = {"position_desired": position_desired, "velocity_desired": velocity_desired}
         if acceleration_desired is not None:
             motion["acceleration_desired"] = acceleration_desired
         check_positive("dt", dt, "s")
+        motion = {name: as_tensor(value, name) for name, value in motion.items()}
         _check_motion(motion)
+        position_desired, velocity_desired, *given = motion.values()
+        stiffness, damping = as_tensor(stiffness, "stiffness"), as_tensor(damping, "damping")
         _check_gains(position_desired, stiffness=stiffness, damping=damping)
         stiffness, damping = torch.broadcast_tensors(stiffness, damping)
         mass = self._mass_matrix(stiffness)
         inertial = torch.zeros_like(position_desired)
         if self.feed_forward:
-            inertial = _accelerations(velocity_desired, acceleration_desired, dt) @ mass.mT
+            inertial = _accelerations(velocity_desired, given[0] if given else None, dt) @ mass.mT
         return Task(position_desired, velocity_desired, inertial, stiffness, damping, mass, dt)
 
     def _check_memory(self, batch: torch.Size, task: Task) -> None:
@@ -262,7 +270,28 @@ def _check_kinds(*values: Tensor) -> None:
         raise ValueError(f"the inputs are of several dtypes or devices, {sorted(map(str, kinds))}: bring them to one.")
 
 
-def _check_start(d: int, **starts: Tensor | None) -> None:
-    for name, value in starts.items():
-        if value is not None and (value.shape[-1:] != (d,) or not bool(torch.isfinite(value).all())):
-            raise ValueError(f"{name} has shape {tuple(value.shape)}, must have shape (..., {d}), all of it finite.")
+def _starts(like: Tensor, **starts: Tensor | Any) -> list[Tensor | None]:
+    """States (..., d) at the start, or None where none is given."""
+    checked: list[Tensor | None] = []
+    for name, given in starts.items():
+        value = None if given is None else as_tensor(given, name)
+        if value is not None and (value.shape[-1:] != like.shape[-1:] or not bool(torch.isfinite(value).all())):
+            raise ValueError(
+                f"{name} has shape {tuple(value.shape)}, must have shape (..., {like.shape[-1]}), all of it finite."
+            )
+        if value is not None:
+            _check_kinds(like, value)
+        checked.append(value)
+    return checked
+
+
+def _check_finished(position: Tensor, velocity: Tensor) -> None:
+    """Check that a motion did not outgrow its numbers."""
+    if bool(torch.isfinite(position.detach().sum() + velocity.detach().sum())):
+        return
+    finite = (torch.isfinite(position) & torch.isfinite(velocity)).all(-1).reshape(-1, position.shape[-2]).all(0)
+    if not bool(finite.all()):
+        raise ValueError(
+            f"the simulation diverged, and is not finite from tick {int((~finite).nonzero()[0])} on: take a shorter "
+            "dt, integrator='exact', or smaller stiffness, velocity and force."
+        )

@@ -7,6 +7,7 @@ from torch_pbd.control.matrices import check_finite
 from torch_pbd.control.schedule import Schedule
 
 Floats = NDArray[np.float64]
+_LARGEST = 1e100  # squares are numbers
 Range = float | tuple[float, float]
 
 
@@ -43,10 +44,11 @@ def _uniform(draw: np.random.RandomState, name: str, limits: Range, n: int, unit
 
 
 def _pair(name: str, limits: tuple[float, float]) -> tuple[float, float]:
-    if len(limits) != 2:
+    if not isinstance(limits, tuple | list) or len(limits) != 2:
         raise ValueError(f"{name} == {limits!r}, must be two numbers, the least and the largest.")
     for value in limits:
         check_finite(name, value)
+        check_not_negative(name, abs(value))
     if limits[0] > limits[1]:
         raise ValueError(f"{name} == {limits!r}, must be the least and then the largest.")
     return limits
@@ -55,6 +57,6 @@ def _pair(name: str, limits: tuple[float, float]) -> tuple[float, float]:
 def check_not_negative(name: str, value: float) -> float:
     """Check that a parameter is a finite number of at least 0; returns it."""
     check_finite(name, value)
-    if value < 0.0:
-        raise ValueError(f"{name} == {value:g}, must not be negative.")
+    if not 0.0 <= value <= _LARGEST:
+        raise ValueError(f"{name} == {value:g}, must not be negative, and at most {_LARGEST:g}.")
     return value

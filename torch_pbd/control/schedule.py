@@ -21,9 +21,12 @@ from torch_pbd.control.schedule_checks import (
     require,
 )
 from torch_pbd.control.schedule_files import read_schedule, write_schedule
+from torch_pbd.memory import require_much
 
 if TYPE_CHECKING:
     from torch_pbd.control.stability_report import StabilityReport
+
+_SLOWEST = 1e-9
 
 
 @final
@@ -192,6 +195,8 @@ class Schedule:
             If ``speed`` is not positive, or none of the guarantees of the report holds at it with ``mass``.
         """
         check_positive("speed", speed)
+        if not _SLOWEST <= speed <= 1.0 / _SLOWEST:
+            raise ValueError(f"speed={speed:g} must be from {_SLOWEST:g} to {1.0 / _SLOWEST:g} times as fast.")
         report = None if mass is None else self.certify(mass=mass, speed=speed)
         if report is not None and not report.stable:
             raise ValueError(
@@ -262,6 +267,8 @@ class Schedule:
 
     def _ticks(self, rate: float) -> Floats:
         check_positive("rate", rate)
+        d, rows = self.n_outputs, self.duration * rate + 1.0
+        require_much(3 * 8.0 * rows * (2 + 2 * d + 3 * d * d), what=f"rate={rate:g} Hz", remedy="Lower rate.")
         n_ticks = count_intervals(self.duration, rate)
         if n_ticks < 1:
             raise ValueError(

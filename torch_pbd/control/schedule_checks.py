@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torch_pbd.arguments import from_tensor, is_finite
+
 ARRAY_DIMS = {"time": 1, "position": 2, "velocity": 2, "stiffness": 3, "damping": 3, "covariance": 3, "type1": 1}
 """Every array of a schedule with its number of axes: (n,), (n, d) or (n, d, d)."""
 
@@ -42,7 +44,7 @@ def check_positive(name: str, value: Any) -> None:
     if (
         isinstance(value, bool)
         or not isinstance(value, int | float | np.integer | np.floating)
-        or not 0.0 < value < math.inf
+        or not (value > 0.0 and is_finite(value))
     ):
         raise ValueError(f"{name} is {value!r}, it must be a positive number.")
 
@@ -106,6 +108,8 @@ def as_floats(values: Any, name: str, n_dims: int) -> Floats:
     """Copy as float64 of an array whose entries are finite and whose squares are too."""
     if np.ma.is_masked(values):
         raise ValueError(f"{name} has masked entries: fill them in first.")
+    if hasattr(values, "detach"):
+        values = from_tensor(values, name)
     try:
         given = np.asarray(values)
     except ValueError as error:
@@ -153,6 +157,8 @@ def _json_copy(value: Any, where: str) -> Any:
         return {key: _json_copy(entry, f"{where}[{key!r}]") for key, entry in value.items()}
     if isinstance(value, list | tuple):
         return [_json_copy(entry, f"{where}[{i}]") for i, entry in enumerate(value)]
+    if isinstance(value, np.generic):
+        value = value.item()
     if value is None or isinstance(value, bool | int | str) or (isinstance(value, float) and math.isfinite(value)):
         return value
     raise ValueError(

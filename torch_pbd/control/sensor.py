@@ -5,11 +5,13 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Integral, Real
-from typing import NamedTuple, final
+from typing import Any, NamedTuple, final
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from torch_pbd.control.matrices import as_tensor, is_finite
 
 
 class Reading(NamedTuple):
@@ -116,7 +118,9 @@ class ForceSensor:
         delay_steps = max(0, round(rate / cutoff - lag))
         return cls(0.3, noise_scale=0.05, resolution=200.0 / 2**13, cutoff=cutoff, delay_steps=delay_steps)
 
-    def start(self, like: Float[Tensor, "*b d"], dt: float, generator: torch.Generator | None = None) -> "ForceReader":
+    def start(
+        self, like: Float[Tensor, "*b d"] | Any, dt: float, generator: torch.Generator | Any = None
+    ) -> "ForceReader":
         """A sensor at rest, to be called with the true force once a tick.
 
         Parameters
@@ -135,13 +139,16 @@ class ForceSensor:
             generator.
         """
         _check_number("dt", dt, math.ulp(0.0), "finite and above 0: the length of a tick in s")
-        if not like.is_floating_point() or like.ndim == 0:
-            raise ValueError(f"like is {like.dtype} of shape {tuple(like.shape)}: forces are floats (..., d).")
+        if not isinstance(like, Tensor) or not like.is_floating_point() or like.ndim == 0:
+            kind = f"{like.dtype} of shape {tuple(like.shape)}" if isinstance(like, Tensor) else type(like).__name__
+            raise ValueError(f"like is {kind}: forces are tensors of floats (..., d).")
         if isinstance(self.bias, tuple) and len(self.bias) != like.shape[-1]:
             raise ValueError(
                 f"bias has {len(self.bias)} values, but the force has {like.shape[-1]} axes: give one for each axis, "
                 "or one number for all."
             )
+        if generator is not None and not isinstance(generator, torch.Generator):
+            raise ValueError(f"generator == {generator!r}, must be a torch.Generator or None.")
         if self.noise_scale > 0 and generator is None:
             raise ValueError(
                 f"noise_scale={self.noise_scale} needs a generator: pass torch.Generator().manual_seed(...), or set "
@@ -149,7 +156,9 @@ class ForceSensor:
             )
         return ForceReader(self, like, dt, generator)
 
-    def measure(self, force: Float[Tensor, "*b t d"], dt: float, generator: torch.Generator | None = None) -> Reading:
+    def measure(
+        self, force: Float[Tensor, "*b t d"] | Any, dt: float, generator: torch.Generator | Any = None
+    ) -> Reading:
         """Readings of a recorded force: equal to the bit to calling the reader once a tick.
 
         Parameters
@@ -171,6 +180,7 @@ class ForceSensor:
         ValueError
             If the recording has no tick, or as by :meth:`start`.
         """
+        force = as_tensor(force, "force")
         if force.ndim < 2 or force.shape[-2] == 0:
             raise ValueError(
                 f"force has shape {tuple(force.shape)}: a recording is (..., T, d) with at least one tick."
@@ -256,7 +266,7 @@ def apply_deadband(force: Float[Tensor, "*b d"], deadband: float) -> Float[Tenso
     return force - force.clamp(-deadband, deadband)
 
 
-def tare(readings: Float[Tensor, "*b n d"]) -> Float[Tensor, "*b d"]:
+def tare(readings: Float[Tensor, "*b n d"] | Any) -> Float[Tensor, "*b d"]:
     """The bias of a sensor from readings at rest: their mean, to be subtracted from later readings.
 
     Parameters
@@ -270,6 +280,7 @@ def tare(readings: Float[Tensor, "*b n d"]) -> Float[Tensor, "*b d"]:
     ValueError
         If there is no reading, or one is not finite.
     """
+    readings = as_tensor(readings, "readings")
     if readings.ndim < 2 or readings.shape[-2] == 0:
         raise ValueError(
             f"readings has shape {tuple(readings.shape)}: a tare needs (..., n, d) with at least one of n."
@@ -282,5 +293,5 @@ def tare(readings: Float[Tensor, "*b n d"]) -> Float[Tensor, "*b d"]:
 
 
 def _check_number(name: str, value: object, least: float, must: str) -> None:
-    if not isinstance(value, Real) or not math.isfinite(value) or value < least:
+    if isinstance(value, bool) or not isinstance(value, Real) or not is_finite(value) or value < least:
         raise ValueError(f"{name}={value!r} must be {must}.")

@@ -6,11 +6,12 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from sklearn.utils import check_random_state
 
+from torch_pbd.arguments import as_floats
 from torch_pbd.control.plant import AdmittancePlant
 from torch_pbd.control.rollout import Rollout
 from torch_pbd.control.schedule import Schedule
+from torch_pbd.seeds import as_random_state
 
 
 def simulate_schedule(
@@ -35,16 +36,23 @@ def simulate_schedule(
         If the force has not one row for each tick.
     """
     shape = schedule.position.shape
-    push = np.zeros(shape) if force is None else np.array(force, dtype=np.float64)
+    push = np.zeros(shape) if force is None else as_floats(force, "force")
     if push.shape != shape:
         raise ValueError(
             f"force has shape {push.shape}, must have shape {shape}: one row in N for each tick of "
             f"schedule(rate={rate:g})."
         )
+    check_plant(robot)
     warn_of_mass(robot, mass, stacklevel=4)
     parts = (schedule.position, schedule.velocity, schedule.stiffness, schedule.damping, push)
-    generator = torch.Generator().manual_seed(int(check_random_state(random_state).randint(2**31 - 1)))
+    generator = torch.Generator().manual_seed(int(as_random_state(random_state).randint(2**31 - 1)))
     return robot.simulate(*map(_tensor, parts), dt=1.0 / rate, generator=generator).numpy()
+
+
+def check_plant(plant: Any) -> None:
+    """Check that a plant is one."""
+    if not isinstance(plant, AdmittancePlant):
+        raise ValueError(f"plant == {plant!r}, must be an AdmittancePlant or None.")
 
 
 def warn_of_mass(robot: AdmittancePlant, mass: float, *, stacklevel: int) -> None:

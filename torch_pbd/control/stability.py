@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torch_pbd.control.coupling import stiffest_environment
 from torch_pbd.control.damping import required_damping_ratio
-from torch_pbd.control.matrices import check_mass, check_positive
+from torch_pbd.control.matrices import as_mass, as_rows, as_semidefinite, check_positive
 from torch_pbd.control.passivity import lyapunov_matrix
 from torch_pbd.control.position_loop import PositionLoop
 from torch_pbd.control.stability_report import StabilityReport
@@ -30,7 +30,7 @@ def certify(
     *,
     mass: Any = 1.0,
     speed: float = 1.0,
-    position_loop: PositionLoop | None = None,
+    position_loop: PositionLoop | Any = None,
     force_cutoff: float | None = 500.0,
     dt: float = 0.001,
 ) -> StabilityReport:
@@ -70,9 +70,11 @@ def certify(
     check_positive("dt", dt, "s")
     if force_cutoff is not None:
         check_positive("force_cutoff", force_cutoff, "Hz")
-    time, stiffness, damping = map(_door, (schedule.time, schedule.stiffness, schedule.damping))
-    inertia = _door(mass)
-    check_mass(inertia)
+    if position_loop is not None and not isinstance(position_loop, PositionLoop):
+        raise ValueError(f"position_loop == {position_loop!r}, must be a PositionLoop or None.")
+    time, stiffness, damping = _rows_of(schedule)
+    inertia = _door(as_mass(mass))
+    is_number = not inertia.ndim
     inertia = inertia if inertia.ndim else inertia * torch.eye(stiffness.shape[-1]).to(stiffness)
     if inertia.shape != stiffness.shape[1:]:
         raise ValueError(f"mass has shape {tuple(inertia.shape)}, must be a number or {tuple(stiffness.shape[1:])}.")
@@ -95,8 +97,26 @@ def certify(
         gain=_gain(time / speed, stiffness, damping, inertia),
         environment_stiffness=stiffest_environment(stiffness, damping, inertia, loop, force_cutoff, dt),
         speed=float(speed),
-        mass=float(_door(mass)) if not _door(mass).ndim else tuple(map(tuple, inertia.tolist())),
+        mass=float(inertia[0, 0]) if is_number else tuple(map(tuple, inertia.tolist())),
     )
+
+
+def _rows_of(schedule: Any) -> tuple[Tensor, Tensor, Tensor]:
+    """Times, stiffness and damping of what may be a schedule, checked as a schedule's are."""
+    missing = [name for name in ("time", "stiffness", "damping") if not hasattr(schedule, name)]
+    if missing:
+        raise ValueError(f"schedule is a {type(schedule).__name__} without {', '.join(missing)}: give a Schedule.")
+    time = _door(as_rows(schedule.time, "schedule.time", 1))
+    if time.ndim != 1 or len(time) < 2 or not bool((time.diff() > 0.0).all()):
+        raise ValueError(f"schedule.time has shape {tuple(time.shape)}, must be two or more times that increase.")
+    gains = [_door(as_semidefinite(getattr(schedule, name), f"schedule.{name}")) for name in ("stiffness", "damping")]
+    for name, gain in zip(("stiffness", "damping"), gains, strict=True):
+        if gain.ndim != 3 or gain.shape != gains[0].shape or len(gain) != len(time):
+            raise ValueError(
+                f"schedule.{name} has shape {tuple(gain.shape)}, must have shape (n, d, d) with n = {len(time)}, the "
+                "number of times."
+            )
+    return time, gains[0], gains[1]
 
 
 def _door(values: Any) -> Tensor:

@@ -9,11 +9,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torch_pbd.control.matrices import as_semidefinite, check_finite
+from torch_pbd.control.matrices import as_semidefinite, check_finite, check_flag
 from torch_pbd.linalg import spectral_map
 
 Bounds = Literal["quantile", "sigma", "variance"]
 _QUANTILES = (0.1, 0.9)
+_SMALLEST = 1e-150  # deviation whose square is a number
 
 
 @final
@@ -61,6 +62,7 @@ class StiffnessLaw:
     smooth: bool = False
 
     def __post_init__(self) -> None:
+        check_flag("smooth", self.smooth)
         if self.bounds not in get_args(Bounds):
             raise ValueError(f"bounds == {self.bounds!r}, must be one of {', '.join(map(repr, get_args(Bounds)))}.")
         for name in ("stiffness_min", "stiffness_max", "sigma_low", "sigma_high"):
@@ -105,7 +107,10 @@ class StiffnessLaw:
         With bounds="quantile" and covariances that do not vary at all, every axis counts as precise, and a
         warning says so.
         """
-        low, high = self._resolved(as_semidefinite(covariance, "covariance"), resolution)
+        check_finite("resolution", resolution)
+        if resolution < 0.0:
+            raise ValueError(f"resolution == {resolution:g}, must not be negative.")
+        low, high = self._resolved(as_semidefinite(covariance, "covariance"), float(resolution))
         return replace(self, sigma_low=low, sigma_high=high, bounds="sigma")
 
     def lipschitz(self) -> float:
@@ -157,7 +162,8 @@ class StiffnessLaw:
                 "bounds='sigma' to say what is precise.",
                 stacklevel=3,
             )
-            return high * (1.0 + 1e-6) or 1.0, (high * (1.0 + 1e-6) or 1.0) * 2.0
+            precise = max(high * (1.0 + 1e-6), _SMALLEST) if high else 1.0
+            return precise, 2.0 * precise
         return low, high
 
 

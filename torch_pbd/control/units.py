@@ -53,7 +53,7 @@ def duration_of(demonstrations: Demonstrations, duration: float | None) -> tuple
     """
     own = float(np.median([time[-1] - time[0] for time in demonstrations.times]))
     if duration is not None:
-        return duration, duration / own
+        return float(duration), duration / own
     scale = in_seconds(demonstrations.time_unit)
     if scale is None:
         warnings.warn(

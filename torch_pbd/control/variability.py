@@ -12,7 +12,7 @@ from torch_pbd.estimators.cholesky import CholeskyCovRegressor
 Floats = NDArray[np.float64]
 
 _RESOLUTION = 1e-5  # of the extent of a movement: smaller standard deviations count as none
-_ROUNDING = 1e-9  # of the largest position
+_ROUNDING = 1e-11  # of the largest position
 
 
 def fit_covariance(regressor: CovarianceRegressor | None, inputs: Floats, varying: Floats) -> CovarianceRegressor:
@@ -27,5 +27,5 @@ def fit_law(law: StiffnessLaw | None, covariance: Floats, varying: Floats) -> St
     """Fix the bounds of a law to covariances (m, d, d) along a movement, of what varies (K, n, d)."""
     extent, largest = float(np.linalg.norm(np.ptp(varying, axis=(0, 1)))), float(np.abs(varying).max())
     if extent <= _ROUNDING * largest:  # nothing moves: the regressor's own floor is in units of the position
-        extent = largest
+        extent = largest or 1.0
     return (StiffnessLaw() if law is None else law).fitted(covariance, resolution=_RESOLUTION * extent)

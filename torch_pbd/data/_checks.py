@@ -6,8 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torch_pbd.arguments import from_tensor
 from torch_pbd.data._missing import drop_missing
 from torch_pbd.data.alignment import Floats
+from torch_pbd.memory import require_much
 
 MIN_SAMPLES = 2
 
@@ -41,6 +43,8 @@ def as_recordings(times: Any, positions: Any, missing: str) -> tuple[tuple[Float
 
 def as_labels(labels: str | Sequence[str], n_outputs: int, argument: str) -> tuple[str, ...]:
     """One string for each output."""
+    if not isinstance(labels, str | list | tuple | np.ndarray) or (not np.ndim(labels) and not isinstance(labels, str)):
+        raise ValueError(f"{argument} is {labels!r}, must be strings: one for each output.")
     values = (labels,) if isinstance(labels, str) else tuple(labels)
     if not all(isinstance(value, str) for value in values):
         raise ValueError(f"{argument} must be strings, one for each output; got {values}.")
@@ -60,14 +64,15 @@ def preview(values: Sequence[object], limit: int = 12) -> str:
 
 def check_choice(value: str, choices: Sequence[str], argument: str) -> None:
     """A string that must be one of a few."""
-    if value not in choices:
+    if not isinstance(value, str) or value not in choices:
         raise ValueError(f"{argument}={value!r} is not one of {', '.join(map(repr, choices))}.")
 
 
 def check_n_steps(n: int) -> None:
     """A number of samples."""
-    if isinstance(n, bool) or not isinstance(n, int | np.integer) or n < MIN_SAMPLES:
+    if isinstance(n, bool) or not isinstance(n, int | np.integer) or not MIN_SAMPLES <= n < 2**53:
         raise ValueError(f"n={n!r} must be an integer of at least {MIN_SAMPLES}: the number of points.")
+    require_much(64.0 * n, what=f"n={n} points", remedy="Lower it.")
 
 
 def _as_list(values: Any, argument: str) -> list[Any]:
@@ -83,6 +88,8 @@ def _as_list(values: Any, argument: str) -> list[Any]:
 
 
 def _as_numbers(values: Any, argument: str, drop: bool) -> NDArray[Any]:
+    if hasattr(values, "detach"):
+        values = from_tensor(values, argument)
     if np.ma.is_masked(values):
         if not drop:
             raise ValueError(

@@ -5,6 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from torch_pbd.arguments import as_floats
+from torch_pbd.memory import require_much
+
 Floats = NDArray[np.float64]
 
 
@@ -80,7 +83,7 @@ def dtw_path(a: ArrayLike, b: ArrayLike) -> NDArray[np.intp]:
     H. Sakoe, S. Chiba, "Dynamic programming algorithm optimization for spoken word recognition", IEEE
     Transactions on Acoustics, Speech, and Signal Processing 26, 1978.
     """
-    first, second = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
+    first, second = as_floats(a, "a"), as_floats(b, "b")
     if first.ndim != 2 or second.ndim != 2 or first.shape[1] != second.shape[1]:
         raise ValueError(
             "dtw_path compares curves of shape (n, d) and (m, d) with the same d; got "
@@ -88,6 +91,9 @@ def dtw_path(a: ArrayLike, b: ArrayLike) -> NDArray[np.intp]:
         )
     if not first.size or not second.size:
         raise ValueError(f"dtw_path needs at least one sample in each curve; got {first.shape}, {second.shape}.")
+    for name, curve in (("a", first), ("b", second)):
+        if not np.isfinite(curve).all():
+            raise ValueError(f"{name} has a value that is not finite: drop or fill in such samples first.")
     return _backtrack(_accumulated_cost(first, second))
 
 
@@ -131,6 +137,7 @@ def _monotone_match(path: NDArray[np.intp]) -> Floats:
 def _accumulated_cost(a: Floats, b: Floats) -> Floats:
     """Least cost (n + 1, m + 1) of a path to each pair; row and column 0 are the border."""
     n, m = len(a), len(b)
+    require_much(24.0 * n * m, what=f"dynamic time warping of {n} by {m} samples", remedy="Take fewer, by n.")
     cost = np.zeros((n, m))
     for column_a, column_b in zip(a.T, b.T, strict=True):
         cost += np.subtract.outer(column_a, column_b) ** 2

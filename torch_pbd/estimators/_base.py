@@ -10,7 +10,6 @@ import torch
 from numpy.typing import ArrayLike
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.utils import check_random_state
 from sklearn.utils._tags import Tags
 from sklearn.utils.validation import check_is_fitted
 from torch import Tensor
@@ -25,14 +24,17 @@ from torch_pbd.estimators._validation import (
     check_inputs_vary,
     check_number,
     check_squares,
+    check_weights,
     checked_queries,
     checked_rows,
     prior_covariance,
 )
 from torch_pbd.linalg import gaussian_log_density, safe_cholesky, student_log_density
+from torch_pbd.memory import require_much
 from torch_pbd.models.conditional import ConditionalNormal
 from torch_pbd.models.spec import module_from_spec, module_spec
 from torch_pbd.optim import Progress
+from torch_pbd.seeds import as_random_state
 
 
 class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
@@ -73,6 +75,7 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
 
     def _learn(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None = None) -> Self:
         """Check everything, fit, and keep what was learned."""
+        self.__dict__.pop("module_", None)  # a fit that fails leaves no mixture of two
         self._check_parameters()
         # Columns side by side: what is asked of each is many times as fast.
         inputs, targets = map(np.asfortranarray, checked_rows(self, X, y, ensure_min_samples=2))
@@ -107,6 +110,9 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
     def _fit(self, X: Floats, y: Floats, **told: Any) -> Fitted:
         """Fit on validated arrays (n, e) and (n, d); ``told`` may hold the demonstrations' numbers (n,)."""
 
+    def __sklearn_is_fitted__(self) -> bool:
+        return "module_" in vars(self)
+
     def _prepare(self) -> None:
         """Work out what predictions need of the module alone."""
 
@@ -115,7 +121,9 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         check_number(self.max_iter, "max_iter", low=1, integer=True)
         check_number(self.tol, "tol", low=0.0, strict=True)
         check_number(self.n_restarts, "n_restarts", low=0, integer=True)
-        check_number(self.verbose, "verbose", low=0, integer=True)
+        if not isinstance(self.verbose, bool):
+            check_number(self.verbose, "verbose", low=0, integer=True)
+        as_random_state(self.random_state)
         if problem := self._device_problem():
             raise ValueError(f"device == {self.device!r} cannot be used here: {problem}. None is the CPU.")
 
@@ -183,8 +191,10 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         sample_weight : array-like of shape (n_samples,), default=None
             Of the rows in the mean. A pipeline asks for it where metadata are routed.
         """
-        weights = None if sample_weight is None else np.asarray(sample_weight, dtype=np.float64)
-        return float(np.average(self.log_likelihood(X, y), weights=weights))
+        densities = self.log_likelihood(X, y)
+        if sample_weight is None:
+            return float(densities.mean())
+        return float(np.average(densities, weights=check_weights(sample_weight, len(densities))))
 
     def sample_y(self, X: ArrayLike, n_samples: int = 1, random_state: Any = None) -> Floats:
         """Draw y at X, independently for each row.
@@ -194,8 +204,13 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         ndarray of shape (n_samples_X, n_outputs, n_samples), or (n_samples_X, n_samples) if y was 1-D
         """
         check_number(n_samples, "n_samples", low=1, integer=True)
-        generator = check_random_state(random_state)
+        generator = as_random_state(random_state)
         x = self._query(X)
+        require_much(
+            4 * 8.0 * len(x) * self.n_outputs_ * n_samples,
+            what=f"n_samples == {n_samples} at {len(x)} rows",
+            remedy="Draw fewer at a time.",
+        )
         mean, scale_tril = (part.cpu().numpy() for part in self._tensors(self._mean_and_tril, x))
         normal = generator.standard_normal((*mean.shape, n_samples))
         degrees = self._degrees(x)
@@ -262,7 +277,13 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         """Why no tensor can be put on the device; empty if it can."""
         try:
             self._door(0.0)
-        except (AssertionError, RuntimeError, TypeError) as error:  # torch's, by build and by device
+        except (
+            AssertionError,
+            OverflowError,
+            RuntimeError,
+            TypeError,
+            ValueError,
+        ) as error:  # torch's, by build and by device
             return str(error).partition("\n")[0].rstrip(".")
         return ""
 

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torch_pbd.arguments import from_tensor
 from torch_pbd.data import Demonstrations, check_unimodal
 from torch_pbd.estimators._validation import Floats
 from torch_pbd.exceptions import DataRankWarning
@@ -21,21 +22,36 @@ def check_groups(groups: Any, n_samples: int) -> NDArray[np.intp]:
     ValueError
         If there is not one label a row, or one is missing.
     """
-    labels = np.asarray(groups)
+    labels = _as_labels(groups)
     if labels.shape != (n_samples,):
         raise ValueError(
             f"groups has shape {labels.shape}, must have shape ({n_samples},): the demonstration of each row of X."
         )
     if labels.dtype.kind == "f" and not np.isfinite(labels).all():
         raise ValueError(f"groups has a label that is not finite, at index {int(np.argmin(np.isfinite(labels)))}.")
+    if labels.dtype.kind in "mM" and np.isnat(labels).any():
+        raise ValueError(f"groups has no label at index {int(np.argmax(np.isnat(labels)))}: it is NaT.")
     if labels.dtype.kind == "O":
         _check_labels(labels)
     return np.unique(labels, return_inverse=True)[1].reshape(-1)
 
 
+def _as_labels(groups: Any) -> NDArray[Any]:
+    if hasattr(groups, "detach"):
+        groups = from_tensor(groups, "groups")
+    if np.ma.is_masked(groups):
+        raise ValueError("groups has masked entries: say of every row which demonstration it is of.")
+    if isinstance(groups, list | tuple) and len({isinstance(label, str) for label in groups}) > 1:
+        groups = np.fromiter(groups, dtype=object, count=len(groups))  # NumPy would make text of the numbers
+    try:
+        return np.asarray(groups)
+    except ValueError as error:
+        raise ValueError(f"groups is ragged: give one label for each row of X ({error}).") from error
+
+
 def _check_labels(labels: NDArray[Any]) -> None:
     for i, label in enumerate(labels):
-        if label is None or label != label:
+        if label is None or type(label).__name__ == "NAType" or label != label:
             raise ValueError(f"groups has no label at index {i}: say of every row which demonstration it is of.")
     kinds = {type(label) for label in labels}
     if len(kinds) > 1:

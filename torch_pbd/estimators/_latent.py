@@ -31,12 +31,11 @@ from torch_pbd.gp import (
 )
 from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky, scale_tril_from_root
-from torch_pbd.memory import require_memory
+from torch_pbd.memory import require_much
 from torch_pbd.models.conditional import MeanAndCovariance
 from torch_pbd.models.training import TrainingSet
 from torch_pbd.optim import FitReport
 
-_LITTLE = 2.0**26  # bytes that are not asked for
 _STRETCHED = 10.0  # an amplitude of so many times the values
 # Spacings of the inputs that an interpolating process may be as short as, and ranges that others may be as long as:
 # with longer ones the prior of a covariance would never take over.
@@ -117,6 +116,14 @@ class LatentCovarianceRegressor(CovarianceRegressor):
     def _works_on_empirical(self, inputs: Floats, counts: Any, n_outputs: int) -> bool:
         """Decide the objective; ``inputs`` are the distinct ones, with their counts."""
         fewest = int(counts.min())
+        if self.objective == "likelihood" and 2 <= fewest <= n_outputs:
+            warnings.warn(
+                f"y has {fewest} demonstrations at an input but {n_outputs} outputs: the likelihood then takes for "
+                f"certain what was only not seen to vary. {n_outputs + 1} or more demonstrations determine the "
+                "covariance; objective='auto' shrinks it.",
+                DataRankWarning,
+                stacklevel=5,
+            )
         if self.objective == "likelihood" or (self.objective == "auto" and fewest < 2):
             return False
         if fewest < 2:
@@ -191,9 +198,7 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         n_inputs = min(n_distinct, self.max_inputs)
         n_processes = (n_outputs + 1) ** 2  # at most
         needed = 8.0 * n_inputs**2 * n_processes * 4
-        if needed < _LITTLE:  # to ask takes a millisecond
-            return
-        require_memory(
+        require_much(
             needed,
             what=f"max_inputs == {self.max_inputs} lets {n_inputs} distinct inputs into kernel matrices, which",
             remedy="Lower max_inputs.",

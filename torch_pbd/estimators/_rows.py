@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torch_pbd.estimators._validation import Floats
+from torch_pbd.memory import require_much
 
 _CHUNK = 1024
 
@@ -16,6 +17,12 @@ def by_chunks(function: Callable[[Any], Any], x: Tensor | Floats) -> Any:
     """What a function of rows gives for all rows of x; what it needs on the way is of a bounded number of them."""
     if len(x) <= _CHUNK:
         return function(x)
-    parts = zip(*(function(x[start : start + _CHUNK]) for start in range(0, len(x), _CHUNK)), strict=True)
+    first = function(x[:_CHUNK])
+    require_much(
+        2.0 * len(x) / _CHUNK * sum(part.nbytes for part in first),  # in parts, and joined
+        what=f"what is predicted for {len(x)} rows",
+        remedy="Predict fewer at a time.",
+    )
+    others = (function(x[start : start + _CHUNK]) for start in range(_CHUNK, len(x), _CHUNK))
     joined: Any = torch.cat if isinstance(x, Tensor) else np.concatenate
-    return tuple(joined(part) for part in parts)
+    return tuple(joined(part) for part in zip(first, *others, strict=True))

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import issparse
 from sklearn.utils.validation import check_is_fitted, check_scalar, validate_data
 
+from torch_pbd.arguments import as_array, check_finite, from_tensor, is_finite
 from torch_pbd.exceptions import DataRankWarning
 
 Floats = NDArray[np.float64]
@@ -26,45 +27,37 @@ _LARGEST = 1e140
 
 
 def as_plain_array(values: Any, name: str) -> Any:
-    """``values`` with a torch tensor turned into an array, and refused where numbers would lose meaning.
+    """``values`` with a torch tensor turned into an array, and refused where they are no numbers or would lose meaning.
 
     Raises
     ------
+    TypeError
+        If an entry is no number at all.
     ValueError
-        If ``values`` holds text, or is of a float type too coarse for its spread: unix time in float32 has
-        steps of 128 s.
+        If ``values`` is ragged, masked, complex, or holds text or dates; or is of a float type too coarse for its
+        spread: unix time in float32 has steps of 128 s.
     """
     if hasattr(values, "detach"):
-        values = _from_tensor(values, name)
-    for label, part in _parts(values):
-        text = part.dtype.kind in "US" or (
-            part.dtype.kind == "O" and any(isinstance(entry, str | bytes) for entry in part.flat)
-        )
-        if text:
-            raise ValueError(
-                f"{name} holds text, which dtype='numeric' is not compatible with: convert it to numbers first."
-            )
+        values = from_tensor(values, name)
+    for label, part in _parts(values, name):
         if part.dtype in (np.float16, np.float32) and part.size:
             _check_resolution(part, name, label)
     return values
 
 
-def _from_tensor(values: Any, name: str) -> Any:
-    try:
-        return values.detach().cpu().numpy()
-    except TypeError as error:  # bfloat16 and smaller
-        raise ValueError(f"{name} is a tensor of {values.dtype}, which is too coarse: record it in float64.") from error
-
-
-def _parts(values: Any) -> list[tuple[Any, NDArray[Any]]]:
+def _parts(values: Any, name: str) -> list[tuple[Any, NDArray[Any]]]:
     """Arrays that ``values`` consists of: the columns of a data frame, with their names; or itself."""
     if hasattr(values, "columns"):
-        return [(label, np.asarray(values[label])) for label in values.columns]
-    if isinstance(values, np.ndarray):
-        return [(None, values)]
-    if hasattr(values, "__array__") or (isinstance(values, list | tuple) and values):
-        return [(None, np.asarray(values))]
-    return []
+        return [(label, as_array(values[label], f"column {label} of {name}")) for label in values.columns]
+    return [] if issparse(values) else [(None, as_array(values, name))]  # scikit-learn says more of the sparse
+
+
+def checked_values(values: Any, name: str) -> Any:
+    """The same, and all of it finite."""
+    values = as_plain_array(values, name)
+    for label, part in _parts(values, name):
+        check_finite(part, name, label)
+    return values
 
 
 def _check_resolution(array: NDArray[Any], name: str, label: Any) -> None:
@@ -87,7 +80,9 @@ def checked_rows(estimator: Any, X: ArrayLike, y: ArrayLike, **options: Any) -> 
     """X (n, e) and y (n,) or (n, d) in float64, checked by scikit-learn and by us."""
     if issparse(y):
         raise TypeError("Sparse data was passed for y, but dense data is required. Use '.toarray()'.")
-    X, y = as_plain_array(X, "X"), as_plain_array(y, "y")
+    X, y = checked_values(X, "X"), checked_values(y, "y")
+    if y is not None and not np.ndim(y):
+        raise ValueError(f"y is {y!r}, must be an array: one row for each row of X.")
     checked: Any = validate_data(estimator, X, y, dtype=np.float64, y_numeric=True, multi_output=True, **options)
     return checked[0], np.asarray(checked[1], dtype=np.float64)
 
@@ -97,7 +92,7 @@ def checked_queries(estimator: Any, X: ArrayLike) -> Floats:
     if _is_plain(X, vars(estimator)):
         return np.asarray(X)
     check_is_fitted(estimator)
-    X = as_plain_array(X, "X")
+    X = checked_values(X, "X")
     least = 0 if getattr(X, "shape", (1,))[0] == 0 and np.ndim(X) == 2 else 1
     return validate_data(estimator, X, dtype=np.float64, reset=False, ensure_min_samples=least)
 
@@ -117,6 +112,16 @@ def _is_plain(X: Any, fitted: Mapping[str, Any]) -> bool:
         and "feature_names_in_" not in fitted
         and bool(np.isfinite(X).all())
     )
+
+
+def check_weights(sample_weight: Any, n_samples: int) -> Floats:
+    """Weights (n,) of rows: finite, none negative, not all zero."""
+    weights = _as_floats(sample_weight, "sample_weight")
+    if weights.shape != (n_samples,):
+        raise ValueError(f"sample_weight has shape {weights.shape}, must have shape ({n_samples},): one for each row.")
+    if not (np.isfinite(weights).all() and (weights >= 0).all() and weights.any()):
+        raise ValueError("sample_weight must be finite, not negative, and above zero somewhere.")
+    return weights
 
 
 def check_squares(array: Floats, name: str) -> None:
@@ -172,14 +177,16 @@ def check_number(
         return
     boundaries = "neither" if strict else "left"
     kind = Integral if integer else Real
+    if isinstance(value, bool | np.bool_):
+        raise TypeError(f"{name} must be an instance of {'int' if integer else 'float'}, not bool; it is {value}.")
     check_scalar(value, name, kind, min_val=low, include_boundaries=boundaries)
-    if not np.isfinite(value):
+    if not is_finite(value):
         raise ValueError(f"{name} == {value}, must be finite.")
 
 
 def check_choice(value: Any, name: str, choices: tuple[str, ...]) -> None:
     """Check that a parameter is one of some strings."""
-    if value not in choices:
+    if not isinstance(value, str) or value not in choices:
         raise ValueError(f"{name} == {value!r}, must be one of {', '.join(map(repr, choices))}.")
 
 
@@ -231,7 +238,12 @@ def prior_covariance(prior: Prior, X: Floats, n_outputs: int) -> Floats:
     """
     shape: tuple[int, ...] = (n_outputs, n_outputs)
     if callable(prior):
-        covariance = _as_floats(prior(X.copy()), "prior(X)")
+        try:
+            value = prior(X.copy())
+        except Exception as error:
+            error.add_note(f"Raised by prior(X), which was asked for covariances at X of shape {X.shape}.")
+            raise
+        covariance = _as_floats(value, "prior(X)")
         name, shape = "prior(X)", (len(X), *shape)
     else:
         covariance = _as_floats(prior, "prior")
@@ -248,7 +260,10 @@ def prior_covariance(prior: Prior, X: Floats, n_outputs: int) -> Floats:
 
 def _as_floats(value: Any, name: str) -> Floats:
     try:
-        return np.array(as_plain_array(value, name), dtype=np.float64)
+        array = np.array(as_plain_array(value, name))
+        if array.dtype.kind == "b":
+            raise TypeError("not bool")
+        return array.astype(np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} == {value!r}, must be numbers ({error}).") from error
 

@@ -6,7 +6,6 @@ from typing import Any, Literal, Self
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
-from sklearn.utils import check_random_state
 
 from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.estimators._demonstrations import check_demonstrations
@@ -25,6 +24,7 @@ from torch_pbd.estimators._validation import (
 from torch_pbd.gp.inducing import FeatureMap, inducing_inputs
 from torch_pbd.kernels import KERNELS, KernelName
 from torch_pbd.linalg import safe_cholesky
+from torch_pbd.memory import require_much
 from torch_pbd.models.heteroscedastic import (
     Families,
     HeteroscedasticFit,
@@ -35,6 +35,7 @@ from torch_pbd.models.heteroscedastic import (
 )
 from torch_pbd.models.training import TrainingSet
 from torch_pbd.optim import FitReport
+from torch_pbd.seeds import as_random_state
 
 # Prior medians of length scale (in ranges of the input) and amplitude, and prior deviation of the constant. Means
 # are of outputs with unit variance, log variances and coefficients of residuals with a pooled unit covariance.
@@ -236,9 +237,14 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         ndarray of shape (n_samples_X, n_outputs, n_outputs, n_samples)
         """
         check_number(n_samples, "n_samples", low=1, integer=True)
-        generator = check_random_state(random_state)
+        generator = as_random_state(random_state)
         x = self._query(X)
         core: Any = self.module_.core
+        require_much(
+            8.0 * n_samples * (len(x) * self.n_outputs_**2 + 3 * sum(core.draw_sizes())),
+            what=f"n_samples == {n_samples} at {len(x)} rows",
+            remedy="Draw fewer at a time.",
+        )
         normal = [[self._door(generator.standard_normal(size)) for size in core.draw_sizes()] for _ in range(n_samples)]
         drawn = [torch.stack(of_process) for of_process in zip(*normal, strict=True)]
         result = np.empty((len(x), self.n_outputs_, self.n_outputs_, n_samples))
@@ -266,6 +272,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         scaling = Standardization.of(X, y)
         standardized = scaling.inputs(X)
         inputs, index = distinct_rows(standardized)
+        self._check_memory(min(len(inputs), self.max_inputs), X.shape[1], y.shape[1])
         prior_tril = self._prior_tril(X, y, scaling)
         training = TrainingSet(
             self._door(standardized), self._door(scaling.outputs(y)), self._door(inputs), self._door(index).long()
@@ -295,6 +302,17 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         self.effective_share_ = 1.0 if fit.correlation is None else float(fit.correlation.share.mean())
         module = HeteroscedasticModel(fit, prior_tril)
         return Fitted(self._assemble(module, scaling), _report(fit, options), features.jitter)
+
+    def _check_memory(self, n_inputs: int, n_features: int, n_outputs: int) -> None:
+        """Measured: of each output's features for the differences that start a search, and of all outputs' together."""
+        size = min(n_inputs, max(max(pair) for pair in self._n_inducing(n_features, n_outputs)))
+        searched = 4 * (n_features + 1) * (n_features + 2) * n_outputs * size * (n_inputs + size)
+        require_much(
+            8.0 * (searched + 24 * (n_outputs * size) ** 2),
+            what=f"max_inputs == {self.max_inputs} with n_inducing == {self.n_inducing} lets {n_inputs} distinct "
+            f"inputs and {size} inducing ones into the fit, which",
+            remedy="Lower them, n_inducing first.",
+        )
 
     def _prior_tril(self, X: Floats, y: Floats, scaling: Standardization) -> torch.Tensor:
         if self.prior is None:

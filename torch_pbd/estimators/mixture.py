@@ -8,7 +8,6 @@ import torch
 from numpy.typing import NDArray
 from sklearn.cluster import KMeans
 from sklearn.neighbors import NearestNeighbors
-from sklearn.utils import check_random_state
 
 from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.estimators._regression import MixtureRegression
@@ -17,9 +16,11 @@ from torch_pbd.estimators._rows import by_chunks
 from torch_pbd.estimators._scaling import Standardization, distinct_rows
 from torch_pbd.estimators._validation import Floats, check_choice, check_number
 from torch_pbd.exceptions import DataRankWarning
+from torch_pbd.memory import require_much
 from torch_pbd.models.mixture import GaussianMixture
 from torch_pbd.models.mixture_fit import expectation_maximization, refine
 from torch_pbd.optim import FitReport
+from torch_pbd.seeds import as_random_state
 
 # An output's residual scale is not taken below this of its whole spread.
 _SMALLEST_RESIDUAL = 1e-6
@@ -114,9 +115,22 @@ class GMMBaseline(CovarianceRegressor):
                 f"n_components == {self.n_components}, must not be above the number of distinct samples, which is "
                 f"{n_distinct} of n_samples = {len(X)}."
             )
+        require_much(
+            # Measured: responsibilities, and the rows centred at and whitened by each component.
+            8.0 * self.n_components * (len(X) * (3 * joint.shape[1] + 4) + self.n_components),
+            what=f"n_components == {self.n_components} for {len(X)} rows",
+            remedy="Take fewer components.",
+        )
         if not (np.ptp(y, axis=0) > 0).any():
             warnings.warn(
                 "y is constant: its covariance is zero, and the smallest that can be told from it is used.",
+                DataRankWarning,
+                stacklevel=4,
+            )
+        if n_distinct <= y.shape[1]:
+            warnings.warn(
+                f"y has {n_distinct} distinct rows but {y.shape[1]} outputs: they leave directions of the covariance "
+                "undetermined, which reg_covar decides. Record more.",
                 DataRankWarning,
                 stacklevel=4,
             )
@@ -124,7 +138,7 @@ class GMMBaseline(CovarianceRegressor):
         data = self._door(np.hstack([(X - scaling.x_shift) / scaling.x_scale, (y - scaling.y_shift) / scaling.y_scale]))
         spread = joint.std(axis=0)
         points = (joint - joint.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
-        generator = check_random_state(self.random_state)
+        generator = as_random_state(self.random_state)
         runs = [self._expectation_maximization(data, points, X.shape[1], generator) for _ in range(1 + self.n_restarts)]
         mixture, report = min(runs, key=lambda run: run[1].loss)
         if self.solver == "lbfgs":

@@ -7,7 +7,7 @@ from typing import final
 
 import numpy as np
 
-from torch_pbd.control.realtime.checks import Numbers, limit, number, vector
+from torch_pbd.control.realtime.checks import Numbers, limit, moment, number, vector
 from torch_pbd.control.realtime.limits import limited
 from torch_pbd.control.realtime.status import TickStatus
 from torch_pbd.control.realtime.steps import Floats, Vector, braked, softened
@@ -115,6 +115,8 @@ class RealTimeAdmittance:
     ) -> None:
         mass = (getattr(schedule, "mass", None) or 1.0) if mass is None else mass
         self._mass = number("mass", mass, "kg; it is the same in all directions, matrices are not supported")
+        if not 1e-50 <= self._mass <= 1e50:
+            raise ValueError(f"mass={mass!r} must be a finite number from 1e-50 to 1e50 kg.")
         self._max_step = number("max_step", max_step, "s")
         if self._max_step * number("rate", rate, "1/s") <= 1.0:
             raise ValueError(f"max_step={max_step} s is no longer than a tick at rate={rate}: raise it, to some ticks.")
@@ -127,7 +129,7 @@ class RealTimeAdmittance:
         self._is_limited = min(self._speed_limit, self._acceleration_limit) < math.inf
         deceleration = number("stop_deceleration", stop_deceleration, "units/s^2")
         self._deceleration = min(deceleration, self._acceleration_limit)
-        if not isinstance(hold_ticks, int | np.integer) or hold_ticks < 0:
+        if isinstance(hold_ticks, bool) or not isinstance(hold_ticks, int | np.integer) or hold_ticks < 0:
             raise ValueError(f"hold_ticks={hold_ticks!r} must be an integer of at least 0: a number of ticks.")
         self._hold_ticks = hold_ticks
         self._soft_start = number("soft_start", soft_start, "s, or 0", zero=True)
@@ -171,8 +173,9 @@ class RealTimeAdmittance:
         RuntimeError
             If another thread is in a tick.
         """
-        if not (math.isfinite(now) and 0.0 <= at < math.inf):
-            raise ValueError(f"now={now!r} must be a finite time in s, and at={at!r} must be one of at least 0.")
+        now, at = moment("now", now), moment("at", at)
+        if at < 0.0:
+            raise ValueError(f"at={at!r} must be a time in the schedule, at least 0 s.")
         d = self._table.n_axes
         here = vector("position", self._table.row(self._table.index_at(at))[:d] if position is None else position, d)
         moving = vector("velocity", (0.0,) * d if velocity is None else velocity, d)
@@ -181,7 +184,7 @@ class RealTimeAdmittance:
         bias = () if force_bias is None else vector("force_bias", force_bias, d)
         if not self._turn.acquire(False):
             raise RuntimeError(_SHARED)
-        self._begin(float(now), here, moving, float(at))
+        self._begin(now, here, moving, at)
         self._bias = bias
         self._turn.release()
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from torch_pbd.arguments import is_finite
 from torch_pbd.control.realtime.steps import Vector
 
 Numbers = Sequence[float] | NDArray[np.float64]
@@ -14,7 +15,7 @@ Numbers = Sequence[float] | NDArray[np.float64]
 def number(name: str, value: float, unit: str, *, zero: bool = False) -> float:
     """A finite number above 0, or from 0 on."""
     real = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-    if not (real and 0.0 <= value < math.inf and (value or zero)):
+    if not (real and is_finite(value) and value >= 0.0 and (value or zero)):
         least = "of at least 0" if zero else "above 0"
         raise ValueError(f"{name}={value!r} must be a finite number {least}, in {unit}.")
     return float(value)
@@ -23,6 +24,14 @@ def number(name: str, value: float, unit: str, *, zero: bool = False) -> float:
 def limit(name: str, value: float | None, unit: str) -> float:
     """A number above 0; none at all is infinite."""
     return math.inf if value is None else number(name, value, f"{unit}, or None")
+
+
+def moment(name: str, value: float) -> float:
+    """A finite time in s."""
+    real = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+    if not (real and is_finite(value)):
+        raise ValueError(f"{name}={value!r} must be a finite time in s.")
+    return float(value)
 
 
 def vector(name: str, values: Numbers, d: int) -> Vector:

@@ -8,6 +8,7 @@ from typing import NamedTuple, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from torch_pbd.arguments import as_floats
 from torch_pbd.control.realtime.steps import Floats, Vector, advance_coupled, advance_modal, advance_plane
 from torch_pbd.control.sampling import Between
 
@@ -15,6 +16,8 @@ Advance = Callable[[Vector, Vector, Vector, Vector, float, float], tuple[Vector,
 
 _ROUNDING = 1e-9  # relative: what is smaller counts as rounding of whoever made the schedule
 _TICK_ROUNDING = 1e-6  # of a tick: 10 s at 1 kHz are 10001 rows, however 10 * 1000 is rounded
+_LARGEST = 1e100  # squares and sums of what is smaller do not overflow
+_READ = ("time", "position", "velocity", "stiffness", "damping")
 _MAX_ROWS = 4_000_000  # an hour at 1 kHz
 
 
@@ -100,16 +103,22 @@ def _gains(stiffness: Floats, damping: Floats) -> tuple[Advance, list[Floats]]:
 
 def _checked(schedule: ScheduleLike) -> list[Floats]:
     """Copies of time, position, velocity, stiffness and damping that a robot can follow."""
-    n, d = np.shape(schedule.position) if np.ndim(schedule.position) == 2 else (0, 0)
+    missing = [name for name in (*_READ, "stiffness_limits") if not hasattr(schedule, name)]
+    if missing:
+        raise ValueError(f"schedule is a {type(schedule).__name__} without {', '.join(missing)}: give a Schedule.")
+    position = as_floats(schedule.position, "schedule.position")
+    if position.ndim != 2 or not position.size:
+        raise ValueError(f"schedule.position has shape {position.shape}: it must be (n, d), n and d at least 1.")
+    n, d = position.shape
     shapes = {"time": (n,), "position": (n, d), "velocity": (n, d), "stiffness": (n, d, d), "damping": (n, d, d)}
-    arrays = {name: np.array(getattr(schedule, name), dtype=np.float64) for name in shapes}
+    arrays = {name: np.array(as_floats(getattr(schedule, name), f"schedule.{name}")) for name in shapes}
     for name, array in arrays.items():
         if not n * d or array.shape != shapes[name]:
             raise ValueError(
                 f"schedule.{name} has shape {array.shape}: with (n, d) positions, n and d at least 1, "
                 f"it must be {shapes[name]}."
             )
-        _refuse(~np.isfinite(array), array, name, "it must be finite.")
+        _refuse(~(np.abs(array) <= _LARGEST), array, name, f"it must be finite, and at most {_LARGEST:g} in size.")
     _refuse(np.diff(arrays["time"], prepend=-np.inf) <= 0.0, arrays["time"], "time", "times must increase strictly.")
     least_stiffness = _symmetrized(arrays, "stiffness", schedule.stiffness_limits)
     least_damping = _symmetrized(arrays, "damping", None)
