@@ -114,3 +114,13 @@ def test_correlation_on_a_circle_is_differentiable(kernel, generator):
     length_scale = torch.tensor([[0.5, 1.0]], dtype=torch.float64, requires_grad=True)
     period = tensor([1.0, np.inf])
     assert torch.autograd.gradcheck(lambda x, scale: correlation(x, other, scale, kernel, period), (x, length_scale))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_infinitely_many_periods_away_the_correlation_is_a_number(kernel, dtype):
+    """1e300 of an input whose unit is 1e-9."""
+    x = torch.tensor([[torch.inf], [-torch.inf], [torch.finfo(dtype).max]], dtype=dtype)
+    period, length_scale = torch.tensor([0.1], dtype=dtype), torch.ones(1, dtype=dtype)
+    found = correlation(x, torch.zeros(1, 1, dtype=dtype), length_scale, kernel, period)
+    assert ((found > 0) & (found <= 1)).all()

@@ -72,7 +72,8 @@ def correlation(
         difference = x[:, dimension : dimension + 1] - other[:, dimension]
         if period is not None and bool(torch.isfinite(period[dimension])):
             radius = period[dimension] / math.pi
-            difference = radius * torch.sin(difference / radius)
+            largest = torch.finfo(x.dtype).max  # the sine of infinity, many small periods away, is no number
+            difference = radius * torch.sin((difference / radius).clamp(-largest, largest))
         return (difference / length_scale[..., dimension, None, None]).square()
 
     square_distance = reduce(add, map(square, range(x.shape[1])))

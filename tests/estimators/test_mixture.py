@@ -10,6 +10,7 @@ from sklearn.exceptions import ConvergenceWarning
 from estimators.zoo import demonstrations, fit, fitted, new, queries
 from torch_pbd import GMMBaseline
 from torch_pbd.data import make_paper_simulation
+from torch_pbd.exceptions import DataRankWarning
 
 
 def standardized(model, X, y):
@@ -122,3 +123,32 @@ def test_more_components_than_rows_is_an_error_with_both_numbers():
     X, y = demonstrations(n_inputs=2, n_demos=2)
     with pytest.raises(ValueError, match=r"n_components == 5, must not be above .* 4 of n_samples = 4"):
         GMMBaseline().fit(X, y)
+
+
+@pytest.mark.parametrize("solver", ["em", "lbfgs"])
+@pytest.mark.parametrize("constant", [0.7, 1e9 / 3.0])
+def test_a_constant_input_is_as_if_it_were_not_there(solver, constant):
+    """Its deviation is 1e-16 of it, which is rounding and not a scale."""
+    X, y = demonstrations()
+    column = np.full_like(X, constant)
+    both = np.hstack([X, column])
+    assert column.std() > 0.0
+    with pytest.warns(DataRankWarning, match="column 1 is constant"):
+        model = GMMBaseline(n_components=3, solver=solver).fit(both, y)
+    alone = GMMBaseline(n_components=3, solver=solver).fit(X, y)
+    x = queries(1)[:40]
+    for mine, others in zip(
+        model.predict(np.hstack([x, np.full_like(x, constant)]), return_cov=True),
+        alone.predict(x, return_cov=True),
+        strict=True,
+    ):
+        np.testing.assert_allclose(mine, others, rtol=1e-4, atol=1e-4)
+
+
+def test_rows_that_differ_by_rounding_are_no_different_samples():
+    """Else k-means finds fewer clusters than it is asked for, and says so in its own words."""
+    X = np.repeat([[-1.0], [0.0], [1.0]], 4, axis=0) + 1e-9 * np.arange(12.0)[:, np.newaxis]
+    y = np.where(X > 0.5, 1.0, 0.0)
+    with pytest.raises(ValueError, match=r"n_components == 5, .* distinct samples, which is 3 of n_samples = 12"):
+        GMMBaseline(n_components=5).fit(X, y)
+    assert fit(GMMBaseline(n_components=3), X, y).predict_cov(X).shape == (12, 1, 1)

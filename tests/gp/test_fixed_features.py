@@ -66,3 +66,11 @@ def test_inducing_inputs_are_taken_farthest_first():
     assert features.farthest_first.tolist()[:3] in ([2, 0, 4], [2, 4, 0])
     around = FeatureMap(tensor([[0.0], [0.5], [0.9]]), period=tensor([1.0]))  # 0.9 is next to 0.0
     assert sorted(around.farthest_first.tolist()[:2])[1] == 1 or around.farthest_first.tolist()[1] == 1
+
+
+def test_where_nothing_can_be_told_one_feature_is_left():
+    """Observations without information, as of outputs that all vanish, are no error."""
+    features = FeatureMap(tensor([[0.0], [0.5], [1.0]]))
+    found = FixedFeatures(features, tensor([[0.2]])).at(tensor([[0.3]]), tensor([1e4]))
+    assert found.values.shape == (1, 1, 1)
+    assert torch.isfinite(found.pull(torch.ones_like(found.values))).all()

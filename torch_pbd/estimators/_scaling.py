@@ -20,33 +20,60 @@ class Standardization:
     x_scale: Floats
     y_shift: Floats
     y_scale: Floats
+    x_parts: tuple[Floats, Floats]
+    """A value that the column has, and the shift less that value. A difference of values is exact, so that what is
+    made of these two is the same numbers wherever the origin is."""
+    y_parts: tuple[Floats, Floats]
 
     @classmethod
     def of(cls, X: Floats, y: Floats) -> "Standardization":
         """Standardization of the columns of X and y.
 
         A constant output gets the largest scale of the others, so that it is precise beside them; a
-        constant input gets a scale of one.
+        constant input its magnitude, beside which rounding is nothing, in all units.
         """
         low, high = X.min(axis=0), X.max(axis=0)
         span = high - low
-        x_scale = np.where(span > CONSTANT * np.maximum(np.abs(low), np.abs(high)), span, 1.0)
+        x_scale = _or_magnitude(span, np.maximum(np.abs(low), np.abs(high)))
         y_shift = y.mean(axis=0)
         y_scale = (y - y_shift).std(axis=0)
         largest = np.abs(y).max(axis=0)
         varies = y_scale > CONSTANT * largest
         if not varies.all():
             y_scale = np.where(varies, y_scale, y_scale[varies].max() if varies.any() else largest)
-            y_scale = np.where(y_scale > 0, y_scale, 1.0)
-        return cls(low + 0.5 * span, x_scale, y_shift, y_scale)
+            y_scale = np.where(y_scale > 0, y_scale, y_scale.max() or 1.0)
+        parts = (low, 0.5 * span), (y[0], (y - y[0]).mean(axis=0))
+        return cls(low + 0.5 * span, x_scale, y_shift, y_scale, *parts)
 
     def inputs(self, X: Floats) -> Floats:
         """Inputs standardized."""
-        return np.asarray(np.round((X - self.x_shift) / self.x_scale, _DECIMALS))
+        return rounded(self.exact_inputs(X))
 
     def outputs(self, y: Floats) -> Floats:
         """Outputs standardized."""
-        return np.asarray(np.round((y - self.y_shift) / self.y_scale, _DECIMALS))
+        return rounded(self.exact_outputs(y))
+
+    def exact_inputs(self, X: Floats) -> Floats:
+        """Inputs standardized with all their digits."""
+        return (X - self.x_parts[0] - self.x_parts[1]) / self.x_scale
+
+    def exact_outputs(self, y: Floats) -> Floats:
+        """Outputs standardized with all their digits."""
+        return (y - self.y_parts[0] - self.y_parts[1]) / self.y_scale
+
+
+def rounded(standardized: Floats) -> Floats:
+    """Standardized numbers, the same in all units."""
+    return np.asarray(np.round(standardized, _DECIMALS))
+
+
+def spread_of(columns: Floats) -> Floats:
+    """Standard deviation of each column; the magnitude of one that is constant but for rounding."""
+    return _or_magnitude(columns.std(axis=0), np.abs(columns).max(axis=0))
+
+
+def _or_magnitude(spread: Floats, magnitude: Floats) -> Floats:
+    return np.where(spread > CONSTANT * magnitude, spread, np.where(magnitude > 0, magnitude, 1.0))
 
 
 def canonical_order(X: Floats, y: Floats) -> NDArray[np.intp]:

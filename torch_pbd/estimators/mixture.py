@@ -1,6 +1,7 @@
 """Gaussian mixture regression: the baseline of the paper, and what many use today."""
 
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.estimators._regression import MixtureRegression
 from torch_pbd.estimators._results import Fitted
 from torch_pbd.estimators._rows import by_chunks
-from torch_pbd.estimators._scaling import Standardization, distinct_rows
+from torch_pbd.estimators._scaling import Standardization, distinct_rows, spread_of
 from torch_pbd.estimators._validation import Floats, check_choice, check_number
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.memory import require_much
@@ -24,6 +25,8 @@ from torch_pbd.seeds import as_random_state
 
 # An output's residual scale is not taken below this of its whole spread.
 _SMALLEST_RESIDUAL = 1e-6
+# Of rows of unit variance: k-means works on squares of distances, and float64 has 16.
+_DECIMALS = 7
 
 
 class GMMBaseline(CovarianceRegressor):
@@ -108,8 +111,8 @@ class GMMBaseline(CovarianceRegressor):
         check_number(self.reg_covar, "reg_covar", low=0.0, strict=True)
 
     def _fit(self, X: Floats, y: Floats, **told: Any) -> Fitted:
-        joint = np.hstack([X, y])
-        n_distinct = len(distinct_rows(joint)[0])
+        points = _points(X, y)
+        n_distinct = len(distinct_rows(points)[0])
         if n_distinct < self.n_components:
             raise ValueError(
                 f"n_components == {self.n_components}, must not be above the number of distinct samples, which is "
@@ -117,7 +120,7 @@ class GMMBaseline(CovarianceRegressor):
             )
         require_much(
             # Measured: responsibilities, and the rows centred at and whitened by each component.
-            8.0 * self.n_components * (len(X) * (3 * joint.shape[1] + 4) + self.n_components),
+            8.0 * self.n_components * (len(X) * (3 * points.shape[1] + 4) + self.n_components),
             what=f"n_components == {self.n_components} for {len(X)} rows",
             remedy="Take fewer components.",
         )
@@ -135,9 +138,7 @@ class GMMBaseline(CovarianceRegressor):
                 stacklevel=4,
             )
         scaling = _by_residual(X, y)
-        data = self._door(np.hstack([(X - scaling.x_shift) / scaling.x_scale, (y - scaling.y_shift) / scaling.y_scale]))
-        spread = joint.std(axis=0)
-        points = (joint - joint.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
+        data = self._door(np.hstack([scaling.exact_inputs(X), scaling.exact_outputs(y)]))
         generator = as_random_state(self.random_state)
         runs = [self._expectation_maximization(data, points, X.shape[1], generator) for _ in range(1 + self.n_restarts)]
         mixture, report = min(runs, key=lambda run: run[1].loss)
@@ -183,7 +184,7 @@ class GMMBaseline(CovarianceRegressor):
     def _expectation_maximization(
         self, data: torch.Tensor, points: Floats, n_features: int, generator: np.random.RandomState
     ) -> tuple[GaussianMixture, FitReport]:
-        """One run from k-means on ``points``, the rows with unit variance."""
+        """One run from k-means on ``points``."""
         kmeans = KMeans(self.n_components, n_init=1, random_state=generator.randint(2**31 - 1))
         labels: NDArray[np.intp] = kmeans.fit(points).labels_
         responsibilities = self._door(np.eye(self.n_components)[labels])
@@ -197,6 +198,13 @@ class GMMBaseline(CovarianceRegressor):
         )
 
 
+def _points(X: Floats, y: Floats) -> Floats:
+    """Rows [x, y] with unit variance, told apart where k-means can."""
+    joint = np.hstack([X, y])
+    above = joint - joint[0]
+    return np.asarray(np.round((above - above.mean(axis=0)) / spread_of(joint), _DECIMALS))
+
+
 def _by_residual(X: Floats, y: Floats) -> Standardization:
     """Standardization of inputs by their deviation, of outputs by that between neighbouring inputs.
 
@@ -204,12 +212,12 @@ def _by_residual(X: Floats, y: Floats) -> Standardization:
     and not to how far y moves.
     """
     whole = Standardization.of(X, y)
-    x_scale = X.std(axis=0)
-    x_scale = np.where(x_scale > 0, x_scale, 1.0)
-    scaled = (X - whole.x_shift) / x_scale
+    x_scale = spread_of(X)
+    # Neighbours at equal distances are so in all units.
+    scaled = replace(whole, x_scale=x_scale).inputs(X)
     # Of the same or the nearest input: the row itself may come first or second among equals.
     neighbour = NearestNeighbors(n_neighbors=2).fit(scaled).kneighbors(scaled, return_distance=False)
     other = np.where(neighbour[:, 0] == np.arange(len(X)), neighbour[:, 1], neighbour[:, 0])
     residual = np.sqrt(0.5 * np.square((y - y[other]) / whole.y_scale).mean(axis=0))
     y_scale = whole.y_scale * np.clip(residual, _SMALLEST_RESIDUAL, 1.0)
-    return Standardization(whole.x_shift, x_scale, whole.y_shift, y_scale)
+    return replace(whole, x_scale=x_scale, y_scale=y_scale)

@@ -86,7 +86,9 @@ class FixedFeatures:
         # The square of a diagonal entry is the variance at an inducing input given those before it, and given the
         # first r of them none is farther from these than the next.
         carried = factor.diagonal(dim1=-2, dim2=-1).square()
-        size = int((carried > negligible[:, None]).any(0).nonzero().max()) + 1
+        told = (carried > negligible[:, None]).any(0)
+        told[0] = True  # where nothing can be told of any process, one feature says so
+        size = int(told.nonzero().max()) + 1
         factor = factor[:, :size, :size]
         squares = self._cross[:, :size]
         cross, cross_slope = self._correlation(squares, length_scale)
