@@ -45,7 +45,9 @@ def simulate_schedule(
     check_plant(robot)
     warn_of_mass(robot, mass, stacklevel=4)
     parts = (schedule.position, schedule.velocity, schedule.stiffness, schedule.damping, push)
-    generator = torch.Generator().manual_seed(int(as_random_state(random_state).randint(2**31 - 1)))
+    draw = as_random_state(random_state)
+    noisy = getattr(robot.sensor, "noise_scale", 0.0) != 0.0  # else nothing is drawn: None is the caller's global state
+    generator = torch.Generator().manual_seed(int(draw.randint(2**31 - 1))) if noisy else None
     return robot.simulate(*map(_tensor, parts), dt=1.0 / rate, generator=generator).numpy()
 
 

@@ -1,13 +1,12 @@
 """Tell a regressor which rows are of one demonstration, if it takes that."""
 
-import warnings
 from typing import TypeVar
 
 from numpy.typing import ArrayLike
 from sklearn.utils.validation import has_fit_parameter
 
 from torch_pbd.estimators._base import CovarianceRegressor
-from torch_pbd.exceptions import UnimodalityWarning
+from torch_pbd.estimators._demonstrations import ways_are_told
 
 Regressor = TypeVar("Regressor", bound=CovarianceRegressor)
 
@@ -19,6 +18,5 @@ def fit_by_demonstration(regressor: Regressor, X: ArrayLike, y: ArrayLike, group
     """
     if not has_fit_parameter(regressor, "groups"):
         return regressor.fit(X, y)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UnimodalityWarning)
+    with ways_are_told():
         return regressor.fit(X, y, groups=groups)  # type: ignore[call-arg]
