@@ -66,21 +66,6 @@ def test_32_so_does_this_one(expected):
     assert digests() == expected
 
 
-@pytest.mark.slow
-def test_32_other_numbers_of_threads_give_the_same_but_for_rounding(tmp_path):
-    """Sums over more threads are in another order: the last bits differ, and searches end elsewhere within ``tol``.
-
-    Measured: 5e-4 of the largest value for draws of `HeteroscedasticGPRegressor`, whose ``tol`` is 1e-3 nats.
-    """
-    for threads in ("1", "2"):
-        run(str(PROGRAM), str(tmp_path / f"{threads}.npz"), OMP_NUM_THREADS=threads)
-    with np.load(tmp_path / "1.npz") as one, np.load(tmp_path / "2.npz") as two:
-        assert len(one.files) > 30
-        for name in one.files:
-            scale = np.abs(one[name]).max()
-            np.testing.assert_allclose(two[name], one[name], rtol=0.0, atol=5e-3 * scale, err_msg=name)
-
-
 DELETED = """
 import os, sys, tempfile
 import torch
@@ -197,7 +182,7 @@ def test_34_a_process_forked_after_a_fit_fits_too(expected):
 
 
 def test_34_workers_give_the_same_scores():
-    """One thread here and there, so to the bit."""
+    """But for the last bits: workers may have other numbers of threads, and sums of more are in another order."""
     X, y, groups = data()
     model = HeteroscedasticGPRegressor()
     folds = {"groups": groups, "cv": LeaveOneGroupOut(), "params": {"groups": groups}, "error_score": "raise"}
