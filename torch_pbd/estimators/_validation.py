@@ -81,7 +81,7 @@ def checked_rows(estimator: Any, X: ArrayLike, y: ArrayLike, **options: Any) -> 
     if issparse(y):
         raise TypeError("Sparse data was passed for y, but dense data is required. Use '.toarray()'.")
     X, y = checked_values(X, "X"), checked_values(y, "y")
-    if y is not None and not np.ndim(y):
+    if y is not None and not np.asarray(y).ndim:
         raise ValueError(f"y is {y!r}, must be an array: one row for each row of X.")
     checked: Any = validate_data(estimator, X, y, dtype=np.float64, y_numeric=True, multi_output=True, **options)
     return checked[0], np.asarray(checked[1], dtype=np.float64)
