@@ -18,7 +18,9 @@ install_import_hook([f"torch_pbd.{floor}" for floor in TORCH_FLOORS], "beartype.
 import numpy as np  # noqa: E402 - the hook must come first
 import pytest  # noqa: E402
 import torch  # noqa: E402
+from hypothesis import settings  # noqa: E402
 
+settings.register_profile("thorough", print_blob=True)
 torch.set_num_threads(1)
 
 

@@ -5,8 +5,6 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from scipy.stats import multivariate_normal, multivariate_t
 
 from estimators.zoo import (
@@ -23,7 +21,6 @@ from estimators.zoo import (
     queries,
     truth,
 )
-from torch_pbd import CholeskyCovRegressor, GMMBaseline, HeteroscedasticGPRegressor, WishartProcessRegressor
 from torch_pbd.metrics import relative_frobenius_error
 
 # A likelihood that shrinks without bound, or is flat in a direction: its optimizer turns the last digits that a
@@ -374,65 +371,3 @@ def test_more_inputs_than_max_inputs_are_merged(name):
     ]
     assert errors[0] < 1.1 * errors[1]
     assert_covariances(merged.predict_cov(queries(1)), 45, 2)
-
-
-def build(kind, objective):
-    if kind is GMMBaseline:
-        return GMMBaseline(
-            n_components=2, n_restarts=0, solver="lbfgs" if objective == "likelihood" else "em", max_iter=30
-        )
-    if kind is HeteroscedasticGPRegressor:
-        return kind(kernel="matern32" if objective == "likelihood" else "squared_exponential", max_iter=10)
-    return kind(objective=objective, n_restarts=0, max_iter=20)
-
-
-@st.composite
-def odd_demonstrations(draw):
-    """Demonstrations of any size and units, with repeated rows and outputs that are constant or copies."""
-    d, e = draw(st.integers(1, 4)), draw(st.integers(1, 3))
-    n_inputs, n_demos = draw(st.integers(2, 7)), draw(st.integers(1, 6))
-    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    X = np.tile(rng.normal(size=(n_inputs, e)), (n_demos, 1))
-    if draw(st.booleans()):
-        X = rng.normal(size=X.shape)
-    y = np.sin(X.sum(1, keepdims=True)) + rng.normal(size=(len(X), d)) * 10.0 ** rng.uniform(-6, 1, size=d)
-    for i in range(d):
-        kind = draw(st.sampled_from(["free", "free", "free", "constant", "copy", "nearly constant"]))
-        if kind == "constant":
-            y[:, i] = draw(st.sampled_from([0.0, 0.5, -3.0]))
-        elif kind == "nearly constant":
-            y[:, i] = 0.5 + 1e-12 * rng.normal(size=len(X))
-        elif kind == "copy":
-            y[:, i] = y[:, 0]
-    if draw(st.booleans()):
-        twice = rng.integers(len(X), size=3)
-        X, y = np.vstack([X, X[twice]]), np.vstack([y, y[twice]])
-    units, offsets = st.sampled_from([1e-9, 1e-3, 1.0, 1e3, 1e9]), st.sampled_from([0.0, 0.0, 1.0, 1e6])
-    X = (X + draw(offsets)) * np.array([draw(units) for _ in range(e)])
-    y = (y + np.array([draw(offsets) for _ in range(d)])) * np.array([draw(units) for _ in range(d)])
-    return X, y
-
-
-KINDS = [
-    CholeskyCovRegressor,
-    WishartProcessRegressor,
-    GMMBaseline,
-    pytest.param(HeteroscedasticGPRegressor, marks=pytest.mark.slow),
-]
-
-
-@pytest.mark.filterwarnings("ignore::torch_pbd.exceptions.DataRankWarning")
-@pytest.mark.parametrize("objective", ["auto", "likelihood"])
-@pytest.mark.parametrize("kind", KINDS)
-@settings(max_examples=30, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
-@given(data=odd_demonstrations())
-def test_whatever_was_recorded_there_is_a_covariance(kind, objective, data):
-    X, y = data
-    model = fit(build(kind, objective), X, y)
-    assert np.isfinite(model.loss_)
-    span = np.ptp(X, axis=0)
-    x = np.vstack([X[:5], X[:5] + 0.3 * span, X[:5] + 1e6 * span, np.full((1, X.shape[1]), 1e300)])
-    mean, covariance = model.predict(x, return_cov=True)
-    assert np.isfinite(mean).all()
-    assert_covariances(covariance, len(x), y.shape[1])
-    assert np.isfinite(model.log_likelihood(X, y)).all()
