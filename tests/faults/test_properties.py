@@ -54,7 +54,7 @@ ERRORS = {
 WARNINGS = {
     (DataRankWarning, r"X has \d+ columns but varies in \d+ directions only"): "a length scale is not determined",
     (DataRankWarning, r"y has \d+ demonstrations at an input but"): "empirical covariances are singular, and shrunk",
-    (DataRankWarning, r"y has \d+ rows but"): "too few rows in all",
+    (DataRankWarning, r"y has \d+ (distinct )?rows but"): "too few rows in all",
     (DataRankWarning, r"The demonstrations are identical"): "there is no variability to learn",
     (DataRankWarning, r"y is constant"): "the same of a mixture",
     (DataRankWarning, r"groups has one demonstration"): "what differs between demonstrations cannot be learned of one",

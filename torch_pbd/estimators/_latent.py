@@ -101,8 +101,9 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         if aligned:
             mean, covariance, report, jitter = self._fit_empirical(problem)
         else:
-            mean = self._fit_mean(training)
+            mean, of_mean = self._fit_mean(training)
             covariance, report, jitter = self._fit_likelihood(problem, training.residual(mean))
+            report = report.after(of_mean, "search of the mean")
         return Fitted(self._assemble(MeanAndCovariance(mean, covariance), scaling), report, jitter)
 
     @abstractmethod
@@ -154,11 +155,11 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         scaled = covariance / scaling.y_scale[:, np.newaxis] / scaling.y_scale
         return safe_cholesky(self._door(scaled), name="prior")
 
-    def _fit_mean(self, training: TrainingSet) -> LatentGP:
+    def _fit_mean(self, training: TrainingSet) -> tuple[LatentGP, FitReport]:
         """Gaussian processes of the mean, by themselves."""
         observations, search = self._mean_job(training)
         (found,) = fit_together([(observations, search)])
-        return condition(observations, found.hyperparameters, self.kernel, basis=found.basis)[0]
+        return condition(observations, found.hyperparameters, self.kernel, basis=found.basis)[0], found.report
 
     def _mean_job(self, training: TrainingSet) -> tuple[Observations, EvidenceSearch]:
         """Means at the inputs, weighted by their counts, and the search for their hyperparameters."""

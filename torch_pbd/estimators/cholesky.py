@@ -179,7 +179,8 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
         found = (of_entries.hyperparameters, self.kernel, values)
         latent, jitter = condition(observations, *found, basis=of_entries.basis)
         prior = problem.prior_tril if problem.prior_tril.ndim == 2 else problem.prior_tril[0]
-        return mean, CholeskyCovariance(latent, prior, log_diagonal=log_diagonal), of_entries.report, jitter
+        report = of_entries.report.after(of_mean.report, "search of the mean")
+        return mean, CholeskyCovariance(latent, prior, log_diagonal=log_diagonal), report, jitter
 
     def _entry_noise(self, problem: Problem) -> Tensor | None:
         """Noise of each entry of the factor, in standardized units; of a logarithm, relative."""

@@ -34,7 +34,7 @@ from torch_pbd.models.heteroscedastic import (
     fit_heteroscedastic,
 )
 from torch_pbd.models.training import TrainingSet
-from torch_pbd.optim import FitReport
+from torch_pbd.optim import FitReport, first_failure
 from torch_pbd.seeds import as_random_state
 
 # Prior medians of length scale (in ranges of the input) and amplitude, and prior deviation of the constant. Means
@@ -332,9 +332,9 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
 
 def _report(fit: HeteroscedasticFit, options: SearchOptions) -> FitReport:
     losses = tuple(-value for value in fit.log_evidence)
-    converged = all(converged for _, converged in options.ends)
-    message = "converged" if converged else f"stopped at max_iter={options.max_iter} iterations of a search"
-    return FitReport(losses[-1], losses, max(n_iter for n_iter, _ in options.ends), converged, message)
+    message = first_failure(message for _, message in options.ends)
+    n_iter = max(n_iter for n_iter, _ in options.ends)
+    return FitReport(losses[-1], losses, n_iter, message == "converged", message)
 
 
 def _warn_if_unresolved(length_scale: torch.Tensor | None, features: FeatureMap) -> None:

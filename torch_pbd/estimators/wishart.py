@@ -157,7 +157,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         return padded(problem.prior_tril, self.df_)
 
     def _fit_empirical(self, problem: Problem) -> tuple[LatentGP, WishartCovariance, FitReport, float]:
-        mean = self._fit_mean(problem.training)
+        mean, of_mean = self._fit_mean(problem.training)
         prior_root = self._prior_root(problem)
         target = empirical_tril(problem.training)
         if self.start == "random":
@@ -166,7 +166,10 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
                 return covariance_mse(wishart_root(deviation, prior_root, matrix), target)
 
             cost = FactorDistance(WishartLink(prior_root), target) if self.latent_prior else loss
-            return mean, *self._train(problem, prior_root, prior_root, cost, prior_weight=0.0, tol=1e-4 * self.tol)
+            found, report, jitter = self._train(
+                problem, prior_root, prior_root, cost, prior_weight=0.0, tol=1e-4 * self.tol
+            )
+            return mean, found, report.after(of_mean, "search of the mean"), jitter
         inputs, matrix = problem.training.inputs, torch.eye(target.shape[-1]).to(target)
 
         def observed(root: Tensor) -> Observations:
@@ -183,6 +186,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         with torch.no_grad():
             mse = float(covariance_mse(wishart_root(latent(inputs), prior_root, matrix), target))
         report = FitReport(mse, (mse,), report.n_iter, report.converged, report.message)
+        report = report.after(of_mean, "search of the mean")
         return mean, WishartCovariance(latent, _constant(prior_root), matrix), report, jitter
 
     def _fit_likelihood(self, problem: Problem, residual: Tensor) -> tuple[WishartCovariance, FitReport, float]:

@@ -1,7 +1,7 @@
 """Many small unrelated optimizations side by side."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import torch
@@ -30,6 +30,8 @@ class BatchReport:
     n_iter: int
     converged: bool
     """All of them, from starts whose loss is finite."""
+    message: str
+    """ "converged", or what ended one that did not."""
     inverse_hessian: Float[Tensor, "b p p"]
     """At the ends, as far as the steps told."""
 
@@ -100,17 +102,25 @@ def minimize_batch(
     alive = torch.isfinite(loss + size) & (size > tol)
     every = _Problems.at(rows, x, loss, gradient, inverse, torch.ones_like(loss))
     active = every.of(alive & (every.promise > _enough(loss, tol)))
-    n_iter = 0
+    n_iter, message = 0, "converged" if bool(torch.isfinite(loss + size).all()) else "the loss at a start is not finite"
     while n_iter < max_iter and len(active.rows):
         n_iter += 1
-        active, settled = _advance(objective, active, tol, first=n_iter == 1)
+        active, settled, blocked = _advance(objective, active, tol, first=n_iter == 1)
+        if bool(blocked.any()):
+            message = "the loss or its gradient is not finite beside the best point"
         if bool(settled.any()) or n_iter == max_iter:  # problems that have ended are not carried along
             every.put(active)
             active = active.of(~settled)
-    converged = len(active.rows) == 0 and bool(torch.isfinite(every.loss).all())
-    report = BatchReport(every.loss, loss, n_iter, converged, every.inverse)
+    if message == "converged" and len(active.rows):
+        message = f"stopped at max_iter={max_iter} iterations"
+    report = BatchReport(every.loss, loss, n_iter, message == "converged", message, every.inverse)
     record.keep(lambda: {"x": every.x, **vars(report)}, ended=True)
     return every.x, report
+
+
+def first_failure(messages: Iterable[str]) -> str:
+    """What ended the first of several searches that did not converge; "converged" if all did."""
+    return next((message for message in messages if message != "converged"), "converged")
 
 
 def _recalled(state: State, like: Tensor) -> tuple[Tensor, BatchReport]:
@@ -173,9 +183,9 @@ class _Problems:
 
 def _advance(
     objective: ValueAndGradient, at: _Problems, tol: float, *, first: bool
-) -> tuple[_Problems, Bool[Tensor, " a"]]:
-    """One step of each problem, and which have ended."""
-    x, loss, gradient = _backtrack(objective, at)
+) -> tuple[_Problems, Bool[Tensor, " a"], Bool[Tensor, " a"]]:
+    """One step of each problem, which have ended, and which of them for want of numbers."""
+    x, loss, gradient, blocked = _backtrack(objective, at)
     change = (gradient - at.gradient).unsqueeze(-1)
     # Where the slope along a step has not fallen the curvature is not that of a minimum.
     convex = (change * at.downhill).sum((-2, -1)) < -2e-3 * at.promise
@@ -184,7 +194,7 @@ def _advance(
     short = ~convex & (gain > 0) & (at.step < _LONGEST_STEP) & (not first)
     new = _Problems.at(at.rows, x, loss, gradient, inverse, torch.where(short, 4.0 * at.step, 1.0))
     settled = ((new.promise <= _enough(loss, tol)) | (gain <= 0.0)) & ~short
-    return new, settled | (gradient.abs().sum(-1) <= tol)
+    return new, settled | (gradient.abs().sum(-1) <= tol), blocked
 
 
 def _enough(loss: Tensor, tol: float) -> Tensor:
@@ -228,14 +238,18 @@ def _updated(inverse: Tensor, step: Tensor, change: Tensor, convex: Tensor) -> T
     return inverse + scale * step @ step.mT - cross - cross.mT
 
 
-def _backtrack(objective: ValueAndGradient, at: _Problems) -> tuple[Tensor, Tensor, Tensor]:
-    """Shorten each problem's step until its loss falls enough; where none does it stays where it is."""
+def _backtrack(objective: ValueAndGradient, at: _Problems) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Shorten each problem's step until its loss falls enough; where none does it stays where it is.
+
+    The last of what is returned tells of problems that stay because even beside them nothing is finite.
+    """
     downhill, slope, step = at.downhill.squeeze(-1), 2.0 * at.promise, at.step
     trial = at.x - step[:, None] * downhill
     value, gradient = objective(trial, at.rows)
     accepted = _accepted(value, gradient, at.loss, step * slope)
+    blocked = torch.zeros_like(accepted)
     if bool(accepted.all()):
-        return trial, value, gradient
+        return trial, value, gradient, blocked
     new_x, new_loss, new_gradient = at.x.clone(), at.loss.clone(), at.gradient.clone()
     left = torch.arange(len(step), device=step.device)
     for _ in range(25):
@@ -248,11 +262,12 @@ def _backtrack(objective: ValueAndGradient, at: _Problems) -> tuple[Tensor, Tens
         step = step.index_copy(0, left, shorter.clamp(0.1 * share, 0.5 * share))
         left = left[~accepted]
         if len(left) == 0:
-            break
+            return new_x, new_loss, new_gradient, blocked
         trial = at.x[left] - step[left, None] * downhill[left]
         value, gradient = objective(trial, at.rows[left])
         accepted = _accepted(value, gradient, at.loss[left], step[left] * slope[left])
-    return new_x, new_loss, new_gradient
+    blocked[left] = ~torch.isfinite(value + gradient.sum(-1))
+    return new_x, new_loss, new_gradient, blocked
 
 
 def _accepted(value: Tensor, gradient: Tensor, loss: Tensor, promised: Tensor) -> Tensor:

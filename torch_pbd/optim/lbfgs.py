@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 import torch
@@ -38,6 +38,12 @@ class FitReport:
     n_iter: int
     converged: bool
     message: str
+
+    def after(self, other: "FitReport", name: str) -> "FitReport":
+        """This report, but not converged where the optimization before it, of this name, is not."""
+        if other.converged or not self.converged:
+            return self
+        return replace(self, converged=False, message=f"{name}: {other.message}")
 
     def state(self) -> State:
         """As a journal keeps it."""

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torch_pbd.exceptions import NotPositiveDefiniteError
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
-from torch_pbd.optim import Progress, Record, State, minimize_batch, recorded
+from torch_pbd.optim import Progress, Record, State, first_failure, minimize_batch, recorded
 
 _SMALL = 10_000  # entries of all processes' features
 _DIFFERENCE = 1e-3  # of hyperparameters, whose gradients' differences tell the curvature at a start
@@ -35,8 +35,8 @@ class SearchOptions:
     """Called at the end of each turn of mean and covariance."""
     slack: float = 1.0
     """Times the tolerance, as long as better evidence is to come."""
-    ends: list[tuple[int, bool]] = field(default_factory=list)
-    """Iterations of each search, and whether it converged."""
+    ends: list[tuple[int, str]] = field(default_factory=list)
+    """Iterations of each search, and "converged" or what else ended it."""
 
     def report(self, turn: int, loss: float, elapsed: float) -> None:
         """Tell the callback."""
@@ -92,12 +92,12 @@ class Search:
             point, inverse_hessian = self._end
             end |= {"point": point, "inverse_hessian": inverse_hessian}
             record.keep(lambda: end | kept, ended=True)
-        self.options.ends.append((end["n_iter"], end["converged"]))
+        self.options.ends.append((end["n_iter"], end["message"]))
         self.theta = self._spread_out(self._end[0]) if self.family.shared else self._end[0]
         return self.theta
 
     def _search(self, evidence: Evidence, like: Tensor) -> tuple[tuple[Tensor, Tensor], State]:
-        """Best point and its inverse Hessian; iterations, and whether every search converged."""
+        """Best point and its inverse Hessian; iterations, and what ended them."""
         every = torch.arange(self.n_processes, device=like.device)
 
         def value(theta: Tensor, rows: Tensor) -> tuple[Tensor, Gradient]:
@@ -133,8 +133,8 @@ class Search:
         best = torch.stack([report.loss for report in reports]).nan_to_num(nan=math.inf).argmin(0)
         row = torch.arange(len(best), device=like.device)
         found = (torch.stack(points)[best, row], torch.stack([report.inverse_hessian for report in reports])[best, row])
-        told = max(report.n_iter for report in reports), all(report.converged for report in reports)
-        return found, dict(zip(("n_iter", "converged"), told, strict=True))
+        message = first_failure(report.message for report in reports)
+        return found, {"n_iter": max(report.n_iter for report in reports), "message": message}
 
     def _starts(
         self, value: Evidence, objective: _Objective, every: Tensor, like: Tensor
