@@ -40,7 +40,7 @@ class FitReport:
     message: str
 
     def after(self, other: "FitReport", name: str) -> "FitReport":
-        """This report, but not converged where the optimization before it, of this name, is not."""
+        """The same report, but not converged where the optimization before it, of this name, is not."""
         if other.converged or not self.converged:
             return self
         return replace(self, converged=False, message=f"{name}: {other.message}")
