@@ -98,9 +98,11 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         self.jitter_ = fitted.jitter
         self._prepare()
         if not report.converged:
+            # More iterations help only where these were too few.
+            more = f"max_iter (now {self.max_iter}) or " if "max_iter" in report.message else ""
             warnings.warn(
                 f"{type(self).__name__} stopped early: {report.message}. The best point found is kept; "
-                f"raise max_iter (now {self.max_iter}) or tol (now {self.tol:g}).",
+                f"raise {more}tol (now {self.tol:g}).",
                 ConvergenceWarning,
                 stacklevel=3,
             )
