@@ -6,7 +6,6 @@ from array import array
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from math import inf, isfinite, isnan, nan
 from pathlib import Path
 from typing import BinaryIO, TextIO
@@ -17,7 +16,6 @@ from numpy.typing import NDArray
 from torch_pbd.data._checks import check_choice, preview
 from torch_pbd.data.demonstrations import Demonstrations, Missing
 from torch_pbd.exceptions import DataFormatError
-from torch_pbd.memory import parsed_bytes, require_memory
 
 DELIMITERS = (",", ";", "\t")
 _LONGEST_HEADER = 2**17
@@ -40,7 +38,6 @@ def read_csv(
     check_choice(decimal, (".", ","), "decimal")
     if delimiter is not None and (len(delimiter) != 1 or delimiter == decimal):
         raise ValueError(f"delimiter={delimiter!r} must be one character, and not the decimal mark {decimal!r}.")
-    _check_memory(path)
     with path.open(encoding="utf-8-sig", newline="") as file:
         try:
             table = _open_table(path, file, delimiter, decimal, missing, wanted=[*([demo] if demo else []), time])
@@ -74,15 +71,6 @@ def write_csv(demonstrations: Demonstrations, handle: BinaryIO) -> None:
         rows = zip(time.tolist(), position.tolist(), strict=True)
         writer.writerows([k, t, *values] for t, values in rows)
     text.detach()
-
-
-def _check_memory(path: Path) -> None:
-    try:
-        with path.open("rb") as file:
-            needed = parsed_bytes(iter(partial(file.read, 2**20), b""))
-        require_memory(needed, what=f"{path}", remedy="Save it as .npz, or read it in parts.")
-    except ValueError as error:
-        raise DataFormatError(str(error)) from error
 
 
 def _open_table(

@@ -61,11 +61,12 @@ def load_demonstrations(
     FileNotFoundError
         If there is no such file.
     ValueError
-        If the suffix is not known, or this machine has too little memory for the file.
+        If the suffix is not known.
     TypeError
         If an option is not one of the format's.
     DataFormatError
-        If the file is not what its suffix says; names the array, or the line and the column.
+        If the file is not what its suffix says; names the array, or the line and the column. Or if it is too large
+        for the memory.
     """
     file = Path(path)
     reader = _READERS[_known_suffix(file)]
@@ -80,7 +81,10 @@ def load_demonstrations(
             f"{file} has {file.stat().st_size} bytes, more than max_bytes={max_bytes}: raise it to read this."
         )
     needed = _COPIES * file.stat().st_size
-    require_memory(needed, what=f"reading {file}", remedy="Split the file, or leave samples out.")
+    try:
+        require_memory(needed, what=f"reading {file}", remedy="Split the file, or leave samples out.")
+    except ValueError as error:
+        raise DataFormatError(str(error)) from error
     return reader(file, max_bytes, missing, **options)
 
 

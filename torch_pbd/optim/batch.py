@@ -107,7 +107,7 @@ def minimize_batch(
         n_iter += 1
         active, settled, blocked = _advance(objective, active, tol, first=n_iter == 1)
         if bool(blocked.any()):
-            message = "the loss or its gradient is not finite beside the best point"
+            message = "the loss or its gradient is not finite any more, even at the best point"
         if bool(settled.any()) or n_iter == max_iter:  # problems that have ended are not carried along
             every.put(active)
             active = active.of(~settled)
@@ -241,7 +241,7 @@ def _updated(inverse: Tensor, step: Tensor, change: Tensor, convex: Tensor) -> T
 def _backtrack(objective: ValueAndGradient, at: _Problems) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Shorten each problem's step until its loss falls enough; where none does it stays where it is.
 
-    The last of what is returned tells of problems that stay because even beside them nothing is finite.
+    The last of what is returned tells of problems that stay because nothing is finite any more, even where they are.
     """
     downhill, slope, step = at.downhill.squeeze(-1), 2.0 * at.promise, at.step
     trial = at.x - step[:, None] * downhill
@@ -266,6 +266,7 @@ def _backtrack(objective: ValueAndGradient, at: _Problems) -> tuple[Tensor, Tens
         trial = at.x[left] - step[left, None] * downhill[left]
         value, gradient = objective(trial, at.rows[left])
         accepted = _accepted(value, gradient, at.loss[left], step[left] * slope[left])
+    value, gradient = objective(at.x[left], at.rows[left])
     blocked[left] = ~torch.isfinite(value + gradient.sum(-1))
     return new_x, new_loss, new_gradient, blocked
 
