@@ -269,7 +269,7 @@ def _whitened_residual(mean: ArrayLike, covariance: ArrayLike, y: ArrayLike) -> 
 
 
 def _log_det(scale_tril: _Floats) -> _Floats:
-    """Log determinant of each factor: half that of its covariance."""
+    # Of a factor: half that of its covariance.
     return np.log(np.diagonal(scale_tril, axis1=-2, axis2=-1)).sum(-1)
 
 

@@ -100,10 +100,8 @@ def plot_covariance_ellipses(
     _check_axes("ax", [ax], 1)
     centres, matrices = as_finite(mean, "mean"), as_finite(covariance, "covariance")
     if matrices.ndim != 3 or matrices.shape[1:] != (2, 2) or centres.shape != matrices.shape[:2]:
-        raise ValueError(
-            f"covariance has shape {matrices.shape} and mean {centres.shape}, must have (n, 2, 2) and (n, 2): take two "
-            "outputs."
-        )
+        shapes = f"covariance has shape {matrices.shape} and mean {centres.shape}"
+        raise ValueError(f"{shapes}, must have (n, 2, 2) and (n, 2): take two outputs.")
     scale = np.abs(matrices).max(axis=(1, 2))
     if (np.abs(matrices - matrices.mT).max(axis=(1, 2)) > 1e-8 * scale).any():
         raise ValueError("covariance must be symmetric: symmetrize it.")

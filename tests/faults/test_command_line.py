@@ -9,24 +9,14 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import torch_pbd
-from torch_pbd import Demonstrations
 from torch_pbd.cli import main
 from torch_pbd.commands import WORK
 
 COMMAND = [sys.executable, "-m", "torch_pbd.cli"]
 GMM = ["--model", "GMMBaseline", "--model.n_components", "2"]
-
-
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    path = tmp_path_factory.mktemp("data") / "made.npz"
-    positions = np.random.default_rng(0).normal(size=(4, 20, 2)).cumsum(axis=1)
-    torch_pbd.save_demonstrations(Demonstrations(np.linspace(0.0, 2.0, 20), positions), path)
-    return path
 
 
 def refused(data, output, capsys):

@@ -33,14 +33,6 @@ SIGNALS = {signal.SIGINT: (130, "interrupted"), signal.SIGTERM: (143, "terminate
 KILLS = Path(__file__).parents[2] / "scripts" / "benchmarks" / "kills.py"
 
 
-@pytest.fixture(scope="module")
-def data(tmp_path_factory):
-    path = tmp_path_factory.mktemp("data") / "made.npz"
-    positions = np.random.default_rng(0).normal(size=(4, 20, 2)).cumsum(axis=1)
-    torch_pbd.save_demonstrations(Demonstrations(np.linspace(0.0, 2.0, 20), positions), path)
-    return path
-
-
 def fit(data, output, model="cholesky", *more):
     arguments = ["--model", *MODELS[model], "--model.max_iter", "30", "--output", str(output), *more]
     return main(["fit", "--data", str(data), *arguments])
