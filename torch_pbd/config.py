@@ -35,6 +35,9 @@ _MODELS = {
 }
 GROUPS = ("imports", "fitting", "likelihood", "heteroscedastic", "prediction", "control", "growth")  # of the benchmark
 _CONTROLLERS = {"recommended": {"class_path": "DMPController"}}
+_Seed: Any = restricted_number_type(
+    "IntFrom0To4294967294", int, [(">=", 0), ("<=", 2**32 - 2)]
+)  # the next one is a seed too
 _NonzeroInt: Any = restricted_number_type("NonzeroInt", int, ("!=", 0))
 _OF_MODELS = ("fit", "experiment", "compare")
 _Reading = Literal["bell", "printed", "bowl"]
@@ -112,7 +115,7 @@ def _parser(command: str, *, only_help: bool) -> _Parser:
     model_type, models_type = (Any, Any) if only_help else _model_types()
     if command == "demo":
         parser.add_argument("--n_demos", type=PositiveInt, default=6, help="demonstrations to learn from, at least 3")
-        parser.add_argument("--seed", type=NonNegativeInt, default=0, help="seed of the demonstrations")
+        parser.add_argument("--seed", type=_Seed, default=0, help="seed of the demonstrations")
         return parser
     if command == "benchmark":
         parser.add_argument("--groups", type=str, default="all", help=f"comma-separated, of {', '.join(GROUPS)}")
@@ -157,7 +160,7 @@ def _add_experiment_arguments(parser: ArgumentParser, controllers_type: Any) -> 
         "--data", type=str | None, default=None, help="file of demonstrations; none: made ones of the tunnel task"
     )
     parser.add_argument("--n_demos", type=PositiveInt, default=6, help="demonstrations to make")
-    parser.add_argument("--seed", type=NonNegativeInt, default=0, help="seed of the demonstrations")
+    parser.add_argument("--seed", type=_Seed, default=0, help="seed of the demonstrations")
     parser.add_argument("--common_start", type=bool, default=False, help="made demonstrations start at one point")
     parser.add_argument(
         "--controllers",

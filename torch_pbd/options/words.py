@@ -57,7 +57,7 @@ def described(hint: Any) -> str:
     if not isinstance(hint, type):
         return ""  # a callable: there is no YAML for it
     if issubclass(hint, int | float):
-        words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", hint.__name__).lower()
+        words = re.sub(r"(?<=[a-z])(?=[A-Z\d])|(?<=\d)(?=[A-Z])", " ", hint.__name__).lower()
         return "a " + words.replace("int", "whole number").replace("float", "number")
     return "a mapping of class_path and init_args"
 
