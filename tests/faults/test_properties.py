@@ -59,6 +59,7 @@ WARNINGS = {
     (DataRankWarning, r"y is constant"): "the same of a mixture",
     (DataRankWarning, r"groups has one demonstration"): "what differs between demonstrations cannot be learned of one",
     (ConvergenceWarning, r"\w+ stopped early: stopped at max_iter"): "some variants are held short",
+    (ConvergenceWarning, r"\w+ stopped early: stopped after \d+ evaluations"): "the same, where steps take many",
     (ConvergenceWarning, r"\w+ stopped early: no step lowers the loss"): "a likelihood flat to the last digit",
     (UnimodalityWarning, r"Demonstration \d+ is far from the other"): "an outlier",
     (UnimodalityWarning, r"The demonstrations seem to follow two ways"): "two modes, or two outliers",

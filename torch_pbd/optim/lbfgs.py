@@ -290,5 +290,5 @@ def _ended(attempt: _Attempt, point: _BestPoint, record: Record, max_iter: int) 
     except FAILURES as error:
         return str(error) or type(error).__name__
     if point.n_evaluations >= attempt.most_evaluations:
-        return f"stopped after {point.n_evaluations} evaluations of the loss"
+        return f"stopped after {point.n_evaluations} evaluations, the most for max_iter={max_iter} iterations"
     return ""
