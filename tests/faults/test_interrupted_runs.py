@@ -108,13 +108,13 @@ def test_36_a_comparison_goes_on_with_the_folds_that_are_left(n_jobs, data, tmp_
 @pytest.mark.slow
 def test_37_killed_runs_lose_nothing(tmp_path):
     """Killed at calls that change files, spread over all that a run makes, and at random times."""
-    command = [sys.executable, str(KILLS), "--trials", "3", "--crash_points", "8", "--models", "CD"]
+    command = [sys.executable, str(KILLS), "--trials", "1", "--crash_points", "5", "--models", "CD"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     name, _, n_changes, n_kills, n_working, lost = done.stdout.splitlines()[1].split()
-    assert (name, n_kills, lost) == ("CD", "11", "0")
+    assert (name, n_kills, lost) == ("CD", "6", "0")
     assert int(n_changes) > 20
-    assert int(n_working) >= 8  # those at changes of files; at a random time a run may have ended
+    assert int(n_working) >= 5  # those at changes of files; at a random time a run may have ended
 
 
 @pytest.mark.parametrize("numbers", [("SIGINT", "SIGINT"), ("SIGTERM", "SIGINT")])
