@@ -55,6 +55,7 @@ WARNINGS = {
     (DataRankWarning, r"X has \d+ columns but varies in \d+ directions only"): "a length scale is not determined",
     (DataRankWarning, r"y has \d+ demonstrations at an input but"): "empirical covariances are singular, and shrunk",
     (DataRankWarning, r"y has \d+ (distinct )?rows but"): "too few rows in all",
+    (DataRankWarning, r"X has rows so near to each other"): "a Wishart process cannot interpolate them",
     (DataRankWarning, r"The demonstrations are identical"): "there is no variability to learn",
     (DataRankWarning, r"y is constant"): "the same of a mixture",
     (DataRankWarning, r"groups has one demonstration"): "what differs between demonstrations cannot be learned of one",

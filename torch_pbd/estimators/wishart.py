@@ -1,5 +1,6 @@
 """The Wishart process ("WP") of the paper, Section IV-A."""
 
+import warnings
 from typing import Any
 
 import torch
@@ -14,7 +15,16 @@ from torch_pbd.estimators._latent import (
     warn_if_stretched,
 )
 from torch_pbd.estimators._validation import Prior, check_choice, check_number, check_solver
-from torch_pbd.gp import LatentGP, LatentValues, Observations, condition, fit_hyperparameters, merge_observations
+from torch_pbd.exceptions import DataRankWarning, NotPositiveDefiniteError
+from torch_pbd.gp import (
+    Hyperparameters,
+    LatentGP,
+    LatentValues,
+    Observations,
+    condition,
+    fit_hyperparameters,
+    merge_observations,
+)
 from torch_pbd.kernels import KernelName
 from torch_pbd.models.costs import Cost, FactorDistance, Likelihood
 from torch_pbd.models.objectives import covariance_mse, gaussian_nll, train
@@ -178,9 +188,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
 
         root = padded(target, self.df_)
         observations = observed(root - prior_root)
-        interpolate = torch.zeros(len(observations.targets)).to(target)
-        search = self._search(observations, _LONGEST_COVARIANCE, problem.length_scale, interpolate)
-        hyperparameters, _, report = fit_hyperparameters(observations, search)
+        hyperparameters, report = self._interpolating(observations, problem)
         warn_if_stretched(hyperparameters.amplitude, observations.targets, given=problem.length_scale is not None)
         latent, jitter = condition(observations, hyperparameters, self.kernel, observed(root).targets)
         with torch.no_grad():
@@ -188,6 +196,25 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         report = FitReport(mse, (mse,), report.n_iter, report.converged, report.message)
         report = report.after(of_mean, "search of the mean")
         return mean, WishartCovariance(latent, _constant(prior_root), matrix), report, jitter
+
+    def _interpolating(self, observations: Observations, problem: Problem) -> tuple[Hyperparameters, FitReport]:
+        """Hyperparameters without noise; where inputs are too near to each other for that, with learned noise."""
+
+        def found(noise_scale: Tensor | None) -> tuple[Hyperparameters, FitReport]:
+            search = self._search(observations, _LONGEST_COVARIANCE, problem.length_scale, noise_scale)
+            hyperparameters, _, report = fit_hyperparameters(observations, search)
+            return hyperparameters, report
+
+        try:
+            return found(torch.zeros_like(observations.targets[:, 0]))
+        except NotPositiveDefiniteError:
+            warnings.warn(
+                "X has rows so near to each other that the empirical covariances at them cannot be interpolated: they "
+                "are smoothed, with a noise that is learned. Make such rows equal, which pools their covariances.",
+                DataRankWarning,
+                stacklevel=6,
+            )
+            return found(None)
 
     def _fit_likelihood(self, problem: Problem, residual: Tensor) -> tuple[WishartCovariance, FitReport, float]:
         prior_root = self._prior_root(problem)
