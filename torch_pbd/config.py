@@ -13,6 +13,7 @@ import yaml
 from jsonargparse import ActionConfigFile, ArgumentParser  # type: ignore[attr-defined]
 from jsonargparse.typing import NonNegativeInt, PositiveFloat, PositiveInt, restricted_number_type
 
+from torch_pbd.console import say
 from torch_pbd.exceptions import ConfigError
 from torch_pbd.options import Option, Options
 
@@ -71,16 +72,17 @@ def parse(command: str, arguments: Sequence[str]) -> tuple[Namespace, str]:
         After ``--help`` and ``--print_config`` are answered.
     """
     if any(argument in ("-h", "--help") for argument in arguments):
-        _parser(command, only_help=True).parse_args(["--help"])
+        say(_parser(command, only_help=True).format_help().rstrip())
+        raise SystemExit(0)
     parser = _parser(command, only_help=False)
     options = Options(parser.options, _classes() if command in _OF_MODELS else {})
     options.read(arguments)
     if options.help_for is not None:
-        print(_class_help(*options.help_for), end="")
+        say(_class_help(*options.help_for).rstrip())
         raise SystemExit(0)
     if options.print_flags is not None:
         shown = options.given() if "skip_default" in options.print_flags else options.complete()
-        print(_as_yaml(_without_nulls(shown) if "skip_unset" in options.print_flags else shown), end="")
+        say(_as_yaml(_without_nulls(shown) if "skip_unset" in options.print_flags else shown).rstrip())
         raise SystemExit(0)
     if (name := options.missing()) is not None:
         raise ConfigError(f"{name} is missing: give --{name}, or {name}: in a file named by --config.")

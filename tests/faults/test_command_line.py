@@ -75,7 +75,9 @@ def test_47_a_link_to_a_folder_is_that_folder(data, tmp_path):
     assert (tmp_path / "link").is_symlink()
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["fit"]])
+@pytest.mark.parametrize(
+    "arguments", [["--help"], ["demo", "--help"], ["demo", "--print_config"], ["fit"]], ids=" ".join
+)
 @pytest.mark.parametrize("closed", ["stdout", "stderr"])
 def test_48_nobody_who_reads_is_no_error(arguments, closed, data, tmp_path):
     """As in ``torch-pbd ... | head -0``: no traceback, and the results are there."""
@@ -86,7 +88,8 @@ def test_48_nobody_who_reads_is_no_error(arguments, closed, data, tmp_path):
     reading, writing = os.pipe()
     os.close(reading)
     streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | {closed: writing}
-    process = subprocess.Popen([*COMMAND, *arguments], text=True, **streams)
+    buffered = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}  # as it is for users
+    process = subprocess.Popen([*COMMAND, *arguments], text=True, env=buffered, **streams)
     os.close(writing)
     out, err = process.communicate(timeout=120)
     assert process.returncode == 0

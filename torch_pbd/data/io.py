@@ -14,9 +14,8 @@ from torch_pbd.files import replacing
 from torch_pbd.memory import require_memory
 
 MAX_BYTES = 512 * 2**20
-_COPIES = (
-    10  # of the bytes of a file, in memory while it is read; for CSV 4.5 measured, twice that with shorter numbers
-)
+# Bytes in memory for each of a file that is read; of a CSV 4.5 are measured, twice that with shorter numbers.
+_COPIES = 10
 
 _READERS: dict[str, Callable[..., Demonstrations]] = {".npz": read_npz, ".csv": read_csv}
 _WRITERS: dict[str, Callable[[Demonstrations, BinaryIO], None]] = {".npz": write_npz, ".csv": write_csv}
