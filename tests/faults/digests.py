@@ -4,6 +4,7 @@ import hashlib
 import sys
 
 import numpy as np
+import torch
 
 from torch_pbd import (
     CholeskyCovRegressor,
@@ -63,7 +64,8 @@ def digests():
 
 
 def put_digests(queue):
-    """The same, told to another process."""
+    """The same, told to another process; on one thread, as that: sums over more are in another order."""
+    torch.set_num_threads(1)
     queue.put(digests())
 
 
