@@ -12,19 +12,21 @@ from numbers import Real
 from typing import Any, Literal, overload
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import gammaincinv
 from sklearn.pipeline import Pipeline
 
-from torch_pbd.arguments import as_floats
+from torch_pbd.covariance_arrays import (
+    Floats,
+    covariances,
+    definite_factor,
+    log_det,
+    matching_covariances,
+    rows_beside,
+    semidefinite_factor,
+)
 
-_Floats = NDArray[np.floating[Any]]
 _Scorer = Callable[[Any, ArrayLike, ArrayLike], float]
-
-_ASYMMETRY = 1e-8  # largest difference of mirrored entries, relative to a matrix's largest entry
-_NEGATIVE = 1e-10  # an eigenvalue no further below zero is rounding, relative to the largest one
-_LARGEST = 1e140  # in size: squares, and their sums, are numbers
-_ZERO_PIVOT = 1e-14  # a pivot of a Cholesky factorization below it is rounding, relative to the diagonal
 
 
 def covariance_mse(
@@ -58,11 +60,11 @@ def covariance_mse(
     """
     _check_choice("on", on, ("cholesky", "matrix"))
     _check_choice("reduce", reduce, ("sum", "mean"))
-    pair = _matching(estimated, reference, names=("estimated", "reference"))
+    pair = matching_covariances(estimated, reference, names=("estimated", "reference"))
     d = pair[0].shape[-1]
     n_entries = d * d
     if on == "cholesky":
-        pair = (_semidefinite_factor("estimated", pair[0]), _semidefinite_factor("reference", pair[1]))
+        pair = (semidefinite_factor("estimated", pair[0]), semidefinite_factor("reference", pair[1]))
         n_entries = d * (d + 1) // 2
     squared = np.square(pair[0] - pair[1]).sum(axis=(-2, -1))
     return float(squared.mean()) / (n_entries if reduce == "mean" else 1)
@@ -80,7 +82,7 @@ def relative_frobenius_error(estimated: ArrayLike, reference: ArrayLike) -> floa
     ValueError
         If shapes disagree, an entry is not finite, a matrix is not symmetric or a reference is zero.
     """
-    estimated, reference = _matching(estimated, reference, names=("estimated", "reference"))
+    estimated, reference = matching_covariances(estimated, reference, names=("estimated", "reference"))
     norm = np.linalg.norm(reference, axis=(-2, -1))
     if (norm <= np.finfo(np.float64).tiny).any():
         raise ValueError(f"reference[{int(np.argmin(norm))}] is zero: no error is relative to it.")
@@ -111,16 +113,18 @@ def gaussian_kl(
         If shapes disagree, an entry is not finite, a matrix is not symmetric and positive definite, or one
         mean is given without the other.
     """
-    reference, estimated = _matching(reference, estimated, names=("reference", "estimated"))
+    reference, estimated = matching_covariances(reference, estimated, names=("reference", "estimated"))
     n, d, _ = reference.shape
     if (reference_mean is None) != (estimated_mean is None):
         raise ValueError("reference_mean and estimated_mean go together: give both or none.")
-    shift: _Floats = np.zeros((n, d))
+    shift: Floats = np.zeros((n, d))
     if reference_mean is not None and estimated_mean is not None:
-        shift = _rows("reference_mean", reference_mean, n, d) - _rows("estimated_mean", estimated_mean, n, d)
-    reference_tril, estimated_tril = _factor("reference", reference), _factor("estimated", estimated)
+        shift = rows_beside("reference_mean", reference_mean, n, d) - rows_beside(
+            "estimated_mean", estimated_mean, n, d
+        )
+    reference_tril, estimated_tril = definite_factor("reference", reference), definite_factor("estimated", estimated)
     whitened = np.linalg.solve(estimated_tril, np.concatenate([reference_tril, shift[..., None]], axis=-1))
-    log_ratio = _log_det(estimated_tril) - _log_det(reference_tril)
+    log_ratio = log_det(estimated_tril) - log_det(reference_tril)
     divergence = 0.5 * (np.square(whitened).sum(axis=(-2, -1)) - d) + log_ratio
     return float(np.mean(np.maximum(divergence, 0.0)))  # equal ones may round to below zero
 
@@ -148,7 +152,7 @@ def negative_log_likelihood(mean: Any, covariance: ArrayLike, y: ArrayLike) -> f
     if _is_estimator(mean):
         return -_mean_log_likelihood(mean, covariance, y)
     whitened, scale_tril = _whitened_residual(mean, covariance, y)
-    nll = 0.5 * np.square(whitened).sum(-1) + _log_det(scale_tril)
+    nll = 0.5 * np.square(whitened).sum(-1) + log_det(scale_tril)
     return float(nll.mean()) + 0.5 * whitened.shape[-1] * math.log(2 * math.pi)
 
 
@@ -226,79 +230,10 @@ def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
         raise ValueError(f"{name} is {value!r}: it must be one of {', '.join(map(repr, choices))}.")
 
 
-def _finite(name: str, array: ArrayLike) -> _Floats:
-    values = as_floats(array, name)
-    if not (np.abs(values) <= _LARGEST).all():
-        raise ValueError(f"{name} has entries that are not finite, or whose squares are not (above {_LARGEST:g}).")
-    return values
-
-
-def _covariances(name: str, array: ArrayLike) -> _Floats:
-    matrices = _finite(name, array)
-    if matrices.ndim != 3 or matrices.shape[1] != matrices.shape[2] or not matrices.size:
-        raise ValueError(f"{name} has shape {matrices.shape}: it must be (n, d, d), one matrix a row.")
-    asymmetry = np.abs(matrices - matrices.mT).max(axis=(1, 2))
-    asymmetric = asymmetry > _ASYMMETRY * np.abs(matrices).max(axis=(1, 2))
-    if asymmetric.any():
-        row = int(np.argmax(asymmetric))
-        raise ValueError(f"{name}[{row}] is not symmetric: mirrored entries differ by {asymmetry[row]:.3g}.")
-    return matrices
-
-
-def _matching(first: ArrayLike, second: ArrayLike, *, names: tuple[str, str]) -> tuple[_Floats, _Floats]:
-    pair = _covariances(names[0], first), _covariances(names[1], second)
-    if pair[0].shape != pair[1].shape:
-        raise ValueError(f"{names[0]} has shape {pair[0].shape} but {names[1]} has shape {pair[1].shape}.")
-    return pair
-
-
-def _rows(name: str, array: ArrayLike, n: int, d: int) -> _Floats:
-    rows = _finite(name, array)
-    if rows.shape != (n, d) and (rows.shape, d) != ((n,), 1):
-        raise ValueError(f"{name} has shape {rows.shape}: these covariances need ({n}, {d}).")
-    return rows.reshape(n, d)
-
-
-def _whitened_residual(mean: ArrayLike, covariance: ArrayLike, y: ArrayLike) -> tuple[_Floats, _Floats]:
+def _whitened_residual(mean: ArrayLike, covariance: ArrayLike, y: ArrayLike) -> tuple[Floats, Floats]:
     """L^-1 (y - mean) and the Cholesky factors L of the covariances."""
-    covariance = _covariances("covariance", covariance)
+    covariance = covariances("covariance", covariance)
     n, d, _ = covariance.shape
-    residual = _rows("y", y, n, d) - _rows("mean", mean, n, d)
-    scale_tril = _factor("covariance", covariance)
+    residual = rows_beside("y", y, n, d) - rows_beside("mean", mean, n, d)
+    scale_tril = definite_factor("covariance", covariance)
     return np.linalg.solve(scale_tril, residual[..., None])[..., 0], scale_tril
-
-
-def _log_det(scale_tril: _Floats) -> _Floats:
-    # Of a factor: half that of its covariance.
-    return np.log(np.diagonal(scale_tril, axis1=-2, axis2=-1)).sum(-1)
-
-
-def _factor(name: str, matrices: _Floats) -> _Floats:
-    """Cholesky factors of positive definite matrices."""
-    try:
-        factor = np.linalg.cholesky(matrices)
-    except np.linalg.LinAlgError:
-        factor = np.zeros_like(matrices)
-    if (np.diagonal(factor, axis1=1, axis2=2) < 1.0 / _LARGEST).any():
-        raise _not_positive(name, "definite", np.linalg.eigvalsh(matrices))
-    return factor
-
-
-def _semidefinite_factor(name: str, matrices: _Floats) -> _Floats:
-    """Cholesky factors of matrices that may be singular: zeros below a pivot that is zero to rounding."""
-    eigenvalues = np.linalg.eigvalsh(matrices)
-    if (eigenvalues[:, 0] < -_NEGATIVE * eigenvalues[:, -1]).any():
-        raise _not_positive(name, "semidefinite", eigenvalues)
-    remainder, factor = matrices.copy(), np.zeros_like(matrices)
-    rounding = _ZERO_PIVOT * np.diagonal(matrices, axis1=-2, axis2=-1)
-    for j in range(matrices.shape[-1]):
-        pivot = remainder[:, j, j]
-        root = np.sqrt(np.where(pivot > rounding[:, j], pivot, np.inf))
-        factor[:, j:, j] = remainder[:, j:, j] / root[:, None]
-        remainder -= factor[:, :, j, None] * factor[:, None, :, j]
-    return factor
-
-
-def _not_positive(name: str, kind: str, eigenvalues: _Floats) -> ValueError:
-    row = int(np.argmin(eigenvalues[:, 0] / np.abs(eigenvalues).max(axis=1).clip(np.finfo(np.float64).tiny)))
-    return ValueError(f"{name}[{row}] is not positive {kind}: its smallest eigenvalue is {eigenvalues[row, 0]:.3g}.")

@@ -15,12 +15,12 @@ from torch_pbd.control.rollout import Rollout
 from torch_pbd.control.schedule import Schedule
 from torch_pbd.data import Demonstrations
 from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.labels import axis_label, output_label, readable_unit, schedule_names, short_unit
 
 Floats = NDArray[np.float64]
 
 # Okabe and Ito's colours, which colour-blind readers tell apart.
 DATA, EMPIRICAL, MODEL, PRIOR, TRUTH = "#999999", "#E69F00", "#0072B2", "#CC79A7", "#009E73"
-_LONGEST_UNIT = 8
 SERIES = (MODEL, EMPIRICAL, TRUTH, PRIOR, "#56B4E9", "#D55E00", "#000000")
 LINES = ("-", "--", ":", "-.")
 
@@ -53,7 +53,7 @@ def plot_demonstrations(
         across, up = (time, columns[0]) if len(outputs) == 1 else columns
         lines += ax.plot(across, up, color=DATA, lw=0.7, alpha=0.8, label=None if lines else label, zorder=1)
     if len(outputs) == 1:
-        ax.set_xlabel(_axis_label("time" if demonstrations.time_unit != "1" else "phase", demonstrations.time_unit))
+        ax.set_xlabel(axis_label("time" if demonstrations.time_unit != "1" else "phase", demonstrations.time_unit))
         ax.set_ylabel(output_label(demonstrations, outputs[0]))
     else:
         ax.set_xlabel(output_label(demonstrations, outputs[0]))
@@ -276,29 +276,3 @@ def _check_axes(name: str, axes: Any, least: int) -> None:
     known = np.ndim(axes) == 1 and all(hasattr(ax, "plot") for ax in axes)
     if not known or len(axes) < least:
         raise ValueError(f"{name} == {axes!r}, must be {least} matplotlib Axes.")
-
-
-def readable_unit(unit: str | None) -> tuple[str, float]:
-    """Unit of a deviation, and what to multiply it by: metres are shown in millimetres."""
-    return ("mm", 1000.0) if unit == "m" else (short_unit(unit), 1.0)
-
-
-def short_unit(unit: str | None) -> str:
-    """Unit for a label or a column; "unit" where there is none, or only a description."""
-    return unit if unit and len(unit) <= _LONGEST_UNIT else "unit"
-
-
-def schedule_names(schedule: Schedule) -> Sequence[str]:
-    """Names of the outputs of a schedule."""
-    return schedule.names or [f"y{i}" for i in range(schedule.position.shape[1])]
-
-
-def output_label(demonstrations: Demonstrations, output: int) -> str:
-    """Name of an output with its unit, for an axis."""
-    units = demonstrations.units
-    unit = units[output] if units is not None else ""
-    return _axis_label(demonstrations.names[output], unit if len(unit) <= _LONGEST_UNIT else "")
-
-
-def _axis_label(name: str, unit: str) -> str:
-    return f"{name} [{unit}]" if unit and unit != "1" else name

@@ -13,7 +13,8 @@ from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.estimators._groups import fit_by_demonstration
 from torch_pbd.experiments.comparison import Score, compare_models
 from torch_pbd.experiments.run_folder import RunFolder, format_table, slug
-from torch_pbd.plotting import MODEL, output_label, plot_covariance_ellipses, plot_demonstrations, plot_model_bands
+from torch_pbd.labels import output_label
+from torch_pbd.plotting import MODEL, plot_covariance_ellipses, plot_demonstrations, plot_model_bands
 
 Align = Literal["auto", "none", "phase", "dtw"]
 Input = Literal["time", "phase"]

@@ -17,7 +17,7 @@ from torch_pbd.control.units import in_metres
 from torch_pbd.data import Demonstrations
 from torch_pbd.experiments.robot_figures import pushes_figure, task_figure, variability_figure
 from torch_pbd.experiments.run_folder import RunFolder, format_table, slug
-from torch_pbd.plotting import readable_unit, schedule_names
+from torch_pbd.labels import readable_unit, schedule_names
 
 _IN_REPORT = ("margin", "max speed", "gain", "environment")
 Floats = NDArray[np.float64]

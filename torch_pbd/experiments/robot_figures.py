@@ -10,11 +10,11 @@ from torch_pbd.control.controller import DMPController
 from torch_pbd.control.rollout import Rollout
 from torch_pbd.control.schedule import Schedule
 from torch_pbd.data import Demonstrations, tunnel_center, tunnel_half_width
+from torch_pbd.labels import output_label
 from torch_pbd.plotting import (
     DATA,
     EMPIRICAL,
     MODEL,
-    output_label,
     plot_covariance_ellipses,
     plot_demonstrations,
     plot_pushes,
