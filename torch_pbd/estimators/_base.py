@@ -1,4 +1,4 @@
-"""What the covariance regressors share: the door between NumPy and torch, and all that follows a fit."""
+"""What the covariance regressors share: the checks before a fit, and all that follows it."""
 
 import warnings
 from abc import ABC, abstractmethod
@@ -8,7 +8,7 @@ from typing import Any, Self
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
-from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
+from sklearn.base import MultiOutputMixin, RegressorMixin
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils._tags import Tags
 from sklearn.utils.validation import check_is_fitted
@@ -19,6 +19,7 @@ from torch_pbd.estimators._progress import printed_progress
 from torch_pbd.estimators._results import Fitted, Uncertainty
 from torch_pbd.estimators._rows import by_chunks
 from torch_pbd.estimators._scaling import Standardization, canonical_order
+from torch_pbd.estimators._torch_estimator import TorchEstimator
 from torch_pbd.estimators._validation import (
     Floats,
     check_inputs_vary,
@@ -32,15 +33,13 @@ from torch_pbd.estimators._validation import (
 from torch_pbd.linalg import gaussian_log_density, safe_cholesky, student_log_density
 from torch_pbd.memory import require_much
 from torch_pbd.models.conditional import ConditionalNormal
-from torch_pbd.models.spec import module_from_spec, module_spec
 from torch_pbd.optim import Progress
 from torch_pbd.seeds import as_random_state
 
 
-class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
+class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator, ABC):
     """Base of the regressors whose covariance depends on the input; not for direct use."""
 
-    device: str | None
     max_iter: int
     tol: float
     verbose: int
@@ -114,9 +113,6 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
 
     def __sklearn_is_fitted__(self) -> bool:
         return "module_" in vars(self)
-
-    def _prepare(self) -> None:
-        """Work out what predictions need of the module alone."""
 
     def _check_parameters(self) -> None:
         """Check the parameters whose values do not depend on the data; subclasses check theirs too."""
@@ -271,24 +267,6 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         covariance = prior_covariance(prior, x.cpu().numpy(), self.n_outputs_)
         return (safe_cholesky(self._door(covariance), name="prior(X)"),)
 
-    def _door(self, array: Any) -> Tensor:
-        """Copy of an array; contiguous, since torch takes no negative strides."""
-        return torch.tensor(np.asarray(array, order="C"), dtype=torch.float64, device=self.device)
-
-    def _device_problem(self) -> str:
-        """Why no tensor can be put on the device; empty if it can."""
-        try:
-            self._door(0.0)
-        except (
-            AssertionError,
-            OverflowError,
-            RuntimeError,
-            TypeError,
-            ValueError,
-        ) as error:  # torch's, by build and by device
-            return str(error).partition("\n")[0].rstrip(".")
-        return ""
-
     def _progress(self) -> Callable[[Progress], None] | None:
         """Callback that prints the loss, or None."""
         return printed_progress(type(self).__name__, self.verbose) if self.verbose else None
@@ -296,29 +274,3 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
     def _assemble(self, core: Any, scaling: Standardization) -> ConditionalNormal:
         parts = (scaling.x_shift, scaling.x_scale, scaling.y_shift, scaling.y_scale)
         return ConditionalNormal(core, *map(self._door, parts)).requires_grad_(False)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """State without tensors: arrays, and what the module is, for pickle, joblib and skops."""
-        state = dict(super().__getstate__())
-        if "module_" in state:
-            module = state.pop("module_")
-            state["_module_spec"] = module_spec(module)
-            state["_module_arrays"] = {k: v.cpu().numpy() for k, v in module.state_dict().items()}
-        return state
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        state = dict(state)
-        arrays, spec = state.pop("_module_arrays", None), state.pop("_module_spec", None)
-        super().__setstate__(state)
-        if arrays is not None:
-            if problem := self._device_problem():
-                warnings.warn(
-                    f"The model was fitted on device {self.device!r}, which this machine lacks ({problem}): it is now "
-                    "on the CPU.",
-                    stacklevel=2,
-                )
-                self.device = None
-            with torch.inference_mode(False):  # else autograd would refuse the module
-                tensors = {name: self._door(array) for name, array in arrays.items()}
-                self.module_ = module_from_spec(spec, tensors).requires_grad_(False)
-            self._prepare()

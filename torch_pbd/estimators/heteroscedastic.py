@@ -1,6 +1,5 @@
 """The recommended regressor: covariance by latent Gaussian processes that are integrated out."""
 
-import warnings
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -9,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.estimators._demonstrations import check_demonstrations
+from torch_pbd.estimators._inducing import check_memory, numbers_to_try, warn_if_unresolved
 from torch_pbd.estimators._latent import default_prior_tril, warn_if_few, warn_if_identical
 from torch_pbd.estimators._results import Fitted
 from torch_pbd.estimators._scaling import Standardization, distinct_rows
@@ -27,27 +27,14 @@ from torch_pbd.linalg import safe_cholesky
 from torch_pbd.memory import require_much
 from torch_pbd.models.heteroscedastic import (
     Families,
-    HeteroscedasticFit,
     HeteroscedasticModel,
-    ProcessFamily,
     SearchOptions,
     fit_heteroscedastic,
 )
 from torch_pbd.models.training import TrainingSet
-from torch_pbd.optim import FitReport, first_failure
 from torch_pbd.seeds import as_random_state
 
-# Prior medians of length scale (in ranges of the input) and amplitude, and prior deviation of the constant. Means
-# are of outputs with unit variance, log variances and coefficients of residuals with a pooled unit covariance.
-_MEAN = (0.3, 1.2, 0.0)
-_LOG_VARIANCE = (0.5, 1.0, 2.0)
-_COEFFICIENT = (0.5, 0.3, 1.0)
-
 _DRAWN = 65536  # matrices drawn at a time: memory stays bounded
-
-# Inducing inputs by default, for one column of X and for several, and where these do not resolve what is learned;
-# and at most of all outputs together, for the mean and for the covariance.
-_N_INDUCING, _N_INDUCING_SEVERAL, _N_INDUCING_MOST, _N_TOGETHER = 48, 128, 128, (800, 400)
 
 
 class HeteroscedasticGPRegressor(CovarianceRegressor):
@@ -264,15 +251,14 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
             raise ValueError(f"shared_length_scale == {self.shared_length_scale!r}, must be True or False.")
 
     def _fit(self, X: Floats, y: Floats, **told: Any) -> Fitted:
-        length_scale = check_length_scale(self.length_scale, X.shape[1])
-        period = check_period(self.period, self.kernel, X.shape[1])
         groups = told.get("groups")
         if groups is not None:
             check_demonstrations(X, y, groups)
         scaling = Standardization.of(X, y)
         standardized = scaling.inputs(X)
         inputs, index = distinct_rows(standardized)
-        self._check_memory(min(len(inputs), self.max_inputs), X.shape[1], y.shape[1])
+        check_memory(self.n_inducing, self.max_inputs, (*inputs.shape, y.shape[1]))
+        held, circle = self._in_ranges(scaling)
         prior_tril = self._prior_tril(X, y, scaling)
         training = TrainingSet(
             self._door(standardized), self._door(scaling.outputs(y)), self._door(inputs), self._door(index).long()
@@ -280,39 +266,30 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         warn_if_few(len(y), y.shape[1])
         warn_if_identical(training)
         training = training.merged(self.max_inputs)
-        kernel: KernelName = "squared_exponential" if self.kernel == "periodic" else self.kernel
-        circle = None if period is None else self._door(period / scaling.x_scale)
-        held = None if length_scale is None else self._door(length_scale / scaling.x_scale)
         group = None if groups is None else self._door(groups).long()
         options = SearchOptions(self.max_iter, self.tol, self.n_restarts, self._progress())
-        *tried, last = dict.fromkeys(self._n_inducing(X.shape[1], y.shape[1]))
-        for sizes in (*tried, last):
-            chosen = [inducing_inputs(training.inputs, size) for size in sizes]
-            of_mean, features = (FeatureMap(z, kernel, circle, len(z) == len(inputs)) for z in chosen)
-            families = Families(
-                ProcessFamily(of_mean, *_MEAN, shared=self.shared_length_scale),
-                ProcessFamily(features, *_LOG_VARIANCE, held, self.shared_length_scale),
-                ProcessFamily(features, *_COEFFICIENT, held),
-            )
-            fit = fit_heteroscedastic(training, group, families, options, needs_resolution=sizes != last)
+        kernel: KernelName = "squared_exponential" if self.kernel == "periodic" else self.kernel
+        to_try = numbers_to_try(self.n_inducing, X.shape[1], y.shape[1])
+        for sizes in to_try:
+            inducing = [inducing_inputs(training.inputs, size) for size in sizes]
+            of_mean, features = (FeatureMap(z, kernel, circle, len(z) == len(inputs)) for z in inducing)
+            families = Families.of(of_mean, features, held, shared=self.shared_length_scale)
+            fit = fit_heteroscedastic(training, group, families, options, needs_resolution=sizes != to_try[-1])
             if fit is not None:
                 break
         assert fit is not None
-        _warn_if_unresolved(held, features)
+        warn_if_unresolved(held, features)
         self.effective_share_ = 1.0 if fit.correlation is None else float(fit.correlation.share.mean())
         module = HeteroscedasticModel(fit, prior_tril)
-        return Fitted(self._assemble(module, scaling), _report(fit, options), features.jitter)
+        report = options.outcome(tuple(-value for value in fit.log_evidence))
+        return Fitted(self._assemble(module, scaling), report, features.jitter)
 
-    def _check_memory(self, n_inputs: int, n_features: int, n_outputs: int) -> None:
-        """Measured: of each output's features for the differences that start a search, and of all outputs' together."""
-        size = min(n_inputs, max(max(pair) for pair in self._n_inducing(n_features, n_outputs)))
-        searched = 4 * (n_features + 1) * (n_features + 2) * n_outputs * size * (n_inputs + size)
-        require_much(
-            8.0 * (searched + 24 * (n_outputs * size) ** 2),
-            what=f"max_inputs == {self.max_inputs} with n_inducing == {self.n_inducing} lets {n_inputs} distinct "
-            f"inputs and {size} inducing ones into the fit, which",
-            remedy="Lower them, n_inducing first.",
-        )
+    def _in_ranges(self, scaling: Standardization) -> tuple[torch.Tensor | None, torch.Tensor | None]:
+        """The length scale and the period that were given, in ranges of the inputs."""
+        length_scale = check_length_scale(self.length_scale, len(scaling.x_scale))
+        period = check_period(self.period, self.kernel, len(scaling.x_scale))
+        held = None if length_scale is None else self._door(length_scale / scaling.x_scale)
+        return held, None if period is None else self._door(period / scaling.x_scale)
 
     def _prior_tril(self, X: Floats, y: Floats, scaling: Standardization) -> torch.Tensor:
         if self.prior is None:
@@ -320,30 +297,3 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         covariance = prior_covariance(self.prior, X, y.shape[1]) / scaling.y_scale[:, np.newaxis] / scaling.y_scale
         tril = safe_cholesky(self._door(covariance), name="prior")
         return tril if tril.ndim == 2 else tril[0]  # a callable is asked again at every prediction
-
-    def _n_inducing(self, n_features: int, n_outputs: int) -> list[tuple[int, int]]:
-        """Inducing inputs of the mean's processes and of the covariance's, to be tried one after another."""
-        if self.n_inducing is not None:
-            return [(self.n_inducing, self.n_inducing)]
-        together = [max(12, most // n_outputs) for most in _N_TOGETHER]
-        few = _N_INDUCING if n_features == 1 else _N_INDUCING_SEVERAL
-        return [(min(size, together[0]), min(size, together[1])) for size in (few, _N_INDUCING_MOST)]
-
-
-def _report(fit: HeteroscedasticFit, options: SearchOptions) -> FitReport:
-    losses = tuple(-value for value in fit.log_evidence)
-    message = first_failure(message for _, message in options.ends)
-    n_iter = max(n_iter for n_iter, _ in options.ends)
-    return FitReport(losses[-1], losses, n_iter, message == "converged", message)
-
-
-def _warn_if_unresolved(length_scale: torch.Tensor | None, features: FeatureMap) -> None:
-    """Warn where a length scale that the user gave is shorter than the inputs can tell."""
-    least = features.shortest_length_scale()
-    if length_scale is not None and bool((length_scale < least).any()):
-        warnings.warn(
-            f"length_scale is below {least:.3g} of the range of X, which is what the inputs (or n_inducing of them) "
-            "resolve: between them the covariance says nothing. Give a longer one, or None to learn it.",
-            UserWarning,
-            stacklevel=5,
-        )

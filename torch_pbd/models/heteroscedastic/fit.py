@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from torch_pbd.gp.inducing import FeatureMap
 from torch_pbd.linalg import scale_tril_from_root
 from torch_pbd.models.heteroscedastic.correlation import (
     DemonstrationCorrelation,
@@ -19,6 +20,12 @@ from torch_pbd.models.heteroscedastic.mean import LatentMean, fit_mean
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
 from torch_pbd.models.heteroscedastic.search import Search, SearchOptions
 from torch_pbd.models.training import TrainingSet, pooled_tril
+
+# Prior medians of length scale (in ranges of the input) and amplitude, and prior deviation of the constant. Means
+# are of outputs with unit variance, log variances and coefficients of residuals with a pooled unit covariance.
+_MEAN = (0.3, 1.2, 0.0)
+_LOG_VARIANCE = (0.5, 1.0, 2.0)
+_COEFFICIENT = (0.5, 0.3, 1.0)
 
 # Rows at an input whose mean is all their own still tell this share of a variance, or nothing would.
 _LEAST_SHARE = 0.1
@@ -37,6 +44,22 @@ class Families:
     mean: ProcessFamily
     log_variance: ProcessFamily
     coefficients: ProcessFamily
+
+    @classmethod
+    def of(
+        cls,
+        of_mean: FeatureMap,
+        of_covariance: FeatureMap,
+        length_scale: Float[Tensor, " e"] | None = None,
+        *,
+        shared: bool = False,
+    ) -> "Families":
+        """Those that the recommended model has, on these features; ``length_scale`` holds the covariance's."""
+        return cls(
+            ProcessFamily(of_mean, *_MEAN, shared=shared),
+            ProcessFamily(of_covariance, *_LOG_VARIANCE, length_scale, shared),
+            ProcessFamily(of_covariance, *_COEFFICIENT, length_scale),
+        )
 
 
 @dataclass(frozen=True)

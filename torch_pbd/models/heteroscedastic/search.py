@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torch_pbd.exceptions import NotPositiveDefiniteError
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
-from torch_pbd.optim import Progress, Record, State, first_failure, minimize_batch, recorded
+from torch_pbd.optim import FitReport, Progress, Record, State, first_failure, minimize_batch, recorded
 
 _SMALL = 10_000  # entries of all processes' features
 _DIFFERENCE = 1e-3  # of hyperparameters, whose gradients' differences tell the curvature at a start
@@ -42,6 +42,11 @@ class SearchOptions:
         """Tell the callback."""
         if self.callback is not None:
             self.callback(Progress(turn, loss, elapsed))
+
+    def outcome(self, losses: tuple[float, ...]) -> FitReport:
+        """What became of a fit with these losses, by how its searches ended."""
+        message = first_failure(message for _, message in self.ends)
+        return FitReport(losses[-1], losses, max(n for n, _ in self.ends), message == "converged", message)
 
 
 @dataclass

@@ -1,0 +1,66 @@
+"""The door between NumPy and torch: arrays to the device, and a fitted module into pickles and back."""
+
+import warnings
+from typing import Any
+
+import numpy as np
+import torch
+from sklearn.base import BaseEstimator
+from torch import Tensor
+
+from torch_pbd.models.conditional import ConditionalNormal
+from torch_pbd.models.spec import module_from_spec, module_spec
+
+
+class TorchEstimator(BaseEstimator):
+    """Base of estimators that keep what they learned in a torch module, ``module_``, on ``device``."""
+
+    device: str | None
+    module_: ConditionalNormal
+
+    def _prepare(self) -> None:
+        """Work out what predictions need of the module alone."""
+
+    def _door(self, array: Any) -> Tensor:
+        """Copy of an array; contiguous, since torch takes no negative strides."""
+        return torch.tensor(np.asarray(array, order="C"), dtype=torch.float64, device=self.device)
+
+    def _device_problem(self) -> str:
+        """Why no tensor can be put on the device; empty if it can."""
+        try:
+            self._door(0.0)
+        except (
+            AssertionError,
+            OverflowError,
+            RuntimeError,
+            TypeError,
+            ValueError,
+        ) as error:  # torch's, by build and by device
+            return str(error).partition("\n")[0].rstrip(".")
+        return ""
+
+    def __getstate__(self) -> dict[str, Any]:
+        """State without tensors: arrays, and what the module is, for pickle, joblib and skops."""
+        state = dict(super().__getstate__())
+        if "module_" in state:
+            module = state.pop("module_")
+            state["_module_spec"] = module_spec(module)
+            state["_module_arrays"] = {k: v.cpu().numpy() for k, v in module.state_dict().items()}
+        return state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        state = dict(state)
+        arrays, spec = state.pop("_module_arrays", None), state.pop("_module_spec", None)
+        super().__setstate__(state)
+        if arrays is not None:
+            if problem := self._device_problem():
+                warnings.warn(
+                    f"The model was fitted on device {self.device!r}, which this machine lacks ({problem}): it is now "
+                    "on the CPU.",
+                    stacklevel=2,
+                )
+                self.device = None
+            with torch.inference_mode(False):  # else autograd would refuse the module
+                tensors = {name: self._door(array) for name, array in arrays.items()}
+                self.module_ = module_from_spec(spec, tensors).requires_grad_(False)
+            self._prepare()
