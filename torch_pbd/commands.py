@@ -29,7 +29,8 @@ def demo(options: Any, folder: Any) -> str:
         "GMM 5": GMMBaseline(n_components=5),
     }
     say(f"{options.n_demos} made demonstrations of the tunnel task; the truth is that of 300 more\n")
-    return run_demo(models, folder, n_demos=options.n_demos, seed=options.seed) + "\n\n" + _LEGEND
+    tables = run_demo(models, folder, n_demos=options.n_demos, seed=options.seed)
+    return f"{tables}\n\n{_LEGEND};\n95 % of fresh: share of the samples of those 300 in it"
 
 
 def fit(options: Any, folder: Any) -> str:
