@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.estimators._mean import mean_that_repeats_allow
 from torch_pbd.estimators._results import Fitted
 from torch_pbd.estimators._scaling import Standardization, distinct_rows
 from torch_pbd.estimators._validation import (
@@ -24,7 +25,6 @@ from torch_pbd.gp import (
     EvidenceSearch,
     LatentGP,
     Observations,
-    condition,
     fit_together,
     resolved_length_scale,
     spacing,
@@ -157,9 +157,8 @@ class LatentCovarianceRegressor(CovarianceRegressor):
 
     def _fit_mean(self, training: TrainingSet) -> tuple[LatentGP, FitReport]:
         """Gaussian processes of the mean, by themselves."""
-        observations, search = self._mean_job(training)
-        (found,) = fit_together([(observations, search)])
-        return condition(observations, found.hyperparameters, self.kernel, basis=found.basis)[0], found.report
+        job = self._mean_job(training)
+        return mean_that_repeats_allow(training, *job, *fit_together([job]))
 
     def _mean_job(self, training: TrainingSet) -> tuple[Observations, EvidenceSearch]:
         """Means at the inputs, weighted by their counts, and the search for their hyperparameters."""

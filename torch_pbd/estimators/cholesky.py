@@ -12,6 +12,7 @@ from torch_pbd.estimators._latent import (
     residual_tril,
     warn_if_stretched,
 )
+from torch_pbd.estimators._mean import mean_that_repeats_allow
 from torch_pbd.estimators._validation import Prior, check_choice, check_number, check_solver
 from torch_pbd.gp import LatentGP, LatentValues, Observations, condition, fit_together
 from torch_pbd.kernels import KernelName
@@ -174,12 +175,12 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
         of_mean, of_entries = fit_together([mean_job, (observations, search)])
         amplitude = of_entries.hyperparameters.amplitude
         warn_if_stretched(amplitude, observations.targets, given=problem.length_scale is not None)
-        mean, _ = condition(mean_job[0], of_mean.hyperparameters, self.kernel, basis=of_mean.basis)
+        mean, of_mean_report = mean_that_repeats_allow(training, *mean_job, of_mean)
         values = tril_to_vector(scale_tril).mT.contiguous()
         found = (of_entries.hyperparameters, self.kernel, values)
         latent, jitter = condition(observations, *found, basis=of_entries.basis)
         prior = problem.prior_tril if problem.prior_tril.ndim == 2 else problem.prior_tril[0]
-        report = of_entries.report.after(of_mean.report, "search of the mean")
+        report = of_entries.report.after(of_mean_report, "search of the mean")
         return mean, CholeskyCovariance(latent, prior, log_diagonal=log_diagonal), report, jitter
 
     def _entry_noise(self, problem: Problem) -> Tensor | None:
