@@ -35,7 +35,10 @@ def as_array(values: Any, name: str) -> NDArray[Any]:
 
 def as_floats(values: Any, name: str) -> Floats:
     """The same in float64, with missing entries as NaN; not a copy where it is such an array already."""
-    return np.asarray(as_array(values, name), dtype=np.float64)
+    array = as_array(values, name)
+    if array.dtype.kind == "O":
+        array = np.reshape([math.nan if _is_missing(entry) else float(entry) for entry in array.flat], array.shape)
+    return np.asarray(array, dtype=np.float64)
 
 
 def from_tensor(values: Any, name: str) -> NDArray[Any]:
@@ -102,8 +105,12 @@ def is_finite(value: Any) -> bool:
         return False
 
 
+def _is_missing(entry: Any) -> bool:
+    return entry is None or type(entry).__name__ == "NAType"
+
+
 def _check_entry(entry: Any, name: str, place: int) -> None:
-    if entry is None or type(entry).__name__ == "NAType":
+    if _is_missing(entry):
         return  # a missing value, of which more is said where NaN are refused
     if np.ndim(entry):
         raise TypeError(f"{name} holds a {type(entry).__name__} as entry {place}: give one number for each.")

@@ -15,6 +15,7 @@ from sklearn.utils.validation import check_is_fitted
 from torch import Tensor
 
 from torch_pbd.estimators._demonstrations import check_groups
+from torch_pbd.estimators._prior import prior_covariance
 from torch_pbd.estimators._progress import printed_progress
 from torch_pbd.estimators._results import Fitted, Uncertainty
 from torch_pbd.estimators._rows import by_chunks
@@ -28,7 +29,6 @@ from torch_pbd.estimators._validation import (
     check_weights,
     checked_queries,
     checked_rows,
-    prior_covariance,
 )
 from torch_pbd.linalg import gaussian_log_density, safe_cholesky, student_log_density
 from torch_pbd.memory import require_much

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.estimators._mean import mean_that_repeats_allow
+from torch_pbd.estimators._prior import standardized_prior
 from torch_pbd.estimators._results import Fitted
 from torch_pbd.estimators._scaling import Standardization, distinct_rows
 from torch_pbd.estimators._validation import (
@@ -18,7 +19,6 @@ from torch_pbd.estimators._validation import (
     check_choice,
     check_length_scale,
     check_number,
-    prior_covariance,
 )
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.gp import (
@@ -59,6 +59,9 @@ class LatentCovarianceRegressor(CovarianceRegressor):
 
     aligned_objective: str
     """Value of ``objective`` that works on empirical covariances."""
+
+    _costly = "max_inputs"
+    """Parameters that decide on the memory."""
 
     objective: str
     prior: Any
@@ -145,15 +148,12 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         return True
 
     def _prior_tril(self, training: TrainingSet, scaling: Standardization) -> Tensor:
-        n_outputs = training.y.shape[1]
         if self.prior is None:
             return default_prior_tril(training.y)
         if isinstance(self.prior, str):  # "paper": the entries of the factor are in the units of y
             return torch.diag(1.0 / self._door(scaling.y_scale))
         X = scaling.x_shift + scaling.x_scale * training.inputs.cpu().numpy()
-        covariance = prior_covariance(self.prior, X, n_outputs)
-        scaled = covariance / scaling.y_scale[:, np.newaxis] / scaling.y_scale
-        return safe_cholesky(self._door(scaled), name="prior")
+        return safe_cholesky(self._door(standardized_prior(self.prior, X, scaling.y_scale)), name="prior")
 
     def _fit_mean(self, training: TrainingSet) -> tuple[LatentGP, FitReport]:
         """Gaussian processes of the mean, by themselves."""
@@ -196,13 +196,17 @@ class LatentCovarianceRegressor(CovarianceRegressor):
 
     def _check_memory(self, n_distinct: int, n_outputs: int) -> None:
         n_inputs = min(n_distinct, self.max_inputs)
-        n_processes = (n_outputs + 1) ** 2  # at most
-        needed = 8.0 * n_inputs**2 * n_processes * 4
+        n_processes = self._n_processes(n_outputs)
         require_much(
-            needed,
-            what=f"max_inputs == {self.max_inputs} lets {n_inputs} distinct inputs into kernel matrices, which",
-            remedy="Lower max_inputs.",
+            8.0 * n_inputs**2 * n_processes * 4,
+            what=f"max_inputs == {self.max_inputs} lets {n_inputs} distinct inputs into kernel matrices of "
+            f"{n_processes} processes, which",
+            remedy=f"Lower {self._costly}.",
         )
+
+    def _n_processes(self, n_outputs: int) -> int:
+        """Processes of the mean and the covariance, at most."""
+        return (n_outputs + 1) ** 2
 
 
 def residual_tril(residual: Tensor) -> Tensor:

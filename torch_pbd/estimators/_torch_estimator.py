@@ -28,7 +28,7 @@ class TorchEstimator(BaseEstimator):
     def _device_problem(self) -> str:
         """Why no tensor can be put on the device; empty if it can."""
         try:
-            self._door(0.0)
+            self._door(0.0).cpu()  # of a meta tensor there are no numbers
         except (
             AssertionError,
             OverflowError,

@@ -1,7 +1,7 @@
 """Checks of what users pass to an estimator, before any work starts."""
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from numbers import Integral, Real
 from typing import Any
 
@@ -10,18 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import issparse
 from sklearn.utils.validation import check_is_fitted, check_scalar, validate_data
 
-from torch_pbd.arguments import as_array, check_finite, from_tensor, is_finite
+from torch_pbd.arguments import as_array, as_floats, check_finite, from_tensor, is_finite
 from torch_pbd.exceptions import DataRankWarning
 
 Floats = NDArray[np.float64]
-Prior = (
-    float | list[list[float]] | str | Callable[[Any], Any] | None
-)  # or any array-like; the type is what YAML can say
-
 # A column whose spread is below this of its largest value differs only by rounding.
 CONSTANT = 1e-11
-# Eigenvalues of a prior below this of the largest cannot be told from zero.
-_SINGULAR = 1e-14
 # Of a value, so that its square, and a thousand of them added up, is a number.
 _LARGEST = 1e140
 
@@ -40,7 +34,7 @@ def as_plain_array(values: Any, name: str) -> Any:
     if hasattr(values, "detach"):
         values = from_tensor(values, name)
     for label, part in _parts(values, name):
-        if part.dtype in (np.float16, np.float32) and part.size:
+        if part.dtype in (np.float16, np.float32) and part.ndim and part.size:
             _check_resolution(part, name, label)
     return values
 
@@ -56,7 +50,7 @@ def checked_values(values: Any, name: str) -> Any:
     """The same, and all of it finite."""
     values = as_plain_array(values, name)
     for label, part in _parts(values, name):
-        check_finite(part, name, label)
+        check_finite(as_floats(part, name) if part.dtype.kind == "O" else part, name, label)
     return values
 
 
@@ -116,7 +110,7 @@ def _is_plain(X: Any, fitted: Mapping[str, Any]) -> bool:
 
 def check_weights(sample_weight: Any, n_samples: int) -> Floats:
     """Weights (n,) of rows: finite, none negative, not all zero."""
-    weights = _as_floats(sample_weight, "sample_weight")
+    weights = parameter_floats(sample_weight, "sample_weight")
     if weights.shape != (n_samples,):
         raise ValueError(f"sample_weight has shape {weights.shape}, must have shape ({n_samples},): one for each row.")
     if not (np.isfinite(weights).all() and (weights >= 0).all() and weights.any()):
@@ -190,9 +184,16 @@ def check_choice(value: Any, name: str, choices: tuple[str, ...]) -> None:
         raise ValueError(f"{name} == {value!r}, must be one of {', '.join(map(repr, choices))}.")
 
 
+def check_flag(value: Any, name: str) -> None:
+    """Check that a parameter is True or False; a text would count as True."""
+    if not isinstance(value, bool | np.bool_):
+        raise ValueError(f"{name} == {value!r}, must be True or False.")
+
+
 def check_solver(solver: str, *, latent_prior: bool) -> None:
     """Check what latent values are trained with."""
     check_choice(solver, "solver", ("auto", "fisher", "lbfgs"))
+    check_flag(latent_prior, "latent_prior")
     if solver == "fisher" and not latent_prior:
         raise ValueError(
             "solver == 'fisher' holds the hyperparameters, which latent_prior=False trains: use solver='auto' or "
@@ -204,7 +205,7 @@ def check_length_scale(value: Any, n_features: int) -> Floats | None:
     """Length scales as an array (n_features,), or None where they are to be learned."""
     if value is None:
         return None
-    scales = _as_floats(value, "length_scale")
+    scales = parameter_floats(value, "length_scale")
     if scales.shape not in [(), (n_features,)] or not (np.isfinite(scales).all() and (scales > 0).all()):
         raise ValueError(
             f"length_scale == {value!r}, must be None, a positive number, or {n_features} positive numbers: one "
@@ -219,7 +220,7 @@ def check_period(value: Any, kernel: str, n_features: int) -> Floats | None:
         if kernel == "periodic":
             raise ValueError("kernel == 'periodic' needs a period, in units of X, such as period=1.0 for a phase.")
         return None
-    periods = _as_floats(value, "period")
+    periods = parameter_floats(value, "period")
     if periods.shape not in [(), (n_features,)] or not (periods > 0).all():
         raise ValueError(
             f"period == {value!r}, must be None, a positive number, or {n_features} positive numbers (or inf): one "
@@ -228,37 +229,8 @@ def check_period(value: Any, kernel: str, n_features: int) -> Floats | None:
     return np.broadcast_to(periods, (n_features,)).copy()
 
 
-def prior_covariance(prior: Prior, X: Floats, n_outputs: int) -> Floats:
-    """Covariances (n, d, d) or (d, d) that a float, array or callable prior stands for.
-
-    Raises
-    ------
-    ValueError
-        If they are not of that shape, finite, symmetric and positive definite.
-    """
-    shape: tuple[int, ...] = (n_outputs, n_outputs)
-    if callable(prior):
-        try:
-            value = prior(X.copy())
-        except Exception as error:
-            error.add_note(f"Raised by prior(X), which was asked for covariances at X of shape {X.shape}.")
-            raise
-        covariance = _as_floats(value, "prior(X)")
-        name, shape = "prior(X)", (len(X), *shape)
-    else:
-        covariance = _as_floats(prior, "prior")
-        name = "prior"
-        if covariance.ndim == 0:
-            covariance = covariance * np.eye(n_outputs)
-    if covariance.shape != shape:
-        raise ValueError(
-            f"{name} has shape {covariance.shape}, must have shape {shape}: a covariance in squared units of y."
-        )
-    _check_positive_definite(covariance.reshape(-1, n_outputs, n_outputs), name)
-    return covariance
-
-
-def _as_floats(value: Any, name: str) -> Floats:
+def parameter_floats(value: Any, name: str) -> Floats:
+    """A parameter of numbers as an array of floats, of any shape."""
     try:
         array = np.array(as_plain_array(value, name))
         if array.dtype.kind == "b":
@@ -266,29 +238,3 @@ def _as_floats(value: Any, name: str) -> Floats:
         return array.astype(np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} == {value!r}, must be numbers ({error}).") from error
-
-
-def _check_positive_definite(covariances: Floats, name: str) -> None:
-    finite = np.isfinite(covariances).all(axis=(1, 2))
-    if not finite.all():
-        raise ValueError(f"{name} has an entry that is not finite, at index {int(np.argmin(finite))}.")
-    scale = np.abs(covariances).max(axis=(1, 2))
-    asymmetry = np.abs(covariances - covariances.transpose(0, 2, 1)).max(axis=(1, 2))
-    if (asymmetry > 1e-9 * scale).any():
-        i = int(np.argmax(asymmetry > 1e-9 * scale))
-        raise ValueError(f"{name} must be symmetric; at index {i} two entries differ by {asymmetry[i]:.3g}.")
-    # Units of outputs may be far apart: judge the correlations, not the covariances.
-    variance = np.diagonal(covariances, axis1=1, axis2=2)
-    smallest = np.linalg.eigvalsh(covariances)[:, 0]
-    bad = ~(variance > 0).all(axis=1)
-    if not bad.any():
-        deviation = np.sqrt(variance)
-        correlations = covariances / deviation[:, :, np.newaxis] / deviation[:, np.newaxis, :]
-        bad = np.linalg.eigvalsh(correlations)[:, 0] <= _SINGULAR
-    if bad.any():
-        i = int(np.argmax(bad))
-        raise ValueError(
-            f"{name} must be positive definite; its smallest eigenvalue is {smallest[i]:.3g}"
-            + (f" at index {i}." if len(covariances) > 1 else ".")
-            + " Far from data it is the covariance: give every direction some variance."
-        )

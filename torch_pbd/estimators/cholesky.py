@@ -13,7 +13,8 @@ from torch_pbd.estimators._latent import (
     warn_if_stretched,
 )
 from torch_pbd.estimators._mean import mean_that_repeats_allow
-from torch_pbd.estimators._validation import Prior, check_choice, check_number, check_solver
+from torch_pbd.estimators._prior import Prior
+from torch_pbd.estimators._validation import check_choice, check_flag, check_number, check_solver
 from torch_pbd.gp import LatentGP, LatentValues, Observations, condition, fit_together
 from torch_pbd.kernels import KernelName
 from torch_pbd.linalg import tril_to_vector
@@ -27,6 +28,7 @@ from torch_pbd.optim import FitReport
 # Logarithms of the empirical diagonal are taken of no less than this of its root mean square over the inputs:
 # an exact zero at one input, as where all recordings start at the origin, would else dominate its neighbours.
 _LEAST_DIAGONAL = 1e-3
+_LARGEST_NOISE = 1e100  # in deviations of y: its square is a number
 
 # Prior standard deviation of the logarithm of a diagonal entry: a factor of e^2 either way is usual.
 _LOG_AMPLITUDE = 2.0
@@ -159,6 +161,7 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
     def _check_parameters(self) -> None:
         super()._check_parameters()
         check_number(self.noise_scale, "noise_scale", low=0.0, optional=True)
+        check_flag(self.bias_correction, "bias_correction")
         check_choice(self.diagonal, "diagonal", ("auto", "raw", "log"))
         check_solver(self.solver, latent_prior=self.latent_prior)
 
@@ -189,6 +192,11 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
             return None
         row, column = torch.tril_indices(*problem.prior_tril.shape[-2:], device=problem.prior_tril.device)
         noise = self.noise_scale / self._door(problem.scaling.y_scale)[row]
+        if not bool((noise < _LARGEST_NOISE).all()):
+            raise ValueError(
+                f"noise_scale == {self.noise_scale:g} is {float(noise.max()):.3g} times the deviation of y: give it in "
+                "the units of y, or None to learn it."
+            )
         if self.diagonal == "log":
             typical = pooled_tril(problem.training).diagonal().clamp_min(1e-6)[row]
             noise = torch.where(row == column, noise / typical, noise)

@@ -10,16 +10,16 @@ from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.estimators._demonstrations import check_demonstrations
 from torch_pbd.estimators._inducing import check_memory, numbers_to_try, warn_if_unresolved
 from torch_pbd.estimators._latent import default_prior_tril, warn_if_few, warn_if_identical
+from torch_pbd.estimators._prior import Prior, standardized_prior
 from torch_pbd.estimators._results import Fitted
 from torch_pbd.estimators._scaling import Standardization, distinct_rows
 from torch_pbd.estimators._validation import (
     Floats,
-    Prior,
     check_choice,
+    check_flag,
     check_length_scale,
     check_number,
     check_period,
-    prior_covariance,
 )
 from torch_pbd.gp.inducing import FeatureMap, inducing_inputs
 from torch_pbd.kernels import KERNELS, KernelName
@@ -247,8 +247,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         check_choice(self.kernel, "kernel", (*KERNELS, "periodic"))
         check_number(self.n_inducing, "n_inducing", low=2, integer=True, optional=True)
         check_number(self.max_inputs, "max_inputs", low=2, integer=True)
-        if not isinstance(self.shared_length_scale, bool | np.bool_):
-            raise ValueError(f"shared_length_scale == {self.shared_length_scale!r}, must be True or False.")
+        check_flag(self.shared_length_scale, "shared_length_scale")
 
     def _fit(self, X: Floats, y: Floats, **told: Any) -> Fitted:
         groups = told.get("groups")
@@ -294,6 +293,5 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
     def _prior_tril(self, X: Floats, y: Floats, scaling: Standardization) -> torch.Tensor:
         if self.prior is None:
             return default_prior_tril(self._door(scaling.outputs(y)))
-        covariance = prior_covariance(self.prior, X, y.shape[1]) / scaling.y_scale[:, np.newaxis] / scaling.y_scale
-        tril = safe_cholesky(self._door(covariance), name="prior")
+        tril = safe_cholesky(self._door(standardized_prior(self.prior, X, scaling.y_scale)), name="prior")
         return tril if tril.ndim == 2 else tril[0]  # a callable is asked again at every prediction

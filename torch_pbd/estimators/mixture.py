@@ -112,7 +112,7 @@ class GMMBaseline(CovarianceRegressor):
 
     def _fit(self, X: Floats, y: Floats, **told: Any) -> Fitted:
         points = _points(X, y)
-        n_distinct = len(distinct_rows(points)[0])
+        n_distinct, n_components = len(distinct_rows(points)[0]), int(self.n_components)
         if n_distinct < self.n_components:
             raise ValueError(
                 f"n_components == {self.n_components}, must not be above the number of distinct samples, which is "
@@ -120,7 +120,7 @@ class GMMBaseline(CovarianceRegressor):
             )
         require_much(
             # Measured: responsibilities, and the rows centred at and whitened by each component.
-            8.0 * self.n_components * (len(X) * (3 * points.shape[1] + 4) + self.n_components),
+            8.0 * n_components * (len(X) * (3 * points.shape[1] + 4) + n_components),
             what=f"n_components == {self.n_components} for {len(X)} rows",
             remedy="Take fewer components.",
         )

@@ -14,7 +14,8 @@ from torch_pbd.estimators._latent import (
     residual_tril,
     warn_if_stretched,
 )
-from torch_pbd.estimators._validation import Prior, check_choice, check_number, check_solver
+from torch_pbd.estimators._prior import Prior
+from torch_pbd.estimators._validation import check_choice, check_number, check_solver
 from torch_pbd.exceptions import DataRankWarning, NotPositiveDefiniteError
 from torch_pbd.gp import (
     Hyperparameters,
@@ -111,6 +112,8 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
 
     aligned_objective = "mse"
 
+    _costly = "df or max_inputs"
+
     def __init__(
         self,
         *,
@@ -152,6 +155,10 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         check_solver(self.solver, latent_prior=self.latent_prior)
         if self.df not in (None, "auto"):
             check_number(self.df, "df", low=1, integer=True)
+
+    def _n_processes(self, n_outputs: int) -> int:
+        df = n_outputs + 1 if self.df in (None, "auto") else int(self.df)
+        return n_outputs * (df + 1)
 
     def _prior_root(self, problem: Problem) -> Tensor:
         """L times the vectors' prior means: (d, df), or (n, d, df) where the prior is callable."""

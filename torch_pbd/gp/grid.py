@@ -80,7 +80,7 @@ class Coordinates:
         self.noisy = len(bounds) > n_length_scales
         like = evidence.projection.targets[:, 0]
         low = [math.log(lowest) + 0.0 * like for lowest, _ in bounds]
-        high = [torch.as_tensor(highest).to(like).log() + 0.0 * like for _, highest in bounds]
+        high = [torch.as_tensor(highest, dtype=like.dtype).to(like).log() + 0.0 * like for _, highest in bounds]
         self.low = torch.stack([*low, like], dim=1)[:, :-1]
         self.half_width = 0.5 * (torch.stack([*high, like], dim=1)[:, :-1] - self.low)
 

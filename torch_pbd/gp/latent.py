@@ -126,6 +126,6 @@ def condition(
     factor, jitter = cholesky_with_jitter(gram, name="the kernel matrix of the training inputs")
     solved = torch.cholesky_solve(targets.reshape(2, -1, gram.shape[-1]).permute(1, 2, 0), factor)
     weight, value_weight = basis.lowered(solved).unbind(-1)
-    root = None if basis.root is None else basis.root.clone()
+    root = None if basis.root is None else basis.root.clone(memory_format=torch.contiguous_format)
     parts = (weight.contiguous(), value_weight.contiguous(), hyperparameters, basis.counts.clone(), kernel, root)
     return LatentGP(basis.nodes.clone(), *parts), jitter
