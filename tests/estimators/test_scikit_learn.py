@@ -90,6 +90,13 @@ def test_a_copy_predicts_the_same_to_the_bit(name, copied):
     assert {key: vars(twin)[key] for key in learned} == learned
 
 
+def test_so_does_one_whose_processes_rest_on_nodes(rng):
+    """What is kept of them must have the same strides in the copy: sums of others are in another order."""
+    X = np.tile(np.linspace(0.0, 1.0, 60), 6)[:, np.newaxis]
+    model = new("cholesky").fit(X, rng.normal(size=(360, 2)).cumsum(axis=0))
+    assert_same_model(by_pickle(model), model, np.linspace(-1.0, 2.0, 40)[:, np.newaxis])
+
+
 @pytest.mark.parametrize("name", DEFAULTS)
 def test_an_unfitted_estimator_can_be_copied_too(name):
     assert repr(by_pickle(new(name))) == repr(by_skops(new(name))) == repr(new(name))

@@ -230,6 +230,12 @@ def test_8_what_is_not_finite_is_refused(name, value):
         place = rf"contains (NaN|infinity).*in row 17, column {last}: leave such rows out"
         with pytest.raises(ValueError, match=f"Input {column} {place}"):
             new(name).fit(**broken)
+        objects = broken | {column: [[None if entry == value or entry != entry else entry for entry in row]
+                                     for row in broken[column].tolist()]}  # fmt: skip
+        with pytest.raises(ValueError, match=f"Input {column} contains NaN.*in row 17, column {last}"):
+            new(name).fit(**objects)
+        with pytest.raises(ValueError, match=f"Input {column} contains NaN.*in row 17, column {last}"):
+            fitted(name).score(**objects)
         frames = {key: pd.DataFrame(part, columns=["a", "b"][: part.shape[1]]) for key, part in broken.items()}
         with pytest.raises(ValueError, match=rf"Input {column} contains .*in row 17, column {'ab'[last]}:"):
             new(name).fit(**frames)
@@ -387,7 +393,7 @@ def test_19_an_input_that_tells_nothing_has_a_bounded_length_scale(name, rng):
 @pytest.mark.parametrize("name", ["cholesky", "wishart-likelihood"])
 def test_20_memory_is_counted_before_it_is_taken(name):
     X, y = np.arange(50_000.0)[:, np.newaxis], np.zeros((50_000, 6))
-    with pytest.raises(ValueError, match=r"max_inputs == 100000 lets 50000 distinct .* GiB.* Lower max_inputs"):
+    with pytest.raises(ValueError, match=r"max_inputs == 100000 lets 50000 distinct .* GiB.* Lower (df or )?max_inputs"):
         new(name, max_inputs=100_000).fit(X, y)
 
 
@@ -399,6 +405,7 @@ def test_20_memory_of_inducing_inputs_components_draws_and_predictions_is_counte
     for refused, words in [
         (lambda: new("heteroscedastic", n_inducing=4000, max_inputs=4000).fit(many, wide), "n_inducing == 4000 .*lets"),
         (lambda: new("mixture", n_components=2000).fit(many, wide), "n_components == 2000 for 5000 rows"),
+        (lambda: new("wishart", df=10**20).fit(*demonstrations()), "processes, which"),
         (lambda: fitted("heteroscedastic").sample_cov(X[:8], 10**8), r"n_samples == 100000000 at 8 rows"),
         (lambda: fitted("cholesky").sample_y(X[:8], 10**8), r"n_samples == 100000000 at 8 rows"),
         (lambda: fitted("cholesky").predict_cov(np.zeros((3_000_000, 1))), "predicted for 3000000 rows"),

@@ -181,6 +181,16 @@ def test_34_a_process_forked_after_a_fit_fits_too(expected):
     assert run("-c", FORK) == expected
 
 
+def test_32_the_default_type_of_torch_changes_nothing(expected):
+    before = torch.get_default_dtype()
+    try:
+        for kind in (torch.float16, torch.float32):
+            torch.set_default_dtype(kind)
+            assert digest("cholesky") == expected[0]
+    finally:
+        torch.set_default_dtype(before)
+
+
 def test_34_workers_give_the_same_scores():
     """But for the last bits: workers may have other numbers of threads, and sums of more are in another order."""
     X, y, groups = data()

@@ -70,6 +70,13 @@ def test_22_what_a_callable_prior_raises_or_changes_stays_with_the_caller(name):
     assert any("Raised by prior(X)" in note for note in raised.value.__notes__)
 
 
+@pytest.mark.parametrize("prior", [1e-9, 1e9, np.diag([1e-4, 1e4])], ids=str)
+@pytest.mark.parametrize("name", ["cholesky", "wishart-likelihood", "heteroscedastic"])
+def test_22_a_prior_that_is_not_held_beside_the_data_is_told(name, prior):
+    with pytest.warns(UserWarning, match=r"prior has variances of .* times those of y"):
+        new(name, prior=prior).fit(*demonstrations())
+
+
 def test_22_a_callable_prior_is_held_to_it_when_it_predicts_too():
     def prior(X):
         return np.where(X[:, :, np.newaxis] < 2.0, 1.0, -1.0) * np.eye(2)
@@ -110,6 +117,9 @@ BAD_PARAMETERS = {
     "n_components": (0, ValueError),
     "solver": ("adam", ValueError),
     "reg_covar": (0.0, ValueError),
+    "latent_prior": ("False", ValueError),
+    "bias_correction": (None, ValueError),
+    "shared_length_scale": (1, ValueError),
 }
 
 
@@ -123,6 +133,21 @@ def test_parameters_out_of_range_are_refused_by_name(name, parameter):
     value, error = BAD_PARAMETERS[parameter]
     with pytest.raises(error, match=f"{parameter} .*must be|{parameter} == .* cannot be used here"):
         new(name, **{parameter: value}).fit(*demonstrations())
+
+
+def test_a_noise_beyond_numbers_and_a_device_without_them_are_refused():
+    for name, parameter, value in [("cholesky", "noise_scale", 1e300), ("heteroscedastic", "device", "meta")]:
+        with pytest.raises(ValueError, match=f"{parameter} == "):
+            new(name, **{parameter: value}).fit(*demonstrations())
+
+
+def test_numbers_of_any_type_are_the_same_number():
+    X, y = demonstrations()
+    model = new("cholesky", length_scale=np.float32(0.25), prior=torch.tensor(2.0)).fit(X, y)
+    np.testing.assert_array_equal(
+        model.predict_cov(NEAR), new("cholesky", length_scale=0.25, prior=2.0).fit(X, y).predict_cov(NEAR)
+    )
+    assert new("mixture", n_components=np.int8(3)).fit(X, y).converged_
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf, "short", "1e-3", True, 10**400, [0.1, 0.2], [[1.0], []]])

@@ -50,7 +50,7 @@ def checked_values(values: Any, name: str) -> Any:
     """The same, and all of it finite."""
     values = as_plain_array(values, name)
     for label, part in _parts(values, name):
-        check_finite(as_floats(part, name) if part.dtype.kind == "O" else part, name, label)
+        check_finite(as_floats(part, name) if part.dtype.kind == "O" and part.ndim else part, name, label)
     return values
 
 
