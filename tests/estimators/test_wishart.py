@@ -1,8 +1,11 @@
+import warnings
+
 import numpy as np
 import pytest
+from sklearn.exceptions import ConvergenceWarning
 
 from estimators.zoo import assert_covariances, demonstrations, fit, fitted, new, queries
-from torch_pbd import WishartProcessRegressor
+from torch_pbd import CholeskyCovRegressor, WishartProcessRegressor
 from torch_pbd.data import make_paper_simulation
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.experiments.reliability.problems import Recipe
@@ -136,3 +139,16 @@ def test_inputs_too_near_to_interpolate_are_smoothed_and_told():
     assert_covariances(model.predict_cov(X), len(X), 5)
     variance = np.diagonal(model.predict_cov(X), axis1=1, axis2=2) / y.var(axis=0)
     assert 1e-3 < variance.min() < variance.max() < 10.0
+
+
+def test_a_constant_output_is_as_precise_by_likelihood_as_with_factors(rng):
+    """Newton's steps fall far short of what they promise there: the search must not take that for its end."""
+    X = np.sort(rng.uniform(size=60))[:, np.newaxis]
+    y = np.column_stack([np.sin(5.0 * X[:, 0]) + 0.1 * rng.normal(size=60), np.full(60, 0.5)])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        scores = [
+            regressor(objective="likelihood", max_iter=300).fit(X, y).score(X, y)
+            for regressor in (WishartProcessRegressor, CholeskyCovRegressor)
+        ]
+    assert scores[0] == pytest.approx(scores[1], abs=0.5)

@@ -13,6 +13,7 @@ from torch_pbd.optim.lbfgs import FAILURES, FitReport, Progress
 _LEAST_SHARE = 1e-4  # of the fall that the slope promises, for a step to be taken
 _LINEAR_SHARE = 0.8  # with more of it the loss is a line rather than a parabola, and a longer step is tried
 _SHORTEST, _LONGEST = 1e-10, 1e3
+_SHORTFALL = 3e4  # of what is little, that a step may promise where its fall is little: it is never all of it
 
 Newton = Callable[[Tensor], tuple[Tensor, Tensor]]
 """Gradient and step at a point."""
@@ -85,8 +86,10 @@ class _Search:
         if found is self.x and -0.5 * slope > max(enough, rounding):
             return "no step lowers the loss, though its slope says so"
         self.x, self.value = found, lowest
-        little = max(enough, relative_tol * abs(value), rounding)
-        return "converged" if -0.5 * slope <= little or value - lowest <= 10.0 * enough else ""
+        little, promise = max(enough, relative_tol * abs(value), rounding), -0.5 * slope
+        # A step that falls far short of its promise is short because of a bend, not because of an end.
+        arrived = value - lowest <= 10.0 * enough and promise <= _SHORTFALL * little
+        return "converged" if promise <= little or arrived else ""
 
     def report(self, message: str) -> FitReport:
         """How it ended, or where it is."""
