@@ -91,12 +91,16 @@ def _run(command: str, arguments: Sequence[str]) -> int:
     import matplotlib as mpl
     import torch
 
+    from torch_pbd.experiments.run_folder import check_names
+
     mpl.use("Agg")
     torch.set_num_threads(1)  # the matrices are small: threads would only wait for each other
     if getattr(options, "data", None) is not None:
         options.data = existing_file(options.data)
     if command == "benchmark":
         options.groups = chosen_groups(options.groups)
+    for argument in ("models", "controllers"):
+        check_names(getattr(options, argument, ()), argument)
     with _run_folder(options.output, command) as folder, warnings.catch_warnings():
         warnings.simplefilter("default")
         warnings.showwarning = Notes()

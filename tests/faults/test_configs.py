@@ -155,6 +155,19 @@ def test_45_wrong_types_are_told_with_what_to_write(refused, command, text, mess
     assert message in refused(command, text)
 
 
+@pytest.mark.parametrize(
+    ("command", "text", "message"),
+    [
+        ("compare", "models: {CD: GMMBaseline, cd: GMMBaseline}", "models: 'CD' and 'cd' would both be written to"),
+        ("compare", "models: {'!!!': GMMBaseline, '???': GMMBaseline}", "models: '!!!' gives no name of a file"),
+        ("compare", "models: {'': GMMBaseline}", "models: '' gives no name of a file"),
+        ("experiment", "controllers: {a b: {}, A-B: {}}", "controllers: 'a b' and 'A-B' would both be written to"),
+    ],
+)
+def test_names_whose_files_would_replace_each_other_are_refused(refused, command, text, message):
+    assert message in refused(command, text)
+
+
 def bomb():
     levels = ["a: &a [x]"] + [
         f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]" for a, b in zip("abcdefgh", "bcdefghi", strict=True)
