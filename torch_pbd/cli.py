@@ -119,6 +119,8 @@ def _run(command: str, arguments: Sequence[str]) -> int:
 def _run_folder(path: str, command: str) -> Any:
     from torch_pbd.experiments.run_folder import RunFolder
 
+    if not path:
+        raise ConfigError("output: it is empty, must be a folder of results. Give one with --output FOLDER.")
     try:
         return RunFolder(path, {"command": command})
     except OSError as error:

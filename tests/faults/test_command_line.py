@@ -53,6 +53,17 @@ def test_47_a_folder_that_may_not_be_written_is_told_before_the_work(data, tmp_p
     assert "Permission denied" in refused(data, locked / "new", capsys)
 
 
+@pytest.mark.parametrize("arguments", [["--output", ""], ["--output="], ["--config", "c.yaml"]], ids=" ".join)
+def test_47_no_name_is_no_folder(arguments, data, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("c.yaml").write_text("output: ''\n")
+    assert main(["fit", "--data", str(data), *GMM, *arguments]) == 2
+    assert capsys.readouterr().err == (
+        "torch-pbd: output: it is empty, must be a folder of results. Give one with --output FOLDER.\n"
+    )
+    assert [path.name for path in tmp_path.iterdir()] == ["c.yaml"]
+
+
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="no folder that nobody can write in")
 def test_47_nor_can_one_be_made_where_nobody_may(data, capsys):
     refused(data, Path("/proc/self/nowhere/runs"), capsys)
