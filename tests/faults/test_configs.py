@@ -278,6 +278,35 @@ def test_45_text_never_becomes_a_function(parameter):
 
 
 @pytest.mark.parametrize(
+    ("name", "parameter", "text", "value"),
+    [
+        ("CholeskyCovRegressor", "prior", "1", 1.0),
+        ("CholeskyCovRegressor", "prior", "1.5", 1.5),
+        ("CholeskyCovRegressor", "prior", "[[1.0,0.0],[0.0,1.0]]", [[1.0, 0.0], [0.0, 1.0]]),
+        ("HeteroscedasticGPRegressor", "prior", "[[2, 0], [0, 2]]", [[2.0, 0.0], [0.0, 2.0]]),
+        ("WishartProcessRegressor", "prior", "null", None),
+        ("CholeskyCovRegressor", "noise_scale", "1", 1.0),
+        ("CholeskyCovRegressor", "length_scale", "2", 2.0),
+        ("CholeskyCovRegressor", "length_scale", "[1, 2.5]", [1.0, 2.5]),
+        ("HeteroscedasticGPRegressor", "period", "1", 1.0),
+        ("HeteroscedasticGPRegressor", "period", "[1, .inf]", [1.0, np.inf]),
+        ("WishartProcessRegressor", "df", "4", 4),
+        ("WishartProcessRegressor", "df", "auto", "auto"),
+        ("WishartProcessRegressor", "device", "0", "0"),
+        ("WishartProcessRegressor", "random_state", "3", 3),
+    ],
+)
+def test_45_a_command_line_says_what_a_file_says(name, parameter, text, value, tmp_path):
+    file = tmp_path / "c.yaml"
+    quoted = f"'{text}'" if isinstance(value, str) else text
+    file.write_text(f"data: x\n{in_model(f'{{{parameter}: {quoted}}}', name).partition(chr(10))[2]}")
+    forms = ["--config", str(file)], ["--data", "x", "--model", name, f"--model.{parameter}", text]
+    for arguments in forms:
+        found = getattr(parse("fit", arguments)[0].model, parameter)
+        assert (found, type(found)) == (value, type(value)), arguments
+
+
+@pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["--data"], "--data has no value: write --data VALUE."),
