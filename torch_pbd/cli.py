@@ -37,6 +37,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _complain(f"{error} Wait for it, or take another with --output FOLDER.", _IN_USE)
     except (ValueError, TypeError, OSError, MemoryError) as error:
         return _complain(str(error) or "the memory is not enough", _ERROR)
+    except (ArithmeticError, RuntimeError) as error:  # from deep inside, where the message alone says little
+        return _complain(f"{type(error).__name__}: {' '.join(str(error).split())}", _ERROR)
     except KeyboardInterrupt as stop:
         return _complain(f"interrupted{_remark(stop)}", _INTERRUPTED)
     except _Terminated as stop:

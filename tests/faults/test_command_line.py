@@ -133,6 +133,26 @@ def test_38_a_signal_while_torch_is_loaded_is_one_line(number, data, monkeypatch
     assert shown.out == ""
 
 
+@pytest.mark.parametrize(
+    "error",
+    [
+        OverflowError("(34, 'Numerical result out of range')"),
+        ZeroDivisionError("division by zero"),
+        RuntimeError("expected a tensor\n\nof another shape"),
+        NotImplementedError("no such kernel"),
+        RecursionError("maximum recursion depth exceeded"),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_an_error_from_deep_inside_is_one_line_with_its_type(error, data, tmp_path, monkeypatch, capsys):
+    def failing(*_):
+        raise error
+
+    monkeypatch.setitem(WORK, "fit", failing)
+    assert main(["fit", "--data", str(data), "--output", str(tmp_path)]) == 1
+    assert capsys.readouterr().err == f"torch-pbd: {type(error).__name__}: {' '.join(str(error).split())}\n"
+
+
 def test_memory_that_is_not_enough_is_one_line(data, tmp_path, monkeypatch, capsys):
     def too_much(*_):
         raise MemoryError
