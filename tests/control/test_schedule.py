@@ -172,6 +172,19 @@ def test_labels_are_checked(rng, label, message):
         Schedule(**values(rng), **label)
 
 
+def test_a_provenance_without_a_bottom_is_refused(rng):
+    lists, mappings, round_list, round_mapping = [], {}, [], {}
+    for _ in range(5000):
+        lists, mappings = [lists], {"below": mappings}
+    round_list.append(round_list)
+    round_mapping["self"] = round_mapping
+    for provenance in ({"a": lists}, mappings, {"a": round_list}, round_mapping):
+        with pytest.raises(ValueError, match="more than 100 levels deep, or holds itself"):
+            Schedule(**values(rng), provenance=provenance)
+    with pytest.raises(ValueError, match=re.escape("provenance['a'] is {1: [")):
+        Schedule(**values(rng), provenance={"a": {1: lists}})
+
+
 def test_a_free_axis_needs_damping(rng):
     given = values(rng)
     free(given)
