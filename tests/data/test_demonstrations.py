@@ -237,6 +237,23 @@ def test_labels_are_one_for_each_output(labels, words):
         Demonstrations(TIME, np.zeros((2, 3, 2)), **labels)
 
 
+@pytest.mark.parametrize(
+    ("labels", "words"),
+    [
+        ({"frame": 3}, "frame is 3, must be text or None"),
+        ({"time_unit": 5}, "time_unit is 5, must be the unit of the times"),
+        ({"time_unit": None}, "time_unit is None, must be the unit of the times"),
+        ({"time_unit": ""}, "time_unit is '', must be the unit of the times"),
+        ({"names": ["x", "a\nb"]}, r"names[1] is 'a\nb', with a control character (U+000A)"),
+        ({"names": ["\ud800", "y"]}, r"names[0] is '\ud800', with half of a surrogate pair (U+D800)"),
+    ],
+)
+def test_labels_that_no_file_could_give_back_are_refused(labels, words):
+    make = getattr(Demonstrations.__init__, "__wrapped__", Demonstrations.__init__)  # beartype would refuse first
+    with pytest.raises(ValueError, match=re.escape(words)):
+        make(Demonstrations.__new__(Demonstrations), [0.0, 1.0], [[[0.0, 1.0], [2.0, 3.0]]], **labels)
+
+
 @pytest.mark.parametrize("d", [1, 2, 9])
 def test_cross_validation_by_demonstration_sees_the_groups(d, rng):
     from sklearn.model_selection import LeaveOneGroupOut

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torch_pbd.arguments import from_tensor, is_finite
+from torch_pbd.arguments import check_text, from_tensor, is_finite
 
 ARRAY_DIMS = {"time": 1, "position": 2, "velocity": 2, "stiffness": 3, "damping": 3, "covariance": 3, "type1": 1}
 """Every array of a schedule with its number of axes: (n,), (n, d) or (n, d, d)."""
@@ -89,6 +89,8 @@ def _checked_labels(labels: Labels, n_outputs: int) -> dict[str, Any]:
     strings = [name for name in listed if isinstance(name, str)]
     if names is not None and not len(set(strings)) == len(listed) == n_outputs:
         raise ValueError(f"names is {names!r}, it must be {n_outputs} different strings, one for each output.")
+    for i, name in enumerate(strings):  # which are titles of columns; the others stand in JSON, which holds any text
+        check_text(name, f"names[{i}]")
     for name in ("units", "frame"):
         if not isinstance(labels[name], str | None):
             raise ValueError(f"{name} is {labels[name]!r}, it must be a string or None.")
