@@ -25,7 +25,8 @@ from torch_pbd.files import remove_drafts, replacing
 from torch_pbd.persistence import save
 
 _PACKAGES = ("torch", "scikit-learn", "numpy", "matplotlib")
-_PARTS = ("figures", "model")
+_PARTS = ("figures", "model", "schedule")
+_SUFFIXES = (".csv", ".json", ".npz", ".png", ".safetensors", ".txt", ".yaml")  # of the files of results
 _LONGEST = 180  # bytes of a name, to which titles, suffixes and marks of drafts are added
 
 
@@ -64,6 +65,7 @@ class RunFolder:
             for folder in (self.path, *(self.path / part for part in _PARTS if (self.path / part).exists())):
                 if not folder.is_dir() or not os.access(folder, os.W_OK):
                     raise PermissionError(f"{folder} is no folder, or not writable")
+                _check_files(folder)
                 remove_drafts(folder)
             self.write_text("env.json", json.dumps(_environment(settings), indent=2) + "\n")
         except BaseException:
@@ -109,6 +111,14 @@ class RunFolder:
         target.parent.mkdir(exist_ok=True)
         save(model, target)
         return target
+
+
+def _check_files(folder: Path) -> None:
+    """Check that what is named as files of results are is none but files, which can be replaced."""
+    for entry in folder.iterdir():
+        named_so = entry.suffix in _SUFFIXES or (entry.name == "checkpoint" and folder.name not in _PARTS)
+        if named_so and entry.exists() and not entry.is_file():
+            raise IsADirectoryError(f"{entry} stands where a file of results may have to: move it away")
 
 
 def _environment(settings: Mapping[str, Any]) -> dict[str, Any]:
