@@ -212,6 +212,13 @@ def test_what_is_not_a_set_of_recordings_is_refused(times, positions, words):
         Demonstrations(times, positions)
 
 
+def test_times_further_apart_than_a_number_are_refused():
+    with pytest.raises(ValueError, match=r"times goes from -1e\+308 to 1e\+308, further than float64 can tell"):
+        Demonstrations([-1e308, 0.0, 1e308], [[0.0, 1.0, 2.0]])
+    longest = Demonstrations([-8e307, 0.0, 8e307], [[0.0, 1.0, 2.0]])
+    np.testing.assert_array_equal(longest.stack("phase")[0][:, 0], [0.0, 0.5, 1.0])
+
+
 @pytest.mark.parametrize("step", [0.01, 100.0])
 def test_unix_time_in_float32_is_refused(step):
     time = (1.7e9 + step * np.arange(4)).astype(np.float32)  # 128 s apart at best

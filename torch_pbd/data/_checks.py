@@ -12,6 +12,7 @@ from torch_pbd.data.alignment import Floats
 from torch_pbd.memory import require_much
 
 MIN_SAMPLES = 2
+_LONGEST = 0.25 * float(np.finfo(np.float64).max)  # quarters of times, whose difference is a number
 
 
 def as_recordings(times: Any, positions: Any, missing: str) -> tuple[tuple[Floats, ...], tuple[Floats, ...]]:
@@ -170,6 +171,11 @@ def _as_time(array: NDArray[Any], argument: str, numbers: NDArray[np.intp]) -> F
     if not np.isfinite(time).all():
         i = int(np.argmin(np.isfinite(time)))
         raise ValueError(f"{argument} is {time[i]} at sample {numbers[i]}: all times must be finite.")
+    if np.ptp(0.25 * time) > _LONGEST:
+        raise ValueError(
+            f"{argument} goes from {time.min():.3g} to {time.max():.3g}, further than float64 can tell: take another "
+            "unit of time."
+        )
     _check_rising(time, array, argument, numbers)
     return time
 
