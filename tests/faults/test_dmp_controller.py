@@ -161,6 +161,13 @@ def test_18_other_forms_of_the_same_numbers_are_the_same_controller(form):
     np.testing.assert_array_equal(model.predict(needing[:5]), controller().predict(X[:5]))
 
 
+def test_16_float32_is_fitted_without_a_word_of_overflow():
+    X, y, groups = stacked()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        new().fit(X.astype(np.float32), y.astype(np.float32), groups=groups)
+
+
 def test_20_a_movement_of_many_ticks_is_refused_with_its_memory(monkeypatch):
     monkeypatch.setattr(torch_pbd.memory, "available_bytes", lambda: 2**27)
     for ask in (lambda: controller().schedule(1e6), lambda: controller().reproduce(1e6)):
