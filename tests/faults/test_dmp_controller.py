@@ -177,6 +177,16 @@ def test_20_a_movement_of_many_ticks_is_refused_with_its_memory(monkeypatch):
         controller().schedule(1e300)
 
 
+@pytest.mark.parametrize("n_steps", [10**5, 10**9, np.int64(10**12)])
+def test_20_a_movement_of_many_steps_is_refused_with_its_memory(n_steps, monkeypatch):
+    monkeypatch.setattr(torch_pbd.memory, "available_bytes", lambda: 2**34)
+    with pytest.raises(ValueError, match=rf"n_steps == {n_steps} of 4 demonstrations of 2 axes needs about .* GiB"):
+        new(n_steps=n_steps).fit(recorded())
+    monkeypatch.setattr(torch_pbd.memory, "available_bytes", lambda: 2**26)
+    with pytest.raises(ValueError, match=rf"n_steps == {10 * n_steps} of 4 .* GiB of memory.*Lower n_steps"):
+        controller().smooth(recorded(), 10 * n_steps)
+
+
 @pytest.mark.parametrize("far", [1e6, -1e6, 1e300, -1e300])
 @pytest.mark.parametrize("method", QUERIES)
 def test_24_far_away_everything_is_finite(method, far):
