@@ -47,13 +47,19 @@ def main(
             "WP": WishartProcessRegressor(),
             "GMM 5": GMMBaseline(random_state=0),
         }
-    tasks = {Path(path).stem: prepare(load_demonstrations(path), align, n_steps) for path in data}
+    tasks = {name: prepare(load_demonstrations(path), align, n_steps) for name, path in _names(data).items()}
     with _where(cluster):
         rows = sweep(models, tasks, max_folds=max_folds, n_jobs=n_jobs)
     print(format_table(summarize(rows)))
     for row in rows:
         if row["error"]:
             print(f"{row['task']}, {row['model']}, without demonstration {row['fold']}: {row['error']}")
+
+
+def _names(data: list[str]) -> dict[str, str]:
+    """Each file by its name without folder and suffix; where several have the same one, by its path."""
+    stems = [Path(path).stem for path in data]
+    return {path if stems.count(stem) > 1 else stem: path for stem, path in zip(stems, data, strict=True)}
 
 
 @contextlib.contextmanager

@@ -1,6 +1,7 @@
 """What users pass as numbers: anything else is refused by its name, before NumPy makes wrong numbers of it."""
 
 import math
+import unicodedata
 from typing import Any
 
 import numpy as np
@@ -95,6 +96,18 @@ def check_kind(value: Any, name: str, kind: type) -> None:
     """Check that an argument is of a class."""
     if not isinstance(value, kind) or isinstance(value, bool):
         raise ValueError(f"{name} is a {type(value).__name__}, must be a {kind.__name__}.")
+
+
+def check_text(value: Any, name: str) -> None:
+    """Check that a name or a unit is text that every file can hold: UTF-8 without line ends and other controls."""
+    if not isinstance(value, str):
+        raise ValueError(f"{name} is {value!r}, must be text.")
+    wrong = next((letter for letter in value if unicodedata.category(letter) in ("Cc", "Cs")), None)
+    if wrong is not None:
+        kind = "a control character" if unicodedata.category(wrong) == "Cc" else "half of a surrogate pair"
+        raise ValueError(
+            f"{name} is {value!a:.80}, with {kind} (U+{ord(wrong):04X}) that not every file can hold: leave it out."
+        )
 
 
 def is_finite(value: Any) -> bool:

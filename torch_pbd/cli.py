@@ -37,6 +37,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _complain(f"{error} Wait for it, or take another with --output FOLDER.", _IN_USE)
     except (ValueError, TypeError, OSError, MemoryError) as error:
         return _complain(str(error) or "the memory is not enough", _ERROR)
+    except (ArithmeticError, RuntimeError) as error:  # from deep inside, where the message alone says little
+        return _complain(f"{type(error).__name__}: {' '.join(str(error).split())}", _ERROR)
     except KeyboardInterrupt as stop:
         return _complain(f"interrupted{_remark(stop)}", _INTERRUPTED)
     except _Terminated as stop:
@@ -91,12 +93,16 @@ def _run(command: str, arguments: Sequence[str]) -> int:
     import matplotlib as mpl
     import torch
 
+    from torch_pbd.experiments.run_folder import check_names
+
     mpl.use("Agg")
     torch.set_num_threads(1)  # the matrices are small: threads would only wait for each other
     if getattr(options, "data", None) is not None:
         options.data = existing_file(options.data)
     if command == "benchmark":
         options.groups = chosen_groups(options.groups)
+    for argument in ("models", "controllers"):
+        check_names(getattr(options, argument, ()), argument)
     with _run_folder(options.output, command) as folder, warnings.catch_warnings():
         warnings.simplefilter("default")
         warnings.showwarning = Notes()
@@ -115,6 +121,8 @@ def _run(command: str, arguments: Sequence[str]) -> int:
 def _run_folder(path: str, command: str) -> Any:
     from torch_pbd.experiments.run_folder import RunFolder
 
+    if not path:
+        raise ConfigError("output: it is empty, must be a folder of results. Give one with --output FOLDER.")
     try:
         return RunFolder(path, {"command": command})
     except OSError as error:

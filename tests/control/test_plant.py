@@ -339,11 +339,19 @@ def test_as_arrays_it_is_the_same_run():
 
 
 @pytest.mark.parametrize(
-    ("name", "part"), [("sensor", 3), ("position_loop", 20.0), ("environment", "wall"), ("stiffness_filter", 5)]
+    ("name", "part", "problem"),
+    [
+        ("sensor", 3, "has no method"),
+        ("position_loop", 20.0, "has no method"),
+        ("environment", "wall", "has no method"),
+        ("stiffness_filter", 5, "has no method"),
+        ("stiffness_filter", EnergyTank, "is a class, must be an object of it"),
+        ("sensor", ForceSensor, "is a class, must be an object of it"),
+    ],
 )
-def test_parts_of_other_kinds_are_refused_at_once(name, part):
+def test_parts_of_other_kinds_are_refused_at_once(name, part, problem):
     unchecked = getattr(
         AdmittancePlant.__init__, "__wrapped__", AdmittancePlant.__init__
     )  # beartype would refuse first
-    with pytest.raises(ValueError, match=rf"{name} == .* has no method"):
+    with pytest.raises(ValueError, match=rf"{name} == .* {problem}"):
         unchecked(AdmittancePlant.__new__(AdmittancePlant), **{name: part})

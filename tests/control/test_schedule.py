@@ -157,6 +157,8 @@ def test_what_cannot_be_run_is_refused_with_its_place(rng, spoil, message):
         ({"names": ["x", 1]}, "names is ['x', 1]"),
         ({"units": 1}, "units is 1, it must be a string or None"),
         ({"frame": b"base"}, "frame is b'base'"),
+        ({"names": ["x", "a\rb"]}, r"names[1] is 'a\rb', with a control character (U+000D)"),
+        ({"names": ["\ud800", "y"]}, r"names[0] is '\ud800', with half of a surrogate pair (U+D800)"),
         ({"covariance_of": "velocity"}, "covariance_of is 'velocity', it must be 'position' or 'forcing'"),
         ({"stiffness_limits": (1000, 50)}, "stiffness_limits is [1000.0, 50.0]"),
         ({"stiffness_limits": (50,)}, "stiffness_limits is [50.0]"),
@@ -170,6 +172,19 @@ def test_what_cannot_be_run_is_refused_with_its_place(rng, spoil, message):
 def test_labels_are_checked(rng, label, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         Schedule(**values(rng), **label)
+
+
+def test_a_provenance_without_a_bottom_is_refused(rng):
+    lists, mappings, round_list, round_mapping = [], {}, [], {}
+    for _ in range(5000):
+        lists, mappings = [lists], {"below": mappings}
+    round_list.append(round_list)
+    round_mapping["self"] = round_mapping
+    for provenance in ({"a": lists}, mappings, {"a": round_list}, round_mapping):
+        with pytest.raises(ValueError, match="more than 100 levels deep, or holds itself"):
+            Schedule(**values(rng), provenance=provenance)
+    with pytest.raises(ValueError, match=re.escape("provenance['a'] is {1: [")):
+        Schedule(**values(rng), provenance={"a": {1: lists}})
 
 
 def test_a_free_axis_needs_damping(rng):
@@ -358,7 +373,7 @@ def test_files_bring_everything_back_to_the_bit(tmp_path, rng, suffix, d, kind):
     given["covariance"][0] *= 1e-300
     labels = dict(LABELLED[kind])
     if "names" in labels:
-        labels["names"] = [labels["names"], "y,z", "ü\n"][:d]
+        labels["names"] = [labels["names"], "y,z", "# ü"][:d]
     schedule = Schedule(**given, **labels)
     path = tmp_path / f"schedule{suffix}"
     schedule.save(path)

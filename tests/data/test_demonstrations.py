@@ -212,6 +212,13 @@ def test_what_is_not_a_set_of_recordings_is_refused(times, positions, words):
         Demonstrations(times, positions)
 
 
+def test_times_further_apart_than_a_number_are_refused():
+    with pytest.raises(ValueError, match=r"times goes from -1e\+308 to 1e\+308, further than float64 can tell"):
+        Demonstrations([-1e308, 0.0, 1e308], [[0.0, 1.0, 2.0]])
+    longest = Demonstrations([-8e307, 0.0, 8e307], [[0.0, 1.0, 2.0]])
+    np.testing.assert_array_equal(longest.stack("phase")[0][:, 0], [0.0, 0.5, 1.0])
+
+
 @pytest.mark.parametrize("step", [0.01, 100.0])
 def test_unix_time_in_float32_is_refused(step):
     time = (1.7e9 + step * np.arange(4)).astype(np.float32)  # 128 s apart at best
@@ -235,6 +242,23 @@ def test_float32_times_that_resolve_their_steps_are_accepted():
 def test_labels_are_one_for_each_output(labels, words):
     with pytest.raises(ValueError, match=re.escape(words)):
         Demonstrations(TIME, np.zeros((2, 3, 2)), **labels)
+
+
+@pytest.mark.parametrize(
+    ("labels", "words"),
+    [
+        ({"frame": 3}, "frame is 3, must be text or None"),
+        ({"time_unit": 5}, "time_unit is 5, must be the unit of the times"),
+        ({"time_unit": None}, "time_unit is None, must be the unit of the times"),
+        ({"time_unit": ""}, "time_unit is '', must be the unit of the times"),
+        ({"names": ["x", "a\nb"]}, r"names[1] is 'a\nb', with a control character (U+000A)"),
+        ({"names": ["\ud800", "y"]}, r"names[0] is '\ud800', with half of a surrogate pair (U+D800)"),
+    ],
+)
+def test_labels_that_no_file_could_give_back_are_refused(labels, words):
+    make = getattr(Demonstrations.__init__, "__wrapped__", Demonstrations.__init__)  # beartype would refuse first
+    with pytest.raises(ValueError, match=re.escape(words)):
+        make(Demonstrations.__new__(Demonstrations), [0.0, 1.0], [[[0.0, 1.0], [2.0, 3.0]]], **labels)
 
 
 @pytest.mark.parametrize("d", [1, 2, 9])

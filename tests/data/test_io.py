@@ -233,6 +233,33 @@ def test_csv_that_cannot_be_read_is_refused_with_its_place(tmp_path, text, optio
         load_text(tmp_path, text, **options)
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"demo": ""}, "no column '' among [demo, time, x]"),
+        ({"demo": 5}, "demo=5 must be the name of a column, or None"),
+        ({"time": None}, "time=None must be the name of a column"),
+        ({"outputs": 3}, "outputs=3 must be names of columns"),
+        ({"outputs": ["x", 3]}, "outputs=['x', 3] must be names of columns"),
+        ({"delimiter": 5}, "delimiter=5 must be one character"),
+        ({"max_bytes": "1GB"}, "max_bytes='1GB' must be a whole number"),
+        ({"max_bytes": None}, "max_bytes=None must be a whole number"),
+    ],
+    ids=repr,
+)
+def test_options_of_other_kinds_are_refused_by_name(tmp_path, options, message):
+    path = tmp_path / "d.csv"
+    path.write_text("demo,time,x\n0,0,1\n0,1,2\n")
+    with pytest.raises(ValueError, match=re.escape(message)):
+        load_demonstrations(path, **options)
+
+
+def test_a_column_without_a_name_may_tell_the_demonstrations_apart(tmp_path):
+    path = tmp_path / "d.csv"
+    path.write_text(",time,x\n0,0,1\n0,1,2\n1,0,1\n1,1,3\n")
+    assert len(load_demonstrations(path, demo="")) == 2
+
+
 @pytest.mark.parametrize("options", [{"decimal": "x"}, {"delimiter": ",", "decimal": ","}, {"delimiter": ", "}])
 def test_marks_of_csv_are_checked(tmp_path, options):
     with pytest.raises(ValueError, match=r"decimal|delimiter"):

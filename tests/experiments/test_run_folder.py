@@ -1,8 +1,10 @@
 import json
+import re
 
 import pytest
 
-from torch_pbd.experiments.run_folder import RunFolder, format_table, slug
+from torch_pbd.exceptions import ConfigError
+from torch_pbd.experiments.run_folder import RunFolder, check_names, format_table, slug
 
 
 def test_a_table_lines_up_and_shows_what_is_not_known_as_a_dash():
@@ -33,3 +35,19 @@ def test_a_folder_that_is_a_file_fails_before_the_work(tmp_path):
 
 def test_names_of_models_become_names_of_files():
     assert slug("Figure 2, CD") == "figure_2_cd"
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["CD", "cd"], "models: 'CD' and 'cd' would both be written to files named 'cd'"),
+        (["GMM 5", "WP", "GMM-5"], "'GMM 5' and 'GMM-5' would both be written"),
+        (["CD", "!!!"], "models: '!!!' gives no name of a file: it must have a letter or a digit"),
+        ([""], "models: '' gives no name of a file"),
+        (["a" * 300], "at most 180 bytes"),
+    ],
+)
+def test_names_that_give_no_files_of_their_own_are_refused(names, message):
+    check_names(["CD", "WP", "GMM 5", "GMM 8", "記録"], "models")
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        check_names(names, "models")

@@ -38,10 +38,21 @@ def test_47_a_file_in_the_place_of_the_folder_is_told_before_the_work(data, tmp_
     assert (tmp_path / "file").read_text() == "mine"
 
 
-@pytest.mark.parametrize("part", ["model", "figures"])
+@pytest.mark.parametrize("part", ["model", "figures", "schedule"])
 def test_47_so_is_one_in_the_place_of_a_folder_in_it(part, data, tmp_path, capsys):
     (tmp_path / part).write_text("mine")
     assert "no folder" in refused(data, tmp_path, capsys)
+
+
+@pytest.mark.parametrize(
+    "part", ["metrics.csv", "config.yaml", "env.json", "checkpoint", "model/gmmbaseline.safetensors", "figures/a.png"]
+)
+def test_47_so_is_a_folder_in_the_place_of_a_file_in_it(part, data, tmp_path, capsys):
+    (tmp_path / part).mkdir(parents=True)
+    (tmp_path / "mine").mkdir()
+    assert f"{part} stands where a file of results may have to: move it away" in refused(data, tmp_path, capsys)
+    (tmp_path / part).rmdir()
+    assert main(["fit", "--data", str(data), *GMM, "--output", str(tmp_path)]) == 0
 
 
 def test_47_a_folder_that_may_not_be_written_is_told_before_the_work(data, tmp_path, capsys):
@@ -51,6 +62,17 @@ def test_47_a_folder_that_may_not_be_written_is_told_before_the_work(data, tmp_p
         pytest.skip("everything is writable for this user")
     assert "Permission denied" in refused(data, locked, capsys)
     assert "Permission denied" in refused(data, locked / "new", capsys)
+
+
+@pytest.mark.parametrize("arguments", [["--output", ""], ["--output="], ["--config", "c.yaml"]], ids=" ".join)
+def test_47_no_name_is_no_folder(arguments, data, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("c.yaml").write_text("output: ''\n")
+    assert main(["fit", "--data", str(data), *GMM, *arguments]) == 2
+    assert capsys.readouterr().err == (
+        "torch-pbd: output: it is empty, must be a folder of results. Give one with --output FOLDER.\n"
+    )
+    assert [path.name for path in tmp_path.iterdir()] == ["c.yaml"]
 
 
 @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="no folder that nobody can write in")
@@ -99,6 +121,18 @@ def test_48_nobody_who_reads_is_no_error(arguments, closed, data, tmp_path):
         torch_pbd.load(tmp_path / "out" / "model" / "gmmbaseline.safetensors")
 
 
+def test_letters_that_a_terminal_has_not_are_no_error(data, tmp_path):
+    """The encoding of the terminal is not that of the file system; nothing is lost because of what is printed."""
+    environment = os.environ | {"PYTHONIOENCODING": "ascii"}
+    arguments = ["fit", "--data", str(data), *GMM, "--output", "ü"]
+    done = subprocess.run(
+        [*COMMAND, *arguments], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.endswith("results: ?\n")
+    torch_pbd.load(tmp_path / "ü" / "model" / "gmmbaseline.safetensors")
+
+
 def test_49_without_a_display_figures_are_drawn(data, tmp_path):
     environment = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY")}
     arguments = ["fit", "--data", str(data), *GMM, "--output", str(tmp_path)]
@@ -120,6 +154,26 @@ def test_38_a_signal_while_torch_is_loaded_is_one_line(number, data, monkeypatch
     shown = capsys.readouterr()
     assert shown.err == {signal.SIGINT: "torch-pbd: interrupted\n", signal.SIGTERM: "torch-pbd: terminated\n"}[number]
     assert shown.out == ""
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        OverflowError("(34, 'Numerical result out of range')"),
+        ZeroDivisionError("division by zero"),
+        RuntimeError("expected a tensor\n\nof another shape"),
+        NotImplementedError("no such kernel"),
+        RecursionError("maximum recursion depth exceeded"),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_an_error_from_deep_inside_is_one_line_with_its_type(error, data, tmp_path, monkeypatch, capsys):
+    def failing(*_):
+        raise error
+
+    monkeypatch.setitem(WORK, "fit", failing)
+    assert main(["fit", "--data", str(data), "--output", str(tmp_path)]) == 1
+    assert capsys.readouterr().err == f"torch-pbd: {type(error).__name__}: {' '.join(str(error).split())}\n"
 
 
 def test_memory_that_is_not_enough_is_one_line(data, tmp_path, monkeypatch, capsys):

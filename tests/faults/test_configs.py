@@ -155,6 +155,19 @@ def test_45_wrong_types_are_told_with_what_to_write(refused, command, text, mess
     assert message in refused(command, text)
 
 
+@pytest.mark.parametrize(
+    ("command", "text", "message"),
+    [
+        ("compare", "models: {CD: GMMBaseline, cd: GMMBaseline}", "models: 'CD' and 'cd' would both be written to"),
+        ("compare", "models: {'!!!': GMMBaseline, '???': GMMBaseline}", "models: '!!!' gives no name of a file"),
+        ("compare", "models: {'': GMMBaseline}", "models: '' gives no name of a file"),
+        ("experiment", "controllers: {a b: {}, A-B: {}}", "controllers: 'a b' and 'A-B' would both be written to"),
+    ],
+)
+def test_names_whose_files_would_replace_each_other_are_refused(refused, command, text, message):
+    assert message in refused(command, text)
+
+
 def bomb():
     levels = ["a: &a [x]"] + [
         f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]" for a, b in zip("abcdefgh", "bcdefghi", strict=True)
@@ -262,6 +275,35 @@ def test_45_nor_is_anything_imported_that_a_command_line_names(arguments, tmp_pa
 def test_45_text_never_becomes_a_function(parameter):
     options, _ = parse("fit", ["--data", "x", "--model", "CholeskyCovRegressor", f"--model.{parameter}", "os.getcwd"])
     assert getattr(options.model, parameter) == "os.getcwd"  # which `fit` refuses
+
+
+@pytest.mark.parametrize(
+    ("name", "parameter", "text", "value"),
+    [
+        ("CholeskyCovRegressor", "prior", "1", 1.0),
+        ("CholeskyCovRegressor", "prior", "1.5", 1.5),
+        ("CholeskyCovRegressor", "prior", "[[1.0,0.0],[0.0,1.0]]", [[1.0, 0.0], [0.0, 1.0]]),
+        ("HeteroscedasticGPRegressor", "prior", "[[2, 0], [0, 2]]", [[2.0, 0.0], [0.0, 2.0]]),
+        ("WishartProcessRegressor", "prior", "null", None),
+        ("CholeskyCovRegressor", "noise_scale", "1", 1.0),
+        ("CholeskyCovRegressor", "length_scale", "2", 2.0),
+        ("CholeskyCovRegressor", "length_scale", "[1, 2.5]", [1.0, 2.5]),
+        ("HeteroscedasticGPRegressor", "period", "1", 1.0),
+        ("HeteroscedasticGPRegressor", "period", "[1, .inf]", [1.0, np.inf]),
+        ("WishartProcessRegressor", "df", "4", 4),
+        ("WishartProcessRegressor", "df", "auto", "auto"),
+        ("WishartProcessRegressor", "device", "0", "0"),
+        ("WishartProcessRegressor", "random_state", "3", 3),
+    ],
+)
+def test_45_a_command_line_says_what_a_file_says(name, parameter, text, value, tmp_path):
+    file = tmp_path / "c.yaml"
+    quoted = f"'{text}'" if isinstance(value, str) else text
+    file.write_text(f"data: x\n{in_model(f'{{{parameter}: {quoted}}}', name).partition(chr(10))[2]}")
+    forms = ["--config", str(file)], ["--data", "x", "--model", name, f"--model.{parameter}", text]
+    for arguments in forms:
+        found = getattr(parse("fit", arguments)[0].model, parameter)
+        assert (found, type(found)) == (value, type(value)), arguments
 
 
 @pytest.mark.parametrize(

@@ -161,6 +161,13 @@ def test_18_other_forms_of_the_same_numbers_are_the_same_controller(form):
     np.testing.assert_array_equal(model.predict(needing[:5]), controller().predict(X[:5]))
 
 
+def test_16_float32_is_fitted_without_a_word_of_overflow():
+    X, y, groups = stacked()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        new().fit(X.astype(np.float32), y.astype(np.float32), groups=groups)
+
+
 def test_20_a_movement_of_many_ticks_is_refused_with_its_memory(monkeypatch):
     monkeypatch.setattr(torch_pbd.memory, "available_bytes", lambda: 2**27)
     for ask in (lambda: controller().schedule(1e6), lambda: controller().reproduce(1e6)):
@@ -168,6 +175,16 @@ def test_20_a_movement_of_many_ticks_is_refused_with_its_memory(monkeypatch):
             ask()
     with pytest.raises(ValueError, match=r"rate == 1e\+300 .* makes 2e\+300 ticks .* lower them"):
         controller().schedule(1e300)
+
+
+@pytest.mark.parametrize("n_steps", [10**5, 10**9, np.int64(10**12)])
+def test_20_a_movement_of_many_steps_is_refused_with_its_memory(n_steps, monkeypatch):
+    monkeypatch.setattr(torch_pbd.memory, "available_bytes", lambda: 2**34)
+    with pytest.raises(ValueError, match=rf"n_steps == {n_steps} of 4 demonstrations of 2 axes needs about .* GiB"):
+        new(n_steps=n_steps).fit(recorded())
+    monkeypatch.setattr(torch_pbd.memory, "available_bytes", lambda: 2**26)
+    with pytest.raises(ValueError, match=rf"n_steps == {10 * n_steps} of 4 .* GiB of memory.*Lower n_steps"):
+        controller().smooth(recorded(), 10 * n_steps)
 
 
 @pytest.mark.parametrize("far", [1e6, -1e6, 1e300, -1e300])

@@ -20,7 +20,7 @@ from torch_pbd.control.stiffness import StiffnessLaw
 from torch_pbd.data import Demonstrations, check_unimodal
 from torch_pbd.estimators._demonstrations import check_groups
 from torch_pbd.estimators._validation import check_squares, checked_values
-from torch_pbd.memory import require_memory
+from torch_pbd.memory import require_memory, require_much
 
 Floats = NDArray[np.float64]
 PhaseInput = Literal["time", "log_s", "s"]
@@ -33,6 +33,9 @@ _FEWEST_CYCLES, _MOST_CYCLES = 0.01, 1e6
 _FASTEST, _SLOWEST = 1e12, 100.0
 _LEAST_DECAY, _MOST_DECAY = 1e-6, {"s": 30.0, "log_s": 1e12}
 _MOST_TICKS = 1e12
+# Measured, in numbers: of each of a demonstration's positions while it is smoothed; of each pair of steps while the
+# forcing is learned, in all and of each axis where they are many; of each axis at a step, while it is tabulated.
+_SMOOTHED, _PAIRED, _PAIRED_AXIS, _TABULATED = 10.0, 34.0, 5.0, 16e3
 _NEEDED = ("get_params", "fit", "predict_cov", "predict_uncertainty")
 
 _CHOICES = {"gate": Gate, "phase_input": PhaseInput, "variability": Variability, "on_unknown": OnUnknown, "goal": Goals}
@@ -236,4 +239,20 @@ def check_memory(n_ticks: int, d: int) -> None:
         3 * 8 * n_ticks * (2 + 2 * d + 3 * d * d),
         what=f"a schedule of {n_ticks} ticks of {d} axes",
         remedy="Lower rate, and let the robot interpolate between its rows.",
+    )
+
+
+def check_steps(n_steps: int, n_demos: int, d: int, *, learned: bool) -> None:
+    """Refuse more points of a movement than fit in memory: smoothed ones, and what learning the forcing of them takes.
+
+    Gaussian processes of the forcing have matrices of all pairs of points, unless a few nodes carry it.
+    """
+    n = float(n_steps)
+    needed = _SMOOTHED * n * n_demos * d
+    if learned:
+        needed += n * (max(_PAIRED, _PAIRED_AXIS * d) * n + _TABULATED * d)
+    require_much(
+        8.0 * needed,
+        what=f"n_steps == {n_steps} of {n_demos} demonstrations of {d} axes",
+        remedy="Lower n_steps: 100 to 500 follow most movements.",
     )

@@ -19,6 +19,7 @@ from torch_pbd.control.arguments import (
     check_against_duration,
     check_memory,
     check_parameters,
+    check_steps,
     check_task,
     count_ticks,
 )
@@ -171,7 +172,8 @@ class DMPController(BaseEstimator):
         Raises
         ------
         ValueError
-            If there are fewer than two demonstrations, too few samples in one, or a parameter cannot be used.
+            If there are fewer than two demonstrations, too few samples in one, a parameter cannot be used, or there is
+            not the memory for ``n_steps``.
         """
         self.__dict__.pop("_impedance", None)  # a fit that fails leaves no mixture of two
         check_parameters(self)
@@ -185,6 +187,7 @@ class DMPController(BaseEstimator):
         automatic = automatic_cutoff(self.duration_, knows_seconds=knows_seconds)
         self.cutoff_ = automatic if self.cutoff == "auto" else self.cutoff
         check_against_duration(self)
+        check_steps(self.n_steps, self.n_demos_, self.n_outputs_, learned=True)
         movements = self.smooth(demonstrations)
         beta = None if self.beta is None else float(self.beta)
         self.dmp_ = DMP(
@@ -341,6 +344,7 @@ class DMPController(BaseEstimator):
         check_task(demonstrations, getattr(self, "n_outputs_", None))
         if n_steps is not None:
             check_count("n_steps", n_steps, 2)
+            check_steps(n_steps, len(demonstrations), demonstrations.n_outputs, learned=False)
         return smooth(demonstrations, self.cutoff_, self.n_steps if n_steps is None else n_steps, self.duration_)
 
     def varying(self, movements: Movements) -> Floats:

@@ -16,7 +16,7 @@ _MOST_RATIO = 1e6
 def damping_from_stiffness(
     stiffness: Float[Tensor, "*b d d"] | Any,
     mass: float | Float[Tensor, "*m d d"] | Any = 1.0,
-    damping_ratio: float | Literal["paper"] = 1.0,
+    damping_ratio: float | Literal["paper"] | Any = 1.0,
 ) -> Float[Tensor, "*b d d"]:
     """Damping in N s/m that gives every mode of mass and stiffness the same damping ratio.
 
@@ -40,7 +40,7 @@ def damping_from_stiffness(
         If a matrix is not symmetric and positive (semi)definite, or the ratio is negative.
     """
     matrix = as_semidefinite(stiffness, "stiffness")
-    if damping_ratio == "paper":
+    if isinstance(damping_ratio, str) and damping_ratio == "paper":
         return spectral_map(matrix, _root)
     if isinstance(damping_ratio, str):
         raise ValueError(f"damping_ratio == {damping_ratio!r}, must be a number or 'paper'.")
@@ -52,6 +52,7 @@ def damping_from_stiffness(
     mass = as_mass(mass)
     if not isinstance(mass, Tensor) or mass.ndim == 0:
         return 2.0 * damping_ratio * mass**0.5 * spectral_map(matrix, _root)
+    _check_shapes(tuple(matrix.shape), tuple(mass.shape))
     root = spectral_map(mass.to(matrix), torch.sqrt)
     inverse = spectral_map(mass.to(matrix), torch.rsqrt)
     return symmetrize(2.0 * damping_ratio * root @ spectral_map(inverse @ matrix @ inverse, _root) @ root)
@@ -94,6 +95,16 @@ def required_damping_ratio(stiffness_ratio: float) -> float:
         return (root - 1.0 / root) / 2.0
     share = (largest - 2.0) / 4.0
     return math.sqrt((1.0 + share) / (1.0 - share)) if share < 1.0 else math.inf
+
+
+def _check_shapes(stiffness: tuple[int, ...], mass: tuple[int, ...]) -> None:
+    """Check that a mass has the axes of a stiffness, and batches that go with its own."""
+    pairs = zip(reversed(stiffness[:-2]), reversed(mass[:-2]), strict=False)
+    if stiffness[-1] != mass[-1] or any(a != b and 1 not in (a, b) for a, b in pairs):
+        raise ValueError(
+            f"mass has shape {mass}, but stiffness has shape {stiffness}: give a number, or a matrix (d, d) of as many "
+            "axes for all of them."
+        )
 
 
 def _root(eigenvalue: Tensor) -> Tensor:

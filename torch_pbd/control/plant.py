@@ -86,6 +86,8 @@ class AdmittancePlant:
             "stiffness_filter": (stiffness_filter, "start"),
         }
         for name, (part, method) in parts.items():
+            if isinstance(part, type):
+                raise ValueError(f"{name} == {part.__name__} is a class, must be an object of it.")
             if part is not None and not callable(getattr(part, method, None)):
                 raise ValueError(f"{name} == {part!r} has no method {method!r}; see the docstring for what it may be.")
         if substeps > 1 and (sensor is not None or position_loop is not None):

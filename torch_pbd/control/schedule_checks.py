@@ -1,6 +1,7 @@
 """What a schedule must be: shapes, finite numbers, symmetric gains, labels that JSON can hold."""
 
 import math
+import reprlib
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torch_pbd.arguments import from_tensor, is_finite
+from torch_pbd.arguments import check_text, from_tensor, is_finite
 
 ARRAY_DIMS = {"time": 1, "position": 2, "velocity": 2, "stiffness": 3, "damping": 3, "covariance": 3, "type1": 1}
 """Every array of a schedule with its number of axes: (n,), (n, d) or (n, d, d)."""
@@ -18,6 +19,7 @@ LABELS = ("names", "units", "frame", "stiffness_limits", "covariance_of", "mass"
 ROUNDING = 1e-9
 """Relative: what is smaller counts as rounding of the caller's arithmetic."""
 
+_DEEPEST = 100  # levels of a provenance, of which JSON and Python's own stack take more
 _LARGEST = 1e100  # squares and sums of what is smaller do not overflow
 
 Floats = NDArray[np.float64]
@@ -87,6 +89,8 @@ def _checked_labels(labels: Labels, n_outputs: int) -> dict[str, Any]:
     strings = [name for name in listed if isinstance(name, str)]
     if names is not None and not len(set(strings)) == len(listed) == n_outputs:
         raise ValueError(f"names is {names!r}, it must be {n_outputs} different strings, one for each output.")
+    for i, name in enumerate(strings):  # which are titles of columns; the others stand in JSON, which holds any text
+        check_text(name, f"names[{i}]")
     for name in ("units", "frame"):
         if not isinstance(labels[name], str | None):
             raise ValueError(f"{name} is {labels[name]!r}, it must be a string or None.")
@@ -95,7 +99,7 @@ def _checked_labels(labels: Labels, n_outputs: int) -> dict[str, Any]:
     if labels["mass"] is not None:
         check_positive("mass", labels["mass"])
     if not isinstance(labels["provenance"], Mapping):
-        raise ValueError(f"provenance is {labels['provenance']!r}, it must be a mapping.")
+        raise ValueError(f"provenance is {reprlib.repr(labels['provenance'])}, it must be a mapping.")
     return {
         **labels,
         "names": None if names is None else tuple(listed),
@@ -151,17 +155,22 @@ def _checked_limits(limits: Any) -> tuple[float, float]:
     return bounds[0], bounds[1]
 
 
-def _json_copy(value: Any, where: str) -> Any:
+def _json_copy(value: Any, where: str, depth: int = 0) -> Any:
     """Copy of what comes back from JSON as it was; tuples come back as lists."""
+    if depth > _DEEPEST:
+        raise ValueError(
+            f"provenance is nested more than {_DEEPEST} levels deep, or holds itself: it must be what JSON can hold, "
+            f"in fewer levels. It goes down by {where[:80]}..."
+        )
     if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
-        return {key: _json_copy(entry, f"{where}[{key!r}]") for key, entry in value.items()}
+        return {key: _json_copy(entry, f"{where}[{key!r}]", depth + 1) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_json_copy(entry, f"{where}[{i}]") for i, entry in enumerate(value)]
+        return [_json_copy(entry, f"{where}[{i}]", depth + 1) for i, entry in enumerate(value)]
     if isinstance(value, np.generic):
         value = value.item()
     if value is None or isinstance(value, bool | int | str) or (isinstance(value, float) and math.isfinite(value)):
         return value
     raise ValueError(
-        f"{where} is {value!r}, it must be what JSON can hold: text, finite numbers, lists, dicts with text for keys. "
-        "Convert arrays with .tolist()."
+        f"{where} is {reprlib.repr(value)}, it must be what JSON can hold: text, finite numbers, lists, dicts with "
+        "text for keys. Convert arrays with .tolist()."
     )

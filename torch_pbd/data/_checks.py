@@ -6,12 +6,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torch_pbd.arguments import from_tensor
+from torch_pbd.arguments import check_text, from_tensor
 from torch_pbd.data._missing import drop_missing
 from torch_pbd.data.alignment import Floats
 from torch_pbd.memory import require_much
 
 MIN_SAMPLES = 2
+_LONGEST = 0.25 * float(np.finfo(np.float64).max)  # quarters of times, whose difference is a number
 
 
 def as_recordings(times: Any, positions: Any, missing: str) -> tuple[tuple[Floats, ...], tuple[Floats, ...]]:
@@ -54,6 +55,24 @@ def as_labels(labels: str | Sequence[str], n_outputs: int, argument: str) -> tup
             "outputs: give one for each output."
         )
     return values
+
+
+def as_names(names: Sequence[str], n_outputs: int) -> tuple[str, ...]:
+    """A name for each output, all different, that any file can hold."""
+    values = as_labels(names, n_outputs, "names")
+    if len(set(values)) < n_outputs:
+        raise ValueError(f"names must differ from each other; got {preview(values)}.")
+    for i, name in enumerate(values):
+        check_text(name, f"names[{i}]")
+    return values
+
+
+def check_frame_and_unit(frame: Any, time_unit: Any) -> None:
+    """Name of a frame, or None, and a unit of times."""
+    if not isinstance(frame, str | None):
+        raise ValueError(f"frame is {frame!r}, must be text or None.")
+    if not isinstance(time_unit, str) or not time_unit:
+        raise ValueError(f"time_unit is {time_unit!r}, must be the unit of the times: 's', or '1' for phase.")
 
 
 def preview(values: Sequence[object], limit: int = 12) -> str:
@@ -152,6 +171,11 @@ def _as_time(array: NDArray[Any], argument: str, numbers: NDArray[np.intp]) -> F
     if not np.isfinite(time).all():
         i = int(np.argmin(np.isfinite(time)))
         raise ValueError(f"{argument} is {time[i]} at sample {numbers[i]}: all times must be finite.")
+    if np.ptp(0.25 * time) > _LONGEST:
+        raise ValueError(
+            f"{argument} goes from {time.min():.3g} to {time.max():.3g}, further than float64 can tell: take another "
+            "unit of time."
+        )
     _check_rising(time, array, argument, numbers)
     return time
 

@@ -36,11 +36,14 @@ def read_csv(
 ) -> Demonstrations:
     """Read the format of `torch_pbd.data.load_demonstrations`, where the options are told."""
     check_choice(decimal, (".", ","), "decimal")
-    if delimiter is not None and (len(delimiter) != 1 or delimiter == decimal):
+    _check_columns(demo, time, outputs)
+    if delimiter is not None and (not isinstance(delimiter, str) or len(delimiter) != 1 or delimiter == decimal):
         raise ValueError(f"delimiter={delimiter!r} must be one character, and not the decimal mark {decimal!r}.")
     with path.open(encoding="utf-8-sig", newline="") as file:
         try:
-            table = _open_table(path, file, delimiter, decimal, missing, wanted=[*([demo] if demo else []), time])
+            table = _open_table(
+                path, file, delimiter, decimal, missing, wanted=[time] if demo is None else [demo, time]
+            )
             names = table.output_names(outputs, taken=[demo, time])
             recorded = table.recordings(demo, [time, *names])
         except UnicodeDecodeError as error:
@@ -71,6 +74,19 @@ def write_csv(demonstrations: Demonstrations, handle: BinaryIO) -> None:
         rows = zip(time.tolist(), position.tolist(), strict=True)
         writer.writerows([k, t, *values] for t, values in rows)
     text.detach()
+
+
+def _check_columns(demo: object, time: object, outputs: object) -> None:
+    """Check that columns are named by text."""
+    if not isinstance(demo, str | None):
+        raise ValueError(f"demo={demo!r} must be the name of a column, or None: the file is one demonstration.")
+    if not isinstance(time, str):
+        raise ValueError(f"time={time!r} must be the name of a column.")
+    names = [outputs] if isinstance(outputs, str) else outputs
+    if names is not None and not (
+        isinstance(names, Sequence | np.ndarray) and all(isinstance(name, str) for name in names)
+    ):
+        raise ValueError(f"outputs={outputs!r} must be names of columns, or None: all the others.")
 
 
 def _open_table(

@@ -6,7 +6,15 @@ from typing import Any, Literal, NamedTuple, final, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torch_pbd.data._checks import as_labels, as_recordings, check_choice, check_n_steps, preview
+from torch_pbd.data._checks import (
+    as_labels,
+    as_names,
+    as_recordings,
+    check_choice,
+    check_frame_and_unit,
+    check_n_steps,
+    preview,
+)
 from torch_pbd.data.alignment import Floats, dtw_warps, interpolate, unit_phases
 
 Missing = Literal["raise", "drop"]
@@ -51,7 +59,7 @@ class Demonstrations:
     ValueError
         If there is no demonstration, if lengths or numbers of outputs disagree, if a demonstration has (left) fewer
         than two samples, if a value is not a finite real number, or if times do not increase strictly or are
-        stored too coarsely to tell samples apart.
+        stored too coarsely to tell samples apart; or if a name has control characters.
 
     Examples
     --------
@@ -80,11 +88,10 @@ class Demonstrations:
     ) -> None:
         self._times, self._positions = as_recordings(times, positions, missing)
         d = self.n_outputs
-        self._names = as_labels([f"y{i}" for i in range(d)] if names is None else names, d, "names")
-        if len(set(self._names)) < d:
-            raise ValueError(f"names must differ from each other; got {preview(self._names)}.")
+        self._names = as_names([f"y{i}" for i in range(d)] if names is None else names, d)
         per_output = (units,) * d if isinstance(units, str) else units
         self._units = None if per_output is None else as_labels(per_output, d, "units")
+        check_frame_and_unit(frame, time_unit)
         self._frame = frame
         self._time_unit = time_unit
 

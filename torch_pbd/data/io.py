@@ -6,6 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import numpy as np
+
 from torch_pbd.data._format_csv import read_csv, write_csv
 from torch_pbd.data._format_npz import read_npz, write_npz
 from torch_pbd.data.demonstrations import Demonstrations, Missing
@@ -60,13 +62,15 @@ def load_demonstrations(
     FileNotFoundError
         If there is no such file.
     ValueError
-        If the suffix is not known.
+        If the suffix is not known, or an option is not as described.
     TypeError
         If an option is not one of the format's.
     DataFormatError
         If the file is not what its suffix says; names the array, or the line and the column. Or if it is too large
         for the memory.
     """
+    if isinstance(max_bytes, bool) or not isinstance(max_bytes, int | np.integer):
+        raise ValueError(f"max_bytes={max_bytes!r} must be a whole number: the bytes of the largest file to read.")
     file = Path(path)
     reader = _READERS[_known_suffix(file)]
     known = list(inspect.signature(reader).parameters)[3:]

@@ -120,7 +120,7 @@ def check_weights(sample_weight: Any, n_samples: int) -> Floats:
 
 def check_squares(array: Floats, name: str) -> None:
     """Check that variances of the columns of ``array`` are numbers that float64 holds."""
-    largest = np.abs(array.reshape(len(array), -1)).max(axis=0)
+    largest = np.abs(array.reshape(len(array), -1)).max(axis=0).astype(np.float64)  # which holds the bounds
     beyond = (largest > _LARGEST) | ((largest > 0) & (largest < 1.0 / _LARGEST))
     if beyond.any():
         column = int(np.argmax(beyond))

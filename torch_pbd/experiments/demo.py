@@ -15,7 +15,7 @@ from torch_pbd.experiments.comparison import compare_models
 from torch_pbd.experiments.recordings import score_row, write_fitted
 from torch_pbd.experiments.robot import run_robot
 from torch_pbd.experiments.robot_figures import draw_tunnel
-from torch_pbd.experiments.run_folder import RunFolder, format_table
+from torch_pbd.experiments.run_folder import RunFolder, check_names, format_table
 from torch_pbd.metrics import mahalanobis_coverage
 from torch_pbd.plotting import MODEL, plot_covariance_ellipses, plot_demonstrations
 
@@ -28,6 +28,7 @@ def run_demo(models: Mapping[str, CovarianceRegressor], folder: RunFolder, *, n_
 
     Returns the tables and the stability report as text.
     """
+    check_names(models, "models")
     demonstrations = make_tunnel_demonstrations(n_demos, rate=_RATE, random_state=seed)
     fresh = make_tunnel_demonstrations(_N_FRESH, rate=_RATE, random_state=seed + 1).to_array()
     true_covariance = np.einsum("kti,ktj->tij", *(2 * [fresh - fresh.mean(axis=0)])) / (_N_FRESH - 1)

@@ -12,7 +12,7 @@ from torch_pbd.data import Demonstrations
 from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.estimators._groups import fit_by_demonstration
 from torch_pbd.experiments.comparison import Score, compare_models
-from torch_pbd.experiments.run_folder import RunFolder, format_table, slug
+from torch_pbd.experiments.run_folder import RunFolder, check_names, format_table, slug
 from torch_pbd.labels import output_label
 from torch_pbd.plotting import MODEL, plot_covariance_ellipses, plot_demonstrations, plot_model_bands
 
@@ -111,6 +111,7 @@ def run_recordings(
     n_jobs: int | None = None,
 ) -> str:
     """Compare models on demonstrations; writes metrics, folds, models and figures, returns the table."""
+    check_names(models, "models")
     X, y, groups = demonstrations.stack(input)
     scores = compare_models(models, X, y, groups, max_folds=max_folds, n_jobs=n_jobs)
     rows = [score_row(score) for score in scores]

@@ -16,7 +16,7 @@ from torch_pbd.control.stability_report import StabilityReport
 from torch_pbd.control.units import in_metres
 from torch_pbd.data import Demonstrations
 from torch_pbd.experiments.robot_figures import pushes_figure, task_figure, variability_figure
-from torch_pbd.experiments.run_folder import RunFolder, format_table, slug
+from torch_pbd.experiments.run_folder import RunFolder, check_names, format_table, slug
 from torch_pbd.labels import readable_unit, schedule_names
 
 _IN_REPORT = ("margin", "max speed", "gain", "environment")
@@ -99,6 +99,7 @@ def run_robot(
     metrics: str = "metrics",
 ) -> str:
     """Run each controller; writes figures, models, schedules, metrics, reports; returns table and reports as text."""
+    check_names(controllers, "controllers")
     rows, reports = [], []
     for name, controller in controllers.items():
         run = run_controller(controller, demonstrations, peak=peak, rate=rate)

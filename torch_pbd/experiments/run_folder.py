@@ -7,7 +7,7 @@ import os
 import platform
 import socket
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -20,12 +20,14 @@ from matplotlib.figure import Figure
 import torch_pbd
 from torch_pbd.control.controller import DMPController
 from torch_pbd.estimators._base import CovarianceRegressor
-from torch_pbd.exceptions import FolderInUseError
+from torch_pbd.exceptions import ConfigError, FolderInUseError
 from torch_pbd.files import remove_drafts, replacing
 from torch_pbd.persistence import save
 
 _PACKAGES = ("torch", "scikit-learn", "numpy", "matplotlib")
-_PARTS = ("figures", "model")
+_PARTS = ("figures", "model", "schedule")
+_SUFFIXES = (".csv", ".json", ".npz", ".png", ".safetensors", ".txt", ".yaml")  # of the files of results
+_LONGEST = 180  # bytes of a name, to which titles, suffixes and marks of drafts are added
 
 
 class RunFolder:
@@ -63,6 +65,7 @@ class RunFolder:
             for folder in (self.path, *(self.path / part for part in _PARTS if (self.path / part).exists())):
                 if not folder.is_dir() or not os.access(folder, os.W_OK):
                     raise PermissionError(f"{folder} is no folder, or not writable")
+                _check_files(folder)
                 remove_drafts(folder)
             self.write_text("env.json", json.dumps(_environment(settings), indent=2) + "\n")
         except BaseException:
@@ -110,6 +113,14 @@ class RunFolder:
         return target
 
 
+def _check_files(folder: Path) -> None:
+    """Check that what is named as files of results are is none but files, which can be replaced."""
+    for entry in folder.iterdir():
+        named_so = entry.suffix in _SUFFIXES or (entry.name == "checkpoint" and folder.name not in _PARTS)
+        if named_so and entry.exists() and not entry.is_file():
+            raise IsADirectoryError(f"{entry} stands where a file of results may have to: move it away")
+
+
 def _environment(settings: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "torch_pbd": torch_pbd.__version__,
@@ -138,6 +149,30 @@ def _owner(path: Path) -> str:
 def slug(name: str) -> str:
     """Name of a file for the name of a model."""
     return "_".join("".join(letter if letter.isalnum() else " " for letter in name).lower().split())
+
+
+def check_names(names: Iterable[str], argument: str) -> None:
+    """Check that every name of a model gives files of its own.
+
+    Raises
+    ------
+    ConfigError
+        If a name has no letter and no digit, or is too long; if two names give the same files.
+    """
+    owners: dict[str, str] = {}
+    for name in names:
+        file = slug(name)
+        if not 0 < len(file.encode()) <= _LONGEST:
+            raise ConfigError(
+                f"{argument}: {name!r:.80} gives no name of a file: it must have a letter or a digit, and at most "
+                f"{_LONGEST} bytes. Rename it."
+            )
+        if file in owners:
+            raise ConfigError(
+                f"{argument}: {owners[file]!r:.80} and {name!r:.80} would both be written to files named {file!r:.80}, "
+                "where one would replace the other: they must differ in letters or digits. Rename one."
+            )
+        owners[file] = name
 
 
 def format_table(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -14,7 +14,7 @@ from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.estimators.mixture import GMMBaseline
 from torch_pbd.experiments.comparison import Score, compare_models, empirical_covariances
 from torch_pbd.experiments.reference import ScikitLearnGMR
-from torch_pbd.experiments.run_folder import RunFolder, format_table, slug
+from torch_pbd.experiments.run_folder import RunFolder, check_names, format_table, slug
 from torch_pbd.plotting import EMPIRICAL, MODEL, TRUTH, plot_covariance_ellipses, plot_model_bands
 
 # Table I: mean squared error on Cholesky entries, and seconds on "a standard laptop in Matlab".
@@ -116,6 +116,7 @@ def run_simulation(
     models: Mapping[str, CovarianceRegressor], folder: RunFolder, *, readings: Sequence[Reading], **options: Any
 ) -> str:
     """Make Table I and the figures of each model (seed 0, first reading); returns the table as text."""
+    check_names(models, "models")
     rows = table1(models, readings=readings, **options)
     folder.write_metrics(rows)
     sizes = {key: options[key] for key in ("n_inputs", "n_demos") if key in options}

@@ -184,4 +184,9 @@ def _value(text: str, hint: Any, place: Place) -> Any:
         if str in parts and not (text.startswith("[") and any(get_origin(part) is list for part in parts)):
             return text
         raise
-    return text if str in parts and value is not None and type(value) not in parts else value
+    return text if str in parts and not any(_is_of(value, part) for part in parts) else value
+
+
+def _is_of(value: Any, part: Any) -> bool:
+    """Whether a value is of the kind of a type: a list for one of lists, a whole number for a float too."""
+    return value is None or type(value) in (part, get_origin(part)) or (part is float and type(value) is int)
