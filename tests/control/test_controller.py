@@ -91,11 +91,13 @@ def test_what_is_unknown_is_soft_apart_from_what_varies(tunnel):
     far = np.array([[30.0], [60.0]])
     within = np.linspace(0.0, 10.0, 50)[:, None]
     narrow = CholeskyCovRegressor(prior=1e-12)  # a prior that claims to know: stiff
-    soft, prior = (DMPController(narrow, on_unknown=policy).fit(tunnel) for policy in ("soft", "prior"))
+    with pytest.warns(UserWarning, match="prior has variances"):
+        soft, prior, refusing = (
+            DMPController(narrow, on_unknown=policy).fit(tunnel) for policy in ("soft", "prior", "raise")
+        )
     np.testing.assert_allclose(soft.predict_stiffness(far), np.tile(50.0 * np.eye(2), (2, 1, 1)), atol=1e-6)
     np.testing.assert_allclose(prior.predict_stiffness(far), np.tile(1000.0 * np.eye(2), (2, 1, 1)), rtol=1e-6)
     np.testing.assert_allclose(soft.predict_stiffness(within), prior.predict_stiffness(within), rtol=1e-6)
-    refusing = DMPController(narrow, on_unknown="raise").fit(tunnel)
     refusing.predict_stiffness(within)
     with pytest.raises(ValueError, match="no data at time 30"):
         refusing.predict_stiffness(far)
