@@ -5,6 +5,7 @@ import pytest
 
 from torch_pbd import CholeskyCovRegressor, WishartProcessRegressor
 from torch_pbd.data import load_demonstrations, make_paper_simulation
+from torch_pbd.exceptions import DataRankWarning
 
 REGRESSORS = [CholeskyCovRegressor, WishartProcessRegressor]
 
@@ -34,6 +35,16 @@ def test_what_they_do_not_agree_on_is_smoothed(regressor):
     X, y, _ = make_paper_simulation(random_state=0)
     error = standardized_error(regressor().fit(X, y), X, y)
     assert 0.3 < np.sqrt(np.square(error).mean()) < 1.5
+
+
+@pytest.mark.parametrize("regressor", REGRESSORS)
+def test_where_it_would_have_to_swing_wildly_it_does_not_and_says_so(regressor, rng):
+    """Pairs of inputs a millionth of the range apart, whose means differ by ten."""
+    X = np.repeat(np.add.outer(np.linspace(0.0, 1.0, 6), [0.0, 1e-6]).ravel(), 6)[:, np.newaxis]
+    y = np.tile(np.repeat([0.0, 10.0], 6), 6)[:, np.newaxis] + 0.1 * rng.normal(size=X.shape)
+    with pytest.warns(DataRankWarning, match="too near to each other for a smooth mean"):
+        model = regressor(objective="likelihood").fit(X, y)
+    assert np.abs(model.predict(np.linspace(0.0, 1.0, 200)[:, np.newaxis])).max() < 20.0
 
 
 @pytest.mark.parametrize("regressor", REGRESSORS)

@@ -1,5 +1,6 @@
 """The mean of CD and WP, held against what repeated rows say of it."""
 
+import warnings
 from dataclasses import replace
 
 import torch
@@ -7,6 +8,7 @@ from jaxtyping import Bool, Float
 from scipy.special import fdtri, stdtrit
 from torch import Tensor
 
+from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.gp import EvidenceSearch, LatentGP, Observations, condition, fit_together
 from torch_pbd.gp.search import Found
 from torch_pbd.models.training import TrainingSet
@@ -14,6 +16,7 @@ from torch_pbd.optim import FitReport
 
 _LEVEL = 1e-4  # of the tests: how often a mean that is right is taken for wrong
 _LEAST_SPREAD = 0.03  # of the pooled one: how small that at an input is believed to be
+_STRETCHED = 10.0  # an amplitude of so many times the means; through means that a process follows it is up to 2
 _ROUNDING = 1e-16  # squared, of standardized outputs
 _SHARE, _LEAST_NOISE = 0.1, 1e-6  # of the smallest error of a mean, and of the outputs' deviation
 
@@ -25,6 +28,11 @@ def mean_that_repeats_allow(
 
     The evidence sees the mean at each input, not how far the rows there differ. With few inputs, or jumps between them,
     it may take for noise what all demonstrations agree on.
+
+    Warns
+    -----
+    DataRankWarning
+        If the means can be followed by a process only that swings far beyond them between the inputs: it is not taken.
     """
     mean, _ = condition(observations, found.hyperparameters, search.kernel, basis=found.basis)
     if int(training.counts.min()) < 2 or not torch.equal(training.inputs[training.index], training.x):
@@ -37,6 +45,15 @@ def mean_that_repeats_allow(
     learned = found.hyperparameters.amplitude * found.hyperparameters.noise_ratio.sqrt()
     noise_scale = torch.where(wrong, _SHARE * spread.least_error(), learned).clamp_min(_LEAST_NOISE)
     (again,) = fit_together([(observations, replace(search, noise_scale=noise_scale))])
+    typical = observations.targets.square().mean(1).sqrt()
+    if bool((again.hyperparameters.amplitude > _STRETCHED * typical)[wrong].any()):
+        warnings.warn(
+            "y has means at the inputs that differ by more than its scatter there, between inputs too near to each "
+            "other for a smooth mean to follow: it does not. Make such rows of X equal, which pools them.",
+            DataRankWarning,
+            stacklevel=6,
+        )
+        return mean, found.report
     return condition(observations, again.hyperparameters, search.kernel, basis=again.basis)[0], again.report
 
 

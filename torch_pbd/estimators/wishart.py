@@ -14,6 +14,7 @@ from torch_pbd.estimators._latent import (
     residual_tril,
     warn_if_stretched,
 )
+from torch_pbd.estimators._mean import mean_that_repeats_allow
 from torch_pbd.estimators._prior import Prior
 from torch_pbd.estimators._validation import check_choice, check_number, check_solver
 from torch_pbd.exceptions import DataRankWarning, NotPositiveDefiniteError
@@ -24,6 +25,7 @@ from torch_pbd.gp import (
     Observations,
     condition,
     fit_hyperparameters,
+    fit_together,
     merge_observations,
 )
 from torch_pbd.kernels import KernelName
@@ -174,7 +176,8 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         return padded(problem.prior_tril, self.df_)
 
     def _fit_empirical(self, problem: Problem) -> tuple[LatentGP, WishartCovariance, FitReport, float]:
-        mean, of_mean = self._fit_mean(problem.training)
+        job = self._mean_job(problem.training)
+        mean, of_mean = mean_that_repeats_allow(problem.training, *job, *fit_together([job]))
         prior_root = self._prior_root(problem)
         target = empirical_tril(problem.training)
         if self.start == "random":
