@@ -17,7 +17,7 @@ from torch_pbd.optim import FitReport
 _LEVEL = 1e-4  # of the tests: how often a mean that is right is taken for wrong
 _LEAST_SPREAD = 0.03  # of the pooled one: how small that at an input is believed to be
 _STRETCHED = 10.0  # an amplitude of so many times the means; through means that a process follows it is up to 2
-_ROUNDING = 1e-16  # squared, of standardized outputs
+_UNRESOLVED = 1e-10  # squared, of standardized outputs: what a smooth process may be off by in any case
 _SHARE, _LEAST_NOISE = 0.1, 1e-6  # of the smallest error of a mean, and of the outputs' deviation
 
 
@@ -45,8 +45,10 @@ def mean_that_repeats_allow(
     learned = found.hyperparameters.amplitude * found.hyperparameters.noise_ratio.sqrt()
     noise_scale = torch.where(wrong, _SHARE * spread.least_error(), learned).clamp_min(_LEAST_NOISE)
     (again,) = fit_together([(observations, replace(search, noise_scale=noise_scale))])
-    typical = observations.targets.square().mean(1).sqrt()
-    if bool((again.hyperparameters.amplitude > _STRETCHED * typical)[wrong].any()):
+    # Over a range or more a large amplitude is a trend.
+    swings = again.hyperparameters.amplitude > _STRETCHED * observations.targets.square().mean(1).sqrt()
+    swings &= again.hyperparameters.length_scale.amin(1) < 1.0
+    if bool(swings[wrong].any()):
         warnings.warn(
             "y has means at the inputs that differ by more than its scatter there, between inputs too near to each "
             "other for a smooth mean to follow: it does not. Make such rows of X equal, which pools them.",
@@ -80,7 +82,7 @@ class _Spread:
         """
         squared = residual.mT.square() * self._counts[:, None]
         n_inputs, degrees = len(squared), float(self._degrees.sum())
-        together = squared.mean(0) > fdtri(n_inputs, degrees, 1.0 - _LEVEL) * self._pooled + _ROUNDING
+        together = squared.mean(0) > fdtri(n_inputs, degrees, 1.0 - _LEVEL) * self._pooled + _UNRESOLVED
         limit = stdtrit(self._degrees.cpu().numpy(), 0.5 * _LEVEL / n_inputs)
-        alone = squared > squared.new_tensor(limit).square()[:, None] * self._local + _ROUNDING
+        alone = squared > squared.new_tensor(limit).square()[:, None] * self._local + _UNRESOLVED
         return together | alone.any(0)
