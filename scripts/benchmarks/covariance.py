@@ -223,7 +223,10 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the recordings (default: %(default)s)")
     parser.add_argument("--jobs", type=int, default=1, help="fits at the same time, each on one thread (default: 1)")
     parser.add_argument(
-        "--table-of", type=Path, nargs="+", help="run nothing: the table of what runs have written into these folders"
+        "--table-of",
+        type=Path,
+        nargs="+",
+        help="run nothing: the table of what runs have written into these folders (of recordings: of --sets)",
     )
     parser.add_argument("--out", type=Path, default=Path("covariance_benchmark"), help="folder of what is written")
     return parser.parse_args(arguments)
@@ -233,8 +236,10 @@ def main(arguments: list[str] | None = None) -> None:
     options = parse(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
     if options.table_of:
-        parts = [read(options.table_of, f"{name}.csv", 3) for name in ("made", "recorded", "pen")]
-        write_table(options.out, *parts)
+        made, recorded, pen = (read(options.table_of, f"{name}.csv", 3) for name in ("made", "recorded", "pen"))
+        if options.sets is not None:
+            recorded = [row for row in recorded if row["set"] in options.sets]
+        write_table(options.out, made, recorded, pen)
         return
     methods = available(options.methods)
     recordings = recordings_of(options.data, options.sets)
