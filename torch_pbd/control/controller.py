@@ -57,7 +57,7 @@ class DMPController(BaseEstimator):
     Parameters
     ----------
     covariance : covariance regressor, default=None
-        Cloned before it is fitted; None is ``CholeskyCovRegressor()``, the paper's.
+        Cloned before it is fitted; None is ``HeteroscedasticGPRegressor()``.
     alpha, beta, gamma, tau : float, default=25.0, None, 0.7, 1.0
         Of the movement primitive, see :class:`~torch_pbd.control.DMP`; the paper's are 1, 1, 0.7, 1.
     gate : {"time", "phase", "none"}, default="time"

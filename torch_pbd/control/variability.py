@@ -7,7 +7,7 @@ from sklearn.base import clone
 from torch_pbd.control.stiffness import StiffnessLaw
 from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.estimators._groups import fit_by_demonstration
-from torch_pbd.estimators.cholesky import CholeskyCovRegressor
+from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
 
 Floats = NDArray[np.float64]
 
@@ -17,7 +17,7 @@ _ROUNDING = 1e-11  # of the largest position
 
 def fit_covariance(regressor: CovarianceRegressor | None, inputs: Floats, varying: Floats) -> CovarianceRegressor:
     """Fit a clone of the regressor to what varies (K, n, d) at common inputs (n, 1); it is told the demonstrations."""
-    fitted: CovarianceRegressor = clone(CholeskyCovRegressor() if regressor is None else regressor)
+    fitted: CovarianceRegressor = clone(HeteroscedasticGPRegressor() if regressor is None else regressor)
     n_demos, n_steps, n_outputs = varying.shape
     groups = np.repeat(np.arange(n_demos), n_steps)
     return fit_by_demonstration(fitted, np.tile(inputs, (n_demos, 1)), varying.reshape(-1, n_outputs), groups)
