@@ -1,21 +1,16 @@
 """The benchmark of covariance regressors: its laws, its peers, its command line."""
 
 import csv
-import sys
-from pathlib import Path
-
-import numpy as np
-import pytest
-
-from torch_pbd.data import make_tunnel_demonstrations, save_demonstrations
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "scripts" / "benchmarks"))
 
 import covariance
 import covariance_libraries as libraries
 import covariance_peers as peers
 import covariance_report as tables
 import covariance_tasks as made
+import numpy as np
+import pytest
+
+from torch_pbd.data import make_tunnel_demonstrations, save_demonstrations
 
 
 def test_laws_have_the_values_of_their_formulas():

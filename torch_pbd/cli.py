@@ -5,7 +5,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from typing import Any
 
 from torch_pbd.console import Notes, say
@@ -87,7 +87,7 @@ def _answer(arguments: Sequence[str]) -> int:
 
 def _run(command: str, arguments: Sequence[str]) -> int:
     from torch_pbd.commands import WORK
-    from torch_pbd.config import chosen_groups, existing_file, parse
+    from torch_pbd.config import existing_file, parse
 
     options, config = parse(command, arguments)
     import matplotlib as mpl
@@ -99,15 +99,13 @@ def _run(command: str, arguments: Sequence[str]) -> int:
     torch.set_num_threads(1)  # the matrices are small: threads would only wait for each other
     if getattr(options, "data", None) is not None:
         options.data = existing_file(options.data)
-    if command == "benchmark":
-        options.groups = chosen_groups(options.groups)
     for argument in ("models", "controllers"):
         check_names(getattr(options, argument, ()), argument)
     with _run_folder(options.output, command) as folder, warnings.catch_warnings():
         warnings.simplefilter("default")
         warnings.showwarning = Notes()
         try:
-            with _checkpoint(options, folder, command, config):
+            with _checkpoint(options, folder, config):
                 folder.write_text("config.yaml", config)
                 say(WORK[command](options, folder))
         except (KeyboardInterrupt, _Terminated) as stop:
@@ -133,13 +131,10 @@ def _run_folder(path: str, command: str) -> Any:
         ) from error
 
 
-def _checkpoint(options: Any, folder: Any, command: str, config: str) -> Any:
+def _checkpoint(options: Any, folder: Any, config: str) -> Any:
     """What keeps the work's checkpoint, begun with the one that is there if asked to."""
-    from torch_pbd.config import RESUMABLE
     from torch_pbd.experiments.resuming import checkpoint_of_run
 
-    if command not in RESUMABLE:
-        return nullcontext()
     return checkpoint_of_run(
         folder.path / _CHECKPOINT,
         config,

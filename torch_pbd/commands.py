@@ -112,14 +112,7 @@ def compare(options: Any, folder: Any) -> str:
     )
 
 
-def benchmark(options: Any, folder: Any) -> str:
-    """Comparisons of speed."""
-    from torch_pbd.experiments.benchmark import run_benchmark
-
-    return run_benchmark(folder, options.groups, n_repetitions=options.n_repetitions, quick=options.quick)
-
-
-WORK = {"demo": demo, "fit": fit, "experiment": experiment, "compare": compare, "benchmark": benchmark}
+WORK = {"demo": demo, "fit": fit, "experiment": experiment, "compare": compare}
 
 
 def _demonstrations(options: Any) -> Any:

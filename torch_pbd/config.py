@@ -22,9 +22,7 @@ COMMANDS = {
     "fit": "fit one model to a file of demonstrations",
     "experiment": "learn a skill, reproduce it on a simulated robot and push it (Figures 5 to 8)",
     "compare": "compare models: on the paper's simulation (Table I, Figures 1 to 3), or on a file",
-    "benchmark": "time fits, predictions and ticks against other libraries; ratios, bars, growth",
 }
-RESUMABLE = ("demo", "fit", "experiment", "compare")
 
 _MODEL_HELP = "an estimator's name, or class_path and init_args; its options: --model.help NAME"
 _MODELS = {
@@ -34,7 +32,6 @@ _MODELS = {
     "GMM 5": {"class_path": "GMMBaseline", "init_args": {"n_components": 5}},
     "GMM 8": {"class_path": "GMMBaseline", "init_args": {"n_components": 8}},
 }
-GROUPS = ("imports", "fitting", "likelihood", "heteroscedastic", "prediction", "control", "growth")  # of the benchmark
 _CONTROLLERS = {"recommended": {"class_path": "DMPController"}}
 _Seed: Any = restricted_number_type(
     "IntFrom0To4294967294", int, [(">=", 0), ("<=", 2**32 - 2)]
@@ -109,20 +106,14 @@ def _parser(command: str, *, only_help: bool) -> _Parser:
     parser = _Parser(prog=f"torch-pbd {command}", description=COMMANDS[command].capitalize() + ".", exit_on_error=False)
     parser.add_argument("--config", action=ActionConfigFile, help="YAML file with any of these options")
     parser.add_argument("--output", type=str, default=f"runs/{command}", help="folder of the results")
-    if command in RESUMABLE:
-        parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in the folder of results")
-        parser.add_argument(
-            "--checkpoint_interval", type=PositiveFloat, default=5.0, help="seconds between two checkpoints"
-        )
+    parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in the folder of results")
+    parser.add_argument(
+        "--checkpoint_interval", type=PositiveFloat, default=5.0, help="seconds between two checkpoints"
+    )
     model_type, models_type = (Any, Any) if only_help else _model_types()
     if command == "demo":
         parser.add_argument("--n_demos", type=PositiveInt, default=6, help="demonstrations to learn from, at least 3")
         parser.add_argument("--seed", type=_Seed, default=0, help="seed of the demonstrations")
-        return parser
-    if command == "benchmark":
-        parser.add_argument("--groups", type=str, default="all", help=f"comma-separated, of {', '.join(GROUPS)}")
-        parser.add_argument("--n_repetitions", type=PositiveInt, default=5, help="of each contender")
-        parser.add_argument("--quick", action="store_true", help="small sizes, once, to see that everything runs")
         return parser
     if command == "experiment":
         _add_experiment_arguments(parser, Any if only_help else _controllers_type())
@@ -214,21 +205,6 @@ def _classes() -> dict[type, dict[str, type]]:
     models = (HeteroscedasticGPRegressor, CholeskyCovRegressor, WishartProcessRegressor, GMMBaseline)
     tables = {_model_types()[0]: models, DMPController: (DMPController,), StiffnessLaw: (StiffnessLaw,)}
     return {base: {known.__name__: known for known in table} for base, table in tables.items()}
-
-
-def chosen_groups(text: str) -> list[str]:
-    """Groups of the benchmark that a comma-separated list names.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such group.
-    """
-    names = list(GROUPS) if text == "all" else [name.strip() for name in text.split(",")]
-    for name in names:
-        if name not in GROUPS:
-            raise ConfigError(f"groups: there is no group {name!r}. {nearest(name, [*GROUPS, 'all'])}")
-    return names
 
 
 def nearest(name: str, known: Collection[str]) -> str:

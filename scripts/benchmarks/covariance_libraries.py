@@ -130,13 +130,13 @@ class GPyTorchFactors(SklearnFactors):
     """gpytorch's batch of exact Gaussian processes on the same means and entries, 100 steps of Adam at 0.1."""
 
     def _mean_process(self, x: Floats, y: Floats) -> Any:
-        from torch_pbd.experiments.benchmark.gpytorch_models import ExactBatch
+        from speed.gpytorch_models import ExactBatch
 
         sites, index, counts = distinct(x)
         return ExactBatch(sites, site_sums(index, y, len(sites)) / counts[:, np.newaxis])
 
     def _factor_process(self, sites: Floats, entries: Floats) -> Any:
-        from torch_pbd.experiments.benchmark.gpytorch_models import ExactBatch
+        from speed.gpytorch_models import ExactBatch
 
         return ExactBatch(sites, entries)
 
@@ -147,7 +147,7 @@ class VariationalFactors(Peer):
     gaussian = False
 
     def _fit(self, x: Floats, y: Floats, groups: Groups | None) -> None:
-        from torch_pbd.experiments.benchmark.gpytorch_models import SampledFactors
+        from speed.gpytorch_models import SampledFactors
 
         self._model = SampledFactors(x, y)
 

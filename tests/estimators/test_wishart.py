@@ -2,13 +2,13 @@ import warnings
 
 import numpy as np
 import pytest
+from reliability.problems import Recipe
 from sklearn.exceptions import ConvergenceWarning
 
 from estimators.zoo import assert_covariances, demonstrations, fit, fitted, new, queries
 from torch_pbd import CholeskyCovRegressor, WishartProcessRegressor
 from torch_pbd.data import make_paper_simulation
 from torch_pbd.exceptions import DataRankWarning
-from torch_pbd.experiments.reliability.problems import Recipe
 from torch_pbd.metrics import covariance_mse
 
 

@@ -1,19 +1,16 @@
-"""``torch-pbd benchmark``: what it measures is that of a machine; here is what it makes of it."""
+"""The benchmark of speed: what it measures is that of a machine; here is what it makes of it."""
 
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-
-from torch_pbd.cli import main
-from torch_pbd.config import GROUPS as NAMES
-from torch_pbd.experiments.benchmark import GROUPS, made, prediction, report
-from torch_pbd.experiments.benchmark import ticks as ticking
-from torch_pbd.experiments.benchmark.fresh import measured
-from torch_pbd.experiments.benchmark.growth import exponent
-from torch_pbd.experiments.benchmark.rows import Findings, Growth, Plan, Row
-from torch_pbd.experiments.benchmark.timing import alternate, ratios
+from speed import GROUPS, made, prediction, report, run_benchmark
+from speed import ticks as ticking
+from speed.fresh import measured
+from speed.growth import exponent
+from speed.rows import Findings, Growth, Plan, Row
+from speed.timing import alternate, ratios
 
 
 class Clock:
@@ -150,22 +147,13 @@ def test_memory_is_what_work_takes_above_its_setup():
     assert 95.0 < found["above"] < 130.0
 
 
-def test_the_command_line_knows_the_groups():
-    assert list(NAMES) == list(GROUPS)
-
-
-def test_a_group_that_is_not_there_is_a_suggestion(capsys):
-    assert main(["benchmark", "--groups", "fiting"]) == 2
-    assert "Did you mean 'fitting'?" in capsys.readouterr().err
-
-
 @pytest.mark.slow
-def test_a_quick_run_leaves_its_numbers(tmp_path, capsys):
-    assert main(["benchmark", "--quick", "--output", str(tmp_path)]) == 0
-    shown = capsys.readouterr().out
+def test_a_quick_run_leaves_its_numbers(tmp_path):
+    with RunFolder(tmp_path, {}) as folder:
+        shown = run_benchmark(folder, quick=True)
     assert "bars held" in shown
     found = json.loads((tmp_path / "benchmark.json").read_text())
-    assert list(found["groups"]) == list(NAMES)
+    assert list(found["groups"]) == list(GROUPS)
     assert {"machine", "versions", "plan"} <= set(found)
     for group in found["groups"].values():
         for row in group["rows"]:

@@ -1,8 +1,7 @@
 """The benchmark of training on a likelihood: its three ways end at one optimum, preconditioned ones soon."""
 
 import pytest
-
-from torch_pbd.experiments.benchmark import likelihood_training as benchmark
+from speed import likelihood_training as benchmark
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -3,8 +3,7 @@
 from dataclasses import replace
 
 from hypothesis import strategies as st
-
-from torch_pbd.experiments.reliability.problems import (
+from reliability.problems import (
     COLUMNS,
     DTYPES,
     GROUPS,

@@ -125,7 +125,7 @@ def test_45_unknown_keys_get_the_nearest_that_is_valid_there(refused, command, t
         ("demo", "n_demos: true", "n_demos is true, must be a positive whole number."),
         ("demo", "n_demos: 6.0", "must be a positive whole number: write 6."),
         ("demo", "seed: -1", "seed is the number -1, must be a whole number from 0 to 4294967294."),
-        ("benchmark", "quick: yes", "quick is the text 'yes', must be true or false: write true."),
+        ("demo", "resume: yes", "resume is the text 'yes', must be true or false: write true."),
         ("compare", "readings: bell", "readings is the text 'bell', must be a list"),
         ("compare", "readings: []", "readings is empty"),
         (

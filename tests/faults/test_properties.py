@@ -13,13 +13,8 @@ from estimators.zoo import assert_covariances, predictions
 from faults.strategies import movement_recipes, recipes
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from sklearn.base import clone
-from sklearn.exceptions import ConvergenceWarning
-
-from torch_pbd import DMPController, GMMBaseline, HeteroscedasticGPRegressor
-from torch_pbd.exceptions import DataRankWarning, NotPositiveDefiniteError, UnimodalityWarning
-from torch_pbd.experiments.reliability.candidates import CANDIDATES, candidate, fit_candidate
-from torch_pbd.experiments.reliability.measures import (
+from reliability.candidates import CANDIDATES, candidate, fit_candidate
+from reliability.measures import (
     beside,
     discrepancy,
     of_origin,
@@ -28,8 +23,13 @@ from torch_pbd.experiments.reliability.measures import (
     scale_of,
     smallest_eigenvalues,
 )
-from torch_pbd.experiments.reliability.movements import movements
-from torch_pbd.experiments.reliability.problems import Recipe
+from reliability.movements import movements
+from reliability.problems import Recipe
+from sklearn.base import clone
+from sklearn.exceptions import ConvergenceWarning
+
+from torch_pbd import DMPController, GMMBaseline, HeteroscedasticGPRegressor
+from torch_pbd.exceptions import DataRankWarning, NotPositiveDefiniteError, UnimodalityWarning
 
 THOROUGH = settings.get_current_profile_name() == "thorough"
 SMALL = {} if THOROUGH else {"most_demos": 6, "most_steps": 8, "most_outputs": 4}

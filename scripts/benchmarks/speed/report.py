@@ -13,8 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import torch_pbd
-from torch_pbd.experiments.benchmark.rows import Findings, Growth, Plan, Row
-from torch_pbd.experiments.benchmark.timing import median
+from speed.rows import Findings, Growth, Plan, Row
+from speed.timing import median
 from torch_pbd.experiments.run_folder import RunFolder, format_table
 from torch_pbd.plotting import SERIES
 

@@ -40,7 +40,7 @@ def measured_fit(model: str, data: str) -> tuple[float, str]:
     """CPU seconds of fitting a new ``model`` to ``demonstrations(data)``, and a note of its memory."""
     setup = (
         "from torch_pbd import CholeskyCovRegressor, HeteroscedasticGPRegressor\n"
-        "from torch_pbd.experiments.benchmark.made import demonstrations\n"
+        "from speed.made import demonstrations\n"
         f"X, y = demonstrations({data})\n{model}.fit(*demonstrations(20, 5))"
     )
     found = measured(setup, f"{model}.fit(X, y)")
@@ -62,6 +62,7 @@ def added_seconds(before: str, then: str) -> float:
 
 def _run(program: str) -> str:
     environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)  # finds what this process finds
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, env=environment)
     if done.returncode:
         raise RuntimeError(f"a program of the benchmark failed: {done.stderr.strip().splitlines()[-1:]}")

@@ -9,10 +9,8 @@ import numpy as np
 from joblib import Parallel, delayed
 from sklearn.base import clone
 
-from torch_pbd.estimators._base import CovarianceRegressor
-from torch_pbd.exceptions import NotPositiveDefiniteError
-from torch_pbd.experiments.reliability.candidates import CANDIDATES, candidate, fit_candidate
-from torch_pbd.experiments.reliability.measures import (
+from reliability.candidates import CANDIDATES, candidate, fit_candidate
+from reliability.measures import (
     Discrepancy,
     Floats,
     Smallest,
@@ -21,7 +19,9 @@ from torch_pbd.experiments.reliability.measures import (
     queries,
     smallest_eigenvalues,
 )
-from torch_pbd.experiments.reliability.problems import Recipe, random_recipe
+from reliability.problems import Recipe, random_recipe
+from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.exceptions import NotPositiveDefiniteError
 
 LAWS = ("units", "origin", "unix_time")
 SHARE = {"cholesky": 3, "wishart": 3, "mixture": 2, "heteroscedastic": 2}

@@ -1,7 +1,7 @@
 """What importing the package and asking the command line for help take."""
 
-from torch_pbd.experiments.benchmark.fresh import added_seconds, wall_seconds
-from torch_pbd.experiments.benchmark.rows import Findings, Plan, Row
+from speed.fresh import added_seconds, wall_seconds
+from speed.rows import Findings, Plan, Row
 
 _NAMES = "torch_pbd.CholeskyCovRegressor, torch_pbd.HeteroscedasticGPRegressor, torch_pbd.GMMBaseline"
 _HELP = "import sys; from torch_pbd.cli import main; main(['--help'])"

@@ -1,8 +1,8 @@
 """How far covariances are from singular, and what units and origins change: 1,000 random fits x 1,000 inputs.
 
-``python scripts/reliability.py`` takes about ten minutes on one core; ``--n_jobs 2`` half of it. The random problems
-are those of ``torch_pbd.experiments.reliability``; a seed in the table is one of them:
-``random_recipe(seed, most_steps=20, most_outputs=4).data()``, fitted by ``candidate(name, seed, X)``.
+``PYTHONPATH=tests python -m reliability`` takes about ten minutes on one core; ``--n_jobs 2`` half of it. A seed in the
+table is one problem: ``random_recipe(seed, most_steps=20, most_outputs=4).data()``, fitted by
+``candidate(name, seed, X)``.
 
 The eigenvalues are the smallest of the covariances scaled to unit variances, and the smallest over the largest of the
 covariances in the units in which a model computes: both are blind to the units of the data, and should not be below
@@ -15,7 +15,7 @@ of the data, an entry of the covariance over the predicted deviations it belongs
 import argparse
 import time
 
-from torch_pbd.experiments.reliability.report import measure_all, table, told
+from reliability.report import measure_all, table, told
 
 
 def main() -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from torch_pbd.experiments.benchmark.timing import median, ratios
+from speed.timing import median, ratios
 
 Bar = tuple[Literal[">=", "<="], float]
 

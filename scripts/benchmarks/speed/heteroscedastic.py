@@ -2,12 +2,12 @@
 
 import numpy as np
 
+from speed.fresh import measured_fit
+from speed.made import Floats
+from speed.rows import Findings, Plan, Row
+from speed.timing import alternate
 from torch_pbd import HeteroscedasticGPRegressor
 from torch_pbd.data import load_demonstrations, make_paper_simulation, paper_covariance
-from torch_pbd.experiments.benchmark.fresh import measured_fit
-from torch_pbd.experiments.benchmark.made import Floats
-from torch_pbd.experiments.benchmark.rows import Findings, Plan, Row
-from torch_pbd.experiments.benchmark.timing import alternate
 from torch_pbd.metrics import gaussian_kl
 
 _RECORDINGS = ("pen_a", "letter_A", "letter_C", "letter_G", "letter_L", "letter_N", "letter_P", "letter_S", "letter_Z")
@@ -43,7 +43,7 @@ def _papers(plan: Plan, seed: int, *, aligned: bool) -> tuple[Floats, Floats]:
 
 
 def _against_gpytorch(plan: Plan) -> list[Row]:
-    from torch_pbd.experiments.benchmark.gpytorch_models import SampledFactors
+    from speed.gpytorch_models import SampledFactors
 
     X, y = _papers(plan, plan.seed, aligned=True)
     scale, shift = y.std(axis=0), y.mean(axis=0)

@@ -2,12 +2,12 @@
 
 import numpy as np
 
+from speed import rollouts
+from speed.rows import Findings, Plan, Row
+from speed.ticks import BLOCK, blocks, clock_cost, memory_kept
 from torch_pbd import DMPController, HeteroscedasticGPRegressor
 from torch_pbd.control import RealTimeAdmittance
 from torch_pbd.data import make_tunnel_demonstrations
-from torch_pbd.experiments.benchmark import rollouts
-from torch_pbd.experiments.benchmark.rows import Findings, Plan, Row
-from torch_pbd.experiments.benchmark.ticks import BLOCK, blocks, clock_cost, memory_kept
 
 
 def measure(plan: Plan) -> Findings:

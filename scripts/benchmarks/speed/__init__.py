@@ -1,4 +1,4 @@
-"""``torch-pbd benchmark``: every comparison of speed in one run."""
+"""Every comparison of speed in one run."""
 
 import os
 import warnings
@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from threadpoolctl import threadpool_limits
 
-from torch_pbd.experiments.benchmark import (
+from speed import (
     control,
     fitting,
     growth,
@@ -18,8 +18,8 @@ from torch_pbd.experiments.benchmark import (
     likelihood,
     prediction,
 )
-from torch_pbd.experiments.benchmark.report import tables, write
-from torch_pbd.experiments.benchmark.rows import Findings, Plan
+from speed.report import tables, write
+from speed.rows import Findings, Plan
 from torch_pbd.experiments.run_folder import RunFolder
 
 GROUPS: dict[str, Callable[[Plan], Findings]] = {

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from reliability.problems import Recipe, as_kind
 from torch_pbd.data import Demonstrations
-from torch_pbd.experiments.reliability.problems import Recipe, as_kind
 
 
 def movements(recipe: Recipe) -> Demonstrations:

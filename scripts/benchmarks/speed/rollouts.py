@@ -12,9 +12,9 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
+from speed.rows import Bar, Plan, Row
+from speed.timing import alternate, median
 from torch_pbd.control import Schedule, StiffnessLaw, damping_from_stiffness, simulate_many
-from torch_pbd.experiments.benchmark.rows import Bar, Plan, Row
-from torch_pbd.experiments.benchmark.timing import alternate, median
 
 N_TICKS, RATE = 1001, 1000.0
 BARE_TICKS = 20

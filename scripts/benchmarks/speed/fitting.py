@@ -4,12 +4,12 @@ import torch
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
+from speed.fresh import measured_fit
+from speed.made import Floats, cholesky_entries, demonstrations
+from speed.rows import Bar, Findings, Plan, Row
+from speed.timing import alternate
 from torch_pbd import CholeskyCovRegressor, WishartProcessRegressor
 from torch_pbd.data import make_paper_simulation
-from torch_pbd.experiments.benchmark.fresh import measured_fit
-from torch_pbd.experiments.benchmark.made import Floats, cholesky_entries, demonstrations
-from torch_pbd.experiments.benchmark.rows import Bar, Findings, Plan, Row
-from torch_pbd.experiments.benchmark.timing import alternate
 from torch_pbd.experiments.comparison import empirical_covariances
 from torch_pbd.gp import EvidenceSearch, Observations, fit_hyperparameters, resolved_length_scale
 from torch_pbd.metrics import covariance_mse
@@ -97,7 +97,7 @@ def _evidence(plan: Plan, n_inputs: int) -> Row:
 
 
 def _against_gpytorch(plan: Plan, n_inputs: int, least: float) -> Row:
-    from torch_pbd.experiments.benchmark.gpytorch_models import ExactBatch
+    from speed.gpytorch_models import ExactBatch
 
     X, y = demonstrations(n_inputs, 50, seed=plan.seed)
     inputs, entries = cholesky_entries(X, y)

@@ -8,12 +8,12 @@ import torch
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.mixture import GaussianMixture as ScikitLearnMixture
 
+from speed.fresh import measured
+from speed.made import demonstrations
+from speed.rows import Findings, Plan, Row
+from speed.timing import alternate
 from torch_pbd import CholeskyCovRegressor, GMMBaseline
 from torch_pbd.data import make_paper_simulation
-from torch_pbd.experiments.benchmark.fresh import measured
-from torch_pbd.experiments.benchmark.made import demonstrations
-from torch_pbd.experiments.benchmark.rows import Findings, Plan, Row
-from torch_pbd.experiments.benchmark.timing import alternate
 from torch_pbd.models.mixture_fit import expectation_maximization
 
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from torch_pbd.experiments.benchmark import likelihood_training
-from torch_pbd.experiments.benchmark.fresh import measured_fit
-from torch_pbd.experiments.benchmark.rows import Findings, Plan, Row
+from speed import likelihood_training
+from speed.fresh import measured_fit
+from speed.rows import Findings, Plan, Row
 
 
 def measure(plan: Plan) -> Findings:
