@@ -45,18 +45,23 @@ def expected():
     return run(str(PROGRAM), PYTHONHASHSEED="0")
 
 
+ASCII = {"LC_ALL": "C", "LANG": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 NOWHERE = dict.fromkeys(("HOME", "USER", "LOGNAME", "XDG_CONFIG_HOME", "XDG_CACHE_HOME"))
 
 
 @pytest.mark.parametrize(
     "variables",
     [
-        {"PYTHONHASHSEED": "1"},
         {"PYTHONHASHSEED": "4294967295", "PYTHONOPTIMIZE": "2"},
-        {"LC_ALL": "C", "LANG": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
-        {**NOWHERE, "MPLCONFIGDIR": "/dev/null/nowhere", "PYTHONDONTWRITEBYTECODE": "1"},
+        {
+            **NOWHERE,
+            "MPLCONFIGDIR": "/dev/null/nowhere",
+            "PYTHONDONTWRITEBYTECODE": "1",
+            "PYTHONHASHSEED": "1",
+            **ASCII,
+        },
     ],
-    ids=["hash", "optimized", "ascii", "homeless"],
+    ids=["optimized", "ascii, homeless, other hashes"],
 )
 def test_32_another_process_gives_the_same_bits(expected, variables):
     assert run(str(PROGRAM), **variables) == expected
