@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
 
-from torch_pbd import DMPController, GMMBaseline, HeteroscedasticGPRegressor
+from torch_pbd import CholeskyCovRegressor, DMPController, GMMBaseline
 from torch_pbd.exceptions import DataRankWarning, NotPositiveDefiniteError, UnimodalityWarning
 from torch_pbd.experiments.reliability.candidates import CANDIDATES, candidate, fit_candidate
 from torch_pbd.experiments.reliability.measures import (
@@ -221,7 +221,7 @@ VARIANTS = [
     {"cutoff": None},
     {"on_unknown": "prior", "damping_ratio": 0.7},
     {"covariance": GMMBaseline(n_components=2), "n_steps": 20},
-    {"covariance": HeteroscedasticGPRegressor(max_iter=30), "n_steps": 20},
+    {"covariance": CholeskyCovRegressor(), "n_steps": 20},
 ]
 
 
