@@ -189,6 +189,8 @@ def test_millimetres_and_milliseconds_plan_and_move_as_metres_and_seconds(tunnel
     X = np.linspace(0.0, 10.0, 21)[:, None]
     np.testing.assert_allclose(other.predict(1e3 * X), 1e3 * controller.predict(X), rtol=1e-5, atol=1e-3)
     np.testing.assert_allclose(other.predict_stiffness(1e3 * X), controller.predict_stiffness(X), rtol=1e-3)
+    expected = controller.schedule(5.0).covariance
+    np.testing.assert_allclose(other.schedule(5.0).covariance, expected, rtol=1e-3, atol=1e-5 * np.abs(expected).max())
 
 
 def test_outputs_in_different_units_are_told_of(tunnel):

@@ -14,6 +14,7 @@ from torch_pbd.experiments.benchmark.fresh import measured
 from torch_pbd.experiments.benchmark.growth import exponent
 from torch_pbd.experiments.benchmark.rows import Findings, Growth, Plan, Row
 from torch_pbd.experiments.benchmark.timing import alternate, ratios
+from torch_pbd.experiments.run_folder import RunFolder
 
 
 class Clock:
@@ -157,6 +158,15 @@ def test_the_command_line_knows_the_groups():
 def test_a_group_that_is_not_there_is_a_suggestion(capsys):
     assert main(["benchmark", "--groups", "fiting"]) == 2
     assert "Did you mean 'fitting'?" in capsys.readouterr().err
+
+
+def test_the_numbers_of_a_run_take_the_place_of_the_last_ones_whole(tmp_path):
+    before, kept = tmp_path / "benchmark.json", tmp_path / "another name of it"
+    before.write_text("of the last run")
+    kept.hardlink_to(before)
+    report.write([], Plan(), RunFolder(tmp_path, {}))
+    assert json.loads(before.read_text())["groups"] == {}
+    assert kept.read_text() == "of the last run"
 
 
 @pytest.mark.slow

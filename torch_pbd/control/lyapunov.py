@@ -17,8 +17,8 @@ _ROUNDS = 8  # of cuts; where K and D commute one is enough, and three have been
 def has_common_function(stiffness: Float[Tensor, "n d d"], damping: Float[Tensor, "n d d"]) -> bool:
     """Whether one quadratic function of the state falls under each of the gains, for a mass of 1.
 
-    It then falls exponentially under any sequence of these pairs (K, D), turned about any axes, of blends of them,
-    and of blends of the same pairs turned, each held for any time or changing continuously.
+    It then falls exponentially under any sequence of these pairs (K, D), turned in any way, and of blends of them, each
+    held for any time or changing continuously.
 
     Notes
     -----
@@ -28,8 +28,7 @@ def has_common_function(stiffness: Float[Tensor, "n d d"], damping: Float[Tensor
     ``T = 4 b (D - b) - (K + b D - a) K^-1 (K + b D - a)`` is, its Schur complement times 2 b; V itself then is,
     because the motion under constant gains dies out (Lyapunov). T is concave in (a, b), so the smallest of all
     eigenvalues is too, and it is maximized by cuts: ``z'T z`` of the eigenvectors z found so far is an upper bound.
-    The first are those of K. Damping of one ratio has been solved by hand: see
-    :func:`~torch_pbd.control.required_damping_ratio`.
+    The first are those of K. For damping of one ratio :func:`~torch_pbd.control.required_damping_ratio` is the answer.
     """
     values, axes = torch.linalg.eigh(stiffness)
     frequency = (values.min().sqrt() * values.max().sqrt()).sqrt()
@@ -43,12 +42,11 @@ def has_common_function(stiffness: Float[Tensor, "n d d"], damping: Float[Tensor
     least = float(torch.linalg.eigvalsh(damp)[:, 0].min())
     if least <= 0.0 or not bool(torch.isfinite(terms).all()):
         return False
-    sizes = terms.abs().amax((1, 2, 3))
-    # Where T is positive b is below every D, and a between the smallest K and the largest K + b D. Both are searched
-    # by their logarithms, which stiffnesses of many powers of ten need, and which moves no maximum.
-    of_b = math.log(1e-6 * least), math.log(least)
+    # Where T is positive b is below every D, and a about between the smallest K and the largest K + b D. They are
+    # searched by their logarithms, which stiffnesses of many powers of ten need, and which moves no maximum.
     largest = stiff.shape[-1] * float(stiff.abs().max() + least * damp.abs().max())
     of_a = math.log(1e-3 * float(values.min()) / float(frequency) ** 2), math.log(largest)
+    of_b = math.log(1e-6 * least), math.log(least)
     cuts = _along(terms, axes)
     for _ in range(_ROUNDS):
 
@@ -60,7 +58,7 @@ def has_common_function(stiffness: Float[Tensor, "n d d"], damping: Float[Tensor
 
         log_b = minimize_convex(lambda log_b: excess(best(log_b), log_b), *of_b, n_steps=32)
         weights = _monomials(best(log_b), log_b, terms)
-        negligible = _ROUNDING * float(weights.abs() @ sizes)
+        negligible = _ROUNDING * float(weights.abs() @ terms.abs().amax((1, 2, 3)))
         if excess(best(log_b), log_b) >= -negligible:
             return False
         eigenvalues, vectors = torch.linalg.eigh(symmetrize(torch.tensordot(weights, terms, 1)))
@@ -76,7 +74,6 @@ def _monomials(log_a: float, log_b: float, like: Tensor) -> Tensor:
 
 
 def _along(terms: Float[Tensor, "k n d d"], vectors: Float[Tensor, "n d m"]) -> Float[Tensor, "k nm"]:
-    """Quadratic forms ``z'A z`` of each of the terms in the columns z."""
     return (vectors * (terms @ vectors)).sum(-2).flatten(1)
 
 

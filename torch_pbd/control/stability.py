@@ -55,8 +55,6 @@ def certify(
     Returns
     -------
     StabilityReport
-        What it guarantees is of the admittance alone: of this mass, integrated exactly, without a lag of the robot or
-        of its force sensor, while nothing touches it.
 
     Raises
     ------
@@ -169,8 +167,7 @@ class _Knots:
             rate = math.exp(log_inverse_alpha) * self.stiffness_rate[rows] + self.damping_rate[rows]
             return 0.5 * torch.linalg.eigvalsh(symmetrize(root[:, rows] @ rate @ root[:, rows]))[..., -1].amax(0)
 
-        # By the logarithm, of which it is no longer convex but still falls and then rises: gains of which K falls
-        # and D rises are covered by a small alpha only.
+        # By its logarithm, of which it still falls and then rises: where K falls and D rises alpha must be small.
         slowest = -math.log(self.alpha_max)
         best = float(_minimize_largest(needed, slowest, slowest + math.log(1e9))[1].max())
         return 1.0 / best if best > 1e-12 else math.inf
@@ -180,20 +177,14 @@ def _minimize_largest(function: Callable[..., Tensor], low: float, high: float) 
     """Where the largest of many convex functions of one variable is smallest, and the values of all of them there.
 
     ``function(x)`` has those of all, ``function(x, rows)`` of some. Most are never the largest: the search is among
-    those that are so at the ends and at the minima of the ones that were, until these are the largest of all.
+    those that are so at the end and at the minima of the ones that were, until these are the largest of all.
     """
-    rows = torch.cat([_largest(function(end)) for end in (low, high)]).unique()
-    while True:
+    found, values, rows = low, function(high), torch.empty(0, dtype=torch.long)
+    while not len(rows) or values.max() > values[rows].max():
+        rows = torch.cat([rows, values.topk(min(_N_WORST, len(values))).indices]).unique()
         found = minimize_convex(lambda x, rows=rows: float(function(x, rows).max()), low, high)
         values = function(found)
-        more = torch.cat([rows, _largest(values)]).unique()
-        if len(more) == len(rows) or values.max() <= values[rows].max():
-            return found, values
-        rows = more
-
-
-def _largest(values: Tensor) -> Tensor:
-    return values.topk(min(_N_WORST, len(values))).indices
+    return found, values
 
 
 def _damping_rule(stiffness: Tensor, damping: Tensor, mass: Tensor) -> tuple[float, float, bool, float]:
@@ -218,9 +209,8 @@ def _gain(maps: Float[Tensor, "m n n"], stiffness: Float[Tensor, "k d d"], mass:
         begun = each @ torch.cat([begun, identity[None]])
         squared = begun.mT @ begun
         # Whether all eigenvalues are below a limit is seen sooner than what they are.
-        record, grown = (
-            torch.linalg.cholesky_ex(limit * (1.0 + 1e-12) * identity - squared).info > 0 for limit in (largest, 1.0)
-        )
+        limits = (limit * (1.0 + 1e-12) * identity for limit in (largest, 1.0))
+        record, grown = (torch.linalg.cholesky_ex(limit - squared).info > 0 for limit in limits)
         if bool(record.any()):
             largest = float(torch.linalg.eigvalsh(squared[record]).max())
         # A part that has not grown so far gains no more than one that begins here.
@@ -230,13 +220,7 @@ def _gain(maps: Float[Tensor, "m n n"], stiffness: Float[Tensor, "k d d"], mass:
     return math.sqrt(largest)
 
 
-def _held_growth(
-    maps: Float[Tensor, "m n n"],
-    stiffness: Float[Tensor, "k d d"],
-    damping: Float[Tensor, "k d d"],
-    mass: Tensor,
-    alpha: float,
-) -> float:
+def _held_growth(maps: Tensor, stiffness: Tensor, damping: Tensor, mass: Tensor, alpha: float) -> float:
     """Largest eigenvalue of ``A' P_next A`` relative to P: A the exact map of an interval with its gains held.
 
     Of the alpha of the margin, or, where that grows, of a half or a quarter of it: at the largest alpha V is not

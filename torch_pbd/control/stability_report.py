@@ -6,8 +6,7 @@ from typing import final
 
 MAX_GAIN = 2.0
 """Gain of a schedule above which its report warns."""
-GROWTH_ROUNDING = 1e-9
-"""Growth over an interval that is none: what rounding leaves of an exact map."""
+GROWTH_ROUNDING = 1e-9  # growth over an interval that is none: what rounding leaves of an exact map
 
 
 @final

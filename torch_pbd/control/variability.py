@@ -21,8 +21,8 @@ def fit_covariance(regressor: CovarianceRegressor | None, inputs: Floats, varyin
     n_demos, n_steps, n_outputs = varying.shape
     between, extent = varying - varying[:1], _extent(varying)
     if float(np.abs(between).max()) <= _RESOLUTION * extent:
-        # One movement, shown again: what a smooth mean leaves of it would count as variability, of which there is
-        # none. It stands still instead, at a distance to which the floors of regressors are relative.
+        # One movement, shown again: what a smooth mean leaves of it would count as variability. It stands still
+        # instead, at a distance to which the floors of regressors are relative.
         varying = extent + between
     groups = np.repeat(np.arange(n_demos), n_steps)
     return fit_by_demonstration(fitted, np.tile(inputs, (n_demos, 1)), varying.reshape(-1, n_outputs), groups)
@@ -34,7 +34,6 @@ def fit_law(law: StiffnessLaw | None, covariance: Floats, varying: Floats) -> St
 
 
 def _extent(varying: Floats) -> float:
-    """Diagonal of the box that holds all that varies (K, n, d)."""
+    """Diagonal of the box around (K, n, d); where nothing moves the largest position, which floors are relative to."""
     extent, largest = float(np.linalg.norm(np.ptp(varying, axis=(0, 1)))), float(np.abs(varying).max())
-    # Where nothing moves, the regressor's own floor is in units of the position.
     return extent if extent > _ROUNDING * largest else largest or 1.0
