@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import torch_pbd.memory
+from torch_pbd import CholeskyCovRegressor
 from torch_pbd.control import AdmittancePlant, DMPController, EnergyTank
 from torch_pbd.data import make_tunnel_demonstrations
 from torch_pbd.memory import available_bytes, parsed_bytes, require_memory
@@ -70,7 +71,9 @@ def test_the_message_has_both_numbers_and_the_remedy(monkeypatch):
 
 
 def test_an_hour_at_1_khz_is_refused_where_it_does_not_fit(monkeypatch):
-    controller = DMPController(n_steps=20).fit(make_tunnel_demonstrations(rate=10.0, random_state=0))
+    controller = DMPController(CholeskyCovRegressor(), n_steps=20).fit(
+        make_tunnel_demonstrations(rate=10.0, random_state=0)
+    )
     monkeypatch.setattr(torch_pbd.memory, "available_bytes", lambda: GIB)
     with pytest.raises(ValueError, match=r"3600001 ticks of 2 axes needs about 1\.45 GiB .* Lower rate"):
         controller.schedule(1000.0, settle=3600.0 - controller.duration_)
@@ -78,7 +81,9 @@ def test_an_hour_at_1_khz_is_refused_where_it_does_not_fit(monkeypatch):
 
 
 def test_a_schedule_is_the_same_in_parts(monkeypatch):
-    controller = DMPController(n_steps=20).fit(make_tunnel_demonstrations(rate=10.0, random_state=0))
+    controller = DMPController(CholeskyCovRegressor(), n_steps=20).fit(
+        make_tunnel_demonstrations(rate=10.0, random_state=0)
+    )
     whole = controller.schedule(50.0)
     monkeypatch.setattr("torch_pbd.control.controller._AT_ONCE", 64)
     parts = controller.schedule(50.0)

@@ -71,7 +71,7 @@ def test_a_model_is_drawn_beyond_the_data_beside_the_empirical_deviations():
 
 def test_pushes_and_stiffness_are_drawn_in_readable_units(rng):
     recorded = Demonstrations(np.linspace(0.0, 2.0, 50), rng.normal(size=(4, 50, 2)).cumsum(axis=1), units="m")
-    controller = DMPController().fit(recorded)
+    controller = DMPController(CholeskyCovRegressor()).fit(recorded)
     schedule, run = controller.schedule(100.0), controller.simulate(rate=100.0)
     figure, axes = plt.subplots(4, 1)
     plot_pushes(run, schedule, 1, axes[:3], unpushed=run)

@@ -21,6 +21,7 @@ from covariance_tasks import TASKS, Recording, Task, load_recordings
 from joblib import Parallel, delayed
 from threadpoolctl import threadpool_limits
 
+from torch_pbd.files import replacing
 from torch_pbd.metrics import gaussian_kl, mahalanobis_coverage
 
 Row = dict[str, Any]
@@ -253,7 +254,8 @@ def main(arguments: list[str] | None = None) -> None:
 def write_table(folder: Path, made: list[Row], recorded: list[Row], pen: list[Row]) -> None:
     """Write and print the tables."""
     text = report(made, recorded, pen)
-    (folder / "table.md").write_text(text, encoding="utf-8")
+    with replacing(folder / "table.md") as file:
+        file.write(text.encode())
     print(f"\n{text}")
 
 

@@ -1,7 +1,7 @@
 """Which input the covariance should depend on: time (the logarithm of the phase is the same) or the phase s.
 
-Six made demonstrations of the tunnel task against the truth of 300: error of the stiffness across the tunnel, of
-the logarithm of the standard deviation, and how fast the stiffness changes. Medians over seeds.
+CD over six made demonstrations of the tunnel task, against the truth of 300: error of the stiffness across the tunnel,
+of the logarithm of the standard deviation, and how fast the stiffness changes. Medians over seeds.
 """
 
 import argparse
@@ -9,6 +9,7 @@ import argparse
 import numpy as np
 import torch
 
+from torch_pbd import CholeskyCovRegressor
 from torch_pbd.control import DMPController, StiffnessLaw
 from torch_pbd.data import make_tunnel_demonstrations
 from torch_pbd.experiments.run_folder import format_table
@@ -48,7 +49,7 @@ def main():
                 for seed in range(n_seeds):
                     shown = make_tunnel_demonstrations(6, rate=RATE, random_state=seed)
                     options = {"variability": variability, "phase_input": phase_input, "n_steps": n_steps}
-                    figures.append(errors(DMPController(**options).fit(shown), truth, n_steps))
+                    figures.append(errors(DMPController(CholeskyCovRegressor(), **options).fit(shown), truth, n_steps))
                 stiffness, scale, rate = (float(value) for value in np.median(figures, axis=0))
                 rows.append(
                     options | {"mean |dK| [N/m]": stiffness, "mean |d log sd|": scale, "max |dK/dt| [N/m/s]": rate}

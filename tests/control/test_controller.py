@@ -1,4 +1,5 @@
 import pickle
+from contextlib import nullcontext
 
 import numpy as np
 import pandas as pd
@@ -6,15 +7,16 @@ import pytest
 import torch
 from sklearn.base import clone
 
-from torch_pbd import CholeskyCovRegressor, Demonstrations, DMPController, GMMBaseline
+from torch_pbd import CholeskyCovRegressor, Demonstrations, DMPController, GMMBaseline, HeteroscedasticGPRegressor
 from torch_pbd.control import AdmittancePlant, ForceSensor, RealTimeAdmittance, Schedule, StiffnessLaw
 from torch_pbd.data import make_tunnel_demonstrations
 from torch_pbd.exceptions import DataRankWarning, UnimodalityWarning
 
 PAPER_LAW = StiffnessLaw(sigma_low=3.5e-4, sigma_high=1.2e-3, bounds="variance")
+CD = CholeskyCovRegressor()  # the paper's; and fitted sooner, where the regressor does not matter
 PAPER = {
-    "alpha": 1.0, "beta": 1.0, "gate": "none", "variability": "forcing", "cutoff": 3.0, "damping_ratio": "paper",
-    "on_unknown": "prior", "stiffness_law": PAPER_LAW,
+    "covariance": CD, "alpha": 1.0, "beta": 1.0, "gate": "none", "variability": "forcing", "cutoff": 3.0,
+    "damping_ratio": "paper", "on_unknown": "prior", "stiffness_law": PAPER_LAW,
 }  # fmt: skip
 
 
@@ -26,6 +28,10 @@ def tunnel():
 @pytest.fixture(scope="module")
 def controller(tunnel):
     return DMPController().fit(tunnel)
+
+
+def test_the_regressor_is_heteroscedastic_unless_another_is_given(controller):
+    assert type(controller.covariance_) is HeteroscedasticGPRegressor
 
 
 def pulse(time, centre):
@@ -114,7 +120,7 @@ def test_times_positions_and_groups_are_the_same_as_demonstrations(tunnel, contr
     stacked = DMPController().fit(X, y, groups=np.array([f"hand {k}" for k in groups]))
     query = np.linspace(0.0, 10.0, 11)[:, None]
     np.testing.assert_array_equal(stacked.predict_stiffness(query), controller.predict_stiffness(query))
-    assert DMPController().fit(X, pd.DataFrame(y, columns=["across", "along"]), groups=groups).names_[1] == "along"
+    assert DMPController(CD).fit(X, pd.DataFrame(y, columns=["across", "along"]), groups=groups).names_[1] == "along"
     with pytest.raises(ValueError, match=r"X does not increase at row 1001.*groups"):
         DMPController().fit(X, y)
 
@@ -127,12 +133,12 @@ def test_times_count_as_those_of_the_demonstrations(tunnel, controller):
     np.testing.assert_allclose(shifted.predict_stiffness(query + 1.7e9), controller.predict_stiffness(query), rtol=1e-2)
     assert shifted.schedule(10.0).time[0] == 0.0
     apart = Demonstrations([time + 20.0 * k for k, time in enumerate(tunnel.times)], tunnel.positions)
-    np.testing.assert_allclose(DMPController().fit(apart).predict(query), controller.predict(query), atol=1e-9)
+    np.testing.assert_allclose(DMPController(CD).fit(apart).predict(query), controller.predict(query), atol=1e-9)
 
 
 @pytest.mark.parametrize("variant", ["unequal", "dropped", "jitter"])
 def test_unaligned_demonstrations_give_about_the_same(variant, controller):
-    other = DMPController().fit(make_tunnel_demonstrations(random_state=0, variant=variant))
+    other = DMPController(CD).fit(make_tunnel_demonstrations(random_state=0, variant=variant))
     share = np.linspace(0.0, 1.0, 40)[:, None]
     narrow = slice(30, 40)  # where all are precise, whatever their lanes are
     stiffness = other.predict_stiffness(share * other.duration_)[narrow, 0, 0]
@@ -143,7 +149,7 @@ def test_unaligned_demonstrations_give_about_the_same(variant, controller):
 
 def test_two_ways_through_are_told_of():
     with pytest.warns(UnimodalityWarning):
-        DMPController().fit(make_tunnel_demonstrations(12, random_state=0, variant="two_path"))
+        DMPController(CD).fit(make_tunnel_demonstrations(12, random_state=0, variant="two_path"))
 
 
 def test_the_regressor_is_cloned_and_any_will_do(tunnel):
@@ -183,19 +189,21 @@ def test_millimetres_and_milliseconds_plan_and_move_as_metres_and_seconds(tunnel
     X = np.linspace(0.0, 10.0, 21)[:, None]
     np.testing.assert_allclose(other.predict(1e3 * X), 1e3 * controller.predict(X), rtol=1e-5, atol=1e-3)
     np.testing.assert_allclose(other.predict_stiffness(1e3 * X), controller.predict_stiffness(X), rtol=1e-3)
+    expected = controller.schedule(5.0).covariance
+    np.testing.assert_allclose(other.schedule(5.0).covariance, expected, rtol=1e-3, atol=1e-5 * np.abs(expected).max())
 
 
 def test_outputs_in_different_units_are_told_of(tunnel):
     mixed = Demonstrations(tunnel.times, [position * [1e3, 1.0] for position in tunnel.positions], units=["mm", "m"])
     with pytest.warns(UserWarning, match="in different units, mm, m: their principal axes mix them"):
-        DMPController().fit(mixed)
+        DMPController(CD).fit(mixed)
 
 
 def test_phases_need_a_duration(tunnel, controller):
     phases = Demonstrations([time / 10.0 for time in tunnel.times], tunnel.positions, time_unit="1")
     with pytest.warns(UserWarning, match=r"in '1', not in s: the movement is taken to last 1 s\. Give duration"):
-        assert DMPController().fit(phases).schedule(100.0).duration == 1.0
-    timed = DMPController(duration=10.0, cutoff=4.0).fit(phases)
+        assert DMPController(CD).fit(phases).schedule(100.0).duration == 1.0
+    timed = DMPController(CD, duration=10.0, cutoff=4.0).fit(phases)
     plan = timed.schedule(50.0)
     np.testing.assert_allclose(plan.velocity, controller.schedule(50.0).velocity, atol=1e-6)
     np.testing.assert_allclose(timed.predict([[0.5]]), controller.predict([[5.0]]), atol=1e-7)
@@ -243,7 +251,7 @@ def test_a_plant_of_another_mass_is_told_of_and_a_noisy_sensor_is_seeded(control
 
 
 def test_the_mass_goes_with_the_schedule(tunnel, tmp_path):
-    heavy = DMPController(mass=4.0).fit(tunnel)
+    heavy = DMPController(CD, mass=4.0).fit(tunnel)
     heavy.schedule(50.0).save(tmp_path / "heavy.json")
     schedule = Schedule.load(tmp_path / "heavy.json")
     assert schedule.mass == 4.0
@@ -259,7 +267,7 @@ def test_the_mass_goes_with_the_schedule(tunnel, tmp_path):
 
 def test_a_cutoff_that_takes_the_movement_away_is_told_of(tunnel):
     with pytest.warns(UserWarning, match="off the mean of the demonstrations.*try a higher cutoff"):
-        blurred = DMPController(cutoff=0.05).fit(tunnel)
+        blurred = DMPController(CD, cutoff=0.05).fit(tunnel)
     assert blurred.reproduction_error_ > 1e-3
 
 
@@ -324,11 +332,13 @@ def test_data_that_cannot_be_used():
         DMPController().fit(make_tunnel_demonstrations(3, duration=1.0, rate=3.0, random_state=0))
 
 
-def test_identical_demonstrations_are_stiff_and_told_of():
-    once = make_tunnel_demonstrations(1, random_state=0)
-    same = Demonstrations([once.times[0]] * 3, [once.positions[0]] * 3)
-    with pytest.warns(DataRankWarning, match="identical"), pytest.warns(UserWarning, match="do not vary"):
-        fitted = DMPController().fit(same)
+@pytest.mark.parametrize(("scale", "noise"), [(1.0, 0.0), (1e-4, 0.0), (1e4, 1e-9)])
+def test_identical_demonstrations_are_stiff_and_told_of(scale, noise, rng):
+    once = make_tunnel_demonstrations(1, rate=20.0, random_state=0)
+    same = [scale * (once.positions[0] + noise * rng.normal(size=once.positions[0].shape)) for _ in range(3)]
+    told = pytest.warns(DataRankWarning, match="identical") if noise == 0.0 else nullcontext()
+    with told, pytest.warns(UserWarning, match="do not vary"):
+        fitted = DMPController(n_steps=50).fit(Demonstrations([once.times[0]] * 3, same))
     stiffness = fitted.predict_stiffness(np.linspace(0.0, 10.0, 5)[:, None])
     np.testing.assert_allclose(stiffness, np.tile(1000.0 * np.eye(2), (5, 1, 1)), rtol=1e-6)
 

@@ -122,6 +122,14 @@ def test_a_smooth_forcing_is_that_of_an_adaptive_integrator():
         np.testing.assert_allclose(velocity, expected[2:].T / 0.8, rtol=0, atol=10 * atol)
 
 
+def test_one_tick_of_a_callable_forcing_is_the_first_of_two():
+    """That is the state at its start, which no forcing has acted on yet."""
+    dmp, goal = DMP(tau=2.0), tensor(1.0)
+    paths = [dmp.rollout(lambda time: time[:, None], 1e-2, goal=goal, n_steps=n)[0] for n in (1, 2)]
+    assert paths[0].shape == (1, 1)
+    torch.testing.assert_close(paths[0], paths[1][:1], rtol=0.0, atol=0.0)
+
+
 def test_a_new_goal_adds_a_step_response_that_never_passes_it():
     position, velocity, acceleration = movement(ticks(3001, 1e-3))
     dmp = DMP(tau=0.5)

@@ -117,6 +117,11 @@ def test_a_duration_slows_movement_and_cutoff_together(rng):
     np.testing.assert_allclose(slow.acceleration, ratio**2 * fast.acceleration, rtol=1e-6, atol=1e-6)
 
 
+def test_the_share_of_half_the_deviations_is_a_quarter_of_the_variance(rng):
+    whole = rng.normal(size=(6, 40, 2))
+    np.testing.assert_allclose(variance_share(0.5 * whole + rng.normal(size=(40, 2)), whole), 0.25, rtol=1e-12)
+
+
 def test_noise_is_told_from_movement():
     recorded = make_tunnel_demonstrations(20, random_state=0)
     movements = smooth(recorded, 4.0, 100)

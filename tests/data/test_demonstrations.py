@@ -226,6 +226,12 @@ def test_unix_time_in_float32_is_refused(step):
         Demonstrations([time], np.zeros((1, 4, 1)))
 
 
+def test_float32_times_that_resolve_half_their_steps_are_refused():
+    time = (100.0 + 1.5e-5 * np.arange(20)).astype(np.float32)
+    with pytest.raises(ValueError, match=r"float32, which resolves 7\.63e-06 at 100, where the mean step is 1\.49e-05"):
+        Demonstrations(time, np.zeros((1, 20, 1)))
+
+
 def test_float32_times_that_resolve_their_steps_are_accepted():
     Demonstrations(np.arange(10_000, dtype=np.float32) / 1000, np.zeros((1, 10_000, 1), np.float32))
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from torch_pbd.data import check_unimodal, load_demonstrations, make_tunnel_demonstrations
+from torch_pbd.data import Demonstrations, check_unimodal, load_demonstrations, make_tunnel_demonstrations
 from torch_pbd.exceptions import UnimodalityWarning
 
 
@@ -13,6 +13,14 @@ def test_two_paths_are_found_and_one_is_not(n_demos, seed):
     two = make_tunnel_demonstrations(n_demos, rate=10.0, random_state=seed, variant="two_path")
     with pytest.warns(UnimodalityWarning, match="two ways"):
         assert not check_unimodal(two)
+
+
+def test_two_paths_without_noise_are_found():
+    """All they differ by is one direction: every other singular value is zero."""
+    time = np.linspace(0.0, 1.0, 50)
+    ways = [np.column_stack([side * np.sin(np.pi * time), time]) for side in (1.0, -1.0)]
+    with pytest.warns(UnimodalityWarning, match="two ways"):
+        assert not check_unimodal(Demonstrations(time, [ways[k % 2] for k in range(8)]))
 
 
 def test_recordings_that_end_in_two_places_are_found(recordings):

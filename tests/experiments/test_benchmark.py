@@ -12,6 +12,8 @@ from speed.growth import exponent
 from speed.rows import Findings, Growth, Plan, Row
 from speed.timing import alternate, ratios
 
+from torch_pbd.experiments.run_folder import RunFolder
+
 
 class Clock:
     """Goes on by what the work says that it takes."""
@@ -145,6 +147,15 @@ def test_memory_is_what_work_takes_above_its_setup():
     setup = "data = np.ones((300, 1 << 17)); data = data[:1].copy()"  # 300 MiB that are given back
     found = measured(setup, "more = np.ones((100, 1 << 17)); del more")
     assert 95.0 < found["above"] < 130.0
+
+
+def test_the_numbers_of_a_run_take_the_place_of_the_last_ones_whole(tmp_path):
+    before, kept = tmp_path / "benchmark.json", tmp_path / "another name of it"
+    before.write_text("of the last run")
+    kept.hardlink_to(before)
+    report.write([], Plan(), RunFolder(tmp_path, {}))
+    assert json.loads(before.read_text())["groups"] == {}
+    assert kept.read_text() == "of the last run"
 
 
 @pytest.mark.slow

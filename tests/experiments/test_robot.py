@@ -34,6 +34,9 @@ def test_a_run_of_any_dimension_leaves_its_figures_schedules_and_models(d, tmp_p
     time = np.linspace(0.0, 2.0, 60)
     ways = rng.normal(size=(5, 1, d)) * (0.05 + 0.2 * np.sin(np.pi * time / 2.0)[:, None] ** 2) + time[:, None]
     folder = RunFolder(tmp_path, {})
+    before, kept = tmp_path / "stability.txt", tmp_path / "another name of it"
+    before.write_text("of the last run")
+    kept.hardlink_to(before)
     text = run_robot({"a b": DMPController(CholeskyCovRegressor())}, Demonstrations(time, ways), folder, rate=100.0)
     assert "early [unit]" in text
     assert "certificate of this one" in text
@@ -45,3 +48,4 @@ def test_a_run_of_any_dimension_leaves_its_figures_schedules_and_models(d, tmp_p
     assert Schedule.load(tmp_path / "schedule" / "a_b_100hz.csv").duration == pytest.approx(2.0)
     assert (tmp_path / "model" / "a_b.safetensors").is_file()
     assert "guaranteed" in (tmp_path / "stability.txt").read_text()
+    assert kept.read_text() == "of the last run"  # the new report took its place whole

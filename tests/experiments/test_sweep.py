@@ -33,7 +33,7 @@ def serial(tasks):
 
 @pytest.fixture(scope="module")
 def schedule(tasks):
-    return DMPController(n_steps=20).fit(tasks["tunnel"]).schedule(20.0)
+    return DMPController(ESTIMATORS["CD"], n_steps=20).fit(tasks["tunnel"]).schedule(20.0)
 
 
 @pytest.fixture(scope="module")

@@ -446,6 +446,23 @@ def test_the_configs_of_this_checkout_are_read_and_given_back(config, tmp_path):
     assert parse(command, [])[1] != text
 
 
+@pytest.mark.parametrize("config", [None, *CONFIGS], ids=lambda path: path.stem if path else "none")
+def test_the_papers_configurations_name_the_papers_regressor_and_all_others_take_the_default(config):
+    command = COMMAND_OF.get(config.stem, "compare") if config else "experiment"
+    options, _ = parse(command, ["--config", str(config)] if config else [])
+    if command == "compare":
+        taken = [type(model) for model in options.models.values()]
+    else:
+        # What a controller takes without one is in tests/control/test_controller.py.
+        taken = [type(each.covariance or HeteroscedasticGPRegressor()) for each in options.controllers.values()]
+    if config is None or config.parent.name != "paper":
+        assert taken[0] is HeteroscedasticGPRegressor
+    elif command == "experiment":
+        assert taken == 3 * [CholeskyCovRegressor] + [HeteroscedasticGPRegressor]
+    else:
+        assert HeteroscedasticGPRegressor not in taken
+
+
 @pytest.mark.parametrize(
     "model", [HeteroscedasticGPRegressor, CholeskyCovRegressor, WishartProcessRegressor, GMMBaseline]
 )

@@ -28,7 +28,7 @@ from reliability.problems import Recipe
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
 
-from torch_pbd import DMPController, GMMBaseline, HeteroscedasticGPRegressor
+from torch_pbd import CholeskyCovRegressor, DMPController, GMMBaseline
 from torch_pbd.exceptions import DataRankWarning, NotPositiveDefiniteError, UnimodalityWarning
 
 THOROUGH = settings.get_current_profile_name() == "thorough"
@@ -221,7 +221,7 @@ VARIANTS = [
     {"cutoff": None},
     {"on_unknown": "prior", "damping_ratio": 0.7},
     {"covariance": GMMBaseline(n_components=2), "n_steps": 20},
-    {"covariance": HeteroscedasticGPRegressor(max_iter=30), "n_steps": 20},
+    {"covariance": CholeskyCovRegressor(), "n_steps": 20},
 ]
 
 

@@ -46,6 +46,8 @@ def stiffest_environment(
         closed = _closed_loop(ticks, position_loop, force_cutoff, dt, middle)
         stable = torch.linalg.eigvals(closed).abs().amax(-1) < 1.0
         low, high = torch.where(stable, middle, low), torch.where(stable, high, middle)
+        lasting = low <= high.min()  # the others are not the least
+        low, high, ticks = low[lasting], high[lasting], ticks[lasting]
     least = float(low.min())
     return math.inf if least > _STIFFEST else least
 

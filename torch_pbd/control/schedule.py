@@ -199,9 +199,11 @@ class Schedule:
             raise ValueError(f"speed={speed:g} must be from {_SLOWEST:g} to {1.0 / _SLOWEST:g} times as fast.")
         report = None if mass is None else self.certify(mass=mass, speed=speed)
         if report is not None and not report.stable:
+            why = f"its margin is {report.margin:.4g} N/m/s. The highest safe speed is {report.max_speed:.4g}"
+            if report.margin >= 0.0:
+                why = f"held between rows, its gains let V grow by {report.held_growth - 1.0:.2g}. Resample it finer"
             raise ValueError(
-                f"speed={speed:g} is not certified to be stable: its margin is {report.margin:.4g} N/m/s. The highest "
-                f"safe speed is {report.max_speed:.4g}; or filter the stiffness, and give no mass here."
+                f"speed={speed:g} is not certified to be stable: {why}; or filter the stiffness, and give no mass here."
             )
         return replace(self, time=self.time / speed, velocity=self.velocity * speed)
 

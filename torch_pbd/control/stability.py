@@ -14,15 +14,16 @@ from torch import Tensor
 
 from torch_pbd.control.coupling import stiffest_environment
 from torch_pbd.control.damping import required_damping_ratio
+from torch_pbd.control.lyapunov import has_common_function, minimize_convex
 from torch_pbd.control.matrices import as_mass, as_rows, as_semidefinite, check_positive
 from torch_pbd.control.passivity import lyapunov_matrix
 from torch_pbd.control.position_loop import PositionLoop
-from torch_pbd.control.stability_report import StabilityReport
+from torch_pbd.control.stability_report import GROWTH_ROUNDING, StabilityReport
 from torch_pbd.control.transitions import admittance_rate, transition
 from torch_pbd.linalg import spectral_map, symmetrize
 
-_MAX_KNOTS = 400  # at which parts begin and end that the gain is of; as many again where the stiffness rises most
-_GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
+_MAX_BEGINNINGS = 400  # of parts of the schedule that are followed at a time for their gain
+_N_WORST = 32  # intervals at which a maximum over all is looked for; more change nothing, fewer are asked more often
 
 
 def certify(
@@ -83,18 +84,20 @@ def certify(
     knots = _Knots.of(time / speed, stiffness, damping, inertia)
     alpha, margin, worst = knots.certificate()
     ratio, required, lawful, smallest = _damping_rule(stiffness, damping, inertia)
+    rate = admittance_rate(stiffness[:-1], damping[:-1], inertia)[..., : 2 * inertia.shape[0], : 2 * inertia.shape[0]]
+    maps = transition(rate * (time / speed).diff()[:, None, None], 1.0)
     loop = PositionLoop() if position_loop is None else position_loop
     return StabilityReport(
         damping_ratio=smallest,
         stiffness_ratio=ratio,
         required_damping_ratio=required,
-        stable_at_any_schedule=lawful and smallest > required,
+        stable_at_any_schedule=lawful,
         alpha=alpha,
         margin=margin,
         margin_time=float(time[worst]),
-        held_growth=_held_growth(time / speed, stiffness, damping, inertia, alpha),
+        held_growth=_held_growth(maps, stiffness, damping, inertia, alpha),
         max_speed=speed * knots.max_speed(),
-        gain=_gain(time / speed, stiffness, damping, inertia),
+        gain=_gain(maps, stiffness, inertia),
         environment_stiffness=stiffest_environment(stiffness, damping, inertia, loop, force_cutoff, dt),
         speed=float(speed),
         mass=float(inertia[0, 0]) if is_number else tuple(map(tuple, inertia.tolist())),
@@ -144,18 +147,15 @@ class _Knots:
     def certificate(self) -> tuple[float, float, int]:
         """Alpha with the largest margin, that margin, and the interval where it is smallest."""
 
-        def excess(alpha: float) -> Tensor:
-            matrix = self.stiffness_rate + alpha * self.damping_rate - 2.0 * alpha * self.stiffness
-            return torch.linalg.eigvalsh(matrix)[..., -1]
+        def excess(alpha: float, rows: Any = slice(None)) -> Tensor:
+            matrix = self.stiffness_rate[rows] + alpha * (self.damping_rate[rows] - 2.0 * self.stiffness[:, rows])
+            return torch.linalg.eigvalsh(matrix)[..., -1].amax(0)
 
         if self.alpha_max <= 0.0:  # no damping somewhere: no alpha will do
             values = excess(0.0)
-            alpha, margin = 0.0, min(-float(values.max()), -math.ulp(0.0))
-        else:
-            alpha = _minimize_convex(lambda a: float(excess(a).max()), 1e-9 * self.alpha_max, self.alpha_max)
-            values = excess(alpha)
-            margin = -float(values.max())
-        return alpha, margin, int(values.amax(0).argmax())
+            return 0.0, min(-float(values.max()), -math.ulp(0.0)), int(values.argmax())
+        alpha, values = _minimize_largest(excess, 1e-9 * self.alpha_max, self.alpha_max)
+        return alpha, -float(values.max()), int(values.argmax())
 
     def max_speed(self) -> float:
         """Largest factor on the rates for which some alpha has no negative margin."""
@@ -163,91 +163,76 @@ class _Knots:
             return 0.0
         root = spectral_map(self.stiffness, torch.rsqrt)
 
-        def needed(inverse_alpha: float) -> float:
-            rate = root @ (inverse_alpha * self.stiffness_rate + self.damping_rate) @ root
-            return 0.5 * float(torch.linalg.eigvalsh(symmetrize(rate))[..., -1].max())
+        def needed(log_inverse_alpha: float, rows: Any = slice(None)) -> Tensor:
+            rate = math.exp(log_inverse_alpha) * self.stiffness_rate[rows] + self.damping_rate[rows]
+            return 0.5 * torch.linalg.eigvalsh(symmetrize(root[:, rows] @ rate @ root[:, rows]))[..., -1].amax(0)
 
-        slowest = 1.0 / self.alpha_max
-        best = needed(_minimize_convex(needed, slowest, 1e3 * slowest))
+        # By its logarithm, of which it still falls and then rises: where K falls and D rises alpha must be small.
+        slowest = -math.log(self.alpha_max)
+        best = float(_minimize_largest(needed, slowest, slowest + math.log(1e9))[1].max())
         return 1.0 / best if best > 1e-12 else math.inf
 
 
-def _minimize_convex(function: Callable[[float], float], low: float, high: float, n_steps: int = 45) -> float:
-    """Where a convex function of one variable is smallest, by golden section; the ends are tried too."""
-    first, last = low, high
-    left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-    at_left, at_right = function(left), function(right)
-    for _ in range(n_steps):
-        if at_left <= at_right:
-            high, right, at_right = right, left, at_left
-            left = high - _GOLDEN * (high - low)
-            at_left = function(left)
-        else:
-            low, left, at_left = left, right, at_right
-            right = low + _GOLDEN * (high - low)
-            at_right = function(right)
-    return min((first, last, left, right), key=function)
+def _minimize_largest(function: Callable[..., Tensor], low: float, high: float) -> tuple[float, Tensor]:
+    """Where the largest of many convex functions of one variable is smallest, and the values of all of them there.
+
+    ``function(x)`` has those of all, ``function(x, rows)`` of some. Most are never the largest: the search is among
+    those that are so at the end and at the minima of the ones that were, until these are the largest of all.
+    """
+    found, values, rows = low, function(high), torch.empty(0, dtype=torch.long)
+    while not len(rows) or values.max() > values[rows].max():
+        rows = torch.cat([rows, values.topk(min(_N_WORST, len(values))).indices]).unique()
+        found = minimize_convex(lambda x, rows=rows: float(function(x, rows).max()), low, high)
+        values = function(found)
+    return found, values
 
 
 def _damping_rule(stiffness: Tensor, damping: Tensor, mass: Tensor) -> tuple[float, float, bool, float]:
-    """Stiffness ratio, damping ratio it requires, whether one ratio makes the damping, and the smallest ratio."""
+    """Stiffness ratio, damping ratio it requires, whether one function falls at all knots, and the smallest ratio."""
     inverse = spectral_map(mass, torch.rsqrt)
     stiff, damp = (symmetrize(inverse @ gain @ inverse) for gain in (stiffness, damping))
     eigenvalues = torch.linalg.eigvalsh(stiff)
     ratio = float(eigenvalues.max() / eigenvalues.min())
     root = spectral_map(stiff, lambda value: value.pow(-0.25))
     ratios = torch.linalg.eigvalsh(symmetrize(root @ damp @ root)) / 2.0
-    smallest, largest = float(ratios.min()), float(ratios.max())
-    return ratio, required_damping_ratio(ratio), largest - smallest <= 1e-6 * largest, smallest
+    return ratio, required_damping_ratio(ratio), has_common_function(stiff, damp), float(ratios.min())
 
 
-def _gain(
-    time: Float[Tensor, " n"], stiffness: Float[Tensor, "n d d"], damping: Float[Tensor, "n d d"], mass: Tensor
-) -> float:
-    """Largest ``||P_j^1/2 Phi(j, i) P_i^-1/2||`` over chosen i < j, with P = diag(K, M) and the exact maps Phi."""
-    d = stiffness.shape[-1]
-    rate = admittance_rate(stiffness[:-1], damping[:-1], mass)[..., : 2 * d, : 2 * d]
-    maps = transition(rate * time.diff()[:, None, None], 1.0)
-    begins, ends = _chosen_knots(stiffness)
-    energy = torch.zeros_like(maps[:1]).repeat(len(time), 1, 1)
-    energy[:, :d, :d], energy[:, d:, d:] = stiffness, mass
-    root, inverse = spectral_map(energy, torch.sqrt), spectral_map(energy, torch.rsqrt)
-    since = maps.new_zeros(0, 2 * d, 2 * d)
+def _gain(maps: Float[Tensor, "m n n"], stiffness: Float[Tensor, "k d d"], mass: Tensor) -> float:
+    """Largest ``||P_j^1/2 Phi(j, i) P_i^-1/2||`` over i < j, with P = diag(K, M) and the exact maps Phi."""
+    energy = torch.stack([torch.block_diag(each, mass) for each in stiffness])
+    root = torch.linalg.cholesky(energy).mT
+    maps = torch.linalg.solve_triangular(root[:-1], root[1:] @ maps, upper=True, left=False)
+    begun, identity = maps[:0], torch.eye(maps.shape[-1]).to(maps)
     largest = 1.0
-    for tick, each in enumerate(maps):
-        if tick in begins:
-            since = torch.cat([since, inverse[tick : tick + 1]])
-        since = each @ since
-        if tick + 1 in ends:
-            grown = root[tick + 1] @ since
-            largest = max(largest, float(torch.linalg.eigvalsh(grown.mT @ grown)[:, -1].max()) ** 0.5)
-    return largest
+    for each in maps:
+        begun = each @ torch.cat([begun, identity[None]])
+        squared = begun.mT @ begun
+        # Whether all eigenvalues are below a limit is seen sooner than what they are.
+        limits = (limit * (1.0 + 1e-12) * identity for limit in (largest, 1.0))
+        record, grown = (torch.linalg.cholesky_ex(limit - squared).info > 0 for limit in limits)
+        if bool(record.any()):
+            largest = float(torch.linalg.eigvalsh(squared[record]).max())
+        # A part that has not grown so far gains no more than one that begins here.
+        begun = begun[grown]
+        if len(begun) > _MAX_BEGINNINGS:
+            begun = begun[torch.linalg.matrix_norm(begun).topk(_MAX_BEGINNINGS).indices]
+    return math.sqrt(largest)
 
 
-def _chosen_knots(stiffness: Tensor) -> tuple[set[int], set[int]]:
-    """Knots to begin and to end at: evenly spaced ones, and those before and after the steepest rises."""
-    n_knots = len(stiffness)
-    root = spectral_map(stiffness[:-1], torch.rsqrt)
-    rise = torch.linalg.eigvalsh(symmetrize(root @ stiffness.diff(dim=0) @ root))[:, -1]
-    steepest = rise.topk(min(_MAX_KNOTS, n_knots - 1)).indices.tolist()
-    even = set(torch.linspace(0, n_knots - 1, min(_MAX_KNOTS, n_knots)).round().long().tolist())
-    return even | set(steepest), even | {knot + 1 for knot in steepest}
+def _held_growth(maps: Tensor, stiffness: Tensor, damping: Tensor, mass: Tensor, alpha: float) -> float:
+    """Largest eigenvalue of ``A' P_next A`` relative to P: A the exact map of an interval with its gains held.
 
-
-def _held_growth(
-    time: Float[Tensor, " n"],
-    stiffness: Float[Tensor, "n d d"],
-    damping: Float[Tensor, "n d d"],
-    mass: Tensor,
-    alpha: float,
-) -> float:
-    """Largest eigenvalue of ``A' P_next A`` relative to P: A the exact map of an interval with its gains held."""
-    if alpha <= 0.0:
-        return math.nan
-    d = stiffness.shape[-1]
-    rate = admittance_rate(stiffness[:-1], damping[:-1], mass)[..., : 2 * d, : 2 * d]
-    maps = transition(rate * time.diff()[:, None, None], 1.0)
-    function = lyapunov_matrix(stiffness, damping, mass, alpha)
-    inverse = torch.linalg.inv(torch.linalg.cholesky(function[:-1]))
-    grown = inverse @ maps.mT @ function[1:] @ maps @ inverse.mT
-    return float(torch.linalg.eigvalsh(symmetrize(grown)).max())
+    Of the alpha of the margin, or, where that grows, of a half or a quarter of it: at the largest alpha V is not
+    damped along some velocity, which only gains that rise between the knots, and not at them, make up for.
+    """
+    least = math.nan
+    for each in (alpha, alpha / 2.0, alpha / 4.0) if alpha > 0.0 else ():
+        function = lyapunov_matrix(stiffness, damping, mass, each)
+        inverse = torch.linalg.inv(torch.linalg.cholesky(function[:-1]))
+        grown = inverse @ maps.mT @ function[1:] @ maps @ inverse.mT
+        growth = float(torch.linalg.eigvalsh(symmetrize(grown)).max())
+        least = growth if math.isnan(least) else min(least, growth)
+        if least <= 1.0 + GROWTH_ROUNDING:
+            break
+    return least

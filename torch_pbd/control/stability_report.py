@@ -6,6 +6,7 @@ from typing import final
 
 MAX_GAIN = 2.0
 """Gain of a schedule above which its report warns."""
+GROWTH_ROUNDING = 1e-9  # growth over an interval that is none: what rounding leaves of an exact map
 
 
 @final
@@ -13,8 +14,8 @@ MAX_GAIN = 2.0
 class StabilityReport:
     """What :func:`certify` found of a schedule at one mass and speed; ``print`` it.
 
-    All but the last figure are of the admittance itself. A lag between it and the robot, by a position loop or a
-    filter of the force, is in ``environment_stiffness`` only.
+    Guaranteed is the admittance of this mass, integrated exactly, without a force. A lag between it and the robot, by
+    a position loop or a filter of the force, is in ``environment_stiffness`` only.
 
     Attributes
     ----------
@@ -23,11 +24,12 @@ class StabilityReport:
     stiffness_ratio : float
         Largest over smallest stiffness R, of all axes and times.
     required_damping_ratio : float
-        From here on any schedule within these limits is exponentially stable:
-        :func:`~torch_pbd.control.required_damping_ratio`.
+        Of damping ``2 zeta (M K)^1/2`` with one zeta, from here on any schedule within these limits is exponentially
+        stable: :func:`~torch_pbd.control.required_damping_ratio`.
     stable_at_any_schedule : bool
-        That the damping is ``2 zeta (M K)^1/2`` with one such zeta at every knot; between them both may be held,
-        or linear.
+        That one function of the state, which no axis is special to, falls at every knot, whatever the damping is. Any
+        schedule of these gains and blends of them, faster, slower, resampled, in another order, held over ticks or
+        linear between knots, is then exponentially stable.
     alpha : float
         Constant of the certificate, 1/s.
     margin : float
@@ -36,12 +38,12 @@ class StabilityReport:
         and ``v + alpha y``. Exact for gains that are linear between the knots of the schedule. Negative says
         that this certificate does not hold, not that the schedule is unstable.
     held_growth : float
-        Largest growth of that V over an interval in which the gains are held instead, as at the ticks of a
-        controller: 1 is none. NaN without an alpha.
+        Largest growth of such a V, of this alpha, a half or a quarter of it, over an interval between knots in which
+        the gains are held instead, as at the ticks of a controller: 1 is none. NaN without an alpha.
     margin_time : float
         Where the margin is smallest, s.
     max_speed : float
-        Largest replay speed at which the certificate holds; 1 is the schedule's own. Where the rule holds, any
+        Largest replay speed at which the margin is not negative; 1 is the schedule's own. Where the rule holds, any
         speed is stable.
     gain : float
         Largest growth of ``sqrt(v'Mv + y'Ky)`` over a part of the schedule from any state, gains held between
@@ -70,8 +72,8 @@ class StabilityReport:
 
     @property
     def certified(self) -> bool:
-        """Whether the certificate holds for this very schedule and speed."""
-        return self.margin >= 0.0
+        """Whether the certificate holds for this very schedule and speed, its gains linear or held between knots."""
+        return self.margin >= 0.0 and self.held_growth <= 1.0 + GROWTH_ROUNDING
 
     @property
     def stable(self) -> bool:
@@ -85,15 +87,16 @@ class StabilityReport:
         speed = "any" if math.isinf(self.max_speed) else f"{self.max_speed:.3g} x"
         if self.stable_at_any_schedule and math.isfinite(self.max_speed):
             speed = f"any, by the rule; by the certificate {speed}"
-        grows = self.certified and self.held_growth > 1.0 + 1e-9
+        grows = self.held_growth > 1.0 + GROWTH_ROUNDING
         held = f"; held between knots, V grows by {self.held_growth - 1.0:.2g}" if grows else ""
-        verdict = "guaranteed" if self.stable else "NOT GUARANTEED: slow down, damp more, or use a filter"
+        remedy = "slow down" if self.margin < 0.0 else "resample it finer"
+        verdict = "guaranteed" if self.stable else f"NOT GUARANTEED: {remedy}, damp more, or use a filter"
         mass = f"{self.mass:g} kg" if isinstance(self.mass, float) else "a mass matrix"
         return "\n".join(
             [
                 f"stability of the admittance at {mass}, replay speed {self.speed:g}: {verdict}",
-                f"  any-schedule rule        {any_schedule}: damping ratio {self.damping_ratio:.3g}, required "
-                f"{self.required_damping_ratio:.3g} for stiffness ratio {self.stiffness_ratio:.3g}",
+                f"  any-schedule rule        {any_schedule}: damping ratio {self.damping_ratio:.3g}; one of "
+                f"{self.required_damping_ratio:.3g} will do for stiffness ratio {self.stiffness_ratio:.3g}",
                 f"  certificate of this one  {certificate}: margin {self.margin:.4g} N/m/s at t = "
                 f"{self.margin_time:.3g} s, alpha {self.alpha:.3g} /s{held}",
                 f"  replay speed limit       {speed}",

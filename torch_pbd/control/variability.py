@@ -19,13 +19,21 @@ def fit_covariance(regressor: CovarianceRegressor | None, inputs: Floats, varyin
     """Fit a clone of the regressor to what varies (K, n, d) at common inputs (n, 1); it is told the demonstrations."""
     fitted: CovarianceRegressor = clone(HeteroscedasticGPRegressor() if regressor is None else regressor)
     n_demos, n_steps, n_outputs = varying.shape
+    between, extent = varying - varying[:1], _extent(varying)
+    if float(np.abs(between).max()) <= _RESOLUTION * extent:
+        # One movement, shown again: what a smooth mean leaves of it would count as variability. It stands still
+        # instead, at a distance to which the floors of regressors are relative.
+        varying = extent + between
     groups = np.repeat(np.arange(n_demos), n_steps)
     return fit_by_demonstration(fitted, np.tile(inputs, (n_demos, 1)), varying.reshape(-1, n_outputs), groups)
 
 
 def fit_law(law: StiffnessLaw | None, covariance: Floats, varying: Floats) -> StiffnessLaw:
     """Fix the bounds of a law to covariances (m, d, d) along a movement, of what varies (K, n, d)."""
+    return (StiffnessLaw() if law is None else law).fitted(covariance, resolution=_RESOLUTION * _extent(varying))
+
+
+def _extent(varying: Floats) -> float:
+    """Diagonal of the box around (K, n, d); where nothing moves the largest position, which floors are relative to."""
     extent, largest = float(np.linalg.norm(np.ptp(varying, axis=(0, 1)))), float(np.abs(varying).max())
-    if extent <= _ROUNDING * largest:  # nothing moves: the regressor's own floor is in units of the position
-        extent = largest or 1.0
-    return (StiffnessLaw() if law is None else law).fitted(covariance, resolution=_RESOLUTION * extent)
+    return extent if extent > _ROUNDING * largest else largest or 1.0

@@ -107,7 +107,7 @@ def run_robot(
         reports.append(f"{name}: a movement of {run.schedule.duration:.3g} s\n{run.report}")
         _write(run, name, demonstrations, folder, in_tunnel=in_tunnel)
     folder.write_metrics(rows, metrics)
-    (folder.path / "stability.txt").write_text("\n\n".join(reports) + "\n", encoding="utf-8")
+    folder.write_text("stability.txt", "\n\n".join(reports) + "\n")
     shown = [{key: value for key, value in row.items() if key not in _IN_REPORT} for row in rows]
     return "\n\n".join([format_table(shown), *reports])
 

@@ -110,8 +110,7 @@ def _processor() -> str:
 
 def write(found: Sequence[Findings], plan: Plan, folder: RunFolder) -> None:
     """``benchmark.json``, ``figures/ratios.png`` and ``figures/growth.png``."""
-    text = json.dumps(as_json(found, plan), indent=1)
-    (folder.path / "benchmark.json").write_text(text + "\n", encoding="utf-8")
+    folder.write_text("benchmark.json", json.dumps(as_json(found, plan), indent=1) + "\n")
     rows = [row for findings in found for row in findings.rows if row.other is not None]
     growth = [one for findings in found for one in findings.growth]
     for name, figure in (("ratios", rows and ratios_figure(rows)), ("growth", growth and growth_figure(growth))):
