@@ -34,7 +34,8 @@ def test_a_run_of_any_dimension_leaves_its_figures_schedules_and_models(d, tmp_p
     time = np.linspace(0.0, 2.0, 60)
     ways = rng.normal(size=(5, 1, d)) * (0.05 + 0.2 * np.sin(np.pi * time / 2.0)[:, None] ** 2) + time[:, None]
     folder = RunFolder(tmp_path, {})
-    text = run_robot({"a b": DMPController(CholeskyCovRegressor())}, Demonstrations(time, ways), folder, rate=100.0)
+    with pytest.warns(UserWarning, match="tell no units"):
+        text = run_robot({"a b": DMPController(CholeskyCovRegressor())}, Demonstrations(time, ways), folder, rate=100.0)
     assert "early [unit]" in text
     assert "certificate of this one" in text
     assert {path.name for path in (tmp_path / "figures").iterdir()} == {
