@@ -13,7 +13,6 @@ LOADERS = (
     "Models are read by torch_pbd.load, schedules by torch_pbd.control.Schedule.load, demonstrations by "
     "torch_pbd.load_demonstrations."
 )
-"""What is told where a file is given to the wrong one of them."""
 
 _DRAFT = re.compile(r"\..+\.\d+\.[0-9a-f]{8}\.draft", re.DOTALL)
 # What systems say of folders that cannot be opened, or not be told to reach the disk.

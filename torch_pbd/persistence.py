@@ -1,6 +1,7 @@
 """Save and load fitted estimators: one safetensors file whose header is JSON; nothing in it is ever executed."""
 
 import os
+import re
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -37,13 +38,9 @@ _MODELS = {
     "HeteroscedasticGPRegressor": "heteroscedastic",
     "GMMBaseline": "mixture",
 }
-_FOREIGN = {
-    f".{suffix}"
-    for suffix in (
-        *("pkl", "pickle", "joblib", "skops", "pt", "pth", "ckpt", "bin", "onnx", "npy", "npz", "h5"),
-        *("hdf5", "mat", "zip", "json", "yaml", "yml", "toml", "csv", "txt", "parquet"),
-    )
-}
+_FOREIGN = re.compile(
+    r"\.(pkl|pickle|joblib|skops|pt|pth|ckpt|bin|onnx|np[yz]|h5|hdf5|mat|zip|json|ya?ml|toml|csv|txt|parquet)", re.I
+)
 # What parts that do not fit together raise.
 _UNSOUND = (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError)
 
@@ -68,9 +65,8 @@ def save(estimator: CovarianceRegressor | DMPController, path: str | os.PathLike
     ValueError
         If it is not sound, and could not be loaded again; or if the suffix is another format's.
     """
-    suffix = Path(path).suffix.lower()
-    if suffix in _FOREIGN:
-        raise ValueError(f"path={str(path)!r} has the suffix of another format, {suffix}: take .safetensors.")
+    if _FOREIGN.fullmatch(Path(path).suffix):
+        raise ValueError(f"path={str(path)!r} has the suffix of another format: take .safetensors.")
     if not is_ours(estimator):
         name = type(estimator).__name__
         raise TypeError(f"estimator is a {name}; can save {', '.join(CLASSES)}. In a pipeline, save that step.")
@@ -104,7 +100,7 @@ def load(path: str | os.PathLike[str]) -> Any:
     try:
         header, arrays = read_checksummed(path, _KEY, FORMAT_VERSION)
     except ModelFileError as error:
-        if path.suffix.lower() not in _FOREIGN:
+        if not _FOREIGN.fullmatch(path.suffix):
             raise
         raise ModelFileError(f"{error} {LOADERS} Pickles are never loaded.") from error
     if header.get("class") not in list(CLASSES):  # a list asks for no hash

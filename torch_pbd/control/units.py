@@ -36,22 +36,19 @@ def common_unit(units: Sequence[str] | None) -> str | None:
 
 
 def warn_of_units(units: Sequence[str] | None) -> None:
-    """Tell what is made of positions whose units are not told, are no lengths and no angles, or differ."""
+    """Tell what is made of positions whose units are not told, differ, or are no lengths and no angles."""
     common = common_unit(units)
     if units is None:
-        text = (
-            "The demonstrations tell no units: positions are taken to be in m, stiffness in N/m. Say what they are in: "
-            "Demonstrations(..., units='m'), or 'mm', 'rad', ...; a robot does not know."
-        )
+        text = "The demonstrations tell no units: positions are taken to be in m. Say so, or in what else: units='m'."
     elif common is None:
         text = (
             f"The outputs are in different units, {', '.join(units)}: their principal axes mix them, and nothing is "
             "converted to m. Bring them to one unit, or control them apart."
         )
-    elif common not in {**LENGTHS, **ANGLES}:
+    elif common not in LENGTHS | ANGLES:
         text = (
-            f"The positions are in {common!r}, which is no known length or angle: stiffness is in N per that unit, and "
-            f"no limits of motion apply. Known are {', '.join([*LENGTHS, *ANGLES])}."
+            f"The positions are in {common!r}, which is no known length or angle ({', '.join(LENGTHS | ANGLES)}): "
+            "stiffness is in N per that unit, and no limits of motion apply."
         )
     else:
         return

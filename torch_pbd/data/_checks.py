@@ -41,8 +41,7 @@ def as_recordings(times: Any, positions: Any, missing: str) -> tuple[tuple[Float
     if drop:
         grids, shared = grids * len(recordings) if shared else grids, False
         grids, recordings, kept = drop_missing(grids, recordings, MIN_SAMPLES)
-    argument = "times" if shared else "times[{}]"
-    counted = _from_common_origin(grids)
+    counted, argument = _from_common_origin(grids), "times" if shared else "times[{}]"
     frozen = [_as_time(t, grids[k], argument.format(k), kept[k]) for k, t in enumerate(counted)]
     times_ = frozen * len(recordings) if shared else frozen
     return tuple(times_), tuple(_as_position(p, k, kept[k]) for k, p in enumerate(recordings))

@@ -132,12 +132,11 @@ def _exact_time(cell: str, time: float) -> float | int:
 
 def _check_movements(path: Path, names: Sequence[str], positions: Sequence[NDArray[np.float64]]) -> None:
     """Refuse columns that count rows or number tasks, which nobody named as outputs."""
-    for j, name in enumerate(names):
-        columns = [position[:, j] for position in positions]
-        steps, values = np.concatenate([*map(np.diff, columns)]), np.sort(np.concatenate(columns))
+    steps, rows = np.vstack([np.diff(position, axis=0) for position in positions]), np.vstack(positions)
+    for name, step, values in zip(names, steps.T, np.sort(rows, axis=0).T, strict=True):
         # A count of all rows is so too where rows of several demonstrations are mixed.
-        counts = (steps == 1.0).all() or ((steps > 0.0).all() and (np.diff(values) == 1.0).all())
-        numbers = name.endswith(("_index", "_id")) and not steps.any()
+        counts = (step == 1.0).all() or ((step > 0.0).all() and (np.diff(values) == 1.0).all())
+        numbers = name.endswith(("_index", "_id")) and not step.any()
         if len(values) >= _FEWEST_COUNTED and (values == np.round(values)).all() and (counts or numbers):
             raise DataFormatError(
                 f"{path}, column {name!r}: it {'counts rows' if counts else 'numbers demonstrations'}, and is no "
@@ -174,9 +173,7 @@ class _Table:
             raise DataFormatError(f"{self.path}, line 1: {what} among {preview(self.header)}.")
         return names
 
-    def recordings(
-        self, demo: str | None, columns: Sequence[str]
-    ) -> tuple[list[NDArray[Any]], list[NDArray[np.float64]]]:
+    def recordings(self, demo: str | None, columns: Sequence[str]) -> tuple[list[NDArray[Any]], list[NDArray[Any]]]:
         """Times, as integers where all are, and the other columns of each demonstration, as they first appear."""
         places = {name: place for place, name in enumerate(self.header)}
         indices = [places[name] for name in columns]

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -18,11 +18,7 @@ from torch_pbd.memory import parsed_bytes, require_memory
 
 
 def read_npz(
-    path: Path,
-    max_bytes: int,
-    missing: Missing,
-    units: str | Sequence[str] | None = None,
-    time_unit: str | None = None,
+    path: Path, max_bytes: int, missing: Missing, units: Any = None, time_unit: str | None = None
 ) -> Demonstrations:
     """Read the format of `torch_pbd.data.load_demonstrations`."""
     try:
@@ -49,7 +45,9 @@ def read_npz(
             time_unit=time_unit or _text(meta, "time_unit") or _without_remark(_text(meta, "t_unit")) or "s",
             missing=missing,
         )
-        demonstrations._alignment = _alignment(meta)
+        demonstrations._alignment = meta.get("alignment")
+        if demonstrations.alignment not in (None, "phase", "dtw"):
+            raise ValueError(f"meta says alignment = {demonstrations.alignment!r:.80}, it must be 'phase' or 'dtw'")
     except (ValueError, TypeError) as error:
         raise DataFormatError(f"{path}: {error}") from error
     _check_counts(path, meta, demonstrations)
@@ -125,13 +123,6 @@ def _text(meta: dict[str, Any], name: str) -> str | None:
     value = meta.get(name)
     if not isinstance(value, str | None):
         raise ValueError(f"meta says {name} = {value!r:.80}, it must be text")
-    return value
-
-
-def _alignment(meta: dict[str, Any]) -> Any:
-    value = meta.get("alignment")
-    if value not in (None, "phase", "dtw"):
-        raise ValueError(f"meta says alignment = {value!r:.80}, it must be 'phase' or 'dtw'")
     return value
 
 

@@ -74,23 +74,17 @@ def _shared_grids(times: Sequence[Floats], units: Sequence[float]) -> list[Float
 
 
 def check_overlap(times: Sequence[Floats], time_unit: str) -> None:
-    """Refuse recordings whose times have less than half of their median duration in common: they would not be compared.
-
-    Raises
-    ------
-    ValueError
-        If so, with the remedies.
-    """
+    """Refuse recordings with less than half of their median duration in common: they would hardly be compared."""
     starts, ends = (np.array([time[i] for time in times]) for i in (0, -1))
-    last, first = int(starts.argmax()), int(ends.argmin())
+    last, first = starts.argmax(), ends.argmin()
     with np.errstate(over="ignore"):
-        common, duration = max(ends[first] - starts[last], 0.0), float(np.median(ends - starts))
+        common, duration = max(ends[first] - starts[last], 0.0), np.median(ends - starts)
     if common < 0.5 * duration:
         raise ValueError(
             f"the demonstrations have {common:.3g} of a median duration of {duration:.3g} {time_unit} in common: "
-            f"demonstration {last} starts at {exact(starts[last])}, {first} ends at {exact(ends[first])}. Count the "
-            "times of each from its start by .from_start() (from_start=True of load_demonstrations), or take one phase "
-            f"for all by .align('phase').{nanoseconds_hint(starts)}"
+            f"number {last} starts last, at {exact(starts[last])}, {first} ends first, at {exact(ends[first])}. Count "
+            "each from its start by .from_start() (from_start=True of load_demonstrations), or take one phase for all by "
+            f".align('phase').{nanoseconds_hint(starts)}"
         )
 
 

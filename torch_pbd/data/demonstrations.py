@@ -184,9 +184,9 @@ class Demonstrations:
         chosen = np.arange(len(self))[index]
         if chosen.ndim == 0:
             return Demonstration(self._times[chosen], self._positions[chosen])
-        part = self._replace([self._times[k] for k in chosen], [self._positions[k] for k in chosen])
-        part._suspects = find_suspects(part._positions, self._names, self._units)
-        return part
+        times, positions = [self._times[k] for k in chosen], [self._positions[k] for k in chosen]
+        suspects = find_suspects(positions, self._names, self._units) if self._suspects else ()
+        return self._replace(times, positions, suspects=suspects)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Demonstrations):
@@ -207,7 +207,7 @@ class Demonstrations:
 
     def __reduce__(self) -> tuple[Any, ...]:
         # By way of __init__: NumPy forgets that an array is read-only when it is pickled or copied.
-        return _rebuild, (self._times, self._positions, self._labels(), self._alignment, self._suspects)
+        return _rebuild, (self._times, self._positions, self._state())
 
     def stack(self, input: Literal["time", "phase"] = "time") -> tuple[Floats, Floats, NDArray[np.intp]]:
         """All samples below each other, as scikit-learn's estimators want them.
@@ -296,9 +296,8 @@ class Demonstrations:
             n = min(round(float(np.median(self.n_steps))), MAX_DEFAULT_STEPS)
         check_n_steps(n)
         grid, positions = on_common_phases(self._times, self._positions, method, n, self._units)
-        aligned = self._replace(grid, positions, time_unit="1")
-        aligned._alignment = "dtw" if "dtw" in (method, self._alignment) else "phase"  # timing taken out is gone
-        return aligned
+        alignment = "dtw" if "dtw" in (method, self._alignment) else "phase"  # timing taken out is gone
+        return self._replace(grid, positions, time_unit="1", alignment=alignment)
 
     def split(self, k: int | Sequence[int]) -> tuple["Demonstrations", "Demonstrations"]:
         """Leave demonstrations out: ``(train, test)``, where ``test`` has those numbered ``k``.
@@ -319,22 +318,17 @@ class Demonstrations:
             "time_unit": self._time_unit,
         }
 
-    def _replace(
-        self, times: ArrayLike | Sequence[ArrayLike], positions: Sequence[ArrayLike], **labels: str
-    ) -> "Demonstrations":
-        return _rebuild(times, positions, {**self._labels(), **labels}, self._alignment, self._suspects)
+    def _state(self) -> dict[str, Any]:
+        return {**self._labels(), "alignment": self._alignment, "suspects": self._suspects}
+
+    def _replace(self, times: Any, positions: Any, **changes: Any) -> "Demonstrations":
+        return _rebuild(times, positions, {**self._state(), **changes})
 
 
-def _rebuild(
-    times: ArrayLike | Sequence[ArrayLike],
-    positions: Sequence[ArrayLike],
-    labels: dict[str, Any],
-    alignment: Alignment | None = None,
-    suspects: tuple[str, ...] = (),
-) -> Demonstrations:
+def _rebuild(times: Any, positions: Any, labels: dict[str, Any]) -> Demonstrations:
     """Demonstrations made of others, whose labels were checked and of which all has been told."""
     rebuilt = object.__new__(Demonstrations)
     rebuilt._times, rebuilt._positions = as_recordings(times, positions, "raise")
-    for name, value in {**labels, "alignment": alignment, "suspects": suspects}.items():
+    for name, value in {"alignment": None, "suspects": (), **labels}.items():
         setattr(rebuilt, f"_{name}", value)
     return rebuilt
