@@ -83,7 +83,7 @@ def check_overlap(times: Sequence[Floats], time_unit: str) -> None:
         raise ValueError(
             f"the demonstrations have {common:.3g} of a median duration of {duration:.3g} {time_unit} in common: "
             f"number {last} starts last, at {exact(starts[last])}, {first} ends first, at {exact(ends[first])}. Count "
-            "each from its start by .from_start() (from_start=True of load_demonstrations), or take one phase for all by "
+            "each from its start by .from_start() (from_start=True of load_demonstrations), or take a phase for all by "
             f".align('phase').{nanoseconds_hint(starts)}"
         )
 
