@@ -71,7 +71,7 @@ def experiment(options: Any, folder: Any) -> str:
         )
         say(describe(demonstrations, "tunnel task"))
     else:
-        demonstrations = load_demonstrations(options.data, missing=options.missing)
+        demonstrations = load_demonstrations(options.data, missing=options.missing, from_start=options.from_start)
         say(describe(demonstrations, options.data.name))
     where = f"along {demonstrations.names[0]}, at 20 % and 80 % of the movement; K is the stiffness there, N/m"
     say(f"pushes of {options.push:g} N {where}\n")
@@ -117,9 +117,10 @@ WORK = {"demo": demo, "fit": fit, "experiment": experiment, "compare": compare}
 
 def _demonstrations(options: Any) -> Any:
     from torch_pbd.data import check_unimodal, load_demonstrations
+    from torch_pbd.data.alignment import TIMING_REMOVED
     from torch_pbd.experiments.recordings import describe, prepare
 
-    recorded = load_demonstrations(options.data, missing=options.missing)
+    recorded = load_demonstrations(options.data, missing=options.missing, from_start=options.from_start)
     say(describe(recorded, options.data.name))
     if len(recorded) == 1:
         warnings.warn(
@@ -130,5 +131,7 @@ def _demonstrations(options: Any) -> Any:
     prepared = prepare(recorded, options.align, options.n_steps)
     if prepared is not recorded:
         say(describe(prepared, f"after align={options.align}"))
+    if prepared.alignment == "dtw":
+        warnings.warn(TIMING_REMOVED, stacklevel=2)
     say("")
     return prepared

@@ -132,9 +132,7 @@ def _parser(command: str, *, only_help: bool) -> _Parser:
             "--n_jobs", type=_NonzeroInt | None, default=None, help="fits at the same time; -1: all cores"
         )
         _add_simulation_arguments(parser)
-    parser.add_argument(
-        "--missing", type=Literal["raise", "drop"], default="raise", help="of the file's samples: refuse, or leave out"
-    )
+    _add_loader_arguments(parser)
     if command == "experiment":
         return parser
     parser.add_argument(
@@ -146,6 +144,15 @@ def _parser(command: str, *, only_help: bool) -> _Parser:
     parser.add_argument("--input", type=Literal["time", "phase"], default="time", help="what the covariance depends on")
     parser.add_argument("--n_steps", type=PositiveInt | None, default=None, help="resample to so many points")
     return parser
+
+
+def _add_loader_arguments(parser: ArgumentParser) -> None:
+    parser.add_argument(
+        "--missing", type=Literal["raise", "drop"], default="raise", help="of the file's samples: refuse, or leave out"
+    )
+    parser.add_argument(
+        "--from_start", type=bool, default=False, help="count the times of each of the file's demonstrations from 0"
+    )
 
 
 def _add_experiment_arguments(parser: ArgumentParser, controllers_type: Any) -> None:

@@ -9,6 +9,11 @@ from pathlib import Path
 from secrets import token_hex
 from typing import BinaryIO
 
+LOADERS = (
+    "Models are read by torch_pbd.load, schedules by torch_pbd.control.Schedule.load, demonstrations by "
+    "torch_pbd.load_demonstrations."
+)
+
 _DRAFT = re.compile(r"\..+\.\d+\.[0-9a-f]{8}\.draft", re.DOTALL)
 # What systems say of folders that cannot be opened, or not be told to reach the disk.
 _NO_SYNC = {errno.EINVAL, errno.ENOTSUP, errno.EBADF, errno.EACCES, errno.EPERM, errno.EISDIR, errno.ENOSYS}

@@ -1,6 +1,7 @@
 """Save and load fitted estimators: one safetensors file whose header is JSON; nothing in it is ever executed."""
 
 import os
+import re
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from torch_pbd.control.controller import DMPController
 from torch_pbd.control.storage import check_controller, controller_state, restore_controller
 from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.exceptions import ModelFileError
+from torch_pbd.files import LOADERS
 from torch_pbd.learned import decode_learned, learned_names
 from torch_pbd.model_header import (
     CLASSES,
@@ -36,6 +38,9 @@ _MODELS = {
     "HeteroscedasticGPRegressor": "heteroscedastic",
     "GMMBaseline": "mixture",
 }
+_FOREIGN = re.compile(
+    r"\.(pkl|pickle|joblib|skops|pt|pth|ckpt|bin|onnx|np[yz]|h5|hdf5|mat|zip|json|ya?ml|toml|csv|txt|parquet)", re.I
+)
 # What parts that do not fit together raise.
 _UNSOUND = (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError)
 
@@ -47,7 +52,8 @@ def save(estimator: CovarianceRegressor | DMPController, path: str | os.PathLike
     ----------
     estimator : fitted covariance regressor or DMPController
     path : path-like
-        File to write; by custom it ends in ``.safetensors``. Its folder must exist.
+        File to write; by custom it ends in ``.safetensors``, never as other formats (``.pkl``, ``.npz``). Its folder
+        must exist.
 
     Raises
     ------
@@ -57,8 +63,10 @@ def save(estimator: CovarianceRegressor | DMPController, path: str | os.PathLike
         If it is not one of this package, has attributes that this package did not give it, or a parameter (a callable
         prior, a random state object) cannot be written as JSON.
     ValueError
-        If it is not sound, and could not be loaded again.
+        If it is not sound, and could not be loaded again; or if the suffix is another format's.
     """
+    if _FOREIGN.fullmatch(Path(path).suffix):
+        raise ValueError(f"path={str(path)!r} has the suffix of another format: take .safetensors.")
     if not is_ours(estimator):
         name = type(estimator).__name__
         raise TypeError(f"estimator is a {name}; can save {', '.join(CLASSES)}. In a pipeline, save that step.")
@@ -89,7 +97,12 @@ def load(path: str | os.PathLike[str]) -> Any:
         If it is damaged, of a newer format, or no model of this package.
     """
     path = Path(path)
-    header, arrays = read_checksummed(path, _KEY, FORMAT_VERSION)
+    try:
+        header, arrays = read_checksummed(path, _KEY, FORMAT_VERSION)
+    except ModelFileError as error:
+        if not _FOREIGN.fullmatch(path.suffix):
+            raise
+        raise ModelFileError(f"{error} {LOADERS} Pickles are never loaded.") from error
     if header.get("class") not in list(CLASSES):  # a list asks for no hash
         raise ModelFileError(f"{path} holds a {header.get('class')!r:.80}; known are {', '.join(CLASSES)}.")
     try:

@@ -132,7 +132,7 @@ def test_times_count_as_those_of_the_demonstrations(tunnel, controller):
     np.testing.assert_allclose(shifted.predict(query + 1.7e9), controller.predict(query), atol=1e-5)
     np.testing.assert_allclose(shifted.predict_stiffness(query + 1.7e9), controller.predict_stiffness(query), rtol=1e-2)
     assert shifted.schedule(10.0).time[0] == 0.0
-    apart = Demonstrations([time + 20.0 * k for k, time in enumerate(tunnel.times)], tunnel.positions)
+    apart = Demonstrations([time + 20.0 * k for k, time in enumerate(tunnel.times)], tunnel.positions, units="m")
     np.testing.assert_allclose(DMPController(CD).fit(apart).predict(query), controller.predict(query), atol=1e-9)
 
 
@@ -200,7 +200,7 @@ def test_outputs_in_different_units_are_told_of(tunnel):
 
 
 def test_phases_need_a_duration(tunnel, controller):
-    phases = Demonstrations([time / 10.0 for time in tunnel.times], tunnel.positions, time_unit="1")
+    phases = Demonstrations([time / 10.0 for time in tunnel.times], tunnel.positions, units="m", time_unit="1")
     with pytest.warns(UserWarning, match=r"in '1', not in s: the movement is taken to last 1 s\. Give duration"):
         assert DMPController(CD).fit(phases).schedule(100.0).duration == 1.0
     timed = DMPController(CD, duration=10.0, cutoff=4.0).fit(phases)
@@ -212,7 +212,8 @@ def test_phases_need_a_duration(tunnel, controller):
 @pytest.mark.parametrize("factor", [1e3, 1e-3])
 def test_other_units_without_a_name_give_the_same_stiffness(tunnel, controller, factor):
     scaled = Demonstrations(tunnel.times, [factor * position for position in tunnel.positions])
-    other = DMPController().fit(scaled)
+    with pytest.warns(UserWarning, match="tell no units"):
+        other = DMPController().fit(scaled)
     X = np.linspace(0.0, 10.0, 21)[:, None]
     np.testing.assert_allclose(other.predict(X) / factor, controller.predict(X), rtol=1e-6, atol=1e-7)
     np.testing.assert_allclose(other.predict_stiffness(X), controller.predict_stiffness(X), rtol=1e-4)
@@ -221,7 +222,7 @@ def test_other_units_without_a_name_give_the_same_stiffness(tunnel, controller, 
 def test_a_constant_output_is_precise():
     tunnel = make_tunnel_demonstrations(random_state=0)
     flat = [np.column_stack([position[:, 0], np.full(len(position), 0.5)]) for position in tunnel.positions]
-    fitted = DMPController().fit(Demonstrations(tunnel.times, flat))
+    fitted = DMPController().fit(Demonstrations(tunnel.times, flat, units="m"))
     X = np.linspace(0.0, 10.0, 21)[:, None]
     np.testing.assert_allclose(fitted.predict(X)[:, 1], 0.5, rtol=1e-9)
     np.testing.assert_allclose(fitted.predict_stiffness(X)[:, 1, 1], 1000.0, rtol=1e-6)
@@ -285,7 +286,7 @@ def test_one_speed_is_that_of_all_ticks(controller):
 
 
 def test_demonstrations_that_stand_still_are_precise():
-    still = Demonstrations(np.arange(100) * 0.02, np.full((6, 100, 2), 0.3))
+    still = Demonstrations(np.arange(100) * 0.02, np.full((6, 100, 2), 0.3), units="m")
     with pytest.warns(DataRankWarning, match="identical"), pytest.warns(UserWarning, match="do not vary"):
         fitted = DMPController().fit(still)
     np.testing.assert_allclose(fitted.predict_stiffness([[1.0]]), 1000.0 * np.eye(2)[None], rtol=1e-9)
@@ -338,7 +339,7 @@ def test_identical_demonstrations_are_stiff_and_told_of(scale, noise, rng):
     same = [scale * (once.positions[0] + noise * rng.normal(size=once.positions[0].shape)) for _ in range(3)]
     told = pytest.warns(DataRankWarning, match="identical") if noise == 0.0 else nullcontext()
     with told, pytest.warns(UserWarning, match="do not vary"):
-        fitted = DMPController(n_steps=50).fit(Demonstrations([once.times[0]] * 3, same))
+        fitted = DMPController(n_steps=50).fit(Demonstrations([once.times[0]] * 3, same, units="m"))
     stiffness = fitted.predict_stiffness(np.linspace(0.0, 10.0, 5)[:, None])
     np.testing.assert_allclose(stiffness, np.tile(1000.0 * np.eye(2), (5, 1, 1)), rtol=1e-6)
 
@@ -348,7 +349,9 @@ def test_recorded_skills_are_learned(name, recordings):
     from torch_pbd import load_demonstrations
 
     recorded = load_demonstrations(recordings / f"{name}.npz")
-    fitted = DMPController(duration=None if recorded.time_unit == "s" else 2.0).fit(recorded)
+    known = recorded.units[0] in ("m", "deg")
+    with nullcontext() if known else pytest.warns(UserWarning, match=f"in '{recorded.units[0]}', which is no known"):
+        fitted = DMPController(duration=None if recorded.time_unit == "s" else 2.0).fit(recorded)
     schedule = fitted.schedule(200.0 / fitted.duration_)
     eigenvalues = np.linalg.eigvalsh(schedule.stiffness)
     assert 50.0 - 1e-6 <= eigenvalues.min() < 200.0

@@ -37,7 +37,8 @@ def test_a_run_of_any_dimension_leaves_its_figures_schedules_and_models(d, tmp_p
     before, kept = tmp_path / "stability.txt", tmp_path / "another name of it"
     before.write_text("of the last run")
     kept.hardlink_to(before)
-    text = run_robot({"a b": DMPController(CholeskyCovRegressor())}, Demonstrations(time, ways), folder, rate=100.0)
+    with pytest.warns(UserWarning, match="tell no units"):
+        text = run_robot({"a b": DMPController(CholeskyCovRegressor())}, Demonstrations(time, ways), folder, rate=100.0)
     assert "early [unit]" in text
     assert "certificate of this one" in text
     assert {path.name for path in (tmp_path / "figures").iterdir()} == {

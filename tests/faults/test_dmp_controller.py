@@ -146,7 +146,7 @@ def test_6_to_17_data_that_cannot_be_used_are_refused(broken, error, message):
 def test_12_recordings_that_are_too_short_are_refused_with_their_number():
     times, positions = [*recorded().times, np.arange(3.0)], [*recorded().positions, np.zeros((3, 2))]
     with pytest.raises(ValueError, match=r"demonstration 4 has 3 samples, needs at least 5 .*or cutoff=None for 3"):
-        new().fit(Demonstrations(times, positions))
+        new().fit(Demonstrations(times, positions, units="m"))
 
 
 @pytest.mark.parametrize("form", [torch.tensor, pd.DataFrame, np.asfortranarray, lambda a: a.tolist()])

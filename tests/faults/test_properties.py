@@ -69,6 +69,7 @@ WARNINGS = {
     (UnimodalityWarning, r"Demonstration \d+ is far from the other"): "an outlier",
     (UnimodalityWarning, r"The demonstrations seem to follow two ways"): "two modes, or two outliers",
     (UserWarning, r"The covariances do not vary"): "a controller has nothing to make stiffness of",
+    (UserWarning, r"The demonstrations tell no units"): "these have none",
     (UserWarning, r"The reproduced movement is .* off the mean"): "noise and outliers are smoothed away",
 }
 

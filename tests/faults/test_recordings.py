@@ -257,7 +257,7 @@ def test_12_too_few_samples_are_told(door, n, tmp_path):
 
 @pytest.mark.parametrize(("cutoff", "least"), [("auto", 5), (None, 3)])
 def test_12_a_movement_has_an_acceleration_from_three_samples_and_is_smoothed_from_five(cutoff, least):
-    short = Demonstrations(TIME[: least - 1], POSITIONS[:, : least - 1])
+    short = Demonstrations(TIME[: least - 1], POSITIONS[:, : least - 1], units="m")
     with pytest.raises(ValueError, match=f"demonstration 0 has {least - 1} samples, needs at least {least}"):
         DMPController(cutoff=cutoff).fit(short)
 

@@ -16,8 +16,13 @@ from torch_pbd.control.dmp import Gate
 from torch_pbd.control.impedance import OnUnknown
 from torch_pbd.control.matrices import check_count, check_finite, check_positive
 from torch_pbd.control.sampling import count_intervals
+from torch_pbd.control.smoothing import CUTOFF_HZ
 from torch_pbd.control.stiffness import StiffnessLaw
+from torch_pbd.control.units import warn_of_units
 from torch_pbd.data import Demonstrations, check_unimodal
+from torch_pbd.data._missing import levels_to_caller
+from torch_pbd.data._units import TIMES
+from torch_pbd.data.alignment import TIMING_REMOVED
 from torch_pbd.estimators._demonstrations import check_groups
 from torch_pbd.estimators._validation import check_squares, checked_values
 from torch_pbd.memory import require_memory, require_much
@@ -82,9 +87,13 @@ def check_against_duration(controller: Any) -> None:
     duration, tau = controller.duration_, float(controller.tau)
     cycles = None if controller.cutoff_ is None else controller.cutoff_ * duration
     if cycles is not None and not _FEWEST_CYCLES <= cycles <= _MOST_CYCLES:
+        # Where the automatic one too would be out of range, the times are in another unit than they say.
+        suspect = controller.cutoff == "auto" or CUTOFF_HZ * duration > _MOST_CYCLES
+        units = f"the unit of the times is suspect, time_unit == {controller.time_unit_!r} (known: {', '.join(TIMES)})"
+        automatic = "leave it 'auto'"
         raise ValueError(
             f"cutoff == {controller.cutoff_:g} Hz is {cycles:.3g} cycles in a movement of duration == {duration:.3g}, "
-            f"must be {_FEWEST_CYCLES:g} to {_MOST_CYCLES:g}: leave it 'auto'."
+            f"must be {_FEWEST_CYCLES:g} to {_MOST_CYCLES:g}: {units if suspect else automatic}."
         )
     alpha, beta, gamma = (float(value) for value in (controller.alpha, controller.beta or 1.0, controller.gamma))
     fastest = max(alpha, math.sqrt(alpha) * math.sqrt(beta)) / tau * duration
@@ -124,14 +133,16 @@ def as_demonstrations(X: Demonstrations | ArrayLike, y: ArrayLike | None, groups
     Raises
     ------
     ValueError
-        If there is one only, shapes disagree, or times do not increase within a demonstration.
+        If there is one only, shapes disagree, times do not increase within a demonstration, or outputs are unit
+        quaternions or angles that jump by a turn.
 
     Warns
     -----
     UnimodalityWarning
         If they follow more than one way.
     UserWarning
-        If their outputs are in different units, which no turned axis of stiffness can have.
+        If their outputs are in different units, which no turned axis of stiffness can have; in none; or in one that
+        is neither a length nor an angle. If their timing was taken out by dynamic time warping.
     """
     if isinstance(X, Demonstrations) and not (y is None and groups is None):
         raise ValueError("X is Demonstrations, which have their positions: give neither y nor groups with them.")
@@ -141,14 +152,13 @@ def as_demonstrations(X: Demonstrations | ArrayLike, y: ArrayLike | None, groups
             "DMPController needs >= 2 demonstrations, got 1: what varies between demonstrations cannot be learned "
             "from one. Record more, or give groups that tell the samples of several apart."
         )
+    if demonstrations._suspects:
+        raise ValueError(f"A controller cannot be learned of these outputs. {' '.join(demonstrations._suspects)}")
     check_unimodal(demonstrations)
-    units = demonstrations.units
-    if units is not None and len(set(units)) > 1:
-        warnings.warn(
-            f"The outputs are in different units, {', '.join(units)}: their principal axes mix them, and nothing is "
-            "converted to m. Bring them to one unit, or control them apart.",
-            stacklevel=3,
-        )
+    if isinstance(X, Demonstrations):  # arrays have no units: they are in m and s
+        warn_of_units(X.units)
+    if demonstrations.alignment == "dtw":
+        warnings.warn(TIMING_REMOVED, stacklevel=levels_to_caller())
     return demonstrations
 
 

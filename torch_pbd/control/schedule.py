@@ -237,7 +237,7 @@ class Schedule:
         """Write one file, in the format of its suffix: .npz, .json or .csv.
 
         All of them hold everything to the last bit, with a version and a checksum. In .csv the labels are lines
-        ``# key: JSON`` before the header, matrices their upper triangles, ``stiffness[x,y]``. The file appears
+        ``# key: JSON`` before the header, matrices their upper triangles, ``stiffness[x][y]``. The file appears
         whole or not at all, and replaces one that is there.
 
         Raises

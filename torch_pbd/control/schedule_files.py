@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch_pbd.archives import read_array, read_members
 from torch_pbd.control.schedule_checks import ARRAY_DIMS, LABELS, Arrays, Labels
 from torch_pbd.exceptions import ModelFileError
-from torch_pbd.files import replacing
+from torch_pbd.files import LOADERS, replacing
 from torch_pbd.memory import parsed_bytes, require_memory
 
 FORMAT = "torch_pbd.schedule"
@@ -79,14 +79,16 @@ def read_schedule(path: Path, build: Callable[..., Built]) -> Built:
 def _known_suffix(path: Path) -> str:
     suffix = path.suffix.lower()
     if suffix not in _ENCODERS:
-        raise ValueError(f"path={str(path)!r} has the suffix {path.suffix!r}; a schedule is .npz, .json or .csv.")
+        raise ValueError(
+            f"path={str(path)!r} has the suffix {path.suffix!r}; a schedule is .npz, .json or .csv. {LOADERS}"
+        )
     return suffix
 
 
 def _check_header(header: Any, *, checksum_needed: bool) -> None:
     found = header.get("format") if isinstance(header, dict) else None
     if found != FORMAT:
-        raise ValueError(f"its format is {found!r}, not {FORMAT!r}.")
+        raise ValueError(f"its format is {found!r}, not {FORMAT!r}. {LOADERS}")
     if header.get("version") != VERSION:
         raise ValueError(f"it has version {header.get('version')!r}, this torch_pbd reads {VERSION}: upgrade it.")
     needed = {"format", "version", *LABELS, *(["sha256"] if checksum_needed else [])}
@@ -151,7 +153,7 @@ def _encode_npz(header: Labels, arrays: Arrays) -> bytes:
 
 def _decode_npz(content: bytes) -> Iterator[Any]:
     members = read_members(content, MAX_BYTES, remedy="Resample the schedule at a lower rate.")
-    yield _parse_json(str(_read_npy("header", members.pop("header", b""))))
+    yield _parse_json(str(_read_npy("header", members.pop("header")))) if "header" in members else {}
     yield {name: _read_npy(name, member) for name, member in members.items()}
 
 
@@ -162,7 +164,9 @@ def _read_npy(name: str, content: bytes) -> NDArray[Any]:
     return array
 
 
-def _columns(names: Sequence[str] | None, n_outputs: int) -> list[tuple[str, str, tuple[int, ...]]]:
+def _columns(
+    names: Sequence[str] | None, n_outputs: int, between: str = "]["
+) -> list[tuple[str, str, tuple[int, ...]]]:
     """Title, array and place in its rows of each column; of symmetric matrices the upper triangle."""
     labels = [str(i) for i in range(n_outputs)] if names is None else names
     axes = range(n_outputs)
@@ -172,7 +176,7 @@ def _columns(names: Sequence[str] | None, n_outputs: int) -> list[tuple[str, str
         3: [(i, j) for i in axes for j in axes[i:]],
     }
     return [
-        (f"{name}[{','.join(labels[i] for i in place)}]" if place else name, name, place)
+        (f"{name}[{between.join(labels[i] for i in place)}]" if place else name, name, place)
         for name, n_dims in ARRAY_DIMS.items()
         for place in places[n_dims]
     ]
@@ -219,7 +223,8 @@ def _read_table(names: Any, lines: Iterator[str], n_lines_before: int) -> Arrays
         )
     columns = _columns(names, n_outputs)
     expected = [title for title, _, _ in columns]
-    if titles != expected:
+    # Files once had titles with commas, stiffness[x,y], which must be quoted.
+    if titles not in (expected, [title for title, _, _ in _columns(names, n_outputs, ",")]):
         raise ValueError(f"line {n_lines_before + 1} must name the columns {','.join(expected)}.")
     rows = [_numbers(cells, expected, n_lines_before + reader.line_num) for cells in reader if cells]
     table = np.array(rows, dtype=np.float64).reshape(len(rows), len(expected))

@@ -6,14 +6,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from torch_pbd.data import Demonstrations
-
-_METRES = {"m": 1.0, "dm": 1e-1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "km": 1e3}
-_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
+from torch_pbd.data._missing import levels_to_caller
+from torch_pbd.data._units import ANGLES, LENGTHS, TIMES
 
 
 def in_seconds(time_unit: str) -> float | None:
     """Seconds of one unit of time; None where it is no unit of time, as of a phase."""
-    return _SECONDS.get(time_unit)
+    return TIMES.get(time_unit)
 
 
 def in_metres(units: Sequence[str] | None) -> float:
@@ -22,18 +21,38 @@ def in_metres(units: Sequence[str] | None) -> float:
     Those are taken as they are: stiffness is then in N per unit, and mass in N s^2 per unit.
     """
     common = common_unit(units)
-    return _METRES.get(common, 1.0) if common is not None else 1.0
+    return LENGTHS.get(common, 1.0) if common is not None else 1.0
 
 
 def robot_unit(units: Sequence[str] | None) -> str | None:
     """Unit of the positions of a robot that follows recordings in these units."""
     common = common_unit(units)
-    return "m" if common in _METRES else common
+    return "m" if common in LENGTHS else common
 
 
 def common_unit(units: Sequence[str] | None) -> str | None:
     """The unit of all outputs; None if they have none, or several."""
     return units[0] if units is not None and len(set(units)) == 1 else None
+
+
+def warn_of_units(units: Sequence[str] | None) -> None:
+    """Tell what is made of positions whose units are not told, differ, or are no lengths and no angles."""
+    common = common_unit(units)
+    if units is None:
+        text = "The demonstrations tell no units: positions are taken to be in m. Say so, or in what else: units='m'."
+    elif common is None:
+        text = (
+            f"The outputs are in different units, {', '.join(units)}: their principal axes mix them, and nothing is "
+            "converted to m. Bring them to one unit, or control them apart."
+        )
+    elif common not in LENGTHS | ANGLES:
+        text = (
+            f"The positions are in {common!r}, which is no known length or angle ({', '.join(LENGTHS | ANGLES)}): "
+            "stiffness is in N per that unit, and no limits of motion apply."
+        )
+    else:
+        return
+    warnings.warn(text, stacklevel=levels_to_caller())
 
 
 def duration_of(demonstrations: Demonstrations, duration: float | None) -> tuple[float, float]:

@@ -8,11 +8,15 @@ from numpy.typing import NDArray
 
 from torch_pbd.arguments import check_text, from_tensor
 from torch_pbd.data._missing import drop_missing
+from torch_pbd.data._units import ANGLES, LENGTHS, TIMES, check_unit, exact, nanoseconds_hint
 from torch_pbd.data.alignment import Floats
 from torch_pbd.memory import require_much
 
 MIN_SAMPLES = 2
 _LONGEST = 0.25 * float(np.finfo(np.float64).max)  # quarters of times, whose difference is a number
+
+# Of dates and durations, which .astype(float) makes numbers that are too coarse, of whatever unit.
+_CONVERSION = {kind: f".astype('{kind}8[ns]').astype('int64') and time_unit='ns'" for kind in "Mm"}
 
 
 def as_recordings(times: Any, positions: Any, missing: str) -> tuple[tuple[Floats, ...], tuple[Floats, ...]]:
@@ -37,7 +41,8 @@ def as_recordings(times: Any, positions: Any, missing: str) -> tuple[tuple[Float
     if drop:
         grids, shared = grids * len(recordings) if shared else grids, False
         grids, recordings, kept = drop_missing(grids, recordings, MIN_SAMPLES)
-    frozen = [_as_time(t, "times" if shared else f"times[{k}]", kept[k]) for k, t in enumerate(grids)]
+    counted, argument = _from_common_origin(grids), "times" if shared else "times[{}]"
+    frozen = [_as_time(t, grids[k], argument.format(k), kept[k]) for k, t in enumerate(counted)]
     times_ = frozen * len(recordings) if shared else frozen
     return tuple(times_), tuple(_as_position(p, k, kept[k]) for k, p in enumerate(recordings))
 
@@ -57,6 +62,16 @@ def as_labels(labels: str | Sequence[str], n_outputs: int, argument: str) -> tup
     return values
 
 
+def as_units(units: str | Sequence[str] | None, n_outputs: int) -> tuple[str, ...] | None:
+    """A unit for each output, or None; one string is that of all."""
+    if units is None:
+        return None
+    values = as_labels((units,) * n_outputs if isinstance(units, str) else units, n_outputs, "units")
+    for i, unit in enumerate(values):
+        check_unit(unit, "units" if isinstance(units, str) else f"units[{i}]", LENGTHS | ANGLES)
+    return values
+
+
 def as_names(names: Sequence[str], n_outputs: int) -> tuple[str, ...]:
     """A name for each output, all different, that any file can hold."""
     values = as_labels(names, n_outputs, "names")
@@ -73,6 +88,22 @@ def check_frame_and_unit(frame: Any, time_unit: Any) -> None:
         raise ValueError(f"frame is {frame!r}, must be text or None.")
     if not isinstance(time_unit, str) or not time_unit:
         raise ValueError(f"time_unit is {time_unit!r}, must be the unit of the times: 's', or '1' for phase.")
+    check_unit(time_unit, "time_unit", TIMES)
+
+
+def as_mask(k: int | Sequence[int], n_demos: int) -> NDArray[np.bool_]:
+    """Which demonstrations are numbered ``k``: some, and not all of them."""
+    mask = np.zeros(n_demos, dtype=bool)
+    numbers = np.atleast_1d(np.asarray(k))
+    if numbers.ndim != 1 or numbers.dtype.kind not in "iu":
+        raise ValueError(f"k must be the number of a demonstration or a list of numbers; got {k!r}.")
+    wrong = numbers[(numbers < -n_demos) | (numbers >= n_demos)]
+    if len(wrong):
+        raise ValueError(f"k has {wrong[0]}, but demonstrations are numbered 0 to {n_demos - 1}.")
+    mask[numbers] = True
+    if mask.all() or not mask.any():
+        raise ValueError(f"k leaves out {mask.sum()} of {n_demos} demonstrations: both parts need some.")
+    return mask
 
 
 def preview(values: Sequence[object], limit: int = 12) -> str:
@@ -122,7 +153,7 @@ def _as_numbers(values: Any, argument: str, drop: bool) -> NDArray[Any]:
     if array.dtype.kind not in "fiu":
         raise ValueError(
             f"{argument} has dtype {array.dtype}: real numbers are needed. Convert it, e.g. with "
-            ".astype(float), once it holds nothing else."
+            f"{_CONVERSION.get(array.dtype.kind, '.astype(float)')}, once it holds nothing else."
         )
     return array
 
@@ -166,7 +197,17 @@ def _as_position(array: NDArray[Any], k: int, numbers: NDArray[np.intp]) -> Floa
     return position
 
 
-def _as_time(array: NDArray[Any], argument: str, numbers: NDArray[np.intp]) -> Floats:
+def _from_common_origin(grids: list[NDArray[Any]]) -> list[NDArray[Any]]:
+    """Times; where whole numbers are beyond what float64 holds, from the first of them on, so that steps stay exact."""
+    beyond = [grid for grid in grids if grid.dtype.kind in "iu" and max(grid.max(), -int(grid.min())) > 2**53]
+    if not beyond:
+        return grids
+    origin = min(int(grid.min()) for grid in beyond)
+    # As Python's integers: differences of the machine's may overflow.
+    return [(grid.astype(object) if grid.dtype.kind in "iu" else grid) - origin for grid in grids]
+
+
+def _as_time(array: NDArray[Any], original: NDArray[Any], argument: str, numbers: NDArray[np.intp]) -> Floats:
     time = _frozen(array)
     if not np.isfinite(time).all():
         i = int(np.argmin(np.isfinite(time)))
@@ -176,7 +217,7 @@ def _as_time(array: NDArray[Any], argument: str, numbers: NDArray[np.intp]) -> F
             f"{argument} goes from {time.min():.3g} to {time.max():.3g}, further than float64 can tell: take another "
             "unit of time."
         )
-    _check_rising(time, array, argument, numbers)
+    _check_rising(time, original, argument, numbers)
     return time
 
 
@@ -185,9 +226,10 @@ def _check_rising(time: Floats, original: NDArray[Any], argument: str, numbers: 
     falls = np.flatnonzero(np.diff(time) <= 0)
     if len(falls):
         i = int(falls[0]) + 1
+        before, here = (exact(stamp) for stamp in original[i - 1 : i + 1].tolist())
         raise ValueError(
-            f"{argument} must increase strictly, but sample {numbers[i]} is at {time[i]!s} after {time[i - 1]!s}. "
-            f"Sort the samples by time and drop repeated ones.{coarse}"
+            f"{argument} must increase strictly, but sample {numbers[i]} is at {here} after {before}. "
+            f"Sort the samples by time and drop repeated ones.{coarse or nanoseconds_hint(original)}"
         )
     if coarse:
         raise ValueError(f"{argument} is too coarse for its own steps.{coarse}")

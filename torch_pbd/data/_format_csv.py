@@ -2,23 +2,27 @@
 
 import csv
 import io
+import re
 from array import array
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import inf, isfinite, isnan, nan
 from pathlib import Path
-from typing import BinaryIO, TextIO
+from typing import Any, BinaryIO, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torch_pbd.data._checks import check_choice, preview
+from torch_pbd.data._units import nanoseconds_hint
 from torch_pbd.data.demonstrations import Demonstrations, Missing
 from torch_pbd.exceptions import DataFormatError
+from torch_pbd.files import LOADERS
 
 DELIMITERS = (",", ";", "\t")
 _LONGEST_HEADER = 2**17
+_FEWEST_COUNTED = 5  # rows; fewer rise by one by chance
 
 
 def read_csv(
@@ -45,13 +49,15 @@ def read_csv(
                 path, file, delimiter, decimal, missing, wanted=[time] if demo is None else [demo, time]
             )
             names = table.output_names(outputs, taken=[demo, time])
-            recorded = table.recordings(demo, [time, *names])
+            times, positions = table.recordings(demo, [time, *names])
         except UnicodeDecodeError as error:
             raise DataFormatError(f"{path} is not text in UTF-8: {error}.") from error
+    if outputs is None and positions:
+        _check_movements(path, names, positions)
     try:
         return Demonstrations(
-            [rows[:, 0] for rows in recorded],
-            [rows[:, 1:] for rows in recorded],
+            times,
+            positions,
             names=names,
             units=units,
             frame=frame,
@@ -109,11 +115,33 @@ def _open_table(
         raise DataFormatError(
             f"{path}, line 1: no column {absent[0]!r} among {preview(header)}. Name the columns by "
             "the options demo=, time= and outputs= (demo=None: one demonstration), or give the delimiter."
+            + f" {LOADERS}"
+            * first.startswith("# format:")
         )
-    twice = [name for name, count in Counter(header).items() if count > 1]
+    twice = [name for name, count in Counter(header).items() if name and count > 1]
     if twice:
         raise DataFormatError(f"{path}, line 1: there are two columns {twice[0]!r}.")
     return _Table(path, file, header, candidates[headers.index(header)], decimal, missing)
+
+
+def _exact_time(cell: str, time: float) -> float | int:
+    """Time in a cell; as an integer where it is one that float64 does not hold, as stamps in ns are."""
+    stamp = int(cell) if abs(time) >= 2**53 and re.fullmatch(r"\s*[+-]?\d{16,19}\s*", cell) else 0
+    return stamp if 2**53 <= abs(stamp) < 2**63 else time
+
+
+def _check_movements(path: Path, names: Sequence[str], positions: Sequence[NDArray[np.float64]]) -> None:
+    """Refuse columns that count rows or number tasks, which nobody named as outputs."""
+    steps, rows = np.vstack([np.diff(position, axis=0) for position in positions]), np.vstack(positions)
+    for name, step, values in zip(names, steps.T, np.sort(rows, axis=0).T, strict=True):
+        # A count of all rows is so too where rows of several demonstrations are mixed.
+        counts = (step == 1.0).all() or ((step > 0.0).all() and (np.diff(values) == 1.0).all())
+        numbers = name.endswith(("_index", "_id")) and not step.any()
+        if len(values) >= _FEWEST_COUNTED and (values == np.round(values)).all() and (counts or numbers):
+            raise DataFormatError(
+                f"{path}, column {name!r}: it {'counts rows' if counts else 'numbers demonstrations'}, and is no "
+                f"movement. Leave it out, or say which columns are: outputs={[n for n in names if n != name]}."
+            )
 
 
 @dataclass(frozen=True)
@@ -131,6 +159,11 @@ class _Table:
         """Columns of the outputs, in their order."""
         if outputs is None:
             names = [name for name in self.header if name not in taken]
+            if "" in names:
+                raise DataFormatError(
+                    f"{self.path}, line 1: column {self.header.index('') + 1} has no name, as the index of a table "
+                    f"that was written without index=False. Leave it out, or say outputs={[*filter(None, names)]}."
+                )
         else:
             names = [outputs] if isinstance(outputs, str) else list(outputs)
         known = set(self.header)
@@ -140,28 +173,34 @@ class _Table:
             raise DataFormatError(f"{self.path}, line 1: {what} among {preview(self.header)}.")
         return names
 
-    def recordings(self, demo: str | None, columns: Sequence[str]) -> list[NDArray[np.float64]]:
-        """Rows of ``columns``, time first, of each demonstration, in the order they first appear."""
+    def recordings(self, demo: str | None, columns: Sequence[str]) -> tuple[list[NDArray[Any]], list[NDArray[Any]]]:
+        """Times, as integers where all are, and the other columns of each demonstration, as they first appear."""
         places = {name: place for place, name in enumerate(self.header)}
         indices = [places[name] for name in columns]
         label_index = None if demo is None else places[demo]
         recorded: dict[str, array[float]] = {}
+        stamps: dict[str, array[int]] = {}
         last: dict[str, float] = {}
         for line, cells in self._rows():
             label = "" if label_index is None else cells[label_index].strip()
             if label_index is not None and not label:
                 raise DataFormatError(f"{self.path}, line {line}, column {demo!r}: the cell is blank.")
             row = [self._number(cells[i], line, self.header[i]) for i in indices]
-            before = last.get(label, -inf)
-            if row[0] <= before:
+            now, before = _exact_time(cells[indices[0]], row[0]), last.get(label, -inf)
+            if now <= before:
                 raise DataFormatError(
-                    f"{self.path}, line {line}, column {columns[0]!r}: {row[0]!r} comes after "
+                    f"{self.path}, line {line}, column {columns[0]!r}: {now!r} comes after "
                     f"{before!r} in demonstration {label!r}: times must increase strictly. Sort the "
-                    "lines by time and drop repeated ones."
+                    f"lines by time and drop repeated ones.{nanoseconds_hint(now)}"
                 )
             recorded.setdefault(label, array("d")).extend(row)
-            last[label] = before if isnan(row[0]) else row[0]
-        return [np.array(values).reshape(-1, len(columns)) for values in recorded.values()]
+            whole = stamps.setdefault(label, array("q"))
+            if isinstance(now, int):
+                whole.append(now)
+            last[label] = before if isnan(now) else now
+        rows = {label: np.array(values).reshape(-1, len(columns)) for label, values in recorded.items()}
+        times = [np.array(stamps[k]) if len(stamps[k]) == len(values) else values[:, 0] for k, values in rows.items()]
+        return times, [values[:, 1:] for values in rows.values()]
 
     def _rows(self) -> Iterator[tuple[int, list[str]]]:
         reader = csv.reader(self.file, delimiter=self.delimiter)

@@ -13,10 +13,13 @@ from torch_pbd.archives import read_array, read_members
 from torch_pbd.data._checks import preview
 from torch_pbd.data.demonstrations import Demonstrations, Missing
 from torch_pbd.exceptions import DataFormatError
+from torch_pbd.files import LOADERS
 from torch_pbd.memory import parsed_bytes, require_memory
 
 
-def read_npz(path: Path, max_bytes: int, missing: Missing) -> Demonstrations:
+def read_npz(
+    path: Path, max_bytes: int, missing: Missing, units: Any = None, time_unit: str | None = None
+) -> Demonstrations:
     """Read the format of `torch_pbd.data.load_demonstrations`."""
     try:
         members = read_members(path.read_bytes(), max_bytes, remedy=f"Raise max_bytes={max_bytes} to read it.")
@@ -37,11 +40,14 @@ def read_npz(path: Path, max_bytes: int, missing: Missing) -> Demonstrations:
             times,
             positions,
             names=meta.get("dims"),
-            units=_units(meta),
+            units=_units(meta) if units is None else units,
             frame=_text(meta, "frame"),
-            time_unit=_text(meta, "time_unit") or _without_remark(_text(meta, "t_unit")) or "s",
+            time_unit=time_unit or _text(meta, "time_unit") or _without_remark(_text(meta, "t_unit")) or "s",
             missing=missing,
         )
+        demonstrations._alignment = meta.get("alignment")
+        if demonstrations.alignment not in (None, "phase", "dtw"):
+            raise ValueError(f"meta says alignment = {demonstrations.alignment!r:.80}, it must be 'phase' or 'dtw'")
     except (ValueError, TypeError) as error:
         raise DataFormatError(f"{path}: {error}") from error
     _check_counts(path, meta, demonstrations)
@@ -61,6 +67,7 @@ def write_npz(demonstrations: Demonstrations, handle: BinaryIO) -> None:
         "units": demonstrations.units,
         "time_unit": demonstrations.time_unit,
         "frame": demonstrations.frame,
+        "alignment": demonstrations.alignment,
     }
     arrays: dict[str, Any] = {"meta": np.array(json.dumps(meta))}
     if aligned:
@@ -99,7 +106,9 @@ def _read_meta(path: Path, members: Mapping[str, bytes]) -> dict[str, Any]:
 def _count(path: Path, files: Iterable[str]) -> int:
     numbers = {int(match[1]) for name in files if (match := re.fullmatch(r"[tx]_(\d+)", name))}
     if not numbers:
-        raise DataFormatError(f"{path} has neither arrays t and x nor t_0, x_0, ...; it has: {_listed(files)}.")
+        raise DataFormatError(
+            f"{path} has neither arrays t and x nor t_0, x_0, ...; it has: {_listed(files)}. {LOADERS}"
+        )
     missing = set(range(len(numbers))) - numbers
     if missing:
         raise DataFormatError(f"{path} has demonstration {max(numbers)} but no t_{min(missing)}, x_{min(missing)}.")

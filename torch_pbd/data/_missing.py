@@ -42,7 +42,7 @@ def drop_missing(times: Arrays, positions: Arrays, min_samples: int) -> tuple[Ar
                 f"{min_samples}: leave this demonstration out, or fill the missing values in."
             )
     if any(hole.any() for hole in holes):
-        warnings.warn(_report(holes), MissingDataWarning, stacklevel=_levels_to_caller())
+        warnings.warn(_report(holes), MissingDataWarning, stacklevel=levels_to_caller())
     kept = [np.flatnonzero(~hole) for hole in holes]
     return (
         [time[numbers] for time, numbers in zip(times, kept, strict=True)],
@@ -66,7 +66,7 @@ def _longest_run(hole: NDArray[np.bool_]) -> int:
     return int((edges[1::2] - edges[::2]).max(initial=0))
 
 
-def _levels_to_caller() -> int:
+def levels_to_caller() -> int:
     """How far up the first frame outside this package is, as ``stacklevel`` counts for who calls this."""
     frame, level = sys._getframe(1), 1
     while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("torch_pbd."):

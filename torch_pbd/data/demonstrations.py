@@ -1,5 +1,6 @@
 """The container: K recordings of one task, checked once, never changed."""
 
+import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any, Literal, NamedTuple, final, overload
 
@@ -7,16 +8,27 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from torch_pbd.data._checks import (
-    as_labels,
+    as_mask,
     as_names,
     as_recordings,
+    as_units,
     check_choice,
     check_frame_and_unit,
     check_n_steps,
     preview,
 )
-from torch_pbd.data.alignment import Floats, dtw_warps, interpolate, unit_phases
+from torch_pbd.data._missing import levels_to_caller
+from torch_pbd.data._suspects import find_suspects
+from torch_pbd.data.alignment import (
+    Floats,
+    check_overlap,
+    interpolate,
+    on_common_phases,
+    times_from_start,
+    unit_phases,
+)
 
+Alignment = Literal["phase", "dtw"]
 Missing = Literal["raise", "drop"]
 MAX_DEFAULT_STEPS = 200
 """Most points `Demonstrations.align` takes of its own accord."""
@@ -39,17 +51,19 @@ class Demonstrations:
     Parameters
     ----------
     times : sequence of K array_like of shape (T_k,), or array_like of shape (T,)
-        Strictly increasing times of the samples, or one array that all demonstrations share.
+        Strictly increasing times of the samples, or one array that all demonstrations share. Whole numbers beyond
+        2**53 (stamps in ns since 1970), which float64 cannot hold, are counted from the first of all: steps are exact.
     positions : sequence of K array_like of shape (T_k, d), or array_like of shape (K, T, d)
         What was recorded. Demonstrations of one output may be 1-D.
     names : sequence of d str, default=None
         Names of the outputs; None calls them y0, y1, ...
     units : str or sequence of d str, default=None
-        Units of the outputs; one string is the unit of all of them.
+        Units of the outputs; one string is the unit of all of them. Known are km, m, dm, cm, mm, um, rad and deg;
+        other words ("pixels") are units of their own.
     frame : str, default=None
         Name of the coordinate frame.
     time_unit : str, default="s"
-        Unit of ``times``; "1" for phase.
+        Unit of ``times``: h, min, s, ms, us, ns; "1" for phase.
     missing : {"raise", "drop"}, default="raise"
         "drop" leaves out samples of which the time or a position is NaN or masked, and warns
         (`MissingDataWarning`) of how many; each demonstration then has its own times. Infinity is an error.
@@ -59,7 +73,13 @@ class Demonstrations:
     ValueError
         If there is no demonstration, if lengths or numbers of outputs disagree, if a demonstration has (left) fewer
         than two samples, if a value is not a finite real number, or if times do not increase strictly or are
-        stored too coarsely to tell samples apart; or if a name has control characters.
+        stored too coarsely to tell samples apart; or if a name has control characters, or a unit is a known one in
+        another spelling ("MM", "millimeter", "sec").
+
+    Warns
+    -----
+    UserWarning
+        If four outputs are unit quaternions, or one is an angle that jumps by a turn: these have no mean as they are.
 
     Examples
     --------
@@ -73,7 +93,7 @@ class Demonstrations:
            [0., 2., 4.]])
     """
 
-    __slots__ = ("_frame", "_names", "_positions", "_time_unit", "_times", "_units")
+    __slots__ = ("_alignment", "_frame", "_names", "_positions", "_suspects", "_time_unit", "_times", "_units")
 
     def __init__(
         self,
@@ -89,11 +109,14 @@ class Demonstrations:
         self._times, self._positions = as_recordings(times, positions, missing)
         d = self.n_outputs
         self._names = as_names([f"y{i}" for i in range(d)] if names is None else names, d)
-        per_output = (units,) * d if isinstance(units, str) else units
-        self._units = None if per_output is None else as_labels(per_output, d, "units")
+        self._units = as_units(units, d)
         check_frame_and_unit(frame, time_unit)
         self._frame = frame
         self._time_unit = time_unit
+        self._alignment: Alignment | None = None
+        self._suspects = find_suspects(self._positions, self._names, self._units)
+        if self._suspects:
+            warnings.warn(" ".join(self._suspects), stacklevel=levels_to_caller())
 
     @property
     def times(self) -> tuple[Floats, ...]:
@@ -126,6 +149,11 @@ class Demonstrations:
         return self._time_unit
 
     @property
+    def alignment(self) -> Alignment | None:
+        """How `align` brought the demonstrations onto one grid; None where it did not."""
+        return self._alignment
+
+    @property
     def n_outputs(self) -> int:
         """Number of outputs d."""
         return self._positions[0].shape[1]
@@ -156,7 +184,9 @@ class Demonstrations:
         chosen = np.arange(len(self))[index]
         if chosen.ndim == 0:
             return Demonstration(self._times[chosen], self._positions[chosen])
-        return self._replace([self._times[k] for k in chosen], [self._positions[k] for k in chosen])
+        times, positions = [self._times[k] for k in chosen], [self._positions[k] for k in chosen]
+        suspects = find_suspects(positions, self._names, self._units) if self._suspects else ()
+        return self._replace(times, positions, suspects=suspects)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Demonstrations):
@@ -177,7 +207,7 @@ class Demonstrations:
 
     def __reduce__(self) -> tuple[Any, ...]:
         # By way of __init__: NumPy forgets that an array is read-only when it is pickled or copied.
-        return _rebuild, (self._times, self._positions, self._labels())
+        return _rebuild, (self._times, self._positions, self._state())
 
     def stack(self, input: Literal["time", "phase"] = "time") -> tuple[Floats, Floats, NDArray[np.intp]]:
         """All samples below each other, as scikit-learn's estimators want them.
@@ -195,8 +225,15 @@ class Demonstrations:
         y : ndarray of shape (n, d)
         groups : ndarray of shape (n,)
             Number of the demonstration, for GroupKFold and LeaveOneGroupOut.
+
+        Raises
+        ------
+        ValueError
+            By time, if what all demonstrations have in common is shorter than half of their median duration.
         """
         check_choice(input, ("time", "phase"), "input")
+        if input == "time":
+            check_overlap(self._times, self._time_unit)
         inputs = self._times if input == "time" else unit_phases(self._times)
         groups = np.repeat(np.arange(len(self)), self.n_steps)
         return np.concatenate(inputs)[:, np.newaxis], np.concatenate(self._positions), groups
@@ -217,6 +254,13 @@ class Demonstrations:
             )
         return np.stack(self._positions)
 
+    def from_start(self) -> "Demonstrations":
+        """The same with the times of each demonstration counted from its start.
+
+        Grids that then differ by no more than their stamps resolve become one, as in ``stack("phase")``.
+        """
+        return self._replace(times_from_start(self._times), self._positions)
+
     def resample(self, n: int) -> "Demonstrations":
         """Each demonstration at ``n`` points evenly spaced over its own time, by linear interpolation.
 
@@ -235,8 +279,9 @@ class Demonstrations:
             "phase" is linear time normalization. "dtw" then takes differences of timing out by dynamic time
             warping (`torch_pbd.data.alignment.dtw_warps`), keeping the ends of each demonstration and the
             mean timing of all. It also takes for timing what only looks like it: use it where the
-            shape is what matters. It compares positions in their units; outputs whose ``units`` differ are
-            compared in standard deviations.
+            shape is what matters, and not to predict new demonstrations, in which the timing comes back
+            (measured: 3.7 nats a step worse). It compares positions in their units; outputs whose ``units``
+            differ are compared in standard deviations.
         n : int, default=None
             Number of phases; None takes the median number of samples, at most 200. "dtw" takes time and
             memory in proportion to its square.
@@ -250,14 +295,9 @@ class Demonstrations:
         if n is None:
             n = min(round(float(np.median(self.n_steps))), MAX_DEFAULT_STEPS)
         check_n_steps(n)
-        grid = np.linspace(0.0, 1.0, n)
-        phases = unit_phases(self._times)
-        warps = np.tile(grid, (len(self), 1))
-        if method == "dtw":
-            curves = np.stack(list(map(interpolate, phases, self._positions, warps)))
-            warps = dtw_warps(curves / self._comparable_scale(curves))
-        aligned = list(map(interpolate, phases, self._positions, warps))
-        return self._replace(grid, aligned, time_unit="1")
+        grid, positions = on_common_phases(self._times, self._positions, method, n, self._units)
+        alignment = "dtw" if "dtw" in (method, self._alignment) else "phase"  # timing taken out is gone
+        return self._replace(grid, positions, time_unit="1", alignment=alignment)
 
     def split(self, k: int | Sequence[int]) -> tuple["Demonstrations", "Demonstrations"]:
         """Leave demonstrations out: ``(train, test)``, where ``test`` has those numbered ``k``.
@@ -267,16 +307,7 @@ class Demonstrations:
         ValueError
             If there is no such demonstration, or if either part would be empty.
         """
-        held_out = np.zeros(len(self), dtype=bool)
-        numbers = np.atleast_1d(np.asarray(k))
-        if numbers.ndim != 1 or numbers.dtype.kind not in "iu":
-            raise ValueError(f"k must be the number of a demonstration or a list of numbers; got {k!r}.")
-        wrong = numbers[(numbers < -len(self)) | (numbers >= len(self))]
-        if len(wrong):
-            raise ValueError(f"k has {wrong[0]}, but demonstrations are numbered 0 to {len(self) - 1}.")
-        held_out[numbers] = True
-        if held_out.all() or not held_out.any():
-            raise ValueError(f"k leaves out {held_out.sum()} of {len(self)} demonstrations: both parts need some.")
+        held_out = as_mask(k, len(self))
         return self[~held_out], self[held_out]
 
     def _labels(self) -> dict[str, Any]:
@@ -287,19 +318,17 @@ class Demonstrations:
             "time_unit": self._time_unit,
         }
 
-    def _replace(
-        self, times: ArrayLike | Sequence[ArrayLike], positions: Sequence[ArrayLike], **labels: str
-    ) -> "Demonstrations":
-        return Demonstrations(times, positions, **{**self._labels(), **labels})
+    def _state(self) -> dict[str, Any]:
+        return {**self._labels(), "alignment": self._alignment, "suspects": self._suspects}
 
-    def _comparable_scale(self, curves: Floats) -> Floats:
-        """What to divide each output by before distances are taken over all of them."""
-        if self._units is None or len(set(self._units)) == 1:
-            return np.ones(self.n_outputs)
-        scale = curves.std(axis=(0, 1))
-        rounding = 1e-12 * np.abs(curves).max(axis=(0, 1))
-        return np.where(scale > rounding, scale, np.inf)  # a constant output tells nothing about timing
+    def _replace(self, times: Any, positions: Any, **changes: Any) -> "Demonstrations":
+        return _rebuild(times, positions, {**self._state(), **changes})
 
 
-def _rebuild(times: Sequence[Floats], positions: Sequence[Floats], labels: dict[str, Any]) -> Demonstrations:
-    return Demonstrations(times, positions, **labels)
+def _rebuild(times: Any, positions: Any, labels: dict[str, Any]) -> Demonstrations:
+    """Demonstrations made of others, whose labels were checked and of which all has been told."""
+    rebuilt = object.__new__(Demonstrations)
+    rebuilt._times, rebuilt._positions = as_recordings(times, positions, "raise")
+    for name, value in {"alignment": None, "suspects": (), **labels}.items():
+        setattr(rebuilt, f"_{name}", value)
+    return rebuilt

@@ -12,7 +12,7 @@ from torch_pbd.data._format_csv import read_csv, write_csv
 from torch_pbd.data._format_npz import read_npz, write_npz
 from torch_pbd.data.demonstrations import Demonstrations, Missing
 from torch_pbd.exceptions import DataFormatError
-from torch_pbd.files import replacing
+from torch_pbd.files import LOADERS, replacing
 from torch_pbd.memory import require_memory
 
 MAX_BYTES = 512 * 2**20
@@ -24,11 +24,16 @@ _WRITERS: dict[str, Callable[[Demonstrations, BinaryIO], None]] = {".npz": write
 
 
 def load_demonstrations(
-    path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES, missing: Missing = "raise", **options: Any
+    path: str | os.PathLike[str],
+    *,
+    max_bytes: int = MAX_BYTES,
+    missing: Missing = "raise",
+    from_start: bool = False,
+    **options: Any,
 ) -> Demonstrations:
     """Demonstrations from a file, in the format that its suffix says.
 
-    ``.npz`` (no options): either ``t`` (T,) and ``x`` (K, T, d), where all demonstrations share one grid of
+    ``.npz``: either ``t`` (T,) and ``x`` (K, T, d), where all demonstrations share one grid of
     times, or ``t_0`` (T_0,), ``x_0`` (T_0, d), ``t_1``, ``x_1``, ...; and, if it is there, ``meta``, a 0-d
     string with a JSON object, of which ``dims`` (names of the outputs), ``units`` or ``unit``, ``time_unit``
     or ``t_unit`` and ``frame`` are read, and ``K`` and ``d`` checked. Other arrays are ignored. Pickled
@@ -44,18 +49,23 @@ def load_demonstrations(
         Larger files (.npz: unpacked) are refused before they are read.
     missing : {"raise", "drop"}, default="raise"
         "drop" leaves out samples with NaN (CSV: and blank cells), and warns of how many, as `Demonstrations` does.
+    from_start : bool, default=False
+        Count the times of each demonstration from its start: `Demonstrations.from_start`.
+    units, time_unit
+        As in `Demonstrations`; None takes those in the file, if it holds them.
     demo : str or None, default="demo"
         CSV: column that tells the demonstrations apart, by any text. None: the file is one demonstration.
     time : str, default="time"
         CSV: column of times.
     outputs : sequence of str, default=None
-        CSV: columns of the outputs, in the order wanted; None takes all the others.
+        CSV: columns of the outputs, in the order wanted; None takes all the others, if each has a name, and none is a
+        count of rows (``frame_index``) or a number of its demonstration (``task_index``).
     delimiter : str, default=None
         CSV: None finds it among comma, semicolon and tab.
     decimal : {".", ","}, default="."
         CSV: decimal mark.
-    units, frame, time_unit
-        CSV: as in `Demonstrations`; such a file does not hold them.
+    frame
+        CSV: as in `Demonstrations`.
 
     Raises
     ------
@@ -88,7 +98,8 @@ def load_demonstrations(
         require_memory(needed, what=f"reading {file}", remedy="Split the file, or leave samples out.")
     except ValueError as error:
         raise DataFormatError(str(error)) from error
-    return reader(file, max_bytes, missing, **options)
+    demonstrations = reader(file, max_bytes, missing, **options)
+    return demonstrations.from_start() if from_start else demonstrations
 
 
 def save_demonstrations(demonstrations: Demonstrations, path: str | os.PathLike[str]) -> None:
@@ -121,6 +132,6 @@ def _known_suffix(file: Path) -> str:
     suffix = file.suffix.lower()
     if suffix not in _READERS:
         raise ValueError(
-            f"{file} has the suffix {file.suffix!r}; known formats of demonstrations: {', '.join(_READERS)}."
+            f"{file} has the suffix {file.suffix!r}; known formats of demonstrations: {', '.join(_READERS)}. {LOADERS}"
         )
     return suffix
