@@ -2,18 +2,24 @@
 
 import math
 import threading
-from operator import sub
-from typing import final
+import warnings
+from operator import add
+from typing import Literal, final
 
 import numpy as np
 
-from torch_pbd.control.realtime.checks import Numbers, limit, moment, number, vector
+from torch_pbd.control.realtime.checks import Numbers, limit, moment, number, vector, whole
+from torch_pbd.control.realtime.clock import ScheduleClock
+from torch_pbd.control.realtime.force import ForceChannel
 from torch_pbd.control.realtime.limits import limited
 from torch_pbd.control.realtime.status import TickStatus
-from torch_pbd.control.realtime.steps import Floats, Vector, braked, softened
+from torch_pbd.control.realtime.steps import Floats, Vector, braked
 from torch_pbd.control.realtime.table import ScheduleLike, ScheduleTable
 
 _FINE = TickStatus(0)
+_COARSE = 0.01  # of a tick, to which a time must be told
+_DECELERATION = 5.0  # units/s^2: from 0.5 m/s to rest in 0.1 s and 25 mm
+_LATE_ON_END = 3  # ticks that are no stall any more
 _SHARED = "this controller is in a tick already: two threads share it. Give each its own."
 
 
@@ -109,38 +115,46 @@ class RealTimeAdmittance:
         velocity_limit: float | None = None,
         acceleration_limit: float | None = None,
         hold_ticks: int = 10,
-        stop_deceleration: float = 5.0,
+        stop_deceleration: float | None = None,
         soft_start: float = 1.0,
         approach_speed: float = 0.5,
+        on_gap: Literal["pause", "resume"] = "pause",
+        max_bad_ticks: int = 10,
+        force_rate_limit: float | None = None,
     ) -> None:
-        mass = (getattr(schedule, "mass", None) or 1.0) if mass is None else mass
+        own_mass = getattr(schedule, "mass", None)
+        mass = (own_mass or 1.0) if mass is None else mass
         self._mass = number("mass", mass, "kg; it is the same in all directions, matrices are not supported")
         if not 1e-50 <= self._mass <= 1e50:
             raise ValueError(f"mass={mass!r} must be a finite number from 1e-50 to 1e50 kg.")
+        if own_mass is not None and self._mass != own_mass:
+            warnings.warn(
+                f"mass is {mass}, but damping_ratio was met for mass={own_mass:g} kg: give both the same.", stacklevel=2
+            )
         self._max_step = number("max_step", max_step, "s")
         if self._max_step * number("rate", rate, "1/s") <= 1.0:
             raise ValueError(f"max_step={max_step} s is no longer than a tick at rate={rate}: raise it, to some ticks.")
-        self._push_limit = number("force_limit", force_limit, "N") / self._mass
-        self._deadband = number("deadband", deadband, "N, or 0", zero=True) / self._mass
-        pull_limit = force_limit if spring_limit is None else spring_limit
-        self._pull_limit = number("spring_limit", pull_limit, "N, or None") / self._mass
-        self._speed_limit = limit("velocity_limit", velocity_limit, "units/s")
-        self._acceleration_limit = limit("acceleration_limit", acceleration_limit, "units/s^2")
-        self._is_limited = min(self._speed_limit, self._acceleration_limit) < math.inf
-        deceleration = number("stop_deceleration", stop_deceleration, "units/s^2")
-        self._deceleration = min(deceleration, self._acceleration_limit)
-        if isinstance(hold_ticks, bool) or not isinstance(hold_ticks, int | np.integer) or hold_ticks < 0:
-            raise ValueError(f"hold_ticks={hold_ticks!r} must be an integer of at least 0: a number of ticks.")
-        self._hold_ticks = hold_ticks
-        self._soft_start = number("soft_start", soft_start, "s, or 0", zero=True)
-        self._approach_speed = number("approach_speed", approach_speed, "units/s")
-        self._table = ScheduleTable.of(schedule, self._mass, float(rate))
-        table = self._table
-        self._packed, self._row_size, self._unpack = table.packed, table.layout.size, table.layout.unpack_from
-        self._rate, self._end, self._advance = table.rate, table.last, table.advance
+        if on_gap not in ("pause", "resume"):
+            raise ValueError(f"on_gap={on_gap!r} must be 'pause' or 'resume'.")
+        self._max_bad_ticks = whole("max_bad_ticks", max_bad_ticks, 1)
+        force_limit = number("force_limit", force_limit, "N")
+        self._channel = ForceChannel(
+            self._mass,
+            force_limit,
+            number("deadband", deadband, "N, or 0", zero=True),
+            limit("force_rate_limit", force_rate_limit, "N/s"),
+            whole("hold_ticks", hold_ticks, 0),
+        )
+        pull_limit = number("spring_limit", force_limit if spring_limit is None else spring_limit, "N, or None")
+        self._pull_limit = pull_limit / self._mass
+        soft_start = number("soft_start", soft_start, "s, or 0", zero=True)
+        approach_speed = number("approach_speed", approach_speed, "units/s")
+        self._table = table = ScheduleTable.of(schedule, self._mass, float(rate))
+        self._advance = table.advance
+        self._clock = ScheduleClock(table, soft_start, approach_speed, catches_up=on_gap == "resume")
+        self._set_limits(velocity_limit, acceleration_limit, stop_deceleration, force_limit + pull_limit)
         self._turn = threading.Lock()
-        self._bias: Vector = ()
-        self._begin(math.nan, self._table.row(0)[: self._table.n_axes], (0.0,) * self._table.n_axes, 0.0)
+        self._begin(math.nan, self._clock.position_at(0.0), (0.0,) * table.n_axes, 0.0, ())
 
     def start(
         self,
@@ -174,19 +188,22 @@ class RealTimeAdmittance:
             If another thread is in a tick.
         """
         now, at = moment("now", now), moment("at", at)
-        if at < 0.0:
-            raise ValueError(f"at={at!r} must be a time in the schedule, at least 0 s.")
+        if math.ulp(now) * self._table.rate > _COARSE:
+            raise ValueError(f"now={now!r} leaves no digits for ticks of {1 / self._table.rate:g} s: give seconds.")
+        if not 0.0 <= at <= self._table.end:
+            raise ValueError(f"at={at!r} must be a time in the schedule, from 0 to {self._table.end!r} s.")
         d = self._table.n_axes
-        here = vector("position", self._table.row(self._table.index_at(at))[:d] if position is None else position, d)
+        here = vector("position", self._clock.position_at(at) if position is None else position, d)
         moving = vector("velocity", (0.0,) * d if velocity is None else velocity, d)
-        if math.hypot(*moving) > self._speed_limit:
+        if self._is_limited and math.hypot(*moving) > self._speed_limit:
             raise ValueError(f"velocity={moving} is beyond velocity_limit={self._speed_limit}: slow the robot first.")
         bias = () if force_bias is None else vector("force_bias", force_bias, d)
         if not self._turn.acquire(False):
             raise RuntimeError(_SHARED)
-        self._begin(now, here, moving, at)
-        self._bias = bias
-        self._turn.release()
+        try:
+            self._begin(now, here, moving, at, bias)
+        finally:
+            self._turn.release()
 
     def tick(self, now: float, force: Numbers) -> TickStatus:
         """Move on to ``now``; ``position`` and ``velocity`` are then the command.
@@ -219,7 +236,7 @@ class RealTimeAdmittance:
 
     @property
     def force(self) -> Vector:  # noqa: D102 - the class describes these
-        return tuple(self._mass * component for component in self._push)
+        return tuple(self._mass * component for component in self._channel.push)
 
     @property
     def desired_position(self) -> Vector:  # noqa: D102
@@ -231,90 +248,113 @@ class RealTimeAdmittance:
 
     @property
     def stiffness(self) -> Floats:  # noqa: D102
-        return self._scale * self._table.stiffness[self._index]
+        return self._scale * self._table.stiffness[self._clock.index]
 
     @property
     def damping(self) -> Floats:  # noqa: D102
-        return self._table.damping[self._index].copy()
+        return self._table.damping[self._clock.index].copy()
 
     @property
     def schedule_time(self) -> float:  # noqa: D102
-        return self._last - self._origin
+        return self._clock.time_at(self._last)
 
-    def _begin(self, now: float, position: Vector, velocity: Vector, at: float) -> None:
-        self.position, self.velocity = position, velocity
-        self._last, self._begun, self._origin = now, now, now - at
-        self._index, self._scale = self._table.index_at(at), 1.0
-        self._row = self._table.row(self._index)
-        self._distance = tuple(map(sub, self._row, position))  # stops at the end of position
-        # The steepest slope of a minimum jerk is 15/8 of its mean.
-        self._blend = max(self._soft_start, 1.875 * math.hypot(*self._distance) / self._approach_speed)
-        self._soft_end = now + self._blend if any(self._distance) and self._soft_start else -math.inf
-        self._push: Vector = (0.0,) * len(position)
-        self._bias = ()
-        self._n_lost, self._is_stopped, self.faults = 0, False, _FINE
+    def _set_limits(self, speed: float | None, acceleration: float | None, stop: float | None, force: float) -> None:
+        """Limits of the command; ``force`` is what sensor and spring may exert together, in N."""
+        self._acceleration_limit = limit("acceleration_limit", acceleration, "units/s^2")
+        self._speed_limit = limit("velocity_limit", speed, "units/s")
+        self._is_limited = min(self._speed_limit, self._acceleration_limit) < math.inf
+        deceleration = max(_DECELERATION, self._clock.acceleration) if stop is None else stop
+        self._deceleration = min(number("stop_deceleration", deceleration, "units/s^2"), self._acceleration_limit)
+        # Velocity answers a force with an impulse response whose absolute values integrate to 2 / damping at most.
+        damping = float(np.linalg.eigvalsh(self._table.damping).min()) * self._mass
+        answer = 2.0 * force / damping if damping > 0.0 else math.inf
+        self._fastest = 1.5 * self._clock.speed + answer if speed is None else self._speed_limit
+
+    def _begin(self, now: float, position: Vector, velocity: Vector, at: float, bias: Vector) -> None:
+        self.position, self.velocity, self.faults = position, velocity, _FINE
+        self._last = self._newest = now
+        self._step = 1.0 / self._table.rate
+        self._is_regular, self._is_new, self._is_stopped = False, True, False
+        self._n_bad = self._n_late = 0
+        self._top_speed = max(self._fastest, math.hypot(*velocity))
+        self._scale, self._row = 1.0, self._clock.begin(now, at, position, velocity)
+        self._channel.begin(len(position), bias)
 
     def _tick(self, now: float, force: Numbers) -> TickStatus:
         try:
-            if self._bias:
-                force = [float(component) - bias for component, bias in zip(force, self._bias, strict=True)]
-            mass = self._mass
-            now, push = float(now), tuple([float(component) / mass for component in force])
+            now = float(now)
         except (TypeError, ValueError, OverflowError):
-            push = ()
-        if len(push) != len(self.position):
-            raise ValueError(f"tick takes a time and {len(self.position)} numbers in N; got {now!r} and {force!r}.")
-        if self._deadband:
-            push = tuple([part - max(-self._deadband, min(self._deadband, part)) for part in push])
-        step, status = now - self._last, _FINE
-        if math.hypot(*push) <= self._push_limit:
-            self._push, self._n_lost = push, 0
-        else:
-            status = self._repair_force(push)
-        if not 0.0 < step <= self._max_step:
-            status |= self._skip(now, step)
-        elif self._is_stopped:
-            self.position, self.velocity = braked(self.position, self.velocity, self._deceleration, step)
-            self._last = now
-        else:
-            limited = self._move(step)
-            status = limited if status is _FINE else status | limited
-            self._last = now
+            raise ValueError(f"now={now!r} must be a time in s.") from None
+        step = now - self._last
+        is_regular = self._is_regular and 0.0 < step <= self._max_step
+        status = self._channel.take(force, step if is_regular else self._step)
+        if status is not _FINE:
+            self._is_stopped = self._is_stopped or self._channel.is_lost
+        moved = self._live(now, step) if is_regular else self._live_irregular(now)
+        if moved is not _FINE:
+            status |= moved
         if self._is_stopped:
             status |= TickStatus.STOPPED
         if status is not _FINE:
             self.faults |= status
         return status
 
-    def _repair_force(self, push: Vector) -> TickStatus:
-        length = math.hypot(*push)
-        if length < math.inf:
-            self._push, self._n_lost = tuple(component / length * self._push_limit for component in push), 0
-            return TickStatus.FORCE_SATURATED
-        self._n_lost += 1
-        self._is_stopped = self._is_stopped or self._n_lost > self._hold_ticks
-        return TickStatus.FORCE_INVALID
-
-    def _skip(self, now: float, step: float) -> TickStatus:
+    def _live_irregular(self, now: float) -> TickStatus:
+        """After the start, or a tick whose time was wrong, or in one: the last tick may not be what ``now`` follows."""
         if math.isnan(self._last):
             raise RuntimeError("tick before start: call start(now) with the time of the same clock first.")
-        if self._max_step < step < math.inf:
-            self._last = now
-            return TickStatus.LATE
-        return TickStatus.CLOCK
+        if self._is_regular:
+            self._is_regular, self._newest = False, self._last
+        if not self._newest < now < math.inf:
+            self._n_bad += 1
+            self._is_stopped = self._is_stopped or self._n_bad >= self._max_bad_ticks
+            self._brake(self._last + self._step, self._step, self._deceleration)
+            return TickStatus.CLOCK
+        if now <= self._last:  # by which bad ticks have lived already, as the clock did not say
+            self._clock.shift(self._newest - self._last)
+            self._last = self._newest
+        step, self._newest, self._n_bad = now - self._last, now, 0
+        if step > self._max_step:
+            return self._bridge(now, step)
+        self._is_regular, self._is_new, self._n_late = True, False, 0
+        return self._live(now, step)
 
-    def _move(self, step: float) -> TickStatus:
-        here = (self.position, self.velocity)
-        index = int((self._last - self._origin) * self._rate + 0.5)  # index_at and row of the table, without calls
-        self._index = index = index if index < self._end else self._end
-        row = self._unpack(self._packed, index * self._row_size)
-        if self._last < self._soft_end:
-            row = softened(row, self._distance, (self._last - self._begun) / self._blend, self._blend)
-        position, velocity, self._scale = self._advance(row, self._push, *here, step, self._pull_limit)
+    def _bridge(self, now: float, gap: float) -> TickStatus:
+        """Begin anew after a gap, of which the robot has seen no command, and must not be thrown to one."""
+        speed = max(math.hypot(*self.velocity), self._clock.speed_at(self._last))
+        # Within 1 + sqrt(2) times as long as it brakes, it can be back too: it rests where it was told to be last.
+        rests = gap * self._deceleration > 3.0 * speed
+        self._brake(now, gap, math.inf if rests else self._deceleration)
+        self._n_late += 1
+        if self._n_late >= _LATE_ON_END:
+            self._is_stopped = True
+            if self._is_new:
+                self.faults |= TickStatus.LATE | TickStatus.STOPPED
+                raise ValueError(
+                    f"max_step={self._max_step:g} s is shorter than all {_LATE_ON_END} ticks since start, the last of "
+                    f"{gap:.4g} s: give a max_step of some ticks of your loop, and times in s."
+                )
+        return TickStatus.LATE
+
+    def _brake(self, now: float, passed: float, deceleration: float) -> None:
+        self._clock.brake(self._last, passed, deceleration)
+        self.position, self.velocity = braked(self.position, self.velocity, deceleration, passed)
+        self._last = now
+
+    def _live(self, now: float, step: float) -> TickStatus:
+        self._step = step
+        if self._is_stopped:
+            self._brake(now, step, self._deceleration)
+            return _FINE
+        here, push = (self.position, self.velocity), self._channel.push
+        row = self._clock.row(self._last, step)
+        if self._clock.boost:
+            push = tuple(map(add, push, self._clock.boost))
+        position, velocity, self._scale = self._advance(row, push, *here, step, self._pull_limit)
         status = _FINE if self._scale == 1.0 else TickStatus.SPRING_LIMITED
-        if self._is_limited:
-            limits = self._speed_limit, self._acceleration_limit
+        if self._is_limited or math.hypot(*velocity) > self._top_speed:
+            limits = self._top_speed, self._acceleration_limit
             position, velocity, reached = limited(position, velocity, *here, step, *limits)
             status |= reached
-        self._row, self.position, self.velocity = row, position, velocity
+        self._row, self.position, self.velocity, self._last = row, position, velocity, now
         return status

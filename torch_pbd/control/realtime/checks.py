@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from torch_pbd.arguments import is_finite
 from torch_pbd.control.realtime.steps import Vector
 
+LARGEST = 1e100  # squares and sums of what is smaller do not overflow
 Numbers = Sequence[float] | NDArray[np.float64]
 
 
@@ -26,6 +27,13 @@ def limit(name: str, value: float | None, unit: str) -> float:
     return math.inf if value is None else number(name, value, f"{unit}, or None")
 
 
+def whole(name: str, value: int, least: int) -> int:
+    """A number of ticks."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise ValueError(f"{name}={value!r} must be an integer of at least {least}: a number of ticks.")
+    return int(value)
+
+
 def moment(name: str, value: float) -> float:
     """A finite time in s."""
     real = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
@@ -35,11 +43,13 @@ def moment(name: str, value: float) -> float:
 
 
 def vector(name: str, values: Numbers, d: int) -> Vector:
-    """Finite floats, d of them."""
+    """Finite floats, d of them, whose squares are finite too."""
     try:
         vector = tuple(map(float, values))
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         vector = ()
-    if len(vector) != d or not all(map(math.isfinite, vector)):
-        raise ValueError(f"{name}={values!r} must be {d} finite numbers, one for each axis of the schedule.")
+    if len(vector) != d or not all(abs(value) <= LARGEST for value in vector):
+        raise ValueError(
+            f"{name}={values!r} must be {d} finite numbers, one for each axis of the schedule, of at most {LARGEST:g}."
+        )
     return vector
