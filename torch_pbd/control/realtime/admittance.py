@@ -8,18 +8,16 @@ from typing import Literal, final
 
 import numpy as np
 
-from torch_pbd.control.realtime.checks import Numbers, limit, moment, number, vector, whole
+from torch_pbd.control.realtime.checks import Numbers, limit, moment, number, vector
 from torch_pbd.control.realtime.clock import ScheduleClock
 from torch_pbd.control.realtime.force import ForceChannel
-from torch_pbd.control.realtime.limits import limited
+from torch_pbd.control.realtime.limits import CommandLimits
 from torch_pbd.control.realtime.status import TickStatus
 from torch_pbd.control.realtime.steps import Floats, Vector, braked
 from torch_pbd.control.realtime.table import ScheduleLike, ScheduleTable
+from torch_pbd.control.realtime.timer import TickTimer
 
 _FINE = TickStatus(0)
-_COARSE = 0.01  # of a tick, to which a time must be told
-_DECELERATION = 5.0  # units/s^2: from 0.5 m/s to rest in 0.1 s and 25 mm
-_LATE_ON_END = 3  # ticks that are no stall any more
 _SHARED = "this controller is in a tick already: two threads share it. Give each its own."
 
 
@@ -131,30 +129,23 @@ class RealTimeAdmittance:
             warnings.warn(
                 f"mass is {mass}, but damping_ratio was met for mass={own_mass:g} kg: give both the same.", stacklevel=2
             )
-        self._max_step = number("max_step", max_step, "s")
-        if self._max_step * number("rate", rate, "1/s") <= 1.0:
-            raise ValueError(f"max_step={max_step} s is no longer than a tick at rate={rate}: raise it, to some ticks.")
         if on_gap not in ("pause", "resume"):
             raise ValueError(f"on_gap={on_gap!r} must be 'pause' or 'resume'.")
-        self._max_bad_ticks = whole("max_bad_ticks", max_bad_ticks, 1)
-        force_limit = number("force_limit", force_limit, "N")
-        self._channel = ForceChannel(
-            self._mass,
-            force_limit,
-            number("deadband", deadband, "N, or 0", zero=True),
-            limit("force_rate_limit", force_rate_limit, "N/s"),
-            whole("hold_ticks", hold_ticks, 0),
-        )
+        self._timer = TickTimer(rate, max_step, max_bad_ticks)
+        self._channel = ForceChannel(self._mass, force_limit, deadband, force_rate_limit, hold_ticks)
         pull_limit = number("spring_limit", force_limit if spring_limit is None else spring_limit, "N, or None")
         self._pull_limit = pull_limit / self._mass
-        soft_start = number("soft_start", soft_start, "s, or 0", zero=True)
-        approach_speed = number("approach_speed", approach_speed, "units/s")
         self._table = table = ScheduleTable.of(schedule, self._mass, float(rate))
         self._advance = table.advance
-        self._clock = ScheduleClock(table, soft_start, approach_speed, catches_up=on_gap == "resume")
-        self._set_limits(velocity_limit, acceleration_limit, stop_deceleration, force_limit + pull_limit)
+        most = limit("acceleration_limit", acceleration_limit, "units/s^2")
+        self._clock = clock = ScheduleClock(table, soft_start, approach_speed, most, on_gap)
+        # Velocity answers a force with an impulse response whose absolute values integrate to 2 / damping at most.
+        damping = float(np.linalg.eigvalsh(table.damping).min()) * self._mass
+        due_speed = clock.speed + (2.0 * (force_limit + pull_limit) / damping if damping > 0.0 else math.inf)
+        given = velocity_limit, acceleration_limit, stop_deceleration
+        self._limits = CommandLimits(*given, due_speed, clock.acceleration)
         self._turn = threading.Lock()
-        self._begin(math.nan, self._clock.position_at(0.0), (0.0,) * table.n_axes, 0.0, ())
+        self._begin(math.nan, None, (0.0,) * table.n_axes, 0.0, ())
 
     def start(
         self,
@@ -188,15 +179,15 @@ class RealTimeAdmittance:
             If another thread is in a tick.
         """
         now, at = moment("now", now), moment("at", at)
-        if math.ulp(now) * self._table.rate > _COARSE:
-            raise ValueError(f"now={now!r} leaves no digits for ticks of {1 / self._table.rate:g} s: give seconds.")
         if not 0.0 <= at <= self._table.end:
             raise ValueError(f"at={at!r} must be a time in the schedule, from 0 to {self._table.end!r} s.")
         d = self._table.n_axes
-        here = vector("position", self._clock.position_at(at) if position is None else position, d)
+        here = None if position is None else vector("position", position, d)
         moving = vector("velocity", (0.0,) * d if velocity is None else velocity, d)
-        if self._is_limited and math.hypot(*moving) > self._speed_limit:
-            raise ValueError(f"velocity={moving} is beyond velocity_limit={self._speed_limit}: slow the robot first.")
+        if math.hypot(*moving) > self._limits.given_speed:
+            raise ValueError(
+                f"velocity={moving} is beyond velocity_limit={self._limits.given_speed}: slow the robot first."
+            )
         bias = () if force_bias is None else vector("force_bias", force_bias, d)
         if not self._turn.acquire(False):
             raise RuntimeError(_SHARED)
@@ -256,41 +247,32 @@ class RealTimeAdmittance:
 
     @property
     def schedule_time(self) -> float:  # noqa: D102
-        return self._clock.time_at(self._last)
+        return self._clock.time_at(self._timer.last)
 
-    def _set_limits(self, speed: float | None, acceleration: float | None, stop: float | None, force: float) -> None:
-        """Limits of the command; ``force`` is what sensor and spring may exert together, in N."""
-        self._acceleration_limit = limit("acceleration_limit", acceleration, "units/s^2")
-        self._speed_limit = limit("velocity_limit", speed, "units/s")
-        self._is_limited = min(self._speed_limit, self._acceleration_limit) < math.inf
-        deceleration = max(_DECELERATION, self._clock.acceleration) if stop is None else stop
-        self._deceleration = min(number("stop_deceleration", deceleration, "units/s^2"), self._acceleration_limit)
-        # Velocity answers a force with an impulse response whose absolute values integrate to 2 / damping at most.
-        damping = float(np.linalg.eigvalsh(self._table.damping).min()) * self._mass
-        answer = 2.0 * force / damping if damping > 0.0 else math.inf
-        self._fastest = 1.5 * self._clock.speed + answer if speed is None else self._speed_limit
-
-    def _begin(self, now: float, position: Vector, velocity: Vector, at: float, bias: Vector) -> None:
-        self.position, self.velocity, self.faults = position, velocity, _FINE
-        self._last = self._newest = now
-        self._step = 1.0 / self._table.rate
-        self._is_regular, self._is_new, self._is_stopped = False, True, False
-        self._n_bad = self._n_late = 0
-        self._top_speed = max(self._fastest, math.hypot(*velocity))
+    def _begin(self, now: float, position: Vector | None, velocity: Vector, at: float, bias: Vector) -> None:
+        self._timer.begin(now)
+        self._channel.begin(len(velocity), bias)
         self._scale, self._row = 1.0, self._clock.begin(now, at, position, velocity)
-        self._channel.begin(len(position), bias)
+        self.position, self.velocity = position or self._row[: len(velocity)], velocity
+        self._top_speed = max(self._limits.speed, math.hypot(*velocity))
+        self._is_stopped, self.faults = False, _FINE
 
     def _tick(self, now: float, force: Numbers) -> TickStatus:
         try:
             now = float(now)
         except (TypeError, ValueError, OverflowError):
             raise ValueError(f"now={now!r} must be a time in s.") from None
-        step = now - self._last
-        is_regular = self._is_regular and 0.0 < step <= self._max_step
-        status = self._channel.take(force, step if is_regular else self._step)
+        timer = self._timer
+        step = now - timer.last
+        is_regular = timer.is_regular and 0.0 < step <= timer.max_step
+        status = self._channel.take(force, step if is_regular else timer.step)
         if status is not _FINE:
             self._is_stopped = self._is_stopped or self._channel.is_lost
-        moved = self._live(now, step) if is_regular else self._live_irregular(now)
+        if is_regular:
+            timer.step = step
+            moved = self._live(now, step)
+        else:
+            moved = self._live_irregular(now)
         if moved is not _FINE:
             status |= moved
         if self._is_stopped:
@@ -299,62 +281,40 @@ class RealTimeAdmittance:
             self.faults |= status
         return status
 
-    def _live_irregular(self, now: float) -> TickStatus:
-        """After the start, or a tick whose time was wrong, or in one: the last tick may not be what ``now`` follows."""
-        if math.isnan(self._last):
-            raise RuntimeError("tick before start: call start(now) with the time of the same clock first.")
-        if self._is_regular:
-            self._is_regular, self._newest = False, self._last
-        if not self._newest < now < math.inf:
-            self._n_bad += 1
-            self._is_stopped = self._is_stopped or self._n_bad >= self._max_bad_ticks
-            self._brake(self._last + self._step, self._step, self._deceleration)
-            return TickStatus.CLOCK
-        if now <= self._last:  # by which bad ticks have lived already, as the clock did not say
-            self._clock.shift(self._newest - self._last)
-            self._last = self._newest
-        step, self._newest, self._n_bad = now - self._last, now, 0
-        if step > self._max_step:
-            return self._bridge(now, step)
-        self._is_regular, self._is_new, self._n_late = True, False, 0
-        return self._live(now, step)
-
-    def _bridge(self, now: float, gap: float) -> TickStatus:
-        """Begin anew after a gap, of which the robot has seen no command, and must not be thrown to one."""
-        speed = max(math.hypot(*self.velocity), self._clock.speed_at(self._last))
-        # Within 1 + sqrt(2) times as long as it brakes, it can be back too: it rests where it was told to be last.
-        rests = gap * self._deceleration > 3.0 * speed
-        self._brake(now, gap, math.inf if rests else self._deceleration)
-        self._n_late += 1
-        if self._n_late >= _LATE_ON_END:
-            self._is_stopped = True
-            if self._is_new:
-                self.faults |= TickStatus.LATE | TickStatus.STOPPED
-                raise ValueError(
-                    f"max_step={self._max_step:g} s is shorter than all {_LATE_ON_END} ticks since start, the last of "
-                    f"{gap:.4g} s: give a max_step of some ticks of your loop, and times in s."
-                )
-        return TickStatus.LATE
-
-    def _brake(self, now: float, passed: float, deceleration: float) -> None:
-        self._clock.brake(self._last, passed, deceleration)
-        self.position, self.velocity = braked(self.position, self.velocity, deceleration, passed)
-        self._last = now
-
     def _live(self, now: float, step: float) -> TickStatus:
-        self._step = step
         if self._is_stopped:
-            self._brake(now, step, self._deceleration)
+            self._brake(now, step, self._limits.deceleration)
             return _FINE
         here, push = (self.position, self.velocity), self._channel.push
-        row = self._clock.row(self._last, step)
+        row = self._clock.row(self._timer.last, step)
         if self._clock.boost:
             push = tuple(map(add, push, self._clock.boost))
         position, velocity, self._scale = self._advance(row, push, *here, step, self._pull_limit)
         status = _FINE if self._scale == 1.0 else TickStatus.SPRING_LIMITED
-        if self._is_limited or math.hypot(*velocity) > self._top_speed:
-            limits = self._top_speed, self._acceleration_limit
-            position, velocity, reached = limited(position, velocity, *here, step, *limits)
+        if self._limits.is_given or math.hypot(*velocity) > self._top_speed:
+            position, velocity, reached = self._limits.limited(position, velocity, *here, step)
             status |= reached
-        self._row, self.position, self.velocity, self._last = row, position, velocity, now
+        self._row, self.position, self.velocity, self._timer.last = row, position, velocity, now
         return status
+
+    def _live_irregular(self, now: float) -> TickStatus:
+        timer = self._timer
+        status, shift = timer.read(now)
+        self._clock.shift(shift)
+        self._is_stopped = self._is_stopped or timer.is_failed
+        if status is _FINE:
+            return self._live(now, timer.step)
+        if status is TickStatus.CLOCK:
+            self._brake(timer.last + timer.step, timer.step, self._limits.deceleration)
+            return status
+        # The robot has seen no command meanwhile. Within 1 + sqrt(2) times as long as it brakes, it can be back too:
+        # after more it rests where it was told to be last, and is not thrown from there.
+        gap, deceleration = now - timer.last, self._limits.deceleration
+        speed = max(math.hypot(*self.velocity), self._clock.speed_at(timer.last))
+        self._brake(now, gap, math.inf if gap * deceleration > 3.0 * speed else deceleration)
+        return status
+
+    def _brake(self, now: float, passed: float, deceleration: float) -> None:
+        self._clock.brake(self._timer.last, passed, deceleration)
+        self.position, self.velocity = braked(self.position, self.velocity, deceleration, passed)
+        self._timer.last = now

@@ -4,7 +4,7 @@ import math
 from collections import deque
 from typing import final
 
-from torch_pbd.control.realtime.checks import Numbers
+from torch_pbd.control.realtime.checks import Numbers, limit, number, whole
 from torch_pbd.control.realtime.status import TickStatus
 from torch_pbd.control.realtime.steps import Vector
 
@@ -15,15 +15,20 @@ _RECENT = 5
 
 @final
 class ForceChannel:
-    """The force that acts, per kg of virtual mass: limits in N, ``rate_limit`` in N/s.
+    """The force that acts, per kg of virtual mass; options as `RealTimeAdmittance` takes them.
 
     A lost force is replaced by the median of the last good ones, on each axis, which fades to nothing over
     ``hold_ticks``: neither a wild reading before the loss nor an old push can carry the robot away.
     """
 
-    def __init__(self, mass: float, limit: float, deadband: float, rate_limit: float, hold_ticks: int) -> None:
-        self._mass, self._limit, self._deadband = mass, limit / mass, deadband / mass
-        self._rate_limit, self._is_slow, self._hold_ticks = rate_limit / mass, rate_limit < math.inf, hold_ticks
+    def __init__(
+        self, mass: float, force_limit: float, deadband: float, force_rate_limit: float | None, hold_ticks: int
+    ) -> None:
+        self._mass = mass
+        self._limit = number("force_limit", force_limit, "N") / mass
+        self._deadband = number("deadband", deadband, "N, or 0", zero=True) / mass
+        self._rate_limit = limit("force_rate_limit", force_rate_limit, "N/s") / mass
+        self._hold_ticks = whole("hold_ticks", hold_ticks, 0)
         self.begin(0, ())
 
     def begin(self, d: int, bias: Vector) -> None:
@@ -57,7 +62,7 @@ class ForceChannel:
                 self._bridge()
                 return TickStatus.FORCE_INVALID
             push, status = tuple([part / length * self._limit for part in push]), TickStatus.FORCE_SATURATED
-        if self._is_slow:
+        if self._rate_limit < math.inf:
             change, most = math.dist(push, self.push), self._rate_limit * step
             if change > most:
                 push = tuple([old + most / change * (new - old) for old, new in zip(self.push, push, strict=True)])

@@ -43,7 +43,7 @@ class ScheduleTable(NamedTuple):
 
     A row has position, velocity and the largest stiffness; then for `advance_modal` the stiffness of each axis, half
     its damping, and the axes; for `advance_coupled` the two matrices. They are packed, for the garbage collector
-    would hold up the loop to walk over a list of a million rows. The last one, at ``end`` s, has no velocity; ``speeds``
+    would hold up the loop to walk over a list of a million rows. The last, at ``end`` s, has no velocity; ``speeds``
     (n,) and the largest ``acceleration`` of the desired motion are those before that.
     """
 
