@@ -1,6 +1,7 @@
 """What the arguments of the real-time controller must be."""
 
 import math
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -20,6 +21,19 @@ def number(name: str, value: float, unit: str, *, zero: bool = False) -> float:
         least = "of at least 0" if zero else "above 0"
         raise ValueError(f"{name}={value!r} must be a finite number {least}, in {unit}.")
     return float(value)
+
+
+def mass_of(schedule: object, mass: float | None) -> float:
+    """Virtual mass, told where it is another than that for which the schedule was damped."""
+    own = getattr(schedule, "mass", None)
+    value = number("mass", (own or 1.0) if mass is None else mass, "kg, the same in all directions: no matrix")
+    if not 1e-50 <= value <= 1e50:
+        raise ValueError(f"mass={mass!r} must be a finite number from 1e-50 to 1e50 kg.")
+    if own is not None and value != own:
+        warnings.warn(
+            f"mass is {mass}, but damping_ratio was met for mass={own:g} kg: give both the same.", stacklevel=3
+        )
+    return value
 
 
 def limit(name: str, value: float | None, unit: str) -> float:

@@ -30,6 +30,8 @@ class ScheduleClock:
     def __init__(
         self, table: ScheduleTable, soft_start: float, approach_speed: float, acceleration_limit: float, on_gap: str
     ) -> None:
+        if on_gap not in ("pause", "resume"):
+            raise ValueError(f"on_gap={on_gap!r} must be 'pause' or 'resume'.")
         self._table, self._d, self._rate, self._catches_up = table, table.n_axes, table.rate, on_gap == "resume"
         self._packed, self._row_size, self._unpack = table.packed, table.layout.size, table.layout.unpack_from
         self._soft_start = number("soft_start", soft_start, "s, or 0", zero=True)
@@ -119,7 +121,7 @@ class ScheduleClock:
         return (*row[:d], *[pace * part for part in motion], *row[2 * d :])
 
     def _desired(self, time: float) -> tuple[Vector, float]:
-        """Row at a time, with what is desired at a pace of 1 on the line to the next one; square of the largest pace."""
+        """Row at a time, with what is desired at a pace of 1, between it and the next; square of the largest pace."""
         table, d, limits = self._table, self._d, self._squared_limits
         if time >= table.end:
             self.index, row, squared_limit = table.last, table.row(table.last), math.inf

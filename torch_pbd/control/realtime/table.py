@@ -83,11 +83,6 @@ class ScheduleTable(NamedTuple):
         """Number of axes d."""
         return self.stiffness.shape[1]
 
-    def index_at(self, time: float) -> int:
-        """The nearest row, ``time`` s after the first; the last from the end on."""
-        index = int(time * self.rate + 0.5)
-        return index if index < self.last else self.last
-
     def row(self, index: int) -> Vector:
         """One row, unpacked."""
         return self.layout.unpack_from(self.packed, index * self.layout.size)
