@@ -14,7 +14,7 @@ from torch_pbd.control.realtime.limits import limited
 from torch_pbd.control.realtime.status import TickStatus
 from torch_pbd.control.realtime.steps import Floats, Vector, braked
 from torch_pbd.control.realtime.table import ScheduleLike, ScheduleTable
-from torch_pbd.control.realtime.timer import TickTimer
+from torch_pbd.control.realtime.timer import SMOOTHING, TickTimer
 
 _FINE = TickStatus(0)
 _DECELERATION = 5.0  # units/s^2: from 0.5 m/s to rest in 0.1 s and 25 mm
@@ -293,7 +293,8 @@ class RealTimeAdmittance:
             position, velocity, reached = limited(position, velocity, *here, step, *limits)
             status |= reached
         self._row, self.position, self.velocity = row, position, velocity
-        self._timer.last, self._timer.step = now, step
+        self._timer.last = now
+        self._timer.step += SMOOTHING * (step - self._timer.step)
         return status
 
     def _live_irregular(self, now: float) -> TickStatus:
@@ -303,7 +304,7 @@ class RealTimeAdmittance:
         if timer.is_failed:
             self._is_stopped = True
         if status is _FINE:
-            return self._live(now, timer.step)
+            return self._live(now, now - timer.last)
         if status is TickStatus.CLOCK:
             now = timer.last + timer.step
         # In 1 + sqrt(2) times as long as it brakes the robot can be back: after a longer gap, without commands, it

@@ -58,13 +58,14 @@ class ScheduleClock:
         d = self._d
         self._at, self._origin, self._lag, self._is_soft = at, now - at, 0.0, False
         self.boost: Vector = ()
-        row, _ = self._desired(at)
+        row, squared_limit = self._desired(at)
         self._distance: Vector = (0.0,) * d if position is None else tuple(map(sub, row, position))
         self._blend = max(self._soft_start, _STEEPEST * math.hypot(*self._distance) / self._approach_speed)
         self._is_soft = any(self._distance) and self._soft_start > 0.0
         motion = row[d : 2 * d]
         square, along = sum(map(mul, motion, motion)), sum(map(mul, motion, velocity))
-        self._pace = min(1.0, max(0.0, along / square)) if square and self._soft_start else 1.0
+        pace = max(0.0, along / square) if square and self._soft_start else 1.0
+        self._pace = min(1.0, pace, math.sqrt(squared_limit))
         self._is_steady = self._pace == 1.0 and not self._is_soft
         return row
 
@@ -95,7 +96,7 @@ class ScheduleClock:
             slower = self._pace * max(0.0, 1.0 - deceleration * passed / speed)
             ran, self._pace = 0.5 * min(passed, speed / deceleration) * (self._pace + slower), slower
         self.shift(passed - ran)
-        self._lag += self._catches_up * (passed - ran)
+        self._lag = max(0.0, self._lag + self._catches_up * (passed - ran))
         self.boost, self._is_steady = (), False
 
     def shift(self, time: float) -> None:
@@ -109,7 +110,8 @@ class ScheduleClock:
         speed = math.hypot(*motion)
         rise = self.gain / speed if speed else math.inf
         goal = min(self._fastest, 1.0 + math.sqrt(2.0 * rise * self._lag)) if self._lag else 1.0
-        self._pace = pace = min(last_pace + rise * step, goal, math.sqrt(squared_limit))
+        change = rise * step
+        self._pace = pace = min(last_pace + change, max(goal, last_pace - change), math.sqrt(squared_limit))
         self.boost = tuple([(pace - last_pace) / step * part for part in motion])
         lost = step - 0.5 * step * (pace + last_pace)
         self._origin += lost

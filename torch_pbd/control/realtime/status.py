@@ -11,7 +11,7 @@ class TickStatus(IntFlag):
     FORCE_SATURATED = 2
     """The force was longer than ``force_limit`` and was shortened to it."""
     CLOCK = 4
-    """``now`` did not increase, or is not finite: the robot brakes over a tick as long as the last good one."""
+    """``now`` did not increase, or is not finite: the robot brakes over a tick as long as they are."""
     LATE = 8
     """More than ``max_step`` after the last tick: the robot has braked meanwhile, and goes on from there."""
     SPRING_LIMITED = 16

@@ -8,11 +8,12 @@ from torch_pbd.control.realtime.status import TickStatus
 
 _COARSE = 0.01  # of a tick, to which a time must be told
 _LATE_ON_END = 3  # ticks that are no stall any more
+SMOOTHING = 0.1  # of how long a tick lasts: neither one short tick nor one long counts for much
 
 
 @final
 class TickTimer:
-    """Ticks of at most ``max_step`` s; ``last`` is until when the motion is known, ``step`` how long a tick lasted."""
+    """Ticks of at most ``max_step`` s; ``last`` is until when the motion is known, ``step`` how long ticks last."""
 
     def __init__(self, rate: float, max_step: float, max_bad_ticks: int) -> None:
         self._rate = number("rate", rate, "1/s")
@@ -39,7 +40,7 @@ class TickTimer:
     def read(self, now: float) -> tuple[TickStatus, float]:
         """What is wrong in a tick that is not like the last one, and the time by which ``last`` was put forward.
 
-        Where the clock does not say how long a tick took, it is taken to be as long as the last good one.
+        Where the clock does not say how long a tick took, it is taken to be as long as they are.
         """
         if math.isnan(self.last):
             raise RuntimeError("tick before start: call start(now) with the time of the same clock first.")
@@ -60,5 +61,5 @@ class TickTimer:
                     f"{step:.4g} s: give a max_step of some ticks of your loop, and times in s."
                 )
             return TickStatus.LATE, shift
-        self.is_regular, self._is_new, self._n_late, self.step = True, False, 0, step
+        self.is_regular, self._is_new, self._n_late = True, False, 0
         return TickStatus(0), shift
