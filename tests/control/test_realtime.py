@@ -28,7 +28,7 @@ def solved(schedule, row, state, force, step):
 @pytest.mark.parametrize("rate", [1000.0, 100.0])
 @pytest.mark.parametrize(("d", "coupled"), [(1, 0.0), (2, 0.0), (2, 1e-5), (2, 1.0), (3, 0.0), (3, 1.0)])
 def test_each_tick_is_the_matrix_exponential(d, coupled, rate, rng):
-    schedule = make_schedule(d, rate=rate, duration=200 / rate, coupled=coupled, offset=7.0)
+    schedule = make_schedule(d, rate=rate, duration=400 / rate, coupled=coupled, offset=7.0)  # whose end is slowed
     controller = RealTimeAdmittance(schedule, mass=MASS, rate=rate, max_step=5 / rate, **EXACT)
     start = 1e-3 * rng.normal(size=2 * d)
     controller.start(3.0, start[:d], start[d:])

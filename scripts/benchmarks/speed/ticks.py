@@ -19,8 +19,8 @@ Tick = tuple[float, tuple[float, float]]
 
 
 def turning_schedule() -> SimpleNamespace:
-    """10 s of a curve; stiffness 200..1000 N/m, its axes turning at 1 rad/s; critical damping."""
-    phase = np.arange(BLOCK + 1) / RATE
+    """11 s of a curve, the last of which no block reaches; 200..1000 N/m, axes turning at 1 rad/s, critical damping."""
+    phase = np.arange(1.1 * BLOCK + 1) / RATE
     axes = np.moveaxis(np.array([[np.cos(phase), -np.sin(phase)], [np.sin(phase), np.cos(phase)]]), -1, 0)
     eigenvalues = 600.0 + 400.0 * np.stack([np.sin(phase), np.cos(2.0 * phase)], axis=1)
     stiffness, damping = (
@@ -42,7 +42,7 @@ def ticks(seed: int, n_ticks: int = BLOCK) -> list[Tick]:
 def controlled(controller: RealTimeAdmittance, block: Iterable[Tick], took: list[int]) -> tuple[float, ...]:
     """Where the controller arrives; nanoseconds of this thread for each tick, with one reading of the clock."""
     clock, tick = time.thread_time_ns, controller.tick
-    controller.start(0.0)
+    controller.start(0.0, velocity=controller._table.row(0)[2:4])  # else the schedule would come up to speed first
     for now, force in block:
         before = clock()
         tick(now, force)
@@ -58,7 +58,7 @@ def bare(controller: RealTimeAdmittance, block: Iterable[Tick], took: list[int])
     clock, expm1 = time.thread_time_ns, math.expm1
     table = controller._table
     packed, unpack, size, end = table.packed, table.layout.unpack_from, table.layout.size, table.last
-    (x, y), vx, vy, last = unpack(packed, 0)[:2], 0.0, 0.0, 0.0
+    (x, y, vx, vy), last = unpack(packed, 0)[:4], 0.0
     for now, (fx, fy) in block:
         before = clock()
         step = now - last

@@ -1,6 +1,7 @@
 """What the arguments of the real-time controller must be."""
 
 import math
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from torch_pbd.arguments import is_finite
 from torch_pbd.control.realtime.steps import Vector
 
+LARGEST = 1e100  # squares and sums of what is smaller do not overflow
 Numbers = Sequence[float] | NDArray[np.float64]
 
 
@@ -21,9 +23,29 @@ def number(name: str, value: float, unit: str, *, zero: bool = False) -> float:
     return float(value)
 
 
+def mass_of(schedule: object, mass: float | None) -> float:
+    """Virtual mass, told where it is another than that for which the schedule was damped."""
+    own = getattr(schedule, "mass", None)
+    value = number("mass", (own or 1.0) if mass is None else mass, "kg, the same in all directions: no matrix")
+    if not 1e-50 <= value <= 1e50:
+        raise ValueError(f"mass={mass!r} must be a finite number from 1e-50 to 1e50 kg.")
+    if own is not None and value != own:
+        warnings.warn(
+            f"mass is {mass}, but damping_ratio was met for mass={own:g} kg: give both the same.", stacklevel=3
+        )
+    return value
+
+
 def limit(name: str, value: float | None, unit: str) -> float:
     """A number above 0; none at all is infinite."""
     return math.inf if value is None else number(name, value, f"{unit}, or None")
+
+
+def whole(name: str, value: int, least: int) -> int:
+    """A number of ticks."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise ValueError(f"{name}={value!r} must be an integer of at least {least}: a number of ticks.")
+    return int(value)
 
 
 def moment(name: str, value: float) -> float:
@@ -35,11 +57,13 @@ def moment(name: str, value: float) -> float:
 
 
 def vector(name: str, values: Numbers, d: int) -> Vector:
-    """Finite floats, d of them."""
+    """Finite floats, d of them, whose squares are finite too."""
     try:
         vector = tuple(map(float, values))
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         vector = ()
-    if len(vector) != d or not all(map(math.isfinite, vector)):
-        raise ValueError(f"{name}={values!r} must be {d} finite numbers, one for each axis of the schedule.")
+    if len(vector) != d or not all(abs(value) <= LARGEST for value in vector):
+        raise ValueError(
+            f"{name}={values!r} must be {d} finite numbers, one for each axis of the schedule, of at most {LARGEST:g}."
+        )
     return vector

@@ -123,14 +123,9 @@ def _responses(stiffness: float, decay: float, step: float) -> tuple[float, floa
     return kick, step * step * series
 
 
-def softened(row: Vector, distance: Vector, phase: float, duration: float) -> Vector:
-    """The row with a desired motion that began ``distance`` away, on its way by minimum jerk; phase 0..1."""
-    d = len(distance)
-    left = 1.0 - phase**3 * (10.0 - 15.0 * phase + 6.0 * phase**2)
-    slope = -30.0 * phase**2 * (1.0 - phase) ** 2 / duration
-    position = [value - left * part for value, part in zip(row[:d], distance, strict=True)]
-    velocity = [value - slope * part for value, part in zip(row[d : 2 * d], distance, strict=True)]
-    return (*position, *velocity, *row[2 * d :])
+def minimum_jerk(phase: float) -> tuple[float, float]:
+    """What is left of a way of 1 by minimum jerk at a phase of 0..1, and the slope over the phase."""
+    return 1.0 - phase**3 * (10.0 - 15.0 * phase + 6.0 * phase**2), -30.0 * phase**2 * (1.0 - phase) ** 2
 
 
 def braked(position: Vector, velocity: Vector, deceleration: float, step: float) -> tuple[Vector, Vector]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torch_pbd.arguments import as_floats
+from torch_pbd.control.realtime.checks import LARGEST
 from torch_pbd.control.realtime.steps import Floats, Vector, advance_coupled, advance_modal, advance_plane
 from torch_pbd.control.sampling import Between
 
@@ -16,7 +17,6 @@ Advance = Callable[[Vector, Vector, Vector, Vector, float, float], tuple[Vector,
 
 _ROUNDING = 1e-9  # relative: what is smaller counts as rounding of whoever made the schedule
 _TICK_ROUNDING = 1e-6  # of a tick: 10 s at 1 kHz are 10001 rows, however 10 * 1000 is rounded
-_LARGEST = 1e100  # squares and sums of what is smaller do not overflow
 _READ = ("time", "position", "velocity", "stiffness", "damping")
 _MAX_ROWS = 4_000_000  # an hour at 1 kHz
 
@@ -43,7 +43,8 @@ class ScheduleTable(NamedTuple):
 
     A row has position, velocity and the largest stiffness; then for `advance_modal` the stiffness of each axis, half
     its damping, and the axes; for `advance_coupled` the two matrices. They are packed, for the garbage collector
-    would hold up the loop to walk over a list of a million rows.
+    would hold up the loop to walk over a list of a million rows. The last, at ``end`` s, has no velocity; ``speeds``
+    (n,) and the largest ``acceleration`` of the desired motion are those before that.
     """
 
     packed: bytes
@@ -53,6 +54,9 @@ class ScheduleTable(NamedTuple):
     advance: Advance
     stiffness: Floats
     damping: Floats
+    end: float
+    speeds: Floats
+    acceleration: float
 
     @classmethod
     def of(cls, schedule: ScheduleLike, mass: float, rate: float) -> Self:
@@ -65,21 +69,19 @@ class ScheduleTable(NamedTuple):
         between = Between(time - time[0], grid)
         position, velocity = between.hermite(*values[:2])
         stiffness, damping = map(between.linear, values[2:])
+        speeds = np.linalg.norm(velocity, axis=1)
+        accelerations = np.linalg.norm(np.diff(velocity, axis=0), axis=1) / np.diff(grid)
+        motion = float(grid[-1]), speeds, float(accelerations.max(initial=0.0))
         velocity[-1] = 0.0
         advance, gains = _gains(stiffness / mass, damping / mass)
         rows = np.concatenate([part.reshape(n_rows, -1) for part in (position, velocity, *gains)], axis=1)
         layout = struct.Struct(f"{rows.shape[1]}d")
-        return cls(rows.tobytes(), layout, n_rows - 1, rate, advance, stiffness, damping)
+        return cls(rows.tobytes(), layout, n_rows - 1, rate, advance, stiffness, damping, *motion)
 
     @property
     def n_axes(self) -> int:
         """Number of axes d."""
         return self.stiffness.shape[1]
-
-    def index_at(self, time: float) -> int:
-        """The nearest row, ``time`` s after the first; the last from the end on."""
-        index = int(time * self.rate + 0.5)
-        return index if index < self.last else self.last
 
     def row(self, index: int) -> Vector:
         """One row, unpacked."""
@@ -118,7 +120,7 @@ def _checked(schedule: ScheduleLike) -> list[Floats]:
                 f"schedule.{name} has shape {array.shape}: with (n, d) positions, n and d at least 1, "
                 f"it must be {shapes[name]}."
             )
-        _refuse(~(np.abs(array) <= _LARGEST), array, name, f"it must be finite, and at most {_LARGEST:g} in size.")
+        _refuse(~(np.abs(array) <= LARGEST), array, name, f"it must be finite, and at most {LARGEST:g} in size.")
     _refuse(np.diff(arrays["time"], prepend=-np.inf) <= 0.0, arrays["time"], "time", "times must increase strictly.")
     least_stiffness = _symmetrized(arrays, "stiffness", schedule.stiffness_limits)
     least_damping = _symmetrized(arrays, "damping", None)

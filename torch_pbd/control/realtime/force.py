@@ -1,0 +1,77 @@
+"""What a measured force counts as: less its bias, within the sensor's range, and bridged where it is lost."""
+
+import math
+from collections import deque
+from typing import final
+
+from torch_pbd.control.realtime.checks import Numbers, limit, number, whole
+from torch_pbd.control.realtime.status import TickStatus
+from torch_pbd.control.realtime.steps import Vector
+
+_FINE = TickStatus(0)
+# A median of five is a good force after one or two wild ones, and 2 ms late at 1 kHz.
+_RECENT = 5
+
+
+@final
+class ForceChannel:
+    """The force that acts, per kg of virtual mass; options as `RealTimeAdmittance` takes them.
+
+    A lost force is replaced by the median of the last good ones, on each axis, which fades to nothing over
+    ``hold_ticks``: neither a wild reading before the loss nor an old push can carry the robot away.
+    """
+
+    def __init__(
+        self, mass: float, force_limit: float, deadband: float, force_rate_limit: float | None, hold_ticks: int
+    ) -> None:
+        self._mass = mass
+        self._limit = number("force_limit", force_limit, "N") / mass
+        self._deadband = number("deadband", deadband, "N, or 0", zero=True) / mass
+        self._rate_limit = limit("force_rate_limit", force_rate_limit, "N/s") / mass
+        self._hold_ticks = whole("hold_ticks", hold_ticks, 0)
+        self.begin(0, ())
+
+    def begin(self, d: int, bias: Vector) -> None:
+        """Forget what was; before the first force there was none."""
+        self.push: Vector = (0.0,) * d
+        self._bias, self._n_lost = bias, 0
+        self._recent = deque([self.push] * _RECENT, _RECENT)
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether the force was not finite for more than ``hold_ticks``."""
+        return self._n_lost > self._hold_ticks
+
+    def take(self, force: Numbers, step: float) -> TickStatus:
+        """Let a force as measured act, as far as it may, ``step`` s after the last one."""
+        try:
+            mass = self._mass
+            if self._bias:
+                push = tuple([(float(part) - bias) / mass for part, bias in zip(force, self._bias, strict=True)])
+            else:
+                push = tuple([float(part) / mass for part in force])
+        except (TypeError, ValueError, OverflowError):
+            push = ()
+        if len(push) != len(self.push):
+            raise ValueError(f"force={force!r} must be {len(self.push)} numbers in N.")
+        if self._deadband:
+            push = tuple([part - max(-self._deadband, min(self._deadband, part)) for part in push])
+        length, status = math.hypot(*push), _FINE
+        if not length <= self._limit:
+            if not length < math.inf:
+                self._bridge()
+                return TickStatus.FORCE_INVALID
+            push, status = tuple([part / length * self._limit for part in push]), TickStatus.FORCE_SATURATED
+        if self._rate_limit < math.inf:
+            change, most = math.dist(push, self.push), self._rate_limit * step
+            if change > most:
+                push = tuple([old + most / change * (new - old) for old, new in zip(self.push, push, strict=True)])
+                status |= TickStatus.FORCE_RATE_LIMITED
+        self.push, self._n_lost = push, 0
+        self._recent.append(push)
+        return status
+
+    def _bridge(self) -> None:
+        self._n_lost += 1
+        share = max(0.0, 1.0 - self._n_lost / (self._hold_ticks + 1))
+        self.push = tuple([share * sorted(parts)[_RECENT // 2] for parts in zip(*self._recent, strict=True)])
