@@ -51,7 +51,7 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator, ABC)
         tags.regressor_tags.poor_score = True  # score is a log-likelihood, not R^2
         return tags
 
-    def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
+    def fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None = None) -> Self:
         """Learn mean and covariance.
 
         Parameters
@@ -60,6 +60,8 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator, ABC)
             Time, phase or position of each sample. Rows that repeat exactly are aligned demonstrations.
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
             What was recorded there.
+        groups : array-like of shape (n_samples,), default=None
+            Demonstration of each sample: checked, and not used; rows count as independent.
 
         Returns
         -------
@@ -68,9 +70,9 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator, ABC)
         Raises
         ------
         ValueError
-            If X, y or a parameter cannot be used; the message names it and says what to do.
+            If X, y, groups or a parameter cannot be used; the message names it and says what to do.
         """
-        return self._learn(X, y)
+        return self._learn(X, y, groups)
 
     def _learn(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None = None) -> Self:
         """Check everything, fit, and keep what was learned."""

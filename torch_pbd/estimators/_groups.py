@@ -1,9 +1,8 @@
-"""Tell a regressor which rows are of one demonstration, if it takes that."""
+"""Fits to rows of which it is known which demonstration they are of."""
 
 from typing import TypeVar
 
 from numpy.typing import ArrayLike
-from sklearn.utils.validation import has_fit_parameter
 
 from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.estimators._demonstrations import ways_are_told
@@ -12,11 +11,9 @@ Regressor = TypeVar("Regressor", bound=CovarianceRegressor)
 
 
 def fit_by_demonstration(regressor: Regressor, X: ArrayLike, y: ArrayLike, groups: ArrayLike) -> Regressor:
-    """Fit, with the demonstrations' numbers where ``fit`` takes them.
+    """Fit with the demonstrations' numbers.
 
     That the demonstrations follow several ways is not said here: whoever has them as demonstrations says it once.
     """
-    if not has_fit_parameter(regressor, "groups"):
-        return regressor.fit(X, y)
     with ways_are_told():
-        return regressor.fit(X, y, groups=groups)  # type: ignore[call-arg]
+        return regressor.fit(X, y, groups=groups)

@@ -40,6 +40,9 @@ _STRETCHED = 10.0  # an amplitude of so many times the values
 # Spacings of the inputs that an interpolating process may be as short as, and ranges that others may be as long as:
 # with longer ones the prior of a covariance would never take over.
 _SHORTEST, _LONGEST_MEAN, _LONGEST_COVARIANCE = 0.75, 10.0, 0.35
+# A hole among inputs on a line: of the range, and in spacings of the others. A smooth process without noise claims to
+# know what is two to three of its length scales from many inputs: of these the hole is to hold so many.
+_HOLE, _SPACINGS, _IN_HOLE = 0.25, 5.0, 6.0
 
 
 @dataclass(frozen=True)
@@ -188,11 +191,12 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         )
 
     def _default_length_scale(self, problem: Problem) -> Tensor:
-        """Length scales (1, e) where they are not learned: a fifth of the range of the inputs."""
+        """Length scales (1, e) where they are not learned: a fifth of the range of the inputs, less beside a hole."""
         n_features = problem.training.inputs.shape[1]
         if problem.length_scale is not None:
             return problem.length_scale[None]
-        return problem.training.inputs.new_full((1, n_features), 0.2 * n_features**0.5)
+        longest = longest_covariance(problem.training.inputs)
+        return problem.training.inputs.new_full((1, n_features), min(0.2, longest) * n_features**0.5)
 
     def _check_memory(self, n_distinct: int, n_outputs: int) -> None:
         n_inputs = min(n_distinct, self.max_inputs)
@@ -207,6 +211,15 @@ class LatentCovarianceRegressor(CovarianceRegressor):
     def _n_processes(self, n_outputs: int) -> int:
         """Processes of the mean and the covariance, at most."""
         return (n_outputs + 1) ** 2
+
+
+def longest_covariance(inputs: Tensor) -> float:
+    """Longest length scale of a covariance, in ranges of the inputs (n, e); a hole among them is longer."""
+    if inputs.shape[1] == 1:
+        hole = float(inputs[:, 0].sort().values.diff().max())
+        if hole > max(_HOLE, _SPACINGS * spacing(inputs)):
+            return min(_LONGEST_COVARIANCE, hole / _IN_HOLE)
+    return _LONGEST_COVARIANCE
 
 
 def residual_tril(residual: Tensor) -> Tensor:

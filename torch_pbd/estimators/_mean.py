@@ -15,6 +15,9 @@ from torch_pbd.models.training import TrainingSet
 from torch_pbd.optim import FitReport
 
 _LEVEL = 1e-4  # of the tests: how often a mean that is right is taken for wrong
+# Standard errors of means that no smoothing may be off by, root mean square, however few rows tell them: of two inputs
+# with two rows each the test would allow for a hundred.
+_CLEAR = 5.0
 _LEAST_SPREAD = 0.03  # of the pooled one: how small that at an input is believed to be
 _STRETCHED = 10.0  # an amplitude of so many times the means; through means that a process follows it is up to 2
 _UNRESOLVED = 1e-10  # squared, of standardized outputs: what a smooth process may be off by in any case
@@ -82,7 +85,8 @@ class _Spread:
         """
         squared = residual.mT.square() * self._counts[:, None]
         n_inputs, degrees = len(squared), float(self._degrees.sum())
-        together = squared.mean(0) > fdtri(n_inputs, degrees, 1.0 - _LEVEL) * self._pooled + _UNRESOLVED
-        limit = stdtrit(self._degrees.cpu().numpy(), 0.5 * _LEVEL / n_inputs)
-        alone = squared > squared.new_tensor(limit).square()[:, None] * self._local + _UNRESOLVED
+        limit = min(float(fdtri(n_inputs, degrees, 1.0 - _LEVEL)), _CLEAR**2)
+        together = squared.mean(0) > limit * self._pooled + _UNRESOLVED
+        each = squared.new_tensor(stdtrit(self._degrees.cpu().numpy(), 0.5 * _LEVEL / n_inputs))
+        alone = squared > each.square()[:, None] * self._local + _UNRESOLVED
         return together | alone.any(0)

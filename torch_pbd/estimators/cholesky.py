@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from torch_pbd.estimators._latent import (
-    _LONGEST_COVARIANCE,
     LatentCovarianceRegressor,
     Problem,
+    longest_covariance,
     residual_tril,
     warn_if_stretched,
 )
@@ -22,7 +22,7 @@ from torch_pbd.models.cholesky import CholeskyCovariance, CholeskyLink, tril_dev
 from torch_pbd.models.costs import Likelihood
 from torch_pbd.models.objectives import train
 from torch_pbd.models.scoring import Solver, train_by_scoring
-from torch_pbd.models.training import empirical_tril, pooled_tril
+from torch_pbd.models.training import empirical_tril, mean_over_geometric, pooled_tril
 from torch_pbd.optim import FitReport
 
 # Logarithms of the empirical diagonal are taken of no less than this of its root mean square over the inputs:
@@ -51,9 +51,8 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
         it, 0.0 interpolates them, which is what Table I of the paper does. Only for "empirical".
     diagonal : {"auto", "raw", "log"}, default="auto"
         Whether the processes of the diagonal entries act on the entries themselves, as in the paper, or on
-        their logarithm, which keeps them from crossing zero between inputs. "auto" takes "raw" for
-        "empirical", where observed entries are positive, and "log" for "likelihood", where nothing else
-        tells an entry from its negative.
+        their logarithm, which keeps them from crossing zero between inputs. "auto" takes "raw" where a
+        ``noise_scale``, which is of entries, is given for "empirical", and else "log".
     bias_correction : bool, default=False
         Divide the empirical factors by their expectation for normal data (Bartlett), which few
         demonstrations make too small: six of two outputs by 5 and 16 %. Only for "empirical".
@@ -166,14 +165,19 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
         check_solver(self.solver, latent_prior=self.latent_prior)
 
     def _fit_empirical(self, problem: Problem) -> tuple[LatentGP, CholeskyCovariance, FitReport, float]:
-        training, log_diagonal = problem.training, self.diagonal == "log"
+        training, smoothed = problem.training, self.noise_scale is None
+        log_diagonal = self.diagonal == "log" or (self.diagonal == "auto" and smoothed)
         scale_tril = empirical_tril(training, bias_correction=self.bias_correction)
         linked = _with_least_diagonal(scale_tril) if log_diagonal else scale_tril
+        if log_diagonal and smoothed:
+            linked = linked.tril(-1) + torch.diag_embed(
+                linked.diagonal(dim1=-2, dim2=-1) * mean_over_geometric(training)
+            )
         deviation = tril_deviation(linked, problem.prior_tril, log_diagonal=log_diagonal)
         degrees = training.counts - 1.0
         observations = Observations(training.inputs, deviation.mT.contiguous(), degrees / degrees.mean())
         noise_scale = self._entry_noise(problem)
-        search = self._search(observations, _LONGEST_COVARIANCE, problem.length_scale, noise_scale)
+        search = self._search(observations, longest_covariance(training.inputs), problem.length_scale, noise_scale)
         mean_job = self._mean_job(training)
         of_mean, of_entries = fit_together([mean_job, (observations, search)])
         amplitude = of_entries.hyperparameters.amplitude
@@ -184,7 +188,8 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
         latent, jitter = condition(observations, *found, basis=of_entries.basis)
         prior = problem.prior_tril if problem.prior_tril.ndim == 2 else problem.prior_tril[0]
         report = of_entries.report.after(of_mean_report, "search of the mean")
-        return mean, CholeskyCovariance(latent, prior, log_diagonal=log_diagonal), report, jitter
+        covariance = CholeskyCovariance(latent, prior, log_diagonal=log_diagonal, bounded=smoothed)
+        return mean, covariance, report, jitter
 
     def _entry_noise(self, problem: Problem) -> Tensor | None:
         """Noise of each entry of the factor, in standardized units; of a logarithm, relative."""
@@ -229,7 +234,8 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
         with torch.no_grad():
             scale_tril = link.root(latent())
         gp = latent.interpolate(tril_to_vector(scale_tril).mT.contiguous())
-        return CholeskyCovariance(gp, prior[0], log_diagonal=log_diagonal), report, latent.jitter
+        covariance = CholeskyCovariance(gp, prior[0], log_diagonal=log_diagonal, bounded=self.latent_prior)
+        return covariance, report, latent.jitter
 
 
 def _with_least_diagonal(scale_tril: Tensor) -> Tensor:

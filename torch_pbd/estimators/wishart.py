@@ -1,6 +1,7 @@
 """The Wishart process ("WP") of the paper, Section IV-A."""
 
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -8,9 +9,9 @@ from sklearn.utils import check_random_state
 from torch import Tensor
 
 from torch_pbd.estimators._latent import (
-    _LONGEST_COVARIANCE,
     LatentCovarianceRegressor,
     Problem,
+    longest_covariance,
     residual_tril,
     warn_if_stretched,
 )
@@ -28,6 +29,7 @@ from torch_pbd.gp import (
     fit_together,
     merge_observations,
 )
+from torch_pbd.gp.projection import FULL, Basis
 from torch_pbd.kernels import KernelName
 from torch_pbd.models.costs import Cost, FactorDistance, Likelihood
 from torch_pbd.models.objectives import covariance_mse, gaussian_nll, train
@@ -37,6 +39,8 @@ from torch_pbd.models.wishart import WishartCovariance, WishartLink, padded, wis
 from torch_pbd.optim import FitReport
 
 _PAPER_MEAN = 8.0  # of all latent processes, in the paper's simulation
+_FEW_ROWS = 8  # whose empirical deviation may by chance be near zero, so that what is drawn through it crosses zero
+_CERTAIN = 1e-8  # ratio of noise: it keeps kernel matrices positive definite, and hides nothing
 _SPREAD = {"empirical": 0.01, "random": 0.5}  # of the random part of whitened values at the start
 
 
@@ -197,24 +201,34 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
             return merge_observations(Observations(inputs, vectors, torch.ones_like(inputs[:, 0])), self.max_inputs)
 
         root = padded(target, self.df_)
-        observations = observed(root - prior_root)
-        hyperparameters, report = self._interpolating(observations, problem)
+        # The evidence of the vectors, not of their deviations: a prior far from them would allow for any swing.
+        observations = observed(root)
+        hyperparameters, report = self._smoothing(observations, problem)
         warn_if_stretched(hyperparameters.amplitude, observations.targets, given=problem.length_scale is not None)
-        latent, jitter = condition(observations, hyperparameters, self.kernel, observed(root).targets)
+        basis = Basis.of(observations, FULL)
+        latent, jitter = condition(observations, hyperparameters, self.kernel, basis=basis)
+        # That the vectors are noisy is no reason for the prior to have a share in them where there are data.
+        certain = replace(hyperparameters, noise_ratio=hyperparameters.noise_ratio.clamp_max(_CERTAIN))
+        priors = observed(prior_root.expand_as(root))
         with torch.no_grad():
+            latent.weight -= condition(priors, certain, self.kernel, basis=basis)[0].weight
             mse = float(covariance_mse(wishart_root(latent(inputs), prior_root, matrix), target))
         report = FitReport(mse, (mse,), report.n_iter, report.converged, report.message)
         report = report.after(of_mean, "search of the mean")
-        return mean, WishartCovariance(latent, _constant(prior_root), matrix), report, jitter
+        return mean, WishartCovariance(latent, _constant(prior_root), matrix, bounded=True), report, jitter
 
-    def _interpolating(self, observations: Observations, problem: Problem) -> tuple[Hyperparameters, FitReport]:
-        """Hyperparameters without noise; where inputs are too near to each other for that, with learned noise."""
+    def _smoothing(self, observations: Observations, problem: Problem) -> tuple[Hyperparameters, FitReport]:
+        """Hyperparameters without noise; with a learned one where "auto" has few rows, or inputs are too near."""
 
         def found(noise_scale: Tensor | None) -> tuple[Hyperparameters, FitReport]:
-            search = self._search(observations, _LONGEST_COVARIANCE, problem.length_scale, noise_scale)
+            search = self._search(
+                observations, longest_covariance(observations.inputs), problem.length_scale, noise_scale
+            )
             hyperparameters, _, report = fit_hyperparameters(observations, search)
             return hyperparameters, report
 
+        if self.objective == "auto" and int(problem.training.counts.min()) < _FEW_ROWS:
+            return found(None)
         try:
             return found(torch.zeros_like(observations.targets[:, 0]))
         except NotPositiveDefiniteError:
@@ -235,25 +249,26 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
             root = wishart_root(deviation, prior_root, matrix)
             return gaussian_nll(root, scatter_root, training.counts) / n_rows
 
-        start = padded(residual_tril(residual), self.df_) if self.start == "empirical" else prior_root
+        pooled = padded(residual_tril(residual), self.df_)
         if not self.latent_prior:
+            start = pooled if self.start == "empirical" else prior_root
             return self._train(problem, prior_root, start, loss, prior_weight=0.0, tol=self.tol)
-        cost = Likelihood(WishartLink(prior_root), scatter_root, training.counts, 1.0 / n_rows)
-        return self._train(problem, prior_root, start, cost, prior_weight=1.0 / n_rows, tol=self.tol)
+        # Around a prior far from them the vectors might swing through zero from one input to the next.
+        cost = Likelihood(WishartLink(pooled), scatter_root, training.counts, 1.0 / n_rows)
+        return self._train(problem, pooled, pooled, cost, prior_weight=1.0 / n_rows, tol=self.tol)
 
     def _train(
-        self, problem: Problem, prior_root: Tensor, start: Tensor, loss: Any, *, prior_weight: float, tol: float
+        self, problem: Problem, centre: Tensor, start: Tensor, loss: Any, *, prior_weight: float, tol: float
     ) -> tuple[WishartCovariance, FitReport, float]:
         """Minimize a loss over the vectors at the inputs: with hyperparameters held a cost, L at I too.
 
-        Else it is ``loss(deviations, L)``, and trained are the hyperparameters and L.
+        Else it is ``loss(deviations, L)``, and trained are the hyperparameters and L. Deviations are from ``centre``.
         """
-        inputs, n_outputs = problem.training.inputs, prior_root.shape[-2]
+        inputs, n_outputs, prior_root = problem.training.inputs, centre.shape[-2], self._prior_root(problem)
         # A free L would grow while the whitened values shrink, and so escape their prior.
         matrix = torch.eye(n_outputs).to(inputs).requires_grad_(not self.latent_prior)
-        deviation = (start - prior_root).mT.flatten(-2).expand(len(inputs), -1).mT.contiguous()
-        prior = prior_root.reshape(-1, n_outputs, self.df_)
-        amplitude = prior.square().sum(-1).mean(0).sqrt().repeat(self.df_)
+        deviation = (start - centre).mT.flatten(-2).expand(len(inputs), -1).mT.contiguous()
+        amplitude = centre.reshape(-1, n_outputs, self.df_).square().sum(-1).mean(0).sqrt().repeat(self.df_)
         latent = LatentValues(
             inputs,
             deviation,
@@ -275,9 +290,11 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         else:
             report = train(lambda values: loss(values, matrix), latent, [matrix], prior_weight=0.0, **limits)
         with torch.no_grad():
-            values = wishart_root(latent(), prior_root, matrix).mT.flatten(1).mT.contiguous()
-        covariance = WishartCovariance(latent.interpolate(values), _constant(prior_root), matrix.detach().tril())
-        return covariance, report, latent.jitter
+            root = wishart_root(latent(), centre, matrix)
+        values, deviations = (part.mT.flatten(1).mT.contiguous() for part in (root, root - prior_root))
+        gp = latent.interpolate(values, deviations if self.latent_prior else None)
+        prior, matrix = _constant(prior_root), matrix.detach().tril()
+        return WishartCovariance(gp, prior, matrix, bounded=self.latent_prior), report, latent.jitter
 
 
 def _constant(prior_root: Tensor) -> Tensor:

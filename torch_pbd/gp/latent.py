@@ -68,6 +68,12 @@ class LatentGP(nn.Module):
         """Mean at x of the processes of ``value_weight``, whose prior mean is zero: what data alone say."""
         return self._weighted(x, self.value_weight)
 
+    def both(self, x: Float[Tensor, "m e"]) -> tuple[Float[Tensor, "m b"], Float[Tensor, "m b"]]:
+        """What :meth:`forward` and :meth:`values` give, by one matrix of correlations."""
+        cross = correlation(x, self.inputs, self.length_scale, self.kernel)
+        deviation, values = (cross @ torch.stack([self.weight, self.value_weight], dim=-1)).unbind(-1)
+        return deviation.mT, values.mT
+
     def _weighted(self, x: Tensor, weight: Tensor) -> Tensor:
         cross = correlation(x, self.inputs, self.length_scale, self.kernel)
         if len(cross) == 1:

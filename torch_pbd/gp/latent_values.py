@@ -127,13 +127,14 @@ class LatentValues(nn.Module):
         return [parameter for parameter in self.parameters() if parameter.requires_grad]
 
     @torch.no_grad()
-    def interpolate(self, values: Float[Tensor, "b n"]) -> LatentGP:
-        """The Gaussian processes through the present deviations, and without a prior through ``values``."""
+    def interpolate(self, values: Float[Tensor, "b n"], deviation: Float[Tensor, "b n"] | None = None) -> LatentGP:
+        """Gaussian processes through ``deviation``, by None the present one, and without a prior through ``values``."""
         if self.train_hyperparameters:
             self.basis, self.jitter = self._basis()
         amplitude = self.log_amplitude.exp()
         hyperparameters = Hyperparameters(self.log_length_scale.exp(), amplitude.clone(), torch.zeros_like(amplitude))
-        weight = amplitude[:, None] * self._weight(self.whitened)
+        whitened = self.whitened if deviation is None else self._solved(deviation / amplitude[:, None])
+        weight = amplitude[:, None] * self._weight(whitened)
         counts = torch.ones_like(self.inputs[:, 0])
         value_weight = self._weight(self._solved(values))
         return LatentGP(self.inputs, weight, value_weight, hyperparameters, counts, self.kernel)

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from torch_pbd.gp import LatentGP
 from torch_pbd.linalg import tril_to_vector, vector_to_tril
+from torch_pbd.models.floor import beside_prior
 
 LARGEST_LOGARITHM = 300.0  # of a diagonal entry: its square is still a number
 
@@ -117,14 +118,18 @@ class CholeskyCovariance(nn.Module):
         Factor of the covariance far from data.
     log_diagonal : bool
         Whether the processes of the diagonal act on its logarithm.
+    bounded : bool, default=False
+        Whether the part of the prior in the entries is kept between nothing and the prior: see ``beside_prior``.
     """
 
     prior_tril: Tensor
 
-    def __init__(self, latent: LatentGP, prior_tril: Float[Tensor, "d d"], *, log_diagonal: bool) -> None:
+    def __init__(
+        self, latent: LatentGP, prior_tril: Float[Tensor, "d d"], *, log_diagonal: bool, bounded: bool = False
+    ) -> None:
         super().__init__()
         self.latent = latent
-        self.log_diagonal = log_diagonal
+        self.log_diagonal, self.bounded = log_diagonal, bounded
         self.register_buffer("prior_tril", prior_tril)
 
     def forward(
@@ -132,7 +137,12 @@ class CholeskyCovariance(nn.Module):
     ) -> Float[Tensor, "n d d"]:
         """Lower triangular root of the covariance at x."""
         prior = self.prior_tril if prior_tril is None else prior_tril
-        return deviation_tril(self.latent(x), prior, log_diagonal=self.log_diagonal)
+        deviation, values = self.latent.both(x)
+        root = deviation_tril(deviation, prior, log_diagonal=self.log_diagonal)
+        if not self.bounded:
+            return root
+        bounded = beside_prior(root, vector_to_tril(values), prior)
+        return bounded.tril(-1) + torch.diag_embed(root.diagonal(dim1=-2, dim2=-1)) if self.log_diagonal else bounded
 
     def variability(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d r"]:
         """Root of the covariance with the prior taken out (Type II): zero far from data."""

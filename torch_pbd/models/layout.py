@@ -93,7 +93,8 @@ def _check_mixture(spec: Mapping[str, Any], tensors: Tensors) -> None:
 
 def _check_processes(spec: Mapping[str, Any], tensors: Tensors) -> None:
     cholesky = spec["covariance"] == "cholesky"
-    _check_entries(spec, {"kernel": str, "mean_kernel": str} | ({"log_diagonal": bool} if cholesky else {}))
+    entries = {"kernel": str, "mean_kernel": str} | ({"log_diagonal": bool} if cholesky else {})
+    _check_entries(spec, entries | ({"bounded": bool} if "bounded" in spec else {}))
     _check_kernels(spec["kernel"], spec["mean_kernel"])
     own = {"prior_tril": "d d"} if cholesky else {"prior_root": "d df", "scale_matrix_tril": "d d"}
     shapes = _SCALING | {f"core.covariance.{name}": shape for name, shape in own.items()}

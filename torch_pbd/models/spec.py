@@ -23,6 +23,7 @@ def module_spec(module: ConditionalNormal) -> dict[str, Any]:
     if isinstance(core, HeteroscedasticModel):
         return {"covariance": "heteroscedastic", **core.spec()}
     spec: dict[str, Any] = {"mean_kernel": core.mean.kernel, "kernel": core.covariance.latent.kernel}
+    spec |= {"bounded": core.covariance.bounded}
     if isinstance(core.covariance, CholeskyCovariance):
         return {"covariance": "cholesky", "log_diagonal": core.covariance.log_diagonal, **spec}
     return {"covariance": "wishart", **spec}
@@ -51,12 +52,13 @@ def module_from_spec(spec: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> 
         core = HeteroscedasticModel.restored(dict(spec), {k: v for k, v in parts.items() if k not in scaling_names})
     else:
         latent = _latent("covariance.latent.", parts, spec["kernel"])
+        bounded = spec.get("bounded", False)  # which the first files do not say
         if spec["covariance"] == "cholesky":
             prior_tril = parts["covariance.prior_tril"]
-            covariance: Any = CholeskyCovariance(latent, prior_tril, log_diagonal=spec["log_diagonal"])
+            covariance: Any = CholeskyCovariance(latent, prior_tril, log_diagonal=spec["log_diagonal"], bounded=bounded)
         else:
             matrix = parts["covariance.scale_matrix_tril"]
-            covariance = WishartCovariance(latent, parts["covariance.prior_root"], matrix)
+            covariance = WishartCovariance(latent, parts["covariance.prior_root"], matrix, bounded)
         core = MeanAndCovariance(_latent("mean.", parts, spec["mean_kernel"]), covariance)
     scaling = [tensors[name] for name in ("x_shift", "x_scale", "y_shift", "y_scale")]
     module = ConditionalNormal(core, *scaling)

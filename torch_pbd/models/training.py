@@ -128,10 +128,27 @@ def empirical_tril(training: TrainingSet, *, bias_correction: bool = False) -> F
     return scale_tril / torch.where(lacking[:, None], 1.0, expected)[:, None, :]
 
 
+def mean_over_geometric(training: TrainingSet) -> Float[Tensor, "n d"]:
+    """Mean of the diagonal entries of an empirical factor over the exponential of their mean logarithm.
+
+    For normal data; one where the factor was shrunk. A smooth logarithm is by this too low: at two rows by a third.
+    """
+    n_outputs, degrees = training.y.shape[1], training.counts - 1.0
+    known = degrees.clamp_min(n_outputs)
+    mean_log = 0.5 * torch.digamma(0.5 * _rest(known, n_outputs)) + (2.0 / known[:, None]).log() * 0.5
+    ratio = _expected_diagonal(known, n_outputs) / mean_log.exp()
+    return torch.where((degrees < n_outputs)[:, None], 1.0, ratio)
+
+
 def _expected_diagonal(degrees: Tensor, n_outputs: int) -> Tensor:
     """Mean of each column of the factor of an empirical covariance over that of the true one."""
-    rest = degrees[:, None] - torch.arange(n_outputs).to(degrees)
+    rest = _rest(degrees, n_outputs)
     return (torch.lgamma((rest + 1.0) / 2.0) - torch.lgamma(rest / 2.0)).exp() * (2.0 / degrees[:, None]).sqrt()
+
+
+def _rest(degrees: Tensor, n_outputs: int) -> Tensor:
+    """Degrees of freedom of each column of an empirical factor: (n, d)."""
+    return degrees[:, None] - torch.arange(n_outputs).to(degrees)
 
 
 def _sum_by(values: Tensor, index: Tensor, n_groups: int) -> Tensor:

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from torch_pbd.gp import LatentGP
+from torch_pbd.models.floor import beside_prior
 
 
 def wishart_root(
@@ -122,15 +123,21 @@ class WishartCovariance(nn.Module):
         L is trained: L multiplies the deviations.
     scale_matrix_tril : Tensor of shape (d, d)
         The paper's L, lower factor of the scale matrix V.
+    bounded : bool, default=False
+        Whether the part of the prior in the vectors is kept between nothing and the prior: see ``beside_prior``.
     """
 
     prior_root: Tensor
 
     def __init__(
-        self, latent: LatentGP, prior_root: Float[Tensor, "d df"], scale_matrix_tril: Float[Tensor, "d d"]
+        self,
+        latent: LatentGP,
+        prior_root: Float[Tensor, "d df"],
+        scale_matrix_tril: Float[Tensor, "d d"],
+        bounded: bool = False,
     ) -> None:
         super().__init__()
-        self.latent = latent
+        self.latent, self.bounded = latent, bounded
         self.scale_matrix_tril = nn.Parameter(scale_matrix_tril)
         self.register_buffer("prior_root", prior_root)
 
@@ -140,9 +147,13 @@ class WishartCovariance(nn.Module):
         """Root of the covariance at x."""
         df = self.prior_root.shape[1]
         prior = self.prior_root if prior_tril is None else padded(prior_tril, df)
-        return wishart_root(self.latent(x), prior, self.scale_matrix_tril)
+        deviation, values = self.latent.both(x)
+        root = wishart_root(deviation, prior, self.scale_matrix_tril)
+        return beside_prior(root, self._vectors(values), prior) if self.bounded else root
 
     def variability(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d r"]:
         """Root of the covariance with the prior taken out (Type II): zero far from data."""
-        n_outputs, df = self.prior_root.shape
-        return self.latent.values(x).reshape(len(x), df, n_outputs).mT
+        return self._vectors(self.latent.values(x))
+
+    def _vectors(self, values: Float[Tensor, "n b"]) -> Float[Tensor, "n d df"]:
+        return values.reshape(len(values), *self.prior_root.shape[::-1]).mT
