@@ -28,15 +28,14 @@ def has_common_function(stiffness: Float[Tensor, "n d d"], damping: Float[Tensor
     ``T = 4 b (D - b) - (K + b D - a) K^-1 (K + b D - a)`` is, its Schur complement times 2 b; V itself then is,
     because the motion under constant gains dies out (Lyapunov). T is concave in (a, b), so the smallest of all
     eigenvalues is too, and it is maximized by cuts: ``z'T z`` of the eigenvectors z found so far is an upper bound.
-    The first are those of K. For damping of one ratio :func:`~torch_pbd.control.required_damping_ratio` is the answer.
+    The first are those of K.
     """
     values, axes = torch.linalg.eigh(stiffness)
     frequency = (values.min().sqrt() * values.max().sqrt()).sqrt()
     stiff, damp = stiffness / frequency**2, damping / frequency
     compliance = (axes * (frequency**2 / values).unsqueeze(-2)) @ axes.mT
     lag, identity = damp @ compliance, torch.eye(stiff.shape[-1]).to(stiff).expand_as(stiff)
-    # T by its monomials a, b, b^2, 1, a b, a^2.
-    terms = torch.stack(
+    terms = torch.stack(  # T by its monomials a, b, b^2, 1, a b, a^2
         [2.0 * identity, 2.0 * damp, -4.0 * identity - lag @ damp, -stiff, lag + lag.mT, -symmetrize(compliance)]
     )
     least = float(torch.linalg.eigvalsh(damp)[:, 0].min())

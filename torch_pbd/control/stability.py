@@ -176,8 +176,8 @@ class _Knots:
 def _minimize_largest(function: Callable[..., Tensor], low: float, high: float) -> tuple[float, Tensor]:
     """Where the largest of many convex functions of one variable is smallest, and the values of all of them there.
 
-    ``function(x)`` has those of all, ``function(x, rows)`` of some. Most are never the largest: the search is among
-    those that are so at the end and at the minima of the ones that were, until these are the largest of all.
+    ``function(x, rows)`` has some of them. Most are never the largest: the search is among those that are so at an end
+    and at the minima of the ones that were, until these are the largest of all.
     """
     found, values, rows = low, function(high), torch.empty(0, dtype=torch.long)
     while not len(rows) or values.max() > values[rows].max():
@@ -208,13 +208,13 @@ def _gain(maps: Float[Tensor, "m n n"], stiffness: Float[Tensor, "k d d"], mass:
     for each in maps:
         begun = each @ torch.cat([begun, identity[None]])
         squared = begun.mT @ begun
-        # Whether all eigenvalues are below a limit is seen sooner than what they are.
-        limits = (limit * (1.0 + 1e-12) * identity for limit in (largest, 1.0))
-        record, grown = (torch.linalg.cholesky_ex(limit - squared).info > 0 for limit in limits)
+        # A part that has not grown so far gains no more than one that begins here. Whether all eigenvalues are below
+        # a limit is seen sooner than what they are.
+        grown = torch.linalg.cholesky_ex((1.0 + 1e-12) * identity - squared).info > 0
+        begun, squared = begun[grown], squared[grown]
+        record = torch.linalg.cholesky_ex(largest * (1.0 + 1e-12) * identity - squared).info > 0
         if bool(record.any()):
             largest = float(torch.linalg.eigvalsh(squared[record]).max())
-        # A part that has not grown so far gains no more than one that begins here.
-        begun = begun[grown]
         if len(begun) > _MAX_BEGINNINGS:
             begun = begun[torch.linalg.matrix_norm(begun).topk(_MAX_BEGINNINGS).indices]
     return math.sqrt(largest)
@@ -223,8 +223,7 @@ def _gain(maps: Float[Tensor, "m n n"], stiffness: Float[Tensor, "k d d"], mass:
 def _held_growth(maps: Tensor, stiffness: Tensor, damping: Tensor, mass: Tensor, alpha: float) -> float:
     """Largest eigenvalue of ``A' P_next A`` relative to P: A the exact map of an interval with its gains held.
 
-    Of the alpha of the margin, or, where that grows, of a half or a quarter of it: at the largest alpha V is not
-    damped along some velocity, which only gains that rise between the knots, and not at them, make up for.
+    Of this alpha, or, where that grows, of a half or a quarter: at the largest some velocity does not damp V.
     """
     least = math.nan
     for each in (alpha, alpha / 2.0, alpha / 4.0) if alpha > 0.0 else ():
