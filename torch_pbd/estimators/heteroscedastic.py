@@ -264,16 +264,23 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         )
         warn_if_few(len(y), y.shape[1])
         warn_if_identical(training)
-        training = training.merged(self.max_inputs)
         group = None if groups is None else self._door(groups).long()
         options = SearchOptions(self.max_iter, self.tol, self.n_restarts, self._progress())
         kernel: KernelName = "squared_exponential" if self.kernel == "periodic" else self.kernel
         to_try = numbers_to_try(self.n_inducing, X.shape[1], y.shape[1])
         for sizes in to_try:
-            inducing = [inducing_inputs(training.inputs, size) for size in sizes]
+            inducing = [inducing_inputs(training.merged(self.max_inputs).inputs, size) for size in sizes]
             of_mean, features = (FeatureMap(z, kernel, circle, len(z) == len(inputs)) for z in inducing)
             families = Families.of(of_mean, features, held, shared=self.shared_length_scale)
-            fit = fit_heteroscedastic(training, group, families, options, needs_resolution=sizes != to_try[-1])
+            fit = fit_heteroscedastic(
+                training,
+                group,
+                families,
+                options,
+                needs_resolution=sizes != to_try[-1],
+                max_inputs=self.max_inputs,
+                n_inducing=self.n_inducing,
+            )
             if fit is not None:
                 break
         assert fit is not None

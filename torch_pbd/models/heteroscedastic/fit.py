@@ -4,7 +4,7 @@ import time
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from torch_pbd.gp.inducing import FeatureMap
@@ -19,6 +19,7 @@ from torch_pbd.models.heteroscedastic.latent import LatentCovariance
 from torch_pbd.models.heteroscedastic.mean import LatentMean, fit_mean
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
 from torch_pbd.models.heteroscedastic.search import Search, SearchOptions
+from torch_pbd.models.heteroscedastic.start import MUCH_LESS, MeanStart, is_signal
 from torch_pbd.models.training import TrainingSet, pooled_tril
 
 # Prior medians of length scale (in ranges of the input) and amplitude, and prior deviation of the constant. Means
@@ -73,6 +74,10 @@ class HeteroscedasticFit:
     correlation: DemonstrationCorrelation | None
     log_evidence: tuple[float, ...]
     """Of the covariance, at the end of each turn, in nats."""
+    whitened: Float[Tensor, "rows d"]
+    """Residuals of unit covariance at each input."""
+    missed: Bool[Tensor, " d"]
+    """Outputs whose residuals are no noise: the mean does not follow them."""
 
 
 def fit_heteroscedastic(
@@ -83,11 +88,16 @@ def fit_heteroscedastic(
     *,
     n_turns: int = 3,
     needs_resolution: bool = False,
+    max_inputs: int = 512,
+    n_inducing: int | None = None,
 ) -> HeteroscedasticFit | None:
     """Mean under the noise learned so far, then covariance of the residuals from it, ``n_turns`` times.
 
     ``group`` tells the demonstrations apart. What the first turns leave of each, whitened, tells how far
     its samples are correlated, which the later ones take into account.
+
+    Where the first mean does not follow the data, it begins again where :class:`MeanStart` says, on as many of the
+    inputs as that needs; the covariance is that of at most ``max_inputs``.
 
     With ``needs_resolution`` the fit is given up, and None, at the end of the first turn in which the inducing inputs
     do not resolve a length scale with room to spare, unless they are all the inputs.
@@ -96,7 +106,8 @@ def fit_heteroscedastic(
     covariance: LatentCovariance | None = None
     correlation: DemonstrationCorrelation | None = None
     evidences: list[float] = []
-    pooled = _start_tril(training)
+    rows, training = training, training.merged(max_inputs)
+    pooled, start = _start_tril(training), None
     size = (training.y.shape[1], training.x.shape[1])
     mean_search, both = Search(families.mean, *size, options), (families.log_variance, families.coefficients)
     searches = CovarianceSearches.of(both, *size, options)
@@ -106,6 +117,15 @@ def fit_heteroscedastic(
         noise = NoiseCorrelation.of(correlation, training.inputs, training.index, group)
         tril = _tril_at(training.inputs, pooled, covariance)
         mean = fit_mean(mean_search, training.inputs, training.means(), training.counts, tril, noise.of_means)
+        if not turn and not _follows(training, group, mean, tril):
+            start = MeanStart.of(rows, families.mean, n_inducing)
+            mean_search = Search(start.family, *size, options, start=start.theta)
+            pooled = start.noise_scale.diag()
+        if start is not None:
+            its = start.training
+            noise_of_mean = NoiseCorrelation.of(correlation, its.inputs, its.index, group)
+            mean = fit_mean(mean_search, its.inputs, its.means(), its.counts, _tril_at(its.inputs, pooled, covariance), noise_of_mean.of_means)
+            tril = _tril_at(training.inputs, pooled, covariance)
         residual, share = _residual(training, mean, tril)
         pooled = pooled if turn else _pooled_tril(residual, share)
         normal, scatter, degrees = _scatter(training, residual, share, pooled)
@@ -116,7 +136,7 @@ def fit_heteroscedastic(
         covariance, evidence = fit_covariance(
             searches, training.inputs, part * scatter, part * degrees, noise, covariance
         )
-        if needs_resolution and not (families.mean.resolved(mean.theta) and covariance.resolved):
+        if needs_resolution and not (mean.family.resolved(mean.theta) and covariance.resolved):
             return None
         evidences.append(evidence)
         options.report(len(evidences), -evidence, time.perf_counter() - started)
@@ -126,7 +146,17 @@ def fit_heteroscedastic(
                 training = training.merged(_n_inputs(training, group))
     assert mean is not None
     assert covariance is not None
-    return HeteroscedasticFit(mean, covariance, pooled, correlation, tuple(evidences))
+    whitened = _whitened(training, normal, covariance)
+    missed = is_signal(whitened, rows, group)
+    return HeteroscedasticFit(mean, covariance, pooled, correlation, tuple(evidences), whitened, missed)
+
+
+def _follows(training: TrainingSet, group: Tensor | None, mean: LatentMean, tril: Tensor) -> bool:
+    """Whether the residuals of a mean are the noise that it was fitted under, and no signal."""
+    residual, _ = _residual(training, mean, tril)
+    whitened = torch.linalg.solve_triangular(tril[training.index], residual.unsqueeze(2), upper=False).squeeze(2)
+    much_less = whitened.square().mean(0) < MUCH_LESS
+    return not bool((much_less | is_signal(whitened, training, group)).any())
 
 
 def _tril_at(inputs: Tensor, pooled: Tensor, covariance: LatentCovariance | None) -> Tensor:
