@@ -1,5 +1,7 @@
 """The recommended regressor: covariance by latent Gaussian processes that are integrated out."""
 
+from collections.abc import Callable
+from functools import cache, partial
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -28,6 +30,7 @@ from torch_pbd.memory import require_much
 from torch_pbd.models.heteroscedastic import (
     Families,
     HeteroscedasticModel,
+    MeanStart,
     SearchOptions,
     fit_heteroscedastic,
 )
@@ -264,22 +267,19 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         )
         warn_if_few(len(y), y.shape[1])
         warn_if_identical(training)
+        rows, training = training, training.merged(self.max_inputs)
         group = None if groups is None else self._door(groups).long()
         options = SearchOptions(self.max_iter, self.tol, self.n_restarts, self._progress())
         kernel: KernelName = "squared_exponential" if self.kernel == "periodic" else self.kernel
         to_try = numbers_to_try(self.n_inducing, X.shape[1], y.shape[1])
+        begin: Callable[[], MeanStart] | None = None
         for sizes in to_try:
-            inducing = [inducing_inputs(training.merged(self.max_inputs).inputs, size) for size in sizes]
+            inducing = [inducing_inputs(training.inputs, size) for size in sizes]
             of_mean, features = (FeatureMap(z, kernel, circle, len(z) == len(inputs)) for z in inducing)
             families = Families.of(of_mean, features, held, shared=self.shared_length_scale)
+            begin = begin or cache(partial(MeanStart.of, rows, families.mean, self.n_inducing))
             fit = fit_heteroscedastic(
-                training,
-                group,
-                families,
-                options,
-                needs_resolution=sizes != to_try[-1],
-                max_inputs=self.max_inputs,
-                n_inducing=self.n_inducing,
+                training, group, families, options, needs_resolution=sizes != to_try[-1], begin=begin
             )
             if fit is not None:
                 break

@@ -4,11 +4,13 @@ from torch_pbd.models.heteroscedastic.fit import Families, HeteroscedasticFit, f
 from torch_pbd.models.heteroscedastic.module import HeteroscedasticModel
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
 from torch_pbd.models.heteroscedastic.search import SearchOptions
+from torch_pbd.models.heteroscedastic.start import MeanStart
 
 __all__ = [
     "Families",
     "HeteroscedasticFit",
     "HeteroscedasticModel",
+    "MeanStart",
     "ProcessFamily",
     "SearchOptions",
     "fit_heteroscedastic",

@@ -1,6 +1,7 @@
 """Fit of mean and covariance, by turns."""
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -19,7 +20,7 @@ from torch_pbd.models.heteroscedastic.latent import LatentCovariance
 from torch_pbd.models.heteroscedastic.mean import LatentMean, fit_mean
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
 from torch_pbd.models.heteroscedastic.search import Search, SearchOptions
-from torch_pbd.models.heteroscedastic.start import MUCH_LESS, MeanStart, is_signal
+from torch_pbd.models.heteroscedastic.start import MOST_CORRELATED, MUCH_LESS, MeanStart, is_signal
 from torch_pbd.models.training import TrainingSet, pooled_tril
 
 # Prior medians of length scale (in ranges of the input) and amplitude, and prior deviation of the constant. Means
@@ -88,16 +89,14 @@ def fit_heteroscedastic(
     *,
     n_turns: int = 3,
     needs_resolution: bool = False,
-    max_inputs: int = 512,
-    n_inducing: int | None = None,
+    begin: Callable[[], MeanStart] | None = None,
 ) -> HeteroscedasticFit | None:
     """Mean under the noise learned so far, then covariance of the residuals from it, ``n_turns`` times.
 
     ``group`` tells the demonstrations apart. What the first turns leave of each, whitened, tells how far
     its samples are correlated, which the later ones take into account.
 
-    Where the first mean does not follow the data, it begins again where :class:`MeanStart` says, on as many of the
-    inputs as that needs; the covariance is that of at most ``max_inputs``.
+    Where the first mean does not follow the data, it is that which ``begin`` finds, if it is given.
 
     With ``needs_resolution`` the fit is given up, and None, at the end of the first turn in which the inducing inputs
     do not resolve a length scale with room to spare, unless they are all the inputs.
@@ -106,7 +105,6 @@ def fit_heteroscedastic(
     covariance: LatentCovariance | None = None
     correlation: DemonstrationCorrelation | None = None
     evidences: list[float] = []
-    rows, training = training, training.merged(max_inputs)
     pooled, start = _start_tril(training), None
     size = (training.y.shape[1], training.x.shape[1])
     mean_search, both = Search(families.mean, *size, options), (families.log_variance, families.coefficients)
@@ -117,15 +115,15 @@ def fit_heteroscedastic(
         noise = NoiseCorrelation.of(correlation, training.inputs, training.index, group)
         tril = _tril_at(training.inputs, pooled, covariance)
         mean = fit_mean(mean_search, training.inputs, training.means(), training.counts, tril, noise.of_means)
-        if not turn and not _follows(training, group, mean, tril):
-            start = MeanStart.of(rows, families.mean, n_inducing)
-            mean_search = Search(start.family, *size, options, start=start.theta)
-            pooled = start.noise_scale.diag()
+        if begin is not None and not turn and not _follows(training, group, mean, tril):
+            start = begin()
+            mean_search, pooled = Search(start.family, *size, options, start.theta, held=True), start.noise_scale.diag()
+            tril = _tril_at(training.inputs, pooled, None)
         if start is not None:
-            its = start.training
-            noise_of_mean = NoiseCorrelation.of(correlation, its.inputs, its.index, group)
-            mean = fit_mean(mean_search, its.inputs, its.means(), its.counts, _tril_at(its.inputs, pooled, covariance), noise_of_mean.of_means)
-            tril = _tril_at(training.inputs, pooled, covariance)
+            its = start.training if noise.of_means is None else start.training.merged(MOST_CORRELATED)
+            of_its = NoiseCorrelation.of(correlation, its.inputs, its.index, group)
+            its_tril = _tril_at(its.inputs, pooled, covariance)
+            mean = fit_mean(mean_search, its.inputs, its.means(), its.counts, its_tril, of_its.of_means)
         residual, share = _residual(training, mean, tril)
         pooled = pooled if turn else _pooled_tril(residual, share)
         normal, scatter, degrees = _scatter(training, residual, share, pooled)
@@ -136,7 +134,8 @@ def fit_heteroscedastic(
         covariance, evidence = fit_covariance(
             searches, training.inputs, part * scatter, part * degrees, noise, covariance
         )
-        if needs_resolution and not (mean.family.resolved(mean.theta) and covariance.resolved):
+        resolved = start is not None or families.mean.resolved(mean.theta)
+        if needs_resolution and not (resolved and covariance.resolved):
             return None
         evidences.append(evidence)
         options.report(len(evidences), -evidence, time.perf_counter() - started)
@@ -147,7 +146,7 @@ def fit_heteroscedastic(
     assert mean is not None
     assert covariance is not None
     whitened = _whitened(training, normal, covariance)
-    missed = is_signal(whitened, rows, group)
+    missed = is_signal(whitened, training, group)
     return HeteroscedasticFit(mean, covariance, pooled, correlation, tuple(evidences), whitened, missed)
 
 

@@ -70,8 +70,8 @@ class Search:
     n_features: int
     options: SearchOptions
     theta: Float[Tensor, "b q"] | None = None
-    start: Float[Tensor, "b q"] | None = None
-    """Where the first run begins, in place of the grid."""
+    held: bool = False
+    """Whether ``theta`` is given, and not searched."""
     _end: tuple[Tensor, Tensor] | None = None
     """Point and inverse Hessian that the last run ended with, of each problem."""
 
@@ -86,6 +86,8 @@ class Search:
         carried : sequence of Tensor, default=()
             What evaluations change and later ones start from: kept with the end in a journal.
         """
+        if self.held and self.theta is not None:
+            return self.theta
         record = Record("evidence", like, *carried, *(self._end or ()))
         if record.ended:
             end = record.state
@@ -150,10 +152,6 @@ class Search:
 
         Those of one length scale are tried together, as they take as many features; all, where calls cost more.
         """
-        if self.start is not None:
-            scales, amplitude = self.start[:, :-1], self.start[:, -1]
-            start = torch.cat([scales.amin(0), amplitude])[None] if self.family.shared else self.start
-            return [(start, _inverse_hessian(objective, start))]
         points = self.family.starts(like, self.n_features)
         small = like.numel() * len(self.family.features.inducing) < _SMALL
         parts = [

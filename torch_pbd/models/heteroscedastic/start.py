@@ -14,7 +14,12 @@ from torch_pbd.models.heteroscedastic.processes import CLEAR, ProcessFamily
 from torch_pbd.models.training import TrainingSet
 
 # Inputs that a fast mean is told apart at, and inducing inputs of all outputs together: a fit of them takes seconds.
-_MOST_INPUTS, _TOGETHER = 1024, 2048
+MOST_CORRELATED = 1024
+"""Inputs of a fast mean, where rows of a demonstration are correlated."""
+_MOST_INPUTS, _MOST_ROWS, _TOGETHER = 1024, 16384, 2048
+# Length scale down to which a search takes a few matrices of 168 rows; and noise, of outputs of unit variance, below
+# which nothing is left to be found with shorter ones: a smooth signal's residual is never white.
+_CHEAP, _NONE = 0.025, 1e-4
 _LONGEST = 10.0  # length scale, in ranges of the inputs: a trend
 _LAGS = 3
 _NOT_WHITE = 21.1  # 0.9999 quantile of the chi-squared distribution of three degrees of freedom
@@ -44,9 +49,15 @@ class MeanStart:
         training = rows.merged(_MOST_INPUTS)
         weights = training.counts / training.counts.mean()
         observations = Observations(training.inputs, training.means().mT.contiguous(), weights)
-        bounds = (resolved_length_scale(training.inputs), _LONGEST)
-        (found,) = fit_together([(observations, EvidenceSearch(length_scale_bounds=bounds))])
-        scale, amplitude = found.hyperparameters.length_scale, found.hyperparameters.amplitude
+        least = resolved_length_scale(training.inputs)
+        for shortest in (max(_CHEAP, least), least):
+            search = EvidenceSearch(length_scale_bounds=(shortest, _LONGEST))
+            found = fit_together([(observations, search)])[0].hyperparameters
+            noise_scale = found.amplitude * found.noise_ratio.sqrt()
+            if bool((noise_scale < _NONE).all()):
+                break
+        scale = found.length_scale
+        scale = scale.amin(0).expand_as(scale) if family.shared else scale
         n_outputs, n_features = scale.shape
         if most is None:
             needed = math.ceil(min((CLEAR / float(scale.min())) ** n_features, len(training.inputs)))
@@ -54,8 +65,8 @@ class MeanStart:
         inducing = inducing_inputs(training.inputs, most)
         features = replace(family.features, inducing=inducing, exact=len(inducing) == len(rows.inputs))
         family = replace(family, features=features)
-        noise_scale = amplitude * (found.hyperparameters.noise_ratio * training.counts.mean()).sqrt()
-        return cls(family, family.theta_of(scale, amplitude), noise_scale, training)
+        noise_scale = noise_scale * training.counts.mean().sqrt()
+        return cls(family, family.theta_of(scale, found.amplitude), noise_scale, rows.merged(_MOST_ROWS // n_outputs))
 
 
 def is_signal(
@@ -70,9 +81,10 @@ def is_signal(
     counts = training.counts[order][:, None]
     total = torch.zeros_like(training.means()).index_add_(0, place, whitened)
     value = total / counts.sqrt()
-    products = [(value[lag:] * value[: len(value) - lag]).sum(0) for lag in range(1, _LAGS + 1)]
-    share = torch.stack(products) / value.square().sum(0).clamp_min(1e-300)
-    coloured = len(value) * share.square().sum(0) > _NOT_WHITE
+    # The square of each sum of products over that of their squares, whatever the variance: chi-squared, of white noise.
+    products = [value[lag:] * value[: len(value) - lag] for lag in range(1, _LAGS + 1)]
+    share = [each.sum(0).square() / each.square().sum(0).clamp_min(1e-300) for each in products]
+    coloured = torch.stack(share).sum(0) > _NOT_WHITE
     if group is None:
         own, own_counts, n_demos = whitened.square().sum(0), counts.sum(), float(counts.mean())
         common, pairs = total.square().sum(0) - own, counts.square().sum() - own_counts
