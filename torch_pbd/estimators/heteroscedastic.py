@@ -1,5 +1,6 @@
 """The recommended regressor: covariance by latent Gaussian processes that are integrated out."""
 
+import warnings
 from collections.abc import Callable
 from functools import cache, partial
 from typing import Any, Literal, Self
@@ -23,6 +24,7 @@ from torch_pbd.estimators._validation import (
     check_number,
     check_period,
 )
+from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.gp.inducing import FeatureMap, inducing_inputs
 from torch_pbd.kernels import KERNELS, KernelName
 from torch_pbd.linalg import safe_cholesky
@@ -32,6 +34,7 @@ from torch_pbd.models.heteroscedastic import (
     HeteroscedasticModel,
     MeanStart,
     SearchOptions,
+    are_copies,
     fit_heteroscedastic,
 )
 from torch_pbd.models.training import TrainingSet
@@ -285,6 +288,23 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
                 break
         assert fit is not None
         warn_if_unresolved(held, features)
+        if groups is None and are_copies(fit.whitened, training, fit.scale, self._door(told["given"]).long()):
+            warnings.warn(
+                "y has rows that repeat those before them along X: they are samples of demonstrations, and counted as "
+                "independent they make the covariance and the mean look far more certain than they are. Give groups, "
+                "the demonstration of each row, to fit (params={'groups': groups} of cross_val_score; a search passes "
+                "them on where set_fit_request(groups=True) and scikit-learn's metadata routing ask for it).",
+                DataRankWarning,
+                stacklevel=4,
+            )
+        elif bool(fit.missed.any()):
+            warnings.warn(
+                f"The mean does not follow output {fit.missed.nonzero().flatten().tolist()} of y: what is left of it "
+                "is no noise, but counted as such. Raise n_inducing or max_inputs, or give groups if rows are of "
+                "several demonstrations.",
+                UserWarning,
+                stacklevel=4,
+            )
         self.effective_share_ = 1.0 if fit.correlation is None else float(fit.correlation.share.mean())
         module = HeteroscedasticModel(fit, prior_tril)
         report = options.outcome(tuple(-value for value in fit.log_evidence))

@@ -3,6 +3,7 @@
 from torch_pbd.models.heteroscedastic.fit import Families, HeteroscedasticFit, fit_heteroscedastic
 from torch_pbd.models.heteroscedastic.module import HeteroscedasticModel
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
+from torch_pbd.models.heteroscedastic.residuals import are_copies
 from torch_pbd.models.heteroscedastic.search import SearchOptions
 from torch_pbd.models.heteroscedastic.start import MeanStart
 
@@ -13,5 +14,6 @@ __all__ = [
     "MeanStart",
     "ProcessFamily",
     "SearchOptions",
+    "are_copies",
     "fit_heteroscedastic",
 ]

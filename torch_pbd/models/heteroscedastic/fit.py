@@ -19,8 +19,9 @@ from torch_pbd.models.heteroscedastic.covariance import CovarianceSearches, fit_
 from torch_pbd.models.heteroscedastic.latent import LatentCovariance
 from torch_pbd.models.heteroscedastic.mean import LatentMean, fit_mean
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
+from torch_pbd.models.heteroscedastic.residuals import is_signal
 from torch_pbd.models.heteroscedastic.search import Search, SearchOptions
-from torch_pbd.models.heteroscedastic.start import MOST_CORRELATED, MUCH_LESS, MeanStart, is_signal
+from torch_pbd.models.heteroscedastic.start import MOST_CORRELATED, MUCH_LESS, MeanStart
 from torch_pbd.models.training import TrainingSet, pooled_tril
 
 # Prior medians of length scale (in ranges of the input) and amplitude, and prior deviation of the constant. Means
@@ -77,6 +78,8 @@ class HeteroscedasticFit:
     """Of the covariance, at the end of each turn, in nats."""
     whitened: Float[Tensor, "rows d"]
     """Residuals of unit covariance at each input."""
+    scale: Float[Tensor, "n d"]
+    """Standard deviations at the inputs."""
     missed: Bool[Tensor, " d"]
     """Outputs whose residuals are no noise: the mean does not follow them."""
 
@@ -146,8 +149,9 @@ def fit_heteroscedastic(
     assert mean is not None
     assert covariance is not None
     whitened = _whitened(training, normal, covariance)
+    scale = (pooled @ covariance.at(training.inputs).tril()).norm(dim=2)
     missed = is_signal(whitened, training, group)
-    return HeteroscedasticFit(mean, covariance, pooled, correlation, tuple(evidences), whitened, missed)
+    return HeteroscedasticFit(mean, covariance, pooled, correlation, tuple(evidences), whitened, scale, missed)
 
 
 def _follows(training: TrainingSet, group: Tensor | None, mean: LatentMean, tril: Tensor) -> bool:
