@@ -1,7 +1,5 @@
 """The recommended regressor: covariance by latent Gaussian processes that are integrated out."""
 
-import warnings
-from collections.abc import Callable
 from functools import cache, partial
 from typing import Any, Literal, Self
 
@@ -10,7 +8,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from torch_pbd.estimators._base import CovarianceRegressor
-from torch_pbd.estimators._demonstrations import check_demonstrations
+from torch_pbd.estimators._demonstrations import check_demonstrations, warn_of_residuals
 from torch_pbd.estimators._inducing import check_memory, numbers_to_try, warn_if_unresolved
 from torch_pbd.estimators._latent import default_prior_tril, warn_if_few, warn_if_identical
 from torch_pbd.estimators._prior import Prior, standardized_prior
@@ -24,7 +22,6 @@ from torch_pbd.estimators._validation import (
     check_number,
     check_period,
 )
-from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.gp.inducing import FeatureMap, inducing_inputs
 from torch_pbd.kernels import KERNELS, KernelName
 from torch_pbd.linalg import safe_cholesky
@@ -32,10 +29,9 @@ from torch_pbd.memory import require_much
 from torch_pbd.models.heteroscedastic import (
     Families,
     HeteroscedasticModel,
-    MeanStart,
     SearchOptions,
-    are_copies,
     fit_heteroscedastic,
+    mean_start,
 )
 from torch_pbd.models.training import TrainingSet
 from torch_pbd.seeds import as_random_state
@@ -275,40 +271,28 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         options = SearchOptions(self.max_iter, self.tol, self.n_restarts, self._progress())
         kernel: KernelName = "squared_exponential" if self.kernel == "periodic" else self.kernel
         to_try = numbers_to_try(self.n_inducing, X.shape[1], y.shape[1])
-        begin: Callable[[], MeanStart] | None = None
+        begin = None
         for sizes in to_try:
             inducing = [inducing_inputs(training.inputs, size) for size in sizes]
             of_mean, features = (FeatureMap(z, kernel, circle, len(z) == len(inputs)) for z in inducing)
             families = Families.of(of_mean, features, held, shared=self.shared_length_scale)
-            begin = begin or cache(partial(MeanStart.of, rows, families.mean, self.n_inducing))
+            begin = begin or cache(partial(mean_start, rows, families.mean, options))
             fit = fit_heteroscedastic(
-                training, group, families, options, needs_resolution=sizes != to_try[-1], begin=begin
+                training,
+                group,
+                families,
+                options,
+                needs_resolution=sizes != to_try[-1],
+                begin=begin if self.n_inducing is None else None,
             )
             if fit is not None:
                 break
         assert fit is not None
         warn_if_unresolved(held, features)
-        if groups is None and are_copies(fit.whitened, training, fit.scale, self._door(told["given"]).long()):
-            warnings.warn(
-                "y has rows that repeat those before them along X: they are samples of demonstrations, and counted as "
-                "independent they make the covariance and the mean look far more certain than they are. Give groups, "
-                "the demonstration of each row, to fit (params={'groups': groups} of cross_val_score; a search passes "
-                "them on where set_fit_request(groups=True) and scikit-learn's metadata routing ask for it).",
-                DataRankWarning,
-                stacklevel=4,
-            )
-        elif bool(fit.missed.any()):
-            warnings.warn(
-                f"The mean does not follow output {fit.missed.nonzero().flatten().tolist()} of y: what is left of it "
-                "is no noise, but counted as such. Raise n_inducing or max_inputs, or give groups if rows are of "
-                "several demonstrations.",
-                UserWarning,
-                stacklevel=4,
-            )
+        warn_of_residuals(fit, group, self._door(told["given"]).long())
         self.effective_share_ = 1.0 if fit.correlation is None else float(fit.correlation.share.mean())
-        module = HeteroscedasticModel(fit, prior_tril)
         report = options.outcome(tuple(-value for value in fit.log_evidence))
-        return Fitted(self._assemble(module, scaling), report, features.jitter)
+        return Fitted(self._assemble(HeteroscedasticModel(fit, prior_tril), scaling), report, features.jitter)
 
     def _in_ranges(self, scaling: Standardization) -> tuple[torch.Tensor | None, torch.Tensor | None]:
         """The length scale and the period that were given, in ranges of the inputs."""

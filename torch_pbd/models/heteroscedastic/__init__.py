@@ -5,15 +5,15 @@ from torch_pbd.models.heteroscedastic.module import HeteroscedasticModel
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
 from torch_pbd.models.heteroscedastic.residuals import are_copies
 from torch_pbd.models.heteroscedastic.search import SearchOptions
-from torch_pbd.models.heteroscedastic.start import MeanStart
+from torch_pbd.models.heteroscedastic.start import mean_start
 
 __all__ = [
     "Families",
     "HeteroscedasticFit",
     "HeteroscedasticModel",
-    "MeanStart",
     "ProcessFamily",
     "SearchOptions",
     "are_copies",
     "fit_heteroscedastic",
+    "mean_start",
 ]

@@ -1,64 +1,48 @@
-"""Where the mean begins if it does not follow the data: hyperparameters and noise that the evidence finds together."""
+"""Where the mean begins if the first one does not follow the data: what the evidence finds together with the noise."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from torch_pbd.gp import EvidenceSearch, Observations, fit_together
 from torch_pbd.gp.inducing import inducing_inputs
 from torch_pbd.gp.neighbourhoods import resolved_length_scale
 from torch_pbd.models.heteroscedastic.processes import CLEAR, ProcessFamily
+from torch_pbd.models.heteroscedastic.search import Search, SearchOptions
 from torch_pbd.models.training import TrainingSet
 
-# Inputs that a fast mean is told apart at, and inducing inputs of all outputs together: a fit of them takes seconds.
-MOST_CORRELATED = 1024
-"""Inputs of a fast mean, where rows of a demonstration are correlated."""
-_MOST_INPUTS, _MOST_ROWS, _TOGETHER = 1024, 16384, 2048
+MOST_INPUTS = 1024
+"""Inputs that short length scales are searched with, and that correlated rows are fitted at: some seconds."""
+
+_MOST_ROWS, _TOGETHER = 16384, 2048  # inputs to fit at, and inducing ones, of all outputs together
 # Length scale down to which a search takes a few matrices of 168 rows; and noise, of outputs of unit variance, below
 # which nothing is left to be found with shorter ones: a smooth signal's residual is never white.
 _CHEAP, _NONE = 0.025, 1e-4
 _LONGEST = 10.0  # length scale, in ranges of the inputs: a trend
-MUCH_LESS = 0.25
-"""Share of the variance that was taken for noise, below which as residual it was not."""
 
 
-@dataclass(frozen=True)
-class MeanStart:
-    """Family on as many inducing inputs as it needs, hyperparameters, noise, and the inputs to fit at."""
+def mean_start(rows: TrainingSet, family: ProcessFamily, options: SearchOptions) -> tuple[Search, Tensor, TrainingSet]:
+    """Start where ``family`` is too coarse for the means at the inputs, or their noise was taken for too large.
 
-    family: ProcessFamily
-    theta: Float[Tensor, "d q"]
-    noise_scale: Float[Tensor, " d"]
-    """Standard deviation of a row."""
-    training: TrainingSet
-
-    @classmethod
-    def of(cls, rows: TrainingSet, family: ProcessFamily, most: int | None) -> "MeanStart":
-        """What the evidence of the means at the inputs finds, with the noise.
-
-        ``most`` bounds the number of inducing inputs, where the user does.
-        """
-        training = rows.merged(_MOST_INPUTS)
-        weights = training.counts / training.counts.mean()
-        observations = Observations(training.inputs, training.means().mT.contiguous(), weights)
-        least = resolved_length_scale(training.inputs)
-        for shortest in (max(_CHEAP, least), least):
-            search = EvidenceSearch(length_scale_bounds=(shortest, _LONGEST))
-            found = fit_together([(observations, search)])[0].hyperparameters
-            noise_scale = found.amplitude * found.noise_ratio.sqrt()
-            if bool((noise_scale < _NONE).all()):
-                break
-        scale = found.length_scale
-        scale = scale.amin(0).expand_as(scale) if family.shared else scale
-        n_outputs, n_features = scale.shape
-        if most is None:
-            needed = math.ceil(min((CLEAR / float(scale.min())) ** n_features, len(training.inputs)))
-            most = max(len(family.features.inducing), min(needed, _TOGETHER // n_outputs))
-        inducing = inducing_inputs(training.inputs, most)
-        features = replace(family.features, inducing=inducing, exact=len(inducing) == len(rows.inputs))
-        family = replace(family, features=features)
-        noise_scale = noise_scale * training.counts.mean().sqrt()
-        return cls(family, family.theta_of(scale, found.amplitude), noise_scale, rows.merged(_MOST_ROWS // n_outputs))
+    That is hyperparameters found, on the inducing inputs that they need; the factor (d, d) of the noise of a row; and
+    the rows at as many inputs as are needed.
+    """
+    training = rows.merged(MOST_INPUTS)
+    rows_at_input = training.counts.mean()
+    observations = Observations(training.inputs, training.means().mT.contiguous(), training.counts / rows_at_input)
+    least = resolved_length_scale(training.inputs)
+    for shortest in (max(_CHEAP, least), least):
+        bounds = (shortest, _LONGEST)
+        found = fit_together([(observations, EvidenceSearch(length_scale_bounds=bounds))])[0].hyperparameters
+        noise_scale = found.amplitude * found.noise_ratio.sqrt()
+        if bool((noise_scale < _NONE).all()):
+            break
+    scale = found.length_scale.amin(0).expand_as(found.length_scale) if family.shared else found.length_scale
+    n_outputs, n_features = scale.shape
+    needed = math.ceil(min((CLEAR / float(scale.min())) ** n_features, len(training.inputs)))
+    inducing = inducing_inputs(training.inputs, max(len(family.features.inducing), min(needed, _TOGETHER // n_outputs)))
+    exact = len(inducing) == len(rows.inputs)
+    family = replace(family, features=replace(family.features, inducing=inducing, exact=exact))
+    search = Search(family, n_outputs, n_features, options, family.theta_of(scale, found.amplitude), held=True)
+    return search, (noise_scale * rows_at_input.sqrt()).diag(), rows.merged(_MOST_ROWS // n_outputs)
