@@ -59,6 +59,8 @@ WARNINGS = {
     (DataRankWarning, r"y has means at the inputs that differ by more"): "a mean that would have to swing wildly",
     (DataRankWarning, r"The demonstrations are identical"): "there is no variability to learn",
     (DataRankWarning, r"y is constant"): "the same of a mixture",
+    (DataRankWarning, r"y has rows that nearly repeat"): "samples of smooth demonstrations, counted as independent",
+    (UserWarning, r"The mean does not follow y in outputs"): "what is left of a signal counts as noise",
     (DataRankWarning, r"groups has one demonstration"): "what differs between demonstrations cannot be learned of one",
     (
         ConvergenceWarning,

@@ -87,7 +87,8 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator, ABC)
         self.n_outputs_ = 1 if self._y_is_1d else targets.shape[1]
         targets = targets.reshape(len(inputs), -1, order="F")
         order = canonical_order(inputs, targets)
-        told = {} if groups is None else {"groups": check_groups(groups, len(inputs))[order]}
+        told = {"given": order.argsort()}
+        told |= {} if groups is None else {"groups": check_groups(groups, len(inputs))[order]}
         with torch.inference_mode(False), torch.enable_grad():
             fitted = self._fit(inputs.T.take(order, axis=1).T, targets.T.take(order, axis=1).T, **told)
         self.module_ = fitted.module
@@ -111,7 +112,10 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator, ABC)
 
     @abstractmethod
     def _fit(self, X: Floats, y: Floats, **told: Any) -> Fitted:
-        """Fit on validated arrays (n, e) and (n, d); ``told`` may hold the demonstrations' numbers (n,)."""
+        """Fit on validated arrays (n, e) and (n, d).
+
+        ``told`` holds the rows in the order they were ``given``, and may hold the demonstrations' numbers (n,).
+        """
 
     def __sklearn_is_fitted__(self) -> bool:
         return "module_" in vars(self)

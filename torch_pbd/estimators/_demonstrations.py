@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from torch_pbd.arguments import from_tensor
 from torch_pbd.data import Demonstrations, check_unimodal
 from torch_pbd.estimators._validation import Floats
 from torch_pbd.exceptions import DataRankWarning
+from torch_pbd.models.heteroscedastic import HeteroscedasticFit, are_copies
 
 _ways_told: ContextVar[bool] = ContextVar("_ways_told", default=False)
 _COVERED = 0.5  # of the range of the input, by a demonstration that is compared with others
@@ -95,3 +97,21 @@ def check_demonstrations(X: Floats, y: Floats, groups: Any) -> None:
         positions.append(y[rows][first])
     if min(len(time) for time in times) > 1 and min(np.ptp(time) for time in times) > _COVERED * np.ptp(X):
         check_unimodal(Demonstrations(times, positions))
+
+
+def warn_of_residuals(fit: HeteroscedasticFit, group: Tensor | None, given: Tensor) -> None:
+    """Warn where rows, ``given`` in this order without groups, are of demonstrations; or the mean misses a signal."""
+    if group is None and are_copies(fit.whitened(), fit.training, given):
+        message = (
+            "y has rows that nearly repeat those beside them along X, as samples of a demonstration do. Without groups "
+            "they count as independent, and what is predicted is far too certain. Give groups, the demonstration of "
+            "each row, to fit; cross_val_score takes params={'groups': groups}, and a search passes them on where "
+            "metadata routing is enabled and set_fit_request(groups=True) asks for them."
+        )
+        warnings.warn(message, DataRankWarning, stacklevel=6)
+    elif bool((missed := fit.missed(group)).any()):
+        message = (
+            f"The mean does not follow y in outputs {missed.nonzero().flatten().tolist()}: what is left is no noise, "
+            "but counts as such. Raise n_inducing and max_inputs; give groups if the rows are of demonstrations."
+        )
+        warnings.warn(message, UserWarning, stacklevel=6)

@@ -1,5 +1,6 @@
 """The recommended regressor: covariance by latent Gaussian processes that are integrated out."""
 
+from functools import cache, partial
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -7,7 +8,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from torch_pbd.estimators._base import CovarianceRegressor
-from torch_pbd.estimators._demonstrations import check_demonstrations
+from torch_pbd.estimators._demonstrations import check_demonstrations, warn_of_residuals
 from torch_pbd.estimators._inducing import check_memory, numbers_to_try, warn_if_unresolved
 from torch_pbd.estimators._latent import default_prior_tril, warn_if_few, warn_if_identical
 from torch_pbd.estimators._prior import Prior, standardized_prior
@@ -30,6 +31,7 @@ from torch_pbd.models.heteroscedastic import (
     HeteroscedasticModel,
     SearchOptions,
     fit_heteroscedastic,
+    mean_start,
 )
 from torch_pbd.models.training import TrainingSet
 from torch_pbd.seeds import as_random_state
@@ -264,24 +266,33 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         )
         warn_if_few(len(y), y.shape[1])
         warn_if_identical(training)
-        training = training.merged(self.max_inputs)
+        rows, training = training, training.merged(self.max_inputs)
         group = None if groups is None else self._door(groups).long()
         options = SearchOptions(self.max_iter, self.tol, self.n_restarts, self._progress())
         kernel: KernelName = "squared_exponential" if self.kernel == "periodic" else self.kernel
         to_try = numbers_to_try(self.n_inducing, X.shape[1], y.shape[1])
+        begin = None
         for sizes in to_try:
             inducing = [inducing_inputs(training.inputs, size) for size in sizes]
             of_mean, features = (FeatureMap(z, kernel, circle, len(z) == len(inputs)) for z in inducing)
             families = Families.of(of_mean, features, held, shared=self.shared_length_scale)
-            fit = fit_heteroscedastic(training, group, families, options, needs_resolution=sizes != to_try[-1])
+            begin = begin or cache(partial(mean_start, rows, families.mean, options))
+            fit = fit_heteroscedastic(
+                training,
+                group,
+                families,
+                options,
+                needs_resolution=sizes != to_try[-1],
+                begin=begin if self.n_inducing is None else None,
+            )
             if fit is not None:
                 break
         assert fit is not None
         warn_if_unresolved(held, features)
+        warn_of_residuals(fit, group, self._door(told["given"]).long())
         self.effective_share_ = 1.0 if fit.correlation is None else float(fit.correlation.share.mean())
-        module = HeteroscedasticModel(fit, prior_tril)
         report = options.outcome(tuple(-value for value in fit.log_evidence))
-        return Fitted(self._assemble(module, scaling), report, features.jitter)
+        return Fitted(self._assemble(HeteroscedasticModel(fit, prior_tril), scaling), report, features.jitter)
 
     def _in_ranges(self, scaling: Standardization) -> tuple[torch.Tensor | None, torch.Tensor | None]:
         """The length scale and the period that were given, in ranges of the inputs."""

@@ -3,7 +3,9 @@
 from torch_pbd.models.heteroscedastic.fit import Families, HeteroscedasticFit, fit_heteroscedastic
 from torch_pbd.models.heteroscedastic.module import HeteroscedasticModel
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
+from torch_pbd.models.heteroscedastic.residuals import are_copies
 from torch_pbd.models.heteroscedastic.search import SearchOptions
+from torch_pbd.models.heteroscedastic.start import mean_start
 
 __all__ = [
     "Families",
@@ -11,5 +13,7 @@ __all__ = [
     "HeteroscedasticModel",
     "ProcessFamily",
     "SearchOptions",
+    "are_copies",
     "fit_heteroscedastic",
+    "mean_start",
 ]

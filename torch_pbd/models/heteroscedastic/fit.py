@@ -1,10 +1,11 @@
 """Fit of mean and covariance, by turns."""
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from torch_pbd.gp.inducing import FeatureMap
@@ -18,7 +19,9 @@ from torch_pbd.models.heteroscedastic.covariance import CovarianceSearches, fit_
 from torch_pbd.models.heteroscedastic.latent import LatentCovariance
 from torch_pbd.models.heteroscedastic.mean import LatentMean, fit_mean
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
+from torch_pbd.models.heteroscedastic.residuals import is_signal
 from torch_pbd.models.heteroscedastic.search import Search, SearchOptions
+from torch_pbd.models.heteroscedastic.start import MOST_INPUTS
 from torch_pbd.models.training import TrainingSet, pooled_tril
 
 # Prior medians of length scale (in ranges of the input) and amplitude, and prior deviation of the constant. Means
@@ -34,6 +37,8 @@ _ROWS_TOGETHER = 8  # neighbours whose differences tell the noise that the first
 _FIRST_SAMPLES = 10.0  # of a demonstration: what counts of it before its correlation is known
 # Of y's standard deviation: an output that is constant, or a copy of another, has this deviation of its own.
 _LEAST_DEVIATION = 1e-6
+_MUCH_LESS = 0.25  # of the variance that was taken for noise
+_WORTH_TELLING = 0.03  # of y's variance: what no smooth mean follows of a corner leaves less
 _LEAST_OWN = 1e-4  # of an output's deviation, as long as the mean is fitted
 
 
@@ -73,6 +78,17 @@ class HeteroscedasticFit:
     correlation: DemonstrationCorrelation | None
     log_evidence: tuple[float, ...]
     """Of the covariance, at the end of each turn, in nats."""
+    training: TrainingSet
+    residual: Float[Tensor, "rows d"]
+
+    def whitened(self) -> Float[Tensor, "rows d"]:
+        """Residuals of unit covariance."""
+        return _whitened(self.training, _solved(self.pooled_tril, self.residual), self.covariance)
+
+    def missed(self, group: Int64[Tensor, " rows"] | None) -> Bool[Tensor, " d"]:
+        """Outputs whose residuals are a signal that the mean does not follow."""
+        worth_telling = self.residual.square().mean(0) > _WORTH_TELLING
+        return worth_telling & is_signal(self.whitened(), self.training, group)
 
 
 def fit_heteroscedastic(
@@ -83,30 +99,33 @@ def fit_heteroscedastic(
     *,
     n_turns: int = 3,
     needs_resolution: bool = False,
+    begin: Callable[[], tuple[Search, Tensor, TrainingSet]] | None = None,
 ) -> HeteroscedasticFit | None:
     """Mean under the noise learned so far, then covariance of the residuals from it, ``n_turns`` times.
 
     ``group`` tells the demonstrations apart. What the first turns leave of each, whitened, tells how far
     its samples are correlated, which the later ones take into account.
 
+    Where the first mean does not follow the data, it is from where ``begin`` says, if it is given: :func:`mean_start`.
+
     With ``needs_resolution`` the fit is given up, and None, at the end of the first turn in which the inducing inputs
     do not resolve a length scale with room to spare, unless they are all the inputs.
     """
-    mean: LatentMean | None = None
     covariance: LatentCovariance | None = None
     correlation: DemonstrationCorrelation | None = None
     evidences: list[float] = []
-    pooled = _start_tril(training)
+    pooled, of_mean = _start_tril(training), training
     size = (training.y.shape[1], training.x.shape[1])
     mean_search, both = Search(families.mean, *size, options), (families.log_variance, families.coefficients)
     searches = CovarianceSearches.of(both, *size, options)
     started = time.perf_counter()
     for turn in range(n_turns):
         options.slack = _SLACK if turn < n_turns - 1 else 1.0
-        noise = NoiseCorrelation.of(correlation, training.inputs, training.index, group)
-        tril = _tril_at(training.inputs, pooled, covariance)
-        mean = fit_mean(mean_search, training.inputs, training.means(), training.counts, tril, noise.of_means)
-        residual, share = _residual(training, mean, tril)
+        mean = _fit_mean(mean_search, of_mean, group, pooled, covariance, correlation)
+        if begin is not None and turn == 0 and not _follows(training, group, mean, pooled):
+            mean_search, pooled, of_mean = begin()
+            mean = _fit_mean(mean_search, of_mean, group, pooled, None, None)
+        residual, share = _residual(training, mean, _tril_at(training.inputs, pooled, covariance))
         pooled = pooled if turn else _pooled_tril(residual, share)
         normal, scatter, degrees = _scatter(training, residual, share, pooled)
         part = 1.0 if turn else _first_part(training, group)
@@ -114,9 +133,14 @@ def fit_heteroscedastic(
         if turn == 1 and correlation is not None and correlation.matters:
             covariance, searches = None, CovarianceSearches.of(both, *size, options)
         covariance, evidence = fit_covariance(
-            searches, training.inputs, part * scatter, part * degrees, noise, covariance
+            searches,
+            training.inputs,
+            part * scatter,
+            part * degrees,
+            NoiseCorrelation.of(correlation, training.inputs, training.index, group),
+            covariance,
         )
-        if needs_resolution and not (families.mean.resolved(mean.theta) and covariance.resolved):
+        if needs_resolution and not (covariance.resolved and (mean_search.held or mean.family.resolved(mean.theta))):
             return None
         evidences.append(evidence)
         options.report(len(evidences), -evidence, time.perf_counter() - started)
@@ -124,9 +148,31 @@ def fit_heteroscedastic(
             correlation = demonstration_correlation(training.x, _whitened(training, normal, covariance), group)
             if correlation.matters:
                 training = training.merged(_n_inputs(training, group))
-    assert mean is not None
+                of_mean = of_mean.merged(MOST_INPUTS) if mean_search.held else training
     assert covariance is not None
-    return HeteroscedasticFit(mean, covariance, pooled, correlation, tuple(evidences))
+    return HeteroscedasticFit(mean, covariance, pooled, correlation, tuple(evidences), training, residual)
+
+
+def _fit_mean(
+    search: Search,
+    training: TrainingSet,
+    group: Tensor | None,
+    pooled: Tensor,
+    covariance: LatentCovariance | None,
+    correlation: DemonstrationCorrelation | None,
+) -> LatentMean:
+    """Mean under the noise so far."""
+    whitener = NoiseCorrelation.of(correlation, training.inputs, training.index, group).of_means
+    tril = _tril_at(training.inputs, pooled, covariance)
+    return fit_mean(search, training.inputs, training.means(), training.counts, tril, whitener)
+
+
+def _follows(training: TrainingSet, group: Tensor | None, mean: LatentMean, pooled: Tensor) -> bool:
+    """Whether residuals of a mean are the noise that it was fitted under: not far less, and no signal."""
+    residual, _ = _residual(training, mean, pooled.expand(len(training.inputs), -1, -1))
+    whitened = _solved(pooled, residual)
+    less = whitened.square().mean(0) < _MUCH_LESS
+    return not bool((less | is_signal(whitened, training, group)).any())
 
 
 def _tril_at(inputs: Tensor, pooled: Tensor, covariance: LatentCovariance | None) -> Tensor:
@@ -150,10 +196,14 @@ def _start_tril(training: TrainingSet) -> Tensor:
 
 def _scatter(training: TrainingSet, residual: Tensor, share: Tensor, pooled: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Residuals of pooled unit covariance (rows, d); their scatter and degrees of freedom at each input."""
-    normal = torch.linalg.solve_triangular(pooled, residual.mT, upper=False).mT
+    normal = _solved(pooled, residual)
     root = training.scatter_root(normal)
     degrees = torch.zeros_like(training.means()).index_add_(0, training.index, share)
     return normal, root @ root.mT, degrees.mT
+
+
+def _solved(tril: Tensor, residual: Tensor) -> Tensor:
+    return torch.linalg.solve_triangular(tril, residual.mT, upper=False).mT
 
 
 def _whitened(training: TrainingSet, normal: Tensor, covariance: LatentCovariance) -> Tensor:

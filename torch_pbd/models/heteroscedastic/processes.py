@@ -10,7 +10,9 @@ from torch import Tensor
 from torch_pbd.gp.fixed_features import FeaturesAt, FixedFeatures
 from torch_pbd.gp.inducing import FeatureMap, PreparedFeatures
 
-_CLEAR = 3.0  # times the shortest length scale
+CLEAR = 3.0
+"""Times the shortest length scale, above which inducing inputs resolve one with room to spare."""
+
 _WIDEST = 4.0  # amplitudes stay within a factor of exp(4) of their prior median
 _SPREAD_LENGTH_SCALE, _SPREAD_AMPLITUDE = 1.0, 1.5  # prior deviations of the logarithms
 _NEGLIGIBLE = 1e-8  # nats of the log evidence, that features which are left out may be worth
@@ -65,9 +67,15 @@ class ProcessFamily:
         least = math.log(self.features.shortest_length_scale())
         return torch.logaddexp(theta[:, :-1], torch.full_like(theta[:, :-1], least)).exp()
 
+    def theta_of(self, length_scale: Float[Tensor, "b e"], amplitude: Float[Tensor, " b"]) -> Float[Tensor, "b q"]:
+        """Hyperparameters of these length scales and amplitudes, or those nearest to them."""
+        above = (length_scale - self.features.shortest_length_scale()).maximum(0.3 * length_scale)
+        strength = (amplitude / self.amplitude).log().clamp(-0.5 * _WIDEST, 0.5 * _WIDEST)
+        return torch.cat([above.log(), strength[:, None]], dim=1)
+
     def resolved(self, theta: Float[Tensor, "b q"]) -> bool:
         """Whether length scales stay clear of the shortest that the inducing inputs resolve."""
-        least = _CLEAR * self.features.shortest_length_scale()
+        least = CLEAR * self.features.shortest_length_scale()
         return self.features.exact or bool((self.length_scale_of(theta) > least).all())
 
     def amplitude_of(self, theta: Float[Tensor, "b q"]) -> Float[Tensor, " b"]:

@@ -70,6 +70,8 @@ class Search:
     n_features: int
     options: SearchOptions
     theta: Float[Tensor, "b q"] | None = None
+    held: bool = False
+    """Whether ``theta`` is given, and not searched."""
     _end: tuple[Tensor, Tensor] | None = None
     """Point and inverse Hessian that the last run ended with, of each problem."""
 
@@ -84,6 +86,8 @@ class Search:
         carried : sequence of Tensor, default=()
             What evaluations change and later ones start from: kept with the end in a journal.
         """
+        if self.held and self.theta is not None:
+            return self.theta
         record = Record("evidence", like, *carried, *(self._end or ()))
         if record.ended:
             end = record.state
