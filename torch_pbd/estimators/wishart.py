@@ -1,6 +1,7 @@
 """The Wishart process ("WP") of the paper, Section IV-A."""
 
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -203,8 +204,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         latent, jitter = condition(observations, hyperparameters, self.kernel, observed(root).targets)
         with torch.no_grad():
             mse = float(covariance_mse(wishart_root(latent(inputs), prior_root, matrix), target))
-        report = FitReport(mse, (mse,), report.n_iter, report.converged, report.message)
-        report = report.after(of_mean, "search of the mean")
+        report = replace(report, loss=mse, loss_curve=(mse,)).after(of_mean, "search of the mean")
         return mean, WishartCovariance(latent, _constant(prior_root), matrix), report, jitter
 
     def _interpolating(self, observations: Observations, problem: Problem) -> tuple[Hyperparameters, FitReport]:
