@@ -1,11 +1,12 @@
 import math
+from importlib import import_module
 
 import pytest
 import torch
 from scipy.optimize import rosen
 
 from torch_pbd.exceptions import NotPositiveDefiniteError
-from torch_pbd.optim import by_autograd, minimize, minimize_batch, minimize_scoring
+from torch_pbd.optim import FitReport, Status, by_autograd, first_failure, minimize, minimize_batch, minimize_scoring
 
 
 def parameter(*values):
@@ -27,8 +28,7 @@ def test_minimize_finds_the_minimum_of_rosenbrock():
 def test_the_curve_falls_and_ends_at_the_loss_of_the_parameters():
     x = parameter(-1.2, 1.0)
     report = minimize(lambda: rosenbrock(x), [x], max_iter=7)
-    assert not report.converged
-    assert "max_iter=7" in report.message
+    assert report.status is Status.MAX_ITER
     assert list(report.loss_curve) == sorted(report.loss_curve, reverse=True)
     assert report.loss == report.loss_curve[-1] == rosenbrock(x).item()
 
@@ -42,8 +42,7 @@ def test_a_loss_that_is_not_finite_leaves_the_best_point(fault):
         return rosenbrock(x) * (fault if len(calls) >= 7 else 1.0)
 
     report = minimize(objective, [x])
-    assert not report.converged
-    assert "not finite" in report.message
+    assert report.status is Status.NOT_FINITE
     assert report.loss == rosenbrock(x).item() <= report.loss_curve[0]
     assert len(calls) == 10  # one failure, three restarts that fail at once
 
@@ -58,6 +57,42 @@ def test_a_fault_that_passes_is_survived():
     report = minimize(objective, [x], tol=1e-10)
     assert report.converged
     assert report.loss < 1e-10
+
+
+def test_a_search_of_torch_that_raises_is_a_failed_line_search(monkeypatch):
+    """Its strong Wolfe search has an IndexError where it brackets no minimum."""
+    monkeypatch.setattr(import_module("torch.optim.lbfgs"), "_strong_wolfe", lambda *_, **__: [][0])
+    x = parameter(-1.2, 1.0)
+    report = minimize(lambda: rosenbrock(x), [x])
+    assert report.status is Status.LINE_SEARCH_FAILED
+    assert "IndexError" in report.message
+    assert (report.loss, report.n_iter) == (rosenbrock(x).item(), 4)
+
+
+def test_a_loss_that_disagrees_with_itself_ends_at_the_most_evaluations():
+    x, calls = parameter(-1.2, 1.0), []
+
+    def objective():
+        calls.append(1)
+        return rosenbrock(x) + 10.0 * (len(calls) % 2)
+
+    report = minimize(objective, [x], tol=1e-10, max_iter=100)
+    assert report.status is Status.MAX_EVALUATIONS
+    assert 3 * 220 / 2 < len(calls) <= 4 * 220 + 4 * 25  # a line search may go beyond
+
+
+@pytest.mark.parametrize("status", Status)
+def test_a_report_after_another_that_failed_has_failed_too(status):
+    first, good = FitReport(2.0, (2.0,), 3, status, "why"), FitReport(1.0, (1.0,), 1, Status.CONVERGED)
+    after = good.after(first, "the first")
+    assert (after.status, after.loss, after.n_iter) == (status, 1.0, 1)
+    assert after.message == ("converged" if status is Status.CONVERGED else "the first: why")
+    assert first.after(good, "") is first
+    assert after.converged == (status is Status.CONVERGED)
+    assert status.is_limit == (status in (Status.MAX_ITER, Status.MAX_EVALUATIONS))
+    expected = Status.NOT_FINITE if status is Status.CONVERGED else status
+    assert first_failure([Status.CONVERGED, status, Status.NOT_FINITE]) is expected
+    assert first_failure([]) is Status.CONVERGED
 
 
 def test_a_barrier_never_ends_worse_than_it_started():
@@ -158,8 +193,7 @@ def test_scoring_stays_where_no_step_lowers_the_loss():
     start = torch.tensor([1.0], dtype=torch.float64)
     x, report = minimize_scoring(lambda x: x.sum(), lambda x: (-torch.ones(1).double(), torch.ones(1).double()), start)
     assert x is start
-    assert not report.converged
-    assert "no step lowers the loss" in report.message
+    assert report.status is Status.LINE_SEARCH_FAILED
     assert report.loss == 1.0
 
 
@@ -187,8 +221,7 @@ def test_scoring_needs_a_finite_start():
 def test_scoring_tells_that_it_stopped_early():
     loss, newton = gauss_newton(lambda x: torch.stack([10 * (x[1] - x[0] ** 2), 1 - x[0]]))
     _, report = minimize_scoring(loss, newton, torch.tensor([-1.2, 1.0], dtype=torch.float64), max_iter=1)
-    assert not report.converged
-    assert "max_iter=1" in report.message
+    assert report.status is Status.MAX_ITER
 
 
 def quadratics(generator):
@@ -276,7 +309,7 @@ def test_whatever_an_evaluation_raises_the_best_point_is_left_and_the_reason_tol
 
     start = rosenbrock(x).item()
     report = minimize(objective, [x])
-    assert not report.converged
+    assert report.status is Status.NOT_FINITE
     assert (str(fault) if isinstance(fault, Exception) else "not finite") in report.message
     assert report.loss == rosenbrock(x).item() == min(report.loss_curve) <= start
     assert len(calls) <= when + 3
@@ -323,7 +356,7 @@ def test_a_batch_loses_only_the_problem_that_raises(fault):
     assert 0.0 < x[0, 0] <= 0.5
     assert x[1, 0] == 0.0
     assert math.isnan(report.loss[1])
-    assert not report.converged
+    assert report.status is Status.NOT_FINITE
     assert x[2, 0].item() == pytest.approx(1.0, abs=1e-6)
 
 
@@ -354,8 +387,8 @@ def test_scoring_ends_where_there_is_no_step_to_take(fault):
         return 2 * x, -0.5 * x
 
     x, report = minimize_scoring(lambda x: x.square().sum(), newton, torch.tensor([2.0], dtype=torch.float64))
-    assert not report.converged
-    assert str(fault) in report.message
+    assert report.status is Status.NOT_FINITE
+    assert report.message == str(fault)
     assert report.loss == x.square().sum().item() < 4.0
     with pytest.raises(ValueError, match="cannot start"):
         minimize_scoring(lambda x: x.square().sum(), lambda _: [][calls[0]], torch.tensor([2.0], dtype=torch.float64))

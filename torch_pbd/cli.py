@@ -12,7 +12,6 @@ from torch_pbd.console import Notes, say
 from torch_pbd.exceptions import ConfigError, FolderInUseError
 
 _ERROR, _USAGE, _IN_USE, _INTERRUPTED, _TERMINATED = 1, 2, 3, 130, 143
-_CHECKPOINT = "checkpoint"  # in the folder of results, while the work goes on
 
 
 class _Terminated(BaseException):
@@ -93,6 +92,7 @@ def _run(command: str, arguments: Sequence[str]) -> int:
     import matplotlib as mpl
     import torch
 
+    from torch_pbd.experiments.resume import finished_fits
     from torch_pbd.experiments.run_folder import check_names
 
     mpl.use("Agg")
@@ -105,11 +105,11 @@ def _run(command: str, arguments: Sequence[str]) -> int:
         warnings.simplefilter("default")
         warnings.showwarning = Notes()
         try:
-            with _checkpoint(options, folder, config):
+            with finished_fits(folder.path / "finished", resume=options.resume) as folder.finished:
                 folder.write_text("config.yaml", config)
                 say(WORK[command](options, folder))
         except (KeyboardInterrupt, _Terminated) as stop:
-            if (folder.path / _CHECKPOINT).exists():
+            if folder.finished and folder.finished.files():
                 stop.args = (f"torch-pbd {command} --config {folder.path / 'config.yaml'} --resume goes on",)
             raise
     say(f"\nresults: {folder.path}")
@@ -129,19 +129,6 @@ def _run_folder(path: str, command: str) -> Any:
         raise ConfigError(
             f"output: {path!r} cannot be a folder of results: {reason}{where}. Give another with --output FOLDER."
         ) from error
-
-
-def _checkpoint(options: Any, folder: Any, config: str) -> Any:
-    """What keeps the work's checkpoint, begun with the one that is there if asked to."""
-    from torch_pbd.experiments.resuming import checkpoint_of_run
-
-    return checkpoint_of_run(
-        folder.path / _CHECKPOINT,
-        config,
-        options.data if hasattr(options, "data") else None,
-        resume=options.resume,
-        interval=options.checkpoint_interval,
-    )
 
 
 def _help(commands: Mapping[str, str]) -> str:

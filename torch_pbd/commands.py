@@ -35,12 +35,12 @@ def demo(options: Any, folder: Any) -> str:
 
 def fit(options: Any, folder: Any) -> str:
     """One model on a file of demonstrations."""
-    from torch_pbd.estimators._groups import fit_by_demonstration
     from torch_pbd.experiments.recordings import write_fitted
+    from torch_pbd.experiments.resume import fit_once
 
     demonstrations = _demonstrations(options)
     X, y, groups = demonstrations.stack(options.input)
-    model = fit_by_demonstration(options.model, X, y, groups)
+    model, _ = fit_once(options.model, X, y, groups, finished=folder.finished)
     name = type(model).__name__
     model_path, figure_path = write_fitted(model, demonstrations, folder, name, options.input)
     row = {

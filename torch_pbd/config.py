@@ -106,10 +106,7 @@ def _parser(command: str, *, only_help: bool) -> _Parser:
     parser = _Parser(prog=f"torch-pbd {command}", description=COMMANDS[command].capitalize() + ".", exit_on_error=False)
     parser.add_argument("--config", action=ActionConfigFile, help="YAML file with any of these options")
     parser.add_argument("--output", type=str, default=f"runs/{command}", help="folder of the results")
-    parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in the folder of results")
-    parser.add_argument(
-        "--checkpoint_interval", type=PositiveFloat, default=5.0, help="seconds between two checkpoints"
-    )
+    parser.add_argument("--resume", action="store_true", help="go on with the finished fits in the folder of results")
     model_type, models_type = (Any, Any) if only_help else _model_types()
     if command == "demo":
         parser.add_argument("--n_demos", type=PositiveInt, default=6, help="demonstrations to learn from, at least 3")

@@ -2,8 +2,9 @@
 
 ``python scripts/benchmarks/kills.py --trials 200`` kills at random times, ``--crash_points 50`` at calls that change
 files (writes, renames, removals), spread over all that a run makes. A trial is lost if a model that was there before is
-gone or changed and no new one took its place whole, if a checkpoint cannot be read, if ``--resume`` fails or ends at
-another loss, or if a draft stays. Children are forked from one process that has loaded torch: POSIX only.
+gone or changed and no new one took its place whole, if a finished fit cannot be read, if ``--resume`` fails or ends at
+another loss, or if a draft or a finished fit stays. Children are forked from one process that has loaded torch: POSIX
+only.
 """
 
 import argparse
@@ -21,11 +22,10 @@ from pathlib import Path
 import numpy as np
 
 import torch_pbd
-from torch_pbd.checkpoint import read_checkpoint
 from torch_pbd.cli import main
-from torch_pbd.experiments import recordings, resuming  # noqa: F401 - loaded before the forks
+from torch_pbd.experiments import recordings  # noqa: F401 - loaded before the forks
 
-_CHANGES = ("fsync", "replace", "rename", "unlink", "link", "mkdir")  # of os
+_CHANGES = ("fsync", "replace", "rename", "unlink", "link", "mkdir", "rmdir")  # of os
 FIT = {
     "CD": ["CholeskyCovRegressor", "--model.objective", "likelihood", "--model.latent_prior", "false"],
     "WP": ["WishartProcessRegressor", "--model.objective", "likelihood", "--model.solver", "fisher"],
@@ -113,7 +113,7 @@ class Trial:
         return self._judged(run)
 
     def _run(self, folder: Path, *more: str) -> int:
-        return main([*self.arguments, *more, "--output", str(folder), "--checkpoint_interval", "1e-9"])
+        return main([*self.arguments, *more, "--output", str(folder)])
 
     def _counted(self, folder: Path, counter: Path) -> int:
         calls = _watch(lambda _: None)
@@ -140,13 +140,13 @@ class Trial:
         if path.read_bytes() not in (earlier, self.model):
             return "the model is neither the earlier one nor the new one"
         torch_pbd.load(path)
-        checkpoint = folder / "checkpoint"
-        if checkpoint.exists():
-            read_checkpoint(checkpoint)
+        finished = folder / "finished"
+        for fit in finished.glob("*.safetensors"):
+            torch_pbd.load(fit)
         code = _in_child(lambda: self._run(folder, "--resume"))
         left = [path.name for path in folder.rglob("*") if path.name.endswith(".draft")]
-        if code or left or checkpoint.exists():
-            return f"--resume ended with {code}, left {left}, checkpoint {checkpoint.exists()}"
+        if code or left or finished.exists():
+            return f"--resume ended with {code}, left {left}, finished fits {finished.exists()}"
         if _loss(folder) != self.loss or path.read_bytes() != self.model:
             return f"--resume ended at loss {_loss(folder)}, the whole run at {self.loss}"
         return ""

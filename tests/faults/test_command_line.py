@@ -38,14 +38,14 @@ def test_47_a_file_in_the_place_of_the_folder_is_told_before_the_work(data, tmp_
     assert (tmp_path / "file").read_text() == "mine"
 
 
-@pytest.mark.parametrize("part", ["model", "figures", "schedule"])
+@pytest.mark.parametrize("part", ["model", "figures", "schedule", "finished"])
 def test_47_so_is_one_in_the_place_of_a_folder_in_it(part, data, tmp_path, capsys):
     (tmp_path / part).write_text("mine")
     assert "no folder" in refused(data, tmp_path, capsys)
 
 
 @pytest.mark.parametrize(
-    "part", ["metrics.csv", "config.yaml", "env.json", "checkpoint", "model/gmmbaseline.safetensors", "figures/a.png"]
+    "part", ["metrics.csv", "config.yaml", "env.json", "model/gmmbaseline.safetensors", "figures/a.png"]
 )
 def test_47_so_is_a_folder_in_the_place_of_a_file_in_it(part, data, tmp_path, capsys):
     (tmp_path / part).mkdir(parents=True)

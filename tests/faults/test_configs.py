@@ -57,7 +57,7 @@ def in_controller(init_args):
         ("fit", "data: x\nmodle: y\n", "c.yaml, line 2: modle is not an option of this command. Did you mean 'model'?"),
         ("compare", "models_: {}\n", "Did you mean 'models'?"),
         ("fit", "models: {}\n", "models is not an option of this command. Did you mean 'model'?"),
-        ("demo", "zzzzz: 1\n", "Known are output, resume, checkpoint_interval, n_demos, seed."),
+        ("demo", "zzzzz: 1\n", "Known are output, resume, n_demos, seed."),
         ("fit", in_model("{n_component: 3}"), "c.yaml, line 4: model.init_args.n_component is not a parameter of GMMB"),
         ("fit", in_model("{n_component: 3}"), "Did you mean 'n_components'?"),
         ("fit", in_model("{kernell: 3}"), "Known are n_components, solver, reg_covar"),  # CD has a kernel, it has none

@@ -1,4 +1,4 @@
-"""A mean that moves fast is followed as closely as scikit-learn follows it; rows of demonstrations are known as such."""
+"""A mean that moves fast is followed as closely as by scikit-learn; rows of demonstrations are known as such."""
 
 import warnings
 
@@ -83,7 +83,7 @@ def test_the_units_of_a_fast_signal_do_not_matter():
 
 
 def test_a_slow_signal_without_noise_is_followed_to_the_ten_thousandth():
-    """The noise was estimated from what neighbours differ by, which here is signal: the mean was off by a thousandth."""
+    """The noise was estimated from what neighbours differ by, here signal: the mean was off by a thousandth."""
     check("sine", 60, 3)
 
 

@@ -66,7 +66,7 @@ WARNINGS = {
         ConvergenceWarning,
         r"\w+ stopped early: (search of the mean: )?stopped at max_iter",
     ): "variants are held short",
-    (ConvergenceWarning, r"\w+ stopped early: stopped after \d+ evaluations"): "the same, where steps take many",
+    (ConvergenceWarning, r"\w+ stopped early: stopped at the most evaluations"): "the same, where steps take many",
     (ConvergenceWarning, r"\w+ stopped early: no step lowers the loss"): "a likelihood flat to the last digit",
     (UnimodalityWarning, r"Demonstration \d+ is far from the other"): "an outlier",
     (UnimodalityWarning, r"The demonstrations seem to follow two ways"): "two modes, or two outliers",

@@ -100,8 +100,7 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator, ABC)
         self.jitter_ = fitted.jitter
         self._prepare()
         if not report.converged:
-            # More iterations help only where these were too few.
-            more = f"max_iter (now {self.max_iter}) or " if "max_iter" in report.message else ""
+            more = f"max_iter (now {self.max_iter}) or " if report.status.is_limit else ""
             warnings.warn(
                 f"{type(self).__name__} stopped early: {report.message}. The best point found is kept; "
                 f"raise {more}tol (now {self.tol:g}).",

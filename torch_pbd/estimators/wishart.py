@@ -213,8 +213,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         with torch.no_grad():
             latent.weight -= condition(priors, certain, self.kernel, basis=basis)[0].weight
             mse = float(covariance_mse(wishart_root(latent(inputs), prior_root, matrix), target))
-        report = FitReport(mse, (mse,), report.n_iter, report.converged, report.message)
-        report = report.after(of_mean, "search of the mean")
+        report = replace(report, loss=mse, loss_curve=(mse,)).after(of_mean, "search of the mean")
         return mean, WishartCovariance(latent, _constant(prior_root), matrix, bounded=True), report, jitter
 
     def _smoothing(self, observations: Observations, problem: Problem) -> tuple[Hyperparameters, FitReport]:

@@ -1,22 +1,17 @@
 """Compare models on one data set: how well each repeats the data, and how well it foretells a demonstration."""
 
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import partial
-from typing import Any
 
 import numpy as np
-import torch
 from joblib import Parallel, delayed
 from numpy.typing import NDArray
 from sklearn.base import clone
 
 from torch_pbd.estimators._base import CovarianceRegressor
-from torch_pbd.estimators._groups import fit_by_demonstration
+from torch_pbd.experiments.resume import FinishedFits, fit_once
 from torch_pbd.experiments.sweep import left_out, score_fold
 from torch_pbd.metrics import covariance_mse, relative_frobenius_error
-from torch_pbd.optim import Record, recorded
 
 Floats = NDArray[np.float64]
 Truth = Callable[[Floats], Floats]
@@ -70,6 +65,7 @@ def compare_models(
     truth: Truth | None = None,
     max_folds: int = 10,
     n_jobs: int | None = None,
+    finished: FinishedFits | None = None,
 ) -> list[Score]:
     """Fit every model on all the data, and once more without each of some demonstrations.
 
@@ -85,6 +81,8 @@ def compare_models(
         Largest number of demonstrations to leave out, each by itself; spread evenly over all. 0 for none.
     n_jobs : int, default=None
         Fits that run at the same time, as in scikit-learn. Times are measured before, one by one.
+    finished : FinishedFits, default=None
+        Where fits are kept, and not repeated if they are there.
 
     Returns
     -------
@@ -92,9 +90,11 @@ def compare_models(
     """
     inputs, empirical = empirical_covariances(X, y)
     folds = left_out(groups, max_folds)
-    with recorded(None):  # a fit that goes on from a checkpoint takes no time
-        fits = {name: _timed_fit(clone(model), X, y, groups) for name, model in models.items()}
-    results = iter(_scored_folds(models, X, y, groups, folds, n_jobs))
+    fits = {name: fit_once(clone(model), X, y, groups, finished=finished) for name, model in models.items()}
+    jobs = (
+        delayed(score_fold)(clone(model), X, y, groups, fold, finished) for model in models.values() for fold in folds
+    )
+    results = iter(Parallel(n_jobs=n_jobs)(jobs))
     scores = []
     for name, (fitted, seconds) in fits.items():
         covariance = fitted.predict_cov(inputs)
@@ -111,35 +111,6 @@ def compare_models(
             )
         )
     return scores
-
-
-def _scored_folds(
-    models: Mapping[str, CovarianceRegressor],
-    X: Floats,
-    y: Floats,
-    groups: NDArray[np.intp],
-    folds: NDArray[np.intp],
-    n_jobs: int | None,
-) -> list[dict[str, Any]]:
-    """What :func:`score_fold` gives, by model and fold; folds that a checkpoint has are not fitted again."""
-    pairs = [(name, fold) for name in models for fold in folds]
-    data = torch.tensor(X), torch.tensor(y)
-    records = [Record(f"{name} without demonstration {fold}", *data) for name, fold in pairs]
-    rows = [record.state for record in records]
-    left = [i for i, record in enumerate(records) if not record.ended]
-    jobs = (delayed(score_fold)(clone(models[pairs[i][0]]), X, y, groups, pairs[i][1]) for i in left)
-    with recorded(None):
-        for i, row in zip(left, Parallel(n_jobs=n_jobs, return_as="generator")(jobs), strict=True):
-            rows[i] = row
-            records[i].keep(partial(dict, row), ended=True)
-    return rows
-
-
-def _timed_fit(
-    model: CovarianceRegressor, X: Floats, y: Floats, groups: NDArray[np.intp]
-) -> tuple[CovarianceRegressor, float]:
-    start = time.perf_counter()
-    return fit_by_demonstration(model, X, y, groups), time.perf_counter() - start
 
 
 def empirical_covariances(X: Floats, y: Floats) -> tuple[Floats, Floats | None]:

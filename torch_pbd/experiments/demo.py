@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 from torch_pbd.control.controller import DMPController
 from torch_pbd.data import Demonstrations, make_tunnel_demonstrations
 from torch_pbd.estimators._base import CovarianceRegressor
-from torch_pbd.estimators._groups import fit_by_demonstration
 from torch_pbd.experiments.comparison import compare_models
 from torch_pbd.experiments.recordings import score_row, write_fitted
+from torch_pbd.experiments.resume import fit_once
 from torch_pbd.experiments.robot import run_robot
 from torch_pbd.experiments.robot_figures import draw_tunnel
 from torch_pbd.experiments.run_folder import RunFolder, check_names, format_table
@@ -33,13 +33,14 @@ def run_demo(models: Mapping[str, CovarianceRegressor], folder: RunFolder, *, n_
     fresh = make_tunnel_demonstrations(_N_FRESH, rate=_RATE, random_state=seed + 1).to_array()
     true_covariance = np.einsum("kti,ktj->tij", *(2 * [fresh - fresh.mean(axis=0)])) / (_N_FRESH - 1)
     X, y, groups = demonstrations.stack()
-    scores = compare_models(models, X, y, groups, truth=lambda _: true_covariance)
-    rows = []
+    scores = compare_models(models, X, y, groups, truth=lambda _: true_covariance, finished=folder.finished)
+    rows, fitted = [], {}
     for score in scores:
-        model = fit_by_demonstration(models[score.model], X, y, groups)
+        model, _ = fit_once(models[score.model], X, y, groups, finished=folder.finished)
+        fitted[score.model] = model
         rows.append(score_row(score) | {"95 % of fresh": _coverage(model, demonstrations, fresh)})
         write_fitted(model, demonstrations, folder, score.model, "time")
-    figure = _tunnel_figure(models, demonstrations)
+    figure = _tunnel_figure(fitted, demonstrations)
     folder.write_figure(figure, "tunnel")
     plt.close(figure)
     folder.write_metrics(rows)

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 
 from torch_pbd.data import Demonstrations
 from torch_pbd.estimators._base import CovarianceRegressor
-from torch_pbd.estimators._groups import fit_by_demonstration
 from torch_pbd.experiments.comparison import Score, compare_models
+from torch_pbd.experiments.resume import fit_once
 from torch_pbd.experiments.run_folder import RunFolder, check_names, format_table, slug
 from torch_pbd.labels import output_label
 from torch_pbd.plotting import MODEL, plot_covariance_ellipses, plot_demonstrations, plot_model_bands
@@ -113,12 +113,13 @@ def run_recordings(
     """Compare models on demonstrations; writes metrics, folds, models and figures, returns the table."""
     check_names(models, "models")
     X, y, groups = demonstrations.stack(input)
-    scores = compare_models(models, X, y, groups, max_folds=max_folds, n_jobs=n_jobs)
+    scores = compare_models(models, X, y, groups, max_folds=max_folds, n_jobs=n_jobs, finished=folder.finished)
     rows = [score_row(score) for score in scores]
     folds = {f"LL {i + 1}": [s.fold_log_likelihood[i] for s in scores] for i in range(rows[0]["folds"])}
     folder.write_metrics([row | {key: values[j] for key, values in folds.items()} for j, row in enumerate(rows)])
     for name, model in models.items():
-        write_fitted(fit_by_demonstration(model, X, y, groups), demonstrations, folder, name, input)
+        fitted, _ = fit_once(model, X, y, groups, finished=folder.finished)
+        write_fitted(fitted, demonstrations, folder, name, input)
     return format_table(rows)
 
 

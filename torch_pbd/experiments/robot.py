@@ -15,6 +15,7 @@ from torch_pbd.control.schedule import Schedule
 from torch_pbd.control.stability_report import StabilityReport
 from torch_pbd.control.units import in_metres
 from torch_pbd.data import Demonstrations
+from torch_pbd.experiments.resume import FinishedFits, fit_once
 from torch_pbd.experiments.robot_figures import pushes_figure, task_figure, variability_figure
 from torch_pbd.experiments.run_folder import RunFolder, check_names, format_table, slug
 from torch_pbd.labels import readable_unit, schedule_names
@@ -47,10 +48,15 @@ def push_profile(time: Floats, duration: float, peak: float, n_outputs: int) -> 
 
 
 def run_controller(
-    controller: DMPController, demonstrations: Demonstrations, *, peak: float = 5.0, rate: float = 1000.0
+    controller: DMPController,
+    demonstrations: Demonstrations,
+    *,
+    peak: float = 5.0,
+    rate: float = 1000.0,
+    finished: FinishedFits | None = None,
 ) -> Run:
-    """Fit, plan, push and certify."""
-    fitted = clone(controller).fit(demonstrations)
+    """Fit, or take from the finished fits; plan, push and certify."""
+    fitted, _ = fit_once(clone(controller), demonstrations, finished=finished)
     schedule = fitted.schedule(rate)
     force = push_profile(schedule.time, fitted.duration_, peak, fitted.n_outputs_)
     rollout = fitted.simulate(force=force, rate=rate)
@@ -102,7 +108,7 @@ def run_robot(
     check_names(controllers, "controllers")
     rows, reports = [], []
     for name, controller in controllers.items():
-        run = run_controller(controller, demonstrations, peak=peak, rate=rate)
+        run = run_controller(controller, demonstrations, peak=peak, rate=rate, finished=folder.finished)
         rows.append(push_row(name, run) | _guarantees(run))
         reports.append(f"{name}: a movement of {run.schedule.duration:.3g} s\n{run.report}")
         _write(run, name, demonstrations, folder, in_tunnel=in_tunnel)

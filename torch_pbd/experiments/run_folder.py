@@ -21,11 +21,12 @@ import torch_pbd
 from torch_pbd.control.controller import DMPController
 from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.exceptions import ConfigError, FolderInUseError
+from torch_pbd.experiments.resume import FinishedFits
 from torch_pbd.files import remove_drafts, replacing
 from torch_pbd.persistence import save
 
 _PACKAGES = ("torch", "scikit-learn", "numpy", "matplotlib")
-_PARTS = ("figures", "model", "schedule")
+_PARTS = ("figures", "model", "schedule", "finished")
 _SUFFIXES = (".csv", ".json", ".npz", ".png", ".safetensors", ".txt", ".yaml")  # of the files of results
 _LONGEST = 180  # bytes of a name, to which titles, suffixes and marks of drafts are added
 
@@ -54,6 +55,8 @@ class RunFolder:
 
     def __init__(self, path: str | Path, settings: Mapping[str, Any]) -> None:
         self.path = Path(path)
+        self.finished: FinishedFits | None = None
+        """Where the run keeps its fits, if it does."""
         self.path.mkdir(parents=True, exist_ok=True)
         # The operating system frees the lock of a process that is killed.
         self._lock = FileLock(self.path / ".lock", timeout=0)
@@ -116,8 +119,7 @@ class RunFolder:
 def _check_files(folder: Path) -> None:
     """Check that what is named as files of results are is none but files, which can be replaced."""
     for entry in folder.iterdir():
-        named_so = entry.suffix in _SUFFIXES or (entry.name == "checkpoint" and folder.name not in _PARTS)
-        if named_so and entry.exists() and not entry.is_file():
+        if entry.suffix in _SUFFIXES and entry.exists() and not entry.is_file():
             raise IsADirectoryError(f"{entry} stands where a file of results may have to: move it away")
 
 

@@ -14,6 +14,7 @@ from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.estimators.mixture import GMMBaseline
 from torch_pbd.experiments.comparison import Score, compare_models, empirical_covariances
 from torch_pbd.experiments.reference import ScikitLearnGMR
+from torch_pbd.experiments.resume import FinishedFits, fit_once
 from torch_pbd.experiments.run_folder import RunFolder, check_names, format_table, slug
 from torch_pbd.plotting import EMPIRICAL, MODEL, TRUTH, plot_covariance_ellipses, plot_model_bands
 
@@ -32,6 +33,7 @@ def table1(
     n_demos: int = 50,
     max_folds: int = 3,
     n_jobs: int | None = None,
+    finished: FinishedFits | None = None,
 ) -> list[dict[str, Any]]:
     """Table I for each reading of eq. (14): medians over the seeds 0 to ``n_seeds - 1``.
 
@@ -52,6 +54,7 @@ def table1(
                 truth=lambda inputs, reading=reading: paper_covariance(inputs, reading=reading),
                 max_folds=max_folds,
                 n_jobs=n_jobs,
+                finished=finished,
             ):
                 scores[score.model].append(score)
         rows += [_row(reading, name, several) for name, several in scores.items()]
@@ -117,14 +120,14 @@ def run_simulation(
 ) -> str:
     """Make Table I and the figures of each model (seed 0, first reading); returns the table as text."""
     check_names(models, "models")
-    rows = table1(models, readings=readings, **options)
+    rows = table1(models, readings=readings, finished=folder.finished, **options)
     folder.write_metrics(rows)
     sizes = {key: options[key] for key in ("n_inputs", "n_demos") if key in options}
-    X, y, _ = make_paper_simulation(**sizes, reading=readings[0], random_state=0)
+    X, y, groups = make_paper_simulation(**sizes, reading=readings[0], random_state=0)
     for name, model in models.items():
-        model.fit(X, y)
-        folder.write_model(model, slug(name))
-        figure = figure_of(model, X, y, name, readings[0])
+        fitted, _ = fit_once(model, X, y, groups, finished=folder.finished)
+        folder.write_model(fitted, slug(name))
+        figure = figure_of(fitted, X, y, name, readings[0])
         folder.write_figure(figure, slug(name))
         plt.close(figure)
     return format_table(rows)

@@ -26,7 +26,7 @@ from torch_pbd.control.monte_carlo import simulate_many
 from torch_pbd.control.schedule import Schedule
 from torch_pbd.data import Demonstrations
 from torch_pbd.estimators._base import CovarianceRegressor
-from torch_pbd.estimators._groups import fit_by_demonstration
+from torch_pbd.experiments.resume import FinishedFits, fit_once
 from torch_pbd.metrics import mahalanobis_coverage
 
 Floats = NDArray[np.float64]
@@ -115,12 +115,17 @@ def left_out(groups: NDArray[np.intp], max_folds: int | None = None) -> NDArray[
 
 
 def score_fold(
-    model: CovarianceRegressor, X: Floats, y: Floats, groups: NDArray[np.intp], demonstration: int
+    model: CovarianceRegressor,
+    X: Floats,
+    y: Floats,
+    groups: NDArray[np.intp],
+    demonstration: int,
+    finished: FinishedFits | None = None,
 ) -> dict[str, float]:
     """Fit without a demonstration, and say how well it is foretold."""
     left = groups == demonstration
     start = time.thread_time()
-    fit_by_demonstration(model, X[~left], y[~left], groups[~left])
+    model, _ = fit_once(model, X[~left], y[~left], groups[~left], finished=finished)
     seconds = time.thread_time() - start
     mean, covariance = model.predict(X[left], return_cov=True)
     coverage = mahalanobis_coverage(mean.reshape(len(mean), -1), covariance, y[left], level=0.95)

@@ -13,7 +13,7 @@ from torch_pbd.exceptions import NotPositiveDefiniteError
 from torch_pbd.gp.grid import EvidenceGrid, EvidenceSearch, together
 from torch_pbd.gp.observations import Hyperparameters, Observations
 from torch_pbd.gp.projection import Basis
-from torch_pbd.optim import FitReport, first_failure, minimize_batch
+from torch_pbd.optim import FitReport, Status, first_failure, minimize_batch
 
 _HOPEFUL = 0.5  # nats for each input that polishing may be worth
 
@@ -92,7 +92,7 @@ def _fit_group(jobs: list[tuple[Observations, EvidenceSearch]]) -> list[Found]:
     results = []
     for *each, first, loss in zip(*parts, ends.start_loss.split(sizes), ends.loss.clone().split(sizes), strict=True):
         curve = (float(first.sum()), float(loss.sum()))
-        report = FitReport(curve[-1], curve, ends.n_iter, ends.message == "converged", ends.message)
+        report = FitReport(curve[-1], curve, ends.n_iter, ends.status)
         results.append(Found(Hyperparameters(*each), loss, report, grid.basis_for(each[0])))
     return results
 
@@ -107,14 +107,14 @@ class _Ends:
     start_loss: Float[Tensor, " b"]
     loss: Float[Tensor, " b"]
     n_iter: int = 0
-    message: str = "converged"
+    status: Status = Status.CONVERGED
 
     def put(self, rows: Tensor, other: "_Ends") -> None:
         """Take the ends of some processes."""
         for name in ("length_scale", "noise_ratio", "amplitude", "start_loss", "loss"):
             getattr(self, name)[rows] = getattr(other, name)
         self.n_iter = max(self.n_iter, other.n_iter)
-        self.message = other.message if self.message == "converged" else self.message
+        self.status = first_failure((self.status, other.status))
 
 
 def _descend_by_levels(grid: EvidenceGrid, search: EvidenceSearch) -> _Ends:
@@ -170,5 +170,5 @@ def _descend(grid: EvidenceGrid, search: EvidenceSearch, chosen: Int64[Tensor, "
     best = final.argmin(1, keepdim=True)
     scale, ratio = coordinates.decode(torch.cat(found)[place.gather(1, best).squeeze(1)], chosen)
     amplitude = grid.evidence.best_variance_at(scale, ratio, chosen).sqrt()
-    n_iter, message = max(report.n_iter for report in reports), first_failure(report.message for report in reports)
-    return _Ends(scale, ratio, amplitude, first.amin(1), final.gather(1, best).squeeze(1), n_iter, message)
+    n_iter, status = max(report.n_iter for report in reports), first_failure(report.status for report in reports)
+    return _Ends(scale, ratio, amplitude, first.amin(1), final.gather(1, best).squeeze(1), n_iter, status)

@@ -2,8 +2,6 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import fields
-from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -12,7 +10,7 @@ from torch import Tensor, nn
 from torch_pbd.exceptions import NotPositiveDefiniteError
 from torch_pbd.linalg import scale_tril_from_root
 from torch_pbd.models.mixture import Components, GaussianMixture
-from torch_pbd.optim import FitReport, Progress, Record, State, minimize
+from torch_pbd.optim import FitReport, Progress, Status, minimize
 
 _BLOCK = 1 << 13  # rows that an E step holds at a time: what it makes of them stays in the cache
 
@@ -58,13 +56,9 @@ def expectation_maximization(
     """
     padded = nn.functional.pad(data, (0, 1), value=1.0)  # by ones: moments of order 0 to 2 in one product
     blocks = [block.mT.contiguous() for block in padded.split(_BLOCK)]
-    record = Record("EM", data, responsibilities)
     components = best = _first_m_step(data, responsibilities, reg_covar)
-    curve, n_iter, converged = list[float](), 0, False
-    if record.state:
-        (components, best), (curve, n_iter, converged) = _recalled(record.state)
     loss, moments = _e_step(components, blocks)
-    curve = curve or [loss]
+    curve, n_iter, converged = [loss], 0, False
     while n_iter < max_iter and not converged:
         n_iter += 1
         components = _m_step(components, moments, reg_covar)
@@ -72,24 +66,10 @@ def expectation_maximization(
         converged = abs(previous - loss) < tol
         if loss < curve[-1]:
             best, curve = components, [*curve, loss]
-        record.keep(partial(_state, components, best, curve, n_iter, converged))
     mixture = GaussianMixture(best.log_weight, best.mean, best.scale_tril, n_features)
     mixture.log_density_floor.copy_(mixture.log_prob_input(data[:, :n_features]).min())
-    message = "converged" if converged else f"stopped at max_iter={max_iter} iterations"
-    return mixture, FitReport(curve[-1], tuple(curve), n_iter, converged, message)
-
-
-def _state(components: Components, best: Components, curve: list[float], n_iter: int, converged: bool) -> State:
-    parts = {"": components, "best ": best}
-    kept: State = {prefix + name: value for prefix, part in parts.items() for name, value in vars(part).items()}
-    return kept | {"curve": curve, "n_iter": n_iter, "converged": converged}
-
-
-def _recalled(state: State) -> tuple[list[Components], tuple[list[float], int, bool]]:
-    """Present and best components, and the curve, the iterations, whether converged, of what was kept."""
-    names = [part.name for part in fields(Components)]
-    found = [Components(*(state[prefix + name] for name in names)) for prefix in ("", "best ")]
-    return found, (list(state["curve"]), state["n_iter"], state["converged"])
+    status = Status.CONVERGED if converged else Status.MAX_ITER
+    return mixture, FitReport(curve[-1], tuple(curve), n_iter, status)
 
 
 def refine(

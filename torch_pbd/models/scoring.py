@@ -19,7 +19,7 @@ class _Posterior:
 
     def __init__(self, cost: Cost, latent: LatentValues, prior_weight: float) -> None:
         self.cost, self.latent, self.prior_weight = cost, latent, prior_weight
-        self.share = torch.zeros((), dtype=torch.float64)
+        self.share = 0.0
         """Of the observed information in the last step's curvature: the next one tries a little more at most."""
         self._last: tuple[Tensor, Covariances] | None = None
 
@@ -48,11 +48,11 @@ class _Posterior:
         # vanishes with the gradient (Fan and Yuan 2005).
         damping = self.prior_weight or 1e-3 * float(gradient.abs().max())
         shares = [0.25 * i for i in range(5)] if self.cost.has_exact_curvature else [0.0]
-        for share in reversed([share for share in shares if share <= float(self.share) + 0.25]):
+        for share in reversed([share for share in shares if share <= self.share + 0.25]):
             factors = list(self.factors(point, damping, share))
             if share == 0.0 or all(bool((factor.diagonal() > 0).all()) for _, factor in factors):
                 break
-        self.share.fill_(share)
+        self.share = share
         step = torch.empty_like(gradient)
         for members, factor in factors:
             solved = torch.cholesky_solve(gradient[members].reshape(-1, 1), factor)
@@ -130,7 +130,6 @@ def train_by_scoring(
             max_iter=max_iter,
             tol=tol,
             relative_tol=cost.relative_tol,
-            carried=[posterior.share],
             callback=callback,
         )
     else:

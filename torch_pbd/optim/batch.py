@@ -1,15 +1,14 @@
 """Many small unrelated optimizations side by side."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from torch_pbd.optim.journal import Record, State
-from torch_pbd.optim.lbfgs import FAILURES
+from torch_pbd.optim.report import FAILURES, Status
 
 _LONGEST_STEP = 1e3  # in steps of BFGS
 _DIFFERENCE = 1e-4  # of parameters, for the first Hessian
@@ -28,12 +27,15 @@ class BatchReport:
     loss: Float[Tensor, " b"]
     start_loss: Float[Tensor, " b"]
     n_iter: int
-    converged: bool
-    """All of them, from starts whose loss is finite."""
-    message: str
-    """ "converged", or what ended one that did not."""
+    status: Status
+    """CONVERGED if all did, from starts whose loss is finite; else what ended one that did not."""
     inverse_hessian: Float[Tensor, "b p p"]
     """At the ends, as far as the steps told."""
+
+    @property
+    def converged(self) -> bool:
+        """Whether all ended by themselves."""
+        return self.status is Status.CONVERGED
 
 
 def by_autograd(
@@ -92,9 +94,6 @@ def minimize_batch(
     report : BatchReport
     """
     x = start.detach().clone()
-    record = Record("batch", x)
-    if record.ended:
-        return _recalled(record.state, x)
     objective = _survived(objective)
     rows = torch.arange(len(x), device=x.device)
     loss, gradient, inverse = _start(objective, rows, x, inverse_hessian)
@@ -102,31 +101,18 @@ def minimize_batch(
     alive = torch.isfinite(loss + size) & (size > tol)
     every = _Problems.at(rows, x, loss, gradient, inverse, torch.ones_like(loss))
     active = every.of(alive & (every.promise > _enough(loss, tol)))
-    n_iter, message = 0, "converged" if bool(torch.isfinite(loss + size).all()) else "the loss at a start is not finite"
+    n_iter, status = 0, Status.CONVERGED if bool(torch.isfinite(loss + size).all()) else Status.NOT_FINITE
     while n_iter < max_iter and len(active.rows):
         n_iter += 1
         active, settled, blocked = _advance(objective, active, tol, first=n_iter == 1)
         if bool(blocked.any()):
-            message = "the loss or its gradient is not finite any more, even at the best point"
+            status = Status.NOT_FINITE
         if bool(settled.any()) or n_iter == max_iter:  # problems that have ended are not carried along
             every.put(active)
             active = active.of(~settled)
-    if message == "converged" and len(active.rows):
-        message = f"stopped at max_iter={max_iter} iterations"
-    report = BatchReport(every.loss, loss, n_iter, message == "converged", message, every.inverse)
-    record.keep(lambda: {"x": every.x, **vars(report)}, ended=True)
-    return every.x, report
-
-
-def first_failure(messages: Iterable[str]) -> str:
-    """What ended the first of several searches that did not converge; "converged" if all did."""
-    return next((message for message in messages if message != "converged"), "converged")
-
-
-def _recalled(state: State, like: Tensor) -> tuple[Tensor, BatchReport]:
-    """Parameters and report that a journal kept."""
-    values: State = {key: value.to(like) if isinstance(value, Tensor) else value for key, value in state.items()}
-    return values.pop("x"), BatchReport(**values)
+    if status is Status.CONVERGED and len(active.rows):
+        status = Status.MAX_ITER
+    return every.x, BatchReport(every.loss, loss, n_iter, status, every.inverse)
 
 
 def _survived(objective: ValueAndGradient) -> ValueAndGradient:

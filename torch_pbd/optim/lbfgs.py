@@ -1,189 +1,70 @@
 """L-BFGS on one objective, which never loses its best point."""
 
 import math
-import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from torch_pbd.optim.journal import Record, State
+from torch_pbd.optim.report import FAILURES, BestSoFar, FitReport, Progress, Status
 
-_ITERATIONS = 5  # between two states that are kept
-_ATTEMPTS = 4
-FAILURES = (ArithmeticError, ValueError, RuntimeError, IndexError)
-"""What an evaluation at a bad point raises: Cholesky and eigenvalues, overflow; and the IndexError of torch's strong
-Wolfe search, when it brackets no minimum. Others are mistakes, which are not survived."""
-
-
-@dataclass(frozen=True)
-class Progress:
-    """What a progress callback is told after each evaluation that improved the loss."""
-
-    n_evaluations: int
-    loss: float
-    elapsed: float
-    """Seconds since the start."""
-
-
-@dataclass(frozen=True)
-class FitReport:
-    """How an optimization ended."""
-
-    loss: float
-    loss_curve: tuple[float, ...]
-    """Best loss so far, at each evaluation that improved it; the first is the loss at the start."""
-    n_iter: int
-    converged: bool
-    message: str
-
-    def after(self, other: "FitReport", name: str) -> "FitReport":
-        """The same report, but not converged where the optimization before it, of this name, is not."""
-        if other.converged or not self.converged:
-            return self
-        return replace(self, converged=False, message=f"{name}: {other.message}")
-
-    def state(self) -> State:
-        """As a journal keeps it."""
-        return asdict(self) | {"loss_curve": list(self.loss_curve)}
-
-    @classmethod
-    def of(cls, state: State) -> "FitReport":
-        """The report that :meth:`state` told of."""
-        values = {part.name: state[part.name] for part in fields(cls)}
-        return cls(**values | {"loss_curve": tuple(state["loss_curve"])})
+_ATTEMPTS = 4  # with first steps of 1, 1/2, 1/4 and 1/8
 
 
 class _NotFiniteError(ArithmeticError):
-    """The loss or its gradient is not a finite number."""
+    """The loss or its gradient is not a finite number, or could not be computed."""
 
 
-@dataclass
-class _BestPoint:
-    """The closure L-BFGS calls: evaluates, and remembers the best parameters it has seen."""
+class _BestPoint(BestSoFar):
+    """Closure for ``torch.optim``: loss and gradients at the parameters, and memory of the best of them."""
 
-    objective: Callable[[], Tensor]
-    parameters: Sequence[Tensor]
-    callback: Callable[[Progress], None] | None
-    n_evaluations: int = 0
-    curve: list[float] = field(default_factory=list)
-    best: list[Tensor] = field(default_factory=list)
-    gradients: list[Tensor] = field(default_factory=list)
-    """At the best point, where it was evaluated here."""
-    started: float = field(default_factory=time.perf_counter)
+    def __init__(
+        self,
+        objective: Callable[[], Tensor],
+        parameters: Sequence[Tensor],
+        callback: Callable[[Progress], None] | None,
+    ) -> None:
+        super().__init__(callback)
+        self._objective, self._parameters = objective, parameters
+        self._best: list[Tensor] = []
+        self._gradients: list[Tensor] = []
 
     def __call__(self) -> float:
-        if self.gradients and all(map(torch.equal, self.parameters, self.best)):
-            self._give(self.gradients)
+        # Each attempt begins with the loss at the best point, which is known.
+        if self._best and all(map(torch.equal, self._parameters, self._best)):
+            self._give(self._gradients)
             return self.curve[-1]
         self.n_evaluations += 1
-        with torch.enable_grad():
-            loss = self.objective()
-            found = torch.autograd.grad(loss, self.parameters, allow_unused=True)
+        try:
+            with torch.enable_grad():
+                loss = self._objective()
+                found = torch.autograd.grad(loss, self._parameters, allow_unused=True)
+        except FAILURES as error:
+            raise _NotFiniteError(str(error) or type(error).__name__) from error
         value = float(loss.detach())
         gradients = [
             torch.zeros_like(parameter) if gradient is None else gradient.contiguous()
-            for parameter, gradient in zip(self.parameters, found, strict=True)
+            for parameter, gradient in zip(self._parameters, found, strict=True)
         ]
         if not math.isfinite(value) or not all(bool(torch.isfinite(gradient).all()) for gradient in gradients):
-            raise _NotFiniteError(f"the loss or its gradient is not finite (loss {value})")
+            raise _NotFiniteError(f"{Status.NOT_FINITE.value} (loss {value})")
         self._give(gradients)
-        if not self.curve or value < self.curve[-1]:
-            self.curve.append(value)
-            self.best = [parameter.detach().clone() for parameter in self.parameters]
-            self.gradients = gradients
-            if self.callback is not None:
-                self.callback(Progress(self.n_evaluations, value, time.perf_counter() - self.started))
+        if self.lowered_by(value):
+            self._best = [parameter.detach().clone() for parameter in self._parameters]
+            self._gradients = gradients
+            self.add(value)
         return value
 
     def _give(self, gradients: Sequence[Tensor]) -> None:
-        for parameter, gradient in zip(self.parameters, gradients, strict=True):
+        for parameter, gradient in zip(self._parameters, gradients, strict=True):
             parameter.grad = gradient.clone()
 
-    def move(self, to: Sequence[Tensor]) -> None:
-        """Give the parameters these values, and drop their gradients."""
-        with torch.no_grad():
-            for parameter, value in zip(self.parameters, to, strict=True):
-                parameter.copy_(value)
-                parameter.grad = None
-
+    @torch.no_grad()
     def restore(self) -> None:
-        """Put the best parameters seen back."""
-        if self.best:
-            self.move(self.best)
-
-    def state(self) -> State:
-        """What has been seen so far, as a journal keeps it."""
-        return {"n_evaluations": self.n_evaluations, "curve": list(self.curve)} | _numbered("best", self.best)
-
-    def resume(self, state: State) -> None:
-        """Go on from :meth:`state`."""
-        self.n_evaluations, self.curve = state["n_evaluations"], list(state["curve"])
-        self.best = [state[f"best.{i}"].to(parameter) for i, parameter in enumerate(self.parameters)]
-
-
-@dataclass
-class _Attempt:
-    """Iterations of one ``torch.optim.LBFGS``, a few at a time, so that its memory can be kept between them."""
-
-    number: int
-    """Of restarts before it, each of which halved the first step."""
-    n_iter: int
-    """Iterations of all attempts."""
-    most_evaluations: int
-    """Of all attempts."""
-    optimizer: torch.optim.LBFGS
-
-    @property
-    def memory(self) -> dict[str, Any]:
-        """What torch keeps between iterations."""
-        return self.optimizer.state[self.optimizer._params[0]]
-
-    def advance(self, point: _BestPoint, max_iter: int) -> bool:
-        """Some iterations; whether it would go on."""
-        (options,), before = self.optimizer.param_groups, self.memory.get("n_iter", 0)
-        options["max_iter"] = min(_ITERATIONS, max_iter - self.n_iter)
-        options["max_eval"] = self.most_evaluations - point.n_evaluations + 1  # the first is one of before
-        try:
-            self.optimizer.step(point)
-        finally:
-            self.n_iter += self.memory.get("n_iter", 0) - before
-        return self.memory["n_iter"] - before == options["max_iter"]
-
-    def state(self) -> State:
-        """As a journal keeps it."""
-        memory = self.memory
-        kept: State = {
-            "attempt": self.number,
-            "n_iter": self.n_iter,
-            "most_evaluations": self.most_evaluations,
-            "iterations": memory["n_iter"],
-        }
-        kept |= _numbered("parameter", [parameter.detach() for parameter in self.optimizer._params])
-        if "d" in memory:
-            kept |= {key: float(memory[key]) for key in ("t", "H_diag", "prev_loss")}
-            kept |= {key: memory[key].clone() for key in ("d", "prev_flat_grad")}
-            kept |= {key: torch.stack(memory[key]) for key in ("old_dirs", "old_stps", "ro") if memory[key]}
-        return kept
-
-    def resume(self, state: State) -> None:
-        """Go on from :meth:`state`."""
-        parameter, memory = self.optimizer._params[0], self.memory
-        self.most_evaluations = state["most_evaluations"]
-        memory |= {"n_iter": state["iterations"], "func_evals": 0}
-        if "d" in state:
-            memory |= {key: state[key] for key in ("t", "H_diag", "prev_loss")}
-            memory |= {key: state[key].to(parameter) for key in ("d", "prev_flat_grad")}
-            memory |= {
-                key: list(state[key].to(parameter).clone().unbind()) if key in state else []
-                for key in ("old_dirs", "old_stps", "ro")
-            }
-
-
-def _numbered(name: str, tensors: Sequence[Tensor]) -> dict[str, Tensor]:
-    return {f"{name}.{i}": tensor.clone() for i, tensor in enumerate(tensors)}
+        """Put the best parameters back, without gradients."""
+        for parameter, value in zip(self._parameters, self._best, strict=False):  # none where the start is not finite
+            parameter.copy_(value)
+            parameter.grad = None
 
 
 def minimize(
@@ -200,7 +81,7 @@ def minimize(
     ``torch.optim.LBFGS`` can raise from its line search, and can return from a failed one at a worse point.
     Here every evaluation is remembered, and a failed run is restarted from the best point with a halved
     first step, at most three times. Whatever ends it, be it a mistake in the objective or an interrupt, the parameters
-    are left at the best point. Under :func:`~torch_pbd.optim.recorded` it can be gone on from.
+    are left at the best point.
 
     Parameters
     ----------
@@ -229,66 +110,42 @@ def minimize(
     ValueError
         If the loss or its gradient is not finite at the start.
     """
-    point = _BestPoint(objective, parameters, callback)
-    record = Record("L-BFGS", *parameters)
-    if record.ended:
-        point.resume(record.state)
-        point.restore()
-        return FitReport.of(record.state)
+    best, n_iter = _BestPoint(objective, parameters, callback), 0
     try:
-        report = _run(point, record, _started(point, record.state), max_iter, tol, history_size)
+        try:
+            best()
+        except _NotFiniteError as error:
+            raise ValueError(f"The optimization cannot start: {error}.") from error
+        for number in range(_ATTEMPTS):
+            optimizer = torch.optim.LBFGS(
+                list(parameters),
+                lr=0.5**number,
+                max_iter=max_iter - n_iter,
+                max_eval=2 * (max_iter - n_iter) + 21,  # a search takes one or two; the first is known
+                tolerance_grad=tol,
+                tolerance_change=tol * max(1.0, abs(best.curve[0])) * 1e-2,
+                history_size=history_size,
+                line_search_fn="strong_wolfe",
+            )
+            status, detail = _attempt(optimizer, best)
+            n_iter += optimizer.state[parameters[0]]["n_iter"]
+            best.restore()
+            if status is Status.CONVERGED or n_iter >= max_iter:
+                break
     finally:
-        point.restore()
-    record.keep(lambda: point.state() | report.state(), ended=True)
-    return report
+        best.restore()
+    if status is Status.CONVERGED and n_iter >= max_iter:
+        status = Status.MAX_ITER
+    return FitReport(best.curve[-1], tuple(best.curve), n_iter, status, detail)
 
 
-def _started(point: _BestPoint, state: State) -> State:
-    """What is known at the start: that of a run that was cut, or nothing once the loss there is."""
-    if state:
-        point.resume(state)
-        return state
+def _attempt(optimizer: torch.optim.LBFGS, best: _BestPoint) -> tuple[Status, str]:
+    """Iterate until the optimizer stops; what stopped it, but for the number of iterations, and a detail."""
     try:
-        point()
-    except FAILURES as error:
-        raise ValueError(f"The optimization cannot start: {error}.") from error
-    return {}
-
-
-def _run(point: _BestPoint, record: Record, state: State, max_iter: int, tol: float, history_size: int) -> FitReport:
-    """Attempts until one ends by itself, or ``max_iter`` iterations."""
-    n_iter, reason = state.get("n_iter", 0), ""
-    for number in range(state.get("attempt", 0), _ATTEMPTS):
-        optimizer = torch.optim.LBFGS(
-            list(point.parameters),
-            lr=0.5**number,
-            tolerance_grad=tol,
-            tolerance_change=tol * max(1.0, abs(point.curve[0])) * 1e-2,
-            history_size=history_size,
-            line_search_fn="strong_wolfe",
-        )
-        attempt = _Attempt(number, n_iter, point.n_evaluations + 2 * (max_iter - n_iter) + 20, optimizer)
-        if state:
-            point.move([state[f"parameter.{i}"] for i in range(len(point.parameters))])
-            attempt.resume(state)
-            state = {}
-        reason = _ended(attempt, point, record, max_iter)
-        n_iter = attempt.n_iter
-        point.restore()
-        if not reason or n_iter >= max_iter:
-            break
-    converged = not reason and n_iter < max_iter
-    message = reason or ("converged" if converged else f"stopped at max_iter={max_iter} iterations")
-    return FitReport(point.curve[-1], tuple(point.curve), n_iter, converged, message)
-
-
-def _ended(attempt: _Attempt, point: _BestPoint, record: Record, max_iter: int) -> str:
-    """Iterate to the end of an attempt; the reason if it failed."""
-    try:
-        while attempt.advance(point, max_iter) and attempt.n_iter < max_iter:
-            record.keep(lambda: point.state() | attempt.state())
-    except FAILURES as error:
-        return str(error) or type(error).__name__
-    if point.n_evaluations >= attempt.most_evaluations:
-        return f"stopped after {point.n_evaluations} evaluations, the most for max_iter={max_iter} iterations"
-    return ""
+        optimizer.step(best)
+    except _NotFiniteError as error:
+        return Status.NOT_FINITE, str(error)
+    except FAILURES as error:  # an IndexError where torch's strong Wolfe search brackets no minimum
+        return Status.LINE_SEARCH_FAILED, f"the line search failed ({type(error).__name__}: {error})"
+    (options,), (memory,) = optimizer.param_groups, optimizer.state.values()
+    return Status.CONVERGED if memory["func_evals"] < options["max_eval"] else Status.MAX_EVALUATIONS, ""

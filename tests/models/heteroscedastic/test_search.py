@@ -8,6 +8,7 @@ from torch_pbd.gp.inducing import FeatureMap
 from torch_pbd.models.heteroscedastic import ProcessFamily, SearchOptions
 from torch_pbd.models.heteroscedastic.linear import LinearEvidence
 from torch_pbd.models.heteroscedastic.search import Search
+from torch_pbd.optim import Status
 
 
 def tensor(values):
@@ -73,7 +74,7 @@ def test_the_next_run_starts_where_the_last_ended(many_inputs, rng):
     search = Search(family, 2, 1, SearchOptions(100, 1e-5))
     first = search.run(evidence_of(family, many_inputs, response), many_inputs)
     assert torch.equal(search.run(evidence_of(family, many_inputs, response), many_inputs), first)
-    assert search.options.ends[-1] == (0, "converged")
+    assert search.options.ends[-1] == (0, Status.CONVERGED)
     other = evidence_of(family, many_inputs, response + 0.05 * torch.randn(2, 40).double())
     anew = Search(family, 2, 1, SearchOptions(100, 1e-5)).run(other, many_inputs)
     torch.testing.assert_close(search.run(other, many_inputs), anew, rtol=0, atol=1e-3)

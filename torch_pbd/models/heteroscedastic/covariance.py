@@ -119,7 +119,7 @@ def _fit_log_variance(search: Search, fixed: FixedFeatures, squares: Squares, ne
             near[rows] = found.location  # where the next evaluation starts
         return found.evidence, lambda: design.pull(found.gradient())
 
-    theta = search.run(evidence, squares.total, [near])
+    theta = search.run(evidence, squares.total)
     return fit_log_variance(squares, Design.of(search.family, fixed, theta, information).values, near)
 
 

@@ -1,7 +1,7 @@
 """Search for the hyperparameters of latent processes."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torch_pbd.exceptions import NotPositiveDefiniteError
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
-from torch_pbd.optim import FitReport, Progress, Record, State, first_failure, minimize_batch, recorded
+from torch_pbd.optim import FitReport, Progress, Status, first_failure, minimize_batch
 
 _SMALL = 10_000  # entries of all processes' features
 _DIFFERENCE = 1e-3  # of hyperparameters, whose gradients' differences tell the curvature at a start
@@ -35,8 +35,8 @@ class SearchOptions:
     """Called at the end of each turn of mean and covariance."""
     slack: float = 1.0
     """Times the tolerance, as long as better evidence is to come."""
-    ends: list[tuple[int, str]] = field(default_factory=list)
-    """Iterations of each search, and "converged" or what else ended it."""
+    ends: list[tuple[int, Status]] = field(default_factory=list)
+    """Iterations of each search, and what ended it."""
 
     def report(self, turn: int, loss: float, elapsed: float) -> None:
         """Tell the callback."""
@@ -45,8 +45,8 @@ class SearchOptions:
 
     def outcome(self, losses: tuple[float, ...]) -> FitReport:
         """What became of a fit with these losses, by how its searches ended."""
-        message = first_failure(message for _, message in self.ends)
-        return FitReport(losses[-1], losses, max(n for n, _ in self.ends), message == "converged", message)
+        status = first_failure(status for _, status in self.ends)
+        return FitReport(losses[-1], losses, max(n for n, _ in self.ends), status)
 
 
 @dataclass
@@ -75,37 +75,16 @@ class Search:
     _end: tuple[Tensor, Tensor] | None = None
     """Point and inverse Hessian that the last run ended with, of each problem."""
 
-    def run(self, evidence: Evidence, like: Tensor, carried: Sequence[Tensor] = ()) -> Float[Tensor, "b q"]:
-        """Hyperparameters for this evidence.
-
-        Parameters
-        ----------
-        evidence : callable
-        like : Tensor
-            Has the dtype and the device to work on.
-        carried : sequence of Tensor, default=()
-            What evaluations change and later ones start from: kept with the end in a journal.
-        """
+    def run(self, evidence: Evidence, like: Tensor) -> Float[Tensor, "b q"]:
+        """Hyperparameters for this evidence; ``like`` has the dtype and the device to work on."""
         if self.held and self.theta is not None:
             return self.theta
-        record = Record("evidence", like, *carried, *(self._end or ()))
-        if record.ended:
-            end = record.state
-            self._end = end["point"].to(like), end["inverse_hessian"].to(like)
-            for tensor, value in zip(carried, (end[f"carried.{i}"] for i in range(len(carried))), strict=True):
-                tensor.copy_(value)
-        else:
-            with recorded(None):  # an evaluation depends on those before it: a search is kept as a whole
-                self._end, end = self._search(evidence, like)
-            kept = {f"carried.{i}": tensor.clone() for i, tensor in enumerate(carried)}
-            point, inverse_hessian = self._end
-            end |= {"point": point, "inverse_hessian": inverse_hessian}
-            record.keep(lambda: end | kept, ended=True)
-        self.options.ends.append((end["n_iter"], end["message"]))
+        self._end, end = self._search(evidence, like)
+        self.options.ends.append(end)
         self.theta = self._spread_out(self._end[0]) if self.family.shared else self._end[0]
         return self.theta
 
-    def _search(self, evidence: Evidence, like: Tensor) -> tuple[tuple[Tensor, Tensor], State]:
+    def _search(self, evidence: Evidence, like: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[int, Status]]:
         """Best point and its inverse Hessian; iterations, and what ended them."""
         every = torch.arange(self.n_processes, device=like.device)
 
@@ -142,8 +121,7 @@ class Search:
         best = torch.stack([report.loss for report in reports]).nan_to_num(nan=math.inf).argmin(0)
         row = torch.arange(len(best), device=like.device)
         found = (torch.stack(points)[best, row], torch.stack([report.inverse_hessian for report in reports])[best, row])
-        message = first_failure(report.message for report in reports)
-        return found, {"n_iter": max(report.n_iter for report in reports), "message": message}
+        return found, (max(report.n_iter for report in reports), first_failure(report.status for report in reports))
 
     def _starts(
         self, value: Evidence, objective: _Objective, every: Tensor, like: Tensor

@@ -1,0 +1,111 @@
+"""Finished fits of a run, kept in its folder until its good end: what a run that was cut need not repeat."""
+
+import hashlib
+import json
+import re
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+import torch_pbd
+from torch_pbd.data import Demonstrations
+from torch_pbd.estimators._groups import fit_by_demonstration
+from torch_pbd.model_header import encode_parameters, is_ours
+from torch_pbd.persistence import load, save
+
+_NAME = re.compile(r"[0-9a-f]{64}-\d+\.\d{6}\.safetensors")
+
+
+class FinishedFits:
+    """Folder of fitted models, named by the SHA-256 of all that a fit depends on, and the seconds that it took.
+
+    Worker processes write and read it too, each file whole.
+
+    Parameters
+    ----------
+    folder : Path
+        Made when the first fit ends.
+    resume : bool, default=False
+        Whether to warn if the first fit that is asked for is not there.
+    """
+
+    def __init__(self, folder: Path, *, resume: bool = False) -> None:
+        self.folder, self._resume = folder, resume
+
+    def files(self) -> list[Path]:
+        """One file a fit."""
+        return [file for file in self.folder.glob("*.safetensors") if _NAME.fullmatch(file.name)]
+
+    def fit(self, model: Any, *data: Any) -> tuple[Any, float]:
+        """The fitted model and the seconds that its fit took: loaded, or fitted now and saved."""
+        key = _key(model, *data)
+        file = next(self.folder.glob(f"{key}-*.safetensors"), None)
+        if self._resume and file is None:
+            warnings.warn(f"There is nothing finished to resume from in {self.folder}: the run begins.", stacklevel=3)
+        self._resume = False
+        if file is not None:
+            return load(file), float(file.stem.partition("-")[2])
+        model, seconds = _timed_fit(model, *data)
+        self.folder.mkdir(exist_ok=True)
+        save(model, self.folder / f"{key}-{seconds:.6f}.safetensors")
+        return model, seconds
+
+    def clear(self) -> None:
+        """Remove the files, and the folder if nothing else is in it."""
+        for file in self.files():
+            file.unlink()
+        with suppress(OSError):
+            self.folder.rmdir()
+
+
+@contextmanager
+def finished_fits(folder: Path, *, resume: bool) -> Iterator[FinishedFits]:
+    """The finished fits of a run, which begins with those of one that was cut, or with none; cleared at a good end."""
+    finished = FinishedFits(folder, resume=resume)
+    if not resume and finished.files():
+        warnings.warn(
+            f"{folder} of a run that was cut is cleared; with --resume that run would have gone on.", stacklevel=3
+        )
+        finished.clear()
+    yield finished
+    finished.clear()
+
+
+def fit_once(model: Any, *data: Any, finished: FinishedFits | None = None) -> tuple[Any, float]:
+    """The fitted model, and the seconds that its fit took.
+
+    Parameters
+    ----------
+    model : covariance regressor or DMPController
+        Or a peer of theirs, which is always fitted.
+    *data : X, y and groups; or Demonstrations
+    finished : FinishedFits, default=None
+        Fits that need not be repeated; this one is added.
+    """
+    return _timed_fit(model, *data) if finished is None or not is_ours(model) else finished.fit(model, *data)
+
+
+def _timed_fit(model: Any, *data: Any) -> tuple[Any, float]:
+    start = time.perf_counter()
+    fitted = model.fit(*data) if isinstance(data[0], Demonstrations) else fit_by_demonstration(model, *data)
+    return fitted, time.perf_counter() - start
+
+
+def _key(model: Any, *data: Any) -> str:
+    """SHA-256 of class, parameters, versions and data."""
+    labels: list[Any] = []
+    if isinstance(data[0], Demonstrations):
+        (demos,) = data
+        labels, data = [demos.names, demos.units, demos.frame, demos.time_unit], (*demos.times, *demos.positions)
+    described = [encode_parameters(model), torch_pbd.__version__, torch.__version__, labels]
+    digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
+    for array in map(np.asarray, data):
+        digest.update(f"{array.dtype} {array.shape}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
