@@ -80,8 +80,7 @@ class Reproduction:
         mean = movements.recorded_mean
         distance = np.linalg.norm(self.motion(movements.time)[0] - mean, axis=1)
         error = float(np.sqrt(np.mean(distance**2)))
-        extent = float(np.linalg.norm(np.ptp(movements.position, axis=(0, 1))))
-        rounding = 1e-9 * float(np.abs(mean).max())
+        extent, rounding = movements.extent, 1e-9 * float(np.abs(mean).max())
         if error > _FAR * extent + rounding:
             remedy = "phase_input='time'" if self.phase.kind == "s" else "a higher cutoff, or more n_steps"
             warnings.warn(
