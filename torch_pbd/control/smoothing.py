@@ -34,8 +34,8 @@ class Movements:
     position, velocity, acceleration : ndarray of shape (K, n, d)
     recorded_mean : ndarray of shape (n, d)
         Mean position as it was recorded, not smoothed, but for holes.
-    extent : float
-        Norm of the ranges of the outputs in all recordings.
+    bounds : ndarray of shape (2, d)
+        Lowest and highest position of all recordings.
     known : ndarray of shape (K, n)
         Where each has samples near.
     noise_scale : ndarray of shape (d,)
@@ -47,7 +47,7 @@ class Movements:
     velocity: Floats
     acceleration: Floats
     recorded_mean: Floats
-    extent: float
+    bounds: Floats
     known: NDArray[np.bool_]
     noise_scale: Floats
 
@@ -107,22 +107,23 @@ def smooth(
         recorded.append(np.where(known[-1][:, np.newaxis], sampled, motions[-1][0]))
     position, velocity, acceleration = (np.stack(parts) for parts in zip(*motions, strict=True))
     if not noise:
-        _check_range(position, bounds, demonstrations.names)
+        for number, path in enumerate(position):
+            check_range(path, bounds, f"demonstration {number}, smoothed,")
     noise_scale = np.sqrt(np.mean(np.concatenate(removed) ** 2, axis=0))
-    extent, mean = float(np.linalg.norm(bounds[1] - bounds[0])), np.mean(recorded, axis=0)
-    return Movements(grid, position, velocity, acceleration, mean, extent, np.stack(known), noise_scale)
+    mean = np.mean(recorded, axis=0)
+    return Movements(grid, position, velocity, acceleration, mean, bounds, np.stack(known), noise_scale)
 
 
-def _check_range(position: Floats, bounds: Floats, names: tuple[str, ...]) -> None:
-    rounding = 1e-11 * np.abs(bounds).max(axis=0)
-    beyond = np.maximum(bounds[0] - position, position - bounds[1]).max(axis=1) - rounding
-    far = np.argwhere(beyond > _MOST_BEYOND * np.ptp(bounds, axis=0))
-    if len(far):
-        number, output = far[0]
+def check_range(path: Floats, bounds: Floats, name: str) -> None:
+    """Raise if a path (n, d) leaves the recorded bounds (2, d) of an output by more than a tenth of its range."""
+    beyond = np.maximum(bounds[0] - path, path - bounds[1]).max(axis=0) - 1e-11 * np.abs(bounds).max(axis=0)
+    ranges = np.ptp(bounds, axis=0)
+    if (beyond > _MOST_BEYOND * ranges).any():
+        output = int(np.argmax(beyond - _MOST_BEYOND * ranges))
         raise ValueError(
-            f"demonstration {number}, smoothed, leaves the recorded range of {names[output]} by "
-            f"{beyond[number, output]:.3g}, must stay within {_MOST_BEYOND:g} of that range, "
-            f"{np.ptp(bounds[:, output]):.3g}: take cutoff='auto', or correct times that come too close to others."
+            f"{name} leaves the recorded range of output {output}, {ranges[output]:.3g}, by {beyond[output]:.3g}, must "
+            f"stay within {_MOST_BEYOND:g} of it: lower the cutoff, take phase_input='time', or correct times that are "
+            "too close to others or not in time_unit."
         )
 
 
