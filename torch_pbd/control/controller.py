@@ -54,7 +54,8 @@ class DMPController(BaseEstimator):
     by eq. (19) and (20), and their damping from it.
 
     Demonstrations may be of any lengths and sampling times: each is smoothed at its true times, and stretched
-    linearly to the median duration.
+    linearly to the median duration. Its first and last sample are the start and the end of the movement, whatever
+    their times: one that was cut short is stretched too. Where fewer than two have samples, nothing is known.
 
     Parameters
     ----------
@@ -105,8 +106,8 @@ class DMPController(BaseEstimator):
         Root mean square of what the smoothing took away; and, were that white noise, the share of the variance
         that its rest behind the smoothing makes.
     unsampled_ : ndarray of shape (m,)
-        Type I uncertainty of the recordings themselves at evenly spaced times of the movement: 0 up to 2.5
-        spacings from a sample, 1 from five (a 40th of the movement at least); of the recording that knows second most.
+        Type I uncertainty of the recordings' times, at evenly spaced times of the movement: 0 up to 2.5 spacings from
+        a sample, 1 from five (a 40th of the movement at least), in the recording that knows second most.
     cutoff_, reproduction_error_ : float
         Hz; root mean square distance of the reproduced path from the mean of the demonstrations as recorded.
     n_outputs_, n_demos_ : int
@@ -177,8 +178,13 @@ class DMPController(BaseEstimator):
         Raises
         ------
         ValueError
-            If there are fewer than two demonstrations, too few samples in one, a parameter cannot be used, or there is
-            not the memory for ``n_steps``.
+            If there are fewer than two demonstrations, too few samples in one, a parameter cannot be used, there is
+            not the memory for ``n_steps``, or a path leaves the recorded range by more than a tenth of it.
+
+        Warns
+        -----
+        UserWarning
+            Of samples that were merged, as their times are too close; of holes, with their times.
         """
         self.__dict__.pop("_impedance", None)  # a fit that fails leaves no mixture of two
         check_parameters(self)
