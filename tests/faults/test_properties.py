@@ -48,6 +48,8 @@ COUNTS = {
 ERRORS = {
     r"X is constant: columns? \d+": "nothing can depend on an input that is the same in all rows",
     r"[Xy] is float16 and column \d+ is stored in steps of": "the type holds less than a thousandth of the range",
+    r"demonstration \d+, smoothed, leaves the recorded range": "through a few samples of noise a curve swings",
+    r"The reproduced movement leaves the recorded range": "the same, of a primitive that they drive",
     r"n_components == \d+, must not be above the number of distinct samples": "a component each is the most there is",
 }
 # What it may warn of, and why; any other warning is a fault.
@@ -72,6 +74,8 @@ WARNINGS = {
     (UnimodalityWarning, r"The demonstrations seem to follow two ways"): "two modes, or two outliers",
     (UserWarning, r"The covariances do not vary"): "a controller has nothing to make stiffness of",
     (UserWarning, r"The demonstrations tell no units"): "these have none",
+    (UserWarning, r"\d+ samples come less than a thousandth"): "times that differ by rounding",
+    (UserWarning, r"Fewer than two of \d+ demonstrations have samples at"): "holes",
     (UserWarning, r"The reproduced movement is .* off the mean"): "noise and outliers are smoothed away",
 }
 

@@ -23,6 +23,7 @@ from torch_pbd.control.arguments import (
     check_task,
     count_ticks,
 )
+from torch_pbd.control.coverage import UNKNOWN, merge_bursts, tabulate_unsampled
 from torch_pbd.control.dmp import DMP, Gate
 from torch_pbd.control.impedance import Gains, Impedance, OnUnknown
 from torch_pbd.control.matrices import check_count
@@ -35,12 +36,13 @@ from torch_pbd.control.simulation import simulate_schedule
 from torch_pbd.control.smoothing import Movements, automatic_cutoff, noise_like, smooth, variance_share
 from torch_pbd.control.stiffness import StiffnessLaw
 from torch_pbd.control.units import common_start, duration_of, in_metres, in_seconds
-from torch_pbd.control.variability import fit_covariance, fit_law
+from torch_pbd.control.variability import fit_covariance, fit_law, with_holes
 from torch_pbd.data import Demonstrations
 from torch_pbd.estimators._base import CovarianceRegressor
 
 Floats = NDArray[np.float64]
 
+_FAR = 1e6  # ranges of the input: only the prior speaks there
 _AT_ONCE = 2**14  # times whose gains are computed together
 
 
@@ -52,7 +54,8 @@ class DMPController(BaseEstimator):
     by eq. (19) and (20), and their damping from it.
 
     Demonstrations may be of any lengths and sampling times: each is smoothed at its true times, and stretched
-    linearly to the median duration.
+    linearly to the median duration. Its first and last sample are the start and the end of the movement, whatever
+    their times: one that was cut short is stretched too. Where fewer than two have samples, nothing is known.
 
     Parameters
     ----------
@@ -102,6 +105,9 @@ class DMPController(BaseEstimator):
     noise_scale_, noise_share_ : ndarray of shape (d,)
         Root mean square of what the smoothing took away; and, were that white noise, the share of the variance
         that its rest behind the smoothing makes.
+    unsampled_ : ndarray of shape (m,)
+        Type I uncertainty of the recordings' times, at evenly spaced times of the movement: 0 up to 2.5 spacings from
+        a sample, 1 from five (a 40th of the movement at least), in the recording that knows second most.
     cutoff_, reproduction_error_ : float
         Hz; root mean square distance of the reproduced path from the mean of the demonstrations as recorded.
     n_outputs_, n_demos_ : int
@@ -172,22 +178,27 @@ class DMPController(BaseEstimator):
         Raises
         ------
         ValueError
-            If there are fewer than two demonstrations, too few samples in one, a parameter cannot be used, or there is
-            not the memory for ``n_steps``.
+            If there are fewer than two demonstrations, too few samples in one, a parameter cannot be used, there is
+            not the memory for ``n_steps``, or a path leaves the recorded range by more than a tenth of it.
+
+        Warns
+        -----
+        UserWarning
+            Of samples that were merged, as their times are too close; of holes, with their times.
         """
         self.__dict__.pop("_impedance", None)  # a fit that fails leaves no mixture of two
         check_parameters(self)
-        demonstrations = as_demonstrations(X, y, groups)
+        demonstrations = merge_bursts(as_demonstrations(X, y, groups))
         self.names_, self.frame_ = demonstrations.names, demonstrations.frame
         self.units_, self.time_unit_ = demonstrations.units, demonstrations.time_unit
         self.n_demos_, self.n_outputs_ = len(demonstrations), demonstrations.n_outputs
         self.duration_, self.time_scale_ = duration_of(demonstrations, self.duration)
         self.start_time_ = common_start(demonstrations)
-        knows_seconds = in_seconds(demonstrations.time_unit) is not None
-        automatic = automatic_cutoff(self.duration_, knows_seconds=knows_seconds)
+        automatic = automatic_cutoff(self.duration_, knows_seconds=in_seconds(self.time_unit_) is not None)
         self.cutoff_ = automatic if self.cutoff == "auto" else self.cutoff
         check_against_duration(self)
         check_steps(self.n_steps, self.n_demos_, self.n_outputs_, learned=True)
+        self.unsampled_ = tabulate_unsampled(demonstrations, self.duration_ / self.time_scale_, self.on_unknown)
         movements = self.smooth(demonstrations)
         beta = None if self.beta is None else float(self.beta)
         self.dmp_ = DMP(
@@ -197,11 +208,14 @@ class DMPController(BaseEstimator):
         self.start_, self.goal_ = self.reproduction_.start, self.reproduction_.goal
         self.reproduction_error_ = self.reproduction_.check_against(movements)
         varying = self.varying(movements)
-        self.covariance_ = fit_covariance(self.covariance, self.phase(movements.time), varying)
+        self.covariance_ = fit_covariance(self.covariance, self.phase(movements.time), varying, movements.known)
         self.noise_scale_ = movements.noise_scale
-        noise = self.smooth(noise_like(demonstrations, movements.noise_scale))
+        noise = smooth(
+            noise_like(demonstrations, movements.noise_scale), self.cutoff_, self.n_steps, self.duration_, noise=True
+        )
         self.noise_share_ = variance_share(self.varying(noise), varying)
-        along = self.covariance_.predict_cov(self.phase(np.linspace(0.0, self.duration_, 1001)))
+        known = np.linspace(0.0, self.duration_, len(self.unsampled_))[self.unsampled_ <= UNKNOWN]
+        along = self.covariance_.predict_cov(self.phase(known[::4]))
         self.law_ = fit_law(self.stiffness_law, along, varying)
         ratio = self.damping_ratio if self.damping_ratio == "paper" else float(self.damping_ratio)
         self._impedance = Impedance(self.law_, float(self.mass), ratio, self.on_unknown)
@@ -345,7 +359,8 @@ class DMPController(BaseEstimator):
         if n_steps is not None:
             check_count("n_steps", n_steps, 2)
             check_steps(n_steps, len(demonstrations), demonstrations.n_outputs, learned=False)
-        return smooth(demonstrations, self.cutoff_, self.n_steps if n_steps is None else n_steps, self.duration_)
+        n_steps = self.n_steps if n_steps is None else n_steps
+        return smooth(merge_bursts(demonstrations), self.cutoff_, n_steps, self.duration_)
 
     def varying(self, movements: Movements) -> Floats:
         """What ``variability`` is of, (K, n, d), in smoothed movements of the same task."""
@@ -366,6 +381,10 @@ class DMPController(BaseEstimator):
         return Gains(*map(np.concatenate, zip(*parts, strict=True)))
 
     def _gains_of(self, time: Floats) -> Gains:
-        inputs = self.phase(time)
-        covariance, unknown = self.covariance_.predict_cov(inputs), self.covariance_.predict_uncertainty(inputs).type1
-        return self._impedance(covariance, unknown, time)
+        start, end = self.phase([0.0, self.duration_])
+        hole = np.interp(time, np.linspace(0.0, self.duration_, len(self.unsampled_)), self.unsampled_)
+        parts = with_holes(self.covariance_, self.phase(time), hole, (end + _FAR * (end - start))[np.newaxis])
+        # Softness counts the hole already; the wide prior would count it again.
+        known, covariance, type1 = parts
+        gains = self._impedance(known if self.on_unknown == "soft" else covariance, type1, time)
+        return gains._replace(covariance=covariance)

@@ -7,14 +7,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torch_pbd.control.coverage import UNKNOWN
 from torch_pbd.control.damping import damping_from_stiffness
 from torch_pbd.control.stiffness import StiffnessLaw
 
 Floats = NDArray[np.float64]
 OnUnknown = Literal["soft", "prior", "raise"]
-
-UNKNOWN = 0.5
-"""Type I uncertainty above which ``on_unknown="raise"`` raises."""
 
 
 class Gains(NamedTuple):

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torch_pbd.control.dmp import DMP
 from torch_pbd.control.forcing import ForcingProcess
-from torch_pbd.control.smoothing import Movements
+from torch_pbd.control.smoothing import Movements, check_range
 
 Floats = NDArray[np.float64]
 
@@ -72,15 +72,21 @@ class Reproduction:
     def check_against(self, movements: Movements) -> float:
         """Root mean square distance of the motion from the mean of the movements as they were recorded.
 
+        Raises
+        ------
+        ValueError
+            If it leaves the recorded range of an output by more than a tenth of it.
+
         Warns
         -----
         UserWarning
             If it is more than 1 % of the extent of all movements.
         """
-        mean = movements.recorded_mean
-        distance = np.linalg.norm(self.motion(movements.time)[0] - mean, axis=1)
+        mean, path = movements.recorded_mean, self.motion(movements.time)[0]
+        check_range(path, movements.bounds, "The reproduced movement")
+        distance = np.linalg.norm(path - mean, axis=1)
         error = float(np.sqrt(np.mean(distance**2)))
-        extent = float(np.linalg.norm(np.ptp(movements.position, axis=(0, 1))))
+        extent = float(np.linalg.norm(np.ptp(movements.bounds, axis=0)))
         rounding = 1e-9 * float(np.abs(mean).max())
         if error > _FAR * extent + rounding:
             remedy = "phase_input='time'" if self.phase.kind == "s" else "a higher cutoff, or more n_steps"

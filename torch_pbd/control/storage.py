@@ -19,6 +19,7 @@ _PLAIN = (
     "time_scale_",     "reproduction_error_",
 )  # fmt: skip
 _ARRAYS = ("noise_scale_", "noise_share_")
+_HOLES = "unsampled_"  # where there are any: other files are as those of versions that knew of none
 _MOTION = ("start", "velocity", "goal", "forcing")
 
 
@@ -27,6 +28,8 @@ def controller_state(controller: DMPController) -> tuple[dict[str, Any], Arrays]
     values = {name: getattr(controller, name) for name in _PLAIN} | {"law_": controller.law_}
     arrays = {name: getattr(controller, name) for name in _ARRAYS}
     arrays |= {name: getattr(controller.reproduction_, name) for name in _MOTION}
+    if controller.unsampled_.any():
+        arrays[_HOLES] = controller.unsampled_
     return values, arrays
 
 
@@ -40,6 +43,10 @@ def check_controller(controller: DMPController, values: dict[str, Any], arrays: 
     """
     check_parameters(controller)
     d = values["n_outputs_"]
+    holes = arrays.get(_HOLES, np.zeros(2))
+    arrays = {name: array for name, array in arrays.items() if name != _HOLES}
+    if holes.dtype != np.float64 or holes.ndim != 1 or len(holes) < 2 or not ((holes >= 0.0) & (holes <= 1.0)).all():
+        raise ValueError(f"{_HOLES} is not of shares from 0 to 1")
     if set(arrays) != {*_ARRAYS, *_MOTION}:
         raise ValueError(f"its arrays are {', '.join(arrays)!r:.200}, they must be {', '.join((*_ARRAYS, *_MOTION))}")
     for name, array in arrays.items():
@@ -72,6 +79,7 @@ def restore_controller(controller: DMPController, covariance: Any, values: dict[
         setattr(controller, name, values[name])
     for name in _ARRAYS:
         setattr(controller, name, arrays[name])
+    controller.unsampled_ = arrays.get(_HOLES, np.zeros(2))
     controller.names_ = tuple(controller.names_)
     controller.units_ = None if controller.units_ is None else tuple(controller.units_)
     dmp = DMP(

@@ -7,6 +7,7 @@ from sklearn.base import clone
 from torch_pbd.control.stiffness import StiffnessLaw
 from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.estimators._groups import fit_by_demonstration
+from torch_pbd.estimators._prior import prior_covariance
 from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
 
 Floats = NDArray[np.float64]
@@ -15,17 +16,37 @@ _RESOLUTION = 1e-5  # of the extent of a movement: smaller standard deviations c
 _ROUNDING = 1e-11  # of the largest position
 
 
-def fit_covariance(regressor: CovarianceRegressor | None, inputs: Floats, varying: Floats) -> CovarianceRegressor:
-    """Fit a clone of the regressor to what varies (K, n, d) at common inputs (n, 1); it is told the demonstrations."""
+def fit_covariance(
+    regressor: CovarianceRegressor | None, inputs: Floats, varying: Floats, known: NDArray[np.bool_]
+) -> CovarianceRegressor:
+    """Fit a clone of the regressor to what varies (K, n, d) at common inputs (n, 1), where two or more know it (K, n).
+
+    It is told the demonstrations. From one alone nothing is known of how they vary, and the others stay aligned.
+    """
     fitted: CovarianceRegressor = clone(HeteroscedasticGPRegressor() if regressor is None else regressor)
-    n_demos, n_steps, n_outputs = varying.shape
     between, extent = varying - varying[:1], _extent(varying)
     if float(np.abs(between).max()) <= _RESOLUTION * extent:
         # One movement, shown again: what a smooth mean leaves of it would count as variability. It stands still
         # instead, at a distance to which the floors of regressors are relative.
         varying = extent + between
-    groups = np.repeat(np.arange(n_demos), n_steps)
-    return fit_by_demonstration(fitted, np.tile(inputs, (n_demos, 1)), varying.reshape(-1, n_outputs), groups)
+    groups, steps = np.nonzero(known & (known.sum(axis=0) > 1))
+    return fit_by_demonstration(fitted, inputs[steps], varying[groups, steps], groups)
+
+
+def with_holes(
+    regressor: CovarianceRegressor, inputs: Floats, hole: Floats, far: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Covariances (n, d, d) without and with holes, and Type I uncertainty (n,), at inputs (n, 1).
+
+    A regressor bridges holes that are short beside its length scale: here the share ``hole`` (n,) of what it says is
+    its prior, at the input, or if that is the same everywhere what it says at ``far`` (1, 1).
+    """
+    known, type1 = regressor.predict_cov(inputs), regressor.predict_uncertainty(inputs).type1
+    if not hole.any():
+        return known, known, type1
+    prior, share = getattr(regressor, "prior", None), hole[:, np.newaxis, np.newaxis]
+    wide = prior_covariance(prior, inputs, known.shape[-1]) if callable(prior) else regressor.predict_cov(far)
+    return known, (1.0 - share) * known + share * wide, 1.0 - (1.0 - hole) * (1.0 - type1)
 
 
 def fit_law(law: StiffnessLaw | None, covariance: Floats, varying: Floats) -> StiffnessLaw:
