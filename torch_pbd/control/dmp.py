@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torch_pbd.control.adaptation import Adaptation, adapt
 from torch_pbd.control.matrices import as_rows, as_tensor, check_count, check_positive
 from torch_pbd.memory import require_much
 
@@ -22,9 +23,14 @@ class DMP:
 
     As printed, eq. (16) does not stop at the goal: f of a movement that ends with a velocity v_end holds the rest
     point at ``goal + tau v_end / beta``. A gate takes the forcing to zero after ``duration``; it is 1 before,
-    where eq. (18) is therefore the inverse of eq. (16) with every gate. Being linear and, with
-    ``beta = alpha / 4``, critically damped, the system answers a change of the goal without overshoot: the
-    motion is the unchanged one plus a step response that rises from 0 to 1 without passing it.
+    where eq. (18) is therefore the inverse of eq. (16) with every gate.
+
+    As printed, another goal or start than those demonstrated adds the response of the spring-damper, which takes
+    0.5 tau whatever the movement takes, and 100 times its acceleration: "additive". "safe" drives the demonstrated
+    movement by eq. (16), and takes its start and goal along by minimum jerk over the duration. The acceleration is
+    at most 1.5 times that of the movement plus such a blend, and no coordinate leaves the hull of start, goal and
+    demonstrated path by more than a tenth: where it would, the shape of the path is made flatter. A goal that
+    changes on the way is reached at the end of the movement, or half a duration later where that is later still.
 
     Parameters
     ----------
@@ -42,6 +48,9 @@ class DMP:
     gate : {"time", "phase", "none"}, default="time"
         "time": closes over ``0.1 duration`` along a minimum-jerk curve. "phase": as the phase decays after
         ``duration``, s / s(duration). "none": the paper's.
+    adaptation : {"safe", "additive"}, default="safe"
+        How it moves to another goal, and from another start; "additive" is the paper's. Without a ``duration``,
+        "safe" takes tau for it.
 
     Raises
     ------
@@ -71,6 +80,7 @@ class DMP:
         *,
         duration: float | None = None,
         gate: Gate = "time",
+        adaptation: Adaptation = "safe",
     ) -> None:
         check_positive("alpha", alpha)
         beta = alpha / 4.0 if beta is None else beta
@@ -79,15 +89,16 @@ class DMP:
             named["duration"] = duration
         for name, value in named.items():
             check_positive(name, value)
-        if gate not in get_args(Gate):
-            raise ValueError(f"gate == {gate!r}, must be one of {', '.join(map(repr, get_args(Gate)))}.")
+        for name, choice, kind in (("gate", gate, Gate), ("adaptation", adaptation, Adaptation)):
+            if choice not in get_args(kind):
+                raise ValueError(f"{name} == {choice!r}, must be one of {', '.join(map(repr, get_args(kind)))}.")
         self.alpha, self.beta, self.gamma, self.tau = alpha, beta, gamma, tau
-        self.duration, self.gate = duration, gate
+        self.duration, self.gate, self.adaptation = duration, gate, adaptation
 
     def __repr__(self) -> str:
         return (
             f"DMP(alpha={self.alpha:g}, beta={self.beta:g}, gamma={self.gamma:g}, tau={self.tau:g}, "
-            f"duration={self.duration}, gate={self.gate!r})"
+            f"duration={self.duration}, gate={self.gate!r}, adaptation={self.adaptation!r})"
         )
 
     def phase(self, time: Tensor | Any) -> Tensor:
@@ -137,6 +148,8 @@ class DMP:
         goal: Tensor | Any,
         position0: Float[Tensor, "*s d"] | Any = None,
         velocity0: Float[Tensor, "*s d"] | Any = None,
+        demonstrated_start: Float[Tensor, "*s d"] | Any = None,
+        demonstrated_goal: Float[Tensor, "*s d"] | Any = None,
         speed: Float[Tensor, " t"] | Any = None,
         n_steps: int | Any = None,
         integrator: Literal["exact", "rk4"] | Any = "exact",
@@ -154,6 +167,9 @@ class DMP:
             One goal, or the goal held over each tick: it may change at run time.
         position0, velocity0 : Tensor of shape (..., d), default=None
             State at the start; None is the origin, at rest.
+        demonstrated_start, demonstrated_goal : Tensor of shape (..., d), default=None
+            Of the movement that the forcing is of, for adaptation="safe", which ``velocity0`` then is of too; None
+            are ``position0`` and the goal of the first tick.
         speed : Tensor of shape (T,), default=None
             How fast movement time passes at each tick, linear between: 0.5 takes twice as long. The path is the
             same at every speed, so the duration changes at run time without overshoot; a speed that jumps makes
@@ -170,34 +186,42 @@ class DMP:
         """
         forcing, n_ticks = _checked_forcing(forcing, n_steps)
         goal = as_rows(goal, "goal", 1)
-        position0, velocity0 = (
-            None if start is None else as_rows(start, name, 1)
-            for name, start in (("position0", position0), ("velocity0", velocity0))
-        )
+        places = {"position0": position0, "velocity0": velocity0}
+        places |= {"demonstrated_start": demonstrated_start, "demonstrated_goal": demonstrated_goal}
+        given = {name: as_rows(place, name, 1) for name, place in places.items() if place is not None}
         if integrator not in ("exact", "rk4"):
             raise ValueError(f"integrator == {integrator!r}, must be 'exact' or 'rk4'.")
         time, steps, passing = _movement_time(n_ticks, dt, speed, goal)
         at_ticks = (_called(forcing, time) if callable(forcing) else forcing) * self.gate_at(time)[:, None]
         goals = goal if goal.ndim > 1 else goal[None]
-        zero = at_ticks.new_zeros(at_ticks.shape[-1])
-        position, velocity = (zero if start is None else start for start in (position0, velocity0))
-        shape = _run_shape(
-            at_ticks, {"goal": goals, "position0": position[..., None, :], "velocity0": velocity[..., None, :]}
-        )
+        shape = _run_shape(at_ticks, {"goal": goals, **{name: place[..., None, :] for name, place in given.items()}})
         at_ticks, goals = at_ticks.expand(shape), goals.expand(shape)
+        start, velocity = (given.get(name, goal.new_zeros(shape[-1])) for name in ("position0", "velocity0"))
         if passing[0] == 0.0 and bool((velocity != 0.0).any()):
             raise ValueError("velocity0 must be 0 where speed[0] is 0: no movement time passes there.")
+        own_start, own_goal = given.get("demonstrated_start", start), given.get("demonstrated_goal", goals[..., 0, :])
+        safe = self.adaptation == "safe" and not (
+            torch.equal(own_start, start) and bool((goals == own_goal[..., None, :]).all())
+        )
+        driven = own_goal[..., None, :].expand(shape) if safe else goals
         scaled = self.tau * velocity / passing[0].clamp_min(1e-12)
-        state = torch.stack([start.expand(*shape[:-2], shape[-1]) for start in (position, scaled)], dim=-1)
+        starts = [place.expand(*shape[:-2], shape[-1]) for place in (own_start if safe else start, scaled)]
         if integrator == "exact":
-            trace = self._exact(at_ticks, goals, steps, state)
+            trace = self._exact(at_ticks, driven, steps, torch.stack(starts, dim=-1))
         else:
             midway = 0.5 * (at_ticks[..., 1:, :] + at_ticks[..., :-1, :])
             if callable(forcing):
                 halfway = 0.5 * (time[1:] + time[:-1])
                 midway = _called(forcing, halfway) * self.gate_at(halfway)[:, None]
-            trace = self._runge_kutta(at_ticks, midway, goals, steps, state)
-        return trace[..., 0], trace[..., 1] / self.tau * passing[:, None]
+            trace = self._runge_kutta(at_ticks, midway, driven, steps, torch.stack(starts, dim=-1))
+        position, rate = trace[..., 0], trace[..., 1] / self.tau
+        if safe:
+            change = trace[..., 1] * -self.alpha + self.alpha * self.beta * (driven - position) + at_ticks
+            position, rate = adapt(
+                (position, rate, change / self.tau**2), time, (position, time), own_goal=own_goal, goals=goals,
+                start=start, duration=self.duration or self.tau,
+            )  # fmt: skip
+        return position, rate * passing[:, None]
 
     def _rate(self, like: Tensor) -> Tensor:
         """Matrix of ``[x, z]' = rate @ [x, z, goal, forcing]``."""

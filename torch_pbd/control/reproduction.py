@@ -3,6 +3,7 @@
 import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -10,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicHermiteSpline
 from torch import Tensor
 
+from torch_pbd.control.adaptation import adapt
+from torch_pbd.control.arguments import time_constant
 from torch_pbd.control.dmp import DMP
 from torch_pbd.control.forcing import ForcingProcess
 from torch_pbd.control.smoothing import Movements
@@ -19,6 +22,9 @@ Floats = NDArray[np.float64]
 _TICKS = 4000  # within the duration
 _FAR = 0.01  # of the extent of a movement
 _SETTLE = 20.0  # time constants after the end at which the movement is at rest
+_BRAKE = 0.2  # of the duration: the most that the stop of a movement that was cut may take
+_CUT, _STEADY = 0.1, 0.5  # of the largest speed; see check_ends
+_ROUNDING = 1e-9  # of the duration
 
 
 @dataclass(frozen=True)
@@ -91,6 +97,27 @@ class Reproduction:
             )
         return error
 
+    def check_ends(self) -> None:
+        """Tell of a movement that was cut while it moved: one that the robot can neither begin nor end as shown.
+
+        A movement by minimum jerk has a tenth of its largest speed after 6 % of its time: who cuts more than that, or
+        does not begin at rest, is told. A movement whose speed stays above half of its largest is meant to pass.
+
+        Warns
+        -----
+        UserWarning
+            If the speed at its start or end is above a tenth of the largest.
+        """
+        speed = np.linalg.norm(self._curve(self.time, 1), axis=1)
+        first, last, largest = float(speed[0]), float(speed[-1]), float(speed.max())
+        if max(first, last) > _CUT * largest > 2.0 * _CUT * float(speed.min()):
+            warnings.warn(
+                f"The movement starts at a speed of {first:.3g} and ends at {last:.3g}, in units of position per s, "
+                f"where its largest is {largest:.3g}: the recordings were cut while moving. Record from rest to rest; "
+                "else a robot at rest needs a ramp at the start, and settle > 0 at the end.",
+                stacklevel=3,
+            )
+
     def forcing_at(self, time: Tensor) -> Tensor:
         """Forcing (m, d), before the gate, at times (m,)."""
         columns = [np.interp(time.numpy(), self.time, column) for column in self.forcing.T]
@@ -99,45 +126,96 @@ class Reproduction:
     def motion(self, time: Floats) -> tuple[Floats, Floats]:
         """Position and velocity (n, d) at any times (n,): at rest at the start before 0, and long after the end.
 
-        The primitive is solved exactly at 4000 ticks in the duration, and interpolated by cubics between.
+        The primitive is solved exactly at 4000 ticks in the duration, and interpolated by cubics between. With
+        adaptation="safe" it is over with the duration.
         """
-        curve, end = self._settled_motion, self._settled_motion.x[-1]
+        curve, end = self._curve, self._curve.x[-1]
         within = np.clip(time, 0.0, end)
         moving = ((time >= 0.0) & (time <= end))[:, np.newaxis]
         return curve(within), np.where(moving, curve(within, 1), 0.0)
 
     @cached_property
-    def _settled_motion(self) -> CubicHermiteSpline:
-        step, dmp = float(self.time[1]), self.dmp
-        slowest = max(2.0 * dmp.tau / dmp.alpha, dmp.tau / dmp.gamma if dmp.gate == "phase" else 0.0)
-        n_ticks = len(self.time) + int((_SETTLE * slowest + 0.1 * self.time[-1]) / step)
-        return CubicHermiteSpline(*self.roll_out(n_ticks, step), axis=0)
+    def _curve(self) -> CubicHermiteSpline:
+        step, dmp, time = float(self.time[1]), self.dmp, self.time
+        if dmp.adaptation != "safe":
+            slowest = max(2.0 * dmp.tau / dmp.alpha, dmp.tau / dmp.gamma if dmp.gate == "phase" else 0.0)
+            time = step * np.arange(len(time) + int((_SETTLE * slowest + 0.1 * time[-1]) / step))
+        goal, start, velocity = map(_tensor, (self.goal, self.start, self.velocity))
+        run = dmp.rollout(self.forcing_at, step, goal=goal, position0=start, velocity0=velocity, n_steps=len(time))
+        positions, velocities = (part.numpy() for part in run)
+        if dmp.adaptation == "safe":  # what is left at the end is taken out as a change of the goal is
+            left, share = positions[-1] - self.goal, time[:, np.newaxis] / time[-1]
+            positions = positions - left * share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+            velocities = velocities - left * 30.0 * (share * (1.0 - share)) ** 2 / time[-1]
+        return CubicHermiteSpline(time, positions, velocities, axis=0)
 
-    def roll_out(
-        self,
-        n_ticks: int,
-        dt: float,
-        *,
-        goal: ArrayLike | None = None,
-        start: ArrayLike | None = None,
-        speed: ArrayLike | None = None,
-    ) -> tuple[Floats, Floats, Floats]:
-        """Time (n,), position and velocity (n, d); see :meth:`DMPController.reproduce`."""
-        pace = None if speed is None else np.asarray(speed, dtype=np.float64)
-        for name, value in (("goal", goal), ("start", start), ("speed", speed)):
-            if value is not None and not np.isfinite(np.asarray(value, dtype=np.float64)).all():
-                raise ValueError(f"{name} has a value that is not finite: {value!r}.")
-        position, velocity = self.dmp.rollout(
-            self.forcing_at,
-            dt,
-            goal=_tensor(self.goal if goal is None else goal),
-            position0=_tensor(self.start if start is None else start),
-            velocity0=_tensor(self.velocity * (1.0 if pace is None else pace[0])),
-            speed=None if pace is None else _tensor(pace),
-            n_steps=n_ticks,
+    def plan(
+        self, time: Floats, *, goal: Floats | None = None, start: Floats | None = None, speed: float | Floats = 1.0
+    ) -> "Plan":
+        """Motion at times (n,) from 0, to goals (d,) or (n, d), from a start (d,), at one speed or those of all times.
+
+        With adaptation="safe", times after the end let the movement brake before it, and come to rest there.
+        """
+        pace = np.broadcast_to(np.asarray(speed, dtype=np.float64), time.shape)[:, np.newaxis]
+        mean_pace = 0.5 * (pace[1:, 0] + pace[:-1, 0])
+        passed = time * speed if np.ndim(speed) == 0 else np.append(0.0, np.cumsum(mean_pace * np.diff(time)))
+        goals = np.broadcast_to(self.goal if goal is None else goal, (len(time), len(self.goal)))
+        start, same = (self.start, goal is None) if start is None else (start, False)
+        if self.dmp.adaptation == "safe":
+            moved, rate, known = self._braked(passed)
+            path = tuple(self._curve(moved, order) * rate[:, np.newaxis] ** order for order in range(3))
+            position, velocity = path[:2] if same else self._adapted(path, passed, goals, start)
+            return Plan(position, velocity * pace, known)
+        position, velocity = self.motion(passed)
+        if not same:  # the primitive is linear: another start and goal add its answer to their change alone
+            step, still = float(time[1]), torch.zeros(goals.shape, dtype=torch.float64)
+            run = self.dmp.rollout(
+                still,
+                step,
+                goal=_tensor(goals - self.goal),
+                position0=_tensor(start - self.start),
+                speed=_tensor(pace[:, 0]),
+            )
+            change = CubicHermiteSpline(step * np.arange(len(time)), *(part.numpy() for part in run), axis=0)
+            return Plan(position + change(time), velocity * pace + change(time, 1), passed)
+        return Plan(position, velocity * pace, passed)
+
+    def _adapted(self, path: tuple[Floats, ...], passed: Floats, goals: Floats, start: Floats) -> tuple[Floats, Floats]:
+        position, velocity = adapt(
+            tuple(map(_tensor, path)),
+            _tensor(passed),
+            (_tensor(self._curve(self.time)), _tensor(self.time)),
+            own_goal=_tensor(self.goal),
+            goals=_tensor(goals),
+            start=_tensor(start),
+            duration=float(self.time[-1]),
         )
-        ticks: Floats = np.arange(n_ticks, dtype=np.float64) * dt
-        return ticks, position.numpy(), velocity.numpy()
+        return position.numpy(), velocity.numpy()
+
+    def _braked(self, passed: Floats) -> tuple[Floats, Floats, Floats]:
+        """Movement time (n,) that comes to rest at the end of the movement, its rate, and the time of the gains (n,).
+
+        A movement that was cut at a speed v is stopped on its own path, half of it before the end and half after it:
+        in 1.5 v / a, which takes no more than its own largest acceleration a; in a fifth of the duration, or in what
+        time there is, if that is less.
+        """
+        end, curve = float(self.time[-1]), self._curve
+        largest = max(float(np.linalg.norm(curve(self.time, 2), axis=1).max()), np.finfo(float).tiny)
+        needed = 1.5 * float(np.linalg.norm(curve(end, 1))) / largest
+        brake = max(0.0, min(needed, _BRAKE * end, 2.0 * (float(passed[-1]) - end)))
+        late = (passed - end) / end
+        share = np.clip(late * end / brake + 0.5, 0.0, 1.0) if brake > _ROUNDING * end else 1.0 * (late > _ROUNDING)
+        moved = np.minimum(passed, end - 0.5 * brake) + brake * (share - share**3 + 0.5 * share**4)
+        rate = 1.0 - share**2 * (3.0 - 2.0 * share)
+        return np.minimum(moved, end), rate, np.maximum(moved, passed - 0.5 * brake)
+
+
+class Plan(NamedTuple):
+    """Position and velocity (n, d) over time, and the movement time (n,) of their gains."""
+
+    position: Floats
+    velocity: Floats
+    movement_time: Floats
 
 
 @dataclass(frozen=True)
@@ -154,6 +232,16 @@ class Phase:
         if self.kind == "log_s":
             return (-self.dmp.gamma * time / self.dmp.tau)[:, np.newaxis]
         return self.dmp.phase(_tensor(time)).numpy()[:, np.newaxis]
+
+
+def primitive(controller: Any) -> DMP:
+    """The primitive of a controller that knows its duration; with adaptation="safe" tau is in units of that."""
+    beta = None if controller.beta is None else float(controller.beta)
+    tau = time_constant(controller)
+    return DMP(
+        float(controller.alpha), beta, float(controller.gamma), tau, duration=controller.duration_, gate=controller.gate,
+        adaptation=controller.adaptation,
+    )  # fmt: skip
 
 
 def _tensor(values: ArrayLike) -> Tensor:

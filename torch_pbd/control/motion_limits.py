@@ -1,0 +1,60 @@
+"""What no robot does: movements beyond it are recordings in other units than they say."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, final
+
+from torch_pbd.control.schedule_checks import check_positive
+from torch_pbd.control.units import robot_unit
+
+_UNITS = {"duration": "s", "distance": "m", "speed": "m/s"}
+
+
+@final
+@dataclass(frozen=True)
+class MotionLimits:
+    """What is beyond what robots do, so that a schedule is refused: its units cannot be right.
+
+    Parameters
+    ----------
+    duration : float, default=600.0
+        Of the movement, s.
+    distance : float, default=10.0
+        Diagonal of the box around the path, m; where it lies does not matter.
+    speed : float, default=10.0
+        In m/s.
+
+    Raises
+    ------
+    ValueError
+        If one is not a positive number.
+    """
+
+    duration: float = 600.0
+    distance: float = 10.0
+    speed: float = 10.0
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            check_positive(name, value)
+
+
+def motion_check(limits: Any, units: Sequence[str] | None, time_unit: str) -> Callable[..., None]:
+    """A function that raises ValueError where a duration, distance or speed, by name, is beyond the limits.
+
+    They are in m and s: of recordings in units that are no lengths it raises nothing.
+    """
+    if not isinstance(limits, MotionLimits | None):
+        raise ValueError(f"limits == {limits!r}, must be MotionLimits or None.")
+    known = units is None or robot_unit(units) == "m"
+
+    def check(**found: float) -> None:
+        for name, value in found.items() if known and limits is not None else ():
+            if value > getattr(limits, name):
+                raise ValueError(
+                    f"the schedule has a {name} of {value:.4g} {_UNITS[name]}, more than limits.{name} == "
+                    f"{getattr(limits, name):g}: are the recordings' units ({', '.join(units or ['none'])}) and time_unit "
+                    f"({time_unit}) right? If so, give limits=MotionLimits({name}=...) or None."
+                )
+
+    return check
