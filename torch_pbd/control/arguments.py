@@ -84,7 +84,7 @@ def check_parameters(controller: Any) -> None:
 
 def check_against_duration(controller: Any) -> None:
     """Check the parameters that only the duration of the movement makes too small or too large."""
-    duration, tau = controller.duration_, time_constant(controller)
+    duration, tau = controller.duration_, controller.dmp_.tau
     if not _BRIEFEST <= duration <= 1.0 / _BRIEFEST:
         raise ValueError(f"duration == {duration:g}, must be {_BRIEFEST:g} to {1.0 / _BRIEFEST:g} s.")
     cycles = None if controller.cutoff_ is None else controller.cutoff_ * duration
@@ -113,11 +113,6 @@ def check_against_duration(controller: Any) -> None:
             f"gamma == {gamma:g} with tau == {tau:g} takes the phase from 1 to exp(-{decay:.3g}) in a movement of "
             f"{duration:.3g} s, where its times cannot be told apart: take phase_input='time', or another gamma."
         )
-
-
-def time_constant(controller: Any) -> float:
-    """Time constant of the primitive in s: with adaptation="safe" tau is in units of the duration."""
-    return float(controller.tau) * (controller.duration_ if controller.adaptation == "safe" else 1.0)
 
 
 def check_task(demonstrations: Any, n_outputs: int | None) -> None:
@@ -228,8 +223,8 @@ def as_speed(values: ArrayLike) -> Floats:
     return speed
 
 
-def count_ticks(duration: float, rate: float, settle: float) -> int:
-    """Ticks of a schedule that ends ``settle`` after the movement."""
+def as_tick_times(duration: float, rate: float, settle: float, d: int, n_ticks: int | None = None) -> Floats:
+    """Times (n,) of the rows of a schedule of d outputs that ends ``settle`` after the movement, or of ``n_ticks``."""
     check_positive("rate", rate)
     check_finite("settle", settle)
     if settle < 0.0:
@@ -239,15 +234,9 @@ def count_ticks(duration: float, rate: float, settle: float) -> int:
             f"rate == {rate:g} with settle == {settle:g} makes {(duration + settle) * rate:.3g} ticks of a movement of "
             f"{duration:g} s, more than {_MOST_TICKS:g}: lower them."
         )
-    n_ticks = count_rows(duration + settle, rate)
-    if n_ticks < 2:
-        raise ValueError(f"rate == {rate:g} gives {n_ticks} tick in {duration:g}, must give at least 2.")
-    return n_ticks
-
-
-def as_tick_times(duration: float, rate: float, settle: float, d: int, n_ticks: int | None = None) -> Floats:
-    """Times (n,) of the ticks of a movement and what comes after it, or of ``n_ticks``, if they fit in memory."""
-    counted = count_ticks(duration, rate, settle)
+    counted = count_rows(duration + settle, rate)
+    if counted < 2:
+        raise ValueError(f"rate == {rate:g} gives {counted} tick in {duration:g}, must give at least 2.")
     check_memory(counted if n_ticks is None else n_ticks, d)
     return row_times(duration + settle, rate) if n_ticks is None else np.arange(n_ticks) / rate
 

@@ -26,10 +26,10 @@ from torch_pbd.control.arguments import (
 from torch_pbd.control.dmp import Gate
 from torch_pbd.control.impedance import Gains, Impedance, OnUnknown
 from torch_pbd.control.matrices import check_count, check_positive
-from torch_pbd.control.motion_limits import MotionLimits, motion_check
+from torch_pbd.control.motion_limits import MotionLimits, check_motion
 from torch_pbd.control.plant import AdmittancePlant
 from torch_pbd.control.provenance import schedule_labels
-from torch_pbd.control.reproduction import Plan, Reproduction, primitive
+from torch_pbd.control.reproduction import Reproduction, primitive
 from torch_pbd.control.rollout import Rollout
 from torch_pbd.control.schedule import Schedule
 from torch_pbd.control.simulation import simulate_schedule
@@ -64,11 +64,10 @@ class DMPController(BaseEstimator):
         Of the movement primitive, see :class:`~torch_pbd.control.DMP`; the paper's are 1, 1, 0.7, 1. With
         adaptation="safe" tau is in units of the duration, else in s.
     adaptation : {"safe", "additive"}, default="safe"
-        How the movement goes to another goal, and from another start: "safe" takes them along over its duration, see
-        :class:`~torch_pbd.control.DMP`; "additive" is the paper's, which throws the robot.
+        How it moves to other goals, and from other starts; "additive", the paper's, throws the robot.
     gate : {"time", "phase", "none"}, default="time"
-        How the forcing ends after a movement with adaptation="additive", so that it comes to rest at the goal; "none"
-        is the paper's. One with "safe" ends with its duration, and brakes on its own path, see :meth:`schedule`.
+        How the forcing ends after an "additive" movement, so that it comes to rest at the goal; "none" is the paper's.
+        A "safe" one is over with its duration, see :meth:`schedule`.
     phase_input : {"time", "log_s", "s"}, default="time"
         What the regressors see: movement time, or the phase s of eq. (17) or its logarithm, which is time in
         other units. "s" is the paper's; scripts/benchmarks/phase_input.py compares them.
@@ -183,11 +182,6 @@ class DMPController(BaseEstimator):
         ValueError
             If there are fewer than two demonstrations, too few samples in one, a parameter cannot be used, or there is
             not the memory for ``n_steps``.
-
-        Warns
-        -----
-        UserWarning
-            If the recordings were cut while moving, or the movement is not that of the demonstrations.
         """
         self.__dict__.pop("_impedance", None)  # a fit that fails leaves no mixture of two
         check_parameters(self)
@@ -200,10 +194,10 @@ class DMPController(BaseEstimator):
         knows_seconds = in_seconds(demonstrations.time_unit) is not None
         automatic = automatic_cutoff(self.duration_, knows_seconds=knows_seconds)
         self.cutoff_ = automatic if self.cutoff == "auto" else self.cutoff
+        self.dmp_ = primitive(self)
         check_against_duration(self)
         check_steps(self.n_steps, self.n_demos_, self.n_outputs_, learned=True)
         movements = self.smooth(demonstrations)
-        self.dmp_ = primitive(self)
         self.reproduction_ = Reproduction.learn(self.dmp_, movements, self.phase_input, own_goals=self.goal == "each")
         self.start_, self.goal_ = self.reproduction_.start, self.reproduction_.goal
         self.reproduction_error_ = self.reproduction_.check_against(movements)
@@ -277,27 +271,17 @@ class DMPController(BaseEstimator):
         """
         check_is_fitted(self)
         check_positive("speed", speed)
-        check = motion_check(limits, self.units_, self.time_unit_)
-        check(duration=self.duration_ / speed)
+        told = self.units_, self.time_unit_
+        check_motion(limits, *told, duration=self.duration_ / speed)
         time = as_tick_times(self.duration_ / speed, rate, settle, self.n_outputs_)
-        plan = self._planned(time, goal, start, float(speed))
+        position, velocity, moved = self._planned(time, goal, start, float(speed))
         metres = in_metres(self.units_)
-        position, velocity = metres * plan.position, metres * plan.velocity
-        check(
-            distance=float(np.linalg.norm(np.ptp(position, axis=0))),
-            speed=float(np.linalg.norm(velocity, axis=1).max()),
-        )
-        gains = self._gains_at(plan.movement_time)
-        return Schedule(
-            time,
-            position,
-            velocity,
-            gains.stiffness,
-            gains.damping,
-            metres**2 * gains.covariance,
-            gains.type1,
-            **schedule_labels(self),
-        )
+        distance = metres * float(np.linalg.norm(np.ptp(position, axis=0)))
+        fastest = metres * float(np.linalg.norm(velocity, axis=1).max())
+        check_motion(limits, *told, distance=distance, speed=fastest)
+        gains = self._gains_at(moved)
+        rows = (time, metres * position, metres * velocity, gains.stiffness, gains.damping)
+        return Schedule(*rows, metres**2 * gains.covariance, gains.type1, **schedule_labels(self))
 
     def simulate(
         self,
@@ -355,9 +339,8 @@ class DMPController(BaseEstimator):
         rate, settle : float
             As for :meth:`schedule`; the ticks are those of the movement at speed 1, or as many as ``speed`` has.
         goal : array-like of shape (d,) or (n, d), default=None
-            Goal, at each tick if it changes at run time; None is ``goal_``. With adaptation="safe" a change is followed
-            without a jump of the acceleration, over the rest of the movement, or half its duration if that is longer:
-            the movement then ends later.
+            Goal, at each tick if it changes at run time; None is ``goal_``. A change is followed over the rest of the
+            movement, or half its duration if that is longer: the movement then ends later.
         start : array-like of shape (d,), default=None
             None is ``start_``.
         speed : float or array-like of shape (n,), default=None
@@ -366,8 +349,7 @@ class DMPController(BaseEstimator):
         check_is_fitted(self)
         paces = as_speed(1.0 if speed is None else speed)
         time = as_tick_times(self.duration_, rate, settle, self.n_outputs_, len(paces) if paces.ndim else None)
-        plan = self._planned(time, goal, start, paces)
-        return time, plan.position, plan.velocity
+        return time, *self._planned(time, goal, start, paces)[:2]
 
     def phase(self, time: ArrayLike) -> Floats:
         """Inputs (n, 1) of ``covariance_`` at movement times (n,), which start at 0: what ``phase_input`` says."""
@@ -395,7 +377,9 @@ class DMPController(BaseEstimator):
         check_is_fitted(self)
         return self.time_scale_ * (as_times(X) - self.start_time_)
 
-    def _planned(self, time: Floats, goal: ArrayLike | None, start: ArrayLike | None, speed: float | Floats) -> Plan:
+    def _planned(
+        self, time: Floats, goal: ArrayLike | None, start: ArrayLike | None, speed: float | Floats
+    ) -> tuple[Floats, Floats, Floats]:
         goal = None if goal is None else as_places(goal, "goal", self.n_outputs_, len(time))
         start = None if start is None else as_places(start, "start", self.n_outputs_)
         return self.reproduction_.plan(time, goal=goal, start=start, speed=speed)

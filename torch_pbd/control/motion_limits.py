@@ -1,6 +1,6 @@
 """What no robot does: movements beyond it are recordings in other units than they say."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, final
 
@@ -23,11 +23,6 @@ class MotionLimits:
         Diagonal of the box around the path, m; where it lies does not matter.
     speed : float, default=10.0
         In m/s.
-
-    Raises
-    ------
-    ValueError
-        If one is not a positive number.
     """
 
     duration: float = 600.0
@@ -39,22 +34,15 @@ class MotionLimits:
             check_positive(name, value)
 
 
-def motion_check(limits: Any, units: Sequence[str] | None, time_unit: str) -> Callable[..., None]:
-    """A function that raises ValueError where a duration, distance or speed, by name, is beyond the limits.
-
-    They are in m and s: of recordings in units that are no lengths it raises nothing.
-    """
+def check_motion(limits: Any, units: Sequence[str] | None, time_unit: str, **found: float) -> None:
+    """Refuse a duration, distance or speed, by name, beyond the limits, in units of length or without units."""
     if not isinstance(limits, MotionLimits | None):
         raise ValueError(f"limits == {limits!r}, must be MotionLimits or None.")
-    known = units is None or robot_unit(units) == "m"
-
-    def check(**found: float) -> None:
-        for name, value in found.items() if known and limits is not None else ():
-            if value > getattr(limits, name):
-                raise ValueError(
-                    f"the schedule has a {name} of {value:.4g} {_UNITS[name]}, more than limits.{name} == "
-                    f"{getattr(limits, name):g}: are the recordings' units ({', '.join(units or ['none'])}) and time_unit "
-                    f"({time_unit}) right? If so, give limits=MotionLimits({name}=...) or None."
-                )
-
-    return check
+    applies = limits is not None and (units is None or robot_unit(units) == "m")
+    for name, value in found.items() if applies else ():
+        if value > getattr(limits, name):
+            raise ValueError(
+                f"the schedule has a {name} of {value:.4g} {_UNITS[name]}, more than limits.{name} == "
+                f"{getattr(limits, name):g}: are units ({', '.join(units or ['none'])}) and time_unit ({time_unit}) of "
+                f"the recordings right? If so, give limits=MotionLimits({name}=...) or None."
+            )

@@ -3,7 +3,7 @@
 import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,7 +12,6 @@ from scipy.interpolate import CubicHermiteSpline
 from torch import Tensor
 
 from torch_pbd.control.adaptation import adapt
-from torch_pbd.control.arguments import time_constant
 from torch_pbd.control.dmp import DMP
 from torch_pbd.control.forcing import ForcingProcess
 from torch_pbd.control.smoothing import Movements
@@ -98,15 +97,10 @@ class Reproduction:
         return error
 
     def check_ends(self) -> None:
-        """Tell of a movement that was cut while it moved: one that the robot can neither begin nor end as shown.
+        """Warn of a movement that was cut while moving, which a robot at rest cannot follow at once.
 
-        A movement by minimum jerk has a tenth of its largest speed after 6 % of its time: who cuts more than that, or
-        does not begin at rest, is told. A movement whose speed stays above half of its largest is meant to pass.
-
-        Warns
-        -----
-        UserWarning
-            If the speed at its start or end is above a tenth of the largest.
+        A minimum jerk has a tenth of its largest speed after 6 % of its time: who cuts more, or does not begin at rest,
+        is told. A movement whose speed never falls below half of its largest is meant to pass.
         """
         speed = np.linalg.norm(self._curve(self.time, 1), axis=1)
         first, last, largest = float(speed[0]), float(speed[-1]), float(speed.max())
@@ -145,59 +139,49 @@ class Reproduction:
         positions, velocities = (part.numpy() for part in run)
         if dmp.adaptation == "safe":  # what is left at the end is taken out as a change of the goal is
             left, share = positions[-1] - self.goal, time[:, np.newaxis] / time[-1]
-            positions = positions - left * share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
-            velocities = velocities - left * 30.0 * (share * (1.0 - share)) ** 2 / time[-1]
+            positions -= left * share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+            velocities -= left * 30.0 * (share * (1.0 - share)) ** 2 / time[-1]
         return CubicHermiteSpline(time, positions, velocities, axis=0)
 
     def plan(
         self, time: Floats, *, goal: Floats | None = None, start: Floats | None = None, speed: float | Floats = 1.0
-    ) -> "Plan":
-        """Motion at times (n,) from 0, to goals (d,) or (n, d), from a start (d,), at one speed or those of all times.
+    ) -> tuple[Floats, Floats, Floats]:
+        """Position and velocity (n, d) at times (n,) from 0, and movement time (n,) of the gains there.
 
-        With adaptation="safe", times after the end let the movement brake before it, and come to rest there.
+        To goals (d,) or (n, d), from a start (d,), at one speed or those of all times. With adaptation="safe" it brakes
+        to rest at the end of the movement, if the times go on after it.
         """
-        pace = np.broadcast_to(np.asarray(speed, dtype=np.float64), time.shape)[:, np.newaxis]
-        mean_pace = 0.5 * (pace[1:, 0] + pace[:-1, 0])
-        passed = time * speed if np.ndim(speed) == 0 else np.append(0.0, np.cumsum(mean_pace * np.diff(time)))
+        pace = np.broadcast_to(np.asarray(speed, dtype=np.float64), time.shape)
+        steps = 0.5 * (pace[1:] + pace[:-1]) * np.diff(time)
+        passed = time * speed if np.ndim(speed) == 0 else np.append(0.0, np.cumsum(steps))
         goals = np.broadcast_to(self.goal if goal is None else goal, (len(time), len(self.goal)))
-        start, same = (self.start, goal is None) if start is None else (start, False)
+        known, (position, velocity) = passed, self.motion(passed)
         if self.dmp.adaptation == "safe":
             moved, rate, known = self._braked(passed)
-            path = tuple(self._curve(moved, order) * rate[:, np.newaxis] ** order for order in range(3))
-            position, velocity = path[:2] if same else self._adapted(path, passed, goals, start)
-            return Plan(position, velocity * pace, known)
-        position, velocity = self.motion(passed)
-        if not same:  # the primitive is linear: another start and goal add its answer to their change alone
-            step, still = float(time[1]), torch.zeros(goals.shape, dtype=torch.float64)
+            path = [self._curve(moved, order) * rate[:, np.newaxis] ** order for order in range(3)]
+            if goal is not None or start is not None:
+                whole = _tensor(self._curve(self.time)), _tensor(self.time)
+                ends = {"own_goal": self.goal, "goals": goals, "start": self.start if start is None else start}
+                places = {name: _tensor(place) for name, place in ends.items()}
+                run = adapt(tuple(map(_tensor, path)), _tensor(passed), whole, **places, duration=float(self.time[-1]))
+                path = [part.numpy() for part in run]
+            position, velocity = path[:2]
+        elif goal is not None or start is not None:
+            # The primitive is linear: another start and goal add its answer to their change alone.
+            still, offset = torch.zeros(goals.shape, dtype=torch.float64), np.zeros(len(self.goal))
+            change = {"goal": goals - self.goal, "position0": offset if start is None else start - self.start}
             run = self.dmp.rollout(
-                still,
-                step,
-                goal=_tensor(goals - self.goal),
-                position0=_tensor(start - self.start),
-                speed=_tensor(pace[:, 0]),
+                still, float(time[1]), **{n: _tensor(x) for n, x in change.items()}, speed=_tensor(pace)
             )
-            change = CubicHermiteSpline(step * np.arange(len(time)), *(part.numpy() for part in run), axis=0)
-            return Plan(position + change(time), velocity * pace + change(time, 1), passed)
-        return Plan(position, velocity * pace, passed)
-
-    def _adapted(self, path: tuple[Floats, ...], passed: Floats, goals: Floats, start: Floats) -> tuple[Floats, Floats]:
-        position, velocity = adapt(
-            tuple(map(_tensor, path)),
-            _tensor(passed),
-            (_tensor(self._curve(self.time)), _tensor(self.time)),
-            own_goal=_tensor(self.goal),
-            goals=_tensor(goals),
-            start=_tensor(start),
-            duration=float(self.time[-1]),
-        )
-        return position.numpy(), velocity.numpy()
+            answer = CubicHermiteSpline(time[1] * np.arange(len(time)), *map(np.asarray, run), axis=0)
+            return position + answer(time), velocity * pace[:, np.newaxis] + answer(time, 1), known
+        return position, velocity * pace[:, np.newaxis], known
 
     def _braked(self, passed: Floats) -> tuple[Floats, Floats, Floats]:
         """Movement time (n,) that comes to rest at the end of the movement, its rate, and the time of the gains (n,).
 
-        A movement that was cut at a speed v is stopped on its own path, half of it before the end and half after it:
-        in 1.5 v / a, which takes no more than its own largest acceleration a; in a fifth of the duration, or in what
-        time there is, if that is less.
+        What was cut at a speed v stops on its own path, half before the end and half after it, in 1.5 v / a, which
+        takes its own largest acceleration a; or in a fifth of the duration, or in what time there is, if that is less.
         """
         end, curve = float(self.time[-1]), self._curve
         largest = max(float(np.linalg.norm(curve(self.time, 2), axis=1).max()), np.finfo(float).tiny)
@@ -208,14 +192,6 @@ class Reproduction:
         moved = np.minimum(passed, end - 0.5 * brake) + brake * (share - share**3 + 0.5 * share**4)
         rate = 1.0 - share**2 * (3.0 - 2.0 * share)
         return np.minimum(moved, end), rate, np.maximum(moved, passed - 0.5 * brake)
-
-
-class Plan(NamedTuple):
-    """Position and velocity (n, d) over time, and the movement time (n,) of their gains."""
-
-    position: Floats
-    velocity: Floats
-    movement_time: Floats
 
 
 @dataclass(frozen=True)
@@ -237,11 +213,9 @@ class Phase:
 def primitive(controller: Any) -> DMP:
     """The primitive of a controller that knows its duration; with adaptation="safe" tau is in units of that."""
     beta = None if controller.beta is None else float(controller.beta)
-    tau = time_constant(controller)
-    return DMP(
-        float(controller.alpha), beta, float(controller.gamma), tau, duration=controller.duration_, gate=controller.gate,
-        adaptation=controller.adaptation,
-    )  # fmt: skip
+    tau = float(controller.tau) * (controller.duration_ if controller.adaptation == "safe" else 1.0)
+    options = {"duration": controller.duration_, "gate": controller.gate, "adaptation": controller.adaptation}
+    return DMP(float(controller.alpha), beta, float(controller.gamma), tau, **options)
 
 
 def _tensor(values: ArrayLike) -> Tensor:
