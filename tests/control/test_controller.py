@@ -13,8 +13,8 @@ from torch_pbd.exceptions import DataRankWarning, UnimodalityWarning
 
 PAPER_LAW = StiffnessLaw(sigma_low=3.5e-4, sigma_high=1.2e-3, bounds="variance")
 PAPER = {
-    "alpha": 1.0, "beta": 1.0, "gate": "none", "variability": "forcing", "cutoff": 3.0, "damping_ratio": "paper",
-    "on_unknown": "prior", "stiffness_law": PAPER_LAW,
+    "alpha": 1.0, "beta": 1.0, "adaptation": "additive", "gate": "none", "variability": "forcing", "cutoff": 3.0,
+    "damping_ratio": "paper", "on_unknown": "prior", "stiffness_law": PAPER_LAW,
 }  # fmt: skip
 
 

@@ -122,9 +122,9 @@ def test_a_smooth_forcing_is_that_of_an_adaptive_integrator():
         np.testing.assert_allclose(velocity, expected[2:].T / 0.8, rtol=0, atol=10 * atol)
 
 
-def test_a_new_goal_adds_a_step_response_that_never_passes_it():
+def test_as_printed_a_new_goal_adds_a_step_response_that_never_passes_it():
     position, velocity, acceleration = movement(ticks(3001, 1e-3))
-    dmp = DMP(tau=0.5)
+    dmp = DMP(tau=0.5, adaptation="additive")
     forcing = dmp.forcing(position, velocity, acceleration, position[-1])
     start = {"position0": position[0], "velocity0": velocity[0]}
     goals = position[-1].repeat(3001, 1)

@@ -62,7 +62,7 @@ class DMPController(BaseEstimator):
         Cloned before it is fitted; None is ``HeteroscedasticGPRegressor()``.
     alpha, beta, gamma, tau : float, default=25.0, None, 0.7, 1.0
         Of the movement primitive, see :class:`~torch_pbd.control.DMP`; the paper's are 1, 1, 0.7, 1. With
-        adaptation="safe" tau is in units of the duration, else in s.
+        adaptation="safe" tau is that of a movement of 10 s, like the paper's, and goes with the duration.
     adaptation : {"safe", "additive"}, default="safe"
         How it moves to other goals, and from other starts; "additive", the paper's, throws the robot.
     gate : {"time", "phase", "none"}, default="time"

@@ -180,8 +180,8 @@ def _evenly(schedule: Schedule, rate: float | None) -> Schedule:
     steps = np.diff(schedule.time)
     if np.ptp(steps[:-1]) > _UNEVEN * steps[0] or steps[-1] > (1.0 + _UNEVEN) * steps[0]:
         raise ValueError(
-            f"schedule has steps from {steps.min():g} to {steps.max():g} s, must be evenly spaced, but for a shorter "
-            "last one: give rate, that of the ticks in Hz."
+            f"schedule has steps from {steps.min():g} to {steps.max():g} s, must be evenly spaced: give rate, that of "
+            "the ticks in Hz."
         )
     return schedule
 

@@ -41,8 +41,9 @@ def check_motion(limits: Any, units: Sequence[str] | None, time_unit: str, **fou
     applies = limits is not None and (units is None or robot_unit(units) == "m")
     for name, value in found.items() if applies else ():
         if value > getattr(limits, name):
+            told, unit = ", ".join(units or ["none"]), _UNITS[name]
             raise ValueError(
-                f"the schedule has a {name} of {value:.4g} {_UNITS[name]}, more than limits.{name} == "
-                f"{getattr(limits, name):g}: are units ({', '.join(units or ['none'])}) and time_unit ({time_unit}) of "
-                f"the recordings right? If so, give limits=MotionLimits({name}=...) or None."
+                f"the schedule has a {name} of {value:.4g} {unit}, more than limits.{name} == "
+                f"{getattr(limits, name):g} {unit}: are units ({told}) and time_unit ({time_unit}) of the recordings right? If so, give "
+                f"limits=MotionLimits({name}=...) or None."
             )

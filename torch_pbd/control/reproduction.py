@@ -133,7 +133,8 @@ class Reproduction:
         step, dmp, time = float(self.time[1]), self.dmp, self.time
         if dmp.adaptation != "safe":
             slowest = max(2.0 * dmp.tau / dmp.alpha, dmp.tau / dmp.gamma if dmp.gate == "phase" else 0.0)
-            time = step * np.arange(len(time) + int((_SETTLE * slowest + 0.1 * time[-1]) / step))
+            n_ticks = len(time) + int((_SETTLE * slowest + 0.1 * time[-1]) / step)
+            time = np.array(step * np.arange(n_ticks), dtype=np.float64)
         goal, start, velocity = map(_tensor, (self.goal, self.start, self.velocity))
         run = dmp.rollout(self.forcing_at, step, goal=goal, position0=start, velocity0=velocity, n_steps=len(time))
         positions, velocities = (part.numpy() for part in run)
@@ -173,7 +174,7 @@ class Reproduction:
             run = self.dmp.rollout(
                 still, float(time[1]), **{n: _tensor(x) for n, x in change.items()}, speed=_tensor(pace)
             )
-            answer = CubicHermiteSpline(time[1] * np.arange(len(time)), *map(np.asarray, run), axis=0)
+            answer = CubicHermiteSpline(time[1] * np.arange(len(time)), *(part.numpy() for part in run), axis=0)
             return position + answer(time), velocity * pace[:, np.newaxis] + answer(time, 1), known
         return position, velocity * pace[:, np.newaxis], known
 
@@ -211,9 +212,9 @@ class Phase:
 
 
 def primitive(controller: Any) -> DMP:
-    """The primitive of a controller that knows its duration; with adaptation="safe" tau is in units of that."""
+    """The primitive of a controller that knows its duration; with adaptation="safe" its tau is that of 10 s."""
     beta = None if controller.beta is None else float(controller.beta)
-    tau = float(controller.tau) * (controller.duration_ if controller.adaptation == "safe" else 1.0)
+    tau = float(controller.tau) * (controller.duration_ / 10.0 if controller.adaptation == "safe" else 1.0)
     options = {"duration": controller.duration_, "gate": controller.gate, "adaptation": controller.adaptation}
     return DMP(float(controller.alpha), beta, float(controller.gamma), tau, **options)
 
