@@ -174,11 +174,11 @@ def test_the_primitive_takes_start_and_goal_along():
 
 
 def test_an_adapted_rollout_is_differentiable_and_a_batch_is_its_members(rng):
-    forcing, start = (torch.tensor(rng.normal(size=shape)).requires_grad_() for shape in ((9, 2), (2,)))
-    goals = torch.tensor(rng.normal(size=(3, 9, 2))).cumsum(1)
+    forcing, start = (torch.tensor(rng.normal(size=shape)).requires_grad_() for shape in ((6, 1), (1,)))
+    goals = torch.tensor(rng.normal(size=(3, 6, 1))).cumsum(1)
     goals[0, :5], goals[1, 2:] = goals[0, 0].clone(), goals[1, 2].clone()
-    shown = {"demonstrated_start": torch.zeros(2).double(), "demonstrated_goal": torch.ones(2).double()}
-    dmp = DMP(duration=0.8)
+    shown = {"demonstrated_start": torch.zeros(1).double(), "demonstrated_goal": torch.ones(1).double()}
+    dmp = DMP(duration=0.5)
 
     def run(force, begin, goal=goals):
         return dmp.rollout(force, 0.1, goal=goal, position0=begin, **shown)

@@ -26,7 +26,7 @@ from torch_pbd.control.arguments import (
 from torch_pbd.control.dmp import Gate
 from torch_pbd.control.impedance import Gains, Impedance, OnUnknown
 from torch_pbd.control.matrices import check_count, check_positive
-from torch_pbd.control.motion_limits import MotionLimits, check_motion
+from torch_pbd.control.motion_limits import MotionLimits, check_motion, counts_as_metres
 from torch_pbd.control.plant import AdmittancePlant
 from torch_pbd.control.provenance import schedule_labels
 from torch_pbd.control.reproduction import Reproduction, primitive
@@ -201,7 +201,8 @@ class DMPController(BaseEstimator):
         self.reproduction_ = Reproduction.learn(self.dmp_, movements, self.phase_input, own_goals=self.goal == "each")
         self.start_, self.goal_ = self.reproduction_.start, self.reproduction_.goal
         self.reproduction_error_ = self.reproduction_.check_against(movements)
-        self.reproduction_.check_ends()
+        if knows_seconds and counts_as_metres(self.units_):
+            self.reproduction_.check_ends(in_metres(self.units_))
         varying = self.varying(movements)
         self.covariance_ = fit_covariance(self.covariance, self.phase(movements.time), varying)
         self.noise_scale_ = movements.noise_scale

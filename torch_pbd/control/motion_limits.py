@@ -34,16 +34,20 @@ class MotionLimits:
             check_positive(name, value)
 
 
+def counts_as_metres(units: Sequence[str] | None) -> bool:
+    """Whether schedules of recordings in these units are in m, or in what is taken for it where none are told."""
+    return units is None or robot_unit(units) == "m"
+
+
 def check_motion(limits: Any, units: Sequence[str] | None, time_unit: str, **found: float) -> None:
     """Refuse a duration, distance or speed, by name, beyond the limits, in units of length or without units."""
     if not isinstance(limits, MotionLimits | None):
         raise ValueError(f"limits == {limits!r}, must be MotionLimits or None.")
-    applies = limits is not None and (units is None or robot_unit(units) == "m")
-    for name, value in found.items() if applies else ():
+    for name, value in found.items() if limits is not None and counts_as_metres(units) else ():
         if value > getattr(limits, name):
             told, unit = ", ".join(units or ["none"]), _UNITS[name]
             raise ValueError(
                 f"the schedule has a {name} of {value:.4g} {unit}, more than limits.{name} == "
-                f"{getattr(limits, name):g} {unit}: are units ({told}) and time_unit ({time_unit}) of the recordings right? If so, give "
-                f"limits=MotionLimits({name}=...) or None."
+                f"{getattr(limits, name):g} {unit}: are units ({told}) and time_unit ({time_unit}) of the recordings "
+                f"right? If so, give limits=MotionLimits({name}=...) or None."
             )

@@ -22,7 +22,7 @@ _TICKS = 4000  # within the duration
 _FAR = 0.01  # of the extent of a movement
 _SETTLE = 20.0  # time constants after the end at which the movement is at rest
 _BRAKE = 0.2  # of the duration: the most that the stop of a movement that was cut may take
-_CUT, _STEADY = 0.1, 0.5  # of the largest speed; see check_ends
+_CUT, _STEADY, _STOPPED = 0.1, 0.5, 0.1  # of the largest speed, the last in m/s; see check_ends
 _ROUNDING = 1e-9  # of the duration
 
 
@@ -96,19 +96,20 @@ class Reproduction:
             )
         return error
 
-    def check_ends(self) -> None:
+    def check_ends(self, metres: float) -> None:
         """Warn of a movement that was cut while moving, which a robot at rest cannot follow at once.
 
-        A minimum jerk has a tenth of its largest speed after 6 % of its time: who cuts more, or does not begin at rest,
-        is told. A movement whose speed never falls below half of its largest is meant to pass.
+        Told is who cuts more than 6 % of a minimum jerk, which has a tenth of its largest speed there. Not told are
+        movements that keep above half of their largest speed, which are meant to pass, and what a robot stops within
+        1 mm at 5 m/s^2: 0.1 m/s. A unit of position is so many ``metres``.
         """
-        speed = np.linalg.norm(self._curve(self.time, 1), axis=1)
-        first, last, largest = float(speed[0]), float(speed[-1]), float(speed.max())
-        if max(first, last) > _CUT * largest > 2.0 * _CUT * float(speed.min()):
+        speed = metres * np.linalg.norm(self._curve(self.time, 1), axis=1)
+        ends, largest = max(float(speed[0]), float(speed[-1])), float(speed.max())
+        if ends > max(_CUT * largest, _STOPPED) and speed.min() < _STEADY * largest:
             warnings.warn(
-                f"The movement starts at a speed of {first:.3g} and ends at {last:.3g}, in units of position per s, "
-                f"where its largest is {largest:.3g}: the recordings were cut while moving. Record from rest to rest; "
-                "else a robot at rest needs a ramp at the start, and settle > 0 at the end.",
+                f"The movement starts at {speed[0]:.3g} m/s and ends at {speed[-1]:.3g} m/s, where its largest speed "
+                f"is {largest:.3g} m/s: the recordings were cut while moving. Record from rest to rest; else a robot at "
+                "rest needs a ramp at the start, and settle > 0 at the end.",
                 stacklevel=3,
             )
 
