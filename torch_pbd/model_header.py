@@ -62,6 +62,8 @@ def decode_parameters(description: Any) -> Any:
         raise ValueError(f"it holds a {name!r:.80}")
     kind = getattr(import_module(CLASSES[name]), name)
     nested = {"covariance": _regressor, _LAW: decode_law} if name == "DMPController" else {}
+    if name == "DMPController":  # files from before there was a choice are of the printed equation
+        parameters = {"adaptation": "additive", **parameters}
     values = {key: nested.get(key, decode)(value) for key, value in parameters.items()}
     device = values.get("device")
     if not isinstance(device, str | None) or (device or "").startswith("meta"):  # which holds no numbers

@@ -130,9 +130,9 @@ def test_one_tick_of_a_callable_forcing_is_the_first_of_two():
     torch.testing.assert_close(paths[0], paths[1][:1], rtol=0.0, atol=0.0)
 
 
-def test_a_new_goal_adds_a_step_response_that_never_passes_it():
+def test_as_printed_a_new_goal_adds_a_step_response_that_never_passes_it():
     position, velocity, acceleration = movement(ticks(3001, 1e-3))
-    dmp = DMP(tau=0.5)
+    dmp = DMP(tau=0.5, adaptation="additive")
     forcing = dmp.forcing(position, velocity, acceleration, position[-1])
     start = {"position0": position[0], "velocity0": velocity[0]}
     goals = position[-1].repeat(3001, 1)

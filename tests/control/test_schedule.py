@@ -257,15 +257,15 @@ def test_what_is_constant_stays_so_to_the_bit(rng):
     assert (fine.type1 == 1.0).all()
 
 
-def test_a_rate_gives_even_ticks_that_end_at_or_before_the_end(rng):
+def test_68_a_rate_gives_even_ticks_and_a_last_one_at_the_end(rng):
     given = values(rng)
-    cases = [(10.0, 1000.0, 10001), (1.0, 3.0, 4), (1.05, 10.0, 11), (0.29, 100.0, 30)]  # 0.29 * 100 < 29
+    cases = [(10.0, 1000.0, 10001), (1.0, 3.0, 4), (1.05, 10.0, 12), (0.29, 100.0, 30)]  # 0.29 * 100 < 29
     for start, (duration, rate, n) in itertools.product([0.0, 0.1], cases):
         given["time"] = start + np.linspace(0.0, duration, 12)
         ticks = Schedule(**given).resample(rate).time
-        assert (len(ticks), ticks[0]) == (n, start)
-        np.testing.assert_allclose(np.diff(ticks), 1.0 / rate, rtol=1e-9)
-        assert ticks[-1] <= given["time"][-1]
+        assert (len(ticks), ticks[0], ticks[-1]) == (n, start, given["time"][-1])
+        np.testing.assert_allclose(np.diff(ticks)[:-1], 1.0 / rate, rtol=1e-9)
+        assert 0.0 < ticks[-1] - ticks[-2] <= (1.0 + 1e-9) / rate
 
 
 @pytest.mark.parametrize(

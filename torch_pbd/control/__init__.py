@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from torch_pbd.control.dmp import DMP
     from torch_pbd.control.environment import Tunnel
     from torch_pbd.control.monte_carlo import simulate_many
+    from torch_pbd.control.motion_limits import MotionLimits
     from torch_pbd.control.passivity import EnergyTank, RateLimit
     from torch_pbd.control.plant import AdmittancePlant
     from torch_pbd.control.position_loop import PositionLoop
@@ -28,6 +29,7 @@ _HOMES = {
     "DMPController": "controller",
     "EnergyTank": "passivity",
     "ForceSensor": "sensor",
+    "MotionLimits": "motion_limits",
     "PositionLoop": "position_loop",
     "RateLimit": "passivity",
     "RealTimeAdmittance": "realtime",
@@ -50,6 +52,7 @@ __all__ = [
     "DMPController",
     "EnergyTank",
     "ForceSensor",
+    "MotionLimits",
     "PositionLoop",
     "RateLimit",
     "RealTimeAdmittance",

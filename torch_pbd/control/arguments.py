@@ -11,11 +11,12 @@ from sklearn.exceptions import NotFittedError
 from sklearn.utils.validation import check_array, check_X_y
 
 from torch_pbd.arguments import as_floats
+from torch_pbd.control.adaptation import Adaptation
 from torch_pbd.control.damping import damping_from_stiffness
 from torch_pbd.control.dmp import Gate
 from torch_pbd.control.impedance import OnUnknown
 from torch_pbd.control.matrices import check_count, check_finite, check_positive
-from torch_pbd.control.sampling import count_intervals
+from torch_pbd.control.sampling import count_rows, row_times
 from torch_pbd.control.smoothing import CUTOFF_HZ
 from torch_pbd.control.stiffness import StiffnessLaw
 from torch_pbd.control.units import warn_of_units
@@ -38,12 +39,16 @@ _FEWEST_CYCLES, _MOST_CYCLES = 0.01, 1e6
 _FASTEST, _SLOWEST = 1e12, 100.0
 _LEAST_DECAY, _MOST_DECAY = 1e-6, {"s": 30.0, "log_s": 1e12}
 _MOST_TICKS = 1e12
+_BRIEFEST = 1e-100  # s: squares of what is briefer, or of its inverse, are no numbers
 # Measured, in numbers: of each of a demonstration's positions while it is smoothed; of each pair of steps while the
 # forcing is learned, in all and of each axis where they are many; of each axis at a step, while it is tabulated.
 _SMOOTHED, _PAIRED, _PAIRED_AXIS, _TABULATED = 10.0, 34.0, 5.0, 16e3
 _NEEDED = ("get_params", "fit", "predict_cov", "predict_uncertainty")
 
-_CHOICES = {"gate": Gate, "phase_input": PhaseInput, "variability": Variability, "on_unknown": OnUnknown, "goal": Goals}
+_CHOICES = {
+    "gate": Gate, "phase_input": PhaseInput, "variability": Variability, "on_unknown": OnUnknown, "goal": Goals,
+    "adaptation": Adaptation,
+}  # fmt: skip
 
 
 def check_parameters(controller: Any) -> None:
@@ -84,7 +89,9 @@ def check_parameters(controller: Any) -> None:
 
 def check_against_duration(controller: Any) -> None:
     """Check the parameters that only the duration of the movement makes too small or too large."""
-    duration, tau = controller.duration_, float(controller.tau)
+    duration, tau = controller.duration_, controller.dmp_.tau
+    if not _BRIEFEST <= duration <= 1.0 / _BRIEFEST:
+        raise ValueError(f"duration == {duration:g}, must be {_BRIEFEST:g} to {1.0 / _BRIEFEST:g} s.")
     cycles = None if controller.cutoff_ is None else controller.cutoff_ * duration
     if cycles is not None and not _FEWEST_CYCLES <= cycles <= _MOST_CYCLES:
         # Where the automatic one too would be out of range, the times are in another unit than they say.
@@ -226,8 +233,8 @@ def as_speed(values: ArrayLike) -> Floats:
     return speed
 
 
-def count_ticks(duration: float, rate: float, settle: float) -> int:
-    """Ticks of a schedule that ends ``settle`` after the movement."""
+def as_tick_times(duration: float, rate: float, settle: float, d: int, n_ticks: int | None = None) -> Floats:
+    """Times (n,) of the rows of a schedule of d outputs that ends ``settle`` after the movement, or of ``n_ticks``."""
     check_positive("rate", rate)
     check_finite("settle", settle)
     if settle < 0.0:
@@ -237,10 +244,11 @@ def count_ticks(duration: float, rate: float, settle: float) -> int:
             f"rate == {rate:g} with settle == {settle:g} makes {(duration + settle) * rate:.3g} ticks of a movement of "
             f"{duration:g} s, more than {_MOST_TICKS:g}: lower them."
         )
-    n_ticks = count_intervals(duration + settle, rate) + 1
-    if n_ticks < 2:
-        raise ValueError(f"rate == {rate:g} gives {n_ticks} tick in {duration:g}, must give at least 2.")
-    return n_ticks
+    counted = count_rows(duration + settle, rate)
+    if counted < 2:
+        raise ValueError(f"rate == {rate:g} gives {counted} tick in {duration:g}, must give at least 2.")
+    check_memory(counted if n_ticks is None else n_ticks, d)
+    return row_times(duration + settle, rate) if n_ticks is None else np.arange(n_ticks) / rate
 
 
 def check_memory(n_ticks: int, d: int) -> None:

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator
 from sklearn.utils.validation import check_is_fitted
 
+from torch_pbd.control.adaptation import Adaptation
 from torch_pbd.control.arguments import (
     Goals,
     PhaseInput,
@@ -15,21 +16,21 @@ from torch_pbd.control.arguments import (
     as_movement_times,
     as_places,
     as_speed,
+    as_tick_times,
     as_times,
     check_against_duration,
-    check_memory,
     check_parameters,
     check_steps,
     check_task,
-    count_ticks,
 )
 from torch_pbd.control.coverage import UNKNOWN, merge_bursts, tabulate_unsampled
-from torch_pbd.control.dmp import DMP, Gate
+from torch_pbd.control.dmp import Gate
 from torch_pbd.control.impedance import Gains, Impedance, OnUnknown
-from torch_pbd.control.matrices import check_count
+from torch_pbd.control.matrices import check_count, check_positive
+from torch_pbd.control.motion_limits import MotionLimits, check_motion, counts_as_metres
 from torch_pbd.control.plant import AdmittancePlant
 from torch_pbd.control.provenance import schedule_labels
-from torch_pbd.control.reproduction import Reproduction
+from torch_pbd.control.reproduction import Reproduction, primitive
 from torch_pbd.control.rollout import Rollout
 from torch_pbd.control.schedule import Schedule
 from torch_pbd.control.simulation import simulate_schedule
@@ -43,6 +44,7 @@ from torch_pbd.estimators._base import CovarianceRegressor
 Floats = NDArray[np.float64]
 
 _FAR = 1e6  # ranges of the input: only the prior speaks there
+_LIMITS = MotionLimits()
 _AT_ONCE = 2**14  # times whose gains are computed together
 
 
@@ -62,9 +64,13 @@ class DMPController(BaseEstimator):
     covariance : covariance regressor, default=None
         Cloned before it is fitted; None is ``HeteroscedasticGPRegressor()``.
     alpha, beta, gamma, tau : float, default=25.0, None, 0.7, 1.0
-        Of the movement primitive, see :class:`~torch_pbd.control.DMP`; the paper's are 1, 1, 0.7, 1.
+        Of the movement primitive, see :class:`~torch_pbd.control.DMP`; the paper's are 1, 1, 0.7, 1. With
+        adaptation="safe" tau is that of a movement of 10 s, like the paper's, and goes with the duration.
+    adaptation : {"safe", "additive"}, default="safe"
+        How it moves to other goals, and from other starts; "additive", the paper's, throws the robot.
     gate : {"time", "phase", "none"}, default="time"
-        How the forcing ends after the movement, so that it comes to rest at the goal; "none" is the paper's.
+        How the forcing ends after an "additive" movement, so that it comes to rest at the goal; "none" is the paper's.
+        A "safe" one is over with its duration, see :meth:`schedule`.
     phase_input : {"time", "log_s", "s"}, default="time"
         What the regressors see: movement time, or the phase s of eq. (17) or its logarithm, which is time in
         other units. "s" is the paper's; scripts/benchmarks/phase_input.py compares them.
@@ -128,6 +134,7 @@ class DMPController(BaseEstimator):
         beta: float | None = None,
         gamma: float = 0.7,
         tau: float = 1.0,
+        adaptation: Adaptation = "safe",
         gate: Gate = "time",
         phase_input: PhaseInput = "time",
         variability: Variability = "position",
@@ -145,6 +152,7 @@ class DMPController(BaseEstimator):
         self.beta = beta
         self.gamma = gamma
         self.tau = tau
+        self.adaptation = adaptation
         self.gate = gate
         self.phase_input = phase_input
         self.variability = variability
@@ -194,19 +202,19 @@ class DMPController(BaseEstimator):
         self.n_demos_, self.n_outputs_ = len(demonstrations), demonstrations.n_outputs
         self.duration_, self.time_scale_ = duration_of(demonstrations, self.duration)
         self.start_time_ = common_start(demonstrations)
-        automatic = automatic_cutoff(self.duration_, knows_seconds=in_seconds(self.time_unit_) is not None)
+        knows_seconds = in_seconds(self.time_unit_) is not None
+        automatic = automatic_cutoff(self.duration_, knows_seconds=knows_seconds)
         self.cutoff_ = automatic if self.cutoff == "auto" else self.cutoff
+        self.dmp_ = primitive(self)
         check_against_duration(self)
         check_steps(self.n_steps, self.n_demos_, self.n_outputs_, learned=True)
         self.unsampled_ = tabulate_unsampled(demonstrations, self.duration_ / self.time_scale_, self.on_unknown)
         movements = self.smooth(demonstrations)
-        beta = None if self.beta is None else float(self.beta)
-        self.dmp_ = DMP(
-            float(self.alpha), beta, float(self.gamma), float(self.tau), duration=self.duration_, gate=self.gate
-        )
         self.reproduction_ = Reproduction.learn(self.dmp_, movements, self.phase_input, own_goals=self.goal == "each")
         self.start_, self.goal_ = self.reproduction_.start, self.reproduction_.goal
         self.reproduction_error_ = self.reproduction_.check_against(movements)
+        if knows_seconds and counts_as_metres(self.units_):
+            self.reproduction_.check_ends(in_metres(self.units_))
         varying = self.varying(movements)
         self.covariance_ = fit_covariance(self.covariance, self.phase(movements.time), varying, movements.known)
         self.noise_scale_ = movements.noise_scale
@@ -237,43 +245,59 @@ class DMPController(BaseEstimator):
         """Damping (n, d, d) in N s/m at times X (n, 1)."""
         return self._gains_at(self._movement_time(X)).damping
 
-    def schedule(self, rate: float = 1000.0, *, settle: float = 0.0) -> Schedule:
+    def schedule(
+        self,
+        rate: float = 1000.0,
+        *,
+        settle: float = 0.0,
+        goal: ArrayLike | None = None,
+        start: ArrayLike | None = None,
+        speed: float = 1.0,
+        limits: MotionLimits | None = _LIMITS,
+    ) -> Schedule:
         """Motion and gains at ``rate``, for a robot: in s and m, if the demonstrations tell units of length.
+
+        It begins at the speed that was shown. Where recordings were cut while moving, a robot at rest needs a ramp.
 
         Parameters
         ----------
         rate : float, default=1000.0
-            In Hz.
+            In Hz; the last row is at the end, and may follow sooner.
         settle : float, default=0.0
-            How long to go on after the movement, in s: with a gate it then comes to rest at the goal. Of what comes
-            after it nothing was shown, so that on_unknown="soft" makes the robot compliant there.
+            How long to go on after the movement, in s: it then comes to rest at the goal. One that was cut while moving
+            brakes on its own path, half before its end and half after. Of what comes after it nothing was shown, so
+            that on_unknown="soft" makes the robot compliant there.
+        goal, start : array-like of shape (d,), default=None
+            In the units of the recordings; None are ``goal_`` and ``start_``. A goal (n, d) is that at each row.
+        speed : float, default=1.0
+            How fast movement time passes: at 0.5 the movement takes twice as long. Gains are those of movement time.
+        limits : MotionLimits or None
+            What no robot does, default 600 s, 10 m, 10 m/s; None is no limits. They hold for recordings in units of
+            length, and such without units.
 
         Returns
         -------
         Schedule
-            From 0, the start of the movement, to ``duration_ + settle``.
+            From 0, the start of the movement, to ``duration_ / speed + settle``.
 
         Raises
         ------
         ValueError
-            If there are less than two ticks, or they do not fit in memory.
+            If there are less than two ticks, they do not fit in memory, or the motion is beyond ``limits``.
         """
         check_is_fitted(self)
-        n_ticks = count_ticks(self.duration_, rate, settle)
-        check_memory(n_ticks, self.n_outputs_)
-        time = np.arange(n_ticks) / rate
-        position, velocity = self.reproduction_.motion(time)
-        gains, metres = self._gains_at(time), in_metres(self.units_)
-        return Schedule(
-            time,
-            metres * position,
-            metres * velocity,
-            gains.stiffness,
-            gains.damping,
-            metres**2 * gains.covariance,
-            gains.type1,
-            **schedule_labels(self),
-        )
+        check_positive("speed", speed)
+        told = self.units_, self.time_unit_
+        check_motion(limits, *told, duration=self.duration_ / speed)
+        time = as_tick_times(self.duration_ / speed, rate, settle, self.n_outputs_)
+        position, velocity, moved = self._planned(time, goal, start, float(speed))
+        metres = in_metres(self.units_)
+        distance = metres * float(np.linalg.norm(np.ptp(position, axis=0)))
+        fastest = metres * float(np.linalg.norm(velocity, axis=1).max())
+        check_motion(limits, *told, distance=distance, speed=fastest)
+        gains = self._gains_at(moved)
+        rows = (time, metres * position, metres * velocity, gains.stiffness, gains.damping)
+        return Schedule(*rows, metres**2 * gains.covariance, gains.type1, **schedule_labels(self))
 
     def simulate(
         self,
@@ -292,7 +316,7 @@ class DMPController(BaseEstimator):
         force : array-like of shape (T, d), default=None
             External force in N at the schedule's ticks; None is none.
         rate : float, default=1000.0
-            Of the ticks, Hz.
+            Of the ticks, Hz. The last one, which may be later than the end of the movement, follows its last row.
         random_state : int, RandomState or None, default=None
             Of the noise of the plant's sensor.
 
@@ -329,24 +353,19 @@ class DMPController(BaseEstimator):
         Parameters
         ----------
         rate, settle : float
-            As for :meth:`schedule`; the number of ticks is that of the movement at speed 1, or that of ``speed``.
+            As for :meth:`schedule`; the ticks are those of the movement at speed 1, or as many as ``speed`` has.
         goal : array-like of shape (d,) or (n, d), default=None
-            Goal, at each tick if it changes at run time; None is ``goal_``.
+            Goal, at each tick if it changes at run time; None is ``goal_``. A change is followed over the rest of the
+            movement, or half its duration if that is longer: the movement then ends later.
         start : array-like of shape (d,), default=None
             None is ``start_``.
         speed : float or array-like of shape (n,), default=None
             How fast movement time passes, at each tick if it changes; it should change smoothly.
         """
         check_is_fitted(self)
-        n_ticks = count_ticks(self.duration_, rate, settle)
-        if speed is not None:
-            paces = as_speed(speed)
-            n_ticks = len(paces) if paces.ndim else n_ticks
-            speed = np.broadcast_to(paces, n_ticks)
-        check_memory(n_ticks, self.n_outputs_)
-        goal = None if goal is None else as_places(goal, "goal", self.n_outputs_, n_ticks)
-        start = None if start is None else as_places(start, "start", self.n_outputs_)
-        return self.reproduction_.roll_out(n_ticks, 1.0 / rate, goal=goal, start=start, speed=speed)
+        paces = as_speed(1.0 if speed is None else speed)
+        time = as_tick_times(self.duration_, rate, settle, self.n_outputs_, len(paces) if paces.ndim else None)
+        return time, *self._planned(time, goal, start, paces)[:2]
 
     def phase(self, time: ArrayLike) -> Floats:
         """Inputs (n, 1) of ``covariance_`` at movement times (n,), which start at 0: what ``phase_input`` says."""
@@ -374,6 +393,13 @@ class DMPController(BaseEstimator):
     def _movement_time(self, X: ArrayLike) -> Floats:
         check_is_fitted(self)
         return self.time_scale_ * (as_times(X) - self.start_time_)
+
+    def _planned(
+        self, time: Floats, goal: ArrayLike | None, start: ArrayLike | None, speed: float | Floats
+    ) -> tuple[Floats, Floats, Floats]:
+        goal = None if goal is None else as_places(goal, "goal", self.n_outputs_, len(time))
+        start = None if start is None else as_places(start, "start", self.n_outputs_)
+        return self.reproduction_.plan(time, goal=goal, start=start, speed=speed)
 
     def _gains_at(self, time: Floats) -> Gains:
         # In parts: a regressor may need a hundred times the memory of what it predicts.

@@ -1,13 +1,15 @@
 """Dynamic movement primitives: eq. (16) to (18)."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Literal, final, get_args
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torch_pbd.control.matrices import as_rows, as_tensor, check_count, check_positive
+from torch_pbd.control.adaptation import Adaptation, adapt
+from torch_pbd.control.matrices import as_rows, as_tensor, broadcasts, check_count, check_positive, run_shape
 from torch_pbd.memory import require_much
 
 Gate = Literal["time", "phase", "none"]
@@ -22,9 +24,13 @@ class DMP:
 
     As printed, eq. (16) does not stop at the goal: f of a movement that ends with a velocity v_end holds the rest
     point at ``goal + tau v_end / beta``. A gate takes the forcing to zero after ``duration``; it is 1 before,
-    where eq. (18) is therefore the inverse of eq. (16) with every gate. Being linear and, with
-    ``beta = alpha / 4``, critically damped, the system answers a change of the goal without overshoot: the
-    motion is the unchanged one plus a step response that rises from 0 to 1 without passing it.
+    where eq. (18) is therefore the inverse of eq. (16) with every gate.
+
+    As printed, another goal or start than those demonstrated adds the answer of the spring-damper, in 0.5 tau whatever
+    the movement takes: "additive". "safe" takes both along by minimum jerk over the duration. The acceleration is then
+    at most 1.5 times that of the movement plus such a blend, and no coordinate leaves the hull of start, goal and
+    demonstrated path by more than a tenth: where it would, the path is made flatter. A goal that changes on the way is
+    reached with the end of the movement, or half a duration after the change where that is later.
 
     Parameters
     ----------
@@ -42,6 +48,9 @@ class DMP:
     gate : {"time", "phase", "none"}, default="time"
         "time": closes over ``0.1 duration`` along a minimum-jerk curve. "phase": as the phase decays after
         ``duration``, s / s(duration). "none": the paper's.
+    adaptation : {"safe", "additive"}, default="safe"
+        How it moves to other goals, and from other starts; "additive" is the paper's. "safe" takes tau where there is
+        no ``duration``.
 
     Raises
     ------
@@ -71,6 +80,7 @@ class DMP:
         *,
         duration: float | None = None,
         gate: Gate = "time",
+        adaptation: Adaptation = "safe",
     ) -> None:
         check_positive("alpha", alpha)
         beta = alpha / 4.0 if beta is None else beta
@@ -79,15 +89,16 @@ class DMP:
             named["duration"] = duration
         for name, value in named.items():
             check_positive(name, value)
-        if gate not in get_args(Gate):
-            raise ValueError(f"gate == {gate!r}, must be one of {', '.join(map(repr, get_args(Gate)))}.")
+        for name, choice, kind in (("gate", gate, Gate), ("adaptation", adaptation, Adaptation)):
+            if choice not in get_args(kind):
+                raise ValueError(f"{name} == {choice!r}, must be one of {', '.join(map(repr, get_args(kind)))}.")
         self.alpha, self.beta, self.gamma, self.tau = alpha, beta, gamma, tau
-        self.duration, self.gate = duration, gate
+        self.duration, self.gate, self.adaptation = duration, gate, adaptation
 
     def __repr__(self) -> str:
         return (
             f"DMP(alpha={self.alpha:g}, beta={self.beta:g}, gamma={self.gamma:g}, tau={self.tau:g}, "
-            f"duration={self.duration}, gate={self.gate!r})"
+            f"duration={self.duration}, gate={self.gate!r}, adaptation={self.adaptation!r})"
         )
 
     def phase(self, time: Tensor | Any) -> Tensor:
@@ -121,7 +132,7 @@ class DMP:
         position, goal = as_rows(position, "position", 1), as_rows(goal, "goal", 1)
         velocity, acceleration = as_rows(velocity, "velocity", 1), as_rows(acceleration, "acceleration", 1)
         for name, value in (("velocity", velocity), ("acceleration", acceleration), ("goal", goal)):
-            if not _broadcasts(value, position) or (name != "goal" and value.shape != position.shape):
+            if not broadcasts(value, position) or (name != "goal" and value.shape != position.shape):
                 raise ValueError(
                     f"{name} has shape {tuple(value.shape)}, but position has shape {tuple(position.shape)}: they must "
                     "be of the same movements and outputs."
@@ -137,6 +148,8 @@ class DMP:
         goal: Tensor | Any,
         position0: Float[Tensor, "*s d"] | Any = None,
         velocity0: Float[Tensor, "*s d"] | Any = None,
+        demonstrated_start: Float[Tensor, "*s d"] | Any = None,
+        demonstrated_goal: Float[Tensor, "*s d"] | Any = None,
         speed: Float[Tensor, " t"] | Any = None,
         n_steps: int | Any = None,
         integrator: Literal["exact", "rk4"] | Any = "exact",
@@ -154,6 +167,8 @@ class DMP:
             One goal, or the goal held over each tick: it may change at run time.
         position0, velocity0 : Tensor of shape (..., d), default=None
             State at the start; None is the origin, at rest.
+        demonstrated_start, demonstrated_goal : Tensor of shape (..., d), default=None
+            Of the movement that forcing and ``velocity0`` are of, for "safe"; None: ``position0`` and the first goal.
         speed : Tensor of shape (T,), default=None
             How fast movement time passes at each tick, linear between: 0.5 takes twice as long. The path is the
             same at every speed, so the duration changes at run time without overshoot; a speed that jumps makes
@@ -170,34 +185,43 @@ class DMP:
         """
         forcing, n_ticks = _checked_forcing(forcing, n_steps)
         goal = as_rows(goal, "goal", 1)
-        position0, velocity0 = (
-            None if start is None else as_rows(start, name, 1)
-            for name, start in (("position0", position0), ("velocity0", velocity0))
-        )
+        starts = {"position0": position0, "velocity0": velocity0}
+        places = {**starts, "demonstrated_start": demonstrated_start, "demonstrated_goal": demonstrated_goal}
+        given = {name: as_rows(place, name, 1) for name, place in places.items() if place is not None}
         if integrator not in ("exact", "rk4"):
             raise ValueError(f"integrator == {integrator!r}, must be 'exact' or 'rk4'.")
         time, steps, passing = _movement_time(n_ticks, dt, speed, goal)
         at_ticks = (_called(forcing, time) if callable(forcing) else forcing) * self.gate_at(time)[:, None]
         goals = goal if goal.ndim > 1 else goal[None]
-        zero = at_ticks.new_zeros(at_ticks.shape[-1])
-        position, velocity = (zero if start is None else start for start in (position0, velocity0))
-        shape = _run_shape(
-            at_ticks, {"goal": goals, "position0": position[..., None, :], "velocity0": velocity[..., None, :]}
-        )
+        shape = run_shape(at_ticks, {"goal": goals, **{name: place[..., None, :] for name, place in given.items()}})
         at_ticks, goals = at_ticks.expand(shape), goals.expand(shape)
+        start, velocity = (given.get(name, goal.new_zeros(shape[-1])) for name in ("position0", "velocity0"))
         if passing[0] == 0.0 and bool((velocity != 0.0).any()):
             raise ValueError("velocity0 must be 0 where speed[0] is 0: no movement time passes there.")
+        own_start, own_goal = given.get("demonstrated_start", start), given.get("demonstrated_goal", goals[..., 0, :])
+        same = bool((own_start == start).all() and (goals == own_goal[..., None, :]).all())
+        safe = self.adaptation == "safe" and not same
+        driven = own_goal[..., None, :].expand(shape) if safe else goals
         scaled = self.tau * velocity / passing[0].clamp_min(1e-12)
-        state = torch.stack([start.expand(*shape[:-2], shape[-1]) for start in (position, scaled)], dim=-1)
-        if integrator == "exact":
-            trace = self._exact(at_ticks, goals, steps, state)
-        else:
-            midway = 0.5 * (at_ticks[..., 1:, :] + at_ticks[..., :-1, :])
-            if callable(forcing):
-                halfway = 0.5 * (time[1:] + time[:-1])
-                midway = _called(forcing, halfway) * self.gate_at(halfway)[:, None]
-            trace = self._runge_kutta(at_ticks, midway, goals, steps, state)
-        return trace[..., 0], trace[..., 1] / self.tau * passing[:, None]
+        begin = torch.stack([each.expand(*shape[:-2], -1) for each in (own_start if safe else start, scaled)], dim=-1)
+        solve = (
+            self._exact if integrator == "exact" else partial(self._runge_kutta, self._midway(forcing, at_ticks, time))
+        )
+        trace = solve(at_ticks, driven, steps, begin)
+        position, rate = trace[..., 0], trace[..., 1] / self.tau
+        if safe:
+            spring = self.beta * (driven - position) - trace[..., 1]
+            path = position, rate, (self.alpha * spring + at_ticks) / self.tau**2
+            ends = {"own_goal": own_goal, "goals": goals, "start": start}
+            position, rate = adapt(path, time, (position, time), **ends, duration=self.duration or self.tau)
+        return position, rate * passing[:, None]
+
+    def _midway(self, forcing: Any, at_ticks: Tensor, time: Tensor) -> Tensor:
+        """Gated forcing in the middle of each tick."""
+        if not callable(forcing):
+            return 0.5 * (at_ticks[..., 1:, :] + at_ticks[..., :-1, :])
+        halfway = 0.5 * (time[1:] + time[:-1])
+        return _called(forcing, halfway) * self.gate_at(halfway)[:, None]
 
     def _rate(self, like: Tensor) -> Tensor:
         """Matrix of ``[x, z]' = rate @ [x, z, goal, forcing]``."""
@@ -220,7 +244,7 @@ class DMP:
             states.append(state)
         return torch.stack(states, dim=-3)
 
-    def _runge_kutta(self, forcing: Tensor, midway: Tensor, goals: Tensor, steps: Tensor, state: Tensor) -> Tensor:
+    def _runge_kutta(self, midway: Tensor, forcing: Tensor, goals: Tensor, steps: Tensor, state: Tensor) -> Tensor:
         rate = self._rate(state).mT
 
         def slope(now: Tensor, force: Tensor, tick: int) -> Tensor:
@@ -255,25 +279,6 @@ def _called(forcing: Callable[[Tensor], Any], time: Tensor) -> Tensor:
             f"forcing(time) has shape {tuple(value.shape)}, must have shape (..., {len(time)}, d), all of it finite."
         )
     return value
-
-
-def _broadcasts(value: Tensor, other: Tensor) -> bool:
-    sizes = zip(reversed(value.shape), reversed(other.shape), strict=False)
-    return value.shape[-1] == other.shape[-1] and all(1 in pair or pair[0] == pair[1] for pair in sizes)
-
-
-def _run_shape(forcing: Tensor, others: dict[str, Tensor]) -> torch.Size:
-    """Shape (..., T, d) of a rollout: T and d are those of the forcing, the batch is that of all."""
-    shape = forcing.shape
-    n_ticks, d = shape[-2:]
-    for name, value in others.items():
-        if value.shape[-1] != d or value.shape[-2] not in (1, n_ticks):
-            raise ValueError(
-                f"{name} is of {value.shape[-1]} outputs and {value.shape[-2]} ticks, must be of {d} outputs, as "
-                f"forcing is, and one or {n_ticks} ticks."
-            )
-        shape = torch.broadcast_shapes(shape, value.shape)
-    return shape
 
 
 def _movement_time(n_ticks: int, dt: float, speed: Any, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -123,7 +123,7 @@ def simulate_many(
         return torch.tensor(values, dtype=torch.float64, device=device)
 
     motion = [tensor(part) for part in (schedule.position, schedule.velocity, schedule.stiffness, schedule.damping)]
-    dt = schedule.duration / (len(schedule) - 1)
+    dt = float(schedule.time[1] - schedule.time[0])
     with torch.no_grad():
         task = robot.task(*motion, dt=dt)
         start = task.position[0] + tensor(offset), task.velocity[0].expand(n_rollouts, -1)
@@ -178,7 +178,7 @@ def _evenly(schedule: Schedule, rate: float | None) -> Schedule:
     if rate is not None:
         return schedule.resample(rate)
     steps = np.diff(schedule.time)
-    if np.ptp(steps) > _UNEVEN * steps.mean():
+    if np.ptp(steps[:-1]) > _UNEVEN * steps[0] or steps[-1] > (1.0 + _UNEVEN) * steps[0]:
         raise ValueError(
             f"schedule has steps from {steps.min():g} to {steps.max():g} s, must be evenly spaced: give rate, that of "
             "the ticks in Hz."

@@ -3,6 +3,7 @@
 import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicHermiteSpline
 from torch import Tensor
 
+from torch_pbd.control.adaptation import adapt
 from torch_pbd.control.dmp import DMP
 from torch_pbd.control.forcing import ForcingProcess
 from torch_pbd.control.smoothing import Movements, check_range
@@ -19,6 +21,9 @@ Floats = NDArray[np.float64]
 _TICKS = 4000  # within the duration
 _FAR = 0.01  # of the extent of a movement
 _SETTLE = 20.0  # time constants after the end at which the movement is at rest
+_BRAKE = 0.2  # of the duration: the most that the stop of a movement that was cut may take
+_CUT, _STEADY, _STOPPED = 0.1, 0.5, 0.1  # of the largest speed, the last in m/s; see check_ends
+_ROUNDING = 1e-9  # of the duration
 
 
 @dataclass(frozen=True)
@@ -97,6 +102,23 @@ class Reproduction:
             )
         return error
 
+    def check_ends(self, metres: float) -> None:
+        """Warn of a movement that was cut while moving, which a robot at rest cannot follow at once.
+
+        Told is who cuts more than 6 % of a minimum jerk, which has a tenth of its largest speed there. Not told are
+        movements that keep above half of their largest speed, which are meant to pass, and what a robot stops within
+        1 mm at 5 m/s^2: 0.1 m/s. A unit of position is so many ``metres``.
+        """
+        speed = metres * np.linalg.norm(self._curve(self.time, 1), axis=1)
+        ends, largest = max(float(speed[0]), float(speed[-1])), float(speed.max())
+        if ends > max(_CUT * largest, _STOPPED) and speed.min() < _STEADY * largest:
+            warnings.warn(
+                f"The movement starts at {speed[0]:.3g} m/s and ends at {speed[-1]:.3g} m/s, where its largest speed "
+                f"is {largest:.3g} m/s: the recordings were cut while moving. Record from rest to rest; else a robot at "
+                "rest needs a ramp at the start, and settle > 0 at the end.",
+                stacklevel=3,
+            )
+
     def forcing_at(self, time: Tensor) -> Tensor:
         """Forcing (m, d), before the gate, at times (m,)."""
         columns = [np.interp(time.numpy(), self.time, column) for column in self.forcing.T]
@@ -105,45 +127,79 @@ class Reproduction:
     def motion(self, time: Floats) -> tuple[Floats, Floats]:
         """Position and velocity (n, d) at any times (n,): at rest at the start before 0, and long after the end.
 
-        The primitive is solved exactly at 4000 ticks in the duration, and interpolated by cubics between.
+        The primitive is solved exactly at 4000 ticks in the duration, and interpolated by cubics between. With
+        adaptation="safe" it is over with the duration.
         """
-        curve, end = self._settled_motion, self._settled_motion.x[-1]
+        curve, end = self._curve, self._curve.x[-1]
         within = np.clip(time, 0.0, end)
         moving = ((time >= 0.0) & (time <= end))[:, np.newaxis]
         return curve(within), np.where(moving, curve(within, 1), 0.0)
 
     @cached_property
-    def _settled_motion(self) -> CubicHermiteSpline:
-        step, dmp = float(self.time[1]), self.dmp
-        slowest = max(2.0 * dmp.tau / dmp.alpha, dmp.tau / dmp.gamma if dmp.gate == "phase" else 0.0)
-        n_ticks = len(self.time) + int((_SETTLE * slowest + 0.1 * self.time[-1]) / step)
-        return CubicHermiteSpline(*self.roll_out(n_ticks, step), axis=0)
+    def _curve(self) -> CubicHermiteSpline:
+        step, dmp, time = float(self.time[1]), self.dmp, self.time
+        if dmp.adaptation != "safe":
+            slowest = max(2.0 * dmp.tau / dmp.alpha, dmp.tau / dmp.gamma if dmp.gate == "phase" else 0.0)
+            n_ticks = len(time) + int((_SETTLE * slowest + 0.1 * time[-1]) / step)
+            time = np.array(step * np.arange(n_ticks), dtype=np.float64)
+        goal, start, velocity = map(_tensor, (self.goal, self.start, self.velocity))
+        run = dmp.rollout(self.forcing_at, step, goal=goal, position0=start, velocity0=velocity, n_steps=len(time))
+        positions, velocities = (part.numpy() for part in run)
+        if dmp.adaptation == "safe":  # what is left at the end is taken out as a change of the goal is
+            left, share = positions[-1] - self.goal, time[:, np.newaxis] / time[-1]
+            positions -= left * share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+            velocities -= left * 30.0 * (share * (1.0 - share)) ** 2 / time[-1]
+        return CubicHermiteSpline(time, positions, velocities, axis=0)
 
-    def roll_out(
-        self,
-        n_ticks: int,
-        dt: float,
-        *,
-        goal: ArrayLike | None = None,
-        start: ArrayLike | None = None,
-        speed: ArrayLike | None = None,
+    def plan(
+        self, time: Floats, *, goal: Floats | None = None, start: Floats | None = None, speed: float | Floats = 1.0
     ) -> tuple[Floats, Floats, Floats]:
-        """Time (n,), position and velocity (n, d); see :meth:`DMPController.reproduce`."""
-        pace = None if speed is None else np.asarray(speed, dtype=np.float64)
-        for name, value in (("goal", goal), ("start", start), ("speed", speed)):
-            if value is not None and not np.isfinite(np.asarray(value, dtype=np.float64)).all():
-                raise ValueError(f"{name} has a value that is not finite: {value!r}.")
-        position, velocity = self.dmp.rollout(
-            self.forcing_at,
-            dt,
-            goal=_tensor(self.goal if goal is None else goal),
-            position0=_tensor(self.start if start is None else start),
-            velocity0=_tensor(self.velocity * (1.0 if pace is None else pace[0])),
-            speed=None if pace is None else _tensor(pace),
-            n_steps=n_ticks,
-        )
-        ticks: Floats = np.arange(n_ticks, dtype=np.float64) * dt
-        return ticks, position.numpy(), velocity.numpy()
+        """Position and velocity (n, d) at times (n,) from 0, and movement time (n,) of the gains there.
+
+        To goals (d,) or (n, d), from a start (d,), at one speed or those of all times. With adaptation="safe" it brakes
+        to rest at the end of the movement, if the times go on after it.
+        """
+        pace = np.broadcast_to(np.asarray(speed, dtype=np.float64), time.shape)
+        steps = 0.5 * (pace[1:] + pace[:-1]) * np.diff(time)
+        passed = time * speed if np.ndim(speed) == 0 else np.append(0.0, np.cumsum(steps))
+        goals = np.broadcast_to(self.goal if goal is None else goal, (len(time), len(self.goal)))
+        known, (position, velocity) = passed, self.motion(passed)
+        if self.dmp.adaptation == "safe":
+            moved, rate, known = self._braked(passed)
+            path = [self._curve(moved, order) * rate[:, np.newaxis] ** order for order in range(3)]
+            if goal is not None or start is not None:
+                whole = _tensor(self._curve(self.time)), _tensor(self.time)
+                ends = {"own_goal": self.goal, "goals": goals, "start": self.start if start is None else start}
+                places = {name: _tensor(place) for name, place in ends.items()}
+                run = adapt(tuple(map(_tensor, path)), _tensor(passed), whole, **places, duration=float(self.time[-1]))
+                path = [part.numpy() for part in run]
+            position, velocity = path[:2]
+        elif goal is not None or start is not None:
+            # The primitive is linear: another start and goal add its answer to their change alone.
+            still, offset = torch.zeros(goals.shape, dtype=torch.float64), np.zeros(len(self.goal))
+            change = {"goal": goals - self.goal, "position0": offset if start is None else start - self.start}
+            run = self.dmp.rollout(
+                still, float(time[1]), **{n: _tensor(x) for n, x in change.items()}, speed=_tensor(pace)
+            )
+            answer = CubicHermiteSpline(time[1] * np.arange(len(time)), *(part.numpy() for part in run), axis=0)
+            return position + answer(time), velocity * pace[:, np.newaxis] + answer(time, 1), known
+        return position, velocity * pace[:, np.newaxis], known
+
+    def _braked(self, passed: Floats) -> tuple[Floats, Floats, Floats]:
+        """Movement time (n,) that comes to rest at the end of the movement, its rate, and the time of the gains (n,).
+
+        What was cut at a speed v stops on its own path, half before the end and half after it, in 1.5 v / a, which
+        takes its own largest acceleration a; or in a fifth of the duration, or in what time there is, if that is less.
+        """
+        end, curve = float(self.time[-1]), self._curve
+        largest = max(float(np.linalg.norm(curve(self.time, 2), axis=1).max()), np.finfo(float).tiny)
+        needed = 1.5 * float(np.linalg.norm(curve(end, 1))) / largest
+        brake = max(0.0, min(needed, _BRAKE * end, 2.0 * (float(passed[-1]) - end)))
+        late = (passed - end) / end
+        share = np.clip(late * end / brake + 0.5, 0.0, 1.0) if brake > _ROUNDING * end else 1.0 * (late > _ROUNDING)
+        moved = np.minimum(passed, end - 0.5 * brake) + brake * (share - share**3 + 0.5 * share**4)
+        rate = 1.0 - share**2 * (3.0 - 2.0 * share)
+        return np.minimum(moved, end), rate, np.maximum(moved, passed - 0.5 * brake)
 
 
 @dataclass(frozen=True)
@@ -160,6 +216,14 @@ class Phase:
         if self.kind == "log_s":
             return (-self.dmp.gamma * time / self.dmp.tau)[:, np.newaxis]
         return self.dmp.phase(_tensor(time)).numpy()[:, np.newaxis]
+
+
+def primitive(controller: Any) -> DMP:
+    """The primitive of a controller that knows its duration; with adaptation="safe" its tau is that of 10 s."""
+    beta = None if controller.beta is None else float(controller.beta)
+    tau = float(controller.tau) * (controller.duration_ / 10.0 if controller.adaptation == "safe" else 1.0)
+    options = {"duration": controller.duration_, "gate": controller.gate, "adaptation": controller.adaptation}
+    return DMP(float(controller.alpha), beta, float(controller.gamma), tau, **options)
 
 
 def _tensor(values: ArrayLike) -> Tensor:

@@ -1,5 +1,7 @@
 """Rows of a schedule between its own: how many at a rate, and what motion and gains are there."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -8,9 +10,15 @@ Floats = NDArray[np.float64]
 _ROUNDING = 1e-6  # of a tick: 10 s at 1 kHz are 10001 rows, however 10 * 1000 is rounded
 
 
-def count_intervals(duration: float, rate: float) -> int:
-    """Whole ticks of ``1 / rate`` within a duration; the rows are one more."""
-    return int(duration * rate + _ROUNDING)
+def count_rows(duration: float, rate: float) -> int:
+    """Rows every ``1 / rate`` within a duration, and one at its end; 1 if it is shorter than a tick."""
+    ticks = duration * rate
+    return math.ceil(ticks - _ROUNDING) + 1 if ticks + _ROUNDING >= 1.0 else 1
+
+
+def row_times(duration: float, rate: float) -> Floats:
+    """Times (n,) of these rows: the last interval may be shorter."""
+    return np.append(np.arange(count_rows(duration, rate) - 1) / rate, duration)
 
 
 def blend(start: Floats, end: Floats, share: Floats) -> Floats:

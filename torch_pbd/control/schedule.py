@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Self, final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from torch_pbd.control.sampling import Between, count_intervals
+from torch_pbd.control.sampling import Between, count_rows, row_times
 from torch_pbd.control.schedule_checks import (
     ARRAY_DIMS,
     LABELS,
@@ -159,7 +159,7 @@ class Schedule:
         Parameters
         ----------
         rate : float, default=None
-            In Hz: rows every 1/rate from the first time on; the last is at or less than 1/rate before the end.
+            In Hz: rows every 1/rate from the first time on, and one at the end.
         times : array_like of shape (m,), default=None
             Strictly increasing, m >= 2, in s; either this or ``rate``. What the rows say in between is lost.
 
@@ -271,12 +271,11 @@ class Schedule:
         check_positive("rate", rate)
         d, rows = self.n_outputs, self.duration * rate + 1.0
         require_much(3 * 8.0 * rows * (2 + 2 * d + 3 * d * d), what=f"rate={rate:g} Hz", remedy="Lower rate.")
-        n_ticks = count_intervals(self.duration, rate)
-        if n_ticks < 1:
+        if count_rows(self.duration, rate) < 2:
             raise ValueError(
                 f"rate={rate:g} Hz has one row in {self.duration:g} s: take {1 / self.duration:g} or more."
             )
-        return np.minimum(self.time[0] + np.arange(n_ticks + 1) / rate, self.time[-1])
+        return np.append(self.time[0] + row_times(self.duration, rate)[:-1], self.time[-1])
 
 
 def _diagonal(matrices: Floats) -> Floats:

@@ -7,9 +7,8 @@ from numpy.typing import NDArray
 
 from torch_pbd.control.arguments import check_parameters
 from torch_pbd.control.controller import DMPController
-from torch_pbd.control.dmp import DMP
 from torch_pbd.control.impedance import Impedance
-from torch_pbd.control.reproduction import Phase, Reproduction
+from torch_pbd.control.reproduction import Phase, Reproduction, primitive
 from torch_pbd.control.stiffness import StiffnessLaw
 
 Arrays = dict[str, NDArray[np.float64]]
@@ -82,11 +81,7 @@ def restore_controller(controller: DMPController, covariance: Any, values: dict[
     controller.unsampled_ = arrays.get(_HOLES, np.zeros(2))
     controller.names_ = tuple(controller.names_)
     controller.units_ = None if controller.units_ is None else tuple(controller.units_)
-    dmp = DMP(
-        controller.alpha, controller.beta, controller.gamma, controller.tau,
-        duration=controller.duration_, gate=controller.gate,
-    )  # fmt: skip
-    controller.covariance_, controller.dmp_ = covariance, dmp
+    controller.covariance_, controller.dmp_ = covariance, (dmp := primitive(controller))
     time = np.linspace(0.0, controller.duration_, len(arrays["forcing"]))
     motion = {name: arrays[name] for name in _MOTION}
     phase = Phase(dmp, controller.phase_input)
