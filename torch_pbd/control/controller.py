@@ -197,8 +197,8 @@ class DMPController(BaseEstimator):
         self.__dict__.pop("_impedance", None)  # a fit that fails leaves no mixture of two
         check_parameters(self)
         demonstrations = merge_bursts(as_demonstrations(X, y, groups))
-        self.names_, self.frame_ = demonstrations.names, demonstrations.frame
-        self.units_, self.time_unit_ = demonstrations.units, demonstrations.time_unit
+        labels = (demonstrations.names, demonstrations.frame, demonstrations.units, demonstrations.time_unit)
+        self.names_, self.frame_, self.units_, self.time_unit_ = labels
         self.n_demos_, self.n_outputs_ = len(demonstrations), demonstrations.n_outputs
         self.duration_, self.time_scale_ = duration_of(demonstrations, self.duration)
         self.start_time_ = common_start(demonstrations)
@@ -223,10 +223,8 @@ class DMPController(BaseEstimator):
         )
         self.noise_share_ = variance_share(self.varying(noise), varying)
         known = np.linspace(0.0, self.duration_, len(self.unsampled_))[self.unsampled_ <= UNKNOWN]
-        along = self.covariance_.predict_cov(self.phase(known[::4]))
-        self.law_ = fit_law(self.stiffness_law, along, varying)
-        ratio = self.damping_ratio if self.damping_ratio == "paper" else float(self.damping_ratio)
-        self._impedance = Impedance(self.law_, float(self.mass), ratio, self.on_unknown)
+        self.law_ = fit_law(self.stiffness_law, self.covariance_.predict_cov(self.phase(known[::4])), varying)
+        self._impedance = Impedance(self.law_, float(self.mass), self.damping_ratio, self.on_unknown)
         return self
 
     def predict(self, X: ArrayLike) -> Floats:
