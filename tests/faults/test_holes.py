@@ -67,7 +67,7 @@ def fitted(demonstrations, **parameters):
     """A controller, and what its fit warned of."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        model = DMPController(**{"covariance": REGRESSORS["GMM"], "n_steps": 60, **parameters}).fit(demonstrations)
+        model = DMPController(**{"covariance": REGRESSORS["GMM"], "n_steps": 40, **parameters}).fit(demonstrations)
     return model, [str(warning.message) for warning in caught]
 
 
@@ -110,7 +110,7 @@ def test_62_a_controller_of_bursts_is_that_of_their_means():
     np.testing.assert_allclose(mine.position, theirs.position, atol=1e-6)
     np.testing.assert_allclose(mine.stiffness, theirs.stiffness, rtol=1e-4, atol=0.1)
     with pytest.warns(UserWarning, match="were merged"):
-        assert len(burst.smooth(Demonstrations([time + 1e3] * 4, positions)).time) == 60
+        assert len(burst.smooth(Demonstrations([time + 1e3] * 4, positions)).time) == 40
 
 
 @pytest.mark.parametrize("cutoff", [None, 400.0])
@@ -207,7 +207,7 @@ def test_63_the_regressor_sees_as_many_demonstrations_as_were_sampled():
 
 @pytest.mark.parametrize("name", ["CD", "WP"])
 def test_63_where_four_of_eight_were_sampled_the_covariance_is_that_of_four(name):
-    model, told = fitted(recordings([None] * 4 + [HOLE] * 4), covariance=REGRESSORS[name])
+    model, told = fitted(recordings([None] * 4 + [HOLE] * 4), covariance=REGRESSORS[name], n_steps=60)
     assert not told
     whole = recordings([None] * 8).to_array()
     for steps, numbers in [(slice(100, 136, 5), slice(4)), (slice(10, 61, 10), slice(8))]:
@@ -312,7 +312,7 @@ def unlucky(seed, kinds, everyone):
 
 
 @settings(
-    max_examples=2000 if THOROUGH else 8,
+    max_examples=2000 if THOROUGH else 4,
     deadline=None,
     derandomize=not THOROUGH,
     database=None,
@@ -331,7 +331,7 @@ def test_62_63_a_refusal_in_words_or_a_path_in_range_and_soft_where_nothing_was_
     times, positions, shares, spacing = unlucky(seed, kinds, everyone)
     try:
         recorded = Demonstrations(times, positions)
-        model, _ = fitted(recorded, covariance=REGRESSORS[name], cutoff=cutoff, n_steps=40)
+        model, _ = fitted(recorded, covariance=REGRESSORS[name], cutoff=cutoff)
     except ValueError as error:
         allowed = ["must increase strictly"] if "repeated" in kinds else []
         allowed += ["leaves the recorded range of output"] if cutoff is None or kinds & {"near", "milliseconds"} else []
