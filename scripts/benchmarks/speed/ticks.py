@@ -136,15 +136,15 @@ def clock_cost(n_readings: int = 20_000) -> float:
 def memory_kept(n_ticks: int) -> int:
     """Bytes that ticks leave behind."""
     controller = RealTimeAdmittance(turning_schedule(), mass=MASS)
-    controller.start(0.0)
-    for i in range(1, 1000):
+    controller.start(0.0, at=10.0)  # most ticks are after the end, where a million of them begin to count
+    for i in range(1, 4000):
         controller.tick(i / RATE, (1.0, 2.0))
     gc.collect()
     tracemalloc.start()
-    for i in range(1000, 2000):
+    for i in range(4000, 5000):
         controller.tick(i / RATE, (1.0, 2.0))
     before = tracemalloc.get_traced_memory()[0]
-    for i in range(2000, 2000 + n_ticks):
+    for i in range(5000, 5000 + n_ticks):
         controller.tick(i / RATE, (1.0, 2.0))
     kept = tracemalloc.get_traced_memory()[0] - before
     tracemalloc.stop()

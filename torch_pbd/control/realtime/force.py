@@ -18,7 +18,8 @@ class ForceChannel:
     """The force that acts, per kg of virtual mass; options as `RealTimeAdmittance` takes them.
 
     A lost force is replaced by the median of the last good ones, on each axis, which fades to nothing over
-    ``hold_ticks``: neither a wild reading before the loss nor an old push can carry the robot away.
+    ``hold_ticks``: neither a wild reading before the loss nor an old push can carry the robot away. After more ticks
+    than that, it ``is_lost``.
     """
 
     def __init__(
@@ -34,13 +35,8 @@ class ForceChannel:
     def begin(self, d: int, bias: Vector) -> None:
         """Forget what was; before the first force there was none."""
         self.push: Vector = (0.0,) * d
-        self._bias, self._n_lost = bias, 0
+        self._bias, self._n_lost, self.is_lost = bias, 0, False
         self._recent = deque([self.push] * _RECENT, _RECENT)
-
-    @property
-    def is_lost(self) -> bool:
-        """Whether the force was not finite for more than ``hold_ticks``."""
-        return self._n_lost > self._hold_ticks
 
     def take(self, force: Numbers, step: float) -> TickStatus:
         """Let a force as measured act, as far as it may, ``step`` s after the last one."""
@@ -73,5 +69,6 @@ class ForceChannel:
 
     def _bridge(self) -> None:
         self._n_lost += 1
+        self.is_lost = self._n_lost > self._hold_ticks
         share = max(0.0, 1.0 - self._n_lost / (self._hold_ticks + 1))
         self.push = tuple([share * sorted(parts)[_RECENT // 2] for parts in zip(*self._recent, strict=True)])
