@@ -29,6 +29,7 @@ from torch_pbd.estimators._validation import (
     check_weights,
     checked_queries,
     checked_rows,
+    without_rounding,
 )
 from torch_pbd.linalg import gaussian_log_density, safe_cholesky, student_log_density
 from torch_pbd.memory import require_much
@@ -83,6 +84,7 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator, ABC)
         check_squares(inputs, "X")
         check_squares(targets, "y")
         check_inputs_vary(inputs)
+        inputs = without_rounding(inputs)
         self._y_is_1d = targets.ndim == 1
         self.n_outputs_ = 1 if self._y_is_1d else targets.shape[1]
         targets = targets.reshape(len(inputs), -1, order="F")

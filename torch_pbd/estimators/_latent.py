@@ -14,21 +14,9 @@ from torch_pbd.estimators._mean import mean_that_repeats_allow
 from torch_pbd.estimators._prior import standardized_prior
 from torch_pbd.estimators._results import Fitted
 from torch_pbd.estimators._scaling import Standardization, distinct_rows
-from torch_pbd.estimators._validation import (
-    Floats,
-    check_choice,
-    check_length_scale,
-    check_number,
-)
+from torch_pbd.estimators._validation import Floats, check_choice, check_length_scale, check_number
 from torch_pbd.exceptions import DataRankWarning
-from torch_pbd.gp import (
-    EvidenceSearch,
-    LatentGP,
-    Observations,
-    fit_together,
-    resolved_length_scale,
-    spacing,
-)
+from torch_pbd.gp import EvidenceSearch, LatentGP, Observations, fit_together, resolved_length_scale, spacing
 from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky, scale_tril_from_root
 from torch_pbd.memory import require_much
@@ -40,8 +28,8 @@ _STRETCHED = 10.0  # an amplitude of so many times the values
 # Spacings of the inputs that an interpolating process may be as short as, and ranges that others may be as long as:
 # with longer ones the prior of a covariance would never take over.
 _SHORTEST, _LONGEST_MEAN, _LONGEST_COVARIANCE = 0.75, 10.0, 0.35
-# A hole among inputs on a line: of the range, and in spacings of the others. A smooth process without noise claims to
-# know what is two to three of its length scales from many inputs: of these the hole is to hold so many.
+# A hole among inputs on a line, of the range and in spacings of the others. It is to hold so many length scales: a
+# smooth process without noise claims to know what is two to three of them from many inputs.
 _HOLE, _SPACINGS, _IN_HOLE = 0.25, 5.0, 6.0
 
 

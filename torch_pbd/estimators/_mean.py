@@ -15,9 +15,7 @@ from torch_pbd.models.training import TrainingSet
 from torch_pbd.optim import FitReport
 
 _LEVEL = 1e-4  # of the tests: how often a mean that is right is taken for wrong
-# Standard errors of means that no smoothing may be off by, root mean square, however few rows tell them: of two inputs
-# with two rows each the test would allow for a hundred.
-_CLEAR = 5.0
+_CLEAR = 5.0  # standard errors of the means, however few rows tell them: of twice two the test would allow for 100
 _LEAST_SPREAD = 0.03  # of the pooled one: how small that at an input is believed to be
 _STRETCHED = 10.0  # an amplitude of so many times the means; through means that a process follows it is up to 2
 _UNRESOLVED = 1e-10  # squared, of standardized outputs: what a smooth process may be off by in any case

@@ -16,6 +16,9 @@ from torch_pbd.exceptions import DataRankWarning
 Floats = NDArray[np.float64]
 # A column whose spread is below this of its largest value differs only by rounding.
 CONSTANT = 1e-11
+# Distance of values that are made equal, in usual distances; and of all, how many are worth saying.
+_NEAR, _MANY = 1e-3, 0.1
+_SHORTEST_PERIOD = 1e-8  # of the range: standardized inputs have ten decimals, and so this phase two
 # Of a value, so that its square, and a thousand of them added up, is a number.
 _LARGEST = 1e140
 
@@ -163,6 +166,37 @@ def check_inputs_vary(X: Floats) -> None:
         )
 
 
+def without_rounding(X: Floats) -> Floats:
+    """X with values of a column made equal that a rounding to float32 has told apart.
+
+    They are within its resolution of the range, or one is the other rounded, and far nearer than usual in the column.
+
+    Warns
+    -----
+    UserWarning
+        If many are, as of recordings of two precisions. In many irregular inputs some come as near by chance.
+    """
+    X = X.copy()
+    for number, column in enumerate(X.T):
+        value, index = np.unique(column, return_inverse=True)
+        gap = np.diff(value, append=np.inf)
+        with np.errstate(over="ignore"):
+            single = value.astype(np.float32)
+        near = gap <= np.finfo(np.float32).eps * np.ptp(value)
+        near[:-1] |= (single[1:] == value[:-1]) | (single[:-1] == value[1:])
+        near &= gap < _NEAR * np.quantile(gap, 0.9, method="lower")
+        first = np.maximum.accumulate(np.where(np.append(False, near[:-1]), 0, np.arange(len(value))))
+        column[:] = value[first[index]]
+        if near.mean() > _MANY:
+            warnings.warn(
+                f"X has {int(near.sum())} values in column {number} that differ from others by a rounding to float32, "
+                "and are taken for equal. Store all recordings in one precision.",
+                UserWarning,
+                stacklevel=4,
+            )
+    return X
+
+
 def check_number(
     value: Any, name: str, *, low: float, strict: bool = False, integer: bool = False, optional: bool = False
 ) -> None:
@@ -214,19 +248,19 @@ def check_length_scale(value: Any, n_features: int) -> Floats | None:
     return np.broadcast_to(scales, (n_features,)).copy()
 
 
-def check_period(value: Any, kernel: str, n_features: int) -> Floats | None:
-    """Periods as an array (n_features,), infinite where an input does not repeat, or None for no input."""
+def check_period(value: Any, kernel: str, x_scale: Floats) -> Floats | None:
+    """Periods as an array (n_features,), infinite where an input of the range ``x_scale`` does not repeat, or None."""
     if value is None:
         if kernel == "periodic":
             raise ValueError("kernel == 'periodic' needs a period, in units of X, such as period=1.0 for a phase.")
         return None
     periods = parameter_floats(value, "period")
-    if periods.shape not in [(), (n_features,)] or not (periods > 0).all():
+    if periods.shape not in [(), x_scale.shape] or not (periods >= _SHORTEST_PERIOD * x_scale).all():
         raise ValueError(
-            f"period == {value!r}, must be None, a positive number, or {n_features} positive numbers (or inf): one "
-            "for each column of X, in its units."
+            f"period == {value!r}, must be None, a positive number, or {len(x_scale)} positive numbers (or inf): one "
+            f"for each column of X, in its units, and no shorter than {_SHORTEST_PERIOD:g} of its range."
         )
-    return np.broadcast_to(periods, (n_features,)).copy()
+    return np.broadcast_to(periods, x_scale.shape).copy()
 
 
 def parameter_floats(value: Any, name: str) -> Floats:

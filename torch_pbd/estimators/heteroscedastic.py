@@ -297,7 +297,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
     def _in_ranges(self, scaling: Standardization) -> tuple[torch.Tensor | None, torch.Tensor | None]:
         """The length scale and the period that were given, in ranges of the inputs."""
         length_scale = check_length_scale(self.length_scale, len(scaling.x_scale))
-        period = check_period(self.period, self.kernel, len(scaling.x_scale))
+        period = check_period(self.period, self.kernel, scaling.x_scale)
         held = None if length_scale is None else self._door(length_scale / scaling.x_scale)
         return held, None if period is None else self._door(period / scaling.x_scale)
 

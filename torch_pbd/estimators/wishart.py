@@ -55,7 +55,8 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
     objective : {"auto", "mse", "likelihood"}, default="auto"
         "mse": eq. (9), the mean squared distance of the Cholesky factors to those of the empirical
         covariances (aligned data: every row of X at least twice). "likelihood": eq. (11), for data anywhere.
-        "auto" takes the first where every input repeats.
+        "auto" takes the first where every input repeats; where one has fewer than 8 rows with a noise that is
+        learned, since interpolated vectors then cross zero.
     df : int, "auto" or None, default=None
         Number of vectors, the degrees of freedom nu; at least d. None or "auto" is d + 1.
     start : {"empirical", "random"}, default="empirical"
@@ -63,9 +64,9 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         zero; for "likelihood" at those of the pooled covariance. "random": at the prior means with noise, and
         L-BFGS has all the way to go, as in the paper.
     latent_prior : bool, default=True
-        Only for "likelihood". True maximizes the posterior density of the vectors at the inputs, with
-        hyperparameters held. False is eq. (11) as printed, which trains them too and overfits: without bound
-        where inputs do not repeat.
+        Only for "likelihood". True maximizes the posterior density of the vectors at the inputs, whose prior means
+        are then the pooled covariance's, with hyperparameters held. False is eq. (11) as printed, which trains them
+        too and overfits: without bound where inputs do not repeat.
     solver : {"auto", "fisher", "lbfgs"}, default="auto"
         Of "likelihood" with ``latent_prior``, and of "mse" from a random start. "fisher" is Newton's method: with the
         Fisher information, expected or, where it is positive definite, observed; for "mse" with Gauss and Newton's
@@ -214,7 +215,8 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
             latent.weight -= condition(priors, certain, self.kernel, basis=basis)[0].weight
             mse = float(covariance_mse(wishart_root(latent(inputs), prior_root, matrix), target))
         report = replace(report, loss=mse, loss_curve=(mse,)).after(of_mean, "search of the mean")
-        return mean, WishartCovariance(latent, _constant(prior_root), matrix, bounded=True), report, jitter
+        prior = prior_root.reshape(-1, *root.shape[1:])[0]  # a callable one is handed in at every prediction
+        return mean, WishartCovariance(latent, prior, matrix, bounded=True), report, jitter
 
     def _smoothing(self, observations: Observations, problem: Problem) -> tuple[Hyperparameters, FitReport]:
         """Hyperparameters without noise; with a learned one where "auto" has few rows, or inputs are too near."""
@@ -292,10 +294,6 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
             root = wishart_root(latent(), centre, matrix)
         values, deviations = (part.mT.flatten(1).mT.contiguous() for part in (root, root - prior_root))
         gp = latent.interpolate(values, deviations if self.latent_prior else None)
-        prior, matrix = _constant(prior_root), matrix.detach().tril()
-        return WishartCovariance(gp, prior, matrix, bounded=self.latent_prior), report, latent.jitter
-
-
-def _constant(prior_root: Tensor) -> Tensor:
-    """The prior that is stored with the module; a callable one is handed in at every prediction."""
-    return prior_root if prior_root.ndim == 2 else prior_root[0]
+        prior = prior_root.reshape(-1, *root.shape[1:])[0]
+        covariance = WishartCovariance(gp, prior, matrix.detach().tril(), bounded=self.latent_prior)
+        return covariance, report, latent.jitter

@@ -62,23 +62,21 @@ class LatentGP(nn.Module):
 
     def forward(self, x: Float[Tensor, "m e"]) -> Float[Tensor, "m b"]:
         """Mean at x less the prior mean: eq. (5)."""
-        return self._weighted(x, self.weight)
+        return self._weighted(x, self.weight)[0]
 
     def values(self, x: Float[Tensor, "m e"]) -> Float[Tensor, "m b"]:
         """Mean at x of the processes of ``value_weight``, whose prior mean is zero: what data alone say."""
-        return self._weighted(x, self.value_weight)
+        return self._weighted(x, self.value_weight)[0]
 
-    def both(self, x: Float[Tensor, "m e"]) -> tuple[Float[Tensor, "m b"], Float[Tensor, "m b"]]:
+    def both(self, x: Float[Tensor, "m e"]) -> list[Float[Tensor, "m b"]]:
         """What :meth:`forward` and :meth:`values` give, by one matrix of correlations."""
-        cross = correlation(x, self.inputs, self.length_scale, self.kernel)
-        deviation, values = (cross @ torch.stack([self.weight, self.value_weight], dim=-1)).unbind(-1)
-        return deviation.mT, values.mT
+        return self._weighted(x, self.weight, self.value_weight)
 
-    def _weighted(self, x: Tensor, weight: Tensor) -> Tensor:
+    def _weighted(self, x: Tensor, *weights: Tensor) -> list[Tensor]:
         cross = correlation(x, self.inputs, self.length_scale, self.kernel)
         if len(cross) == 1:
-            return cross[0] @ weight.mT
-        return (cross @ weight.unsqueeze(-1)).squeeze(-1).mT
+            return [cross[0] @ weight.mT for weight in weights]
+        return [(cross @ weight.unsqueeze(-1)).squeeze(-1).mT for weight in weights]
 
     def variance(self, x: Float[Tensor, "m e"]) -> Float[Tensor, "m b"]:
         """Variance of the latent value at x: eq. (6)."""

@@ -28,10 +28,9 @@ def spacing(inputs: Float[Tensor, "n e"], quantile: float = 0.9) -> float:
             ordered[int(place) : int(place) + 2].tolist() if place < len(ordered) - 1 else [float(ordered[-1])] * 2
         )
         return float(low + (place - int(place)) * (high - low))
-    if len(inputs) > 2000:
-        inputs = inputs[:: len(inputs) // 1000]
-    distance = torch.cdist(inputs, inputs, compute_mode="donot_use_mm_for_euclid_dist")
-    distance.fill_diagonal_(float("inf"))
+    chosen = torch.arange(0, len(inputs), max(1, len(inputs) // 1000), device=inputs.device)
+    distance = torch.cdist(inputs[chosen], inputs, compute_mode="donot_use_mm_for_euclid_dist")
+    distance[torch.arange(len(chosen)), chosen] = float("inf")
     return float(distance.amin(1).quantile(quantile))
 
 

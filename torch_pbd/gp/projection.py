@@ -139,16 +139,10 @@ class Projection:
         return self.n_inputs - self.targets.shape[1]
 
 
-def basis_for(
-    observations: Observations,
-    length_scale: Tensor,
-    noise_ratio: Tensor,
-    kernel: KernelName,
-    max_inputs: int | None = None,
-) -> Basis:
+def basis_for(observations: Observations, length_scale: Tensor, noise_ratio: Tensor, kernel: KernelName) -> Basis:
     """The coarsest basis that carries the length scales."""
     noisy = bool((noise_ratio >= _LEAST_NOISE_RATIO).all())
-    levels = resolutions(observations, kernel, noisy=noisy, max_inputs=max_inputs)
+    levels = resolutions(observations, kernel, noisy=noisy)
     shortest = 1.0001 * float(length_scale.min())  # a search ends at the bound but for rounding
     level = next((level for level in levels if shortest >= level.shortest_length_scale), levels[-1])
     return Basis.of(observations, level)

@@ -17,10 +17,9 @@ def with_floor(root: Float[Tensor, "*b d r"]) -> Float[Tensor, "*b d s"]:
 def beside_prior(
     root: Float[Tensor, "*n d r"], values: Float[Tensor, "*n d r"], prior: Float[Tensor, "*m d r"]
 ) -> Float[Tensor, "*n d r"]:
-    """Root of a covariance in which the prior's part is between nothing and the prior, entry by entry.
+    """Root of a covariance whose part beside ``values``, those without prior, is kept between nothing and the prior.
 
-    What a process adds to ``values``, those of one without prior, is the prior times one less its interpolation of
-    ones. Between two inputs half a length scale or more apart that interpolation swings to 1.14: of a prior far above
-    the values, as of a movement of many standard deviations, it would take more away than there is.
+    It is the prior times one less an interpolation of ones, which swings to 1.14 between two inputs: of a prior far
+    above the values, as of a movement of many standard deviations, it would take more away than there is.
     """
     return values + (root - values).clamp(prior.clamp_max(0.0), prior.clamp_min(0.0))

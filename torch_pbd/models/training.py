@@ -131,24 +131,18 @@ def empirical_tril(training: TrainingSet, *, bias_correction: bool = False) -> F
 def mean_over_geometric(training: TrainingSet) -> Float[Tensor, "n d"]:
     """Mean of the diagonal entries of an empirical factor over the exponential of their mean logarithm.
 
-    For normal data; one where the factor was shrunk. A smooth logarithm is by this too low: at two rows by a third.
+    For normal data, of which they are chi; one where the factor was shrunk.
     """
     n_outputs, degrees = training.y.shape[1], training.counts - 1.0
-    known = degrees.clamp_min(n_outputs)
-    mean_log = 0.5 * torch.digamma(0.5 * _rest(known, n_outputs)) + (2.0 / known[:, None]).log() * 0.5
-    ratio = _expected_diagonal(known, n_outputs) / mean_log.exp()
+    half = 0.5 * (degrees[:, None] - torch.arange(n_outputs).to(degrees)).clamp_min(1.0)
+    ratio = (torch.lgamma(half + 0.5) - torch.lgamma(half) - 0.5 * torch.digamma(half)).exp()
     return torch.where((degrees < n_outputs)[:, None], 1.0, ratio)
 
 
 def _expected_diagonal(degrees: Tensor, n_outputs: int) -> Tensor:
     """Mean of each column of the factor of an empirical covariance over that of the true one."""
-    rest = _rest(degrees, n_outputs)
+    rest = degrees[:, None] - torch.arange(n_outputs).to(degrees)
     return (torch.lgamma((rest + 1.0) / 2.0) - torch.lgamma(rest / 2.0)).exp() * (2.0 / degrees[:, None]).sqrt()
-
-
-def _rest(degrees: Tensor, n_outputs: int) -> Tensor:
-    """Degrees of freedom of each column of an empirical factor: (n, d)."""
-    return degrees[:, None] - torch.arange(n_outputs).to(degrees)
 
 
 def _sum_by(values: Tensor, index: Tensor, n_groups: int) -> Tensor:
