@@ -34,7 +34,7 @@ def reaching():
 @cache
 def cut():
     """A reach of 1 m in 4 s, cut in the middle: at its highest speed, 15 / 8 of the mean."""
-    with pytest.warns(UserWarning, match=r"ends at 0\.469 m/s, where its largest speed is 0\.469 m/s.*cut while"):
+    with pytest.warns(UserWarning, match=r"ends at 0\.469 m/s, where its largest is 0\.469: .* cut while"):
         return fitted(lambda u: (minimum_jerk(0.5 * u), 0.0))
 
 

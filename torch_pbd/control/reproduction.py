@@ -113,9 +113,9 @@ class Reproduction:
         ends, largest = max(float(speed[0]), float(speed[-1])), float(speed.max())
         if ends > max(_CUT * largest, _STOPPED) and speed.min() < _STEADY * largest:
             warnings.warn(
-                f"The movement starts at {speed[0]:.3g} m/s and ends at {speed[-1]:.3g} m/s, where its largest speed "
-                f"is {largest:.3g} m/s: the recordings were cut while moving. Record from rest to rest; else a robot "
-                "at rest needs a ramp at the start, and settle > 0 at the end.",
+                f"The movement starts at {speed[0]:.3g} m/s and ends at {speed[-1]:.3g} m/s, where its largest is "
+                f"{largest:.3g}: the recordings were cut while moving. Record from rest to rest; else a robot at rest "
+                "needs a ramp at the start, and settle > 0 at the end.",
                 stacklevel=3,
             )
 
