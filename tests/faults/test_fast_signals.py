@@ -1,4 +1,4 @@
-"""A mean that moves fast is followed as closely as by scikit-learn; rows of demonstrations are known as such."""
+"""A fast mean is followed as closely as scikit-learn follows it, and rows of demonstrations are known as such."""
 
 import warnings
 
@@ -120,7 +120,7 @@ def test_a_signal_that_is_not_followed_is_told():
 # --- demonstrations without groups
 
 
-def smooth(n_demos=6, n_steps=40, d=2, jitter=0.0, seed=0):
+def smooth(n_demos=5, n_steps=30, d=1, jitter=0.0, seed=0):
     """Smooth deviations from a bend, at common inputs or each demonstration at its own."""
     rng = np.random.default_rng(seed)
     x = np.linspace(0.0, 1.0, n_steps) + jitter * rng.uniform(-0.5, 0.5, size=(n_demos, n_steps)) / n_steps
@@ -164,14 +164,14 @@ def test_independent_draws_raise_no_alarm(aligned, seed):
 @pytest.mark.parametrize("kind", ["normal", "heavy tails", "skewed", "louder along the input"])
 @pytest.mark.parametrize("layout", ["demonstrations", "scattered"])
 def test_white_noise_is_taken_for_white(kind, layout):
-    """At most one alarm of either kind in a hundred draws; 300 of each here."""
+    """At most one alarm of either kind in a hundred draws; 100 of each here."""
     import torch
 
-    from torch_pbd.models.heteroscedastic.residuals import are_copies, is_signal
+    from torch_pbd.models.heteroscedastic.residuals import NOT_WHITE, are_copies, is_signal
     from torch_pbd.models.training import TrainingSet
 
     rng, alarms, n_rows = np.random.default_rng(0), 0, 90
-    for _ in range(300):
+    for _ in range(100):
         x = np.tile(np.linspace(0.0, 1.0, 30), 3) if layout == "demonstrations" else rng.uniform(size=n_rows)
         noise = {
             "normal": rng.normal(size=(n_rows, 2)),
@@ -182,5 +182,5 @@ def test_white_noise_is_taken_for_white(kind, layout):
         inputs, index = np.unique(x, return_inverse=True)
         y, order = torch.tensor(noise), torch.arange(n_rows)
         rows = TrainingSet(torch.tensor(x)[:, None], y, torch.tensor(inputs)[:, None], torch.tensor(index))
-        alarms += are_copies(y, rows, order) or bool(is_signal(y, rows, None).any())
-    assert alarms <= 3
+        alarms += are_copies(y, rows, order) or bool(is_signal(y, rows, None, NOT_WHITE).any())
+    assert alarms <= 1

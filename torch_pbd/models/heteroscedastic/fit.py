@@ -19,7 +19,7 @@ from torch_pbd.models.heteroscedastic.covariance import CovarianceSearches, fit_
 from torch_pbd.models.heteroscedastic.latent import LatentCovariance
 from torch_pbd.models.heteroscedastic.mean import LatentMean, fit_mean
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
-from torch_pbd.models.heteroscedastic.residuals import is_signal
+from torch_pbd.models.heteroscedastic.residuals import DOUBTFUL, NOT_WHITE, is_signal
 from torch_pbd.models.heteroscedastic.search import Search, SearchOptions
 from torch_pbd.models.heteroscedastic.start import MOST_INPUTS
 from torch_pbd.models.training import TrainingSet, pooled_tril
@@ -88,7 +88,7 @@ class HeteroscedasticFit:
     def missed(self, group: Int64[Tensor, " rows"] | None) -> Bool[Tensor, " d"]:
         """Outputs whose residuals are a signal that the mean does not follow."""
         worth_telling = self.residual.square().mean(0) > _WORTH_TELLING
-        return worth_telling & is_signal(self.whitened(), self.training, group)
+        return worth_telling & is_signal(self.whitened(), self.training, group, NOT_WHITE)
 
 
 def fit_heteroscedastic(
@@ -172,7 +172,7 @@ def _follows(training: TrainingSet, group: Tensor | None, mean: LatentMean, pool
     residual, _ = _residual(training, mean, pooled.expand(len(training.inputs), -1, -1))
     whitened = _solved(pooled, residual)
     less = whitened.square().mean(0) < _MUCH_LESS
-    return not bool((less | is_signal(whitened, training, group)).any())
+    return not bool((less | is_signal(whitened, training, group, DOUBTFUL)).any())
 
 
 def _tril_at(inputs: Tensor, pooled: Tensor, covariance: LatentCovariance | None) -> Tensor:

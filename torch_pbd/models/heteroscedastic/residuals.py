@@ -7,7 +7,8 @@ from torch import Tensor
 from torch_pbd.models.training import TrainingSet
 
 _LAGS = 3
-_NOT_WHITE = 21.1  # 0.9999 quantile of the chi-squared distribution of three degrees of freedom
+# 0.95 and 0.9999 quantiles of the chi-squared distribution of three degrees of freedom: to look again, and to tell.
+DOUBTFUL, NOT_WHITE = 7.81, 21.1
 # What residuals of K demonstrations have in common, of their variance, that is no chance: the mean square of means of
 # K would be four times what it should be. Smooth demonstrations have few independent places along the input.
 _MOST_COMMON, _COMMON = 0.5, 3.0
@@ -21,9 +22,10 @@ _CONSTANT = 1e-20  # variance of an output that does not vary
 
 
 def is_signal(
-    whitened: Float[Tensor, "rows d"], training: TrainingSet, group: Int64[Tensor, " rows"] | None
+    whitened: Float[Tensor, "rows d"], training: TrainingSet, group: Int64[Tensor, " rows"] | None, least: float
 ) -> Bool[Tensor, " d"]:
-    """Whether residuals of unit variance have something in common along the inputs: not white, and of all rows there.
+    """Whether residuals of unit variance have something in common along the inputs: not white (a test's statistic
+    is above ``least``), and of all rows there.
 
     Rows of one demonstration may be alike; what tells are those of others at an input, and at the next.
     """
@@ -31,7 +33,10 @@ def is_signal(
     both = torch.cat([whitened, torch.ones_like(whitened[:, :1])], dim=1)
     total = both.new_zeros(len(training.inputs), both.shape[1]).index_add_(0, place, both)
     value = total[:, :-1] / total[:, -1:].sqrt()
-    coloured = sum(_correlation(value[lag:], value[: len(value) - lag])[1] for lag in range(1, _LAGS + 1)) > _NOT_WHITE
+    # A bounded score: a burst has few large residuals, but all of them are alike.
+    value = value / (value.abs() + value.abs().median(0).values).clamp_min(1e-300)
+    value = value - value.mean(0)
+    coloured = sum(_correlation(value[lag:], value[: len(value) - lag])[1] for lag in range(1, _LAGS + 1)) > least
     if group is None:
         n_demos, alike = float(training.counts.mean()), total.square().sum(0) - both.square().sum(0)
     else:
