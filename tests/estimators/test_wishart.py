@@ -123,22 +123,15 @@ def test_the_solver_is_checked():
         WishartProcessRegressor(solver="fisher", latent_prior=False).fit(X, y)
 
 
-@pytest.mark.filterwarnings("ignore:y has 2 demonstrations")
-def test_inputs_too_near_to_interpolate_are_smoothed_and_told():
-    """Without noise every kernel matrix of the search is singular; a problem that random ones found."""
-    recipe = Recipe(
-        seed=2, n_demos=11, n_steps=33, n_outputs=5, n_features=3, inputs="clustered", columns=("free",) * 3,
-        outputs=("free",) * 5, x_units=(3, -9, -9), y_units=(-9,) * 5, x_offsets=(0.0,) * 3, y_offsets=(0.0,) * 5,
-        twice=0, dtypes=("float16", "float64"), layouts=("C", "C"), groups="demonstrations",
-    )  # fmt: skip
-    X, y, _ = recipe.data()
+def test_inputs_too_near_to_interpolate_are_smoothed_and_told(rng):
+    """Bursts of samples a billionth of the range apart: without noise every kernel matrix of the search is singular."""
+    X = np.repeat(np.add.outer(np.linspace(0.0, 1.0, 3), 1e-9 * np.arange(20)).ravel(), 3)[:, np.newaxis]
+    y = rng.normal(size=(180, 2))
     with pytest.warns(DataRankWarning, match="rows so near to each other") as told:
         model = WishartProcessRegressor(objective="mse").fit(X, y)
     assert {warning.filename for warning in told} == {__file__}
-    X = X.astype(np.float64)
-    assert_covariances(model.predict_cov(X), len(X), 5)
-    variance = np.diagonal(model.predict_cov(X), axis1=1, axis2=2) / y.var(axis=0)
-    assert 1e-3 < variance.min() < variance.max() < 10.0
+    variance = np.diagonal(model.predict_cov(X), axis1=1, axis2=2)
+    assert 0.1 < variance.min() < variance.max() < 2.0
 
 
 def test_a_constant_output_is_as_precise_by_likelihood_as_with_factors(rng):

@@ -51,7 +51,7 @@ def test_81_the_deviation_does_not_collapse_between_inputs(name, inputs, n_demos
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
-@pytest.mark.parametrize("n_demos", [2, 3, 5, 50])
+@pytest.mark.parametrize("n_demos", [2, 3, 50])
 @pytest.mark.parametrize("speed", [0.0, 1000.0])
 def test_81_it_does_for_no_number_of_inputs_and_demonstrations(name, n_demos, speed):
     grids = [np.linspace(0.0, 1.0, n) for n in (2, 3, 4, 5, 7, 10, 20)]
@@ -68,6 +68,8 @@ def test_81_it_does_for_no_number_of_inputs_and_demonstrations(name, n_demos, sp
 
 @pytest.mark.parametrize("name", MODELS)
 def test_81_a_hole_is_seen_and_the_prior_speaks_there(name):
+    many = np.r_[np.linspace(0.0, 0.35, 30), np.linspace(0.65, 1.0, 30)]
+    assert MODELS[name].fit(*moving(many, 3, 1)).predict_uncertainty([[0.5]]).type1[0] > 0.5
     hole = MODELS[name].fit(*moving(HOLE, 12, 1))
     middle, far = hole.predict_cov([[0.5], [100.0]])[:, 0, 0]
     assert hole.predict_uncertainty([[0.5]]).type1[0] > 0.9

@@ -4,7 +4,7 @@ import torch
 from scipy.stats import chi
 
 from torch_pbd.gp import neighbourhoods
-from torch_pbd.models.training import TrainingSet, empirical_tril, pooled_tril
+from torch_pbd.models.training import TrainingSet, empirical_tril, mean_over_geometric, pooled_tril
 
 COUNTS = {
     "equal": [5] * 8,
@@ -164,3 +164,15 @@ def test_the_residual_is_that_of_all_rows_whatever_they_share(counts, rng):
     assert sum(asked) == len(counts)
     assert max(asked) <= 1024
     torch.testing.assert_close(training.merged(2).residual(mean), expected, rtol=0, atol=0)
+
+
+def test_the_mean_over_the_geometric_mean_is_that_of_chi_variables():
+    counts, n_outputs = [2, 3, 4, 7, 50], 3
+    index = torch.repeat_interleave(torch.arange(5), torch.tensor(counts))
+    inputs = torch.arange(5, dtype=torch.float64)[:, None]
+    training = TrainingSet(inputs[index], torch.zeros(len(index), n_outputs, dtype=torch.float64), inputs, index)
+    expected = np.ones((5, n_outputs))
+    for i, count in enumerate(counts[2:], start=2):
+        laws = [chi(count - 1 - column) for column in range(n_outputs)]
+        expected[i] = [law.mean() / np.exp(law.expect(np.log)) for law in laws]
+    np.testing.assert_allclose(mean_over_geometric(training), expected, rtol=1e-6)

@@ -168,15 +168,8 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         if noise_scale is not None and not bool((noise_scale > 0).any()):
             # Interpolated: longer than where inputs come closest, and the process swings between the others.
             shortest = min(0.5, max(1e-6, _SHORTEST * spacing(observations.inputs, 0.1)))
-        return EvidenceSearch(
-            self.kernel,
-            (shortest, longest),
-            length_scale,
-            noise_scale,
-            self.max_inputs,
-            self.n_restarts,
-            max_iter=max(100, self.max_iter),
-        )
+        limits = self.max_inputs, self.n_restarts, max(100, self.max_iter)
+        return EvidenceSearch(self.kernel, (shortest, longest), length_scale, noise_scale, *limits)
 
     def _default_length_scale(self, problem: Problem) -> Tensor:
         """Length scales (1, e) where they are not learned: a fifth of the range of the inputs, less beside a hole."""

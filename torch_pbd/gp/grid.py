@@ -168,7 +168,7 @@ class EvidenceGrid:
         n_features, fixed = projection.basis.nodes.shape[1], self._search.length_scale
         if fixed is None:
             step = _FINE_STEP if len(projection.basis.nodes) <= _SMALL else _GRID_STEP
-            n_steps = math.ceil(math.log(longest / self.shortest) / math.log(step) - 1e-9)
+            n_steps = max(0, math.ceil(math.log(longest / self.shortest) / math.log(step) - 1e-9))
             new = torch.logspace(math.log10(self.shortest), math.log10(longest), n_steps + 1, dtype=self._scales.dtype)
             new = new.to(self._scales.device)
             new = new[:-1] if len(self._scales) else new
