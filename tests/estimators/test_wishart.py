@@ -2,7 +2,6 @@ import warnings
 
 import numpy as np
 import pytest
-from reliability.problems import Recipe
 from sklearn.exceptions import ConvergenceWarning
 
 from estimators.zoo import assert_covariances, demonstrations, fit, fitted, new, queries
