@@ -272,7 +272,7 @@ def test_finished_fits_of_another_run_are_told_of_where_they_are_not_used(data, 
     fits = watched(monkeypatch)
     assert fit(data, tmp_path) == 0
     assert fits == ["GMMBaseline"]
-    assert "with --resume that run would have gone on" in capsys.readouterr().err
+    assert "--resume would have gone on with it" in capsys.readouterr().err
     assert [file.name for file in finished(tmp_path)] == ["mine.safetensors"]
 
 
