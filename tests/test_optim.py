@@ -116,7 +116,7 @@ def test_a_batch_finds_what_each_problem_alone_finds(generator):
         return rosenbrock(x - target[rows] + 1.0)
 
     found, report = minimize_batch(by_autograd(objective), start, max_iter=300, tol=1e-11)
-    assert report.converged
+    assert report.status is Status.CONVERGED
     torch.testing.assert_close(found, target, rtol=1e-6, atol=1e-6)
 
 
@@ -273,7 +273,7 @@ def test_with_its_inverse_hessian_a_quadratic_takes_newtons_step_and_at_the_end_
     torch.testing.assert_close(found, minimum, rtol=1e-9, atol=1e-9)
     close = minimum + 1e-5
     found, report = minimize_batch(objective, close, tol=1e-6, inverse_hessian=inverse)
-    assert (report.n_iter, report.converged) == (0, True)
+    assert (report.n_iter, report.status) == (0, Status.CONVERGED)
     assert torch.equal(found, close)
 
 
@@ -281,7 +281,7 @@ def test_a_batch_may_be_empty(generator):
     _, _, objective = quadratics(generator)
     found, report = minimize_batch(objective, torch.zeros(0, 3, dtype=torch.float64))
     assert found.shape == (0, 3)
-    assert (report.n_iter, report.converged) == (0, True)
+    assert (report.n_iter, report.status) == (0, Status.CONVERGED)
 
 
 RAISED = [

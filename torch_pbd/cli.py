@@ -39,9 +39,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ArithmeticError, RuntimeError) as error:  # from deep inside, where the message alone says little
         return _complain(f"{type(error).__name__}: {' '.join(str(error).split())}", _ERROR)
     except KeyboardInterrupt as stop:
-        return _complain(f"interrupted{_remark(stop)}", _INTERRUPTED)
+        return _complain("; ".join(("interrupted", *stop.args)), _INTERRUPTED)
     except _Terminated as stop:
-        return _complain(f"terminated{_remark(stop)}", _TERMINATED)
+        return _complain("; ".join(("terminated", *stop.args)), _TERMINATED)
 
 
 @contextmanager
@@ -63,10 +63,6 @@ def _signals() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _remark(stop: BaseException) -> str:
-    return f"; {stop.args[0]}" if stop.args else ""
 
 
 def _answer(arguments: Sequence[str]) -> int:

@@ -31,6 +31,7 @@ from torch_pbd import (
 from torch_pbd.cli import main
 from torch_pbd.experiments import resume, robot
 from torch_pbd.experiments.demo import run_demo
+from torch_pbd.experiments.reference import ScikitLearnGMR
 from torch_pbd.experiments.resume import FinishedFits, finished_fits, fit_once
 from torch_pbd.experiments.robot import run_robot
 from torch_pbd.experiments.run_folder import RunFolder
@@ -247,6 +248,14 @@ def test_fits_of_other_parameters_data_or_versions_are_others(recorded, monkeypa
             assert not {resume._key(*given) for given in others} & set(keys)
 
 
+def test_a_peer_that_has_no_file_is_always_fitted(recorded, tmp_path, monkeypatch):
+    fits = watched(monkeypatch)
+    for _ in range(2):
+        fit_once(ScikitLearnGMR(2), *recorded.stack(), finished=FinishedFits(tmp_path / "finished"))
+    assert len(fits) == 2
+    assert finished(tmp_path) == []
+
+
 def test_finished_fits_of_another_run_are_told_of_where_they_are_not_used(data, tmp_path, monkeypatch, capsys):
     def cut():
         with monkeypatch.context() as patched:
@@ -263,7 +272,7 @@ def test_finished_fits_of_another_run_are_told_of_where_they_are_not_used(data, 
     fits = watched(monkeypatch)
     assert fit(data, tmp_path) == 0
     assert fits == ["GMMBaseline"]
-    assert "with --resume that run would have gone on" in capsys.readouterr().err
+    assert "--resume would have gone on with it" in capsys.readouterr().err
     assert [file.name for file in finished(tmp_path)] == ["mine.safetensors"]
 
 

@@ -1,7 +1,7 @@
 """Compare models on one data set: how well each repeats the data, and how well it foretells a demonstration."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from joblib import Parallel, delayed
@@ -22,6 +22,8 @@ class Score:
     """What one model does on one data set."""
 
     model: str
+    fitted: CovarianceRegressor
+    """To all the data."""
     cholesky_mse: float
     """To the empirical covariances, squared units of y: the MSE of the paper's Table I. NaN if not aligned."""
     frobenius: float
@@ -31,7 +33,7 @@ class Score:
     fold_coverage: tuple[float, ...]
     """Share of each demonstration left out that lies within the 95 % ellipse."""
     fit_seconds: float
-    smallest_eigenvalue: float = field(default=float("nan"))
+    smallest_eigenvalue: float
     """Of the predicted correlations, over the data."""
 
     @property
@@ -102,6 +104,7 @@ def compare_models(
         scores.append(
             Score(
                 model=name,
+                fitted=fitted,
                 cholesky_mse=float("nan") if empirical is None else covariance_mse(covariance, empirical),
                 frobenius=float("nan") if truth is None else relative_frobenius_error(covariance, truth(inputs)),
                 fold_log_likelihood=tuple(row["log_likelihood"] for row in held_out),

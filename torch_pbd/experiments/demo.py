@@ -12,7 +12,6 @@ from torch_pbd.data import Demonstrations, make_tunnel_demonstrations
 from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.experiments.comparison import compare_models
 from torch_pbd.experiments.recordings import score_row, write_fitted
-from torch_pbd.experiments.resume import fit_once
 from torch_pbd.experiments.robot import run_robot
 from torch_pbd.experiments.robot_figures import draw_tunnel
 from torch_pbd.experiments.run_folder import RunFolder, check_names, format_table
@@ -34,13 +33,11 @@ def run_demo(models: Mapping[str, CovarianceRegressor], folder: RunFolder, *, n_
     true_covariance = np.einsum("kti,ktj->tij", *(2 * [fresh - fresh.mean(axis=0)])) / (_N_FRESH - 1)
     X, y, groups = demonstrations.stack()
     scores = compare_models(models, X, y, groups, truth=lambda _: true_covariance, finished=folder.finished)
-    rows, fitted = [], {}
+    rows = []
     for score in scores:
-        model, _ = fit_once(models[score.model], X, y, groups, finished=folder.finished)
-        fitted[score.model] = model
-        rows.append(score_row(score) | {"95 % of fresh": _coverage(model, demonstrations, fresh)})
-        write_fitted(model, demonstrations, folder, score.model, "time")
-    figure = _tunnel_figure(fitted, demonstrations)
+        rows.append(score_row(score) | {"95 % of fresh": _coverage(score.fitted, demonstrations, fresh)})
+        write_fitted(score.fitted, demonstrations, folder, score.model, "time")
+    figure = _tunnel_figure({score.model: score.fitted for score in scores}, demonstrations)
     folder.write_figure(figure, "tunnel")
     plt.close(figure)
     folder.write_metrics(rows)

@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 from torch_pbd.data import Demonstrations
 from torch_pbd.estimators._base import CovarianceRegressor
 from torch_pbd.experiments.comparison import Score, compare_models
-from torch_pbd.experiments.resume import fit_once
 from torch_pbd.experiments.run_folder import RunFolder, check_names, format_table, slug
 from torch_pbd.labels import output_label
 from torch_pbd.plotting import MODEL, plot_covariance_ellipses, plot_demonstrations, plot_model_bands
@@ -117,9 +116,8 @@ def run_recordings(
     rows = [score_row(score) for score in scores]
     folds = {f"LL {i + 1}": [s.fold_log_likelihood[i] for s in scores] for i in range(rows[0]["folds"])}
     folder.write_metrics([row | {key: values[j] for key, values in folds.items()} for j, row in enumerate(rows)])
-    for name, model in models.items():
-        fitted, _ = fit_once(model, X, y, groups, finished=folder.finished)
-        write_fitted(fitted, demonstrations, folder, name, input)
+    for score in scores:
+        write_fitted(score.fitted, demonstrations, folder, score.model, input)
     return format_table(rows)
 
 

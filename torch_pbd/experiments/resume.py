@@ -7,6 +7,7 @@ import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,39 +23,20 @@ from torch_pbd.persistence import load, save
 _NAME = re.compile(r"[0-9a-f]{64}-\d+\.\d{6}\.safetensors")
 
 
+@dataclass
 class FinishedFits:
     """Folder of fitted models, named by the SHA-256 of all that a fit depends on, and the seconds that it took.
 
-    Worker processes write and read it too, each file whole.
-
-    Parameters
-    ----------
-    folder : Path
-        Made when the first fit ends.
-    resume : bool, default=False
-        Whether to warn if the first fit that is asked for is not there.
+    It is made when the first fit ends. Worker processes write and read it too, each file whole.
     """
 
-    def __init__(self, folder: Path, *, resume: bool = False) -> None:
-        self.folder, self._resume = folder, resume
+    folder: Path
+    resume: bool = False
+    """Whether the next fit that is asked for should be there."""
 
-    def files(self) -> list[Path]:
-        """One file a fit."""
-        return [file for file in self.folder.glob("*.safetensors") if _NAME.fullmatch(file.name)]
-
-    def fit(self, model: Any, *data: Any) -> tuple[Any, float]:
-        """The fitted model and the seconds that its fit took: loaded, or fitted now and saved."""
-        key = _key(model, *data)
-        file = next(self.folder.glob(f"{key}-*.safetensors"), None)
-        if self._resume and file is None:
-            warnings.warn(f"There is nothing finished to resume from in {self.folder}: the run begins.", stacklevel=3)
-        self._resume = False
-        if file is not None:
-            return load(file), float(file.stem.partition("-")[2])
-        model, seconds = _timed_fit(model, *data)
-        self.folder.mkdir(exist_ok=True)
-        save(model, self.folder / f"{key}-{seconds:.6f}.safetensors")
-        return model, seconds
+    def files(self, key: str = "") -> list[Path]:
+        """One file a fit; those of a key."""
+        return [file for file in self.folder.glob(f"{key}*") if _NAME.fullmatch(file.name)]
 
     def clear(self) -> None:
         """Remove the files, and the folder if nothing else is in it."""
@@ -67,18 +49,16 @@ class FinishedFits:
 @contextmanager
 def finished_fits(folder: Path, *, resume: bool) -> Iterator[FinishedFits]:
     """The finished fits of a run, which begins with those of one that was cut, or with none; cleared at a good end."""
-    finished = FinishedFits(folder, resume=resume)
+    finished = FinishedFits(folder, resume)
     if not resume and finished.files():
-        warnings.warn(
-            f"{folder} of a run that was cut is cleared; with --resume that run would have gone on.", stacklevel=3
-        )
+        warnings.warn(f"{folder} of a run that was cut is cleared: --resume would have gone on with it.", stacklevel=3)
         finished.clear()
     yield finished
     finished.clear()
 
 
 def fit_once(model: Any, *data: Any, finished: FinishedFits | None = None) -> tuple[Any, float]:
-    """The fitted model, and the seconds that its fit took.
+    """The fitted model, loaded or fitted and kept, and the seconds that its fit took.
 
     Parameters
     ----------
@@ -88,7 +68,19 @@ def fit_once(model: Any, *data: Any, finished: FinishedFits | None = None) -> tu
     finished : FinishedFits, default=None
         Fits that need not be repeated; this one is added.
     """
-    return _timed_fit(model, *data) if finished is None or not is_ours(model) else finished.fit(model, *data)
+    if finished is None or not is_ours(model):
+        return _timed_fit(model, *data)
+    key = _key(model, *data)
+    found = finished.files(key)
+    if finished.resume and not found:
+        warnings.warn(f"There is nothing finished to resume from in {finished.folder}: the run begins.", stacklevel=2)
+    finished.resume = False
+    if found:
+        return load(found[0]), float(found[0].stem.partition("-")[2])
+    model, seconds = _timed_fit(model, *data)
+    finished.folder.mkdir(exist_ok=True)
+    save(model, finished.folder / f"{key}-{seconds:.6f}.safetensors")
+    return model, seconds
 
 
 def _timed_fit(model: Any, *data: Any) -> tuple[Any, float]:
@@ -101,8 +93,8 @@ def _key(model: Any, *data: Any) -> str:
     """SHA-256 of class, parameters, versions and data."""
     labels: list[Any] = []
     if isinstance(data[0], Demonstrations):
-        (demos,) = data
-        labels, data = [demos.names, demos.units, demos.frame, demos.time_unit], (*demos.times, *demos.positions)
+        demos = data[0]
+        labels, data = [demos.names, demos.units, demos.frame, demos.time_unit], demos.stack()
     described = [encode_parameters(model), torch_pbd.__version__, torch.__version__, labels]
     digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
     for array in map(np.asarray, data):

@@ -55,8 +55,7 @@ class RunFolder:
 
     def __init__(self, path: str | Path, settings: Mapping[str, Any]) -> None:
         self.path = Path(path)
-        self.finished: FinishedFits | None = None
-        """Where the run keeps its fits, if it does."""
+        self.finished: FinishedFits | None = None  # where the run keeps its fits, if it does
         self.path.mkdir(parents=True, exist_ok=True)
         # The operating system frees the lock of a process that is killed.
         self._lock = FileLock(self.path / ".lock", timeout=0)

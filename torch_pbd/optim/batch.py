@@ -32,11 +32,6 @@ class BatchReport:
     inverse_hessian: Float[Tensor, "b p p"]
     """At the ends, as far as the steps told."""
 
-    @property
-    def converged(self) -> bool:
-        """Whether all ended by themselves."""
-        return self.status is Status.CONVERGED
-
 
 def by_autograd(
     objective: Callable[[Float[Tensor, "a p"], Int64[Tensor, " a"]], Float[Tensor, " a"]],
@@ -159,12 +154,8 @@ class _Problems:
 
     def put(self, others: "_Problems") -> None:
         """Take what became of some of them."""
-        self.x, self.loss, self.inverse = (
-            mine.index_copy(0, others.rows, its)
-            for mine, its in zip(
-                (self.x, self.loss, self.inverse), (others.x, others.loss, others.inverse), strict=True
-            )
-        )
+        for name in ("x", "loss", "inverse"):
+            setattr(self, name, getattr(self, name).index_copy(0, others.rows, getattr(others, name)))
 
 
 def _advance(
@@ -229,34 +220,25 @@ def _backtrack(objective: ValueAndGradient, at: _Problems) -> tuple[Tensor, Tens
 
     The last of what is returned tells of problems that stay because nothing is finite any more, even where they are.
     """
-    downhill, slope, step = at.downhill.squeeze(-1), 2.0 * at.promise, at.step
-    trial = at.x - step[:, None] * downhill
-    value, gradient = objective(trial, at.rows)
-    accepted = _accepted(value, gradient, at.loss, step * slope)
-    blocked = torch.zeros_like(accepted)
-    if bool(accepted.all()):
-        return trial, value, gradient, blocked
-    new_x, new_loss, new_gradient = at.x.clone(), at.loss.clone(), at.gradient.clone()
+    x, loss, gradient, step = at.x, at.loss, at.gradient, at.step
     left = torch.arange(len(step), device=step.device)
+    blocked = torch.zeros_like(left, dtype=torch.bool)
     for _ in range(25):
-        done = left[accepted]
-        new_x[done], new_loss[done], new_gradient[done] = trial[accepted], value[accepted], gradient[accepted]
+        before, slope, share = at.loss[left], 2.0 * at.promise[left], step[left]
+        trial = at.x[left] - share[:, None] * at.downhill[left].squeeze(-1)
+        value, its_gradient = objective(trial, at.rows[left])
+        finite = torch.isfinite(value + its_gradient.sum(-1))
+        accepted = finite & (value <= before - 1e-4 * (share * slope))  # Armijo's rule
+        x, loss, gradient = (
+            old.index_copy(0, left[accepted], new[accepted])
+            for old, new in ((x, trial), (loss, value), (gradient, its_gradient))
+        )
+        if bool(accepted.all()):
+            return x, loss, gradient, blocked
         # The minimum of the parabola through both values and the slope, kept within a tenth and a half.
-        share = step[left]
-        parabola = 0.5 * share * slope[left] / ((value - at.loss[left]) / share + slope[left])
-        shorter = torch.where(torch.isfinite(value + gradient.sum(-1)), parabola, 0.1 * share)
-        step = step.index_copy(0, left, shorter.clamp(0.1 * share, 0.5 * share))
-        left = left[~accepted]
-        if len(left) == 0:
-            return new_x, new_loss, new_gradient, blocked
-        trial = at.x[left] - step[left, None] * downhill[left]
-        value, gradient = objective(trial, at.rows[left])
-        accepted = _accepted(value, gradient, at.loss[left], step[left] * slope[left])
-    value, gradient = objective(at.x[left], at.rows[left])
-    blocked[left] = ~torch.isfinite(value + gradient.sum(-1))
-    return new_x, new_loss, new_gradient, blocked
-
-
-def _accepted(value: Tensor, gradient: Tensor, loss: Tensor, promised: Tensor) -> Tensor:
-    """Armijo's rule; a value that is not finite is not accepted."""
-    return (value <= loss - 1e-4 * promised) & torch.isfinite(value + gradient.sum(-1))
+        parabola = 0.5 * share * slope / ((value - before) / share + slope)
+        shorter = torch.where(finite, parabola, 0.1 * share).clamp(0.1 * share, 0.5 * share)
+        step, left = step.index_copy(0, left, shorter), left[~accepted]
+    value, its_gradient = objective(at.x[left], at.rows[left])
+    blocked[left] = ~torch.isfinite(value + its_gradient.sum(-1))
+    return x, loss, gradient, blocked

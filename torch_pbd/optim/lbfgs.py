@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from torch_pbd.optim.report import FAILURES, BestSoFar, FitReport, Progress, Status
+from torch_pbd.optim.report import FAILURES, BestSoFar, Callback, FitReport, Status
 
-_ATTEMPTS = 4  # with first steps of 1, 1/2, 1/4 and 1/8
+_ATTEMPTS = 4  # with first steps of 1, 1/2, 1/4 and 1/8 of what torch takes
 
 
 class _NotFiniteError(ArithmeticError):
@@ -18,46 +18,36 @@ class _NotFiniteError(ArithmeticError):
 class _BestPoint(BestSoFar):
     """Closure for ``torch.optim``: loss and gradients at the parameters, and memory of the best of them."""
 
-    def __init__(
-        self,
-        objective: Callable[[], Tensor],
-        parameters: Sequence[Tensor],
-        callback: Callable[[Progress], None] | None,
-    ) -> None:
+    def __init__(self, objective: Callable[[], Tensor], parameters: Sequence[Tensor], callback: Callback) -> None:
         super().__init__(callback)
         self._objective, self._parameters = objective, parameters
         self._best: list[Tensor] = []
-        self._gradients: list[Tensor] = []
+        self._gradients: Sequence[Tensor] = []
 
     def __call__(self) -> float:
         # Each attempt begins with the loss at the best point, which is known.
-        if self._best and all(map(torch.equal, self._parameters, self._best)):
-            self._give(self._gradients)
-            return self.curve[-1]
-        self.n_evaluations += 1
-        try:
-            with torch.enable_grad():
-                loss = self._objective()
-                found = torch.autograd.grad(loss, self._parameters, allow_unused=True)
-        except FAILURES as error:
-            raise _NotFiniteError(str(error) or type(error).__name__) from error
-        value = float(loss.detach())
-        gradients = [
-            torch.zeros_like(parameter) if gradient is None else gradient.contiguous()
-            for parameter, gradient in zip(self._parameters, found, strict=True)
-        ]
-        if not math.isfinite(value) or not all(bool(torch.isfinite(gradient).all()) for gradient in gradients):
-            raise _NotFiniteError(f"{Status.NOT_FINITE.value} (loss {value})")
-        self._give(gradients)
+        known = bool(self._best) and all(map(torch.equal, self._parameters, self._best))
+        value, gradients = (self.curve[-1], self._gradients) if known else self._evaluated()
+        for parameter, gradient in zip(self._parameters, gradients, strict=True):
+            parameter.grad = gradient.clone()
         if self.lowered_by(value):
             self._best = [parameter.detach().clone() for parameter in self._parameters]
             self._gradients = gradients
             self.add(value)
         return value
 
-    def _give(self, gradients: Sequence[Tensor]) -> None:
-        for parameter, gradient in zip(self._parameters, gradients, strict=True):
-            parameter.grad = gradient.clone()
+    def _evaluated(self) -> tuple[float, Sequence[Tensor]]:
+        self.n_evaluations += 1
+        try:
+            with torch.enable_grad():
+                loss = self._objective()
+                gradients = torch.autograd.grad(loss, self._parameters, materialize_grads=True)
+        except FAILURES as error:
+            raise _NotFiniteError(str(error) or type(error).__name__) from error
+        value = float(loss.detach())
+        if not math.isfinite(value) or not all(bool(torch.isfinite(gradient).all()) for gradient in gradients):
+            raise _NotFiniteError(f"{Status.NOT_FINITE.value} (loss {value})")
+        return value, [gradient.contiguous() for gradient in gradients]
 
     @torch.no_grad()
     def restore(self) -> None:
@@ -73,8 +63,7 @@ def minimize(
     *,
     max_iter: int = 200,
     tol: float = 1e-8,
-    history_size: int = 20,
-    callback: Callable[[Progress], None] | None = None,
+    callback: Callback = None,
 ) -> FitReport:
     """Minimize a scalar objective by L-BFGS with a strong Wolfe line search; leaves the best point seen.
 
@@ -95,10 +84,8 @@ def minimize(
     tol : float, default=1e-8
         Stop when the largest gradient entry, or the change of the loss, is below it: scale the objective
         so that one unit matters.
-    history_size : int, default=20
-        Pairs of steps and gradient changes kept.
     callback : callable, optional
-        Called with a :class:`Progress` after each improvement.
+        Called with a :class:`~torch_pbd.optim.Progress` after each improvement.
 
     Returns
     -------
@@ -112,10 +99,7 @@ def minimize(
     """
     best, n_iter = _BestPoint(objective, parameters, callback), 0
     try:
-        try:
-            best()
-        except _NotFiniteError as error:
-            raise ValueError(f"The optimization cannot start: {error}.") from error
+        best()
         for number in range(_ATTEMPTS):
             optimizer = torch.optim.LBFGS(
                 list(parameters),
@@ -124,7 +108,7 @@ def minimize(
                 max_eval=2 * (max_iter - n_iter) + 21,  # a search takes one or two; the first is known
                 tolerance_grad=tol,
                 tolerance_change=tol * max(1.0, abs(best.curve[0])) * 1e-2,
-                history_size=history_size,
+                history_size=20,  # pairs of steps and changes of the gradient
                 line_search_fn="strong_wolfe",
             )
             status, detail = _attempt(optimizer, best)
@@ -132,6 +116,8 @@ def minimize(
             best.restore()
             if status is Status.CONVERGED or n_iter >= max_iter:
                 break
+    except _NotFiniteError as error:  # at the start: an attempt ends with its own
+        raise ValueError(f"The optimization cannot start: {error}.") from error
     finally:
         best.restore()
     if status is Status.CONVERGED and n_iter >= max_iter:

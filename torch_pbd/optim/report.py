@@ -1,5 +1,6 @@
 """How far an optimization is, and how it ended."""
 
+import math
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -69,20 +70,23 @@ class FitReport:
         return replace(self, status=other.status, detail=f"{name}: {other.message}")
 
 
-class BestSoFar:
-    """Falling curve of the best losses of a search; its callback hears of each improvement."""
+Callback = Callable[[Progress], None] | None
 
-    def __init__(self, callback: Callable[[Progress], None] | None) -> None:
+
+class BestSoFar:
+    """Base of searches: the falling curve of their best losses, of which a callback hears."""
+
+    def __init__(self, callback: Callback) -> None:
         self.curve: list[float] = []
         self.n_evaluations = 0
         self._callback, self._started = callback, time.perf_counter()
 
     def lowered_by(self, loss: float) -> bool:
-        """Whether a loss is below all before it."""
-        return not self.curve or loss < self.curve[-1]
+        """Whether a loss is finite and below all before it."""
+        return math.isfinite(loss) and (not self.curve or loss < self.curve[-1])
 
     def add(self, loss: float) -> None:
-        """Take a loss that is below all before it for the best so far."""
+        """Take such a loss for the best so far."""
         self.curve.append(loss)
         if self._callback is not None:
             self._callback(Progress(self.n_evaluations, loss, time.perf_counter() - self._started))

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torch_pbd.optim.report import FAILURES, BestSoFar, FitReport, Progress, Status
+from torch_pbd.optim.report import FAILURES, BestSoFar, Callback, FitReport, Status
 
 _LEAST_SHARE = 1e-4  # of the fall that the slope promises, for a step to be taken
 _LINEAR_SHARE = 0.8  # with more of it the loss is a line rather than a parabola, and a longer step is tried
@@ -20,9 +20,7 @@ Newton = Callable[[Tensor], tuple[Tensor, Tensor]]
 class _Search(BestSoFar):
     """Where the optimization is, and the losses it has seen."""
 
-    def __init__(
-        self, loss: Callable[[Tensor], Tensor], start: Tensor, callback: Callable[[Progress], None] | None
-    ) -> None:
+    def __init__(self, loss: Callable[[Tensor], Tensor], start: Tensor, callback: Callback) -> None:
         super().__init__(callback)
         self.loss, self.x, self.n_iter = loss, start, 0
         self.value = self.evaluate(start)
@@ -37,10 +35,8 @@ class _Search(BestSoFar):
                 raise ValueError(f"The optimization cannot start: {error}.") from error
             return math.nan
         if self.lowered_by(value):
-            if not math.isfinite(value):
-                return math.nan
             self.add(value)
-        return value
+        return value if math.isfinite(value) else math.nan
 
     def along(self, x: Tensor, value: float, step: Tensor, slope: float) -> tuple[Tensor, float]:
         """Point with a lower loss on the way from ``x``, and that loss; ``x`` itself where there is none."""
@@ -91,7 +87,7 @@ def minimize_scoring(
     max_iter: int = 100,
     tol: float = 1e-8,
     relative_tol: float = 0.0,
-    callback: Callable[[Progress], None] | None = None,
+    callback: Callback = None,
 ) -> tuple[Tensor, FitReport]:
     """Minimize a loss whose gradient and curvature are known in closed form; never ends above the start.
 
@@ -115,7 +111,7 @@ def minimize_scoring(
     relative_tol : float, default=0.0
         Or that promises one below this share of the loss. For sums of squares, whose smallest value is zero.
     callback : callable, optional
-        Called with a :class:`Progress` after each improvement.
+        Called with a :class:`~torch_pbd.optim.Progress` after each improvement.
 
     Returns
     -------
