@@ -68,10 +68,13 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
     n_inducing : int or None, default=None
         Inputs on which the processes rest. None takes all distinct inputs up to 48 and of more the centres of as
         many neighbourhoods; if the length scales that are found come near their distances, 128; at once for
-        several columns of X. All outputs together have at most 400 (the mean 800).
+        several columns of X. All outputs together have at most 400 (the mean 800). A mean that does not follow the
+        data on these gets as many as its length scales need, 2048 for all outputs at most.
     max_inputs : int, default=512
         Where X has more distinct rows, neighbours are merged into this many; into fewer where samples of a
-        demonstration turn out correlated, so that each input has rows of about all demonstrations.
+        demonstration turn out correlated, so that each input has rows of about all demonstrations. A mean that
+        does not follow the data on these is fitted at up to 16384 / d of the distinct rows, and its length scales are
+        looked for with 1024: about 170 cycles over the range.
     max_iter : int, default=100
         Largest number of BFGS iterations of a search for hyperparameters.
     tol : float, default=1e-3
@@ -193,6 +196,11 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         -----
         UnimodalityWarning
             If demonstrations (of one input) seem to follow several ways.
+        DataRankWarning
+            If no groups are given and rows nearly repeat those beside them, as samples of a demonstration do. Rows in
+            the order of their recording are recognized, and rows that repeat inputs in any order.
+        UserWarning
+            If the mean does not follow the data.
         """
         return self._learn(X, y, groups)
 

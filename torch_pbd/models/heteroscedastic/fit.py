@@ -38,6 +38,7 @@ _FIRST_SAMPLES = 10.0  # of a demonstration: what counts of it before its correl
 # Of y's standard deviation: an output that is constant, or a copy of another, has this deviation of its own.
 _LEAST_DEVIATION = 1e-6
 _MUCH_LESS = 0.25  # of the variance that was taken for noise
+_NEARLY_ALL = 0.9  # of y's variance: a mean of nothing is doubtful, in few rows too
 _WORTH_TELLING = 0.03  # of y's variance: what no smooth mean follows of a corner leaves less
 _LEAST_OWN = 1e-4  # of an output's deviation, as long as the mean is fitted
 
@@ -168,11 +169,11 @@ def _fit_mean(
 
 
 def _follows(training: TrainingSet, group: Tensor | None, mean: LatentMean, pooled: Tensor) -> bool:
-    """Whether residuals of a mean are the noise that it was fitted under: not far less, and no signal."""
+    """Whether residuals of a mean are the noise that it was fitted under: not far less, no signal, and not all of y."""
     residual, _ = _residual(training, mean, pooled.expand(len(training.inputs), -1, -1))
     whitened = _solved(pooled, residual)
-    less = whitened.square().mean(0) < _MUCH_LESS
-    return not bool((less | is_signal(whitened, training, group, DOUBTFUL)).any())
+    wrong = (whitened.square().mean(0) < _MUCH_LESS) | is_signal(whitened, training, group, DOUBTFUL)
+    return not bool((wrong | ((training.counts.mean() < 2.0) & (residual.square().mean(0) > _NEARLY_ALL))).any())
 
 
 def _tril_at(inputs: Tensor, pooled: Tensor, covariance: LatentCovariance | None) -> Tensor:

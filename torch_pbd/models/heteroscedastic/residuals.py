@@ -7,12 +7,14 @@ from torch import Tensor
 from torch_pbd.models.training import TrainingSet
 
 _LAGS = 3
-# 0.95 and 0.9999 quantiles of the chi-squared distribution of three degrees of freedom: to look again, and to tell.
-DOUBTFUL, NOT_WHITE = 7.81, 21.1
+# To look again and to tell: the chi-squared distribution of three degrees of freedom exceeds them once in 20 and once in
+# 10^6 times. Residuals whitened by a covariance of many outputs and few rows do so more often.
+DOUBTFUL, NOT_WHITE = 7.81, 30.7
 # What residuals of K demonstrations have in common, of their variance, that is no chance: the mean square of means of
 # K would be four times what it should be. Smooth demonstrations have few independent places along the input.
 _MOST_COMMON, _COMMON = 0.5, 3.0
-# The same quantile of one degree of freedom, and the level of the other test, which heavy tails take to a hundredth.
+# A number of one degree of freedom that is above it once in 10^4 times; the level of the test of smoothness, which
+# noise that is far louder in places exceeds by far.
 _ALIKE, _LEVEL = 15.1, 1e-5
 # Correlation of neighbours that is strong, and that of strangers, relative to it, where a mean would explain it.
 _STRONG, _OF_STRANGERS = 0.5, 0.5
