@@ -68,7 +68,8 @@ def fitted(demonstrations, **parameters):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         model = DMPController(**{"covariance": REGRESSORS["GMM"], "n_steps": 40, **parameters}).fit(demonstrations)
-    return model, [str(warning.message) for warning in caught]
+    told = [str(warning.message) for warning in caught]
+    return model, [message for message in told if "tell no units" not in message and "cut while moving" not in message]
 
 
 @cache
@@ -187,7 +188,7 @@ def test_63_in_a_hole_the_prior_is_the_prior_and_refusing_refuses():
 class Spy(GMMBaseline):
     """Remembers the rows that it was fitted to."""
 
-    def fit(self, X, y):
+    def fit(self, X, y, groups=None):
         type(self).rows = np.asarray(X)[:, 0].copy()
         return super().fit(X, y)
 
@@ -339,7 +340,7 @@ def test_62_63_a_refusal_in_words_or_a_path_in_range_and_soft_where_nothing_was_
             raise
         return
     assert "repeated" not in kinds
-    schedule = model.schedule(400.0 / model.duration_)
+    schedule = model.schedule(400.0 / model.duration_, limits=None)
     assert beyond(schedule.position, recorded) <= 0.1 + 1e-6
     assert np.isfinite(schedule.stiffness).all()
     at = schedule.time / model.duration_

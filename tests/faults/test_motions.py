@@ -23,7 +23,10 @@ def fitted(path, lasting=2.0, *, units="m", time_unit="s", **parameters):
     time = np.linspace(0.0, lasting, 81)
     position = np.column_stack(np.broadcast_arrays(*path(time / lasting)))
     shown = Demonstrations([time] * 3, [scale * position for scale in SCALES], units=units, time_unit=time_unit)
-    return DMPController(CholeskyCovRegressor(max_iter=2), n_steps=50, **parameters).fit(shown)
+    controller = DMPController(CholeskyCovRegressor(max_iter=2), n_steps=50, **parameters)
+    told = "tell no units" if units is None else f"in '{units}', which is no known length"
+    with nullcontext() if units in ("m", "mm", "deg") else pytest.warns(UserWarning, match=told):
+        return controller.fit(shown)
 
 
 @cache
@@ -159,7 +162,9 @@ def test_73_recordings_that_were_cut(name, recordings):
 
 def test_73_movements_from_rest_to_rest_or_at_a_steady_pace_are_not_told_of(recordings):
     model = CholeskyCovRegressor(max_iter=2)
-    DMPController(model).fit(load_demonstrations(recordings / "letter_G.npz"))
+    with pytest.warns(UserWarning, match="which is no known length") as told:
+        DMPController(model).fit(load_demonstrations(recordings / "letter_G.npz"))
+    assert len(told) == 1
     tunnel = DMPController(model).fit(make_tunnel_demonstrations(4, rate=20.0, random_state=0))
     settled = tunnel.schedule(100.0, settle=2.0)  # 0.06 m/s to the last: stops on its path
     assert settled.position[:, 1].max() <= tunnel.goal_[1] + 1e-9
