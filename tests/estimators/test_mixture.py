@@ -143,6 +143,7 @@ def test_a_constant_input_is_as_if_it_were_not_there(solver, constant, rng):
         np.testing.assert_allclose(mine, others, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.filterwarnings("ignore:X has 9 values in column 0 that differ from others by a rounding")
 def test_rows_that_differ_by_rounding_are_no_different_samples():
     """Else k-means finds fewer clusters than it is asked for, and says so in its own words."""
     X = np.repeat([[-1.0], [0.0], [1.0]], 4, axis=0) + 1e-9 * np.arange(12.0)[:, np.newaxis]
