@@ -92,8 +92,9 @@ def whole(data, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def recorded(data):
-    """Few samples of what is in the file."""
-    return load_demonstrations(data).resample(8)
+    """Few samples of what is in the file, in metres."""
+    few = load_demonstrations(data).resample(8)
+    return Demonstrations(few.times, few.positions, units="m")
 
 
 @pytest.mark.parametrize("number", SIGNALS)

@@ -1,6 +1,7 @@
 """Schedules that end where they should, at rest, within what robots do. Numbers are those of the list of faults."""
 
 import json
+from contextlib import nullcontext
 from functools import cache
 
 import numpy as np

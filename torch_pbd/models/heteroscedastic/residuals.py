@@ -7,8 +7,8 @@ from torch import Tensor
 from torch_pbd.models.training import TrainingSet
 
 _LAGS = 3
-# To look again and to tell: the chi-squared distribution of three degrees of freedom exceeds them once in 20 times, and
-# once in 10^6. Residuals whitened by a covariance of many outputs and few rows do so more often.
+# To look again, and to tell: a chi-squared number of three degrees of freedom is above them once in 20 and once in 10^6
+# times. Residuals whitened by a covariance of many outputs and few rows do so more often.
 DOUBTFUL, NOT_WHITE = 7.81, 30.7
 # What residuals of K demonstrations have in common, of their variance, that is no chance: the mean square of means of
 # K would be four times what it should be. Smooth demonstrations have few independent places along the input.

@@ -10,7 +10,7 @@ from torch_pbd.gp.inducing import inducing_inputs
 from torch_pbd.gp.neighbourhoods import resolved_length_scale
 from torch_pbd.models.heteroscedastic.processes import CLEAR, ProcessFamily
 from torch_pbd.models.heteroscedastic.search import Search, SearchOptions
-from torch_pbd.models.training import TrainingSet
+from torch_pbd.models.training import TrainingSet, pooled_tril
 
 MOST_INPUTS = 1024
 """Inputs that short length scales are searched with, and that correlated rows are fitted at: some seconds."""
@@ -19,6 +19,7 @@ _MOST_ROWS, _TOGETHER = 16384, 2048  # inputs to fit at, and inducing ones, of a
 # Length scale down to which a search takes a few matrices of 168 rows; and noise, of outputs of unit variance, below
 # which nothing is left to be found with shorter ones: a smooth signal's residual is never white.
 _CHEAP, _NONE = 0.025, 1e-4
+_LEAST_NOISE = 3e-5  # with less, kernel matrices are singular
 _LONGEST = 10.0  # length scale, in ranges of the inputs: a trend
 
 
@@ -31,10 +32,15 @@ def mean_start(rows: TrainingSet, family: ProcessFamily, options: SearchOptions)
     training = rows.merged(MOST_INPUTS)
     rows_at_input = training.counts.mean()
     observations = Observations(training.inputs, training.means().mT.contiguous(), training.counts / rows_at_input)
+    noise = pooled_tril(rows).norm(dim=1) / rows_at_input.sqrt()
+    # Rows that repeat inputs tell the noise, unless they are copies.
+    known = noise if 2 * len(rows.inputs) <= len(rows.x) and bool((noise > _LEAST_NOISE).all()) else None
     least = resolved_length_scale(training.inputs)
     for shortest in (max(_CHEAP, least), least):
         bounds = (shortest, _LONGEST)
-        found = fit_together([(observations, EvidenceSearch(length_scale_bounds=bounds))])[0].hyperparameters
+        found = fit_together([(observations, EvidenceSearch(length_scale_bounds=bounds, noise_scale=known))])[
+            0
+        ].hyperparameters
         noise_scale = found.amplitude * found.noise_ratio.sqrt()
         if bool((noise_scale < _NONE).all()):
             break
