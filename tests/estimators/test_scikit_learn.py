@@ -275,7 +275,7 @@ def test_covariances_pass_through_a_pipeline(name):
 
 
 def small_grid(name):
-    return {"n_components": [1, 3]} if name == "mixture" else {"length_scale": [0.2, 0.4]}
+    return {"n_components": [1, 3]} if name == "mixture" else {"length_scale": [0.25, 0.4]}
 
 
 @pytest.mark.parametrize("name", DEFAULTS)
