@@ -165,12 +165,16 @@ def test_an_experiment_on_a_file_takes_its_covariance_from_the_config(recording,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["kuka_cube_pick", "letter_G"])
-def test_recorded_skills_are_pushed(name, recordings, tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("name", "told"), [("kuka_cube_pick", "cut while moving"), ("letter_G", "which is no known length")]
+)
+def test_recorded_skills_are_pushed(name, told, recordings, tmp_path, capsys):
     config = Path(__file__).parents[1] / "configs" / "robot.yaml"
     data = ["--data", str(recordings / f"{name}.npz")]
     assert main(["experiment", "--config", str(config), *data, "--output", str(tmp_path)]) == 0
-    assert capsys.readouterr().err == ""
+    remarks = capsys.readouterr().err
+    assert told in remarks
+    assert len(remarks.splitlines()) == 3  # one for each controller
     with (tmp_path / "metrics.csv").open() as file:
         for row in csv.DictReader(file):
             assert row["stable"] == "yes"

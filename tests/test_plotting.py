@@ -71,7 +71,7 @@ def test_a_model_is_drawn_beyond_the_data_beside_the_empirical_deviations():
 
 @pytest.mark.filterwarnings("ignore:The movement starts at")  # as a random walk does
 def test_pushes_and_stiffness_are_drawn_in_readable_units(rng):
-    recorded = Demonstrations(np.linspace(0.0, 2.0, 50), rng.normal(size=(4, 50, 2)).cumsum(axis=1), units="m")
+    recorded = Demonstrations(np.linspace(0.0, 2.0, 50), 0.01 * rng.normal(size=(4, 50, 2)).cumsum(axis=1), units="m")
     controller = DMPController(CholeskyCovRegressor()).fit(recorded)
     schedule, run = controller.schedule(100.0), controller.simulate(rate=100.0)
     figure, axes = plt.subplots(4, 1)

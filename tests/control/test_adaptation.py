@@ -101,10 +101,8 @@ def test_72_the_papers_equation_does():
 def test_72_on_recordings(name, recordings):
     recorded = load_demonstrations(recordings / f"{name}.npz")
     controller = DMPController(CholeskyCovRegressor(max_iter=2))
-    if name.startswith("kuka"):
-        with pytest.warns(UserWarning, match="cut while moving"):
-            controller.fit(recorded)
-    else:
+    told = "cut while moving" if name.startswith("kuka") else "which is no known length"
+    with pytest.warns(UserWarning, match=told):
         controller.fit(recorded)
     path = controller.reproduce(100.0)[1]
     extent, axes = np.ptp(path, axis=0).max(), np.eye(path.shape[1])
