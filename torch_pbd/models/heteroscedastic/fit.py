@@ -172,10 +172,11 @@ def _follows(training: TrainingSet, group: Tensor | None, mean: LatentMean, pool
     """Whether residuals of a mean are the noise that it was fitted under: not far less, no signal, and not all of y."""
     residual, _ = _residual(training, mean, pooled.expand(len(training.inputs), -1, -1))
     whitened = _solved(pooled, residual)
-    wrong = is_signal(whitened, training, group, DOUBTFUL)
+    less = whitened.square().mean(0) < _MUCH_LESS
+    wrong = is_signal(whitened, training, group, DOUBTFUL) & ~less
     # The noise was estimated from neighbours, unless rows repeat inputs.
     if training.counts.mean() < 2.0 or not torch.equal(training.inputs[training.index], training.x):
-        wrong = wrong | (whitened.square().mean(0) < _MUCH_LESS) | (residual.square().mean(0) > _NEARLY_ALL)
+        wrong = wrong | less | (residual.square().mean(0) > _NEARLY_ALL)
     return not bool(wrong.any())
 
 
