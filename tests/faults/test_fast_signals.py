@@ -161,6 +161,14 @@ def test_independent_draws_raise_no_alarm(aligned, seed):
     HeteroscedasticGPRegressor().fit(X, y)
 
 
+def test_outputs_that_vary_together_raise_no_alarm():
+    """Of the second nothing is left beyond the first but rounding, which is no signal that the mean misses."""
+    time = np.linspace(0.0, 2.0, 100)
+    X, shifts = np.tile(time, 4)[:, None], np.repeat(0.01 * np.arange(4.0), 100)
+    y = np.column_stack([np.tile(time**2 * (3.0 - time) / 4.0, 4), np.zeros(400)]) + shifts[:, None]
+    HeteroscedasticGPRegressor().fit(X, y, groups=np.repeat(np.arange(4), 100))
+
+
 @pytest.mark.parametrize("kind", ["normal", "heavy tails", "skewed", "louder along the input"])
 @pytest.mark.parametrize("layout", ["demonstrations", "scattered"])
 def test_white_noise_is_taken_for_white(kind, layout):

@@ -88,7 +88,8 @@ class HeteroscedasticFit:
 
     def missed(self, group: Int64[Tensor, " rows"] | None) -> Bool[Tensor, " d"]:
         """Outputs whose residuals are a signal that the mean does not follow."""
-        worth_telling = self.residual.square().mean(0) > _WORTH_TELLING
+        # What an output has beyond those before it: of outputs that vary together nothing is left but rounding.
+        worth_telling = self.pooled_tril.diagonal().square() > _WORTH_TELLING
         return worth_telling & is_signal(self.whitened(), self.training, group, NOT_WHITE)
 
 
