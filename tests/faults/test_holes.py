@@ -208,7 +208,9 @@ def test_63_the_regressor_sees_as_many_demonstrations_as_were_sampled():
 
 @pytest.mark.parametrize("name", ["CD", "WP"])
 def test_63_where_four_of_eight_were_sampled_the_covariance_is_that_of_four(name):
-    model, told = fitted(recordings([None] * 4 + [HOLE] * 4), covariance=REGRESSORS[name], n_steps=60)
+    # CD by what follows the empirical factors, and not their logarithms, which are smoother.
+    regressor = CholeskyCovRegressor(diagonal="raw") if name == "CD" else REGRESSORS[name]
+    model, told = fitted(recordings([None] * 4 + [HOLE] * 4), covariance=regressor, n_steps=60)
     assert not told
     whole = recordings([None] * 8).to_array()
     for steps, numbers in [(slice(100, 136, 5), slice(4)), (slice(10, 61, 10), slice(8))]:

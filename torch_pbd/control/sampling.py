@@ -7,7 +7,9 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-_ROUNDING = 1e-6  # of a tick: 10 s at 1 kHz are 10001 rows, however 10 * 1000 is rounded
+# Of a tick: 10 s at 1 kHz are 10001 rows, however 10 * 1000 is rounded; and stamps tell a duration to the thousandth of
+# their spacing, beyond which they count as one, so that a last interval shorter than that is none.
+_ROUNDING = 1e-3
 
 
 def count_rows(duration: float, rate: float) -> int:

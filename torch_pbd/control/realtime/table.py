@@ -16,7 +16,7 @@ from torch_pbd.control.sampling import Between
 Advance = Callable[[Vector, Vector, Vector, Vector, float, float], tuple[Vector, Vector, float]]
 
 _ROUNDING = 1e-9  # relative: what is smaller counts as rounding of whoever made the schedule
-_TICK_ROUNDING = 1e-6  # of a tick: 10 s at 1 kHz are 10001 rows, however 10 * 1000 is rounded
+_TICK_ROUNDING = 1e-3  # of a tick: 10 s at 1 kHz are 10001 rows, as those of a schedule are counted
 _READ = ("time", "position", "velocity", "stiffness", "damping")
 _MAX_ROWS = 4_000_000  # an hour at 1 kHz
 
