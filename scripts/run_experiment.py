@@ -2,7 +2,7 @@
 
 import sys
 
-from torch_pbd.cli import main
+from torch_pbd.cli.main import main
 
 if __name__ == "__main__":
     sys.exit(main(["experiment", *sys.argv[1:]]))

@@ -14,7 +14,7 @@ from jsonargparse import auto_cli
 
 from torch_pbd import CholeskyCovRegressor, GMMBaseline, HeteroscedasticGPRegressor, WishartProcessRegressor
 from torch_pbd.data import load_demonstrations
-from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.experiments.recordings import prepare
 from torch_pbd.experiments.run_folder import format_table
 from torch_pbd.experiments.sweep import summarize, sweep

@@ -4,7 +4,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from torch_pbd.archives import read_array, read_members
+from torch_pbd.files.archives import read_array, read_members
 
 
 def npy(array, version=None):
@@ -70,6 +70,6 @@ def test_members_come_by_name_and_limits_are_told():
 
 
 def test_a_list_of_members_beyond_the_memory_is_not_read(monkeypatch):
-    monkeypatch.setattr("torch_pbd.memory.available_bytes", lambda: 10**6)
+    monkeypatch.setattr("torch_pbd.files.memory.available_bytes", lambda: 10**6)
     with pytest.raises(ValueError, match="its list of members needs about"):
         read_members(b"PK\x01\x02" * 1000, 10**4, remedy="")

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from safetensors.numpy import save as to_bytes
 
-from torch_pbd.checksummed import MAX_HEADER_BYTES, _digest, read_checksummed, write_checksummed
 from torch_pbd.exceptions import ModelFileError
+from torch_pbd.files.tensors import MAX_HEADER_BYTES, _digest, read_checksummed, write_checksummed
 
 ARRAYS = {
     "weight": np.arange(12.0).reshape(3, 4),
@@ -167,6 +167,6 @@ def test_a_header_of_safetensors_that_is_longer_than_any_of_ours_is_not_parsed(p
 
 
 def test_a_file_larger_than_the_memory_is_not_read(path, monkeypatch):
-    monkeypatch.setattr("torch_pbd.memory.available_bytes", lambda: 1000)
+    monkeypatch.setattr("torch_pbd.files.memory.available_bytes", lambda: 1000)
     with pytest.raises(ModelFileError, match="GiB of memory"):
         read_checksummed(path, "kind", 1)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import torch_pbd
-from torch_pbd.cli import main
+from torch_pbd.cli.main import main
 from torch_pbd.control import Schedule
 from torch_pbd.data import Demonstrations, make_tunnel_demonstrations
 
@@ -25,7 +25,7 @@ def recording(tmp_path):
 )
 def test_help_does_not_wait_for_torch(arguments):
     program = (
-        "import sys\nfrom torch_pbd.cli import main\n"
+        "import sys\nfrom torch_pbd.cli.main import main\n"
         f"try:\n    main({arguments!r})\nexcept SystemExit:\n    pass\n"
         "assert not {'torch', 'sklearn', 'matplotlib'} & set(sys.modules)"
     )

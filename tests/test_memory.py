@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-import torch_pbd.memory
+import torch_pbd.files.memory
 from torch_pbd import CholeskyCovRegressor
 from torch_pbd.control import AdmittancePlant, DMPController, EnergyTank
 from torch_pbd.data import make_tunnel_demonstrations
-from torch_pbd.memory import available_bytes, parsed_bytes, require_memory
+from torch_pbd.files.memory import available_bytes, parsed_bytes, require_memory
 
 GIB = 2**30
 
@@ -21,8 +21,8 @@ GIB = 2**30
 def system(tmp_path, monkeypatch):
     """A machine of 64 GiB; writes the files by which it tells the limits of groups."""
     monkeypatch.setattr(os, "sysconf", {"SC_PAGE_SIZE": 4096, "SC_PHYS_PAGES": 64 * GIB // 4096}.__getitem__)
-    monkeypatch.setattr(torch_pbd.memory, "_CONTROL_GROUPS", tmp_path / "cgroup")
-    monkeypatch.setattr(torch_pbd.memory, "_MOUNT", tmp_path / "mount")
+    monkeypatch.setattr(torch_pbd.files.memory, "_CONTROL_GROUPS", tmp_path / "cgroup")
+    monkeypatch.setattr(torch_pbd.files.memory, "_MOUNT", tmp_path / "mount")
 
     def write(groups, limits):
         (tmp_path / "cgroup").write_text(groups)
@@ -64,7 +64,7 @@ def test_a_system_that_does_not_tell_sets_no_limit(system, monkeypatch):
 
 
 def test_the_message_has_both_numbers_and_the_remedy(monkeypatch):
-    monkeypatch.setattr(torch_pbd.memory, "available_bytes", lambda: 10 * GIB)
+    monkeypatch.setattr(torch_pbd.files.memory, "available_bytes", lambda: 10 * GIB)
     require_memory(8 * GIB, what="this", remedy="")
     with pytest.raises(ValueError, match=r"^a sum needs about 8\.5 GiB of memory, but 8 GiB can be used here\. Add\.$"):
         require_memory(8.5 * GIB, what="a sum", remedy="Add.")
@@ -74,7 +74,7 @@ def test_an_hour_at_1_khz_is_refused_where_it_does_not_fit(monkeypatch):
     controller = DMPController(CholeskyCovRegressor(), n_steps=20).fit(
         make_tunnel_demonstrations(rate=10.0, random_state=0)
     )
-    monkeypatch.setattr(torch_pbd.memory, "available_bytes", lambda: GIB)
+    monkeypatch.setattr(torch_pbd.files.memory, "available_bytes", lambda: GIB)
     with pytest.raises(ValueError, match=r"3600001 ticks of 2 axes needs about 1\.45 GiB .* Lower rate"):
         controller.schedule(1000.0, settle=3600.0 - controller.duration_)
     assert len(controller.schedule(100.0)) == 1001
@@ -95,7 +95,7 @@ def test_a_schedule_is_the_same_in_parts(monkeypatch):
 def test_trajectories_that_do_not_fit_are_refused(monkeypatch):
     still, gains = torch.zeros(50, 2).double(), torch.eye(2).double().expand(50, 2, 2)
     force = torch.zeros(1000, 1, 1).double().expand(1000, 50, 2)
-    monkeypatch.setattr(torch_pbd.memory, "available_bytes", lambda: 5 * 10**6)  # four fifths are 80 bytes a tick
+    monkeypatch.setattr(torch_pbd.files.memory, "available_bytes", lambda: 5 * 10**6)  # four fifths are 80 bytes a tick
     assert AdmittancePlant().simulate(still, still, gains, gains, force, dt=0.01).position.shape == (1000, 50, 2)
     plant = AdmittancePlant(stiffness_filter=EnergyTank())
     with pytest.raises(ValueError, match=r"1000 rollouts of 50 ticks needs .* or take simulate_many"):

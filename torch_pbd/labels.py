@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from torch_pbd.control.schedule import Schedule
+from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.data import Demonstrations
 
 _LONGEST_UNIT = 8  # letters; what is longer is a description

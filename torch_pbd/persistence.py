@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.utils.validation import check_is_fitted
 
-from torch_pbd.checksummed import read_checksummed, write_checksummed
 from torch_pbd.control.controller import DMPController
 from torch_pbd.control.storage import check_controller, controller_state, restore_controller
-from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.exceptions import ModelFileError
-from torch_pbd.files import LOADERS
+from torch_pbd.files.atomic import LOADERS
+from torch_pbd.files.tensors import read_checksummed, write_checksummed
 from torch_pbd.learned import decode_learned, learned_names
 from torch_pbd.model_header import (
     CLASSES,

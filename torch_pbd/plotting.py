@@ -11,10 +11,10 @@ from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike, NDArray
 
 from torch_pbd.arguments import as_finite, check_kind, is_finite
-from torch_pbd.control.rollout import Rollout
-from torch_pbd.control.schedule import Schedule
+from torch_pbd.control.schedule.schedule import Schedule
+from torch_pbd.control.simulation.rollout import Rollout
 from torch_pbd.data import Demonstrations
-from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.labels import axis_label, output_label, readable_unit, schedule_names, short_unit
 
 Floats = NDArray[np.float64]

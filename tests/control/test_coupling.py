@@ -5,11 +5,11 @@ import math
 import pytest
 import torch
 
-from torch_pbd.control.coupling import stiffest_environment
 from torch_pbd.control.damping import damping_from_stiffness
-from torch_pbd.control.plant import AdmittancePlant
-from torch_pbd.control.position_loop import PositionLoop
-from torch_pbd.control.sensor import ForceSensor
+from torch_pbd.control.simulation.plant import AdmittancePlant
+from torch_pbd.control.simulation.position_loop import PositionLoop
+from torch_pbd.control.simulation.sensor import ForceSensor
+from torch_pbd.control.stability.coupling import stiffest_environment
 
 DT = 1e-3
 

@@ -9,7 +9,7 @@ import scipy.integrate
 import scipy.signal
 import torch
 
-from torch_pbd.control.dmp import DMP
+from torch_pbd.control.primitive.dmp import DMP
 
 PAPER = {"alpha": 1.0, "beta": 1.0}
 DEFAULT = {}

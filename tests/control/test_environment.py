@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from torch_pbd.control.environment import Tunnel, tunnel_center, tunnel_half_width
+from torch_pbd.control.simulation.walls import Tunnel, tunnel_center, tunnel_half_width
 from torch_pbd.data import synthetic
 
 

@@ -7,9 +7,9 @@ import pytest
 import scipy.stats
 import torch
 
-import torch_pbd.control.monte_carlo
-import torch_pbd.control.rollouts
-import torch_pbd.memory
+import torch_pbd.control.simulation.monte_carlo
+import torch_pbd.control.simulation.rollouts
+import torch_pbd.files.memory
 from torch_pbd.control import (
     AdmittancePlant,
     EnergyTank,
@@ -21,7 +21,7 @@ from torch_pbd.control import (
     simulate_many,
 )
 from torch_pbd.control.damping import damping_from_stiffness
-from torch_pbd.control.transitions import admittance_rate, transition
+from torch_pbd.control.simulation.transitions import admittance_rate, transition
 
 RATE = 200.0
 
@@ -91,7 +91,7 @@ def test_it_is_each_rollout_by_itself(d, integrator):
     ids=lambda parts: "-".join(parts),
 )
 def test_what_acts_in_the_loop_acts_in_each(parts, monkeypatch):
-    monkeypatch.setattr(torch_pbd.control.rollouts, "_CHUNK", 3)
+    monkeypatch.setattr(torch_pbd.control.simulation.rollouts, "_CHUNK", 3)
     schedule, plant = turning_schedule(n_ticks=101), AdmittancePlant(**parts)
     summary = simulate_many(schedule, 5, plant=plant, duration=0.2, random_state=0)
     check_against(one_by_one(schedule, summary, plant), schedule, summary, rtol=1e-11)
@@ -178,7 +178,7 @@ def test_starts_are_spread():
 
 @pytest.mark.parametrize("plant", [None, AdmittancePlant(sensor=ForceSensor(noise_scale=0.5))], ids=["linear", "noisy"])
 def test_a_seed_is_a_result_to_the_last_bit(plant, monkeypatch):
-    monkeypatch.setattr(torch_pbd.control.rollouts, "_CHUNK", 7)
+    monkeypatch.setattr(torch_pbd.control.simulation.rollouts, "_CHUNK", 7)
     schedule = turning_schedule(n_ticks=60)
     runs = [
         simulate_many(schedule, 20, plant=plant, duration=0.1, reference="undisturbed", random_state=seed)
@@ -193,7 +193,7 @@ def test_a_seed_is_a_result_to_the_last_bit(plant, monkeypatch):
 def test_chunks_make_no_difference(monkeypatch):
     schedule = turning_schedule(n_ticks=101)
     whole = simulate_many(schedule, 50, duration=0.1, random_state=0)
-    monkeypatch.setattr(torch_pbd.control.rollouts, "_CHUNK", 8)
+    monkeypatch.setattr(torch_pbd.control.simulation.rollouts, "_CHUNK", 8)
     parts = simulate_many(schedule, 50, duration=0.1, random_state=0)
     for name in ("deviation", "peak_deviation", "peak_time", "return_time", "final_deviation"):
         np.testing.assert_allclose(getattr(parts, name), getattr(whole, name), rtol=1e-12, atol=1e-15)
@@ -251,7 +251,7 @@ def test_arguments_are_checked(arguments, words):
 
 
 def test_too_many_rollouts_are_refused_before_they_are_drawn(monkeypatch):
-    monkeypatch.setattr(torch_pbd.memory, "available_bytes", lambda: 2**20)
+    monkeypatch.setattr(torch_pbd.files.memory, "available_bytes", lambda: 2**20)
     with pytest.raises(
         ValueError, match=r"n_rollouts == 100000 needs about 0\.\d+ GiB of memory, but 0\.000781 GiB can be"
     ):

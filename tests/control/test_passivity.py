@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from torch_pbd.control.damping import damping_from_stiffness
-from torch_pbd.control.passivity import EnergyTank, RateLimit, lyapunov_matrix
-from torch_pbd.control.plant import AdmittancePlant
-from torch_pbd.control.transitions import admittance_rate, transition
+from torch_pbd.control.simulation.filters import EnergyTank, RateLimit, lyapunov_matrix
+from torch_pbd.control.simulation.plant import AdmittancePlant
+from torch_pbd.control.simulation.transitions import admittance_rate, transition
 
 SOFTEST, STIFFEST = 50.0, 1000.0
 MASS = torch.tensor([[1.5, 0.4], [0.4, 0.8]], dtype=torch.float64)

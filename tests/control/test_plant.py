@@ -10,11 +10,11 @@ import scipy.signal
 import torch
 
 from torch_pbd.control.damping import damping_from_stiffness
-from torch_pbd.control.environment import Tunnel
-from torch_pbd.control.passivity import EnergyTank
-from torch_pbd.control.plant import AdmittancePlant
-from torch_pbd.control.position_loop import PositionLoop
-from torch_pbd.control.sensor import ForceSensor
+from torch_pbd.control.simulation.filters import EnergyTank
+from torch_pbd.control.simulation.plant import AdmittancePlant
+from torch_pbd.control.simulation.position_loop import PositionLoop
+from torch_pbd.control.simulation.sensor import ForceSensor
+from torch_pbd.control.simulation.walls import Tunnel
 
 
 def tensor(*values):

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from torch_pbd.control.damping import damping_from_stiffness
-from torch_pbd.control.plant import AdmittancePlant
+from torch_pbd.control.simulation.plant import AdmittancePlant
 
 mujoco = pytest.importorskip("mujoco")
 

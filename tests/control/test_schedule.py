@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicHermiteSpline
 
-from torch_pbd.control import schedule_files
-from torch_pbd.control.schedule import Schedule
+from torch_pbd.control.schedule import files as schedule_files
+from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.exceptions import ModelFileError
 
 ARRAYS = tuple(schedule_files.ARRAY_DIMS)
@@ -626,5 +626,5 @@ def test_paths_are_checked(tmp_path, schedule):
 
 
 def test_torch_is_not_imported():
-    code = "import sys, torch_pbd.control.schedule; sys.exit('torch' in sys.modules or 'scipy' in sys.modules)"
+    code = "import sys, torch_pbd.control.schedule.schedule; sys.exit('torch' in sys.modules or 'scipy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -7,7 +7,7 @@ import pytest
 import scipy.signal
 import torch
 
-from torch_pbd.control.sensor import ForceSensor, apply_deadband, tare
+from torch_pbd.control.simulation.sensor import ForceSensor, apply_deadband, tare
 
 DT = 1e-3
 EVERYTHING = ForceSensor(0.3, 0.05, 0.02, 5.0, cutoff=125.0, delay_steps=3, deadband=0.1)

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from scipy.signal import butter, filtfilt
 
-from torch_pbd.control import smoothing
-from torch_pbd.control.smoothing import automatic_cutoff, noise_like, variance_share
+from torch_pbd.control.primitive import smoothing
+from torch_pbd.control.primitive.smoothing import automatic_cutoff, noise_like, variance_share
 from torch_pbd.data import Demonstrations, make_tunnel_demonstrations
 
 

@@ -11,12 +11,12 @@ import scipy.linalg
 import torch
 
 from torch_pbd import CholeskyCovRegressor, DMPController, load_demonstrations
-from torch_pbd.control import stability as module
 from torch_pbd.control.damping import damping_from_stiffness, required_damping_ratio
-from torch_pbd.control.lyapunov import has_common_function
-from torch_pbd.control.plant import AdmittancePlant
-from torch_pbd.control.stability import _Knots, certify
-from torch_pbd.control.transitions import admittance_rate, transition
+from torch_pbd.control.simulation.plant import AdmittancePlant
+from torch_pbd.control.simulation.transitions import admittance_rate, transition
+from torch_pbd.control.stability import certify as module
+from torch_pbd.control.stability.certify import _Knots, certify
+from torch_pbd.control.stability.lyapunov import has_common_function
 from torch_pbd.data import make_tunnel_demonstrations
 
 N_KNOTS = 12

@@ -21,7 +21,7 @@ from torch_pbd.control import (
     damping_from_stiffness,
     simulate_many,
 )
-from torch_pbd.control.sensor import tare
+from torch_pbd.control.simulation.sensor import tare
 from torch_pbd.data import check_unimodal, make_paper_simulation, make_tunnel_demonstrations, paper_mean
 from torch_pbd.data.alignment import dtw_path
 from torch_pbd.metrics import (

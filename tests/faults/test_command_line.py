@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 import torch_pbd
-from torch_pbd.cli import main
-from torch_pbd.commands import WORK
+from torch_pbd.cli.commands import WORK
+from torch_pbd.cli.main import main
 
-COMMAND = [sys.executable, "-m", "torch_pbd.cli"]
+COMMAND = [sys.executable, "-m", "torch_pbd.cli.main"]
 GMM = ["--model", "GMMBaseline", "--model.n_components", "2"]
 
 
@@ -149,7 +149,7 @@ def test_38_a_signal_while_torch_is_loaded_is_one_line(number, data, monkeypatch
     def interrupted(*_):
         signal.raise_signal(number)
 
-    monkeypatch.setattr("torch_pbd.config.parse", interrupted)
+    monkeypatch.setattr("torch_pbd.cli.config.parse", interrupted)
     assert main(["fit", "--data", str(data)]) == {signal.SIGINT: 130, signal.SIGTERM: 143}[number]
     shown = capsys.readouterr()
     assert shown.err == {signal.SIGINT: "torch-pbd: interrupted\n", signal.SIGTERM: "torch-pbd: terminated\n"}[number]

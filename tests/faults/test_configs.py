@@ -14,10 +14,10 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from torch_pbd import CholeskyCovRegressor, GMMBaseline, HeteroscedasticGPRegressor, WishartProcessRegressor
-from torch_pbd.cli import main
-from torch_pbd.config import COMMANDS, parse
+from torch_pbd.cli.config import COMMANDS, parse
+from torch_pbd.cli.main import main
+from torch_pbd.cli.yaml import MAX_BYTES, read_yaml, read_yaml_file
 from torch_pbd.exceptions import ConfigError
-from torch_pbd.options.yaml_reader import MAX_BYTES, read_yaml, read_yaml_file
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").rglob("*.yaml"))
 COMMAND_OF = {"robot": "experiment"}
@@ -417,7 +417,7 @@ def test_45_line_ends_and_a_byte_order_mark_do_not_matter(tmp_path, newline, mar
 
 
 def test_45_a_pipe_may_be_a_config(tmp_path):
-    program = "from torch_pbd.cli import main; import sys; sys.exit(main(sys.argv[1:]))"
+    program = "from torch_pbd.cli.main import main; import sys; sys.exit(main(sys.argv[1:]))"
     arguments = ["fit", "--config", "/dev/stdin", "--print_config=skip_default"]
     shown = subprocess.run(
         [sys.executable, "-c", program, *arguments], input="data: x\nalign: dtw\n", capture_output=True, text=True

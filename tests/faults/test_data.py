@@ -13,10 +13,10 @@ import torch
 from estimators.zoo import DEFAULTS, LATENT, VARIANTS, assert_covariances, demonstrations, fit, fitted, new
 from sklearn import config_context
 
-import torch_pbd.memory
+import torch_pbd.files.memory
 from torch_pbd import CholeskyCovRegressor, DMPController, GMMBaseline, WishartProcessRegressor
 from torch_pbd.data import make_tunnel_demonstrations
-from torch_pbd.estimators._rows import by_chunks
+from torch_pbd.estimators.rows import by_chunks
 from torch_pbd.exceptions import DataRankWarning, UnimodalityWarning
 
 EMPIRICAL = [CholeskyCovRegressor(objective="empirical"), WishartProcessRegressor(objective="mse")]
@@ -399,7 +399,7 @@ def test_20_memory_is_counted_before_it_is_taken(name):
 
 def test_20_memory_of_inducing_inputs_components_draws_and_predictions_is_counted(monkeypatch):
     X = demonstrations()[0]
-    monkeypatch.setattr(torch_pbd.memory, "available_bytes", lambda: 2**27)
+    monkeypatch.setattr(torch_pbd.files.memory, "available_bytes", lambda: 2**27)
     many = np.linspace(0.0, 1.0, 5000)[:, np.newaxis]
     wide = np.hstack([np.sin(many), np.cos(many)])
     for refused, words in [

@@ -12,7 +12,7 @@ import pytest
 import torch
 from sklearn.exceptions import NotFittedError
 
-import torch_pbd.memory
+import torch_pbd.files.memory
 from torch_pbd import CholeskyCovRegressor, Demonstrations, DMPController
 from torch_pbd.control import AdmittancePlant, StiffnessLaw
 from torch_pbd.data import make_tunnel_demonstrations
@@ -169,7 +169,7 @@ def test_16_float32_is_fitted_without_a_word_of_overflow():
 
 
 def test_20_a_movement_of_many_ticks_is_refused_with_its_memory(monkeypatch):
-    monkeypatch.setattr(torch_pbd.memory, "available_bytes", lambda: 2**27)
+    monkeypatch.setattr(torch_pbd.files.memory, "available_bytes", lambda: 2**27)
     for ask in (lambda: controller().schedule(1e6), lambda: controller().reproduce(1e6)):
         with pytest.raises(ValueError, match=r"a schedule of 2000001 ticks of 2 axes needs about .* GiB.*Lower rate"):
             ask()
@@ -179,10 +179,10 @@ def test_20_a_movement_of_many_ticks_is_refused_with_its_memory(monkeypatch):
 
 @pytest.mark.parametrize("n_steps", [10**5, 10**9, np.int64(10**12)])
 def test_20_a_movement_of_many_steps_is_refused_with_its_memory(n_steps, monkeypatch):
-    monkeypatch.setattr(torch_pbd.memory, "available_bytes", lambda: 2**34)
+    monkeypatch.setattr(torch_pbd.files.memory, "available_bytes", lambda: 2**34)
     with pytest.raises(ValueError, match=rf"n_steps == {n_steps} of 4 demonstrations of 2 axes needs about .* GiB"):
         new(n_steps=n_steps).fit(recorded())
-    monkeypatch.setattr(torch_pbd.memory, "available_bytes", lambda: 2**26)
+    monkeypatch.setattr(torch_pbd.files.memory, "available_bytes", lambda: 2**26)
     with pytest.raises(ValueError, match=rf"n_steps == {10 * n_steps} of 4 .* GiB of memory.*Lower n_steps"):
         controller().smooth(recorded(), 10 * n_steps)
 

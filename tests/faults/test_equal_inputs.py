@@ -6,7 +6,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from torch_pbd import CholeskyCovRegressor, GMMBaseline, HeteroscedasticGPRegressor, WishartProcessRegressor
-from torch_pbd.estimators._validation import without_rounding
+from torch_pbd.estimators.validation import without_rounding
 from torch_pbd.gp import spacing
 
 REGRESSORS = [CholeskyCovRegressor, WishartProcessRegressor, HeteroscedasticGPRegressor, GMMBaseline]

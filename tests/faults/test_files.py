@@ -301,7 +301,7 @@ def test_43_an_archive_that_unpacks_to_more_than_the_memory_is_not_unpacked(name
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as file:
         file.writestr("x.npy", npy(f"({2**22},)") + bytes(2**25))
     path = kind.file(tmp_path, stream.getvalue())
-    monkeypatch.setattr("torch_pbd.memory.available_bytes", lambda: 2**24)
+    monkeypatch.setattr("torch_pbd.files.memory.available_bytes", lambda: 2**24)
     assert_refused_cheaply(kind, path)
 
 
@@ -332,7 +332,7 @@ HOSTILE = {
 @pytest.mark.parametrize("hostile", HOSTILE)
 @each_kind
 def test_43_text_that_is_costly_to_parse_is_refused(kind, hostile, tmp_path, monkeypatch):
-    monkeypatch.setattr("torch_pbd.memory.available_bytes", lambda: 2**23)
+    monkeypatch.setattr("torch_pbd.files.memory.available_bytes", lambda: 2**23)
     assert_refused_cheaply(kind, kind.file(tmp_path, HOSTILE[hostile]), most=2**23)
 
 

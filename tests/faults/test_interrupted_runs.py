@@ -28,7 +28,7 @@ from torch_pbd import (
     WishartProcessRegressor,
     load_demonstrations,
 )
-from torch_pbd.cli import main
+from torch_pbd.cli.main import main
 from torch_pbd.experiments import resume, robot
 from torch_pbd.experiments.demo import run_demo
 from torch_pbd.experiments.reference import ScikitLearnGMR
@@ -308,8 +308,8 @@ def test_38_the_second_signal_ends_the_process_at_once(numbers):
     """Even where what the first one raises is held up."""
     script = f"""
 import signal, sys
-import torch_pbd.config
-from torch_pbd.cli import main
+import torch_pbd.cli.config
+from torch_pbd.cli.main import main
 
 def signalled(*_):
     try:
@@ -317,7 +317,7 @@ def signalled(*_):
     finally:
         signal.raise_signal(signal.{numbers[1]})
 
-torch_pbd.config.parse = signalled
+torch_pbd.cli.config.parse = signalled
 sys.exit(main(["demo"]))
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=False)

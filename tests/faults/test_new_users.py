@@ -16,10 +16,10 @@ from scipy.spatial.transform import Rotation
 
 import torch_pbd
 from torch_pbd import Demonstrations, DMPController, GMMBaseline
-from torch_pbd.cli import main
+from torch_pbd.cli.main import main
 from torch_pbd.control import Schedule
-from torch_pbd.control.arguments import as_demonstrations
-from torch_pbd.control.units import common_unit, duration_of, in_metres, in_seconds
+from torch_pbd.control.parameters import as_demonstrations
+from torch_pbd.control.primitive.units import common_unit, duration_of, in_metres, in_seconds
 from torch_pbd.data import load_demonstrations, make_tunnel_demonstrations, save_demonstrations
 from torch_pbd.exceptions import DataFormatError, ModelFileError
 

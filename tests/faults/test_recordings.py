@@ -227,7 +227,7 @@ def test_10_times_that_do_not_increase_are_told_at_the_first(door, times, index,
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_11_jittered_times_are_taken_as_they_are(degree, rng):
     """Sampling 20 % early or late: a controller's mean acceleration is that of the polynomial, not of even steps."""
-    from torch_pbd.control.smoothing import smooth
+    from torch_pbd.control.primitive.smoothing import smooth
 
     even = np.arange(50) * 0.04
     times = [even + np.r_[0.0, rng.uniform(-0.2, 0.2, size=48) * 0.04, 0.0] for _ in range(3)]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import clone
 
-from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.estimators.cholesky import CholeskyCovRegressor
 from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
 from torch_pbd.estimators.mixture import GMMBaseline

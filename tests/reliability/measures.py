@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torch_pbd.estimators._base import CovarianceRegressor
-from torch_pbd.estimators._scaling import Standardization
-from torch_pbd.estimators._validation import CONSTANT
+from torch_pbd.estimators.base import CovarianceRegressor
+from torch_pbd.estimators.scaling import Standardization
+from torch_pbd.estimators.validation import CONSTANT
 
 Floats = NDArray[np.float64]
 Fit = Callable[[Floats, Floats], CovarianceRegressor]

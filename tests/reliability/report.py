@@ -20,7 +20,7 @@ from reliability.measures import (
     smallest_eigenvalues,
 )
 from reliability.problems import Recipe, random_recipe
-from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.exceptions import NotPositiveDefiniteError
 
 LAWS = ("units", "origin", "unix_time")

@@ -6,44 +6,44 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from torch_pbd.control.controller import DMPController
     from torch_pbd.control.damping import damping_from_stiffness, required_damping_ratio
-    from torch_pbd.control.dmp import DMP
-    from torch_pbd.control.environment import Tunnel
-    from torch_pbd.control.monte_carlo import simulate_many
-    from torch_pbd.control.motion_limits import MotionLimits
-    from torch_pbd.control.passivity import EnergyTank, RateLimit
-    from torch_pbd.control.plant import AdmittancePlant
-    from torch_pbd.control.position_loop import PositionLoop
+    from torch_pbd.control.primitive.dmp import DMP
+    from torch_pbd.control.primitive.motion_limits import MotionLimits
     from torch_pbd.control.realtime import RealTimeAdmittance, TickStatus
-    from torch_pbd.control.rollout import Rollout
-    from torch_pbd.control.rollout_summary import RolloutSummary
-    from torch_pbd.control.schedule import Schedule
-    from torch_pbd.control.sensor import ForceSensor
-    from torch_pbd.control.stability import certify
-    from torch_pbd.control.stability_report import StabilityReport
+    from torch_pbd.control.schedule.schedule import Schedule
+    from torch_pbd.control.simulation.filters import EnergyTank, RateLimit
+    from torch_pbd.control.simulation.monte_carlo import simulate_many
+    from torch_pbd.control.simulation.plant import AdmittancePlant
+    from torch_pbd.control.simulation.position_loop import PositionLoop
+    from torch_pbd.control.simulation.rollout import Rollout
+    from torch_pbd.control.simulation.sensor import ForceSensor
+    from torch_pbd.control.simulation.summary import RolloutSummary
+    from torch_pbd.control.simulation.walls import Tunnel
+    from torch_pbd.control.stability.certify import certify
+    from torch_pbd.control.stability.report import StabilityReport
     from torch_pbd.control.stiffness import StiffnessLaw
 
 # Where each name lives: the controller of the control loop must load without torch.
 _HOMES = {
-    "AdmittancePlant": "plant",
-    "DMP": "dmp",
+    "AdmittancePlant": "simulation.plant",
+    "DMP": "primitive.dmp",
     "DMPController": "controller",
-    "EnergyTank": "passivity",
-    "ForceSensor": "sensor",
-    "MotionLimits": "motion_limits",
-    "PositionLoop": "position_loop",
-    "RateLimit": "passivity",
+    "EnergyTank": "simulation.filters",
+    "ForceSensor": "simulation.sensor",
+    "MotionLimits": "primitive.motion_limits",
+    "PositionLoop": "simulation.position_loop",
+    "RateLimit": "simulation.filters",
     "RealTimeAdmittance": "realtime",
-    "Rollout": "rollout",
-    "RolloutSummary": "rollout_summary",
+    "Rollout": "simulation.rollout",
+    "RolloutSummary": "simulation.summary",
     "Schedule": "schedule",
-    "StabilityReport": "stability_report",
+    "StabilityReport": "stability.report",
     "StiffnessLaw": "stiffness",
     "TickStatus": "realtime",
-    "Tunnel": "environment",
-    "certify": "stability",
+    "Tunnel": "simulation.walls",
+    "certify": "stability.certify",
     "damping_from_stiffness": "damping",
     "required_damping_ratio": "damping",
-    "simulate_many": "monte_carlo",
+    "simulate_many": "simulation.monte_carlo",
 }
 
 __all__ = [

@@ -7,8 +7,9 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator
 from sklearn.utils.validation import check_is_fitted
 
-from torch_pbd.control.adaptation import Adaptation
-from torch_pbd.control.arguments import (
+from torch_pbd.control.impedance import Gains, Impedance, OnUnknown
+from torch_pbd.control.matrices import check_count, check_positive
+from torch_pbd.control.parameters import (
     Goals,
     PhaseInput,
     Variability,
@@ -23,23 +24,22 @@ from torch_pbd.control.arguments import (
     check_steps,
     check_task,
 )
-from torch_pbd.control.coverage import UNKNOWN, merge_bursts, tabulate_unsampled
-from torch_pbd.control.dmp import Gate
-from torch_pbd.control.impedance import Gains, Impedance, OnUnknown
-from torch_pbd.control.matrices import check_count, check_positive
-from torch_pbd.control.motion_limits import MotionLimits, check_motion, counts_as_metres
-from torch_pbd.control.plant import AdmittancePlant
+from torch_pbd.control.primitive.adaptation import Adaptation
+from torch_pbd.control.primitive.coverage import UNKNOWN, merge_bursts, tabulate_unsampled
+from torch_pbd.control.primitive.dmp import Gate
+from torch_pbd.control.primitive.motion_limits import MotionLimits, check_motion, counts_as_metres
+from torch_pbd.control.primitive.reproduction import Reproduction, primitive
+from torch_pbd.control.primitive.smoothing import Movements, automatic_cutoff, noise_like, smooth, variance_share
+from torch_pbd.control.primitive.units import common_start, duration_of, in_metres, in_seconds
 from torch_pbd.control.provenance import schedule_labels
-from torch_pbd.control.reproduction import Reproduction, primitive
-from torch_pbd.control.rollout import Rollout
-from torch_pbd.control.schedule import Schedule
-from torch_pbd.control.simulation import simulate_schedule
-from torch_pbd.control.smoothing import Movements, automatic_cutoff, noise_like, smooth, variance_share
+from torch_pbd.control.schedule.schedule import Schedule
+from torch_pbd.control.simulation.plant import AdmittancePlant
+from torch_pbd.control.simulation.rollout import Rollout
+from torch_pbd.control.simulation.run import simulate_schedule
 from torch_pbd.control.stiffness import StiffnessLaw
-from torch_pbd.control.units import common_start, duration_of, in_metres, in_seconds
 from torch_pbd.control.variability import fit_covariance, fit_law, with_holes
 from torch_pbd.data import Demonstrations
-from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.estimators.base import CovarianceRegressor
 
 Floats = NDArray[np.float64]
 

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torch_pbd.control.coverage import UNKNOWN
 from torch_pbd.control.damping import damping_from_stiffness
+from torch_pbd.control.primitive.coverage import UNKNOWN
 from torch_pbd.control.stiffness import StiffnessLaw
 
 Floats = NDArray[np.float64]

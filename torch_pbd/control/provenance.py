@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from sklearn.base import BaseEstimator
 
-from torch_pbd.control.units import robot_unit
+from torch_pbd.control.primitive.units import robot_unit
 
 
 def schedule_labels(controller: Any) -> dict[str, Any]:

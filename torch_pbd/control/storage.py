@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torch_pbd.control.arguments import check_parameters
 from torch_pbd.control.controller import DMPController
 from torch_pbd.control.impedance import Impedance
-from torch_pbd.control.reproduction import Phase, Reproduction, primitive
+from torch_pbd.control.parameters import check_parameters
+from torch_pbd.control.primitive.reproduction import Phase, Reproduction, primitive
 from torch_pbd.control.stiffness import StiffnessLaw
 
 Arrays = dict[str, NDArray[np.float64]]

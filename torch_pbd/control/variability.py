@@ -5,10 +5,10 @@ from numpy.typing import NDArray
 from sklearn.base import clone
 
 from torch_pbd.control.stiffness import StiffnessLaw
-from torch_pbd.estimators._base import CovarianceRegressor
-from torch_pbd.estimators._groups import fit_by_demonstration
-from torch_pbd.estimators._prior import prior_covariance
+from torch_pbd.estimators.base import CovarianceRegressor
+from torch_pbd.estimators.groups import fit_by_demonstration
 from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
+from torch_pbd.estimators.prior import prior_covariance
 
 Floats = NDArray[np.float64]
 

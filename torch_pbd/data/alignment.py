@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from torch_pbd.arguments import as_floats
-from torch_pbd.data._units import exact, nanoseconds_hint
-from torch_pbd.memory import require_much
+from torch_pbd.data.units import exact, nanoseconds_hint
+from torch_pbd.files.memory import require_much
 
 Floats = NDArray[np.float64]
 

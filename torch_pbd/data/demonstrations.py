@@ -7,7 +7,16 @@ from typing import Any, Literal, NamedTuple, final, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torch_pbd.data._checks import (
+from torch_pbd.data.alignment import (
+    Floats,
+    check_overlap,
+    interpolate,
+    on_common_phases,
+    times_from_start,
+    unit_phases,
+)
+from torch_pbd.data.missing import levels_to_caller
+from torch_pbd.data.recordings import (
     as_mask,
     as_names,
     as_recordings,
@@ -17,16 +26,7 @@ from torch_pbd.data._checks import (
     check_n_steps,
     preview,
 )
-from torch_pbd.data._missing import levels_to_caller
-from torch_pbd.data._suspects import find_suspects
-from torch_pbd.data.alignment import (
-    Floats,
-    check_overlap,
-    interpolate,
-    on_common_phases,
-    times_from_start,
-    unit_phases,
-)
+from torch_pbd.data.suspects import find_suspects
 
 Alignment = Literal["phase", "dtw"]
 Missing = Literal["raise", "drop"]

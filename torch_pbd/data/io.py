@@ -8,12 +8,12 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from torch_pbd.data._format_csv import read_csv, write_csv
-from torch_pbd.data._format_npz import read_npz, write_npz
 from torch_pbd.data.demonstrations import Demonstrations, Missing
+from torch_pbd.data.formats.csv import read_csv, write_csv
+from torch_pbd.data.formats.npz import read_npz, write_npz
 from torch_pbd.exceptions import DataFormatError
-from torch_pbd.files import LOADERS, replacing
-from torch_pbd.memory import require_memory
+from torch_pbd.files.atomic import LOADERS, replacing
+from torch_pbd.files.memory import require_memory
 
 MAX_BYTES = 512 * 2**20
 # Bytes in memory for each of a file that is read; of a CSV 4.5 are measured, twice that with shorter numbers.

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from torch_pbd.arguments import as_finite, as_floats, is_finite
-from torch_pbd.data._checks import check_choice
 from torch_pbd.data.alignment import Floats
 from torch_pbd.data.demonstrations import Demonstrations
-from torch_pbd.memory import require_much
+from torch_pbd.data.recordings import check_choice
+from torch_pbd.files.memory import require_much
 from torch_pbd.seeds import as_random_state
 
 Reading = Literal["printed", "bell", "bowl"]

@@ -5,16 +5,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torch_pbd.estimators._latent import (
+from torch_pbd.estimators.latent import (
     LatentCovarianceRegressor,
     Problem,
     longest_covariance,
     residual_tril,
     warn_if_stretched,
 )
-from torch_pbd.estimators._mean import mean_that_repeats_allow
-from torch_pbd.estimators._prior import Prior
-from torch_pbd.estimators._validation import check_choice, check_flag, check_number, check_solver
+from torch_pbd.estimators.mean import mean_that_repeats_allow
+from torch_pbd.estimators.prior import Prior
+from torch_pbd.estimators.validation import check_choice, check_flag, check_number, check_solver
 from torch_pbd.gp import LatentGP, LatentValues, Observations, condition, fit_together
 from torch_pbd.kernels import KernelName
 from torch_pbd.linalg import tril_to_vector

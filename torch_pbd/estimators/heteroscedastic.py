@@ -7,14 +7,14 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from torch_pbd.estimators._base import CovarianceRegressor
-from torch_pbd.estimators._demonstrations import check_demonstrations, warn_of_residuals
-from torch_pbd.estimators._inducing import check_memory, numbers_to_try, warn_if_unresolved
-from torch_pbd.estimators._latent import default_prior_tril, warn_if_few, warn_if_identical
-from torch_pbd.estimators._prior import Prior, standardized_prior
-from torch_pbd.estimators._results import Fitted
-from torch_pbd.estimators._scaling import Standardization, distinct_rows
-from torch_pbd.estimators._validation import (
+from torch_pbd.estimators.base import CovarianceRegressor
+from torch_pbd.estimators.demonstrations import check_demonstrations, warn_of_residuals
+from torch_pbd.estimators.inducing import check_memory, numbers_to_try, warn_if_unresolved
+from torch_pbd.estimators.latent import default_prior_tril, warn_if_few, warn_if_identical
+from torch_pbd.estimators.prior import Prior, standardized_prior
+from torch_pbd.estimators.results import Fitted
+from torch_pbd.estimators.scaling import Standardization, distinct_rows
+from torch_pbd.estimators.validation import (
     Floats,
     check_choice,
     check_flag,
@@ -22,10 +22,10 @@ from torch_pbd.estimators._validation import (
     check_number,
     check_period,
 )
+from torch_pbd.files.memory import require_much
 from torch_pbd.gp.inducing import FeatureMap, inducing_inputs
 from torch_pbd.kernels import KERNELS, KernelName
 from torch_pbd.linalg import safe_cholesky
-from torch_pbd.memory import require_much
 from torch_pbd.models.heteroscedastic import (
     Families,
     HeteroscedasticModel,

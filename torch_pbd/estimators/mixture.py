@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from sklearn.cluster import KMeans
 from sklearn.neighbors import NearestNeighbors
 
-from torch_pbd.estimators._base import CovarianceRegressor
-from torch_pbd.estimators._regression import MixtureRegression
-from torch_pbd.estimators._results import Fitted
-from torch_pbd.estimators._rows import by_chunks
-from torch_pbd.estimators._scaling import Standardization, distinct_rows, spread_of
-from torch_pbd.estimators._validation import Floats, check_choice, check_number
+from torch_pbd.estimators.base import CovarianceRegressor
+from torch_pbd.estimators.regression import MixtureRegression
+from torch_pbd.estimators.results import Fitted
+from torch_pbd.estimators.rows import by_chunks
+from torch_pbd.estimators.scaling import Standardization, distinct_rows, spread_of
+from torch_pbd.estimators.validation import Floats, check_choice, check_number
 from torch_pbd.exceptions import DataRankWarning
-from torch_pbd.memory import require_much
+from torch_pbd.files.memory import require_much
 from torch_pbd.models.mixture import GaussianMixture
 from torch_pbd.models.mixture_fit import expectation_maximization, refine
 from torch_pbd.optim import FitReport

@@ -8,16 +8,16 @@ import torch
 from sklearn.utils import check_random_state
 from torch import Tensor
 
-from torch_pbd.estimators._latent import (
+from torch_pbd.estimators.latent import (
     LatentCovarianceRegressor,
     Problem,
     longest_covariance,
     residual_tril,
     warn_if_stretched,
 )
-from torch_pbd.estimators._mean import mean_that_repeats_allow
-from torch_pbd.estimators._prior import Prior
-from torch_pbd.estimators._validation import check_choice, check_number, check_solver
+from torch_pbd.estimators.mean import mean_that_repeats_allow
+from torch_pbd.estimators.prior import Prior
+from torch_pbd.estimators.validation import check_choice, check_number, check_solver
 from torch_pbd.exceptions import DataRankWarning, NotPositiveDefiniteError
 from torch_pbd.gp import (
     Hyperparameters,

@@ -8,7 +8,7 @@ from joblib import Parallel, delayed
 from numpy.typing import NDArray
 from sklearn.base import clone
 
-from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.experiments.resume import FinishedFits, fit_once
 from torch_pbd.experiments.sweep import left_out, score_fold
 from torch_pbd.metrics import covariance_mse, relative_frobenius_error

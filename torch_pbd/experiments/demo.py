@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from torch_pbd.control.controller import DMPController
 from torch_pbd.data import Demonstrations, make_tunnel_demonstrations
-from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.experiments.comparison import compare_models
 from torch_pbd.experiments.recordings import score_row, write_fitted
 from torch_pbd.experiments.robot import run_robot

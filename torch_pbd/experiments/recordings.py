@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from torch_pbd.data import Demonstrations
-from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.experiments.comparison import Score, compare_models
 from torch_pbd.experiments.run_folder import RunFolder, check_names, format_table, slug
 from torch_pbd.labels import output_label

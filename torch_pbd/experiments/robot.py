@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from sklearn.base import clone
 
 from torch_pbd.control.controller import DMPController
-from torch_pbd.control.rollout import Rollout
-from torch_pbd.control.schedule import Schedule
-from torch_pbd.control.stability_report import StabilityReport
-from torch_pbd.control.units import in_metres
+from torch_pbd.control.primitive.units import in_metres
+from torch_pbd.control.schedule.schedule import Schedule
+from torch_pbd.control.simulation.rollout import Rollout
+from torch_pbd.control.stability.report import StabilityReport
 from torch_pbd.data import Demonstrations
 from torch_pbd.experiments.resume import FinishedFits, fit_once
 from torch_pbd.experiments.robot_figures import pushes_figure, task_figure, variability_figure

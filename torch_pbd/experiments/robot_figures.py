@@ -7,8 +7,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
 from torch_pbd.control.controller import DMPController
-from torch_pbd.control.rollout import Rollout
-from torch_pbd.control.schedule import Schedule
+from torch_pbd.control.schedule.schedule import Schedule
+from torch_pbd.control.simulation.rollout import Rollout
 from torch_pbd.data import Demonstrations, tunnel_center, tunnel_half_width
 from torch_pbd.labels import output_label
 from torch_pbd.plotting import (

@@ -19,10 +19,10 @@ from matplotlib.figure import Figure
 
 import torch_pbd
 from torch_pbd.control.controller import DMPController
-from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.exceptions import ConfigError, FolderInUseError
 from torch_pbd.experiments.resume import FinishedFits
-from torch_pbd.files import remove_drafts, replacing
+from torch_pbd.files.atomic import remove_drafts, replacing
 from torch_pbd.persistence import save
 
 _PACKAGES = ("torch", "scikit-learn", "numpy", "matplotlib")

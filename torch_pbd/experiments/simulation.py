@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from torch_pbd.data import make_paper_simulation, paper_covariance, paper_mean
 from torch_pbd.data.synthetic import Reading
-from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.estimators.mixture import GMMBaseline
 from torch_pbd.experiments.comparison import Score, compare_models, empirical_covariances
 from torch_pbd.experiments.reference import ScikitLearnGMR

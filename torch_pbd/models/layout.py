@@ -6,8 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torch_pbd.files.memory import require_memory
 from torch_pbd.kernels import KERNELS
-from torch_pbd.memory import require_memory
 
 Tensors = Mapping[str, Tensor]
 Sizes = dict[str, int]

@@ -10,7 +10,7 @@ from speed.rollouts import pushed
 from speed.rows import Findings, Growth, Plan
 from speed.timing import alternate, median
 from torch_pbd import CholeskyCovRegressor, HeteroscedasticGPRegressor
-from torch_pbd.estimators._base import CovarianceRegressor
+from torch_pbd.estimators.base import CovarianceRegressor
 
 # Name of a size, what it is called in `demonstrations`, and its values; else 20 inputs, 10 draws, d = 2, e = 1.
 _SIZES: list[tuple[str, str, list[int]]] = [

@@ -4,7 +4,7 @@ from speed.fresh import added_seconds, wall_seconds
 from speed.rows import Findings, Plan, Row
 
 _NAMES = "torch_pbd.CholeskyCovRegressor, torch_pbd.HeteroscedasticGPRegressor, torch_pbd.GMMBaseline"
-_HELP = "import sys; from torch_pbd.cli import main; main(['--help'])"
+_HELP = "import sys; from torch_pbd.cli.main import main; main(['--help'])"
 
 
 def measure(plan: Plan) -> Findings:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch_pbd.arguments import as_floats
 from torch_pbd.control.realtime.checks import LARGEST
 from torch_pbd.control.realtime.steps import Floats, Vector, advance_coupled, advance_modal, advance_plane
-from torch_pbd.control.sampling import Between
+from torch_pbd.control.schedule.rows import Between
 
 Advance = Callable[[Vector, Vector, Vector, Vector, float, float], tuple[Vector, Vector, float]]
 

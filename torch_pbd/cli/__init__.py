@@ -1,0 +1,1 @@
+"""The command line: ``torch-pbd demo``, ``fit`` and so on."""

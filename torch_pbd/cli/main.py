@@ -1,0 +1,152 @@
+"""The command line: ``torch-pbd demo``, ``fit`` and so on; torch loads once there is work."""
+
+import signal
+import sys
+import threading
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from torch_pbd.console import Notes, say
+from torch_pbd.exceptions import ConfigError, FolderInUseError
+
+_ERROR, _USAGE, _IN_USE, _INTERRUPTED, _TERMINATED = 1, 2, 3, 130, 143
+
+
+class _Terminated(BaseException):
+    """SIGTERM, as KeyboardInterrupt is SIGINT."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    Returns
+    -------
+    int
+        Exit code: 0; 1, it failed; 2, it cannot be used; 3, another run writes the folder; 130 and 143, interrupted and
+        terminated.
+    """
+    try:
+        with _signals():
+            return _answer(list(sys.argv[1:] if arguments is None else arguments))
+    except ConfigError as error:
+        return _complain(str(error), _USAGE)
+    except FolderInUseError as error:
+        return _complain(f"{error} Wait for it, or take another with --output FOLDER.", _IN_USE)
+    except (ValueError, TypeError, OSError, MemoryError) as error:
+        return _complain(str(error) or "the memory is not enough", _ERROR)
+    except (ArithmeticError, RuntimeError) as error:  # from deep inside, where the message alone says little
+        return _complain(f"{type(error).__name__}: {' '.join(str(error).split())}", _ERROR)
+    except KeyboardInterrupt as stop:
+        return _complain("; ".join(("interrupted", *stop.args)), _INTERRUPTED)
+    except _Terminated as stop:
+        return _complain("; ".join(("terminated", *stop.args)), _TERMINATED)
+
+
+@contextmanager
+def _signals() -> Iterator[None]:
+    """SIGINT and SIGTERM are exceptions, the first time; the next one ends the process at once."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    errors = {signal.SIGINT: KeyboardInterrupt, signal.SIGTERM: _Terminated}
+
+    def handle(number: int, _: object) -> None:
+        for each in errors:
+            signal.signal(each, signal.SIG_DFL)
+        raise errors[signal.Signals(number)]
+
+    before = {number: signal.signal(number, handle) for number in errors}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _answer(arguments: Sequence[str]) -> int:
+    import torch_pbd
+    from torch_pbd.cli.config import COMMANDS, nearest
+
+    if not arguments or arguments[0] in ("-h", "--help"):
+        say(_help(COMMANDS))
+        return 0
+    if arguments[0] == "--version":
+        say(torch_pbd.__version__)
+        return 0
+    if arguments[0] not in COMMANDS:
+        raise ConfigError(f"there is no command {arguments[0]!r}. {nearest(arguments[0], COMMANDS)}")
+    return _run(arguments[0], arguments[1:])
+
+
+def _run(command: str, arguments: Sequence[str]) -> int:
+    from torch_pbd.cli.commands import WORK
+    from torch_pbd.cli.config import existing_file, parse
+
+    options, config = parse(command, arguments)
+    import matplotlib as mpl
+    import torch
+
+    from torch_pbd.experiments.resume import finished_fits
+    from torch_pbd.experiments.run_folder import check_names
+
+    mpl.use("Agg")
+    torch.set_num_threads(1)  # the matrices are small: threads would only wait for each other
+    if getattr(options, "data", None) is not None:
+        options.data = existing_file(options.data)
+    for argument in ("models", "controllers"):
+        check_names(getattr(options, argument, ()), argument)
+    with _run_folder(options.output, command) as folder, warnings.catch_warnings():
+        warnings.simplefilter("default")
+        warnings.showwarning = Notes()
+        try:
+            with finished_fits(folder.path / "finished", resume=options.resume) as folder.finished:
+                folder.write_text("config.yaml", config)
+                say(WORK[command](options, folder))
+        except (KeyboardInterrupt, _Terminated) as stop:
+            if folder.finished and folder.finished.files():
+                stop.args = (f"torch-pbd {command} --config {folder.path / 'config.yaml'} --resume goes on",)
+            raise
+    say(f"\nresults: {folder.path}")
+    return 0
+
+
+def _run_folder(path: str, command: str) -> Any:
+    from torch_pbd.experiments.run_folder import RunFolder
+
+    if not path:
+        raise ConfigError("output: it is empty, must be a folder of results. Give one with --output FOLDER.")
+    try:
+        return RunFolder(path, {"command": command})
+    except OSError as error:
+        reason = error.strerror or str(error)
+        where = f" ({error.filename})" if error.filename else ""
+        raise ConfigError(
+            f"output: {path!r} cannot be a folder of results: {reason}{where}. Give another with --output FOLDER."
+        ) from error
+
+
+def _help(commands: Mapping[str, str]) -> str:
+    width = max(map(len, commands))
+    lines = [f"  {name:<{width}}  {text}" for name, text in commands.items()]
+    return "\n".join(
+        [
+            "torch-pbd: learn how precise people are from demonstrations",
+            "",
+            "usage: torch-pbd COMMAND [--config FILE] [--option value ...]",
+            "",
+            *lines,
+            "",
+            "Options of a command: torch-pbd COMMAND --help. As YAML: torch-pbd COMMAND --print_config.",
+        ]
+    )
+
+
+def _complain(message: str, code: int) -> int:
+    say(f"torch-pbd: {message}", sys.stderr)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,294 @@
+"""Dynamic movement primitives: eq. (16) to (18)."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Literal, final, get_args
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torch_pbd.control.matrices import as_rows, as_tensor, broadcasts, check_count, check_positive, run_shape
+from torch_pbd.control.primitive.adaptation import Adaptation, adapt
+from torch_pbd.files.memory import require_much
+
+Gate = Literal["time", "phase", "none"]
+
+
+@final
+class DMP:
+    """A spring-damper towards a goal, and a forcing term over a phase that encodes the movement.
+
+    ``tau z' = alpha (beta (goal - x) - z) + gate f(s)``, ``tau x' = z``, ``tau s' = -gamma s`` with s(0) = 1. The
+    forcing of a demonstration, eq. (18), drives it along that demonstration again.
+
+    As printed, eq. (16) does not stop at the goal: f of a movement that ends with a velocity v_end holds the rest
+    point at ``goal + tau v_end / beta``. A gate takes the forcing to zero after ``duration``; it is 1 before,
+    where eq. (18) is therefore the inverse of eq. (16) with every gate.
+
+    As printed, another goal or start than those demonstrated adds the answer of the spring-damper, in 0.5 tau whatever
+    the movement takes: "additive". "safe" takes both along by minimum jerk over the duration. The acceleration is then
+    at most 1.5 times that of the movement plus such a blend, and no coordinate leaves the hull of start, goal and
+    demonstrated path by more than a tenth: where it would, the path is made flatter. A goal that changes on the way is
+    reached with the end of the movement, or half a duration after the change where that is later.
+
+    Parameters
+    ----------
+    alpha : float, default=25.0
+        Positive. The natural frequency is ``sqrt(alpha beta) / tau``.
+    beta : float, default=None
+        Positive; None is ``alpha / 4``, critical damping. The damping ratio is ``sqrt(alpha / beta) / 2``: the
+        paper's alpha = beta = 1 gives 0.5, and overshoots.
+    gamma : float, default=0.7
+        Decay of the phase, positive.
+    tau : float, default=1.0
+        Time constant in s; twice the tau is half the speed.
+    duration : float, default=None
+        When the movement ends and the gate begins to close, in s, for this tau; None is never.
+    gate : {"time", "phase", "none"}, default="time"
+        "time": closes over ``0.1 duration`` along a minimum-jerk curve. "phase": as the phase decays after
+        ``duration``, s / s(duration). "none": the paper's.
+    adaptation : {"safe", "additive"}, default="safe"
+        How it moves to other goals, and from other starts; "additive" is the paper's. "safe" takes tau where there is
+        no ``duration``.
+
+    Raises
+    ------
+    ValueError
+        If a parameter is not as described.
+
+    References
+    ----------
+    A. Ijspeert, J. Nakanishi, H. Hoffmann, P. Pastor, S. Schaal, "Dynamical movement primitives: learning
+    attractor models for motor behaviors", Neural Computation 25, 2013.
+
+    Examples
+    --------
+    >>> import torch
+    >>> dmp = DMP(duration=1.0)
+    >>> position, velocity = dmp.rollout(torch.zeros(3001, 1).double(), 0.001, goal=torch.ones(1).double())
+    >>> bool((position.diff(dim=0) > -1e-12).all() and position.max() < 1.0 + 1e-12), round(float(position[-1]), 4)
+    (True, 1.0)
+    """
+
+    def __init__(
+        self,
+        alpha: float = 25.0,
+        beta: float | None = None,
+        gamma: float = 0.7,
+        tau: float = 1.0,
+        *,
+        duration: float | None = None,
+        gate: Gate = "time",
+        adaptation: Adaptation = "safe",
+    ) -> None:
+        check_positive("alpha", alpha)
+        beta = alpha / 4.0 if beta is None else beta
+        named = {"beta": beta, "gamma": gamma, "tau": tau}
+        if duration is not None:
+            named["duration"] = duration
+        for name, value in named.items():
+            check_positive(name, value)
+        for name, choice, kind in (("gate", gate, Gate), ("adaptation", adaptation, Adaptation)):
+            if choice not in get_args(kind):
+                raise ValueError(f"{name} == {choice!r}, must be one of {', '.join(map(repr, get_args(kind)))}.")
+        self.alpha, self.beta, self.gamma, self.tau = alpha, beta, gamma, tau
+        self.duration, self.gate, self.adaptation = duration, gate, adaptation
+
+    def __repr__(self) -> str:
+        return (
+            f"DMP(alpha={self.alpha:g}, beta={self.beta:g}, gamma={self.gamma:g}, tau={self.tau:g}, "
+            f"duration={self.duration}, gate={self.gate!r}, adaptation={self.adaptation!r})"
+        )
+
+    def phase(self, time: Tensor | Any) -> Tensor:
+        """Phase s of eq. (17) at ``time`` in s: its solution ``exp(-gamma time / tau)``, never integrated."""
+        return torch.exp(-self.gamma * as_tensor(time, "time") / self.tau)
+
+    def gate_at(self, time: Tensor | Any) -> Tensor:
+        """What the forcing is multiplied by at ``time`` in s: 1 up to ``duration``."""
+        time = as_tensor(time, "time")
+        if self.gate == "none" or self.duration is None:
+            return torch.ones_like(time)
+        if self.gate == "phase":
+            return self.phase((time - self.duration).clamp_min(0.0))
+        u = ((time - self.duration) / (0.1 * self.duration)).clamp(0.0, 1.0)
+        return 1.0 - u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
+
+    def forcing(
+        self,
+        position: Float[Tensor, "*b d"] | Any,
+        velocity: Float[Tensor, "*b d"] | Any,
+        acceleration: Float[Tensor, "*b d"] | Any,
+        goal: Float[Tensor, "*g d"] | Any,
+    ) -> Float[Tensor, "*b d"]:
+        """Forcing that makes the primitive move like this: eq. (18), in the units of position.
+
+        Raises
+        ------
+        ValueError
+            If shapes disagree, or a value is not finite.
+        """
+        position, goal = as_rows(position, "position", 1), as_rows(goal, "goal", 1)
+        velocity, acceleration = as_rows(velocity, "velocity", 1), as_rows(acceleration, "acceleration", 1)
+        for name, value in (("velocity", velocity), ("acceleration", acceleration), ("goal", goal)):
+            if not broadcasts(value, position) or (name != "goal" and value.shape != position.shape):
+                raise ValueError(
+                    f"{name} has shape {tuple(value.shape)}, but position has shape {tuple(position.shape)}: they must "
+                    "be of the same movements and outputs."
+                )
+        spring = self.beta * (goal - position) - self.tau * velocity
+        return self.tau**2 * acceleration - self.alpha * spring
+
+    def rollout(
+        self,
+        forcing: Float[Tensor, "*b t d"] | Callable[[Tensor], Tensor] | Any,
+        dt: float | Any,
+        *,
+        goal: Tensor | Any,
+        position0: Float[Tensor, "*s d"] | Any = None,
+        velocity0: Float[Tensor, "*s d"] | Any = None,
+        demonstrated_start: Float[Tensor, "*s d"] | Any = None,
+        demonstrated_goal: Float[Tensor, "*s d"] | Any = None,
+        speed: Float[Tensor, " t"] | Any = None,
+        n_steps: int | Any = None,
+        integrator: Literal["exact", "rk4"] | Any = "exact",
+    ) -> tuple[Float[Tensor, "*o t d"], Float[Tensor, "*o t d"]]:
+        """Position and velocity at ticks of ``dt`` seconds.
+
+        Parameters
+        ----------
+        forcing : Tensor of shape (..., T, d), or callable
+            At the ticks, before the gate; "exact" solves for forcing that is linear between ticks (first-order
+            hold). A callable maps movement times (m,) in s to (..., m, d), and needs ``n_steps``.
+        dt : float
+            In s.
+        goal : Tensor of shape (d,), (..., 1, d) or (..., T, d)
+            One goal, or the goal held over each tick: it may change at run time.
+        position0, velocity0 : Tensor of shape (..., d), default=None
+            State at the start; None is the origin, at rest.
+        demonstrated_start, demonstrated_goal : Tensor of shape (..., d), default=None
+            Of the movement that forcing and ``velocity0`` are of, for "safe"; None: ``position0`` and the first goal.
+        speed : Tensor of shape (T,), default=None
+            How fast movement time passes at each tick, linear between: 0.5 takes twice as long. The path is the
+            same at every speed, so the duration changes at run time without overshoot; a speed that jumps makes
+            the velocity jump. ``velocity0`` is that at speed[0].
+        n_steps : int, default=None
+            T, where ``forcing`` is a callable.
+        integrator : {"exact", "rk4"}, default="exact"
+            "rk4" is Runge and Kutta's, of order 4 where ``forcing`` is a smooth callable.
+
+        Raises
+        ------
+        ValueError
+            If a shape is wrong, a value is not finite, or a speed is negative.
+        """
+        forcing, n_ticks = _checked_forcing(forcing, n_steps)
+        goal = as_rows(goal, "goal", 1)
+        starts = {"position0": position0, "velocity0": velocity0}
+        places = {**starts, "demonstrated_start": demonstrated_start, "demonstrated_goal": demonstrated_goal}
+        given = {name: as_rows(place, name, 1) for name, place in places.items() if place is not None}
+        if integrator not in ("exact", "rk4"):
+            raise ValueError(f"integrator == {integrator!r}, must be 'exact' or 'rk4'.")
+        time, steps, passing = _movement_time(n_ticks, dt, speed, goal)
+        at_ticks = (_called(forcing, time) if callable(forcing) else forcing) * self.gate_at(time)[:, None]
+        goals = goal if goal.ndim > 1 else goal[None]
+        shape = run_shape(at_ticks, {"goal": goals, **{name: place[..., None, :] for name, place in given.items()}})
+        at_ticks, goals = at_ticks.expand(shape), goals.expand(shape)
+        start, velocity = (given.get(name, goal.new_zeros(shape[-1])) for name in ("position0", "velocity0"))
+        if passing[0] == 0.0 and bool((velocity != 0.0).any()):
+            raise ValueError("velocity0 must be 0 where speed[0] is 0: no movement time passes there.")
+        own_start, own_goal = given.get("demonstrated_start", start), given.get("demonstrated_goal", goals[..., 0, :])
+        same = bool((own_start == start).all() and (goals == own_goal[..., None, :]).all())
+        safe = self.adaptation == "safe" and not same
+        driven = own_goal[..., None, :].expand(shape) if safe else goals
+        scaled = self.tau * velocity / passing[0].clamp_min(1e-12)
+        begin = torch.stack([each.expand(*shape[:-2], -1) for each in (own_start if safe else start, scaled)], dim=-1)
+        solve = (
+            self._exact if integrator == "exact" else partial(self._runge_kutta, self._midway(forcing, at_ticks, time))
+        )
+        trace = solve(at_ticks, driven, steps, begin)
+        position, rate = trace[..., 0], trace[..., 1] / self.tau
+        if safe:
+            spring = self.beta * (driven - position) - trace[..., 1]
+            path = position, rate, (self.alpha * spring + at_ticks) / self.tau**2
+            ends = {"own_goal": own_goal, "goals": goals, "start": start}
+            position, rate = adapt(path, time, (position, time), **ends, duration=self.duration or self.tau)
+        return position, rate * passing[:, None]
+
+    def _midway(self, forcing: Any, at_ticks: Tensor, time: Tensor) -> Tensor:
+        """Gated forcing in the middle of each tick."""
+        if not callable(forcing):
+            return 0.5 * (at_ticks[..., 1:, :] + at_ticks[..., :-1, :])
+        halfway = 0.5 * (time[1:] + time[:-1])
+        return _called(forcing, halfway) * self.gate_at(halfway)[:, None]
+
+    def _rate(self, like: Tensor) -> Tensor:
+        """Matrix of ``[x, z]' = rate @ [x, z, goal, forcing]``."""
+        alpha, beta, tau = self.alpha, self.beta, self.tau
+        rows = [[0.0, 1.0, 0.0, 0.0], [-alpha * beta, -alpha, alpha * beta, 1.0]]
+        return torch.tensor(rows, dtype=like.dtype, device=like.device) / tau
+
+    def _exact(self, forcing: Tensor, goals: Tensor, steps: Tensor, state: Tensor) -> Tensor:
+        """Exact for forcing that is linear between ticks and goals held over them."""
+        lengths, index = steps.unique(return_inverse=True)  # mostly one
+        rate = state.new_zeros(len(lengths), 5, 5)
+        rate[:, :2, :4] = self._rate(state) * lengths[:, None, None]
+        rate[:, 3, 4] = 1.0  # the forcing rises by the last component
+        maps = torch.linalg.matrix_exp(rate)[:, :2]
+        states = [state]
+        for tick, kind in enumerate(index.tolist()):
+            rise = forcing[..., tick + 1, :] - forcing[..., tick, :]
+            inputs = torch.stack([goals[..., tick, :], forcing[..., tick, :], rise], dim=-1)
+            state = torch.cat([state, inputs], dim=-1) @ maps[kind].mT
+            states.append(state)
+        return torch.stack(states, dim=-3)
+
+    def _runge_kutta(self, midway: Tensor, forcing: Tensor, goals: Tensor, steps: Tensor, state: Tensor) -> Tensor:
+        rate = self._rate(state).mT
+
+        def slope(now: Tensor, force: Tensor, tick: int) -> Tensor:
+            return torch.cat([now, torch.stack([goals[..., tick, :], force], dim=-1)], dim=-1) @ rate
+
+        states = [state]
+        for tick, step in enumerate(steps.tolist()):
+            k1 = slope(state, forcing[..., tick, :], tick)
+            k2 = slope(state + 0.5 * step * k1, midway[..., tick, :], tick)
+            k3 = slope(state + 0.5 * step * k2, midway[..., tick, :], tick)
+            k4 = slope(state + step * k3, forcing[..., tick + 1, :], tick)
+            state = state + step / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+            states.append(state)
+        return torch.stack(states, dim=-3)
+
+
+def _checked_forcing(forcing: Any, n_steps: Any) -> tuple[Any, int]:
+    """Forcing as it is to be asked for, and the number of ticks."""
+    if not callable(forcing):
+        rows = as_rows(forcing, "forcing", 2)
+        return rows, rows.shape[-2]
+    check_count("n_steps", n_steps, 1)
+    require_much(100.0 * n_steps, what=f"n_steps == {n_steps}", remedy="Take fewer.")
+    return forcing, n_steps
+
+
+def _called(forcing: Callable[[Tensor], Any], time: Tensor) -> Tensor:
+    """Forcing (..., m, d) at times (m,), of a callable."""
+    value = as_tensor(forcing(time), "forcing(time)")
+    if value.ndim < 2 or value.shape[-2] != len(time) or not bool(torch.isfinite(value.detach()).all()):
+        raise ValueError(
+            f"forcing(time) has shape {tuple(value.shape)}, must have shape (..., {len(time)}, d), all of it finite."
+        )
+    return value
+
+
+def _movement_time(n_ticks: int, dt: float, speed: Any, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Movement time at the ticks, from each to the next, and how fast it passes at them."""
+    check_positive("dt", dt, "s")
+    if speed is None:
+        return torch.arange(n_ticks).to(like) * dt, like.new_full((n_ticks - 1,), dt), like.new_ones(n_ticks)
+    speed = as_tensor(speed, "speed")
+    if speed.shape != (n_ticks,) or not bool((torch.isfinite(speed) & (speed >= 0.0)).all()):
+        raise ValueError(f"speed has shape {tuple(speed.shape)}, must be {n_ticks} finite numbers, none negative.")
+    passing = speed.to(like)
+    steps = 0.5 * (passing[1:] + passing[:-1]) * dt
+    return torch.cat([steps.new_zeros(1), steps.cumsum(0)]), steps, passing

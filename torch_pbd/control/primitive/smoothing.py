@@ -1,0 +1,193 @@
+"""Positions, velocities and accelerations of recorded movements, at their true times, by smoothing splines."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline, CubicHermiteSpline, make_interp_spline, make_smoothing_spline
+
+from torch_pbd.control.primitive.coverage import UNKNOWN, holes_of, spacing_of, unsampled
+from torch_pbd.data import Demonstrations
+from torch_pbd.data.alignment import interpolate
+
+Floats = NDArray[np.float64]
+
+CUTOFF_HZ = 4.0
+"""Cutoff of slow movements: hands move below it, and tremor (8 to 12 Hz) and encoders' steps are above."""
+
+CUTOFF_CYCLES = 40.0
+"""Least cutoff of any movement, in cycles a movement: fast ones have detail above 4 Hz."""
+
+_LEAST_SAMPLES = {True: 5, False: 3}
+_MOST_BEYOND = 0.1  # of the range of an output in all recordings; paths through holes keep half of it
+
+
+@dataclass(frozen=True)
+class Movements:
+    """K movements at n common movement times, derivatives with respect to movement time.
+
+    Attributes
+    ----------
+    time : ndarray of shape (n,)
+        From 0 to the duration, s; each demonstration is stretched to it linearly.
+    position, velocity, acceleration : ndarray of shape (K, n, d)
+    recorded_mean : ndarray of shape (n, d)
+        Mean position as it was recorded, not smoothed, but for holes.
+    bounds : ndarray of shape (2, d)
+        Lowest and highest position of all recordings.
+    known : ndarray of shape (K, n)
+        Where each has samples near.
+    noise_scale : ndarray of shape (d,)
+        Root mean square of what the smoothing took away, in the units of position.
+    """
+
+    time: Floats
+    position: Floats
+    velocity: Floats
+    acceleration: Floats
+    recorded_mean: Floats
+    bounds: Floats
+    known: NDArray[np.bool_]
+    noise_scale: Floats
+
+
+def smooth(
+    demonstrations: Demonstrations, cutoff: float | None, n_steps: int, duration: float, *, noise: bool = False
+) -> Movements:
+    """Smooth each demonstration, and sample all at ``n_steps`` common movement times.
+
+    With a cutoff each output is the cubic smoothing spline whose weight halves the amplitude at the cutoff: at
+    even sampling it is a Butterworth filter of second order run forward and backward, and it takes the times
+    as they are, even or not. Without one it is the spline of degree 5 (3 below six samples) through all
+    samples: exact for polynomials, and noise goes through, times the square of its frequency in the
+    acceleration.
+
+    In a hole it follows the mean of those that have none there, plus the least bent curve that joins the differences
+    from it on both sides, a cubic; not beyond the recorded range by more than a twentieth of it.
+
+    Parameters
+    ----------
+    demonstrations : Demonstrations
+    cutoff : float or None
+        In Hz of movement time.
+    n_steps : int
+    duration : float
+        Of the movement, s: each demonstration is stretched to it, and a cutoff with the median of them.
+    noise : bool, default=False
+        Whether it is noise, which may leave its range.
+
+    Raises
+    ------
+    ValueError
+        If a demonstration has too few samples, or leaves the recorded range of an output by a tenth of it.
+    """
+    least = _LEAST_SAMPLES[cutoff is not None]
+    for number, n_samples in enumerate(demonstrations.n_steps):
+        if n_samples < least:
+            purpose = "to be smoothed, or cutoff=None for 3" if cutoff is not None else "for an acceleration"
+            raise ValueError(
+                f"demonstration {number} has {n_samples} samples, needs at least {least} {purpose}: leave it out, or "
+                "record it at a higher rate."
+            )
+    durations = [time[-1] - time[0] for time in demonstrations.times]
+    own_cutoff = None if cutoff is None else cutoff * duration / float(np.median(durations))
+    samples = np.concatenate(demonstrations.positions)
+    bounds = np.stack([samples.min(axis=0), samples.max(axis=0)])
+    splines = _splines(demonstrations, own_cutoff, bounds)
+    grid = np.linspace(0.0, duration, n_steps)
+    motions, removed, recorded, known = [], [], [], []
+    for (time, position), lasting, spline in zip(demonstrations, durations, splines, strict=True):
+        stretch = lasting / duration
+        own = np.clip(grid * stretch, 0.0, lasting)
+        motions.append([spline(own, order) * stretch**order for order in range(3)])
+        removed.append(position - spline(time - time[0]))
+        known.append(unsampled(time - time[0], own) <= UNKNOWN)
+        sampled = interpolate(time - time[0], position, own)
+        recorded.append(np.where(known[-1][:, np.newaxis], sampled, motions[-1][0]))
+    position, velocity, acceleration = (np.stack(parts) for parts in zip(*motions, strict=True))
+    if not noise:
+        for number, path in enumerate(position):
+            check_range(path, bounds, f"demonstration {number}, smoothed,")
+    noise_scale = np.sqrt(np.mean(np.concatenate(removed) ** 2, axis=0))
+    mean = np.mean(recorded, axis=0)
+    return Movements(grid, position, velocity, acceleration, mean, bounds, np.stack(known), noise_scale)
+
+
+def check_range(path: Floats, bounds: Floats, name: str) -> None:
+    """Raise if a path (n, d) leaves the recorded bounds (2, d) of an output by more than a tenth of its range."""
+    beyond = np.maximum(bounds[0] - path, path - bounds[1]).max(axis=0) - 1e-11 * np.abs(bounds).max(axis=0)
+    ranges = np.ptp(bounds, axis=0)
+    if (beyond > _MOST_BEYOND * ranges).any():
+        output = int(np.argmax(beyond - _MOST_BEYOND * ranges))
+        raise ValueError(
+            f"{name} leaves the recorded range of output {output}, {ranges[output]:.3g}, by {beyond[output]:.3g}, must "
+            f"stay within {_MOST_BEYOND:g} of it: lower the cutoff, take phase_input='time', or correct times that are "
+            "too close to others or not in time_unit."
+        )
+
+
+def _splines(demonstrations: Demonstrations, cutoff: float | None, bounds: Floats) -> list[BSpline]:
+    """Spline of each demonstration over its time from its start."""
+    times, margin = [time - time[0] for time in demonstrations.times], 0.5 * _MOST_BEYOND * np.ptp(bounds, axis=0)
+    splines = [_spline(*of_one, cutoff) for of_one in zip(times, demonstrations.positions, strict=True)]
+    bridged = list(splines)
+    for number, (time, filled) in enumerate(zip(times, demonstrations.positions, strict=True)):
+        samples = time
+        for edges in [time[i : i + 2] for i in holes_of(time)]:
+            inner = np.linspace(edges[0], edges[1], round(np.ptp(edges) / spacing_of(time)) + 1)[1:-1]
+            path = np.clip(_through(splines, times, number, edges, inner), bounds[0] - margin, bounds[1] + margin)
+            after = np.searchsorted(samples, inner)
+            samples, filled = np.insert(samples, after, inner), np.insert(filled, after, path, axis=0)
+        if len(samples) > len(time):
+            bridged[number] = _spline(samples, filled, cutoff)
+    return bridged
+
+
+def _through(splines: list[BSpline], times: list[Floats], number: int, edges: Floats, inner: Floats) -> Floats:
+    """Path of one demonstration at times ``inner`` of its hole between ``edges``."""
+    rates = [time[-1] / times[number][-1] for time in times]
+    knowing = [k for k, time in enumerate(times) if unsampled(time, rates[k] * inner).max() <= UNKNOWN]
+
+    def known(at: Floats, order: int = 0) -> Any:
+        return sum(splines[k](rates[k] * at, order) * rates[k] ** order for k in knowing) / max(1, len(knowing))
+
+    own = splines[number]
+    return known(inner) + CubicHermiteSpline(edges, own(edges) - known(edges), own(edges, 1) - known(edges, 1))(inner)
+
+
+def _spline(time: Floats, position: Floats, cutoff: float | None) -> BSpline:
+    if cutoff is None:
+        return make_interp_spline(time, position, k=5 if len(time) > 5 else min(3, len(time) - 1))
+    # Weights by the spacing make the sum an integral: lam = 1 / w^4 then halves the amplitude at w. In units of
+    # the mean spacing and of each output's spread, which keeps the spline's equations well conditioned. A sample
+    # beside a hole stands for no more time than others: it would count as free of noise.
+    between = np.diff(time)
+    between[holes_of(time)] = spacing_of(time)
+    spacing = np.gradient(np.r_[0.0, np.cumsum(between)])
+    unit = spacing.mean()
+    offset = position.mean(axis=0)
+    spread = np.ptp(position, axis=0)
+    scale = np.where(spread > 0.0, spread, 1.0)
+    weight = 1.0 / (2.0 * np.pi * cutoff * unit) ** 4
+    smoothed = make_smoothing_spline(time / unit, (position - offset) / scale, spacing / unit, weight)
+    return BSpline(smoothed.t * unit, smoothed.c * scale + offset, smoothed.k)
+
+
+def automatic_cutoff(duration: float, *, knows_seconds: bool) -> float:
+    """40 cycles a movement of ``duration`` s; where the recordings tell seconds, not below 4 Hz."""
+    return max(CUTOFF_HZ if knows_seconds else 0.0, CUTOFF_CYCLES / duration)
+
+
+def noise_like(demonstrations: Demonstrations, noise_scale: Floats) -> Demonstrations:
+    """White noise of that scale at the sampling times of the demonstrations: what smoothing makes of it is noise."""
+    random = np.random.default_rng(0)
+    noise = [random.normal(size=(n, demonstrations.n_outputs)) * noise_scale for n in demonstrations.n_steps]
+    return Demonstrations(demonstrations.times, noise, time_unit=demonstrations.time_unit)
+
+
+def variance_share(part: Floats, whole: Floats) -> Floats:
+    """Variance between demonstrations of one set of movements (K, n, d) over that of another, (d,), at most 1."""
+    variance = whole.var(axis=0, ddof=1).mean(axis=0)
+    share = part.var(axis=0, ddof=1).mean(axis=0) / np.where(variance > 0.0, variance, np.inf)
+    return np.minimum(share, 1.0)

@@ -1,0 +1,290 @@
+"""What a controller is told over time: where to be, how stiff and how damped, and how sure the model was."""
+
+import os
+from collections.abc import Mapping
+from dataclasses import KW_ONLY, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self, final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from torch_pbd.control.schedule.contents import (
+    ARRAY_DIMS,
+    LABELS,
+    Floats,
+    as_floats,
+    check_positive,
+    checked_fields,
+    require,
+)
+from torch_pbd.control.schedule.files import read_schedule, write_schedule
+from torch_pbd.control.schedule.rows import Between, count_rows, row_times
+from torch_pbd.files.memory import require_much
+
+if TYPE_CHECKING:
+    from torch_pbd.control.stability.report import StabilityReport
+
+_SLOWEST = 1e-9
+
+
+@final
+@dataclass(frozen=True)
+class DiagonalLoss:
+    """What is lost where a controller takes the diagonals of stiffness and damping only; all 0 if nothing is.
+
+    Attributes
+    ----------
+    stiffness_max, stiffness_median, damping_max, damping_median : float
+        Frobenius norm of what is off the diagonal over that of the whole; largest and median over time.
+    displacement, time : float
+        Largest ||x - x_diagonal|| / ||x|| over all forces and times, where the force displaces the robot by x
+        with the whole stiffness, and when that is, in s. 1 is an error as large as the displacement.
+    """
+
+    stiffness_max: float
+    stiffness_median: float
+    damping_max: float
+    damping_median: float
+    displacement: float
+    time: float
+
+    def __str__(self) -> str:
+        return (
+            f"diagonal gains lose {self.stiffness_max:.1%} of the stiffness (median {self.stiffness_median:.1%}), "
+            f"{self.damping_max:.1%} of the damping (median {self.damping_median:.1%}); displacements under a force "
+            f"are off by up to {self.displacement:.1%}, at {self.time:.6g} s"
+        )
+
+
+@final
+@dataclass(frozen=True, eq=False, repr=False)
+class Schedule:
+    """Position, velocity, stiffness and damping over time, with the covariance they come from.
+
+    Between its rows it is what `resample` says. It is immutable; its arrays are read-only float64 copies.
+
+    Parameters
+    ----------
+    time : array_like of shape (n,)
+        In s, strictly increasing, n >= 2.
+    position, velocity : array_like of shape (n, d)
+        Desired, in ``units`` and ``units``/s.
+    stiffness, damping : array_like of shape (n, d, d)
+        In N/m and N s/m, symmetric and positive semidefinite. Where the stiffness is singular, the damping
+        must be positive definite: nothing else would stop the robot.
+    covariance : array_like of shape (n, d, d)
+        Of the demonstrations; symmetric and positive semidefinite.
+    type1 : array_like of shape (n,)
+        How little the model knows: 0 (on data) to 1 (the prior alone).
+    names : sequence of d str, default=None
+        Of the outputs.
+    units, frame : str, default="m", None
+        Unit of the position, name of the coordinate frame; None where it is not told.
+    stiffness_limits : (float, float), default=None
+        Least and largest eigenvalue that the stiffness may have, in N/m.
+    covariance_of : {"position", "forcing"}, default="position"
+        What the covariance is of: a forcing is that of eq. (18).
+    mass : float, default=None
+        Virtual mass of the admittance that the damping was computed for, kg.
+    provenance : mapping, default={}
+        Whatever JSON can hold about where the schedule comes from.
+
+    Raises
+    ------
+    ValueError
+        If an argument is not as described; names the row.
+    """
+
+    time: Floats
+    position: Floats
+    velocity: Floats
+    stiffness: Floats
+    damping: Floats
+    covariance: Floats
+    type1: Floats
+    _: KW_ONLY
+    names: tuple[str, ...] | None = None
+    units: str | None = "m"
+    frame: str | None = None
+    stiffness_limits: tuple[float, float] | None = None
+    covariance_of: str = "position"
+    mass: float | None = None
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, value in checked_fields(vars(self)).items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def n_outputs(self) -> int:
+        """Number of outputs d."""
+        return self.position.shape[1]
+
+    @property
+    def duration(self) -> float:
+        """From the first row to the last, in s."""
+        return float(self.time[-1] - self.time[0])
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Schedule):
+            return NotImplemented
+        arrays = zip(self._arrays().values(), other._arrays().values(), strict=True)
+        return self._labels() == other._labels() and all(np.array_equal(*pair) for pair in arrays)
+
+    def __repr__(self) -> str:
+        eigenvalues = np.linalg.eigvalsh(self.stiffness)
+        outputs = f"names={self.names}" if self.names else f"n_outputs={self.n_outputs}"
+        return (
+            f"Schedule(n={len(self)}, {outputs}, time={self.time[0]:.6g}..{self.time[-1]:.6g} s, "
+            f"stiffness={eigenvalues.min():.4g}..{eigenvalues.max():.4g} N/m, frame={self.frame!r})"
+        )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # By way of the constructor: NumPy forgets that an array is read-only when it is pickled or copied.
+        return partial(Schedule, **self._arrays(), **self._labels()), ()
+
+    def resample(self, rate: float | None = None, *, times: ArrayLike | None = None) -> "Schedule":
+        """Rows at other times, all within the schedule.
+
+        Stiffness, damping, covariance and type1 are piecewise linear, so they stay symmetric, positive
+        semidefinite and within their limits. The position is the cubic of each interval that has the positions
+        and velocities of its ends (Hermite), the velocity the derivative of that cubic and not a straight line:
+        it stays the velocity of the position, and damping acts on no motion that the position does not make.
+
+        Parameters
+        ----------
+        rate : float, default=None
+            In Hz: rows every 1/rate from the first time on, and one at the end.
+        times : array_like of shape (m,), default=None
+            Strictly increasing, m >= 2, in s; either this or ``rate``. What the rows say in between is lost.
+
+        Raises
+        ------
+        ValueError
+            If not exactly one is given, ``rate`` leaves less than two rows, or a time is outside.
+        """
+        if (rate is None) == (times is None):
+            raise ValueError(f"give either rate or times; got rate={rate!r} and times={times!r}.")
+        grid = self._ticks(rate) if rate is not None else as_floats(times, "times", 1)
+        first, last = self.time[0], self.time[-1]
+        require((grid >= first) & (grid <= last), grid, "times", f"it must be within {first!s} and {last!s} s.")
+        between = Between(self.time, grid)
+        position, velocity = between.hermite(self.position, self.velocity)
+        rows: dict[str, Any] = {name: between.linear(array) for name, array in self._arrays().items()}
+        rows |= {"time": grid, "position": position, "velocity": velocity}
+        return Schedule(**rows, **self._labels())
+
+    def retime(self, speed: float, *, mass: Any = None) -> "Schedule":
+        """The same schedule ``speed`` times as fast: time / speed, velocity * speed, gains as they are.
+
+        Parameters
+        ----------
+        speed : float
+            Positive; the stiffness rises that much faster too.
+        mass : float or array_like of shape (d, d), default=None
+            Of the admittance in kg, to compute the stability certificate at the new speed. None: not checked.
+
+        Raises
+        ------
+        ValueError
+            If ``speed`` is not positive, or none of the guarantees of the report holds at it with ``mass``.
+        """
+        check_positive("speed", speed)
+        if not _SLOWEST <= speed <= 1.0 / _SLOWEST:
+            raise ValueError(f"speed={speed:g} must be from {_SLOWEST:g} to {1.0 / _SLOWEST:g} times as fast.")
+        report = None if mass is None else self.certify(mass=mass, speed=speed)
+        if report is not None and not report.stable:
+            why = f"its margin is {report.margin:.4g} N/m/s. The highest safe speed is {report.max_speed:.4g}"
+            if report.margin >= 0.0:
+                why = f"held between rows, its gains let V grow by {report.held_growth - 1.0:.2g}. Resample it finer"
+            raise ValueError(
+                f"speed={speed:g} is not certified to be stable: {why}; or filter the stiffness, and give no mass here."
+            )
+        return replace(self, time=self.time / speed, velocity=self.velocity * speed)
+
+    def certify(self, *, mass: Any = None, **options: Any) -> "StabilityReport":
+        """`torch_pbd.control.certify` of this schedule, whose options it takes; no mass is its own, or 1 kg."""
+        from torch_pbd.control.stability.certify import certify  # here: it needs torch, a schedule does not
+
+        return certify(self, mass=(self.mass or 1.0) if mass is None else mass, **options)
+
+    def diagonal(self) -> tuple["Schedule", DiagonalLoss]:
+        """With diagonal stiffness and damping, for controllers that take no other, and what that loses.
+
+        The nearest diagonal matrix, in the Frobenius norm, is the diagonal itself. It lies between the least and
+        the largest eigenvalue, so within the limits too.
+        """
+        stiffness, damping = _diagonal(self.stiffness), _diagonal(self.damping)
+        # x = K^-1 f and x_diagonal = D^-1 f differ by (I - D^-1 K) x: by its spectral norm, for the worst x.
+        gains = np.diagonal(stiffness, axis1=1, axis2=2)[..., np.newaxis]
+        coupling = (stiffness - self.stiffness) / np.where(gains > 0.0, gains, 1.0)
+        displacement = np.linalg.norm(coupling, ord=2, axis=(1, 2))
+        worst = int(displacement.argmax())
+        loss = DiagonalLoss(
+            *_relative_loss(self.stiffness, stiffness),
+            *_relative_loss(self.damping, damping),
+            displacement=float(displacement[worst]),
+            time=float(self.time[worst]),
+        )
+        return replace(self, stiffness=stiffness, damping=damping), loss
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write one file, in the format of its suffix: .npz, .json or .csv.
+
+        All of them hold everything to the last bit, with a version and a checksum. In .csv the labels are lines
+        ``# key: JSON`` before the header, matrices their upper triangles, ``stiffness[x][y]``. The file appears
+        whole or not at all, and replaces one that is there.
+
+        Raises
+        ------
+        ValueError, OSError
+            If the suffix is another; if the file cannot be written.
+        """
+        write_schedule(Path(path), self._arrays(), self._labels())
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Self:
+        """Read what `save` wrote; nothing in the file is executed.
+
+        Raises
+        ------
+        FileNotFoundError, ValueError
+            If there is no such file; if its suffix is none of .npz, .json and .csv.
+        ModelFileError
+            If the file is torn, changed, of a newer version, or does not hold a schedule. A .csv that was
+            edited on purpose loads once its line ``# sha256: ...`` is deleted.
+        """
+        return read_schedule(Path(path), build=cls)
+
+    def _arrays(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in ARRAY_DIMS}
+
+    def _labels(self) -> dict[str, Any]:
+        return {**{name: getattr(self, name) for name in LABELS}, "provenance": dict(self.provenance)}
+
+    def _ticks(self, rate: float) -> Floats:
+        check_positive("rate", rate)
+        d, rows = self.n_outputs, self.duration * rate + 1.0
+        require_much(3 * 8.0 * rows * (2 + 2 * d + 3 * d * d), what=f"rate={rate:g} Hz", remedy="Lower rate.")
+        if count_rows(self.duration, rate) < 2:
+            raise ValueError(
+                f"rate={rate:g} Hz has one row in {self.duration:g} s: take {1 / self.duration:g} or more."
+            )
+        return np.append(self.time[0] + row_times(self.duration, rate)[:-1], self.time[-1])
+
+
+def _diagonal(matrices: Floats) -> Floats:
+    """Only the diagonals, without what rounding left below zero."""
+    return np.eye(matrices.shape[1]) * np.maximum(matrices, 0.0)
+
+
+def _relative_loss(matrices: Floats, diagonal: Floats) -> tuple[float, float]:
+    """Frobenius norm of what is lost relative to the whole, 0 where all is zero: largest and median over time."""
+    whole = np.linalg.norm(matrices, axis=(1, 2))
+    loss = np.linalg.norm(matrices - diagonal, axis=(1, 2)) / np.where(whole > 0.0, whole, 1.0)
+    return float(loss.max()), float(np.median(loss))

@@ -1,0 +1,1 @@
+"""The simulated robot: plant, walls, force sensor, pushes, and what becomes of them."""

@@ -1,0 +1,226 @@
+"""Online filters that keep a varying stiffness from feeding energy into the robot.
+
+Both stand between the stiffness that is asked for and the one in effect, at every tick, and take the largest
+share of the step that their invariant allows. Damping steps by the same share. State and gains are those of
+``M a = u - K y - D v`` held over a tick, y the deviation from the desired position.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Protocol, final
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torch_pbd.control.matrices import check_finite
+from torch_pbd.control.simulation.transitions import admittance_rate, transition
+from torch_pbd.linalg import symmetrize
+
+_MARGIN = 1e-13  # of a share: what its own rounding may cost
+
+
+@dataclass(frozen=True)
+class Gains:
+    """Stiffness and damping in effect, (..., d, d), and the share (...) of the step towards the wanted ones."""
+
+    stiffness: Tensor
+    damping: Tensor
+    share: Tensor
+
+
+class StiffnessFilter(Protocol):
+    """What :class:`~torch_pbd.control.AdmittancePlant` asks of a filter."""
+
+    def start(self, stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> "ActiveFilter":
+        """Begin a run over the wanted gains (..., T, d, d)."""
+
+
+class ActiveFilter(Protocol):
+    """A filter in a run."""
+
+    tank_energy: Tensor | None
+
+    def select(self, stiffness: Tensor, damping: Tensor, deviation: Tensor, velocity: Tensor) -> Gains:
+        """Gains for this tick, of the wanted ones (..., d, d) and the state (..., d) at its start."""
+
+    def settle(self, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor], force: Tensor) -> None:
+        """Take note of the tick: (deviation, velocity) at its start and end, and the force held in it."""
+
+
+@final
+@dataclass(frozen=True)
+class RateLimit:
+    """Raise the stiffness no faster than a common Lyapunov function allows.
+
+    ``V = 1/2 (v + a y)' M (v + a y) + 1/2 y' (K + a D - a^2 M) y`` does not grow from one tick to the next
+    without an external force, whatever the schedule asks for: the discrete form, for gains held over a tick, of
+    the conditions of K. Kronander and A. Billard, "Stability considerations for variable impedance control",
+    IEEE Transactions on Robotics 32, 2016. It needs no measurement. The admittance is passive with respect to
+    ``v + a y`` and a force that is held over each tick; behind a position loop that lags, a robot need not be.
+
+    Parameters
+    ----------
+    alpha : float, default=None
+        The constant a, in 1/s, below the smallest eigenvalue of ``M^-1/2 D M^-1/2`` in the schedule; None is
+        half of that. The larger, the faster the stiffness may rise.
+    """
+
+    alpha: float | None = None
+
+    def __post_init__(self) -> None:
+        check_finite("alpha", self.alpha, optional=True)
+
+    def start(self, stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> "_RateLimited":
+        """Begin a run over the wanted gains (..., T, d, d).
+
+        Raises
+        ------
+        ValueError
+            If alpha is not below what the damping of the schedule allows, or the stiffness is not positive.
+        """
+        inverse = torch.linalg.inv(torch.linalg.cholesky(mass))
+        limit = float(torch.linalg.eigvalsh(symmetrize(inverse @ damping @ inverse.mT)).min())
+        alpha = 0.5 * limit if self.alpha is None else self.alpha
+        if not 0.0 < alpha < limit:
+            raise ValueError(
+                f"alpha == {alpha:g} /s, must be above 0 and below {limit:g} /s, the smallest damping over mass of "
+                "the schedule. Leave it None, or damp more."
+            )
+        if float(torch.linalg.eigvalsh(stiffness).min()) <= 0.0:
+            raise ValueError("stiffness must be positive definite for a rate limit: a free axis has no equilibrium.")
+        return _RateLimited(alpha, mass, dt)
+
+
+class _RateLimited:
+    tank_energy: Tensor | None = None
+
+    def __init__(self, alpha: float, mass: Tensor, dt: float) -> None:
+        self._alpha, self._mass, self._dt = alpha, mass, dt
+        self._gains: Gains | None = None
+
+    def select(self, stiffness: Tensor, damping: Tensor, deviation: Tensor, velocity: Tensor) -> Gains:
+        last = self._gains
+        if last is None:
+            self._gains = Gains(stiffness, damping, stiffness.new_ones(stiffness.shape[:-2]))
+            return self._gains
+        rise = stiffness - last.stiffness + self._alpha * (damping - last.damping)
+        self._gains = _partway(last, stiffness, damping, self._largest_share(last, rise))
+        return self._gains
+
+    def _largest_share(self, last: Gains, rise: Tensor) -> Tensor:
+        """Largest s in [0, 1] for which the tick that was pays for the step s dP of the function.
+
+        Whatever its state x at the start and its force f: ``E' (P + s dP) E <= P + W`` with E the map of (x, f) to
+        the state at the end, and W twice the work of f on ``v + a y``, by the equation of motion integrated.
+        """
+        d = rise.shape[-1]
+        end = transition(admittance_rate(last.stiffness, last.damping, self._mass), self._dt)[..., : 2 * d, :]
+        start = torch.eye(3 * d).to(end)
+        moved = end - start[: 2 * d]
+        pull = self._dt * start[2 * d :] - self._mass @ moved[..., d:, :] - last.damping @ moved[..., :d, :]
+        port = moved[..., :d, :] + self._alpha * torch.linalg.solve(last.stiffness, pull)
+        function = lyapunov_matrix(last.stiffness, last.damping, self._mass, self._alpha)
+        work = torch.nn.functional.pad(port, (0, 0, 2 * d, 0))
+        paid = torch.nn.functional.pad(function, (0, d, 0, d)) + work + work.mT - end.mT @ function @ end
+        factor = torch.linalg.cholesky(symmetrize(paid))
+        half = torch.linalg.solve_triangular(factor, end[..., :d, :].mT, upper=False)
+        needed = torch.linalg.eigvalsh(symmetrize(half @ rise @ half.mT))[..., -1]
+        return torch.where(needed > 1.0, (1.0 - _MARGIN) / needed.clamp_min(1.0), 1.0)
+
+    def settle(self, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor], force: Tensor) -> None:
+        """Nothing: the limit holds for every state."""
+
+
+def lyapunov_matrix(
+    stiffness: Float[Tensor, "*b d d"], damping: Float[Tensor, "*b d d"], mass: Float[Tensor, "d d"], alpha: float
+) -> Float[Tensor, "*b n n"]:
+    """Twice the matrix of Kronander and Billard's V in (deviation, velocity), n = 2 d."""
+    cross = (alpha * mass).expand_as(stiffness)
+    upper = torch.cat([stiffness + alpha * damping, cross], dim=-1)
+    lower = torch.cat([cross, mass.expand_as(stiffness)], dim=-1)
+    return torch.cat([upper, lower], dim=-2)
+
+
+@final
+@dataclass(frozen=True)
+class EnergyTank:
+    """Pay for every rise of the stiffness from a tank that dissipation fills.
+
+    A rise at deviation y puts ``1/2 y' (K_new - K) y`` into the spring: it comes out of the tank, and where the
+    tank has less, only that share of the rise is made; the stiffness may always fall. With the energy H of
+    spring and mass, T of the tank and the work W of external force and desired motion,
+    ``H + T - W <= H_0 + T_0`` at every tick, to rounding. What a falling stiffness takes out of the spring goes into
+    the tank whole. As for :class:`RateLimit`, this is of the admittance, not of a robot that lags behind it. After
+    F. Ferraguti, C. Secchi, C. Fantuzzi, "A tank-based approach to impedance control with variable stiffness",
+    ICRA 2013, made exact for gains that switch at ticks.
+
+    Parameters
+    ----------
+    energy : float, default=0.0
+        In the tank at the start, J: what the schedule may inject beyond what the motion has dissipated.
+    energy_max : float, default=10.0
+        Most the tank holds, J; what comes beyond is lost.
+    efficiency : float, default=0.5
+        Share of the dissipated energy that goes into the tank, 0 <= efficiency < 1. With 1 the robot would be
+        passive but need never come to rest: all it dissipates could be injected again.
+    """
+
+    energy: float = 0.0
+    energy_max: float = 10.0
+    efficiency: float = 0.5
+
+    def __post_init__(self) -> None:
+        for name in ("energy", "energy_max", "efficiency"):
+            check_finite(name, getattr(self, name))
+        if not 0.0 <= self.energy <= self.energy_max:
+            raise ValueError(f"energy == {self.energy:g} J, must be from 0 to energy_max == {self.energy_max:g} J.")
+        if not 0.0 <= self.efficiency < 1.0:
+            raise ValueError(f"efficiency == {self.efficiency:g}, must be at least 0 and less than 1.")
+
+    def start(self, stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> "_Tank":
+        """Begin a run over the wanted gains (..., T, d, d)."""
+        return _Tank(self, mass)
+
+
+class _Tank:
+    tank_energy: Tensor
+
+    def __init__(self, tank: EnergyTank, mass: Tensor) -> None:
+        self._tank, self._mass = tank, mass
+        self._gains: Gains | None = None
+
+    def select(self, stiffness: Tensor, damping: Tensor, deviation: Tensor, velocity: Tensor) -> Gains:
+        last = self._gains
+        share = deviation.new_ones(deviation.shape[:-1])
+        if last is None:
+            self.tank_energy = torch.full_like(share, self._tank.energy)
+            batch = (*share.shape, -1, -1)
+            self._gains = Gains(stiffness.expand(batch), damping.expand(batch), share)
+            return self._gains
+        asked = 0.5 * _quadratic(stiffness - last.stiffness, deviation)
+        lacking = asked > self.tank_energy
+        share = torch.where(lacking, (1.0 - _MARGIN) * self.tank_energy / torch.where(lacking, asked, 1.0), 1.0)
+        self._gains = _partway(last, stiffness, damping, share)
+        paid = 0.5 * _quadratic(self._gains.stiffness - last.stiffness, deviation)
+        self.tank_energy = (self.tank_energy - paid).clamp(0.0, self._tank.energy_max)
+        return self._gains
+
+    def settle(self, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor], force: Tensor) -> None:
+        work = (force * (after[0] - before[0])).sum(-1)
+        dissipated = self._energy(*before) + work - self._energy(*after)
+        # What looks like negative dissipation is rounding: it is charged in full.
+        gain = torch.where(dissipated > 0.0, self._tank.efficiency * dissipated, dissipated)
+        self.tank_energy = (self.tank_energy + gain).clamp(0.0, self._tank.energy_max)
+
+    def _energy(self, deviation: Tensor, velocity: Tensor) -> Tensor:
+        assert self._gains is not None
+        return 0.5 * (_quadratic(self._gains.stiffness, deviation) + _quadratic(self._mass, velocity))
+
+
+def _partway(last: Gains, stiffness: Tensor, damping: Tensor, share: Tensor) -> Gains:
+    weight = share[..., None, None]
+    return Gains(torch.lerp(last.stiffness, stiffness, weight), torch.lerp(last.damping, damping, weight), share)
+
+
+def _quadratic(matrix: Tensor, vector: Tensor) -> Any:
+    return (vector.unsqueeze(-2) @ matrix @ vector.unsqueeze(-1))[..., 0, 0]

@@ -1,0 +1,240 @@
+"""The ticks behind :class:`~torch_pbd.control.AdmittancePlant`, with and without what acts in the loop."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torch_pbd.control.simulation.filters import ActiveFilter, StiffnessFilter
+from torch_pbd.control.simulation.position_loop import PositionLoop
+from torch_pbd.control.simulation.sensor import ForceSensor
+from torch_pbd.control.simulation.transitions import Integrator, admittance_rate, transition
+from torch_pbd.control.simulation.walls import Tunnel
+
+_MATRICES_AT_ONCE = (
+    2**13
+)  # transitions computed together: bounds the memory; a power of 2, as the lengths of blocks are
+
+State = tuple[Tensor, Tensor]
+"""Position and velocity (..., d)."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a run is to follow, checked: motions (..., T, d), gains (..., T, d, d)."""
+
+    position: Tensor
+    velocity: Tensor
+    inertial_force: Tensor
+    stiffness: Tensor
+    damping: Tensor
+    mass: Tensor
+    dt: float
+
+    @property
+    def n_ticks(self) -> int:
+        """Number of ticks T."""
+        return self.position.shape[-2]
+
+    @property
+    def push(self) -> Tensor:
+        """Force of the desired motion (..., T, d), where no filter changes the damping."""
+        return (self.damping @ self.velocity.unsqueeze(-1)).squeeze(-1) + self.inertial_force
+
+    @property
+    def steps(self) -> Tensor:
+        """How far the desired position moves at the end of each tick (..., T, d); 0 after the last."""
+        return torch.cat([self.position.diff(dim=-2), torch.zeros_like(self.position[..., :1, :])], dim=-2)
+
+
+@runtime_checkable
+class Hooks(Protocol):
+    """What acts within the loop; None where there is no such thing."""
+
+    sensor: ForceSensor | None
+    position_loop: PositionLoop | None
+    environment: Tunnel | None
+    substeps: int
+    stiffness_filter: Any
+    integrator: Integrator
+
+
+def open_loop(task: Task, force: Tensor, state: State, integrator: Integrator) -> State:
+    """Positions and velocities (..., T, d) under forces (..., T, d), where force and gains are known beforehand."""
+    d = task.position.shape[-1]
+    now = torch.cat([state[0] - task.position[..., 0, :], state[1]], dim=-1)
+    # Blocks of ticks are matrices that all rollouts share, if these share their gains and desired motion.
+    shared = task.stiffness.ndim == 3 and task.position.ndim == task.velocity.ndim == task.inertial_force.ndim == 2
+    trace = (_by_blocks if shared else _by_ticks)(task, force, now, integrator)
+    return trace[..., :d] + task.position, trace[..., d:]
+
+
+def _by_blocks(task: Task, force: Tensor, start: Tensor, integrator: Integrator) -> Tensor:
+    """Deviations and velocities (..., T, 2 d) from those at the start (..., 2 d)."""
+    batch, size = start.shape[:-1], start.shape[-1]
+    length = block_length(size // 2, n_forces=32)
+    surplus = -task.n_ticks % length
+    forces = torch.nn.functional.pad(force, (0, 0, 0, surplus)).flatten(-2)
+    forces = forces.expand(*batch, -1).reshape(-1, forces.shape[-1]).mT
+    now, states = start.reshape(-1, size).mT, []  # rollouts are columns
+    blocks = forces.split(length * size // 2)
+    for response, held in zip(block_responses(task, integrator, length), blocks, strict=True):
+        of_start, drift, of_forces = response.flatten(0, 1).split([size, 1, len(held)], dim=1)
+        within = torch.addmm(torch.addmm(drift, of_start, now), of_forces, held)
+        states.append(within[:-size])
+        now = within[-size:]
+    trace = torch.cat(states).unflatten(0, (-1, size))[: task.n_ticks]
+    return trace.permute(2, 0, 1).unflatten(0, batch) if batch else trace[..., 0]
+
+
+def _by_ticks(task: Task, force: Tensor, now: Tensor, integrator: Integrator) -> Tensor:
+    """The same where each rollout has gains or a desired motion of its own."""
+    d = force.shape[-1]
+    total, steps, states = force + task.push, task.steps, []
+    deviation, velocity = now[..., :d], now[..., d:]
+    for ticks, maps in tick_maps(task, task.dt, integrator):
+        for tick, each in enumerate(maps.unbind(-3), start=ticks.start):
+            states.append(torch.cat([deviation, velocity], dim=-1))
+            deviation, velocity = _moved(each, deviation, velocity, total[..., tick, :].expand_as(deviation))
+            deviation = deviation - steps[..., tick, :]
+    return torch.stack(states, dim=-2)
+
+
+def block_length(d: int, n_forces: int = 64) -> int:
+    """Ticks of a block with up to so many components of forces, a power of 2, at least 4.
+
+    The longer, the fewer steps, but the work of each grows with its square.
+    """
+    return 1 << max(2, (n_forces // d).bit_length() - 1)
+
+
+def block_responses(task: Task, integrator: Integrator, length: int) -> Iterator[Float[Tensor, "l1 m n"]]:
+    """What blocks of L ticks do, for a task (T, ...) without a batch: states at their ticks from what acts on them.
+
+    A matrix (L + 1, 2 d, 2 d + 1 + L d) for each block: of the deviation and velocity at its start, of 1, and of its
+    forces, tick by tick. The last of the L + 1 states is that at the start of the next block; ticks beyond the
+    last one of the task are as that one.
+    """
+    d = task.position.shape[-1]
+    unit = torch.eye(2 * d + 1 + length * d).to(task.position)
+    push, steps = task.push, torch.nn.functional.pad(task.steps, (0, d))
+    for ticks, maps in tick_maps(task, task.dt, integrator):
+        drift = maps[..., 2 * d :] @ push[ticks].unsqueeze(-1) - steps[ticks].unsqueeze(-1)
+        each = torch.cat([maps[..., : 2 * d], drift, maps[..., 2 * d :]], dim=-1)
+        surplus = -len(each) % length
+        each = torch.cat([each, each[-1:].expand(surplus, -1, -1)]).unflatten(0, (-1, length))
+        states = [unit[: 2 * d].expand(len(each), -1, -1)]
+        for tick in range(length):
+            held = torch.cat([unit[2 * d, None], unit[2 * d + 1 + tick * d :][:d]]).expand(len(each), -1, -1)
+            states.append(each[:, tick] @ torch.cat([states[-1], held], dim=1))
+        yield from torch.stack(states, dim=1)
+
+
+def tick_maps(task: Task, dt: float, integrator: Integrator) -> Iterator[tuple[slice, Tensor]]:
+    """Maps of stretches of ticks of the task's own gains over ``dt``, (..., n, 2 d, 3 d), and which ticks."""
+    batch = max(1, task.stiffness[..., 0, 0, 0].numel())
+    n_together = max(1, _MATRICES_AT_ONCE // batch)
+    for first in range(0, task.n_ticks, n_together):
+        ticks = slice(first, min(first + n_together, task.n_ticks))
+        stiffness, damping = task.stiffness[..., ticks, :, :], task.damping[..., ticks, :, :]
+        yield ticks, _tick_map(stiffness, damping, task.mass, dt, integrator)
+
+
+def _tick_map(stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float, integrator: Integrator) -> Tensor:
+    return transition(admittance_rate(stiffness, damping, mass), dt, integrator)[..., : 2 * stiffness.shape[-1], :]
+
+
+def _moved(each: Float[Tensor, "*b m n"], deviation: Tensor, velocity: Tensor, force: Tensor) -> State:
+    """State after a tick, of its map (m = 2 d rows, n = 3 d columns), the state before it and the force held."""
+    before = torch.cat([deviation, velocity, force], dim=-1)
+    after = before @ each.mT if each.ndim == 2 else (each @ before.unsqueeze(-1)).squeeze(-1)
+    d = deviation.shape[-1]
+    return after[..., :d], after[..., d:]
+
+
+def closed_loop(
+    task: Task, force: Tensor, state: State, hooks: Hooks, generator: torch.Generator | None
+) -> dict[str, Any]:
+    """Fields of a Rollout where a sensor, walls, a position loop or a filter act within the loop."""
+    loop = Loop(task, state, hooks, generator)
+    ticks = [loop.run(tick, force[..., tick, :]) for tick in range(task.n_ticks)]
+    behind = {"position": 2, "velocity": 2, "force": 2, "commanded_position": 2, "stiffness": 3, "damping": 3}
+    return {name: torch.stack([each[name] for each in ticks], dim=-behind.get(name, 1)) for name in ticks[0]}
+
+
+class Loop:
+    """State (..., d) of a closed-loop run, to be moved on tick by tick."""
+
+    def __init__(self, task: Task, state: State, hooks: Hooks, generator: torch.Generator | None) -> None:
+        self._task, self._hooks = task, hooks
+        self._deviation, self._velocity = state[0] - task.position[..., 0, :], state[1]
+        self._robot = None if hooks.position_loop is None else hooks.position_loop.start(*state, task.dt)
+        self._read = None if hooks.sensor is None else hooks.sensor.start(state[0], task.dt, generator)
+        wanted: StiffnessFilter | None = hooks.stiffness_filter
+        self._filter: ActiveFilter | None = None
+        if wanted is not None:
+            self._filter = wanted.start(task.stiffness, task.damping, task.mass, task.dt)
+        self._part = task.dt / hooks.substeps
+        stretches = tick_maps(task, self._part, hooks.integrator)
+        self._maps = (each for _, maps in stretches for each in maps.unbind(-3))
+
+    def run(self, tick: int, force: Tensor) -> dict[str, Tensor]:
+        """One tick under a force (..., d): measure, choose the gains, move; fields of a Rollout at its start."""
+        task = self._task
+        desired, still = task.position[..., tick, :], tick + 1 == task.n_ticks
+        commanded = self._deviation + desired
+        position, velocity = (commanded, self._velocity) if self._robot is None else (
+            self._robot.position, self._robot.velocity
+        )  # fmt: skip
+        felt = force + self._wall(position, velocity)
+        values = {"position": position, "velocity": velocity, "commanded_position": commanded, "force": felt}
+        stiffness, damping, said = self._gains(tick)
+        measured, saturated = self._measured(felt)
+        push = (damping @ task.velocity[..., tick, :].unsqueeze(-1)).squeeze(-1) + task.inertial_force[..., tick, :]
+        self._move(stiffness, damping, (force, measured), push, desired)
+        if self._robot is not None:
+            self._robot(commanded)
+        if not still:
+            self._deviation = self._deviation - (task.position[..., tick + 1, :] - desired)
+        return values | {"stiffness": stiffness, "damping": damping} | said | saturated
+
+    def _wall(self, position: Tensor, velocity: Tensor) -> Tensor:
+        environment = self._hooks.environment
+        return torch.zeros_like(position) if environment is None else environment.force(position, velocity)
+
+    def _measured(self, force: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        if self._read is None:
+            return force, {}
+        reading = self._read(force)
+        return reading.force, {"saturated": reading.saturated}
+
+    def _gains(self, tick: int) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+        stiffness, damping = self._task.stiffness[..., tick, :, :], self._task.damping[..., tick, :, :]
+        if self._filter is None:
+            return stiffness, damping, {}
+        gains = self._filter.select(stiffness, damping, self._deviation, self._velocity)
+        said = {"filter_share": gains.share}
+        if self._filter.tank_energy is not None:
+            said["tank_energy"] = self._filter.tank_energy
+        return gains.stiffness, gains.damping, said
+
+    def _move(
+        self, stiffness: Tensor, damping: Tensor, forces: tuple[Tensor, Tensor], push: Tensor, desired: Tensor
+    ) -> None:
+        """Move over the tick, by the measured force; the walls are evaluated anew in each of its parts."""
+        hooks, (outside, force) = self._hooks, forces
+        if self._filter is None:
+            each = next(self._maps)
+        else:
+            each = _tick_map(stiffness, damping, self._task.mass, self._part, hooks.integrator)
+        for part in range(hooks.substeps):
+            before = self._deviation, self._velocity
+            if part:
+                force = outside + self._wall(before[0] + desired, before[1])
+            held = (force + push).expand_as(before[0])
+            self._deviation, self._velocity = _moved(each, *before, held)
+            if self._filter is not None:
+                self._filter.settle(before, (self._deviation, self._velocity), held)

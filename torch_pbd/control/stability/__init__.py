@@ -1,0 +1,1 @@
+"""What is guaranteed of a schedule: exponential decay, passivity, stiff environments."""

@@ -1,0 +1,117 @@
+"""Which rows are of one demonstration: their labels, and what is amiss with the demonstrations."""
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torch_pbd.arguments import from_tensor
+from torch_pbd.data import Demonstrations, check_unimodal
+from torch_pbd.estimators.validation import Floats
+from torch_pbd.exceptions import DataRankWarning
+from torch_pbd.models.heteroscedastic import HeteroscedasticFit, are_copies
+
+_ways_told: ContextVar[bool] = ContextVar("_ways_told", default=False)
+_COVERED = 0.5  # of the range of the input, by a demonstration that is compared with others
+
+
+@contextmanager
+def ways_are_told() -> Iterator[None]:
+    """Let a fit in it not warn of several ways; what other threads are warned of stays as it is."""
+    token = _ways_told.set(True)
+    try:
+        yield
+    finally:
+        _ways_told.reset(token)
+
+
+def check_groups(groups: Any, n_samples: int) -> NDArray[np.intp]:
+    """Number of each row's demonstration, from labels of any kind.
+
+    Raises
+    ------
+    ValueError
+        If there is not one label a row, or one is missing.
+    """
+    labels = _as_labels(groups)
+    if labels.shape != (n_samples,):
+        raise ValueError(
+            f"groups has shape {labels.shape}, must have shape ({n_samples},): the demonstration of each row of X."
+        )
+    if labels.dtype.kind == "f" and not np.isfinite(labels).all():
+        raise ValueError(f"groups has a label that is not finite, at index {int(np.argmin(np.isfinite(labels)))}.")
+    if labels.dtype.kind in "mM" and np.isnat(labels).any():
+        raise ValueError(f"groups has no label at index {int(np.argmax(np.isnat(labels)))}: it is NaT.")
+    if labels.dtype.kind == "O":
+        _check_labels(labels)
+    return np.unique(labels, return_inverse=True)[1].reshape(-1)
+
+
+def _as_labels(groups: Any) -> NDArray[Any]:
+    if hasattr(groups, "detach"):
+        groups = from_tensor(groups, "groups")
+    if np.ma.is_masked(groups):
+        raise ValueError("groups has masked entries: say of every row which demonstration it is of.")
+    if isinstance(groups, list | tuple) and len({isinstance(label, str) for label in groups}) > 1:
+        groups = np.fromiter(groups, dtype=object, count=len(groups))  # NumPy would make text of the numbers
+    try:
+        return np.asarray(groups)
+    except ValueError as error:
+        raise ValueError(f"groups is ragged: give one label for each row of X ({error}).") from error
+
+
+def _check_labels(labels: NDArray[Any]) -> None:
+    for i, label in enumerate(labels):
+        if label is None or type(label).__name__ == "NAType" or label != label:
+            raise ValueError(f"groups has no label at index {i}: say of every row which demonstration it is of.")
+    kinds = {type(label) for label in labels}
+    if len(kinds) > 1:
+        names = ", ".join(sorted(kind.__name__ for kind in kinds))
+        raise ValueError(f"groups has labels of several types ({names}): use one, so that 1 and '1' are not mixed up.")
+
+
+def check_demonstrations(X: Floats, y: Floats, groups: Any) -> None:
+    """Warn where demonstrations are too few to tell their correlation, or seem to follow several ways.
+
+    The ways are looked for along one input, among demonstrations that cover most of it.
+    """
+    counts = np.bincount(groups)
+    if len(counts) < 2:
+        warnings.warn(
+            "groups has one demonstration: how far its samples repeat each other cannot be told from it, and they "
+            "count as independent. What is predicted is its noise, not how demonstrations differ.",
+            DataRankWarning,
+            stacklevel=5,
+        )
+    if _ways_told.get() or X.shape[1] > 1 or len(counts) < 2 or counts.min() < 2:
+        return
+    times, positions = [], []
+    for rows in np.split(np.argsort(groups, kind="stable"), np.cumsum(counts)[:-1]):
+        time, first = np.unique(X[rows, 0], return_index=True)
+        times.append(time)
+        positions.append(y[rows][first])
+    if min(len(time) for time in times) > 1 and min(np.ptp(time) for time in times) > _COVERED * np.ptp(X):
+        check_unimodal(Demonstrations(times, positions))
+
+
+def warn_of_residuals(fit: HeteroscedasticFit, group: Tensor | None, given: Tensor) -> None:
+    """Warn where rows, ``given`` in this order without groups, are of demonstrations; or the mean misses a signal."""
+    if group is None and are_copies(fit.whitened(), fit.training, given):
+        message = (
+            "y has rows that nearly repeat those beside them along X, as samples of a demonstration do. Without groups "
+            "they count as independent, and what is predicted is far too certain. Give groups, the demonstration of "
+            "each row, to fit; cross_val_score takes params={'groups': groups}, and a search passes them on where "
+            "metadata routing is enabled and set_fit_request(groups=True) asks for them."
+        )
+        warnings.warn(message, DataRankWarning, stacklevel=6)
+    elif bool((missed := fit.missed(group)).any()):
+        message = (
+            f"The mean does not follow y in outputs {missed.nonzero().flatten().tolist()}: what is left is no noise, "
+            "but counts as such. Raise n_inducing and max_inputs; give groups if the rows are of demonstrations."
+        )
+        warnings.warn(message, UserWarning, stacklevel=6)

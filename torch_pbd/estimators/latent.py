@@ -1,0 +1,254 @@
+"""What the two regressors on latent Gaussian processes (CD and WP) share."""
+
+import warnings
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torch_pbd.estimators.base import CovarianceRegressor
+from torch_pbd.estimators.mean import mean_that_repeats_allow
+from torch_pbd.estimators.prior import standardized_prior
+from torch_pbd.estimators.results import Fitted
+from torch_pbd.estimators.scaling import Standardization, distinct_rows
+from torch_pbd.estimators.validation import Floats, check_choice, check_length_scale, check_number
+from torch_pbd.exceptions import DataRankWarning
+from torch_pbd.files.memory import require_much
+from torch_pbd.gp import EvidenceSearch, LatentGP, Observations, fit_together, resolved_length_scale, spacing
+from torch_pbd.kernels import KERNELS
+from torch_pbd.linalg import safe_cholesky, scale_tril_from_root
+from torch_pbd.models.conditional import MeanAndCovariance
+from torch_pbd.models.training import TrainingSet
+from torch_pbd.optim import FitReport
+
+_STRETCHED = 10.0  # an amplitude of so many times the values
+# Spacings of the inputs that an interpolating process may be as short as, and ranges that others may be as long as:
+# with longer ones the prior of a covariance would never take over.
+_SHORTEST, _LONGEST_MEAN, _LONGEST_COVARIANCE = 0.75, 10.0, 0.35
+# A hole among inputs on a line, of the range and in spacings of the others. It is to hold so many length scales: a
+# smooth process without noise claims to know what is two to three of them from many inputs.
+_HOLE, _SPACINGS, _IN_HOLE = 0.25, 5.0, 6.0
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A fit in standardized units."""
+
+    training: TrainingSet
+    scaling: Standardization
+    prior_tril: Tensor
+    """(d, d), or (n, d, d) at the training inputs where the prior is callable."""
+    length_scale: Tensor | None
+    """(e,), where the user gave it."""
+
+
+class LatentCovarianceRegressor(CovarianceRegressor):
+    """Base of CD and WP: mean by d Gaussian processes, covariance by more of them; not for direct use."""
+
+    aligned_objective: str
+    """Value of ``objective`` that works on empirical covariances."""
+
+    _costly = "max_inputs"
+    """Parameters that decide on the memory."""
+
+    objective: str
+    prior: Any
+    kernel: Any
+    length_scale: Any
+    max_inputs: int
+    latent_prior: bool
+
+    def _check_parameters(self) -> None:
+        super()._check_parameters()
+        check_choice(self.objective, "objective", ("auto", self.aligned_objective, "likelihood"))
+        check_choice(self.kernel, "kernel", tuple(KERNELS))
+        check_number(self.max_inputs, "max_inputs", low=2, integer=True)
+        if isinstance(self.prior, str):
+            check_choice(self.prior, "prior", ("paper",))
+
+    def _fit(self, X: Floats, y: Floats, **told: Any) -> Fitted:
+        scaling = Standardization.of(X, y)
+        standardized = scaling.inputs(X)
+        inputs, index = distinct_rows(standardized)
+        self._check_memory(len(inputs), y.shape[1])
+        training = TrainingSet(
+            self._door(standardized),
+            self._door(scaling.outputs(y)),
+            self._door(inputs),
+            self._door(index).long(),
+        )
+        aligned = self._works_on_empirical(scaling.x_shift + scaling.x_scale * inputs, np.bincount(index), y.shape[1])
+        length_scale = check_length_scale(self.length_scale, X.shape[1])
+        if not aligned:
+            warn_if_few(len(y), y.shape[1])
+            training = training.merged(self.max_inputs)
+        problem = Problem(
+            training,
+            scaling,
+            self._prior_tril(training, scaling),
+            None if length_scale is None else self._door(length_scale / scaling.x_scale),
+        )
+        warn_if_identical(training)
+        if aligned:
+            mean, covariance, report, jitter = self._fit_empirical(problem)
+        else:
+            mean, of_mean = self._fit_mean(training)
+            covariance, report, jitter = self._fit_likelihood(problem, training.residual(mean))
+            report = report.after(of_mean, "search of the mean")
+        return Fitted(self._assemble(MeanAndCovariance(mean, covariance), scaling), report, jitter)
+
+    @abstractmethod
+    def _fit_empirical(self, problem: Problem) -> tuple[LatentGP, Any, FitReport, float]:
+        """Mean, and covariance module from the empirical covariances of aligned data."""
+
+    @abstractmethod
+    def _fit_likelihood(self, problem: Problem, residual: Tensor) -> tuple[Any, FitReport, float]:
+        """Covariance module by maximum likelihood of the residuals (rows, d) from the mean."""
+
+    def _works_on_empirical(self, inputs: Floats, counts: Any, n_outputs: int) -> bool:
+        """Decide the objective; ``inputs`` are the distinct ones, with their counts."""
+        fewest = int(counts.min())
+        if self.objective == "likelihood" and 2 <= fewest <= n_outputs:
+            warnings.warn(
+                f"y has {fewest} demonstrations at an input but {n_outputs} outputs: the likelihood then takes for "
+                f"certain what was only not seen to vary. {n_outputs + 1} or more demonstrations determine the "
+                "covariance; objective='auto' shrinks it.",
+                DataRankWarning,
+                stacklevel=5,
+            )
+        if self.objective == "likelihood" or (self.objective == "auto" and fewest < 2):
+            return False
+        if fewest < 2:
+            i = int(np.argmin(counts))
+            raise ValueError(
+                f"objective={self.objective!r} needs >= 2 demonstrations at each input, got 1 at X = "
+                f"{inputs[i].tolist()} ({int((counts < 2).sum())} of {len(inputs)} inputs have one row). "
+                "Align the demonstrations, record more, or use objective='likelihood'."
+            )
+        if fewest <= n_outputs:
+            warnings.warn(
+                f"y has {fewest} demonstrations at an input but {n_outputs} outputs: that empirical covariance "
+                f"is singular, and is shrunk towards the pooled covariance. {n_outputs + 1} or more "
+                "demonstrations determine it.",
+                DataRankWarning,
+                stacklevel=5,
+            )
+        return True
+
+    def _prior_tril(self, training: TrainingSet, scaling: Standardization) -> Tensor:
+        if self.prior is None:
+            return default_prior_tril(training.y)
+        if isinstance(self.prior, str):  # "paper": the entries of the factor are in the units of y
+            return torch.diag(1.0 / self._door(scaling.y_scale))
+        X = scaling.x_shift + scaling.x_scale * training.inputs.cpu().numpy()
+        return safe_cholesky(self._door(standardized_prior(self.prior, X, scaling.y_scale)), name="prior")
+
+    def _fit_mean(self, training: TrainingSet) -> tuple[LatentGP, FitReport]:
+        """Gaussian processes of the mean, by themselves."""
+        job = self._mean_job(training)
+        return mean_that_repeats_allow(training, *job, *fit_together([job]))
+
+    def _mean_job(self, training: TrainingSet) -> tuple[Observations, EvidenceSearch]:
+        """Means at the inputs, weighted by their counts, and the search for their hyperparameters."""
+        weights = training.counts / training.counts.mean()
+        observations = Observations(training.inputs, training.means().mT.contiguous(), weights)
+        return observations, self._search(observations, _LONGEST_MEAN)
+
+    def _search(
+        self,
+        observations: Observations,
+        longest: float,
+        length_scale: Tensor | None = None,
+        noise_scale: Tensor | None = None,
+    ) -> EvidenceSearch:
+        shortest = resolved_length_scale(observations.inputs)
+        if noise_scale is not None and not bool((noise_scale > 0).any()):
+            # Interpolated: longer than where inputs come closest, and the process swings between the others.
+            shortest = min(0.5, max(1e-6, _SHORTEST * spacing(observations.inputs, 0.1)))
+        limits = self.max_inputs, self.n_restarts, max(100, self.max_iter)
+        return EvidenceSearch(self.kernel, (shortest, longest), length_scale, noise_scale, *limits)
+
+    def _default_length_scale(self, problem: Problem) -> Tensor:
+        """Length scales (1, e) where they are not learned: a fifth of the range of the inputs, less beside a hole."""
+        n_features = problem.training.inputs.shape[1]
+        if problem.length_scale is not None:
+            return problem.length_scale[None]
+        longest = longest_covariance(problem.training.inputs)
+        return problem.training.inputs.new_full((1, n_features), min(0.2, longest) * n_features**0.5)
+
+    def _check_memory(self, n_distinct: int, n_outputs: int) -> None:
+        n_inputs = min(n_distinct, self.max_inputs)
+        n_processes = self._n_processes(n_outputs)
+        require_much(
+            8.0 * n_inputs**2 * n_processes * 4,
+            what=f"max_inputs == {self.max_inputs} lets {n_inputs} distinct inputs into kernel matrices of "
+            f"{n_processes} processes, which",
+            remedy=f"Lower {self._costly}.",
+        )
+
+    def _n_processes(self, n_outputs: int) -> int:
+        """Processes of the mean and the covariance, at most."""
+        return (n_outputs + 1) ** 2
+
+
+def longest_covariance(inputs: Tensor) -> float:
+    """Longest length scale of a covariance, in ranges of the inputs (n, e); a hole among them is longer."""
+    if inputs.shape[1] == 1:
+        hole = float(inputs[:, 0].sort().values.diff().max())
+        if hole > max(_HOLE, _SPACINGS * spacing(inputs)):
+            return min(_LONGEST_COVARIANCE, hole / _IN_HOLE)
+    return _LONGEST_COVARIANCE
+
+
+def residual_tril(residual: Tensor) -> Tensor:
+    """Factor of the covariance of all residuals, where the training of a likelihood starts."""
+    floor = 1e-6 * torch.eye(residual.shape[1]).to(residual)
+    return scale_tril_from_root(torch.cat([residual.mT / len(residual) ** 0.5, floor], dim=1))
+
+
+def default_prior_tril(y: Tensor) -> Tensor:
+    """Factor of a wide prior: four times the covariance of all of y around its mean.
+
+    A thousandth of the unit matrix is mixed in: outputs that move together, or do not move at all, have
+    some freedom of their own where nothing is known.
+    """
+    centred = (0.999 / (len(y) - 1)) ** 0.5 * (y - y.mean(0)).mT
+    return 2.0 * scale_tril_from_root(torch.cat([centred, 0.001**0.5 * torch.eye(y.shape[1]).to(y)], dim=1))
+
+
+def warn_if_few(n_rows: int, n_outputs: int) -> None:
+    """Warn of no more rows than outputs, whose covariance is singular."""
+    if n_rows <= n_outputs:
+        warnings.warn(
+            f"y has {n_rows} rows but {n_outputs} outputs: they leave directions of the covariance undetermined, "
+            "which the prior decides. Record more.",
+            DataRankWarning,
+            stacklevel=5,
+        )
+
+
+def warn_if_identical(training: TrainingSet) -> None:
+    """Warn of outputs that never vary where inputs repeat."""
+    repeated = len(training.y) - len(training.inputs)
+    mean = training.means()[training.index] if repeated else training.y.mean(0)
+    if float((training.y - mean).square().sum(0).max()) < 1e-18 * max(1, repeated or len(training.y) - 1):
+        warnings.warn(
+            "The demonstrations are identical: their covariance is zero, and the smallest that can be told "
+            "from it is used.",
+            DataRankWarning,
+            stacklevel=5,
+        )
+
+
+def warn_if_stretched(amplitude: Tensor, targets: Tensor, *, given: bool) -> None:
+    """Warn where a length scale that the user gave is too long for what changes over the inputs."""
+    if given and bool((amplitude > _STRETCHED * targets.square().mean(1).sqrt().clamp_min(1e-12)).any()):
+        warnings.warn(
+            "length_scale is so long that the covariance follows the data only as the difference of large numbers: "
+            "beside the data it will overshoot the prior. Give a shorter one, or None to learn it.",
+            UserWarning,
+            stacklevel=6,
+        )

@@ -1,0 +1,173 @@
+"""Files of arrays and a JSON header under one checksum: safetensors, of which nothing is executed."""
+
+import hashlib
+import json
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from safetensors import SafetensorError, deserialize
+from safetensors.numpy import save as to_bytes
+
+from torch_pbd.exceptions import ModelFileError
+from torch_pbd.files.atomic import replacing
+from torch_pbd.files.memory import require_memory
+
+Arrays = dict[str, NDArray[Any]]
+
+MAX_HEADER_BYTES = 2**22
+"""Longest JSON header that is written or read, about 200 000 numbers: lists in it take up to 20 times the memory."""
+
+_MAX_OUTER_BYTES = 4 * MAX_HEADER_BYTES  # the header of safetensors, in which ours is a string with escapes
+_DTYPES: dict[str, np.dtype[Any]] = {
+    "F64": np.dtype("float64"),
+    "F32": np.dtype("float32"),
+    "I64": np.dtype("int64"),
+    "I32": np.dtype("int32"),
+    "I16": np.dtype("int16"),
+    "I8": np.dtype("int8"),
+    "U64": np.dtype("uint64"),
+    "U32": np.dtype("uint32"),
+    "U16": np.dtype("uint16"),
+    "U8": np.dtype("uint8"),
+    "BOOL": np.dtype("bool"),
+}
+_DAMAGE = (
+    SafetensorError,
+    struct.error,
+    AttributeError,
+    KeyError,
+    TypeError,
+    ValueError,
+    OSError,
+    RecursionError,
+    MemoryError,
+)  # what reading raises about bytes that are not what they claim to be
+# The file, the arrays in it, and one array's bytes under the checksum.
+_COPIES = 3.0
+
+
+def write_checksummed(path: Path, key: str, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays and a header to one file, which is there whole or not at all.
+
+    Parameters
+    ----------
+    path : Path
+    key : str
+        Kind of the file: the name of the header in the metadata of safetensors.
+    header : mapping
+        What JSON can hold; with ``format_version``, and without ``sha256``, which is added.
+    arrays : mapping of str to ndarray
+        Of floats in 32 or 64 bits, of integers in 8 to 64, or of bools.
+
+    Raises
+    ------
+    TypeError
+        If an array is of another type, or an entry of the header is not what JSON can hold.
+    ValueError
+        If the header is longer than 4 MiB.
+    OSError
+        If it cannot be written; with the path.
+    """
+    for name, array in arrays.items():
+        if array.dtype not in _DTYPES.values():
+            raise TypeError(
+                f"array {name!r} is of {array.dtype}, it must be of {', '.join(map(str, _DTYPES.values()))}."
+            )
+    whole = {name: np.asarray(array, order="C") for name, array in arrays.items()}
+    plain = json.loads(json.dumps(dict(header)))
+    text = json.dumps({**plain, "sha256": _digest(plain, whole)})
+    if len(text) > MAX_HEADER_BYTES:
+        raise ValueError(
+            f"the header of {path} has {len(text)} bytes, more than the {MAX_HEADER_BYTES} that are read again: "
+            "keep long lists as arrays."
+        )
+    with replacing(path) as file:
+        file.write(to_bytes(whole, metadata={key: text}))
+
+
+def read_checksummed(path: Path, key: str, format_version: int) -> tuple[dict[str, Any], Arrays]:
+    """Header, less its checksum, and arrays of a file that :func:`write_checksummed` wrote.
+
+    Parameters
+    ----------
+    path : Path
+    key : str
+    format_version : int
+        That which ``format_version`` in the header must be.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ModelFileError
+        If it is not of this kind, of another version, too large for the memory, or not as it was written: to the
+        byte, but for the spelling of what safetensors says of the arrays.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"no model file at {path}")
+    try:
+        require_memory(_COPIES * path.stat().st_size, what=f"{path}", remedy="Read it where there is more.")
+    except ValueError as error:
+        raise ModelFileError(str(error)) from error
+    try:
+        # Not mapped into memory: a file that shrinks while it is read would end the process.
+        content = path.read_bytes()
+        _check_length(content)
+        arrays = {name: _array(view) for name, view in deserialize(content)}
+        text = _header_text(content, key)
+        header = json.loads(text)
+        if json.dumps(header) != text:
+            raise ValueError("its header is not as it was written")
+    except _DAMAGE as error:
+        raise ModelFileError(f"{path} is not a model of {key}, or is damaged ({_brief(error)}).") from error
+    found = header.get("format_version") if isinstance(header, dict) else None
+    if type(found) is not int or found != format_version:
+        raise ModelFileError(
+            f"{path} has format version {found!s:.40}; this torch_pbd reads {format_version}. Upgrade it."
+        )
+    if header.pop("sha256", None) != _digest(header, arrays):
+        raise ModelFileError(f"{path} is damaged: it does not match its checksum.")
+    return header, arrays
+
+
+def _check_length(content: bytes) -> None:
+    (length,) = struct.unpack_from("<Q", content)
+    if length > min(_MAX_OUTER_BYTES, len(content) - 8):
+        raise ValueError(f"it declares a header of {length} bytes")
+
+
+def _header_text(content: bytes, key: str) -> str:
+    """Our header, of the metadata in the header of safetensors, which has been read without an error."""
+    (length,) = struct.unpack_from("<Q", content)
+    metadata = json.loads(content[8 : 8 + length]).get("__metadata__", {})
+    if set(metadata) != {key}:
+        raise ValueError(f"it is not marked {key!r}")
+    text = metadata[key]
+    if not isinstance(text, str) or len(text) > MAX_HEADER_BYTES:
+        raise ValueError(f"its header is longer than {MAX_HEADER_BYTES} bytes")
+    return text
+
+
+def _array(view: Mapping[str, Any]) -> NDArray[Any]:
+    """Array of what safetensors found: its bytes are as many as its shape needs."""
+    dtype = _DTYPES[view["dtype"]]
+    array = np.frombuffer(view["data"], dtype=dtype).reshape(view["shape"])
+    if dtype.kind == "b" and (array.view(np.uint8) > 1).any():
+        raise ValueError("it holds a bool that is neither false nor true")
+    return array
+
+
+def _brief(error: BaseException) -> str:
+    return f"{str(error) or type(error).__name__:.200}"
+
+
+def _digest(header: dict[str, Any], arrays: Mapping[str, NDArray[Any]]) -> str:
+    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
+    for name in sorted(arrays):
+        digest.update(f"{name} {arrays[name].dtype} {arrays[name].shape} ".encode())
+        digest.update(arrays[name].tobytes())
+    return digest.hexdigest()
