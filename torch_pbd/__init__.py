@@ -3,6 +3,8 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from torch_pbd.registry import ESTIMATORS
+
 if TYPE_CHECKING:
     from torch_pbd.control.controller import DMPController
     from torch_pbd.data import Demonstrations, load_demonstrations, save_demonstrations
@@ -16,11 +18,7 @@ __version__ = "0.1.0"
 
 # Where each public name lives: torch and scikit-learn take seconds to import, so they wait for their first use.
 _HOMES = {
-    "CholeskyCovRegressor": "torch_pbd.estimators.cholesky",
-    "WishartProcessRegressor": "torch_pbd.estimators.wishart",
-    "HeteroscedasticGPRegressor": "torch_pbd.estimators.heteroscedastic",
-    "GMMBaseline": "torch_pbd.estimators.mixture",
-    "DMPController": "torch_pbd.control.controller",
+    **ESTIMATORS,
     "Demonstrations": "torch_pbd.data",
     "load_demonstrations": "torch_pbd.data",
     "save_demonstrations": "torch_pbd.data",

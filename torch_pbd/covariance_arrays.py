@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torch_pbd.arguments import as_floats
+from torch_pbd import checks
 
 Floats = NDArray[np.floating[Any]]
 
@@ -17,7 +17,7 @@ _ZERO_PIVOT = 1e-14  # a pivot of a Cholesky factorization below it is rounding,
 
 def _finite(name: str, array: ArrayLike) -> Floats:
     """Numbers whose squares, and their sums, are finite."""
-    values = as_floats(array, name)
+    values = checks.real_floats(array, name)
     if not (np.abs(values) <= _LARGEST).all():
         raise ValueError(f"{name} has entries that are not finite, or whose squares are not (above {_LARGEST:g}).")
     return values

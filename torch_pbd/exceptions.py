@@ -1,6 +1,10 @@
 """The few errors and warnings of this package that Python and scikit-learn do not have."""
 
 
+class InvalidParameterError(ValueError, TypeError):
+    """An argument has a type or a value that cannot be used; the message names it, and says what it must be."""
+
+
 class NotPositiveDefiniteError(ValueError):
     """A matrix that must be positive definite is not, even with the largest jitter allowed."""
 

@@ -1,21 +1,13 @@
 """Estimators' classes, parameters and plain values as JSON, and back: only what closed tables name."""
 
 from dataclasses import asdict, fields
-from importlib import import_module
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torch_pbd.control.stiffness import StiffnessLaw
-
-REGRESSORS = {
-    "CholeskyCovRegressor": "torch_pbd.estimators.cholesky",
-    "WishartProcessRegressor": "torch_pbd.estimators.wishart",
-    "HeteroscedasticGPRegressor": "torch_pbd.estimators.heteroscedastic",
-    "GMMBaseline": "torch_pbd.estimators.mixture",
-}
-CLASSES = REGRESSORS | {"DMPController": "torch_pbd.control.controller"}
+from torch_pbd.registry import ESTIMATORS, REGRESSORS, load_class
 
 _LAW = "stiffness_law"
 _INTEGERS = {f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)}
@@ -29,7 +21,7 @@ _ENTRIES: dict[str, tuple[type, ...]] = {
 
 def is_ours(estimator: Any) -> bool:
     """Whether an object is of one of the classes, and not of a subclass that bears its name."""
-    return CLASSES.get(type(estimator).__name__) == type(estimator).__module__
+    return ESTIMATORS.get(type(estimator).__name__) == type(estimator).__module__
 
 
 def encode_parameters(estimator: Any) -> dict[str, Any]:
@@ -58,9 +50,9 @@ def decode_parameters(description: Any) -> Any:
     if not isinstance(description, dict) or not {"class", "params"} <= set(description):
         raise ValueError("it has no class and parameters")
     name, parameters = description["class"], description["params"]
-    if name not in list(CLASSES) or not isinstance(parameters, dict):  # a list asks for no hash
+    if name not in list(ESTIMATORS) or not isinstance(parameters, dict):  # a list asks for no hash
         raise ValueError(f"it holds a {name!r:.80}")
-    kind = getattr(import_module(CLASSES[name]), name)
+    kind = load_class(name)
     nested = {"covariance": _regressor, _LAW: decode_law} if name == "DMPController" else {}
     if name == "DMPController":  # files from before there was a choice are of the printed equation
         parameters = {"adaptation": "additive", **parameters}

@@ -18,8 +18,6 @@ from torch_pbd.files.atomic import LOADERS
 from torch_pbd.files.tensors import read_checksummed, write_checksummed
 from torch_pbd.learned import decode_learned, learned_names
 from torch_pbd.model_header import (
-    CLASSES,
-    REGRESSORS,
     decode_law,
     decode_parameters,
     encode,
@@ -28,6 +26,7 @@ from torch_pbd.model_header import (
     is_ours,
 )
 from torch_pbd.models.layout import check_layout
+from torch_pbd.registry import ESTIMATORS, REGRESSORS
 
 FORMAT_VERSION = 1
 _KEY = "torch_pbd"
@@ -69,7 +68,7 @@ def save(estimator: CovarianceRegressor | DMPController, path: str | os.PathLike
         raise ValueError(f"path={str(path)!r} has the suffix of another format: take .safetensors.")
     if not is_ours(estimator):
         name = type(estimator).__name__
-        raise TypeError(f"estimator is a {name}; can save {', '.join(CLASSES)}. In a pipeline, save that step.")
+        raise TypeError(f"estimator is a {name}; can save {', '.join(ESTIMATORS)}. In a pipeline, save that step.")
     check_is_fitted(estimator)
     description, arrays = _described(estimator)
     header = {
@@ -103,8 +102,8 @@ def load(path: str | os.PathLike[str]) -> Any:
         if not _FOREIGN.fullmatch(path.suffix):
             raise
         raise ModelFileError(f"{error} {LOADERS} Pickles are never loaded.") from error
-    if header.get("class") not in list(CLASSES):  # a list asks for no hash
-        raise ModelFileError(f"{path} holds a {header.get('class')!r:.80}; known are {', '.join(CLASSES)}.")
+    if header.get("class") not in list(ESTIMATORS):  # a list asks for no hash
+        raise ModelFileError(f"{path} holds a {header.get('class')!r:.80}; known are {', '.join(ESTIMATORS)}.")
     try:
         if not isinstance(header.pop("versions", None), dict) or header.pop("format_version") != FORMAT_VERSION:
             raise ValueError("it does not say what wrote it")

@@ -10,7 +10,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike, NDArray
 
-from torch_pbd.arguments import as_finite, check_kind, is_finite
+from torch_pbd import checks
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.rollout import Rollout
 from torch_pbd.data import Demonstrations
@@ -43,7 +43,7 @@ def plot_demonstrations(
     -------
     list of Line2D, one a demonstration
     """
-    check_kind(demonstrations, "demonstrations", Demonstrations)
+    checks.instance(demonstrations, "demonstrations", Demonstrations)
     outputs = list(outputs) if isinstance(outputs, np.ndarray | range) and np.ndim(outputs) else outputs
     _check_outputs(outputs, demonstrations.n_outputs)
     _check_axes("ax", [ax], 1)
@@ -73,7 +73,7 @@ def plot_std_band(
 ) -> tuple[Line2D, PolyCollection]:
     """Draw a mean (n,) over x (n,) with a band of ``n_std`` standard deviations (n,) on either side."""
     _check_axes("ax", [ax], 1)
-    across, middle, half = (as_finite(*named).ravel() for named in ((x, "x"), (mean, "mean"), (std, "std")))
+    across, middle, half = (checks.finite(*named).ravel() for named in ((x, "x"), (mean, "mean"), (std, "std")))
     for name, values in (("mean", middle), ("std", half)):
         if len(values) != len(across):
             raise ValueError(f"{name} has {len(values)} values, must have {len(across)}: one for each of x.")
@@ -98,7 +98,7 @@ def plot_covariance_ellipses(
 ) -> LineCollection:
     """Draw the ``n_std`` ellipses of covariances (n, 2, 2) around means (n, 2)."""
     _check_axes("ax", [ax], 1)
-    centres, matrices = as_finite(mean, "mean"), as_finite(covariance, "covariance")
+    centres, matrices = checks.finite(mean, "mean"), checks.finite(covariance, "covariance")
     if matrices.ndim != 3 or matrices.shape[1:] != (2, 2) or centres.shape != matrices.shape[:2]:
         shapes = f"covariance has shape {matrices.shape} and mean {centres.shape}"
         raise ValueError(f"{shapes}, must have (n, 2, 2) and (n, 2): take two outputs.")
@@ -143,14 +143,14 @@ def plot_model_bands(
         Maps x (n, 1) to (mean, std), both (n, n_outputs), where the truth is known.
     """
     if not hasattr(model, "predict_cov"):
-        raise ValueError(f"model == {model!r}, must be a fitted covariance regressor.")
-    inputs, targets = as_finite(X, "X"), as_finite(y, "y")
+        raise ValueError(f"model is {model!r}, must be a fitted covariance regressor.")
+    inputs, targets = checks.finite(X, "X"), checks.finite(y, "y")
     if inputs.ndim != 2 or inputs.shape[1] != 1 or not targets.ndim or len(targets) != len(inputs):
         raise ValueError(f"X has shape {inputs.shape} and y {targets.shape}, must have (n, 1) and (n, n_outputs).")
     targets = targets.reshape(len(targets), -1)
     _check_axes("axes", axes, targets.shape[1])
-    if not isinstance(beyond, Real) or not is_finite(beyond):
-        raise ValueError(f"beyond == {beyond!r}, must be a finite number: how far to draw, in ranges of X.")
+    if not isinstance(beyond, Real) or not checks.is_finite(beyond):
+        raise ValueError(f"beyond is {beyond!r}, must be a finite number: how far to draw, in ranges of X.")
     low, high = inputs.min(), inputs.max()
     query = np.linspace(low - beyond * (high - low), high + beyond * (high - low), 401)[:, np.newaxis]
     mean, covariance = model.predict(query, return_cov=True)
@@ -211,7 +211,7 @@ def plot_stiffness(schedule: Schedule, ax: Axes) -> list[Line2D]:
     -------
     list of Line2D, one an output
     """
-    check_kind(schedule, "schedule", Schedule)
+    checks.instance(schedule, "schedule", Schedule)
     _check_axes("ax", [ax], 1)
     lines: list[Line2D] = []
     for output, name in enumerate(schedule_names(schedule)):
@@ -242,8 +242,8 @@ def plot_pushes(
     unpushed : Rollout, default=None
         The same run without pushes, drawn dashed: how far the robot lags behind by itself.
     """
-    check_kind(rollout, "rollout", Rollout)
-    check_kind(schedule, "schedule", Schedule)
+    checks.instance(rollout, "rollout", Rollout)
+    checks.instance(schedule, "schedule", Schedule)
     _check_outputs([output], schedule.n_outputs)
     _check_axes("axes", axes, 3)
     unit, scale = readable_unit(schedule.units)
@@ -269,10 +269,10 @@ def plot_pushes(
 def _check_outputs(outputs: Any, n_outputs: int) -> None:
     known = isinstance(outputs, Sequence) and all(isinstance(one, int | np.integer) for one in outputs)
     if not known or len(outputs) not in (1, 2) or not all(0 <= one < n_outputs for one in outputs):
-        raise ValueError(f"outputs == {outputs!r}, must be one or two numbers from 0 to {n_outputs - 1}.")
+        raise ValueError(f"outputs is {outputs!r}, must be one or two numbers from 0 to {n_outputs - 1}.")
 
 
 def _check_axes(name: str, axes: Any, least: int) -> None:
     known = np.ndim(axes) == 1 and all(hasattr(ax, "plot") for ax in axes)
     if not known or len(axes) < least:
-        raise ValueError(f"{name} == {axes!r}, must be {least} matplotlib Axes.")
+        raise ValueError(f"{name} is {axes!r}, must be {least} matplotlib Axes.")

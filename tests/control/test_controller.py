@@ -306,17 +306,17 @@ def test_simulation_follows_the_schedule_and_takes_any_plant(controller):
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
-        ({"alpha": 0.0}, "alpha == 0, must be positive"),
-        ({"beta": -1.0}, "beta == -1, must be positive"),
-        ({"tau": 0.0}, "tau == 0"),
-        ({"phase_input": "phase"}, "phase_input == 'phase', must be one of 'time', 'log_s', 's'"),
-        ({"variability": "velocity"}, "variability == 'velocity'"),
-        ({"on_unknown": "stiff"}, "on_unknown == 'stiff'"),
-        ({"gate": "open"}, "gate == 'open'"),
-        ({"cutoff": -3.0}, "cutoff == -3, must be positive"),
-        ({"n_steps": 2}, "n_steps == 2"),
-        ({"mass": 0.0}, "mass == 0 kg"),
-        ({"damping_ratio": -1.0}, "damping_ratio == -1"),
+        ({"alpha": 0.0}, "alpha is 0, must be positive"),
+        ({"beta": -1.0}, "beta is -1, must be positive"),
+        ({"tau": 0.0}, "tau is 0"),
+        ({"phase_input": "phase"}, "phase_input is 'phase', must be one of 'time', 'log_s', 's'"),
+        ({"variability": "velocity"}, "variability is 'velocity'"),
+        ({"on_unknown": "stiff"}, "on_unknown is 'stiff'"),
+        ({"gate": "open"}, "gate is 'open'"),
+        ({"cutoff": -3.0}, "cutoff is -3, must be positive"),
+        ({"n_steps": 2}, "n_steps is 2"),
+        ({"mass": 0.0}, "mass is 0 kg"),
+        ({"damping_ratio": -1.0}, "damping_ratio is -1"),
     ],
 )
 def test_parameters_that_cannot_be_used_are_told_before_work(tunnel, parameters, message):

@@ -252,11 +252,11 @@ def test_rollouts_are_differentiable(rng):
 @pytest.mark.parametrize(
     ("parameters", "words"),
     [
-        ({"alpha": 0.0}, "alpha == 0"),
-        ({"beta": -1.0}, "beta == -1"),
-        ({"gamma": math.nan}, "gamma == nan"),
-        ({"tau": math.inf}, "tau == inf"),
-        ({"duration": 0.0}, "duration == 0"),
+        ({"alpha": 0.0}, "alpha is 0"),
+        ({"beta": -1.0}, "beta is -1"),
+        ({"gamma": math.nan}, "gamma is nan"),
+        ({"tau": math.inf}, "tau is inf"),
+        ({"duration": 0.0}, "duration is 0"),
     ],
 )
 def test_parameters_are_checked(parameters, words):
@@ -270,14 +270,14 @@ STILL = torch.zeros(5, 2).double()
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"dt": 0.0}, "dt == 0 s"),
-        ({"dt": math.nan}, "dt == nan"),
+        ({"dt": 0.0}, "dt is 0 s"),
+        ({"dt": math.nan}, "dt is nan"),
         ({"speed": tensor(1.0, 1.0, -0.1, 1.0, 1.0)}, "speed"),
         ({"speed": tensor(1.0, 1.0, math.nan, 1.0, 1.0)}, "speed"),
         ({"speed": torch.zeros(5), "velocity0": torch.ones(2).double()}, "velocity0"),
         ({"goal": torch.zeros(3).double()}, "goal is of 3 outputs"),
         ({"goal": torch.zeros(4, 2).double()}, "goal is of 2 outputs and 4 ticks"),
-        ({"forcing": lambda time: time[:, None]}, "n_steps == None"),
+        ({"forcing": lambda time: time[:, None]}, "n_steps is None"),
     ],
 )
 def test_arguments_of_a_rollout_are_checked(arguments, words):

@@ -229,19 +229,19 @@ def test_a_plant_of_another_mass_is_told_of():
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"n_rollouts": 0}, "n_rollouts == 0, must be an integer of at least 1"),
-        ({"every": 0}, "every == 0"),
-        ({"peak": -1.0}, "peak == -1, must not be negative"),
-        ({"peak": (3.0, 1.0)}, "peak == (3.0, 1.0), must be the least and then the largest"),
-        ({"duration": 0.0}, "duration == 0.0 s, must be positive and at most 1.5 s"),
-        ({"duration": (0.1, 2.0)}, "duration == (0.1, 2.0) s"),
-        ({"onset": (-1.0, 1.0)}, "onset == (-1.0, 1.0) s, must lie in 0 to 1.5 s"),
-        ({"onset": (0.1, 0.2, 0.3)}, "onset == (0.1, 0.2, 0.3), must be two numbers"),
-        ({"start_scale": -0.1}, "start_scale == -0.1"),
-        ({"reference": "actual"}, "reference == 'actual', must be one of 'desired', 'undisturbed'"),
-        ({"threshold": 0.0}, "threshold == 0 m, must be positive"),
-        ({"quantiles": (0.5, 1.5)}, "quantiles == (0.5, 1.5)"),
-        ({"quantiles": ()}, "quantiles == ()"),
+        ({"n_rollouts": 0}, "n_rollouts is 0, must be an integer of at least 1"),
+        ({"every": 0}, "every is 0"),
+        ({"peak": -1.0}, "peak is -1, must not be negative"),
+        ({"peak": (3.0, 1.0)}, "peak is (3.0, 1.0), must be the least and then the largest"),
+        ({"duration": 0.0}, "duration is 0.0 s, must be positive and at most 1.5 s"),
+        ({"duration": (0.1, 2.0)}, "duration is (0.1, 2.0) s"),
+        ({"onset": (-1.0, 1.0)}, "onset is (-1.0, 1.0) s, must lie in 0 to 1.5 s"),
+        ({"onset": (0.1, 0.2, 0.3)}, "onset is (0.1, 0.2, 0.3), must be two numbers"),
+        ({"start_scale": -0.1}, "start_scale is -0.1"),
+        ({"reference": "actual"}, "reference is 'actual', must be one of 'desired', 'undisturbed'"),
+        ({"threshold": 0.0}, "threshold is 0 m, must be positive"),
+        ({"quantiles": (0.5, 1.5)}, "quantiles is (0.5, 1.5)"),
+        ({"quantiles": ()}, "quantiles is ()"),
     ],
 )
 def test_arguments_are_checked(arguments, words):
@@ -253,6 +253,6 @@ def test_arguments_are_checked(arguments, words):
 def test_too_many_rollouts_are_refused_before_they_are_drawn(monkeypatch):
     monkeypatch.setattr(torch_pbd.files.memory, "available_bytes", lambda: 2**20)
     with pytest.raises(
-        ValueError, match=r"n_rollouts == 100000 needs about 0\.\d+ GiB of memory, but 0\.000781 GiB can be"
+        ValueError, match=r"n_rollouts=100000 needs about 0\.\d+ GiB of memory, but 0\.000781 GiB can be"
     ):
         simulate_many(turning_schedule(), 100_000)

@@ -229,11 +229,11 @@ def test_the_function_is_that_of_kronander_and_billard(generator):
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: EnergyTank(energy=-1.0), "energy == -1 J"),
-        (lambda: EnergyTank(energy=11.0), "energy_max == 10 J"),
-        (lambda: EnergyTank(efficiency=1.0), "efficiency == 1"),
-        (lambda: EnergyTank(energy_max=math.inf), "energy_max == inf"),
-        (lambda: RateLimit(alpha=math.nan), "alpha == nan"),
+        (lambda: EnergyTank(energy=-1.0), "energy is -1 J"),
+        (lambda: EnergyTank(energy=11.0), "energy_max=10 J"),
+        (lambda: EnergyTank(efficiency=1.0), "efficiency is 1"),
+        (lambda: EnergyTank(energy_max=math.inf), "energy_max is inf"),
+        (lambda: RateLimit(alpha=math.nan), "alpha is nan"),
     ],
 )
 def test_parameters_are_checked(make, words):
@@ -243,7 +243,7 @@ def test_parameters_are_checked(make, words):
 
 @pytest.mark.parametrize(
     ("alpha", "lowest", "words"),
-    [(5.0, 100.0, "below 4 /s"), (0.0, 100.0, "alpha == 0 /s"), (1.0, 0.0, "positive definite")],
+    [(5.0, 100.0, "below 4 /s"), (0.0, 100.0, "alpha is 0 /s"), (1.0, 0.0, "positive definite")],
 )
 def test_a_rate_limit_needs_damping_and_stiffness(alpha, lowest, words):
     stiffness = torch.diag_embed(torch.tensor([[100.0, 200.0], [lowest, 200.0]]).double())

@@ -190,7 +190,7 @@ def test_both_solvers_of_the_likelihood_predict_the_same(d, diagonal, aligned):
 
 def test_the_solver_is_checked():
     X, y = demonstrations(aligned=False)
-    with pytest.raises(ValueError, match="solver == 'newton', must be one of 'auto', 'fisher', 'lbfgs'"):
+    with pytest.raises(ValueError, match="solver is 'newton', must be one of 'auto', 'fisher', 'lbfgs'"):
         CholeskyCovRegressor(solver="newton").fit(X, y)
-    with pytest.raises(ValueError, match="solver == 'fisher' holds the hyperparameters, which latent_prior=False"):
+    with pytest.raises(ValueError, match="solver='fisher' holds the hyperparameters, which latent_prior=False"):
         CholeskyCovRegressor(solver="fisher", latent_prior=False).fit(X, y)

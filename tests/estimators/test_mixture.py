@@ -121,7 +121,7 @@ def test_the_regularization_is_relative_to_the_residual(solver):
 
 def test_more_components_than_rows_is_an_error_with_both_numbers():
     X, y = demonstrations(n_inputs=2, n_demos=2)
-    with pytest.raises(ValueError, match=r"n_components == 5, must not be above .* 4 of n_samples = 4"):
+    with pytest.raises(ValueError, match=r"n_components is 5, must not be above .* 4 of n_samples = 4"):
         GMMBaseline().fit(X, y)
 
 
@@ -148,6 +148,6 @@ def test_rows_that_differ_by_rounding_are_no_different_samples():
     """Else k-means finds fewer clusters than it is asked for, and says so in its own words."""
     X = np.repeat([[-1.0], [0.0], [1.0]], 4, axis=0) + 1e-9 * np.arange(12.0)[:, np.newaxis]
     y = np.where(X > 0.5, 1.0, 0.0)
-    with pytest.raises(ValueError, match=r"n_components == 5, .* distinct samples, which is 3 of n_samples = 12"):
+    with pytest.raises(ValueError, match=r"n_components=5, .* distinct samples, which is 3 of n_samples = 12"):
         GMMBaseline(n_components=5).fit(X, y)
     assert fit(GMMBaseline(n_components=3), X, y).predict_cov(X).shape == (12, 1, 1)

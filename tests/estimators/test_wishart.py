@@ -116,9 +116,9 @@ def test_both_solvers_predict_the_same(objective):
 
 def test_the_solver_is_checked():
     X, y = demonstrations(aligned=False)
-    with pytest.raises(ValueError, match="solver == 'em', must be one of 'auto', 'fisher', 'lbfgs'"):
+    with pytest.raises(ValueError, match="solver is 'em', must be one of 'auto', 'fisher', 'lbfgs'"):
         WishartProcessRegressor(solver="em").fit(X, y)
-    with pytest.raises(ValueError, match="solver == 'fisher' holds the hyperparameters, which latent_prior=False"):
+    with pytest.raises(ValueError, match="solver='fisher' holds the hyperparameters, which latent_prior=False"):
         WishartProcessRegressor(solver="fisher", latent_prior=False).fit(X, y)
 
 

@@ -173,17 +173,17 @@ def test_20_a_movement_of_many_ticks_is_refused_with_its_memory(monkeypatch):
     for ask in (lambda: controller().schedule(1e6), lambda: controller().reproduce(1e6)):
         with pytest.raises(ValueError, match=r"a schedule of 2000001 ticks of 2 axes needs about .* GiB.*Lower rate"):
             ask()
-    with pytest.raises(ValueError, match=r"rate == 1e\+300 .* makes 2e\+300 ticks .* lower them"):
+    with pytest.raises(ValueError, match=r"rate=1e\+300 .* makes 2e\+300 ticks .* lower them"):
         controller().schedule(1e300)
 
 
 @pytest.mark.parametrize("n_steps", [10**5, 10**9, np.int64(10**12)])
 def test_20_a_movement_of_many_steps_is_refused_with_its_memory(n_steps, monkeypatch):
     monkeypatch.setattr(torch_pbd.files.memory, "available_bytes", lambda: 2**34)
-    with pytest.raises(ValueError, match=rf"n_steps == {n_steps} of 4 demonstrations of 2 axes needs about .* GiB"):
+    with pytest.raises(ValueError, match=rf"n_steps={n_steps} of 4 demonstrations of 2 axes needs about .* GiB"):
         new(n_steps=n_steps).fit(recorded())
     monkeypatch.setattr(torch_pbd.files.memory, "available_bytes", lambda: 2**26)
-    with pytest.raises(ValueError, match=rf"n_steps == {10 * n_steps} of 4 .* GiB of memory.*Lower n_steps"):
+    with pytest.raises(ValueError, match=rf"n_steps={10 * n_steps} of 4 .* GiB of memory.*Lower n_steps"):
         controller().smooth(recorded(), 10 * n_steps)
 
 
@@ -230,7 +230,7 @@ def test_25_a_controller_that_is_not_fitted_says_so(method):
 
 def test_25_a_fit_that_fails_leaves_no_mixture_of_two():
     model = new().fit(recorded())
-    with pytest.raises(ValueError, match="alpha == -1"):
+    with pytest.raises(ValueError, match="alpha is -1"):
         model.set_params(alpha=-1.0).fit(recorded())
     with pytest.raises(NotFittedError):
         model.predict([[0.0]])
@@ -264,7 +264,7 @@ def test_parameters_out_of_range_are_refused_by_name(name, value):
 
 @pytest.mark.parametrize(("phase_input", "gamma"), [("s", 1e300), ("s", 1e-300), ("log_s", 1e300), ("s", 50.0)])
 def test_a_phase_whose_times_cannot_be_told_apart_is_refused(phase_input, gamma):
-    with pytest.raises(ValueError, match=r"gamma == .* takes the phase from 1 to exp.*phase_input='time'"):
+    with pytest.raises(ValueError, match=r"gamma=.* takes the phase from 1 to exp.*phase_input='time'"):
         new(phase_input=phase_input, gamma=gamma).fit(recorded())
 
 
@@ -281,9 +281,9 @@ BAD_CALLS = [
     ("simulate", {"force": np.full((201, 2), np.nan)}, "force has a value that is not finite, at tick 0"),
     ("simulate", {"force": np.zeros((201, 2)) + 1j}, "Complex data not supported: force"),
     ("simulate", {"force": np.ma.masked_all((201, 2))}, "force has masked entries"),
-    ("simulate", {"plant": "x"}, "plant == 'x', must be an AdmittancePlant"),
+    ("simulate", {"plant": "x"}, "plant is 'x', must be an AdmittancePlant"),
     ("simulate", {"plant": AdmittancePlant}, "must be an AdmittancePlant or None"),
-    ("simulate", {"random_state": -1}, "random_state == -1, must be None"),
+    ("simulate", {"random_state": -1}, "random_state is -1, must be None"),
     ("reproduce", {"goal": 1.0}, r"goal has shape \(\), must have shape \(2,\)"),
     ("reproduce", {"goal": np.zeros((3, 2))}, r"goal has shape \(3, 2\)"),
     ("reproduce", {"goal": ["1", "2"]}, "goal holds text"),
@@ -292,13 +292,13 @@ BAD_CALLS = [
     ("reproduce", {"speed": []}, r"speed has shape \(0,\)"),
     ("reproduce", {"speed": -1.0}, "speed has a negative value"),
     ("reproduce", {"speed": np.ones((2, 2))}, r"speed has shape \(2, 2\)"),
-    ("schedule", {"settle": -1.0}, "settle == -1, must not be negative"),
-    ("schedule", {"settle": np.nan}, "settle == nan, must be a finite number"),
+    ("schedule", {"settle": -1.0}, "settle is -1, must not be negative"),
+    ("schedule", {"settle": np.nan}, "settle is nan, must be a finite number"),
     ("phase", {"time": 1.0}, r"time has shape \(\), must be finite times of shape \(n,\)"),
     ("phase", {"time": [np.nan]}, "must be finite times"),
     ("smooth", {"demonstrations": np.zeros((4, 5, 2))}, "demonstrations is a ndarray, must be Demonstrations"),
-    ("smooth", {"demonstrations": recorded(), "n_steps": 0}, "n_steps == 0, must be an integer of at least 2"),
-    ("varying", {"movements": "x"}, r"movements == str, must be what smooth\(demonstrations\) returns"),
+    ("smooth", {"demonstrations": recorded(), "n_steps": 0}, "n_steps is 0, must be an integer of at least 2"),
+    ("varying", {"movements": "x"}, r"movements is str, must be what smooth\(demonstrations\) returns"),
 ]
 
 
@@ -312,5 +312,5 @@ def test_arguments_that_cannot_be_used_are_refused_by_name(method, given, messag
 @pytest.mark.parametrize("rate", ["100", None, 0.0, -1.0, np.nan, np.inf, True, 1e-3, 10**400])
 def test_rates_that_are_none_are_refused(rate):
     for method in ("schedule", "simulate", "reproduce"):
-        with pytest.raises(ValueError, match="rate == "):
+        with pytest.raises(ValueError, match="rate is "):
             getattr(controller(), method)(rate=rate)

@@ -69,7 +69,7 @@ def test_67_a_few_that_chance_brings_near_are_merged_without_a_word(rng):
 @pytest.mark.parametrize("period", [5e-324, 1e-308, 1e-100, 1e-10])
 def test_86_a_period_below_the_resolution_of_the_inputs_is_an_error_in_words(kernel, period):
     X, y = np.tile(EXACT, 8)[:, np.newaxis], PATH.ravel()
-    with pytest.raises(ValueError, match=f"period == {period}, must be .* no shorter than 1e-08 of its range"):
+    with pytest.raises(ValueError, match=f"period is {period}, must be .* no shorter than 1e-08 of its range"):
         HeteroscedasticGPRegressor(kernel=kernel, period=period).fit(X, y)
 
 

@@ -348,6 +348,6 @@ def test_what_could_not_be_loaded_again_is_not_saved(tmp_path):
     with pytest.raises(ValueError, match="cannot be saved, as it is not sound: y_shift holds a number that is not"):
         torch_pbd.save(model, path)
     controller = torch_pbd.load(GOLDEN / "DMPController.safetensors")
-    with pytest.raises(ValueError, match="the DMPController cannot be saved, as it is not sound: gate == 'open'"):
+    with pytest.raises(ValueError, match="the DMPController cannot be saved, as it is not sound: gate is 'open'"):
         torch_pbd.save(controller.set_params(gate="open"), path)
     assert list(tmp_path.iterdir()) == []

@@ -50,7 +50,7 @@ ERRORS = {
     r"[Xy] is float16 and column \d+ is stored in steps of": "the type holds less than a thousandth of the range",
     r"demonstration \d+, smoothed, leaves the recorded range": "through a few samples of noise a curve swings",
     r"The reproduced movement leaves the recorded range": "the same, of a primitive that they drive",
-    r"n_components == \d+, must not be above the number of distinct samples": "a component each is the most there is",
+    r"n_components is \d+, must not be above the number of distinct samples": "a component each is the most there is",
 }
 # What it may warn of, and why; any other warning is a fault.
 WARNINGS = {

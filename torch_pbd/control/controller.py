@@ -382,7 +382,7 @@ class DMPController(BaseEstimator):
     def varying(self, movements: Movements) -> Floats:
         """What ``variability`` is of, (K, n, d), in smoothed movements of the same task."""
         if not isinstance(movements, Movements):
-            raise ValueError(f"movements == {type(movements).__name__}, must be what smooth(demonstrations) returns.")
+            raise ValueError(f"movements is {type(movements).__name__}, must be what smooth(demonstrations) returns.")
         return movements.position if self.variability == "position" else self.reproduction_.forcing_of(movements)
 
     def __sklearn_is_fitted__(self) -> bool:

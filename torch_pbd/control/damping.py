@@ -43,12 +43,12 @@ def damping_from_stiffness(
     if isinstance(damping_ratio, str) and damping_ratio == "paper":
         return spectral_map(matrix, _root)
     if isinstance(damping_ratio, str):
-        raise ValueError(f"damping_ratio == {damping_ratio!r}, must be a number or 'paper'.")
+        raise ValueError(f"damping_ratio is {damping_ratio!r}, must be a number or 'paper'.")
     check_finite("damping_ratio", damping_ratio)
     if damping_ratio < 0.0:
-        raise ValueError(f"damping_ratio == {damping_ratio:g}, must not be negative: the motion would gain energy.")
+        raise ValueError(f"damping_ratio is {damping_ratio:g}, must not be negative: the motion would gain energy.")
     if damping_ratio > _MOST_RATIO:
-        raise ValueError(f"damping_ratio == {damping_ratio:g}, must be at most {_MOST_RATIO:g}; 1 is critical.")
+        raise ValueError(f"damping_ratio is {damping_ratio:g}, must be at most {_MOST_RATIO:g}; 1 is critical.")
     mass = as_mass(mass)
     if not isinstance(mass, Tensor) or mass.ndim == 0:
         return 2.0 * damping_ratio * mass**0.5 * spectral_map(matrix, _root)
@@ -88,7 +88,7 @@ def required_damping_ratio(stiffness_ratio: float) -> float:
     """
     check_finite("stiffness_ratio", stiffness_ratio)
     if stiffness_ratio < 1.0:
-        raise ValueError(f"stiffness_ratio == {stiffness_ratio:g}, must be at least 1: largest over smallest.")
+        raise ValueError(f"stiffness_ratio is {stiffness_ratio:g}, must be at least 1: largest over smallest.")
     root = stiffness_ratio**0.25
     largest = root + 1.0 / root
     if largest <= 4.0:

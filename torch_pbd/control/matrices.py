@@ -24,7 +24,7 @@ def check_mass(mass: Any) -> None:
     if not isinstance(mass, Tensor) or mass.ndim == 0:
         check_positive("mass", float(mass) if isinstance(mass, Tensor) else mass, "kg")
         if not _LIGHTEST <= float(mass) <= 1.0 / _LIGHTEST:
-            raise ValueError(f"mass == {float(mass):g} kg, must be from {_LIGHTEST:g} to {1.0 / _LIGHTEST:g} kg.")
+            raise ValueError(f"mass is {float(mass):g} kg, must be from {_LIGHTEST:g} to {1.0 / _LIGHTEST:g} kg.")
         return
     mass = as_semidefinite(mass, "mass")
     if not len(mass):
@@ -76,7 +76,7 @@ def _copied(value: Any, name: str) -> Tensor:
         # Torch takes no negative strides, which a copy has not.
         return torch.tensor(value.copy() if hasattr(value, "strides") else value, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise ValueError(f"{name} == {value!r}, must be numbers of one shape ({error}).") from error
+        raise ValueError(f"{name} is {value!r}, must be numbers of one shape ({error}).") from error
 
 
 def as_rows(value: Any, name: str, n_dims: int) -> Tensor:
@@ -130,7 +130,7 @@ def check_finite(name: str, value: Any, *, optional: bool = False) -> None:
     if optional and value is None:
         return
     if isinstance(value, bool) or not isinstance(value, Real) or not is_finite(value):
-        raise ValueError(f"{name} == {value!r}, must be a finite number.")
+        raise ValueError(f"{name} is {value!r}, must be a finite number.")
 
 
 def check_device(device: Any) -> None:
@@ -139,7 +139,7 @@ def check_device(device: Any) -> None:
         torch.empty(0, device=device)
     except (AssertionError, OverflowError, RuntimeError, TypeError, ValueError) as error:
         problem = str(error).partition("\n")[0].rstrip(".")
-        raise ValueError(f"device == {device!r} cannot be used here: {problem}. None is the CPU.") from error
+        raise ValueError(f"device is {device!r}, which cannot be used here: {problem}. None is the CPU.") from error
 
 
 def is_finite(value: Any) -> bool:
@@ -153,20 +153,20 @@ def is_finite(value: Any) -> bool:
 def check_flag(name: str, value: Any) -> None:
     """Check that a parameter is True or False; a text would count as True."""
     if not isinstance(value, bool) and str(getattr(value, "dtype", "")) != "bool":
-        raise ValueError(f"{name} == {value!r}, must be True or False.")
+        raise ValueError(f"{name} is {value!r}, must be True or False.")
 
 
 def check_positive(name: str, value: Any, unit: str = "") -> None:
     """Check that a parameter is a positive finite number."""
     check_finite(name, value)
     if value <= 0.0:
-        raise ValueError(f"{name} == {value:g}{unit and ' ' + unit}, must be positive.")
+        raise ValueError(f"{name} is {value:g}{unit and ' ' + unit}, must be positive.")
 
 
 def check_count(name: str, value: Any, least: int) -> None:
     """Check that a parameter is an integer not below ``least``."""
     if isinstance(value, bool) or not isinstance(value, Integral) or not least <= int(value) < _MANY:
-        raise ValueError(f"{name} == {value!r}, must be an integer of at least {least}.")
+        raise ValueError(f"{name} is {value!r}, must be an integer of at least {least}.")
 
 
 def broadcasts(value: Tensor, other: Tensor) -> bool:

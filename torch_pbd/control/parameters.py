@@ -10,7 +10,7 @@ from scipy.sparse import issparse
 from sklearn.exceptions import NotFittedError
 from sklearn.utils.validation import check_array, check_X_y
 
-from torch_pbd.arguments import as_floats
+from torch_pbd import checks
 from torch_pbd.control.damping import damping_from_stiffness
 from torch_pbd.control.impedance import OnUnknown
 from torch_pbd.control.matrices import check_count, check_finite, check_positive
@@ -62,18 +62,18 @@ def check_parameters(controller: Any) -> None:
     for name, kind in _CHOICES.items():
         if getattr(controller, name) not in get_args(kind):
             listed = ", ".join(map(repr, get_args(kind)))
-            raise ValueError(f"{name} == {getattr(controller, name)!r}, must be one of {listed}.")
+            raise ValueError(f"{name} is {getattr(controller, name)!r}, must be one of {listed}.")
     check_count("n_steps", controller.n_steps, 5)
     if controller.cutoff not in ("auto", None):
         check_positive("cutoff", controller.cutoff)
     regressor = controller.covariance
     if regressor is not None and (isinstance(regressor, type) or not all(hasattr(regressor, need) for need in _NEEDED)):
         raise ValueError(
-            f"covariance == {regressor!r}, must be a covariance regressor, not yet fitted or fitted, or None."
+            f"covariance is {regressor!r}, must be a covariance regressor, not yet fitted or fitted, or None."
         )
     law = controller.stiffness_law
     if law is not None and not isinstance(law, StiffnessLaw):
-        raise ValueError(f"stiffness_law == {law!r}, must be a StiffnessLaw or None.")
+        raise ValueError(f"stiffness_law is {law!r}, must be a StiffnessLaw or None.")
     if controller.duration is not None:
         check_positive("duration", controller.duration, "s")
     for name, unit in (("mass", "kg"), ("alpha", ""), ("gamma", ""), ("tau", "s")):
@@ -91,35 +91,35 @@ def check_against_duration(controller: Any) -> None:
     """Check the parameters that only the duration of the movement makes too small or too large."""
     duration, tau = controller.duration_, controller.dmp_.tau
     if not _BRIEFEST <= duration <= 1.0 / _BRIEFEST:
-        raise ValueError(f"duration == {duration:g}, must be {_BRIEFEST:g} to {1.0 / _BRIEFEST:g} s.")
+        raise ValueError(f"duration is {duration:g}, must be {_BRIEFEST:g} to {1.0 / _BRIEFEST:g} s.")
     cycles = None if controller.cutoff_ is None else controller.cutoff_ * duration
     if cycles is not None and not _FEWEST_CYCLES <= cycles <= _MOST_CYCLES:
         # Where the automatic one too would be out of range, the times are in another unit than they say.
         suspect = controller.cutoff == "auto" or CUTOFF_HZ * duration > _MOST_CYCLES
-        units = f"the unit of the times is suspect, time_unit == {controller.time_unit_!r} (known: {', '.join(TIMES)})"
+        units = f"the unit of the times is suspect, time_unit={controller.time_unit_!r} (known: {', '.join(TIMES)})"
         automatic = "leave it 'auto'"
         raise ValueError(
-            f"cutoff == {controller.cutoff_:g} Hz is {cycles:.3g} cycles in a movement of duration == {duration:.3g}, "
+            f"cutoff={controller.cutoff_:g} Hz is {cycles:.3g} cycles in a movement of duration={duration:.3g}, "
             f"must be {_FEWEST_CYCLES:g} to {_MOST_CYCLES:g}: {units if suspect else automatic}."
         )
     alpha, beta, gamma = (float(value) for value in (controller.alpha, controller.beta or 1.0, controller.gamma))
     fastest = max(alpha, math.sqrt(alpha) * math.sqrt(beta)) / tau * duration
     if fastest > _FASTEST:
         raise ValueError(
-            f"alpha == {alpha:g} and beta == {beta:g} with tau == {tau:g} are {fastest:.3g} time constants in a "
+            f"alpha={alpha:g} and beta={beta:g} with tau={tau:g} are {fastest:.3g} time constants in a "
             f"movement of {duration:.3g} s, must be at most {_FASTEST:g}: lower alpha or raise tau."
         )
     resting = max(2.0 * tau / alpha, tau / gamma if controller.gate == "phase" else 0.0) / duration
     if resting > _SLOWEST:
         raise ValueError(
-            f"alpha == {alpha:g} and gamma == {gamma:g} with tau == {tau:g} let the primitive rest only {resting:.3g} "
-            f"durations (duration == {duration:.3g}) after the movement, must be at most {_SLOWEST:g}: raise alpha, or "
+            f"alpha={alpha:g} and gamma={gamma:g} with tau={tau:g} let the primitive rest only {resting:.3g} "
+            f"durations (duration={duration:.3g}) after the movement, must be at most {_SLOWEST:g}: raise alpha, or "
             "lower tau."
         )
     decay = gamma * duration / tau
     if controller.phase_input != "time" and not _LEAST_DECAY <= decay <= _MOST_DECAY[controller.phase_input]:
         raise ValueError(
-            f"gamma == {gamma:g} with tau == {tau:g} takes the phase from 1 to exp(-{decay:.3g}) in a movement of "
+            f"gamma={gamma:g} with tau={tau:g} takes the phase from 1 to exp(-{decay:.3g}) in a movement of "
             f"{duration:.3g} s, where its times cannot be told apart: take phase_input='time', or another gamma."
         )
 
@@ -203,7 +203,7 @@ def as_times(X: ArrayLike) -> Floats:
 
 def as_movement_times(time: ArrayLike) -> Floats:
     """Movement times (n,), finite."""
-    times = as_floats(time, "time")
+    times = checks.real_floats(time, "time")
     if times.ndim != 1 or not np.isfinite(times).all():
         raise ValueError(f"time has shape {times.shape}, must be finite times of shape (n,), in s from the start.")
     return times
@@ -211,7 +211,7 @@ def as_movement_times(time: ArrayLike) -> Floats:
 
 def as_places(values: ArrayLike, name: str, d: int, n_ticks: int | None = None) -> Floats:
     """A place (d,), or one for each tick (n, d), finite."""
-    places = as_floats(values, name)
+    places = checks.real_floats(values, name)
     allowed = [(d,)] if n_ticks is None else [(d,), (1, d), (n_ticks, d)]
     if places.shape not in allowed:
         listed = " or ".join(map(str, allowed))
@@ -223,7 +223,7 @@ def as_places(values: ArrayLike, name: str, d: int, n_ticks: int | None = None) 
 
 def as_speed(values: ArrayLike) -> Floats:
     """How fast movement time passes: a number, or one for each tick (n,); finite, none negative."""
-    speed = as_floats(values, "speed")
+    speed = checks.real_floats(values, "speed")
     if speed.ndim > 1 or not speed.size:
         raise ValueError(f"speed has shape {speed.shape}, must be a number, or (n,): one for each tick.")
     if not np.isfinite(speed).all():
@@ -238,15 +238,15 @@ def as_tick_times(duration: float, rate: float, settle: float, d: int, n_ticks: 
     check_positive("rate", rate)
     check_finite("settle", settle)
     if settle < 0.0:
-        raise ValueError(f"settle == {settle:g}, must not be negative.")
+        raise ValueError(f"settle is {settle:g}, must not be negative.")
     if (duration + settle) * rate > _MOST_TICKS:
         raise ValueError(
-            f"rate == {rate:g} with settle == {settle:g} makes {(duration + settle) * rate:.3g} ticks of a movement of "
+            f"rate={rate:g} with settle={settle:g} makes {(duration + settle) * rate:.3g} ticks of a movement of "
             f"{duration:g} s, more than {_MOST_TICKS:g}: lower them."
         )
     counted = count_rows(duration + settle, rate)
     if counted < 2:
-        raise ValueError(f"rate == {rate:g} gives {counted} tick in {duration:g}, must give at least 2.")
+        raise ValueError(f"rate={rate:g} gives {counted} tick in {duration:g}, must give at least 2.")
     check_memory(counted if n_ticks is None else n_ticks, d)
     return row_times(duration + settle, rate) if n_ticks is None else np.arange(n_ticks) / rate
 
@@ -271,6 +271,6 @@ def check_steps(n_steps: int, n_demos: int, d: int, *, learned: bool) -> None:
         needed += n * (max(_PAIRED, _PAIRED_AXIS * d) * n + _TABULATED * d)
     require_much(
         8.0 * needed,
-        what=f"n_steps == {n_steps} of {n_demos} demonstrations of {d} axes",
+        what=f"n_steps={n_steps} of {n_demos} demonstrations of {d} axes",
         remedy="Lower n_steps: 100 to 500 follow most movements.",
     )

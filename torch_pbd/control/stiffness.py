@@ -64,28 +64,28 @@ class StiffnessLaw:
     def __post_init__(self) -> None:
         check_flag("smooth", self.smooth)
         if self.bounds not in get_args(Bounds):
-            raise ValueError(f"bounds == {self.bounds!r}, must be one of {', '.join(map(repr, get_args(Bounds)))}.")
+            raise ValueError(f"bounds is {self.bounds!r}, must be one of {', '.join(map(repr, get_args(Bounds)))}.")
         for name in ("stiffness_min", "stiffness_max", "sigma_low", "sigma_high"):
             check_finite(name, getattr(self, name), optional=name.startswith("sigma"))
         if not 0.0 < self.stiffness_min <= self.stiffness_max:
             raise ValueError(
-                f"stiffness_min == {self.stiffness_min:g} and stiffness_max == {self.stiffness_max:g} N/m, must be "
+                f"stiffness_min={self.stiffness_min:g} and stiffness_max={self.stiffness_max:g} N/m, must be "
                 "0 < stiffness_min <= stiffness_max."
             )
         given = [value for value in (self.sigma_low, self.sigma_high) if value is not None]
         if self.bounds == "quantile" and given:
             raise ValueError(
-                f"sigma_low == {self.sigma_low} and sigma_high == {self.sigma_high} are standard deviations: give "
+                f"sigma_low={self.sigma_low} and sigma_high={self.sigma_high} are standard deviations: give "
                 "bounds='sigma' with them (or 'variance'). bounds='quantile' takes its own from the covariances."
             )
         if self.bounds != "quantile" and (self.sigma_low is None or self.sigma_high is None):
             raise ValueError(
-                f"bounds == {self.bounds!r} needs sigma_low and sigma_high, got {self.sigma_low}, {self.sigma_high}. "
+                f"bounds={self.bounds!r} needs sigma_low and sigma_high, got {self.sigma_low}, {self.sigma_high}. "
                 "Give both, or let bounds='quantile' take them from the covariances."
             )
         if given and not 0.0 <= given[0] < given[1]:
             raise ValueError(
-                f"sigma_low == {given[0]:g} and sigma_high == {given[1]:g}, must be 0 <= sigma_low < sigma_high."
+                f"sigma_low={given[0]:g} and sigma_high={given[1]:g}, must be 0 <= sigma_low < sigma_high."
             )
 
     def __call__(self, covariance: Float[Tensor, "*b d d"] | Any) -> Float[Tensor, "*b d d"]:
@@ -109,7 +109,7 @@ class StiffnessLaw:
         """
         check_finite("resolution", resolution)
         if resolution < 0.0:
-            raise ValueError(f"resolution == {resolution:g}, must not be negative.")
+            raise ValueError(f"resolution is {resolution:g}, must not be negative.")
         low, high = self._resolved(as_semidefinite(covariance, "covariance"), float(resolution))
         return replace(self, sigma_low=low, sigma_high=high, bounds="sigma")
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torch_pbd.arguments import as_floats
+from torch_pbd import checks
 from torch_pbd.data.units import exact, nanoseconds_hint
 from torch_pbd.files.memory import require_much
 
@@ -127,7 +127,7 @@ def dtw_path(a: ArrayLike, b: ArrayLike) -> NDArray[np.intp]:
     H. Sakoe, S. Chiba, "Dynamic programming algorithm optimization for spoken word recognition", IEEE
     Transactions on Acoustics, Speech, and Signal Processing 26, 1978.
     """
-    first, second = as_floats(a, "a"), as_floats(b, "b")
+    first, second = checks.real_floats(a, "a"), checks.real_floats(b, "b")
     if first.ndim != 2 or second.ndim != 2 or first.shape[1] != second.shape[1]:
         raise ValueError(
             "dtw_path compares curves of shape (n, d) and (m, d) with the same d; got "

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torch_pbd.arguments import check_text, from_tensor
+from torch_pbd import checks
 from torch_pbd.data.alignment import Floats
 from torch_pbd.data.missing import drop_missing
 from torch_pbd.data.units import ANGLES, LENGTHS, TIMES, check_unit, exact, nanoseconds_hint
@@ -78,7 +78,7 @@ def as_names(names: Sequence[str], n_outputs: int) -> tuple[str, ...]:
     if len(set(values)) < n_outputs:
         raise ValueError(f"names must differ from each other; got {preview(values)}.")
     for i, name in enumerate(values):
-        check_text(name, f"names[{i}]")
+        checks.text(name, f"names[{i}]")
     return values
 
 
@@ -139,7 +139,7 @@ def _as_list(values: Any, argument: str) -> list[Any]:
 
 def _as_numbers(values: Any, argument: str, drop: bool) -> NDArray[Any]:
     if hasattr(values, "detach"):
-        values = from_tensor(values, argument)
+        values = checks.from_tensor(values, argument)
     if np.ma.is_masked(values):
         if not drop:
             raise ValueError(

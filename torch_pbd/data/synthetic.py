@@ -6,12 +6,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torch_pbd.arguments import as_finite, as_floats, is_finite
+from torch_pbd import checks
 from torch_pbd.data.alignment import Floats
 from torch_pbd.data.demonstrations import Demonstrations
 from torch_pbd.data.recordings import check_choice
 from torch_pbd.files.memory import require_much
-from torch_pbd.seeds import as_random_state
 
 Reading = Literal["printed", "bell", "bowl"]
 Variant = Literal["plain", "unequal", "dropped", "jitter", "outlier", "two_path"]
@@ -106,7 +105,7 @@ def make_paper_simulation(
 
 def tunnel_center(y: ArrayLike) -> Floats:
     """Centre line of the tunnel: x in m at y in m, one period of a 2 cm sine over the path of 0.6 m."""
-    return 0.02 * np.sin(2.0 * np.pi * as_floats(y, "y") / PATH_LENGTH)
+    return 0.02 * np.sin(2.0 * np.pi * checks.real_floats(y, "y") / PATH_LENGTH)
 
 
 def tunnel_half_width(y: ArrayLike) -> Floats:
@@ -114,7 +113,7 @@ def tunnel_half_width(y: ArrayLike) -> Floats:
 
     12 cm up to y = 0.2 m, 1 cm from y = 0.45 m, and a smoothstep ``3 s^2 - 2 s^3`` between them.
     """
-    s = np.clip((as_floats(y, "y") - 0.2) / 0.25, 0.0, 1.0)
+    s = np.clip((checks.real_floats(y, "y") - 0.2) / 0.25, 0.0, 1.0)
     return 0.12 - 0.11 * s**2 * (3.0 - 2.0 * s)
 
 
@@ -167,7 +166,7 @@ def make_tunnel_demonstrations(
     check_choice(variant, _VARIANTS, "variant")
     _check_count(n_demos, "n_demos")
     for name, value in (("duration", duration), ("rate", rate)):
-        if isinstance(value, bool) or not isinstance(value, Real) or not is_finite(value):
+        if isinstance(value, bool) or not isinstance(value, Real) or not checks.is_finite(value):
             raise ValueError(f"{name}={value!r} must be a positive number.")
     require_much(400.0 * n_demos * abs(duration * rate), what=f"n_demos={n_demos}", remedy="Make fewer samples.")
     if not (np.isfinite(duration * rate) and duration > 0.0 and round(duration * rate) >= 1):
@@ -247,11 +246,11 @@ def _band_noise(
 def _generator(random_state: Seed) -> Random:
     if isinstance(random_state, np.random.Generator):
         return random_state
-    return as_random_state(random_state)
+    return checks.seed(random_state)
 
 
 def _column(xi: ArrayLike) -> Floats:
-    x = as_finite(xi, "xi")
+    x = checks.finite(xi, "xi")
     if x.ndim > 2 or (x.ndim == 2 and x.shape[1] != 1):
         raise ValueError(f"xi has shape {x.shape}: eq. (14) has one input, (n,) or (n, 1).")
     return x.reshape(-1)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torch_pbd.arguments import check_kind
+from torch_pbd import checks
 from torch_pbd.data.alignment import Floats
 from torch_pbd.data.demonstrations import Demonstrations
 from torch_pbd.exceptions import UnimodalityWarning
@@ -47,7 +47,7 @@ def check_unimodal(demonstrations: Demonstrations) -> bool:
     UnimodalityWarning
         If there are two groups, or one demonstration far from all others.
     """
-    check_kind(demonstrations, "demonstrations", Demonstrations)
+    checks.instance(demonstrations, "demonstrations", Demonstrations)
     if len(demonstrations) < _LEAST_DEMOS:
         return True
     aligned = demonstrations if demonstrations.is_aligned else demonstrations.align()

@@ -14,6 +14,7 @@ from sklearn.utils._tags import Tags
 from sklearn.utils.validation import check_is_fitted
 from torch import Tensor
 
+from torch_pbd import checks
 from torch_pbd.estimators.demonstrations import check_groups
 from torch_pbd.estimators.prior import prior_covariance
 from torch_pbd.estimators.progress import printed_progress
@@ -35,7 +36,6 @@ from torch_pbd.files.memory import require_much
 from torch_pbd.linalg import gaussian_log_density, safe_cholesky, student_log_density
 from torch_pbd.models.conditional import ConditionalNormal
 from torch_pbd.optim import Progress
-from torch_pbd.seeds import as_random_state
 
 
 class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator, ABC):
@@ -128,9 +128,9 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator, ABC)
         check_number(self.n_restarts, "n_restarts", low=0, integer=True)
         if not isinstance(self.verbose, bool):
             check_number(self.verbose, "verbose", low=0, integer=True)
-        as_random_state(self.random_state)
+        checks.seed(self.random_state)
         if problem := self._device_problem():
-            raise ValueError(f"device == {self.device!r} cannot be used here: {problem}. None is the CPU.")
+            raise ValueError(f"device is {self.device!r}, which cannot be used here: {problem}. None is the CPU.")
 
     def predict(self, X: ArrayLike, *, return_std: bool = False, return_cov: bool = False) -> Any:
         """Mean of y at X, and with it the standard deviations or the covariances.
@@ -209,11 +209,11 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator, ABC)
         ndarray of shape (n_samples_X, n_outputs, n_samples), or (n_samples_X, n_samples) if y was 1-D
         """
         check_number(n_samples, "n_samples", low=1, integer=True)
-        generator = as_random_state(random_state)
+        generator = checks.seed(random_state)
         x = self._query(X)
         require_much(
             4 * 8.0 * len(x) * self.n_outputs_ * n_samples,
-            what=f"n_samples == {n_samples} at {len(x)} rows",
+            what=f"n_samples={n_samples} at {len(x)} rows",
             remedy="Draw fewer at a time.",
         )
         mean, scale_tril = (part.cpu().numpy() for part in self._tensors(self._mean_and_tril, x))

@@ -199,7 +199,7 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
         noise = self.noise_scale / self._door(problem.scaling.y_scale)[row]
         if not bool((noise < _LARGEST_NOISE).all()):
             raise ValueError(
-                f"noise_scale == {self.noise_scale:g} is {float(noise.max()):.3g} times the deviation of y: give it in "
+                f"noise_scale={self.noise_scale:g} is {float(noise.max()):.3g} times the deviation of y: give it in "
                 "the units of y, or None to learn it."
             )
         if self.diagonal == "log":

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torch_pbd.arguments import from_tensor
+from torch_pbd import checks
 from torch_pbd.data import Demonstrations, check_unimodal
 from torch_pbd.estimators.validation import Floats
 from torch_pbd.exceptions import DataRankWarning
@@ -54,7 +54,7 @@ def check_groups(groups: Any, n_samples: int) -> NDArray[np.intp]:
 
 def _as_labels(groups: Any) -> NDArray[Any]:
     if hasattr(groups, "detach"):
-        groups = from_tensor(groups, "groups")
+        groups = checks.from_tensor(groups, "groups")
     if np.ma.is_masked(groups):
         raise ValueError("groups has masked entries: say of every row which demonstration it is of.")
     if isinstance(groups, list | tuple) and len({isinstance(label, str) for label in groups}) > 1:

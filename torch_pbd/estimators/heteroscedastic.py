@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
+from torch_pbd import checks
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.estimators.demonstrations import check_demonstrations, warn_of_residuals
 from torch_pbd.estimators.inducing import check_memory, numbers_to_try, warn_if_unresolved
@@ -34,7 +35,6 @@ from torch_pbd.models.heteroscedastic import (
     mean_start,
 )
 from torch_pbd.models.training import TrainingSet
-from torch_pbd.seeds import as_random_state
 
 _DRAWN = 65536  # matrices drawn at a time: memory stays bounded
 
@@ -234,12 +234,12 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         ndarray of shape (n_samples_X, n_outputs, n_outputs, n_samples)
         """
         check_number(n_samples, "n_samples", low=1, integer=True)
-        generator = as_random_state(random_state)
+        generator = checks.seed(random_state)
         x = self._query(X)
         core: Any = self.module_.core
         require_much(
             8.0 * n_samples * (len(x) * self.n_outputs_**2 + 3 * sum(core.draw_sizes())),
-            what=f"n_samples == {n_samples} at {len(x)} rows",
+            what=f"n_samples={n_samples} at {len(x)} rows",
             remedy="Draw fewer at a time.",
         )
         normal = [[self._door(generator.standard_normal(size)) for size in core.draw_sizes()] for _ in range(n_samples)]

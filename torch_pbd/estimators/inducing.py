@@ -37,7 +37,7 @@ def check_memory(n_inducing: int | None, max_inputs: int, shape: tuple[int, int,
     searched = 4 * (n_features + 1) * (n_features + 2) * n_outputs * size * (n_inputs + size)
     require_much(
         8.0 * (searched + 24 * (n_outputs * size) ** 2),
-        what=f"max_inputs == {max_inputs} with n_inducing == {n_inducing} lets {n_inputs} distinct "
+        what=f"max_inputs={max_inputs} with n_inducing={n_inducing} lets {n_inputs} distinct "
         f"inputs and {size} inducing ones into the fit, which",
         remedy="Lower them, n_inducing first.",
     )

@@ -184,7 +184,7 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         n_processes = self._n_processes(n_outputs)
         require_much(
             8.0 * n_inputs**2 * n_processes * 4,
-            what=f"max_inputs == {self.max_inputs} lets {n_inputs} distinct inputs into kernel matrices of "
+            what=f"max_inputs={self.max_inputs} lets {n_inputs} distinct inputs into kernel matrices of "
             f"{n_processes} processes, which",
             remedy=f"Lower {self._costly}.",
         )

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sklearn.cluster import KMeans
 from sklearn.neighbors import NearestNeighbors
 
+from torch_pbd import checks
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.estimators.regression import MixtureRegression
 from torch_pbd.estimators.results import Fitted
@@ -21,7 +22,6 @@ from torch_pbd.files.memory import require_much
 from torch_pbd.models.mixture import GaussianMixture
 from torch_pbd.models.mixture_fit import expectation_maximization, refine
 from torch_pbd.optim import FitReport
-from torch_pbd.seeds import as_random_state
 
 # An output's residual scale is not taken below this of its whole spread.
 _SMALLEST_RESIDUAL = 1e-6
@@ -115,13 +115,13 @@ class GMMBaseline(CovarianceRegressor):
         n_distinct, n_components = len(distinct_rows(points)[0]), int(self.n_components)
         if n_distinct < self.n_components:
             raise ValueError(
-                f"n_components == {self.n_components}, must not be above the number of distinct samples, which is "
+                f"n_components is {self.n_components}, must not be above the number of distinct samples, which is "
                 f"{n_distinct} of n_samples = {len(X)}."
             )
         require_much(
             # Measured: responsibilities, and the rows centred at and whitened by each component.
             8.0 * n_components * (len(X) * (3 * points.shape[1] + 4) + n_components),
-            what=f"n_components == {self.n_components} for {len(X)} rows",
+            what=f"n_components={self.n_components} for {len(X)} rows",
             remedy="Take fewer components.",
         )
         if not (np.ptp(y, axis=0) > 0).any():
@@ -139,7 +139,7 @@ class GMMBaseline(CovarianceRegressor):
             )
         scaling = _by_residual(X, y)
         data = self._door(np.hstack([scaling.exact_inputs(X), scaling.exact_outputs(y)]))
-        generator = as_random_state(self.random_state)
+        generator = checks.seed(self.random_state)
         runs = [self._expectation_maximization(data, points, X.shape[1], generator) for _ in range(1 + self.n_restarts)]
         mixture, report = min(runs, key=lambda run: run[1].loss)
         if self.solver == "lbfgs":

@@ -2,15 +2,14 @@
 
 import warnings
 from collections.abc import Mapping
-from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import issparse
-from sklearn.utils.validation import check_is_fitted, check_scalar, validate_data
+from sklearn.utils.validation import check_is_fitted, validate_data
 
-from torch_pbd.arguments import as_array, as_floats, check_finite, from_tensor, is_finite
+from torch_pbd import checks
 from torch_pbd.exceptions import DataRankWarning
 
 Floats = NDArray[np.float64]
@@ -35,7 +34,7 @@ def as_plain_array(values: Any, name: str) -> Any:
         spread: unix time in float32 has steps of 128 s.
     """
     if hasattr(values, "detach"):
-        values = from_tensor(values, name)
+        values = checks.from_tensor(values, name)
     for label, part in _parts(values, name):
         if part.dtype in (np.float16, np.float32) and part.ndim and part.size:
             _check_resolution(part, name, label)
@@ -45,15 +44,17 @@ def as_plain_array(values: Any, name: str) -> Any:
 def _parts(values: Any, name: str) -> list[tuple[Any, NDArray[Any]]]:
     """Arrays that ``values`` consists of: the columns of a data frame, with their names; or itself."""
     if hasattr(values, "columns"):
-        return [(label, as_array(values[label], f"column {label} of {name}")) for label in values.columns]
-    return [] if issparse(values) else [(None, as_array(values, name))]  # scikit-learn says more of the sparse
+        return [(label, checks.real_array(values[label], f"column {label} of {name}")) for label in values.columns]
+    return [] if issparse(values) else [(None, checks.real_array(values, name))]  # scikit-learn says more of the sparse
 
 
 def checked_values(values: Any, name: str) -> Any:
     """The same, and all of it finite."""
     values = as_plain_array(values, name)
     for label, part in _parts(values, name):
-        check_finite(as_floats(part, name) if part.dtype.kind == "O" and part.ndim else part, name, label)
+        checks.check_finite(
+            checks.real_floats(part, name) if part.dtype.kind == "O" and part.ndim else part, name, label
+        )
     return values
 
 
@@ -201,27 +202,24 @@ def check_number(
     value: Any, name: str, *, low: float, strict: bool = False, integer: bool = False, optional: bool = False
 ) -> None:
     """Check that a parameter is a number not below ``low`` (above it, if ``strict``)."""
-    if optional and value is None:
-        return
-    boundaries = "neither" if strict else "left"
-    kind = Integral if integer else Real
-    if isinstance(value, bool | np.bool_):
-        raise TypeError(f"{name} must be an instance of {'int' if integer else 'float'}, not bool; it is {value}.")
-    check_scalar(value, name, kind, min_val=low, include_boundaries=boundaries)
-    if not is_finite(value):
-        raise ValueError(f"{name} == {value}, must be finite.")
+    if integer:
+        checks.count(value, name, least=int(low), optional=optional)
+    elif strict:
+        checks.number(value, name, above=low, optional=optional)
+    else:
+        checks.number(value, name, least=low, optional=optional)
 
 
 def check_choice(value: Any, name: str, choices: tuple[str, ...]) -> None:
     """Check that a parameter is one of some strings."""
     if not isinstance(value, str) or value not in choices:
-        raise ValueError(f"{name} == {value!r}, must be one of {', '.join(map(repr, choices))}.")
+        raise ValueError(f"{name} is {value!r}, must be one of {', '.join(map(repr, choices))}.")
 
 
 def check_flag(value: Any, name: str) -> None:
     """Check that a parameter is True or False; a text would count as True."""
     if not isinstance(value, bool | np.bool_):
-        raise ValueError(f"{name} == {value!r}, must be True or False.")
+        raise ValueError(f"{name} is {value!r}, must be True or False.")
 
 
 def check_solver(solver: str, *, latent_prior: bool) -> None:
@@ -242,7 +240,7 @@ def check_length_scale(value: Any, n_features: int) -> Floats | None:
     scales = parameter_floats(value, "length_scale")
     if scales.shape not in [(), (n_features,)] or not (np.isfinite(scales).all() and (scales > 0).all()):
         raise ValueError(
-            f"length_scale == {value!r}, must be None, a positive number, or {n_features} positive numbers: one "
+            f"length_scale is {value!r}, must be None, a positive number, or {n_features} positive numbers: one "
             "for each column of X, in its units."
         )
     return np.broadcast_to(scales, (n_features,)).copy()
@@ -257,7 +255,7 @@ def check_period(value: Any, kernel: str, x_scale: Floats) -> Floats | None:
     periods = parameter_floats(value, "period")
     if periods.shape not in [(), x_scale.shape] or not (periods >= _SHORTEST_PERIOD * x_scale).all():
         raise ValueError(
-            f"period == {value!r}, must be None, a positive number, or {len(x_scale)} positive numbers (or inf): one "
+            f"period is {value!r}, must be None, a positive number, or {len(x_scale)} positive numbers (or inf): one "
             f"for each column of X, in its units, and no shorter than {_SHORTEST_PERIOD:g} of its range."
         )
     return np.broadcast_to(periods, x_scale.shape).copy()
@@ -271,4 +269,4 @@ def parameter_floats(value: Any, name: str) -> Floats:
             raise TypeError("not bool")
         return array.astype(np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} == {value!r}, must be numbers ({error}).") from error
+        raise ValueError(f"{name} is {value!r}, must be numbers ({error}).") from error

@@ -173,7 +173,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         self.df_ = n_outputs + 1 if self.df in (None, "auto") else int(self.df)
         if self.df_ < n_outputs:
             raise ValueError(
-                f"df == {self.df_}, must be at least {n_outputs}, the number of outputs: the covariance of a "
+                f"df is {self.df_}, must be at least {n_outputs}, the number of outputs: the covariance of a "
                 "Wishart process with fewer vectors is singular."
             )
         if isinstance(self.prior, str):

@@ -88,7 +88,7 @@ def tabulate_unsampled(demonstrations: Demonstrations, lasting: float, on_unknow
     if holes:
         warnings.warn(
             f"Fewer than two of {len(each)} demonstrations have samples at {preview(holes)} {demonstrations.time_unit} "
-            f"after the start: how they vary there is unknown, and on_unknown == {on_unknown!r} decides on the "
+            f"after the start: how they vary there is unknown, and on_unknown={on_unknown!r} decides on the "
             "stiffness. Record what is missing.",
             stacklevel=3,
         )

@@ -91,7 +91,7 @@ class DMP:
             check_positive(name, value)
         for name, choice, kind in (("gate", gate, Gate), ("adaptation", adaptation, Adaptation)):
             if choice not in get_args(kind):
-                raise ValueError(f"{name} == {choice!r}, must be one of {', '.join(map(repr, get_args(kind)))}.")
+                raise ValueError(f"{name} is {choice!r}, must be one of {', '.join(map(repr, get_args(kind)))}.")
         self.alpha, self.beta, self.gamma, self.tau = alpha, beta, gamma, tau
         self.duration, self.gate, self.adaptation = duration, gate, adaptation
 
@@ -189,7 +189,7 @@ class DMP:
         places = {**starts, "demonstrated_start": demonstrated_start, "demonstrated_goal": demonstrated_goal}
         given = {name: as_rows(place, name, 1) for name, place in places.items() if place is not None}
         if integrator not in ("exact", "rk4"):
-            raise ValueError(f"integrator == {integrator!r}, must be 'exact' or 'rk4'.")
+            raise ValueError(f"integrator is {integrator!r}, must be 'exact' or 'rk4'.")
         time, steps, passing = _movement_time(n_ticks, dt, speed, goal)
         at_ticks = (_called(forcing, time) if callable(forcing) else forcing) * self.gate_at(time)[:, None]
         goals = goal if goal.ndim > 1 else goal[None]
@@ -267,7 +267,7 @@ def _checked_forcing(forcing: Any, n_steps: Any) -> tuple[Any, int]:
         rows = as_rows(forcing, "forcing", 2)
         return rows, rows.shape[-2]
     check_count("n_steps", n_steps, 1)
-    require_much(100.0 * n_steps, what=f"n_steps == {n_steps}", remedy="Take fewer.")
+    require_much(100.0 * n_steps, what=f"n_steps={n_steps}", remedy="Take fewer.")
     return forcing, n_steps
 
 

@@ -42,7 +42,7 @@ def counts_as_metres(units: Sequence[str] | None) -> bool:
 def check_motion(limits: Any, units: Sequence[str] | None, time_unit: str, **found: float) -> None:
     """Refuse a duration, distance or speed, by name, beyond the limits, in units of length or without units."""
     if not isinstance(limits, MotionLimits | None):
-        raise ValueError(f"limits == {limits!r}, must be MotionLimits or None.")
+        raise ValueError(f"limits is {limits!r}, must be MotionLimits or None.")
     for name, value in found.items() if limits is not None and counts_as_metres(units) else ():
         if value > getattr(limits, name):
             told, unit = ", ".join(units or ["none"]), _UNITS[name]

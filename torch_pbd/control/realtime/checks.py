@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from torch_pbd.arguments import is_finite
+from torch_pbd import checks
 from torch_pbd.control.realtime.steps import Vector
 
 LARGEST = 1e100  # squares and sums of what is smaller do not overflow
@@ -17,7 +17,7 @@ Numbers = Sequence[float] | NDArray[np.float64]
 def number(name: str, value: float, unit: str, *, zero: bool = False) -> float:
     """A finite number above 0, or from 0 on."""
     real = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-    if not (real and is_finite(value) and value >= 0.0 and (value or zero)):
+    if not (real and checks.is_finite(value) and value >= 0.0 and (value or zero)):
         least = "of at least 0" if zero else "above 0"
         raise ValueError(f"{name}={value!r} must be a finite number {least}, in {unit}.")
     return float(value)
@@ -51,7 +51,7 @@ def whole(name: str, value: int, least: int) -> int:
 def moment(name: str, value: float) -> float:
     """A finite time in s."""
     real = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
-    if not (real and is_finite(value)):
+    if not (real and checks.is_finite(value)):
         raise ValueError(f"{name}={value!r} must be a finite time in s.")
     return float(value)
 

@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from torch_pbd.arguments import as_floats
+from torch_pbd import checks
 from torch_pbd.control.realtime.checks import LARGEST
 from torch_pbd.control.realtime.steps import Floats, Vector, advance_coupled, advance_modal, advance_plane
 from torch_pbd.control.schedule.rows import Between
@@ -108,12 +108,12 @@ def _checked(schedule: ScheduleLike) -> list[Floats]:
     missing = [name for name in (*_READ, "stiffness_limits") if not hasattr(schedule, name)]
     if missing:
         raise ValueError(f"schedule is a {type(schedule).__name__} without {', '.join(missing)}: give a Schedule.")
-    position = as_floats(schedule.position, "schedule.position")
+    position = checks.real_floats(schedule.position, "schedule.position")
     if position.ndim != 2 or not position.size:
         raise ValueError(f"schedule.position has shape {position.shape}: it must be (n, d), n and d at least 1.")
     n, d = position.shape
     shapes = {"time": (n,), "position": (n, d), "velocity": (n, d), "stiffness": (n, d, d), "damping": (n, d, d)}
-    arrays = {name: np.array(as_floats(getattr(schedule, name), f"schedule.{name}")) for name in shapes}
+    arrays = {name: np.array(checks.real_floats(getattr(schedule, name), f"schedule.{name}")) for name in shapes}
     for name, array in arrays.items():
         if not n * d or array.shape != shapes[name]:
             raise ValueError(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torch_pbd.arguments import check_text, from_tensor, is_finite
+from torch_pbd import checks
 
 ARRAY_DIMS = {"time": 1, "position": 2, "velocity": 2, "stiffness": 3, "damping": 3, "covariance": 3, "type1": 1}
 """Every array of a schedule with its number of axes: (n,), (n, d) or (n, d, d)."""
@@ -46,7 +46,7 @@ def check_positive(name: str, value: Any) -> None:
     if (
         isinstance(value, bool)
         or not isinstance(value, int | float | np.integer | np.floating)
-        or not (value > 0.0 and is_finite(value))
+        or not (value > 0.0 and checks.is_finite(value))
     ):
         raise ValueError(f"{name} is {value!r}, it must be a positive number.")
 
@@ -90,7 +90,7 @@ def _checked_labels(labels: Labels, n_outputs: int) -> dict[str, Any]:
     if names is not None and not len(set(strings)) == len(listed) == n_outputs:
         raise ValueError(f"names is {names!r}, it must be {n_outputs} different strings, one for each output.")
     for i, name in enumerate(strings):  # which are titles of columns; the others stand in JSON, which holds any text
-        check_text(name, f"names[{i}]")
+        checks.text(name, f"names[{i}]")
     for name in ("units", "frame"):
         if not isinstance(labels[name], str | None):
             raise ValueError(f"{name} is {labels[name]!r}, it must be a string or None.")
@@ -113,7 +113,7 @@ def as_floats(values: Any, name: str, n_dims: int) -> Floats:
     if np.ma.is_masked(values):
         raise ValueError(f"{name} has masked entries: fill them in first.")
     if hasattr(values, "detach"):
-        values = from_tensor(values, name)
+        values = checks.from_tensor(values, name)
     try:
         given = np.asarray(values)
     except ValueError as error:

@@ -83,7 +83,7 @@ class RateLimit:
         alpha = 0.5 * limit if self.alpha is None else self.alpha
         if not 0.0 < alpha < limit:
             raise ValueError(
-                f"alpha == {alpha:g} /s, must be above 0 and below {limit:g} /s, the smallest damping over mass of "
+                f"alpha is {alpha:g} /s, must be above 0 and below {limit:g} /s, the smallest damping over mass of "
                 "the schedule. Leave it None, or damp more."
             )
         if float(torch.linalg.eigvalsh(stiffness).min()) <= 0.0:
@@ -173,9 +173,9 @@ class EnergyTank:
         for name in ("energy", "energy_max", "efficiency"):
             check_finite(name, getattr(self, name))
         if not 0.0 <= self.energy <= self.energy_max:
-            raise ValueError(f"energy == {self.energy:g} J, must be from 0 to energy_max == {self.energy_max:g} J.")
+            raise ValueError(f"energy={self.energy:g} J, must be from 0 to energy_max={self.energy_max:g} J.")
         if not 0.0 <= self.efficiency < 1.0:
-            raise ValueError(f"efficiency == {self.efficiency:g}, must be at least 0 and less than 1.")
+            raise ValueError(f"efficiency is {self.efficiency:g}, must be at least 0 and less than 1.")
 
     def start(self, stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> "_Tank":
         """Begin a run over the wanted gains (..., T, d, d)."""

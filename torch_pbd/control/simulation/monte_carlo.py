@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torch_pbd.arguments import as_floats, check_kind
+from torch_pbd import checks
 from torch_pbd.control.matrices import check_count, check_device, check_positive
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.plant import AdmittancePlant
@@ -19,7 +19,6 @@ from torch_pbd.control.simulation.run import check_plant, warn_of_mass
 from torch_pbd.control.simulation.summary import RolloutSummary, quantiles_in
 from torch_pbd.control.simulation.ticks import block_length
 from torch_pbd.files.memory import require_memory
-from torch_pbd.seeds import as_random_state
 
 Floats = NDArray[np.float64]
 Reference = Literal["desired", "undisturbed"]
@@ -107,14 +106,14 @@ def simulate_many(
     >>> summary.deviation.shape, bool((summary.peak_deviation > 0.0).all())
     ((10001, 3), True)
     """
-    check_kind(schedule, "schedule", Schedule)
+    checks.instance(schedule, "schedule", Schedule)
     check_device(device)
     check_count("n_rollouts", n_rollouts, 1)
     check_count("every", every, 1)
     levels = _check_choices(reference, threshold, quantiles)
     schedule = _evenly(schedule, rate)
     _check_memory(n_rollouts, schedule, len(levels))
-    robot, draw = _robot(schedule, plant), as_random_state(random_state)
+    robot, draw = _robot(schedule, plant), checks.seed(random_state)
     begin, lasting, push = draw_pushes(draw, (n_rollouts, schedule.n_outputs), schedule, peak, duration, onset)
     offset = check_not_negative("start_scale", start_scale) * draw.standard_normal(push.shape)
     seeds = iter(draw.randint(2**31 - 1, size=n_rollouts).tolist())  # at most so many sensors
@@ -153,12 +152,12 @@ def simulate_many(
 
 def _check_choices(reference: str, threshold: float | None, quantiles: tuple[float, ...]) -> Floats:
     if reference not in get_args(Reference):
-        raise ValueError(f"reference == {reference!r}, must be one of {', '.join(map(repr, get_args(Reference)))}.")
+        raise ValueError(f"reference is {reference!r}, must be one of {', '.join(map(repr, get_args(Reference)))}.")
     if threshold is not None:
         check_positive("threshold", check_not_negative("threshold", threshold), "m")
-    levels = np.array(as_floats(quantiles, "quantiles"))
+    levels = np.array(checks.real_floats(quantiles, "quantiles"))
     if levels.ndim != 1 or not len(levels) or not ((levels >= 0.0) & (levels <= 1.0)).all():
-        raise ValueError(f"quantiles == {quantiles!r}, must be one or more numbers from 0 to 1.")
+        raise ValueError(f"quantiles is {quantiles!r}, must be one or more numbers from 0 to 1.")
     return levels
 
 
@@ -169,7 +168,7 @@ def _check_memory(n_rollouts: int, schedule: Schedule, n_levels: int) -> None:
     of_ticks = len(schedule) * (4 * d * d + 4 * d + n_levels)
     require_memory(
         8.0 * (n_rollouts * of_each + of_ticks),
-        what=f"n_rollouts == {n_rollouts}",
+        what=f"n_rollouts={n_rollouts}",
         remedy="Simulate fewer at a time, with several seeds.",
     )
 

@@ -75,7 +75,7 @@ class AdmittancePlant:
     ) -> None:
         if integrator not in get_args(Integrator):
             raise ValueError(
-                f"integrator == {integrator!r}, must be one of {', '.join(map(repr, get_args(Integrator)))}."
+                f"integrator is {integrator!r}, must be one of {', '.join(map(repr, get_args(Integrator)))}."
             )
         check_count("substeps", substeps, 1)
         check_flag("feed_forward", feed_forward)
@@ -87,12 +87,12 @@ class AdmittancePlant:
         }
         for name, (part, method) in parts.items():
             if isinstance(part, type):
-                raise ValueError(f"{name} == {part.__name__} is a class, must be an object of it.")
+                raise ValueError(f"{name} is the class {part.__name__}, must be an object of it.")
             if part is not None and not callable(getattr(part, method, None)):
-                raise ValueError(f"{name} == {part!r} has no method {method!r}; see the docstring for what it may be.")
+                raise ValueError(f"{name}={part!r} has no method {method!r}; see the docstring for what it may be.")
         if substeps > 1 and (sensor is not None or position_loop is not None):
             raise ValueError(
-                f"substeps == {substeps}, must be 1 with a sensor or a position loop: they act once a tick. "
+                f"substeps is {substeps}, must be 1 with a sensor or a position loop: they act once a tick. "
                 "Shorten dt instead."
             )
         if stiffness_filter is not None and (integrator != "exact" or substeps > 1):
@@ -170,7 +170,7 @@ class AdmittancePlant:
         state = start.expand(*batch, -1), speed.expand(*batch, -1)
         hooks = (self.sensor, self.position_loop, self.environment, self.stiffness_filter)
         if generator is not None and not isinstance(generator, torch.Generator):
-            raise ValueError(f"generator == {generator!r}, must be a torch.Generator or None.")
+            raise ValueError(f"generator is {generator!r}, must be a torch.Generator or None.")
         if all(hook is None for hook in hooks):
             position, velocity = open_loop(task, force, state, self.integrator)
             record: dict[str, Any] = {"position": position, "velocity": velocity, "commanded_position": position}

@@ -22,7 +22,7 @@ def draw_pushes(
     """Onsets, from the start of the schedule on and in order, durations (R,) and forces at the peak (R, d)."""
     lasting = _uniform(draw, "duration", duration, shape[0], "s")
     if (lasting <= 0.0).any() or lasting.max() > schedule.duration:
-        raise ValueError(f"duration == {duration!r} s, must be positive and at most {schedule.duration:g} s.")
+        raise ValueError(f"duration is {duration!r} s, must be positive and at most {schedule.duration:g} s.")
     share = draw.uniform(size=shape[0])
     if onset is None:
         begin = share * (schedule.duration - lasting)
@@ -30,7 +30,7 @@ def draw_pushes(
         first, last = _pair("onset", onset)
         begin = first + share * (last - first) - schedule.time[0]
         if begin.min() < 0.0 or begin.max() > schedule.duration:
-            raise ValueError(f"onset == {onset!r} s, must lie in {schedule.time[0]:g} to {schedule.time[-1]:g} s.")
+            raise ValueError(f"onset is {onset!r} s, must lie in {schedule.time[0]:g} to {schedule.time[-1]:g} s.")
     direction = draw.standard_normal(shape)
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     strength = _uniform(draw, "peak", peak, shape[0], "N")
@@ -45,12 +45,12 @@ def _uniform(draw: np.random.RandomState, name: str, limits: Range, n: int, unit
 
 def _pair(name: str, limits: tuple[float, float]) -> tuple[float, float]:
     if not isinstance(limits, tuple | list) or len(limits) != 2:
-        raise ValueError(f"{name} == {limits!r}, must be two numbers, the least and the largest.")
+        raise ValueError(f"{name} is {limits!r}, must be two numbers, the least and the largest.")
     for value in limits:
         check_finite(name, value)
         check_not_negative(name, abs(value))
     if limits[0] > limits[1]:
-        raise ValueError(f"{name} == {limits!r}, must be the least and then the largest.")
+        raise ValueError(f"{name} is {limits!r}, must be the least and then the largest.")
     return limits
 
 
@@ -58,5 +58,5 @@ def check_not_negative(name: str, value: float) -> float:
     """Check that a parameter is a finite number of at least 0; returns it."""
     check_finite(name, value)
     if not 0.0 <= value <= _LARGEST:
-        raise ValueError(f"{name} == {value:g}, must not be negative, and at most {_LARGEST:g}.")
+        raise ValueError(f"{name} is {value:g}, must not be negative, and at most {_LARGEST:g}.")
     return value

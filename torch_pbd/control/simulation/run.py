@@ -7,11 +7,10 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from torch_pbd.arguments import as_floats
+from torch_pbd import checks
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.plant import AdmittancePlant
 from torch_pbd.control.simulation.rollout import Rollout
-from torch_pbd.seeds import as_random_state
 
 
 def simulate_schedule(
@@ -36,7 +35,7 @@ def simulate_schedule(
         If the force has not one row for each tick.
     """
     shape = schedule.position.shape
-    push = np.zeros(shape) if force is None else as_floats(force, "force")
+    push = np.zeros(shape) if force is None else checks.real_floats(force, "force")
     if push.shape != shape:
         raise ValueError(
             f"force has shape {push.shape}, must have shape {shape}: one row in N for each tick of "
@@ -45,7 +44,7 @@ def simulate_schedule(
     check_plant(robot)
     warn_of_mass(robot, mass, stacklevel=4)
     parts = (schedule.position, schedule.velocity, schedule.stiffness, schedule.damping, push)
-    draw = as_random_state(random_state)
+    draw = checks.seed(random_state)
     noisy = getattr(robot.sensor, "noise_scale", 0.0) != 0.0  # else nothing is drawn: None is the caller's global state
     generator = torch.Generator().manual_seed(int(draw.randint(2**31 - 1))) if noisy else None
     return robot.simulate(*map(_tensor, parts), dt=1.0 / rate, generator=generator).numpy()
@@ -54,7 +53,7 @@ def simulate_schedule(
 def check_plant(plant: Any) -> None:
     """Check that a plant is one."""
     if not isinstance(plant, AdmittancePlant):
-        raise ValueError(f"plant == {plant!r}, must be an AdmittancePlant or None.")
+        raise ValueError(f"plant is {plant!r}, must be an AdmittancePlant or None.")
 
 
 def warn_of_mass(robot: AdmittancePlant, mass: float, *, stacklevel: int) -> None:

@@ -148,7 +148,7 @@ class ForceSensor:
                 "or one number for all."
             )
         if generator is not None and not isinstance(generator, torch.Generator):
-            raise ValueError(f"generator == {generator!r}, must be a torch.Generator or None.")
+            raise ValueError(f"generator is {generator!r}, must be a torch.Generator or None.")
         if self.noise_scale > 0 and generator is None:
             raise ValueError(
                 f"noise_scale={self.noise_scale} needs a generator: pass torch.Generator().manual_seed(...), or set "

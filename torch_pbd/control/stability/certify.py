@@ -72,7 +72,7 @@ def certify(
     if force_cutoff is not None:
         check_positive("force_cutoff", force_cutoff, "Hz")
     if position_loop is not None and not isinstance(position_loop, PositionLoop):
-        raise ValueError(f"position_loop == {position_loop!r}, must be a PositionLoop or None.")
+        raise ValueError(f"position_loop is {position_loop!r}, must be a PositionLoop or None.")
     time, stiffness, damping = _rows_of(schedule)
     inertia = _door(as_mass(mass))
     is_number = not inertia.ndim

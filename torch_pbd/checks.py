@@ -1,0 +1,343 @@
+"""Checks of what users pass, in one dialect: the value first, its name second; what comes back is what to go on with.
+
+Every refusal is one sentence, ``name is 3, must be an integer of at least 4: remedy``, and one exception,
+:class:`~torch_pbd.exceptions.InvalidParameterError`.
+"""
+
+import math
+import sys
+import unicodedata
+import warnings
+from collections.abc import Sequence
+from contextlib import suppress
+from numbers import Integral, Real
+from typing import Any, Literal, get_args, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torch_pbd.exceptions import InvalidParameterError
+
+Floats = NDArray[np.float64]
+
+LARGEST = 1e100
+"""Numbers no larger than this have squares, and sums of many squares, that float64 holds."""
+
+ROUNDING = 1e-9
+"""Relative: what is smaller counts as rounding of the caller's arithmetic. float64 itself makes errors of 1e-13 in
+matrices of a hundred rows; files of ten digits make 1e-10."""
+
+_MOST = 2**53  # whole numbers above it are not all floats
+_LONGEST = 80  # letters of a value that are shown
+
+
+def refusal(value: Any, name: str, must: str, remedy: str = "", unit: str = "") -> InvalidParameterError:
+    """Error to raise for an argument that cannot be used."""
+    shown = repr(value.item() if isinstance(value, np.generic) else value)
+    shown = shown if len(shown) <= _LONGEST else f"{shown[:_LONGEST]}..."
+    return InvalidParameterError(
+        f"{name} is {shown}{unit and ' ' + unit}, must be {must}{remedy and ': ' + remedy.rstrip('.')}."
+    )
+
+
+@overload
+def number(
+    value: Any,
+    name: str,
+    *,
+    above: float | None = ...,
+    least: float | None = ...,
+    below: float | None = ...,
+    most: float | None = ...,
+    unit: str = ...,
+    optional: Literal[False] = ...,
+    remedy: str = ...,
+) -> float: ...
+@overload
+def number(
+    value: Any,
+    name: str,
+    *,
+    above: float | None = ...,
+    least: float | None = ...,
+    below: float | None = ...,
+    most: float | None = ...,
+    unit: str = ...,
+    optional: Literal[True],
+    remedy: str = ...,
+) -> float | None: ...
+def number(
+    value: Any,
+    name: str,
+    *,
+    above: float | None = None,
+    least: float | None = None,
+    below: float | None = None,
+    most: float | None = None,
+    unit: str = "",
+    optional: bool = False,
+    remedy: str = "",
+) -> float | None:
+    """Finite real number, within bounds: above or from ``least`` on, below or up to ``most``.
+
+    Parameters
+    ----------
+    value, name
+        What was passed, and the name of the argument.
+    above, least, below, most : float or None
+        Bounds, the first and the third not part of what is allowed.
+    unit : str
+        Unit that the message gives.
+    optional : bool
+        None is allowed, and comes back.
+    remedy : str
+        What to do, at the end of the message.
+
+    Raises
+    ------
+    InvalidParameterError
+        If it is anything else: a bool, a text, NaN.
+    """
+    if optional and value is None:
+        return None
+    if isinstance(value, Real) and not isinstance(value, bool | np.bool_) and is_finite(value):
+        real = float(value)
+        too_small = (above is not None and real <= above) or (least is not None and real < least)
+        too_large = (below is not None and real >= below) or (most is not None and real > most)
+        if not (too_small or too_large):
+            return real
+    bounds = [
+        f"{word} {bound:g}"
+        for word, bound in (("above", above), ("of at least", least), ("below", below), ("at most", most))
+        if bound is not None
+    ]
+    must = f"a finite number{' ' if bounds else ''}{' and '.join(bounds)}{' or None' if optional else ''}"
+    raise refusal(value, name, must, remedy, unit)
+
+
+@overload
+def count(
+    value: Any, name: str, *, least: int = ..., most: int = ..., optional: Literal[False] = ..., remedy: str = ...
+) -> int: ...
+@overload
+def count(
+    value: Any, name: str, *, least: int = ..., most: int = ..., optional: Literal[True], remedy: str = ...
+) -> int | None: ...
+def count(
+    value: Any, name: str, *, least: int = 1, most: int = _MOST, optional: bool = False, remedy: str = ""
+) -> int | None:
+    """Whole number from ``least`` to ``most``; None too, if ``optional``."""
+    if optional and value is None:
+        return None
+    if isinstance(value, Integral) and not isinstance(value, bool | np.bool_) and least <= int(value) <= most:
+        return int(value)
+    upper = f" and at most {most}" if most < _MOST else ""
+    must = f"an integer of at least {least}{upper}{' or None' if optional else ''}"
+    raise refusal(value, name, must, remedy)
+
+
+def flag(value: Any, name: str) -> bool:
+    """True or False: a text, such as "no", would count as True."""
+    if not isinstance(value, bool | np.bool_):
+        raise refusal(value, name, "True or False")
+    return bool(value)
+
+
+def choice(value: Any, name: str, choices: Any) -> Any:
+    """One of some strings: a sequence of them, or a ``Literal``."""
+    known: tuple[str, ...] = get_args(choices) or tuple(choices)
+    if not isinstance(value, str) or value not in known:
+        raise refusal(value, name, f"one of {', '.join(map(repr, known))}")
+    return value
+
+
+def instance(value: Any, name: str, kind: type, *, optional: bool = False, remedy: str = "") -> Any:
+    """Object of a class; None too, if ``optional``."""
+    if not isinstance(value, kind) and not (optional and value is None):
+        article = "an" if kind.__name__[0] in "AEIOUaeiou" else "a"
+        raise refusal(value, name, f"{article} {kind.__name__}{' or None' if optional else ''}", remedy)
+    return value
+
+
+def text(value: Any, name: str, *, optional: bool = False) -> Any:
+    """Text that every file can hold, UTF-8 without line ends and other controls; None too, if ``optional``."""
+    if optional and value is None:
+        return None
+    if not isinstance(value, str):
+        raise refusal(value, name, f"text{' or None' if optional else ''}")
+    wrong = next((letter for letter in value if unicodedata.category(letter) in ("Cc", "Cs")), None)
+    if wrong is not None:
+        kind = "a control character" if unicodedata.category(wrong) == "Cc" else "half of a surrogate pair"
+        raise InvalidParameterError(
+            f"{name} is {value!a:.80}, with {kind} (U+{ord(wrong):04X}) that not every file can hold: leave it out."
+        )
+    return value
+
+
+def seed(value: Any, name: str = "random_state") -> np.random.RandomState:
+    """RandomState of a seed, as scikit-learn makes it; None is NumPy's global one."""
+    from sklearn.utils import check_random_state  # a second to import, which schedules and the loop need not spend
+
+    if not isinstance(value, bool):
+        with suppress(ValueError):
+            return check_random_state(value)
+    raise refusal(value, name, "None, an integer from 0 to 2**32 - 1 or a numpy.random.RandomState")
+
+
+def array(values: Any, name: str, shape: Sequence[int | str]) -> Floats:
+    """Array of finite float64 whose squares are finite too, of a shape in which letters stand for any size.
+
+    ``shape`` is such as ``("n", 3)``. The result is no copy where ``values`` is such an array already.
+    """
+    floats = real_floats(values, name)
+    fits = len(shape) == floats.ndim and all(
+        isinstance(size, str) or size == own for size, own in zip(shape, floats.shape, strict=True)
+    )
+    if not fits:
+        expected = f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"
+        raise InvalidParameterError(f"{name} has shape {floats.shape}, must have shape {expected}.")
+    require(np.abs(floats) <= LARGEST, floats, name, f"finite and at most {LARGEST:g} in size")
+    return floats
+
+
+def require(good: NDArray[np.bool_], values: NDArray[Any], name: str, must: str, remedy: str = "") -> None:
+    """Refuse the first value of an array that is not good, by its index."""
+    if not good.all():
+        index = tuple(map(int, np.argwhere(~good)[0]))
+        value = values[index]
+        raise refusal(value, f"{name}[{', '.join(map(str, index))}]" if index else name, must, remedy)
+
+
+def semidefinite(matrices: NDArray[Any], name: str, *, definite: bool = False) -> None:
+    """Check that matrices (..., d, d) of finite floats are symmetric and positive semidefinite, or definite.
+
+    Both to rounding, :data:`ROUNDING` of a matrix's largest entry, or a hundred times the resolution of its dtype.
+    A positive definite matrix has a Cholesky factor, which is what is asked of it.
+    """
+    if matrices.ndim < 2 or matrices.shape[-1] != matrices.shape[-2] or not matrices.shape[-1]:
+        raise InvalidParameterError(f"{name} has shape {matrices.shape}, must have shape (..., d, d).")
+    tolerance = max(ROUNDING, 100.0 * float(np.finfo(matrices.dtype).eps))
+    scale = np.abs(matrices).max(axis=(-2, -1), initial=0.0)
+    require(scale <= LARGEST, scale, f"the largest entry of {name}", f"finite and at most {LARGEST:g} in size")
+    skew = np.abs(matrices - np.swapaxes(matrices, -2, -1)).max(axis=(-2, -1), initial=0.0)
+    remedy = "symmetrize the matrix, (A + A') / 2"
+    require(skew <= tolerance * scale, skew, f"the asymmetry of {name}", "zero", remedy)
+    lowest = np.linalg.eigvalsh(matrices)[..., 0] if matrices.size else scale
+    must = "above zero (positive definite)" if definite else "at least zero (positive semidefinite)"
+    good = lowest > 0.0 if definite else lowest >= -tolerance * scale
+    require(good, lowest, f"the smallest eigenvalue of {name}", must, "build it as a product A A'")
+
+
+def warn(message: str, category: type[Warning] = UserWarning) -> None:
+    """Warn at the line that called this package: the first frame outside of it."""
+    frame, level = sys._getframe(1), 2
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == "torch_pbd":
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, category, stacklevel=level - 1)
+
+
+def real_array(values: Any, name: str) -> NDArray[Any]:
+    """``values`` as an array of real numbers, in their own type: lists, tensors, series; not checked for NaN.
+
+    Raises
+    ------
+    TypeError
+        If an entry is no number at all.
+    ValueError
+        If ``values`` is ragged, masked, complex, or holds text, dates or records.
+    """
+    if hasattr(values, "detach"):
+        values = from_tensor(values, name)
+    if np.ma.is_masked(values):
+        raise ValueError(f"{name} has masked entries: leave them out, or fill them in first.")
+    try:
+        array = np.asarray(values)
+    except ValueError as error:
+        raise ValueError(f"{name} is ragged, its rows have different lengths: {error}") from error
+    except RuntimeError as error:  # a list of tensors that need gradients
+        raise ValueError(f"{name} cannot be made an array: {error}") from error
+    check_real(array, name)
+    return array
+
+
+def real_floats(values: Any, name: str) -> Floats:
+    """Array of real numbers in float64, with missing entries as NaN; not a copy where it is such an array already."""
+    array = real_array(values, name)
+    if array.dtype.kind == "O":
+        array = np.reshape([math.nan if _is_missing(entry) else float(entry) for entry in array.flat], array.shape)
+    return np.asarray(array, dtype=np.float64)
+
+
+def from_tensor(values: Any, name: str) -> NDArray[Any]:
+    """A torch tensor as an array, without its gradient."""
+    if str(values.layout) != "torch.strided":
+        raise ValueError(f"{name} is a sparse tensor: give a dense one, with .to_dense().")
+    try:
+        return np.asarray(values.detach().cpu().resolve_conj().resolve_neg().numpy())
+    except TypeError as error:  # bfloat16 and smaller
+        raise ValueError(f"{name} is a tensor of {values.dtype}, which is too coarse: record it in float64.") from error
+    except (NotImplementedError, RuntimeError) as error:
+        raise ValueError(f"{name} is a tensor that holds no numbers: {error}") from error
+
+
+def check_real(array: NDArray[Any], name: str) -> None:
+    """Check that an array holds real numbers, or objects that are."""
+    kind = array.dtype.kind
+    if kind in "biuf":
+        return
+    if kind in "US" or (kind == "O" and any(isinstance(entry, str | bytes) for entry in array.flat)):
+        raise ValueError(
+            f"{name} holds text, which dtype='numeric' is not compatible with: convert it to numbers first."
+        )
+    if kind == "c":
+        raise ValueError(f"Complex data not supported: {name} is {array.dtype}. Give real and imaginary parts apart.")
+    if kind in "mM":
+        raise ValueError(f"{name} holds dates or durations ({array.dtype}): give numbers, such as seconds since then.")
+    if kind != "O":
+        raise ValueError(f"{name} has dtype {array.dtype}: give an array of plain numbers.")
+    for place, entry in enumerate(array.flat):
+        _check_entry(entry, name, place)
+
+
+def check_finite(array: NDArray[Any], name: str, column: Any = None) -> None:
+    """Check that the columns of an array of floats (n, ...) have no NaN and no infinity, in scikit-learn's words."""
+    if array.dtype.kind != "f" or bool(np.isfinite(array).all()):
+        return
+    row, *place = map(int, np.argwhere(~np.isfinite(array))[0])
+    what = "NaN" if np.isnan(array[row, *place]) else "infinity or a value too large for dtype('float64')"
+    within = place[0] if place else column
+    where = f"row {row}" if within is None else f"row {row}, column {within}"
+    raise ValueError(f"Input {name} contains {what}. The first is in {where}: leave such rows out, or fill them in.")
+
+
+def finite(values: Any, name: str) -> Floats:
+    """Floats of any shape, all of them finite."""
+    array = real_floats(values, name)
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} has a value that is not finite.")
+    return array
+
+
+def is_finite(value: Any) -> bool:
+    """Whether a real number is one that a float can hold."""
+    try:
+        return math.isfinite(value)
+    except OverflowError:
+        return False
+
+
+def _is_missing(entry: Any) -> bool:
+    return entry is None or type(entry).__name__ == "NAType"
+
+
+def _check_entry(entry: Any, name: str, place: int) -> None:
+    if _is_missing(entry):
+        return  # a missing value, of which more is said where NaN are refused
+    if np.ndim(entry):
+        raise TypeError(f"{name} holds a {type(entry).__name__} as entry {place}: give one number for each.")
+    try:
+        float(entry)
+    except TypeError as error:
+        raise TypeError(f"{name} holds what is no number, as entry {place}: {error}.") from error
+    except OverflowError as error:
+        raise ValueError(f"{name} holds a number too large for float64, as entry {place}.") from error

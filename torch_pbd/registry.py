@@ -1,0 +1,19 @@
+"""Estimators by name and where they live: the one table of classes that the package, its files and commands read."""
+
+from importlib import import_module
+from typing import Any
+
+REGRESSORS = {
+    "HeteroscedasticGPRegressor": "torch_pbd.estimators.heteroscedastic",
+    "CholeskyCovRegressor": "torch_pbd.estimators.cholesky",
+    "WishartProcessRegressor": "torch_pbd.estimators.wishart",
+    "GMMBaseline": "torch_pbd.estimators.mixture",
+}
+"""Covariance regressors, the recommended one first."""
+
+ESTIMATORS = {**REGRESSORS, "DMPController": "torch_pbd.control.controller"}
+
+
+def load_class(name: str) -> Any:
+    """Class of an estimator; imports its module, and with it torch and scikit-learn."""
+    return getattr(import_module(ESTIMATORS[name]), name)
