@@ -6,7 +6,7 @@ from sklearn.base import clone
 
 from torch_pbd.control.stiffness import StiffnessLaw
 from torch_pbd.estimators.base import CovarianceRegressor
-from torch_pbd.estimators.groups import fit_by_demonstration
+from torch_pbd.estimators.demonstrations import fit_by_demonstration
 from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
 from torch_pbd.estimators.prior import prior_covariance
 

@@ -5,6 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torch_pbd import checks
 from torch_pbd.estimators.latent import (
     LatentCovarianceRegressor,
     Problem,
@@ -14,7 +15,7 @@ from torch_pbd.estimators.latent import (
 )
 from torch_pbd.estimators.mean import mean_that_repeats_allow
 from torch_pbd.estimators.prior import Prior
-from torch_pbd.estimators.validation import check_choice, check_flag, check_number, check_solver
+from torch_pbd.estimators.validation import check_solver
 from torch_pbd.gp import LatentGP, LatentValues, Observations, condition, fit_together
 from torch_pbd.kernels import KernelName
 from torch_pbd.linalg import tril_to_vector
@@ -159,9 +160,9 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
 
     def _check_parameters(self) -> None:
         super()._check_parameters()
-        check_number(self.noise_scale, "noise_scale", low=0.0, optional=True)
-        check_flag(self.bias_correction, "bias_correction")
-        check_choice(self.diagonal, "diagonal", ("auto", "raw", "log"))
+        checks.number(self.noise_scale, "noise_scale", least=0.0, optional=True)
+        checks.flag(self.bias_correction, "bias_correction")
+        checks.choice(self.diagonal, "diagonal", ("auto", "raw", "log"))
         check_solver(self.solver, latent_prior=self.latent_prior)
 
     def _fit_empirical(self, problem: Problem) -> tuple[LatentGP, CholeskyCovariance, FitReport, float]:

@@ -8,21 +8,13 @@ import torch
 from numpy.typing import ArrayLike
 
 from torch_pbd import checks
-from torch_pbd.estimators.base import CovarianceRegressor
+from torch_pbd.estimators.base import CovarianceRegressor, Fitted
 from torch_pbd.estimators.demonstrations import check_demonstrations, warn_of_residuals
 from torch_pbd.estimators.inducing import check_memory, numbers_to_try, warn_if_unresolved
 from torch_pbd.estimators.latent import default_prior_tril, warn_if_few, warn_if_identical
 from torch_pbd.estimators.prior import Prior, standardized_prior
-from torch_pbd.estimators.results import Fitted
 from torch_pbd.estimators.scaling import Standardization, distinct_rows
-from torch_pbd.estimators.validation import (
-    Floats,
-    check_choice,
-    check_flag,
-    check_length_scale,
-    check_number,
-    check_period,
-)
+from torch_pbd.estimators.validation import Floats, check_length_scale, check_period
 from torch_pbd.files.memory import require_much
 from torch_pbd.gp.inducing import FeatureMap, inducing_inputs
 from torch_pbd.kernels import KERNELS, KernelName
@@ -233,7 +225,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         -------
         ndarray of shape (n_samples_X, n_outputs, n_outputs, n_samples)
         """
-        check_number(n_samples, "n_samples", low=1, integer=True)
+        checks.count(n_samples, "n_samples", least=1)
         generator = checks.seed(random_state)
         x = self._query(X)
         core: Any = self.module_.core
@@ -254,10 +246,10 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
 
     def _check_parameters(self) -> None:
         super()._check_parameters()
-        check_choice(self.kernel, "kernel", (*KERNELS, "periodic"))
-        check_number(self.n_inducing, "n_inducing", low=2, integer=True, optional=True)
-        check_number(self.max_inputs, "max_inputs", low=2, integer=True)
-        check_flag(self.shared_length_scale, "shared_length_scale")
+        checks.choice(self.kernel, "kernel", (*KERNELS, "periodic"))
+        checks.count(self.n_inducing, "n_inducing", least=2, optional=True)
+        checks.count(self.max_inputs, "max_inputs", least=2)
+        checks.flag(self.shared_length_scale, "shared_length_scale")
 
     def _fit(self, X: Floats, y: Floats, **told: Any) -> Fitted:
         groups = told.get("groups")

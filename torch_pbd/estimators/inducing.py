@@ -1,9 +1,8 @@
 """How many inducing inputs a fit takes, the memory that they need, and what they resolve."""
 
-import warnings
-
 from torch import Tensor
 
+from torch_pbd import checks
 from torch_pbd.files.memory import require_much
 from torch_pbd.gp.inducing import FeatureMap
 
@@ -47,9 +46,7 @@ def warn_if_unresolved(length_scale: Tensor | None, features: FeatureMap) -> Non
     """Warn where a length scale that the user gave is shorter than the inputs can tell."""
     least = features.shortest_length_scale()
     if length_scale is not None and bool((length_scale < least).any()):
-        warnings.warn(
+        checks.warn(
             f"length_scale is below {least:.3g} of the range of X, which is what the inputs (or n_inducing of them) "
-            "resolve: between them the covariance says nothing. Give a longer one, or None to learn it.",
-            UserWarning,
-            stacklevel=5,
+            "resolve: between them the covariance says nothing. Give a longer one, or None to learn it."
         )

@@ -1,6 +1,5 @@
 """Gaussian mixture regression: the baseline of the paper, and what many use today."""
 
-import warnings
 from dataclasses import replace
 from typing import Any
 
@@ -11,12 +10,11 @@ from sklearn.cluster import KMeans
 from sklearn.neighbors import NearestNeighbors
 
 from torch_pbd import checks
-from torch_pbd.estimators.base import CovarianceRegressor
+from torch_pbd.estimators.base import CovarianceRegressor, Fitted
 from torch_pbd.estimators.regression import MixtureRegression
-from torch_pbd.estimators.results import Fitted
-from torch_pbd.estimators.rows import by_chunks
 from torch_pbd.estimators.scaling import Standardization, distinct_rows, spread_of
-from torch_pbd.estimators.validation import Floats, check_choice, check_number
+from torch_pbd.estimators.torch_estimator import by_chunks
+from torch_pbd.estimators.validation import Floats
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.files.memory import require_much
 from torch_pbd.models.mixture import GaussianMixture
@@ -106,9 +104,9 @@ class GMMBaseline(CovarianceRegressor):
 
     def _check_parameters(self) -> None:
         super()._check_parameters()
-        check_number(self.n_components, "n_components", low=1, integer=True)
-        check_choice(self.solver, "solver", ("em", "lbfgs"))
-        check_number(self.reg_covar, "reg_covar", low=0.0, strict=True)
+        checks.count(self.n_components, "n_components", least=1)
+        checks.choice(self.solver, "solver", ("em", "lbfgs"))
+        checks.number(self.reg_covar, "reg_covar", above=0.0)
 
     def _fit(self, X: Floats, y: Floats, **told: Any) -> Fitted:
         points = _points(X, y)
@@ -125,17 +123,15 @@ class GMMBaseline(CovarianceRegressor):
             remedy="Take fewer components.",
         )
         if not (np.ptp(y, axis=0) > 0).any():
-            warnings.warn(
+            checks.warn(
                 "y is constant: its covariance is zero, and the smallest that can be told from it is used.",
                 DataRankWarning,
-                stacklevel=4,
             )
         if n_distinct <= y.shape[1]:
-            warnings.warn(
+            checks.warn(
                 f"y has {n_distinct} distinct rows but {y.shape[1]} outputs: they leave directions of the covariance "
                 "undetermined, which reg_covar decides. Record more.",
                 DataRankWarning,
-                stacklevel=4,
             )
         scaling = _by_residual(X, y)
         data = self._door(np.hstack([scaling.exact_inputs(X), scaling.exact_outputs(y)]))

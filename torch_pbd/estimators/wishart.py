@@ -1,6 +1,5 @@
 """The Wishart process ("WP") of the paper, Section IV-A."""
 
-import warnings
 from dataclasses import replace
 from typing import Any
 
@@ -8,6 +7,7 @@ import torch
 from sklearn.utils import check_random_state
 from torch import Tensor
 
+from torch_pbd import checks
 from torch_pbd.estimators.latent import (
     LatentCovarianceRegressor,
     Problem,
@@ -17,7 +17,7 @@ from torch_pbd.estimators.latent import (
 )
 from torch_pbd.estimators.mean import mean_that_repeats_allow
 from torch_pbd.estimators.prior import Prior
-from torch_pbd.estimators.validation import check_choice, check_number, check_solver
+from torch_pbd.estimators.validation import check_solver
 from torch_pbd.exceptions import DataRankWarning, NotPositiveDefiniteError
 from torch_pbd.gp import (
     Hyperparameters,
@@ -158,10 +158,10 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
 
     def _check_parameters(self) -> None:
         super()._check_parameters()
-        check_choice(self.start, "start", tuple(_SPREAD))
+        checks.choice(self.start, "start", tuple(_SPREAD))
         check_solver(self.solver, latent_prior=self.latent_prior)
         if self.df not in (None, "auto"):
-            check_number(self.df, "df", low=1, integer=True)
+            checks.count(self.df, "df", least=1)
 
     def _n_processes(self, n_outputs: int) -> int:
         df = n_outputs + 1 if self.df in (None, "auto") else int(self.df)
@@ -233,11 +233,10 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         try:
             return found(torch.zeros_like(observations.targets[:, 0]))
         except NotPositiveDefiniteError:
-            warnings.warn(
+            checks.warn(
                 "X has rows so near to each other that the empirical covariances at them cannot be interpolated: they "
                 "are smoothed, with a noise that is learned. Make such rows equal, which pools their covariances.",
                 DataRankWarning,
-                stacklevel=6,
             )
             return found(None)
 

@@ -16,7 +16,7 @@ import torch
 
 import torch_pbd
 from torch_pbd.data import Demonstrations
-from torch_pbd.estimators.groups import fit_by_demonstration
+from torch_pbd.estimators.demonstrations import fit_by_demonstration
 from torch_pbd.model_header import encode_parameters, is_ours
 from torch_pbd.persistence import load, save
 
