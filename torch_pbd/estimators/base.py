@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from sklearn.base import MultiOutputMixin, RegressorMixin
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils._tags import Tags
@@ -33,6 +33,8 @@ from torch_pbd.files.memory import require_much
 from torch_pbd.linalg import gaussian_log_density, safe_cholesky, student_log_density
 from torch_pbd.models.conditional import ConditionalNormal
 from torch_pbd.optim import FitReport, Progress
+
+Integers = NDArray[np.intp]
 
 
 class Uncertainty(NamedTuple):
@@ -103,10 +105,10 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator, ABC)
         self.n_outputs_ = 1 if self._y_is_1d else targets.shape[1]
         targets = targets.reshape(len(inputs), -1, order="F")
         order = canonical_order(inputs, targets)
-        told = {"given": order.argsort()}
-        told |= {} if groups is None else {"groups": check_groups(groups, len(inputs))[order]}
+        numbers = None if groups is None else check_groups(groups, len(inputs))[order]
         with torch.inference_mode(False), torch.enable_grad():
-            fitted = self._fit(inputs.T.take(order, axis=1).T, targets.T.take(order, axis=1).T, **told)
+            rows = inputs.T.take(order, axis=1).T, targets.T.take(order, axis=1).T
+            fitted = self._fit(*rows, groups=numbers, recorded=order.argsort())
         self.module_ = fitted.module
         report = fitted.report
         self.n_iter_ = max(1, report.n_iter)
@@ -125,10 +127,10 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator, ABC)
         return self
 
     @abstractmethod
-    def _fit(self, X: Floats, y: Floats, **told: Any) -> Fitted:
+    def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, recorded: Integers) -> Fitted:
         """Fit on validated arrays (n, e) and (n, d).
 
-        ``told`` holds the rows in the order they were ``given``, and may hold the demonstrations' numbers (n,).
+        ``groups`` has the number of each row's demonstration, ``recorded`` the rows in the order of their recording.
         """
 
     def __sklearn_is_fitted__(self) -> bool:
@@ -187,6 +189,12 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator, ABC)
         inputs = checked_queries(self, X)
         type1 = self._arrays(lambda x: (self.module_.type1(x),), inputs)[0]
         return Uncertainty(type1, self._variability(inputs))
+
+    def predict_df(self, X: ArrayLike) -> Floats:
+        """Degrees of freedom of the predictive density at X: (n_samples,), infinite where it is normal."""
+        x = self._query(X)
+        degrees = self._degrees(x)
+        return np.full(len(x), np.inf) if degrees is None else degrees.cpu().numpy()
 
     def log_likelihood(self, X: ArrayLike, y: ArrayLike) -> Floats:
         """Log density of each row of y at X, in nats: (n_samples,)."""

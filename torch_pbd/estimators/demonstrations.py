@@ -16,18 +16,18 @@ from torch_pbd.estimators.validation import Floats
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.models.heteroscedastic import HeteroscedasticFit, are_copies
 
-_ways_told: ContextVar[bool] = ContextVar("_ways_told", default=False)
+_unimodality_reported: ContextVar[bool] = ContextVar("_unimodality_reported", default=False)
 _COVERED = 0.5  # of the range of the input, by a demonstration that is compared with others
 
 
 @contextmanager
-def ways_are_told() -> Iterator[None]:
+def unimodality_reported() -> Iterator[None]:
     """Let a fit in it not warn of several ways; what other threads are warned of stays as it is."""
-    token = _ways_told.set(True)
+    token = _unimodality_reported.set(True)
     try:
         yield
     finally:
-        _ways_told.reset(token)
+        _unimodality_reported.reset(token)
 
 
 def check_groups(groups: Any, n_samples: int) -> NDArray[np.intp]:
@@ -87,7 +87,7 @@ def check_demonstrations(X: Floats, y: Floats, groups: Any) -> None:
             "count as independent. What is predicted is its noise, not how demonstrations differ.",
             DataRankWarning,
         )
-    if _ways_told.get() or X.shape[1] > 1 or len(counts) < 2 or counts.min() < 2:
+    if _unimodality_reported.get() or X.shape[1] > 1 or len(counts) < 2 or counts.min() < 2:
         return
     times, positions = [], []
     for rows in np.split(np.argsort(groups, kind="stable"), np.cumsum(counts)[:-1]):
@@ -116,12 +116,12 @@ def warn_of_residuals(fit: HeteroscedasticFit, group: Tensor | None, given: Tens
         checks.warn(message)
 
 
-def fit_by_demonstration(regressor: Any, X: ArrayLike, y: ArrayLike, groups: ArrayLike) -> Any:
+def fit_with_groups(regressor: Any, X: ArrayLike, y: ArrayLike, groups: ArrayLike) -> Any:
     """Regressor fitted with the demonstrations' numbers, if its ``fit`` takes them: what users bring along need not.
 
     That the demonstrations follow several ways is not said here: whoever has them as demonstrations says it once.
     """
     if not has_fit_parameter(regressor, "groups"):
         return regressor.fit(X, y)
-    with ways_are_told():
+    with unimodality_reported():
         return regressor.fit(X, y, groups=groups)

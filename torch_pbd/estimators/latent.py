@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torch_pbd import checks
 from torch_pbd.estimators.base import CovarianceRegressor, Fitted
-from torch_pbd.estimators.mean import mean_that_repeats_allow
+from torch_pbd.estimators.mean import mean_consistent_with_repeats
 from torch_pbd.estimators.prior import standardized_prior
 from torch_pbd.estimators.scaling import Standardization, distinct_rows
 from torch_pbd.estimators.validation import Floats, check_length_scale
@@ -68,8 +68,8 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         if isinstance(self.prior, str):
             checks.choice(self.prior, "prior", ("paper",))
 
-    def _fit(self, X: Floats, y: Floats, **told: Any) -> Fitted:
-        scaling = Standardization.of(X, y)
+    def _fit(self, X: Floats, y: Floats, **_: Any) -> Fitted:
+        scaling = Standardization.fit(X, y)
         standardized = scaling.inputs(X)
         inputs, index = distinct_rows(standardized)
         self._check_memory(len(inputs), y.shape[1])
@@ -94,9 +94,9 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         if aligned:
             mean, covariance, report, jitter = self._fit_empirical(problem)
         else:
-            mean, of_mean = self._fit_mean(training)
+            mean, mean_report = self._fit_mean(training)
             covariance, report, jitter = self._fit_likelihood(problem, training.residual(mean))
-            report = report.after(of_mean, "search of the mean")
+            report = report.after(mean_report, "search of the mean")
         return Fitted(self._assemble(MeanAndCovariance(mean, covariance), scaling), report, jitter)
 
     @abstractmethod
@@ -146,7 +146,7 @@ class LatentCovarianceRegressor(CovarianceRegressor):
     def _fit_mean(self, training: TrainingSet) -> tuple[LatentGP, FitReport]:
         """Gaussian processes of the mean, by themselves."""
         job = self._mean_job(training)
-        return mean_that_repeats_allow(training, *job, *fit_together([job]))
+        return mean_consistent_with_repeats(training, *job, *fit_together([job]))
 
     def _mean_job(self, training: TrainingSet) -> tuple[Observations, EvidenceSearch]:
         """Means at the inputs, weighted by their counts, and the search for their hyperparameters."""

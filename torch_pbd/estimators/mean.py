@@ -22,7 +22,7 @@ _UNRESOLVED = 1e-10  # squared, of standardized outputs: what a smooth process m
 _SHARE, _LEAST_NOISE = 0.1, 1e-6  # of the smallest error of a mean, and of the outputs' deviation
 
 
-def mean_that_repeats_allow(
+def mean_consistent_with_repeats(
     training: TrainingSet, observations: Observations, search: EvidenceSearch, found: Found
 ) -> tuple[LatentGP, FitReport]:
     """The processes that the evidence found; or ones through the means, where rows that repeat inputs contradict them.

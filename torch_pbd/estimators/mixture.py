@@ -108,7 +108,7 @@ class GMMBaseline(CovarianceRegressor):
         checks.choice(self.solver, "solver", ("em", "lbfgs"))
         checks.number(self.reg_covar, "reg_covar", above=0.0)
 
-    def _fit(self, X: Floats, y: Floats, **told: Any) -> Fitted:
+    def _fit(self, X: Floats, y: Floats, **_: Any) -> Fitted:
         points = _points(X, y)
         n_distinct, n_components = len(distinct_rows(points)[0]), int(self.n_components)
         if n_distinct < self.n_components:
@@ -151,7 +151,7 @@ class GMMBaseline(CovarianceRegressor):
 
     def _prepare(self) -> None:
         if self.device is None:
-            self._regression = MixtureRegression.of(self.module_)
+            self._regression = MixtureRegression.from_module(self.module_)
 
     def __getstate__(self) -> dict[str, Any]:
         """As the base class gives it, without what follows from the module."""
@@ -161,7 +161,7 @@ class GMMBaseline(CovarianceRegressor):
 
     def _mean(self, X: Floats) -> Floats:
         regression = self._regression
-        if regression is None or not regression.is_of(self.module_):
+        if regression is None or not regression.matches(self.module_):
             return super()._mean(X)
         return by_chunks(lambda rows: (regression.mean(rows),), X)[0]
 
@@ -173,7 +173,7 @@ class GMMBaseline(CovarianceRegressor):
 
     def _moments(self, X: Floats) -> tuple[Floats, ...]:
         regression = self._regression
-        if regression is None or not regression.is_of(self.module_):
+        if regression is None or not regression.matches(self.module_):
             return super()._moments(X)
         return by_chunks(regression.moments, X)
 
@@ -207,7 +207,7 @@ def _by_residual(X: Floats, y: Floats) -> Standardization:
     So a regularization of the joint covariance is relative to what the covariance of y given x will be,
     and not to how far y moves.
     """
-    whole = Standardization.of(X, y)
+    whole = Standardization.fit(X, y)
     x_scale = spread_of(X)
     # Neighbours at equal distances are so in all units.
     scaled = replace(whole, x_scale=x_scale).inputs(X)

@@ -15,7 +15,7 @@ from torch_pbd.estimators.latent import (
     residual_tril,
     warn_if_stretched,
 )
-from torch_pbd.estimators.mean import mean_that_repeats_allow
+from torch_pbd.estimators.mean import mean_consistent_with_repeats
 from torch_pbd.estimators.prior import Prior
 from torch_pbd.estimators.validation import check_solver
 from torch_pbd.exceptions import DataRankWarning, NotPositiveDefiniteError
@@ -182,7 +182,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
 
     def _fit_empirical(self, problem: Problem) -> tuple[LatentGP, WishartCovariance, FitReport, float]:
         job = self._mean_job(problem.training)
-        mean, of_mean = mean_that_repeats_allow(problem.training, *job, *fit_together([job]))
+        mean, mean_report = mean_consistent_with_repeats(problem.training, *job, *fit_together([job]))
         prior_root = self._prior_root(problem)
         target = empirical_tril(problem.training)
         if self.start == "random":
@@ -194,7 +194,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
             found, report, jitter = self._train(
                 problem, prior_root, prior_root, cost, prior_weight=0.0, tol=1e-4 * self.tol
             )
-            return mean, found, report.after(of_mean, "search of the mean"), jitter
+            return mean, found, report.after(mean_report, "search of the mean"), jitter
         inputs, matrix = problem.training.inputs, torch.eye(target.shape[-1]).to(target)
 
         def observed(root: Tensor) -> Observations:
@@ -214,7 +214,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         with torch.no_grad():
             latent.weight -= condition(priors, certain, self.kernel, basis=basis)[0].weight
             mse = float(covariance_mse(wishart_root(latent(inputs), prior_root, matrix), target))
-        report = replace(report, loss=mse, loss_curve=(mse,)).after(of_mean, "search of the mean")
+        report = replace(report, loss=mse, loss_curve=(mse,)).after(mean_report, "search of the mean")
         prior = prior_root.reshape(-1, *root.shape[1:])[0]  # a callable one is handed in at every prediction
         return mean, WishartCovariance(latent, prior, matrix, bounded=True), report, jitter
 
