@@ -21,7 +21,7 @@ from torch_pbd.models.heteroscedastic.mean import LatentMean, fit_mean
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
 from torch_pbd.models.heteroscedastic.residuals import DOUBTFUL, NOT_WHITE, is_signal
 from torch_pbd.models.heteroscedastic.search import Search, SearchOptions
-from torch_pbd.models.heteroscedastic.start import MOST_INPUTS
+from torch_pbd.models.heteroscedastic.start import MOST_INPUTS, MeanStart
 from torch_pbd.models.training import TrainingSet, pooled_tril
 
 # Prior medians of length scale (in ranges of the input) and amplitude, and prior deviation of the constant. Means
@@ -101,14 +101,15 @@ def fit_heteroscedastic(
     *,
     n_turns: int = 3,
     needs_resolution: bool = False,
-    begin: Callable[[], tuple[Search, Tensor, TrainingSet]] | None = None,
+    begin: Callable[[], MeanStart] | None = None,
 ) -> HeteroscedasticFit | None:
     """Mean under the noise learned so far, then covariance of the residuals from it, ``n_turns`` times.
 
     ``group`` tells the demonstrations apart. What the first turns leave of each, whitened, tells how far
     its samples are correlated, which the later ones take into account.
 
-    Where the first mean does not follow the data, it is from where ``begin`` says, if it is given: :func:`mean_start`.
+    Where the first mean does not follow the data, and the evidence for what ``begin`` finds (:func:`mean_start`) is
+    clearly higher, the mean is from there.
 
     With ``needs_resolution`` the fit is given up, and None, at the end of the first turn in which the inducing inputs
     do not resolve a length scale with room to spare, unless they are all the inputs.
@@ -124,8 +125,13 @@ def fit_heteroscedastic(
     for turn in range(n_turns):
         options.slack = _SLACK if turn < n_turns - 1 else 1.0
         mean = _fit_mean(mean_search, of_mean, group, pooled, covariance, correlation)
-        if begin is not None and turn == 0 and not _follows(training, group, mean, pooled):
-            mean_search, pooled, of_mean = begin()
+        if (
+            begin is not None
+            and turn == 0
+            and not _follows(training, group, mean, pooled)
+            and (start := begin()).improves(mean, pooled)
+        ):
+            mean_search, pooled, of_mean = start.search, start.noise_tril, start.rows
             mean = _fit_mean(mean_search, of_mean, group, pooled, None, None)
         residual, share = _residual(training, mean, _tril_at(training.inputs, pooled, covariance))
         pooled = pooled if turn else _pooled_tril(residual, share)
