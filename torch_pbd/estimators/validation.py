@@ -200,7 +200,7 @@ def check_solver(solver: str, *, latent_prior: bool) -> None:
     checks.flag(latent_prior, "latent_prior")
     if solver == "fisher" and not latent_prior:
         raise ValueError(
-            "solver == 'fisher' holds the hyperparameters, which latent_prior=False trains: use solver='auto' or "
+            "solver='fisher' holds the hyperparameters, which latent_prior=False trains: use solver='auto' or "
             "'lbfgs', or latent_prior=True."
         )
 
