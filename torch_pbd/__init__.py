@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
     from torch_pbd.estimators.mixture import GMMBaseline
     from torch_pbd.estimators.wishart import WishartProcessRegressor
-    from torch_pbd.movement import TrajectoryRegressor
+    from torch_pbd.movement import KMPBaseline, ProMPBaseline, TrajectoryRegressor
     from torch_pbd.persistence import load, save
 
 __version__ = "0.1.0"
@@ -46,6 +46,8 @@ __all__ = [
     "Demonstrations",
     "GMMBaseline",
     "HeteroscedasticGPRegressor",
+    "KMPBaseline",
+    "ProMPBaseline",
     "TrajectoryRegressor",
     "WishartProcessRegressor",
     "load",

@@ -11,7 +11,11 @@ REGRESSORS = {
 }
 """Covariance regressors, the recommended one first."""
 
-MOVEMENTS = {"TrajectoryRegressor": "torch_pbd.movement.trajectory"}
+MOVEMENTS = {
+    "TrajectoryRegressor": "torch_pbd.movement.trajectory",
+    "ProMPBaseline": "torch_pbd.movement.promp",
+    "KMPBaseline": "torch_pbd.movement.kmp",
+}
 """Models of whole movements."""
 
 ESTIMATORS = {**REGRESSORS, **MOVEMENTS, "DMPController": "torch_pbd.control.controller"}
