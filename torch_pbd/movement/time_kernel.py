@@ -7,7 +7,6 @@ to be as large as where movements start or end in one point, which marginals mis
 
 import math
 from dataclasses import dataclass, replace
-from typing import get_args
 
 import torch
 from jaxtyping import Bool, Float
@@ -66,7 +65,7 @@ class TimeKernel:
 
 
 def fit_time_kernel(
-    grid: Float[Tensor, " T"], residual: Float[Tensor, "K T d"], kernel: KernelName | None, share: float | None
+    grid: Float[Tensor, " T"], residual: Float[Tensor, "K T d"], kernel: KernelName, share: float | None
 ) -> TimeKernel:
     """Time kernel of whitened residuals, NaN where a demonstration has no sample near.
 
@@ -75,47 +74,44 @@ def fit_time_kernel(
     grid : Tensor of shape (T,)
         Times, of a range of one.
     residual : Tensor of shape (K, T, d)
-    kernel : str or None
-        None takes the likeliest of all.
+    kernel : str
     share : float or None
         None takes that with the highest likelihood of demonstrations left out in turn.
     """
     residual = _unit_rms(residual)
-    kernels = get_args(KernelName) if kernel is None else (kernel,)
     sizes = residual.square().nanmean((0, 2)).sqrt()
     usual = (sizes > sizes.nanmedian() / _USUAL) & (sizes < sizes.nanmedian() * _USUAL)
-    found = _search(grid, residual, usual, kernels)
-    nugget = _step_nuggets(grid, residual, found, _LEAST)
+    found = _search(grid, residual, usual, kernel)
+    unit = _unit_kernel(grid, found[0], kernel)
+    nugget = _step_nuggets(unit, residual, _LEAST)
     for _ in range(_ROUNDS):
         smooth = nugget <= _SMOOTH
-        again = _search(grid, residual, smooth if 2 * smooth.sum() >= len(grid) else nugget <= nugget.median(), kernels)
+        again = _search(grid, residual, smooth if 2 * smooth.sum() >= len(grid) else nugget <= nugget.median(), kernel)
         if again == found:
             break
-        found = again
-        nugget = _step_nuggets(grid, residual, found, min(found[2], 0.1 * _SMOOTH))
-    result = TimeKernel(grid, found[0], found[1], nugget, 1.0, _filled(grid, residual, found, nugget))
+        found, unit = again, _unit_kernel(grid, again[0], kernel)
+        nugget = _step_nuggets(unit, residual, min(again[1], 0.1 * _SMOOTH))
+    result = TimeKernel(grid, kernel, found[0], nugget, 1.0, _filled(unit, residual, nugget))
     return replace(result, share=_best_share(result) if share is None else share)
 
 
-def _search(
-    grid: Tensor, residual: Tensor, steps: Bool[Tensor, " T"], kernels: tuple[KernelName, ...]
-) -> tuple[KernelName, float, float]:
-    """Kernel, length scale and shared nugget eta of the highest likelihood of ``(1 - eta) K + eta I``."""
+def _unit_kernel(grid: Float[Tensor, " T"], length_scale: float, kernel: KernelName) -> Float[Tensor, "T T"]:
+    return correlation(grid[:, None], grid[:, None], grid.new_tensor([length_scale]), kernel)
+
+
+def _search(grid: Tensor, residual: Tensor, steps: Bool[Tensor, " T"], kernel: KernelName) -> tuple[float, float]:
+    """Length scale and shared nugget eta of the highest likelihood of ``(1 - eta) K + eta I``."""
     steps = steps if 2 * int(steps.sum()) >= len(grid) else torch.ones_like(steps)
     chosen = _unit_rms(residual[:, steps])
-    groups, time = list(_by_pattern(chosen)), grid[steps][:, None]
-    best: tuple[float, tuple[KernelName, float, float]] | None = None
-    for kernel in kernels:
-        unit = correlation(time, time, _LENGTHS[:, None].to(grid), kernel)  # (lengths, n, n)
-        for nugget in _NUGGETS:
-            whole = (1.0 - nugget) * unit + nugget * torch.eye(len(time)).to(grid)
-            values = sum(_log_likelihood(whole[:, seen][:, :, seen], rows) for seen, rows in groups)
-            index = int(torch.as_tensor(values).argmax())
-            value = float(torch.as_tensor(values)[index])
-            if best is None or value > best[0]:
-                best = value, (kernel, float(_LENGTHS[index]), nugget)
-    assert best is not None
-    return best[1]
+    groups, time = _by_pattern(chosen), grid[steps][:, None]
+    unit = correlation(time, time, _LENGTHS[:, None].to(grid), kernel)
+    values = []
+    for nugget in _NUGGETS:
+        whole = (1.0 - nugget) * unit + nugget * torch.eye(len(time)).to(grid)
+        each = [_log_likelihood(whole[:, seen][:, :, seen], rows) for seen, rows in groups]
+        values.append(torch.stack(each).sum(0))
+    best = int(torch.stack(values).argmax())
+    return float(_LENGTHS[best % len(_LENGTHS)]), _NUGGETS[best // len(_LENGTHS)]
 
 
 def _log_likelihood(covariance: Float[Tensor, "b n n"], rows: Float[Tensor, "n s"]) -> Float[Tensor, " b"]:
@@ -126,19 +122,16 @@ def _log_likelihood(covariance: Float[Tensor, "b n n"], rows: Float[Tensor, "n s
     return torch.where((info == 0) & torch.isfinite(value), value, -torch.inf)
 
 
-def _step_nuggets(
-    grid: Tensor, residual: Tensor, found: tuple[KernelName, float, float], least: float
-) -> Float[Tensor, " T"]:
+def _step_nuggets(unit: Float[Tensor, "T T"], residual: Float[Tensor, "K T d"], least: float) -> Float[Tensor, " T"]:
     """Nugget of each step, by expectation maximization over the independent parts of the residuals.
 
     With ``S = K + diag e`` and ``a = S^-1 z`` an independent part has the mean ``e_t a_t`` and the variance
     ``e_t - e_t^2 [S^-1]_tt``; their second moment is the next e_t.
     """
-    unit = correlation(grid[:, None], grid[:, None], grid.new_tensor([found[1]]), found[0])
-    groups = list(_by_pattern(residual))
-    nugget = torch.full_like(grid, max(least, _FIRST))
+    groups = _by_pattern(residual)
+    nugget = torch.full_like(unit[0], max(least, _FIRST))
     for _ in range(_N_STEPS):
-        moment, count = torch.zeros_like(grid), torch.zeros_like(grid)
+        moment, count = torch.zeros_like(nugget), torch.zeros_like(nugget)
         for seen, rows in groups:
             own = nugget[seen]
             inverse = torch.cholesky_inverse(
@@ -155,13 +148,8 @@ def _step_nuggets(
     return nugget
 
 
-def _filled(
-    grid: Tensor, residual: Tensor, found: tuple[KernelName, float, float], nugget: Tensor
-) -> Float[Tensor, "K T d"]:
+def _filled(unit: Float[Tensor, "T T"], residual: Float[Tensor, "K T d"], nugget: Tensor) -> Float[Tensor, "K T d"]:
     """Residuals with the kernel's expectation where there were none."""
-    if not bool(residual.isnan().any()):
-        return residual
-    unit = correlation(grid[:, None], grid[:, None], grid.new_tensor([found[1]]), found[0])
     filled = residual.clone()
     for k, own in enumerate(residual):
         seen = ~own.isnan().any(1)

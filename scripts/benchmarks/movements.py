@@ -1,0 +1,328 @@
+"""Models of whole movements, judged by left-out demonstrations of recorded sets, and by made data of known law.
+
+Every fold of every set goes into a CSV file; the table in docs/movements.md is what this prints. Recordings are taken
+over 50 steps of phase (handwriting over 200), in units of their pooled deviation; the first eight demonstrations are
+left out in turn, with at most 40 of the others to learn from.
+"""
+
+import argparse
+import csv
+import math
+import time
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from joblib import Parallel, delayed
+from movement_primitives.promp import ProMP
+from scipy.stats import multivariate_normal, multivariate_t
+
+from torch_pbd import KMPBaseline, ProMPBaseline, TrajectoryRegressor, load_demonstrations
+from torch_pbd.metrics import gaussian_kl
+
+Floats = Any
+DATA = Path(__file__).parents[3] / "shared" / "data"
+SETS = [
+    *(f"letter_{letter}" for letter in "ACGLNPSZ"),
+    *("pen_a", "handwriting_fda", "gait_hip_knee", "kuka_cube_pick", "kuka_cshape_top", "adroit_door_palm"),
+    *("mouse_choice_1", "snooker_skilled"),
+]
+N_STEPS = {"handwriting_fda": 200}
+N_FOLDS, MOST_TRAINED, N_DRAWS = 8, 40, 300
+MODELS = {
+    "TrajectoryRegressor": TrajectoryRegressor,
+    "ProMPBaseline": ProMPBaseline,
+    "KMPBaseline": KMPBaseline,
+    "rows independent": None,
+    "movement_primitives": None,
+}
+REGIONS = ("deviation", "offset", "length", "largest")
+
+
+def load(name: str) -> tuple[Floats, Floats]:
+    """Phases (n,) and movements (K, n, d) in units of their pooled deviation."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        y = load_demonstrations(DATA / f"{name}.npz").align(n=N_STEPS.get(name, 50)).to_array()
+    return np.linspace(0.0, 1.0, y.shape[1]), (y - y.mean((0, 1))) / y.std((0, 1))
+
+
+class Independent:
+    """The recommended regressor with its rows taken for independent."""
+
+    def __init__(self, trajectory: TrajectoryRegressor) -> None:
+        self._model = trajectory.regressor_
+
+    def joint(self, X: Floats) -> tuple[Floats, Floats, float]:
+        """Mean (n, d), covariance (n, d, n, d) and degrees of freedom."""
+        mean, own = self._model.predict(X, return_cov=True)
+        n, d = mean.shape
+        covariance = np.zeros((n, d, n, d))
+        covariance[np.arange(n), :, np.arange(n)] = own
+        return mean, covariance, float(np.median(self._model.predict_df(X)))
+
+
+class Published:
+    """movement_primitives' ProMP as it comes, with its own noise variance on the diagonal."""
+
+    def __init__(self, grid: Floats, demos: Floats) -> None:
+        self._grid, self._d = grid, demos.shape[2]
+        self._model = ProMP(self._d, 10)
+        self._model.imitate([grid] * len(demos), list(demos))
+
+    def joint(self, X: Floats) -> tuple[Floats, Floats, float]:
+        """Mean (n, d), covariance (n, d, n, d) and degrees of freedom."""
+        n, d = len(self._grid), self._d
+        covariance = self._model.cov_trajectory(self._grid) + max(self._model.variance, 1e-8) * np.eye(n * d)
+        covariance = covariance.reshape(d, n, d, n).transpose(1, 0, 3, 2)
+        return self._model.mean_trajectory(self._grid), covariance, math.inf
+
+
+def log_density(x: Floats, mean: Floats, covariance: Floats, df: float) -> float:
+    """Joint log density of a movement, from scipy, in nats."""
+    flat = covariance.reshape(mean.size, mean.size)
+    if math.isinf(df):
+        return float(multivariate_normal(mean.ravel(), flat, allow_singular=True).logpdf(x.ravel()))
+    return float(multivariate_t(mean.ravel(), flat * (df - 2.0) / df, df=df, allow_singular=True).logpdf(x.ravel()))
+
+
+def given(joint: tuple[Floats, Floats, float], seen: Floats, x: Floats) -> tuple[Floats, Floats]:
+    """Mean and covariance of the steps that were not seen, given those that were, by dense normal formulas."""
+    mean, covariance, _ = joint
+    d = mean.shape[1]
+    flat, rows = covariance.reshape(mean.size, mean.size), np.flatnonzero(np.repeat(seen, d))
+    rest = np.flatnonzero(np.repeat(~seen, d))
+    own = flat[np.ix_(rows, rows)]
+    gain = np.linalg.lstsq(own, flat[np.ix_(rows, rest)], rcond=1e-12)[0].T
+    conditional = mean.ravel()[rest] + gain @ (x.ravel()[rows] - mean.ravel()[rows])
+    return conditional.reshape(-1, d), flat[np.ix_(rest, rest)] - gain @ flat[np.ix_(rows, rest)]
+
+
+def judge_conditioning(joint: tuple[Floats, Floats, float], seen: Floats, x: Floats, ahead: slice) -> dict[str, float]:
+    """Error over that of the unconditioned mean, nats a step above it, and what 95 % ellipses hold, of steps ahead."""
+    mean, covariance, df = joint
+    d = mean.shape[1]
+    conditional, left = given(joint, seen, x)
+    left = left.reshape(len(conditional), d, len(conditional), d)
+    rest = np.flatnonzero(~seen)[ahead]
+    error, before = conditional[ahead] - x[rest], mean[rest] - x[rest]
+    own = left[np.arange(len(conditional)), :, np.arange(len(conditional))][ahead]
+    own = own + 1e-12 * np.eye(d) * np.trace(covariance[rest, :, rest].mean(0))
+    square = np.einsum("ni,ni->n", error, np.linalg.solve(own, error[..., None])[..., 0])
+    gain = [
+        log_density(x[t], conditional[ahead][i], own[i], df) - log_density(x[t], mean[t], covariance[t, :, t], df)
+        for i, t in enumerate(rest)
+    ]
+    draws = 4096
+    generator = np.random.default_rng(0)
+    normal = np.square(generator.standard_normal((draws, d))).sum(1)
+    if math.isfinite(df):
+        normal *= (df - 2.0) / generator.chisquare(df, draws)
+    return {
+        "rmse": float(np.sqrt(np.square(error).mean() / np.square(before).mean())),
+        "gain": float(np.mean(gain)),
+        "holds_95": float((square <= np.quantile(normal, 0.95)).mean()),
+    }
+
+
+def statistics(x: Floats, mean: Floats, deviation: Floats) -> Floats:
+    """Whole-movement statements of movements (s, n, d): (s, 4), as ``REGIONS``."""
+    standardized = (x - mean) / deviation
+    return np.stack(
+        [
+            np.square(standardized).mean((1, 2)),
+            np.sqrt(np.square(standardized.mean(1)).sum(1)),
+            np.sqrt(np.square(np.diff(x, axis=1)).sum(2)).sum(1),
+            np.abs(standardized).max((1, 2)),
+        ],
+        axis=1,
+    )
+
+
+def judge(joint: tuple[Floats, Floats, float], x: Floats, train: Floats, draws: Floats) -> dict[str, float]:
+    """Everything that one left-out movement says of one model."""
+    mean, covariance, df = joint
+    n = len(mean)
+    half, ends = np.arange(n) < n // 2, np.isin(np.arange(n), [n // 2, n - 1])
+    row: dict[str, float] = {"joint": log_density(x, mean, covariance, df)}
+    cases = {
+        "next": (half, slice(0, max(1, n // 10))),
+        "rest": (half, slice(None)),
+        "between": (ends, slice(n // 2, -1)),
+    }
+    for name, (seen, steps) in cases.items():
+        row |= {f"{name}_{key}": value for key, value in judge_conditioning(joint, seen, x, steps).items()}
+    deviation = np.sqrt(np.einsum("nini->ni", covariance))
+    own, of_draws = statistics(x[None], mean, deviation)[0], statistics(draws, mean, deviation)
+    low, high = np.quantile(of_draws, [0.05, 0.95], axis=0)
+    row |= {f"region_{name}": float(low[i] <= own[i] <= high[i]) for i, name in enumerate(REGIONS)}
+    rough = [np.sqrt(np.square(np.diff(part, 2, axis=1)).mean()) for part in (draws, train)]
+    return row | {"roughness": float(rough[0] / rough[1])}
+
+
+def drawn(joint: tuple[Floats, Floats, float], seed: int) -> Floats:
+    """Movements of a joint law, by a dense root."""
+    mean, covariance, df = joint
+    generator = np.random.default_rng(seed)
+    values, vectors = np.linalg.eigh(covariance.reshape(mean.size, mean.size))
+    normal = (vectors * np.sqrt(values.clip(0.0))) @ generator.standard_normal((mean.size, N_DRAWS))
+    if math.isfinite(df):
+        normal *= np.sqrt((df - 2.0) / generator.chisquare(df, N_DRAWS))
+    return mean + normal.T.reshape(N_DRAWS, *mean.shape)
+
+
+def fold(name: str, left_out: int, n_train: int) -> list[dict[str, Any]]:
+    """All models on one left-out demonstration of one set."""
+    grid, y = load(name)
+    train = np.delete(y, left_out, axis=0)
+    train = train[np.random.default_rng(left_out).permutation(len(train))[:n_train]]
+    n_demos, n, d = train.shape
+    X, rows, groups = np.tile(grid, n_demos)[:, None], train.reshape(-1, d), np.repeat(np.arange(n_demos), n)
+    at, trajectory, results = grid[:, None], None, []
+    for model, make in MODELS.items():
+        start = time.process_time()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            if make is not None:
+                fitted = make().fit(X, rows, groups=groups)
+                trajectory = trajectory or fitted
+                joint = (*fitted.predict_joint(at), fitted.df_)
+            else:
+                joint = (Independent(trajectory) if model == "rows independent" else Published(grid, train)).joint(at)
+        seconds = time.process_time() - start
+        row = judge(joint, y[left_out], train, drawn(joint, left_out))
+        results.append({"set": name, "fold": left_out, "K": n_demos, "model": model, **row, "seconds": seconds})
+    return results
+
+
+def made(law: str, kernel: str, length: float, n_demos: int, seed: int) -> list[dict[str, Any]]:
+    """KL divergence per step from a made law, whose covariance and kernel are known, to what models learn of it."""
+    n = 60
+    grid = np.linspace(0.0, 1.0, n)
+    r = np.abs(grid[:, None] - grid) / length
+    root5 = math.sqrt(5.0) * r
+    unit = np.exp(-0.5 * r**2) if kernel == "squared exponential" else (1 + root5 + root5**2 / 3) * np.exp(-root5)
+    unit = unit + 1e-6 * np.eye(n)
+    mean = np.stack([np.sin(3.0 * grid), np.cos(2.0 * grid)], axis=1)
+    if law == "bell":
+        width = 0.3 + np.exp(-0.5 * np.square((grid - 0.5) / 0.15))
+        factor = np.stack([np.array([[w, 0.0], [0.5 * w, 0.7]]) for w in width])
+    elif law == "rotating":
+        angle = np.pi * grid
+        factor = np.stack([[[math.cos(a), -0.2 * math.sin(a)], [math.sin(a), 0.2 * math.cos(a)]] for a in angle])
+    else:  # the deviations fall by thirty within the last twentieth
+        share = np.clip((grid - 0.95) / 0.05, 0.0, 1.0)
+        factor = (1.0 - 0.97 * share**2 * (3.0 - 2.0 * share))[:, None, None] * np.eye(2)
+    whole = np.einsum("iab,ij,jcb->iajc", factor, unit, factor).reshape(2 * n, 2 * n)
+    draws = mean.ravel() + np.random.default_rng(seed).multivariate_normal(np.zeros(2 * n), whole, n_demos)
+    X, groups = np.tile(grid, n_demos)[:, None], np.repeat(np.arange(n_demos), n)
+    results = []
+    for model in (TrajectoryRegressor, ProMPBaseline):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            fitted = model().fit(X, draws.reshape(-1, 2), groups=groups)
+        own_mean, own = fitted.predict_joint(grid[:, None])
+        moments = own.reshape(1, 2 * n, 2 * n), mean.reshape(1, -1), own_mean.reshape(1, -1)
+        kl = gaussian_kl(whole[None], moments[0], reference_mean=moments[1], estimated_mean=moments[2])
+        row = {"law": law, "kernel": kernel, "length": length, "K": n_demos, "seed": seed}
+        results.append({**row, "model": model.__name__, "kl_per_step": kl / n})
+    return results
+
+
+def table_of_sets(rows: list[dict[str, Any]]) -> str:
+    """Joint log likelihood of each set, and paired differences to ProMPBaseline."""
+    names = list(dict.fromkeys(row["set"] for row in rows))
+    values: dict[tuple[str, str], list[float]] = {}
+    for row in rows:
+        values.setdefault((row["set"], row["model"]), []).append(row["joint"])
+    lines = ["| set | " + " | ".join(MODELS) + " | ahead of ProMPBaseline |", "|" + " --- |" * (len(MODELS) + 2)]
+    for name in names:
+        difference = np.subtract(values[name, "TrajectoryRegressor"], values[name, "ProMPBaseline"])
+        error = difference.std(ddof=1) / math.sqrt(len(difference)) if len(difference) > 1 else math.nan
+        means = " | ".join(f"{np.mean(values[name, model]):.0f}" for model in MODELS)
+        lines.append(f"| {name} | {means} | {difference.mean():.0f} +- {error:.0f} |")
+    return "\n".join(lines)
+
+
+def table_of_models(rows: list[dict[str, Any]]) -> str:
+    """Everything else, in the mean over the sets; ratios as geometric means."""
+    columns = [key for key in rows[0] if key not in ("set", "fold", "K", "model", "joint")]
+    lines = ["| model | " + " | ".join(column.replace("_", " ") for column in columns) + " |"]
+    lines.append("|" + " --- |" * (len(columns) + 1))
+    for model in MODELS:
+        entries = []
+        for column in columns:
+            each = [
+                [row[column] for row in rows if row["model"] == model and row["set"] == name]
+                for name in dict.fromkeys(row["set"] for row in rows)
+            ]
+            ratio = column.endswith("rmse") or column == "roughness"
+            means = [np.exp(np.log(part).mean()) if ratio else np.mean(part) for part in each]
+            entries.append(f"{np.exp(np.log(means).mean()) if ratio else np.mean(means):.2f}")
+        lines.append(f"| {model} | {' | '.join(entries)} |")
+    return "\n".join(lines)
+
+
+def table_of_laws(rows: list[dict[str, Any]]) -> str:
+    """KL divergences a step, means over seeds with the paired standard error."""
+    lines = ["| law | kernel | length | K | TrajectoryRegressor | ProMPBaseline | difference |", "|" + " --- |" * 7]
+    values: dict[tuple[Any, ...], dict[str, list[float]]] = {}
+    for row in rows:
+        key = row["law"], row["kernel"], row["length"], row["K"]
+        values.setdefault(key, {}).setdefault(row["model"], []).append(row["kl_per_step"])
+    for key, each in values.items():
+        own, other = (np.array(each[model]) for model in ("TrajectoryRegressor", "ProMPBaseline"))
+        difference = own - other
+        error = difference.std(ddof=1) / math.sqrt(len(own)) if len(own) > 1 else math.nan
+        figures = f"{own.mean():.2f} | {other.mean():.2f} | {difference.mean():.2f} +- {error:.2f}"
+        lines.append(f"| {' | '.join(map(str, key))} | {figures} |")
+    return "\n".join(lines)
+
+
+def write(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Rows as CSV."""
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def main() -> None:
+    """Run what is asked for, and print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--output", type=Path, default=Path("runs/movements"))
+    parser.add_argument("--sets", nargs="*", default=SETS)
+    parser.add_argument("--folds", type=int, default=N_FOLDS)
+    parser.add_argument("--n_train", type=int, default=MOST_TRAINED, help="demonstrations learned from, at most")
+    parser.add_argument("--seeds", type=int, default=4, help="of made data; 0 leaves them out")
+    parser.add_argument("--n_jobs", type=int, default=2)
+    options = parser.parse_args()
+    options.output.mkdir(parents=True, exist_ok=True)
+    jobs = [
+        delayed(fold)(name, left_out, options.n_train)
+        for name in options.sets
+        for left_out in range(min(options.folds, len(load(name)[1])))
+    ]
+    parallel = Parallel(n_jobs=options.n_jobs)
+    rows = [row for part in parallel(jobs) for row in part]
+    if rows:
+        write(options.output / "movements.csv", rows)
+        print(table_of_sets(rows), table_of_models(rows), sep="\n\n")
+    kernels, laws = ("squared exponential", "Matern 5/2"), ("bell", "rotating", "collapsing")
+    jobs = [
+        delayed(made)(law, kernel, length, n_demos, seed)
+        for law in laws
+        for kernel in kernels
+        for length in (0.1, 0.3)
+        for n_demos in (6, 12)
+        for seed in range(options.seeds)
+    ]
+    rows = [row for part in parallel(jobs) for row in part]
+    if rows:
+        write(options.output / "laws.csv", rows)
+        print("", table_of_laws(rows), sep="\n")
+
+
+if __name__ == "__main__":
+    main()
