@@ -1,14 +1,14 @@
-"""What a measured force counts as: less its bias, within the sensor's range, and bridged where it is lost."""
+"""The force channel: a measured force less its bias, within the sensor's range, and bridged where it is lost."""
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from typing import final
 
-from torch_pbd.control.realtime.checks import Numbers, limit, number, whole
-from torch_pbd.control.realtime.status import TickStatus
+from torch_pbd import checks
+from torch_pbd.control.realtime.limits import FINE, TickStatus
 from torch_pbd.control.realtime.steps import Vector
 
-_FINE = TickStatus(0)
 # A median of five is a good force after one or two wild ones, and 2 ms late at 1 kHz.
 _RECENT = 5
 
@@ -26,19 +26,20 @@ class ForceChannel:
         self, mass: float, force_limit: float, deadband: float, force_rate_limit: float | None, hold_ticks: int
     ) -> None:
         self._mass = mass
-        self._limit = number("force_limit", force_limit, "N") / mass
-        self._deadband = number("deadband", deadband, "N, or 0", zero=True) / mass
-        self._rate_limit = limit("force_rate_limit", force_rate_limit, "N/s") / mass
-        self._hold_ticks = whole("hold_ticks", hold_ticks, 0)
+        self._limit = checks.number(force_limit, "force_limit", above=0.0, unit="N") / mass
+        self._deadband = checks.number(deadband, "deadband", least=0.0, unit="N") / mass
+        rate = checks.number(force_rate_limit, "force_rate_limit", above=0.0, unit="N/s", optional=True)
+        self._rate_limit = math.inf if rate is None else rate / mass
+        self._hold_ticks = checks.count(hold_ticks, "hold_ticks", least=0)
         self.begin(0, ())
 
     def begin(self, d: int, bias: Vector) -> None:
-        """Forget what was; before the first force there was none."""
+        """Forget all forces; before the first there was none."""
         self.push: Vector = (0.0,) * d
         self._bias, self._n_lost, self.is_lost = bias, 0, False
         self._recent = deque([self.push] * _RECENT, _RECENT)
 
-    def take(self, force: Numbers, step: float) -> TickStatus:
+    def take(self, force: Sequence[float] | checks.Floats, step: float) -> TickStatus:
         """Let a force as measured act, as far as it may, ``step`` s after the last one."""
         try:
             mass = self._mass
@@ -49,10 +50,10 @@ class ForceChannel:
         except (TypeError, ValueError, OverflowError):
             push = ()
         if len(push) != len(self.push):
-            raise ValueError(f"force={force!r} must be {len(self.push)} numbers in N.")
+            raise checks.refusal(force, "force", f"{len(self.push)} numbers in N")
         if self._deadband:
             push = tuple([part - max(-self._deadband, min(self._deadband, part)) for part in push])
-        length, status = math.hypot(*push), _FINE
+        length, status = math.hypot(*push), FINE
         if not length <= self._limit:
             if not length < math.inf:
                 self._bridge()
