@@ -208,7 +208,7 @@ def test_prints_on_one_line():
     controller.start(0.0, at=0.1)
     controller.tick(0.5, [0.0, 0.0])
     assert repr(controller) == (
-        "RealTimeAdmittance(n_axes=2, rows=201, rate=1000 Hz, mass=0.5 kg, schedule_time=0.1..0.2 s, faults=LATE)"
+        "RealTimeAdmittance(n_axes=2, mass=0.5 kg, rate=1000 Hz, schedule_time=0.1..0.2 s, faults=LATE)"
     )
 
 

@@ -220,7 +220,7 @@ def test_59_calls_that_make_no_sense_say_so():
         ((0.0, [0.0]), r"position has shape \(1,\), must have shape \(2,\)"),
         ((0.0, [0.0, math.nan]), r"position\[1\] is nan"),
         ((0.0, None, ["a", "b"]), "velocity holds text"),
-        ((0.0, None, [0.8, 0.8]), "at most 1, the velocity_limit, in length: slow"),
+        ((0.0, None, [0.8, 0.8]), "the speed is .* at most 1: slow it down"),
     ]:
         with pytest.raises(ValueError, match=words):
             controller.start(*arguments)

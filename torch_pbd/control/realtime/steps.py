@@ -1,13 +1,18 @@
 """One tick of the real-time controller, solved exactly: with floats where axes are shared, else with NumPy."""
 
 import math
+from collections.abc import Sequence
 from operator import mul, sub
 
 import numpy as np
 
+from torch_pbd import checks
 from torch_pbd.checks import Floats
 
+Numbers = Sequence[float] | Floats
 Vector = tuple[float, ...]
+State = tuple[Vector, Vector]
+"""Position and velocity."""
 
 # Of (w h)^2, w the frequency of an axis and h the step: below, two terms of a series in it have all digits.
 _CRITICAL = 1e-7
@@ -15,12 +20,10 @@ _CRITICAL = 1e-7
 _SHORT = 0.01
 
 
-def advance_plane(
-    row: Vector, push: Vector, position: Vector, velocity: Vector, step: float, pull_limit: float
-) -> tuple[Vector, Vector, float]:
+def advance_plane(row: Vector, push: Vector, state: State, step: float, pull_limit: float) -> tuple[State, float]:
     """`advance_modal` for d = 2, written out."""
     goal_x, goal_y, goal_vx, goal_vy, top, stiff_1, stiff_2, decay_1, decay_2, cos, sin, _, _ = row
-    (x, y), (vx, vy), (push_x, push_y) = position, velocity, push
+    ((x, y), (vx, vy)), (push_x, push_y) = state, push
     off_x, off_y = x - goal_x, y - goal_y
     off_1, off_2 = cos * off_x + sin * off_y, cos * off_y - sin * off_x
     v_1, v_2 = cos * vx + sin * vy, cos * vy - sin * vx
@@ -36,19 +39,17 @@ def advance_plane(
     dv_1 = s_1 * q_1 - (2.0 * decay_1 * s_1 + stiff_1 * p_1) * v_1
     dv_2 = s_2 * q_2 - (2.0 * decay_2 * s_2 + stiff_2 * p_2) * v_2
     there = (x + cos * dx_1 - sin * dx_2, y + sin * dx_1 + cos * dx_2)
-    return there, (vx + cos * dv_1 - sin * dv_2, vy + sin * dv_1 + cos * dv_2), scale
+    return (there, (vx + cos * dv_1 - sin * dv_2, vy + sin * dv_1 + cos * dv_2)), scale
 
 
-def advance_modal(
-    row: Vector, push: Vector, position: Vector, velocity: Vector, step: float, pull_limit: float
-) -> tuple[Vector, Vector, float]:
+def advance_modal(row: Vector, push: Vector, state: State, step: float, pull_limit: float) -> tuple[State, float]:
     """Position and velocity after ``step`` s, and the scale of the stiffness; each axis by itself.
 
     Along an axis, y = x - x_d follows y'' + 2 a y' + k y = f + 2 a v_d, all per kg. With the responses S and P of
     `_responses` and q = f + 2 a v_d - k y, y grows by S v + P q and v by S q - (2 a S + k P) v: increments, which
     keep their digits in short ticks.
     """
-    d = len(push)
+    (position, velocity), d = state, len(push)
     stiffness, decay = row[2 * d + 1 : 3 * d + 1], row[3 * d + 1 : 4 * d + 1]
     axes = [row[start : start + d] for start in range(4 * d + 1, len(row), d)]
     off = tuple(map(sub, position, row))
@@ -64,14 +65,12 @@ def advance_modal(
         for i, share in enumerate(axis):
             there[i] += dx * share
             faster[i] += dv * share
-    return tuple(there), tuple(faster), scale
+    return (tuple(there), tuple(faster)), scale
 
 
-def advance_coupled(
-    row: Vector, push: Vector, position: Vector, velocity: Vector, step: float, pull_limit: float
-) -> tuple[Vector, Vector, float]:
+def advance_coupled(row: Vector, push: Vector, state: State, step: float, pull_limit: float) -> tuple[State, float]:
     """As `advance_modal` for matrices that share no axes: exp(X) - 1 of the whole system, time in ticks."""
-    d = len(push)
+    (position, velocity), d = state, len(push)
     goal, goal_velocity, (top,), gains = np.split(np.array(row), [d, 2 * d, 2 * d + 1])
     stiffness, damping = gains.reshape(2, d, d)
     off = np.subtract(position, goal)
@@ -83,7 +82,7 @@ def advance_coupled(
     rate[d:-1, -1] = step**2 * (push + damping @ goal_velocity)
     change = _expm1(rate) @ np.concatenate([off, np.multiply(step, velocity), [1.0]])
     there, faster = np.add(position, change[:d]), np.add(velocity, change[d:-1] / step)
-    return tuple(there.tolist()), tuple(faster.tolist()), scale
+    return (tuple(there.tolist()), tuple(faster.tolist())), scale
 
 
 def _expm1(matrix: Floats) -> Floats:
@@ -126,13 +125,19 @@ def _responses(stiffness: float, decay: float, step: float) -> tuple[float, floa
     return impulse, step * step * series
 
 
+def vector(values: Numbers, name: str, d: int) -> Vector:
+    """Finite floats, one for each of d axes."""
+    return tuple(checks.array(values, name, (d,)).tolist())
+
+
 def minimum_jerk(phase: float) -> tuple[float, float]:
     """Rest of a way of 1 by minimum jerk at a phase of 0..1, and its slope over the phase."""
     return 1.0 - phase**3 * (10.0 - 15.0 * phase + 6.0 * phase**2), -30.0 * phase**2 * (1.0 - phase) ** 2
 
 
-def braked(position: Vector, velocity: Vector, deceleration: float, step: float) -> tuple[Vector, Vector]:
+def braked(state: State, deceleration: float, step: float) -> State:
     """Position and velocity after braking for ``step`` s, or until standing still."""
+    position, velocity = state
     speed = math.hypot(*velocity)
     braking = min(step, speed / deceleration)
     left = 1.0 - deceleration * step / speed if braking == step else 0.0

@@ -8,16 +8,28 @@ import numpy as np
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.control.realtime.steps import Vector, advance_coupled, advance_modal, advance_plane
+from torch_pbd.control.realtime.steps import State, Vector, advance_coupled, advance_modal, advance_plane
 from torch_pbd.control.schedule import Schedule
 from torch_pbd.control.schedule.contents import checked_arrays
 from torch_pbd.control.schedule.rows import Between, count_rows, row_times
 from torch_pbd.exceptions import InvalidParameterError
 
-Advance = Callable[[Vector, Vector, Vector, Vector, float, float], tuple[Vector, Vector, float]]
+Advance = Callable[[Vector, Vector, State, float, float], tuple[State, float]]
 
 _READ = ("time", "position", "velocity", "stiffness", "damping")
+# Products of gains with masses from this one to its inverse, in kg, are numbers.
+_LIGHTEST = 1e-50
 _MAX_ROWS = 4_000_000  # an hour at 1 kHz, which takes 670 MB for d = 2
+
+
+def virtual_mass(schedule: Schedule | Any, mass: float | None) -> float:
+    """Virtual mass in kg, that of the schedule if None; a warning where it is another."""
+    own = getattr(schedule, "mass", None)
+    given = (own or 1.0) if mass is None else mass
+    value = checks.number(given, "mass", least=_LIGHTEST, most=1.0 / _LIGHTEST, unit="kg")
+    if own is not None and value != own:
+        checks.warn(f"mass is {mass}, but damping_ratio was met for mass={own:g} kg: give both the same.")
+    return value
 
 
 @final

@@ -10,6 +10,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from itertools import chain, combinations_with_replacement
 from pathlib import Path
 from typing import Any, TypeVar
@@ -36,11 +37,7 @@ _DAMAGE = (ArithmeticError, LookupError, MemoryError, RuntimeError, TypeError, V
 
 
 def write_schedule(path: Path, arrays: Arrays, labels: Labels) -> None:
-    """Write one file in the format of its suffix, which is there whole or not at all.
-
-    Raises ValueError if the suffix is not known or the file would be larger than what is read again, OSError
-    with the path if it cannot be written.
-    """
+    """Write one file in the format of its suffix, as :meth:`Schedule.save` says."""
     encode = _ENCODERS[_known_suffix(path)]
     header = {"format": FORMAT, "version": VERSION, **labels}
     content = encode({**header, "sha256": _digest(header, arrays)}, arrays)
@@ -54,11 +51,7 @@ def write_schedule(path: Path, arrays: Arrays, labels: Labels) -> None:
 
 
 def read_schedule(path: Path, build: Callable[..., Built]) -> Built:
-    """Result of ``build`` for the arrays and labels, given by their names, in a file of :func:`write_schedule`.
-
-    Raises ValueError if the suffix is not known, FileNotFoundError if there is no such file, ModelFileError if
-    it is torn, changed, of a newer version, or no schedule.
-    """
+    """Result of ``build`` for the arrays and labels of a file, given by their names; see :meth:`Schedule.load`."""
     suffix = _known_suffix(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist, or is not a file.")
@@ -223,15 +216,15 @@ def _read_table(names: Any, lines: Iterator[str], n_lines_before: int) -> Arrays
 def _numbers(cells: Sequence[str], titles: Sequence[str], line: int) -> list[float]:
     if len(cells) != len(titles):
         raise ValueError(f"line {line} has {len(cells)} cells, but there are {len(titles)} columns.")
-    row = []
-    for cell, title in zip(cells, titles, strict=True):
-        try:
-            row.append(math.nan if "_" in cell else float(cell))  # Python alone reads 1_0 as ten
-        except ValueError:
-            row.append(math.nan)
-        if not math.isfinite(row[-1]):
-            raise ValueError(f"line {line}, column {title!r}: {cell!r} is not a finite number.")
-    return row
+    return [_number(cell, f"line {line}, column {title!r}") for cell, title in zip(cells, titles, strict=True)]
+
+
+def _number(cell: str, where: str) -> float:
+    # Python alone reads 1_0 as ten.
+    with suppress(ValueError):
+        if "_" not in cell and math.isfinite(value := float(cell)):
+            return value
+    raise ValueError(f"{where}: {cell!r} is not a finite number.")
 
 
 _ENCODERS = {".npz": _encode_npz, ".json": _encode_json, ".csv": _encode_csv}

@@ -147,10 +147,9 @@ class Schedule:
     def resample(self, rate: float | None = None, *, times: ArrayLike | None = None) -> "Schedule":
         """Rows at other times, all within the schedule.
 
-        Stiffness, damping, covariance and type1 are piecewise linear, so they stay symmetric, positive
-        semidefinite and within their limits. The position is the cubic of each interval that has the positions
-        and velocities of its ends (Hermite), the velocity the derivative of that cubic and not a straight line:
-        it stays the velocity of the position, and damping acts on no motion that the position does not make.
+        Stiffness, damping, covariance and type1 are piecewise linear, so they stay symmetric, positive semidefinite
+        and within their limits. The position is the cubic of each interval through positions and velocities of its
+        ends (Hermite), the velocity its derivative: damping acts on no motion that the position does not make.
 
         Parameters
         ----------
@@ -173,17 +172,17 @@ class Schedule:
         position, velocity = between.hermite(self.position, self.velocity)
         rows: dict[str, Any] = {name: between.linear(array) for name, array in self._arrays().items()}
         rows |= {"time": grid, "position": position, "velocity": velocity}
-        return Schedule(**rows, **self._labels())
+        return replace(self, **rows)
 
     def retime(self, speed: float, *, mass: Any = None) -> "Schedule":
-        """The same schedule ``speed`` times as fast: time / speed, velocity * speed, gains as they are.
+        """Schedule that is ``speed`` times as fast: time / speed, velocity * speed, gains as they are.
 
         Parameters
         ----------
         speed : float
             From 1e-9 to 1e9; the stiffness rises that much faster too.
         mass : float or array_like of shape (d, d), default=None
-            Of the admittance in kg, to compute the stability certificate at the new speed. None: not checked.
+            Mass of the admittance in kg, to certify the stability at the new speed. None: not checked.
 
         Raises
         ------
@@ -196,9 +195,8 @@ class Schedule:
             remedy = f"the margin is {report.margin:.4g} N/m/s; the highest safe speed is {report.max_speed:.4g}"
             if report.margin >= 0.0:
                 remedy = f"held between rows, its gains let V grow by {report.held_growth - 1.0:.2g}; resample it finer"
-            raise checks.refusal(
-                speed, "speed", "certified to be stable", f"{remedy}, or filter the stiffness and give no mass here"
-            )
+            remedy = f"{remedy}, or filter the stiffness and give no mass here"
+            raise checks.refusal(speed, "speed", "certified to be stable", remedy)
         return replace(self, time=self.time / speed, velocity=self.velocity * speed)
 
     def certify(self, *, mass: Any = None, **options: Any) -> "StabilityReport":
@@ -208,12 +206,10 @@ class Schedule:
         return certify(self, mass=(self.mass or 1.0) if mass is None else mass, **options)
 
     def diagonal(self) -> tuple["Schedule", DiagonalLoss]:
-        """Schedule with diagonal stiffness and damping, for controllers that take no other, and what that loses.
-
-        The nearest diagonal matrix, in the Frobenius norm, is the diagonal itself. It lies between the least and
-        the largest eigenvalue, so within the limits too.
-        """
-        stiffness, damping = _diagonal(self.stiffness), _diagonal(self.damping)
+        """Schedule with diagonal stiffness and damping, for controllers that take no other, and what that loses."""
+        # The nearest diagonal matrix, in the Frobenius norm, is the diagonal itself. It lies between the least and the
+        # largest eigenvalue, so within the limits too; rounding may leave it below zero.
+        stiffness, damping = (np.eye(self.n_outputs) * np.maximum(gain, 0.0) for gain in (self.stiffness, self.damping))
         # x = K^-1 f and x_diagonal = D^-1 f differ by (I - D^-1 K) x: by its spectral norm, for the worst x.
         gains = np.diagonal(stiffness, axis1=1, axis2=2)[..., np.newaxis]
         coupling = (stiffness - self.stiffness) / np.where(gains > 0.0, gains, 1.0)
@@ -237,13 +233,13 @@ class Schedule:
         Raises
         ------
         ValueError, OSError
-            If the suffix is another; if the file cannot be written.
+            If the suffix is another, or the file would be larger than 1 GiB; if it cannot be written.
         """
         write_schedule(Path(path), self._arrays(), self._labels())
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
-        """Read what `save` wrote; nothing in the file is executed.
+        """Read a file of `save`; nothing in it is executed.
 
         Raises
         ------
@@ -268,11 +264,6 @@ class Schedule:
         if count_rows(self.duration, rate) < 2:
             raise checks.refusal(rate, "rate", f"at least {1 / self.duration:g}, for two rows", unit="Hz")
         return np.append(self.time[0] + row_times(self.duration, rate)[:-1], self.time[-1])
-
-
-def _diagonal(matrices: Floats) -> Floats:
-    """Diagonal matrices of the diagonals, without what rounding left below zero."""
-    return np.eye(matrices.shape[1]) * np.maximum(matrices, 0.0)
 
 
 def _relative_loss(matrices: Floats, diagonal: Floats) -> tuple[float, float]:
