@@ -217,13 +217,14 @@ def semidefinite(matrices: NDArray[Any], name: str, *, definite: bool = False) -
     if matrices.ndim < 2 or matrices.shape[-1] != matrices.shape[-2] or not matrices.shape[-1]:
         raise InvalidParameterError(f"{name} has shape {matrices.shape}, must have shape (..., d, d).")
     tolerance = max(ROUNDING, 100.0 * float(np.finfo(matrices.dtype).eps))
-    scale = np.abs(matrices).max(axis=(-2, -1), initial=0.0)
+    scale = np.abs(matrices).max(axis=(-2, -1), initial=0.0).astype(np.float64)  # float32 cannot hold LARGEST
     require(scale <= LARGEST, scale, f"the largest entry of {name}", f"finite and at most {LARGEST:g} in size")
     skew = np.abs(matrices - np.swapaxes(matrices, -2, -1)).max(axis=(-2, -1), initial=0.0)
     remedy = "symmetrize the matrix, (A + A') / 2"
     require(skew <= tolerance * scale, skew, f"the asymmetry of {name}", "zero", remedy)
-    # A matrix of zeros has no scale, and passes any shift.
-    if eigenvalues_above(matrices, 0.0 if definite else -tolerance * np.where(scale > 0.0, scale, 1.0)):
+    # Semidefinite ones are told by their Cholesky factors; zeros have no scale, and pass any shift. Whether a matrix is
+    # definite is decided by its eigenvalues, for singular ones have Cholesky factors by chance of rounding.
+    if not definite and eigenvalues_above(matrices, -tolerance * np.where(scale > 0.0, scale, 1.0)):
         return
     lowest = np.linalg.eigvalsh(matrices)[..., 0]
     must = "above zero (positive definite)" if definite else "at least zero (positive semidefinite)"

@@ -168,6 +168,16 @@ def test_after_the_end_the_last_row_holds_without_velocity():
     np.testing.assert_allclose(controller.velocity, 0.0, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("duration", [1e-9, 1e-7, 1e-4, 9.999e-4])
+def test_a_schedule_shorter_than_a_tick_is_run(duration):
+    controller = RealTimeAdmittance(constant(100.0, 20.0, position=0.1, duration=duration))
+    controller.start(0.0, [0.1])
+    for i in range(1, 100):
+        assert controller.tick(i / 1000, [0.0]) == 0
+    np.testing.assert_allclose(controller.position, 0.1, rtol=1e-12)
+    assert controller.schedule_time == duration
+
+
 def test_a_soft_start_follows_minimum_jerk_and_then_the_schedule():
     controller = one_axis(soft_start=0.5, approach_speed=1.875 / 0.5)  # as fast as that is over 1 m
     controller.start(0.0, [1.0])
