@@ -231,7 +231,7 @@ def test_77_another_mass_than_that_of_the_schedule_is_told():
     [
         ({"now": 0.0, "position": [0.0], "at": 1e306}, r"at is 1e\+306 s, .* at least 0 and at most 3"),
         ({"now": 0.0, "at": 3.0001}, "at most 3"),
-        ({"now": 0.0, "at": 10**400}, "at is 1000.* must be a finite number"),
+        ({"now": 0.0, "at": 10**400}, "at is .* must be a finite number"),
         ({"now": 1e300}, "small enough to tell ticks of 0.001 s apart: give seconds"),
         ({"now": 1_767_225_600_000_000_000}, "give seconds"),  # unix time in ns
         ({"now": 0.0, "position": [1e300]}, r"position\[0\] is 1e\+300, must be finite"),
