@@ -568,7 +568,7 @@ def test_an_edited_csv_loads_once_its_checksum_is_deleted(tmp_path, schedule):
     [
         ("# frame: ", "# a remark ", "line 5 must be '# key: value' with a new key, but is '# a remark"),
         ("# units:", "# names:", "line 4 must be '# key: value' with a new key"),
-        ("null", "NaN", "it holds NaN: all numbers must be finite"),
+        ("null", "NaN", "it does not match its checksum"),
         ('["x", "y"]', '["x"]', "names is ['x'], but there are 2 columns of positions"),
         ("position[y]", "position[z]", "line 11 must name the columns time,position[x],position[y],velocity[x]"),
         ("\n0.9,", "\n0.9,1,", "line 13 has 16 cells, but there are 15 columns"),

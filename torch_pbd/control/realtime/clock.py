@@ -97,11 +97,13 @@ class ScheduleClock:
         own, fastest = table.acceleration, float(table.speeds.max())
         # Acceleration of a soft start that comes up to speed; without one, a second is as long as its default.
         soft = max(fastest, approach_speed) / (soft_start or 1.0)
+        # One half of a limit is left for the schedule's own acceleration.
         self.gain = min(max(_SHARE * own, soft), 0.5 * acceleration_limit)
         self.speed = _SPEED * fastest + approach_speed
         self.acceleration = max((1.0 + _SHARE) * own + self.gain, _SHARPEST / _STEEPEST * soft)
         room = (self.acceleration - self.gain) / own if own else math.inf
         self._fastest = min(_SPEED, math.sqrt(room)) if self._catches_up else 1.0
+        # Integral of dt / |x'| from each row to the end; where the schedule rests it is long, not endless.
         times = np.append(np.arange(table.last) / table.rate, table.end)
         speeds = np.maximum(0.5 * (table.speeds[1:] + table.speeds[:-1]), 1e-9 * self.speed)
         left = np.append(np.cumsum((np.diff(times) / speeds)[::-1])[::-1], 0.0)
@@ -120,6 +122,7 @@ class ScheduleClock:
         self._distance: Vector = (0.0,) * d if position is None else tuple(map(sub, row, position))
         self._blend = max(self._soft_start, _STEEPEST * math.hypot(*self._distance) / self._approach_speed)
         self._is_soft = any(self._distance) and self._soft_start > 0.0
+        # The pace at which the desired motion is nearest to that of the robot.
         motion = row[d : 2 * d]
         square, along = sum(map(mul, motion, motion)), sum(map(mul, motion, velocity))
         pace = max(0.0, along / square) if square and self._soft_start else 1.0
@@ -166,6 +169,8 @@ class ScheduleClock:
         row, squared_limit = self._desired(time)
         motion = row[d : 2 * d]
         speed = math.hypot(*motion)
+        # The pace changes by `rise` a second at most. From a pace of 1 + p, p^2 / (2 rise) of the lag is made up for by
+        # the time it is down to 1 again: the p of the whole lag is the one to go for.
         rise = self.gain / speed if speed else math.inf
         goal = min(self._fastest, 1.0 + math.sqrt(2.0 * rise * self._lag)) if self._lag else 1.0
         change = rise * step

@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from functools import partial
 from itertools import chain, combinations_with_replacement
 from pathlib import Path
 from typing import Any, TypeVar
@@ -69,21 +70,18 @@ def read_schedule(path: Path, build: Callable[..., Built]) -> Built:
             raise ValueError(f"its arrays are {', '.join(arrays) or 'none'}, must be {', '.join(ARRAY_DIMS)}.")
         rest = {key: value for key, value in header.items() if key != "sha256"}
         if "sha256" in header and header["sha256"] != _digest(rest, arrays):
-            line = "delete the line that starts with '# sha256:' to accept it as it is"
-            edited = line if suffix == ".csv" else "save it again"
-            raise ValueError(
-                f"it does not match its checksum: it is damaged, or, if it was edited on purpose, {edited}."
-            )
+            line = "delete the line that starts with '# sha256:' to accept it"
+            remedy = line if suffix == ".csv" else "save it again"
+            raise ValueError(f"it does not match its checksum: it is damaged, or, if edited on purpose, {remedy}.")
         return build(**arrays, **{key: header[key] for key in LABELS})
     except _DAMAGE as error:
         raise ModelFileError(f"{path} cannot be read as a schedule: {error}") from error
 
 
 def _known_suffix(path: Path) -> str:
-    suffix = path.suffix.lower()
-    if suffix not in _ENCODERS:
+    if path.suffix.lower() not in _ENCODERS:
         raise InvalidParameterError(f"{path} has the suffix {path.suffix!r}, must have .npz, .json or .csv. {LOADERS}")
-    return suffix
+    return path.suffix.lower()
 
 
 def _check_header(header: Any, optional: set[str]) -> None:
@@ -107,17 +105,14 @@ def _digest(header: Labels, arrays: Arrays) -> str:
     return digest.hexdigest()
 
 
-def _parse_json(text: str) -> Any:
-    def refuse(constant: str) -> None:
-        raise ValueError(f"it holds {constant}: all numbers must be finite.")
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    entries = dict(pairs)
+    if len(entries) < len(pairs):
+        raise ValueError(f"it holds an object with two entries of one name, among {', '.join(entries):.80}.")
+    return entries
 
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        entries = dict(pairs)
-        if len(entries) < len(pairs):
-            raise ValueError(f"it holds an object with two entries of one name, among {', '.join(entries):.80}.")
-        return entries
 
-    return json.loads(text, parse_constant=refuse, object_pairs_hook=unique)
+_parse_json = partial(json.loads, object_pairs_hook=_unique)
 
 
 def _encode_json(header: Labels, arrays: Arrays) -> bytes:
