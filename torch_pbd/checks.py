@@ -219,10 +219,13 @@ def semidefinite(matrices: NDArray[Any], name: str, *, definite: bool = False, r
     if matrices.ndim < 2 or matrices.shape[-1] != matrices.shape[-2] or not matrices.shape[-1]:
         raise InvalidParameterError(f"{name} has shape {matrices.shape}, must have shape (..., d, d).")
     tolerance = max(ROUNDING, 100.0 * float(np.finfo(matrices.dtype).eps))
-    scale = np.abs(matrices).max(axis=(-2, -1), initial=0.0)
+    scale = np.abs(matrices).max(axis=(-2, -1), initial=0.0).astype(np.float64)  # float32 cannot hold LARGEST
     require(scale <= LARGEST, scale, f"the largest entry of {name}", f"finite and at most {LARGEST:g} in size")
     skew = np.abs(matrices - np.swapaxes(matrices, -2, -1)).max(axis=(-2, -1), initial=0.0)
     require(skew <= tolerance * scale, skew, f"the asymmetry of {name}", "zero", "symmetrize it, (A + A') / 2")
+    # Cholesky factors tell semidefinite ones; matrices of zeros have no scale, and pass any shift.
+    if not definite and eigenvalues_above(matrices, -tolerance * np.where(scale > 0.0, scale, 1.0)):
+        return
     judged = matrices
     if definite:
         deviation = np.sqrt(np.diagonal(matrices, axis1=-2, axis2=-1).clip(0.0))
@@ -235,6 +238,18 @@ def semidefinite(matrices: NDArray[Any], name: str, *, definite: bool = False, r
         own = np.linalg.eigvalsh(matrices)[..., 0]
         must = "above zero, positive definite" if definite else "zero or more, positive semidefinite"
         require(good, own, f"the smallest eigenvalue of {name}", must, remedy or "build it as a product A A'")
+
+
+def eigenvalues_above(matrices: NDArray[Any], bound: float | Floats) -> bool:
+    """Whether all eigenvalues of symmetric matrices (..., d, d) are above a bound, or bounds (...,).
+
+    That is whether the shifted matrices have Cholesky factors, which take a tenth of the time of eigenvalues.
+    """
+    try:
+        np.linalg.cholesky(matrices - np.multiply.outer(bound, np.eye(matrices.shape[-1])))
+    except np.linalg.LinAlgError:
+        return False
+    return True
 
 
 def warn(message: str, category: type[Warning] = UserWarning) -> None:

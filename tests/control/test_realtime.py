@@ -1,15 +1,18 @@
 """The controller of the loop: exact ticks. What it does with what is bad is in tests/faults/test_control.py."""
 
+import itertools
 import math
 
 import mpmath
 import numpy as np
 import pytest
+import torch
 from control.loops import MASS, USED, constant, make_schedule, one_axis
 from scipy.interpolate import CubicHermiteSpline
 from scipy.linalg import expm
 
 from torch_pbd.control.realtime import RealTimeAdmittance, TickStatus, steps
+from torch_pbd.control.schedule import Schedule
 
 EXACT = {"soft_start": 0.0, "spring_limit": 1e9}  # nothing but the law itself
 
@@ -147,9 +150,9 @@ def test_bias_and_deadband_keep_a_drifting_sensor_from_moving_the_robot():
         pushed.tick(i / 1000, [-2.7])  # 3.2 N less the deadband
         plain.tick(i / 1000, [-3.0])
     np.testing.assert_allclose(pushed.position, plain.position, rtol=1e-12)
-    with pytest.raises(ValueError, match=r"force_bias=.* must be 1 finite numbers"):
+    with pytest.raises(ValueError, match=r"force_bias\[0\] is nan, must be finite"):
         still.start(0.0, force_bias=[math.nan])
-    with pytest.raises(ValueError, match=r"deadband=-1\.0 must be a finite number of at least 0"):
+    with pytest.raises(ValueError, match=r"deadband is -1\.0 N, must be a finite number of at least 0"):
         one_axis(deadband=-1.0)
 
 
@@ -165,6 +168,16 @@ def test_after_the_end_the_last_row_holds_without_velocity():
     np.testing.assert_allclose(controller.velocity, 0.0, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("duration", [1e-9, 1e-7, 1e-4, 9.999e-4])
+def test_a_schedule_shorter_than_a_tick_is_run(duration):
+    controller = RealTimeAdmittance(constant(100.0, 20.0, position=0.1, duration=duration))
+    controller.start(0.0, [0.1])
+    for i in range(1, 100):
+        assert controller.tick(i / 1000, [0.0]) == 0
+    np.testing.assert_allclose(controller.position, 0.1, rtol=1e-12)
+    assert controller.schedule_time == duration
+
+
 def test_a_soft_start_follows_minimum_jerk_and_then_the_schedule():
     controller = one_axis(soft_start=0.5, approach_speed=1.875 / 0.5)  # as fast as that is over 1 m
     controller.start(0.0, [1.0])
@@ -175,6 +188,38 @@ def test_a_soft_start_follows_minimum_jerk_and_then_the_schedule():
         np.testing.assert_allclose(controller.desired_position[0], left, rtol=0, atol=1e-12)
         slope = (-30.0 * t**2 + 60.0 * t**3 - 30.0 * t**4) / 0.5
         np.testing.assert_allclose(controller.desired_velocity[0], slope, rtol=0, atol=1e-12)
+
+
+def test_a_row_of_a_schedule_is_decomposed_once_on_its_way_into_the_loop(monkeypatch):
+    rows = vars(make_schedule(duration=0.5))
+    n, decomposed = len(rows["time"]), []
+
+    def counted(function):
+        def call(matrices, *args, **options):
+            decomposed.append(math.prod(np.shape(matrices)[:-2]))
+            return function(matrices, *args, **options)
+
+        return call
+
+    for library, name in itertools.product((np.linalg, torch.linalg), ("eigh", "eigvalsh", "eig", "eigvals")):
+        monkeypatch.setattr(library, name, counted(getattr(library, name)))
+    limits = (50.0 * (1 - 1e-12), 1e4 * (1 + 1e-12))
+    covariance, type1 = 1e-6 * rows["stiffness"], np.zeros(n)
+    schedule = Schedule(**{**rows, "stiffness_limits": limits}, covariance=covariance, type1=type1)
+    assert sum(decomposed) == 0  # Cholesky factors say that the gains are sound
+    RealTimeAdmittance(schedule)
+    assert sum(decomposed) == n  # the axes along which ticks are solved
+    RealTimeAdmittance(make_schedule(duration=0.5))
+    assert sum(decomposed) == 2 * n
+
+
+def test_prints_on_one_line():
+    controller = RealTimeAdmittance(make_schedule(duration=0.2), mass=MASS)
+    controller.start(0.0, at=0.1)
+    controller.tick(0.5, [0.0, 0.0])
+    assert repr(controller) == (
+        "RealTimeAdmittance(n_axes=2, mass=0.5 kg, rate=1000 Hz, schedule_time=0.1..0.2 s, faults=LATE)"
+    )
 
 
 def test_status_prints_well():

@@ -119,26 +119,26 @@ def free(given):
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (with_entry("stiffness", (3, 0, 1), np.nan), "stiffness is nan at row 3, entry (0, 1): it must be finite"),
-        (with_entry("position", (2, 1), np.inf), "position is inf at row 2, entry (1,): it must be finite"),
-        (with_entry("velocity", (2, 1), 1e200), "velocity is 1e+200 at row 2, entry (1,): it must be finite and at"),
-        (with_entry("time", 6, 0.5), "time is 0.5 at row 6: it must increase strictly. Sort the rows"),
-        (lambda given: given["time"].put(6, given["time"][5]), "at row 6: it must increase strictly"),
-        (with_entry("type1", 7, 1.1), "type1 is 1.1 at row 7: it must be within 0"),
-        (with_entry("type1", 7, -0.1), "type1 is -0.1 at row 7: it must be within 0"),
-        (with_entry("stiffness", 8, 2000 * np.eye(2)), "the eigenvalue of stiffness is 2000.0 at row 8, entry (0,)"),
-        (with_entry("stiffness", 8, 49.9 * np.eye(2)), "stiffness_limits are 50 and 1000 N/m. Limit the stiffness"),
-        (with_entry("stiffness", 8, -np.eye(2)), "the smallest eigenvalue of stiffness is -1.0 at row 8"),
-        (with_entry("damping", 8, -np.eye(2)), "the smallest eigenvalue of damping is -1.0 at row 8"),
-        (skewed, "at row 3, entry (0, 1): it must be that of the entry across the diagonal. Symmetrize"),
-        (indefinite, "the smallest eigenvalue of covariance is -1.0 at row 4"),
-        (lambda given: given.update(velocity=np.zeros((12, 3))), "velocity has shape (12, 3), it must be (12, 2)"),
-        (lambda given: given.update(time=np.arange(11.0)), "time has shape (11,), it must be (12,)"),
-        (lambda given: given.update(damping=np.eye(2)), "damping has dtype float64 and shape (2, 2)"),
-        (lambda given: given.update(type1=["0"] * 12), "type1 has dtype <U1"),
+        (with_entry("stiffness", (3, 0, 1), np.nan), "stiffness[3, 0, 1] is nan, must be finite"),
+        (with_entry("position", (2, 1), np.inf), "position[2, 1] is inf, must be finite"),
+        (with_entry("velocity", (2, 1), 1e200), "velocity[2, 1] is 1e+200, must be finite and at most"),
+        (with_entry("time", 6, 0.5), "time[6] is 0.5, must be later than the time before it: sort the rows"),
+        (lambda given: given["time"].put(6, given["time"][5]), ", must be later than the time before it"),
+        (with_entry("type1", 7, 1.1), "type1[7] is 1.1, must be from 0"),
+        (with_entry("type1", 7, -0.1), "type1[7] is -0.1, must be from 0"),
+        (with_entry("stiffness", 8, 2000 * np.eye(2)), "the eigenvalue of stiffness[8, 0] is 2000.0"),
+        (with_entry("stiffness", 8, 49.9 * np.eye(2)), "within stiffness_limits, 50 and 1000 N/m: limit the stiffness"),
+        (with_entry("stiffness", 8, -np.eye(2)), "the smallest eigenvalue of stiffness[8] is -1.0"),
+        (with_entry("damping", 8, -np.eye(2)), "the smallest eigenvalue of damping[8] is -1.0"),
+        (skewed, "the asymmetry of stiffness[3] is "),
+        (indefinite, "the smallest eigenvalue of covariance[4] is -1.0"),
+        (lambda given: given.update(velocity=np.zeros((12, 3))), "velocity has shape (12, 3), must have shape (12, 2)"),
+        (lambda given: given.update(time=np.arange(11.0)), "time has shape (11,), must have shape (12,)"),
+        (lambda given: given.update(damping=np.eye(2)), "damping has shape (2, 2), must have shape (12, 2, 2)"),
+        (lambda given: given.update(type1=["0"] * 12), "type1 holds text"),
         (lambda given: given.update(type1=np.ma.masked_less(given["type1"], 0.5)), "type1 has masked entries"),
         (lambda given: given.update(position=[[0.0, 1.0], [0.0]]), "position is ragged"),
-        (lambda given: given.update({name: given[name][:1] for name in given}), "has 1 rows (at least 2 are needed)"),
+        (lambda given: given.update({name: given[name][:1] for name in given}), "(1, 2), must have at least 2 rows"),
     ],
 )
 def test_what_cannot_be_run_is_refused_with_its_place(rng, spoil, message):
@@ -151,20 +151,20 @@ def test_what_cannot_be_run_is_refused_with_its_place(rng, spoil, message):
 @pytest.mark.parametrize(
     ("label", "message"),
     [
-        ({"names": ["x"]}, "names is ['x'], it must be 2 different strings"),
+        ({"names": ["x"]}, "names is ['x'], must be 2 different strings"),
         ({"names": "xy"}, "names is 'xy'"),
         ({"names": ["x", "x"]}, "names is ['x', 'x']"),
         ({"names": ["x", 1]}, "names is ['x', 1]"),
-        ({"units": 1}, "units is 1, it must be a string or None"),
+        ({"units": 1}, "units is 1, must be a str or None"),
         ({"frame": b"base"}, "frame is b'base'"),
         ({"names": ["x", "a\rb"]}, r"names[1] is 'a\rb', with a control character (U+000D)"),
         ({"names": ["\ud800", "y"]}, r"names[0] is '\ud800', with half of a surrogate pair (U+D800)"),
-        ({"covariance_of": "velocity"}, "covariance_of is 'velocity', it must be 'position' or 'forcing'"),
-        ({"stiffness_limits": (1000, 50)}, "stiffness_limits is [1000.0, 50.0]"),
-        ({"stiffness_limits": (50,)}, "stiffness_limits is [50.0]"),
-        ({"stiffness_limits": (-1, 1000)}, "stiffness_limits is [-1.0, 1000.0]"),
-        ({"provenance": ["seed"]}, "provenance is ['seed'], it must be a mapping"),
-        ({"provenance": {"a": [1, np.ones(2)]}}, "provenance['a'][1] is array([1., 1.]), it must be what JSON can"),
+        ({"covariance_of": "velocity"}, "covariance_of is 'velocity', must be one of 'position', 'forcing'"),
+        ({"stiffness_limits": (1000, 50)}, "stiffness_limits[1] is 50.0 N/m, must be a finite number above 0"),
+        ({"stiffness_limits": (50,)}, "stiffness_limits has shape (1,)"),
+        ({"stiffness_limits": (-1, 1000)}, "stiffness_limits[0] is -1.0 N/m"),
+        ({"provenance": ["seed"]}, "provenance is ['seed'], must be a Mapping"),
+        ({"provenance": {"a": [1, np.ones(2)]}}, "provenance['a'][1] is array([1., 1.]), must be what JSON can"),
         ({"provenance": {"a": float("nan")}}, "provenance['a'] is nan"),
         ({"provenance": {"a": {1: 2}}}, "provenance['a'] is {1: 2}"),
     ],
@@ -190,7 +190,7 @@ def test_a_provenance_without_a_bottom_is_refused(rng):
 def test_a_free_axis_needs_damping(rng):
     given = values(rng)
     free(given)
-    with pytest.raises(ValueError, match=r"smallest eigenvalue of damping is 0\.0 at row 5: where the stiffness is"):
+    with pytest.raises(ValueError, match=r"eigenvalue of damping\[5\] is 0\.0, must be above zero where the stiffness"):
         Schedule(**given)
     given["damping"][5, 1, 1] = 0.1
     Schedule(**given)
@@ -209,7 +209,7 @@ def test_tolerances_are_relative(rng, scale):
     for limits in [(low * (1.0 + 1e-6), high), (low, high * (1.0 - 1e-6))]:
         with pytest.raises(ValueError, match="eigenvalue of stiffness"):
             Schedule(**given, stiffness_limits=limits)
-    with pytest.raises(ValueError, match=r"smallest eigenvalue of covariance is -.* at row 3"):
+    with pytest.raises(ValueError, match=r"smallest eigenvalue of covariance\[3\] is -"):
         Schedule(**{**given, "covariance": -1e-6 * given["covariance"] * (np.arange(12) == 3)[:, None, None]})
     for tilt, allowed in [(1e-11, True), (1e-7, False)]:
         tilted = copy.deepcopy(given)
@@ -217,7 +217,7 @@ def test_tolerances_are_relative(rng, scale):
         if allowed:
             Schedule(**tilted)
         else:
-            with pytest.raises(ValueError, match="across the diagonal"):
+            with pytest.raises(ValueError, match="asymmetry of stiffness"):
                 Schedule(**tilted)
 
 
@@ -273,12 +273,12 @@ def test_68_a_rate_gives_even_ticks_and_a_last_one_at_the_end(rng):
     [
         ({}, "give either rate or times; got rate=None"),
         ({"rate": 10.0, "times": [1.0, 2.0]}, "give either rate or times"),
-        ({"rate": 0.0}, "rate is 0.0, it must be a positive number"),
-        ({"rate": 0.01}, "rate=0.01 Hz has one row in"),
-        ({"times": [1.0, 99.0]}, "times is 99.0 at row 1: it must be within 0."),
-        ({"times": [0.0, 1.0]}, "times is 0.0 at row 0: it must be within 0."),
-        ({"times": [2.0, 1.0]}, "time is 1.0 at row 1: it must increase strictly"),
-        ({"times": [[1.0, 2.0]]}, "times has dtype float64 and shape (1, 2)"),
+        ({"rate": 0.0}, "rate is 0.0 Hz, must be a finite number above 0"),
+        ({"rate": 0.01}, "rate is 0.01 Hz, must be at least"),
+        ({"times": [1.0, 99.0]}, "times[1] is 99.0, must be from 0."),
+        ({"times": [0.0, 1.0]}, "times[0] is 0.0, must be from 0."),
+        ({"times": [2.0, 1.0]}, "time[1] is 1.0, must be later than"),
+        ({"times": [[1.0, 2.0]]}, "times has shape (1, 2), must have shape (m,)"),
     ],
 )
 def test_resample_refuses_times_outside(schedule, options, message):
@@ -295,7 +295,7 @@ def test_retimed_motion_is_the_same_path(schedule):
     np.testing.assert_allclose(fast_rows.stiffness, slow_rows.stiffness, rtol=1e-9)
     assert fast.retime(0.5) == schedule
     for speed in (0.0, -1.0, np.nan, np.inf, True, "2"):
-        with pytest.raises(ValueError, match=r"speed is .*, it must be a positive number"):
+        with pytest.raises(ValueError, match=r"speed is .*, must be a finite number"):
             schedule.retime(speed)
 
 
@@ -307,10 +307,10 @@ def test_retime_with_a_mass_refuses_what_no_guarantee_covers():
     weak = Schedule(**rows, stiffness=stiffness, damping=np.sqrt(stiffness))
     limit = weak.certify(mass=10.0).max_speed
     assert weak.retime(0.9 * limit, mass=10.0) == weak.retime(0.9 * limit)
-    with pytest.raises(ValueError, match=rf"speed=1 is not certified .* highest safe speed is {limit:.4g};"):
+    with pytest.raises(ValueError, match=rf"speed is 1.0, must be certified .* highest safe speed is {limit:.4g},"):
         weak.retime(1.0, mass=10.0)
     coarse = weak.resample(times=time[::10])
-    with pytest.raises(ValueError, match=r"held between rows, its gains let V grow by .* Resample it finer"):
+    with pytest.raises(ValueError, match=r"held between rows, its gains let V grow by .* resample it finer"):
         coarse.retime(0.99 * coarse.certify(mass=10.0).max_speed, mass=10.0)
     # Critical damping is safe at this ratio of stiffness whatever the speed, though no certificate holds.
     critical = Schedule(**rows, stiffness=stiffness, damping=2.0 * np.sqrt(10.0 * stiffness))
@@ -454,14 +454,14 @@ def rewritten(path, change):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda header, _: header.update(version=2), "it has version 2, this torch_pbd reads 1: upgrade it"),
-        (lambda header, _: header.update(format="other"), "its format is 'other', not 'torch_pbd.schedule'"),
+        (lambda header, _: header.update(version=2), "it has version 2, must have 1: upgrade torch_pbd"),
+        (lambda header, _: header.update(format="other"), "its format is 'other', must be 'torch_pbd.schedule'"),
         (lambda header, _: header.pop("frame"), "its header has no 'frame'"),
         (lambda header, _: header.update(colour=1.0), "its header has an unknown 'colour'"),
-        (lambda header, _: header.update(names=["x", "x"]), "names is ['x', 'x'], it must be 2 different strings"),
-        (lambda header, _: header.update(provenance=None), "provenance is None, it must be a mapping"),
-        (lambda header, _: header.update(stiffness_limits=[1, 2]), "the eigenvalue of stiffness is"),
-        (lambda _, arrays: arrays.update(time=np.flip(arrays["time"])), "it must increase"),
+        (lambda header, _: header.update(names=["x", "x"]), "names is ['x', 'x'], must be 2 different strings"),
+        (lambda header, _: header.update(provenance=None), "provenance is None, must be a Mapping"),
+        (lambda header, _: header.update(stiffness_limits=[1, 2]), "the eigenvalue of stiffness["),
+        (lambda _, arrays: arrays.update(time=np.flip(arrays["time"])), "must be later than"),
         (lambda _, arrays: arrays.update(type1=arrays["type1"] * np.nan), "nan"),
         (lambda _, arrays: arrays.update(damping=-arrays["damping"]), "the smallest eigenvalue of damping"),
     ],
@@ -568,7 +568,7 @@ def test_an_edited_csv_loads_once_its_checksum_is_deleted(tmp_path, schedule):
     [
         ("# frame: ", "# a remark ", "line 5 must be '# key: value' with a new key, but is '# a remark"),
         ("# units:", "# names:", "line 4 must be '# key: value' with a new key"),
-        ("null", "NaN", "it holds NaN: all numbers must be finite"),
+        ("null", "NaN", "it does not match its checksum"),
         ('["x", "y"]', '["x"]', "names is ['x'], but there are 2 columns of positions"),
         ("position[y]", "position[z]", "line 11 must name the columns time,position[x],position[y],velocity[x]"),
         ("\n0.9,", "\n0.9,1,", "line 13 has 16 cells, but there are 15 columns"),
@@ -612,9 +612,9 @@ def test_who_reads_while_a_file_is_replaced_reads_the_old_one(saved):
 
 
 def test_paths_are_checked(tmp_path, schedule):
-    with pytest.raises(ValueError, match=r"has the suffix '\.mat'; a schedule is \.npz, \.json or \.csv"):
+    with pytest.raises(ValueError, match=r"has the suffix '\.mat', must have \.npz, \.json or \.csv"):
         schedule.save(tmp_path / "schedule.mat")
-    with pytest.raises(ValueError, match=r"has the suffix ''; a schedule is \.npz, \.json or \.csv"):
+    with pytest.raises(ValueError, match=r"has the suffix '', must have \.npz, \.json or \.csv"):
         Schedule.load(tmp_path / "schedule")
     with pytest.raises(FileNotFoundError, match=r"schedule\.csv does not exist"):
         Schedule.load(tmp_path / "schedule.csv")

@@ -166,19 +166,19 @@ def with_row(name, row, value, **more):
 @pytest.mark.parametrize(
     ("schedule", "words"),
     [
-        (with_row("stiffness", 3, np.nan), "schedule.stiffness[3] is [[nan, nan], [nan, nan]]: it must be finite"),
-        (with_row("position", 2, np.inf), "schedule.position[2] is [inf, inf]: it must be finite"),
-        (with_row("time", 4, 0.003), "schedule.time[4] is 0.003: times must increase"),
-        (with_row("stiffness", 5, [[100.0, 9.0], [8.0, 100.0]]), "[[100.0, 9.0], [8.0, 100.0]]: it must be symmetric"),
-        (with_row("damping", 6, [[1.0, 2.0], [2.0, 1.0]]), "schedule.damping[6] is [[1.0, 2.0], [2.0, 1.0]]: no eigen"),
-        (with_row("stiffness", 7, [[1e4, 0.0], [0.0, 0.0]], damping=np.zeros((11, 2, 2))), "stiffness[7] is"),
+        (with_row("stiffness", 3, np.nan), "schedule.stiffness[3, 0, 0] is nan, must be finite"),
+        (with_row("position", 2, np.inf), "schedule.position[2, 0] is inf, must be finite"),
+        (with_row("time", 4, 0.003), "schedule.time[4] is 0.003, must be later"),
+        (with_row("stiffness", 5, [[100.0, 9.0], [8.0, 100.0]]), "the asymmetry of schedule.stiffness[5] is 1.0"),
+        (with_row("damping", 6, [[1.0, 2.0], [2.0, 1.0]]), "smallest eigenvalue of schedule.damping[6] is -1.0"),
+        (with_row("stiffness", 7, [[1e4, 0.0], [0.0, 0.0]], damping=np.zeros((11, 2, 2))), "damping[7] is 0.0"),
         (
             with_row("stiffness", 0, 49.0 * np.eye(2), stiffness_limits=(50, 1e4)),
-            "within stiffness_limits=(50, 10000.0)",
+            "within stiffness_limits, 50 and 10000 N/m",
         ),
-        (with_row("stiffness", 9, 1.1e4 * np.eye(2), stiffness_limits=(50, 1e4)), "schedule.stiffness[9]"),
-        (with_row("time", 0, 0.0, position=np.zeros((11, 3))), "schedule.velocity has shape (11, 2)"),
-        (with_row("time", 0, 0.0, position=np.zeros(11)), "must be"),
+        (with_row("stiffness", 9, 1.1e4 * np.eye(2), stiffness_limits=(50, 1e4)), "of schedule.stiffness[9, 0]"),
+        (with_row("time", 0, 0.0, position=np.zeros((11, 3))), "schedule.velocity has shape (11, 2), must"),
+        (with_row("time", 0, 0.0, position=np.zeros(11)), "must have"),
         (with_row("time", 10, 1e7), "lower it"),
     ],
 )
@@ -207,7 +207,7 @@ def test_55_a_schedule_that_cannot_be_followed_is_refused(schedule, words):
     ],
 )
 def test_56_a_parameter_out_of_range_is_named(option, value):
-    with pytest.raises(ValueError, match=f"(?s)^{option}=.* (must|is no longer)"):
+    with pytest.raises(ValueError, match=f"(?s)^{option} is .* must be"):
         RealTimeAdmittance(make_schedule(duration=0.01), **{option: value})
 
 
@@ -216,15 +216,15 @@ def test_59_calls_that_make_no_sense_say_so():
     with pytest.raises(RuntimeError, match=r"call start\(now\)"):
         controller.tick(0.0, [0.0, 0.0])
     for arguments, words in [
-        ((math.nan,), "now=nan"),
-        ((0.0, [0.0]), r"position=\[0.0\] must be 2 finite"),
-        ((0.0, [0.0, math.nan]), "position="),
-        ((0.0, None, ["a", "b"]), "velocity="),
-        ((0.0, None, [0.8, 0.8]), "velocity_limit=1.0: slow"),
+        ((math.nan,), "now is nan"),
+        ((0.0, [0.0]), r"position has shape \(1,\), must have shape \(2,\)"),
+        ((0.0, [0.0, math.nan]), r"position\[1\] is nan"),
+        ((0.0, None, ["a", "b"]), "velocity holds text"),
+        ((0.0, None, [0.8, 0.8]), "the speed is .* at most 1: slow it down"),
     ]:
         with pytest.raises(ValueError, match=words):
             controller.start(*arguments)
-    with pytest.raises(ValueError, match=r"at=-1\.0"):
+    with pytest.raises(ValueError, match=r"at is -1\.0"):
         controller.start(0.0, at=-1.0)
     controller.start(0.0)
     for force in ([1.0], [1.0, 2.0, 3.0], None, [None, 1.0], 5.0):

@@ -229,13 +229,13 @@ def test_77_another_mass_than_that_of_the_schedule_is_told():
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"now": 0.0, "position": [0.0], "at": 1e306}, r"at=1e\+306 must be a time in the schedule, from 0 to 3.0 s"),
-        ({"now": 0.0, "at": 3.0001}, "from 0 to 3.0 s"),
-        ({"now": 0.0, "at": 10**400}, "must be a finite time in s"),
-        ({"now": 1e300}, "leaves no digits for ticks of 0.001 s: give seconds"),
+        ({"now": 0.0, "position": [0.0], "at": 1e306}, r"at is 1e\+306 s, .* at least 0 and at most 3"),
+        ({"now": 0.0, "at": 3.0001}, "at most 3"),
+        ({"now": 0.0, "at": 10**400}, "at is .* must be a finite number"),
+        ({"now": 1e300}, "small enough to tell ticks of 0.001 s apart: give seconds"),
         ({"now": 1_767_225_600_000_000_000}, "give seconds"),  # unix time in ns
-        ({"now": 0.0, "position": [1e300]}, r"position=\[1e\+300\] must be 1 finite numbers"),
-        ({"now": 0.0, "velocity": [10**400]}, "velocity="),
+        ({"now": 0.0, "position": [1e300]}, r"position\[0\] is 1e\+300, must be finite"),
+        ({"now": 0.0, "velocity": [10**400]}, "velocity holds a number too large"),
     ],
 )
 def test_78_a_start_that_is_refused_leaves_the_controller_free(arguments, words):
@@ -251,7 +251,7 @@ def test_79_a_loop_that_is_always_too_slow_is_refused_with_its_step():
     controller.start(0.0)
     for i in (1, 2):
         assert controller.tick(0.011 * i, [5.0]) == TickStatus.LATE
-    with pytest.raises(ValueError, match=r"max_step=0.01 s is shorter than all 3 ticks since start, .* 0.011 s: give"):
+    with pytest.raises(ValueError, match=r"max_step is 0.01 s, must be longer .* all 3 since start .* 0.011 s: give"):
         controller.tick(0.033, [5.0])
     assert (controller.position, controller.velocity) == ((0.0,), (0.0,))
     controller = one_axis(max_step=0.033)
@@ -275,5 +275,5 @@ def test_79_a_loop_that_has_become_too_slow_stops_the_robot():
     [("on_gap", "skip"), ("max_bad_ticks", 0), ("max_bad_ticks", 2.5), ("force_rate_limit", 0.0)],
 )
 def test_56_the_options_of_bad_times_and_forces_are_checked(option, value):
-    with pytest.raises(ValueError, match=f"^{option}="):
+    with pytest.raises(ValueError, match=f"^{option} is "):
         RealTimeAdmittance(cut(0.01), **{option: value})

@@ -104,7 +104,7 @@ def test_arguments_of_a_schedule_are_refused_by_name(options, message):
 @pytest.mark.parametrize("name", ["duration", "distance", "speed"])
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan, "1", None])
 def test_66_limits_are_positive_numbers(name, value):
-    with pytest.raises(ValueError, match=f"{name} is .*, it must be a positive number"):
+    with pytest.raises(ValueError, match=f"{name} is .*, must be a finite number above 0"):
         MotionLimits(**{name: value})
 
 

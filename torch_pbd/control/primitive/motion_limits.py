@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, final
 
+from torch_pbd import checks
 from torch_pbd.control.primitive.units import robot_unit
-from torch_pbd.control.schedule.contents import check_positive
 
 _UNITS = {"duration": "s", "distance": "m", "speed": "m/s"}
 
@@ -31,7 +31,7 @@ class MotionLimits:
 
     def __post_init__(self) -> None:
         for name, value in asdict(self).items():
-            check_positive(name, value)
+            checks.number(value, name, above=0.0, unit=_UNITS[name])
 
 
 def counts_as_metres(units: Sequence[str] | None) -> bool:

@@ -1,4 +1,4 @@
-"""Where the real-time controller is in its schedule: begun, paused, caught up and ended without a jerk."""
+"""The two clocks of the real-time controller: that of the loop, and where it is in its schedule."""
 
 import math
 from operator import mul, sub
@@ -6,10 +6,17 @@ from typing import final
 
 import numpy as np
 
-from torch_pbd.control.realtime.checks import number
+from torch_pbd import checks
+from torch_pbd.control.realtime.limits import FINE, TickStatus
 from torch_pbd.control.realtime.steps import Vector, minimum_jerk
 from torch_pbd.control.realtime.table import ScheduleTable
 
+# A reading must tell ticks apart to 1 %: times since 1970 in s do, in ns they do not.
+_COARSE = 0.01
+# One late tick is a stall, two may be; three on end are a loop that is too slow.
+_LATE_ON_END = 3
+# Share of the newest tick in how long a tick lasts: neither one short tick nor one long counts for much.
+SMOOTHING = 0.1
 # The desired motion may be 1.5 times as fast as the schedule, and accelerate so much more: one half of that changes the
 # pace, the other is left for the square of the pace while it catches up.
 _SPEED, _SHARE = 1.5, 0.25
@@ -18,8 +25,60 @@ _STEEPEST, _SHARPEST = 1.875, 5.7735
 
 
 @final
+class TickTimer:
+    """Ticks of at most ``max_step`` s; ``last`` is until when the motion is known, ``step`` how long ticks last."""
+
+    def __init__(self, rate: float, max_step: float, max_bad_ticks: int) -> None:
+        self._rate = checks.number(rate, "rate", above=0.0, unit="1/s")
+        self.max_step = checks.number(max_step, "max_step", above=1.0 / self._rate, unit="s", remedy="give some ticks")
+        self._max_bad_ticks = checks.count(max_bad_ticks, "max_bad_ticks")
+        self.begin(math.nan)
+
+    def begin(self, now: float) -> None:
+        """Count from ``now``."""
+        if math.ulp(now) * self._rate > _COARSE:
+            must = f"small enough to tell ticks of {1.0 / self._rate:g} s apart"
+            raise checks.refusal(now, "now", must, "give seconds", unit="s")
+        self.last = self._newest = now
+        self.step = 1.0 / self._rate
+        self.is_regular, self._is_new = False, True
+        self._n_bad = self._n_late = 0
+
+    @property
+    def is_failed(self) -> bool:
+        """Whether bad or late ticks are too many on end for the robot to go on."""
+        return self._n_bad >= self._max_bad_ticks or self._n_late >= _LATE_ON_END
+
+    def read(self, now: float) -> tuple[TickStatus, float]:
+        """Fault of a tick that is not like the last one, and the time by which ``last`` was put forward.
+
+        Where the clock does not say how long a tick took, it is taken to be as long as they are.
+        """
+        if math.isnan(self.last):
+            raise RuntimeError("tick before start: call start(now) with the time of the same clock first.")
+        if self.is_regular:
+            self.is_regular, self._newest = False, self.last
+        if not self._newest < now < math.inf:
+            self._n_bad += 1
+            return TickStatus.CLOCK, 0.0
+        shift = 0.0
+        # The clock has lost what bad ticks have lived through.
+        if self._n_bad and now < self.last + 0.5 * self.step:
+            shift, self.last = now - self.step - self.last, now - self.step
+        self._newest, self._n_bad, step = now, 0, now - self.last
+        if step > self.max_step:
+            self._n_late += 1
+            if self._is_new and self._n_late >= _LATE_ON_END:
+                must = f"longer than a tick: all {self._n_late} since start were longer, the last of {step:.4g} s"
+                raise checks.refusal(self.max_step, "max_step", must, "give some ticks, and times in s", unit="s")
+            return TickStatus.LATE, shift
+        self.is_regular, self._is_new, self._n_late = True, False, 0
+        return FINE, shift
+
+
+@final
 class ScheduleClock:
-    """Schedule time, which runs at a pace from 0 to 1, or a little more to catch up, and what is desired then.
+    """Schedule time, which runs at a pace from 0 to 1, or a little more to catch up, and the motion desired then.
 
     At a pace r the desired velocity is r x' and its acceleration r^2 x'' + r' x'. The second term is at most ``gain``,
     also towards the end of a schedule that ends while moving: there r^2 <= 2 gain times the integral of dt / |x'| over
@@ -30,20 +89,21 @@ class ScheduleClock:
     def __init__(
         self, table: ScheduleTable, soft_start: float, approach_speed: float, acceleration_limit: float, on_gap: str
     ) -> None:
-        if on_gap not in ("pause", "resume"):
-            raise ValueError(f"on_gap={on_gap!r} must be 'pause' or 'resume'.")
-        self._table, self._d, self._rate, self._catches_up = table, table.n_axes, table.rate, on_gap == "resume"
+        self._catches_up = checks.choice(on_gap, "on_gap", ("pause", "resume")) == "resume"
+        self._table, self._d, self._rate = table, table.n_axes, table.rate
         self._packed, self._row_size, self._unpack = table.packed, table.layout.size, table.layout.unpack_from
-        self._soft_start = number("soft_start", soft_start, "s, or 0", zero=True)
-        self._approach_speed = number("approach_speed", approach_speed, "units/s")
+        self._soft_start = checks.number(soft_start, "soft_start", least=0.0, unit="s")
+        self._approach_speed = checks.number(approach_speed, "approach_speed", above=0.0, unit="units/s")
         own, fastest = table.acceleration, float(table.speeds.max())
-        # What a soft start needs to come up to speed; without one, a second is as long as its default.
+        # Acceleration of a soft start that comes up to speed; without one, a second is as long as its default.
         soft = max(fastest, approach_speed) / (soft_start or 1.0)
+        # One half of a limit is left for the schedule's own acceleration.
         self.gain = min(max(_SHARE * own, soft), 0.5 * acceleration_limit)
         self.speed = _SPEED * fastest + approach_speed
         self.acceleration = max((1.0 + _SHARE) * own + self.gain, _SHARPEST / _STEEPEST * soft)
         room = (self.acceleration - self.gain) / own if own else math.inf
         self._fastest = min(_SPEED, math.sqrt(room)) if self._catches_up else 1.0
+        # Integral of dt / |x'| from each row to the end; where the schedule rests it is long, not endless.
         times = np.append(np.arange(table.last) / table.rate, table.end)
         speeds = np.maximum(0.5 * (table.speeds[1:] + table.speeds[:-1]), 1e-9 * self.speed)
         left = np.append(np.cumsum((np.diff(times) / speeds)[::-1])[::-1], 0.0)
@@ -62,6 +122,7 @@ class ScheduleClock:
         self._distance: Vector = (0.0,) * d if position is None else tuple(map(sub, row, position))
         self._blend = max(self._soft_start, _STEEPEST * math.hypot(*self._distance) / self._approach_speed)
         self._is_soft = any(self._distance) and self._soft_start > 0.0
+        # The pace at which the desired motion is nearest to that of the robot.
         motion = row[d : 2 * d]
         square, along = sum(map(mul, motion, motion)), sum(map(mul, motion, velocity))
         pace = max(0.0, along / square) if square and self._soft_start else 1.0
@@ -79,7 +140,7 @@ class ScheduleClock:
         return self._pace * math.hypot(*row[self._d : 2 * self._d])
 
     def row(self, begin: float, step: float) -> Vector:
-        """Row of the table, with what is desired, for a tick; without calls where nothing is ramped."""
+        """Row of the table, with the desired motion, for a tick; without calls where nothing is ramped."""
         if self._is_steady:
             self.index = index = int((begin - self._origin) * self._rate + 0.5)
             if index < self._tail:
@@ -108,6 +169,8 @@ class ScheduleClock:
         row, squared_limit = self._desired(time)
         motion = row[d : 2 * d]
         speed = math.hypot(*motion)
+        # The pace changes by `rise` a second at most. From a pace of 1 + p, p^2 / (2 rise) of the lag is made up for by
+        # the time it is down to 1 again: the p of the whole lag is the one to go for.
         rise = self.gain / speed if speed else math.inf
         goal = min(self._fastest, 1.0 + math.sqrt(2.0 * rise * self._lag)) if self._lag else 1.0
         change = rise * step
@@ -116,14 +179,15 @@ class ScheduleClock:
         lost = step - 0.5 * step * (pace + last_pace)
         self._origin += lost
         self._lag = max(0.0, self._lag + lost) if self._lag else 0.0
-        if pace == 1.0 != last_pace:  # onto a row: without ramps a tick takes the nearest one
+        # Time is put onto a row where the ramp ends: without ramps a tick takes the nearest one.
+        if pace == 1.0 != last_pace:
             self._origin += time + step - lost - round((time + step - lost) * self._rate) / self._rate
         if not self._is_soft and (time >= self._table.end or (pace == last_pace == 1.0 and not self._lag)):
             self.boost, self._is_steady = (), True
         return (*row[:d], *[pace * part for part in motion], *row[2 * d :])
 
     def _desired(self, time: float) -> tuple[Vector, float]:
-        """Row at a time, with what is desired at a pace of 1, between it and the next; square of the largest pace."""
+        """Row at a time, its motion at a pace of 1 between it and the next, and the square of the largest pace."""
         table, d, limits = self._table, self._d, self._squared_limits
         if time >= table.end:
             self.index, row, squared_limit = table.last, table.row(table.last), math.inf
@@ -138,9 +202,8 @@ class ScheduleClock:
         self._is_soft = phase < 1.0
         if self._is_soft:
             left, slope = minimum_jerk(phase)
+            slope /= self._blend
             position = [value - left * part for value, part in zip(row, self._distance, strict=False)]
-            velocity = [
-                value - slope / self._blend * part for value, part in zip(row[d:], self._distance, strict=False)
-            ]
+            velocity = [value - slope * part for value, part in zip(row[d:], self._distance, strict=False)]
             row = (*position, *velocity, *row[2 * d :])
         return row, squared_limit

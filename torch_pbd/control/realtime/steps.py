@@ -1,24 +1,29 @@
 """One tick of the real-time controller, solved exactly: with floats where axes are shared, else with NumPy."""
 
 import math
+from collections.abc import Sequence
 from operator import mul, sub
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from torch_pbd import checks
+from torch_pbd.checks import Floats
+
+Numbers = Sequence[float] | Floats
 Vector = tuple[float, ...]
+State = tuple[Vector, Vector]
+"""Position and velocity."""
 
-_CRITICAL = 1e-7  # of (w h)^2: below, two terms of a series have all digits
-_SHORT = 0.01  # of a h: below, five terms have
+# Of (w h)^2, w the frequency of an axis and h the step: below, two terms of a series in it have all digits.
+_CRITICAL = 1e-7
+# Of a h, a half the damping: below, five terms have.
+_SHORT = 0.01
 
 
-def advance_plane(
-    row: Vector, push: Vector, position: Vector, velocity: Vector, step: float, pull_limit: float
-) -> tuple[Vector, Vector, float]:
+def advance_plane(row: Vector, push: Vector, state: State, step: float, pull_limit: float) -> tuple[State, float]:
     """`advance_modal` for d = 2, written out."""
     goal_x, goal_y, goal_vx, goal_vy, top, stiff_1, stiff_2, decay_1, decay_2, cos, sin, _, _ = row
-    (x, y), (vx, vy), (push_x, push_y) = position, velocity, push
+    ((x, y), (vx, vy)), (push_x, push_y) = state, push
     off_x, off_y = x - goal_x, y - goal_y
     off_1, off_2 = cos * off_x + sin * off_y, cos * off_y - sin * off_x
     v_1, v_2 = cos * vx + sin * vy, cos * vy - sin * vx
@@ -28,48 +33,44 @@ def advance_plane(
         stiff_1, stiff_2 = scale * stiff_1, scale * stiff_2
     q_1 = cos * push_x + sin * push_y + 2.0 * decay_1 * (cos * goal_vx + sin * goal_vy) - stiff_1 * off_1
     q_2 = cos * push_y - sin * push_x + 2.0 * decay_2 * (cos * goal_vy - sin * goal_vx) - stiff_2 * off_2
-    kick_1, ramp_1 = _responses(stiff_1, decay_1, step)
-    kick_2, ramp_2 = _responses(stiff_2, decay_2, step)
-    dx_1, dx_2 = kick_1 * v_1 + ramp_1 * q_1, kick_2 * v_2 + ramp_2 * q_2
-    dv_1 = kick_1 * q_1 - (2.0 * decay_1 * kick_1 + stiff_1 * ramp_1) * v_1
-    dv_2 = kick_2 * q_2 - (2.0 * decay_2 * kick_2 + stiff_2 * ramp_2) * v_2
-    moved = (x + cos * dx_1 - sin * dx_2, y + sin * dx_1 + cos * dx_2)
-    return moved, (vx + cos * dv_1 - sin * dv_2, vy + sin * dv_1 + cos * dv_2), scale
+    s_1, p_1 = _responses(stiff_1, decay_1, step)
+    s_2, p_2 = _responses(stiff_2, decay_2, step)
+    dx_1, dx_2 = s_1 * v_1 + p_1 * q_1, s_2 * v_2 + p_2 * q_2
+    dv_1 = s_1 * q_1 - (2.0 * decay_1 * s_1 + stiff_1 * p_1) * v_1
+    dv_2 = s_2 * q_2 - (2.0 * decay_2 * s_2 + stiff_2 * p_2) * v_2
+    there = (x + cos * dx_1 - sin * dx_2, y + sin * dx_1 + cos * dx_2)
+    return (there, (vx + cos * dv_1 - sin * dv_2, vy + sin * dv_1 + cos * dv_2)), scale
 
 
-def advance_modal(
-    row: Vector, push: Vector, position: Vector, velocity: Vector, step: float, pull_limit: float
-) -> tuple[Vector, Vector, float]:
-    """Position and velocity after ``step`` s, and by what the stiffness was scaled; each axis by itself.
+def advance_modal(row: Vector, push: Vector, state: State, step: float, pull_limit: float) -> tuple[State, float]:
+    """Position and velocity after ``step`` s, and the scale of the stiffness; each axis by itself.
 
     Along an axis, y = x - x_d follows y'' + 2 a y' + k y = f + 2 a v_d, all per kg. With the responses S and P of
     `_responses` and q = f + 2 a v_d - k y, y grows by S v + P q and v by S q - (2 a S + k P) v: increments, which
     keep their digits in short ticks.
     """
-    d = len(push)
+    (position, velocity), d = state, len(push)
     stiffness, decay = row[2 * d + 1 : 3 * d + 1], row[3 * d + 1 : 4 * d + 1]
     axes = [row[start : start + d] for start in range(4 * d + 1, len(row), d)]
     off = tuple(map(sub, position, row))
     off_axes = [_dot(axis, off) for axis in axes]
     pull = row[2 * d] * sum(k * y * y for k, y in zip(stiffness, off_axes, strict=True))
     scale = pull_limit / math.sqrt(pull) if pull > pull_limit * pull_limit else 1.0
-    moved, sped = list(position), list(velocity)
+    there, faster = list(position), list(velocity)
     for axis, k, a, y in zip(axes, stiffness, decay, off_axes, strict=True):
-        kick, ramp = _responses(scale * k, a, step)
+        s, p = _responses(scale * k, a, step)
         v = _dot(axis, velocity)
         q = _dot(axis, push) + 2.0 * a * _dot(axis, row[d : 2 * d]) - scale * k * y
-        dx, dv = kick * v + ramp * q, kick * q - (2.0 * a * kick + scale * k * ramp) * v
+        dx, dv = s * v + p * q, s * q - (2.0 * a * s + scale * k * p) * v
         for i, share in enumerate(axis):
-            moved[i] += dx * share
-            sped[i] += dv * share
-    return tuple(moved), tuple(sped), scale
+            there[i] += dx * share
+            faster[i] += dv * share
+    return (tuple(there), tuple(faster)), scale
 
 
-def advance_coupled(
-    row: Vector, push: Vector, position: Vector, velocity: Vector, step: float, pull_limit: float
-) -> tuple[Vector, Vector, float]:
+def advance_coupled(row: Vector, push: Vector, state: State, step: float, pull_limit: float) -> tuple[State, float]:
     """As `advance_modal` for matrices that share no axes: exp(X) - 1 of the whole system, time in ticks."""
-    d = len(push)
+    (position, velocity), d = state, len(push)
     goal, goal_velocity, (top,), gains = np.split(np.array(row), [d, 2 * d, 2 * d + 1])
     stiffness, damping = gains.reshape(2, d, d)
     off = np.subtract(position, goal)
@@ -80,14 +81,15 @@ def advance_coupled(
     rate[d:-1, :d], rate[d:-1, d:-1] = -(step**2) * scale * stiffness, -step * damping
     rate[d:-1, -1] = step**2 * (push + damping @ goal_velocity)
     change = _expm1(rate) @ np.concatenate([off, np.multiply(step, velocity), [1.0]])
-    moved, sped = np.add(position, change[:d]), np.add(velocity, change[d:-1] / step)
-    return tuple(moved.tolist()), tuple(sped.tolist()), scale
+    there, faster = np.add(position, change[:d]), np.add(velocity, change[d:-1] / step)
+    return (tuple(there.tolist()), tuple(faster.tolist())), scale
 
 
 def _expm1(matrix: Floats) -> Floats:
     """exp(matrix) - 1 by Taylor series and doubling: without the 1, slow motions keep their digits beside fast ones."""
     doublings = max(0, math.frexp(np.abs(matrix).sum(axis=1).max())[1] + 1)
-    small = matrix / 2.0**doublings  # of a norm of at most 1/2, for which 14 terms have all digits
+    # The norm is now 1/2 at most, for which 14 terms have all digits.
+    small = matrix / 2.0**doublings
     power = small / 14.0
     for order in range(13, 0, -1):
         power = (small + small @ power) / order
@@ -97,10 +99,10 @@ def _expm1(matrix: Floats) -> Floats:
 
 
 def _responses(stiffness: float, decay: float, step: float) -> tuple[float, float]:
-    """How far, in ``step`` s, a velocity of 1 and an acceleration of 1 carry an axis: S and P.
+    """Impulse response S of y'' + 2 a y' + k y = 0 (y = 0, y' = 1 at first) after ``step`` s, and its integral P.
 
-    S is the solution of y'' + 2 a y' + k y = 0 from y = 0, y' = 1, and P its integral. They are written such that no
-    exponential overflows and no difference of nearly equal numbers is left, near critical damping and k = 0 too.
+    They are written such that no exponential overflows and no difference of nearly equal numbers is left, near
+    critical damping and k = 0 too.
     """
     lag = decay * step
     bend = stiffness * step * step - lag * lag
@@ -114,22 +116,28 @@ def _responses(stiffness: float, decay: float, step: float) -> tuple[float, floa
     lost = -math.expm1(-lag)
     if bend > _CRITICAL:
         angle = math.sqrt(bend)
-        kick = (1.0 - lost) * math.sin(angle) * step / angle
-        return kick, (lost - decay * kick + 2.0 * (1.0 - lost) * math.sin(0.5 * angle) ** 2) / stiffness
-    kick = (1.0 - lost) * step * (1.0 - bend / 6.0)
+        impulse = (1.0 - lost) * math.sin(angle) * step / angle
+        return impulse, (lost - decay * impulse + 2.0 * (1.0 - lost) * math.sin(0.5 * angle) ** 2) / stiffness
+    impulse = (1.0 - lost) * step * (1.0 - bend / 6.0)
     if lag > _SHORT:
-        return kick, (lost - decay * kick + 0.5 * bend * (1.0 - lost)) / stiffness
+        return impulse, (lost - decay * impulse + 0.5 * bend * (1.0 - lost)) / stiffness
     series = 0.5 - lag * (1 / 3 - lag * (1 / 8 - lag * (1 / 30 - lag / 144))) - bend * (1 / 24 - lag / 30)
-    return kick, step * step * series
+    return impulse, step * step * series
+
+
+def vector(values: Numbers, name: str, d: int) -> Vector:
+    """Finite floats, one for each of d axes."""
+    return tuple(checks.array(values, name, (d,)).tolist())
 
 
 def minimum_jerk(phase: float) -> tuple[float, float]:
-    """What is left of a way of 1 by minimum jerk at a phase of 0..1, and the slope over the phase."""
+    """Rest of a way of 1 by minimum jerk at a phase of 0..1, and its slope over the phase."""
     return 1.0 - phase**3 * (10.0 - 15.0 * phase + 6.0 * phase**2), -30.0 * phase**2 * (1.0 - phase) ** 2
 
 
-def braked(position: Vector, velocity: Vector, deceleration: float, step: float) -> tuple[Vector, Vector]:
+def braked(state: State, deceleration: float, step: float) -> State:
     """Position and velocity after braking for ``step`` s, or until standing still."""
+    position, velocity = state
     speed = math.hypot(*velocity)
     braking = min(step, speed / deceleration)
     left = 1.0 - deceleration * step / speed if braking == step else 0.0
@@ -138,7 +146,7 @@ def braked(position: Vector, velocity: Vector, deceleration: float, step: float)
 
 
 def drift(position: Vector, before: Vector, after: Vector, time: float) -> Vector:
-    """Where a velocity leads that changes evenly."""
+    """Position after a time in which the velocity changes evenly."""
     return tuple(x + 0.5 * time * (v + w) for x, v, w in zip(position, before, after, strict=True))
 
 

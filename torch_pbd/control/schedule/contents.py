@@ -1,4 +1,4 @@
-"""What a schedule must be: shapes, finite numbers, symmetric gains, labels that JSON can hold."""
+"""Contents of a schedule: shapes, finite numbers, gains that can be followed, labels that JSON can hold."""
 
 import math
 import reprlib
@@ -10,157 +10,118 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torch_pbd import checks
+from torch_pbd.checks import Floats
+from torch_pbd.exceptions import InvalidParameterError
 
 ARRAY_DIMS = {"time": 1, "position": 2, "velocity": 2, "stiffness": 3, "damping": 3, "covariance": 3, "type1": 1}
 """Every array of a schedule with its number of axes: (n,), (n, d) or (n, d, d)."""
 
 LABELS = ("names", "units", "frame", "stiffness_limits", "covariance_of", "mass", "provenance")
 
-ROUNDING = 1e-9
-"""Relative: what is smaller counts as rounding of the caller's arithmetic."""
+# JSON's reader and Python's own stack take more levels than this, on every system.
+_DEEPEST = 100
 
-_DEEPEST = 100  # levels of a provenance, of which JSON and Python's own stack take more
-_LARGEST = 1e100  # squares and sums of what is smaller do not overflow
-
-Floats = NDArray[np.float64]
 Arrays = Mapping[str, NDArray[Any]]
 Labels = Mapping[str, Any]
 
 
 def checked_fields(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields of a schedule, if they are sound: read-only copies in float64, and labels that cannot change."""
-    copies = {name: as_floats(fields[name], name, n_dims) for name, n_dims in ARRAY_DIMS.items()}
-    _check_shapes(copies)
-    _check_rows(copies["time"], copies["type1"])
-    for name in ("stiffness", "damping", "covariance"):
-        copies[name] = _symmetrized(copies[name], name)
-    labels = _checked_labels({name: fields[name] for name in LABELS}, n_outputs=copies["position"].shape[1])
-    _check_gains(copies["stiffness"], copies["damping"], labels["stiffness_limits"])
-    for copy in copies.values():
-        copy.setflags(write=False)
-    return {**copies, **labels}
-
-
-def check_positive(name: str, value: Any) -> None:
-    """Refuse what is not a positive number."""
-    if (
-        isinstance(value, bool)
-        or not isinstance(value, int | float | np.integer | np.floating)
-        or not (value > 0.0 and checks.is_finite(value))
-    ):
-        raise ValueError(f"{name} is {value!r}, it must be a positive number.")
-
-
-def _check_shapes(arrays: Arrays) -> None:
-    n, d = arrays["position"].shape
-    for name, array in arrays.items():
-        expected = (n, d, d)[: array.ndim]
-        if array.shape != expected or n < 2 or d < 1:
-            raise ValueError(
-                f"{name} has shape {array.shape}, it must be {expected}: position has {n} rows (at least 2 are needed) "
-                f"and {d} outputs (at least 1)."
-            )
-
-
-def _check_rows(time: Floats, type1: Floats) -> None:
-    later = np.diff(time, prepend=-np.inf) > 0.0
-    require(later, time, "time", "it must increase strictly. Sort the rows by time and drop repeated ones.")
-    require((type1 >= 0.0) & (type1 <= 1.0), type1, "type1", "it must be within 0 (on data) and 1 (the prior alone).")
-
-
-def _check_gains(stiffness: Floats, damping: Floats, limits: tuple[float, float] | None) -> None:
-    """Refuse stiffness outside its limits, and motion on which neither stiffness nor damping acts."""
-    spectrum, losses = np.linalg.eigvalsh(stiffness), np.linalg.eigvalsh(damping)
-    held = spectrum[:, 0] > ROUNDING * spectrum[:, -1]
-    damped = losses[:, 0] > ROUNDING * losses[:, -1]
-    remedy = "where the stiffness is singular, the damping must be positive definite. Raise one of the two."
-    require(held | damped, losses[:, 0], "the smallest eigenvalue of damping", remedy)
+    """Fields of a schedule that are sound: read-only copies in float64, and labels that cannot change."""
+    limits = fields["stiffness_limits"]
     if limits is not None:
-        low, high = limits
-        within = (spectrum >= low - ROUNDING * high) & (spectrum <= high + ROUNDING * high)
-        remedy = f"stiffness_limits are {low:g} and {high:g} N/m. Limit the stiffness to them, or widen them."
-        require(within, spectrum, "the eigenvalue of stiffness", remedy)
+        low, high = checks.array(limits, "stiffness_limits", (2,)).tolist()
+        low = checks.number(low, "stiffness_limits[0]", least=0.0, unit="N/m")
+        limits = low, checks.number(high, "stiffness_limits[1]", above=0.0, least=low, unit="N/m")
+    arrays = checked_arrays({name: fields[name] for name in ARRAY_DIMS}, limits)
+    arrays = {name: array.copy() for name, array in arrays.items()}
+    for array in arrays.values():
+        array.setflags(write=False)
+    labels = _checked_labels({name: fields[name] for name in LABELS}, n_outputs=arrays["position"].shape[1])
+    return {**arrays, **labels, "stiffness_limits": limits}
+
+
+def checked_arrays(
+    fields: Mapping[str, Any], limits: tuple[float, float] | None, within: str = ""
+) -> dict[str, Floats]:
+    """Arrays of a schedule in float64, with covariance and type1 or without, that a robot can follow.
+
+    Matrices are symmetric to the last bit; the other arrays are no copies where they need not be. ``within`` goes
+    before their names in messages.
+    """
+    position = checks.array(fields["position"], f"{within}position", ("n", "d"))
+    n, d = position.shape
+    if n < 2 or not d:
+        raise InvalidParameterError(
+            f"{within}position has shape {position.shape}, must have at least 2 rows, 1 column."
+        )
+    arrays = {name: checks.array(fields[name], within + name, (n, d, d)[: ARRAY_DIMS[name]]) for name in fields}
+    later = np.diff(arrays["time"], prepend=-np.inf) > 0.0
+    remedy = "sort the rows by time and drop repeated ones"
+    checks.require(later, arrays["time"], f"{within}time", "later than the time before it", remedy)
+    if "type1" in arrays:
+        type1 = arrays["type1"]
+        checks.require((type1 >= 0.0) & (type1 <= 1.0), type1, "type1", "from 0 (on data) to 1 (the prior alone)")
+    for name in [name for name in arrays if ARRAY_DIMS[name] == 3]:
+        checks.semidefinite(arrays[name], within + name)
+        arrays[name] = 0.5 * (arrays[name] + arrays[name].swapaxes(1, 2))
+    if limits is not None:
+        _check_limits(arrays["stiffness"], limits, within)
+    _check_held(arrays["stiffness"], arrays["damping"], within)
+    return arrays
+
+
+def _check_limits(stiffness: Floats, limits: tuple[float, float], within: str) -> None:
+    """Refuse eigenvalues of the stiffness beyond the limits, to rounding."""
+    low, high = limits
+    least, most = low - checks.ROUNDING * high, high + checks.ROUNDING * high
+    if checks.eigenvalues_above(stiffness, least) and checks.eigenvalues_above(-stiffness, -most):
+        return
+    eigenvalues = np.linalg.eigvalsh(stiffness)
+    good = (eigenvalues >= least) & (eigenvalues <= most)
+    must = f"within stiffness_limits, {low:g} and {high:g} N/m"
+    name = f"the eigenvalue of {within}stiffness"
+    checks.require(good, eigenvalues, name, must, "limit the stiffness to them, or widen them")
+
+
+def _check_held(stiffness: Floats, damping: Floats, within: str) -> None:
+    """Refuse rows in which neither stiffness nor damping acts along some axis: nothing else would stop the robot."""
+    scales = [checks.ROUNDING * np.abs(gain).max(axis=(1, 2)) for gain in (stiffness, damping)]
+    if checks.eigenvalues_above(stiffness, scales[0]):
+        return
+    lowest = [np.linalg.eigvalsh(gain)[:, 0] for gain in (stiffness, damping)]
+    must = "above zero where the stiffness is singular, for nothing else stops the robot"
+    name = f"the smallest eigenvalue of {within}damping"
+    good = (lowest[0] > scales[0]) | (lowest[1] > scales[1])
+    checks.require(good, lowest[1], name, must, "raise one of the two")
 
 
 def _checked_labels(labels: Labels, n_outputs: int) -> dict[str, Any]:
-    """The labels of a schedule as tuples, strings and a copy of the provenance, if they are sound."""
-    names, limits = labels["names"], labels["stiffness_limits"]
-    listed = list(names) if isinstance(names, list | tuple) else []
-    strings = [name for name in listed if isinstance(name, str)]
-    if names is not None and not len(set(strings)) == len(listed) == n_outputs:
-        raise ValueError(f"names is {names!r}, it must be {n_outputs} different strings, one for each output.")
-    for i, name in enumerate(strings):  # which are titles of columns; the others stand in JSON, which holds any text
-        checks.text(name, f"names[{i}]")
+    """Labels of a schedule that are sound, as tuples and a copy of the provenance."""
+    names = labels["names"]
+    if names is not None:
+        listed = list(names) if isinstance(names, list | tuple) else []
+        if not (all(isinstance(name, str) for name in listed) and len(set(listed)) == len(listed) == n_outputs):
+            raise checks.refusal(names, "names", f"{n_outputs} different strings, one for each output")
+        # Names are titles of columns; other texts stand in JSON, which can hold line ends and controls too.
+        names = tuple(checks.text(name, f"names[{i}]") for i, name in enumerate(listed))
     for name in ("units", "frame"):
-        if not isinstance(labels[name], str | None):
-            raise ValueError(f"{name} is {labels[name]!r}, it must be a string or None.")
-    if labels["covariance_of"] not in ("position", "forcing"):
-        raise ValueError(f"covariance_of is {labels['covariance_of']!r}, it must be 'position' or 'forcing'.")
-    if labels["mass"] is not None:
-        check_positive("mass", labels["mass"])
-    if not isinstance(labels["provenance"], Mapping):
-        raise ValueError(f"provenance is {reprlib.repr(labels['provenance'])}, it must be a mapping.")
+        checks.instance(labels[name], name, str, optional=True)
+    checks.choice(labels["covariance_of"], "covariance_of", ("position", "forcing"))
+    checks.instance(labels["provenance"], "provenance", Mapping)
     return {
         **labels,
-        "names": None if names is None else tuple(listed),
-        "stiffness_limits": None if limits is None else _checked_limits(limits),
+        "names": names,
+        "mass": checks.number(labels["mass"], "mass", above=0.0, unit="kg", optional=True),
         "provenance": MappingProxyType(_json_copy(labels["provenance"], "provenance")),
     }
-
-
-def as_floats(values: Any, name: str, n_dims: int) -> Floats:
-    """Copy as float64 of an array whose entries are finite and whose squares are too."""
-    if np.ma.is_masked(values):
-        raise ValueError(f"{name} has masked entries: fill them in first.")
-    if hasattr(values, "detach"):
-        values = checks.from_tensor(values, name)
-    try:
-        given = np.asarray(values)
-    except ValueError as error:
-        raise ValueError(f"{name} is ragged, its rows have different lengths: {error}") from error
-    if given.dtype.kind not in "fiu" or given.ndim != n_dims:
-        raise ValueError(f"{name} has dtype {given.dtype} and shape {given.shape}: give real numbers, {n_dims}-D.")
-    copy = np.array(given, dtype=np.float64, order="C")
-    require(np.abs(copy) <= _LARGEST, copy, name, f"it must be finite and at most {_LARGEST:g} in size.")
-    return copy
-
-
-def require(good: NDArray[np.bool_], values: NDArray[Any], name: str, must: str) -> None:
-    """Refuse the first value that is not good, by its row and its place in it."""
-    if not good.all():
-        row, *place = map(int, np.argwhere(~good)[0])
-        where = f"row {row}, entry {tuple(place)}" if place else f"row {row}"
-        raise ValueError(f"{name} is {values[row, *place]!s} at {where}: {must}")
-
-
-def _symmetrized(matrices: Floats, name: str) -> Floats:
-    skew = matrices - matrices.swapaxes(1, 2)
-    scale = np.abs(matrices).max(axis=(1, 2), keepdims=True)
-    remedy = "it must be that of the entry across the diagonal. Symmetrize the matrix: (A + A') / 2."
-    require(np.abs(skew) <= ROUNDING * scale, matrices, name, remedy)
-    symmetric: Floats = 0.5 * (matrices + matrices.swapaxes(1, 2))
-    spectrum = np.linalg.eigvalsh(symmetric)
-    sound = spectrum[:, 0] >= -ROUNDING * np.abs(spectrum).max(axis=1)
-    remedy = "it must not be negative: build the matrix as Q diag(q >= 0) Q', or as a product A A'."
-    require(sound, spectrum[:, 0], f"the smallest eigenvalue of {name}", remedy)
-    return symmetric
-
-
-def _checked_limits(limits: Any) -> tuple[float, float]:
-    bounds = as_floats(limits, "stiffness_limits", 1).tolist()
-    if len(bounds) != 2 or not 0.0 <= bounds[0] <= bounds[1] or bounds[1] == 0.0:
-        raise ValueError(
-            f"stiffness_limits is {bounds}, it must be (least, largest) in N/m, 0 <= least <= largest > 0."
-        )
-    return bounds[0], bounds[1]
 
 
 def _json_copy(value: Any, where: str, depth: int = 0) -> Any:
     """Copy of what comes back from JSON as it was; tuples come back as lists."""
     if depth > _DEEPEST:
-        raise ValueError(
-            f"provenance is nested more than {_DEEPEST} levels deep, or holds itself: it must be what JSON can hold, "
-            f"in fewer levels. It goes down by {where[:80]}..."
+        raise InvalidParameterError(
+            f"provenance is nested more than {_DEEPEST} levels deep, or holds itself, down by {where:.80}..., must be "
+            "what JSON can hold, in fewer levels."
         )
     if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
         return {key: _json_copy(entry, f"{where}[{key!r}]", depth + 1) for key, entry in value.items()}
@@ -170,7 +131,7 @@ def _json_copy(value: Any, where: str, depth: int = 0) -> Any:
         value = value.item()
     if value is None or isinstance(value, bool | int | str) or (isinstance(value, float) and math.isfinite(value)):
         return value
-    raise ValueError(
-        f"{where} is {reprlib.repr(value)}, it must be what JSON can hold: text, finite numbers, lists, dicts with "
-        "text for keys. Convert arrays with .tolist()."
+    raise InvalidParameterError(
+        f"{where} is {reprlib.repr(value)}, must be what JSON can hold, such as text, finite numbers, lists and dicts "
+        "with text for keys: convert arrays with .tolist()."
     )

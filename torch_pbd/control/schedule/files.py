@@ -10,15 +10,16 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence
-from itertools import chain
+from contextlib import suppress
+from functools import partial
+from itertools import chain, combinations_with_replacement
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torch_pbd.control.schedule.contents import ARRAY_DIMS, LABELS, Arrays, Labels
-from torch_pbd.exceptions import ModelFileError
+from torch_pbd.exceptions import InvalidParameterError, ModelFileError
 from torch_pbd.files.archives import read_array, read_members
 from torch_pbd.files.atomic import LOADERS, replacing
 from torch_pbd.files.memory import parsed_bytes, require_memory
@@ -32,22 +33,18 @@ Built = TypeVar("Built")
 # A decoder gives the header, and then, once that is known to be of a version that can be read, the arrays.
 Decoder = Callable[[bytes], Iterator[Any]]
 
-# What parsers raise about bytes that are not what they claim to be (RecursionError is a RuntimeError).
+# Parsers raise these about bytes that are not what they claim to be (RecursionError is a RuntimeError).
 _DAMAGE = (ArithmeticError, LookupError, MemoryError, RuntimeError, TypeError, ValueError, csv.Error)
 
 
 def write_schedule(path: Path, arrays: Arrays, labels: Labels) -> None:
-    """Write one file in the format of its suffix, which is there whole or not at all.
-
-    Raises ValueError if the suffix is not known or the file would be larger than what is read again, OSError
-    with the path if it cannot be written.
-    """
+    """Write one file in the format of its suffix, as :meth:`Schedule.save` says."""
     encode = _ENCODERS[_known_suffix(path)]
     header = {"format": FORMAT, "version": VERSION, **labels}
     content = encode({**header, "sha256": _digest(header, arrays)}, arrays)
     if len(content) > MAX_BYTES:
         raise ValueError(
-            f"{path} would have {len(content)} bytes, more than the {MAX_BYTES} that are read again: "
+            f"{path} would have {len(content)} bytes, must have at most the {MAX_BYTES} that are read again: "
             "resample the schedule at a lower rate, or save it in parts."
         )
     with replacing(path) as file:
@@ -55,55 +52,48 @@ def write_schedule(path: Path, arrays: Arrays, labels: Labels) -> None:
 
 
 def read_schedule(path: Path, build: Callable[..., Built]) -> Built:
-    """What ``build`` makes of the arrays and labels, given by their names, of a file of :func:`write_schedule`.
-
-    Raises ValueError if the suffix is not known, FileNotFoundError if there is no such file, ModelFileError if
-    it is torn, changed, of a newer version, or no schedule.
-    """
+    """Result of ``build`` for the arrays and labels of a file, given by their names; see :meth:`Schedule.load`."""
     suffix = _known_suffix(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist, or is not a file.")
     if path.stat().st_size > MAX_BYTES:
         raise ModelFileError(f"{path} has {path.stat().st_size} bytes; a schedule has at most {MAX_BYTES}.")
-    parts = _DECODERS[suffix](path.read_bytes())
+    content = path.read_bytes()
     try:
+        if suffix != ".npz":
+            require_memory(parsed_bytes([content]), what="what it says", remedy="Save it as .npz.")
+        parts = _DECODERS[suffix](content)
         header = next(parts)
-        _check_header(header, checksum_needed=suffix != ".csv")
+        _check_header(header, optional={"sha256"} if suffix == ".csv" else set())
         arrays = next(parts)
-        _check_content(header, arrays, editable=suffix == ".csv")
+        if set(arrays) != set(ARRAY_DIMS):
+            raise ValueError(f"its arrays are {', '.join(arrays) or 'none'}, must be {', '.join(ARRAY_DIMS)}.")
+        rest = {key: value for key, value in header.items() if key != "sha256"}
+        if "sha256" in header and header["sha256"] != _digest(rest, arrays):
+            line = "delete the line that starts with '# sha256:' to accept it"
+            remedy = line if suffix == ".csv" else "save it again"
+            raise ValueError(f"it does not match its checksum: it is damaged, or, if edited on purpose, {remedy}.")
         return build(**arrays, **{key: header[key] for key in LABELS})
     except _DAMAGE as error:
         raise ModelFileError(f"{path} cannot be read as a schedule: {error}") from error
 
 
 def _known_suffix(path: Path) -> str:
-    suffix = path.suffix.lower()
-    if suffix not in _ENCODERS:
-        raise ValueError(
-            f"path={str(path)!r} has the suffix {path.suffix!r}; a schedule is .npz, .json or .csv. {LOADERS}"
-        )
-    return suffix
+    if path.suffix.lower() not in _ENCODERS:
+        raise InvalidParameterError(f"{path} has the suffix {path.suffix!r}, must have .npz, .json or .csv. {LOADERS}")
+    return path.suffix.lower()
 
 
-def _check_header(header: Any, *, checksum_needed: bool) -> None:
+def _check_header(header: Any, optional: set[str]) -> None:
     found = header.get("format") if isinstance(header, dict) else None
     if found != FORMAT:
-        raise ValueError(f"its format is {found!r}, not {FORMAT!r}. {LOADERS}")
+        raise ValueError(f"its format is {found!r}, must be {FORMAT!r}. {LOADERS}")
     if header.get("version") != VERSION:
-        raise ValueError(f"it has version {header.get('version')!r}, this torch_pbd reads {VERSION}: upgrade it.")
-    needed = {"format", "version", *LABELS, *(["sha256"] if checksum_needed else [])}
-    for words, keys in [("has no", needed - set(header)), ("has an unknown", set(header) - needed - {"sha256"})]:
+        raise ValueError(f"it has version {header.get('version')!r}, must have {VERSION}: upgrade torch_pbd.")
+    known = {"format", "version", "sha256", *LABELS}
+    for words, keys in [("has no", known - optional - set(header)), ("has an unknown", set(header) - known)]:
         if keys:
             raise ValueError(f"its header {words} {min(keys)!r}.")
-
-
-def _check_content(header: Labels, arrays: Arrays, *, editable: bool) -> None:
-    if set(arrays) != set(ARRAY_DIMS):
-        raise ValueError(f"its arrays are {', '.join(arrays) or 'none'}; they must be {', '.join(ARRAY_DIMS)}.")
-    rest = {key: value for key, value in header.items() if key != "sha256"}
-    if "sha256" in header and header["sha256"] != _digest(rest, arrays):
-        edited = "delete the line that starts with '# sha256:' to accept it as it is" if editable else "save it again"
-        raise ValueError(f"it does not match its checksum: it is damaged, or, if it was edited on purpose, {edited}.")
 
 
 def _digest(header: Labels, arrays: Arrays) -> str:
@@ -115,21 +105,14 @@ def _digest(header: Labels, arrays: Arrays) -> str:
     return digest.hexdigest()
 
 
-def _require_parsed(content: bytes) -> None:
-    require_memory(parsed_bytes([content]), what="what it says", remedy="Save it as .npz.")
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    entries = dict(pairs)
+    if len(entries) < len(pairs):
+        raise ValueError(f"it holds an object with two entries of one name, among {', '.join(entries):.80}.")
+    return entries
 
 
-def _parse_json(text: str) -> Any:
-    def refuse(constant: str) -> None:
-        raise ValueError(f"it holds {constant}: all numbers must be finite.")
-
-    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        entries = dict(pairs)
-        if len(entries) < len(pairs):
-            raise ValueError(f"it holds an object with two entries of one name, among {', '.join(entries):.80}.")
-        return entries
-
-    return json.loads(text, parse_constant=refuse, object_pairs_hook=unique)
+_parse_json = partial(json.loads, object_pairs_hook=_unique)
 
 
 def _encode_json(header: Labels, arrays: Arrays) -> bytes:
@@ -137,7 +120,6 @@ def _encode_json(header: Labels, arrays: Arrays) -> bytes:
 
 
 def _decode_json(content: bytes) -> Iterator[Any]:
-    _require_parsed(content)
     header = _parse_json(content.decode())
     lists = header.pop("arrays", {}) if isinstance(header, dict) else {}
     yield header
@@ -153,28 +135,23 @@ def _encode_npz(header: Labels, arrays: Arrays) -> bytes:
 
 def _decode_npz(content: bytes) -> Iterator[Any]:
     members = read_members(content, MAX_BYTES, remedy="Resample the schedule at a lower rate.")
-    yield _parse_json(str(_read_npy("header", members.pop("header")))) if "header" in members else {}
-    yield {name: _read_npy(name, member) for name, member in members.items()}
-
-
-def _read_npy(name: str, content: bytes) -> NDArray[Any]:
-    array = read_array(name, content)
-    if array.dtype.str != "<f8" and not (name == "header" and array.dtype.kind == "U" and not array.ndim):
-        raise ValueError(f"{name} is not an array of float64, it is of {array.dtype}.")
-    return array
+    header = read_array("header", members.pop("header")) if "header" in members else np.array("{}")
+    if header.dtype.kind != "U" or header.ndim:
+        raise ValueError(f"header is an array of {header.dtype}, must be one text.")
+    yield _parse_json(str(header))
+    arrays = {name: read_array(name, member) for name, member in members.items()}
+    for name, array in arrays.items():
+        if array.dtype.str != "<f8":
+            raise ValueError(f"{name} is an array of {array.dtype}, must be one of float64.")
+    yield arrays
 
 
 def _columns(
     names: Sequence[str] | None, n_outputs: int, between: str = "]["
 ) -> list[tuple[str, str, tuple[int, ...]]]:
     """Title, array and place in its rows of each column; of symmetric matrices the upper triangle."""
-    labels = [str(i) for i in range(n_outputs)] if names is None else names
-    axes = range(n_outputs)
-    places: dict[int, list[tuple[int, ...]]] = {
-        1: [()],
-        2: [(i,) for i in axes],
-        3: [(i, j) for i in axes for j in axes[i:]],
-    }
+    labels = names or [str(i) for i in range(n_outputs)]
+    places = {n_dims: [*combinations_with_replacement(range(n_outputs), n_dims - 1)] for n_dims in (1, 2, 3)}
     return [
         (f"{name}[{between.join(labels[i] for i in place)}]" if place else name, name, place)
         for name, n_dims in ARRAY_DIMS.items()
@@ -194,7 +171,6 @@ def _encode_csv(header: Labels, arrays: Arrays) -> bytes:
 
 
 def _decode_csv(content: bytes) -> Iterator[Any]:
-    _require_parsed(content)
     stream = io.StringIO(content.decode("utf-8-sig"), newline="")
     header: dict[str, Any] = {}
     first = ""
@@ -212,23 +188,20 @@ def _decode_csv(content: bytes) -> Iterator[Any]:
 def _read_table(names: Any, lines: Iterator[str], n_lines_before: int) -> Arrays:
     reader = csv.reader(lines)
     titles = next(reader, [])
-    n_outputs = sum(title.startswith("position[") for title in titles)
-    if names is not None and (not isinstance(names, list) or len(names) != n_outputs):
-        raise ValueError(f"names is {names}, but there are {n_outputs} columns of positions.")
-    n_columns = 2 + 2 * n_outputs + 3 * n_outputs * (n_outputs + 1) // 2
+    d = sum(title.startswith("position[") for title in titles)
+    if names is not None and (not isinstance(names, list) or len(names) != d):
+        raise ValueError(f"names is {names}, but there are {d} columns of positions.")
+    # Counted before they are named, for titles of thousands of outputs would take gigabytes.
+    n_columns, line = 2 + 2 * d + 3 * d * (d + 1) // 2, n_lines_before + 1
     if len(titles) != n_columns:
-        raise ValueError(
-            f"line {n_lines_before + 1} names {len(titles)} columns, of which {n_outputs} are positions: they must be "
-            f"{n_columns}."
-        )
-    columns = _columns(names, n_outputs)
-    expected = [title for title, _, _ in columns]
+        raise ValueError(f"line {line} names {len(titles)} columns, of which {d} are positions, must name {n_columns}.")
+    columns = _columns(names, d)
     # Files once had titles with commas, stiffness[x,y], which must be quoted.
-    if titles not in (expected, [title for title, _, _ in _columns(names, n_outputs, ",")]):
-        raise ValueError(f"line {n_lines_before + 1} must name the columns {','.join(expected)}.")
-    rows = [_numbers(cells, expected, n_lines_before + reader.line_num) for cells in reader if cells]
-    table = np.array(rows, dtype=np.float64).reshape(len(rows), len(expected))
-    arrays: Arrays = {name: np.empty((len(rows), *[n_outputs] * (n - 1))) for name, n in ARRAY_DIMS.items()}
+    if not any(titles == [title for title, *_ in _columns(names, d, between)] for between in ("][", ",")):
+        raise ValueError(f"line {line} must name the columns {','.join(title for title, *_ in columns)}.")
+    rows = [_numbers(cells, titles, n_lines_before + reader.line_num) for cells in reader if cells]
+    table = np.reshape(rows, (-1, n_columns))
+    arrays: Arrays = {name: np.empty((len(table), *[d] * (n_dims - 1))) for name, n_dims in ARRAY_DIMS.items()}
     for values, (_, name, place) in zip(table.T, columns, strict=True):
         arrays[name].T[place] = values
         arrays[name].T[place[::-1]] = values
@@ -238,16 +211,15 @@ def _read_table(names: Any, lines: Iterator[str], n_lines_before: int) -> Arrays
 def _numbers(cells: Sequence[str], titles: Sequence[str], line: int) -> list[float]:
     if len(cells) != len(titles):
         raise ValueError(f"line {line} has {len(cells)} cells, but there are {len(titles)} columns.")
-    row = []
-    for cell, title in zip(cells, titles, strict=True):
-        try:
-            value = math.nan if "_" in cell else float(cell)  # Python alone reads 1_0 as ten
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            raise ValueError(f"line {line}, column {title!r}: {cell!r} is not a finite number.")
-        row.append(value)
-    return row
+    return [_number(cell, f"line {line}, column {title!r}") for cell, title in zip(cells, titles, strict=True)]
+
+
+def _number(cell: str, where: str) -> float:
+    # Python alone reads 1_0 as ten.
+    with suppress(ValueError):
+        if "_" not in cell and math.isfinite(value := float(cell)):
+            return value
+    raise ValueError(f"{where}: {cell!r} is not a finite number.")
 
 
 _ENCODERS = {".npz": _encode_npz, ".json": _encode_json, ".csv": _encode_csv}

@@ -3,9 +3,8 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from torch_pbd.checks import Floats
 
 # Of a tick: 10 s at 1 kHz are 10001 rows, however 10 * 1000 is rounded; and stamps tell a duration to the thousandth of
 # their spacing, beyond which they count as one, so that a last interval shorter than that is none.

@@ -1,4 +1,4 @@
-"""What a controller is told over time: where to be, how stiff and how damped, and how sure the model was."""
+"""The schedule of a controller: position, velocity, stiffness and damping over time, and how sure the model was."""
 
 import os
 from collections.abc import Mapping
@@ -10,34 +10,30 @@ from typing import TYPE_CHECKING, Any, Self, final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from torch_pbd.control.schedule.contents import (
-    ARRAY_DIMS,
-    LABELS,
-    Floats,
-    as_floats,
-    check_positive,
-    checked_fields,
-    require,
-)
+from torch_pbd import checks
+from torch_pbd.checks import Floats
+from torch_pbd.control.schedule.contents import ARRAY_DIMS, LABELS, checked_fields
 from torch_pbd.control.schedule.files import read_schedule, write_schedule
 from torch_pbd.control.schedule.rows import Between, count_rows, row_times
+from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.files.memory import require_much
 
 if TYPE_CHECKING:
     from torch_pbd.control.stability.report import StabilityReport
 
+# Times and velocities keep their digits at any speed that is not a mistake: a year for a second, and the reverse.
 _SLOWEST = 1e-9
 
 
 @final
 @dataclass(frozen=True)
 class DiagonalLoss:
-    """What is lost where a controller takes the diagonals of stiffness and damping only; all 0 if nothing is.
+    """Loss of a controller that takes the diagonals of stiffness and damping only; all 0 if they are all there is.
 
     Attributes
     ----------
     stiffness_max, stiffness_median, damping_max, damping_median : float
-        Frobenius norm of what is off the diagonal over that of the whole; largest and median over time.
+        Frobenius norm of the entries off the diagonal over that of the whole; largest and median over time.
     displacement, time : float
         Largest ||x - x_diagonal|| / ||x|| over all forces and times, where the force displaces the robot by x
         with the whole stiffness, and when that is, in s. 1 is an error as large as the displacement.
@@ -75,17 +71,17 @@ class Schedule:
         In N/m and N s/m, symmetric and positive semidefinite. Where the stiffness is singular, the damping
         must be positive definite: nothing else would stop the robot.
     covariance : array_like of shape (n, d, d)
-        Of the demonstrations; symmetric and positive semidefinite.
+        Covariance of the demonstrations; symmetric and positive semidefinite.
     type1 : array_like of shape (n,)
         How little the model knows: 0 (on data) to 1 (the prior alone).
     names : sequence of d str, default=None
-        Of the outputs.
+        Names of the outputs.
     units, frame : str, default="m", None
-        Unit of the position, name of the coordinate frame; None where it is not told.
+        Unit of the position, name of the coordinate frame; None where it is not known.
     stiffness_limits : (float, float), default=None
         Least and largest eigenvalue that the stiffness may have, in N/m.
     covariance_of : {"position", "forcing"}, default="position"
-        What the covariance is of: a forcing is that of eq. (18).
+        Quantity that the covariance belongs to: a forcing is that of eq. (18).
     mass : float, default=None
         Virtual mass of the admittance that the damping was computed for, kg.
     provenance : mapping, default={}
@@ -93,8 +89,8 @@ class Schedule:
 
     Raises
     ------
-    ValueError
-        If an argument is not as described; names the row.
+    InvalidParameterError
+        If an argument is not as described; a ValueError that names the row.
     """
 
     time: Floats
@@ -124,7 +120,7 @@ class Schedule:
 
     @property
     def duration(self) -> float:
-        """From the first row to the last, in s."""
+        """Time from the first row to the last, in s."""
         return float(self.time[-1] - self.time[0])
 
     def __len__(self) -> int:
@@ -145,16 +141,15 @@ class Schedule:
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # By way of the constructor: NumPy forgets that an array is read-only when it is pickled or copied.
+        # Copies go through the constructor: NumPy forgets that an array is read-only when it is pickled or copied.
         return partial(Schedule, **self._arrays(), **self._labels()), ()
 
     def resample(self, rate: float | None = None, *, times: ArrayLike | None = None) -> "Schedule":
         """Rows at other times, all within the schedule.
 
-        Stiffness, damping, covariance and type1 are piecewise linear, so they stay symmetric, positive
-        semidefinite and within their limits. The position is the cubic of each interval that has the positions
-        and velocities of its ends (Hermite), the velocity the derivative of that cubic and not a straight line:
-        it stays the velocity of the position, and damping acts on no motion that the position does not make.
+        Stiffness, damping, covariance and type1 are piecewise linear, so they stay symmetric, positive semidefinite
+        and within their limits. The position is the cubic of each interval through positions and velocities of its
+        ends (Hermite), the velocity its derivative: damping acts on no motion that the position does not make.
 
         Parameters
         ----------
@@ -169,42 +164,39 @@ class Schedule:
             If not exactly one is given, ``rate`` leaves less than two rows, or a time is outside.
         """
         if (rate is None) == (times is None):
-            raise ValueError(f"give either rate or times; got rate={rate!r} and times={times!r}.")
-        grid = self._ticks(rate) if rate is not None else as_floats(times, "times", 1)
+            raise InvalidParameterError(f"give either rate or times; got rate={rate!r} and times={times!r}.")
+        grid = self._ticks(rate) if rate is not None else checks.array(times, "times", ("m",))
         first, last = self.time[0], self.time[-1]
-        require((grid >= first) & (grid <= last), grid, "times", f"it must be within {first!s} and {last!s} s.")
+        checks.require((grid >= first) & (grid <= last), grid, "times", f"from {first!s} to {last!s} s")
         between = Between(self.time, grid)
         position, velocity = between.hermite(self.position, self.velocity)
         rows: dict[str, Any] = {name: between.linear(array) for name, array in self._arrays().items()}
         rows |= {"time": grid, "position": position, "velocity": velocity}
-        return Schedule(**rows, **self._labels())
+        return replace(self, **rows)
 
     def retime(self, speed: float, *, mass: Any = None) -> "Schedule":
-        """The same schedule ``speed`` times as fast: time / speed, velocity * speed, gains as they are.
+        """Schedule that is ``speed`` times as fast: time / speed, velocity * speed, gains as they are.
 
         Parameters
         ----------
         speed : float
-            Positive; the stiffness rises that much faster too.
+            From 1e-9 to 1e9; the stiffness rises that much faster too.
         mass : float or array_like of shape (d, d), default=None
-            Of the admittance in kg, to compute the stability certificate at the new speed. None: not checked.
+            Mass of the admittance in kg, to certify the stability at the new speed. None: not checked.
 
         Raises
         ------
         ValueError
-            If ``speed`` is not positive, or none of the guarantees of the report holds at it with ``mass``.
+            If ``speed`` is not within these, or none of the guarantees of the report holds at it with ``mass``.
         """
-        check_positive("speed", speed)
-        if not _SLOWEST <= speed <= 1.0 / _SLOWEST:
-            raise ValueError(f"speed={speed:g} must be from {_SLOWEST:g} to {1.0 / _SLOWEST:g} times as fast.")
+        speed = checks.number(speed, "speed", least=_SLOWEST, most=1.0 / _SLOWEST)
         report = None if mass is None else self.certify(mass=mass, speed=speed)
         if report is not None and not report.stable:
-            why = f"its margin is {report.margin:.4g} N/m/s. The highest safe speed is {report.max_speed:.4g}"
+            remedy = f"the margin is {report.margin:.4g} N/m/s; the highest safe speed is {report.max_speed:.4g}"
             if report.margin >= 0.0:
-                why = f"held between rows, its gains let V grow by {report.held_growth - 1.0:.2g}. Resample it finer"
-            raise ValueError(
-                f"speed={speed:g} is not certified to be stable: {why}; or filter the stiffness, and give no mass here."
-            )
+                remedy = f"held between rows, its gains let V grow by {report.held_growth - 1.0:.2g}; resample it finer"
+            remedy = f"{remedy}, or filter the stiffness and give no mass here"
+            raise checks.refusal(speed, "speed", "certified to be stable", remedy)
         return replace(self, time=self.time / speed, velocity=self.velocity * speed)
 
     def certify(self, *, mass: Any = None, **options: Any) -> "StabilityReport":
@@ -214,12 +206,10 @@ class Schedule:
         return certify(self, mass=(self.mass or 1.0) if mass is None else mass, **options)
 
     def diagonal(self) -> tuple["Schedule", DiagonalLoss]:
-        """With diagonal stiffness and damping, for controllers that take no other, and what that loses.
-
-        The nearest diagonal matrix, in the Frobenius norm, is the diagonal itself. It lies between the least and
-        the largest eigenvalue, so within the limits too.
-        """
-        stiffness, damping = _diagonal(self.stiffness), _diagonal(self.damping)
+        """Schedule with diagonal stiffness and damping, for controllers that take no other, and what that loses."""
+        # The nearest diagonal matrix, in the Frobenius norm, is the diagonal itself. It lies between the least and the
+        # largest eigenvalue, so within the limits too; rounding may leave it below zero.
+        stiffness, damping = (np.eye(self.n_outputs) * np.maximum(gain, 0.0) for gain in (self.stiffness, self.damping))
         # x = K^-1 f and x_diagonal = D^-1 f differ by (I - D^-1 K) x: by its spectral norm, for the worst x.
         gains = np.diagonal(stiffness, axis1=1, axis2=2)[..., np.newaxis]
         coupling = (stiffness - self.stiffness) / np.where(gains > 0.0, gains, 1.0)
@@ -243,13 +233,13 @@ class Schedule:
         Raises
         ------
         ValueError, OSError
-            If the suffix is another; if the file cannot be written.
+            If the suffix is another, or the file would be larger than 1 GiB; if it cannot be written.
         """
         write_schedule(Path(path), self._arrays(), self._labels())
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
-        """Read what `save` wrote; nothing in the file is executed.
+        """Read a file of `save`; nothing in it is executed.
 
         Raises
         ------
@@ -268,23 +258,16 @@ class Schedule:
         return {**{name: getattr(self, name) for name in LABELS}, "provenance": dict(self.provenance)}
 
     def _ticks(self, rate: float) -> Floats:
-        check_positive("rate", rate)
+        rate = checks.number(rate, "rate", above=0.0, unit="Hz")
         d, rows = self.n_outputs, self.duration * rate + 1.0
         require_much(3 * 8.0 * rows * (2 + 2 * d + 3 * d * d), what=f"rate={rate:g} Hz", remedy="Lower rate.")
         if count_rows(self.duration, rate) < 2:
-            raise ValueError(
-                f"rate={rate:g} Hz has one row in {self.duration:g} s: take {1 / self.duration:g} or more."
-            )
+            raise checks.refusal(rate, "rate", f"at least {1 / self.duration:g}, for two rows", unit="Hz")
         return np.append(self.time[0] + row_times(self.duration, rate)[:-1], self.time[-1])
 
 
-def _diagonal(matrices: Floats) -> Floats:
-    """Only the diagonals, without what rounding left below zero."""
-    return np.eye(matrices.shape[1]) * np.maximum(matrices, 0.0)
-
-
 def _relative_loss(matrices: Floats, diagonal: Floats) -> tuple[float, float]:
-    """Frobenius norm of what is lost relative to the whole, 0 where all is zero: largest and median over time."""
+    """Frobenius norm of the entries lost relative to the whole, 0 where all is zero: largest and median over time."""
     whole = np.linalg.norm(matrices, axis=(1, 2))
     loss = np.linalg.norm(matrices - diagonal, axis=(1, 2)) / np.where(whole > 0.0, whole, 1.0)
     return float(loss.max()), float(np.median(loss))
