@@ -146,6 +146,16 @@ def test_74_the_command_never_outgrows_what_force_and_schedule_can_cause():
     assert np.abs(velocities).max() <= 2.0 * 400.0 / 2.0 + 0.5 + 1.0
 
 
+@pytest.mark.parametrize("mass", [0.2, 10.0])
+def test_74_the_speed_that_a_force_can_cause_does_not_depend_on_the_mass(mass):
+    controller = RealTimeAdmittance(constant(1e-6, 10.0), mass=mass, force_limit=200.0, spring_limit=1.0)
+    controller.start(0.0)
+    times = np.arange(1, 12_001) / 1000
+    _, velocities, _ = went(controller, times, np.full((len(times), 1), 200.0))
+    assert velocities[-1] == pytest.approx(20.0, rel=1e-4)  # F / D
+    assert controller.faults == 0
+
+
 CLOCKS = {
     "back": lambda now: now - 5.0,
     "still": lambda now: 1.0,

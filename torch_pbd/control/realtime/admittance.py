@@ -121,8 +121,9 @@ class RealTimeAdmittance:
         self._clock = clock = ScheduleClock(table, soft_start, approach_speed, limits.acceleration, on_gap)
         stop = checks.number(stop_deceleration, "stop_deceleration", above=0.0, unit="units/s^2", optional=True)
         self._deceleration = min(stop or max(_DECELERATION, clock.acceleration), limits.acceleration)
-        # Velocity answers a force with an impulse response whose absolute values integrate to 2 / damping at most.
-        damping = table.least_damping * self._mass
+        # Velocity answers a force with an impulse response whose absolute values integrate to 2 / damping at most,
+        # whatever the mass.
+        damping = table.least_damping
         answer = 2.0 * (force_limit + pull) / damping if damping > 0.0 else math.inf
         self._speed_due = clock.speed + answer if velocity_limit is None else limits.speed
         self._turn = threading.Lock()
