@@ -74,9 +74,9 @@ def remove_drafts(folder: Path) -> int:
 
 
 def _target(path: Path) -> Path:
-    """The file to replace: where links lead to one, that one."""
+    """File to replace: the one that links lead to."""
     target = Path(os.path.realpath(path)) if path.is_symlink() else path
-    if target.is_symlink():
+    if target.is_symlink():  # still, after all have been followed: a circle
         raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
     if not target.parent.is_dir():
         raise FileNotFoundError(f"the folder {target.parent} does not exist: make it before saving {path.name}.")
@@ -89,14 +89,13 @@ def _target(path: Path) -> Path:
 
 def _sync_folder(folder: Path) -> None:
     """Have the new name reach the disk too, on systems that can be asked for it."""
+    descriptor = None
     try:
         descriptor = os.open(folder, os.O_RDONLY)
-    except OSError:
-        return
-    try:
         os.fsync(descriptor)
     except OSError as error:
         if error.errno not in _NO_SYNC:
             raise
     finally:
-        os.close(descriptor)
+        if descriptor is not None:
+            os.close(descriptor)
