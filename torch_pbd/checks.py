@@ -208,23 +208,30 @@ def require(good: NDArray[np.bool_], values: NDArray[Any], name: str, must: str,
         raise refusal(value, f"{name}[{', '.join(map(str, index))}]" if index else name, must, remedy)
 
 
-def semidefinite(matrices: NDArray[Any], name: str, *, definite: bool = False) -> None:
-    """Check that matrices (..., d, d) of finite floats are symmetric and positive semidefinite, or definite.
+def symmetric(matrices: NDArray[Any], name: str) -> NDArray[Any]:
+    """Check that matrices (..., d, d) of finite floats are symmetric to rounding; returns the rounding of each (...,).
 
-    Both to rounding, :data:`ROUNDING` of a matrix's largest entry, or a hundred times the resolution of its dtype.
-    A positive definite matrix has a Cholesky factor, which is what is asked of it.
+    It is :data:`ROUNDING` of a matrix's largest entry, or a hundred times the resolution of its dtype.
     """
     if matrices.ndim < 2 or matrices.shape[-1] != matrices.shape[-2] or not matrices.shape[-1]:
         raise InvalidParameterError(f"{name} has shape {matrices.shape}, must have shape (..., d, d).")
-    tolerance = max(ROUNDING, 100.0 * float(np.finfo(matrices.dtype).eps))
     scale = np.abs(matrices).max(axis=(-2, -1), initial=0.0)
     require(scale <= LARGEST, scale, f"the largest entry of {name}", f"finite and at most {LARGEST:g} in size")
+    rounding: NDArray[Any] = max(ROUNDING, 100.0 * float(np.finfo(matrices.dtype).eps)) * scale
     skew = np.abs(matrices - np.swapaxes(matrices, -2, -1)).max(axis=(-2, -1), initial=0.0)
-    remedy = "symmetrize the matrix, (A + A') / 2"
-    require(skew <= tolerance * scale, skew, f"the asymmetry of {name}", "zero", remedy)
-    lowest = np.linalg.eigvalsh(matrices)[..., 0] if matrices.size else scale
+    require(skew <= rounding, skew, f"the asymmetry of {name}", "zero", "symmetrize the matrix, (A + A') / 2")
+    return rounding
+
+
+def semidefinite(matrices: NDArray[Any], name: str, *, definite: bool = False) -> None:
+    """Check that matrices (..., d, d) of finite floats are symmetric and positive semidefinite, or definite.
+
+    Both to rounding, as in :func:`symmetric`.
+    """
+    rounding = symmetric(matrices, name)
+    lowest = np.linalg.eigvalsh(matrices)[..., 0] if matrices.size else rounding
     must = "above zero (positive definite)" if definite else "at least zero (positive semidefinite)"
-    good = lowest > 0.0 if definite else lowest >= -tolerance * scale
+    good = lowest > 0.0 if definite else lowest >= -rounding
     require(good, lowest, f"the smallest eigenvalue of {name}", must, "build it as a product A A'")
 
 
@@ -233,7 +240,7 @@ def warn(message: str, category: type[Warning] = UserWarning) -> None:
     frame, level = sys._getframe(1), 2
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == "torch_pbd":
         frame, level = frame.f_back, level + 1
-    warnings.warn(message, category, stacklevel=level - 1)
+    warnings.warn(message, category, stacklevel=level)
 
 
 def real_array(values: Any, name: str) -> NDArray[Any]:
@@ -292,7 +299,8 @@ def check_real(array: NDArray[Any], name: str) -> None:
     if kind == "c":
         raise ValueError(f"Complex data not supported: {name} is {array.dtype}. Give real and imaginary parts apart.")
     if kind in "mM":
-        raise ValueError(f"{name} holds dates or durations ({array.dtype}): give numbers, such as seconds since then.")
+        nanoseconds = f".astype('{kind}8[ns]').astype('int64')"
+        raise ValueError(f"{name} holds dates or durations ({array.dtype}): give numbers, as {nanoseconds} does in ns.")
     if kind != "O":
         raise ValueError(f"{name} has dtype {array.dtype}: give an array of plain numbers.")
     for place, entry in enumerate(array.flat):
