@@ -3,6 +3,9 @@
 Covariances have shape (n, d, d), one matrix a row, in the squared units of y. Scorers go to ``scoring=`` of
 ``cross_val_score`` and ``GridSearchCV``, which take the highest score for the best: select models by
 :func:`log_likelihood_scorer`; :func:`negative_log_likelihood` and :func:`mahalanobis_coverage` are to report.
+
+All raise ValueError, by the name of the argument, where shapes disagree, an entry is not finite, a matrix is not
+symmetric or, where its Cholesky factor is needed, not positive definite.
 """
 
 import math
@@ -49,11 +52,6 @@ def covariance_mse(
     reduce : {"sum", "mean"}, default="sum"
         Over the entries of one row, d (d + 1) / 2 of a factor and d^2 of a matrix: their sum is the squared
         norm; their mean is what code that averages everything reports. The paper does not say which it is.
-
-    Raises
-    ------
-    ValueError
-        If shapes disagree, an entry is not finite, a matrix is not symmetric or has a negative eigenvalue.
     """
     checks.choice(on, "on", ("cholesky", "matrix"))
     checks.choice(reduce, "reduce", ("sum", "mean"))
@@ -74,11 +72,7 @@ def relative_frobenius_error(estimated: ArrayLike, reference: ArrayLike) -> floa
     Parameters
     ----------
     estimated, reference : array_like of shape (n, d, d)
-
-    Raises
-    ------
-    ValueError
-        If shapes disagree, an entry is not finite, a matrix is not symmetric or a reference is zero.
+        No reference is zero.
     """
     estimated = _covariances(estimated, "estimated")
     reference = _covariances(reference, "reference", estimated.shape)
@@ -105,12 +99,6 @@ def gaussian_kl(
         Positive definite covariances; mind the order.
     reference_mean, estimated_mean : array_like of shape (n, d) or (n,), default=None
         Both or none: None compares the covariances alone, as if the means were equal.
-
-    Raises
-    ------
-    ValueError
-        If shapes disagree, an entry is not finite, a matrix is not symmetric and positive definite, or one
-        mean is given without the other.
     """
     reference = _covariances(reference, "reference")
     estimated = _covariances(estimated, "estimated", reference.shape)
@@ -145,8 +133,6 @@ def negative_log_likelihood(mean: Any, covariance: ArrayLike, y: ArrayLike) -> f
 
     Raises
     ------
-    ValueError
-        If shapes disagree, an entry is not finite, or a covariance is not symmetric and positive definite.
     TypeError
         If the estimator has no ``log_likelihood``.
     """
@@ -183,17 +169,15 @@ def mahalanobis_coverage(
 
     Raises
     ------
-    ValueError
-        If ``level`` is out of range, shapes disagree, an entry is not finite, or a covariance is not
-        symmetric and positive definite.
     TypeError
         If ``covariance`` or ``y`` is missing.
     """
     if covariance is None and y is None and (mean is None or isinstance(mean, Real)):
-        return partial(mahalanobis_coverage, level=_level(level if mean is None else mean))
+        level = checks.number(level if mean is None else mean, "level", above=0.0, below=1.0)
+        return partial(mahalanobis_coverage, level=level)
     if covariance is None or y is None:
         raise TypeError("mahalanobis_coverage takes mean, covariance, y; or estimator, X, y; or a level.")
-    level = _level(level)
+    checks.number(level, "level", above=0.0, below=1.0)
     if _is_estimator(mean):
         mean, covariance = mean.predict(covariance, return_cov=True)
     whitened, _ = _whitened_residual(mean, covariance, y)
@@ -218,10 +202,6 @@ def _mean_log_likelihood(estimator: Any, X: ArrayLike, y: ArrayLike) -> float:
         raise TypeError(f"{type(last).__name__} has no log_likelihood(X, y): pass a covariance regressor.")
     # A pipeline passes on score, its mean, and not log_likelihood itself.
     return float(np.mean(last.log_likelihood(X, y)) if last is estimator else estimator.score(X, y))
-
-
-def _level(level: Any) -> float:
-    return checks.number(level, "level", above=0.0, below=1.0)
 
 
 def _whitened_residual(mean: ArrayLike, covariance: ArrayLike, y: ArrayLike) -> tuple[Floats, Floats]:

@@ -26,12 +26,8 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     A reader sees the old file or the new one; on an error the old one is as it was. The new one has the permissions
     of the old one. Where ``path`` is a link, the file that it leads to is replaced, and the link stays.
 
-    Raises
-    ------
-    FileNotFoundError
-        If its folder does not exist.
-    OSError
-        If it cannot be written, or is a folder, a pipe or a device; with the path, which a full disk does not say.
+    Raises FileNotFoundError if its folder does not exist, and OSError, with the path (which a full disk does not say),
+    if it cannot be written, or is a folder, a pipe or a device.
     """
     file_path = _target(path)
     draft = file_path.with_name(f".{file_path.name}.{os.getpid()}.{token_hex(4)}.draft")

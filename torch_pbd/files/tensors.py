@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from torch_pbd.exceptions import ModelFileError
@@ -24,41 +23,16 @@ MAX_HEADER_BYTES = 2**22
 _MAX_OUTER_BYTES = 4 * MAX_HEADER_BYTES  # the header of safetensors, in which ours is a string with escapes
 _COPIES = 3.0  # the file, the arrays in it, and one array's bytes under the checksum
 _TYPES = ["float64", "float32", "int64", "int32", "int16", "int8", "uint64", "uint32", "uint16", "uint8", "bool"]
-# What reading raises about bytes that are not what they claim to be.
-_DAMAGE = (
-    SafetensorError,
-    struct.error,
-    AttributeError,
-    KeyError,
-    TypeError,
-    ValueError,
-    OSError,
-    RecursionError,
-    MemoryError,
-)
 
 
 def write_checksummed(path: Path, key: str, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays and a header to one file, which is there whole or not at all.
+    """Write arrays of numbers or bools, and a header of what JSON can hold, to one file that is there whole or not.
 
-    Parameters
-    ----------
-    path : Path
-    key : str
-        Kind of the file: the name of the header in the metadata of safetensors.
-    header : mapping
-        What JSON can hold; with ``format_version``, and without ``sha256``, which is added.
-    arrays : mapping of str to ndarray
-        Of floats in 32 or 64 bits, of integers in 8 to 64, or of bools.
+    ``key`` is the kind of the file: the name of the header in the metadata of safetensors. The header has
+    ``format_version``; ``sha256`` is added to it.
 
-    Raises
-    ------
-    TypeError
-        If an array is of another type, or an entry of the header is not what JSON can hold.
-    ValueError
-        If the header is longer than 4 MiB.
-    OSError
-        If it cannot be written; with the path.
+    Raises TypeError if an array is of another type or the header not for JSON, ValueError if it is longer than 4 MiB,
+    OSError, with the path, if the file cannot be written.
     """
     whole = {name: np.asarray(array, order="C") for name, array in arrays.items()}
     _check_types(whole)
@@ -93,7 +67,7 @@ def read_checksummed(path: Path, key: str, format_version: int) -> tuple[dict[st
         header = json.loads(text)
         if json.dumps(header) != text:
             raise ValueError("its header is not as it was written")
-    except _DAMAGE as error:
+    except Exception as error:  # parsers of bytes that are not what they claim to be raise errors of all kinds
         what = f"{str(error) or type(error).__name__:.200}"
         raise ModelFileError(f"{path} is not a model of {key}, or is damaged ({what}).") from error
     found = header.get("format_version") if isinstance(header, dict) else None

@@ -14,18 +14,19 @@ from typing import Any, BinaryIO, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
+from torch_pbd import checks
 from torch_pbd.data.demonstrations import Demonstrations, Missing
-from torch_pbd.data.recordings import check_choice, preview
+from torch_pbd.data.recordings import as_texts, preview
 from torch_pbd.data.units import nanoseconds_hint
 from torch_pbd.exceptions import DataFormatError
 from torch_pbd.files.atomic import LOADERS
 
 DELIMITERS = (",", ";", "\t")
-_LONGEST_HEADER = 2**17
+_LONGEST_HEADER = 2**17  # characters, of thousands of columns; a file without line ends would be one header
 _FEWEST_COUNTED = 5  # rows; fewer rise by one by chance
 
 
-def read_csv(
+def read(
     path: Path,
     max_bytes: int,
     missing: Missing,
@@ -38,17 +39,18 @@ def read_csv(
     frame: str | None = None,
     time_unit: str = "s",
 ) -> Demonstrations:
-    """Read the format of `torch_pbd.data.load_demonstrations`, where the options are told."""
-    check_choice(decimal, (".", ","), "decimal")
-    _check_columns(demo, time, outputs)
+    """Read the format of `torch_pbd.data.load_demonstrations`, which describes the options."""
+    checks.choice(decimal, "decimal", (".", ","))
+    checks.text(demo, "demo", optional=True)
+    checks.text(time, "time")
+    named = None if outputs is None else as_texts(outputs, "outputs")
     if delimiter is not None and (not isinstance(delimiter, str) or len(delimiter) != 1 or delimiter == decimal):
-        raise ValueError(f"delimiter={delimiter!r} must be one character, and not the decimal mark {decimal!r}.")
+        raise checks.refusal(delimiter, "delimiter", f"one character, and not the decimal mark {decimal!r}")
+    wanted = [time] if demo is None else [demo, time]
     with path.open(encoding="utf-8-sig", newline="") as file:
         try:
-            table = _open_table(
-                path, file, delimiter, decimal, missing, wanted=[time] if demo is None else [demo, time]
-            )
-            names = table.output_names(outputs, taken=[demo, time])
+            table = _open_table(path, file, delimiter, decimal, missing, wanted)
+            names = table.output_names(named, wanted)
             times, positions = table.recordings(demo, [time, *names])
         except UnicodeDecodeError as error:
             raise DataFormatError(f"{path} is not text in UTF-8: {error}.") from error
@@ -56,19 +58,13 @@ def read_csv(
         _check_movements(path, names, positions)
     try:
         return Demonstrations(
-            times,
-            positions,
-            names=names,
-            units=units,
-            frame=frame,
-            time_unit=time_unit,
-            missing=missing,
+            times, positions, names=names, units=units, frame=frame, time_unit=time_unit, missing=missing
         )
     except ValueError as error:
         raise DataFormatError(f"{path}: {error}") from error
 
 
-def write_csv(demonstrations: Demonstrations, handle: BinaryIO) -> None:
+def write(demonstrations: Demonstrations, handle: BinaryIO) -> None:
     """Write columns ``demo,time,<names>``; the shortest decimals that come back to the last bit."""
     unusable = [name for name in demonstrations.names if name in ("demo", "time") or name != name.strip()]
     if unusable:
@@ -80,19 +76,6 @@ def write_csv(demonstrations: Demonstrations, handle: BinaryIO) -> None:
         rows = zip(time.tolist(), position.tolist(), strict=True)
         writer.writerows([k, t, *values] for t, values in rows)
     text.detach()
-
-
-def _check_columns(demo: object, time: object, outputs: object) -> None:
-    """Check that columns are named by text."""
-    if not isinstance(demo, str | None):
-        raise ValueError(f"demo={demo!r} must be the name of a column, or None: the file is one demonstration.")
-    if not isinstance(time, str):
-        raise ValueError(f"time={time!r} must be the name of a column.")
-    names = [outputs] if isinstance(outputs, str) else outputs
-    if names is not None and not (
-        isinstance(names, Sequence | np.ndarray) and all(isinstance(name, str) for name in names)
-    ):
-        raise ValueError(f"outputs={outputs!r} must be names of columns, or None: all the others.")
 
 
 def _open_table(
@@ -115,8 +98,7 @@ def _open_table(
         raise DataFormatError(
             f"{path}, line 1: no column {absent[0]!r} among {preview(header)}. Name the columns by "
             "the options demo=, time= and outputs= (demo=None: one demonstration), or give the delimiter."
-            + f" {LOADERS}"
-            * first.startswith("# format:")
+            f"{' ' + LOADERS if first.startswith('# format:') else ''}"
         )
     twice = [name for name, count in Counter(header).items() if name and count > 1]
     if twice:
@@ -125,7 +107,7 @@ def _open_table(
 
 
 def _exact_time(cell: str, time: float) -> float | int:
-    """Time in a cell; as an integer where it is one that float64 does not hold, as stamps in ns are."""
+    """Time of a cell, an integer where float64 does not hold it, as of stamps in ns."""
     stamp = int(cell) if abs(time) >= 2**53 and re.fullmatch(r"\s*[+-]?\d{16,19}\s*", cell) else 0
     return stamp if 2**53 <= abs(stamp) < 2**63 else time
 
@@ -155,21 +137,18 @@ class _Table:
     decimal: str
     missing: Missing
 
-    def output_names(self, outputs: Sequence[str] | None, taken: Sequence[str | None]) -> list[str]:
+    def output_names(self, outputs: Sequence[str] | None, taken: Sequence[str]) -> list[str]:
         """Columns of the outputs, in their order."""
-        if outputs is None:
-            names = [name for name in self.header if name not in taken]
-            if "" in names:
-                raise DataFormatError(
-                    f"{self.path}, line 1: column {self.header.index('') + 1} has no name, as the index of a table "
-                    f"that was written without index=False. Leave it out, or say outputs={[*filter(None, names)]}."
-                )
-        else:
-            names = [outputs] if isinstance(outputs, str) else list(outputs)
+        names = [name for name in self.header if name not in taken] if outputs is None else list(outputs)
+        if outputs is None and "" in names:
+            raise DataFormatError(
+                f"{self.path}, line 1: column {self.header.index('') + 1} has no name, as the index of a table that "
+                f"was written without index=False. Leave it out, or say outputs={[*filter(None, names)]}."
+            )
         known = set(self.header)
-        missing = [name for name in names if name not in known]
-        if missing or not names:
-            what = f"no column {missing[0]!r}" if missing else "no column of outputs"
+        absent = [name for name in names if name not in known]
+        if absent or not names:
+            what = f"no column {absent[0]!r}" if absent else "no column of outputs"
             raise DataFormatError(f"{self.path}, line 1: {what} among {preview(self.header)}.")
         return names
 

@@ -17,7 +17,7 @@ from torch_pbd.files.atomic import LOADERS
 from torch_pbd.files.memory import parsed_bytes, require_memory
 
 
-def read_npz(
+def read(
     path: Path, max_bytes: int, missing: Missing, units: Any = None, time_unit: str | None = None
 ) -> Demonstrations:
     """Read the format of `torch_pbd.data.load_demonstrations`."""
@@ -30,11 +30,11 @@ def read_npz(
         times: Any = _read(path, members, "t")
         positions: Any = _read(path, members, "x")
         if positions.ndim != 3:
-            raise DataFormatError(f"{path}: x has shape {positions.shape}, it must be (K, T, d).")
+            raise DataFormatError(f"{path}: x has shape {positions.shape}, must have shape (K, T, d).")
     else:
-        n_demos = _count(path, members)
-        times = [_read(path, members, f"t_{k}") for k in range(n_demos)]
-        positions = [_read(path, members, f"x_{k}") for k in range(n_demos)]
+        numbers = range(_count(path, members))
+        times = [_read(path, members, f"t_{k}") for k in numbers]
+        positions = [_read(path, members, f"x_{k}") for k in numbers]
     try:
         demonstrations = Demonstrations(
             times,
@@ -43,21 +43,20 @@ def read_npz(
             units=_units(meta) if units is None else units,
             frame=_text(meta, "frame"),
             time_unit=time_unit or _text(meta, "time_unit") or _without_remark(_text(meta, "t_unit")) or "s",
+            alignment=meta.get("alignment"),
             missing=missing,
         )
-        demonstrations._alignment = meta.get("alignment")
-        if demonstrations.alignment not in (None, "phase", "dtw"):
-            raise ValueError(f"meta says alignment = {demonstrations.alignment!r:.80}, it must be 'phase' or 'dtw'")
     except (ValueError, TypeError) as error:
         raise DataFormatError(f"{path}: {error}") from error
-    _check_counts(path, meta, demonstrations)
+    for key, count in {"K": len(demonstrations), "d": demonstrations.n_outputs}.items():
+        if meta.get(key, count) != count:
+            raise DataFormatError(f"{path}: meta says {key} = {meta[key]}, but the arrays have {count}.")
     return demonstrations
 
 
-def write_npz(demonstrations: Demonstrations, handle: BinaryIO) -> None:
+def write(demonstrations: Demonstrations, handle: BinaryIO) -> None:
     """Write the format of `torch_pbd.data.load_demonstrations`."""
-    aligned = demonstrations.is_aligned
-    lengths = demonstrations.n_steps
+    aligned, lengths = demonstrations.is_aligned, demonstrations.n_steps
     meta = {
         "K": len(demonstrations),
         "T": lengths[0] if aligned else [min(lengths), max(lengths)],
@@ -137,11 +136,5 @@ def _units(meta: dict[str, Any]) -> Any:
 
 
 def _without_remark(unit: Any) -> Any:
-    """The unit before the remark in brackets that some recordings add to it."""
+    """Unit before the remark in brackets that some recordings add to it."""
     return unit.partition(" (")[0] if isinstance(unit, str) else unit
-
-
-def _check_counts(path: Path, meta: dict[str, Any], demonstrations: Demonstrations) -> None:
-    for key, count in {"K": len(demonstrations), "d": demonstrations.n_outputs}.items():
-        if meta.get(key, count) != count:
-            raise DataFormatError(f"{path}: meta says {key} = {meta[key]}, but the arrays have {count}.")
