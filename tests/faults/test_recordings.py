@@ -341,13 +341,13 @@ def test_51_a_file_too_large_is_refused_before_it_is_read(suffix, tmp_path, monk
         file.truncate(40 * 10**9)  # a thousand million lines; no block of it is on the disk
     with pytest.raises(DataFormatError, match=r"has 40000000000 bytes, more than max_bytes=536870912: raise it"):
         load_demonstrations(path)
-    with pytest.raises(ValueError, match=r"reading .*huge.* needs about 373 GiB of memory, but .* Split the file"):
+    with pytest.raises(ValueError, match=r"huge.*: reading it needs about 373 GiB of memory, but .* Split the file"):
         load_demonstrations(path, max_bytes=10**12)
 
 
 def test_51_memory_is_counted_for_files_below_the_limit_too(tmp_path, monkeypatch):
     from_text(CSV, tmp_path)
     monkeypatch.setattr(memory, "available_bytes", lambda: 100)
-    with pytest.raises(ValueError, match=r"set\.csv needs about"):
+    with pytest.raises(ValueError, match=r"set\.csv: reading it needs about"):
         load_demonstrations(tmp_path / "set.csv")
     assert io.MAX_BYTES == 512 * 2**20

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.distance import cdist
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
@@ -152,7 +151,9 @@ def _accumulated_cost(a: Floats, b: Floats) -> Floats:
     """Least cost (n + 1, m + 1) of a path to each pair; row and column 0 are the border."""
     n, m = len(a), len(b)
     require_much(24.0 * n * m, what=f"dynamic time warping of {n} by {m} samples", remedy="Take fewer, by n.")
-    cost = cdist(a, b, "sqeuclidean")
+    cost = np.zeros((n, m))  # squared distances; scipy's cdist takes a second to import
+    for column_a, column_b in zip(a.T, b.T, strict=True):
+        cost += np.subtract.outer(column_a, column_b) ** 2
     total = np.full((n + 1, m + 1), np.inf)
     total[0, 0] = 0.0
     for diagonal in range(n + m - 1):  # pairs with i + j = diagonal depend on earlier diagonals only

@@ -17,8 +17,8 @@ MAX_BYTES = 512 * 2**20
 # Bytes in memory for each of a file that is read; of a CSV 4.5 are measured, twice that with shorter numbers.
 _COPIES = 10
 
-# Each module has read(path, max_bytes, missing, **options) and write(demonstrations, handle); they are imported when a
-# file of theirs is met, and what they need from extras with them.
+# Each module has read(path, max_bytes, missing, **options), of which what it raises gets the path here, and
+# write(demonstrations, handle). It is imported when a file of its kind is met, and what it needs from extras with it.
 _FORMATS = {".npz": "torch_pbd.data.formats.npz", ".csv": "torch_pbd.data.formats.csv"}
 
 
@@ -93,10 +93,10 @@ def load_demonstrations(
         )
     try:
         needed = _COPIES * file.stat().st_size
-        require_memory(needed, what=f"reading {file}", remedy="Split the file, or leave samples out.")
-    except ValueError as error:
-        raise DataFormatError(str(error)) from error
-    demonstrations: Demonstrations = reader(file, max_bytes, missing, **options)
+        require_memory(needed, what="reading it", remedy="Split the file, or leave samples out.")
+        demonstrations: Demonstrations = reader(file, max_bytes, missing, **options)
+    except (ValueError, TypeError) as error:
+        raise DataFormatError(f"{file}: {error}") from error
     return demonstrations.from_start() if from_start else demonstrations
 
 
