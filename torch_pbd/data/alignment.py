@@ -55,6 +55,7 @@ def check_overlap(times: Sequence[Floats], time_unit: str) -> None:
     """Refuse recordings with less than half of their median duration in common: most samples would have no match."""
     starts, ends = (np.array([time[i] for time in times]) for i in (0, -1))
     last, first = starts.argmax(), ends.argmin()
+    # Times may lie so far apart that their difference is infinite, which is no overlap either.
     with np.errstate(over="ignore"):
         common, duration = max(ends[first] - starts[last], 0.0), np.median(ends - starts)
     if common < 0.5 * duration:
@@ -135,8 +136,10 @@ def _comparable_scale(curves: Floats, units: Sequence[str] | None) -> Floats:
     if units is None or len(set(units)) == 1:
         return np.ones(curves.shape[2])
     scale = curves.std(axis=(0, 1))
+    # An output that is constant but for rounding tells nothing about timing: 1e-12 is what sums of thousands of samples
+    # leave of float64's 1e-16.
     rounding = 1e-12 * np.abs(curves).max(axis=(0, 1))
-    return np.where(scale > rounding, scale, np.inf)  # a constant output tells nothing about timing
+    return np.where(scale > rounding, scale, np.inf)
 
 
 def _monotone_match(path: NDArray[np.intp]) -> Floats:
@@ -156,7 +159,9 @@ def _accumulated_cost(a: Floats, b: Floats) -> Floats:
         cost += np.subtract.outer(column_a, column_b) ** 2
     total = np.full((n + 1, m + 1), np.inf)
     total[0, 0] = 0.0
-    for diagonal in range(n + m - 1):  # pairs with i + j = diagonal depend on earlier diagonals only
+    # D(i, j) = c(i, j) + min(D(i-1, j-1), D(i-1, j), D(i, j-1)): pairs with one i + j depend on earlier diagonals only,
+    # so that each diagonal is one operation.
+    for diagonal in range(n + m - 1):
         i = np.arange(max(0, diagonal - m + 1), min(n, diagonal + 1))
         j = diagonal - i
         before = np.minimum(total[i, j], np.minimum(total[i, j + 1], total[i + 1, j]))

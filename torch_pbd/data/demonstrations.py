@@ -260,7 +260,8 @@ class Demonstrations:
         checks.choice(method, "method", Alignment)
         n = _checked_n(min(round(float(np.median(self.n_steps))), MAX_DEFAULT_STEPS) if n is None else n)
         grid, positions = on_common_phases(self.times, self.positions, method, n, self.units)
-        alignment = "dtw" if "dtw" in (method, self.alignment) else "phase"  # timing taken out is gone
+        # Timing that was taken out stays out, whatever is done to the demonstrations afterwards.
+        alignment = "dtw" if "dtw" in (method, self.alignment) else "phase"
         return self._replace(grid, positions, time_unit="1", alignment=alignment)
 
     def split(self, k: int | Sequence[int]) -> tuple["Demonstrations", "Demonstrations"]:

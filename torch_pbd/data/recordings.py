@@ -12,7 +12,8 @@ from torch_pbd.data.units import ANGLES, LENGTHS, TIMES, check_unit, exact, nano
 from torch_pbd.exceptions import InvalidParameterError, MissingDataWarning
 
 MIN_SAMPLES = 2
-_LONGEST = 0.25 * float(np.finfo(np.float64).max)  # quarters of times, whose difference is a number
+# Times further apart would have infinite durations, and phases of NaN. Quarters have finite differences.
+_LONGEST = 0.25 * float(np.finfo(np.float64).max)
 Arrays = list[NDArray[Any]]
 
 
@@ -124,6 +125,7 @@ def _samples(values: Any, name: str, drop: bool) -> NDArray[Any]:
 
 def _grids(times: Any, n_demos: int, drop: bool) -> tuple[Arrays, bool]:
     """Times of each demonstration, and whether they are one array that all of them share."""
+    # Times are one array for all if the first entry is a number, and not an array of its own.
     stamps = _as_list(times, "times")
     if _numbers(stamps[0], "times[0]", drop).ndim == 0:
         return [_grid(times, "times", drop)] * n_demos, True
@@ -183,6 +185,7 @@ def _not_missing(grids: Arrays, samples: Arrays) -> list[NDArray[np.intp]]:
 
 
 def _longest_run(hole: NDArray[np.bool_]) -> int:
+    # A run begins where the padded mask turns true and ends where it turns false: edges alternate.
     edges = np.flatnonzero(np.diff(np.r_[False, hole, False]))
     return int((edges[1::2] - edges[::2]).max(initial=0))
 
@@ -211,7 +214,7 @@ def _from_common_origin(grids: Arrays) -> Arrays:
     if not beyond:
         return grids
     origin = min(int(grid.min()) for grid in beyond)
-    # As Python's integers: differences of the machine's may overflow.
+    # As Python's integers, whose differences, over all of int64 or of uint64, do not overflow.
     return [(grid.astype(object) if grid.dtype.kind in "iu" else grid) - origin for grid in grids]
 
 

@@ -167,6 +167,7 @@ def _lanes(n_demos: int, variant: Variant, random: Random) -> NDArray[np.float64
     lanes = random.uniform(-0.6, 0.6, size=n_demos)
     if variant != "two_path":
         return lanes
+    # As many on either side; the lanes, 0 to 0.6 from the middle, go to 0.4 to 0.6.
     side = random.permutation(np.where(np.arange(n_demos) % 2, 1.0, -1.0))
     return side * (0.4 + np.abs(lanes) / 3.0)
 
@@ -186,9 +187,11 @@ def _tunnel_path(time: Floats, duration: float, lane: float, common_start: bool,
     wander, correction, tremor = (
         _band_noise(time, low, high, random) for low, high in [(0.0, 0.25), (0.25, 1.0), (8.0, 12.0)]
     )
+    # The lane is between the walls, whatever its noise adds: tanh keeps it within 0.85 of the half-width.
     along = PATH_LENGTH * time / duration
     across = 0.85 * tunnel_half_width(along) * np.tanh(lane + 0.12 * wander + 0.04 * correction)
     if common_start:
+        # Minimum jerk (Flash, Hogan 1985): velocity and acceleration vanish at both ends of the blend.
         s = np.clip(time / (0.15 * duration), 0.0, 1.0)
         across *= s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
     x = tunnel_center(along) + across + 1e-4 * tremor

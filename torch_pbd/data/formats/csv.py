@@ -116,6 +116,7 @@ class _Table:
                     "times must increase strictly. Sort the lines by time and drop repeated ones."
                     f"{nanoseconds_hint(now)}"
                 )
+            # Arrays of numbers take 8 bytes for each, where lists take 32.
             recorded.setdefault(label, array("d")).extend(row)
             whole = stamps.setdefault(label, array("q"))
             if isinstance(now, int):
@@ -171,6 +172,7 @@ def _open_table(file: TextIO, delimiter: str | None, decimal: str, missing: Miss
         headers = [[name.strip() for name in next(csv.reader([first], delimiter=c), [])] for c in candidates]
     except csv.Error as error:
         raise ValueError(f"line 1: {error}.") from error
+    # A mark that is not the delimiter finds one column, or cuts names that hold it.
     header = max(headers, key=lambda names: (set(wanted) <= set(names), len(names)))
     absent = [name for name in wanted if name not in header]
     if absent:

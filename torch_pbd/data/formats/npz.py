@@ -23,6 +23,7 @@ def read(
     """Read the format of `torch_pbd.data.load_demonstrations`."""
     members = read_members(path.read_bytes(), max_bytes, remedy=f"Raise max_bytes={max_bytes} to read it.")
     meta = _read_meta(members)
+    # One grid of times for all demonstrations, or a grid for each.
     if "t" in members:
         times: Any = _read(members, "t")
         positions: Any = _read(members, "x")
@@ -32,6 +33,7 @@ def read(
         numbers = range(_count(members))
         times = [_read(members, f"t_{k}") for k in numbers]
         positions = [_read(members, f"x_{k}") for k in numbers]
+    # Public recordings say unit and t_unit, with a remark in brackets: "s (100 Hz)".
     demonstrations = Demonstrations(
         times,
         positions,
