@@ -27,6 +27,7 @@ ROUNDING = 1e-9
 """Relative: what is smaller counts as rounding of the caller's arithmetic. float64 itself makes errors of 1e-13 in
 matrices of a hundred rows; files of ten digits make 1e-10."""
 
+_SINGULAR = 1e-14  # an eigenvalue of correlations that rounding alone can make
 _MOST = 2**53  # whole numbers above it are not all floats
 _LONGEST = 80  # letters of a value that are shown
 
@@ -34,7 +35,8 @@ _LONGEST = 80  # letters of a value that are shown
 def refusal(value: Any, name: str, must: str, remedy: str = "", unit: str = "") -> InvalidParameterError:
     """Error to raise for an argument that cannot be used."""
     shown = repr(value.item() if isinstance(value, np.generic) else value)
-    shown = shown if len(shown) <= _LONGEST else f"{shown[:_LONGEST]}..."
+    if len(shown) > _LONGEST or "\n" in shown:
+        shown = f"a {type(value).__name__}"
     return InvalidParameterError(
         f"{name} is {shown}{unit and ' ' + unit}, must be {must}{remedy and ': ' + remedy.rstrip('.')}."
     )
@@ -204,12 +206,12 @@ def require(good: NDArray[np.bool_], values: NDArray[Any], name: str, must: str,
     """Refuse the first value of an array that is not good, by its index."""
     if not good.all():
         index = tuple(map(int, np.argwhere(~good)[0]))
-        value = values[index]
-        raise refusal(value, f"{name}[{', '.join(map(str, index))}]" if index else name, must, remedy)
+        where = f"{name}[{', '.join(map(str, index))}]" if index else name
+        raise refusal(values[index], where, must, remedy)
 
 
 def symmetric(matrices: NDArray[Any], name: str) -> NDArray[Any]:
-    """Check that matrices (..., d, d) of finite floats are symmetric to rounding; returns the rounding of each (...,).
+    """Check that matrices (..., d, d) of floats are finite and symmetric to rounding; returns that of each (...,).
 
     It is :data:`ROUNDING` of a matrix's largest entry, or a hundred times the resolution of its dtype.
     """
@@ -219,20 +221,29 @@ def symmetric(matrices: NDArray[Any], name: str) -> NDArray[Any]:
     require(scale <= LARGEST, scale, f"the largest entry of {name}", f"finite and at most {LARGEST:g} in size")
     rounding: NDArray[Any] = max(ROUNDING, 100.0 * float(np.finfo(matrices.dtype).eps)) * scale
     skew = np.abs(matrices - np.swapaxes(matrices, -2, -1)).max(axis=(-2, -1), initial=0.0)
-    require(skew <= rounding, skew, f"the asymmetry of {name}", "zero", "symmetrize the matrix, (A + A') / 2")
+    require(skew <= rounding, skew, f"the asymmetry of {name}", "zero", "symmetrize it, (A + A') / 2")
     return rounding
 
 
-def semidefinite(matrices: NDArray[Any], name: str, *, definite: bool = False) -> None:
-    """Check that matrices (..., d, d) of finite floats are symmetric and positive semidefinite, or definite.
+def semidefinite(matrices: NDArray[Any], name: str, *, definite: bool = False, remedy: str = "") -> None:
+    """Check that matrices (..., d, d) of floats are finite, symmetric and positive semidefinite, or definite.
 
-    Both to rounding, as in :func:`symmetric`.
+    Symmetric and semidefinite to rounding, as in :func:`symmetric`. Definite is judged by the correlations, as outputs
+    may have units that are far apart.
     """
     rounding = symmetric(matrices, name)
-    lowest = np.linalg.eigvalsh(matrices)[..., 0] if matrices.size else rounding
-    must = "above zero (positive definite)" if definite else "at least zero (positive semidefinite)"
-    good = lowest > 0.0 if definite else lowest >= -rounding
-    require(good, lowest, f"the smallest eigenvalue of {name}", must, "build it as a product A A'")
+    judged = matrices
+    if definite:
+        deviation = np.sqrt(np.diagonal(matrices, axis1=-2, axis2=-1).clip(0.0))
+        product = deviation[..., :, np.newaxis] * deviation[..., np.newaxis, :]
+        # A variance of zero or less leaves zeros, which are not definite.
+        judged = np.divide(matrices, product, out=np.zeros_like(matrices), where=product > 0.0)
+    lowest = np.linalg.eigvalsh(judged)[..., 0] if matrices.size else rounding
+    good = lowest > _SINGULAR if definite else lowest >= -rounding
+    if not good.all():
+        own = np.linalg.eigvalsh(matrices)[..., 0]
+        must = "above zero, positive definite" if definite else "zero or more, positive semidefinite"
+        require(good, own, f"the smallest eigenvalue of {name}", must, remedy or "build it as a product A A'")
 
 
 def warn(message: str, category: type[Warning] = UserWarning) -> None:
