@@ -210,21 +210,30 @@ def require(good: NDArray[np.bool_], values: NDArray[Any], name: str, must: str,
         raise refusal(values[index], where, must, remedy)
 
 
-def semidefinite(matrices: NDArray[Any], name: str, *, definite: bool = False, remedy: str = "") -> None:
-    """Check that matrices (..., d, d) of floats are finite, symmetric and positive semidefinite, or definite.
+def symmetric(matrices: NDArray[Any], name: str) -> NDArray[Any]:
+    """Check that matrices (..., d, d) of floats are finite and symmetric to rounding; returns that of each (...,).
 
-    Symmetric and semidefinite to rounding: :data:`ROUNDING` of a matrix's largest entry, or a hundred times the
-    resolution of its dtype. Definite is judged by the correlations, as outputs may have units that are far apart.
+    It is :data:`ROUNDING` of a matrix's largest entry, or a hundred times the resolution of its dtype.
     """
     if matrices.ndim < 2 or matrices.shape[-1] != matrices.shape[-2] or not matrices.shape[-1]:
         raise InvalidParameterError(f"{name} has shape {matrices.shape}, must have shape (..., d, d).")
-    tolerance = max(ROUNDING, 100.0 * float(np.finfo(matrices.dtype).eps))
     scale = np.abs(matrices).max(axis=(-2, -1), initial=0.0).astype(np.float64)  # float32 cannot hold LARGEST
     require(scale <= LARGEST, scale, f"the largest entry of {name}", f"finite and at most {LARGEST:g} in size")
+    rounding: NDArray[Any] = max(ROUNDING, 100.0 * float(np.finfo(matrices.dtype).eps)) * scale
     skew = np.abs(matrices - np.swapaxes(matrices, -2, -1)).max(axis=(-2, -1), initial=0.0)
-    require(skew <= tolerance * scale, skew, f"the asymmetry of {name}", "zero", "symmetrize it, (A + A') / 2")
+    require(skew <= rounding, skew, f"the asymmetry of {name}", "zero", "symmetrize it, (A + A') / 2")
+    return rounding
+
+
+def semidefinite(matrices: NDArray[Any], name: str, *, definite: bool = False, remedy: str = "") -> None:
+    """Check that matrices (..., d, d) of floats are finite, symmetric and positive semidefinite, or definite.
+
+    Symmetric and semidefinite to rounding, as in :func:`symmetric`. Definite is judged by the correlations, as outputs
+    may have units that are far apart.
+    """
+    rounding = symmetric(matrices, name)
     # Cholesky factors tell semidefinite ones; matrices of zeros have no scale, and pass any shift.
-    if not definite and eigenvalues_above(matrices, -tolerance * np.where(scale > 0.0, scale, 1.0)):
+    if not definite and eigenvalues_above(matrices, -np.where(rounding > 0.0, rounding, 1.0)):
         return
     judged = matrices
     if definite:
@@ -232,8 +241,8 @@ def semidefinite(matrices: NDArray[Any], name: str, *, definite: bool = False, r
         product = deviation[..., :, np.newaxis] * deviation[..., np.newaxis, :]
         # A variance of zero or less leaves zeros, which are not definite.
         judged = np.divide(matrices, product, out=np.zeros_like(matrices), where=product > 0.0)
-    lowest = np.linalg.eigvalsh(judged)[..., 0] if matrices.size else scale
-    good = lowest > _SINGULAR if definite else lowest >= -tolerance * scale
+    lowest = np.linalg.eigvalsh(judged)[..., 0] if matrices.size else rounding
+    good = lowest > _SINGULAR if definite else lowest >= -rounding
     if not good.all():
         own = np.linalg.eigvalsh(matrices)[..., 0]
         must = "above zero, positive definite" if definite else "zero or more, positive semidefinite"
@@ -316,7 +325,8 @@ def check_real(array: NDArray[Any], name: str) -> None:
     if kind == "c":
         raise ValueError(f"Complex data not supported: {name} is {array.dtype}. Give real and imaginary parts apart.")
     if kind in "mM":
-        raise ValueError(f"{name} holds dates or durations ({array.dtype}): give numbers, such as seconds since then.")
+        nanoseconds = f".astype('{kind}8[ns]').astype('int64')"
+        raise ValueError(f"{name} holds dates or durations ({array.dtype}): give numbers, as {nanoseconds} does in ns.")
     if kind != "O":
         raise ValueError(f"{name} has dtype {array.dtype}: give an array of plain numbers.")
     for place, entry in enumerate(array.flat):

@@ -3,30 +3,30 @@
 Covariances have shape (n, d, d), one matrix a row, in the squared units of y. Scorers go to ``scoring=`` of
 ``cross_val_score`` and ``GridSearchCV``, which take the highest score for the best: select models by
 :func:`log_likelihood_scorer`; :func:`negative_log_likelihood` and :func:`mahalanobis_coverage` are to report.
+
+All raise ValueError, by the name of the argument, where shapes disagree, an entry is not finite, a matrix is not
+symmetric or, where its Cholesky factor is needed, not positive definite.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from numbers import Real
 from typing import Any, Literal, overload
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import gammaincinv
 from sklearn.pipeline import Pipeline
 
-from torch_pbd.covariance_arrays import (
-    Floats,
-    covariances,
-    definite_factor,
-    log_det,
-    matching_covariances,
-    rows_beside,
-    semidefinite_factor,
-)
+from torch_pbd import checks
+from torch_pbd.exceptions import InvalidParameterError
 
+Floats = NDArray[np.floating[Any]]
 _Scorer = Callable[[Any, ArrayLike, ArrayLike], float]
+# A pivot of a Cholesky factorization below it is rounding, relative to the diagonal: float64 makes errors of 1e-16, of
+# which a row of a factor collects some.
+_ZERO_PIVOT = 1e-14
 
 
 def covariance_mse(
@@ -52,21 +52,17 @@ def covariance_mse(
     reduce : {"sum", "mean"}, default="sum"
         Over the entries of one row, d (d + 1) / 2 of a factor and d^2 of a matrix: their sum is the squared
         norm; their mean is what code that averages everything reports. The paper does not say which it is.
-
-    Raises
-    ------
-    ValueError
-        If shapes disagree, an entry is not finite, a matrix is not symmetric or has a negative eigenvalue.
     """
-    _check_choice("on", on, ("cholesky", "matrix"))
-    _check_choice("reduce", reduce, ("sum", "mean"))
-    pair = matching_covariances(estimated, reference, names=("estimated", "reference"))
-    d = pair[0].shape[-1]
+    checks.choice(on, "on", ("cholesky", "matrix"))
+    checks.choice(reduce, "reduce", ("sum", "mean"))
+    first = _covariances(estimated, "estimated")
+    second = _covariances(reference, "reference", first.shape)
+    d = first.shape[-1]
     n_entries = d * d
     if on == "cholesky":
-        pair = (semidefinite_factor("estimated", pair[0]), semidefinite_factor("reference", pair[1]))
+        first, second = _semidefinite_factor(first, "estimated"), _semidefinite_factor(second, "reference")
         n_entries = d * (d + 1) // 2
-    squared = np.square(pair[0] - pair[1]).sum(axis=(-2, -1))
+    squared = np.square(first - second).sum(axis=(-2, -1))
     return float(squared.mean()) / (n_entries if reduce == "mean" else 1)
 
 
@@ -76,16 +72,13 @@ def relative_frobenius_error(estimated: ArrayLike, reference: ArrayLike) -> floa
     Parameters
     ----------
     estimated, reference : array_like of shape (n, d, d)
-
-    Raises
-    ------
-    ValueError
-        If shapes disagree, an entry is not finite, a matrix is not symmetric or a reference is zero.
+        No reference is zero.
     """
-    estimated, reference = matching_covariances(estimated, reference, names=("estimated", "reference"))
+    estimated = _covariances(estimated, "estimated")
+    reference = _covariances(reference, "reference", estimated.shape)
     norm = np.linalg.norm(reference, axis=(-2, -1))
-    if (norm <= np.finfo(np.float64).tiny).any():
-        raise ValueError(f"reference[{int(np.argmin(norm))}] is zero: no error is relative to it.")
+    tiny = np.finfo(np.float64).tiny
+    checks.require(norm > tiny, norm, "the norm of reference", "above zero", "no error is relative to zero")
     return float(np.mean(np.linalg.norm(estimated - reference, axis=(-2, -1)) / norm))
 
 
@@ -106,25 +99,21 @@ def gaussian_kl(
         Positive definite covariances; mind the order.
     reference_mean, estimated_mean : array_like of shape (n, d) or (n,), default=None
         Both or none: None compares the covariances alone, as if the means were equal.
-
-    Raises
-    ------
-    ValueError
-        If shapes disagree, an entry is not finite, a matrix is not symmetric and positive definite, or one
-        mean is given without the other.
     """
-    reference, estimated = matching_covariances(reference, estimated, names=("reference", "estimated"))
+    reference = _covariances(reference, "reference")
+    estimated = _covariances(estimated, "estimated", reference.shape)
     n, d, _ = reference.shape
     if (reference_mean is None) != (estimated_mean is None):
-        raise ValueError("reference_mean and estimated_mean go together: give both or none.")
-    shift: Floats = np.zeros((n, d))
+        raise InvalidParameterError("reference_mean and estimated_mean go together: give both or none.")
+    shift = np.zeros((n, d))
     if reference_mean is not None and estimated_mean is not None:
-        shift = rows_beside("reference_mean", reference_mean, n, d) - rows_beside(
-            "estimated_mean", estimated_mean, n, d
-        )
-    reference_tril, estimated_tril = definite_factor("reference", reference), definite_factor("estimated", estimated)
+        shift = _rows(reference_mean, "reference_mean", n, d) - _rows(estimated_mean, "estimated_mean", n, d)
+    # With reference S = R R' and estimate L L': tr(S^-1_est S) is the squared norm of L^-1 R, the distance of the means
+    # that of L^-1 shift. Both are solved at once.
+    reference_tril = _definite_factor(reference, "reference")
+    estimated_tril = _definite_factor(estimated, "estimated")
     whitened = np.linalg.solve(estimated_tril, np.concatenate([reference_tril, shift[..., None]], axis=-1))
-    log_ratio = log_det(estimated_tril) - log_det(reference_tril)
+    log_ratio = _log_det(estimated_tril) - _log_det(reference_tril)
     divergence = 0.5 * (np.square(whitened).sum(axis=(-2, -1)) - d) + log_ratio
     return float(np.mean(np.maximum(divergence, 0.0)))  # equal ones may round to below zero
 
@@ -144,15 +133,13 @@ def negative_log_likelihood(mean: Any, covariance: ArrayLike, y: ArrayLike) -> f
 
     Raises
     ------
-    ValueError
-        If shapes disagree, an entry is not finite, or a covariance is not symmetric and positive definite.
     TypeError
         If the estimator has no ``log_likelihood``.
     """
     if _is_estimator(mean):
         return -_mean_log_likelihood(mean, covariance, y)
     whitened, scale_tril = _whitened_residual(mean, covariance, y)
-    nll = 0.5 * np.square(whitened).sum(-1) + log_det(scale_tril)
+    nll = 0.5 * np.square(whitened).sum(-1) + _log_det(scale_tril)
     return float(nll.mean()) + 0.5 * whitened.shape[-1] * math.log(2 * math.pi)
 
 
@@ -182,17 +169,15 @@ def mahalanobis_coverage(
 
     Raises
     ------
-    ValueError
-        If ``level`` is out of range, shapes disagree, an entry is not finite, or a covariance is not
-        symmetric and positive definite.
     TypeError
         If ``covariance`` or ``y`` is missing.
     """
     if covariance is None and y is None and (mean is None or isinstance(mean, Real)):
-        return partial(mahalanobis_coverage, level=_check_level(level if mean is None else mean))
+        level = checks.number(level if mean is None else mean, "level", above=0.0, below=1.0)
+        return partial(mahalanobis_coverage, level=level)
     if covariance is None or y is None:
         raise TypeError("mahalanobis_coverage takes mean, covariance, y; or estimator, X, y; or a level.")
-    _check_level(level)
+    checks.number(level, "level", above=0.0, below=1.0)
     if _is_estimator(mean):
         mean, covariance = mean.predict(covariance, return_cov=True)
     whitened, _ = _whitened_residual(mean, covariance, y)
@@ -219,21 +204,53 @@ def _mean_log_likelihood(estimator: Any, X: ArrayLike, y: ArrayLike) -> float:
     return float(np.mean(last.log_likelihood(X, y)) if last is estimator else estimator.score(X, y))
 
 
-def _check_level(level: Any) -> float:
-    if isinstance(level, bool) or not isinstance(level, Real) or not 0 < float(level) < 1:
-        raise ValueError(f"level is {level!r}: it must be between 0 and 1, both excluded.")
-    return float(level)
-
-
-def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    if not isinstance(value, str) or value not in choices:
-        raise ValueError(f"{name} is {value!r}: it must be one of {', '.join(map(repr, choices))}.")
-
-
 def _whitened_residual(mean: ArrayLike, covariance: ArrayLike, y: ArrayLike) -> tuple[Floats, Floats]:
-    """L^-1 (y - mean) and the Cholesky factors L of the covariances."""
-    covariance = covariances("covariance", covariance)
+    """L^-1 (y - mean), and the Cholesky factors L of the covariances."""
+    covariance = _covariances(covariance, "covariance")
     n, d, _ = covariance.shape
-    residual = rows_beside("y", y, n, d) - rows_beside("mean", mean, n, d)
-    scale_tril = definite_factor("covariance", covariance)
+    residual = _rows(y, "y", n, d) - _rows(mean, "mean", n, d)
+    scale_tril = _definite_factor(covariance, "covariance")
     return np.linalg.solve(scale_tril, residual[..., None])[..., 0], scale_tril
+
+
+def _covariances(values: ArrayLike, name: str, shape: Sequence[int | str] = ("n", "d", "d")) -> Floats:
+    """Symmetric matrices, one a row."""
+    matrices = checks.array(values, name, shape)
+    if not len(matrices):
+        raise InvalidParameterError(f"{name} has shape {matrices.shape}, must have at least one row.")
+    checks.symmetric(matrices, name)
+    return matrices
+
+
+def _rows(values: ArrayLike, name: str, n: int, d: int) -> Floats:
+    """Rows (n, d) that belong to n covariances of d outputs; of one output also (n,)."""
+    rows = checks.real_floats(values, name)
+    return checks.array(rows[:, np.newaxis] if rows.ndim == d == 1 else rows, name, (n, d))
+
+
+def _log_det(scale_tril: Floats) -> Floats:
+    """Log determinants of factors: half those of their covariances."""
+    return np.log(np.diagonal(scale_tril, axis1=-2, axis2=-1)).sum(-1)
+
+
+def _definite_factor(matrices: Floats, name: str) -> Floats:
+    """Cholesky factors of positive definite matrices."""
+    try:
+        return np.linalg.cholesky(matrices)
+    except np.linalg.LinAlgError:
+        checks.semidefinite(matrices, name, definite=True)  # names the first that has none
+        raise
+
+
+def _semidefinite_factor(matrices: Floats, name: str) -> Floats:
+    """Cholesky factors of matrices that may be singular: columns of zeros where a pivot is zero to rounding."""
+    checks.semidefinite(matrices, name)
+    remainder, factor = matrices.copy(), np.zeros_like(matrices)
+    rounding = _ZERO_PIVOT * np.diagonal(matrices, axis1=-2, axis2=-1)
+    # Outer products: column j of the factor is that of what columns before it leave over, by the root of its pivot.
+    for j in range(matrices.shape[-1]):
+        pivot = remainder[:, j, j]
+        root = np.sqrt(np.where(pivot > rounding[:, j], pivot, np.inf))
+        factor[:, j:, j] = remainder[:, j:, j] / root[:, None]
+        remainder -= factor[:, :, j, None] * factor[:, None, :, j]
+    return factor

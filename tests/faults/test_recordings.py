@@ -10,9 +10,10 @@ import warnings
 import numpy as np
 import pytest
 
-from torch_pbd import CholeskyCovRegressor, DMPController, memory
+from torch_pbd import CholeskyCovRegressor, DMPController
 from torch_pbd.data import Demonstrations, io, load_demonstrations, make_tunnel_demonstrations
 from torch_pbd.exceptions import DataFormatError, MissingDataWarning
+from torch_pbd.files import memory
 
 TIME = np.arange(6.0)
 POSITIONS = np.random.default_rng(0).normal(size=(3, 6, 2))
@@ -159,6 +160,14 @@ def test_9_masked_samples_are_missing_ones():
     np.testing.assert_array_equal(kept.positions[1], POSITIONS[1][[0, 1, 2, 3, 5]])
 
 
+def test_9_samples_of_objects_that_are_none_are_missing_ones():
+    holed = with_entry(POSITIONS, (1, 3, 1), np.nan).astype(object)
+    holed[1, 3, 1] = None
+    with pytest.warns(MissingDataWarning, match="1 of 6 in demonstration 1"):
+        kept = Demonstrations(TIME, holed, missing="drop")
+    np.testing.assert_array_equal(kept.positions[1], POSITIONS[1][[0, 1, 2, 4, 5]])
+
+
 def test_9_one_line_a_demonstration_gets_no_longer_with_many():
     holed = with_entry(np.zeros((40, 6, 1)), (slice(None), 3), np.nan)
     with pytest.warns(
@@ -169,7 +178,7 @@ def test_9_one_line_a_demonstration_gets_no_longer_with_many():
 
 @pytest.mark.parametrize("missing", ["fill", None, True])
 def test_9_the_choice_is_one_of_two(missing, tmp_path):
-    with pytest.raises(ValueError, match=r"missing=.* is not one of 'raise', 'drop'"):
+    with pytest.raises(ValueError, match=r"missing is .*, must be one of 'raise', 'drop'"):
         Demonstrations(TIME, POSITIONS, missing=missing)
 
 
@@ -265,7 +274,7 @@ def test_12_a_movement_has_an_acceleration_from_three_samples_and_is_smoothed_fr
 @pytest.mark.parametrize(
     ("times", "positions", "message"),
     [
-        ([], [], "positions is empty: at least one demonstration is needed"),
+        ([], [], "positions is empty, must have at least one demonstration"),
         (np.empty((0,)), np.empty((0, 0, 2)), "positions is empty"),
         (TIME, np.empty((2, 6, 0)), r"positions\[0\] has shape \(6, 0\)"),
         (np.empty(0), np.empty((2, 0, 2)), "times is empty"),
@@ -332,13 +341,13 @@ def test_51_a_file_too_large_is_refused_before_it_is_read(suffix, tmp_path, monk
         file.truncate(40 * 10**9)  # a thousand million lines; no block of it is on the disk
     with pytest.raises(DataFormatError, match=r"has 40000000000 bytes, more than max_bytes=536870912: raise it"):
         load_demonstrations(path)
-    with pytest.raises(ValueError, match=r"reading .*huge.* needs about 373 GiB of memory, but .* Split the file"):
+    with pytest.raises(ValueError, match=r"huge.*: reading it needs about 373 GiB of memory, but .* Split the file"):
         load_demonstrations(path, max_bytes=10**12)
 
 
 def test_51_memory_is_counted_for_files_below_the_limit_too(tmp_path, monkeypatch):
     from_text(CSV, tmp_path)
     monkeypatch.setattr(memory, "available_bytes", lambda: 100)
-    with pytest.raises(ValueError, match=r"set\.csv needs about"):
+    with pytest.raises(ValueError, match=r"set\.csv: reading it needs about"):
         load_demonstrations(tmp_path / "set.csv")
     assert io.MAX_BYTES == 512 * 2**20

@@ -1,7 +1,6 @@
 """What the arguments of a controller must be."""
 
 import math
-import warnings
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -22,7 +21,6 @@ from torch_pbd.control.schedule.rows import count_rows, row_times
 from torch_pbd.control.stiffness import StiffnessLaw
 from torch_pbd.data import Demonstrations, check_unimodal
 from torch_pbd.data.alignment import TIMING_REMOVED
-from torch_pbd.data.missing import levels_to_caller
 from torch_pbd.data.units import TIMES
 from torch_pbd.estimators.demonstrations import check_groups
 from torch_pbd.estimators.validation import check_squares, checked_values
@@ -159,13 +157,13 @@ def as_demonstrations(X: Demonstrations | ArrayLike, y: ArrayLike | None, groups
             "DMPController needs >= 2 demonstrations, got 1: what varies between demonstrations cannot be learned "
             "from one. Record more, or give groups that tell the samples of several apart."
         )
-    if demonstrations._suspects:
-        raise ValueError(f"A controller cannot be learned of these outputs. {' '.join(demonstrations._suspects)}")
+    if demonstrations.suspects:
+        raise ValueError(f"A controller cannot be learned of these outputs. {' '.join(demonstrations.suspects)}")
     check_unimodal(demonstrations)
     if isinstance(X, Demonstrations):  # arrays have no units: they are in m and s
         warn_of_units(X.units)
     if demonstrations.alignment == "dtw":
-        warnings.warn(TIMING_REMOVED, stacklevel=levels_to_caller())
+        checks.warn(TIMING_REMOVED)
     return demonstrations
 
 

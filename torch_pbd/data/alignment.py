@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from torch_pbd import checks
+from torch_pbd.checks import Floats
 from torch_pbd.data.units import exact, nanoseconds_hint
+from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.files.memory import require_much
-
-Floats = NDArray[np.float64]
 
 TIMING_REMOVED = (
     "The demonstrations were aligned by dynamic time warping, which took differences of timing out that every new "
@@ -19,45 +19,21 @@ TIMING_REMOVED = (
 
 
 def interpolate(times: Floats, positions: Floats, query: Floats) -> Floats:
-    """Positions at other times, linearly between the samples.
-
-    Parameters
-    ----------
-    times : ndarray of shape (n,)
-        Strictly increasing.
-    positions : ndarray of shape (n, d)
-    query : ndarray of shape (m,)
-        Times within the range of ``times``; outside it the end point is held.
-
-    Returns
-    -------
-    ndarray of shape (m, d)
-    """
+    """Positions (n, d) at other times (m,), linearly between the samples; beyond them the end point is held."""
     return np.column_stack([np.interp(query, times, column) for column in positions.T])
 
 
 def unit_phases(times: Sequence[Floats]) -> list[Floats]:
-    """Time of each demonstration mapped affinely onto 0..1.
+    """Time of each demonstration mapped affinely onto 0..1, exactly 0 and 1 at its ends.
 
-    Grids that differ only by offset and duration get the same phases to the last bit: rounding (1e-9 of the
-    duration, or the resolution of large time stamps where that is coarser) would otherwise hide from an
-    estimator that the demonstrations are aligned.
-
-    Parameters
-    ----------
-    times : sequence of K ndarrays of shape (T_k,)
-        Strictly increasing.
-
-    Returns
-    -------
-    list of K ndarrays of shape (T_k,)
-        From exactly 0 to exactly 1.
+    Grids that differ only by offset and duration get the same phases to the last bit: rounding would otherwise hide
+    from an estimator that the demonstrations are aligned.
     """
     return _shared_grids(times, [time[-1] - time[0] for time in times])
 
 
 def times_from_start(times: Sequence[Floats]) -> list[Floats]:
-    """Times counted from the start of each demonstration, with grids that differ only by rounding the same."""
+    """Times counted from the start of each demonstration; grids that differ only by rounding become one."""
     return _shared_grids(times, [1.0] * len(times))
 
 
@@ -68,19 +44,22 @@ def _shared_grids(times: Sequence[Floats], units: Sequence[float]) -> list[Float
     for time, unit in zip(times, units, strict=True):
         own = (time - time[0]) / unit
         grid = grids.setdefault(len(time), own)
+        # Rounding is a billionth of the duration, or what large stamps resolve: each difference has two, and two grids
+        # are compared.
         rounding = max(1e-9 * own[-1], 4.0 * np.spacing(np.abs(time[[0, -1]]).max()) / unit)
         shared.append(grid if np.abs(own - grid).max() <= rounding else own)
     return shared
 
 
 def check_overlap(times: Sequence[Floats], time_unit: str) -> None:
-    """Refuse recordings with less than half of their median duration in common: they would hardly be compared."""
+    """Refuse recordings with less than half of their median duration in common: most samples would have no match."""
     starts, ends = (np.array([time[i] for time in times]) for i in (0, -1))
     last, first = starts.argmax(), ends.argmin()
+    # Times may lie so far apart that their difference is infinite, which is no overlap either.
     with np.errstate(over="ignore"):
         common, duration = max(ends[first] - starts[last], 0.0), np.median(ends - starts)
     if common < 0.5 * duration:
-        raise ValueError(
+        raise InvalidParameterError(
             f"the demonstrations have {common:.3g} of a median duration of {duration:.3g} {time_unit} in common: "
             f"number {last} starts last, at {exact(starts[last])}, {first} ends first, at {exact(ends[first])}. Count "
             "each from its start by .from_start() (from_start=True of load_demonstrations), or take a phase for all by "
@@ -127,38 +106,20 @@ def dtw_path(a: ArrayLike, b: ArrayLike) -> NDArray[np.intp]:
     H. Sakoe, S. Chiba, "Dynamic programming algorithm optimization for spoken word recognition", IEEE
     Transactions on Acoustics, Speech, and Signal Processing 26, 1978.
     """
-    first, second = checks.real_floats(a, "a"), checks.real_floats(b, "b")
-    if first.ndim != 2 or second.ndim != 2 or first.shape[1] != second.shape[1]:
-        raise ValueError(
-            "dtw_path compares curves of shape (n, d) and (m, d) with the same d; got "
-            f"{first.shape} and {second.shape}."
-        )
+    first = checks.array(a, "a", ("n", "d"))
+    second = checks.array(b, "b", ("m", first.shape[1]))
     if not first.size or not second.size:
-        raise ValueError(f"dtw_path needs at least one sample in each curve; got {first.shape}, {second.shape}.")
-    for name, curve in (("a", first), ("b", second)):
-        if not np.isfinite(curve).all():
-            raise ValueError(f"{name} has a value that is not finite: drop or fill in such samples first.")
+        raise InvalidParameterError(f"a has shape {first.shape} and b {second.shape}, must have samples and outputs.")
     return _backtrack(_accumulated_cost(first, second))
 
 
 def dtw_warps(curves: Floats) -> Floats:
-    """Phase of each curve as a function of a phase common to all of them.
+    """Phase (K, n) of each of the curves (K, n, d) as a function of a phase common to all, from exactly 0 to exactly 1.
 
-    Every curve is matched with one of them, the one with the least total distance to the others at equal
-    phase (the medoid); where several of its samples match one sample of the medoid their mean counts, which
-    makes the match a monotone map. The common phase is the mean of these maps, so that the result has the
-    mean timing of the demonstrations, not the timing of the medoid: the warps average to the identity in the
-    sense that w_k = h_k(h^-1(s)) with h the mean of the h_k.
-
-    Parameters
-    ----------
-    curves : ndarray of shape (K, n, d)
-        On one evenly spaced grid of phases. Distances are Euclidean over the outputs as they are given.
-
-    Returns
-    -------
-    ndarray of shape (K, n)
-        Never decreasing, from exactly 0 to exactly 1.
+    Every curve is matched with the medoid, the one with the least total distance to the others at equal phase; where
+    several of its samples match one of the medoid their mean counts, which makes the match a monotone map. The common
+    phase is the mean of these maps, so that the result has the mean timing of the demonstrations, not that of the
+    medoid: w_k = h_k(h^-1(s)), with h the mean of the h_k, average to the identity.
     """
     flat = curves.reshape(len(curves), -1)
     medoid = int(np.argmin([np.linalg.norm(flat - curve, axis=1).sum() for curve in flat]))
@@ -171,12 +132,14 @@ def dtw_warps(curves: Floats) -> Floats:
 
 
 def _comparable_scale(curves: Floats, units: Sequence[str] | None) -> Floats:
-    """What to divide each output of curves (K, n, d) by before distances are taken over all of them, (d,)."""
+    """Divisor (d,) of each output of curves (K, n, d), after which distances over all of them mean something."""
     if units is None or len(set(units)) == 1:
         return np.ones(curves.shape[2])
     scale = curves.std(axis=(0, 1))
+    # An output that is constant but for rounding tells nothing about timing: 1e-12 is what sums of thousands of samples
+    # leave of float64's 1e-16.
     rounding = 1e-12 * np.abs(curves).max(axis=(0, 1))
-    return np.where(scale > rounding, scale, np.inf)  # a constant output tells nothing about timing
+    return np.where(scale > rounding, scale, np.inf)
 
 
 def _monotone_match(path: NDArray[np.intp]) -> Floats:
@@ -191,12 +154,14 @@ def _accumulated_cost(a: Floats, b: Floats) -> Floats:
     """Least cost (n + 1, m + 1) of a path to each pair; row and column 0 are the border."""
     n, m = len(a), len(b)
     require_much(24.0 * n * m, what=f"dynamic time warping of {n} by {m} samples", remedy="Take fewer, by n.")
-    cost = np.zeros((n, m))
+    cost = np.zeros((n, m))  # squared distances; scipy's cdist takes a second to import
     for column_a, column_b in zip(a.T, b.T, strict=True):
         cost += np.subtract.outer(column_a, column_b) ** 2
     total = np.full((n + 1, m + 1), np.inf)
     total[0, 0] = 0.0
-    for diagonal in range(n + m - 1):  # pairs with i + j = diagonal depend on earlier diagonals only
+    # D(i, j) = c(i, j) + min(D(i-1, j-1), D(i-1, j), D(i, j-1)): pairs with one i + j depend on earlier diagonals only,
+    # so that each diagonal is one operation.
+    for diagonal in range(n + m - 1):
         i = np.arange(max(0, diagonal - m + 1), min(n, diagonal + 1))
         j = diagonal - i
         before = np.minimum(total[i, j], np.minimum(total[i, j + 1], total[i + 1, j]))

@@ -1,37 +1,25 @@
 """The container: K recordings of one task, checked once, never changed."""
 
-import warnings
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, final, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torch_pbd.data.alignment import (
-    Floats,
-    check_overlap,
-    interpolate,
-    on_common_phases,
-    times_from_start,
-    unit_phases,
-)
-from torch_pbd.data.missing import levels_to_caller
-from torch_pbd.data.recordings import (
-    as_mask,
-    as_names,
-    as_recordings,
-    as_units,
-    check_choice,
-    check_frame_and_unit,
-    check_n_steps,
-    preview,
-)
-from torch_pbd.data.suspects import find_suspects
+from torch_pbd import checks
+from torch_pbd.checks import Floats
+from torch_pbd.data.alignment import check_overlap, interpolate, on_common_phases, times_from_start, unit_phases
+from torch_pbd.data.recordings import MIN_SAMPLES, as_names, as_recordings, as_time_unit, as_units, preview
+from torch_pbd.data.units import find_suspects
+from torch_pbd.exceptions import InvalidParameterError
+from torch_pbd.files.memory import require_much
 
 Alignment = Literal["phase", "dtw"]
 Missing = Literal["raise", "drop"]
+
 MAX_DEFAULT_STEPS = 200
-"""Most points `Demonstrations.align` takes of its own accord."""
+"""Most points `Demonstrations.align` takes of its own accord: dynamic time warping takes time in their square."""
 
 
 class Demonstration(NamedTuple):
@@ -42,6 +30,7 @@ class Demonstration(NamedTuple):
 
 
 @final
+@dataclass(frozen=True, init=False, eq=False, repr=False)
 class Demonstrations:
     """K recordings of one task, of any lengths and sampling times, with the same d outputs.
 
@@ -64,17 +53,25 @@ class Demonstrations:
         Name of the coordinate frame.
     time_unit : str, default="s"
         Unit of ``times``: h, min, s, ms, us, ns; "1" for phase.
+    alignment : {"phase", "dtw"}, default=None
+        How `align` brought the demonstrations onto one grid; None where it did not.
     missing : {"raise", "drop"}, default="raise"
         "drop" leaves out samples of which the time or a position is NaN or masked, and warns
         (`MissingDataWarning`) of how many; each demonstration then has its own times. Infinity is an error.
 
+    Attributes
+    ----------
+    times, positions, names, units, frame, time_unit, alignment
+        As above: tuples of K read-only arrays, tuples of d strings.
+    suspects : tuple of str
+        Sentences on outputs that have no mean as they are, each with its remedy.
+
     Raises
     ------
     ValueError
-        If there is no demonstration, if lengths or numbers of outputs disagree, if a demonstration has (left) fewer
-        than two samples, if a value is not a finite real number, or if times do not increase strictly or are
-        stored too coarsely to tell samples apart; or if a name has control characters, or a unit is a known one in
-        another spelling ("MM", "millimeter", "sec").
+        If there is no demonstration, lengths or numbers of outputs disagree, a demonstration has (left) fewer than two
+        samples, a value is not a finite real number, times do not increase strictly or are stored too coarsely to tell
+        samples apart, a name has control characters, or a unit is a known one in another spelling ("MM", "sec").
 
     Warns
     -----
@@ -93,7 +90,14 @@ class Demonstrations:
            [0., 2., 4.]])
     """
 
-    __slots__ = ("_alignment", "_frame", "_names", "_positions", "_suspects", "_time_unit", "_times", "_units")
+    times: tuple[Floats, ...]
+    positions: tuple[Floats, ...]
+    names: tuple[str, ...]
+    units: tuple[str, ...] | None
+    frame: str | None
+    time_unit: str
+    alignment: Alignment | None
+    suspects: tuple[str, ...]
 
     def __init__(
         self,
@@ -104,76 +108,46 @@ class Demonstrations:
         units: str | Sequence[str] | None = None,
         frame: str | None = None,
         time_unit: str = "s",
+        alignment: Alignment | None = None,
         missing: Missing = "raise",
     ) -> None:
-        self._times, self._positions = as_recordings(times, positions, missing)
-        d = self.n_outputs
-        self._names = as_names([f"y{i}" for i in range(d)] if names is None else names, d)
-        self._units = as_units(units, d)
-        check_frame_and_unit(frame, time_unit)
-        self._frame = frame
-        self._time_unit = time_unit
-        self._alignment: Alignment | None = None
-        self._suspects = find_suspects(self._positions, self._names, self._units)
-        if self._suspects:
-            warnings.warn(" ".join(self._suspects), stacklevel=levels_to_caller())
-
-    @property
-    def times(self) -> tuple[Floats, ...]:
-        """Times (T_k,) of each demonstration."""
-        return self._times
-
-    @property
-    def positions(self) -> tuple[Floats, ...]:
-        """Positions (T_k, d) of each demonstration."""
-        return self._positions
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Name of each output."""
-        return self._names
-
-    @property
-    def units(self) -> tuple[str, ...] | None:
-        """Unit of each output, or None where it was not told."""
-        return self._units
-
-    @property
-    def frame(self) -> str | None:
-        """Name of the coordinate frame."""
-        return self._frame
-
-    @property
-    def time_unit(self) -> str:
-        """Unit of the times; "1" where they are phases."""
-        return self._time_unit
-
-    @property
-    def alignment(self) -> Alignment | None:
-        """How `align` brought the demonstrations onto one grid; None where it did not."""
-        return self._alignment
+        times_, positions_ = as_recordings(times, positions, missing)
+        d = positions_[0].shape[1]
+        names_, units_ = as_names(names, d), as_units(units, d)
+        # A frozen class sets its attributes by its dictionary.
+        vars(self).update(
+            times=times_,
+            positions=positions_,
+            names=names_,
+            units=units_,
+            frame=checks.text(frame, "frame", optional=True),
+            time_unit=as_time_unit(time_unit),
+            alignment=alignment if alignment is None else checks.choice(alignment, "alignment", Alignment),
+            suspects=find_suspects(positions_, names_, units_),
+        )
+        if self.suspects:
+            checks.warn(" ".join(self.suspects))
 
     @property
     def n_outputs(self) -> int:
         """Number of outputs d."""
-        return self._positions[0].shape[1]
+        return self.positions[0].shape[1]
 
     @property
     def n_steps(self) -> tuple[int, ...]:
         """Number of samples T_k of each demonstration."""
-        return tuple(len(time) for time in self._times)
+        return tuple(map(len, self.times))
 
     @property
     def is_aligned(self) -> bool:
         """Whether all demonstrations share exactly one grid of times."""
-        first = self._times[0]
-        return all(time is first or np.array_equal(time, first) for time in self._times)
+        return all(np.array_equal(time, self.times[0]) for time in self.times)
 
     def __len__(self) -> int:
-        return len(self._times)
+        return len(self.times)
 
     def __iter__(self) -> Iterator[Demonstration]:
-        return map(Demonstration, self._times, self._positions)
+        return map(Demonstration, self.times, self.positions)
 
     @overload
     def __getitem__(self, index: int) -> Demonstration: ...
@@ -183,31 +157,32 @@ class Demonstrations:
         """One demonstration by its number; several by a slice, a list of numbers or a mask."""
         chosen = np.arange(len(self))[index]
         if chosen.ndim == 0:
-            return Demonstration(self._times[chosen], self._positions[chosen])
-        times, positions = [self._times[k] for k in chosen], [self._positions[k] for k in chosen]
-        suspects = find_suspects(positions, self._names, self._units) if self._suspects else ()
+            return Demonstration(self.times[chosen], self.positions[chosen])
+        times, positions = [self.times[k] for k in chosen], [self.positions[k] for k in chosen]
+        suspects = find_suspects(positions, self.names, self.units) if self.suspects else ()
         return self._replace(times, positions, suspects=suspects)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Demonstrations):
             return NotImplemented
-        return self._labels() == other._labels() and all(
-            len(mine) == len(theirs) and all(map(np.array_equal, mine, theirs))
-            for mine, theirs in [(self._times, other._times), (self._positions, other._positions)]
+        labels = ("n_steps", "names", "units", "frame", "time_unit")
+        arrays = zip((*self.times, *self.positions), (*other.times, *other.positions), strict=True)
+        return all(getattr(self, name) == getattr(other, name) for name in labels) and all(
+            np.array_equal(mine, theirs) for mine, theirs in arrays
         )
 
     def __repr__(self) -> str:
         shortest, longest = min(self.n_steps), max(self.n_steps)
         n_steps = f"{longest}" if shortest == longest else f"{shortest}..{longest}"
-        outputs = f"outputs={self._names}" if self.n_outputs <= 6 else f"n_outputs={self.n_outputs}"
+        outputs = f"outputs={self.names}" if self.n_outputs <= 6 else f"n_outputs={self.n_outputs}"
         return (
             f"Demonstrations(n_demos={len(self)}, n_steps={n_steps}, {outputs}, "
-            f"time_unit={self._time_unit!r}, aligned={self.is_aligned})"
+            f"time_unit={self.time_unit!r}, aligned={self.is_aligned})"
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
         # By way of __init__: NumPy forgets that an array is read-only when it is pickled or copied.
-        return _rebuild, (self._times, self._positions, self._state())
+        return _rebuild, (self.times, self.positions, vars(self))
 
     def stack(self, input: Literal["time", "phase"] = "time") -> tuple[Floats, Floats, NDArray[np.intp]]:
         """All samples below each other, as scikit-learn's estimators want them.
@@ -231,44 +206,36 @@ class Demonstrations:
         ValueError
             By time, if what all demonstrations have in common is shorter than half of their median duration.
         """
-        check_choice(input, ("time", "phase"), "input")
+        checks.choice(input, "input", ("time", "phase"))
         if input == "time":
-            check_overlap(self._times, self._time_unit)
-        inputs = self._times if input == "time" else unit_phases(self._times)
+            check_overlap(self.times, self.time_unit)
+        inputs = self.times if input == "time" else unit_phases(self.times)
         groups = np.repeat(np.arange(len(self)), self.n_steps)
-        return np.concatenate(inputs)[:, np.newaxis], np.concatenate(self._positions), groups
+        return np.concatenate(inputs)[:, np.newaxis], np.concatenate(self.positions), groups
 
     def to_array(self) -> Floats:
-        """Positions (K, T, d) of aligned demonstrations.
-
-        Raises
-        ------
-        ValueError
-            If the demonstrations do not share one grid of times.
-        """
+        """Positions (K, T, d) of aligned demonstrations; ValueError if they do not share one grid of times."""
         if not self.is_aligned:
-            lengths = preview(self.n_steps)
-            raise ValueError(
-                f"the demonstrations are not aligned (lengths {lengths}, or times that differ): use .align() "
-                "for a common phase, or .resample(n) where all cover the same time."
+            raise InvalidParameterError(
+                f"the demonstrations are not aligned (lengths {preview(self.n_steps)}, or times that differ): use "
+                ".align() for a common phase, or .resample(n) where all cover the same time."
             )
-        return np.stack(self._positions)
+        return np.stack(self.positions)
 
     def from_start(self) -> "Demonstrations":
-        """The same with the times of each demonstration counted from its start.
+        """These demonstrations with the times of each counted from its start.
 
         Grids that then differ by no more than their stamps resolve become one, as in ``stack("phase")``.
         """
-        return self._replace(times_from_start(self._times), self._positions)
+        return self._replace(times_from_start(self.times), self.positions)
 
     def resample(self, n: int) -> "Demonstrations":
         """Each demonstration at ``n`` points evenly spaced over its own time, by linear interpolation.
 
         Demonstrations that start and end at the same times are aligned afterwards.
         """
-        check_n_steps(n)
-        grids = [np.linspace(time[0], time[-1], n) for time in self._times]
-        return self._replace(grids, list(map(interpolate, self._times, self._positions, grids)))
+        grids = [np.linspace(time[0], time[-1], _checked_n(n)) for time in self.times]
+        return self._replace(grids, list(map(interpolate, self.times, self.positions, grids)))
 
     def align(self, method: Literal["phase", "dtw"] = "phase", n: int | None = None) -> "Demonstrations":
         """All demonstrations on one grid of phases, evenly spaced over 0..1; ``time_unit`` becomes "1".
@@ -276,59 +243,54 @@ class Demonstrations:
         Parameters
         ----------
         method : {"phase", "dtw"}, default="phase"
-            "phase" is linear time normalization. "dtw" then takes differences of timing out by dynamic time
-            warping (`torch_pbd.data.alignment.dtw_warps`), keeping the ends of each demonstration and the
-            mean timing of all. It also takes for timing what only looks like it: use it where the
-            shape is what matters, and not to predict new demonstrations, in which the timing comes back
-            (measured: 3.7 nats a step worse). It compares positions in their units; outputs whose ``units``
-            differ are compared in standard deviations.
+            "phase" is linear time normalization. "dtw" then takes differences of timing out by dynamic time warping
+            (`torch_pbd.data.alignment.dtw_warps`), keeping the ends of each demonstration and the mean timing of all.
+            It also takes for timing what only looks like it: use it where the shape is what matters, and not to predict
+            new demonstrations, in which the timing comes back (measured: 3.7 nats a step worse). It compares positions
+            in their units; outputs whose ``units`` differ are compared in standard deviations.
         n : int, default=None
-            Number of phases; None takes the median number of samples, at most 200. "dtw" takes time and
-            memory in proportion to its square.
+            Number of phases; None takes the median number of samples, at most 200. "dtw" takes time and memory in
+            proportion to its square.
 
         Returns
         -------
         Demonstrations
             Aligned.
         """
-        check_choice(method, ("phase", "dtw"), "method")
-        if n is None:
-            n = min(round(float(np.median(self.n_steps))), MAX_DEFAULT_STEPS)
-        check_n_steps(n)
-        grid, positions = on_common_phases(self._times, self._positions, method, n, self._units)
-        alignment = "dtw" if "dtw" in (method, self._alignment) else "phase"  # timing taken out is gone
+        checks.choice(method, "method", Alignment)
+        n = _checked_n(min(round(float(np.median(self.n_steps))), MAX_DEFAULT_STEPS) if n is None else n)
+        grid, positions = on_common_phases(self.times, self.positions, method, n, self.units)
+        # Timing that was taken out stays out, whatever is done to the demonstrations afterwards.
+        alignment = "dtw" if "dtw" in (method, self.alignment) else "phase"
         return self._replace(grid, positions, time_unit="1", alignment=alignment)
 
     def split(self, k: int | Sequence[int]) -> tuple["Demonstrations", "Demonstrations"]:
-        """Leave demonstrations out: ``(train, test)``, where ``test`` has those numbered ``k``.
-
-        Raises
-        ------
-        ValueError
-            If there is no such demonstration, or if either part would be empty.
-        """
-        held_out = as_mask(k, len(self))
+        """Leave demonstrations out: ``(train, test)``, where ``test`` has those numbered ``k``, and ``train`` some."""
+        held_out = np.zeros(len(self), dtype=bool)
+        try:
+            held_out[np.asarray(k)] = True
+        except IndexError as error:
+            must = f"the number of a demonstration, or a list of them, numbered 0 to {len(self) - 1}"
+            raise checks.refusal(k, "k", must) from error
+        if held_out.all():
+            raise InvalidParameterError(
+                f"k leaves out {len(self)} of {len(self)} demonstrations: both parts need some."
+            )
         return self[~held_out], self[held_out]
 
-    def _labels(self) -> dict[str, Any]:
-        return {
-            "names": self._names,
-            "units": self._units,
-            "frame": self._frame,
-            "time_unit": self._time_unit,
-        }
-
-    def _state(self) -> dict[str, Any]:
-        return {**self._labels(), "alignment": self._alignment, "suspects": self._suspects}
-
     def _replace(self, times: Any, positions: Any, **changes: Any) -> "Demonstrations":
-        return _rebuild(times, positions, {**self._state(), **changes})
+        return _rebuild(times, positions, {**vars(self), **changes})
 
 
-def _rebuild(times: Any, positions: Any, labels: dict[str, Any]) -> Demonstrations:
-    """Demonstrations made of others, whose labels were checked and of which all has been told."""
+def _rebuild(times: Any, positions: Any, attributes: dict[str, Any]) -> Demonstrations:
+    """Demonstrations made of others, whose labels were checked and whose suspects were warned of."""
     rebuilt = object.__new__(Demonstrations)
-    rebuilt._times, rebuilt._positions = as_recordings(times, positions, "raise")
-    for name, value in {"alignment": None, "suspects": (), **labels}.items():
-        setattr(rebuilt, f"_{name}", value)
+    times, positions = as_recordings(times, positions, "raise")
+    vars(rebuilt).update(attributes, times=times, positions=positions)
     return rebuilt
+
+
+def _checked_n(n: int) -> int:
+    checks.count(n, "n", least=MIN_SAMPLES)
+    require_much(64.0 * n, what=f"n={n} points", remedy="Lower it.")
+    return n

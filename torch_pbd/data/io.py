@@ -1,16 +1,14 @@
-"""Demonstrations from files and to files: the doors; each format has its own module."""
+"""Demonstrations from files and to files: the doors; each format has its own module, named in one table."""
 
 import inspect
 import os
-from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
-from typing import Any, BinaryIO
+from types import ModuleType
+from typing import Any
 
-import numpy as np
-
+from torch_pbd import checks
 from torch_pbd.data.demonstrations import Demonstrations, Missing
-from torch_pbd.data.formats.csv import read_csv, write_csv
-from torch_pbd.data.formats.npz import read_npz, write_npz
 from torch_pbd.exceptions import DataFormatError
 from torch_pbd.files.atomic import LOADERS, replacing
 from torch_pbd.files.memory import require_memory
@@ -19,8 +17,9 @@ MAX_BYTES = 512 * 2**20
 # Bytes in memory for each of a file that is read; of a CSV 4.5 are measured, twice that with shorter numbers.
 _COPIES = 10
 
-_READERS: dict[str, Callable[..., Demonstrations]] = {".npz": read_npz, ".csv": read_csv}
-_WRITERS: dict[str, Callable[[Demonstrations, BinaryIO], None]] = {".npz": write_npz, ".csv": write_csv}
+# Each module has read(path, max_bytes, missing, **options), of which what it raises gets the path here, and
+# write(demonstrations, handle). It is imported when a file of its kind is met, and what it needs from extras with it.
+_FORMATS = {".npz": "torch_pbd.data.formats.npz", ".csv": "torch_pbd.data.formats.csv"}
 
 
 def load_demonstrations(
@@ -79,10 +78,9 @@ def load_demonstrations(
         If the file is not what its suffix says; names the array, or the line and the column. Or if it is too large
         for the memory.
     """
-    if isinstance(max_bytes, bool) or not isinstance(max_bytes, int | np.integer):
-        raise ValueError(f"max_bytes={max_bytes!r} must be a whole number: the bytes of the largest file to read.")
+    checks.count(max_bytes, "max_bytes", remedy="the bytes of the largest file to read")
     file = Path(path)
-    reader = _READERS[_known_suffix(file)]
+    reader = _format(file).read
     known = list(inspect.signature(reader).parameters)[3:]
     unknown = [option for option in options if option not in known]
     if unknown:
@@ -93,12 +91,12 @@ def load_demonstrations(
         raise DataFormatError(
             f"{file} has {file.stat().st_size} bytes, more than max_bytes={max_bytes}: raise it to read this."
         )
-    needed = _COPIES * file.stat().st_size
     try:
-        require_memory(needed, what=f"reading {file}", remedy="Split the file, or leave samples out.")
-    except ValueError as error:
-        raise DataFormatError(str(error)) from error
-    demonstrations = reader(file, max_bytes, missing, **options)
+        needed = _COPIES * file.stat().st_size
+        require_memory(needed, what="reading it", remedy="Split the file, or leave samples out.")
+        demonstrations: Demonstrations = reader(file, max_bytes, missing, **options)
+    except (ValueError, TypeError) as error:
+        raise DataFormatError(f"{file}: {error}") from error
     return demonstrations.from_start() if from_start else demonstrations
 
 
@@ -123,15 +121,15 @@ def save_demonstrations(demonstrations: Demonstrations, path: str | os.PathLike[
         If the folder does not exist.
     """
     file = Path(path)
-    write = _WRITERS[_known_suffix(file)]
+    write = _format(file).write
     with replacing(file) as handle:
         write(demonstrations, handle)
 
 
-def _known_suffix(file: Path) -> str:
+def _format(file: Path) -> ModuleType:
     suffix = file.suffix.lower()
-    if suffix not in _READERS:
+    if suffix not in _FORMATS:
         raise ValueError(
-            f"{file} has the suffix {file.suffix!r}; known formats of demonstrations: {', '.join(_READERS)}. {LOADERS}"
+            f"{file} has the suffix {file.suffix!r}; known formats of demonstrations: {', '.join(_FORMATS)}. {LOADERS}"
         )
-    return suffix
+    return import_module(_FORMATS[suffix])

@@ -1,4 +1,4 @@
-"""What a set of recordings must be before it becomes ``Demonstrations``."""
+"""Recordings before they become ``Demonstrations``: rows of finite samples at times that rise, and their labels."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -7,155 +7,187 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torch_pbd import checks
-from torch_pbd.data.alignment import Floats
-from torch_pbd.data.missing import drop_missing
+from torch_pbd.checks import Floats
 from torch_pbd.data.units import ANGLES, LENGTHS, TIMES, check_unit, exact, nanoseconds_hint
-from torch_pbd.files.memory import require_much
+from torch_pbd.exceptions import InvalidParameterError, MissingDataWarning
 
 MIN_SAMPLES = 2
-_LONGEST = 0.25 * float(np.finfo(np.float64).max)  # quarters of times, whose difference is a number
-
-# Of dates and durations, which .astype(float) makes numbers that are too coarse, of whatever unit.
-_CONVERSION = {kind: f".astype('{kind}8[ns]').astype('int64') and time_unit='ns'" for kind in "Mm"}
+# Times further apart would have infinite durations, and phases of NaN. Quarters have finite differences.
+_LONGEST = 0.25 * float(np.finfo(np.float64).max)
+Arrays = list[NDArray[Any]]
 
 
 def as_recordings(times: Any, positions: Any, missing: str) -> tuple[tuple[Floats, ...], tuple[Floats, ...]]:
-    """Read-only float64 copies: K times (T_k,) and K positions (T_k, d)."""
-    check_choice(missing, ("raise", "drop"), "missing")
-    drop = missing == "drop"
-    recordings = [_position_array(p, k, drop) for k, p in enumerate(_as_list(positions, "positions"))]
-    stamps = _as_list(times, "times")
-    shared = _as_numbers(stamps[0], "times[0]", drop).ndim == 0
-    if shared:
-        grids = [_time_array(times, "times", drop)]
-        _check_shared_length(len(grids[0]), recordings)
-    elif len(stamps) != len(recordings):
-        raise ValueError(
-            f"times has {len(stamps)} arrays but positions has {len(recordings)} demonstrations: give one "
-            "time array for each demonstration, or one 1-D array that all of them share."
-        )
-    else:
-        grids = [_time_array(time, f"times[{k}]", drop) for k, time in enumerate(stamps)]
-    _check_consistent(grids * len(recordings) if shared else grids, recordings)
-    kept: Sequence[NDArray[np.intp]] = [np.arange(len(position)) for position in recordings]
+    """Read-only float64 copies: K times (T_k,) and K positions (T_k, d), less the missing samples if these are dropped.
+
+    Messages number the samples as they were before.
+    """
+    drop = checks.choice(missing, "missing", ("raise", "drop")) == "drop"
+    samples = [_samples(entry, f"positions[{k}]", drop) for k, entry in enumerate(_as_list(positions, "positions"))]
+    grids, shared = _grids(times, len(samples), drop)
+    names = ["times" if shared else f"times[{k}]" for k in range(len(grids))]
+    _check_shapes(grids, samples, names)
+    kept = [np.arange(len(grid)) for grid in grids]
     if drop:
-        grids, shared = grids * len(recordings) if shared else grids, False
-        grids, recordings, kept = drop_missing(grids, recordings, MIN_SAMPLES)
-    counted, argument = _from_common_origin(grids), "times" if shared else "times[{}]"
-    frozen = [_as_time(t, grids[k], argument.format(k), kept[k]) for k, t in enumerate(counted)]
-    times_ = frozen * len(recordings) if shared else frozen
-    return tuple(times_), tuple(_as_position(p, k, kept[k]) for k, p in enumerate(recordings))
+        kept = _not_missing(grids, samples)
+        grids = [grid[numbers] for grid, numbers in zip(grids, kept, strict=True)]
+        samples = [sample[numbers] for sample, numbers in zip(samples, kept, strict=True)]
+    return (
+        tuple(map(_rising, _from_common_origin(grids), grids, names, kept)),
+        tuple(_finite(sample, k, kept[k]) for k, sample in enumerate(samples)),
+    )
 
 
-def as_labels(labels: str | Sequence[str], n_outputs: int, argument: str) -> tuple[str, ...]:
-    """One string for each output."""
-    if not isinstance(labels, str | list | tuple | np.ndarray) or (not np.ndim(labels) and not isinstance(labels, str)):
-        raise ValueError(f"{argument} is {labels!r}, must be strings: one for each output.")
-    values = (labels,) if isinstance(labels, str) else tuple(labels)
-    if not all(isinstance(value, str) for value in values):
-        raise ValueError(f"{argument} must be strings, one for each output; got {values}.")
-    if len(values) != n_outputs:
-        raise ValueError(
-            f"{argument} has {len(values)} entries {preview(values)} but the demonstrations have {n_outputs} "
-            "outputs: give one for each output."
+def as_texts(values: Any, name: str) -> tuple[str, ...]:
+    """Several texts, or one."""
+    if not isinstance(values, str | list | tuple | np.ndarray):
+        raise checks.refusal(values, name, "strings")
+    entries = (values,) if isinstance(values, str) else values
+    return tuple(checks.text(entry, f"{name}[{i}]") for i, entry in enumerate(entries))
+
+
+def as_labels(values: Any, n_outputs: int, name: str) -> tuple[str, ...]:
+    """Text for each output."""
+    labels = as_texts(values, name)
+    if len(labels) != n_outputs:
+        raise InvalidParameterError(
+            f"{name} has {len(labels)} entries {preview(labels)} but the demonstrations have {n_outputs} outputs: "
+            "give one for each output."
         )
+    return labels
+
+
+def as_names(names: Any, n_outputs: int) -> tuple[str, ...]:
+    """Name for each output, all different; y0, y1, ... where none are given."""
+    values = as_labels([f"y{i}" for i in range(n_outputs)] if names is None else names, n_outputs, "names")
+    if len(set(values)) < n_outputs:
+        raise InvalidParameterError(f"names must differ from each other; got {preview(values)}.")
     return values
 
 
-def as_units(units: str | Sequence[str] | None, n_outputs: int) -> tuple[str, ...] | None:
-    """A unit for each output, or None; one string is that of all."""
+def as_units(units: Any, n_outputs: int) -> tuple[str, ...] | None:
+    """Unit for each output, or None; one string is that of all."""
     if units is None:
         return None
-    values = as_labels((units,) * n_outputs if isinstance(units, str) else units, n_outputs, "units")
+    one = isinstance(units, str)
+    values = (units,) * n_outputs if one else as_labels(units, n_outputs, "units")
     for i, unit in enumerate(values):
-        check_unit(unit, "units" if isinstance(units, str) else f"units[{i}]", LENGTHS | ANGLES)
+        check_unit(unit, "units" if one else f"units[{i}]", LENGTHS | ANGLES)
     return values
 
 
-def as_names(names: Sequence[str], n_outputs: int) -> tuple[str, ...]:
-    """A name for each output, all different, that any file can hold."""
-    values = as_labels(names, n_outputs, "names")
-    if len(set(values)) < n_outputs:
-        raise ValueError(f"names must differ from each other; got {preview(values)}.")
-    for i, name in enumerate(values):
-        checks.text(name, f"names[{i}]")
-    return values
-
-
-def check_frame_and_unit(frame: Any, time_unit: Any) -> None:
-    """Name of a frame, or None, and a unit of times."""
-    if not isinstance(frame, str | None):
-        raise ValueError(f"frame is {frame!r}, must be text or None.")
+def as_time_unit(time_unit: Any) -> str:
+    """Unit of the times."""
     if not isinstance(time_unit, str) or not time_unit:
-        raise ValueError(f"time_unit is {time_unit!r}, must be the unit of the times: 's', or '1' for phase.")
+        raise checks.refusal(time_unit, "time_unit", "the unit of the times", "'s', or '1' for phase")
     check_unit(time_unit, "time_unit", TIMES)
-
-
-def as_mask(k: int | Sequence[int], n_demos: int) -> NDArray[np.bool_]:
-    """Which demonstrations are numbered ``k``: some, and not all of them."""
-    mask = np.zeros(n_demos, dtype=bool)
-    numbers = np.atleast_1d(np.asarray(k))
-    if numbers.ndim != 1 or numbers.dtype.kind not in "iu":
-        raise ValueError(f"k must be the number of a demonstration or a list of numbers; got {k!r}.")
-    wrong = numbers[(numbers < -n_demos) | (numbers >= n_demos)]
-    if len(wrong):
-        raise ValueError(f"k has {wrong[0]}, but demonstrations are numbered 0 to {n_demos - 1}.")
-    mask[numbers] = True
-    if mask.all() or not mask.any():
-        raise ValueError(f"k leaves out {mask.sum()} of {n_demos} demonstrations: both parts need some.")
-    return mask
+    return time_unit
 
 
 def preview(values: Sequence[object], limit: int = 12) -> str:
-    """The values as a list, cut where it gets long."""
+    """Values as a list, cut where it gets long."""
     shown = ", ".join(str(value) for value in values[:limit])
     return f"[{shown}, ... {len(values)} in all]" if len(values) > limit else f"[{shown}]"
 
 
-def check_choice(value: str, choices: Sequence[str], argument: str) -> None:
-    """A string that must be one of a few."""
-    if not isinstance(value, str) or value not in choices:
-        raise ValueError(f"{argument}={value!r} is not one of {', '.join(map(repr, choices))}.")
-
-
-def check_n_steps(n: int) -> None:
-    """A number of samples."""
-    if isinstance(n, bool) or not isinstance(n, int | np.integer) or not MIN_SAMPLES <= n < 2**53:
-        raise ValueError(f"n={n!r} must be an integer of at least {MIN_SAMPLES}: the number of points.")
-    require_much(64.0 * n, what=f"n={n} points", remedy="Lower it.")
-
-
-def _as_list(values: Any, argument: str) -> list[Any]:
+def _as_list(values: Any, name: str) -> list[Any]:
     try:
         entries = list(values)
     except TypeError as error:
-        raise ValueError(
-            f"{argument} must be a list with one array for each demonstration, or one array; got {values!r}."
-        ) from error
+        raise checks.refusal(values, name, "a list of one array for each demonstration, or one array") from error
     if not entries:
-        raise ValueError(f"{argument} is empty: at least one demonstration is needed.")
+        raise InvalidParameterError(f"{name} is empty, must have at least one demonstration.")
     return entries
 
 
-def _as_numbers(values: Any, argument: str, drop: bool) -> NDArray[Any]:
-    if hasattr(values, "detach"):
-        values = checks.from_tensor(values, argument)
+def _numbers(values: Any, name: str, drop: bool) -> NDArray[Any]:
+    """Real numbers in their own type, as whole numbers beyond 2**53 are exact in none else."""
     if np.ma.is_masked(values):
         if not drop:
-            raise ValueError(
-                f"{argument} has masked entries: drop these samples (missing='drop') or fill them in first."
+            raise InvalidParameterError(
+                f"{name} has masked entries: drop these samples (missing='drop') or fill them in first."
             )
         values = np.ma.filled(np.ma.asarray(values, dtype=np.float64), np.nan)
-    try:
-        array = np.asarray(values)
-    except ValueError as error:
-        raise ValueError(f"{argument} is ragged, its rows have different lengths: {error}") from error
-    if array.dtype.kind not in "fiu":
-        raise ValueError(
-            f"{argument} has dtype {array.dtype}: real numbers are needed. Convert it, e.g. with "
-            f"{_CONVERSION.get(array.dtype.kind, '.astype(float)')}, once it holds nothing else."
+    array = checks.real_array(values, name)
+    return array if array.dtype.kind in "fiu" else checks.real_floats(array, name)
+
+
+def _samples(values: Any, name: str, drop: bool) -> NDArray[Any]:
+    array = _numbers(values, name, drop)
+    samples = array[:, np.newaxis] if array.ndim == 1 else array
+    if samples.ndim != 2 or samples.shape[1] == 0:
+        raise InvalidParameterError(
+            f"{name} has shape {array.shape}, must be (n_samples, n_outputs), or (n_samples,) for one output: one "
+            "demonstration alone is written [positions]."
         )
-    return array
+    return samples
+
+
+def _grids(times: Any, n_demos: int, drop: bool) -> tuple[Arrays, bool]:
+    """Times of each demonstration, and whether they are one array that all of them share."""
+    # Times are one array for all if the first entry is a number, and not an array of its own.
+    stamps = _as_list(times, "times")
+    if _numbers(stamps[0], "times[0]", drop).ndim == 0:
+        return [_grid(times, "times", drop)] * n_demos, True
+    if len(stamps) != n_demos:
+        raise InvalidParameterError(
+            f"times has {len(stamps)} arrays but positions has {n_demos} demonstrations: give one time array for each "
+            "demonstration, or one 1-D array that all of them share."
+        )
+    return [_grid(time, f"times[{k}]", drop) for k, time in enumerate(stamps)], False
+
+
+def _grid(values: Any, name: str, drop: bool) -> NDArray[Any]:
+    grid = _numbers(values, name, drop)
+    if grid.ndim != 1:
+        raise InvalidParameterError(f"{name} has shape {grid.shape}, must be 1-D: one time for each sample.")
+    if len(grid) < MIN_SAMPLES:
+        raise InvalidParameterError(f"{name} has {len(grid)} samples: a demonstration needs at least {MIN_SAMPLES}.")
+    return grid
+
+
+def _check_shapes(grids: Arrays, samples: Arrays, names: list[str]) -> None:
+    lengths, n_outputs = [len(sample) for sample in samples], samples[0].shape[1]
+    for k, (grid, sample) in enumerate(zip(grids, samples, strict=True)):
+        if len(grid) != len(sample):
+            raise InvalidParameterError(
+                f"{names[k]} has {len(grid)} samples but positions[{k}] has {len(sample)}, of lengths "
+                f"{preview(lengths)}: give each demonstration its own times, one for each sample, then use .resample() "
+                "or .align(). One demonstration alone is written [positions]."
+            )
+        if sample.shape[1] != n_outputs:
+            raise InvalidParameterError(
+                f"positions[{k}] has {sample.shape[1]} outputs but positions[0] has {n_outputs}: all demonstrations "
+                "must have the same outputs."
+            )
+
+
+def _not_missing(grids: Arrays, samples: Arrays) -> list[NDArray[np.intp]]:
+    """Numbers of the samples of which neither the time nor a position is NaN; warns of how many are."""
+    holes = [np.isnan(grid) | np.isnan(sample).any(1) for grid, sample in zip(grids, samples, strict=True)]
+    lost = {k: (int(hole.sum()), len(hole)) for k, hole in enumerate(holes) if hole.any()}
+    for k, (n_lost, n) in lost.items():
+        if n - n_lost < MIN_SAMPLES:
+            raise InvalidParameterError(
+                f"positions[{k}] has {n - n_lost} of {n} samples left without missing values, must be at least "
+                f"{MIN_SAMPLES}: leave this demonstration out, or fill the missing values in."
+            )
+    if lost:
+        counts = [f"{n_lost} of {n} in demonstration {k}" for k, (n_lost, n) in lost.items()]
+        shown = ", ".join(counts[:12]) + (f", ... ({len(counts)} demonstrations in all)" if len(counts) > 12 else "")
+        checks.warn(
+            f"Dropped {sum(map(np.sum, holes))} of {sum(map(len, holes))} samples that have missing values: {shown}. "
+            f"At most {max(map(_longest_run, holes))} of them follow each other; what interpolates later draws "
+            "straight lines there.",
+            MissingDataWarning,
+        )
+    return [np.flatnonzero(~hole) for hole in holes]
+
+
+def _longest_run(hole: NDArray[np.bool_]) -> int:
+    # A run begins where the padded mask turns true and ends where it turns false: edges alternate.
+    edges = np.flatnonzero(np.diff(np.r_[False, hole, False]))
+    return int((edges[1::2] - edges[::2]).max(initial=0))
 
 
 def _frozen(array: NDArray[Any]) -> Floats:
@@ -164,112 +196,62 @@ def _frozen(array: NDArray[Any]) -> Floats:
     return copy
 
 
-def _position_array(values: Any, k: int, drop: bool) -> NDArray[Any]:
-    array = _as_numbers(values, f"positions[{k}]", drop)
-    if array.ndim == 1:
-        array = array[:, np.newaxis]
-    if array.ndim != 2 or array.shape[1] == 0:
-        raise ValueError(
-            f"positions[{k}] has shape {np.shape(values)}: a demonstration is (n_samples, n_outputs), or "
-            "(n_samples,) for one output. One demonstration alone is written [positions]."
-        )
-    return array
-
-
-def _time_array(values: Any, argument: str, drop: bool) -> NDArray[Any]:
-    array = _as_numbers(values, argument, drop)
-    if array.ndim != 1:
-        raise ValueError(f"{argument} has shape {array.shape}: times are 1-D, one for each sample.")
-    if len(array) < MIN_SAMPLES:
-        raise ValueError(f"{argument} has {len(array)} samples: a demonstration needs at least {MIN_SAMPLES}.")
-    return array
-
-
-def _as_position(array: NDArray[Any], k: int, numbers: NDArray[np.intp]) -> Floats:
-    position = _frozen(array)
+def _finite(samples: NDArray[Any], k: int, numbers: NDArray[np.intp]) -> Floats:
+    position = _frozen(samples)
     if not np.isfinite(position).all():
         i, j = np.argwhere(~np.isfinite(position))[0]
-        value = position[i, j]
-        remedy = "Drop the missing samples (missing='drop') or fill them in" if np.isnan(value) else "Correct the value"
-        raise ValueError(
-            f"positions[{k}] is {value} at sample {numbers[i]}, output {j}: all values must be finite. {remedy} first."
+        missing = np.isnan(position[i, j])
+        remedy = "drop the missing samples (missing='drop') or fill them in" if missing else "correct the value"
+        raise InvalidParameterError(
+            f"positions[{k}] is {position[i, j]} at sample {numbers[i]}, output {j}, must be finite: {remedy} first."
         )
     return position
 
 
-def _from_common_origin(grids: list[NDArray[Any]]) -> list[NDArray[Any]]:
+def _from_common_origin(grids: Arrays) -> Arrays:
     """Times; where whole numbers are beyond what float64 holds, from the first of them on, so that steps stay exact."""
     beyond = [grid for grid in grids if grid.dtype.kind in "iu" and max(grid.max(), -int(grid.min())) > 2**53]
     if not beyond:
         return grids
     origin = min(int(grid.min()) for grid in beyond)
-    # As Python's integers: differences of the machine's may overflow.
+    # As Python's integers, whose differences, over all of int64 or of uint64, do not overflow.
     return [(grid.astype(object) if grid.dtype.kind in "iu" else grid) - origin for grid in grids]
 
 
-def _as_time(array: NDArray[Any], original: NDArray[Any], argument: str, numbers: NDArray[np.intp]) -> Floats:
-    time = _frozen(array)
+def _rising(grid: NDArray[Any], original: NDArray[Any], name: str, numbers: NDArray[np.intp]) -> Floats:
+    """Times that rise strictly; messages show them as in ``original``."""
+    time = _frozen(grid)
     if not np.isfinite(time).all():
         i = int(np.argmin(np.isfinite(time)))
-        raise ValueError(f"{argument} is {time[i]} at sample {numbers[i]}: all times must be finite.")
+        raise InvalidParameterError(f"{name} is {time[i]} at sample {numbers[i]}, must be finite.")
     if np.ptp(0.25 * time) > _LONGEST:
-        raise ValueError(
-            f"{argument} goes from {time.min():.3g} to {time.max():.3g}, further than float64 can tell: take another "
+        raise InvalidParameterError(
+            f"{name} goes from {time.min():.3g} to {time.max():.3g}, further than float64 can tell: take another "
             "unit of time."
         )
-    _check_rising(time, original, argument, numbers)
-    return time
-
-
-def _check_rising(time: Floats, original: NDArray[Any], argument: str, numbers: NDArray[np.intp]) -> None:
-    coarse = _coarseness(original)
-    falls = np.flatnonzero(np.diff(time) <= 0)
+    coarse, falls = _coarseness(original), np.flatnonzero(np.diff(time) <= 0)
     if len(falls):
         i = int(falls[0]) + 1
         before, here = (exact(stamp) for stamp in original[i - 1 : i + 1].tolist())
-        raise ValueError(
-            f"{argument} must increase strictly, but sample {numbers[i]} is at {here} after {before}. "
+        raise InvalidParameterError(
+            f"{name} must increase strictly, but sample {numbers[i]} is at {here} after {before}. "
             f"Sort the samples by time and drop repeated ones.{coarse or nanoseconds_hint(original)}"
         )
     if coarse:
-        raise ValueError(f"{argument} is too coarse for its own steps.{coarse}")
+        raise InvalidParameterError(f"{name} is too coarse for its own steps.{coarse}")
+    return time
 
 
 def _coarseness(time: NDArray[Any]) -> str:
-    """Why times of low precision (unix time in float32) are unusable; empty if they are not."""
+    """Reason why times of low precision, as Unix time in float32, are unusable; empty where they are not."""
     if time.dtype.kind != "f" or time.dtype.itemsize >= 8:
         return ""
     resolution = float(np.spacing(np.abs(time).max()))
     step = float(time[-1] - time[0]) / (len(time) - 1)
+    # A quarter of a step moves a derivative by as much: what is finer is left to smoothing.
     if resolution <= 0.25 * step:
         return ""
     return (
         f" It is {time.dtype}, which resolves {resolution:.3g} at {float(time[-1]):.6g}, where the mean "
         f"step is {step:.3g}: record times as float64, or count them from the start of the demonstration."
     )
-
-
-def _check_shared_length(n_samples: int, recordings: list[NDArray[Any]]) -> None:
-    lengths = [len(position) for position in recordings]
-    if any(length != n_samples for length in lengths):
-        alone = " One demonstration alone is written [positions]." if len(recordings) == n_samples else ""
-        raise ValueError(
-            f"times is one array of {n_samples} samples for all demonstrations, but positions have lengths "
-            f"{preview(lengths)}: give each demonstration its own times, then use .resample() or "
-            f".align().{alone}"
-        )
-
-
-def _check_consistent(grids: list[NDArray[Any]], recordings: list[NDArray[Any]]) -> None:
-    n_outputs = recordings[0].shape[1]
-    for k, (time, position) in enumerate(zip(grids, recordings, strict=True)):
-        if len(time) != len(position):
-            raise ValueError(
-                f"times[{k}] has {len(time)} samples but positions[{k}] has {len(position)}: each sample "
-                "needs its time."
-            )
-        if position.shape[1] != n_outputs:
-            raise ValueError(
-                f"positions[{k}] has {position.shape[1]} outputs but positions[0] has {n_outputs}: all "
-                "demonstrations must have the same outputs."
-            )

@@ -1,15 +1,13 @@
 """Demonstrations whose covariance is known: the simulation of the paper, and a tunnel that narrows."""
 
-from numbers import Real
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from torch_pbd import checks
-from torch_pbd.data.alignment import Floats
+from torch_pbd.checks import Floats
 from torch_pbd.data.demonstrations import Demonstrations
-from torch_pbd.data.recordings import check_choice
 from torch_pbd.files.memory import require_much
 
 Reading = Literal["printed", "bell", "bowl"]
@@ -20,20 +18,14 @@ Seed = int | Random | None
 PATH_LENGTH = 0.6
 """Distance that the tunnel task covers along y, in m."""
 
-_VARIANTS = ("plain", "unequal", "dropped", "jitter", "outlier", "two_path")
-_QUANTUM = 5e-6  # resolution of the recorded positions, m
+# Of a good optical tracker: resolution of the recorded positions and noise along the path, in m.
+_QUANTUM, _NOISE = 5e-6, 2e-6
 
 
 def paper_mean(xi: ArrayLike) -> Floats:
     """Mean of eq. (14): ``[30 sin(xi / 20), 30 tanh(xi / 20)]``.
 
-    Parameters
-    ----------
-    xi : array_like of shape (n,) or (n, 1)
-
-    Returns
-    -------
-    ndarray of shape (n, 2)
+    The inputs have shape (n,) or (n, 1), the result (n, 2).
     """
     x = _column(xi)
     return np.column_stack([30.0 * np.sin(x / 20.0), 30.0 * np.tanh(x / 20.0)])
@@ -45,7 +37,7 @@ def paper_covariance(xi: ArrayLike, reading: Reading = "bell") -> Floats:
     Parameters
     ----------
     xi : array_like of shape (n,) or (n, 1)
-        Above -150; the paper uses -100 to 100.
+        Above -150, where the variances are positive; the paper uses -100 to 100.
     reading : {"bell", "printed", "bowl"}, default="bell"
         The paper prints s as ``150 exp(-xi/50)^2``, which can be read as ``150 exp(-(xi/50)^2)`` ("bell"),
         as ``150 (exp(-xi/50))^2`` ("printed"), or with the sign inside the square, ``150 exp((xi/50)^2)``
@@ -54,17 +46,10 @@ def paper_covariance(xi: ArrayLike, reading: Reading = "bell") -> Floats:
     Returns
     -------
     ndarray of shape (n, 2, 2)
-
-    Raises
-    ------
-    ValueError
-        If ``reading`` is not one of these, or an input is -150 or below, where a variance is negative.
     """
-    check_choice(reading, ("printed", "bell", "bowl"), "reading")
+    checks.choice(reading, "reading", Reading)
     x = _column(xi)
-    if (x <= -150.0).any():
-        i = int(np.argmax(x <= -150.0))
-        raise ValueError(f"xi is {x[i]} at index {i}: eq. (14) has a variance of xi + 150, so xi must be above -150.")
+    checks.require(x > -150.0, x, "xi", "above -150", "eq. (14) has a variance of xi + 150")
     exponent = {"printed": -2.0 * x / 50.0, "bell": -((x / 50.0) ** 2), "bowl": (x / 50.0) ** 2}[reading]
     covariance = np.zeros((len(x), 2, 2))
     covariance[:, 0, 0] = 150.0 * np.exp(exponent)
@@ -94,8 +79,8 @@ def make_paper_simulation(
     groups : ndarray of shape (n_inputs * n_demos,)
         Number of the demonstration.
     """
-    _check_count(n_inputs, "n_inputs")
-    _check_count(n_demos, "n_demos")
+    checks.count(n_inputs, "n_inputs")
+    checks.count(n_demos, "n_demos")
     require_much(80.0 * n_inputs * n_demos, what=f"n_inputs={n_inputs}, n_demos={n_demos}", remedy="Make fewer.")
     xi = np.linspace(-100.0, 100.0, n_inputs)
     scale = np.sqrt(np.diagonal(paper_covariance(xi, reading), axis1=1, axis2=2))
@@ -157,23 +142,13 @@ def make_tunnel_demonstrations(
     -------
     Demonstrations
         Outputs x and y in m, times in s.
-
-    Raises
-    ------
-    ValueError
-        If ``variant`` is unknown, or the numbers leave no demonstration of two samples.
     """
-    check_choice(variant, _VARIANTS, "variant")
-    _check_count(n_demos, "n_demos")
-    for name, value in (("duration", duration), ("rate", rate)):
-        if isinstance(value, bool) or not isinstance(value, Real) or not checks.is_finite(value):
-            raise ValueError(f"{name}={value!r} must be a positive number.")
-    require_much(400.0 * n_demos * abs(duration * rate), what=f"n_demos={n_demos}", remedy="Make fewer samples.")
-    if not (np.isfinite(duration * rate) and duration > 0.0 and round(duration * rate) >= 1):
-        raise ValueError(
-            f"duration={duration} s at rate={rate} /s is not a recording: both must be positive, and their "
-            "product, the number of steps, at least 1."
-        )
+    checks.choice(variant, "variant", Variant)
+    checks.count(n_demos, "n_demos")
+    checks.number(duration, "duration", above=0.0, unit="s")
+    checks.number(rate, "rate", above=0.0, unit="Hz")
+    checks.number(duration * rate, "duration * rate, the number of steps,", above=0.5)  # rounded, it is one
+    require_much(400.0 * n_demos * duration * rate, what=f"n_demos={n_demos}", remedy="Make fewer samples.")
     random = _generator(random_state)
     lanes = _lanes(n_demos, variant, random)
     times, positions = [], []
@@ -192,6 +167,7 @@ def _lanes(n_demos: int, variant: Variant, random: Random) -> NDArray[np.float64
     lanes = random.uniform(-0.6, 0.6, size=n_demos)
     if variant != "two_path":
         return lanes
+    # As many on either side; the lanes, 0 to 0.6 from the middle, go to 0.4 to 0.6.
     side = random.permutation(np.where(np.arange(n_demos) % 2, 1.0, -1.0))
     return side * (0.4 + np.abs(lanes) / 3.0)
 
@@ -207,32 +183,22 @@ def _sample_times(duration: float, rate: float, variant: Variant, random: Random
     return time
 
 
-def _tunnel_path(
-    time: Floats,
-    duration: float,
-    lane: float,
-    common_start: bool,
-    random: Random,
-) -> Floats:
+def _tunnel_path(time: Floats, duration: float, lane: float, common_start: bool, random: Random) -> Floats:
     wander, correction, tremor = (
         _band_noise(time, low, high, random) for low, high in [(0.0, 0.25), (0.25, 1.0), (8.0, 12.0)]
     )
+    # The lane is between the walls, whatever its noise adds: tanh keeps it within 0.85 of the half-width.
     along = PATH_LENGTH * time / duration
     across = 0.85 * tunnel_half_width(along) * np.tanh(lane + 0.12 * wander + 0.04 * correction)
     if common_start:
+        # Minimum jerk (Flash, Hogan 1985): velocity and acceleration vanish at both ends of the blend.
         s = np.clip(time / (0.15 * duration), 0.0, 1.0)
         across *= s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
     x = tunnel_center(along) + across + 1e-4 * tremor
-    return np.column_stack([x, along + 2e-6 * random.normal(size=len(time))])
+    return np.column_stack([x, along + _NOISE * random.normal(size=len(time))])
 
 
-def _band_noise(
-    time: Floats,
-    low: float,
-    high: float,
-    random: Random,
-    n_waves: int = 32,
-) -> Floats:
+def _band_noise(time: Floats, low: float, high: float, random: Random, n_waves: int = 32) -> Floats:
     """Stationary noise of unit variance with frequencies between ``low`` and ``high``, in Hz.
 
     A sum of cosines with random frequencies and phases, which is exact at any times, evenly spaced or not
@@ -244,18 +210,10 @@ def _band_noise(
 
 
 def _generator(random_state: Seed) -> Random:
-    if isinstance(random_state, np.random.Generator):
-        return random_state
-    return checks.seed(random_state)
+    return random_state if isinstance(random_state, np.random.Generator) else checks.seed(random_state)
 
 
 def _column(xi: ArrayLike) -> Floats:
-    x = checks.finite(xi, "xi")
-    if x.ndim > 2 or (x.ndim == 2 and x.shape[1] != 1):
-        raise ValueError(f"xi has shape {x.shape}: eq. (14) has one input, (n,) or (n, 1).")
-    return x.reshape(-1)
-
-
-def _check_count(value: int, argument: str) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 1 <= value < 2**53:
-        raise ValueError(f"{argument}={value!r} must be an integer of at least 1.")
+    """Inputs (n,) of eq. (14), which has one."""
+    x = checks.real_floats(xi, "xi")
+    return checks.array(x.reshape(-1, 1) if x.ndim < 2 else x, "xi", ("n", 1))[:, 0]

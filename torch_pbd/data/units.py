@@ -1,10 +1,13 @@
-"""Units of outputs and of times: the known ones, and words that were meant to be one of them."""
+"""Units of outputs and times, and outputs that are no coordinates of a flat space: quaternions, wrapped angles."""
 
 import difflib
 import math
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from torch_pbd.checks import Floats, refusal
 
 LENGTHS = {"km": 1e3, "m": 1.0, "dm": 1e-1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
 """Metres of one unit."""
@@ -15,7 +18,6 @@ ANGLES = {"rad": 1.0, "deg": math.pi / 180.0}
 TIMES = {"h": 3600.0, "min": 60.0, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Seconds of one unit."""
 
-_KNOWN = {**LENGTHS, **ANGLES, **TIMES}
 _PREFIXES = ("", "kilo", "deci", "centi", "milli", "micro", "nano")
 _SPELLED = {prefix + stem for prefix in _PREFIXES for stem in ("meter", "metre", "second", "radian")}
 _SPELLED |= {"inch", "inches", "in", "foot", "feet", "ft", "yard", "mile", "micron", "μm", "degree", "°"}
@@ -25,8 +27,17 @@ _LONG, _CLOSE = [word for word in _SPELLED if len(word) >= 5], 0.9
 # Seconds since 1970 are 1.7e9, and 1.7e18 in ns; no movement is counted in so many of anything coarser.
 _LIKE_NS = 1e14
 
+# Four numbers rounded to three decimals: their squared sum is off by up to 2 sum |q| 0.0005, at most 0.002. What varies
+# little around a point of norm 1 is a quaternion only if it keeps to the sphere far better than it varies.
+_OFF_SPHERE, _OFF_SPHERE_SHARE = 2.5e-3, 0.1
+_SAMPLES_ON_SPHERE = 0.9  # what is interpolated between q and -q is off it
+# In turns: how far off one a jump may be, and how large other steps of an angle that was sampled densely enough.
+_QUARTER = 0.25
+_MOST_JUMPS = 0.1  # of all steps; a signal that jumps more often is another kind of signal
+_LARGEST_ANGLE = 1e9  # differences of far larger numbers may overflow
 
-def check_unit(unit: str, argument: str, known: dict[str, float]) -> None:
+
+def check_unit(unit: str, name: str, known: dict[str, float]) -> None:
     """Refuse what was meant to be a known unit but is none, as "millimeter", "inch" and, of those ``known``, "MM".
 
     Those of other kinds may be other units in other cases: "Ns" is no nanosecond.
@@ -34,12 +45,13 @@ def check_unit(unit: str, argument: str, known: dict[str, float]) -> None:
     folded = unit.strip(" .").casefold()
     forms = {folded, folded.removesuffix("s")}
     close = forms & {*known, *_SPELLED} or difflib.get_close_matches(folded, _LONG, n=1, cutoff=_CLOSE)
-    if unit not in _KNOWN and close:
+    if unit not in LENGTHS | ANGLES | TIMES and close:
         listed = "; ".join(", ".join(kind) for kind in (LENGTHS, ANGLES, TIMES))
-        raise ValueError(
-            f"{argument} is {unit!r}, must be written as one of the known units, {listed}: convert what is in others, "
-            "such as inches. A word like none of them, such as 'pixels', is taken for a unit of its own."
+        remedy = (
+            "convert what is in others, such as inches. A word like none of them, such as 'pixels', is taken for a "
+            "unit of its own"
         )
+        raise refusal(unit, name, f"written as one of the known units, {listed}", remedy)
 
 
 def exact(time: float | int) -> str:
@@ -47,7 +59,7 @@ def exact(time: float | int) -> str:
     return str(int(time)) if abs(time) >= _LIKE_NS and time == int(time) else str(time)
 
 
-def nanoseconds_hint(times: NDArray[np.generic] | float | int) -> str:
+def nanoseconds_hint(times: Any) -> str:
     """Sentence on the unit of times that look like ns; empty for others."""
     stamps = np.asarray(times)
     largest = float(np.abs(stamps.astype(np.float64)).max())
@@ -57,3 +69,45 @@ def nanoseconds_hint(times: NDArray[np.generic] | float | int) -> str:
         f", of which float64 tells {np.spacing(largest):.0f} apart: give integers" if stamps.dtype.kind == "f" else ""
     )
     return f" Whole numbers above {_LIKE_NS:g} look like ns (time_unit='ns'){coarse}."
+
+
+def find_suspects(positions: Sequence[Floats], names: Sequence[str], units: Sequence[str] | None) -> tuple[str, ...]:
+    """Sentences on outputs that are no coordinates, with the remedy; without units, an angle may be in rad or deg."""
+    within = [np.clip(position, -_LARGEST_ANGLE, _LARGEST_ANGLE) for position in positions]
+    return (*_quaternions(np.concatenate(within), names), *_wrapped(within, names, units))
+
+
+def _quaternions(samples: Floats, names: Sequence[str]) -> Iterator[str]:
+    extent, first = np.ptp(samples, axis=0), 0
+    while first + 4 <= len(names):
+        four = slice(first, first + 4)
+        off = np.abs(np.square(samples[:, four]).sum(axis=1) - 1.0)
+        spread = extent[four].max()
+        found = spread > 0.0 and np.mean(off <= min(_OFF_SPHERE, _OFF_SPHERE_SHARE * spread)) >= _SAMPLES_ON_SPHERE
+        first += 4 if found else 1
+        if found:
+            yield (
+                f"Outputs {', '.join(names[four])} have the squared sum 1, as unit quaternions do: q and -q are the "
+                "same rotation, so their mean and their covariance are not those of rotations. Leave them out, as by "
+                "outputs=[...] of load_demonstrations."
+            )
+
+
+def _wrapped(positions: Sequence[Floats], names: Sequence[str], units: Sequence[str] | None) -> Iterator[str]:
+    steps = np.abs(np.concatenate([np.diff(position, axis=0) for position in positions]))
+    extent = np.ptp(np.concatenate(positions), axis=0)
+    known: Sequence[str | None] = units or [None] * len(names)
+    for name, unit, step, whole in zip(names, known, steps.T, extent, strict=True):
+        for angle in ANGLES if unit is None else {unit} & set(ANGLES):
+            turn = 2.0 * math.pi / ANGLES[angle]
+            jumps = np.abs(step - turn) <= _QUARTER * turn
+            other = step[~jumps].max(initial=0.0)
+            # What goes on behind the jump is as smooth as elsewhere.
+            smooth = np.abs(step[jumps] - turn) <= max(3.0 * other, 1e-3 * turn)
+            dense = other < _QUARTER * turn and 0 < jumps.sum() <= _MOST_JUMPS * len(step)
+            if dense and smooth.all() and (unit is not None or whole <= 1.01 * turn):
+                yield (
+                    f"Output {name} jumps by a turn, {turn:.4g} {angle}, between two samples: means of such recordings "
+                    "are no angles, and a robot would turn back the long way. Unwrap each recording first, by "
+                    f"numpy.unwrap({name}{'' if angle == 'rad' else ', period=360'})."
+                )

@@ -26,12 +26,8 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     A reader sees the old file or the new one; on an error the old one is as it was. The new one has the permissions
     of the old one. Where ``path`` is a link, the file that it leads to is replaced, and the link stays.
 
-    Raises
-    ------
-    FileNotFoundError
-        If its folder does not exist.
-    OSError
-        If it cannot be written, or is a folder, a pipe or a device; with the path, which a full disk does not say.
+    Raises FileNotFoundError if its folder does not exist, and OSError, with the path (which a full disk does not say),
+    if it cannot be written, or is a folder, a pipe or a device.
     """
     file_path = _target(path)
     draft = file_path.with_name(f".{file_path.name}.{os.getpid()}.{token_hex(4)}.draft")
@@ -74,9 +70,9 @@ def remove_drafts(folder: Path) -> int:
 
 
 def _target(path: Path) -> Path:
-    """The file to replace: where links lead to one, that one."""
+    """File to replace: the one that links lead to."""
     target = Path(os.path.realpath(path)) if path.is_symlink() else path
-    if target.is_symlink():
+    if target.is_symlink():  # still, after all have been followed: a circle
         raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
     if not target.parent.is_dir():
         raise FileNotFoundError(f"the folder {target.parent} does not exist: make it before saving {path.name}.")
@@ -89,14 +85,13 @@ def _target(path: Path) -> Path:
 
 def _sync_folder(folder: Path) -> None:
     """Have the new name reach the disk too, on systems that can be asked for it."""
+    descriptor = None
     try:
         descriptor = os.open(folder, os.O_RDONLY)
-    except OSError:
-        return
-    try:
         os.fsync(descriptor)
     except OSError as error:
         if error.errno not in _NO_SYNC:
             raise
     finally:
-        os.close(descriptor)
+        if descriptor is not None:
+            os.close(descriptor)

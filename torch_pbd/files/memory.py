@@ -2,12 +2,14 @@
 
 import os
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 _SHARE = 0.8  # of what there is: the rest is for what else runs
 _GIB = 2.0**30
+_MOST = 2.0**100  # bytes that are worth a number in a message
+# Asking the system takes a millisecond, which small arrays are not worth.
 _LITTLE = 2.0**26
-_MOST = 2.0**100
 # Bytes that Python takes for what these marks begin or end: numbers and their places, lists, mappings, strings.
 _PARSED = {b",": 40.0, b";": 40.0, b"\t": 40.0, b"\n": 120.0, b"[": 80.0, b"{": 250.0, b'"': 30.0}
 _CONTROL_GROUPS = Path("/proc/self/cgroup")
@@ -17,8 +19,8 @@ _MOUNT = Path("/sys/fs/cgroup")
 def available_bytes() -> int:
     """Memory of this machine in bytes, or the limit of the control group that the process runs in, if lower.
 
-    Containers and batch systems set such limits (cgroup v2 or v1). What other processes use is not taken off. Where
-    the system does not tell its memory, it is as if there were no end to it.
+    Containers and batch systems set such limits (cgroup v2 or v1). What other processes use is not taken off. A system
+    that does not tell its memory has no end of it.
     """
     try:
         physical = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
@@ -34,10 +36,8 @@ def require_memory(needed_bytes: float, *, what: str, remedy: str) -> None:
     ----------
     needed_bytes : float
         Estimate of the most that is held at one time.
-    what : str
-        What needs it; the message starts with it: "a schedule of 3600001 ticks".
-    remedy : str
-        What to do: "Lower rate."
+    what, remedy : str
+        Beginning and end of the message: "a schedule of 3600001 ticks", "Lower rate."
 
     Raises
     ------
@@ -53,28 +53,24 @@ def require_memory(needed_bytes: float, *, what: str, remedy: str) -> None:
 
 
 def require_much(needed_bytes: float, *, what: str, remedy: str) -> None:
-    """The same, of which a need of up to 64 MiB is not even asked: to ask takes a millisecond."""
+    """:func:`require_memory` for what may well be little: up to 64 MiB are taken to be there."""
     if needed_bytes > _LITTLE:
         require_memory(needed_bytes, what=what, remedy=remedy)
 
 
 def parsed_bytes(text: Iterable[bytes]) -> float:
-    """Estimate of the memory that numbers, lists and strings take that are read from text: JSON, or a table.
+    """Estimate of the memory that numbers, lists and strings take that are read from pieces of JSON or of a table.
 
-    Parameters
-    ----------
-    text : iterable of bytes
-        In pieces. Counted are the marks of each: what a short one takes may be 30 times its length.
+    Counted are the marks between them: what a short number takes may be 30 times its length.
     """
     return sum(2.0 * len(part) + sum(size * part.count(mark) for mark, size in _PARSED.items()) for part in text)
 
 
 def _control_group_limits() -> Iterator[int]:
     """Limits of the process's memory group and of all above it, under either version of control groups."""
-    try:
+    lines: list[str] = []
+    with suppress(OSError):
         lines = _CONTROL_GROUPS.read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return
     for line in lines:
         _, controllers, path = line.split(":", 2)
         if controllers and "memory" not in controllers.split(","):
@@ -82,15 +78,6 @@ def _control_group_limits() -> Iterator[int]:
         mount, file = (_MOUNT / "memory", "memory.limit_in_bytes") if controllers else (_MOUNT, "memory.max")
         group = mount / path.lstrip("/")
         # A container may see its own group as the root, under the path that it has outside.
-        for folder in {group, *group.parents, mount}:
-            if folder.is_relative_to(mount):
-                yield from _limit(folder / file)
-
-
-def _limit(file: Path) -> Iterator[int]:
-    try:
-        text = file.read_text(encoding="utf-8").strip()
-    except OSError:
-        return
-    if text.isdigit():  # "max" is none
-        yield int(text)
+        for folder in {folder for folder in (group, *group.parents, mount) if folder.is_relative_to(mount)}:
+            with suppress(OSError, ValueError):  # absent, or "max": no limit
+                yield int((folder / file).read_text(encoding="utf-8"))

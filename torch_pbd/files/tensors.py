@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from safetensors import SafetensorError, deserialize
-from safetensors.numpy import save as to_bytes
+from safetensors.numpy import load, save
 
 from torch_pbd.exceptions import ModelFileError
 from torch_pbd.files.atomic import replacing
@@ -22,62 +21,21 @@ MAX_HEADER_BYTES = 2**22
 """Longest JSON header that is written or read, about 200 000 numbers: lists in it take up to 20 times the memory."""
 
 _MAX_OUTER_BYTES = 4 * MAX_HEADER_BYTES  # the header of safetensors, in which ours is a string with escapes
-_DTYPES: dict[str, np.dtype[Any]] = {
-    "F64": np.dtype("float64"),
-    "F32": np.dtype("float32"),
-    "I64": np.dtype("int64"),
-    "I32": np.dtype("int32"),
-    "I16": np.dtype("int16"),
-    "I8": np.dtype("int8"),
-    "U64": np.dtype("uint64"),
-    "U32": np.dtype("uint32"),
-    "U16": np.dtype("uint16"),
-    "U8": np.dtype("uint8"),
-    "BOOL": np.dtype("bool"),
-}
-_DAMAGE = (
-    SafetensorError,
-    struct.error,
-    AttributeError,
-    KeyError,
-    TypeError,
-    ValueError,
-    OSError,
-    RecursionError,
-    MemoryError,
-)  # what reading raises about bytes that are not what they claim to be
-# The file, the arrays in it, and one array's bytes under the checksum.
-_COPIES = 3.0
+_COPIES = 3.0  # the file, the arrays in it, and one array's bytes under the checksum
+_TYPES = ["float64", "float32", "int64", "int32", "int16", "int8", "uint64", "uint32", "uint16", "uint8", "bool"]
 
 
 def write_checksummed(path: Path, key: str, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays and a header to one file, which is there whole or not at all.
+    """Write arrays of numbers or bools, and a header of what JSON can hold, to one file that is there whole or not.
 
-    Parameters
-    ----------
-    path : Path
-    key : str
-        Kind of the file: the name of the header in the metadata of safetensors.
-    header : mapping
-        What JSON can hold; with ``format_version``, and without ``sha256``, which is added.
-    arrays : mapping of str to ndarray
-        Of floats in 32 or 64 bits, of integers in 8 to 64, or of bools.
+    ``key`` is the kind of the file: the name of the header in the metadata of safetensors. The header has
+    ``format_version``; ``sha256`` is added to it.
 
-    Raises
-    ------
-    TypeError
-        If an array is of another type, or an entry of the header is not what JSON can hold.
-    ValueError
-        If the header is longer than 4 MiB.
-    OSError
-        If it cannot be written; with the path.
+    Raises TypeError if an array is of another type or the header not for JSON, ValueError if it is longer than 4 MiB,
+    OSError, with the path, if the file cannot be written.
     """
-    for name, array in arrays.items():
-        if array.dtype not in _DTYPES.values():
-            raise TypeError(
-                f"array {name!r} is of {array.dtype}, it must be of {', '.join(map(str, _DTYPES.values()))}."
-            )
     whole = {name: np.asarray(array, order="C") for name, array in arrays.items()}
+    _check_types(whole)
     plain = json.loads(json.dumps(dict(header)))
     text = json.dumps({**plain, "sha256": _digest(plain, whole)})
     if len(text) > MAX_HEADER_BYTES:
@@ -86,26 +44,15 @@ def write_checksummed(path: Path, key: str, header: Mapping[str, Any], arrays: M
             "keep long lists as arrays."
         )
     with replacing(path) as file:
-        file.write(to_bytes(whole, metadata={key: text}))
+        file.write(save(whole, metadata={key: text}))
 
 
 def read_checksummed(path: Path, key: str, format_version: int) -> tuple[dict[str, Any], Arrays]:
     """Header, less its checksum, and arrays of a file that :func:`write_checksummed` wrote.
 
-    Parameters
-    ----------
-    path : Path
-    key : str
-    format_version : int
-        That which ``format_version`` in the header must be.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ModelFileError
-        If it is not of this kind, of another version, too large for the memory, or not as it was written: to the
-        byte, but for the spelling of what safetensors says of the arrays.
+    Raises FileNotFoundError if there is no such file, and ModelFileError if it is not of this kind, of another
+    ``format_version``, too large for the memory, or not as it was written: to the byte, but for the spelling of what
+    safetensors says of the arrays.
     """
     if not path.is_file():
         raise FileNotFoundError(f"no model file at {path}")
@@ -114,16 +61,15 @@ def read_checksummed(path: Path, key: str, format_version: int) -> tuple[dict[st
     except ValueError as error:
         raise ModelFileError(str(error)) from error
     try:
-        # Not mapped into memory: a file that shrinks while it is read would end the process.
+        # Not mapped into memory, as safe_open would: a file that shrinks while it is read would end the process.
         content = path.read_bytes()
-        _check_length(content)
-        arrays = {name: _array(view) for name, view in deserialize(content)}
-        text = _header_text(content, key)
+        text, arrays = _unpacked(content, key)
         header = json.loads(text)
         if json.dumps(header) != text:
             raise ValueError("its header is not as it was written")
-    except _DAMAGE as error:
-        raise ModelFileError(f"{path} is not a model of {key}, or is damaged ({_brief(error)}).") from error
+    except Exception as error:  # parsers of bytes that are not what they claim to be raise errors of all kinds
+        what = f"{str(error) or type(error).__name__:.200}"
+        raise ModelFileError(f"{path} is not a model of {key}, or is damaged ({what}).") from error
     found = header.get("format_version") if isinstance(header, dict) else None
     if type(found) is not int or found != format_version:
         raise ModelFileError(
@@ -134,35 +80,29 @@ def read_checksummed(path: Path, key: str, format_version: int) -> tuple[dict[st
     return header, arrays
 
 
-def _check_length(content: bytes) -> None:
+def _unpacked(content: bytes, key: str) -> tuple[str, Arrays]:
+    """Our header as text, and the arrays: their bytes are as many as their shapes need."""
     (length,) = struct.unpack_from("<Q", content)
-    if length > min(_MAX_OUTER_BYTES, len(content) - 8):
+    if length > _MAX_OUTER_BYTES:
         raise ValueError(f"it declares a header of {length} bytes")
-
-
-def _header_text(content: bytes, key: str) -> str:
-    """Our header, of the metadata in the header of safetensors, which has been read without an error."""
-    (length,) = struct.unpack_from("<Q", content)
+    arrays: Arrays = load(content)
+    _check_types(arrays)
+    # Metadata, texts by their names, are read by safe_open alone. By now this is known to be a sound header.
     metadata = json.loads(content[8 : 8 + length]).get("__metadata__", {})
     if set(metadata) != {key}:
         raise ValueError(f"it is not marked {key!r}")
     text = metadata[key]
-    if not isinstance(text, str) or len(text) > MAX_HEADER_BYTES:
+    if len(text) > MAX_HEADER_BYTES:
         raise ValueError(f"its header is longer than {MAX_HEADER_BYTES} bytes")
-    return text
+    return text, arrays
 
 
-def _array(view: Mapping[str, Any]) -> NDArray[Any]:
-    """Array of what safetensors found: its bytes are as many as its shape needs."""
-    dtype = _DTYPES[view["dtype"]]
-    array = np.frombuffer(view["data"], dtype=dtype).reshape(view["shape"])
-    if dtype.kind == "b" and (array.view(np.uint8) > 1).any():
-        raise ValueError("it holds a bool that is neither false nor true")
-    return array
-
-
-def _brief(error: BaseException) -> str:
-    return f"{str(error) or type(error).__name__:.200}"
+def _check_types(arrays: Mapping[str, NDArray[Any]]) -> None:
+    for name, array in arrays.items():
+        if not array.dtype.isnative or array.dtype.name not in _TYPES:
+            raise TypeError(f"array {name!r} is of {array.dtype}, it must be of {', '.join(_TYPES)}.")
+        if array.dtype.kind == "b" and (array.view(np.uint8) > 1).any():
+            raise ValueError(f"array {name!r} holds a bool that is neither false nor true")
 
 
 def _digest(header: dict[str, Any], arrays: Mapping[str, NDArray[Any]]) -> str:

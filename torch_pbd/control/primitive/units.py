@@ -5,8 +5,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from torch_pbd import checks
 from torch_pbd.data import Demonstrations
-from torch_pbd.data.missing import levels_to_caller
 from torch_pbd.data.units import ANGLES, LENGTHS, TIMES
 
 
@@ -52,7 +52,7 @@ def warn_of_units(units: Sequence[str] | None) -> None:
         )
     else:
         return
-    warnings.warn(text, stacklevel=levels_to_caller())
+    checks.warn(text)
 
 
 def duration_of(demonstrations: Demonstrations, duration: float | None) -> tuple[float, float]:

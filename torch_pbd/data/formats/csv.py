@@ -14,18 +14,18 @@ from typing import Any, BinaryIO, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
+from torch_pbd import checks
 from torch_pbd.data.demonstrations import Demonstrations, Missing
-from torch_pbd.data.recordings import check_choice, preview
+from torch_pbd.data.recordings import as_texts, preview
 from torch_pbd.data.units import nanoseconds_hint
-from torch_pbd.exceptions import DataFormatError
 from torch_pbd.files.atomic import LOADERS
 
 DELIMITERS = (",", ";", "\t")
-_LONGEST_HEADER = 2**17
+_LONGEST_HEADER = 2**17  # characters, of thousands of columns; a file without line ends would be one header
 _FEWEST_COUNTED = 5  # rows; fewer rise by one by chance
 
 
-def read_csv(
+def read(
     path: Path,
     max_bytes: int,
     missing: Missing,
@@ -38,37 +38,27 @@ def read_csv(
     frame: str | None = None,
     time_unit: str = "s",
 ) -> Demonstrations:
-    """Read the format of `torch_pbd.data.load_demonstrations`, where the options are told."""
-    check_choice(decimal, (".", ","), "decimal")
-    _check_columns(demo, time, outputs)
+    """Read the format of `torch_pbd.data.load_demonstrations`, which describes the options."""
+    checks.choice(decimal, "decimal", (".", ","))
+    checks.text(demo, "demo", optional=True)
+    checks.text(time, "time")
+    named = None if outputs is None else as_texts(outputs, "outputs")
     if delimiter is not None and (not isinstance(delimiter, str) or len(delimiter) != 1 or delimiter == decimal):
-        raise ValueError(f"delimiter={delimiter!r} must be one character, and not the decimal mark {decimal!r}.")
+        raise checks.refusal(delimiter, "delimiter", f"one character, and not the decimal mark {decimal!r}")
+    wanted = [time] if demo is None else [demo, time]
     with path.open(encoding="utf-8-sig", newline="") as file:
         try:
-            table = _open_table(
-                path, file, delimiter, decimal, missing, wanted=[time] if demo is None else [demo, time]
-            )
-            names = table.output_names(outputs, taken=[demo, time])
+            table = _open_table(file, delimiter, decimal, missing, wanted)
+            names = table.output_names(named, wanted)
             times, positions = table.recordings(demo, [time, *names])
         except UnicodeDecodeError as error:
-            raise DataFormatError(f"{path} is not text in UTF-8: {error}.") from error
+            raise ValueError(f"it is not text in UTF-8: {error}.") from error
     if outputs is None and positions:
-        _check_movements(path, names, positions)
-    try:
-        return Demonstrations(
-            times,
-            positions,
-            names=names,
-            units=units,
-            frame=frame,
-            time_unit=time_unit,
-            missing=missing,
-        )
-    except ValueError as error:
-        raise DataFormatError(f"{path}: {error}") from error
+        _check_movements(names, positions)
+    return Demonstrations(times, positions, names=names, units=units, frame=frame, time_unit=time_unit, missing=missing)
 
 
-def write_csv(demonstrations: Demonstrations, handle: BinaryIO) -> None:
+def write(demonstrations: Demonstrations, handle: BinaryIO) -> None:
     """Write columns ``demo,time,<names>``; the shortest decimals that come back to the last bit."""
     unusable = [name for name in demonstrations.names if name in ("demo", "time") or name != name.strip()]
     if unusable:
@@ -82,117 +72,51 @@ def write_csv(demonstrations: Demonstrations, handle: BinaryIO) -> None:
     text.detach()
 
 
-def _check_columns(demo: object, time: object, outputs: object) -> None:
-    """Check that columns are named by text."""
-    if not isinstance(demo, str | None):
-        raise ValueError(f"demo={demo!r} must be the name of a column, or None: the file is one demonstration.")
-    if not isinstance(time, str):
-        raise ValueError(f"time={time!r} must be the name of a column.")
-    names = [outputs] if isinstance(outputs, str) else outputs
-    if names is not None and not (
-        isinstance(names, Sequence | np.ndarray) and all(isinstance(name, str) for name in names)
-    ):
-        raise ValueError(f"outputs={outputs!r} must be names of columns, or None: all the others.")
-
-
-def _open_table(
-    path: Path, file: TextIO, delimiter: str | None, decimal: str, missing: Missing, wanted: list[str]
-) -> "_Table":
-    """Read the header; the delimiter is the one that finds the columns wanted, and most columns."""
-    first = file.readline(_LONGEST_HEADER)
-    if len(first) == _LONGEST_HEADER:
-        raise DataFormatError(
-            f"{path}, line 1: it is longer than {_LONGEST_HEADER} characters; it must name the columns."
-        )
-    candidates = [delimiter] if delimiter else [mark for mark in DELIMITERS if mark != decimal]
-    try:
-        headers = [[name.strip() for name in next(csv.reader([first], delimiter=c), [])] for c in candidates]
-    except csv.Error as error:
-        raise DataFormatError(f"{path}, line 1: {error}.") from error
-    header = max(headers, key=lambda names: (set(wanted) <= set(names), len(names)))
-    absent = [name for name in wanted if name not in header]
-    if absent:
-        raise DataFormatError(
-            f"{path}, line 1: no column {absent[0]!r} among {preview(header)}. Name the columns by "
-            "the options demo=, time= and outputs= (demo=None: one demonstration), or give the delimiter."
-            + f" {LOADERS}"
-            * first.startswith("# format:")
-        )
-    twice = [name for name, count in Counter(header).items() if name and count > 1]
-    if twice:
-        raise DataFormatError(f"{path}, line 1: there are two columns {twice[0]!r}.")
-    return _Table(path, file, header, candidates[headers.index(header)], decimal, missing)
-
-
-def _exact_time(cell: str, time: float) -> float | int:
-    """Time in a cell; as an integer where it is one that float64 does not hold, as stamps in ns are."""
-    stamp = int(cell) if abs(time) >= 2**53 and re.fullmatch(r"\s*[+-]?\d{16,19}\s*", cell) else 0
-    return stamp if 2**53 <= abs(stamp) < 2**63 else time
-
-
-def _check_movements(path: Path, names: Sequence[str], positions: Sequence[NDArray[np.float64]]) -> None:
-    """Refuse columns that count rows or number tasks, which nobody named as outputs."""
-    steps, rows = np.vstack([np.diff(position, axis=0) for position in positions]), np.vstack(positions)
-    for name, step, values in zip(names, steps.T, np.sort(rows, axis=0).T, strict=True):
-        # A count of all rows is so too where rows of several demonstrations are mixed.
-        counts = (step == 1.0).all() or ((step > 0.0).all() and (np.diff(values) == 1.0).all())
-        numbers = name.endswith(("_index", "_id")) and not step.any()
-        if len(values) >= _FEWEST_COUNTED and (values == np.round(values)).all() and (counts or numbers):
-            raise DataFormatError(
-                f"{path}, column {name!r}: it {'counts rows' if counts else 'numbers demonstrations'}, and is no "
-                f"movement. Leave it out, or say which columns are: outputs={[n for n in names if n != name]}."
-            )
-
-
 @dataclass(frozen=True)
 class _Table:
     """A CSV file whose header has been read: its numbers, with the lines they stand in."""
 
-    path: Path
     file: TextIO
     header: list[str]
     delimiter: str
     decimal: str
     missing: Missing
 
-    def output_names(self, outputs: Sequence[str] | None, taken: Sequence[str | None]) -> list[str]:
+    def output_names(self, outputs: Sequence[str] | None, taken: Sequence[str]) -> list[str]:
         """Columns of the outputs, in their order."""
-        if outputs is None:
-            names = [name for name in self.header if name not in taken]
-            if "" in names:
-                raise DataFormatError(
-                    f"{self.path}, line 1: column {self.header.index('') + 1} has no name, as the index of a table "
-                    f"that was written without index=False. Leave it out, or say outputs={[*filter(None, names)]}."
-                )
-        else:
-            names = [outputs] if isinstance(outputs, str) else list(outputs)
+        names = [name for name in self.header if name not in taken] if outputs is None else list(outputs)
+        if outputs is None and "" in names:
+            raise ValueError(
+                f"line 1: column {self.header.index('') + 1} has no name, as the index of a table that was written "
+                f"without index=False. Leave it out, or say outputs={[*filter(None, names)]}."
+            )
         known = set(self.header)
-        missing = [name for name in names if name not in known]
-        if missing or not names:
-            what = f"no column {missing[0]!r}" if missing else "no column of outputs"
-            raise DataFormatError(f"{self.path}, line 1: {what} among {preview(self.header)}.")
+        absent = [name for name in names if name not in known]
+        if absent or not names:
+            what = f"no column {absent[0]!r}" if absent else "no column of outputs"
+            raise ValueError(f"line 1: {what} among {preview(self.header)}.")
         return names
 
     def recordings(self, demo: str | None, columns: Sequence[str]) -> tuple[list[NDArray[Any]], list[NDArray[Any]]]:
         """Times, as integers where all are, and the other columns of each demonstration, as they first appear."""
         places = {name: place for place, name in enumerate(self.header)}
         indices = [places[name] for name in columns]
-        label_index = None if demo is None else places[demo]
         recorded: dict[str, array[float]] = {}
         stamps: dict[str, array[int]] = {}
         last: dict[str, float] = {}
         for line, cells in self._rows():
-            label = "" if label_index is None else cells[label_index].strip()
-            if label_index is not None and not label:
-                raise DataFormatError(f"{self.path}, line {line}, column {demo!r}: the cell is blank.")
+            label = "" if demo is None else cells[places[demo]].strip()
+            if demo is not None and not label:
+                raise ValueError(f"line {line}, column {demo!r}: the cell is blank.")
             row = [self._number(cells[i], line, self.header[i]) for i in indices]
             now, before = _exact_time(cells[indices[0]], row[0]), last.get(label, -inf)
             if now <= before:
-                raise DataFormatError(
-                    f"{self.path}, line {line}, column {columns[0]!r}: {now!r} comes after "
-                    f"{before!r} in demonstration {label!r}: times must increase strictly. Sort the "
-                    f"lines by time and drop repeated ones.{nanoseconds_hint(now)}"
+                raise ValueError(
+                    f"line {line}, column {columns[0]!r}: {now!r} comes after {before!r} in demonstration {label!r}: "
+                    "times must increase strictly. Sort the lines by time and drop repeated ones."
+                    f"{nanoseconds_hint(now)}"
                 )
+            # Arrays of numbers take 8 bytes for each, where lists take 32.
             recorded.setdefault(label, array("d")).extend(row)
             whole = stamps.setdefault(label, array("q"))
             if isinstance(now, int):
@@ -209,33 +133,75 @@ class _Table:
             try:
                 cells = next(reader, None)
             except csv.Error as error:
-                raise DataFormatError(f"{self.path}, line {line}: {error}.") from error
+                raise ValueError(f"line {line}: {error}.") from error
             if cells is None:
                 return
-            if not cells:
-                continue
-            if len(cells) != len(self.header):
-                raise DataFormatError(
-                    f"{self.path}, line {line}: {len(cells)} cells under {len(self.header)} "
-                    f"column names (delimiter {self.delimiter!r}, decimal mark {self.decimal!r})."
+            if cells and len(cells) != len(self.header):
+                raise ValueError(
+                    f"line {line}: {len(cells)} cells under {len(self.header)} column names (delimiter "
+                    f"{self.delimiter!r}, decimal mark {self.decimal!r})."
                 )
-            yield line, cells
+            if cells:
+                yield line, cells
 
     def _number(self, cell: str, line: int, column: str) -> float:
-        text = cell.strip()
-        if self.missing == "drop" and (not text or text.lower() in ("nan", "+nan", "-nan")):
+        text, foreign = cell.strip(), "_" if self.decimal == "." else "_."
+        if self.missing == "drop" and text.lower() in ("", "nan", "+nan", "-nan"):
             return nan
-        foreign = "_" if self.decimal == "." else "_."
         try:
-            if any(mark in text for mark in foreign):
-                raise ValueError
-            value = float(text.replace(self.decimal, "."))
+            # Python reads 1_0 as ten.
+            value = nan if any(mark in text for mark in foreign) else float(text.replace(self.decimal, "."))
         except ValueError:
-            value = float("nan")
+            value = nan
         if not isfinite(value):
             what = f"{text!r} is not a finite number" if text else "the cell is blank"
-            raise DataFormatError(
-                f"{self.path}, line {line}, column {column!r}: {what} (decimal mark {self.decimal!r}). "
-                "Drop the line (missing='drop' does, where the cell is blank or nan), or fill the value in."
+            raise ValueError(
+                f"line {line}, column {column!r}: {what} (decimal mark {self.decimal!r}). Drop the line "
+                "(missing='drop' does, where the cell is blank or nan), or fill the value in."
             )
         return value
+
+
+def _open_table(file: TextIO, delimiter: str | None, decimal: str, missing: Missing, wanted: list[str]) -> _Table:
+    """Read the header; the delimiter is the one that finds the columns wanted, and most columns."""
+    first = file.readline(_LONGEST_HEADER)
+    if len(first) == _LONGEST_HEADER:
+        raise ValueError(f"line 1: it is longer than {_LONGEST_HEADER} characters; it must name the columns.")
+    candidates = [delimiter] if delimiter else [mark for mark in DELIMITERS if mark != decimal]
+    try:
+        headers = [[name.strip() for name in next(csv.reader([first], delimiter=c), [])] for c in candidates]
+    except csv.Error as error:
+        raise ValueError(f"line 1: {error}.") from error
+    # A mark that is not the delimiter finds one column, or cuts names that hold it.
+    header = max(headers, key=lambda names: (set(wanted) <= set(names), len(names)))
+    absent = [name for name in wanted if name not in header]
+    if absent:
+        raise ValueError(
+            f"line 1: no column {absent[0]!r} among {preview(header)}. Name the columns by the options demo=, time= "
+            "and outputs= (demo=None: one demonstration), or give the delimiter."
+            f"{' ' + LOADERS if first.startswith('# format:') else ''}"
+        )
+    twice = [name for name, count in Counter(header).items() if name and count > 1]
+    if twice:
+        raise ValueError(f"line 1: there are two columns {twice[0]!r}.")
+    return _Table(file, header, candidates[headers.index(header)], decimal, missing)
+
+
+def _exact_time(cell: str, time: float) -> float | int:
+    """Time of a cell, an integer where float64 does not hold it, as of stamps in ns."""
+    stamp = int(cell) if abs(time) >= 2**53 and re.fullmatch(r"\s*[+-]?\d{16,19}\s*", cell) else 0
+    return stamp if 2**53 <= abs(stamp) < 2**63 else time
+
+
+def _check_movements(names: Sequence[str], positions: Sequence[NDArray[np.float64]]) -> None:
+    """Refuse columns that count rows or number tasks, which nobody named as outputs."""
+    steps, rows = np.vstack([np.diff(position, axis=0) for position in positions]), np.vstack(positions)
+    for name, step, values in zip(names, steps.T, np.sort(rows, axis=0).T, strict=True):
+        # A count of all rows is so too where rows of several demonstrations are mixed.
+        counts = (step == 1.0).all() or ((step > 0.0).all() and (np.diff(values) == 1.0).all())
+        numbers = name.endswith(("_index", "_id")) and not step.any()
+        if len(values) >= _FEWEST_COUNTED and (values == np.round(values)).all() and (counts or numbers):
+            raise ValueError(
+                f"column {name!r}: it {'counts rows' if counts else 'numbers demonstrations'}, and is no movement. "
+                f"Leave it out, or say which columns are: outputs={[n for n in names if n != name]}."
+            )

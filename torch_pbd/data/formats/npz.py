@@ -9,55 +9,50 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from torch_pbd import checks
 from torch_pbd.data.demonstrations import Demonstrations, Missing
 from torch_pbd.data.recordings import preview
-from torch_pbd.exceptions import DataFormatError
 from torch_pbd.files.archives import read_array, read_members
 from torch_pbd.files.atomic import LOADERS
 from torch_pbd.files.memory import parsed_bytes, require_memory
 
 
-def read_npz(
+def read(
     path: Path, max_bytes: int, missing: Missing, units: Any = None, time_unit: str | None = None
 ) -> Demonstrations:
     """Read the format of `torch_pbd.data.load_demonstrations`."""
-    try:
-        members = read_members(path.read_bytes(), max_bytes, remedy=f"Raise max_bytes={max_bytes} to read it.")
-    except ValueError as error:
-        raise DataFormatError(f"{path}: {error}") from error
-    meta = _read_meta(path, members)
+    members = read_members(path.read_bytes(), max_bytes, remedy=f"Raise max_bytes={max_bytes} to read it.")
+    meta = _read_meta(members)
+    # One grid of times for all demonstrations, or a grid for each.
     if "t" in members:
-        times: Any = _read(path, members, "t")
-        positions: Any = _read(path, members, "x")
+        times: Any = _read(members, "t")
+        positions: Any = _read(members, "x")
         if positions.ndim != 3:
-            raise DataFormatError(f"{path}: x has shape {positions.shape}, it must be (K, T, d).")
+            raise ValueError(f"x has shape {positions.shape}, must have shape (K, T, d).")
     else:
-        n_demos = _count(path, members)
-        times = [_read(path, members, f"t_{k}") for k in range(n_demos)]
-        positions = [_read(path, members, f"x_{k}") for k in range(n_demos)]
-    try:
-        demonstrations = Demonstrations(
-            times,
-            positions,
-            names=meta.get("dims"),
-            units=_units(meta) if units is None else units,
-            frame=_text(meta, "frame"),
-            time_unit=time_unit or _text(meta, "time_unit") or _without_remark(_text(meta, "t_unit")) or "s",
-            missing=missing,
-        )
-        demonstrations._alignment = meta.get("alignment")
-        if demonstrations.alignment not in (None, "phase", "dtw"):
-            raise ValueError(f"meta says alignment = {demonstrations.alignment!r:.80}, it must be 'phase' or 'dtw'")
-    except (ValueError, TypeError) as error:
-        raise DataFormatError(f"{path}: {error}") from error
-    _check_counts(path, meta, demonstrations)
+        numbers = range(_count(members))
+        times = [_read(members, f"t_{k}") for k in numbers]
+        positions = [_read(members, f"x_{k}") for k in numbers]
+    # Public recordings say unit and t_unit, with a remark in brackets: "s (100 Hz)".
+    demonstrations = Demonstrations(
+        times,
+        positions,
+        names=meta.get("dims"),
+        units=_units(meta) if units is None else units,
+        frame=_text(meta, "frame"),
+        time_unit=time_unit or _text(meta, "time_unit") or _without_remark(_text(meta, "t_unit")) or "s",
+        alignment=meta.get("alignment"),
+        missing=missing,
+    )
+    for key, count in {"K": len(demonstrations), "d": demonstrations.n_outputs}.items():
+        if meta.get(key, count) != count:
+            raise ValueError(f"meta says {key} = {meta[key]}, but the arrays have {count}.")
     return demonstrations
 
 
-def write_npz(demonstrations: Demonstrations, handle: BinaryIO) -> None:
+def write(demonstrations: Demonstrations, handle: BinaryIO) -> None:
     """Write the format of `torch_pbd.data.load_demonstrations`."""
-    aligned = demonstrations.is_aligned
-    lengths = demonstrations.n_steps
+    aligned, lengths = demonstrations.is_aligned, demonstrations.n_steps
     meta = {
         "K": len(demonstrations),
         "T": lengths[0] if aligned else [min(lengths), max(lengths)],
@@ -78,19 +73,19 @@ def write_npz(demonstrations: Demonstrations, handle: BinaryIO) -> None:
     np.savez_compressed(handle, **arrays)
 
 
-def _read(path: Path, members: Mapping[str, bytes], name: str) -> NDArray[Any]:
+def _read(members: Mapping[str, bytes], name: str) -> NDArray[Any]:
     if name not in members:
-        raise DataFormatError(f"{path} has no array {name!r}; it has: {_listed(members)}.")
+        raise ValueError(f"it has no array {name!r}; it has: {_listed(members)}.")
     try:
         return read_array(name, members[name])
     except ValueError as error:
-        raise DataFormatError(f"{path}: array {name!r} cannot be read: {error}") from error
+        raise ValueError(f"array {name!r} cannot be read: {error}") from error
 
 
-def _read_meta(path: Path, members: Mapping[str, bytes]) -> dict[str, Any]:
+def _read_meta(members: Mapping[str, bytes]) -> dict[str, Any]:
     if "meta" not in members:
         return {}
-    text = _read(path, members, "meta")
+    text = _read(members, "meta")
     try:
         if text.ndim:
             raise ValueError(f"it has shape {text.shape}")
@@ -99,19 +94,17 @@ def _read_meta(path: Path, members: Mapping[str, bytes]) -> dict[str, Any]:
         if not isinstance(meta, dict):
             raise TypeError(f"it is a {type(meta).__name__}")
     except (ValueError, TypeError, RecursionError) as error:
-        raise DataFormatError(f"{path}: meta must be a 0-d string with a JSON object: {error}") from error
+        raise ValueError(f"meta must be a 0-d string with a JSON object: {error}") from error
     return meta
 
 
-def _count(path: Path, files: Iterable[str]) -> int:
-    numbers = {int(match[1]) for name in files if (match := re.fullmatch(r"[tx]_(\d+)", name))}
+def _count(names: Iterable[str]) -> int:
+    numbers = {int(match[1]) for name in names if (match := re.fullmatch(r"[tx]_(\d+)", name))}
     if not numbers:
-        raise DataFormatError(
-            f"{path} has neither arrays t and x nor t_0, x_0, ...; it has: {_listed(files)}. {LOADERS}"
-        )
+        raise ValueError(f"it has neither arrays t and x nor t_0, x_0, ...; it has: {_listed(names)}. {LOADERS}")
     missing = set(range(len(numbers))) - numbers
     if missing:
-        raise DataFormatError(f"{path} has demonstration {max(numbers)} but no t_{min(missing)}, x_{min(missing)}.")
+        raise ValueError(f"it has demonstration {max(numbers)} but no t_{min(missing)}, x_{min(missing)}.")
     return len(numbers)
 
 
@@ -119,29 +112,21 @@ def _listed(names: Iterable[str]) -> str:
     return f"{', '.join(names):.200}" or "none"
 
 
-def _text(meta: dict[str, Any], name: str) -> str | None:
-    value = meta.get(name)
-    if not isinstance(value, str | None):
-        raise ValueError(f"meta says {name} = {value!r:.80}, it must be text")
-    return value
+def _text(meta: dict[str, Any], name: str) -> Any:
+    return checks.text(meta.get(name), f"{name} in meta", optional=True)
 
 
 def _units(meta: dict[str, Any]) -> Any:
-    units = meta.get("units")
-    if isinstance(units, dict):
-        missing = [name for name in meta.get("dims") or () if name not in units]
-        if missing:
-            raise ValueError(f"units in meta has no entry for output {missing[0]!r}; it has {preview([*units])}.")
-        return [units[name] for name in meta.get("dims") or ()]
-    return units if units is not None else _without_remark(meta.get("unit"))
+    """Units of the outputs: in the order of ``dims``, by their names, or one for all."""
+    units, names = meta.get("units"), meta.get("dims") or ()
+    if not isinstance(units, dict):
+        return _without_remark(meta.get("unit")) if units is None else units
+    missing = [name for name in names if name not in units]
+    if missing:
+        raise ValueError(f"units in meta has no entry for output {missing[0]!r}; it has {preview([*units])}.")
+    return [units[name] for name in names]
 
 
 def _without_remark(unit: Any) -> Any:
-    """The unit before the remark in brackets that some recordings add to it."""
+    """Unit before the remark in brackets that some recordings add to it."""
     return unit.partition(" (")[0] if isinstance(unit, str) else unit
-
-
-def _check_counts(path: Path, meta: dict[str, Any], demonstrations: Demonstrations) -> None:
-    for key, count in {"K": len(demonstrations), "d": demonstrations.n_outputs}.items():
-        if meta.get(key, count) != count:
-            raise DataFormatError(f"{path}: meta says {key} = {meta[key]}, but the arrays have {count}.")
