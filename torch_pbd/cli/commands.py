@@ -97,8 +97,8 @@ mean +- standard error and its median over the folds; 95 % holds: share of
 left-out samples in the 95 % ellipse; least eig.: smallest eigenvalue of the
 predicted correlations"""
 _DEMO_LEGEND = f"""{_LEGEND}
-fresh LL: log-likelihood of the fresh demonstrations, nats per sample; 95 % of
-fresh: share of their samples in the 95 % ellipse; least eig.: smallest
+fresh LL: log-likelihood of the fresh demonstrations, nats per sample;
+95 % of fresh: share of their samples in the 95 % ellipse; least eig.: smallest
 eigenvalue of the predicted correlations"""
 
 

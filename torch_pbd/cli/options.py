@@ -9,14 +9,14 @@ import textwrap
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib import import_module
 from typing import Annotated, Any, Literal, NamedTuple, NoReturn, get_args, get_origin, get_type_hints
 
 import yaml
 
-from torch_pbd.cli.words import alternatives, described, remedy, shown, unknown, visible
-from torch_pbd.cli.yaml import Keys, read_yaml, read_yaml_file
+from torch_pbd.cli.words import Place, alternatives, described, remedy, shown, unknown, visible
+from torch_pbd.cli.yaml import read_yaml, read_yaml_file
 from torch_pbd.console import say
 from torch_pbd.exceptions import ConfigError
 from torch_pbd.registry import ESTIMATORS, REGRESSORS
@@ -96,31 +96,12 @@ def _help(usage: str, about: str, options: Mapping[str, Option]) -> str:
     return "\n".join([*lines, "", "--config FILE: YAML of any of these, as --print_config shows them all."])
 
 
-def _class_help(text: str, place: "Place") -> str:
+def _class_help(text: str, place: Place) -> str:
     """Parameters of a class, and what its docstring says of them."""
     table = {name: module for known in CLASSES.values() for name, module in known.items()}
     spec = _Spec(_find_class(text, table, place), table, {})
     lines = [f"  {name}: {described(hint)}; default {default}" for name, (hint, default) in spec.parameters().items()]
     return "\n".join([f"parameters of {spec.name}:", *lines, "", inspect.getdoc(spec.load()) or ""])
-
-
-@dataclass(frozen=True)
-class Place:
-    """Where a value stands: a file or the command line, the keys below it, and the line of each."""
-
-    source: str = ""
-    keys: Keys = ()
-    lines: Mapping[Keys, int] = field(default_factory=dict)
-
-    def below(self, key: str | int) -> "Place":
-        """Place of an entry of this value."""
-        return Place(self.source, (*self.keys, key), self.lines)
-
-    def error(self, problem: str) -> ConfigError:
-        """Error with file, line and keys."""
-        lines = [self.lines[self.keys[:n]] for n in range(len(self.keys) + 1) if self.keys[:n] in self.lines]
-        where = f"{self.source}, line {lines[-1]}: " if lines else ""
-        return ConfigError(f"{where}{'.'.join(visible(str(key)) for key in self.keys)} {problem}")
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,15 @@
-"""Words for values and types in messages about options, and the remedies that can be guessed."""
+"""Words of messages about options: places, values and types, and the remedies that can be guessed."""
 
 import difflib
 import math
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+from torch_pbd.cli.yaml import Keys
+from torch_pbd.exceptions import ConfigError
 
 _LONGEST = 120  # letters of a name: one line of a wide terminal
 _LONGEST_VALUE = 60
@@ -20,6 +24,25 @@ _NAMES: dict[Any, str] = {
 }
 _KINDS = {int: "the number ", float: "the number ", str: "the text "}
 _TRUTH = {"yes": "true", "on": "true", "y": "true", "no": "false", "off": "false", "n": "false"}
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a value stands: a file or the command line, the keys below it, and the line of each."""
+
+    source: str = ""
+    keys: Keys = ()
+    lines: Mapping[Keys, int] = field(default_factory=dict)
+
+    def below(self, key: str | int) -> "Place":
+        """Place of an entry of this value."""
+        return Place(self.source, (*self.keys, key), self.lines)
+
+    def error(self, problem: str) -> ConfigError:
+        """Error with file, line and keys."""
+        lines = [self.lines[self.keys[:n]] for n in range(len(self.keys) + 1) if self.keys[:n] in self.lines]
+        where = f"{self.source}, line {lines[-1]}: " if lines else ""
+        return ConfigError(f"{where}{'.'.join(visible(str(key)) for key in self.keys)} {problem}")
 
 
 def visible(name: str) -> str:

@@ -106,7 +106,7 @@ class RunFolder:
         from matplotlib.layout_engine import ConstrainedLayoutEngine
 
         # A figure with a layout of its own would be laid out twice and drawn twice, which takes as long again.
-        if figure.get_layout_engine() is None:
+        if figure.axes and figure.get_layout_engine() is None:
             ConstrainedLayoutEngine().execute(figure)
         with replacing(target) as file:
             figure.savefig(file, format="png", dpi=_DPI)
