@@ -6,54 +6,48 @@ cluster only.
 """
 
 import contextlib
+import sys
 from pathlib import Path
-from typing import Literal
 
 import joblib
-from jsonargparse import auto_cli
 
-from torch_pbd import CholeskyCovRegressor, GMMBaseline, HeteroscedasticGPRegressor, WishartProcessRegressor
+from torch_pbd.cli.commands import OPTIONS as COMMANDS
+from torch_pbd.cli.options import Option, parse
+from torch_pbd.console import say
 from torch_pbd.data import load_demonstrations
-from torch_pbd.estimators.base import CovarianceRegressor
+from torch_pbd.exceptions import ConfigError
 from torch_pbd.experiments.recordings import prepare
 from torch_pbd.experiments.run_folder import format_table
 from torch_pbd.experiments.sweep import summarize, sweep
 
+_COMPARE = COMMANDS["compare"]
+OPTIONS = {
+    "data": Option(list[str] | None, None, "files of demonstrations, .npz or .csv", required=True),
+    "models": _COMPARE["models"]._replace(help="name: regressor, several; the first is the one to beat"),
+    "cluster": Option(str | None, None, "address of a dask scheduler; none: processes here"),
+    "n_jobs": _COMPARE["n_jobs"]._replace(help="jobs at the same time; -1: all cores; on a cluster, none: all"),
+    "max_folds": Option(int | None, None, "demonstrations to leave out of each file; none: each of them"),
+    "align": _COMPARE["align"],
+    "n_steps": _COMPARE["n_steps"],
+}
 
-def main(
-    data: list[str],
-    models: dict[str, CovarianceRegressor] | None = None,
-    cluster: str | None = None,
-    n_jobs: int | None = None,
-    max_folds: int | None = None,
-    align: Literal["auto", "none", "phase", "dtw"] = "auto",
-    n_steps: int | None = None,
-) -> None:
-    """Sweep and print.
 
-    Args:
-        data: Files of demonstrations, .npz or .csv.
-        models: Name and regressor, several; the first is what the others are held against.
-        cluster: Address of a dask scheduler; none are processes here.
-        n_jobs: Jobs at the same time, -1 for all cores; on a cluster, none for all.
-        max_folds: Demonstrations to leave out of each file; none for each of them.
-        align: How demonstrations come onto one grid.
-        n_steps: Points of that grid.
-    """
-    if models is None:
-        models = {
-            "HGP": HeteroscedasticGPRegressor(),
-            "CD": CholeskyCovRegressor(),
-            "WP": WishartProcessRegressor(),
-            "GMM 5": GMMBaseline(random_state=0),
-        }
-    tasks = {name: prepare(load_demonstrations(path), align, n_steps) for name, path in _names(data).items()}
-    with _where(cluster):
-        rows = sweep(models, tasks, max_folds=max_folds, n_jobs=n_jobs)
+def main(arguments: list[str]) -> int:
+    """Sweep and print."""
+    try:
+        options, _ = parse("python scripts/sweep.py", "leave one demonstration out, of every file", OPTIONS, arguments)
+    except ConfigError as error:
+        say(f"sweep.py: {error}", sys.stderr)
+        return 2
+    files = _names(options.data).items()
+    tasks = {name: prepare(load_demonstrations(path), options.align, options.n_steps) for name, path in files}
+    with _where(options.cluster):
+        rows = sweep(options.models, tasks, max_folds=options.max_folds, n_jobs=options.n_jobs)
     print(format_table(summarize(rows)))
     for row in rows:
         if row["error"]:
             print(f"{row['task']}, {row['model']}, without demonstration {row['fold']}: {row['error']}")
+    return 0
 
 
 def _names(data: list[str]) -> dict[str, str]:
@@ -74,4 +68,4 @@ def _where(cluster: str | None):
 
 
 if __name__ == "__main__":
-    auto_cli(main, as_positional=False)
+    sys.exit(main(sys.argv[1:]))

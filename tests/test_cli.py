@@ -77,7 +77,7 @@ def test_compare_without_data_is_table_1(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["comparre"], "no command 'comparre'. Did you mean 'compare'"),
+        (["comparre"], "'comparre' is not a command. Did you mean 'compare'"),
         (["fit"], "data"),
         (["fit", "--data", "missing.npz"], "no file 'missing.npz'"),
         (["fit", "--data", "x.npz", "--modle", "GMMBaseline"], "Did you mean 'model'"),

@@ -1,12 +1,12 @@
 """Figures of demonstrations and of what a model learned from them; each takes data and an Axes."""
 
 from collections.abc import Sequence
-from numbers import Real
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike, NDArray
 
@@ -15,7 +15,6 @@ from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.rollout import Rollout
 from torch_pbd.data import Demonstrations
 from torch_pbd.estimators.base import CovarianceRegressor
-from torch_pbd.labels import axis_label, output_label, readable_unit, schedule_names, short_unit
 
 Floats = NDArray[np.float64]
 
@@ -23,6 +22,53 @@ Floats = NDArray[np.float64]
 DATA, EMPIRICAL, MODEL, PRIOR, TRUTH = "#999999", "#E69F00", "#0072B2", "#CC79A7", "#009E73"
 SERIES = (MODEL, EMPIRICAL, TRUTH, PRIOR, "#56B4E9", "#D55E00", "#000000")
 LINES = ("-", "--", ":", "-.")
+
+_N_BARS = 30  # inputs up to which error bars are drawn; of more they would touch, and lines are
+_LONGEST_UNIT = 8  # letters; a longer one is a description
+_FLAT = 3.0  # ratio of the sides of a plane from which on equal scales would leave a sliver
+
+
+def figure_grid(n_rows: int, n_columns: int, size: tuple[float, float], **options: Any) -> tuple[Figure, Any]:
+    """Figure of ``size`` in inches and its Axes (n_rows, n_columns); pyplot does not know it, so nothing needs closing.
+
+    ``options`` are those of ``Figure.subplots``.
+    """
+    figure = Figure(figsize=size)
+    return figure, figure.subplots(n_rows, n_columns, squeeze=False, **options)
+
+
+def legend_below(figure: Figure, ax: Axes, n_columns: int = 4) -> None:
+    """Draw the legend of one Axes, which holds for all, below the figure."""
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=n_columns, fontsize=9)
+
+
+def equal_scales(ax: Axes) -> None:
+    """Give both axes of a plane one scale, unless it is so long that nothing would be seen across it."""
+    width, height = (abs(high - low) for low, high in (ax.get_xlim(), ax.get_ylim()))
+    if width < _FLAT * height and height < _FLAT * width:
+        ax.set_aspect("equal", adjustable="datalim")
+
+
+def readable_unit(unit: str | None) -> tuple[str, float]:
+    """Unit of a deviation, and what to multiply it by: metres are shown in millimetres."""
+    return ("mm", 1000.0) if unit == "m" else (short_unit(unit), 1.0)
+
+
+def short_unit(unit: str | None) -> str:
+    """Unit for a label or a column; "unit" where there is none, or only a description."""
+    return unit if unit and len(unit) <= _LONGEST_UNIT else "unit"
+
+
+def schedule_names(schedule: Schedule) -> Sequence[str]:
+    """Names of the outputs of a schedule."""
+    return schedule.names or [f"y{i}" for i in range(schedule.position.shape[1])]
+
+
+def output_label(demonstrations: Demonstrations, output: int) -> str:
+    """Name of an output for an axis, with its unit in brackets if it has one."""
+    unit = demonstrations.units[output] if demonstrations.units is not None else "1"
+    in_brackets = f" [{unit}]" if 0 < len(unit) <= _LONGEST_UNIT and unit != "1" else ""
+    return f"{demonstrations.names[output]}{in_brackets}"
 
 
 def plot_demonstrations(
@@ -46,18 +92,15 @@ def plot_demonstrations(
     checks.instance(demonstrations, "demonstrations", Demonstrations)
     outputs = list(outputs) if isinstance(outputs, np.ndarray | range) and np.ndim(outputs) else outputs
     _check_outputs(outputs, demonstrations.n_outputs)
-    _check_axes("ax", [ax], 1)
+    _check_axes("ax", [ax])
     lines: list[Line2D] = []
     for time, position in demonstrations:
         columns = position[:, list(outputs)].T
         across, up = (time, columns[0]) if len(outputs) == 1 else columns
         lines += ax.plot(across, up, color=DATA, lw=0.7, alpha=0.8, label=None if lines else label, zorder=1)
-    if len(outputs) == 1:
-        ax.set_xlabel(axis_label("time" if demonstrations.time_unit != "1" else "phase", demonstrations.time_unit))
-        ax.set_ylabel(output_label(demonstrations, outputs[0]))
-    else:
-        ax.set_xlabel(output_label(demonstrations, outputs[0]))
-        ax.set_ylabel(output_label(demonstrations, outputs[1]))
+    unit = demonstrations.time_unit
+    labels = ["phase" if unit == "1" else f"time [{unit}]", *(output_label(demonstrations, one) for one in outputs)]
+    ax.set(xlabel=labels[-2], ylabel=labels[-1])
     return lines
 
 
@@ -72,13 +115,9 @@ def plot_std_band(
     label: str | None = None,
 ) -> tuple[Line2D, PolyCollection]:
     """Draw a mean (n,) over x (n,) with a band of ``n_std`` standard deviations (n,) on either side."""
-    _check_axes("ax", [ax], 1)
+    _check_axes("ax", [ax])
     across, middle, half = (checks.finite(*named).ravel() for named in ((x, "x"), (mean, "mean"), (std, "std")))
-    for name, values in (("mean", middle), ("std", half)):
-        if len(values) != len(across):
-            raise ValueError(f"{name} has {len(values)} values, must have {len(across)}: one for each of x.")
-    if (half < 0.0).any():
-        raise ValueError(f"std has a value of {half.min():g}, must not be negative: give standard deviations.")
+    checks.require(half >= 0.0, half, "std", "at least zero", "give standard deviations")
     (line,) = ax.plot(across, middle, color=color, lw=1.5, label=label, zorder=3)
     band = ax.fill_between(
         across, middle - n_std * half, middle + n_std * half, color=color, alpha=0.22, lw=0, zorder=2
@@ -97,16 +136,10 @@ def plot_covariance_ellipses(
     linestyle: str = "-",
 ) -> LineCollection:
     """Draw the ``n_std`` ellipses of covariances (n, 2, 2) around means (n, 2)."""
-    _check_axes("ax", [ax], 1)
-    centres, matrices = checks.finite(mean, "mean"), checks.finite(covariance, "covariance")
-    if matrices.ndim != 3 or matrices.shape[1:] != (2, 2) or centres.shape != matrices.shape[:2]:
-        shapes = f"covariance has shape {matrices.shape} and mean {centres.shape}"
-        raise ValueError(f"{shapes}, must have (n, 2, 2) and (n, 2): take two outputs.")
-    scale = np.abs(matrices).max(axis=(1, 2))
-    if (np.abs(matrices - matrices.mT).max(axis=(1, 2)) > 1e-8 * scale).any():
-        raise ValueError("covariance must be symmetric: symmetrize it.")
-    if (np.linalg.eigvalsh(matrices)[:, 0] < -1e-8 * scale).any():
-        raise ValueError("covariance must be positive semidefinite: an ellipse has no negative axis.")
+    _check_axes("ax", [ax])
+    centres = checks.array(mean, "mean", ("n", 2))
+    matrices = checks.array(covariance, "covariance", (len(centres), 2, 2))
+    checks.semidefinite(matrices, "covariance")
     angle = np.linspace(0.0, 2.0 * np.pi, 73)
     circle = np.stack([np.cos(angle), np.sin(angle)])
     values, axes = np.linalg.eigh(matrices)
@@ -142,15 +175,10 @@ def plot_model_bands(
     true_std : callable, default=None
         Maps x (n, 1) to (mean, std), both (n, n_outputs), where the truth is known.
     """
-    if not hasattr(model, "predict_cov"):
-        raise ValueError(f"model is {model!r}, must be a fitted covariance regressor.")
-    inputs, targets = checks.finite(X, "X"), checks.finite(y, "y")
-    if inputs.ndim != 2 or inputs.shape[1] != 1 or not targets.ndim or len(targets) != len(inputs):
-        raise ValueError(f"X has shape {inputs.shape} and y {targets.shape}, must have (n, 1) and (n, n_outputs).")
-    targets = targets.reshape(len(targets), -1)
+    inputs, targets = checks.array(X, "X", ("n", 1)), checks.finite(y, "y")
+    targets = targets.reshape(len(inputs), -1)
     _check_axes("axes", axes, targets.shape[1])
-    if not isinstance(beyond, Real) or not checks.is_finite(beyond):
-        raise ValueError(f"beyond is {beyond!r}, must be a finite number: how far to draw, in ranges of X.")
+    beyond = checks.number(beyond, "beyond", remedy="how far to draw, in ranges of X")
     low, high = inputs.min(), inputs.max()
     query = np.linspace(low - beyond * (high - low), high + beyond * (high - low), 401)[:, np.newaxis]
     mean, covariance = model.predict(query, return_cov=True)
@@ -161,32 +189,22 @@ def plot_model_bands(
         plot_std_band(query, mean[:, output], std[:, output], ax, label="model: mean, 2 sd")
         if true_std is not None:
             centre, deviation = true_std(query)
-            for sign in (-2.0, 2.0):
-                edge = centre[:, output] + sign * deviation[:, output]
-                ax.plot(query, edge, "--", color=TRUTH, lw=1.1, label="truth: 2 sd" if sign > 0 else None, zorder=3)
-        if len(position):
-            _draw_empirical(position, empirical_mean[:, output], empirical_std[:, output], ax)
+            draw_edges(query[:, 0], centre[:, output], deviation[:, output], ax, "truth: 2 sd", TRUTH)
+        if 0 < len(position) <= _N_BARS:
+            style: dict[str, Any] = {"fmt": ".", "ms": 4, "capsize": 2, "lw": 1.2, "label": "empirical: mean, 2 sd"}
+            middle, half = empirical_mean[:, output], 2.0 * empirical_std[:, output]
+            ax.errorbar(position, middle, half, color=EMPIRICAL, zorder=4, **style)
+        elif len(position):
+            draw_edges(position, empirical_mean[:, output], empirical_std[:, output], ax, "empirical: 2 sd")
         for edge in (low, high):
             ax.axvline(edge, color=DATA, lw=0.8, ls=":", label="end of the data" if edge == low else None)
 
 
-def _draw_empirical(position: Floats, mean: Floats, std: Floats, ax: Axes) -> None:
-    """Error bars at a few inputs, lines at many."""
-    if len(position) <= 30:
-        ax.errorbar(
-            position, mean, 2.0 * std, fmt=".", ms=4, color=EMPIRICAL, capsize=2, lw=1.2, zorder=4,
-            label="empirical: mean, 2 sd",
-        )  # fmt: skip
-        return
-    for sign in (-2.0, 2.0):
-        ax.plot(
-            position,
-            mean + sign * std,
-            color=EMPIRICAL,
-            lw=1.0,
-            zorder=4,
-            label="empirical: 2 sd" if sign > 0 else None,
-        )
+def draw_edges(x: Floats, mean: Floats, std: Floats, ax: Axes, label: str, color: str = EMPIRICAL) -> None:
+    """Draw lines two standard deviations above and below a mean."""
+    style = "--" if color == TRUTH else "-"
+    lines = ax.plot(x, np.stack([mean + 2.0 * std, mean - 2.0 * std], axis=1), style, color=color, lw=1.0, zorder=2.5)
+    lines[0].set_label(label)
 
 
 def _empirical_bands(position: Floats, targets: Floats) -> tuple[Floats, Floats, Floats]:
@@ -212,7 +230,7 @@ def plot_stiffness(schedule: Schedule, ax: Axes) -> list[Line2D]:
     list of Line2D, one an output
     """
     checks.instance(schedule, "schedule", Schedule)
-    _check_axes("ax", [ax], 1)
+    _check_axes("ax", [ax])
     lines: list[Line2D] = []
     for output, name in enumerate(schedule_names(schedule)):
         color, dashes = SERIES[output % len(SERIES)], LINES[output // len(SERIES) % len(LINES)]
@@ -272,7 +290,7 @@ def _check_outputs(outputs: Any, n_outputs: int) -> None:
         raise ValueError(f"outputs is {outputs!r}, must be one or two numbers from 0 to {n_outputs - 1}.")
 
 
-def _check_axes(name: str, axes: Any, least: int) -> None:
+def _check_axes(name: str, axes: Any, least: int = 1) -> None:
     known = np.ndim(axes) == 1 and all(hasattr(ax, "plot") for ax in axes)
     if not known or len(axes) < least:
         raise ValueError(f"{name} is {axes!r}, must be {least} matplotlib Axes.")

@@ -5,7 +5,7 @@ from sklearn.base import BaseEstimator
 from torch_pbd import GMMBaseline
 from torch_pbd.data import make_paper_simulation, paper_covariance
 from torch_pbd.experiments.comparison import compare_models, empirical_covariances
-from torch_pbd.experiments.reference import ScikitLearnGMR
+from torch_pbd.experiments.simulation import ScikitLearnGMR
 from torch_pbd.metrics import covariance_mse
 
 

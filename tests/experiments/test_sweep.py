@@ -100,7 +100,7 @@ def test_a_job_that_fails_is_a_row_with_its_error(tasks, serial):
     assert without_times(others) == without_times(serial[:8])
     for row in failed:
         assert np.isnan([row["log_likelihood"], row["coverage"], row["fit_seconds"]]).all()
-        assert row["error"].startswith("ValueError: n_components=-1")
+        assert row["error"].startswith("InvalidParameterError: n_components is -1")
     table = summarize(rows)
     assert [row["failed"] for row in table] == [4, 0, 0]
     assert np.isnan(table[0]["held-out LL"])

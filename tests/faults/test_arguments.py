@@ -273,9 +273,9 @@ CALLS = [
     (lambda: plotting.plot_demonstrations(Demonstrations(TIME, [STILL]), [5], plt.gca()), r"outputs is \[5\]"),
     (lambda: plotting.plot_stiffness(None, plt.gca()), "schedule is None"),
     (lambda: plotting.plot_stiffness(SCHEDULE, None), r"ax is \[None\], must be 1 matplotlib Axes"),
-    (lambda: plotting.plot_std_band(TIME, TIME, -TIME - 1.0, plt.gca()), "std has a value of -1.19, must not be"),
+    (lambda: plotting.plot_std_band(TIME, TIME, -TIME - 1.0, plt.gca()), r"std\[0\] is -1.0, must be at least zero"),
     (lambda: plotting.plot_covariance_ellipses([[0, 0]], [-np.eye(2)], plt.gca()), "must be positive semidefinite"),
-    (lambda: plotting.plot_covariance_ellipses([[0] * 3], [np.eye(3)], plt.gca()), "covariance has shape .1, 3, 3."),
+    (lambda: plotting.plot_covariance_ellipses([[0] * 3], [np.eye(3)], plt.gca()), "mean has shape .1, 3., must have"),
 ]  # fmt: skip
 
 

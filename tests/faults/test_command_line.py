@@ -149,7 +149,7 @@ def test_38_a_signal_while_torch_is_loaded_is_one_line(number, data, monkeypatch
     def interrupted(*_):
         signal.raise_signal(number)
 
-    monkeypatch.setattr("torch_pbd.cli.config.parse", interrupted)
+    monkeypatch.setattr("torch_pbd.cli.commands.parse", interrupted)
     assert main(["fit", "--data", str(data)]) == {signal.SIGINT: 130, signal.SIGTERM: 143}[number]
     shown = capsys.readouterr()
     assert shown.err == {signal.SIGINT: "torch-pbd: interrupted\n", signal.SIGTERM: "torch-pbd: terminated\n"}[number]

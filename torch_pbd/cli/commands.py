@@ -1,36 +1,122 @@
-"""What each command does with its options, in a folder of results: the text it ends with."""
+"""Commands: the options of each, and its work in a folder of results, which ends with a text."""
 
-import warnings
-from typing import Any
+import math
+from argparse import Namespace
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+from torch_pbd.cli import options
+from torch_pbd.cli.options import Option, made
 from torch_pbd.console import say
 from torch_pbd.exceptions import ConfigError
 
-_LEGEND = """MSE: squared distance of Cholesky factors to the empirical covariances, units of the data (Table I)
-error to truth: relative Frobenius error of the covariance; held-out LL: log-likelihood of left-out
-demonstrations, nats per sample, its mean +- standard error and its median over the folds; 95 % holds: share of
-left-out samples in the 95 % ellipse; least eig.: smallest eigenvalue of the predicted correlations"""
+if TYPE_CHECKING:
+    from torch_pbd.control.controller import DMPController
+    from torch_pbd.estimators.base import CovarianceRegressor
+
+COMMANDS = {
+    "demo": "learn from six made demonstrations of the tunnel task; the main job, no data needed",
+    "fit": "fit one model to a file of demonstrations",
+    "experiment": "learn a skill, reproduce it on a simulated robot and push it (Figures 5 to 8)",
+    "compare": "compare models: on the paper's simulation (Table I, Figures 1 to 3), or on a file",
+}
+
+_MODELS = {
+    "HGP": "HeteroscedasticGPRegressor",
+    "CD": "CholeskyCovRegressor",
+    "WP": "WishartProcessRegressor",
+    "GMM 5": {"class_path": "GMMBaseline", "init_args": {"n_components": 5}},
+    "GMM 8": {"class_path": "GMMBaseline", "init_args": {"n_components": 8}},
+}
+"""The models that are compared by default; a mixture has as many components as in the paper's Table I."""
+
+_Count = Annotated[int, (1, math.inf)]
+_Seed = Annotated[int, (0, 2**32 - 2)]  # NumPy's seeds end at 2**32 - 1, and the demo takes the next one too
+_MADE = {
+    "n_demos": Option(_Count, 6, "demonstrations to make"),
+    "seed": Option(_Seed, 0, "seed of the demonstrations"),
+}
+_FILE = {
+    "data": Option(str | None, None, "file of demonstrations, .npz or .csv; none: made or simulated ones"),
+    "missing": Option(Literal["raise", "drop"], "raise", "of the file's samples: refuse, or leave out"),
+    "from_start": Option(bool, False, "count the times of each of the file's demonstrations from 0"),
+}
+_GRID = {
+    "align": Option(Literal["auto", "none", "phase", "dtw"], "auto", "auto: by phase where sampling times differ"),
+    "input": Option(Literal["time", "phase"], "time", "what the covariance depends on"),
+    "n_steps": Option(_Count | None, None, "resample to so many points"),
+}
+_CLASS_HELP = "by name, or class_path and init_args; see"
+OPTIONS: dict[str, dict[str, Option]] = {
+    "demo": _MADE,
+    "fit": {
+        **_FILE,
+        "data": Option(str | None, None, "file of demonstrations, .npz or .csv", required=True),
+        "model": Option("CovarianceRegressor", _MODELS["HGP"], f"estimator {_CLASS_HELP} --model.help NAME"),
+        **_GRID,
+    },
+    "experiment": {
+        **_FILE,
+        **_MADE,
+        "common_start": Option(bool, False, "made demonstrations start at one point"),
+        "controllers": Option(
+            dict[str, "DMPController"],
+            {"recommended": "DMPController"},
+            f"controllers {_CLASS_HELP} --controllers.help DMPController",
+        ),
+        "push": Option(Annotated[float, (-1e6, 1e6)], 5.0, "peak of the two pushes along the first output, N"),
+        "rate": Option(Annotated[float, (1e-3, 1e6)], 1000.0, "ticks of the controller, Hz"),
+    },
+    "compare": {
+        **_FILE,
+        "models": Option(dict[str, "CovarianceRegressor"], _MODELS, f"estimators {_CLASS_HELP} --models.help NAME"),
+        "max_folds": Option(Annotated[int, (0, math.inf)], 10, "demonstrations to leave out, one by one"),
+        "n_jobs": Option(
+            Annotated[int, (-math.inf, -1)] | _Count | None, None, "fits at the same time; -1: all cores"
+        ),
+        "readings": Option(
+            list[Literal["bell", "printed", "bowl"]], ["bell", "printed", "bowl"], "of eq. (14), which is ambiguous"
+        ),
+        "n_seeds": Option(_Count, 10, "simulations to take the median of"),
+        "n_inputs": Option(_Count, 10, "inputs of the simulation"),
+        "n_draws": Option(_Count, 50, "draws at each input of the simulation"),
+        **_GRID,
+    },
+}  # fmt: skip
+
+OPENINGS = {
+    "demo": "{n_demos} made demonstrations of the tunnel task; the truth is that of 300 fresh ones\n",
+}
+"""First lines, said before torch, which takes seconds to load."""
+
+_LEGEND = """MSE: squared distance of Cholesky factors to the empirical covariances, units of
+the data (Table I); error to truth: relative Frobenius error of the covariance;"""
+_FOLDS_LEGEND = f"""{_LEGEND}
+held-out LL: log-likelihood of left-out demonstrations, nats per sample, its
+mean +- standard error and its median over the folds; 95 % holds: share of
+left-out samples in the 95 % ellipse; least eig.: smallest eigenvalue of the
+predicted correlations"""
+_DEMO_LEGEND = f"""{_LEGEND}
+fresh LL: log-likelihood of the fresh demonstrations, nats per sample;
+95 % of fresh: share of their samples in the 95 % ellipse; least eig.: smallest
+eigenvalue of the predicted correlations"""
+
+
+def parse(command: str, arguments: Sequence[str]) -> tuple[Namespace, str]:
+    """Options of a command, and the YAML that gives them again."""
+    run = {
+        "output": Option(str, f"runs/{command}", "folder of the results"),
+        "resume": Option(bool, False, "go on with the finished fits in the folder of results"),
+    }
+    return options.parse(f"torch-pbd {command}", COMMANDS[command], run | OPTIONS[command], arguments)
 
 
 def demo(options: Any, folder: Any) -> str:
     """The main job: made demonstrations of the tunnel task, four models, a robot that is pushed."""
-    from torch_pbd import (
-        CholeskyCovRegressor,
-        GMMBaseline,
-        HeteroscedasticGPRegressor,
-        WishartProcessRegressor,
-    )
     from torch_pbd.experiments.demo import run_demo
 
-    models = {
-        "HGP": HeteroscedasticGPRegressor(),
-        "CD": CholeskyCovRegressor(),
-        "WP": WishartProcessRegressor(),
-        "GMM 5": GMMBaseline(n_components=5),
-    }
-    say(f"{options.n_demos} made demonstrations of the tunnel task; the truth is that of 300 more\n")
-    tables = run_demo(models, folder, n_demos=options.n_demos, seed=options.seed)
-    return f"{tables}\n\n{_LEGEND};\n95 % of fresh: share of the samples of those 300 in it"
+    models = made({name: _MODELS[name] for name in ("HGP", "CD", "WP", "GMM 5")}, OPTIONS["compare"]["models"].type)
+    return f"{run_demo(models, folder, n_demos=options.n_demos, seed=options.seed)}\n\n{_DEMO_LEGEND}"
 
 
 def fit(options: Any, folder: Any) -> str:
@@ -43,17 +129,12 @@ def fit(options: Any, folder: Any) -> str:
     model, _ = fit_once(options.model, X, y, groups, finished=folder.finished)
     name = type(model).__name__
     model_path, figure_path = write_fitted(model, demonstrations, folder, name, options.input)
-    row = {
-        "n_iter": model.n_iter_,
-        "loss": model.loss_,
-        "converged": model.converged_,
-        "jitter": model.jitter_,
-        "LL": model.score(X, y),
-    }
-    folder.write_metrics([{"model": name} | row])
+    likelihood = model.score(X, y)
+    learned = {key: getattr(model, f"{key}_") for key in ("n_iter", "loss", "converged", "jitter")}
+    folder.write_metrics([{"model": name, **learned, "LL": likelihood}])
     settled = "converged" if model.converged_ else "did not converge"
     return (
-        f"{name} {settled} after {model.n_iter_} iterations; log-likelihood {row['LL']:.3f} nats per sample of the "
+        f"{name} {settled} after {model.n_iter_} iterations; log-likelihood {likelihood:.3f} nats per sample of the "
         f"data it was fitted to\nmodel:   {model_path}\nfigure:  {figure_path}"
     )
 
@@ -62,60 +143,44 @@ def experiment(options: Any, folder: Any) -> str:
     """A skill, learned and reproduced on a simulated robot that is pushed."""
     from torch_pbd.data import load_demonstrations, make_tunnel_demonstrations
     from torch_pbd.experiments.recordings import describe
-    from torch_pbd.experiments.robot import run_robot
-    from torch_pbd.experiments.robot_figures import framework_figure
+    from torch_pbd.experiments.robot import framework_figure, run_robot
 
-    if options.data is None:
+    made = options.data is None
+    if made:
         demonstrations = make_tunnel_demonstrations(
             options.n_demos, random_state=options.seed, common_start=options.common_start
         )
-        say(describe(demonstrations, "tunnel task"))
     else:
         demonstrations = load_demonstrations(options.data, missing=options.missing, from_start=options.from_start)
-        say(describe(demonstrations, options.data.name))
+    say(describe(demonstrations, "tunnel task" if made else options.data.name))
     where = f"along {demonstrations.names[0]}, at 20 % and 80 % of the movement; K is the stiffness there, N/m"
     say(f"pushes of {options.push:g} N {where}\n")
     folder.write_figure(framework_figure(), "figure5_framework")
-    made = options.data is None
     return run_robot(options.controllers, demonstrations, folder, peak=options.push, rate=options.rate, in_tunnel=made)
 
 
 def compare(options: Any, folder: Any) -> str:
     """Models on a file, demonstration by demonstration, or on the paper's simulation."""
+    how = {"max_folds": options.max_folds, "n_jobs": options.n_jobs}
     if options.data is not None:
         from torch_pbd.experiments.recordings import run_recordings
 
         demonstrations = _demonstrations(options)
         if len(demonstrations) < 2:
             raise ConfigError("data: there is one demonstration; to compare models, at least two are needed.")
-        table = run_recordings(
-            options.models,
-            demonstrations,
-            folder,
-            input=options.input,
-            max_folds=options.max_folds,
-            n_jobs=options.n_jobs,
-        )
-        return f"{table}\n\n{_LEGEND}"
+        return f"{run_recordings(options.models, demonstrations, folder, options.input, **how)}\n\n{_FOLDS_LEGEND}"
     from torch_pbd.experiments.simulation import run_simulation
 
     say(f"eq. (14): {options.n_inputs} inputs x {options.n_draws} draws, medians over {options.n_seeds} seeds\n")
-    return run_simulation(
-        options.models,
-        folder,
-        readings=options.readings,
-        n_seeds=options.n_seeds,
-        n_inputs=options.n_inputs,
-        n_demos=options.n_draws,
-        max_folds=options.max_folds,
-        n_jobs=options.n_jobs,
-    )
+    sizes = {"n_seeds": options.n_seeds, "n_inputs": options.n_inputs, "n_demos": options.n_draws}
+    return run_simulation(options.models, folder, options.readings, **sizes, **how)
 
 
 WORK = {"demo": demo, "fit": fit, "experiment": experiment, "compare": compare}
 
 
 def _demonstrations(options: Any) -> Any:
+    from torch_pbd import checks
     from torch_pbd.data import check_unimodal, load_demonstrations
     from torch_pbd.data.alignment import TIMING_REMOVED
     from torch_pbd.experiments.recordings import describe, prepare
@@ -123,15 +188,12 @@ def _demonstrations(options: Any) -> Any:
     recorded = load_demonstrations(options.data, missing=options.missing, from_start=options.from_start)
     say(describe(recorded, options.data.name))
     if len(recorded) == 1:
-        warnings.warn(
-            "There is one demonstration: what varies between demonstrations cannot be told from how one moves.",
-            stacklevel=2,
-        )
+        checks.warn("There is one demonstration: what varies between demonstrations cannot be told from how one moves.")
     check_unimodal(recorded)
     prepared = prepare(recorded, options.align, options.n_steps)
     if prepared is not recorded:
         say(describe(prepared, f"after align={options.align}"))
     if prepared.alignment == "dtw":
-        warnings.warn(TIMING_REMOVED, stacklevel=2)
+        checks.warn(TIMING_REMOVED)
     say("")
     return prepared

@@ -4,10 +4,14 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
+import torch_pbd
+from torch_pbd.cli import commands
+from torch_pbd.cli.words import unknown
 from torch_pbd.console import Notes, say
 from torch_pbd.exceptions import ConfigError, FolderInUseError
 
@@ -66,35 +70,31 @@ def _signals() -> Iterator[None]:
 
 
 def _answer(arguments: Sequence[str]) -> int:
-    import torch_pbd
-    from torch_pbd.cli.config import COMMANDS, nearest
-
     if not arguments or arguments[0] in ("-h", "--help"):
-        say(_help(COMMANDS))
+        say("torch-pbd: learn how precise people are from demonstrations\n")
+        say("usage: torch-pbd COMMAND [--config FILE] [--option VALUE ...]\n")
+        for name, about in commands.COMMANDS.items():
+            say(f"  {name:<10}  {about}")
+        say("\nOptions of a command: torch-pbd COMMAND --help. As YAML: torch-pbd COMMAND --print_config.")
         return 0
-    if arguments[0] == "--version":
+    command, *rest = arguments
+    if command == "--version":
         say(torch_pbd.__version__)
         return 0
-    if arguments[0] not in COMMANDS:
-        raise ConfigError(f"there is no command {arguments[0]!r}. {nearest(arguments[0], COMMANDS)}")
-    return _run(arguments[0], arguments[1:])
+    if command not in commands.COMMANDS:
+        raise ConfigError(f"{command!r} {unknown(command, commands.COMMANDS, 'a command')}")
+    return _run(command, rest)
 
 
 def _run(command: str, arguments: Sequence[str]) -> int:
-    from torch_pbd.cli.commands import WORK
-    from torch_pbd.cli.config import existing_file, parse
-
-    options, config = parse(command, arguments)
-    import matplotlib as mpl
-    import torch
-
+    options, config = commands.parse(command, arguments)
     from torch_pbd.experiments.resume import finished_fits
     from torch_pbd.experiments.run_folder import check_names
 
-    mpl.use("Agg")
-    torch.set_num_threads(1)  # the matrices are small: threads would only wait for each other
     if getattr(options, "data", None) is not None:
-        options.data = existing_file(options.data)
+        options.data = Path(options.data)
+        if not options.data.is_file():
+            raise ConfigError(f"data: there is no file {str(options.data)!r}; give one with --data FILE.")
     for argument in ("models", "controllers"):
         check_names(getattr(options, argument, ()), argument)
     with _run_folder(options.output, command) as folder, warnings.catch_warnings():
@@ -103,7 +103,12 @@ def _run(command: str, arguments: Sequence[str]) -> int:
         try:
             with finished_fits(folder.path / "finished", resume=options.resume) as folder.finished:
                 folder.write_text("config.yaml", config)
-                say(WORK[command](options, folder))
+                if command in commands.OPENINGS:
+                    say(commands.OPENINGS[command].format(**vars(options)))
+                import torch
+
+                torch.set_num_threads(1)  # the matrices are small: threads would only wait for each other
+                say(commands.WORK[command](options, folder))
         except (KeyboardInterrupt, _Terminated) as stop:
             if folder.finished and folder.finished.files():
                 stop.args = (f"torch-pbd {command} --config {folder.path / 'config.yaml'} --resume goes on",)
@@ -125,22 +130,6 @@ def _run_folder(path: str, command: str) -> Any:
         raise ConfigError(
             f"output: {path!r} cannot be a folder of results: {reason}{where}. Give another with --output FOLDER."
         ) from error
-
-
-def _help(commands: Mapping[str, str]) -> str:
-    width = max(map(len, commands))
-    lines = [f"  {name:<{width}}  {text}" for name, text in commands.items()]
-    return "\n".join(
-        [
-            "torch-pbd: learn how precise people are from demonstrations",
-            "",
-            "usage: torch-pbd COMMAND [--config FILE] [--option value ...]",
-            "",
-            *lines,
-            "",
-            "Options of a command: torch-pbd COMMAND --help. As YAML: torch-pbd COMMAND --print_config.",
-        ]
-    )
 
 
 def _complain(message: str, code: int) -> int:

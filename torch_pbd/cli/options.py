@@ -1,53 +1,150 @@
-"""Options from a command line and the YAML files that it names, each held to its type; the later one wins."""
+"""Options from a command line and the YAML files that it names: each held to its type, and the later one wins.
 
-import math
+Classes are named, by ``class_path`` and ``init_args`` or by a name alone, from one closed table. Torch is loaded only
+where a class is given parameters, or built.
+"""
+
+import inspect
+import textwrap
+from argparse import Namespace
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, get_origin
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Annotated, Any, Literal, NamedTuple, NoReturn, get_args, get_origin, get_type_hints
 
-from torch_pbd.cli.values import Classes, Place, Types, alternatives, find_class, unknown
-from torch_pbd.cli.words import shown, visible
+import yaml
+
+from torch_pbd.cli.words import Place, alternatives, described, remedy, shown, unknown, visible
 from torch_pbd.cli.yaml import read_yaml, read_yaml_file
+from torch_pbd.console import say
 from torch_pbd.exceptions import ConfigError
+from torch_pbd.registry import ESTIMATORS, REGRESSORS
 
-_PRINT_FLAGS = ("skip_default", "skip_unset")
+CLASSES: Mapping[str, Mapping[str, str]] = {
+    "CovarianceRegressor": REGRESSORS,
+    "DMPController": {"DMPController": ESTIMATORS["DMPController"]},
+    "StiffnessLaw": {"StiffnessLaw": "torch_pbd.control.stiffness"},
+}
+"""The closed table: the classes that a value of a type can be of, and their modules. No other is ever imported."""
+
+_CLASS_KEYS = ("class_path", "init_args")
+_HELP_WIDTH = 80  # of the terminals that people start with
 
 
 class Option(NamedTuple):
-    """What an option takes, its default as it would stand in a file, and how it is given."""
+    """Type of an option, its default as it would stand in a file, and one line on what it is for.
+
+    A number within bounds is ``Annotated[int, (least, most)]``; a class is named by a key of :data:`CLASSES`.
+    """
 
     type: Any
     default: Any
+    help: str
     required: bool = False
-    is_flag: bool = False
 
 
-class Options:
-    """Values of the options of a command, from the defaults to the last argument.
+def parse(usage: str, about: str, options: Mapping[str, Option], arguments: Sequence[str]) -> tuple[Namespace, str]:
+    """Values of a command line as objects, and the YAML that gives them again.
 
-    Parameters
-    ----------
-    options : mapping
-        The options there are, by name.
-    classes : mapping
-        The classes there are, by the type that they are asked for as.
+    Raises
+    ------
+    ConfigError
+        If an argument or a key of a file cannot be used.
+    SystemExit
+        After ``--help``, ``--NAME.help CLASS`` and ``--print_config`` are answered.
     """
+    if {"-h", "--help"} & set(arguments):
+        _answer(_help(usage, about, options))
+    given = _Values(options)
+    given.read(arguments)
+    if given.print_config == "skip_default":
+        values = {name: value for name, value in given.values.items() if value != given.defaults[name]}
+        _answer(_as_yaml(_plain(values)))
+    complete = _plain(given.values, complete=True)
+    if given.print_config is not None:
+        _answer(_as_yaml(complete))
+    for name, option in options.items():
+        if option.required and given.values[name] is None:
+            raise ConfigError(f"{name} is missing: give --{name}, or {name}: in a file named by --config.")
+    complete.pop("resume", None)  # the same options begin a run and resume it
+    return Namespace(**{name: _build(value, name) for name, value in given.values.items()}), _as_yaml(complete)
 
-    def __init__(self, options: Mapping[str, Option], classes: Classes) -> None:
-        self.types = Types(classes)
-        self.print_flags: list[str] | None = None
-        self.help_for: tuple[type, str] | None = None
+
+def made(value: Any, hint: Any) -> Any:
+    """Objects of a type, given as they would stand in a file."""
+    return _build(_take(value, hint, Place()), "value")
+
+
+def _answer(text: str) -> NoReturn:
+    say(text.rstrip())
+    raise SystemExit(0)
+
+
+def _as_yaml(values: dict[str, Any]) -> str:
+    return str(yaml.safe_dump(values, allow_unicode=True, sort_keys=False, default_flow_style=False))
+
+
+def _help(usage: str, about: str, options: Mapping[str, Option]) -> str:
+    lines = [f"usage: {usage} [--config FILE] [--option VALUE ...]", "", f"{about[0].upper()}{about[1:]}.", ""]
+    width = max(map(len, options))
+    for name, option in options.items():
+        default = ", ".join(option.default) if isinstance(option.default, dict | list) else option.default
+        kind = f"{described(option.type)}; {'required' if option.required else f'default {default}'}"
+        text = f"  --{name:<{width}}  {option.help} ({kind})"
+        lines += textwrap.wrap(text, _HELP_WIDTH, subsequent_indent=" " * (width + 6))
+    return "\n".join([*lines, "", "--config FILE: YAML of any of these, as --print_config shows them all."])
+
+
+def _class_help(text: str, place: Place) -> str:
+    """Parameters of a class, and what its docstring says of them."""
+    table = {name: module for known in CLASSES.values() for name, module in known.items()}
+    spec = _Spec(_find_class(text, table, place), table, {})
+    lines = [f"  {name}: {described(hint)}; default {default}" for name, (hint, default) in spec.parameters().items()]
+    return "\n".join([f"parameters of {spec.name}:", *lines, "", inspect.getdoc(spec.load()) or ""])
+
+
+@dataclass(frozen=True)
+class _Spec:
+    """An object yet to be made: its class, of a table of modules by name, and the parameters given."""
+
+    name: str
+    table: Mapping[str, str]
+    init_args: dict[str, Any]
+
+    def load(self) -> Any:
+        return getattr(import_module(self.table[self.name]), self.name)
+
+    def parameters(self) -> dict[str, tuple[Any, Any]]:
+        """Type and default of each parameter of the class."""
+        known = self.load()
+        hints = get_type_hints(known.__init__)
+        return {name: (hints[name], p.default) for name, p in inspect.signature(known).parameters.items()}
+
+
+class _Text(str):
+    """Value of the command line, which its type says how to read."""
+
+    __slots__ = ()
+
+
+class _Dotted(dict[str, Any]):
+    """Entry named by a dotted option: it is changed, and the others beside it stay."""
+
+
+class _Values:
+    """Values of the options of a command, from the defaults to the last argument."""
+
+    def __init__(self, options: Mapping[str, Option]) -> None:
         self._options = options
-        self._defaults = {name: self._default(name, option) for name, option in options.items()}
-        self.values: dict[str, Any] = dict(self._defaults)
+        self.print_config: str | None = None
+        self.defaults = {
+            n: None if o.default is None else _take(o.default, o.type, Place()) for n, o in options.items()
+        }
+        self.values: dict[str, Any] = dict(self.defaults)
 
     def read(self, arguments: Sequence[str]) -> None:
-        """Take ``--name value``, ``--name=value``, ``--name.key value`` and ``--config FILE``, one after another.
-
-        Raises
-        ------
-        ConfigError
-            If one of them, or an entry of a file, cannot be used.
-        """
+        """Take ``--name value``, ``--name=value``, ``--name.key value`` and ``--config FILE``, one after another."""
         rest = list(arguments)
         while rest:
             argument = rest.pop(0)
@@ -55,138 +152,140 @@ class Options:
                 raise ConfigError(f"there is {argument!r} where an option should stand: options begin with --.")
             name, equals, text = argument[2:].partition("=")
             if name == "print_config":
-                self._print(text)
-            elif not equals and self._needs_no_value(name):
+                if text not in ("", "skip_default"):
+                    raise ConfigError(f"--print_config={text} {unknown(text, ['skip_default'], 'a flag of it')}")
+                self.print_config = text
+            elif name == "config" and (equals or rest):
+                self._read_file(text if equals else rest.pop(0))
+            elif equals or (rest and not rest[0].startswith("--")):
+                self._set(name, text if equals else rest.pop(0))
+            elif name != "config" and self._option(name.split(".")[0], Place(keys=(f"--{name}",))).type is bool:
                 self.values[name] = True
             else:
-                if not equals:
-                    if not rest or rest[0].startswith("--"):
-                        raise ConfigError(f"--{name} {self._without_value(name)}")
-                    text = rest.pop(0)
-                self._set(name, text)
+                raise ConfigError(f"--{name} has no value: write --{name} VALUE.")
 
-    def missing(self) -> str | None:
-        """Name of an option that must be given and is not."""
-        return next((name for name, o in self._options.items() if o.required and self.values[name] is None), None)
-
-    def complete(self) -> dict[str, Any]:
-        """All values as they would stand in a file, those of classes with all their parameters."""
-        complete: dict[str, Any] = self.types.complete(self.values)
-        return complete
-
-    def given(self) -> dict[str, Any]:
-        """Those values that are not the default, and of classes only the parameters given."""
-        return {name: self.types.plain(value) for name, value in self.values.items() if value != self._defaults[name]}
-
-    def objects(self) -> dict[str, Any]:
-        """All values, with objects where a class is meant.
-
-        Raises
-        ------
-        ConfigError
-            If a constructor refuses its parameters.
-        """
-        return {name: self.types.build(value, name) for name, value in self.values.items()}
-
-    def _default(self, name: str, option: Option) -> Any:
-        if option.default is None:
-            return None
-        return self.types.take(option.default, option.type, Place(f"the default of {name}", {}))
-
-    def _needs_no_value(self, name: str) -> bool:
-        return name in self._options and self._options[name].is_flag
-
-    def _without_value(self, name: str) -> str:
-        if name.split(".")[0].rstrip("+") not in (*self._options, "config"):
-            return self._unknown(name)
-        example = " true" if name in self._options and self._options[name].type is bool else " VALUE"
-        return f"has no value: write --{name}{example}."
-
-    def _unknown(self, name: str) -> str:
-        return unknown(name.split(".")[0], [*self._options], "an option of this command")
-
-    def _print(self, flags: str) -> None:
-        self.print_flags = [flag for flag in flags.split(",") if flag]
-        for flag in self.print_flags:
-            if flag not in _PRINT_FLAGS:
-                raise ConfigError(f"--print_config={flag} {unknown(flag, _PRINT_FLAGS, 'a flag of it')}")
-
-    def _set(self, name: str, text: str) -> None:
-        if name == "config":
-            self._read_file(text)
-            return
-        place = Place(f"--{name}", {})
-        first, *keys = name.split(".")
-        adds = first.endswith("+") and not keys
-        first = first.removesuffix("+") if adds else first
-        if first not in self._options:
-            raise place.error(self._unknown(name))
-        hint, before = self._options[first].type, self.values[first]
-        if keys and keys[-1] == "help":
-            self._help(first, keys[:-1], text, place)
-        elif adds:
-            self.values[first] = self._entries(before, text, hint, place)
-        else:
-            value = self.types.put(keys, lambda part: _value(text, part, place), hint, place, before)
-            self.values[first] = _finite(value, place)
-
-    def _entries(self, before: Any, text: str, hint: Any, place: Place) -> list[Any]:
-        if not isinstance(before, list):
-            raise place.error("cannot be added to: it is no list.")
-        value = _value(text, hint, place)
-        return [*before, *self.types.take(value if isinstance(value, list) else [value], hint, place)]
-
-    def _help(self, name: str, keys: Sequence[str], text: str, place: Place) -> None:
-        table = self.types.named(self._options[name].type)
-        for key in keys:
-            for known in table.values():
-                if key in self.types.parameters(known):
-                    table = self.types.named(self.types.parameters(known)[key][0])
-                    break
-        if not table:
-            raise place.error("is there for classes only.")
-        if get_origin(self._options[name].type) is dict and not keys:
-            keys = ["NAME"]
-        self.help_for = find_class(text, table, place), ".".join([name, *keys])
+    def _option(self, name: str, place: Place) -> Option:
+        if name not in self._options:
+            raise place.error(unknown(name, self._options, "an option of this command"))
+        return self._options[name]
 
     def _read_file(self, path: str) -> None:
         document = read_yaml_file(path)
-        root = Place(visible(path), document.lines)
         for name, value in document.content.items():
-            place = root.below(name)
-            if name == "config":
-                raise place.error("cannot stand in a file: name each file by its own --config.")
-            if name not in self._options:
-                raise place.error(self._unknown(name))
-            option = self._options[name]
-            if value is None and option.default is None:
-                self.values[name] = None
-            else:
-                taken = self.types.take(value, option.type, place, self.values[name])
-                self.values[name] = _finite(taken, place)
+            place = Place(visible(path), (name,), document.lines)
+            self.values[name] = _take(value, self._option(name, place).type, place, self.values[name])
+
+    def _set(self, dotted: str, text: str) -> None:
+        name, *keys = dotted.split(".")
+        place = Place(keys=(f"--{name}",))
+        option = self._option(name, place)
+        if keys and keys[-1] == "help":
+            _answer(_class_help(text, Place(keys=(f"--{dotted}",))))
+        value: Any = _Text(text)
+        for key in reversed(keys):
+            value = _Dotted({key: value})
+        self.values[name] = _take(value, option.type, place, self.values[name])
 
 
-def _finite(value: Any, place: Place) -> Any:
-    """The value, which must be no infinite number; a parameter of a class may be one."""
-    if isinstance(value, float) and math.isinf(value):
-        raise place.error(f"is {shown(value)}, must be a finite number.")
-    return value
-
-
-def _value(text: str, hint: Any, place: Place) -> Any:
-    """A text of the command line read as YAML, or left as it is where its type takes any text."""
-    parts = alternatives(hint)
-    if parts == (str,):
-        return text
-    try:
-        value = read_yaml(text, place.source).content
-    except ConfigError:
-        if str in parts and not (text.startswith("[") and any(get_origin(part) is list for part in parts)):
-            return text
-        raise
-    return text if str in parts and not any(_is_of(value, part) for part in parts) else value
+def _take(value: Any, hint: Any, place: Place, before: Any = None) -> Any:
+    """Value as its type has it; ``before`` is what it adds to, where a class is changed in part."""
+    if isinstance(value, _Text):
+        value = _read_text(value, hint, place)
+    for part in alternatives(hint):
+        table = CLASSES.get(part if isinstance(part, str) else getattr(part, "__name__", ""))
+        if table and value is not None:
+            return _take_class(value, table, place, before)
+        if get_origin(part) is dict and isinstance(value, dict) and value:
+            kept = before if isinstance(value, _Dotted) else {}
+            inner = get_args(part)[1]
+            return kept | {key: _take(v, inner, place.below(key), kept.get(key)) for key, v in value.items()}
+        if get_origin(part) is list and isinstance(value, list) and value:
+            return [_take(entry, get_args(part)[0], place.below(i)) for i, entry in enumerate(value)]
+    if value in ([], {}):
+        raise place.error(f"is empty, must be {described(hint)}.")
+    for part in sorted(alternatives(hint), key=lambda part: part is float):  # a whole number stays one where it may
+        if _is_of(value, part):
+            return float(value) if part is float or get_args(part)[:1] == (float,) else value
+    raise place.error(f"is {shown(value)}, must be {described(hint)}{remedy(value, hint)}")
 
 
 def _is_of(value: Any, part: Any) -> bool:
-    """Whether a value is of the kind of a type: a list for one of lists, a whole number for a float too."""
-    return value is None or type(value) in (part, get_origin(part)) or (part is float and type(value) is int)
+    """Whether a value that is no list and no mapping is of a type that is no union."""
+    if get_origin(part) is Literal:
+        return isinstance(value, str) and value in get_args(part)
+    if get_origin(part) is Annotated:
+        kind, (least, most) = get_args(part)
+        return _is_of(value, kind) and bool(least <= value <= most)
+    if part is float:
+        return (type(value) is float and value == value) or (type(value) is int and abs(value) < 1e300)
+    return part is Any or type(value) is part
+
+
+def _read_text(text: str, hint: Any, place: Place) -> Any:
+    """Text of the command line read as YAML, or left as it is where its type takes any text."""
+    parts = alternatives(hint)
+    if str in parts and not (text.startswith("[") and any(get_origin(part) is list for part in parts)):
+        with suppress(ConfigError):
+            value = read_yaml(text, "").content
+            if any(_is_of(value, part) for part in parts if part is not str):
+                return value
+        return str(text)
+    return read_yaml(text, ".".join(map(str, place.keys))).content
+
+
+def _find_class(name: Any, table: Mapping[str, str], place: Place) -> str:
+    """Name of a class of the table, which may have the name of its module before it."""
+    short = name.rsplit(".", 1)[-1] if isinstance(name, str) else ""
+    if short not in table or name not in (short, f"torch_pbd.{short}", f"{table[short]}.{short}"):
+        raise place.error(f"== {name!r:.80} {unknown(short, table, 'a class that can be used here')}")
+    return short
+
+
+def _take_class(value: Any, table: Mapping[str, str], place: Place, before: _Spec | None) -> _Spec:
+    inside, only = place.below("init_args"), next(iter(table)) if len(table) == 1 else None
+    if isinstance(value, str):
+        name, value = _find_class(value, table, place), {}
+    elif not isinstance(value, dict):
+        raise place.error(f"is {shown(value)}, must be a mapping of class_path and init_args.")
+    elif "class_path" in value:
+        name = _find_class(value["class_path"], table, place.below("class_path"))
+    elif before or only:
+        name = before.name if before else str(only)
+        if "init_args" not in value and (only or isinstance(value, _Dotted)):
+            value, inside = {"init_args": value}, place
+    else:
+        raise place.error(f"has no class_path, must be one of {', '.join(table)}.")
+    for key in set(value).difference(_CLASS_KEYS):
+        raise place.below(key).error(unknown(key, _CLASS_KEYS, "a key here; parameters stand below init_args"))
+    spec = _Spec(name, table, dict(before.init_args) if before and before.name == name else {})
+    given = value.get("init_args")
+    given = read_yaml(given, "init_args").content if isinstance(given, _Text) else given
+    if not isinstance(given, dict | None):
+        raise inside.error(f"is {shown(given)}, must be a mapping: one 'name: value' a line.")
+    for key, entry in (given or {}).items():
+        known = spec.parameters()
+        if key not in known:
+            raise inside.below(key).error(unknown(key, known, f"a parameter of {name}"))
+        spec.init_args[key] = _take(entry, known[key][0], inside.below(key), spec.init_args.get(key))
+    return spec
+
+
+def _plain(value: Any, *, complete: bool = False) -> Any:
+    """Value as a file would have it, with all parameters of its classes or with those that were given."""
+    if isinstance(value, _Spec):
+        defaults = {name: default for name, (_, default) in value.parameters().items()} if complete else {}
+        init_args = _plain(defaults | value.init_args, complete=complete)
+        return {"class_path": f"torch_pbd.{value.name}", "init_args": init_args}
+    if isinstance(value, dict):
+        return {key: _plain(entry, complete=complete) for key, entry in value.items()}
+    return value
+
+
+def _build(value: Any, name: str) -> Any:
+    """Value with objects in the place of their classes and parameters."""
+    if isinstance(value, _Spec):
+        try:
+            return value.load()(**_build(value.init_args, name))
+        except (TypeError, ValueError) as error:
+            raise error if isinstance(error, ConfigError) else ConfigError(f"{name}: {error}") from error
+    return {key: _build(entry, f"{name}.{key}") for key, entry in value.items()} if isinstance(value, dict) else value

@@ -1,7 +1,8 @@
-"""Compare models on one data set: how well each repeats the data, and how well it foretells a demonstration."""
+"""Compare models on one data set: how well each repeats the data, and how well it predicts a demonstration."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from joblib import Parallel, delayed
@@ -10,52 +11,56 @@ from sklearn.base import clone
 
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.experiments.resume import FinishedFits, fit_once
-from torch_pbd.experiments.sweep import left_out, score_fold
+from torch_pbd.experiments.sweep import left_out, mean_and_error, score_fold
 from torch_pbd.metrics import covariance_mse, relative_frobenius_error
 
 Floats = NDArray[np.float64]
-Truth = Callable[[Floats], Floats]
 
 
 @dataclass(frozen=True)
 class Score:
-    """What one model does on one data set."""
+    """Result of one model on one data set."""
 
     model: str
     fitted: CovarianceRegressor
-    """To all the data."""
+    """The model, fitted to all the data."""
     cholesky_mse: float
-    """To the empirical covariances, squared units of y: the MSE of the paper's Table I. NaN if not aligned."""
+    """Error to the empirical covariances, squared units of y: the MSE of the paper's Table I. NaN if not aligned."""
     frobenius: float
     """Relative error to the true covariance, NaN where it is not known."""
     fold_log_likelihood: tuple[float, ...]
-    """Of each demonstration left out, in nats per sample."""
+    """Log-likelihood of each demonstration left out, in nats per sample."""
     fold_coverage: tuple[float, ...]
     """Share of each demonstration left out that lies within the 95 % ellipse."""
     fit_seconds: float
     smallest_eigenvalue: float
-    """Of the predicted correlations, over the data."""
+    """Smallest eigenvalue of the predicted correlations, over the data."""
 
     @property
     def log_likelihood(self) -> float:
         """Mean over the demonstrations left out."""
-        return float(np.mean(self.fold_log_likelihood)) if self.fold_log_likelihood else float("nan")
-
-    @property
-    def log_likelihood_median(self) -> float:
-        """Median over the demonstrations left out."""
-        return float(np.median(self.fold_log_likelihood)) if self.fold_log_likelihood else float("nan")
+        return mean_and_error(self.fold_log_likelihood)[0]
 
     @property
     def log_likelihood_error(self) -> float:
         """Standard error of the mean over the demonstrations left out."""
-        folds = self.fold_log_likelihood
-        return float(np.std(folds, ddof=1) / len(folds) ** 0.5) if len(folds) > 1 else float("nan")
+        return mean_and_error(self.fold_log_likelihood)[1]
 
-    @property
-    def coverage(self) -> float:
-        """Mean over the demonstrations left out."""
-        return float(np.mean(self.fold_coverage)) if self.fold_coverage else float("nan")
+    def row(self) -> dict[str, Any]:
+        """Row of a table."""
+        folds = self.fold_log_likelihood
+        return {
+            "model": self.model,
+            "MSE": self.cholesky_mse,
+            "error to truth": self.frobenius,
+            "held-out LL": self.log_likelihood,
+            "+-": self.log_likelihood_error,
+            "median": float(np.median(folds)) if folds else float("nan"),
+            "95 % holds": mean_and_error(self.fold_coverage)[0],
+            "folds": len(folds),
+            "least eig.": self.smallest_eigenvalue,
+            "fit [s]": self.fit_seconds,
+        }
 
 
 def compare_models(
@@ -64,7 +69,7 @@ def compare_models(
     y: Floats,
     groups: NDArray[np.intp],
     *,
-    truth: Truth | None = None,
+    truth: Callable[[Floats], Floats] | None = None,
     max_folds: int = 10,
     n_jobs: int | None = None,
     finished: FinishedFits | None = None,
@@ -100,6 +105,7 @@ def compare_models(
     scores = []
     for name, (fitted, seconds) in fits.items():
         covariance = fitted.predict_cov(inputs)
+        scale = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
         held_out = [next(results) for _ in folds]
         scores.append(
             Score(
@@ -110,7 +116,9 @@ def compare_models(
                 fold_log_likelihood=tuple(row["log_likelihood"] for row in held_out),
                 fold_coverage=tuple(row["coverage"] for row in held_out),
                 fit_seconds=seconds,
-                smallest_eigenvalue=_smallest_eigenvalue(covariance),
+                smallest_eigenvalue=float(
+                    np.linalg.eigvalsh(covariance / scale[:, :, np.newaxis] / scale[:, np.newaxis]).min()
+                ),
             )
         )
     return scores
@@ -121,14 +129,5 @@ def empirical_covariances(X: Floats, y: Floats) -> tuple[Floats, Floats | None]:
     inputs, index, counts = np.unique(X, axis=0, return_inverse=True, return_counts=True)
     if counts.min() < 2:
         return inputs, None
-    index = index.reshape(-1)
-    covariances = np.empty((len(inputs), y.shape[1], y.shape[1]))
-    order = np.argsort(index, kind="stable")
-    for i, rows in enumerate(np.split(y[order], np.cumsum(counts)[:-1])):
-        covariances[i] = np.cov(rows.T)
-    return inputs, covariances
-
-
-def _smallest_eigenvalue(covariance: Floats) -> float:
-    scale = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    return float(np.linalg.eigvalsh(covariance / scale[:, :, np.newaxis] / scale[:, np.newaxis]).min())
+    groups = np.split(y[np.argsort(index.ravel(), kind="stable")], np.cumsum(counts)[:-1])
+    return inputs, np.stack([np.atleast_2d(np.cov(rows.T)) for rows in groups])

@@ -1,10 +1,12 @@
-"""Finished fits of a run, kept in its folder until its good end: what a run that was cut need not repeat."""
+"""Finished fits of a run, kept in its folder until its good end: a run that was cut need not repeat them.
+
+Importing this module does not load torch: a command says its first line before.
+"""
 
 import hashlib
 import json
 import re
 import time
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -12,13 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 import torch_pbd
-from torch_pbd.data import Demonstrations
-from torch_pbd.estimators.demonstrations import fit_with_groups
-from torch_pbd.model_header import encode_parameters, is_ours
-from torch_pbd.persistence import load, save
+from torch_pbd import checks
 
 _NAME = re.compile(r"[0-9a-f]{64}-\d+\.\d{6}\.safetensors")
 
@@ -51,7 +49,7 @@ def finished_fits(folder: Path, *, resume: bool) -> Iterator[FinishedFits]:
     """The finished fits of a run, which begins with those of one that was cut, or with none; cleared at a good end."""
     finished = FinishedFits(folder, resume)
     if not resume and finished.files():
-        warnings.warn(f"{folder} of a run that was cut is cleared: --resume would have gone on with it.", stacklevel=3)
+        checks.warn(f"{folder} of a run that was cut is cleared: --resume would have gone on with it.")
         finished.clear()
     yield finished
     finished.clear()
@@ -68,12 +66,15 @@ def fit_once(model: Any, *data: Any, finished: FinishedFits | None = None) -> tu
     finished : FinishedFits, default=None
         Fits that need not be repeated; this one is added.
     """
+    from torch_pbd.model_header import is_ours
+    from torch_pbd.persistence import load, save
+
     if finished is None or not is_ours(model):
         return _timed_fit(model, *data)
     key = _key(model, *data)
     found = finished.files(key)
     if finished.resume and not found:
-        warnings.warn(f"There is nothing finished to resume from in {finished.folder}: the run begins.", stacklevel=2)
+        checks.warn(f"There is nothing finished to resume from in {finished.folder}: the run begins.")
     finished.resume = False
     if found:
         return load(found[0]), float(found[0].stem.partition("-")[2])
@@ -84,16 +85,22 @@ def fit_once(model: Any, *data: Any, finished: FinishedFits | None = None) -> tu
 
 
 def _timed_fit(model: Any, *data: Any) -> tuple[Any, float]:
+    from torch_pbd.estimators.demonstrations import fit_with_groups
+
     start = time.perf_counter()
-    fitted = model.fit(*data) if isinstance(data[0], Demonstrations) else fit_with_groups(model, *data)
+    fitted = model.fit(*data) if len(data) == 1 else fit_with_groups(model, *data)
     return fitted, time.perf_counter() - start
 
 
 def _key(model: Any, *data: Any) -> str:
     """SHA-256 of class, parameters, versions and data."""
+    import torch
+
+    from torch_pbd.model_header import encode_parameters
+
     labels: list[Any] = []
-    if isinstance(data[0], Demonstrations):
-        demos = data[0]
+    if len(data) == 1:
+        (demos,) = data
         labels, data = [demos.names, demos.units, demos.frame, demos.time_unit], demos.stack()
     described = [encode_parameters(model), torch_pbd.__version__, torch.__version__, labels]
     digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode())

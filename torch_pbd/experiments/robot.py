@@ -4,8 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 from numpy.typing import NDArray
 from sklearn.base import clone
 
@@ -14,17 +16,34 @@ from torch_pbd.control.primitive.units import in_metres
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.rollout import Rollout
 from torch_pbd.control.stability.report import StabilityReport
-from torch_pbd.data import Demonstrations
+from torch_pbd.data import Demonstrations, tunnel_center, tunnel_half_width
 from torch_pbd.experiments.resume import FinishedFits, fit_once
-from torch_pbd.experiments.robot_figures import pushes_figure, task_figure, variability_figure
-from torch_pbd.experiments.run_folder import RunFolder, check_names, format_table, slug
-from torch_pbd.labels import readable_unit, schedule_names
+from torch_pbd.experiments.run_folder import RunFolder, format_table, slug
+from torch_pbd.plotting import (
+    DATA,
+    EMPIRICAL,
+    MODEL,
+    draw_edges,
+    equal_scales,
+    figure_grid,
+    legend_below,
+    output_label,
+    plot_covariance_ellipses,
+    plot_demonstrations,
+    plot_pushes,
+    plot_std_band,
+    plot_stiffness,
+    readable_unit,
+    schedule_names,
+)
 
-_IN_REPORT = ("margin", "max speed", "gain", "environment")
 Floats = NDArray[np.float64]
 
 _PUSHES = (0.2, 0.8)  # of the duration: 2 s and 8 s of the paper's 10 s
-_PUSH_LENGTH = 0.08
+_PUSH_LENGTH = 0.08  # of the duration: 0.8 s
+_N_ELLIPSES = 13  # one every 0.8 s of the paper's movement: more would cover each other
+_MOST_OUTPUTS = 6  # panels of Figure 7 that a page holds
+_NOT_SHOWN = ("margin", "max speed", "gain", "environment", "stable", "max |dK/dt|")  # the report below the table has
 
 
 @dataclass(frozen=True)
@@ -82,7 +101,7 @@ def push_row(name: str, run: Run) -> dict[str, Any]:
 
 
 def _guarantees(run: Run) -> dict[str, Any]:
-    """Columns of what is guaranteed."""
+    """Columns on stability."""
     report, rates = run.report, np.diff(run.schedule.stiffness, axis=0) / np.diff(run.schedule.time)[:, None, None]
     return {
         "stable": "yes" if report.stable else "NO",
@@ -105,7 +124,6 @@ def run_robot(
     metrics: str = "metrics",
 ) -> str:
     """Run each controller; writes figures, models, schedules, metrics, reports; returns table and reports as text."""
-    check_names(controllers, "controllers")
     rows, reports = [], []
     for name, controller in controllers.items():
         run = run_controller(controller, demonstrations, peak=peak, rate=rate, finished=folder.finished)
@@ -114,21 +132,120 @@ def run_robot(
         _write(run, name, demonstrations, folder, in_tunnel=in_tunnel)
     folder.write_metrics(rows, metrics)
     folder.write_text("stability.txt", "\n\n".join(reports) + "\n")
-    shown = [{key: value for key, value in row.items() if key not in _IN_REPORT} for row in rows]
+    shown = [{key: value for key, value in row.items() if key not in _NOT_SHOWN} for row in rows]
     return "\n\n".join([format_table(shown), *reports])
 
 
 def _write(run: Run, name: str, demonstrations: Demonstrations, folder: RunFolder, *, in_tunnel: bool) -> None:
-    figures = {
-        "figure6_task": task_figure(run.controller, demonstrations, name, in_tunnel=in_tunnel),
-        "figure7_variability": variability_figure(run.controller, demonstrations, name),
-        "figure8_pushes": pushes_figure(run.rollout, run.unpushed, run.schedule, name),
-    }
-    for title, figure in figures.items():
-        folder.write_figure(figure, f"{slug(name)}_{title}")
-        plt.close(figure)
-    folder.write_model(run.controller, slug(name))
+    file = slug(name)
+    task = task_figure(run.controller, demonstrations, name, in_tunnel=in_tunnel)
+    folder.write_figure(task, f"{file}_figure6_task")
+    folder.write_figure(variability_figure(run, demonstrations, name), f"{file}_figure7_variability")
+    folder.write_figure(pushes_figure(run, name), f"{file}_figure8_pushes")
+    folder.write_model(run.controller, file)
     target = folder.path / "schedule"
     target.mkdir(exist_ok=True)
-    run.schedule.save(target / f"{slug(name)}.npz")
-    run.schedule.resample(100.0).save(target / f"{slug(name)}_100hz.csv")
+    run.schedule.save(target / f"{file}.npz")
+    run.schedule.resample(100.0).save(target / f"{file}_100hz.csv")
+
+
+_BOXES = (
+    ("demonstrations", (0.9, 1.5)),
+    ("smoothing, derivatives\nforcing, eq. (18)", (2.85, 1.5)),
+    ("Gaussian process:\nmean forcing, eq. (5)", (4.8, 2.4)),
+    ("covariance model\neq. (8), (13)", (4.8, 0.6)),
+    ("movement primitive\neq. (16), (17)", (6.75, 2.4)),
+    ("stiffness, damping\neq. (19), (20)", (6.75, 0.6)),
+    ("admittance, eq. (15)\nrobot", (8.7, 1.5)),
+)
+_ARROWS = ((0, 1), (1, 2), (1, 3), (2, 4), (3, 5), (4, 6), (5, 6))
+_BOX = (1.6, 0.72)  # width and height
+
+
+def framework_figure() -> Figure:
+    """Way from demonstrations to motion and gains: Figure 5."""
+    figure, ((ax,),) = figure_grid(1, 1, (9.6, 3.0))
+    ax.set_axis_off()
+    ax.set(xlim=(0.0, 9.6), ylim=(0.0, 3.0))
+    for text, (x, y) in _BOXES:
+        corner, style = (x - _BOX[0] / 2.0, y - _BOX[1] / 2.0), "round,pad=0,rounding_size=0.06"
+        ax.add_patch(FancyBboxPatch(corner, *_BOX, boxstyle=style, fc="white", ec=MODEL, lw=1.4, zorder=3))
+        ax.text(x, y, text, ha="center", va="center", fontsize=8, zorder=4)
+    for start, stop in _ARROWS:
+        (x, y), (to_x, to_y) = _BOXES[start][1], _BOXES[stop][1]
+        last = stop == len(_BOXES) - 1  # reached from above and below, the others from the left
+        head = (to_x, to_y + np.sign(y - to_y) * _BOX[1] / 2.0) if last else (to_x - _BOX[0] / 2.0, to_y)
+        ax.add_patch(FancyArrowPatch((x + _BOX[0] / 2.0, y), head, arrowstyle="-|>", mutation_scale=14, color="black"))
+    return figure
+
+
+def task_figure(
+    controller: DMPController, demonstrations: Demonstrations, name: str, *, in_tunnel: bool = False
+) -> Figure:
+    """Demonstrations, reproduction and, of positions, the inferred variability as ellipses: Figure 6."""
+    figure, ((ax,),) = figure_grid(1, 1, (5.2, 6.0))
+    if in_tunnel:
+        draw_tunnel(ax)
+    plot_demonstrations(demonstrations, range(min(demonstrations.n_outputs, 2)), ax)
+    time = np.linspace(0.0, controller.duration_, 400)
+    path = controller.reproduction_.motion(time)[0]
+    in_plane = path.shape[1] > 1
+    across, up = path[:, :2].T if in_plane else (time, path[:, 0])
+    ax.plot(across, up, color=MODEL, lw=1.8, label="reproduction", zorder=4)
+    if controller.variability == "position" and in_plane:
+        some = np.linspace(0.0, controller.duration_, _N_ELLIPSES)
+        covariance = controller.covariance_.predict_cov(controller.phase(some))[:, :2, :2]
+        centres = controller.reproduction_.motion(some)[0][:, :2]
+        plot_covariance_ellipses(centres, covariance, ax, color=EMPIRICAL, label="inferred: 2 sd")
+    ax.set_title(name, fontsize=10)
+    if in_plane and not in_tunnel:
+        equal_scales(ax)
+    legend_below(figure, ax, 2)
+    return figure
+
+
+def draw_tunnel(ax: Axes) -> None:
+    """Draw the walls of the tunnel task."""
+    along = np.linspace(0.0, 0.6, 200)
+    for side in (-1.0, 1.0):
+        wall = tunnel_center(along) + side * tunnel_half_width(along)
+        ax.plot(wall, along, color="black", lw=1.5, label="wall" if side > 0 else None)
+
+
+def variability_figure(run: Run, demonstrations: Demonstrations, name: str) -> Figure:
+    """Empirical and inferred standard deviations of positions or of forcing, and the stiffness: Figure 7."""
+    controller = run.controller
+    movements = controller.smooth(demonstrations, 200)
+    varying = controller.varying(movements)
+    in_position = controller.variability == "position"
+    n_shown = min(demonstrations.n_outputs, _MOST_OUTPUTS)
+    figure, grid = figure_grid(n_shown + 1, 1, (6.4, 1.9 * (n_shown + 1)), sharex=True)
+    axes = grid[:, 0]
+    covariance = controller.covariance_.predict_cov(controller.phase(movements.time))
+    centre, deviation = varying.mean(axis=0), varying.std(axis=0, ddof=1)
+    inferred = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    for output, ax in enumerate(axes[:-1]):
+        curves = [(movements.time, one[:, output]) for one in varying]
+        if in_position:  # as recorded, not as smoothed
+            duration = controller.duration_
+            curves = [((t - t[0]) / (t[-1] - t[0]) * duration, position[:, output]) for t, position in demonstrations]
+        for time, curve in curves:
+            ax.plot(time, curve, color=DATA, lw=0.7, alpha=0.8, zorder=1)
+        ax.lines[0].set_label("demonstrations")
+        plot_std_band(movements.time, centre[:, output], inferred[:, output], ax, label="mean, inferred 2 sd")
+        draw_edges(movements.time, centre[:, output], deviation[:, output], ax, "empirical 2 sd")
+        name_of = demonstrations.names[output]
+        ax.set_ylabel(output_label(demonstrations, output) if in_position else f"forcing {name_of}")
+    plot_stiffness(run.schedule.resample(200.0 / controller.duration_), axes[-1])
+    axes[-1].legend(fontsize=8, ncols=3)
+    axes[0].set_title(name, fontsize=10)
+    legend_below(figure, axes[0])
+    return figure
+
+
+def pushes_figure(run: Run, name: str) -> Figure:
+    """Deviation, force and stiffness along the first output over time: Figure 8."""
+    figure, axes = figure_grid(3, 1, (6.4, 6.0), sharex=True)
+    plot_pushes(run.rollout, run.schedule, 0, axes[:, 0], unpushed=run.unpushed)
+    axes[0, 0].set_title(name, fontsize=10)
+    return figure

@@ -1,34 +1,36 @@
-"""The folder a run writes: what was run, on what, and what came out."""
+"""The folder a run writes: its settings and environment, models, metrics and figures.
+
+Importing this module does not load torch: a folder that cannot be written is refused before.
+"""
 
 import csv
 import io
 import json
 import os
 import platform
+import re
 import socket
 import sys
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from filelock import FileLock, Timeout
-from matplotlib.figure import Figure
 
 import torch_pbd
-from torch_pbd.control.controller import DMPController
-from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.exceptions import ConfigError, FolderInUseError
 from torch_pbd.experiments.resume import FinishedFits
 from torch_pbd.files.atomic import remove_drafts, replacing
-from torch_pbd.persistence import save
 
 _PACKAGES = ("torch", "scikit-learn", "numpy", "matplotlib")
 _PARTS = ("figures", "model", "schedule", "finished")
 _SUFFIXES = (".csv", ".json", ".npz", ".png", ".safetensors", ".txt", ".yaml")  # of the files of results
-_LONGEST = 180  # bytes of a name, to which titles, suffixes and marks of drafts are added
+_LONGEST = 180  # bytes of a name, to which titles, suffixes and marks of drafts are added: file systems take 255
+_DPI = 110  # a figure of 12 inches fills a screen
+_WIDTH = 80  # columns of the terminals that people start with
 
 
 class RunFolder:
@@ -77,9 +79,7 @@ class RunFolder:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -99,16 +99,23 @@ class RunFolder:
         writer.writerows(rows)
         self.write_text(f"{name}.csv", text.getvalue())
 
-    def write_figure(self, figure: Figure, name: str) -> Path:
+    def write_figure(self, figure: Any, name: str) -> Path:
         """Write ``figures/<name>.png``."""
         target = self.path / "figures" / f"{name}.png"
         target.parent.mkdir(exist_ok=True)
+        from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+        # A figure with a layout of its own would be laid out twice and drawn twice, which takes as long again.
+        if figure.axes and figure.get_layout_engine() is None:
+            ConstrainedLayoutEngine().execute(figure)
         with replacing(target) as file:
-            figure.savefig(file, format="png", dpi=150)
+            figure.savefig(file, format="png", dpi=_DPI)
         return target
 
-    def write_model(self, model: CovarianceRegressor | DMPController, name: str) -> Path:
+    def write_model(self, model: Any, name: str) -> Path:
         """Write ``model/<name>.safetensors``."""
+        from torch_pbd.persistence import save
+
         target = self.path / "model" / f"{name}.safetensors"
         target.parent.mkdir(exist_ok=True)
         save(model, target)
@@ -149,7 +156,7 @@ def _owner(path: Path) -> str:
 
 def slug(name: str) -> str:
     """Name of a file for the name of a model."""
-    return "_".join("".join(letter if letter.isalnum() else " " for letter in name).lower().split())
+    return "_".join(re.findall(r"[^\W_]+", name.lower()))
 
 
 def check_names(names: Iterable[str], argument: str) -> None:
@@ -164,40 +171,60 @@ def check_names(names: Iterable[str], argument: str) -> None:
     for name in names:
         file = slug(name)
         if not 0 < len(file.encode()) <= _LONGEST:
-            raise ConfigError(
-                f"{argument}: {name!r:.80} gives no name of a file: it must have a letter or a digit, and at most "
-                f"{_LONGEST} bytes. Rename it."
-            )
+            must = f"it must have a letter or a digit, and at most {_LONGEST} bytes"
+            raise ConfigError(f"{argument}: {name!r:.80} gives no name of a file: {must}. Rename it.")
         if file in owners:
             raise ConfigError(
                 f"{argument}: {owners[file]!r:.80} and {name!r:.80} would both be written to files named {file!r:.80}, "
-                "where one would replace the other: they must differ in letters or digits. Rename one."
+                "must differ in letters or digits: rename one."
             )
         owners[file] = name
 
 
 def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Text table of rows with the same keys; numbers to three digits, what is not known as a dash.
+    """Text table of rows with the same keys; numbers to three digits, and a dash for one that is not known.
 
-    A column of which nothing is known is left out.
+    A column of which nothing is known is left out. Where the table would be wider than a terminal, the headers take up
+    to three lines, and then the longest texts too.
     """
-    header = [column for column in rows[0] if any(row[column] == row[column] for row in rows)]
-    cells = [[_cell(row[column]) for column in header] for row in rows]
-    widths = [max(len(column), *(len(line[i]) for line in cells)) for i, column in enumerate(header)]
-    is_text = [isinstance(rows[0][column], str) for column in header]
+    columns = [column for column in rows[0] if any(row[column] == row[column] for row in rows)]
+    texts = {column for column in columns if isinstance(rows[0][column], str)}
+    cells = {column: [_cell(row[column]) for row in rows] for column in columns}
+    for n_lines in (1, 2, 3):
+        widths = {column: max(_header_width(column, n_lines), *map(len, cells[column])) for column in columns}
+        spare = _WIDTH - sum(widths.values()) - 2 * (len(columns) - 1)
+        if spare >= 0:
+            break
+    longest = max(texts, key=lambda column: widths[column], default=None)
+    if longest and spare < 0:
+        words = (len(word) for cell in cells[longest] for word in cell.split())
+        widths[longest] = max(widths[longest] + spare, len(longest), *words)
 
-    def line(entries: Sequence[str]) -> str:
-        columns = zip(entries, widths, is_text, strict=True)
-        return "  ".join(e.ljust(w) if text else e.rjust(w) for e, w, text in columns).rstrip()
+    def lines(entries: Mapping[str, str], *, at_bottom: bool = False) -> list[str]:
+        wrapped = [textwrap.wrap(entries[c], widths[c], break_on_hyphens=False) or [""] for c in columns]
+        height = max(map(len, wrapped))
+        blanks = [[""] * (height - len(own)) for own in wrapped]
+        full = [blank + own if at_bottom else own + blank for own, blank in zip(wrapped, blanks, strict=True)]
+        pads = [str.ljust if c in texts else str.rjust for c in columns]
+        padded = [[pad(e, widths[c]) for e in own] for c, own, pad in zip(columns, full, pads, strict=True)]
+        return ["  ".join(line).rstrip() for line in zip(*padded, strict=True)]
 
-    return "\n".join([line(header), "  ".join("-" * width for width in widths), *map(line, cells)])
+    header = lines({c: c for c in columns}, at_bottom=True) + lines({c: "-" * widths[c] for c in columns})
+    return "\n".join(header + [line for i in range(len(rows)) for line in lines({c: cells[c][i] for c in columns})])
+
+
+def _header_width(header: str, n_lines: int) -> int:
+    longest = max(map(len, header.split()), default=1)
+    widths = range(longest, max(longest, len(header)) + 1)
+    return next(width for width in widths if len(textwrap.wrap(header, width, break_on_hyphens=False)) <= n_lines)
 
 
 def _cell(value: Any) -> str:
-    if isinstance(value, float):
-        if value != value:
-            return "-"
-        if 1000 <= abs(value) < 1e5:
-            return f"{value:.0f}"
-        return f"{value:.2f}" if 0.1 <= abs(value) < 1000 else f"{value:.2e}" if value else "0"
-    return str(value)
+    if not isinstance(value, float):
+        return str(value)
+    size = abs(value)
+    if value != value or not value:
+        return "-" if value else "0"
+    if 0.1 <= size < 1e5:
+        return f"{value:.2f}" if size < 100.0 else f"{value:.0f}"
+    return f"{value:.2g}" if 1e-3 <= size < 0.1 else f"{value:.2e}"

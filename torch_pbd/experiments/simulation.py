@@ -1,22 +1,34 @@
 """The paper's simulation (Section IV-E): Table I and Figures 1 to 3, on data drawn from eq. (14)."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from functools import partial
+from typing import Any, Self
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from scipy.stats import multivariate_normal
+from sklearn.base import BaseEstimator
+from sklearn.mixture import GaussianMixture
 
 from torch_pbd.data import make_paper_simulation, paper_covariance, paper_mean
 from torch_pbd.data.synthetic import Reading
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.estimators.mixture import GMMBaseline
 from torch_pbd.experiments.comparison import Score, compare_models, empirical_covariances
-from torch_pbd.experiments.reference import ScikitLearnGMR
-from torch_pbd.experiments.resume import FinishedFits, fit_once
-from torch_pbd.experiments.run_folder import RunFolder, check_names, format_table, slug
-from torch_pbd.plotting import EMPIRICAL, MODEL, TRUTH, plot_covariance_ellipses, plot_model_bands
+from torch_pbd.experiments.resume import FinishedFits
+from torch_pbd.experiments.run_folder import RunFolder, format_table, slug
+from torch_pbd.plotting import (
+    EMPIRICAL,
+    MODEL,
+    TRUTH,
+    figure_grid,
+    legend_below,
+    plot_covariance_ellipses,
+    plot_model_bands,
+)
+
+Floats = NDArray[np.float64]
 
 # Table I: mean squared error on Cholesky entries, and seconds on "a standard laptop in Matlab".
 PAPER_TABLE_1 = {"CD": (3.54e-13, 0.167), "WP": (0.0206, 8.64), "GMM 8": (1.05, 0.515), "GMM 5": (7.71, 0.237)}
@@ -34,100 +46,142 @@ def table1(
     max_folds: int = 3,
     n_jobs: int | None = None,
     finished: FinishedFits | None = None,
-) -> list[dict[str, Any]]:
+) -> tuple[list[dict[str, Any]], dict[str, CovarianceRegressor]]:
     """Table I for each reading of eq. (14): medians over the seeds 0 to ``n_seeds - 1``.
 
     A model whose name is one of the paper's (CD, WP, GMM 5, GMM 8) has the paper's figure beside it. Beside each
     mixture is scikit-learn's with as many components, from starts of its own.
+
+    Returns
+    -------
+    rows : list of dict
+    fitted : dict
+        The models by name, fitted to the data of the first reading and seed 0.
     """
-    rows = []
-    models = _with_references(models)
-    for reading in readings:
-        scores: dict[str, list[Score]] = {name: [] for name in models}
-        for seed in range(n_seeds):
-            X, y, groups = make_paper_simulation(n_inputs, n_demos, reading=reading, random_state=seed)
-            for score in compare_models(
-                models,
-                X,
-                y,
-                groups,
-                truth=lambda inputs, reading=reading: paper_covariance(inputs, reading=reading),
-                max_folds=max_folds,
-                n_jobs=n_jobs,
-                finished=finished,
-            ):
-                scores[score.model].append(score)
-        rows += [_row(reading, name, several) for name, several in scores.items()]
-    return rows
-
-
-def _with_references(models: Mapping[str, CovarianceRegressor]) -> dict[str, Any]:
     contenders: dict[str, Any] = {}
     for name, model in models.items():
         contenders[name] = model
         if isinstance(model, GMMBaseline):
             contenders[f"{name}, scikit-learn"] = ScikitLearnGMR(model.n_components)
-    return contenders
+    rows: list[dict[str, Any]] = []
+    fitted: dict[str, CovarianceRegressor] = {}
+    for reading in readings:
+        scores: dict[str, list[Score]] = {name: [] for name in contenders}
+        for seed in range(n_seeds):
+            data = make_paper_simulation(n_inputs, n_demos, reading=reading, random_state=seed)
+            options: dict[str, Any] = {"max_folds": max_folds, "n_jobs": n_jobs, "finished": finished}
+            truth = partial(paper_covariance, reading=reading)
+            for score in compare_models(contenders, *data, truth=truth, **options):
+                scores[score.model].append(score)
+                fitted.setdefault(score.model, score.fitted)
+        rows += [_row(reading, name, several) for name, several in scores.items()]
+    return rows, {name: fitted[name] for name in models}
 
 
 def _row(reading: str, name: str, scores: Sequence[Score]) -> dict[str, Any]:
-    def median(values: Sequence[float]) -> float:
-        return float(np.median(values))
-
     paper_mse, paper_seconds = PAPER_TABLE_1.get(name, (float("nan"), float("nan")))
+    rows = [score.row() for score in scores]
+    columns = ("MSE", "error to truth", "held-out LL", "fit [s]")
+    mse, error, likelihood, seconds = (float(np.median([row[column] for row in rows])) for column in columns)
     return {
         "reading": reading,
         "model": name,
-        "MSE": median([score.cholesky_mse for score in scores]),
+        "MSE": mse,
         "paper's MSE": paper_mse,
-        "error to truth": median([score.frobenius for score in scores]),
-        "held-out LL": median([score.log_likelihood for score in scores]),
-        "fit [s]": median([score.fit_seconds for score in scores]),
+        "error to truth": error,
+        "held-out LL": likelihood,
+        "fit [s]": seconds,
         "paper's [s]": paper_seconds,
     }
 
 
-def figure_of(
-    model: CovarianceRegressor, X: NDArray[np.float64], y: NDArray[np.float64], name: str, reading: Reading
-) -> Figure:
+def figure_of(model: CovarianceRegressor, X: Floats, y: Floats, name: str, reading: Reading) -> Figure:
     """One of Figures 1 to 3: the outputs over xi, and the covariances at the inputs, beyond the data too."""
-    figure, axes = plt.subplots(1, 3, figsize=(13, 4.6), layout="constrained")
+    figure, ((*bands, plane),) = figure_grid(1, 3, (12.0, 4.2))
 
-    def truth(xi: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def truth(xi: Floats) -> tuple[Floats, Floats]:
         variance = np.diagonal(paper_covariance(xi.clip(_LEAST_XI), reading=reading), axis1=1, axis2=2)
         return paper_mean(xi), np.where(xi > _LEAST_XI, np.sqrt(variance), np.nan)
 
-    plot_model_bands(model, X, y, axes[:2], beyond=_BEYOND, true_std=truth)
-    for output, ax in enumerate(axes[:2]):
+    plot_model_bands(model, X, y, bands, beyond=_BEYOND, true_std=truth)
+    for output, ax in enumerate(bands):
         ax.set(xlabel="input xi", ylabel=f"output y{output + 1}")
     inputs, empirical = empirical_covariances(X, y)
-    mean, covariance = model.predict(inputs, return_cov=True)
-    plot_covariance_ellipses(paper_mean(inputs), paper_covariance(inputs, reading=reading), axes[2], color=TRUTH,
-                             label="truth", linestyle="--")  # fmt: skip
+    true = paper_covariance(inputs, reading=reading)
+    plot_covariance_ellipses(paper_mean(inputs), true, plane, color=TRUTH, label="truth", linestyle="--")
     if empirical is not None:
         centres = np.stack([y[X[:, 0] == xi].mean(axis=0) for xi in inputs[:, 0]])
-        plot_covariance_ellipses(centres, empirical, axes[2], color=EMPIRICAL, label="empirical")
-    plot_covariance_ellipses(mean, covariance, axes[2], color=MODEL, label="model")
-    axes[2].set(xlabel="output y1", ylabel="output y2", title="2 sd ellipses at the inputs")
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=9)
+        plot_covariance_ellipses(centres, empirical, plane, color=EMPIRICAL, label="empirical")
+    plot_covariance_ellipses(*model.predict(inputs, return_cov=True), plane, color=MODEL, label="model")
+    plane.set(xlabel="output y1", ylabel="output y2", title="2 sd ellipses at the inputs")
+    legend_below(figure, bands[0])
     figure.suptitle(f'{name} on eq. (14), reading "{reading}"')
     return figure
 
 
 def run_simulation(
-    models: Mapping[str, CovarianceRegressor], folder: RunFolder, *, readings: Sequence[Reading], **options: Any
+    models: Mapping[str, CovarianceRegressor], folder: RunFolder, readings: Sequence[Reading], **options: Any
 ) -> str:
     """Make Table I and the figures of each model (seed 0, first reading); returns the table as text."""
-    check_names(models, "models")
-    rows = table1(models, readings=readings, finished=folder.finished, **options)
+    rows, fitted = table1(models, readings=readings, finished=folder.finished, **options)
     folder.write_metrics(rows)
     sizes = {key: options[key] for key in ("n_inputs", "n_demos") if key in options}
-    X, y, groups = make_paper_simulation(**sizes, reading=readings[0], random_state=0)
-    for name, model in models.items():
-        fitted, _ = fit_once(model, X, y, groups, finished=folder.finished)
-        folder.write_model(fitted, slug(name))
-        figure = figure_of(fitted, X, y, name, readings[0])
-        folder.write_figure(figure, slug(name))
-        plt.close(figure)
+    X, y, _ = make_paper_simulation(**sizes, reading=readings[0], random_state=0)
+    for name, model in fitted.items():
+        folder.write_model(model, slug(name))
+        folder.write_figure(figure_of(model, X, y, name, readings[0]), slug(name))
     return format_table(rows)
+
+
+class ScikitLearnGMR(BaseEstimator):
+    """scikit-learn's mixture over the standardized [x, y], conditioned by Schur complements.
+
+    Parameters
+    ----------
+    n_components : int, default=5
+    random_state : int, default=0
+    """
+
+    def __init__(self, n_components: int = 5, random_state: int = 0) -> None:
+        self.n_components = n_components
+        self.random_state = random_state
+
+    def fit(self, X: Floats, y: Floats) -> Self:
+        """Fit on arrays (n, e) and (n, d), the best of three starts of k-means."""
+        joint = np.hstack([X, y])
+        self._shift, self._scale = joint.mean(axis=0), joint.std(axis=0)
+        self.mixture_ = GaussianMixture(
+            self.n_components, tol=1e-7, max_iter=1000, n_init=3, random_state=self.random_state
+        ).fit((joint - self._shift) / self._scale)
+        self._n_features = X.shape[1]
+        return self
+
+    def predict(self, X: Floats, return_cov: bool = False) -> Any:
+        """Mean (n, d), and with it the covariances (n, d, d)."""
+        e, mixture = self._n_features, self.mixture_
+        x = (X - self._shift[:e]) / self._scale[:e]
+        parts = list(zip(mixture.weights_, mixture.means_, mixture.covariances_, strict=True))
+        log_share = np.stack(
+            [np.log(w) + multivariate_normal(m[:e], c[:e, :e]).logpdf(x) for w, m, c in parts], axis=-1
+        )
+        share = np.exp(log_share - log_share.max(axis=-1, keepdims=True))
+        share /= share.sum(axis=-1, keepdims=True)
+        gains = [np.linalg.solve(c[:e, :e], c[:e, e:]) for _, _, c in parts]
+        means = np.stack([m[e:] + (x - m[:e]) @ gain for (_, m, _), gain in zip(parts, gains, strict=True)], axis=1)
+        within = np.stack([c[e:, e:] - c[e:, :e] @ gain for (_, _, c), gain in zip(parts, gains, strict=True)])
+        mean = np.einsum("nk,nkd->nd", share, means)
+        apart = means - mean[:, np.newaxis]
+        covariance = np.einsum("nk,kij->nij", share, within) + np.einsum("nk,nki,nkj->nij", share, apart, apart)
+        scale = self._scale[e:]
+        mean = self._shift[e:] + scale * mean
+        return (mean, covariance * scale[:, np.newaxis] * scale) if return_cov else mean
+
+    def predict_cov(self, X: Floats) -> Floats:
+        """Covariances (n, d, d)."""
+        return np.asarray(self.predict(X, return_cov=True)[1])
+
+    def score(self, X: Floats, y: Floats) -> float:
+        """Mean log density of the rows of y."""
+        mean, covariance = self.predict(X, return_cov=True)
+        rows = zip(y, mean, covariance, strict=True)
+        return float(np.mean([multivariate_normal(m, c).logpdf(target) for target, m, c in rows]))

@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from joblib import Parallel, delayed
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from sklearn.base import clone
 from threadpoolctl import threadpool_limits
 
@@ -122,7 +122,7 @@ def score_fold(
     demonstration: int,
     finished: FinishedFits | None = None,
 ) -> dict[str, float]:
-    """Fit without a demonstration, and say how well it is foretold."""
+    """Fit without a demonstration, and score how well it is predicted."""
     left = groups == demonstration
     start = time.thread_time()
     model, _ = fit_once(model, X[~left], y[~left], groups[~left], finished=finished)
@@ -140,33 +140,36 @@ def summarize(rows: Sequence[Row]) -> list[Row]:
     """
     table = []
     for task in dict.fromkeys(row["task"] for row in rows):
-        of_task = [row for row in rows if row["task"] == task]
-        models = list(dict.fromkeys(row["model"] for row in of_task))
-        values = {name: np.array([row["log_likelihood"] for row in of_task if row["model"] == name]) for name in models}
-        for name in models:
-            of_model = [row for row in of_task if row["model"] == name]
-            mean, error = _mean(values[name])
-            ahead, ahead_error = _mean(values[name] - values[models[0]]) if name != models[0] else (np.nan, np.nan)
+        folds: dict[str, list[Row]] = {}
+        for row in rows:
+            if row["task"] == task:
+                folds.setdefault(row["model"], []).append(row)
+        values = {name: np.array([row["log_likelihood"] for row in own]) for name, own in folds.items()}
+        first = next(iter(folds))
+        for name, own in folds.items():
+            mean, error = mean_and_error(values[name])
+            ahead, ahead_error = mean_and_error(values[name] - values[first] if name != first else ())
             table.append(
                 {
                     "task": task,
                     "model": name,
                     "held-out LL": mean,
                     "+-": error,
-                    f"against {models[0]}": ahead,
+                    f"against {first}": ahead,
                     "+- ": ahead_error,
-                    "95 % holds": _mean(np.array([row["coverage"] for row in of_model]))[0],
-                    "folds": len(of_model),
-                    "failed": sum(bool(row["error"]) for row in of_model),
-                    "fit [s]": _mean(np.array([row["fit_seconds"] for row in of_model]))[0],
+                    "95 % holds": mean_and_error([row["coverage"] for row in own])[0],
+                    "folds": len(own),
+                    "failed": sum(bool(row["error"]) for row in own),
+                    "fit [s]": mean_and_error([row["fit_seconds"] for row in own])[0],
                 }
             )
     return table
 
 
-def _mean(values: Floats) -> tuple[float, float]:
-    """Mean and its standard error over the folds that have a result."""
-    known = values[~np.isnan(values)]
+def mean_and_error(values: ArrayLike) -> tuple[float, float]:
+    """Mean over the folds that have a result, and its standard error; NaN where those are too few."""
+    known = np.asarray(values, dtype=float)
+    known = known[~np.isnan(known)]
     mean = float(known.mean()) if len(known) else np.nan
     return mean, float(known.std(ddof=1) / len(known) ** 0.5) if len(known) > 1 else np.nan
 
