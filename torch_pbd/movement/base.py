@@ -23,6 +23,7 @@ from torch_pbd.movement.conditioning import Conditioned, Observed
 from torch_pbd.movement.joint import JointNormal
 
 _MOST_ENTRIES = 4096  # conditioned on one by one: a matrix of their size squared is factorized
+_AT_ONCE = 512  # rows whose marginals are found together
 _RESOLUTION = 10  # decimals of a time, in ranges of those of the fit: nearer ones are equal
 
 
@@ -344,8 +345,12 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
 
     def _marginals(self, time: Floats) -> tuple[Floats, Floats]:
         """Mean (n, d) and covariance (n, d, d) of each row."""
-        law, rows = self._law(time)
-        return law.mean[rows].numpy(), law.marginal()[rows].numpy()
+        parts = []
+        for start in range(0, max(1, len(time)), _AT_ONCE):  # rows need no correlation with each other
+            law, rows = self._law(time[start : start + _AT_ONCE])
+            parts.append((law.mean[rows].numpy(), law.marginal()[rows].numpy()))
+        mean, covariance = zip(*parts, strict=True)
+        return np.concatenate(mean), np.concatenate(covariance)
 
     def _score(self, recording: Recording) -> float:
         """Joint log density of one demonstration."""
