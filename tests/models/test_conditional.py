@@ -6,8 +6,8 @@ import torch
 
 from torch_pbd.gp import Hyperparameters, Observations, condition
 from torch_pbd.models.cholesky import CholeskyCovariance
-from torch_pbd.models.conditional import ConditionalNormal, MeanAndCovariance
-from torch_pbd.models.floor import VARIANCE_FLOOR
+from torch_pbd.models.conditional import ConditionalNormal
+from torch_pbd.models.core import VARIANCE_FLOOR, MeanAndCovariance
 from torch_pbd.models.mixture import GaussianMixture
 from torch_pbd.models.wishart import WishartCovariance, padded
 

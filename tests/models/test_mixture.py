@@ -11,8 +11,7 @@ from sklearn.cluster import KMeans
 from sklearn.exceptions import ConvergenceWarning
 
 from torch_pbd.exceptions import NotPositiveDefiniteError
-from torch_pbd.models.mixture import GaussianMixture
-from torch_pbd.models.mixture_fit import expectation_maximization, refine
+from torch_pbd.models.mixture import GaussianMixture, expectation_maximization, refine
 from torch_pbd.optim import Status
 
 REG = 1e-6
@@ -163,7 +162,7 @@ def test_a_variance_far_below_the_movement_survives(k, rng):
 def test_em_splits_the_rows_into_blocks_without_a_trace(rng, monkeypatch):
     data = curve(rng)
     whole, _ = fit(data, 3, tol=0.0, max_iter=5)
-    monkeypatch.setattr("torch_pbd.models.mixture_fit._BLOCK", 77)
+    monkeypatch.setattr("torch_pbd.models.mixture._BLOCK", 77)
     blocks, _ = fit(data, 3, tol=0.0, max_iter=5)
     torch.testing.assert_close(blocks.state_dict(), whole.state_dict(), rtol=1e-9, atol=1e-11)
 
@@ -375,7 +374,7 @@ def test_single_precision_stays_single(rng):
 
 @pytest.mark.parametrize(
     ("n_features", "diagonal", "message"),
-    [(0, 1.0, "1 to 1"), (2, 1.0, "n_features is 2"), (1, 0.0, "diagonal")],
+    [(0, 1.0, "at least 1 and at most 1"), (2, 1.0, "n_features is 2"), (1, 0.0, "diagonal")],
 )
 def test_what_is_no_mixture_is_an_error(n_features, diagonal, message):
     with pytest.raises(ValueError, match=message):

@@ -19,8 +19,7 @@ from torch_pbd.estimators.scaling import Standardization, distinct_rows, spread_
 from torch_pbd.estimators.validation import Floats, check_choice, check_number
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.files.memory import require_much
-from torch_pbd.models.mixture import GaussianMixture
-from torch_pbd.models.mixture_fit import expectation_maximization, refine
+from torch_pbd.models.mixture import GaussianMixture, expectation_maximization, refine
 from torch_pbd.optim import FitReport
 
 # An output's residual scale is not taken below this of its whole spread.
@@ -79,6 +78,7 @@ class GMMBaseline(CovarianceRegressor):
     Robotics 9, 2016.
     """
 
+    _core_class = GaussianMixture
     _regression: MixtureRegression | None = None
 
     def __init__(

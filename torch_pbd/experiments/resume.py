@@ -17,8 +17,8 @@ import torch
 import torch_pbd
 from torch_pbd.data import Demonstrations
 from torch_pbd.estimators.groups import fit_by_demonstration
-from torch_pbd.model_header import encode_parameters, is_ours
 from torch_pbd.persistence import load, save
+from torch_pbd.persistence.plain import encode_parameters, is_ours
 
 _NAME = re.compile(r"[0-9a-f]{64}-\d+\.\d{6}\.safetensors")
 
