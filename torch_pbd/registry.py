@@ -11,7 +11,10 @@ REGRESSORS = {
 }
 """Covariance regressors, the recommended one first."""
 
-ESTIMATORS = {**REGRESSORS, "DMPController": "torch_pbd.control.controller"}
+MOVEMENTS = {"TrajectoryRegressor": "torch_pbd.movement.trajectory"}
+"""Models of whole movements."""
+
+ESTIMATORS = {**REGRESSORS, **MOVEMENTS, "DMPController": "torch_pbd.control.controller"}
 
 
 def load_class(name: str) -> Any:

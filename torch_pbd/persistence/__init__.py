@@ -25,6 +25,7 @@ from torch_pbd.exceptions import ModelFileError
 from torch_pbd.files.atomic import LOADERS
 from torch_pbd.files.tensors import Arrays, read_checksummed, write_checksummed
 from torch_pbd.persistence.plain import (
+    SAVED,
     check_entries,
     decode_learned,
     decode_parameters,
@@ -33,7 +34,7 @@ from torch_pbd.persistence.plain import (
     is_ours,
     learned_checks,
 )
-from torch_pbd.registry import ESTIMATORS, REGRESSORS
+from torch_pbd.registry import REGRESSORS
 
 FORMAT_VERSION = 1
 _KEY = "torch_pbd"
@@ -81,7 +82,7 @@ def save(estimator: CovarianceRegressor | DMPController, path: str | os.PathLike
         raise ValueError(f"path={str(path)!r} has the suffix of another format: take .safetensors.")
     name = type(estimator).__name__
     if not is_ours(estimator):
-        raise TypeError(f"estimator is a {name}; can save {', '.join(ESTIMATORS)}. In a pipeline, save that step.")
+        raise TypeError(f"estimator is a {name}; can save {', '.join(SAVED)}. In a pipeline, save that step.")
     check_is_fitted(estimator)
     description, arrays = _described(estimator)
     try:
@@ -118,8 +119,8 @@ def load(path: str | os.PathLike[str]) -> Any:
         if not _FOREIGN.fullmatch(path.suffix):
             raise
         raise ModelFileError(f"{error} {LOADERS} Pickles are never loaded.") from error
-    if header.get("class") not in list(ESTIMATORS):  # a list asks for no hash
-        raise ModelFileError(f"{path} holds a {header.get('class')!r:.80}; known are {', '.join(ESTIMATORS)}.")
+    if header.get("class") not in list(SAVED):  # a list asks for no hash
+        raise ModelFileError(f"{path} holds a {header.get('class')!r:.80}; known are {', '.join(SAVED)}.")
     try:
         if not isinstance(header.pop("versions", None), dict) or header.pop("format_version") != FORMAT_VERSION:
             raise ValueError("it does not say what wrote it")

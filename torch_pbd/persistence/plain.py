@@ -10,9 +10,12 @@ from numpy.typing import NDArray
 
 from torch_pbd import checks
 from torch_pbd.control.stiffness import StiffnessLaw
-from torch_pbd.registry import ESTIMATORS, REGRESSORS, load_class
+from torch_pbd.registry import ESTIMATORS, MOVEMENTS, REGRESSORS, load_class
 
 Check = Callable[[Any, str], Any]
+
+SAVED = {name: module for name, module in ESTIMATORS.items() if name not in MOVEMENTS}
+"""Classes that files hold, and the modules in which they are."""
 
 _LAW = "stiffness_law"
 _INTEGERS = [f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)]
@@ -21,7 +24,7 @@ _DTYPES = ["float64", "float32", "float16", *_INTEGERS, "bool", "object"]
 
 def is_ours(estimator: Any) -> bool:
     """Whether an object is of one of the classes, and not of a subclass that bears its name."""
-    return ESTIMATORS.get(type(estimator).__name__) == type(estimator).__module__
+    return SAVED.get(type(estimator).__name__) == type(estimator).__module__
 
 
 def encode_parameters(estimator: Any) -> dict[str, Any]:
@@ -47,7 +50,7 @@ def decode_parameters(description: Any) -> Any:
     if not isinstance(description, dict) or not {"class", "params"} <= set(description):
         raise ValueError("it has no class and parameters")
     name, parameters = description["class"], description["params"]
-    if name not in list(ESTIMATORS) or not isinstance(parameters, dict):  # a list asks for no hash
+    if name not in list(SAVED) or not isinstance(parameters, dict):  # a list asks for no hash
         raise ValueError(f"it holds a {name!r:.80}")
     if name == "DMPController":  # files from before there was a choice are of the printed equation
         parameters = {"adaptation": "additive", **parameters}

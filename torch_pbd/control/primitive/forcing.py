@@ -26,7 +26,7 @@ class ForcingProcess:
     """
 
     def __init__(self, X: Floats, forcing: Floats, n_demos: int) -> None:
-        self._scaling = Standardization.of(X, forcing)
+        self._scaling = Standardization.fit(X, forcing)
         inputs = torch.tensor(self._scaling.inputs(X))
         targets = torch.tensor(self._scaling.outputs(forcing)).mT.contiguous()
         counts = torch.full((len(X),), float(n_demos), dtype=torch.float64)

@@ -1,0 +1,5 @@
+"""Whole movements: the joint law of a demonstration, drawn from, judged by, and conditioned."""
+
+from torch_pbd.movement.trajectory import TrajectoryRegressor
+
+__all__ = ["TrajectoryRegressor"]
