@@ -8,11 +8,11 @@ from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float, Int64
-from torch import Tensor
+from torch import Tensor, nn
 
 from torch_pbd.gp import LatentGP
 from torch_pbd.linalg import tril_to_vector, vector_to_tril
-from torch_pbd.models.core import CovarianceProcess, MeanAndCovariance, Shapes, beside_prior, blank, latent_skeleton
+from torch_pbd.models.core import MeanAndCovariance, Shapes, beside_prior, blank, latent_skeleton
 
 _LARGEST_LOGARITHM = 300.0  # of a diagonal entry: its square is still a number
 _LEAST_DIAGONAL = 1e-6  # in standardized units: an entry of zero has no logarithm, and the floor is of this size
@@ -98,7 +98,7 @@ class CholeskyLink:
             yield below * (below + 1) // 2 + column, jacobian.mT @ jacobian
 
 
-class CholeskyCovariance(CovarianceProcess):
+class CholeskyCovariance(nn.Module):
     """The lower factor of the covariance: prior factor plus p = d(d+1)/2 latent processes, eq. (13).
 
     Parameters
@@ -110,6 +110,7 @@ class CholeskyCovariance(CovarianceProcess):
     log_diagonal : bool
         Whether the processes of the diagonal act on its logarithm.
     bounded : bool, default=False
+        Whether the part of the prior in the entries is kept between nothing and the prior: see ``beside_prior``.
     """
 
     prior_tril: Tensor
@@ -117,8 +118,8 @@ class CholeskyCovariance(CovarianceProcess):
     def __init__(
         self, latent: LatentGP, prior_tril: Float[Tensor, "d d"], *, log_diagonal: bool, bounded: bool = False
     ) -> None:
-        super().__init__(latent, bounded=bounded)
-        self.log_diagonal = bool(log_diagonal)
+        super().__init__()
+        self.latent, self.log_diagonal, self.bounded = latent, log_diagonal, bounded
         self.register_buffer("prior_tril", prior_tril)
 
     def forward(
@@ -138,23 +139,21 @@ class CholeskyCovariance(CovarianceProcess):
         """Factor with the prior taken out (Type II): zero far from data."""
         return vector_to_tril(self.latent.values(x))
 
-    def config(self) -> dict[str, Any]:
-        """Kernel, and on what the processes act."""
-        return {**super().config(), "log_diagonal": self.log_diagonal}
-
-    @classmethod
-    def skeleton(
-        cls, config: Mapping[str, Any], shapes: Shapes, n_features: int, n_outputs: int
-    ) -> "CholeskyCovariance":
-        """Model without numbers."""
-        n_processes = n_outputs * (n_outputs + 1) // 2
-        latent = latent_skeleton(shapes, "covariance.latent", n_processes, n_features, config["kernel"])
-        options = {"log_diagonal": config["log_diagonal"], "bounded": config.get("bounded", False)}
-        return cls(latent, blank(n_outputs, n_outputs), **options)
-
 
 class MeanAndCholesky(MeanAndCovariance):
     """Core of the Cholesky decomposition approach."""
 
     kind = "cholesky"
-    covariance_class = CholeskyCovariance
+
+    def config(self) -> dict[str, Any]:
+        """Kernels, and on what the processes act."""
+        return {**super().config(), "log_diagonal": self.covariance.log_diagonal}
+
+    @classmethod
+    def skeleton(cls, config: Mapping[str, Any], shapes: Shapes, n_features: int, n_outputs: int) -> "MeanAndCholesky":
+        """Core without numbers."""
+        mean = latent_skeleton(shapes, "mean", n_outputs, n_features, config["mean_kernel"])
+        n_processes = n_outputs * (n_outputs + 1) // 2
+        latent = latent_skeleton(shapes, "covariance.latent", n_processes, n_features, config["kernel"])
+        options = {"log_diagonal": bool(config["log_diagonal"]), "bounded": bool(config.get("bounded", False))}
+        return cls(mean, CholeskyCovariance(latent, blank(n_outputs, n_outputs), **options))

@@ -22,7 +22,7 @@ class ConditionalNormal(nn.Module):
     x_shift, x_scale : Tensor of shape (e,)
         Standardized inputs are ``(x - x_shift) / x_scale``.
     y_shift, y_scale : Tensor of shape (d,)
-        The same for the outputs.
+        Standardized outputs are ``(y - y_shift) / y_scale``.
     """
 
     x_shift: Tensor

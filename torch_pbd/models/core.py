@@ -76,42 +76,6 @@ class Core(nn.Module, ABC):
         """Core of a ``config()`` without numbers, as large as the arrays of these names and shapes say."""
 
 
-class CovarianceProcess(nn.Module, ABC):
-    """Root of a covariance: a prior, and latent processes which say how data differ from it (CD and WP).
-
-    Parameters
-    ----------
-    latent : LatentGP
-    bounded : bool
-        Whether the part of the prior in the root is kept between nothing and the prior: see ``beside_prior``.
-    """
-
-    def __init__(self, latent: LatentGP, *, bounded: bool) -> None:
-        super().__init__()
-        self.latent, self.bounded = latent, bool(bounded)
-
-    @abstractmethod
-    def forward(
-        self, x: Float[Tensor, "n e"], prior_tril: Float[Tensor, "n d d"] | None = None
-    ) -> Float[Tensor, "n d r"]:
-        """Root of the covariance at x."""
-
-    @abstractmethod
-    def variability(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d r"]:
-        """Root of the covariance with the prior taken out: zero far from data."""
-
-    def config(self) -> dict[str, Any]:
-        """Plain values that are not in the ``state_dict``."""
-        return {"kernel": self.latent.kernel, "bounded": self.bounded}
-
-    @classmethod
-    @abstractmethod
-    def skeleton(
-        cls, config: Mapping[str, Any], shapes: Shapes, n_features: int, n_outputs: int
-    ) -> "CovarianceProcess":
-        """As of a :class:`Core`; the names begin with "covariance."."""
-
-
 def beside_prior(
     root: Float[Tensor, "*n d r"], values: Float[Tensor, "*n d r"], prior: Float[Tensor, "*m d r"]
 ) -> Float[Tensor, "*n d r"]:
@@ -124,11 +88,16 @@ def beside_prior(
 
 
 class MeanAndCovariance(Core):
-    """Gaussian processes for the mean beside a model of the covariance's root."""
+    """Gaussian processes for the mean beside a covariance of latent processes, by its root (CD and WP).
 
-    covariance_class: ClassVar[type[CovarianceProcess]]
+    Parameters
+    ----------
+    mean : LatentGP
+    covariance : CholeskyCovariance or WishartCovariance
+        Maps inputs, and another prior, to roots; has ``latent``, ``bounded`` and ``variability``.
+    """
 
-    def __init__(self, mean: LatentGP, covariance: CovarianceProcess) -> None:
+    def __init__(self, mean: LatentGP, covariance: Any) -> None:
         super().__init__()
         self.mean, self.covariance = mean, covariance
 
@@ -149,7 +118,7 @@ class MeanAndCovariance(Core):
         return self.covariance(x, prior_tril)
 
     def variability(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d r"]:
-        """Root of the covariance with the prior taken out."""
+        """Root of the covariance with the prior taken out: zero far from data."""
         return self.covariance.variability(x)
 
     def type1(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
@@ -157,16 +126,9 @@ class MeanAndCovariance(Core):
         return self.covariance.latent.type1(x)
 
     def config(self) -> dict[str, Any]:
-        """Kernels, and what the covariance adds."""
-        return {"covariance": self.kind, "mean_kernel": self.mean.kernel, **self.covariance.config()}
-
-    @classmethod
-    def skeleton(
-        cls, config: Mapping[str, Any], shapes: Shapes, n_features: int, n_outputs: int
-    ) -> "MeanAndCovariance":
-        """Core without numbers."""
-        mean = latent_skeleton(shapes, "mean", n_outputs, n_features, config["mean_kernel"])
-        return cls(mean, cls.covariance_class.skeleton(config, shapes, n_features, n_outputs))
+        """Kernels, and whether the part of the prior is bounded."""
+        latent, bounded = self.covariance.latent, self.covariance.bounded
+        return {"covariance": self.kind, "mean_kernel": self.mean.kernel, "kernel": latent.kernel, "bounded": bounded}
 
 
 def blank(*shape: int) -> Tensor:

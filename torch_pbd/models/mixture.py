@@ -89,12 +89,8 @@ class GaussianMixture(Core):
         return self.strict_lower.tril(-1) + torch.diag_embed(self.log_diagonal.exp())
 
     def log_prob(self, data: Float[Tensor, "n p"]) -> Float[Tensor, " n"]:
-        """Log density at each row [x, y]."""
-        return self.components().log_prob(data)
-
-    def log_prob_input(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
-        """Log density of the inputs alone, at each row of ``x``."""
-        return self.components(self.n_features).log_prob(x)
+        """Log density at each row [x, y], or [x] alone."""
+        return self.components(data.shape[1]).log_prob(data)
 
     def forward(
         self, x: Float[Tensor, "n e"], prior_tril: Float[Tensor, "n d d"] | None = None
@@ -125,7 +121,7 @@ class GaussianMixture(Core):
         set by the fits). A mixture knows only Type II uncertainty (paper, section IV-C): this measure is
         ours, and the covariance does *not* return to a prior where it is 1.
         """
-        return -torch.expm1((self.log_prob_input(x) - self.log_density_floor).clamp(max=0.0))
+        return -torch.expm1((self.log_prob(x) - self.log_density_floor).clamp(max=0.0))
 
     def config(self) -> dict[str, Any]:
         """Number of inputs."""
@@ -138,7 +134,7 @@ class GaussianMixture(Core):
         return cls(blank(k), blank(k, p), blank(k, p, p), n_features)
 
     def components(self, size: int | None = None) -> Components:
-        """Components over all variables, or over the first ``size``."""
+        """Components over the first ``size`` variables, or over all."""
         log_weight = self.log_weight.log_softmax(0)
         return Components(log_weight, self.mean[:, :size], self.scale_tril[:, :size, :size])
 
@@ -153,8 +149,9 @@ def expectation_maximization(
     tol: float,
     max_iter: int,
 ) -> tuple[GaussianMixture, FitReport]:
-    """Fit a mixture by expectation maximization, from given responsibilities.
+    """Fit a mixture by expectation maximization, from given responsibilities: the best iterate.
 
+    Its loss is the negative mean log-likelihood, in nats per row.
     The updates are those of scikit-learn's ``GaussianMixture(covariance_type="full")``, but carried out in
     each component's present frame: an E step whitens the data and gathers weighted moments, near the identity
     there, and an M step moves the frames. Strongly correlated data keep their digits so.
@@ -171,11 +168,6 @@ def expectation_maximization(
         Added to every variance of every component. The data being standardized, it is a share of theirs.
     tol, max_iter : float, int
         Stop when the mean log-likelihood, in nats per row, changes by less than ``tol``.
-
-    Returns
-    -------
-    mixture, report : GaussianMixture, FitReport
-        The best iterate, and its loss: the negative mean log-likelihood, in nats per row.
 
     Raises
     ------
@@ -245,7 +237,7 @@ def refine(
 def _with_density_floor(components: Components, inputs: Float[Tensor, "n e"]) -> GaussianMixture:
     """Mixture of these components, which knows the lowest density of the training inputs."""
     mixture = GaussianMixture(components.log_weight, components.mean, components.scale_tril, inputs.shape[1])
-    mixture.log_density_floor.fill_(mixture.log_prob_input(inputs).min())
+    mixture.log_density_floor.fill_(mixture.log_prob(inputs).min())
     return mixture
 
 

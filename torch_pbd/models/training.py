@@ -1,4 +1,4 @@
-"""Training rows with their distinct inputs found, and the statistics the models need of them."""
+"""Training rows with their distinct inputs found, and the statistics of them that models are fitted to."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -10,7 +10,7 @@ from torch import Tensor
 from torch_pbd.gp import neighbourhoods
 from torch_pbd.linalg import scale_tril_from_root
 
-_CHUNK = 1024  # inputs that a mean is evaluated at together
+_CHUNK = 1024  # inputs that a mean is evaluated at together: its correlations take 8 kB for each, of 1000 inputs
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class TrainingSet:
         return _sum_by(self.y, self.index, len(self.inputs)) / self.counts[:, None]
 
     def merged(self, max_inputs: int) -> "TrainingSet":
-        """The same rows with at most ``max_inputs`` distinct inputs: neighbours are taken together."""
+        """Rows with at most ``max_inputs`` distinct inputs: neighbours are taken together."""
         if len(self.inputs) <= max_inputs:
             return self
         index = neighbourhoods(self.inputs, max_inputs)[self.index]
@@ -45,9 +45,9 @@ class TrainingSet:
         return replace(self, inputs=_sum_by(self.x, index, n_inputs) / counts[:, None], index=index)
 
     def residual(self, mean: Callable[[Tensor], Tensor]) -> Float[Tensor, "rows d"]:
-        """What y is above its mean at each row; ``mean`` maps inputs (m, e) to (m, d).
+        """Residual of y from its mean at each row; ``mean`` maps inputs (m, e) to (m, d).
 
-        It is asked for a bounded number of inputs at a time, and where rows repeat an input for that alone.
+        It is evaluated for a bounded number of inputs at a time, and where rows repeat an input for that alone.
         """
         repeated = torch.equal(self.inputs[self.index], self.x)
         at = self.inputs if repeated else self.x
@@ -59,8 +59,8 @@ class TrainingSet:
         """Root of the scatter at each input: ``root @ root.mT`` is the sum of ``w w'`` over its rows.
 
         The rows of each input are laid side by side, and where they are more than d reduced to d by a QR
-        decomposition: no product is formed, and K <= d rows are no special case. Inputs of about as many
-        rows are treated together, so memory is linear in the rows.
+        decomposition: no product is formed, and K <= d rows are no special case. Inputs whose numbers of rows lie
+        between the same powers of two are treated together, so memory is linear in the rows.
         """
         counts = torch.bincount(self.index, minlength=len(self.inputs))
         n_outputs, order = residual.shape[1], self.index.argsort(stable=True)

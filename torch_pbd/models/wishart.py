@@ -9,15 +9,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from torch_pbd.gp import LatentGP
-from torch_pbd.models.core import (
-    CovarianceProcess,
-    MeanAndCovariance,
-    Shapes,
-    beside_prior,
-    blank,
-    latent_skeleton,
-    size_of,
-)
+from torch_pbd.models.core import MeanAndCovariance, Shapes, beside_prior, blank, latent_skeleton, size_of
 
 
 def wishart_root(
@@ -119,7 +111,7 @@ def _block(equation: str, left: Tensor, right: Tensor) -> Tensor:
     return torch.einsum(equation, left, right).flatten(3, 4).flatten(1, 2)
 
 
-class WishartCovariance(CovarianceProcess):
+class WishartCovariance(nn.Module):
     """A Wishart process at the mean of its latent processes: eq. (8).
 
     Parameters
@@ -132,6 +124,7 @@ class WishartCovariance(CovarianceProcess):
     scale_matrix_tril : Tensor of shape (d, d)
         The paper's L, lower factor of the scale matrix V.
     bounded : bool, default=False
+        Whether the part of the prior in the vectors is kept between nothing and the prior: see ``beside_prior``.
     """
 
     prior_root: Tensor
@@ -144,7 +137,8 @@ class WishartCovariance(CovarianceProcess):
         *,
         bounded: bool = False,
     ) -> None:
-        super().__init__(latent, bounded=bounded)
+        super().__init__()
+        self.latent, self.bounded = latent, bounded
         self.scale_matrix_tril = nn.Parameter(scale_matrix_tril)
         self.register_buffer("prior_root", prior_root)
 
@@ -161,16 +155,6 @@ class WishartCovariance(CovarianceProcess):
         """Root with the prior taken out (Type II): zero far from data."""
         return self._vectors(self.latent.values(x))
 
-    @classmethod
-    def skeleton(
-        cls, config: Mapping[str, Any], shapes: Shapes, n_features: int, n_outputs: int
-    ) -> "WishartCovariance":
-        """Model without numbers."""
-        df = size_of(shapes, "covariance.prior_root", 1)
-        latent = latent_skeleton(shapes, "covariance.latent", n_outputs * df, n_features, config["kernel"])
-        parts = blank(n_outputs, df), blank(n_outputs, n_outputs)
-        return cls(latent, *parts, bounded=config.get("bounded", False))
-
     def _vectors(self, values: Float[Tensor, "n b"]) -> Float[Tensor, "n d df"]:
         return values.reshape(len(values), *self.prior_root.shape[::-1]).mT
 
@@ -179,4 +163,12 @@ class MeanAndWishart(MeanAndCovariance):
     """Core of the Wishart process approach."""
 
     kind = "wishart"
-    covariance_class = WishartCovariance
+
+    @classmethod
+    def skeleton(cls, config: Mapping[str, Any], shapes: Shapes, n_features: int, n_outputs: int) -> "MeanAndWishart":
+        """Core without numbers."""
+        mean = latent_skeleton(shapes, "mean", n_outputs, n_features, config["mean_kernel"])
+        df = size_of(shapes, "covariance.prior_root", 1)
+        latent = latent_skeleton(shapes, "covariance.latent", n_outputs * df, n_features, config["kernel"])
+        parts, bounded = (blank(n_outputs, df), blank(n_outputs, n_outputs)), bool(config.get("bounded", False))
+        return cls(mean, WishartCovariance(latent, *parts, bounded=bounded))

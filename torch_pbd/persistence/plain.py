@@ -28,25 +28,13 @@ def is_ours(estimator: Any) -> bool:
 
 
 def encode_parameters(estimator: Any) -> dict[str, Any]:
-    """Class and parameters of an estimator.
-
-    Raises
-    ------
-    TypeError
-        If a parameter is not what a file can hold; it is named.
-    """
+    """Class and parameters of an estimator; a TypeError names one that a file cannot hold."""
     parameters = estimator.get_params(deep=False).items()
     return {"class": type(estimator).__name__, "params": {name: encode(value, name) for name, value in parameters}}
 
 
 def decode_parameters(description: Any) -> Any:
-    """Unfitted estimator of what :func:`encode_parameters` gave.
-
-    Raises
-    ------
-    ValueError, TypeError
-        If it is of no known class, or a parameter is unknown or of a type that it cannot have.
-    """
+    """Unfitted estimator of what :func:`encode_parameters` gave."""
     if not isinstance(description, dict) or not {"class", "params"} <= set(description):
         raise ValueError("it has no class and parameters")
     name, parameters = description["class"], description["params"]
@@ -67,13 +55,7 @@ def learned_checks(estimator: Any) -> dict[str, Check]:
 
 
 def decode_learned(estimator: Any, values: Any) -> dict[str, Any]:
-    """Learned attributes of an estimator, from their JSON.
-
-    Raises
-    ------
-    ValueError, TypeError, OverflowError
-        If one is missing, unknown or not what it must be.
-    """
+    """Learned attributes of an estimator, from their JSON; none is missing, unknown or not what it must be."""
     table = learned_checks(estimator)
     if "n_features_in_" in table and isinstance(values, dict) and "feature_names_in_" in values:
         table["feature_names_in_"] = _names
@@ -92,13 +74,7 @@ def check_entries(entries: Any, names: set[str], what: str) -> None:
 
 
 def encode(value: Any, name: str) -> Any:
-    """JSON of plain values; arrays, stiffness laws and unfitted estimators are marked.
-
-    Raises
-    ------
-    TypeError
-        If a file cannot hold it; ``name`` is that of the attribute.
-    """
+    """JSON of an attribute of this name; arrays, stiffness laws and unfitted estimators are marked."""
     if isinstance(value, np.ndarray) and value.dtype.name in _DTYPES:
         return {"array": encode(value.tolist(), name), "dtype": value.dtype.name}
     if isinstance(value, np.generic):
