@@ -90,7 +90,7 @@ def save(estimator: CovarianceRegressor | DMPController, path: str | os.PathLike
             warnings.simplefilter("ignore")  # of a device that is not here: who loads the file is warned
             _restored(description, arrays)
     except _UNSOUND as error:
-        raise ValueError(f"the {name} cannot be saved, as it is not sound: {error}.") from error
+        raise ValueError(f"the {name} cannot be saved, as it is not sound: {_brief(error)}.") from error
     versions = {package: version(package) for package in ("torch", "scikit-learn", "numpy")}
     header = {"format_version": FORMAT_VERSION, **description, "versions": versions}
     write_checksummed(Path(path), _KEY, header, arrays)
@@ -126,8 +126,11 @@ def load(path: str | os.PathLike[str]) -> Any:
             raise ValueError("it does not say what wrote it")
         return _restored(header, arrays)
     except _UNSOUND as error:
-        brief = " ".join(str(error).split())[:500]
-        raise ModelFileError(f"{path} does not describe a whole {header['class']} ({brief}).") from error
+        raise ModelFileError(f"{path} does not describe a whole {header['class']} ({_brief(error)}).") from error
+
+
+def _brief(error: BaseException) -> str:
+    return " ".join(str(error).split())[:500].rstrip(".")
 
 
 def _described(estimator: Any) -> tuple[dict[str, Any], Arrays]:
@@ -194,10 +197,9 @@ def _check_numbers(name: str, array: Any) -> None:
         checks.require(array >= 0.0, array, name, "at least 0")
     if last == "log_diagonal":
         checks.require(np.abs(array) < _LARGEST_LOGARITHM, array, name, f"below {_LARGEST_LOGARITHM:g} in size")
-    if last in _FACTORS:
-        factor, must = np.atleast_2d(array), "the lower factor of a positive definite matrix"
-        if (factor != np.tril(factor)).any() or (np.diagonal(factor) <= 0.0).any():
-            raise ValueError(f"array {name!r:.80} must be {must}")
+    factor = np.atleast_2d(array)
+    if last in _FACTORS and ((factor != np.tril(factor)).any() or (np.diagonal(factor) <= 0.0).any()):
+        raise ValueError(f"array {name!r:.80} must be the lower factor of a positive definite matrix")
 
 
 def _described_controller(controller: DMPController) -> tuple[dict[str, Any], Arrays]:
@@ -229,23 +231,20 @@ def _restore_controller(controller: Any, description: dict[str, Any], arrays: Ar
             if len(learned[name]) != d:
                 raise ValueError(f"{name} has {len(learned[name])} entries, must have {d}")
             setattr(controller, name, tuple(learned[name]))
-    # No hole, at the start and at the end.
-    controller.unsampled_ = own.pop(_HOLES, np.zeros(2))
-    check_entries(own, {*_NOISE, *_MOTION}, "its arrays")
-    for name, array in {**own, _HOLES: controller.unsampled_}.items():
+    shapes: dict[str, tuple[int | str, ...]] = dict.fromkeys((*_NOISE, *_MOTION), (d,))
+    shapes |= {"forcing": ("m", d), _HOLES: ("m",)}
+    own.setdefault(_HOLES, np.zeros(2))  # none at the start, none at the end
+    check_entries(own, set(shapes), "its arrays")
+    for name, array in own.items():
         _check_numbers(name, array)
-        checks.array(array, name, {"forcing": ("m", d), _HOLES: ("m",)}.get(name, (d,)))
-    holes = controller.unsampled_
-    checks.require((holes >= 0.0) & (holes <= 1.0), holes, _HOLES, "a share from 0 to 1")
-    if min(len(holes), len(own["forcing"])) < 2:
+        checks.array(array, name, shapes[name])
+    checks.require((own[_HOLES] >= 0.0) & (own[_HOLES] <= 1.0), own[_HOLES], _HOLES, "a share from 0 to 1")
+    if min(len(own["forcing"]), len(own[_HOLES])) < 2:
         raise ValueError(f"forcing and {_HOLES} must have a row at the start and one at the end")
-    for name in _NOISE:
+    for name in (*_NOISE, _HOLES):
         setattr(controller, name, own.pop(name))
-    controller.dmp_ = primitive(controller)
-    time, phase = (
-        np.linspace(0.0, controller.duration_, len(own["forcing"])),
-        Phase(controller.dmp_, controller.phase_input),
-    )
-    controller.reproduction_ = Reproduction(controller.dmp_, phase, controller.goal == "each", time=time, **own)
+    controller.dmp_ = dmp = primitive(controller)
+    phase, time = Phase(dmp, controller.phase_input), np.linspace(0.0, controller.duration_, len(own["forcing"]))
+    controller.reproduction_ = Reproduction(dmp, phase, controller.goal == "each", time=time, **own)
     controller.start_, controller.goal_ = own["start"], own["goal"]
     controller._impedance = Impedance(controller.law_, controller.mass, controller.damping_ratio, controller.on_unknown)
