@@ -48,8 +48,6 @@ class Components:
 class GaussianMixture(Core):
     """Gaussian mixture over the joint vector [x, y], inputs first; as a core, Gaussian mixture regression.
 
-    Its parameters are unconstrained: any optimizer may move them.
-
     Parameters
     ----------
     log_weight : Tensor of shape (k,)

@@ -231,16 +231,8 @@ def _restore_controller(controller: Any, description: dict[str, Any], arrays: Ar
             if len(learned[name]) != d:
                 raise ValueError(f"{name} has {len(learned[name])} entries, must have {d}")
             setattr(controller, name, tuple(learned[name]))
-    shapes: dict[str, tuple[int | str, ...]] = dict.fromkeys((*_NOISE, *_MOTION), (d,))
-    shapes |= {"forcing": ("m", d), _HOLES: ("m",)}
     own.setdefault(_HOLES, np.zeros(2))  # none at the start, none at the end
-    check_entries(own, set(shapes), "its arrays")
-    for name, array in own.items():
-        _check_numbers(name, array)
-        checks.array(array, name, shapes[name])
-    checks.require((own[_HOLES] >= 0.0) & (own[_HOLES] <= 1.0), own[_HOLES], _HOLES, "a share from 0 to 1")
-    if min(len(own["forcing"]), len(own[_HOLES])) < 2:
-        raise ValueError(f"forcing and {_HOLES} must have a row at the start and one at the end")
+    _check_movement(own, d)
     for name in (*_NOISE, _HOLES):
         setattr(controller, name, own.pop(name))
     controller.dmp_ = dmp = primitive(controller)
@@ -248,3 +240,16 @@ def _restore_controller(controller: Any, description: dict[str, Any], arrays: Ar
     controller.reproduction_ = Reproduction(dmp, phase, controller.goal == "each", time=time, **own)
     controller.start_, controller.goal_ = own["start"], own["goal"]
     controller._impedance = Impedance(controller.law_, controller.mass, controller.damping_ratio, controller.on_unknown)
+
+
+def _check_movement(arrays: Arrays, n_outputs: int) -> None:
+    """Check the arrays of a controller's own."""
+    shapes: dict[str, tuple[int | str, ...]] = dict.fromkeys((*_NOISE, *_MOTION), (n_outputs,))
+    shapes |= {"forcing": ("m", n_outputs), _HOLES: ("m",)}
+    check_entries(arrays, set(shapes), "its arrays")
+    for name, array in arrays.items():
+        _check_numbers(name, array)
+        checks.array(array, name, shapes[name])
+    checks.require((arrays[_HOLES] >= 0.0) & (arrays[_HOLES] <= 1.0), arrays[_HOLES], _HOLES, "a share from 0 to 1")
+    if min(len(arrays["forcing"]), len(arrays[_HOLES])) < 2:
+        raise ValueError(f"forcing and {_HOLES} must have a row at the start and one at the end")
