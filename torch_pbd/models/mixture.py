@@ -149,7 +149,6 @@ def expectation_maximization(
 ) -> tuple[GaussianMixture, FitReport]:
     """Fit a mixture by expectation maximization, from given responsibilities: the best iterate.
 
-    Its loss is the negative mean log-likelihood, in nats per row.
     The updates are those of scikit-learn's ``GaussianMixture(covariance_type="full")``, but carried out in
     each component's present frame: an E step whitens the data and gathers weighted moments, near the identity
     there, and an M step moves the frames. Strongly correlated data keep their digits so.
@@ -157,15 +156,13 @@ def expectation_maximization(
     Parameters
     ----------
     data : Tensor of shape (n, e + d)
-        Inputs and outputs side by side, standardized.
+        Inputs, ``n_features`` of them, and outputs side by side, standardized.
     responsibilities : Tensor of shape (n, k)
         Share of each component in each row; rows add up to one. An M step from them is the first iterate.
-    n_features : int
-        Number of inputs e.
     reg_covar : float
-        Added to every variance of every component. The data being standardized, it is a share of theirs.
+        Added to every variance of every component: a share of those of the standardized data.
     tol, max_iter : float, int
-        Stop when the mean log-likelihood, in nats per row, changes by less than ``tol``.
+        Stop when the loss, the negative mean log-likelihood in nats per row, changes by less than ``tol``.
 
     Raises
     ------
@@ -243,6 +240,7 @@ def _spread_above(scale_tril: Float[Tensor, "k p p"], reg_covar: float) -> Float
     """Factor B with which scale_tril B B^T scale_tril^T + reg_covar I are the covariances."""
     identity = torch.eye(scale_tril.shape[-1]).to(scale_tril).expand_as(scale_tril)
     inverse = torch.linalg.solve_triangular(scale_tril, identity, upper=False)
+    # Of C B B' C' = C C' - reg_covar I follows B B' = I - reg_covar C^-1 C^-T.
     excess, axes = torch.linalg.eigh(identity - reg_covar * inverse @ inverse.mT)
     if not reg_covar > 0 or (excess < -(torch.finfo(excess.dtype).eps ** 0.5)).any():
         raise ValueError(f"reg_covar is {reg_covar:g}: it must be above 0, and at most what the mixture has.")
@@ -260,6 +258,7 @@ def _regular(root: Float[Tensor, "k p r"], reg_covar: float) -> Float[Tensor, "k
 
 
 def _first_m_step(data: Float[Tensor, "n p"], share: Float[Tensor, "n k"], reg_covar: float) -> Components:
+    """Most likely components of given responsibilities."""
     count = share.sum(0) + 10 * torch.finfo(data.dtype).eps
     mean = share.mT @ data / count.unsqueeze(-1)
     root = (share / count).mT.sqrt().unsqueeze(1) * (data.mT - mean.unsqueeze(-1))
@@ -269,6 +268,7 @@ def _first_m_step(data: Float[Tensor, "n p"], share: Float[Tensor, "n k"], reg_c
 def _e_step(components: Components, blocks: list[Tensor]) -> tuple[float, Float[Tensor, "k q q"]]:
     """Negative mean log-likelihood, and each component's weighted moments in its own frame, q = p + 1."""
     k, p = components.mean.shape
+    # Maps of [x, 1] to [C^-1 (x - mean), 1], so that one product whitens a block for all components.
     affine = torch.eye(p + 1).to(components.mean).repeat(k, 1, 1)
     affine[:, :p, p:] = -components.mean.unsqueeze(-1)
     affine[:, :p] = torch.linalg.solve_triangular(components.scale_tril, affine[:, :p], upper=False)
@@ -289,6 +289,7 @@ def _m_step(components: Components, moments: Float[Tensor, "k q q"], reg_covar: 
     frame, p = components.scale_tril, components.mean.shape[-1]
     eps = torch.finfo(moments.dtype).eps
     count = moments[:, p, p] + 10 * eps  # a component that has lost all its data stays where it is
+    # With mean s and second moment M in a frame C, mean and covariance are C s more, and C (M - s s') C'.
     shift = moments[:, :p, p:] / count[:, None, None]
     second = moments[:, :p, :p] / count[:, None, None]
     variance, axes = torch.linalg.eigh(second - shift @ shift.mT)

@@ -70,6 +70,7 @@ class TrainingSet:
         group = self.index[order]
         position = torch.arange(len(order), device=order.device) - (counts.cumsum(0) - counts)[group]
         size = counts.clamp_min(1).log2().ceil()
+        # Rows of an input lie in its slot one after the other; zeros, which add nothing, fill up the shorter ones.
         for exponent in size.unique():
             members = (size == exponent).nonzero().squeeze(-1)
             rows = size[group] == exponent
@@ -119,6 +120,7 @@ def empirical_tril(training: TrainingSet, *, bias_correction: bool = False) -> F
     lacking = degrees < n_outputs
     prior_degrees = float(n_outputs + 1)
     if bool(lacking.any()):
+        # The prior adds d + 1 times the pooled covariance to the scatter, by roots side by side, and d + 1 degrees.
         prior_root = prior_degrees**0.5 * pooled_tril(training) * lacking[:, None, None]
         root = torch.cat([root, prior_root], dim=-1)
     scale_tril = scale_tril_from_root(root) / (degrees + prior_degrees * lacking).sqrt()[:, None, None]
@@ -133,6 +135,8 @@ def mean_over_geometric(training: TrainingSet) -> Float[Tensor, "n d"]:
 
     For normal data, of which they are chi; one where the factor was shrunk.
     """
+    # Entry i of K rows is chi with 2 h = K - i degrees: its mean is sqrt(2) gamma(h + 1/2) / gamma(h), and that of its
+    # logarithm (log(2) + digamma(h)) / 2.
     n_outputs, degrees = training.y.shape[1], training.counts - 1.0
     half = 0.5 * (degrees[:, None] - torch.arange(n_outputs).to(degrees)).clamp_min(1.0)
     ratio = (torch.lgamma(half + 0.5) - torch.lgamma(half) - 0.5 * torch.digamma(half)).exp()
@@ -141,6 +145,7 @@ def mean_over_geometric(training: TrainingSet) -> Float[Tensor, "n d"]:
 
 def _expected_diagonal(degrees: Tensor, n_outputs: int) -> Tensor:
     """Mean of each column of the factor of an empirical covariance over that of the true one."""
+    # Column i of the factor of the scatter has a mean of that of chi with K - i degrees times that of the true one.
     rest = degrees[:, None] - torch.arange(n_outputs).to(degrees)
     return (torch.lgamma((rest + 1.0) / 2.0) - torch.lgamma(rest / 2.0)).exp() * (2.0 / degrees[:, None]).sqrt()
 

@@ -68,6 +68,7 @@ class WishartLink:
 
         With D = S + S', S = C^-1 dU (C^-1 U)', it is 1/2 tr(D D) = tr(S' S) + tr(S S). ``inverse`` is that of C.
         """
+        # Entry i of vector j, against entry k of vector l.
         whitened = inverse @ root
         cross = whitened.mT @ inverse
         block = _block("njl,nik->njilk", whitened.mT @ whitened, inverse.mT @ inverse)
