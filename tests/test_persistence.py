@@ -107,7 +107,7 @@ def test_what_a_file_cannot_hold_is_an_error_that_says_so(tmp_path):
         torch_pbd.save(model, path)
     with pytest.raises(NotFittedError, match="not fitted yet"):
         torch_pbd.save(new("mixture"), path)
-    with pytest.raises(TypeError, match="estimator is a LinearRegression; can save CholeskyCovRegressor"):
+    with pytest.raises(TypeError, match="estimator is a LinearRegression; can save HeteroscedasticGPRegressor"):
         torch_pbd.save(LinearRegression().fit(X, y), path)
     with pytest.raises(TypeError, match=r"estimator is a Pipeline.*In a pipeline, save that step"):
         torch_pbd.save(make_pipeline(new("mixture")).fit(X, y), path)

@@ -10,7 +10,7 @@ import torch
 from scipy.sparse import csr_array
 
 from estimators.zoo import DEFAULTS, VARIANTS, demonstrations, fitted, new, queries
-from torch_pbd.estimators import _validation
+from torch_pbd.estimators import validation
 
 BAD = {
     "features": np.zeros((3, 2)),
@@ -40,7 +40,7 @@ def complaint(model, X):
 def test_what_cannot_be_predicted_at_is_refused_as_by_all_checks(name, bad, monkeypatch):
     model = fitted(name)
     refused = complaint(model, BAD[bad])
-    monkeypatch.setattr(_validation, "_is_plain", lambda *_: False)
+    monkeypatch.setattr(validation, "_is_plain", lambda *_: False)
     assert refused == complaint(model, BAD[bad])
 
 
@@ -48,7 +48,7 @@ def test_what_cannot_be_predicted_at_is_refused_as_by_all_checks(name, bad, monk
 def test_an_estimator_that_is_not_fitted_says_so(name, monkeypatch):
     refused = complaint(new(name), np.zeros((3, 1)))
     assert "not fitted" in refused[1]
-    monkeypatch.setattr(_validation, "_is_plain", lambda *_: False)
+    monkeypatch.setattr(validation, "_is_plain", lambda *_: False)
     assert refused == complaint(new(name), np.zeros((3, 1)))
 
 
@@ -63,7 +63,7 @@ def test_names_of_features_are_compared():
 def test_plain_arrays_are_predicted_at_without_further_checks_and_alike(name, monkeypatch):
     model, X = fitted(name), queries(1)
     checked = model.predict(X.tolist(), return_cov=True)
-    monkeypatch.setattr(_validation, "validate_data", None)
+    monkeypatch.setattr(validation, "validate_data", None)
     for form in (X, np.asfortranarray(X), np.repeat(X, 2, axis=0)[::2], X[::-1][::-1]):
         for mine, other in zip(model.predict(form, return_cov=True), checked, strict=True):
             np.testing.assert_array_equal(mine, other)

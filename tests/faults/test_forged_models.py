@@ -70,7 +70,7 @@ def test_43_a_format_that_is_not_ours_is_not_guessed_at(version, tmp_path):
 def test_43_a_class_that_is_not_ours_is_refused(name, tmp_path):
     header, arrays = parts("CholeskyCovRegressor")
     assert_refused(
-        forge(tmp_path, {**header, "class": name}, arrays), r"holds a .*; known are CholeskyCovRegressor", most=2**24
+        forge(tmp_path, {**header, "class": name}, arrays), r"holds a .*; known are Heteroscedastic", most=2**24
     )
 
 
@@ -314,7 +314,7 @@ def test_43_shapes_that_would_broadcast_to_more_than_the_memory_are_refused(tmp_
         "core.log_diagonal": np.zeros((1, 10**5)),
         "core.log_weight": np.zeros(1),
     }
-    assert_refused(forge(tmp_path, header, {**arrays, **wide}), "has shape", most=2**25)
+    assert_refused(forge(tmp_path, header, {**arrays, **wide}), "size mismatch", most=2**25)
     header, arrays = parts("CholeskyCovRegressor")
     n = 10**6
     latent = "core.covariance.latent."
@@ -345,7 +345,7 @@ def test_what_could_not_be_loaded_again_is_not_saved(tmp_path):
         torch_pbd.save(model, path)
     del model.note
     model.module_.y_shift[0] = np.nan
-    with pytest.raises(ValueError, match="cannot be saved, as it is not sound: y_shift holds a number that is not"):
+    with pytest.raises(ValueError, match=r"cannot be saved, as it is not sound: y_shift\[0\] is nan, must be finite"):
         torch_pbd.save(model, path)
     controller = torch_pbd.load(GOLDEN / "DMPController.safetensors")
     with pytest.raises(ValueError, match="the DMPController cannot be saved, as it is not sound: gate is 'open'"):

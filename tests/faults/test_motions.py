@@ -184,7 +184,7 @@ def test_files_keep_how_a_movement_adapts_and_old_ones_are_of_the_printed_equati
         assert (again.adaptation, again.dmp_.tau) == (adaptation, controller.dmp_.tau)
         mine, its = (each.schedule(50.0, goal=[0.5, 0.0], start=[0.1, 0.1]) for each in (controller, again))
         assert mine == its
-    from torch_pbd.model_header import decode_parameters
+    from torch_pbd.persistence.plain import decode_parameters
 
     described = json.loads('{"class": "DMPController", "params": {"alpha": 9.0}}')
     assert decode_parameters(described).adaptation == "additive"

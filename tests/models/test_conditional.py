@@ -5,11 +5,11 @@ import pytest
 import torch
 
 from torch_pbd.gp import Hyperparameters, Observations, condition
-from torch_pbd.models.cholesky import CholeskyCovariance
-from torch_pbd.models.conditional import ConditionalNormal, MeanAndCovariance
-from torch_pbd.models.floor import VARIANCE_FLOOR
+from torch_pbd.models.cholesky import CholeskyCovariance, MeanAndCholesky
+from torch_pbd.models.conditional import ConditionalNormal
+from torch_pbd.models.core import VARIANCE_FLOOR
 from torch_pbd.models.mixture import GaussianMixture
-from torch_pbd.models.wishart import WishartCovariance, padded
+from torch_pbd.models.wishart import MeanAndWishart, WishartCovariance, padded
 
 MODELS = ["cholesky", "cholesky, logarithmic", "wishart", "mixture"]
 WITH_PRIOR = MODELS[:3]
@@ -42,10 +42,10 @@ def core(kind, d, rng):
         return GaussianMixture(tensor([0.2, 0.3, 0.5]).log(), tensor(rng.normal(size=(3, d + 2))), factor, 2)
     if kind == "wishart":
         covariance = WishartCovariance(processes(d * (d + 1), rng), padded(lower(d, rng), d + 1), lower(d, rng))
-    else:
-        latent = processes(d * (d + 1) // 2, rng)
-        covariance = CholeskyCovariance(latent, lower(d, rng), log_diagonal="logarithmic" in kind)
-    return MeanAndCovariance(processes(d, rng), covariance)
+        return MeanAndWishart(processes(d, rng), covariance)
+    latent = processes(d * (d + 1) // 2, rng)
+    covariance = CholeskyCovariance(latent, lower(d, rng), log_diagonal="logarithmic" in kind)
+    return MeanAndCholesky(processes(d, rng), covariance)
 
 
 def model_of(kind, d, rng):

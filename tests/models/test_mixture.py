@@ -11,8 +11,7 @@ from sklearn.cluster import KMeans
 from sklearn.exceptions import ConvergenceWarning
 
 from torch_pbd.exceptions import NotPositiveDefiniteError
-from torch_pbd.models.mixture import GaussianMixture
-from torch_pbd.models.mixture_fit import expectation_maximization, refine
+from torch_pbd.models.mixture import GaussianMixture, expectation_maximization, refine
 from torch_pbd.optim import Status
 
 REG = 1e-6
@@ -163,7 +162,7 @@ def test_a_variance_far_below_the_movement_survives(k, rng):
 def test_em_splits_the_rows_into_blocks_without_a_trace(rng, monkeypatch):
     data = curve(rng)
     whole, _ = fit(data, 3, tol=0.0, max_iter=5)
-    monkeypatch.setattr("torch_pbd.models.mixture_fit._BLOCK", 77)
+    monkeypatch.setattr("torch_pbd.models.mixture._BLOCK", 77)
     blocks, _ = fit(data, 3, tol=0.0, max_iter=5)
     torch.testing.assert_close(blocks.state_dict(), whole.state_dict(), rtol=1e-9, atol=1e-11)
 
@@ -243,7 +242,7 @@ def test_densities_are_those_of_scipy(rng, generator):
     inputs = np.sum([w * multivariate_normal(m[:2], c[:2, :2]).pdf(data[:, :2]) for w, m, c in parts], axis=0)
     with torch.no_grad():
         np.testing.assert_allclose(mixture.log_prob(tensor(data)), np.log(joint), rtol=1e-9)
-        np.testing.assert_allclose(mixture.log_prob_input(tensor(data[:, :2])), np.log(inputs), rtol=1e-9)
+        np.testing.assert_allclose(mixture.log_prob(tensor(data[:, :2])), np.log(inputs), rtol=1e-9)
 
 
 def test_densities_and_conditioning_are_differentiable(rng, generator):
@@ -256,7 +255,7 @@ def test_densities_and_conditioning_are_differentiable(rng, generator):
             return torch.func.functional_call(mixture, parameters, (data,))
         return torch.func.functional_call(_Method(mixture, method), _inside(parameters), (data,))
 
-    for method, width in [("log_prob", 3), ("log_prob_input", 1), ("forward", 1)]:
+    for method, width in [("log_prob", 3), ("log_prob", 1), ("forward", 1)]:
         data = tensor(rng.normal(size=(3, width))).requires_grad_()
         assert torch.autograd.gradcheck(lambda *inputs, m=method: call(m, *inputs), (data, *values))
 
@@ -280,7 +279,7 @@ def test_far_inputs_stay_finite_with_their_gradients(distance, rng):
     mixture, _ = fit(curve(rng), 5)
     x = tensor([[-distance], [distance]]).requires_grad_()
     mean, root = mixture(x)
-    density = mixture.log_prob_input(x)
+    density = mixture.log_prob(x)
     joint = mixture.log_prob(torch.cat([x, x, -x], dim=1))
     for value in (mean, root, root @ root.mT, density, joint, mixture.type1(x)):
         assert torch.isfinite(value).all()
@@ -319,7 +318,7 @@ def test_refining_a_stopped_fit_improves_it_and_moves_its_density_floor(rng):
     assert refined.loss_curve[0] == pytest.approx(report.loss, rel=1e-9)
     assert refined.loss < report.loss - 0.01
     assert -mixture.log_prob(data).mean().item() == pytest.approx(refined.loss, rel=1e-11)
-    assert mixture.log_density_floor.item() == mixture.log_prob_input(data[:, :1]).min().item()
+    assert mixture.log_density_floor.item() == mixture.log_prob(data[:, :1]).min().item()
     assert np.linalg.eigvalsh(numpy_parts(mixture)[2]).min() >= REG * (1 - 1e-6)
 
 
@@ -375,7 +374,7 @@ def test_single_precision_stays_single(rng):
 
 @pytest.mark.parametrize(
     ("n_features", "diagonal", "message"),
-    [(0, 1.0, "1 to 1"), (2, 1.0, "n_features is 2"), (1, 0.0, "diagonal")],
+    [(0, 1.0, "at least 1 and at most 1"), (2, 1.0, "n_features is 2"), (1, 0.0, "diagonal")],
 )
 def test_what_is_no_mixture_is_an_error(n_features, diagonal, message):
     with pytest.raises(ValueError, match=message):

@@ -7,17 +7,26 @@ from scipy.stats import multivariate_normal
 from sklearn.gaussian_process.kernels import RBF
 
 from torch_pbd.gp import LatentValues
-from torch_pbd.models.cholesky import deviation_tril
-from torch_pbd.models.floor import VARIANCE_FLOOR, with_floor
-from torch_pbd.models.objectives import covariance_mse, gaussian_nll, train
+from torch_pbd.models.cholesky import CholeskyLink
+from torch_pbd.models.core import VARIANCE_FLOOR, with_floor
+from torch_pbd.models.costs import FactorDistance, Likelihood
 from torch_pbd.models.training import TrainingSet
-from torch_pbd.models.wishart import padded, wishart_root
+from torch_pbd.models.wishart import WishartLink, padded, wishart_root
+from torch_pbd.optim import minimize
 
 COUNTS = {"aligned": [7] * 5, "ragged": [1, 2, 3, 10, 1], "not aligned": [1] * 12}
 
 
 def tensor(array):
     return torch.tensor(array, dtype=torch.float64)
+
+
+def gaussian_nll(root, scatter_root, counts):
+    return Likelihood(CholeskyLink(torch.eye(root.shape[1]).to(root), False), scatter_root, counts, 1.0).at_root(root)
+
+
+def covariance_mse(root, target):
+    return FactorDistance(WishartLink(target[0]), target).at_root(root)
 
 
 def training_set(counts, d, rng):
@@ -92,7 +101,7 @@ def test_objectives_of_a_cholesky_factor_are_differentiable(objective, log_diago
     loss = loss_of(objective, training, d, rng)
     prior_tril = 2.0 * torch.eye(d).double()
     deviation = tensor(0.5 * rng.normal(size=(3, d * (d + 1) // 2))).requires_grad_()
-    assert torch.autograd.gradcheck(lambda u: loss(deviation_tril(u, prior_tril, log_diagonal=log_diagonal)), deviation)
+    assert torch.autograd.gradcheck(lambda u: loss(CholeskyLink(prior_tril, log_diagonal).root(u)), deviation)
 
 
 @pytest.mark.parametrize("objective", LOSSES)
@@ -136,12 +145,8 @@ def test_a_covariance_that_collapses_has_a_likelihood_that_is_bounded(d):
 def test_training_on_two_rows_ends_at_the_bound():
     latent = LatentValues(tensor([[0.0], [1.0]]), torch.zeros(1, 2).double(), tensor([1.0]), tensor([[0.1]]))
     none, counts = torch.zeros(2, 1, 1).double(), torch.ones(2).double()
-    prior_tril = torch.ones(1, 1).double()
-
-    def loss(deviation):
-        return gaussian_nll(deviation_tril(deviation, prior_tril, log_diagonal=True), none, counts)
-
-    report = train(loss, latent, prior_weight=0.0, max_iter=200, tol=1e-8)
+    cost = Likelihood(CholeskyLink(torch.ones(1, 1).double(), True), none, counts, 1.0)
+    report = minimize(lambda: cost(latent()), latent.trained(), max_iter=200, tol=1e-8)
     lowest = math.log(2 * math.pi * VARIANCE_FLOOR)
     assert report.converged
     assert lowest <= report.loss < lowest + 1e-3
@@ -159,32 +164,15 @@ def test_the_posterior_mode_under_gaussian_noise_is_the_mean_of_a_gaussian_proce
     )
     latent.log_amplitude.requires_grad_(False)
     latent.log_length_scale.requires_grad_(False)
-    report = train(
-        lambda deviation: 0.5 * (deviation - tensor(y)).square().sum() / noise_scale**2,
-        latent,
-        prior_weight=1.0,
-        max_iter=500,
-        tol=1e-10,
-    )
+
+    def loss():
+        likelihood = 0.5 * (latent() - tensor(y)).square().sum() / noise_scale**2
+        return likelihood + 0.5 * latent.whitened.square().sum()
+
+    report = minimize(loss, latent.trained(), max_iter=500, tol=1e-10)
     assert report.converged
     for row in range(2):
         gram = amplitude[row] ** 2 * RBF(0.2)(x)
         expected = gram @ np.linalg.solve(gram + noise_scale**2 * np.eye(8), y[:, row])
         # L-BFGS stops where the loss no longer falls in its twelfth digit: half as many for the place.
         np.testing.assert_allclose(latent().detach()[:, row], expected, rtol=0, atol=1e-5)
-
-
-def test_training_moves_the_other_parameters_too(rng):
-    latent = LatentValues(tensor([[0.0]]), torch.zeros(1, 1).double(), tensor([1.0]), tensor([[1.0]]))
-    other = torch.zeros(1, dtype=torch.float64, requires_grad=True)
-    train(
-        lambda u: (u - 2).square().sum() + (other - 3).square().sum(),
-        latent,
-        [other],
-        prior_weight=0.0,
-        max_iter=50,
-        tol=1e-9,
-    )
-    # A parabola to 1e-11 of its height is at the root of that from its bottom.
-    assert latent().item() == pytest.approx(2.0, abs=1e-5)
-    assert other.item() == pytest.approx(3.0, abs=1e-5)

@@ -6,9 +6,8 @@ from scipy.optimize import minimize as scipy_minimize
 from torch_pbd.gp import LatentValues
 from torch_pbd.linalg import scale_tril_from_root, tril_to_vector
 from torch_pbd.models.cholesky import CholeskyLink, tril_deviation
+from torch_pbd.models.core import with_floor
 from torch_pbd.models.costs import Covariances, FactorDistance, Likelihood
-from torch_pbd.models.floor import with_floor
-from torch_pbd.models.objectives import covariance_mse, gaussian_nll
 from torch_pbd.models.scoring import train_by_scoring
 from torch_pbd.models.training import TrainingSet
 from torch_pbd.models.wishart import WishartLink, padded, wishart_root
@@ -23,6 +22,11 @@ def tensor(array):
 
 def random_tril(d, rng):
     return tensor(np.linalg.cholesky(np.atleast_2d(np.cov(rng.normal(size=(d, 3 * d + 2))))))
+
+
+def gaussian_nll(root, scatter_root, counts):
+    """Differentiable by autograd; its value is that of scipy in test_objectives."""
+    return Likelihood(CholeskyLink(torch.eye(root.shape[1]).to(root), False), scatter_root, counts, 1.0).at_root(root)
 
 
 def make_link(kind, d, rng, n_inputs=None):
@@ -77,7 +81,7 @@ def test_distance_and_gradient_are_those_of_autograd(d, rng):
     link = make_link("wishart", d, rng)
     deviation = deviations(link, 4, rng).requires_grad_()
     target = torch.stack([random_tril(d, rng) for _ in range(4)])
-    expected = covariance_mse(link.root(deviation), target)
+    expected = FactorDistance(link, target).at_root(link.root(deviation))
     found = FactorDistance(link, target)(deviation)
     assert found.item() == pytest.approx(expected.item(), rel=1e-12)
     gradients = [torch.autograd.grad(value, deviation)[0] for value in (found, expected)]
@@ -116,7 +120,7 @@ def test_information_is_the_expected_hessian_of_autograd(kind, d, own_priors, rn
 
     hessian = torch.autograd.functional.hessian(nll, deviation.flatten())
     cost = Likelihood(link, expected_root, counts, 1.0)
-    found = block_diagonal(cost.curvature(Covariances(link, deviation), 0.0), 3, n_processes(link))
+    found = block_diagonal(cost.curvature(Covariances.at(link, deviation), 0.0), 3, n_processes(link))
     torch.testing.assert_close(found, hessian, rtol=1e-7, atol=1e-7 * float(hessian.abs().max()))
 
 
@@ -129,7 +133,7 @@ def test_observed_information_is_the_hessian_of_autograd(d, rng):
         return gaussian_nll(link.root(flat.reshape(deviation.shape)), scatter_root, counts)
 
     hessian = torch.autograd.functional.hessian(nll, deviation.flatten())
-    cost, point = Likelihood(link, scatter_root, counts, 1.0), Covariances(link, deviation)
+    cost, point = Likelihood(link, scatter_root, counts, 1.0), Covariances.at(link, deviation)
     found = [block_diagonal(cost.curvature(point, share), 3, n_processes(link)) for share in (0.0, 0.25, 1.0)]
     scale = float(hessian.abs().max())
     torch.testing.assert_close(found[2], hessian, rtol=1e-7, atol=1e-7 * scale)
@@ -147,7 +151,7 @@ def test_the_curvature_of_a_distance_is_the_square_of_its_derivatives(d, rng):
 
     jacobian = torch.autograd.functional.jacobian(entries, deviation.flatten())
     cost = FactorDistance(link, target)
-    found = block_diagonal(cost.curvature(Covariances(link, deviation), 0.0), 3, n_processes(link))
+    found = block_diagonal(cost.curvature(Covariances.at(link, deviation), 0.0), 3, n_processes(link))
     torch.testing.assert_close(found, 2.0 / 3.0 * jacobian.mT @ jacobian, rtol=1e-8, atol=1e-8)
 
 

@@ -19,12 +19,11 @@ from torch_pbd.estimators.validation import check_solver
 from torch_pbd.gp import LatentGP, LatentValues, Observations, condition, fit_together
 from torch_pbd.kernels import KernelName
 from torch_pbd.linalg import tril_to_vector
-from torch_pbd.models.cholesky import CholeskyCovariance, CholeskyLink, tril_deviation
+from torch_pbd.models.cholesky import CholeskyCovariance, CholeskyLink, MeanAndCholesky, tril_deviation
 from torch_pbd.models.costs import Likelihood
-from torch_pbd.models.objectives import train
 from torch_pbd.models.scoring import Solver, train_by_scoring
 from torch_pbd.models.training import empirical_tril, mean_over_geometric, pooled_tril
-from torch_pbd.optim import FitReport
+from torch_pbd.optim import FitReport, minimize
 
 # Logarithms of the empirical diagonal are taken of no less than this of its root mean square over the inputs:
 # an exact zero at one input, as where all recordings start at the origin, would else dominate its neighbours.
@@ -120,6 +119,8 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
     """
 
     aligned_objective = "empirical"
+
+    _core_class = MeanAndCholesky
 
     def __init__(
         self,
@@ -231,7 +232,7 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
         if self.latent_prior:
             report = train_by_scoring(cost, latent, prior_weight=1.0 / n_rows, solver=self.solver, **limits)
         else:
-            report = train(cost, latent, prior_weight=0.0, **limits)
+            report = minimize(lambda: cost(latent()), latent.trained(), **limits)
         with torch.no_grad():
             scale_tril = link.root(latent())
         gp = latent.interpolate(tril_to_vector(scale_tril).mT.contiguous())

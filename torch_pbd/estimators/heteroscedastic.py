@@ -131,6 +131,8 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
     (3, 2, 2, 5)
     """
 
+    _core_class, _learned = HeteroscedasticModel, {"effective_share_": checks.number}
+
     def __init__(
         self,
         *,

@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from torch_pbd.files.memory import require_much
 from torch_pbd.gp import EvidenceSearch, LatentGP, Observations, fit_together, resolved_length_scale, spacing
 from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky, scale_tril_from_root
-from torch_pbd.models.conditional import MeanAndCovariance
+from torch_pbd.models.core import MeanAndCovariance
 from torch_pbd.models.training import TrainingSet
 from torch_pbd.optim import FitReport
 
@@ -50,6 +50,7 @@ class LatentCovarianceRegressor(CovarianceRegressor):
     aligned_objective: str
     """Value of ``objective`` that works on empirical covariances."""
 
+    _core_class: ClassVar[type[MeanAndCovariance]]
     _costly = "max_inputs"
     """Parameters that decide on the memory."""
 
@@ -97,7 +98,7 @@ class LatentCovarianceRegressor(CovarianceRegressor):
             mean, mean_report = self._fit_mean(training)
             covariance, report, jitter = self._fit_likelihood(problem, training.residual(mean))
             report = report.after(mean_report, "search of the mean")
-        return Fitted(self._assemble(MeanAndCovariance(mean, covariance), scaling), report, jitter)
+        return Fitted(self._assemble(self._core_class(mean, covariance), scaling), report, jitter)
 
     @abstractmethod
     def _fit_empirical(self, problem: Problem) -> tuple[LatentGP, Any, FitReport, float]:

@@ -17,8 +17,7 @@ from torch_pbd.estimators.torch_estimator import by_chunks
 from torch_pbd.estimators.validation import Floats
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.files.memory import require_much
-from torch_pbd.models.mixture import GaussianMixture
-from torch_pbd.models.mixture_fit import expectation_maximization, refine
+from torch_pbd.models.mixture import GaussianMixture, expectation_maximization, refine
 from torch_pbd.optim import FitReport
 
 # An output's residual scale is not taken below this of its whole spread.
@@ -77,6 +76,7 @@ class GMMBaseline(CovarianceRegressor):
     Robotics 9, 2016.
     """
 
+    _core_class = GaussianMixture
     _regression: MixtureRegression | None = None
 
     def __init__(

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torch_pbd.estimators.validation import Floats
 from torch_pbd.models.conditional import ConditionalNormal
-from torch_pbd.models.floor import VARIANCE_FLOOR
+from torch_pbd.models.core import VARIANCE_FLOOR
 
 # Of standardized inputs: squares of what follows stay finite.
 _LIMIT = np.finfo(np.float64).max ** (1 / 6)

@@ -1,7 +1,7 @@
 """The door between NumPy and torch: arrays to the device, and a fitted module into pickles and back."""
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -12,7 +12,7 @@ from torch_pbd import checks
 from torch_pbd.estimators.validation import Floats
 from torch_pbd.files.memory import require_much
 from torch_pbd.models.conditional import ConditionalNormal
-from torch_pbd.models.spec import module_from_spec, module_spec
+from torch_pbd.models.core import Core
 
 _CHUNK = 1024  # rows: what a prediction needs on the way is then some tens of MB for ten outputs
 
@@ -22,6 +22,11 @@ class TorchEstimator(BaseEstimator):
 
     device: str | None
     module_: ConditionalNormal
+
+    _core_class: ClassVar[type[Core]]
+    """Class of the core of ``module_``."""
+    _learned: ClassVar[Mapping[str, Callable[[Any, str], Any]]] = {}
+    """Attributes that only fits of this class learn, and how model files check them."""
 
     def _prepare(self) -> None:
         """Work out what predictions need of the module alone."""
@@ -43,13 +48,13 @@ class TorchEstimator(BaseEstimator):
         state = dict(super().__getstate__())
         if "module_" in state:
             module = state.pop("module_")
-            state["_module_spec"] = module_spec(module)
+            state["_module_config"] = module.core.config()
             state["_module_arrays"] = {k: v.cpu().numpy() for k, v in module.state_dict().items()}
         return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         state = dict(state)
-        arrays, spec = state.pop("_module_arrays", None), state.pop("_module_spec", None)
+        arrays, config = state.pop("_module_arrays", None), state.pop("_module_config", None)
         super().__setstate__(state)
         if arrays is not None:
             if problem := self._device_problem():
@@ -60,7 +65,7 @@ class TorchEstimator(BaseEstimator):
                 self.device = None
             with torch.inference_mode(False):  # else autograd would refuse the module
                 tensors = {name: self._door(array) for name, array in arrays.items()}
-                self.module_ = module_from_spec(spec, tensors).requires_grad_(False)
+                self.module_ = ConditionalNormal.restored(self._core_class, config, tensors).requires_grad_(False)
             self._prepare()
 
 

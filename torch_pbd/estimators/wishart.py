@@ -32,11 +32,10 @@ from torch_pbd.gp import (
 from torch_pbd.gp.projection import FULL, Basis
 from torch_pbd.kernels import KernelName
 from torch_pbd.models.costs import Cost, FactorDistance, Likelihood
-from torch_pbd.models.objectives import covariance_mse, gaussian_nll, train
 from torch_pbd.models.scoring import Solver, train_by_scoring
 from torch_pbd.models.training import empirical_tril
-from torch_pbd.models.wishart import WishartCovariance, WishartLink, padded, wishart_root
-from torch_pbd.optim import FitReport
+from torch_pbd.models.wishart import MeanAndWishart, WishartCovariance, WishartLink, padded, wishart_root
+from torch_pbd.optim import FitReport, minimize
 
 _PAPER_MEAN = 8.0  # of all latent processes, in the paper's simulation
 _FEW_ROWS = 8  # whose empirical deviation may by chance be near zero, so that what is drawn through it crosses zero
@@ -119,6 +118,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
 
     aligned_objective = "mse"
 
+    _core_class, _learned = MeanAndWishart, {"df_": checks.count}
     _costly = "df or max_inputs"
 
     def __init__(
@@ -185,12 +185,8 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         mean, mean_report = mean_consistent_with_repeats(problem.training, *job, *fit_together([job]))
         prior_root = self._prior_root(problem)
         target = empirical_tril(problem.training)
+        cost = FactorDistance(WishartLink(prior_root), target)
         if self.start == "random":
-
-            def loss(deviation: Tensor, matrix: Tensor) -> Tensor:
-                return covariance_mse(wishart_root(deviation, prior_root, matrix), target)
-
-            cost = FactorDistance(WishartLink(prior_root), target) if self.latent_prior else loss
             found, report, jitter = self._train(
                 problem, prior_root, prior_root, cost, prior_weight=0.0, tol=1e-4 * self.tol
             )
@@ -213,7 +209,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         priors = observed(prior_root.expand_as(root))
         with torch.no_grad():
             latent.weight -= condition(priors, certain, self.kernel, basis=basis)[0].weight
-            mse = float(covariance_mse(wishart_root(latent(inputs), prior_root, matrix), target))
+            mse = float(cost.at_root(wishart_root(latent(inputs), prior_root, matrix)))
         report = replace(report, loss=mse, loss_curve=(mse,)).after(mean_report, "search of the mean")
         prior = prior_root.reshape(-1, *root.shape[1:])[0]  # a callable one is handed in at every prediction
         return mean, WishartCovariance(latent, prior, matrix, bounded=True), report, jitter
@@ -243,26 +239,20 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
     def _fit_likelihood(self, problem: Problem, residual: Tensor) -> tuple[WishartCovariance, FitReport, float]:
         prior_root = self._prior_root(problem)
         training, n_rows = problem.training, len(residual)
-        scatter_root = training.scatter_root(residual)
-
-        def loss(deviation: Tensor, matrix: Tensor) -> Tensor:
-            root = wishart_root(deviation, prior_root, matrix)
-            return gaussian_nll(root, scatter_root, training.counts) / n_rows
-
         pooled = padded(residual_tril(residual), self.df_)
-        if not self.latent_prior:
-            start = pooled if self.start == "empirical" else prior_root
-            return self._train(problem, prior_root, start, loss, prior_weight=0.0, tol=self.tol)
         # Around a prior far from them the vectors might swing through zero from one input to the next.
-        cost = Likelihood(WishartLink(pooled), scatter_root, training.counts, 1.0 / n_rows)
-        return self._train(problem, pooled, pooled, cost, prior_weight=1.0 / n_rows, tol=self.tol)
+        centre = pooled if self.latent_prior else prior_root
+        start = pooled if self.latent_prior or self.start == "empirical" else prior_root
+        cost = Likelihood(WishartLink(centre), training.scatter_root(residual), training.counts, 1.0 / n_rows)
+        return self._train(problem, centre, start, cost, prior_weight=1.0 / n_rows, tol=self.tol)
 
     def _train(
-        self, problem: Problem, centre: Tensor, start: Tensor, loss: Any, *, prior_weight: float, tol: float
+        self, problem: Problem, centre: Tensor, start: Tensor, cost: Cost, *, prior_weight: float, tol: float
     ) -> tuple[WishartCovariance, FitReport, float]:
-        """Minimize a loss over the vectors at the inputs: with hyperparameters held a cost, L at I too.
+        """Minimize a cost over the vectors' deviations from ``centre`` at the inputs.
 
-        Else it is ``loss(deviations, L)``, and trained are the hyperparameters and L. Deviations are from ``centre``.
+        With ``latent_prior`` hyperparameters are held, and L is I; else they are trained too, as printed, and
+        ``prior_weight`` does not count.
         """
         inputs, n_outputs, prior_root = problem.training.inputs, centre.shape[-2], self._prior_root(problem)
         # A free L would grow while the whitened values shrink, and so escape their prior.
@@ -285,10 +275,11 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         with torch.no_grad():
             latent.whitened += _SPREAD[self.start] * noise
         limits: Any = {"max_iter": self.max_iter, "tol": tol, "callback": self._progress()}
-        if isinstance(loss, Cost):
-            report = train_by_scoring(loss, latent, prior_weight=prior_weight, solver=self.solver, **limits)
+        if self.latent_prior:
+            report = train_by_scoring(cost, latent, prior_weight=prior_weight, solver=self.solver, **limits)
         else:
-            report = train(lambda values: loss(values, matrix), latent, [matrix], prior_weight=0.0, **limits)
+            trained = [*latent.trained(), matrix]
+            report = minimize(lambda: cost.at_root(wishart_root(latent(), centre, matrix)), trained, **limits)
         with torch.no_grad():
             root = wishart_root(latent(), centre, matrix)
         values, deviations = (part.mT.flatten(1).mT.contiguous() for part in (root, root - prior_root))

@@ -66,8 +66,8 @@ def fit_once(model: Any, *data: Any, finished: FinishedFits | None = None) -> tu
     finished : FinishedFits, default=None
         Fits that need not be repeated; this one is added.
     """
-    from torch_pbd.model_header import is_ours
     from torch_pbd.persistence import load, save
+    from torch_pbd.persistence.plain import is_ours
 
     if finished is None or not is_ours(model):
         return _timed_fit(model, *data)
@@ -96,7 +96,7 @@ def _key(model: Any, *data: Any) -> str:
     """SHA-256 of class, parameters, versions and data."""
     import torch
 
-    from torch_pbd.model_header import encode_parameters
+    from torch_pbd.persistence.plain import encode_parameters
 
     labels: list[Any] = []
     if len(data) == 1:

@@ -1,10 +1,10 @@
 """Covariance by Gaussian processes on the entries of its Cholesky factor (Section IV-D, "CD")."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float, Int64
@@ -12,44 +12,35 @@ from torch import Tensor, nn
 
 from torch_pbd.gp import LatentGP
 from torch_pbd.linalg import tril_to_vector, vector_to_tril
-from torch_pbd.models.floor import beside_prior
+from torch_pbd.models.core import MeanAndCovariance, Shapes, beside_prior, blank, latent_skeleton
 
-LARGEST_LOGARITHM = 300.0  # of a diagonal entry: its square is still a number
+_LARGEST_LOGARITHM = 300.0  # of a diagonal entry: its square is still a number
+_LEAST_DIAGONAL = 1e-6  # in standardized units: an entry of zero has no logarithm, and the floor is of this size
 
 
 def tril_deviation(
     scale_tril: Float[Tensor, "*n d d"], prior_tril: Float[Tensor, "*m d d"], *, log_diagonal: bool
 ) -> Float[Tensor, "*n p"]:
-    """What the latent processes must add to the prior's factor to give ``scale_tril``."""
+    """Sum that the latent processes must make of the prior's factor to give ``scale_tril``, entry by entry."""
     return tril_to_vector(_linked(scale_tril, log_diagonal) - _linked(prior_tril, log_diagonal))
-
-
-def deviation_tril(
-    deviation: Float[Tensor, "n p"], prior_tril: Float[Tensor, "*m d d"], *, log_diagonal: bool
-) -> Float[Tensor, "n d d"]:
-    """Inverse of :func:`tril_deviation`."""
-    linked = _linked(prior_tril, log_diagonal) + vector_to_tril(deviation)
-    if not log_diagonal:
-        return linked
-    diagonal = linked.diagonal(dim1=-2, dim2=-1).clamp_max(LARGEST_LOGARITHM)
-    return linked.tril(-1) + torch.diag_embed(diagonal.exp())
 
 
 def _linked(scale_tril: Tensor, log_diagonal: bool) -> Tensor:
     if not log_diagonal:
         return scale_tril
-    diagonal = scale_tril.diagonal(dim1=-2, dim2=-1).clamp_min(1e-6)
+    diagonal = scale_tril.diagonal(dim1=-2, dim2=-1).clamp_min(_LEAST_DIAGONAL)
     return scale_tril.tril(-1) + torch.diag_embed(diagonal.log())
 
 
 @dataclass(frozen=True)
 class CholeskyLink:
-    """Root of the covariance as a function of the latent deviations, and its derivatives.
+    """Root of the covariance as a function of the latent deviations, eq. (13), and its derivatives.
 
     Parameters
     ----------
     prior_tril : Tensor of shape (d, d) or (n, d, d)
     log_diagonal : bool
+        Whether the deviations of the diagonal are of its logarithm.
     """
 
     prior_tril: Tensor
@@ -59,16 +50,16 @@ class CholeskyLink:
     """Whitened values to solve for together: a step costs the cube of it, and few are taken."""
 
     def root(self, deviation: Float[Tensor, "n p"]) -> Float[Tensor, "n d d"]:
-        """Lower triangular factors: :func:`deviation_tril` with what does not change kept."""
+        """Lower triangular factors: the inverse of :func:`tril_deviation`."""
         size = self.prior_tril.shape[-1]
         linked, entries = self._prior
         root = linked.expand(len(deviation), -1).index_add(1, entries, deviation)
         if self.log_diagonal:
-            root[:, :: size + 1].clamp_max_(LARGEST_LOGARITHM).exp_()
+            root[:, :: size + 1].clamp_max_(_LARGEST_LOGARITHM).exp_()
         return root.reshape(-1, size, size)
 
-    def pulled_back(self, root: Float[Tensor, "n d d"], gradient: Float[Tensor, "n d d"]) -> Float[Tensor, "n p"]:
-        """Gradient in the deviations of what has this one in the root, whose diagonal it overwrites."""
+    def vjp(self, root: Float[Tensor, "n d d"], gradient: Float[Tensor, "n d d"]) -> Float[Tensor, "n p"]:
+        """Gradient in the deviations, from that in the root, whose diagonal it overwrites."""
         if self.log_diagonal:
             gradient.diagonal(dim1=-2, dim2=-1).mul_(root.diagonal(dim1=-2, dim2=-1))
         return gradient.flatten(1)[:, self._prior[1]]
@@ -128,8 +119,7 @@ class CholeskyCovariance(nn.Module):
         self, latent: LatentGP, prior_tril: Float[Tensor, "d d"], *, log_diagonal: bool, bounded: bool = False
     ) -> None:
         super().__init__()
-        self.latent = latent
-        self.log_diagonal, self.bounded = log_diagonal, bounded
+        self.latent, self.log_diagonal, self.bounded = latent, log_diagonal, bounded
         self.register_buffer("prior_tril", prior_tril)
 
     def forward(
@@ -138,12 +128,32 @@ class CholeskyCovariance(nn.Module):
         """Lower triangular root of the covariance at x."""
         prior = self.prior_tril if prior_tril is None else prior_tril
         deviation, values = self.latent.both(x)
-        root = deviation_tril(deviation, prior, log_diagonal=self.log_diagonal)
+        root = CholeskyLink(prior, self.log_diagonal).root(deviation)
         if not self.bounded:
             return root
         bounded = beside_prior(root, vector_to_tril(values), prior)
+        # Of a logarithm the part of the prior is a factor, which takes nothing away.
         return bounded.tril(-1) + torch.diag_embed(root.diagonal(dim1=-2, dim2=-1)) if self.log_diagonal else bounded
 
-    def variability(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d r"]:
-        """Root of the covariance with the prior taken out (Type II): zero far from data."""
+    def variability(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d d"]:
+        """Factor with the prior taken out (Type II): zero far from data."""
         return vector_to_tril(self.latent.values(x))
+
+
+class MeanAndCholesky(MeanAndCovariance):
+    """Core of the Cholesky decomposition approach."""
+
+    kind = "cholesky"
+
+    def config(self) -> dict[str, Any]:
+        """Kernels, and on what the processes act."""
+        return {**super().config(), "log_diagonal": self.covariance.log_diagonal}
+
+    @classmethod
+    def skeleton(cls, config: Mapping[str, Any], shapes: Shapes, n_features: int, n_outputs: int) -> "MeanAndCholesky":
+        """Core without numbers."""
+        mean = latent_skeleton(shapes, "mean", n_outputs, n_features, config["mean_kernel"])
+        n_processes = n_outputs * (n_outputs + 1) // 2
+        latent = latent_skeleton(shapes, "covariance.latent", n_processes, n_features, config["kernel"])
+        options = {"log_diagonal": bool(config["log_diagonal"]), "bounded": bool(config.get("bounded", False))}
+        return cls(mean, CholeskyCovariance(latent, blank(n_outputs, n_outputs), **options))

@@ -1,41 +1,14 @@
 """The fitted model: a normal distribution of y whose mean and covariance depend on x, in the data's units."""
 
+import json
+from collections.abc import Mapping
 from typing import Any
 
-import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torch_pbd.gp import LatentGP
 from torch_pbd.linalg import scale_tril_from_root, symmetrize
-from torch_pbd.models.cholesky import CholeskyCovariance
-from torch_pbd.models.floor import with_floor
-from torch_pbd.models.heteroscedastic import HeteroscedasticModel
-from torch_pbd.models.mixture import GaussianMixture
-from torch_pbd.models.wishart import WishartCovariance
-
-
-class MeanAndCovariance(nn.Module):
-    """Gaussian processes for the mean beside a model of the covariance's root, in standardized units."""
-
-    def __init__(self, mean: LatentGP, covariance: CholeskyCovariance | WishartCovariance) -> None:
-        super().__init__()
-        self.mean = mean
-        self.covariance = covariance
-
-    def forward(
-        self, x: Float[Tensor, "n e"], prior_tril: Float[Tensor, "n d d"] | None = None
-    ) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d r"]]:
-        """Mean, and a root of the covariance."""
-        return self.mean(x), self.covariance(x, prior_tril)
-
-    def variability(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d r"]:
-        """Root of the covariance with the prior taken out: Type II uncertainty."""
-        return self.covariance.variability(x)
-
-    def type1(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
-        """Type I uncertainty of the covariance's latent processes."""
-        return self.covariance.latent.type1(x)
+from torch_pbd.models.core import Core, blank, size_of, with_floor
 
 
 class ConditionalNormal(nn.Module):
@@ -45,13 +18,11 @@ class ConditionalNormal(nn.Module):
 
     Parameters
     ----------
-    core : MeanAndCovariance, HeteroscedasticModel or GaussianMixture
-        Maps standardized inputs (n, e) to a mean (n, d) and a root (n, d, r) of the covariance, and has
-        ``type1(x)``.
+    core : Core
     x_shift, x_scale : Tensor of shape (e,)
         Standardized inputs are ``(x - x_shift) / x_scale``.
     y_shift, y_scale : Tensor of shape (d,)
-        The same for the outputs.
+        Standardized outputs are ``(y - y_shift) / y_scale``.
     """
 
     x_shift: Tensor
@@ -61,7 +32,7 @@ class ConditionalNormal(nn.Module):
 
     def __init__(
         self,
-        core: MeanAndCovariance | HeteroscedasticModel | GaussianMixture,
+        core: Core,
         x_shift: Float[Tensor, " e"],
         x_scale: Float[Tensor, " e"],
         y_shift: Float[Tensor, " d"],
@@ -74,6 +45,29 @@ class ConditionalNormal(nn.Module):
         self.register_buffer("y_shift", y_shift)
         self.register_buffer("y_scale", y_scale)
 
+    @classmethod
+    def restored(cls, core_class: type[Core], config: Any, state: Mapping[str, Tensor]) -> "ConditionalNormal":
+        """Model of its core's ``config()`` and of its ``state_dict()``, whose tensors it takes over.
+
+        Raises
+        ------
+        ValueError, TypeError, LookupError, RuntimeError
+            If a value or a tensor is missing, unknown, or of another type or shape; or if the model would not fit in
+            memory. Nothing is allocated before.
+        """
+        if not isinstance(config, Mapping) or config.get("covariance") != core_class.kind:
+            raise ValueError("its model is of another class")
+        shapes = {name.removeprefix("core."): tensor.shape for name, tensor in state.items()}
+        n_features, n_outputs = size_of(shapes, "x_shift"), size_of(shapes, "y_shift")
+        core = core_class.skeleton(config, shapes, n_features, n_outputs)
+        # Spelled out, since 0 equals False; what the first files do not say is as the class has it.
+        given, own = (json.dumps({**core.config(), **more}, sort_keys=True) for more in (config, {}))
+        if given != own:
+            raise ValueError(f"its model is described by {given:.300}, must be by {own:.300}")
+        module = cls(core, blank(n_features), blank(n_features), blank(n_outputs), blank(n_outputs))
+        module.load_state_dict(state, strict=True, assign=True)
+        return module
+
     def forward(
         self, x: Float[Tensor, "n e"], prior_scale_tril: Float[Tensor, "n d d"] | None = None
     ) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d d"]]:
@@ -81,34 +75,29 @@ class ConditionalNormal(nn.Module):
 
         ``prior_scale_tril`` replaces the prior the model was fitted with, where that depends on x.
         """
-        mean, root = self._mean_and_root(x, prior_scale_tril)
-        return mean, scale_tril_from_root(root)
+        mean, root = self.core(self._standardized(x), self._standardized_prior(prior_scale_tril))
+        return self.y_shift + self.y_scale * mean, scale_tril_from_root(self._in_units(root))
 
     def moments(
         self, x: Float[Tensor, "n e"], prior_scale_tril: Float[Tensor, "n d d"] | None = None
     ) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d d"]]:
         """Mean, and covariance, symmetric to the last bit."""
-        mean, root = self._mean_and_root(x, prior_scale_tril)
-        return mean, symmetrize(root @ root.mT)
+        mean, root = self.core(self._standardized(x), self._standardized_prior(prior_scale_tril))
+        return self.y_shift + self.y_scale * mean, self._square(root)
 
     def mean(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d"]:
         """Mean alone, without the work that a covariance takes."""
-        core, standardized = self.core, self._standardized(x)
-        mean = core(standardized)[0] if isinstance(core, GaussianMixture) else core.mean(standardized)
-        return self.y_shift + self.y_scale * mean
+        return self.y_shift + self.y_scale * self.core.predict_mean(self._standardized(x))
 
     def covariance(
         self, x: Float[Tensor, "n e"], prior_scale_tril: Float[Tensor, "n d d"] | None = None
     ) -> Float[Tensor, "n d d"]:
         """Covariance alone, symmetric to the last bit."""
-        if not isinstance(self.core, MeanAndCovariance):
-            return self.moments(x, prior_scale_tril)[1]
-        return self._square(self.core.covariance(*self._arguments(x, prior_scale_tril)))
+        prior = self._standardized_prior(prior_scale_tril)
+        return self._square(self.core.predict_root(self._standardized(x), prior))
 
     def degrees(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"] | None:
         """Degrees of freedom of the predictive Student's t; None where the density is normal everywhere."""
-        if not isinstance(self.core, HeteroscedasticModel):
-            return None
         return self.core.degrees(self._standardized(x))
 
     def draw_covariance(
@@ -117,11 +106,12 @@ class ConditionalNormal(nn.Module):
         normal: list[Float[Tensor, "*s _"]],
         prior_scale_tril: Float[Tensor, "n d d"] | None = None,
     ) -> Float[Tensor, "*s n d d"]:
-        """Posterior draws of the covariance function at x, each made of standard normal numbers."""
-        if not isinstance(self.core, HeteroscedasticModel):
-            raise TypeError("only the heteroscedastic model knows the posterior of its covariance")
-        prior = None if prior_scale_tril is None else prior_scale_tril / self.y_scale[:, None]
-        return self._square(self.core.draw(self._standardized(x), normal, prior))
+        """Posterior draws of the covariance function at x, each made of standard normal numbers.
+
+        Only the heteroscedastic core knows the posterior of its covariance.
+        """
+        core: Any = self.core
+        return self._square(core.draw(self._standardized(x), normal, self._standardized_prior(prior_scale_tril)))
 
     def type1(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
         """Type I uncertainty: 0 on data, 1 where only the prior speaks."""
@@ -129,26 +119,13 @@ class ConditionalNormal(nn.Module):
 
     def type2(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d d"]:
         """Type II uncertainty: the variability of the data, without the prior; squared units of y."""
-        standardized = self._standardized(x)
-        if isinstance(self.core, GaussianMixture):
-            return self._square(self.core(standardized)[1])  # it has no prior
-        return self._square(self.core.variability(standardized))
-
-    def _mean_and_root(self, x: Tensor, prior_scale_tril: Tensor | None) -> tuple[Tensor, Tensor]:
-        core: Any = self.core
-        if torch.compiler.is_compiling() and isinstance(core, HeteroscedasticModel):
-            core = torch.compiler.disable(core.forward)  # it looks at numbers on its way, which no graph can hold
-        mean, root = core(*self._arguments(x, prior_scale_tril))
-        return self.y_shift + self.y_scale * mean, self._in_units(root)
-
-    def _arguments(self, x: Tensor, prior_scale_tril: Tensor | None) -> tuple[Tensor, ...]:
-        """What the core takes: standardized inputs, and the prior where it is another than the core's."""
-        if prior_scale_tril is None:
-            return (self._standardized(x),)
-        return self._standardized(x), prior_scale_tril / self.y_scale[:, None]
+        return self._square(self.core.variability(self._standardized(x)))
 
     def _standardized(self, x: Tensor) -> Tensor:
         return (x - self.x_shift) / self.x_scale
+
+    def _standardized_prior(self, prior_scale_tril: Tensor | None) -> Tensor | None:
+        return None if prior_scale_tril is None else prior_scale_tril / self.y_scale[:, None]
 
     def _square(self, root: Tensor) -> Tensor:
         """Covariance of a root in standardized units, with the floor, in the units of the data."""

@@ -1,8 +1,9 @@
-"""The paper's cost functions with gradient and curvature in closed form."""
+"""The paper's cost functions, eq. (9), (11) and (12), with gradient and curvature in closed form."""
 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -11,10 +12,34 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from torch_pbd.linalg import tril_to_vector
+from torch_pbd.linalg import scale_tril_from_root, tril_to_vector
 from torch_pbd.models.cholesky import CholeskyLink
-from torch_pbd.models.floor import VARIANCE_FLOOR, with_floor
+from torch_pbd.models.core import VARIANCE_FLOOR, with_floor
 from torch_pbd.models.wishart import WishartLink
+
+Link = CholeskyLink | WishartLink
+
+
+@dataclass(frozen=True)
+class Covariances:
+    """Covariances at the inputs: the root without the floor, and the Cholesky factor C with it."""
+
+    root: Float[Tensor, "n d r"]
+    scale_tril: Float[Tensor, "n d d"]
+
+    @classmethod
+    def at(cls, link: Link, deviation: Float[Tensor, "n b"]) -> "Covariances":
+        """Covariances of latent deviations; not differentiable."""
+        root = link.root(deviation)
+        # As scale_tril_from_root, without the orthogonal part, which only a gradient needs.
+        upper = torch.linalg.qr(with_floor(root).mT, mode="r").R
+        diagonal = upper.diagonal(dim1=-2, dim2=-1)
+        return cls(root, (upper * torch.ones_like(diagonal).copysign(diagonal).unsqueeze(-1)).mT)
+
+    @cached_property
+    def inverse(self) -> Float[Tensor, "n d d"]:
+        """Inverse of C."""
+        return torch.linalg.inv(self.scale_tril).tril()
 
 
 class _ClosedForm(torch.autograd.Function):
@@ -22,8 +47,7 @@ class _ClosedForm(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, deviation: Tensor, cost: "Cost") -> Tensor:
-        point = Covariances(cost.link, deviation)
-        value, gradient = cost.value_and_gradient(point)
+        value, gradient = cost.value_and_gradient(Covariances.at(cost.link, deviation))
         ctx.save_for_backward(gradient)
         return value
 
@@ -33,35 +57,13 @@ class _ClosedForm(torch.autograd.Function):
         return gradients[0] * ctx.saved_tensors[0], None
 
 
-class Covariances:
-    """Covariances at the inputs with their floor: what all derivatives there are made of.
-
-    Parameters
-    ----------
-    link : CholeskyLink or WishartLink
-    deviation : Tensor of shape (n, b)
-    """
-
-    def __init__(self, link: CholeskyLink | WishartLink, deviation: Float[Tensor, "n b"]) -> None:
-        self.root = link.root(deviation)
-        # scale_tril_from_root without the orthogonal part
-        upper = torch.linalg.qr(with_floor(self.root).mT, mode="r").R
-        diagonal = upper.diagonal(dim1=-2, dim2=-1)
-        self.scale_tril = (upper * torch.ones_like(diagonal).copysign(diagonal).unsqueeze(-1)).mT
-
-    @cached_property
-    def inverse(self) -> Tensor:
-        """Of the factors."""
-        return torch.linalg.inv(self.scale_tril).tril()
-
-
 class Cost(ABC):
     """Function of the covariances at the inputs, and through a link of the latent deviations there.
 
-    All of it is written in D, the change of a covariance over itself: dSigma = C D C', C its factor.
+    All of it is written in D, the change of a covariance over itself: dSigma = C D C'.
     """
 
-    link: CholeskyLink | WishartLink
+    link: Link
     has_exact_curvature = False
     relative_tol = 0.0
 
@@ -70,6 +72,10 @@ class Cost(ABC):
         value: Tensor = _ClosedForm.apply(deviation, self)
         return value
 
+    def at_root(self, root: Float[Tensor, "n d r"]) -> Float[Tensor, ""]:
+        """Cost of any roots, differentiable by autograd: eq. (9) and (11) as printed, where L is trained too."""
+        return self.value(Covariances(root, scale_tril_from_root(with_floor(root))))
+
     def value(self, point: Covariances) -> Float[Tensor, ""]:
         """Cost alone."""
         return self._value_and_residual(point)[0]
@@ -77,15 +83,16 @@ class Cost(ABC):
     def value_and_gradient(self, point: Covariances) -> tuple[Float[Tensor, ""], Float[Tensor, "n b"]]:
         """Cost, and its gradient in the deviations."""
         value, residual = self._value_and_residual(point)
-        # The covariance is root root' and a floor that grows with the trace of that.
+        # With G the gradient in D, that in Sigma is C^-T G C^-1. Sigma is root root' and a floor that grows with the
+        # trace of that, so the root's gradient is twice (C^-T G C^-1 + floor tr(C^-T G C^-1) I) root.
         in_covariance = point.inverse.mT @ self._in_change(residual, point) @ point.inverse
-        of_floor = VARIANCE_FLOOR * in_covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
-        in_covariance.diagonal(dim1=-2, dim2=-1).add_(of_floor.unsqueeze(-1))
-        return value, self.link.pulled_back(point.root, 2.0 * in_covariance @ point.root)
+        by_floor = VARIANCE_FLOOR * in_covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
+        in_covariance.diagonal(dim1=-2, dim2=-1).add_(by_floor.unsqueeze(-1))
+        return value, self.link.vjp(point.root, 2.0 * in_covariance @ point.root)
 
     @abstractmethod
     def _value_and_residual(self, point: Covariances) -> tuple[Tensor, Tensor]:
-        """Cost, and what its gradient is made of."""
+        """Cost, and the residual that its gradient is made of."""
 
     @abstractmethod
     def _in_change(self, residual: Tensor, point: Covariances) -> Tensor:
@@ -100,23 +107,21 @@ class Cost(ABC):
 
 
 class Likelihood(Cost):
-    """Negative log likelihood, eq. (11) and (12), times a weight; its curvature is the expected information.
+    """Negative log likelihood of all rows, eq. (11) and (12), times a weight.
 
     Parameters
     ----------
     link : CholeskyLink or WishartLink
-    scatter_root, counts
-        As for :func:`torch_pbd.models.objectives.gaussian_nll`.
+    scatter_root : Tensor of shape (n, d, r)
+        Of the sums of ``w w'`` at each distinct input, w the residuals from the mean (``TrainingSet.scatter_root``).
+    counts : Tensor of shape (n,)
+        Rows at each distinct input.
     weight : float
         One over the number of rows gives nats per row.
     """
 
     def __init__(
-        self,
-        link: CholeskyLink | WishartLink,
-        scatter_root: Float[Tensor, "n d r"],
-        counts: Float[Tensor, " n"],
-        weight: float,
+        self, link: Link, scatter_root: Float[Tensor, "n d r"], counts: Float[Tensor, " n"], weight: float
     ) -> None:
         self.link, self._scatter_root, self._weight = link, scatter_root, weight
         self._counts = counts[:, None, None]
@@ -126,11 +131,13 @@ class Likelihood(Cost):
         self.has_exact_curvature = isinstance(link, WishartLink)
 
     def _value_and_residual(self, point: Covariances) -> tuple[Tensor, Tensor]:
+        # Sum over all rows of w' Sigma^-1 w / 2 + log det C + d log(2 pi) / 2, the sum of squares by input.
         whitened = torch.linalg.solve_triangular(point.scale_tril, self._scatter_root, upper=False)
         log_det = self._counts[:, 0, 0] @ point.scale_tril.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         return self._weight * (0.5 * whitened.square().sum() + log_det + self._constant), whitened
 
     def _in_change(self, residual: Tensor, point: Covariances) -> Tensor:
+        # (n I - Z) / 2 with Z the whitened scatter.
         return torch.baddbmm(self._identity, residual, residual.mT, beta=0.5 * self._weight, alpha=-0.5 * self._weight)
 
     def curvature(self, point: Covariances, share: float) -> Iterator[tuple[Tensor, Tensor]]:
@@ -139,21 +146,20 @@ class Likelihood(Cost):
             total = information * (self._weight * self._counts)
             if share and isinstance(self.link, WishartLink):
                 whitened = point.inverse @ self._scatter_root
-                observed = self.link.observed_information(
-                    point.root, point.inverse, whitened @ whitened.mT, self._counts
-                )
+                scatter = whitened @ whitened.mT
+                observed = self.link.observed_information(point.root, point.inverse, scatter, self._counts)
                 total = total.lerp(self._weight * observed, share)
             yield members, total
 
 
 class FactorDistance(Cost):
-    """Mean squared distance of the vectorized Cholesky factors, eq. (9); its curvature is Gauss and Newton's.
+    """Mean squared distance J_MSE of the vectorized Cholesky factors, eq. (9); its curvature is Gauss and Newton's.
 
     Parameters
     ----------
     link : WishartLink
     target : Tensor of shape (n, d, d)
-        Lower Cholesky factors.
+        Lower Cholesky factors of the empirical covariances.
     """
 
     link: WishartLink

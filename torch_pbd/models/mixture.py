@@ -1,12 +1,21 @@
-"""Gaussian mixtures over inputs and outputs together, and the regression that conditions them on inputs."""
+"""Gaussian mixtures over inputs and outputs together: regression, expectation maximization, and L-BFGS after it."""
 
 import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import final
+from typing import Any, final
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+
+from torch_pbd import checks
+from torch_pbd.exceptions import InvalidParameterError, NotPositiveDefiniteError
+from torch_pbd.linalg import scale_tril_from_root
+from torch_pbd.models.core import Core, Shapes, blank, size_of
+from torch_pbd.optim import FitReport, Progress, Status, minimize
+
+_BLOCK = 1 << 13  # rows that an E step holds at a time: what it makes of them stays in the cache
 
 
 @dataclass(frozen=True)
@@ -19,7 +28,7 @@ class Components:
 
     def whiten(self, data: Float[Tensor, "n p"]) -> Float[Tensor, "k p n"]:
         """Each row in each component's frame, where that component is N(0, I)."""
-        # Entries beyond 2e51 (in float64) are pulled back: squares of what follows stay finite, no inf - inf.
+        # Entries beyond 2e51 (in float64) are brought back to it: squares of what follows stay finite, no inf - inf.
         limit = torch.finfo(data.dtype).max ** (1 / 6)
         residual = data.clamp(-limit, limit).mT - self.mean.unsqueeze(-1)
         return torch.linalg.solve_triangular(self.scale_tril, residual, upper=False)
@@ -36,11 +45,8 @@ class Components:
 
 
 @final
-class GaussianMixture(nn.Module):
-    """Gaussian mixture over the joint vector [x, y], inputs first.
-
-    Calling it is Gaussian mixture regression (GMR; Calinon, Intelligent Service Robotics 9, 2016, section 5).
-    Its parameters are unconstrained: any optimizer may move them.
+class GaussianMixture(Core):
+    """Gaussian mixture over the joint vector [x, y], inputs first; as a core, Gaussian mixture regression.
 
     Parameters
     ----------
@@ -52,12 +58,10 @@ class GaussianMixture(nn.Module):
         Lower Cholesky factors of the components' covariances.
     n_features : int
         Number of inputs e: the leading columns of the data.
-
-    Raises
-    ------
-    ValueError
-        If ``n_features`` leaves no input or no output, or a factor's diagonal is not positive.
     """
+
+    kind = "mixture"
+    log_density_floor: Tensor
 
     def __init__(
         self,
@@ -67,18 +71,15 @@ class GaussianMixture(nn.Module):
         n_features: int,
     ) -> None:
         super().__init__()
-        if not 1 <= n_features < mean.shape[-1]:
-            raise ValueError(f"n_features is {n_features}: it must be 1 to {mean.shape[-1] - 1}.")
+        self.n_features = checks.count(n_features, "n_features", most=mean.shape[-1] - 1)
         diagonal = scale_tril.diagonal(dim1=-2, dim2=-1)
-        if not (diagonal > 0).all():
-            raise ValueError("scale_tril has a diagonal entry that is not positive.")
-        self.n_features = n_features
+        if not diagonal.is_meta and not (diagonal > 0).all():  # a skeleton holds no numbers
+            raise InvalidParameterError("scale_tril has a diagonal entry that is not positive.")
         self.log_weight = nn.Parameter(log_weight.detach().clone())
         self.mean = nn.Parameter(mean.detach().clone())
         self.log_diagonal = nn.Parameter(diagonal.detach().log())
         self.strict_lower = nn.Parameter(scale_tril.detach().tril(-1))
-        self.log_density_floor: Tensor
-        self.register_buffer("log_density_floor", mean.new_tensor(-math.inf))
+        self.register_buffer("log_density_floor", torch.full_like(mean[:1, 0], -math.inf))
 
     @property
     def scale_tril(self) -> Float[Tensor, "k p p"]:
@@ -86,17 +87,16 @@ class GaussianMixture(nn.Module):
         return self.strict_lower.tril(-1) + torch.diag_embed(self.log_diagonal.exp())
 
     def log_prob(self, data: Float[Tensor, "n p"]) -> Float[Tensor, " n"]:
-        """Log density at each row [x, y]."""
-        return self.components().log_prob(data)
+        """Log density at each row [x, y], or [x] alone."""
+        return self.components(data.shape[1]).log_prob(data)
 
-    def log_prob_input(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
-        """Log density of the inputs alone, at each row of ``x``."""
-        return self.components(self.n_features).log_prob(x)
+    def forward(
+        self, x: Float[Tensor, "n e"], prior_tril: Float[Tensor, "n d d"] | None = None
+    ) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d r"]]:
+        """Mean of y given each row of ``x``, and a root of its covariance, r = k (d + 1); there is no prior in it.
 
-    def forward(self, x: Float[Tensor, "n e"]) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d r"]]:
-        """Mean of y given each row of ``x``, and a root of its covariance, r = k (d + 1).
-
-        With h_k the responsibility of component k for x, and mu_k|x and Sigma_k|x what it says of y,
+        Gaussian mixture regression (Calinon, Intelligent Service Robotics 9, 2016, section 5): with h_k the
+        responsibility of component k for x, and mu_k|x and Sigma_k|x the mean and covariance of y in it,
 
             mean = sum_k h_k mu_k|x,
             root @ root.mT = sum_k h_k (Sigma_k|x + (mu_k|x - mean)(mu_k|x - mean)^T).
@@ -119,9 +119,182 @@ class GaussianMixture(nn.Module):
         set by the fits). A mixture knows only Type II uncertainty (paper, section IV-C): this measure is
         ours, and the covariance does *not* return to a prior where it is 1.
         """
-        return -torch.expm1((self.log_prob_input(x) - self.log_density_floor).clamp(max=0.0))
+        return -torch.expm1((self.log_prob(x) - self.log_density_floor).clamp(max=0.0))
+
+    def config(self) -> dict[str, Any]:
+        """Number of inputs."""
+        return {"covariance": self.kind, "n_features": self.n_features}
+
+    @classmethod
+    def skeleton(cls, config: Mapping[str, Any], shapes: Shapes, n_features: int, n_outputs: int) -> "GaussianMixture":
+        """Mixture without numbers."""
+        k, p = size_of(shapes, "log_weight"), n_features + n_outputs
+        return cls(blank(k), blank(k, p), blank(k, p, p), n_features)
 
     def components(self, size: int | None = None) -> Components:
-        """The components, over the first ``size`` variables only where it is given."""
+        """Components over the first ``size`` variables, or over all."""
         log_weight = self.log_weight.log_softmax(0)
         return Components(log_weight, self.mean[:, :size], self.scale_tril[:, :size, :size])
+
+
+@torch.no_grad()
+def expectation_maximization(
+    data: Float[Tensor, "n p"],
+    responsibilities: Float[Tensor, "n k"],
+    *,
+    n_features: int,
+    reg_covar: float,
+    tol: float,
+    max_iter: int,
+) -> tuple[GaussianMixture, FitReport]:
+    """Fit a mixture by expectation maximization, from given responsibilities: the best iterate.
+
+    The updates are those of scikit-learn's ``GaussianMixture(covariance_type="full")``, but carried out in
+    each component's present frame: an E step whitens the data and gathers weighted moments, near the identity
+    there, and an M step moves the frames. Strongly correlated data keep their digits so.
+
+    Parameters
+    ----------
+    data : Tensor of shape (n, e + d)
+        Inputs, ``n_features`` of them, and outputs side by side, standardized.
+    responsibilities : Tensor of shape (n, k)
+        Share of each component in each row; rows add up to one. An M step from them is the first iterate.
+    reg_covar : float
+        Added to every variance of every component: a share of those of the standardized data.
+    tol, max_iter : float, int
+        Stop when the loss, the negative mean log-likelihood in nats per row, changes by less than ``tol``.
+
+    Raises
+    ------
+    NotPositiveDefiniteError
+        If a component collapses and ``reg_covar`` is zero.
+    """
+    padded = nn.functional.pad(data, (0, 1), value=1.0)  # by ones: moments of order 0 to 2 in one product
+    blocks = [block.mT.contiguous() for block in padded.split(_BLOCK)]
+    components = best = _first_m_step(data, responsibilities, reg_covar)
+    loss, moments = _e_step(components, blocks)
+    curve, n_iter, converged = [loss], 0, False
+    while n_iter < max_iter and not converged:
+        n_iter += 1
+        components = _m_step(components, moments, reg_covar)
+        previous, (loss, moments) = loss, _e_step(components, blocks)
+        converged = abs(previous - loss) < tol
+        if loss < curve[-1]:
+            best, curve = components, [*curve, loss]
+    mixture = _with_density_floor(best, data[:, :n_features])
+    status = Status.CONVERGED if converged else Status.MAX_ITER
+    return mixture, FitReport(curve[-1], tuple(curve), n_iter, status)
+
+
+def refine(
+    mixture: GaussianMixture,
+    data: Float[Tensor, "n p"],
+    *,
+    reg_covar: float,
+    tol: float,
+    max_iter: int,
+    callback: Callable[[Progress], None] | None = None,
+) -> FitReport:
+    """Maximize a mixture's likelihood by L-BFGS on all its parameters, in place; never worse than its start.
+
+    The likelihood alone is unbounded: a component may shrink onto a point. So covariances are
+    A A^T + reg_covar I with A free: the floor that EM keeps, but maximized with, not added afterwards. Means
+    and A are measured in the components' frames at the start, where the problem is nearly isotropic.
+
+    ``mixture``, ``data`` and ``reg_covar`` are as in :func:`expectation_maximization`, whose loss this lowers, the
+    others as in :func:`~torch_pbd.optim.minimize`.
+
+    Raises
+    ------
+    ValueError
+        If ``reg_covar`` is not above zero, or the mixture has a variance below it.
+    """
+    with torch.no_grad():
+        start = mixture.components()
+        spread = _spread_above(start.scale_tril, reg_covar).requires_grad_()
+        shift = torch.zeros_like(start.mean).requires_grad_()
+        log_weight = start.log_weight.clone().requires_grad_()
+
+    def components() -> Components:
+        mean = start.mean + (start.scale_tril @ shift.unsqueeze(-1)).squeeze(-1)
+        return Components(log_weight.log_softmax(0), mean, _regular(start.scale_tril @ spread, reg_covar))
+
+    def loss() -> Tensor:
+        return -components().log_prob(data).mean()
+
+    report = minimize(loss, [log_weight, shift, spread], max_iter=max_iter, tol=tol, callback=callback)
+    if len(report.loss_curve) > 1:  # else the start is the best, and stays as it is to the bit
+        mixture.load_state_dict(_with_density_floor(components(), data[:, : mixture.n_features]).state_dict())
+    return report
+
+
+@torch.no_grad()
+def _with_density_floor(components: Components, inputs: Float[Tensor, "n e"]) -> GaussianMixture:
+    """Mixture of these components, which knows the lowest density of the training inputs."""
+    mixture = GaussianMixture(components.log_weight, components.mean, components.scale_tril, inputs.shape[1])
+    mixture.log_density_floor.fill_(mixture.log_prob(inputs).min())
+    return mixture
+
+
+def _spread_above(scale_tril: Float[Tensor, "k p p"], reg_covar: float) -> Float[Tensor, "k p p"]:
+    """Factor B with which scale_tril B B^T scale_tril^T + reg_covar I are the covariances."""
+    identity = torch.eye(scale_tril.shape[-1]).to(scale_tril).expand_as(scale_tril)
+    inverse = torch.linalg.solve_triangular(scale_tril, identity, upper=False)
+    # Of C B B' C' = C C' - reg_covar I follows B B' = I - reg_covar C^-1 C^-T.
+    excess, axes = torch.linalg.eigh(identity - reg_covar * inverse @ inverse.mT)
+    if not reg_covar > 0 or (excess < -(torch.finfo(excess.dtype).eps ** 0.5)).any():
+        raise ValueError(f"reg_covar is {reg_covar:g}: it must be above 0, and at most what the mixture has.")
+    return axes * excess.clamp_min(0).sqrt().unsqueeze(-2)
+
+
+def _regular(root: Float[Tensor, "k p r"], reg_covar: float) -> Float[Tensor, "k p p"]:
+    """Lower Cholesky factors of ``root @ root.mT + reg_covar * I``."""
+    floor = (math.sqrt(reg_covar) * torch.eye(root.shape[-2]).to(root)).expand(len(root), -1, -1)
+    scale_tril = scale_tril_from_root(torch.cat([root, floor], dim=-1))
+    rounding = root.shape[-2] * torch.finfo(root.dtype).eps * scale_tril.detach().norm(dim=-1)
+    if (scale_tril.diagonal(dim1=-2, dim2=-1) <= rounding).any():
+        raise NotPositiveDefiniteError("A component has collapsed: raise reg_covar, or take fewer.")
+    return scale_tril
+
+
+def _first_m_step(data: Float[Tensor, "n p"], share: Float[Tensor, "n k"], reg_covar: float) -> Components:
+    """Most likely components of given responsibilities."""
+    count = share.sum(0) + 10 * torch.finfo(data.dtype).eps
+    mean = share.mT @ data / count.unsqueeze(-1)
+    root = (share / count).mT.sqrt().unsqueeze(1) * (data.mT - mean.unsqueeze(-1))
+    return Components((count / count.sum()).log(), mean, _regular(root, reg_covar))
+
+
+def _e_step(components: Components, blocks: list[Tensor]) -> tuple[float, Float[Tensor, "k q q"]]:
+    """Negative mean log-likelihood, and each component's weighted moments in its own frame, q = p + 1."""
+    k, p = components.mean.shape
+    # Maps of [x, 1] to [C^-1 (x - mean), 1], so that one product whitens a block for all components.
+    affine = torch.eye(p + 1).to(components.mean).repeat(k, 1, 1)
+    affine[:, :p, p:] = -components.mean.unsqueeze(-1)
+    affine[:, :p] = torch.linalg.solve_triangular(components.scale_tril, affine[:, :p], upper=False)
+    loss, moments = affine.new_zeros(()), torch.zeros_like(affine)
+    for block in blocks:
+        whitened = affine @ block
+        log_joint = components.log_joint(whitened[:, :p])
+        largest = log_joint.amax(0)
+        share = (log_joint - largest).exp()
+        total = share.sum(0)
+        loss -= (largest + total.log()).sum()
+        moments += ((share / total).unsqueeze(1) * whitened) @ whitened.mT
+    return float(loss) / sum(block.shape[1] for block in blocks), moments
+
+
+def _m_step(components: Components, moments: Float[Tensor, "k q q"], reg_covar: float) -> Components:
+    """Most likely components, given moments in the frames of the present ones."""
+    frame, p = components.scale_tril, components.mean.shape[-1]
+    eps = torch.finfo(moments.dtype).eps
+    count = moments[:, p, p] + 10 * eps  # a component that has lost all its data stays where it is
+    # With mean s and second moment M in a frame C, mean and covariance are C s more, and C (M - s s') C'.
+    shift = moments[:, :p, p:] / count[:, None, None]
+    second = moments[:, :p, :p] / count[:, None, None]
+    variance, axes = torch.linalg.eigh(second - shift @ shift.mT)
+    rounding = p * eps * second.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True)
+    scale = torch.where(variance > rounding, variance, 0.0).sqrt()
+    mean = components.mean + (frame @ shift).squeeze(-1)
+    root = frame @ (axes * scale.unsqueeze(-2))
+    return Components((count / count.sum()).log(), mean, _regular(root, reg_covar))

@@ -1,7 +1,7 @@
 """Training of latent values under their prior by Fisher scoring, or by L-BFGS that is preconditioned once."""
 
 from collections.abc import Callable, Iterator
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -15,25 +15,26 @@ Solver = Literal["auto", "fisher", "lbfgs"]
 
 
 class _Posterior:
-    """Cost and prior as a function of whitened values."""
+    """Cost and negative log prior density as a function of whitened values, which a priori are standard normal."""
 
     def __init__(self, cost: Cost, latent: LatentValues, prior_weight: float) -> None:
         self.cost, self.latent, self.prior_weight = cost, latent, prior_weight
         self.share = 0.0
-        """Of the observed information in the last step's curvature: the next one tries a little more at most."""
+        """Share of the observed information in the curvature of the last step."""
         self._last: tuple[Tensor, Covariances] | None = None
 
     def at(self, whitened: Tensor) -> Covariances:
         """Covariances of whitened values, kept until those of others are asked for."""
         if self._last is None or self._last[0] is not whitened:
-            self._last = whitened, Covariances(self.cost.link, self.latent(whitened))
+            self._last = whitened, Covariances.at(self.cost.link, self.latent(whitened))
         return self._last[1]
 
     def loss(self, whitened: Tensor) -> Tensor:
+        """Loss alone, as the line search of Newton's method needs it."""
         return self.cost.value(self.at(whitened)) + 0.5 * self.prior_weight * whitened.square().sum()
 
     def differentiable(self, whitened: Tensor) -> Tensor:
-        """The loss, with its gradient in closed form."""
+        """Loss with its gradient, as L-BFGS needs it."""
         return self.cost(self.latent(whitened)) + 0.5 * self.prior_weight * whitened.square().sum()
 
     def newton(self, whitened: Tensor) -> tuple[Tensor, Tensor]:
@@ -47,6 +48,7 @@ class _Posterior:
         # Without a prior the curvature is singular, as vectors may turn: Levenberg and Marquardt's damping, which
         # vanishes with the gradient (Fan and Yuan 2005).
         damping = self.prior_weight or 1e-3 * float(gradient.abs().max())
+        # Quarters, from one more than in the last step downwards: each that fails costs a decomposition.
         shares = [0.25 * i for i in range(5)] if self.cost.has_exact_curvature else [0.0]
         for share in reversed([share for share in shares if share <= self.share + 0.25]):
             factors = list(self.factors(point, damping, share))
@@ -72,25 +74,6 @@ class _Posterior:
                 name = "the information of the latent values"
                 factor = torch.zeros_like(matrix) if share else cholesky_with_jitter(matrix, name=name)[0]
             yield members, factor
-
-
-class _Unit:
-    """Coordinates z of whitened values in which the curvature at the start is the unit matrix, and z = 0 is the start.
-
-    Without blocks the coordinates are the whitened values less their start.
-    """
-
-    def __init__(self, start: Tensor, blocks: list[tuple[Tensor, Tensor]]) -> None:
-        self.start, self.blocks = start, blocks
-
-    def whitened(self, z: Tensor) -> Tensor:
-        if not self.blocks:
-            return self.start + z
-        step = torch.zeros_like(z)
-        for members, factor in self.blocks:
-            solved = torch.linalg.solve_triangular(factor.mT, z[members].reshape(-1, 1), upper=True)
-            step = step.index_copy(0, members, solved.reshape(len(members), -1))
-        return self.start + step
 
 
 def train_by_scoring(
@@ -122,23 +105,26 @@ def train_by_scoring(
     posterior = _Posterior(cost, latent, prior_weight)
     start = latent.whitened.detach().clone()
     small = cost.link.block_size(len(start)) * start.shape[1] <= cost.link.largest_block
+    limits: Any = {"max_iter": max_iter, "tol": tol, "callback": callback}
     if solver == "fisher" or (solver == "auto" and small):
-        found, report = minimize_scoring(
-            posterior.loss,
-            posterior.newton,
-            start,
-            max_iter=max_iter,
-            tol=tol,
-            relative_tol=cost.relative_tol,
-            callback=callback,
-        )
+        loss, newton = posterior.loss, posterior.newton
+        found, report = minimize_scoring(loss, newton, start, relative_tol=cost.relative_tol, **limits)
     else:
         blocks = list(posterior.factors(posterior.at(start), prior_weight)) if small and prior_weight else []
-        unit, z = _Unit(start, blocks), torch.zeros_like(start, requires_grad=True)
-        report = minimize(
-            lambda: posterior.differentiable(unit.whitened(z)), [z], max_iter=max_iter, tol=tol, callback=callback
-        )
-        found = unit.whitened(z.detach())
+        z = torch.zeros_like(start, requires_grad=True)
+        report = minimize(lambda: posterior.differentiable(start + _step(z, blocks)), [z], **limits)
+        found = start + _step(z.detach(), blocks)
     with torch.no_grad():
         latent.whitened.copy_(found)
     return report
+
+
+def _step(z: Tensor, blocks: list[tuple[Tensor, Tensor]]) -> Tensor:
+    """Step of the whitened values, in coordinates z in which the curvature of these factors is the unit matrix."""
+    if not blocks:
+        return z
+    step = torch.zeros_like(z)
+    for members, factor in blocks:
+        solved = torch.linalg.solve_triangular(factor.mT, z[members].reshape(-1, 1), upper=True)
+        step = step.index_copy(0, members, solved.reshape(len(members), -1))
+    return step

@@ -1,4 +1,4 @@
-"""Training rows with their distinct inputs found, and the statistics the models need of them."""
+"""Training rows with their distinct inputs found, and the statistics of them that models are fitted to."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -10,7 +10,7 @@ from torch import Tensor
 from torch_pbd.gp import neighbourhoods
 from torch_pbd.linalg import scale_tril_from_root
 
-_CHUNK = 1024  # inputs that a mean is evaluated at together
+_CHUNK = 1024  # inputs that a mean is evaluated at together: its correlations take 8 kB for each, of 1000 inputs
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class TrainingSet:
         return _sum_by(self.y, self.index, len(self.inputs)) / self.counts[:, None]
 
     def merged(self, max_inputs: int) -> "TrainingSet":
-        """The same rows with at most ``max_inputs`` distinct inputs: neighbours are taken together."""
+        """Rows with at most ``max_inputs`` distinct inputs: neighbours are taken together."""
         if len(self.inputs) <= max_inputs:
             return self
         index = neighbourhoods(self.inputs, max_inputs)[self.index]
@@ -45,9 +45,9 @@ class TrainingSet:
         return replace(self, inputs=_sum_by(self.x, index, n_inputs) / counts[:, None], index=index)
 
     def residual(self, mean: Callable[[Tensor], Tensor]) -> Float[Tensor, "rows d"]:
-        """What y is above its mean at each row; ``mean`` maps inputs (m, e) to (m, d).
+        """Residual of y from its mean at each row; ``mean`` maps inputs (m, e) to (m, d).
 
-        It is asked for a bounded number of inputs at a time, and where rows repeat an input for that alone.
+        It is evaluated for a bounded number of inputs at a time, and where rows repeat an input for that alone.
         """
         repeated = torch.equal(self.inputs[self.index], self.x)
         at = self.inputs if repeated else self.x
@@ -59,8 +59,8 @@ class TrainingSet:
         """Root of the scatter at each input: ``root @ root.mT`` is the sum of ``w w'`` over its rows.
 
         The rows of each input are laid side by side, and where they are more than d reduced to d by a QR
-        decomposition: no product is formed, and K <= d rows are no special case. Inputs of about as many
-        rows are treated together, so memory is linear in the rows.
+        decomposition: no product is formed, and K <= d rows are no special case. Inputs whose numbers of rows lie
+        between the same powers of two are treated together, so memory is linear in the rows.
         """
         counts = torch.bincount(self.index, minlength=len(self.inputs))
         n_outputs, order = residual.shape[1], self.index.argsort(stable=True)
@@ -70,6 +70,7 @@ class TrainingSet:
         group = self.index[order]
         position = torch.arange(len(order), device=order.device) - (counts.cumsum(0) - counts)[group]
         size = counts.clamp_min(1).log2().ceil()
+        # Rows of an input lie in its slot one after the other; zeros, which add nothing, fill up the shorter ones.
         for exponent in size.unique():
             members = (size == exponent).nonzero().squeeze(-1)
             rows = size[group] == exponent
@@ -119,6 +120,7 @@ def empirical_tril(training: TrainingSet, *, bias_correction: bool = False) -> F
     lacking = degrees < n_outputs
     prior_degrees = float(n_outputs + 1)
     if bool(lacking.any()):
+        # The prior adds d + 1 times the pooled covariance to the scatter, by roots side by side, and d + 1 degrees.
         prior_root = prior_degrees**0.5 * pooled_tril(training) * lacking[:, None, None]
         root = torch.cat([root, prior_root], dim=-1)
     scale_tril = scale_tril_from_root(root) / (degrees + prior_degrees * lacking).sqrt()[:, None, None]
@@ -133,6 +135,8 @@ def mean_over_geometric(training: TrainingSet) -> Float[Tensor, "n d"]:
 
     For normal data, of which they are chi; one where the factor was shrunk.
     """
+    # Entry i of K rows is chi with 2 h = K - i degrees: its mean is sqrt(2) gamma(h + 1/2) / gamma(h), and that of its
+    # logarithm (log(2) + digamma(h)) / 2.
     n_outputs, degrees = training.y.shape[1], training.counts - 1.0
     half = 0.5 * (degrees[:, None] - torch.arange(n_outputs).to(degrees)).clamp_min(1.0)
     ratio = (torch.lgamma(half + 0.5) - torch.lgamma(half) - 0.5 * torch.digamma(half)).exp()
@@ -141,6 +145,7 @@ def mean_over_geometric(training: TrainingSet) -> Float[Tensor, "n d"]:
 
 def _expected_diagonal(degrees: Tensor, n_outputs: int) -> Tensor:
     """Mean of each column of the factor of an empirical covariance over that of the true one."""
+    # Column i of the factor of the scatter has a mean of that of chi with K - i degrees times that of the true one.
     rest = degrees[:, None] - torch.arange(n_outputs).to(degrees)
     return (torch.lgamma((rest + 1.0) / 2.0) - torch.lgamma(rest / 2.0)).exp() * (2.0 / degrees[:, None]).sqrt()
 

@@ -1,29 +1,29 @@
 """Covariance as a Wishart process: a sum of outer products of Gaussian process vectors (Section IV-A)."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from torch_pbd.gp import LatentGP
-from torch_pbd.models.floor import beside_prior
+from torch_pbd.models.core import MeanAndCovariance, Shapes, beside_prior, blank, latent_skeleton, size_of
 
 
 def wishart_root(
     deviation: Float[Tensor, "n b"],
     prior_root: Float[Tensor, "*m d df"],
-    scale_matrix_tril: Float[Tensor, "d d"],
+    scale_matrix_tril: Float[Tensor, "d d"] | None = None,
 ) -> Float[Tensor, "n d df"]:
-    """Root of eq. (8): its columns are L u_i(x), i = 1..df.
+    """Root of eq. (8): its columns are L u_i(x), i = 1..df; L is the unit matrix where it is not given.
 
     ``deviation`` holds the df vectors' deviations from their prior means one after the other.
     """
     n_outputs, df = prior_root.shape[-2:]
     vectors = deviation.reshape(len(deviation), df, n_outputs).mT
-    return prior_root + scale_matrix_tril.tril() @ vectors
+    return prior_root + (vectors if scale_matrix_tril is None else scale_matrix_tril.tril() @ vectors)
 
 
 def padded(prior_tril: Float[Tensor, "*m d d"], df: int) -> Float[Tensor, "*m d df"]:
@@ -51,10 +51,10 @@ class WishartLink:
 
     def root(self, deviation: Float[Tensor, "n b"]) -> Float[Tensor, "n d df"]:
         """Roots whose columns are the vectors."""
-        return self.prior_root + deviation.reshape(len(deviation), *self.prior_root.shape[:-3:-1]).mT
+        return wishart_root(deviation, self.prior_root)
 
-    def pulled_back(self, root: Float[Tensor, "n d df"], gradient: Float[Tensor, "n d df"]) -> Float[Tensor, "n b"]:
-        """Gradient in the deviations of what has this one in the root."""
+    def vjp(self, root: Float[Tensor, "n d df"], gradient: Float[Tensor, "n d df"]) -> Float[Tensor, "n b"]:
+        """Gradient in the deviations, from that in the root."""
         return gradient.mT.flatten(1)
 
     def block_size(self, n_processes: int) -> int:
@@ -68,6 +68,7 @@ class WishartLink:
 
         With D = S + S', S = C^-1 dU (C^-1 U)', it is 1/2 tr(D D) = tr(S' S) + tr(S S). ``inverse`` is that of C.
         """
+        # Entry i of vector j, against entry k of vector l.
         whitened = inverse @ root
         cross = whitened.mT @ inverse
         block = _block("njl,nik->njilk", whitened.mT @ whitened, inverse.mT @ inverse)
@@ -134,6 +135,7 @@ class WishartCovariance(nn.Module):
         latent: LatentGP,
         prior_root: Float[Tensor, "d df"],
         scale_matrix_tril: Float[Tensor, "d d"],
+        *,
         bounded: bool = False,
     ) -> None:
         super().__init__()
@@ -145,15 +147,29 @@ class WishartCovariance(nn.Module):
         self, x: Float[Tensor, "n e"], prior_tril: Float[Tensor, "n d d"] | None = None
     ) -> Float[Tensor, "n d df"]:
         """Root of the covariance at x."""
-        df = self.prior_root.shape[1]
-        prior = self.prior_root if prior_tril is None else padded(prior_tril, df)
+        prior = self.prior_root if prior_tril is None else padded(prior_tril, self.prior_root.shape[1])
         deviation, values = self.latent.both(x)
         root = wishart_root(deviation, prior, self.scale_matrix_tril)
         return beside_prior(root, self._vectors(values), prior) if self.bounded else root
 
-    def variability(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d r"]:
-        """Root of the covariance with the prior taken out (Type II): zero far from data."""
+    def variability(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d df"]:
+        """Root with the prior taken out (Type II): zero far from data."""
         return self._vectors(self.latent.values(x))
 
     def _vectors(self, values: Float[Tensor, "n b"]) -> Float[Tensor, "n d df"]:
         return values.reshape(len(values), *self.prior_root.shape[::-1]).mT
+
+
+class MeanAndWishart(MeanAndCovariance):
+    """Core of the Wishart process approach."""
+
+    kind = "wishart"
+
+    @classmethod
+    def skeleton(cls, config: Mapping[str, Any], shapes: Shapes, n_features: int, n_outputs: int) -> "MeanAndWishart":
+        """Core without numbers."""
+        mean = latent_skeleton(shapes, "mean", n_outputs, n_features, config["mean_kernel"])
+        df = size_of(shapes, "covariance.prior_root", 1)
+        latent = latent_skeleton(shapes, "covariance.latent", n_outputs * df, n_features, config["kernel"])
+        parts, bounded = (blank(n_outputs, df), blank(n_outputs, n_outputs)), bool(config.get("bounded", False))
+        return cls(mean, WishartCovariance(latent, *parts, bounded=bounded))

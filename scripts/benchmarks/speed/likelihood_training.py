@@ -18,9 +18,8 @@ from torch_pbd.data.synthetic import paper_mean
 from torch_pbd.gp import LatentValues
 from torch_pbd.kernels import correlation
 from torch_pbd.linalg import safe_cholesky, scale_tril_from_root
-from torch_pbd.models.cholesky import CholeskyLink, deviation_tril, tril_deviation
+from torch_pbd.models.cholesky import CholeskyLink, tril_deviation
 from torch_pbd.models.costs import Likelihood
-from torch_pbd.models.objectives import gaussian_nll
 from torch_pbd.models.scoring import Solver, train_by_scoring
 from torch_pbd.optim import Progress, minimize
 
@@ -75,12 +74,13 @@ def plain(problem: Problem, watch: Watch, tol: float = 1e-9) -> None:
     n_rows = len(problem.counts)
     gram = correlation(problem.inputs, problem.inputs, torch.tensor([LENGTH_SCALE], dtype=torch.float64))
     factor = safe_cholesky(gram, name="kernel matrix")
+    link = CholeskyLink(problem.prior_tril, True)
+    cost = Likelihood(link, problem.scatter_root, problem.counts, 1.0)
     start = torch.linalg.solve_triangular(factor, problem.start.mT / problem.amplitude, upper=False)
     whitened = start.requires_grad_()
 
     def objective() -> Tensor:
-        root = deviation_tril(problem.amplitude * (factor @ whitened), problem.prior_tril, log_diagonal=True)
-        loss = gaussian_nll(root, problem.scatter_root, problem.counts)
+        loss = cost.at_root(link.root(problem.amplitude * (factor @ whitened)))
         return (loss + 0.5 * whitened.square().sum()) / n_rows
 
     minimize(objective, [whitened], max_iter=2000, tol=tol, callback=watch)

@@ -14,7 +14,7 @@ from speed.rows import Findings, Plan, Row
 from speed.timing import alternate
 from torch_pbd import CholeskyCovRegressor, GMMBaseline
 from torch_pbd.data import make_paper_simulation
-from torch_pbd.models.mixture_fit import expectation_maximization
+from torch_pbd.models.mixture import expectation_maximization
 
 
 def measure(plan: Plan) -> Findings:

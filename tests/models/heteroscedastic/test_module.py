@@ -9,6 +9,7 @@ from scipy.optimize import brentq
 from scipy.special import polygamma
 
 from torch_pbd.gp.inducing import FeatureMap
+from torch_pbd.models.conditional import ConditionalNormal
 from torch_pbd.models.heteroscedastic import (
     Families,
     HeteroscedasticModel,
@@ -39,6 +40,15 @@ def fitted(d=2, *, period=None, length_scale=None, n=12, n_demos=8, seed=0):
     return HeteroscedasticModel(fit, PRIOR * torch.eye(d, dtype=torch.float64))
 
 
+def restored(config, state):
+    """The core of a whole model of one input."""
+    n_outputs = len(state["pooled_tril"])
+    scaling = {"x_shift": torch.zeros(1), "x_scale": torch.ones(1)}
+    scaling |= {"y_shift": torch.zeros(n_outputs), "y_scale": torch.ones(n_outputs)}
+    whole = {f"core.{name}": tensor for name, tensor in state.items()} | scaling
+    return ConditionalNormal.restored(HeteroscedasticModel, config, whole).core
+
+
 @pytest.fixture(scope="module")
 def model():
     return fitted()
@@ -56,7 +66,7 @@ def queries():
 def test_a_model_comes_back_from_its_spec_and_its_tensors(d, period, length_scale):
     period, length_scale = (each and torch.tensor(each, dtype=torch.float64) for each in (period, length_scale))
     model = fitted(d, period=period, length_scale=length_scale)
-    again = HeteroscedasticModel.restored(json.loads(json.dumps(model.spec())), model.state_dict())
+    again = restored(json.loads(json.dumps(model.config())), model.state_dict())
     x = queries()
     for mine, others in zip(
         (*model(x), model.variability(x), model.degrees(x), model.type1(x)),
@@ -65,7 +75,7 @@ def test_a_model_comes_back_from_its_spec_and_its_tensors(d, period, length_scal
     ):
         assert torch.equal(mine, others)
     assert again.draw_sizes() == model.draw_sizes()
-    assert again.spec() == model.spec()
+    assert again.config() == model.config()
 
 
 def test_nothing_is_missing_at_the_inducing_inputs_and_all_far_away(model):
@@ -180,7 +190,7 @@ def test_a_buffer_that_changes_changes_what_is_predicted(change, inference):
     with torch.inference_mode(inference):
         before = model(x)[1]
     change(model)
-    anew = HeteroscedasticModel.restored(model.spec(), dict(model.state_dict()))
+    anew = restored(model.config(), model.state_dict())
     for mine, others in zip(everything(model, x), everything(anew, x), strict=True):
         assert torch.equal(mine, others)
     assert not torch.equal(before, model(x)[1])

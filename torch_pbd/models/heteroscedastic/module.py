@@ -1,14 +1,17 @@
 """The fitted model as a module: everything that predicts is in its buffers."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from torch_pbd import checks
 from torch_pbd.gp.inducing import FeatureMap
-from torch_pbd.kernels import KernelName
+from torch_pbd.kernels import KERNELS, KernelName
 from torch_pbd.linalg import safe_cholesky, symmetrize
+from torch_pbd.models.core import Core, Shapes, blank, size_of
 from torch_pbd.models.heteroscedastic.fit import HeteroscedasticFit
 from torch_pbd.models.heteroscedastic.latent import LatentCovariance
 from torch_pbd.models.heteroscedastic.linear import Weights
@@ -19,9 +22,10 @@ from torch_pbd.models.heteroscedastic.processes import ProcessFamily
 # Far from data a log variance may be anything: of its variance no more than this enters an expectation.
 _MOST_LOG_VARIANCE = 2.0
 _LEAST_DEGREES = 3.0  # below two, Student's t has no covariance
+_FAMILIES = ("mean", "log_variance", "coefficient")
 
 
-class HeteroscedasticModel(nn.Module):
+class HeteroscedasticModel(Core):
     """Predictive density in standardized units: Student's t, its moments from the latent processes.
 
     Parameters
@@ -31,6 +35,7 @@ class HeteroscedasticModel(nn.Module):
         Factor of the covariance far from data.
     """
 
+    kind = "heteroscedastic"
     inducing: Tensor
     mean_inducing: Tensor
     mean_theta: Tensor
@@ -48,7 +53,7 @@ class HeteroscedasticModel(nn.Module):
         super().__init__()
         mean, covariance = fit.mean, fit.covariance
         families = (mean.family, covariance.log_variance_family, covariance.coefficient_family)
-        for name, family in zip(("mean", "log_variance", "coefficient"), families, strict=True):
+        for name, family in zip(_FAMILIES, families, strict=True):
             if family.fixed_length_scale is not None:
                 self.register_buffer(f"{name}_length_scale", family.fixed_length_scale)
         features = mean.family.features
@@ -76,19 +81,52 @@ class HeteroscedasticModel(nn.Module):
         self.exact = [family.features.exact for family in families]
         self.medians = [(family.length_scale, family.amplitude, family.constant) for family in families]
 
-    def spec(self) -> dict[str, Any]:
-        """All of the model that is not in its buffers: JSON-able."""
-        return {"kernel": self.kernel, "exact": self.exact, "medians": [list(row) for row in self.medians]}
+    def config(self) -> dict[str, Any]:
+        """Kernel, and what the three families of processes are but for their length scales."""
+        medians = [list(row) for row in self.medians]
+        return {"covariance": self.kind, "kernel": self.kernel, "exact": self.exact, "medians": medians}
 
     @classmethod
-    def restored(cls, spec: dict[str, Any], tensors: dict[str, Tensor]) -> "HeteroscedasticModel":
-        """Model of a spec and of the buffers' tensors."""
+    def skeleton(
+        cls, config: Mapping[str, Any], shapes: Shapes, n_features: int, n_outputs: int
+    ) -> "HeteroscedasticModel":
+        """Model without numbers."""
+        medians = checks.array(config["medians"], "medians", (len(_FAMILIES), 3))  # length scale, amplitude, constant
+        checks.require(medians[:, :2] > 0.0, medians[:, :2], "medians", "above 0")
+        checks.require(medians >= 0.0, medians, "medians", "at least 0")
+        if len(config["exact"]) != len(_FAMILIES):
+            raise ValueError(f"exact is {config['exact']!r:.80}, must be for {', '.join(_FAMILIES)}")
+        n_rows = sum(name.startswith("coefficient_weights_") for name in shapes)
+        if n_rows != n_outputs - 1:
+            raise ValueError(
+                f"it has coefficients of {n_rows} outputs, must have them of all {n_outputs} but the first"
+            )
+        e, d, m, a = n_features, n_outputs, size_of(shapes, "inducing"), size_of(shapes, "mean_inducing")
+        # A constant is one more feature.
+        in_mean, in_log_variance, in_row = (n + bool(row[2]) for n, row in zip((a, m, m), medians, strict=True))
+        sizes: dict[str, tuple[int, ...]] = {
+            "inducing": (m, e),
+            "mean_inducing": (a, e),
+            "mean_theta": (d, e + 1),
+            "mean_weights": (d * in_mean,),
+            "mean_root": (d * in_mean, d * in_mean),
+            "log_variance_theta": (d, e + 1),
+            "log_variance_weights": (d, in_log_variance),
+            "log_variance_root": (d, in_log_variance, in_log_variance),
+            "coefficient_theta": (d - 1, e + 1),
+            "pooled_tril": (d, d),
+            "prior_tril": (d, d),
+        }
+        for i in range(1, d):
+            sizes |= {f"coefficient_weights_{i}": (i * in_row,), f"coefficient_root_{i}": (i * in_row, i * in_row)}
+        optional = ("period", *(f"{name}_length_scale" for name in _FAMILIES))
         model = cls.__new__(cls)
         nn.Module.__init__(model)
-        for name, tensor in tensors.items():
-            model.register_buffer(name, tensor)
-        model.kernel, model.exact = spec["kernel"], [bool(exact) for exact in spec["exact"]]
-        model.medians = [(float(a), float(b), float(c)) for a, b, c in spec["medians"]]
+        for name, size in (sizes | {name: (e,) for name in optional if name in shapes}).items():
+            model.register_buffer(name, blank(*size))
+        model.kernel = checks.choice(config["kernel"], "kernel", KERNELS)
+        model.exact = [checks.flag(exact, "exact") for exact in config["exact"]]
+        model.medians = [tuple(row) for row in medians.tolist()]
         return model
 
     def forward(
@@ -97,6 +135,11 @@ class HeteroscedasticModel(nn.Module):
         """Mean, and a root of the predictive covariance: of the variability, of the error of its estimate and
         of the mean's, and of the prior with the share that missing data leave it.
         """
+        # It looks at numbers on its way, which no graph can hold.
+        moments = torch.compiler.disable(self._moments) if torch.compiler.is_compiling() else self._moments
+        return moments(x, prior_tril)
+
+    def _moments(self, x: Tensor, prior_tril: Tensor | None) -> tuple[Tensor, Tensor]:
         prior = self.prior_tril if prior_tril is None else prior_tril
         prepared = self._prepared()
         of_mean, *of_covariance, of_nearness = prepared.features(x)
@@ -109,7 +152,7 @@ class HeteroscedasticModel(nn.Module):
         known = _root_of_share(1.0 - missing) * torch.cat([root, error_root], dim=-1)
         return mean, torch.cat([known, _root_of_share(missing) * prior.expand(len(x), -1, -1)], dim=-1)
 
-    def mean(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d"]:
+    def predict_mean(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d"]:
         """Mean alone, equal to the bit."""
         prepared = self._prepared()
         return prepared.mean.expectation(prepared.features(x)[0])
@@ -201,8 +244,8 @@ class HeteroscedasticModel(nn.Module):
     def _family(self, number: int) -> ProcessFamily:
         inducing = self.inducing if number else self.mean_inducing
         features = FeatureMap(inducing, self.kernel, getattr(self, "period", None), self.exact[number])
-        name = ("mean", "log_variance", "coefficient")[number]
-        return ProcessFamily(features, *self.medians[number], getattr(self, f"{name}_length_scale", None))
+        length_scale = getattr(self, f"{_FAMILIES[number]}_length_scale", None)
+        return ProcessFamily(features, *self.medians[number], length_scale)
 
 
 def _missing(features: Tensor) -> Tensor:

@@ -1,0 +1,255 @@
+"""Save and load fitted estimators: one safetensors file whose header is JSON; nothing in it is ever executed.
+
+A file of format 1 holds of a regressor its class, its parameters, what its fit learned ("fitted"), the ``config()`` of
+its model's core ("module"), and as arrays the ``state_dict`` of the model. Of a controller it holds class, parameters,
+what its fit learned, as arrays its movement, and under "covariance_" all that of its regressor.
+"""
+
+import os
+import re
+import warnings
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from sklearn.utils.validation import check_is_fitted
+
+from torch_pbd import checks
+from torch_pbd.control.controller import DMPController
+from torch_pbd.control.impedance import Impedance
+from torch_pbd.control.parameters import check_parameters
+from torch_pbd.control.primitive.reproduction import Phase, Reproduction, primitive
+from torch_pbd.estimators.base import CovarianceRegressor
+from torch_pbd.exceptions import ModelFileError
+from torch_pbd.files.atomic import LOADERS
+from torch_pbd.files.tensors import Arrays, read_checksummed, write_checksummed
+from torch_pbd.persistence.plain import (
+    SAVED,
+    check_entries,
+    decode_learned,
+    decode_parameters,
+    encode,
+    encode_parameters,
+    is_ours,
+    learned_checks,
+)
+from torch_pbd.registry import REGRESSORS
+
+FORMAT_VERSION = 1
+_KEY = "torch_pbd"
+_PART = "covariance_."  # before the names of the arrays of a controller's regressor
+_FOREIGN = re.compile(
+    r"\.(pkl|pickle|joblib|skops|pt|pth|ckpt|bin|onnx|np[yz]|h5|hdf5|mat|zip|json|ya?ml|toml|csv|txt|parquet)", re.I
+)
+# What parts that do not fit together raise.
+_UNSOUND = (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError)
+
+# Arrays of a model by the last part of their name. Infinite ones mean that there is none; logarithms above 300 are of
+# factors whose squares are no numbers.
+_MAY_BE_INFINITE = ("period", "log_density_floor")
+_POSITIVE = ("x_scale", "y_scale", "length_scale", "counts", "period")
+_NOT_NEGATIVE = ("amplitude", "noise_ratio")
+_FACTORS = ("prior_tril", "pooled_tril")
+_LARGEST_LOGARITHM = 300.0
+
+# Arrays of a controller: for each output one number, but for the forcing.
+_NOISE, _MOTION = ("noise_scale_", "noise_share_"), ("start", "velocity", "goal", "forcing")
+_HOLES = "unsampled_"  # where there are any: other files are as those of versions that knew of none
+
+
+def save(estimator: CovarianceRegressor | DMPController, path: str | os.PathLike[str]) -> None:
+    """Save a fitted estimator to one file, which is there whole or not at all.
+
+    Parameters
+    ----------
+    estimator : fitted covariance regressor or DMPController
+    path : path-like
+        File to write; by custom it ends in ``.safetensors``, never as other formats (``.pkl``, ``.npz``). Its folder
+        must exist.
+
+    Raises
+    ------
+    sklearn.exceptions.NotFittedError
+        If the estimator is not fitted.
+    TypeError
+        If it is not one of this package, has attributes that this package did not give it, or a parameter (a callable
+        prior, a random state object) cannot be written as JSON.
+    ValueError
+        If it is not sound, and could not be loaded again; or if the suffix is another format's.
+    """
+    if _FOREIGN.fullmatch(Path(path).suffix):
+        raise ValueError(f"path={str(path)!r} has the suffix of another format: take .safetensors.")
+    name = type(estimator).__name__
+    if not is_ours(estimator):
+        raise TypeError(f"estimator is a {name}; can save {', '.join(SAVED)}. In a pipeline, save that step.")
+    check_is_fitted(estimator)
+    description, arrays = _described(estimator)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of a device that is not here: who loads the file is warned
+            _restored(description, arrays)
+    except _UNSOUND as error:
+        raise ValueError(f"the {name} cannot be saved, as it is not sound: {_brief(error)}.") from error
+    versions = {package: version(package) for package in ("torch", "scikit-learn", "numpy")}
+    header = {"format_version": FORMAT_VERSION, **description, "versions": versions}
+    write_checksummed(Path(path), _KEY, header, arrays)
+
+
+def load(path: str | os.PathLike[str]) -> Any:
+    """Load an estimator that :func:`save` wrote: it predicts the same to the last bit.
+
+    One that was fitted on a device which this machine lacks is put on the CPU, with a warning.
+
+    Nothing in the file is executed, and no more is allocated than a small multiple of its size, whoever made it: names
+    of classes, parameters, attributes and arrays are looked up in closed tables, and all shapes compared. What
+    well-formed numbers say is believed.
+
+    Raises
+    ------
+    FileNotFoundError
+        If there is no such file.
+    ModelFileError
+        If it is damaged, of a newer format, or no model of this package.
+    """
+    path = Path(path)
+    try:
+        header, arrays = read_checksummed(path, _KEY, FORMAT_VERSION)
+    except ModelFileError as error:
+        if not _FOREIGN.fullmatch(path.suffix):
+            raise
+        raise ModelFileError(f"{error} {LOADERS} Pickles are never loaded.") from error
+    if header.get("class") not in list(SAVED):  # a list asks for no hash
+        raise ModelFileError(f"{path} holds a {header.get('class')!r:.80}; known are {', '.join(SAVED)}.")
+    try:
+        if not isinstance(header.pop("versions", None), dict) or header.pop("format_version") != FORMAT_VERSION:
+            raise ValueError("it does not say what wrote it")
+        return _restored(header, arrays)
+    except _UNSOUND as error:
+        raise ModelFileError(f"{path} does not describe a whole {header['class']} ({_brief(error)}).") from error
+
+
+def _brief(error: BaseException) -> str:
+    return " ".join(str(error).split())[:500].rstrip(".")
+
+
+def _described(estimator: Any) -> tuple[dict[str, Any], Arrays]:
+    """Class, parameters and what was learned, as JSON can hold it; and the arrays."""
+    return _described_controller(estimator) if isinstance(estimator, DMPController) else _described_regressor(estimator)
+
+
+def _restored(description: Any, arrays: Arrays) -> Any:
+    """Estimator of a description and its arrays."""
+    estimator = decode_parameters(description)
+    restore = _restore_controller if isinstance(estimator, DMPController) else _restore_regressor
+    restore(estimator, description, arrays)
+    return estimator
+
+
+def _described_regressor(estimator: CovarianceRegressor) -> tuple[dict[str, Any], Arrays]:
+    state = estimator.__getstate__()
+    arrays, config = state.pop("_module_arrays"), state.pop("_module_config")
+    learned = {key: value for key, value in state.items() if key not in estimator.get_params(deep=False)}
+    unknown = set(learned) - {*learned_checks(estimator), "feature_names_in_"}
+    if unknown:
+        raise TypeError(
+            f"estimator has an attribute {min(unknown)!r}, which a model file cannot hold: delete it, or pickle the "
+            "estimator."
+        )
+    fitted = {key: encode(value, key) for key, value in learned.items()}
+    return {**encode_parameters(estimator), "module": config, "fitted": fitted}, arrays
+
+
+def _restore_regressor(estimator: Any, description: dict[str, Any], arrays: Arrays) -> None:
+    check_entries(description, {"class", "params", "fitted", "module"}, "its header")
+    learned = decode_learned(estimator, description["fitted"])
+    for name, array in arrays.items():
+        _check_numbers(name, array)
+    state = {"_module_config": description["module"], "_module_arrays": arrays}
+    estimator.__setstate__({**vars(estimator), **learned, **state})
+    module = estimator.module_
+    sizes = (len(module.x_shift), len(module.y_shift))
+    if sizes != (estimator.n_features_in_, estimator.n_outputs_):
+        raise ValueError(f"its arrays are for {sizes[0]} inputs and {sizes[1]} outputs, it says otherwise")
+    if estimator._y_is_1d and estimator.n_outputs_ != 1:
+        raise ValueError(f"it says that y was 1-D, and that there are {estimator.n_outputs_} outputs")
+    if len(learned.get("feature_names_in_", module.x_shift)) != sizes[0]:
+        raise ValueError(f"it has not {sizes[0]} names of inputs")
+    if "df_" in learned and module.core.covariance.prior_root.shape[1] != estimator.df_:
+        raise ValueError(f"df_ is {estimator.df_}, its arrays are for another")
+    # What can be said of numbers that are well-formed is whether they predict at the middle of their data.
+    mean, scale_tril = module(module.x_shift[None])
+    sound = mean.isfinite().all() and scale_tril.isfinite().all() and (scale_tril.diagonal(dim1=-2, dim2=-1) > 0).all()
+    if not bool(sound):
+        raise ValueError("it predicts no mean and positive definite covariance at the middle of its data")
+
+
+def _check_numbers(name: str, array: Any) -> None:
+    """Check that an array is of float64 in the range that those of its name have; of any shape."""
+    if array.dtype != np.float64:
+        raise ValueError(f"array {name!r:.80} is of {array.dtype}, must be of float64")
+    last = name.rpartition(".")[2]
+    finite = ~np.isnan(array) if last in _MAY_BE_INFINITE else np.isfinite(array)
+    checks.require(finite, array, name, "finite")
+    if last.endswith(_POSITIVE):
+        checks.require(array > 0.0, array, name, "above 0")
+    if last.endswith(_NOT_NEGATIVE):
+        checks.require(array >= 0.0, array, name, "at least 0")
+    if last == "log_diagonal":
+        checks.require(np.abs(array) < _LARGEST_LOGARITHM, array, name, f"below {_LARGEST_LOGARITHM:g} in size")
+    factor = np.atleast_2d(array)
+    if last in _FACTORS and ((factor != np.tril(factor)).any() or (np.diagonal(factor) <= 0.0).any()):
+        raise ValueError(f"array {name!r:.80} must be the lower factor of a positive definite matrix")
+
+
+def _described_controller(controller: DMPController) -> tuple[dict[str, Any], Arrays]:
+    fitted = {name: encode(getattr(controller, name), name) for name in learned_checks(controller)}
+    arrays = {name: getattr(controller, name) for name in _NOISE}
+    arrays |= {name: getattr(controller.reproduction_, name) for name in _MOTION}
+    if controller.unsampled_.any():
+        arrays[_HOLES] = controller.unsampled_
+    regressor, parts = _described(controller.covariance_)
+    arrays |= {_PART + key: value for key, value in parts.items()}
+    return {**encode_parameters(controller), "fitted": fitted, "covariance_": regressor}, arrays
+
+
+def _restore_controller(controller: Any, description: dict[str, Any], arrays: Arrays) -> None:
+    check_entries(description, {"class", "params", "fitted", "covariance_"}, "its header")
+    regressor = description["covariance_"]
+    if not isinstance(regressor, dict) or regressor.get("class") not in list(REGRESSORS):
+        raise ValueError("its covariance is no regressor")
+    parts = {key.removeprefix(_PART): value for key, value in arrays.items() if key.startswith(_PART)}
+    own = {key: value for key, value in arrays.items() if not key.startswith(_PART)}
+    learned = decode_learned(controller, description["fitted"])
+    vars(controller).update(learned)
+    check_parameters(controller)
+    controller.covariance_, d = _restored(regressor, parts), controller.n_outputs_
+    if (controller.covariance_.n_features_in_, controller.covariance_.n_outputs_) != (1, d):
+        raise ValueError(f"its regressor must have 1 input, time, and {d} outputs")
+    for name in ("names_", "units_"):
+        if learned[name] is not None:
+            if len(learned[name]) != d:
+                raise ValueError(f"{name} has {len(learned[name])} entries, must have {d}")
+            setattr(controller, name, tuple(learned[name]))
+    own.setdefault(_HOLES, np.zeros(2))  # none at the start, none at the end
+    _check_movement(own, d)
+    for name in (*_NOISE, _HOLES):
+        setattr(controller, name, own.pop(name))
+    controller.dmp_ = dmp = primitive(controller)
+    phase, time = Phase(dmp, controller.phase_input), np.linspace(0.0, controller.duration_, len(own["forcing"]))
+    controller.reproduction_ = Reproduction(dmp, phase, controller.goal == "each", time=time, **own)
+    controller.start_, controller.goal_ = own["start"], own["goal"]
+    controller._impedance = Impedance(controller.law_, controller.mass, controller.damping_ratio, controller.on_unknown)
+
+
+def _check_movement(arrays: Arrays, n_outputs: int) -> None:
+    """Check the arrays of a controller's own."""
+    shapes: dict[str, tuple[int | str, ...]] = dict.fromkeys((*_NOISE, *_MOTION), (n_outputs,))
+    shapes |= {"forcing": ("m", n_outputs), _HOLES: ("m",)}
+    check_entries(arrays, set(shapes), "its arrays")
+    for name, array in arrays.items():
+        _check_numbers(name, array)
+        checks.array(array, name, shapes[name])
+    checks.require((arrays[_HOLES] >= 0.0) & (arrays[_HOLES] <= 1.0), arrays[_HOLES], _HOLES, "a share from 0 to 1")
+    if min(len(arrays["forcing"]), len(arrays[_HOLES])) < 2:
+        raise ValueError(f"forcing and {_HOLES} must have a row at the start and one at the end")
