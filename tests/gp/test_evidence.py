@@ -4,7 +4,6 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from gp.oracle import negative_log_evidence
 from scipy.stats import multivariate_normal
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
@@ -19,10 +18,9 @@ from torch_pbd.gp import (
     condition,
     fit_hyperparameters,
     fit_together,
+    negative_log_evidence,
     spacing,
 )
-from torch_pbd.gp.evidence import Evidence
-from torch_pbd.gp.projection import FULL, Basis
 from torch_pbd.optim import Status, minimize
 
 LENGTH_BOUNDS = (0.02, 10.0)
@@ -40,14 +38,6 @@ def tensor(array):
 def once(x, y):
     """Observations of rows of y, one at each input."""
     return Observations(tensor(x), tensor(np.atleast_2d(y)), torch.ones(len(x), dtype=torch.float64))
-
-
-def evidence_at(observations, hyperparameters, kernel="squared_exponential"):
-    """Negative log evidence of given hyperparameters, whose amplitude follows from a noise that is held."""
-    noise_scale = hyperparameters.amplitude * hyperparameters.noise_ratio.sqrt()
-    evidence = Evidence(Basis(observations, FULL), observations.targets, kernel, noise_scale)
-    scale = hyperparameters.length_scale.expand(len(noise_scale), -1)
-    return evidence(scale, hyperparameters.noise_ratio, torch.arange(len(scale)))[0]
 
 
 def noisy(signal, n, rng, n_processes=10):
@@ -86,7 +76,7 @@ def test_evidence_is_that_of_scikit_learn(kernel, oracle, length_scale, rng):
         model = GaussianProcessRegressor(
             ConstantKernel(amplitude**2) * oracle(length_scale), alpha=noise_scale**2 / n, optimizer=None
         ).fit(x, y)
-        found = evidence_at(observations, hyperparameters, kernel)
+        found = negative_log_evidence(observations, hyperparameters, kernel)
         np.testing.assert_allclose(found, [-model.log_marginal_likelihood_value_], rtol=1e-9)
 
 
@@ -103,14 +93,14 @@ def test_evidence_of_means_is_that_of_all_rows_but_for_their_scatter(rng):
     )
     means = Observations(tensor(x[:, None]), tensor([[float(row.mean()) for row in rows]]), tensor(counts))
     hyperparameters = Hyperparameters(tensor([[0.4]]), tensor([amplitude]), tensor([(noise_scale / amplitude) ** 2]))
-    assert evidence_at(means, hyperparameters).item() == pytest.approx(all_rows - scatter, rel=1e-9)
+    assert negative_log_evidence(means, hyperparameters).item() == pytest.approx(all_rows - scatter, rel=1e-9)
 
 
 def test_evidence_is_not_a_number_only_where_the_kernel_matrix_is_singular(generator):
     inputs = torch.linspace(0, 1, 30, dtype=torch.float64)[:, None]
     targets = torch.randn(2, 30, dtype=torch.float64, generator=generator)
     hyperparameters = Hyperparameters(tensor([[5.0], [0.02]]), tensor([1.0, 1.0]), tensor([0.0, 0.0]))
-    found = evidence_at(Observations(inputs, targets, torch.ones(30).double()), hyperparameters)
+    found = negative_log_evidence(Observations(inputs, targets, torch.ones(30).double()), hyperparameters)
     assert found.isnan().tolist() == [True, False]
 
 

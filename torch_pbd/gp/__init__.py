@@ -1,5 +1,6 @@
 """Batches of independent Gaussian processes over the same inputs: eq. (3) to (6), and their evidence."""
 
+from torch_pbd.gp.evidence import negative_log_evidence
 from torch_pbd.gp.grid import EvidenceSearch
 from torch_pbd.gp.latent import LatentGP, condition
 from torch_pbd.gp.latent_values import LatentValues
@@ -23,6 +24,7 @@ __all__ = [
     "fit_hyperparameters",
     "fit_together",
     "merge_observations",
+    "negative_log_evidence",
     "neighbourhoods",
     "resolved_length_scale",
     "spacing",

@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from torch_pbd.gp.projection import Basis
+from torch_pbd.gp.neighbourhoods import Hyperparameters, Observations
+from torch_pbd.gp.projection import FULL, Basis
 from torch_pbd.kernels import correlation, value_and_slope
 
 _LEAST_VARIANCE = 1e-200  # squared amplitude of targets that are all zero
@@ -136,6 +137,17 @@ class Evidence:
         factor, info = torch.linalg.cholesky_ex(covariance)
         solved = torch.cholesky_solve(self.targets[rows].unsqueeze(-1), factor).squeeze(-1)
         return torch.where(info[:, None] == 0, solved, math.nan)
+
+
+def negative_log_evidence(
+    observations: Observations, hyperparameters: Hyperparameters, kernel: str = "squared_exponential"
+) -> Float[Tensor, " b"]:
+    """Negative log evidence of processes with noise, in nats; NaN where the covariance is not positive definite."""
+    noise_scale = hyperparameters.amplitude * hyperparameters.noise_ratio.sqrt()
+    evidence = Evidence(Basis(observations, FULL), observations.targets, kernel, noise_scale)
+    length_scale = hyperparameters.length_scale.expand(len(noise_scale), -1)
+    rows = torch.arange(len(noise_scale), device=noise_scale.device)
+    return evidence(length_scale, hyperparameters.noise_ratio, rows)[0]
 
 
 def _inverse_and_log_det(matrix: Float[Tensor, "a r r"]) -> tuple[Tensor, Tensor]:

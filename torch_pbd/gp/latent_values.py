@@ -98,8 +98,8 @@ class LatentValues(nn.Module):
         deviation = (basis @ whitened.unsqueeze(-1)).squeeze(-1)
         return (self.log_amplitude.exp()[:, None] * deviation).mT
 
-    def pulled_back(self, gradient: Float[Tensor, "n b"]) -> Float[Tensor, "b r"]:
-        """Gradient in the whitened values of what has this one in the deviations."""
+    def vjp(self, gradient: Float[Tensor, "n b"]) -> Float[Tensor, "b r"]:
+        """Gradient in the whitened values, from that in the deviations."""
         scaled = self.log_amplitude.exp()[:, None] * gradient.mT
         return (self.basis.mT @ scaled.unsqueeze(-1)).squeeze(-1)
 
