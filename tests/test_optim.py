@@ -6,11 +6,23 @@ import torch
 from scipy.optimize import rosen
 
 from torch_pbd.exceptions import NotPositiveDefiniteError
-from torch_pbd.optim import FitReport, Status, by_autograd, first_failure, minimize, minimize_batch, minimize_scoring
+from torch_pbd.optim import FitReport, Status, first_failure, minimize, minimize_batch, minimize_scoring
 
 
 def parameter(*values):
     return torch.tensor(values, dtype=torch.float64, requires_grad=True)
+
+
+def by_autograd(objective):
+    """Values and gradients of losses (a,) of unrelated problems."""
+
+    def value_and_gradient(x, rows):
+        leaf = x.detach().requires_grad_()
+        loss = objective(leaf, rows)
+        (gradient,) = torch.autograd.grad(loss.sum(), leaf)
+        return loss.detach(), gradient
+
+    return value_and_gradient
 
 
 def rosenbrock(x):

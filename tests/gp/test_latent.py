@@ -238,11 +238,11 @@ def test_the_normal_matrix_is_the_hessian_of_autograd(length_scale, members, gen
     torch.testing.assert_close(found.tril(), hessian.tril(), rtol=1e-9, atol=1e-12 * float(hessian.abs().max()))
 
 
-def test_a_gradient_is_pulled_back_as_by_autograd(generator):
+def test_the_vjp_is_that_of_autograd(generator):
     _, latent = smooth(tensor([[0.1]]), False)
     weight = torch.randn(30, 2, dtype=torch.float64, generator=generator)
     (expected,) = torch.autograd.grad((weight * latent()).sum(), latent.whitened)
-    torch.testing.assert_close(latent.pulled_back(weight), expected, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(latent.vjp(weight), expected, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("train_hyperparameters", [False, True])

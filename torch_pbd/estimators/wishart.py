@@ -202,7 +202,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         observations = observed(root)
         hyperparameters, report = self._smoothing(observations, problem)
         warn_if_stretched(hyperparameters.amplitude, observations.targets, given=problem.length_scale is not None)
-        basis = Basis.of(observations, FULL)
+        basis = Basis(observations, FULL)
         latent, jitter = condition(observations, hyperparameters, self.kernel, basis=basis)
         # That the vectors are noisy is no reason for the prior to have a share in them where there are data.
         certain = replace(hyperparameters, noise_ratio=hyperparameters.noise_ratio.clamp_max(_CERTAIN))

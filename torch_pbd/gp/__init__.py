@@ -4,8 +4,14 @@ from torch_pbd.gp.evidence import negative_log_evidence
 from torch_pbd.gp.grid import EvidenceSearch
 from torch_pbd.gp.latent import LatentGP, condition
 from torch_pbd.gp.latent_values import LatentValues
-from torch_pbd.gp.neighbourhoods import merge_observations, neighbourhoods, resolved_length_scale, spacing
-from torch_pbd.gp.observations import Hyperparameters, Observations
+from torch_pbd.gp.neighbourhoods import (
+    Hyperparameters,
+    Observations,
+    merge_observations,
+    neighbourhoods,
+    resolved_length_scale,
+    spacing,
+)
 from torch_pbd.gp.search import fit_hyperparameters, fit_together
 
 __all__ = [

@@ -4,9 +4,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torch_pbd.gp.observations import Hyperparameters, Observations
-from torch_pbd.gp.projection import Basis, basis_for
-from torch_pbd.kernels import KernelName, correlation
+from torch_pbd.gp.neighbourhoods import Hyperparameters, Observations
+from torch_pbd.gp.projection import FULL, Basis
+from torch_pbd.kernels import correlation
 from torch_pbd.linalg import cholesky_with_jitter, safe_cholesky
 
 
@@ -26,7 +26,7 @@ class LatentGP(nn.Module):
         Of the b processes; ``length_scale`` of shape (1, e) where all share it.
     counts : Tensor of shape (n,)
         Observations behind each value; they divide the noise variance.
-    kernel : KernelName
+    kernel : str
     root : Tensor of shape (r, n), default=None
         Where the inputs are nodes: what was observed are r combinations of the values there.
     """
@@ -46,7 +46,7 @@ class LatentGP(nn.Module):
         value_weight: Float[Tensor, "b n"],
         hyperparameters: Hyperparameters,
         counts: Float[Tensor, " n"],
-        kernel: KernelName = "squared_exponential",
+        kernel: str = "squared_exponential",
         root: Float[Tensor, "r n"] | None = None,
     ) -> None:
         super().__init__()
@@ -111,25 +111,24 @@ class LatentGP(nn.Module):
 def condition(
     observations: Observations,
     hyperparameters: Hyperparameters,
-    kernel: KernelName = "squared_exponential",
+    kernel: str = "squared_exponential",
     values: Float[Tensor, "b n"] | None = None,
     *,
     basis: Basis | None = None,
 ) -> tuple[LatentGP, float]:
     """Gaussian processes conditioned on noisy observations, and the relative jitter that needed.
 
-    ``values`` are those whose prior mean is zero, if they are others than the targets. Of a ``basis`` that carries
-    the processes (by default the smallest), the nodes are the inputs of what is returned.
+    ``values`` are those whose prior mean is zero, if they are others than the targets. The nodes of a ``basis`` that
+    carries the processes, by default all inputs, are the inputs of what is returned.
     """
     values = observations.targets if values is None else values
-    if basis is None:
-        basis = basis_for(observations, hyperparameters.length_scale, hyperparameters.noise_ratio, kernel)
-    targets = basis.project(torch.cat([observations.targets, values])).targets
+    basis = Basis(observations, FULL) if basis is None else basis
+    targets, _ = basis.project(torch.cat([observations.targets, values]))
     gram = basis.covariance(correlation(basis.nodes, basis.nodes, hyperparameters.length_scale, kernel))
     gram = gram + hyperparameters.noise_ratio[:, None, None] * torch.eye(gram.shape[-1]).to(gram)
     factor, jitter = cholesky_with_jitter(gram, name="the kernel matrix of the training inputs")
     solved = torch.cholesky_solve(targets.reshape(2, -1, gram.shape[-1]).permute(1, 2, 0), factor)
-    weight, value_weight = basis.lowered(solved).unbind(-1)
+    weight, value_weight = basis.node_weights(solved).unbind(-1)
     root = None if basis.root is None else basis.root.clone(memory_format=torch.contiguous_format)
     parts = (weight.contiguous(), value_weight.contiguous(), hyperparameters, basis.counts.clone(), kernel, root)
     return LatentGP(basis.nodes.clone(), *parts), jitter

@@ -1,14 +1,32 @@
-"""Distances between training inputs, and the merging of neighbours where there are too many inputs."""
+"""Observations of processes, distances between their inputs, and merging of neighbours where there are too many."""
 
 import heapq
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from torch_pbd.gp.observations import Observations
-
 _SHORTEST = 0.75  # spacings of the inputs: shorter "needles" explain each point by itself
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Targets of b processes at n distinct inputs, the mean of ``counts`` observations each."""
+
+    inputs: Float[Tensor, "n e"]
+    targets: Float[Tensor, "b n"]
+    counts: Float[Tensor, " n"]
+
+
+@dataclass(frozen=True)
+class Hyperparameters:
+    """Hyperparameters of b processes; one length scale where all share it."""
+
+    length_scale: Float[Tensor, "g e"]
+    amplitude: Float[Tensor, " b"]
+    noise_ratio: Float[Tensor, " b"]
+    """Noise variance over the squared amplitude."""
 
 
 def resolved_length_scale(inputs: Float[Tensor, "n e"]) -> float:
@@ -22,11 +40,9 @@ def spacing(inputs: Float[Tensor, "n e"], quantile: float = 0.9) -> float:
     """Distance to the nearest other input, a quantile over the inputs; the finest detail they show."""
     if inputs.shape[1] == 1 and len(inputs) > 1:
         gap = torch.nn.functional.pad(inputs[:, 0].sort().values.diff(), (1, 1), value=float("inf"))
-        ordered = torch.minimum(gap[1:], gap[:-1]).sort().values
-        place = quantile * (len(ordered) - 1)
-        low, high = (
-            ordered[int(place) : int(place) + 2].tolist() if place < len(ordered) - 1 else [float(ordered[-1])] * 2
-        )
+        nearest = torch.minimum(gap[1:], gap[:-1]).sort().values.tolist()
+        place = quantile * (len(nearest) - 1)
+        low, high = nearest[int(place)], nearest[min(int(place) + 1, len(nearest) - 1)]
         return float(low + (place - int(place)) * (high - low))
     chosen = torch.arange(0, len(inputs), max(1, len(inputs) // 1000), device=inputs.device)
     distance = torch.cdist(inputs[chosen], inputs, compute_mode="donot_use_mm_for_euclid_dist")
@@ -47,7 +63,7 @@ def neighbourhoods(inputs: Float[Tensor, "n e"], max_inputs: int) -> Int64[Tenso
     if inputs.shape[1] == 1:
         runs = everything * max_inputs // len(inputs)
         return torch.empty_like(runs).index_copy(0, inputs[:, 0].argsort(stable=True), runs)
-    groups = [(-len(inputs), "", everything)]  # the second tells the way through the halves, and is never equal
+    groups = [(-len(inputs), "", everything)]  # the second is the way through the halves, and never equal
     for _ in range(1, max_inputs):
         _, way, group = heapq.heappop(groups)
         members = inputs[group]
@@ -55,7 +71,7 @@ def neighbourhoods(inputs: Float[Tensor, "n e"], max_inputs: int) -> Int64[Tenso
         low, high = group[members[:, widest].argsort(stable=True)].tensor_split(2)
         heapq.heappush(groups, (-len(low), way + "0", low))
         heapq.heappush(groups, (-len(high), way + "1", high))
-    index = torch.empty(len(inputs), dtype=torch.long, device=inputs.device)
+    index = torch.empty_like(everything)
     for number, (_, _, group) in enumerate(sorted(groups, key=lambda entry: entry[1])):
         index[group] = number
     return index

@@ -1,32 +1,30 @@
 """Observations brought down to what a smooth kernel can tell of them: cost no longer depends on their number."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torch_pbd.gp.neighbourhoods import merge_observations, resolved_length_scale
-from torch_pbd.gp.observations import Observations
-from torch_pbd.kernels import KernelName
+from torch_pbd.gp.neighbourhoods import Observations, merge_observations, resolved_length_scale
+from torch_pbd.kernels import KERNELS
 
-_N_NODES = (32, 48, 88, 168)
+_N_NODES = (32, 48, 88, 168)  # twice the cost of a decomposition, or six times, from one to the next
 _WORTH = 1.5  # inputs for each node, below which nothing is gained
-_LEAST_NOISE_RATIO = 0.999e-10  # what the nodes cannot tell is treated as noise, so there must be some
 
 
-@dataclass(frozen=True)
-class Resolution:
+class Resolution(NamedTuple):
     """How finely observations are looked at."""
 
     n_nodes: int | None
     """Chebyshev nodes; by None the inputs, or the centres of their neighbourhoods."""
     max_inputs: int | None
-    """Of the neighbourhoods."""
+    """Largest number of neighbourhoods; by None each input is for itself."""
     shortest_length_scale: float
-    """What it carries."""
+    """Shortest length scale that it carries."""
 
 
 FULL = Resolution(None, None, 0.0)
@@ -34,24 +32,24 @@ FULL = Resolution(None, None, 0.0)
 
 
 def resolutions(
-    observations: Observations, kernel: KernelName, *, noisy: bool, max_inputs: int | None = None
+    observations: Observations, kernel: str, *, noisy: bool, max_inputs: int | None = None
 ) -> list[Resolution]:
-    """Those to try, the coarsest first."""
+    """Resolutions to try, the coarsest first; what nodes do not carry is treated as noise, so there must be some."""
     n_inputs, n_features = observations.inputs.shape
     finest = FULL
     if noisy and max_inputs is not None and n_inputs > max_inputs:
         centres = merge_observations(replace(observations, targets=observations.targets[:0]), max_inputs).inputs
         finest = Resolution(None, max_inputs, resolved_length_scale(centres))
-    if not noisy or n_features > 1 or kernel != "squared_exponential":
+    if not noisy or n_features > 1 or not KERNELS[kernel].on_nodes:
         return [finest]
     extent = float(observations.inputs.max() - observations.inputs.min())
     sizes = [size for size in _N_NODES if min(n_inputs, max_inputs or n_inputs) >= _WORTH * size]
-    return [*(Resolution(size, None, extent * _shortest(size)) for size in sizes), finest]
+    # Interpolation is exact to 1e-13 down to this length scale (fitted; within 10 %).
+    return [*(Resolution(size, None, extent * 4.0 / (size - 8)) for size in sizes), finest]
 
 
-@dataclass(frozen=True)
 class Basis:
-    """Coordinates r of weighted observations at n inputs, in which what a process says of them is told by m nodes.
+    """Coordinates r of weighted observations at n inputs, in which a process is that of m nodes.
 
     With W the counts, the observations ``W^1/2 y`` have the covariance ``W^1/2 C W^1/2 + ratio * I`` over the squared
     amplitude. On a line the squared exponential C is ``B C_nodes B'`` to rounding, B the polynomial interpolation
@@ -59,98 +57,62 @@ class Basis:
     ``Q' W^1/2 y`` have the covariance ``root C_nodes root' + ratio * I``, and the remainder is noise alone.
     Where the nodes are the inputs the root is ``W^1/2``; where they are centres of neighbourhoods B is the
     membership, and the remainder what the members differ by.
+
+    Parameters
+    ----------
+    observations : Observations
+        Whose inputs and counts count; the targets do not.
+    resolution : Resolution
     """
 
-    nodes: Float[Tensor, "m e"]
-    counts: Float[Tensor, " m"]
-    """Square of the root's diagonal, where it is diagonal; else ones."""
-    root: Float[Tensor, "r m"] | None
-    orthogonal: Float[Tensor, "n r"] | None
+    root: Float[Tensor, "r m"] | None = None
+    """None where it is diagonal, with the roots of the nodes' counts."""
+    orthogonal: Float[Tensor, "n r"] | None = None
     """Q; None where it is the membership."""
-    observations: Observations
-    """Whose inputs and counts these are; without targets."""
-    resolution: Resolution
 
-    @classmethod
-    def of(cls, observations: Observations, resolution: Resolution) -> "Basis":
-        """Basis of the inputs and counts of observations."""
-        bare = replace(observations, targets=observations.targets[:0])
-        if resolution.n_nodes is None:
-            merged = bare if resolution.max_inputs is None else merge_observations(bare, resolution.max_inputs)
-            return cls(merged.inputs, merged.counts, None, None, bare, resolution)
-        nodes, interpolation = _interpolation(observations.inputs[:, 0], resolution.n_nodes)
-        orthogonal, root = torch.linalg.qr(observations.counts.sqrt()[:, None] * interpolation)
-        return cls(nodes[:, None], torch.ones_like(nodes), root, orthogonal, bare, resolution)
+    def __init__(self, observations: Observations, resolution: Resolution) -> None:
+        self.observations = replace(observations, targets=observations.targets[:0])
+        self.resolution = resolution
+        if resolution.n_nodes is not None:
+            nodes, interpolation = _interpolation(observations.inputs[:, 0], resolution.n_nodes)
+            self.orthogonal, self.root = torch.linalg.qr(observations.counts.sqrt()[:, None] * interpolation)
+            self.nodes, self.counts = nodes[:, None], torch.ones_like(nodes)
+        else:
+            merged = merge_observations(self.observations, resolution.max_inputs or len(observations.counts))
+            self.nodes, self.counts = merged.inputs, merged.counts
 
-    def project(self, targets: Float[Tensor, "b n"]) -> "Projection":
-        """Coordinates of targets."""
-        data = self.observations
-        weighted = targets * data.counts.sqrt()
+    def project(self, targets: Float[Tensor, "b n"]) -> tuple[Float[Tensor, "b r"], Float[Tensor, " b"]]:
+        """Coordinates of targets, and the squared norm of what is outside the basis."""
+        weighted = targets * self.observations.counts.sqrt()
         if self.orthogonal is not None:
             inside = weighted @ self.orthogonal
-            remainder = (weighted - inside @ self.orthogonal.mT).square().sum(1)
-        elif self.resolution.max_inputs is not None:
-            inside = merge_observations(replace(data, targets=targets), self.resolution.max_inputs).targets
-            inside = inside * self.counts.sqrt()
-            remainder = (weighted.square().sum(1) - inside.square().sum(1)).clamp_min(0.0)
-        else:
-            inside, remainder = weighted, torch.zeros_like(weighted[:, 0])
-        return Projection(self, inside, remainder, weighted, len(data.counts), float(data.counts.log().sum()))
+            return inside, (weighted - inside @ self.orthogonal.mT).square().sum(1)
+        if self.resolution.max_inputs is None:
+            return weighted, torch.zeros_like(weighted[:, 0])
+        merged = merge_observations(replace(self.observations, targets=targets), self.resolution.max_inputs)
+        inside = merged.targets * self.counts.sqrt()
+        return inside, (weighted.square().sum(1) - inside.square().sum(1)).clamp_min(0.0)
 
     def covariance(self, correlation: Float[Tensor, "*b m m"]) -> Float[Tensor, "*b r r"]:
-        """Of the coordinates over the squared amplitude, without noise, from the correlation of the nodes."""
+        """Covariance of the coordinates over the squared amplitude, without noise, from the nodes' correlation."""
         if self.root is not None:
             return self.root @ correlation @ self.root.mT
         return correlation * self._weights
 
-    @cached_property
-    def _weights(self) -> Float[Tensor, "m m"]:
-        """Of the entries of a covariance, where the root is diagonal."""
-        weight = self.counts.sqrt()
-        return weight[:, None] * weight
-
-    def pulled_back(self, matrix: Float[Tensor, "*b r r"]) -> Float[Tensor, "*b m m"]:
-        """``root' matrix root``: the gradient by the correlation of the nodes, given that by the covariance."""
+    def covariance_vjp(self, gradient: Float[Tensor, "*b r r"]) -> Float[Tensor, "*b m m"]:
+        """``root' gradient root``: gradient by the correlation of the nodes, from that by the covariance."""
         if self.root is not None:
-            return self.root.mT @ matrix @ self.root
-        return self.covariance(matrix)
+            return self.root.mT @ gradient @ self.root
+        return gradient * self._weights
 
-    def lowered(self, values: Float[Tensor, "*b r q"]) -> Float[Tensor, "*b m q"]:
+    def node_weights(self, values: Float[Tensor, "*b r q"]) -> Float[Tensor, "*b m q"]:
         """``root' values``: weights of the correlations with the nodes."""
         return self.root.mT @ values if self.root is not None else self.counts.sqrt()[:, None] * values
 
-
-@dataclass(frozen=True)
-class Projection:
-    """Observations of b processes in the coordinates of a basis."""
-
-    basis: Basis
-    targets: Float[Tensor, "b r"]
-    remainder: Float[Tensor, " b"]
-    """Squared norm of what is outside the basis."""
-    weighted: Float[Tensor, "b n"]
-    """The observations times the roots of their counts."""
-    n_inputs: int
-    sum_log_counts: float
-
-    @property
-    def n_outside(self) -> int:
-        """Dimensions that are noise alone."""
-        return self.n_inputs - self.targets.shape[1]
-
-
-def basis_for(observations: Observations, length_scale: Tensor, noise_ratio: Tensor, kernel: KernelName) -> Basis:
-    """The coarsest basis that carries the length scales."""
-    noisy = bool((noise_ratio >= _LEAST_NOISE_RATIO).all())
-    levels = resolutions(observations, kernel, noisy=noisy)
-    shortest = 1.0001 * float(length_scale.min())  # a search ends at the bound but for rounding
-    level = next((level for level in levels if shortest >= level.shortest_length_scale), levels[-1])
-    return Basis.of(observations, level)
-
-
-def _shortest(n_nodes: int) -> float:
-    """Length scale, of a range of one, down to which interpolation is exact to 1e-13 (fitted; within 10 %)."""
-    return 4.0 / (n_nodes - 8)
+    @cached_property
+    def _weights(self) -> Float[Tensor, "m m"]:
+        weight = self.counts.sqrt()
+        return weight[:, None] * weight
 
 
 def _interpolation(x: Float[Tensor, " n"], n_nodes: int) -> tuple[Tensor, Tensor]:

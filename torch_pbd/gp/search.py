@@ -1,4 +1,14 @@
-"""Hyperparameters of Gaussian processes by their evidence: a grid, then BFGS from its deepest valleys."""
+"""Hyperparameters of Gaussian processes by their evidence: a grid, then BFGS from its deepest valleys.
+
+What is maximized is the evidence in length scales and noise ratio; the best amplitude is known in closed form
+(:mod:`~torch_pbd.gp.evidence`). The steps, in :func:`_maximize`:
+
+1. the evidence on a grid of length scales that a few nodes carry, at a cost that does not grow with the inputs
+   (:mod:`~torch_pbd.gp.projection`);
+2. which processes may be better with shorter length scales than these (:meth:`EvidenceGrid.unsettled`);
+3. for the others, BFGS from the deepest valleys of the grid;
+4. for the rest, and those that BFGS led to the shortest length scale, the next grid, with more nodes.
+"""
 
 import math
 from collections.abc import Sequence
@@ -11,11 +21,20 @@ from torch import Tensor
 
 from torch_pbd.exceptions import NotPositiveDefiniteError
 from torch_pbd.gp.grid import EvidenceGrid, EvidenceSearch, together
-from torch_pbd.gp.observations import Hyperparameters, Observations
+from torch_pbd.gp.neighbourhoods import Hyperparameters, Observations
 from torch_pbd.gp.projection import Basis
 from torch_pbd.optim import FitReport, Status, first_failure, minimize_batch
 
-_HOPEFUL = 0.5  # nats for each input that polishing may be worth
+# Nats for each input that polishing may be worth: an optimum deeper than that below its start on the grid would, on
+# a line, have to be a spike. Without the bound searches take a sixth longer, and 1200 processes gained nothing.
+_HOPEFUL = 0.5
+
+# Multiplications of a decomposition for all processes below which the next level is so cheap that there is nothing to
+# gain by leaving processes behind.
+_FEW = 2e7
+
+# Times the shortest length scale of a level, below which BFGS has ended at that bound.
+_AT_BOUND = 1.02
 
 
 def fit_hyperparameters(
@@ -43,7 +62,7 @@ def fit_hyperparameters(
 
 
 class Found(NamedTuple):
-    """What a search found."""
+    """Result of a search."""
 
     hyperparameters: Hyperparameters
     loss: Float[Tensor, " b"]
@@ -54,7 +73,7 @@ class Found(NamedTuple):
 
 
 def fit_together(jobs: Sequence[tuple[Observations, EvidenceSearch]]) -> list[Found]:
-    """What :func:`fit_hyperparameters` finds for each job, in one search where inputs and counts are the same.
+    """Results of :func:`fit_hyperparameters` for each job, in one search where inputs and counts are the same.
 
     A search of few processes costs little more than one of many: what is common is done once, and evaluations are
     batched. Jobs that hold a length scale or a noise are searched by themselves.
@@ -66,12 +85,11 @@ def fit_together(jobs: Sequence[tuple[Observations, EvidenceSearch]]) -> list[Fo
 
 def _searchable_together(job: tuple[Observations, EvidenceSearch], other: tuple[Observations, EvidenceSearch]) -> bool:
     (data, search), (its_data, its_search) = job, other
-    free = search.length_scale is None and search.noise_scale is None
     bounds = (search.length_scale_bounds[0], its_search.length_scale_bounds[1])
     return (
-        free
-        and replace(its_search, length_scale_bounds=bounds) == replace(search, length_scale_bounds=bounds)
-        and its_search.length_scale_bounds[0] == search.length_scale_bounds[0]
+        search.length_scale is None
+        and search.noise_scale is None
+        and its_search == replace(search, length_scale_bounds=bounds)
         and torch.equal(data.inputs, its_data.inputs)
         and torch.equal(data.counts, its_data.counts)
     )
@@ -85,7 +103,7 @@ def _fit_group(jobs: list[tuple[Observations, EvidenceSearch]]) -> list[Found]:
         targets = torch.cat([data.targets for data, _ in jobs])
         longest = torch.cat([its.length_scale_bounds[1] * torch.ones_like(data.targets[:, 0]) for data, its in jobs])
         grid = EvidenceGrid(replace(jobs[0][0], targets=targets), search, longest)
-        ends = _descend_by_levels(grid, search)
+        ends = _maximize(grid, search)
     # Copies, made outside of the inference mode: autograd would refuse its tensors.
     sizes = [len(data.targets) for data, _ in jobs]
     parts = (part.clone().split(sizes) for part in (ends.length_scale, ends.amplitude, ends.noise_ratio))
@@ -93,7 +111,9 @@ def _fit_group(jobs: list[tuple[Observations, EvidenceSearch]]) -> list[Found]:
     for *each, first, loss in zip(*parts, ends.start_loss.split(sizes), ends.loss.clone().split(sizes), strict=True):
         curve = (float(first.sum()), float(loss.sum()))
         report = FitReport(curve[-1], curve, ends.n_iter, ends.status)
-        results.append(Found(Hyperparameters(*each), loss, report, grid.basis_for(each[0])))
+        shortest = 1.0001 * float(each[0].min())  # a search ends at the bound but for rounding
+        basis = next((basis for least, basis in grid.bases if shortest >= least), grid.bases[-1][1])
+        results.append(Found(Hyperparameters(*each), loss, report, basis))
     return results
 
 
@@ -117,58 +137,63 @@ class _Ends:
         self.status = first_failure((self.status, other.status))
 
 
-def _descend_by_levels(grid: EvidenceGrid, search: EvidenceSearch) -> _Ends:
-    """A process stays at the first level that suffices for it, unless the next is so cheap that all may go on."""
-    blank = torch.zeros(len(grid.processes)).to(grid.evidence.projection.targets)
-    scales = blank[:, None].repeat(1, grid.evidence.projection.basis.nodes.shape[1])
-    ends = _Ends(scales, blank.clone(), blank.clone(), blank.clone(), blank.clone())
+def _maximize(grid: EvidenceGrid, search: EvidenceSearch) -> _Ends:
+    """Steps 1 to 4 of this module, until all processes have ended."""
+    grid.refine()
+    blank = torch.zeros(4, len(grid.processes)).to(grid.evidence.targets)
+    ends = _Ends(
+        blank[0][:, None].repeat(1, grid.evidence.basis.nodes.shape[1]), blank[0], blank[1], blank[2], blank[3]
+    )
     while True:
-        left = grid.unsettled()
-        if not bool(left.any()) or not grid.few:
-            rows = (~left).nonzero().squeeze(1)
-            if len(rows):
-                found = _descend(grid, search, rows)
-                ends.put(grid.processes[rows], found)
-                if not grid.finest:  # a process that ends where its level does may be taken further by the next one
-                    left[rows[found.length_scale.amin(1) < 1.02 * grid.shortest]] = True
-            if not bool(left.any()):
-                return ends
-            grid.keep(left)
+        left, level = grid.unsettled(), grid.next_level
+        if level is not None and bool(left.any()):
+            n_nodes = level.n_nodes or level.max_inputs or grid.evidence.n_inputs
+            if len(left) * n_nodes**3 <= _FEW:
+                grid.refine()
+                continue
+        rows = (~left).nonzero().squeeze(1)
+        if len(rows):
+            found = _descend(grid, search, rows)
+            ends.put(grid.processes[rows], found)
+            if level is not None:  # the next one may take these further
+                left[rows[found.length_scale.amin(1) < _AT_BOUND * grid.shortest]] = True
+        if not bool(left.any()):
+            return ends
+        grid.keep(left)
         grid.refine()
 
 
 def _descend(grid: EvidenceGrid, search: EvidenceSearch, chosen: Int64[Tensor, " a"]) -> _Ends:
-    """Polish the deepest valleys of some of a grid's processes."""
-    coordinates, n_inputs = grid.coordinates(), grid.evidence.projection.n_inputs
+    """BFGS from the deepest valleys of some of a grid's processes; of each the best end."""
+    evidence, coordinates = grid.evidence, grid.coordinates()
     length_scale, noise_ratio, loss = (part[chosen] for part in grid.valleys(1 + search.n_restarts))
-    # A start far worse than another for each input is not polished: its optimum would have to be a spike. One that the
-    # grid takes for singular, by a strict rule, is tried where there is no other.
-    hopeful = (loss <= loss[:, :1] + _HOPEFUL * n_inputs) & loss.isfinite()
+    # The deepest is taken in any case, even if the grid takes it for singular, by a strict rule.
+    hopeful = (loss <= loss[:, :1] + _HOPEFUL * evidence.n_inputs) & loss.isfinite()
     hopeful[:, 0] = True
     number, valley = hopeful.nonzero().unbind(1)
     process = chosen[number]
     starts = coordinates.encode(length_scale[number, valley], noise_ratio[number, valley], process)
-    size, found, reports = together(grid.evidence.projection), [], []
+    size, points, reports = together(evidence.basis), [], []
     for part, rows in zip(starts.split(size), process.split(size), strict=True):
-        end, report = minimize_batch(
+        point, report = minimize_batch(
             lambda z, index, rows=rows: coordinates.loss(z, rows[index]), part, max_iter=search.max_iter, tol=search.tol
         )
-        found.append(end)
+        points.append(point)
         reports.append(report)
     never = torch.full_like(loss, math.inf)
     first, final = (
         never.index_put((number, valley), torch.cat(values).nan_to_num(nan=math.inf))
         for values in zip(*((report.start_loss, report.loss) for report in reports), strict=True)
     )
-    if not bool(torch.isfinite(final.amin(1)).all()):
+    lowest, best = final.min(1)
+    if not bool(lowest.isfinite().all()):
         raise NotPositiveDefiniteError(
             "The kernel matrix is singular wherever the hyperparameters were searched. Allow for noise "
             "(noise_scale=None), or give a shorter length_scale."
         )
     place = torch.zeros_like(loss, dtype=torch.long)
     place[number, valley] = torch.arange(len(number), device=loss.device)
-    best = final.argmin(1, keepdim=True)
-    scale, ratio = coordinates.decode(torch.cat(found)[place.gather(1, best).squeeze(1)], chosen)
-    amplitude = grid.evidence.best_variance_at(scale, ratio, chosen).sqrt()
+    scale, ratio = coordinates.decode(torch.cat(points)[place.gather(1, best[:, None]).squeeze(1)], chosen)
+    amplitude = evidence.best_variance(scale, ratio, chosen).sqrt()
     n_iter, status = max(report.n_iter for report in reports), first_failure(report.status for report in reports)
-    return _Ends(scale, ratio, amplitude, first.amin(1), final.gather(1, best).squeeze(1), n_iter, status)
+    return _Ends(scale, ratio, amplitude, first.amin(1), lowest, n_iter, status)

@@ -44,7 +44,7 @@ class _Posterior:
         definite: expected, it knows nothing of the bend of the valleys in which the vectors of a Wishart process turn.
         """
         point = self.at(whitened)
-        gradient = self.latent.pulled_back(self.cost.value_and_gradient(point)[1]) + self.prior_weight * whitened
+        gradient = self.latent.vjp(self.cost.value_and_gradient(point)[1]) + self.prior_weight * whitened
         # Without a prior the curvature is singular, as vectors may turn: Levenberg and Marquardt's damping, which
         # vanishes with the gradient (Fan and Yuan 2005).
         damping = self.prior_weight or 1e-3 * float(gradient.abs().max())

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torch_pbd.kernels import KernelName, correlation
+from torch_pbd.kernels import correlation
 from torch_pbd.linalg import safe_cholesky, symmetrize
 
 # Length scales in ranges of the time, from the spacing of some fifty steps to a movement that bends once; and nuggets
@@ -32,7 +32,7 @@ class TimeKernel:
     """Correlation along the movement as it was found on a grid of T steps, from K demonstrations."""
 
     grid: Float[Tensor, " T"]
-    kernel: KernelName
+    kernel: str
     length_scale: float
     nugget: Float[Tensor, " T"]
     share: float
@@ -65,7 +65,7 @@ class TimeKernel:
 
 
 def fit_time_kernel(
-    grid: Float[Tensor, " T"], residual: Float[Tensor, "K T d"], kernel: KernelName, share: float | None
+    grid: Float[Tensor, " T"], residual: Float[Tensor, "K T d"], kernel: str, share: float | None
 ) -> TimeKernel:
     """Time kernel of whitened residuals, NaN where a demonstration has no sample near.
 
@@ -95,11 +95,11 @@ def fit_time_kernel(
     return replace(result, share=_best_share(result) if share is None else share)
 
 
-def _unit_kernel(grid: Float[Tensor, " T"], length_scale: float, kernel: KernelName) -> Float[Tensor, "T T"]:
+def _unit_kernel(grid: Float[Tensor, " T"], length_scale: float, kernel: str) -> Float[Tensor, "T T"]:
     return correlation(grid[:, None], grid[:, None], grid.new_tensor([length_scale]), kernel)
 
 
-def _search(grid: Tensor, residual: Tensor, steps: Bool[Tensor, " T"], kernel: KernelName) -> tuple[float, float]:
+def _search(grid: Tensor, residual: Tensor, steps: Bool[Tensor, " T"], kernel: str) -> tuple[float, float]:
     """Length scale and shared nugget eta of the highest likelihood of ``(1 - eta) K + eta I``."""
     steps = steps if 2 * int(steps.sum()) >= len(grid) else torch.ones_like(steps)
     chosen = _unit_rms(residual[:, steps])

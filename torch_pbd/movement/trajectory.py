@@ -14,7 +14,7 @@ from torch_pbd.estimators.base import Uncertainty
 from torch_pbd.estimators.demonstrations import fit_with_groups
 from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
 from torch_pbd.estimators.validation import Floats
-from torch_pbd.kernels import KERNELS, KernelName
+from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky
 from torch_pbd.movement.base import MovementRegressor, Recording
 from torch_pbd.movement.conditioning import Conditioned
@@ -46,7 +46,7 @@ class TrajectoryLaw(nn.Module):
     def __init__(self, marginals: nn.Module | None, time_kernel: TimeKernel, x_shift: float, x_scale: float) -> None:
         super().__init__()
         self.marginals = marginals
-        self.kernel: KernelName = time_kernel.kernel
+        self.kernel = time_kernel.kernel
         for name in ("grid", "nugget", "residual"):
             self.register_buffer(name, getattr(time_kernel, name))
         for name, value in (
@@ -184,7 +184,7 @@ class TrajectoryRegressor(MovementRegressor):
         kernel = "matern52" if self.time_kernel == "auto" else self.time_kernel
         share = None if self.shrinkage == "auto" else 1.0 - float(self.shrinkage)
         scaled = torch.from_numpy((grid - low) / (high - low))
-        found = fit_time_kernel(scaled, torch.from_numpy(whitened), kernel, share)  # type: ignore[arg-type]
+        found = fit_time_kernel(scaled, torch.from_numpy(whitened), kernel, share)
         self.module_ = TrajectoryLaw(getattr(self.regressor_, "module_", None), found, low, high - low)
         self.module_.requires_grad_(False)
         degrees = self.regressor_.predict_df(grid[:, np.newaxis])

@@ -1,6 +1,6 @@
 """L-BFGS that never loses its best point, for one objective and for many small ones side by side; Fisher scoring."""
 
-from torch_pbd.optim.batch import BatchReport, by_autograd, minimize_batch
+from torch_pbd.optim.batch import BatchReport, minimize_batch
 from torch_pbd.optim.lbfgs import minimize
 from torch_pbd.optim.report import FitReport, Progress, Status, first_failure
 from torch_pbd.optim.scoring import minimize_scoring
@@ -10,7 +10,6 @@ __all__ = [
     "FitReport",
     "Progress",
     "Status",
-    "by_autograd",
     "first_failure",
     "minimize",
     "minimize_batch",

@@ -11,9 +11,11 @@ from torch import Tensor
 from torch_pbd.optim.report import FAILURES, Status
 
 _LONGEST_STEP = 1e3  # in steps of BFGS
-_DIFFERENCE = 1e-4  # of parameters, for the first Hessian
+_DIFFERENCE = 1e-4  # of parameters of order one, for the first Hessian: errors of 1e-4 of it, or 1e-12 by rounding
 _LEAST_CURVATURE = 1e-3  # of a Hessian's largest: a flatter direction gets no longer step
-_FIRST_REACH = 1.0  # of the first step, in any parameter
+_FIRST_REACH = 1.0  # largest change of any parameter in the first step
+_ARMIJO = 1e-4  # least share of the fall that the slope promises (Nocedal and Wright, section 3.1)
+_HALVINGS = 25  # down to 3e-8 of a step at most
 
 ValueAndGradient = Callable[
     [Float[Tensor, "a p"], Int64[Tensor, " a"]], tuple[Float[Tensor, " a"], Float[Tensor, "a p"]]
@@ -28,24 +30,9 @@ class BatchReport:
     start_loss: Float[Tensor, " b"]
     n_iter: int
     status: Status
-    """CONVERGED if all did, from starts whose loss is finite; else what ended one that did not."""
+    """CONVERGED if all did, from starts whose loss is finite; else how one ended that did not."""
     inverse_hessian: Float[Tensor, "b p p"]
-    """At the ends, as far as the steps told."""
-
-
-def by_autograd(
-    objective: Callable[[Float[Tensor, "a p"], Int64[Tensor, " a"]], Float[Tensor, " a"]],
-) -> ValueAndGradient:
-    """Value and gradient of losses (a,) of unrelated problems."""
-
-    def value_and_gradient(x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        with torch.enable_grad():
-            leaf = x.detach().requires_grad_()
-            loss = objective(leaf, rows)
-            (gradient,) = torch.autograd.grad(loss.sum(), leaf)
-        return loss.detach(), gradient
-
-    return value_and_gradient
+    """BFGS's estimate at the ends."""
 
 
 def minimize_batch(
@@ -60,8 +47,7 @@ def minimize_batch(
 
     Each problem has its own inverse Hessian, its own step and its own end: a joint L-BFGS over all of them
     would share one line search and one memory between problems that have nothing to do with each other, and with a
-    handful of parameters the whole matrix costs less than a limited memory of it. Parameters are expected to be of
-    order one.
+    handful of parameters the whole matrix costs less than a limited memory of it.
     Steps are accepted by the Armijo rule, so the loss never rises; a value that is not finite counts as
     too far. Where the slope along a step has not fallen, which tells no Hessian, the next step starts four times as
     long.
@@ -69,11 +55,11 @@ def minimize_batch(
     Parameters
     ----------
     objective : callable
-        Given parameters (a, p) of a problems and their indices in the batch, returns their losses (a,) and
-        gradients (a, p); see :func:`by_autograd`. Problems at whose points it raises an ArithmeticError, ValueError,
-        RuntimeError or IndexError count as not finite there; which they are it is asked one by one.
+        Given parameters (a, p), of order one, of a problems and their indices in the batch, returns their losses (a,)
+        and gradients (a, p). Problems at whose points it raises an ArithmeticError, ValueError, RuntimeError or
+        IndexError count as not finite there; which they are it is asked one by one.
     start : Tensor of shape (b, p)
-        Where to start. A problem whose loss there is not finite stays there.
+        A problem whose loss there is not finite stays there.
     max_iter : int, default=100
         Largest number of iterations.
     tol : float, default=1e-6
@@ -89,13 +75,13 @@ def minimize_batch(
     report : BatchReport
     """
     x = start.detach().clone()
-    objective = _survived(objective)
+    objective = _guarded(objective)
     rows = torch.arange(len(x), device=x.device)
     loss, gradient, inverse = _start(objective, rows, x, inverse_hessian)
     size = gradient.abs().sum(-1)  # of no parameters it is zero, and there is nothing to do
     alive = torch.isfinite(loss + size) & (size > tol)
-    every = _Problems.at(rows, x, loss, gradient, inverse, torch.ones_like(loss))
-    active = every.of(alive & (every.promise > _enough(loss, tol)))
+    every = _problems(rows, x, loss, gradient, inverse, torch.ones_like(loss))
+    active = every.restrict(alive & (every.promise > _negligible(loss, tol)))
     n_iter, status = 0, Status.CONVERGED if bool(torch.isfinite(loss + size).all()) else Status.NOT_FINITE
     while n_iter < max_iter and len(active.rows):
         n_iter += 1
@@ -104,25 +90,25 @@ def minimize_batch(
             status = Status.NOT_FINITE
         if bool(settled.any()) or n_iter == max_iter:  # problems that have ended are not carried along
             every.put(active)
-            active = active.of(~settled)
+            active = active.restrict(~settled)
     if status is Status.CONVERGED and len(active.rows):
         status = Status.MAX_ITER
     return every.x, BatchReport(every.loss, loss, n_iter, status, every.inverse)
 
 
-def _survived(objective: ValueAndGradient) -> ValueAndGradient:
+def _guarded(objective: ValueAndGradient) -> ValueAndGradient:
     """The objective, with NaN for problems at whose points it raises; they are found one by one."""
 
-    def survived(x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+    def guarded(x: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         try:
             return objective(x, rows)
         except FAILURES:
             if len(rows) < 2:
                 return x.new_full((len(x),), math.nan), torch.full_like(x, math.nan)
-            each = [survived(x[i : i + 1], rows[i : i + 1]) for i in range(len(rows))]
-            return torch.cat([value for value, _ in each]), torch.cat([gradient for _, gradient in each])
+            losses, gradients = zip(*(guarded(x[i : i + 1], rows[i : i + 1]) for i in range(len(rows))), strict=True)
+            return torch.cat(losses), torch.cat(gradients)
 
-    return survived
+    return guarded
 
 
 @dataclass
@@ -135,46 +121,45 @@ class _Problems:
     gradient: Float[Tensor, "a p"]
     inverse: Float[Tensor, "a p p"]
     step: Float[Tensor, " a"]
-    """How many of Newton's are tried next."""
+    """Multiple of Newton's step that is tried next."""
     downhill: Float[Tensor, "a p 1"]
     """Newton's step, but for its sign."""
     promise: Float[Tensor, " a"]
-    """By how much it should lower the loss."""
+    """Fall of the loss by Newton's step, were the loss the parabola that it is taken for."""
 
-    @classmethod
-    def at(cls, rows: Tensor, x: Tensor, loss: Tensor, gradient: Tensor, inverse: Tensor, step: Tensor) -> "_Problems":
-        """Problems at these points."""
-        downhill = inverse @ gradient.unsqueeze(-1)
-        promise = 0.5 * (gradient * downhill.squeeze(-1)).sum(-1)
-        return cls(rows, x, loss, gradient, inverse, step, downhill, promise)
-
-    def of(self, chosen: Bool[Tensor, " a"]) -> "_Problems":
-        """Some of them."""
+    def restrict(self, chosen: Bool[Tensor, " a"]) -> "_Problems":
+        """Problems that are chosen."""
         return self if bool(chosen.all()) else _Problems(*(part[chosen] for part in vars(self).values()))
 
     def put(self, others: "_Problems") -> None:
-        """Take what became of some of them."""
+        """Take the present points of some of the problems."""
         for name in ("x", "loss", "inverse"):
             setattr(self, name, getattr(self, name).index_copy(0, others.rows, getattr(others, name)))
+
+
+def _problems(rows: Tensor, x: Tensor, loss: Tensor, gradient: Tensor, inverse: Tensor, step: Tensor) -> _Problems:
+    downhill = inverse @ gradient.unsqueeze(-1)
+    promise = 0.5 * (gradient * downhill.squeeze(-1)).sum(-1)
+    return _Problems(rows, x, loss, gradient, inverse, step, downhill, promise)
 
 
 def _advance(
     objective: ValueAndGradient, at: _Problems, tol: float, *, first: bool
 ) -> tuple[_Problems, Bool[Tensor, " a"], Bool[Tensor, " a"]]:
-    """One step of each problem, which have ended, and which of them for want of numbers."""
+    """Problems after a step each, which of them have ended, and which for want of finite numbers."""
     x, loss, gradient, blocked = _backtrack(objective, at)
     change = (gradient - at.gradient).unsqueeze(-1)
     # Where the slope along a step has not fallen the curvature is not that of a minimum.
     convex = (change * at.downhill).sum((-2, -1)) < -2e-3 * at.promise
-    inverse = _updated(at.inverse, (x - at.x).unsqueeze(-1), change, convex)
+    inverse = _bfgs_update(at.inverse, (x - at.x).unsqueeze(-1), change, convex)
     gain = at.loss - loss
     short = ~convex & (gain > 0) & (at.step < _LONGEST_STEP) & (not first)
-    new = _Problems.at(at.rows, x, loss, gradient, inverse, torch.where(short, 4.0 * at.step, 1.0))
-    settled = ((new.promise <= _enough(loss, tol)) | (gain <= 0.0)) & ~short
+    new = _problems(at.rows, x, loss, gradient, inverse, torch.where(short, 4.0 * at.step, 1.0))
+    settled = ((new.promise <= _negligible(loss, tol)) | (gain <= 0.0)) & ~short
     return new, settled | (gradient.abs().sum(-1) <= tol), blocked
 
 
-def _enough(loss: Tensor, tol: float) -> Tensor:
+def _negligible(loss: Tensor, tol: float) -> Tensor:
     """Gain that is none."""
     return 1e-2 * tol + torch.finfo(loss.dtype).eps * loss.abs()
 
@@ -182,7 +167,7 @@ def _enough(loss: Tensor, tol: float) -> Tensor:
 def _start(
     objective: ValueAndGradient, rows: Tensor, x: Tensor, inverse_hessian: Tensor | None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Losses, gradients and inverse Hessians where problems start; given none, by differences of the gradient.
+    """Losses, gradients and inverse Hessians at the start; given none, by differences of the gradient.
 
     These get the absolute values of their eigenvalues; where they are not finite they are of a step of length one.
     """
@@ -206,8 +191,11 @@ def _start(
     return loss, gradient, inverse * (_FIRST_REACH / reach.clamp_min(_FIRST_REACH))[:, None, None]
 
 
-def _updated(inverse: Tensor, step: Tensor, change: Tensor, convex: Tensor) -> Tensor:
-    """Inverse Hessians after a step (b, p, 1) and the change of the gradient along it, where it was convex."""
+def _bfgs_update(inverse: Tensor, step: Tensor, change: Tensor, convex: Tensor) -> Tensor:
+    """Inverse Hessians after a step s (b, p, 1) and the change y of the gradient along it, where it was convex.
+
+    With r = 1 / (y's) it is ``(I - r s y') H (I - r y s') + r s s'`` (Nocedal and Wright, eq. (6.17)), multiplied out.
+    """
     applied = inverse @ change
     share = torch.where(convex[:, None, None], 1.0 / (step.mT @ change), 0.0)  # the update is zero where it is
     cross = applied @ (share * step.mT)
@@ -216,19 +204,20 @@ def _updated(inverse: Tensor, step: Tensor, change: Tensor, convex: Tensor) -> T
 
 
 def _backtrack(objective: ValueAndGradient, at: _Problems) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Shorten each problem's step until its loss falls enough; where none does it stays where it is.
+    """Points, losses and gradients of each problem after a step, shortened until the loss falls enough.
 
-    The last of what is returned tells of problems that stay because nothing is finite any more, even where they are.
+    Where no step does a problem stays where it is; the last of the results are those that stay because nothing is
+    finite any more, even there.
     """
     x, loss, gradient, step = at.x, at.loss, at.gradient, at.step
     left = torch.arange(len(step), device=step.device)
     blocked = torch.zeros_like(left, dtype=torch.bool)
-    for _ in range(25):
+    for _ in range(_HALVINGS):
         before, slope, share = at.loss[left], 2.0 * at.promise[left], step[left]
         trial = at.x[left] - share[:, None] * at.downhill[left].squeeze(-1)
         value, its_gradient = objective(trial, at.rows[left])
         finite = torch.isfinite(value + its_gradient.sum(-1))
-        accepted = finite & (value <= before - 1e-4 * (share * slope))  # Armijo's rule
+        accepted = finite & (value <= before - _ARMIJO * (share * slope))
         x, loss, gradient = (
             old.index_copy(0, left[accepted], new[accepted])
             for old, new in ((x, trial), (loss, value), (gradient, its_gradient))

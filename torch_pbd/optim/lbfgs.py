@@ -15,7 +15,7 @@ class _NotFiniteError(ArithmeticError):
     """The loss or its gradient is not a finite number, or could not be computed."""
 
 
-class _BestPoint(BestSoFar):
+class _Closure(BestSoFar):
     """Closure for ``torch.optim``: loss and gradients at the parameters, and memory of the best of them."""
 
     def __init__(self, objective: Callable[[], Tensor], parameters: Sequence[Tensor], callback: Callback) -> None:
@@ -27,16 +27,16 @@ class _BestPoint(BestSoFar):
     def __call__(self) -> float:
         # Each attempt begins with the loss at the best point, which is known.
         known = bool(self._best) and all(map(torch.equal, self._parameters, self._best))
-        value, gradients = (self.curve[-1], self._gradients) if known else self._evaluated()
+        value, gradients = (self.curve[-1], self._gradients) if known else self._evaluate()
         for parameter, gradient in zip(self._parameters, gradients, strict=True):
             parameter.grad = gradient.clone()
-        if self.lowered_by(value):
+        if self.is_lower(value):
             self._best = [parameter.detach().clone() for parameter in self._parameters]
             self._gradients = gradients
-            self.add(value)
+            self.record(value)
         return value
 
-    def _evaluated(self) -> tuple[float, Sequence[Tensor]]:
+    def _evaluate(self) -> tuple[float, Sequence[Tensor]]:
         self.n_evaluations += 1
         try:
             with torch.enable_grad():
@@ -68,9 +68,8 @@ def minimize(
     """Minimize a scalar objective by L-BFGS with a strong Wolfe line search; leaves the best point seen.
 
     ``torch.optim.LBFGS`` can raise from its line search, and can return from a failed one at a worse point.
-    Here every evaluation is remembered, and a failed run is restarted from the best point with a halved
-    first step, at most three times. Whatever ends it, be it a mistake in the objective or an interrupt, the parameters
-    are left at the best point.
+    Here a failed run is restarted from the best point with a halved first step, at most three times. Whatever ends it,
+    be it a mistake in the objective or an interrupt, the parameters are left at the best point.
 
     Parameters
     ----------
@@ -97,41 +96,38 @@ def minimize(
     ValueError
         If the loss or its gradient is not finite at the start.
     """
-    best, n_iter = _BestPoint(objective, parameters, callback), 0
+    closure, n_iter = _Closure(objective, parameters, callback), 0
     try:
-        best()
+        closure()
         for number in range(_ATTEMPTS):
+            max_eval = 2 * (max_iter - n_iter) + 21  # a search takes one or two; the first is known
             optimizer = torch.optim.LBFGS(
                 list(parameters),
                 lr=0.5**number,
                 max_iter=max_iter - n_iter,
-                max_eval=2 * (max_iter - n_iter) + 21,  # a search takes one or two; the first is known
+                max_eval=max_eval,
                 tolerance_grad=tol,
-                tolerance_change=tol * max(1.0, abs(best.curve[0])) * 1e-2,
+                tolerance_change=tol * max(1.0, abs(closure.curve[0])) * 1e-2,
                 history_size=20,  # pairs of steps and changes of the gradient
                 line_search_fn="strong_wolfe",
             )
-            status, detail = _attempt(optimizer, best)
-            n_iter += optimizer.state[parameters[0]]["n_iter"]
-            best.restore()
+            memory, detail = optimizer.state[parameters[0]], ""
+            try:
+                optimizer.step(closure)
+                status = Status.CONVERGED if memory["func_evals"] < max_eval else Status.MAX_EVALUATIONS
+            except _NotFiniteError as error:
+                status, detail = Status.NOT_FINITE, str(error)
+            except FAILURES as error:  # an IndexError where torch's strong Wolfe search brackets no minimum
+                status = Status.LINE_SEARCH_FAILED
+                detail = f"the line search failed ({type(error).__name__}: {error})"
+            n_iter += memory["n_iter"]
+            closure.restore()
             if status is Status.CONVERGED or n_iter >= max_iter:
                 break
     except _NotFiniteError as error:  # at the start: an attempt ends with its own
         raise ValueError(f"The optimization cannot start: {error}.") from error
     finally:
-        best.restore()
+        closure.restore()
     if status is Status.CONVERGED and n_iter >= max_iter:
         status = Status.MAX_ITER
-    return FitReport(best.curve[-1], tuple(best.curve), n_iter, status, detail)
-
-
-def _attempt(optimizer: torch.optim.LBFGS, best: _BestPoint) -> tuple[Status, str]:
-    """Iterate until the optimizer stops; what stopped it, but for the number of iterations, and a detail."""
-    try:
-        optimizer.step(best)
-    except _NotFiniteError as error:
-        return Status.NOT_FINITE, str(error)
-    except FAILURES as error:  # an IndexError where torch's strong Wolfe search brackets no minimum
-        return Status.LINE_SEARCH_FAILED, f"the line search failed ({type(error).__name__}: {error})"
-    (options,), (memory,) = optimizer.param_groups, optimizer.state.values()
-    return Status.CONVERGED if memory["func_evals"] < options["max_eval"] else Status.MAX_EVALUATIONS, ""
+    return FitReport(closure.curve[-1], tuple(closure.curve), n_iter, status, detail)

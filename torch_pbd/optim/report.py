@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 FAILURES = (ArithmeticError, ValueError, RuntimeError, IndexError)
-"""What an evaluation at a bad point raises: Cholesky and eigenvalues, overflow. Others are mistakes, which are not
-survived."""
+"""Exceptions of an evaluation at a bad point: Cholesky and eigenvalues, overflow. Others are mistakes, passed on."""
 
 
 class Status(Enum):
@@ -41,6 +40,9 @@ class Progress:
     """Seconds since the start."""
 
 
+Callback = Callable[[Progress], None] | None
+
+
 @dataclass(frozen=True)
 class FitReport:
     """How an optimization ended, and what it came to."""
@@ -51,7 +53,7 @@ class FitReport:
     n_iter: int
     status: Status
     detail: str = ""
-    """What was raised, or in which search, where the status alone does not tell."""
+    """Message of an exception, or name of a search, where the status alone does not tell."""
 
     @property
     def converged(self) -> bool:
@@ -60,17 +62,14 @@ class FitReport:
 
     @property
     def message(self) -> str:
-        """What ended it, in words."""
+        """How it ended, in words."""
         return self.detail or self.status.value
 
     def after(self, other: "FitReport", name: str) -> "FitReport":
-        """The same report, but not converged where the optimization before it, of this name, is not."""
+        """Report with the status of the optimization before it, of this name, where that has not converged."""
         if other.converged or not self.converged:
             return self
         return replace(self, status=other.status, detail=f"{name}: {other.message}")
-
-
-Callback = Callable[[Progress], None] | None
 
 
 class BestSoFar:
@@ -81,12 +80,12 @@ class BestSoFar:
         self.n_evaluations = 0
         self._callback, self._started = callback, time.perf_counter()
 
-    def lowered_by(self, loss: float) -> bool:
+    def is_lower(self, loss: float) -> bool:
         """Whether a loss is finite and below all before it."""
         return math.isfinite(loss) and (not self.curve or loss < self.curve[-1])
 
-    def add(self, loss: float) -> None:
-        """Take such a loss for the best so far."""
+    def record(self, loss: float) -> None:
+        """Take a lower loss for the best so far."""
         self.curve.append(loss)
         if self._callback is not None:
             self._callback(Progress(self.n_evaluations, loss, time.perf_counter() - self._started))

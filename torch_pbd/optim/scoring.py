@@ -8,9 +8,9 @@ from torch import Tensor
 
 from torch_pbd.optim.report import FAILURES, BestSoFar, Callback, FitReport, Status
 
-_LEAST_SHARE = 1e-4  # of the fall that the slope promises, for a step to be taken
-_LINEAR_SHARE = 0.8  # with more of it the loss is a line rather than a parabola, and a longer step is tried
-_SHORTEST, _LONGEST = 1e-10, 1e3
+_ARMIJO = 1e-4  # least share of the fall that the slope promises, for a step to be taken
+_LINEAR = 0.8  # with a larger share the loss is a line rather than a parabola, and a longer step is tried
+_SHORTEST, _LONGEST = 1e-10, 1e3  # multiples of Newton's step
 _SHORTFALL = 3e4  # of what is little, that a step may promise where its fall is little: it is never all of it
 
 Newton = Callable[[Tensor], tuple[Tensor, Tensor]]
@@ -18,61 +18,60 @@ Newton = Callable[[Tensor], tuple[Tensor, Tensor]]
 
 
 class _Search(BestSoFar):
-    """Where the optimization is, and the losses it has seen."""
+    """Point of an optimization, and the losses it has seen."""
 
     def __init__(self, loss: Callable[[Tensor], Tensor], start: Tensor, callback: Callback) -> None:
         super().__init__(callback)
-        self.loss, self.x, self.n_iter = loss, start, 0
-        self.value = self.evaluate(start)
+        self._loss, self.x, self.n_iter = loss, start, 0
+        self.value = self._evaluate(start)
 
-    def evaluate(self, x: Tensor) -> float:
-        """Loss at x; NaN where it is not finite, or raises what an evaluation at a bad point raises."""
+    def _evaluate(self, x: Tensor) -> float:
+        """Loss at x; NaN where it is not finite, or raises one of the exceptions of a bad point."""
         self.n_evaluations += 1
         try:
-            value = float(self.loss(x))
+            value = float(self._loss(x))
         except FAILURES as error:
             if not self.curve:
                 raise ValueError(f"The optimization cannot start: {error}.") from error
             return math.nan
-        if self.lowered_by(value):
-            self.add(value)
+        if self.is_lower(value):
+            self.record(value)
         return value if math.isfinite(value) else math.nan
 
-    def along(self, x: Tensor, value: float, step: Tensor, slope: float) -> tuple[Tensor, float]:
-        """Point with a lower loss on the way from ``x``, and that loss; ``x`` itself where there is none."""
-        length, found, lowest = 1.0, x, value
+    def _line_search(self, step: Tensor, slope: float) -> tuple[Tensor, float]:
+        """Point with a lower loss along a step, and that loss; the present point where there is none."""
+        length, found, lowest = 1.0, self.x, self.value
         while _SHORTEST < length < _LONGEST:
-            trial = x + length * step
-            reached = self.evaluate(trial)
-            share = (value - reached) / (-length * slope)  # NaN counts as too far
-            if not share >= _LEAST_SHARE or reached >= lowest:
-                if found is not x:
+            trial = self.x + length * step
+            reached = self._evaluate(trial)
+            share = (self.value - reached) / (-length * slope)  # NaN counts as too far
+            if share >= _ARMIJO and reached < lowest:
+                found, lowest = trial, reached
+                if length < 1.0 or share <= _LINEAR:
                     break
+                length *= 2.0
+            elif found is not self.x:
+                break
+            else:
                 # The minimum of the parabola through both values and the slope, kept within a tenth and a half.
                 parabola = 0.5 / (1.0 - share) if math.isfinite(share) else 0.1
                 length *= min(0.5, max(0.1, parabola))
-                continue
-            longer = length >= 1.0 and share > _LINEAR_SHARE
-            found, lowest = trial, reached
-            if not longer:
-                break
-            length *= 2.0
         return found, lowest
 
     def step(self, newton: Newton, enough: float, relative_tol: float) -> Status | None:
-        """One iteration; why it was the last, None if it was not."""
+        """One iteration; how it ended the optimization, None if it did not."""
         self.n_iter += 1
         value, (gradient, step) = self.value, newton(self.x)
         slope = float((gradient * step).sum())
         if not math.isfinite(slope) or not bool(torch.isfinite(step).all()):
             raise ValueError(f"the gradient is not finite (loss {value}, slope {slope} along the step)")
-        found, lowest = self.along(self.x, value, step, slope) if slope < 0 else (self.x, value)
-        # Of a fall below the rounding of the loss nothing can be seen.
-        rounding = 1e-14 * max(1.0, abs(value))
-        if found is self.x and -0.5 * slope > max(enough, rounding):
+        found, lowest = self._line_search(step, slope) if slope < 0 else (self.x, value)
+        # A fall below the rounding of the loss cannot be seen.
+        promise, rounding = -0.5 * slope, 1e-14 * max(1.0, abs(value))
+        if found is self.x and promise > max(enough, rounding):
             return Status.LINE_SEARCH_FAILED
         self.x, self.value = found, lowest
-        little, promise = max(enough, relative_tol * abs(value), rounding), -0.5 * slope
+        little = max(enough, relative_tol * abs(value), rounding)
         # A step that falls far short of its promise is short because of a bend, not because of an end.
         arrived = value - lowest <= 10.0 * enough and promise <= _SHORTFALL * little
         return Status.CONVERGED if promise <= little or arrived else None

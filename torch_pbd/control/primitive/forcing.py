@@ -5,7 +5,7 @@ import torch
 from numpy.typing import NDArray
 
 from torch_pbd.estimators.scaling import Standardization
-from torch_pbd.gp import EvidenceSearch, Observations, condition, fit_hyperparameters
+from torch_pbd.gp import EvidenceSearch, Observations, condition, fit_together
 
 Floats = NDArray[np.float64]
 
@@ -33,7 +33,8 @@ class ForcingProcess:
         observations = Observations(inputs, targets, counts)
         # No length scale below what the knots resolve: it would be a needle at each of them.
         search = EvidenceSearch(length_scale_bounds=(min(0.5, 0.75 / len(X)), 10.0))
-        self._process, _ = condition(observations, fit_hyperparameters(observations, search)[0])
+        (found,) = fit_together([(observations, search)])
+        self._process, _ = condition(observations, found.hyperparameters, basis=found.basis)
 
     def predict(self, X: Floats) -> Floats:
         """Forcing (m, d) at X (m, 1)."""

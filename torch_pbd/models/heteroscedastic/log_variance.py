@@ -15,7 +15,6 @@ from torch_pbd.models.heteroscedastic.linear import LinearEvidence, Weights, inv
 
 # Newton's steps (in the logarithm of a variance) end at this one: that after it is about its square.
 _MAX_ITER, _TOL = 60, 1e-5
-_FAR = 1.0  # steps above this are not of the Newton method but safer ones
 _LEAST_RESIDUAL = -40.0
 # Of the pooled variance: an exact zero, as where all recordings start at the origin, has no logarithm.
 LEAST_SQUARE = 1e-6
@@ -163,7 +162,7 @@ def _maximize(features: Tensor, target: Tensor, half: Tensor, pooled: Tensor, st
     (1 + F' diag(w) F) m = F' (w F m - slope). The first takes F m from the ``start``; if that was no better
     than the ``pooled`` variance everywhere, it starts there again.
     """
-    mean, location = _least_squares(features, target, half, start, far=False)
+    mean, location = _least_squares(features, target, half, start)
     value = _loss(location - target, half, mean)
     from_pooled = pooled / features[:, 0, -1:]
     lost = ~(value <= _loss(pooled - target, half, from_pooled))
@@ -173,9 +172,8 @@ def _maximize(features: Tensor, target: Tensor, half: Tensor, pooled: Tensor, st
         mean = torch.where(lost[:, None], constant, mean)
         location = torch.where(lost[:, None], pooled, location)
         value = _loss(location - target, half, mean)
-    far = bool(lost.any())
     for _ in range(_MAX_ITER):
-        new_mean, new_location = _least_squares(features, target, half, location, far=far)
+        new_mean, new_location = _least_squares(features, target, half, location)
         step, change = new_mean - mean, new_location - location
         share = torch.ones_like(value)
         for _ in range(20):
@@ -189,26 +187,17 @@ def _maximize(features: Tensor, target: Tensor, half: Tensor, pooled: Tensor, st
         mean = torch.where(better[:, None], new_mean, mean)
         location = torch.where(better[:, None], new_location, location)
         value = torch.where(better, new_value, value)
-        largest = float((share * change.abs().amax(-1)).where(better, 0.0).max())
-        if largest < _TOL and not far:
+        if float((share * change.abs().amax(-1)).where(better, 0.0).max()) < _TOL:
             break
-        far = largest > _FAR
     return mean, location
 
 
-def _least_squares(
-    features: Tensor, target: Tensor, half: Tensor, location: Tensor, *, far: bool
-) -> tuple[Tensor, Tensor]:
-    """Next mean and log variances. Far from the end with more curvature where they are above the target: that of the
-    parabola with the minimum there, which bounds the sum from above and keeps a step from going beyond.
-    """
+def _least_squares(features: Tensor, target: Tensor, half: Tensor, location: Tensor) -> tuple[Tensor, Tensor]:
+    """Next mean and log variances, by Newton's method."""
     residual = (location - target).clamp_min(_LEAST_RESIDUAL)
     decay = torch.exp(-residual)
     slope = half * (1.0 - decay)
     weight = half * decay
-    if far:
-        above = residual > 1e-3
-        weight = torch.where(above, slope / residual.where(above, 1.0), weight)
     precision = features.mT @ (weight.unsqueeze(-1) * features) + torch.eye(features.shape[-1]).to(features)
     factor = safe_cholesky(precision, name="the precision of the log variances")
     projected = features.mT @ (weight * location - slope).unsqueeze(-1)

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from torch_pbd import checks
 from torch_pbd.gp.inducing import FeatureMap
-from torch_pbd.kernels import KERNELS, KernelName
+from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky, symmetrize
 from torch_pbd.models.core import Core, Shapes, blank, size_of
 from torch_pbd.models.heteroscedastic.fit import HeteroscedasticFit
@@ -77,7 +77,7 @@ class HeteroscedasticModel(Core):
             tensors["period"] = features.period
         for name, tensor in tensors.items():
             self.register_buffer(name, tensor.detach().clone().contiguous())
-        self.kernel: KernelName = features.kernel
+        self.kernel: str = features.kernel
         self.exact = [family.features.exact for family in families]
         self.medians = [(family.length_scale, family.amplitude, family.constant) for family in families]
 
