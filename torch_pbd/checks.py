@@ -208,24 +208,35 @@ def require(good: NDArray[np.bool_], values: NDArray[Any], name: str, must: str,
         raise refusal(value, f"{name}[{', '.join(map(str, index))}]" if index else name, must, remedy)
 
 
-def semidefinite(matrices: NDArray[Any], name: str, *, definite: bool = False) -> None:
-    """Check that matrices (..., d, d) of finite floats are symmetric and positive semidefinite, or definite.
+def symmetric(matrices: NDArray[Any], name: str) -> Floats:
+    """Check that matrices (..., d, d) of floats are finite, and symmetric to rounding: that rounding of each (...).
 
-    Both to rounding, :data:`ROUNDING` of a matrix's largest entry, or a hundred times the resolution of its dtype.
-    A positive definite matrix has a Cholesky factor, which is what is asked of it.
+    It is :data:`ROUNDING` of a matrix's largest entry, or a hundred times the resolution of its dtype.
     """
     if matrices.ndim < 2 or matrices.shape[-1] != matrices.shape[-2] or not matrices.shape[-1]:
         raise InvalidParameterError(f"{name} has shape {matrices.shape}, must have shape (..., d, d).")
-    tolerance = max(ROUNDING, 100.0 * float(np.finfo(matrices.dtype).eps))
     scale = np.abs(matrices).max(axis=(-2, -1), initial=0.0)
-    require(scale <= LARGEST, scale, f"the largest entry of {name}", f"finite and at most {LARGEST:g} in size")
+    most = min(LARGEST, float(np.finfo(matrices.dtype).max) ** 0.75)  # whose products are numbers in float32 too
+    require(scale <= most, scale, f"the largest entry of {name}", f"finite and at most {most:g} in size")
+    rounding = max(ROUNDING, 100.0 * float(np.finfo(matrices.dtype).eps)) * scale
     skew = np.abs(matrices - np.swapaxes(matrices, -2, -1)).max(axis=(-2, -1), initial=0.0)
     remedy = "symmetrize the matrix, (A + A') / 2"
-    require(skew <= tolerance * scale, skew, f"the asymmetry of {name}", "zero", remedy)
-    lowest = np.linalg.eigvalsh(matrices)[..., 0] if matrices.size else scale
+    require(skew <= rounding, skew, f"the asymmetry of {name}", "zero", remedy)
+    return rounding
+
+
+def positive(lowest: NDArray[Any], name: str, rounding: Floats, *, definite: bool = False) -> None:
+    """Check the smallest eigenvalues (...) of symmetric matrices: above zero, or above minus their rounding (...)."""
     must = "above zero (positive definite)" if definite else "at least zero (positive semidefinite)"
-    good = lowest > 0.0 if definite else lowest >= -tolerance * scale
+    good = lowest > 0.0 if definite else lowest >= -rounding
     require(good, lowest, f"the smallest eigenvalue of {name}", must, "build it as a product A A'")
+
+
+def semidefinite(matrices: NDArray[Any], name: str, *, definite: bool = False) -> None:
+    """Check that matrices (..., d, d) of floats are finite, symmetric and positive semidefinite, or definite."""
+    rounding = symmetric(matrices, name)
+    lowest = np.linalg.eigvalsh(matrices)[..., 0] if matrices.size else rounding
+    positive(lowest, name, rounding, definite=definite)
 
 
 def warn(message: str, category: type[Warning] = UserWarning) -> None:
@@ -233,7 +244,7 @@ def warn(message: str, category: type[Warning] = UserWarning) -> None:
     frame, level = sys._getframe(1), 2
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == "torch_pbd":
         frame, level = frame.f_back, level + 1
-    warnings.warn(message, category, stacklevel=level - 1)
+    warnings.warn(message, category, stacklevel=level)
 
 
 def real_array(values: Any, name: str) -> NDArray[Any]:
