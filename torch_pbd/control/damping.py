@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torch_pbd import checks
-from torch_pbd.control.matrices import as_mass, as_semidefinite
+from torch_pbd.control.matrices import as_mass, as_semidefinite, broadcasts
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.linalg import spectral_map, symmetrize
 
@@ -48,7 +48,11 @@ def damping_from_stiffness(
     mass = as_mass(mass)
     if not isinstance(mass, Tensor) or mass.ndim == 0:
         return 2.0 * ratio * mass**0.5 * spectral_map(matrix, _root, spectrum)
-    _check_shapes(tuple(matrix.shape), tuple(mass.shape))
+    if not broadcasts(mass, matrix):
+        raise InvalidParameterError(
+            f"mass has shape {tuple(mass.shape)}, but stiffness has shape {tuple(matrix.shape)}: give a number, or a "
+            "matrix (d, d) of as many axes for all of them."
+        )
     mass = mass.to(matrix)
     along_mass = torch.linalg.eigh(symmetrize(mass.detach()))
     root, inverse = (spectral_map(mass, function, tuple(along_mass)) for function in (torch.sqrt, torch.rsqrt))
@@ -58,9 +62,8 @@ def damping_from_stiffness(
 def required_damping_ratio(stiffness_ratio: float) -> float:
     """Damping ratio from which a robot is exponentially stable under any schedule of stiffness whatever.
 
-    Above it, for damping ``2 zeta (m K)^1/2``, however fast K changes and its axes turn, as long as its eigenvalues
-    stay between ``k`` and ``stiffness_ratio * k``. Both may change at any time, be held over ticks of any length, or
-    be blends of such pairs (linear between knots): the derivative below is linear in both.
+    For damping ``2 zeta (m K)^1/2``, however fast K changes and its axes turn, as long as its eigenvalues stay between
+    ``k`` and ``stiffness_ratio * k``; held over ticks of any length, or blends of such pairs (linear between knots).
 
     ``(R^(1/4) - R^(-1/4)) / 2`` up to R = 194: 0.82 for R = 20, and critical damping does up to 33.9. Above 194
     more is needed than this, and from 1154 on the proof gives no ratio: infinity.
@@ -91,16 +94,6 @@ def required_damping_ratio(stiffness_ratio: float) -> float:
         return (root - 1.0 / root) / 2.0
     share = (largest - 2.0) / 4.0
     return math.sqrt((1.0 + share) / (1.0 - share)) if share < 1.0 else math.inf
-
-
-def _check_shapes(stiffness: tuple[int, ...], mass: tuple[int, ...]) -> None:
-    """Check that a mass has the axes of a stiffness, and batches that go with its own."""
-    pairs = zip(reversed(stiffness[:-2]), reversed(mass[:-2]), strict=False)
-    if stiffness[-1] != mass[-1] or any(a != b and 1 not in (a, b) for a, b in pairs):
-        raise InvalidParameterError(
-            f"mass has shape {mass}, but stiffness has shape {stiffness}: give a number, or a matrix (d, d) of as many "
-            "axes for all of them."
-        )
 
 
 def _root(eigenvalue: Tensor) -> Tensor:

@@ -44,11 +44,6 @@ class StiffnessLaw:
     smooth : bool, default=False
         Replace the straight line by ``3 u^2 - 2 u^3``: the stiffness then has a continuous derivative.
 
-    Raises
-    ------
-    ValueError
-        If a parameter is not as described.
-
     Examples
     --------
     >>> import torch
@@ -81,23 +76,16 @@ class StiffnessLaw:
         checks.number(self.sigma_high, "sigma_high", above=low, remedy=remedy)
 
     def __call__(self, covariance: Float[Tensor, "*b d d"] | Any) -> Float[Tensor, "*b d d"]:
-        """Stiffness in N/m of covariances (..., d, d), symmetric to the last bit.
-
-        Raises
-        ------
-        ValueError
-            If a covariance is not finite, symmetric and positive semidefinite.
-        """
+        """Stiffness in N/m of covariances (..., d, d), positive semidefinite; symmetric to the last bit."""
         matrix, spectrum = as_semidefinite(covariance, "covariance")
         low, high = self._quantiles(spectrum[0]) if self.bounds == "quantile" else self._scales()
         return spectral_map(matrix, lambda variance: self._stiffness(variance, low, high), spectrum)
 
     def fitted(self, covariance: Float[Tensor, "*b d d"] | Any, *, resolution: float = 0.0) -> "StiffnessLaw":
-        """The same law with its bounds fixed, as standard deviations, to those of ``covariance`` (..., d, d).
+        """Law with its bounds fixed, as standard deviations, to those of ``covariance`` (..., d, d).
 
-        Quantiles take standard deviations below ``resolution``, which cannot be told from zero, for that.
-        With bounds="quantile" and covariances that do not vary at all, every axis counts as precise, and a
-        warning says so.
+        For quantiles, smaller standard deviations count as ``resolution``. If the covariances do not vary at all, every
+        axis counts as precise, with a warning.
         """
         checks.number(resolution, "resolution", least=0.0)
         matrix, _ = as_semidefinite(covariance, "covariance")
@@ -154,7 +142,7 @@ class StiffnessLaw:
 
 
 def _quantile(ordered: Tensor, share: float) -> float:
-    """Linear interpolation between order statistics; ``torch.quantile`` refuses more than 2^24 values."""
+    """Linear interpolation between order statistics, of more than the 2^24 values that ``torch.quantile`` takes."""
     place = share * (len(ordered) - 1)
     below = min(int(place), len(ordered) - 2) if len(ordered) > 1 else 0
     above = min(below + 1, len(ordered) - 1)

@@ -45,13 +45,7 @@ class RateLimit(StiffnessFilter):
         checks.number(self.alpha, "alpha", above=0.0, unit="1/s", optional=True)
 
     def start(self, stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> "_RateLimited":
-        """Begin a run over the wanted gains (..., T, d, d).
-
-        Raises
-        ------
-        ValueError
-            If alpha is not below what the damping of the schedule allows, or the stiffness is not positive.
-        """
+        """Begin a run over the wanted gains (..., T, d, d), which must allow alpha and be positive definite."""
         inverse = torch.linalg.inv(torch.linalg.cholesky(mass))
         limit = float(torch.linalg.eigvalsh(symmetrize(inverse @ damping @ inverse.mT)).min())
         alpha = 0.5 * limit if self.alpha is None else self.alpha

@@ -10,14 +10,7 @@ from torch_pbd.control.matrices import as_mass, as_tensor
 from torch_pbd.control.simulation.position_loop import PositionLoop
 from torch_pbd.control.simulation.rollout import Rollout
 from torch_pbd.control.simulation.sensor import ForceSensor
-from torch_pbd.control.simulation.ticks import (
-    Environment,
-    StiffnessFilter,
-    Task,
-    closed_loop,
-    nothing_acts,
-    open_loop,
-)
+from torch_pbd.control.simulation.ticks import Environment, StiffnessFilter, Task, closed_loop, nothing_acts, open_loop
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.files.memory import require_memory
 
@@ -26,9 +19,8 @@ from torch_pbd.files.memory import require_memory
 class AdmittancePlant:
     """A mass on a spring and a damper that a desired motion drags along, in d axes, batched over rollouts.
 
-    ``M a = f + K (x_d - x) + D (v_d - v)``, eq. (15) as admittance: the robot moves as the measured force and
-    the impedance ask. All inputs are held over a tick (zero-order hold) and the desired position stands still
-    in it; states are those at the start of ticks.
+    ``M a = f + K (x_d - x) + D (v_d - v)``, eq. (15) as admittance. All inputs are held over a tick (zero-order hold),
+    in which the desired position stands still; states are those at the start of ticks.
 
     Parameters
     ----------
@@ -40,9 +32,9 @@ class AdmittancePlant:
         Add ``M a_d``, which eq. (15) lacks: the robot then follows but for half a tick's motion, the mean lag of
         a desired position that stands still in each tick.
     sensor : ForceSensor, default=None
-        What the admittance measures of the external force; None measures it as it is.
+        Between the external force and the admittance; None measures it as it is.
     position_loop : PositionLoop, default=None
-        How the robot follows the admittance; None follows at once.
+        Between the admittance and the robot; None follows at once.
     environment : Tunnel, default=None
         Walls, whose force adds to the external one; or any object with a method ``force(position, velocity)``.
     substeps : int, default=1
@@ -50,11 +42,6 @@ class AdmittancePlant:
         filters act once a tick, as on a real robot: with one of them it must be 1.
     stiffness_filter : RateLimit or EnergyTank, default=None
         Holds back what would feed energy into the robot.
-
-    Raises
-    ------
-    ValueError
-        If a parameter is not as described.
 
     Examples
     --------
@@ -120,8 +107,7 @@ class AdmittancePlant:
         stiffness, damping : Tensor of shape (..., T, d, d)
             In N/m and N s/m, symmetric and positive semidefinite; they need not commute.
         force : Tensor of shape (..., T, d), default=None
-            External force in N, held over each tick; None is none. Leading dimensions are those of the batch,
-            and broadcast.
+            External force in N; None is none. Leading dimensions are those of the batch, and broadcast.
         dt : float
             In s.
         position0, velocity0 : Tensor of shape (..., d), default=None
@@ -134,27 +120,25 @@ class AdmittancePlant:
         Returns
         -------
         Rollout
-            With the state at the start of each tick; differentiable in all inputs.
+            Differentiable in all inputs.
 
         Raises
         ------
         ValueError
-            If shapes disagree, a value is not finite, a matrix is not positive semidefinite, or the rollouts do
-            not fit in memory.
+            If shapes disagree, a value is not finite, a matrix is not positive semidefinite, the rollouts do not fit in
+            memory, or they diverge.
         """
-        required = {"position_desired": position_desired, "velocity_desired": velocity_desired}
-        gains = {"stiffness": as_tensor(stiffness, "stiffness"), "damping": as_tensor(damping, "damping")}
-        optional = {"acceleration_desired": acceleration_desired, "force": force}
-        starts = {"position0": position0, "velocity0": velocity0}
-        motions = required | {name: value for name, value in (optional | starts).items() if value is not None}
-        given = {name: as_tensor(value, name) for name, value in motions.items()} | gains
         checks.number(dt, "dt", above=0.0, unit="s")
         checks.instance(generator, "generator", torch.Generator, optional=True)
-        _check_given(given)
-        motion = (given[name] for name in ("position_desired", "velocity_desired", "stiffness", "damping"))
-        task = self.task(*motion, dt=dt, acceleration_desired=given.get("acceleration_desired"))
-        start = given.get("position0"), given.get("velocity0")
-        return self.run(task, given.get("force"), *start, generator=generator)
+        required = {"position_desired": position_desired, "velocity_desired": velocity_desired}
+        gains = {"stiffness": stiffness, "damping": damping}
+        optional = {"acceleration_desired": acceleration_desired, "force": force}
+        optional |= {"position0": position0, "velocity0": velocity0}
+        given = required | gains | {name: value for name, value in optional.items() if value is not None}
+        tensors = {name: as_tensor(value, name) for name, value in given.items()}
+        _check_given(tensors)
+        acting = {name: tensors.pop(name, None) for name in ("force", "position0", "velocity0")}
+        return self.run(self.task(**tensors, dt=dt), **acting, generator=generator)
 
     def task(
         self,
@@ -204,8 +188,8 @@ class AdmittancePlant:
         state = start.expand(*batch, -1), speed.expand(*batch, -1)
         if nothing_acts(self):
             position, velocity = open_loop(task, force, state)
-            record: dict[str, Any] = {"position": position, "velocity": velocity, "commanded_position": position}
             gains = (*batch, *task.stiffness.shape[-3:])
+            record: dict[str, Any] = {"position": position, "velocity": velocity, "commanded_position": position}
             record |= {"stiffness": task.stiffness.expand(gains), "damping": task.damping.expand(gains)}
             record |= {"force": force.expand_as(position)}
         else:
@@ -215,7 +199,7 @@ class AdmittancePlant:
         return Rollout(time, desired_position=task.position, **record)
 
     def _check_memory(self, batch: torch.Size, task: Task) -> None:
-        """Measured: five motions are held, and where rollouts differ in their gains, twelve matrices."""
+        # Measured: five motions are held, and where rollouts differ in their gains, twelve matrices.
         d = task.position.shape[-1]
         of_each = 5 * d + (12 * d * d if task.stiffness.ndim > 3 or self.stiffness_filter is not None else 0)
         if task.position.device.type == "cpu":  # elsewhere torch raises by itself
@@ -227,7 +211,7 @@ class AdmittancePlant:
 
 
 def _check_given(given: dict[str, Tensor]) -> None:
-    """Check the tensors that :meth:`AdmittancePlant.simulate` was given; the desired position says what T and d are."""
+    """Check the tensors that :meth:`AdmittancePlant.simulate` was given; T and d are those of the desired position."""
     kinds = sorted({f"{value.dtype} on {value.device}" for value in given.values()})
     if len(kinds) > 1:
         raise InvalidParameterError(

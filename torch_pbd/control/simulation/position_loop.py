@@ -37,7 +37,7 @@ class PositionLoop:
         return f"PositionLoop(bandwidth={self.bandwidth:g} Hz, delay_steps={self.delay_steps})"
 
     def lag(self, dt: float) -> float:
-        """How late the loop follows a ramp, in s: ``2 / w``, the delay, and half a tick of hold."""
+        """Time in s by which the loop follows a ramp late: ``2 / w``, the delay, and half a tick of hold."""
         return 1.0 / (math.pi * self.bandwidth) + (self.delay_steps + 0.5) * dt
 
     def transition(self, dt: float, like: Tensor) -> Float[Tensor, "2 3"]:

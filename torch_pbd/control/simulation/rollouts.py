@@ -118,91 +118,85 @@ def simulate_blocks(
     """
     n_rollouts, d = start[0].shape
     chunk = _CHUNK if task.position.device.type == "cpu" else n_rollouts
-    product = _Product(task, chunk) if nothing_acts(hooks) else None
-    chunks = []
-    for first in range(0, n_rollouts, chunk):
-        columns = slice(first, min(first + chunk, n_rollouts))
-        state, part = (start[0][columns], start[1][columns]), pushes[columns]
-        run = _Looped(task, state, hooks, generators()) if product is None else _Linear(task, state, product)
-        end = part.onset + part.duration
-        ends = end.cummax(0).values.tolist()
-        chunks.append((columns, run, part, part.onset.tolist(), ends, float(end.min())))
+    columns = [slice(first, min(first + chunk, n_rollouts)) for first in range(0, n_rollouts, chunk)]
+    starts = [(start[0][each], start[1][each]) for each in columns]
+    runs = _Linear(task, starts, chunk) if nothing_acts(hooks) else _Looped(task, starts, hooks, generators)
+    parts = [pushes[each] for each in columns]
+    timings = [_Timing(part) for part in parts]
     length = block_length(d)
     for first in range(0, task.n_ticks, length):
         ticks = slice(first, min(first + length, task.n_ticks))
         times = task.dt * torch.arange(first, first + length).to(task.position)
-        since, until = task.dt * first, task.dt * ticks.stop
-        for columns, run, part, onsets, ends, first_end in chunks:
-            # From the first rollout whose push lasts into the block to the last whose push begins before its end.
-            pushed = slice(bisect_right(ends, since), bisect_left(onsets, until))
-            over = first_end < until or ticks.stop == task.n_ticks
-            yield Deviations(ticks, columns, run.move(ticks, pushed, part[pushed].force(times)), over)
+        for k, (part, timing) in enumerate(zip(parts, timings, strict=True)):
+            pushed = timing.pushed(task.dt * first, task.dt * ticks.stop)
+            over = timing.first_end < task.dt * ticks.stop or ticks.stop == task.n_ticks
+            yield Deviations(ticks, columns[k], runs.move(k, ticks, pushed, part[pushed].force(times)), over)
 
 
-class _Product:
-    """Effect of a block on a chunk of rollouts, in memory that is used again and again and so stays in the cache."""
+class _Timing:
+    """Times of the pushes of a chunk, which are in the order of their onsets."""
 
-    def __init__(self, task: Task, chunk: int) -> None:
+    def __init__(self, pushes: Pushes) -> None:
+        end = pushes.onset + pushes.duration
+        self._onsets, self._ends = pushes.onset.tolist(), end.cummax(0).values.tolist()
+        self.first_end = float(end.min())
+
+    def pushed(self, start: float, stop: float) -> slice:
+        """Rollouts from the first whose push lasts beyond ``start`` to the last whose push begins before ``stop``."""
+        return slice(bisect_right(self._ends, start), bisect_left(self._onsets, stop))
+
+
+class _Linear:
+    """Chunks of rollouts of a linear task, columns of matrices whose memory is used again and so stays in the cache."""
+
+    def __init__(self, task: Task, starts: list[State], chunk: int) -> None:
         d, length = task.position.shape[-1], block_length(task.position.shape[-1])
-        self._responses, self._first = block_responses(task, length), -1
+        self._states = [torch.cat([p - task.position[0], v], dim=-1).mT.contiguous() for p, v in starts]
+        self._responses = block_responses(task, length)
         self._inputs = task.position.new_ones(2 * d + 1, chunk)
         self._outputs = task.position.new_empty(length * d + 2 * d, chunk)
 
-    def __call__(self, first: int, state: Tensor, pushed: slice, forces: Tensor) -> Tensor:
-        """Deviations (L d, r), axis by axis, in the block from a tick on, and then the state (2 d, r) after it."""
+    def move(self, k: int, ticks: slice, pushed: slice, forces: Tensor) -> Tensor:
+        """Deviations (d, L, r) of chunk k at a block of ticks, valid until the next call; forces (L, d, p) act on some.
+
+        All chunks are moved over a block, in their order, before the next one is.
+        """
+        state = self._states[k]
         size, r = state.shape
-        if first != self._first:
+        if k == 0:
             each = next(self._responses)
+            # Deviations axis by axis, and then the state after the block.
             response = torch.cat([each[:-1, : size // 2].transpose(0, 1).flatten(0, 1), each[-1]])
             self._free, self._forced = response[:, : size + 1].contiguous(), response[:, size + 1 :].contiguous()
-            self._first = first
         self._inputs[:size, :r] = state
         within = torch.mm(self._free, self._inputs[:, :r], out=self._outputs[:, :r])
         if forces.numel():
             within[:, pushed].addmm_(self._forced, forces.flatten(0, 1))
-        return within
-
-
-class _Linear:
-    """Rollouts of a linear task: columns of a matrix."""
-
-    def __init__(self, task: Task, start: State, product: _Product) -> None:
-        self._state = torch.cat([start[0] - task.position[0], start[1]], dim=-1).mT.contiguous()
-        self._product = product
-
-    def move(self, ticks: slice, pushed: slice, forces: Tensor) -> Tensor:
-        """Deviations (d, L, r) at a block of ticks, valid until another block is asked for of any rollouts.
-
-        Forces (L, d, p) act on the pushed ones.
-        """
-        size = len(self._state)
-        within = self._product(ticks.start, self._state, pushed, forces)
-        self._state.copy_(within[-size:])
+        state.copy_(within[-size:])
         return within[:-size].unflatten(0, (size // 2, -1))[:, : ticks.stop - ticks.start]
 
 
 class _Looped:
-    """Rollouts in which something acts at every tick."""
+    """Chunks of rollouts in which something acts at every tick."""
 
-    def __init__(self, task: Task, start: State, hooks: Hooks, generator: torch.Generator) -> None:
-        self._task, self._loop = task, Loop(task, start, hooks, generator)
-        self._still = torch.zeros_like(start[0])
+    def __init__(
+        self, task: Task, starts: list[State], hooks: Hooks, generators: Callable[[], torch.Generator]
+    ) -> None:
+        self._task, self._loops = task, [Loop(task, start, hooks, generators()) for start in starts]
+        self._still = [torch.zeros_like(start[0]) for start in starts]
 
-    def move(self, ticks: slice, pushed: slice, forces: Tensor) -> Tensor:
-        """Deviations (d, L, r) at a block of ticks; forces (L, d, p) act on the pushed ones."""
+    def move(self, k: int, ticks: slice, pushed: slice, forces: Tensor) -> Tensor:
+        """Deviations (d, L, r) of chunk k at a block of ticks; forces (L, d, p) act on some."""
         deviations = []
         for tick in range(ticks.start, ticks.stop):
-            force = self._still.clone()
+            force = self._still[k].clone()
             force[pushed] = forces[tick - ticks.start].mT
-            deviations.append(self._loop.run(tick, force)["position"] - self._task.position[tick])
+            deviations.append(self._loops[k].run(tick, force)["position"] - self._task.position[tick])
         return torch.stack(deviations).permute(2, 0, 1)
 
 
 class Tally:
-    """Squared peak of each of R rollouts, when it was, and the last tick above a limit after the push.
-
-    The limit is ``threshold`` in m, or else ``share`` of the rollout's own peak.
-    """
+    """Squared peak of each of R rollouts, its tick, and the last above ``threshold`` m or ``share`` of the peak."""
 
     def __init__(self, n_rollouts: int, like: Tensor, *, threshold: float | None, share: float) -> None:
         zero = torch.zeros(n_rollouts, dtype=like.dtype, device=like.device)

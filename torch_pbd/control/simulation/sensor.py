@@ -54,11 +54,6 @@ class ForceSensor:
         Readings up to it are zero, those above are nearer to zero by it [N]: continuous. It acts on the bias too:
         to remove that, read without a deadband, subtract the result of :func:`tare`, then :func:`apply_deadband`.
 
-    Raises
-    ------
-    ValueError
-        If a parameter is not as described.
-
     Examples
     --------
     >>> import torch
@@ -97,18 +92,11 @@ class ForceSensor:
 
     @classmethod
     def jr3(cls, cutoff: float = 500.0, rate: float = 1000.0) -> "ForceSensor":
-        """A sensor like the paper's JR3. The figures are plausible ones, not from a data sheet or a measurement.
+        """A sensor like the paper's JR3, by plausible figures that are not from a data sheet or a measurement.
 
         A range of 200 N in 2^13 steps, noise of 0.05 N, a bias of 0.3 N on each axis (0.2 to 0.5 N of drift are
-        usual), and a delay of about ``1 / cutoff`` in all, rounded to ticks; what the first-order filter lacks of it
-        is ``delay_steps``.
-
-        Parameters
-        ----------
-        cutoff : float, default=500.0
-            The JR3's digital filters have 500, 125, 31.25, 7.813, 1.953 and 0.4883 Hz.
-        rate : float, default=1000.0
-            Ticks a second at which it will be read: the delay is a number of ticks.
+        usual), and a delay of about ``1 / cutoff`` in all, rounded to ticks of ``rate`` Hz; what the first-order filter
+        lacks of it is ``delay_steps``. The JR3's digital filters have 500, 125, 31.25, 7.813, 1.953 and 0.4883 Hz.
         """
         checks.number(cutoff, "cutoff", above=0.0, unit="Hz")
         checks.number(rate, "rate", above=0.0, unit="Hz")
@@ -125,17 +113,11 @@ class ForceSensor:
         Parameters
         ----------
         like : Tensor of shape (..., d)
-            Shape, dtype and device of the forces to come; its values do not matter.
+            Of the shape, dtype and device of the forces to come; its values do not matter.
         dt : float
             Length of a tick [s].
         generator : torch.Generator or None, default=None
-            Source of the noise.
-
-        Raises
-        ------
-        ValueError
-            If ``dt`` is not above zero, ``bias`` has not one value for each axis, or there is noise but no
-            generator.
+            Source of the noise, which must be given if there is any.
         """
         checks.number(dt, "dt", above=0.0, unit="s")
         if isinstance(self.bias, tuple) and len(self.bias) != like.shape[-1]:
@@ -150,19 +132,9 @@ class ForceSensor:
     def measure(
         self, force: Float[Tensor, "*b t d"] | Any, dt: float, generator: torch.Generator | Any = None
     ) -> Reading:
-        """Readings of a recorded force: equal to the bit to calling the reader once a tick.
+        """Readings (..., T, d) of a true force (..., T, d) in N: equal to the bit to those of a reader tick by tick.
 
-        Parameters
-        ----------
-        force : Tensor of shape (..., T, d)
-            True force at each tick [N], T at least 1.
-        dt, generator
-            As for :meth:`start`.
-
-        Returns
-        -------
-        Reading
-            ``force`` (..., T, d) and ``saturated`` (..., T).
+        ``dt`` and ``generator`` are as for :meth:`start`.
         """
         force = as_tensor(force, "force")
         if force.ndim < 2 or force.shape[-2] == 0:
@@ -174,10 +146,7 @@ class ForceSensor:
 
 @final
 class ForceReader:
-    """Sensor in use: made by :meth:`ForceSensor.start`, called with the true force once a tick.
-
-    It keeps the state of the filter and the readings still under way, and nothing else.
-    """
+    """Sensor in use, called with the true force once a tick: state of the filter, and readings still under way."""
 
     def __init__(
         self, sensor: ForceSensor, like: Float[Tensor, "*b d"], dt: float, generator: torch.Generator | None
@@ -204,7 +173,7 @@ class ForceReader:
         return self._under_way.popleft()
 
     def _low_pass(self, level: Tensor) -> Tensor:
-        """State of ``dx/dt = 2 pi cutoff (level - x)`` at the start of the tick, and step it over the tick."""
+        """State of ``dx/dt = 2 pi cutoff (level - x)`` at the start of the tick, over which it moves on."""
         if self._gain is None:
             return level
         before = self._filtered

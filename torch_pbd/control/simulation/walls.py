@@ -44,11 +44,6 @@ class Tunnel:
     virtual : bool, default=False
         A drawn wall, as on the display of the paper: penetration counts but there is no force.
 
-    Raises
-    ------
-    ValueError
-        If ``stiffness`` is not finite and above zero, or ``damping`` not finite and at least zero.
-
     Notes
     -----
     A force that is held for a tick h makes the wall give back more energy than it took, unless there is enough
@@ -100,15 +95,7 @@ class Tunnel:
     def report(
         self, rollout_position: Float[Tensor, "*b t 2"] | Any, velocity: Float[Tensor, "*b t 2"] | Any, dt: float
     ) -> "ContactReport":
-        """Contacts of a rollout with the walls.
-
-        Parameters
-        ----------
-        rollout_position, velocity : Tensor of shape (..., T, 2)
-            At the start of each tick [m, m/s], finite.
-        dt : float
-            Length of a tick [s].
-        """
+        """Contacts of a rollout: positions and velocities (..., T, 2) at the start of ticks of ``dt`` s, all finite."""
         checks.number(dt, "dt", above=0.0, unit="s")
         rollout_position, velocity = as_rows(rollout_position, "rollout_position", 2), as_rows(velocity, "velocity", 2)
         depth = self.penetration(rollout_position)
@@ -145,14 +132,14 @@ class ContactReport:
 
     Attributes
     ----------
-    max_penetration : Tensor of shape (...)
-        Greatest depth beyond a wall [m]; 0 where it was not touched.
-    time_in_wall : Tensor of shape (...)
-        Number of ticks that start beyond a wall, times dt [s].
-    impulse : Tensor of shape (...)
-        Sum of the size of the wall's force times dt [N s]; 0 for a virtual wall.
-    n_contacts : Tensor of shape (...)
-        How often a wall was entered; to start in it counts.
+    max_penetration : (...), m
+        Greatest depth beyond a wall; 0 where it was not touched.
+    time_in_wall : (...), s
+        Number of ticks that start beyond a wall, times dt.
+    impulse : (...), N s
+        Sum of the size of the wall's force times dt; 0 for a virtual wall.
+    n_contacts : (...)
+        Number of times that a wall was entered; to start in it counts.
     """
 
     max_penetration: Float[Tensor, "*b"]

@@ -43,7 +43,7 @@ def certify(
     Parameters
     ----------
     schedule : Schedule
-        Or anything with ``time`` (n,), ``stiffness`` and ``damping`` (n, d, d).
+        Or any object with ``time`` (n,), ``stiffness`` and ``damping`` (n, d, d).
     mass : float or array_like of shape (d, d), default=1.0
         Virtual mass of the admittance, kg.
     speed : float, default=1.0
@@ -55,10 +55,6 @@ def certify(
     dt : float, default=0.001
         Tick of the controller, s.
 
-    Returns
-    -------
-    StabilityReport
-
     Raises
     ------
     ValueError
@@ -67,8 +63,7 @@ def certify(
     References
     ----------
     K. Kronander, A. Billard, "Stability considerations for variable impedance control", IEEE Transactions on
-    Robotics 32, 2016. Its conditions are linear in time between knots where K and D are, so that holding at the
-    ends of every interval is holding throughout; and they are convex in alpha, which is found by golden section.
+    Robotics 32, 2016.
     """
     checks.number(speed, "speed", above=0.0)
     checks.number(dt, "dt", above=0.0, unit="s")
