@@ -77,6 +77,7 @@ def as_semidefinite(value: Any, name: str) -> tuple[Tensor, tuple[Tensor, Tensor
     return matrix, (eigenvalues, axes)
 
 
+# The parameters of the primitive and of the controller are checked by these three until they go to checks.py.
 def check_finite(name: str, value: Any, *, optional: bool = False) -> None:
     """Check that a parameter is a finite number, or None where that is allowed."""
     if value is not None or not optional:
@@ -85,7 +86,9 @@ def check_finite(name: str, value: Any, *, optional: bool = False) -> None:
 
 def check_positive(name: str, value: Any, unit: str = "") -> None:
     """Check that a parameter is a positive finite number."""
-    checks.number(value, name, above=0.0, unit=unit)
+    checks.number(value, name)
+    if value <= 0.0:
+        raise InvalidParameterError(f"{name} is {value:g}{unit and ' ' + unit}, must be positive.")
 
 
 def check_count(name: str, value: Any, least: int) -> None:
