@@ -9,9 +9,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small: th
 from jaxtyping import install_import_hook
 
 TORCH_CONTROL = [
-    "damping", "matrices", "stiffness", "primitive.dmp", "stability.certify", "stability.coupling",
+    "damping", "matrices", "stiffness", "primitive.dmp", "stability.certify", "stability.lyapunov",
     *(f"simulation.{part}" for part in (
-        "walls", "filters", "plant", "sensor", "rollout", "rollouts", "position_loop", "ticks", "transitions")),
+        "walls", "filters", "plant", "sensor", "rollout", "rollouts", "position_loop", "ticks")),
 ]  # fmt: skip
 TORCH_MOVEMENT = [f"movement.{part}" for part in ("joint", "conditioning", "time_kernel")]
 TORCH_FLOORS = [

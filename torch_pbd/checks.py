@@ -210,19 +210,27 @@ def require(good: NDArray[np.bool_], values: NDArray[Any], name: str, must: str,
         raise refusal(values[index], where, must, remedy)
 
 
-def symmetric(matrices: NDArray[Any], name: str) -> NDArray[Any]:
+def symmetric(matrices: NDArray[Any], name: str) -> Floats:
     """Check that matrices (..., d, d) of floats are finite and symmetric to rounding; returns that of each (...,).
 
     It is :data:`ROUNDING` of a matrix's largest entry, or a hundred times the resolution of its dtype.
     """
     if matrices.ndim < 2 or matrices.shape[-1] != matrices.shape[-2] or not matrices.shape[-1]:
         raise InvalidParameterError(f"{name} has shape {matrices.shape}, must have shape (..., d, d).")
-    scale = np.abs(matrices).max(axis=(-2, -1), initial=0.0).astype(np.float64)  # float32 cannot hold LARGEST
-    require(scale <= LARGEST, scale, f"the largest entry of {name}", f"finite and at most {LARGEST:g} in size")
-    rounding: NDArray[Any] = max(ROUNDING, 100.0 * float(np.finfo(matrices.dtype).eps)) * scale
+    scale = np.abs(matrices).max(axis=(-2, -1), initial=0.0).astype(np.float64)
+    most = min(LARGEST, float(np.finfo(matrices.dtype).max) ** 0.75)  # whose products are numbers in float32 too
+    require(scale <= most, scale, f"the largest entry of {name}", f"finite and at most {most:g} in size")
+    rounding: Floats = max(ROUNDING, 100.0 * float(np.finfo(matrices.dtype).eps)) * scale
     skew = np.abs(matrices - np.swapaxes(matrices, -2, -1)).max(axis=(-2, -1), initial=0.0)
     require(skew <= rounding, skew, f"the asymmetry of {name}", "zero", "symmetrize it, (A + A') / 2")
     return rounding
+
+
+def positive(lowest: NDArray[Any], name: str, rounding: float | Floats, *, definite: bool = False) -> None:
+    """Check the smallest eigenvalues (...) of symmetric matrices: above zero, or above minus their rounding (...)."""
+    must = "above zero, positive definite" if definite else "zero or more, positive semidefinite"
+    good = lowest > 0.0 if definite else lowest >= -rounding
+    require(good, lowest, f"the smallest eigenvalue of {name}", must, "build it as a product A A'")
 
 
 def semidefinite(matrices: NDArray[Any], name: str, *, definite: bool = False, remedy: str = "") -> None:
@@ -232,20 +240,19 @@ def semidefinite(matrices: NDArray[Any], name: str, *, definite: bool = False, r
     may have units that are far apart.
     """
     rounding = symmetric(matrices, name)
-    # Cholesky factors tell semidefinite ones; matrices of zeros have no scale, and pass any shift.
-    if not definite and eigenvalues_above(matrices, -np.where(rounding > 0.0, rounding, 1.0)):
+    if not definite:
+        # Cholesky factors tell semidefinite ones; matrices of zeros have no scale, and pass any shift.
+        if not eigenvalues_above(matrices, -np.where(rounding > 0.0, rounding, 1.0)):
+            positive(np.linalg.eigvalsh(matrices)[..., 0], name, rounding)
         return
-    judged = matrices
-    if definite:
-        deviation = np.sqrt(np.diagonal(matrices, axis1=-2, axis2=-1).clip(0.0))
-        product = deviation[..., :, np.newaxis] * deviation[..., np.newaxis, :]
-        # A variance of zero or less leaves zeros, which are not definite.
-        judged = np.divide(matrices, product, out=np.zeros_like(matrices), where=product > 0.0)
-    lowest = np.linalg.eigvalsh(judged)[..., 0] if matrices.size else rounding
-    good = lowest > _SINGULAR if definite else lowest >= -rounding
+    deviation = np.sqrt(np.diagonal(matrices, axis1=-2, axis2=-1).clip(0.0))
+    product = deviation[..., :, np.newaxis] * deviation[..., np.newaxis, :]
+    # A variance of zero or less leaves zeros, which are not definite.
+    correlations = np.divide(matrices, product, out=np.zeros_like(matrices), where=product > 0.0)
+    good = np.linalg.eigvalsh(correlations)[..., 0] > _SINGULAR
     if not good.all():
         own = np.linalg.eigvalsh(matrices)[..., 0]
-        must = "above zero, positive definite" if definite else "zero or more, positive semidefinite"
+        must = "above zero, positive definite"
         require(good, own, f"the smallest eigenvalue of {name}", must, remedy or "build it as a product A A'")
 
 

@@ -116,8 +116,10 @@ class _SpectralMap(torch.autograd.Function):
     """Function of a symmetric matrix whose gradient survives equal eigenvalues, which that of eigh does not."""
 
     @staticmethod
-    def forward(ctx: Any, matrix: Tensor, function: Callable[[Tensor], Tensor]) -> Tensor:
-        eigenvalues, axes = torch.linalg.eigh(matrix)
+    def forward(
+        ctx: Any, matrix: Tensor, function: Callable[[Tensor], Tensor], spectrum: tuple[Tensor, Tensor] | None
+    ) -> Tensor:
+        eigenvalues, axes = torch.linalg.eigh(matrix) if spectrum is None else spectrum
         with torch.enable_grad():
             leaf = eigenvalues.detach().requires_grad_(ctx.needs_input_grad[0])
             mapped = function(leaf)
@@ -127,7 +129,7 @@ class _SpectralMap(torch.autograd.Function):
         return symmetrize(axes * mapped.unsqueeze(-2) @ axes.mT)
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
         if torch.is_grad_enabled():  # the axes are constants here: a second derivative would be wrong in silence
             raise RuntimeError("spectral_map has no second derivatives: call autograd without create_graph=True.")
         eigenvalues, axes, mapped, slope = ctx.saved_tensors
@@ -138,10 +140,14 @@ class _SpectralMap(torch.autograd.Function):
         rise = mapped.unsqueeze(-1) - mapped.unsqueeze(-2)
         mean_slope = 0.5 * (slope.unsqueeze(-1) + slope.unsqueeze(-2))
         divided = torch.where(equal, mean_slope, rise / torch.where(equal, 1.0, gap))
-        return axes @ (divided * (axes.mT @ symmetrize(gradients[0]) @ axes)) @ axes.mT, None
+        return axes @ (divided * (axes.mT @ symmetrize(gradients[0]) @ axes)) @ axes.mT, None, None
 
 
-def spectral_map(matrix: Float[Tensor, "*b d d"], function: Callable[[Tensor], Tensor]) -> Float[Tensor, "*b d d"]:
+def spectral_map(
+    matrix: Float[Tensor, "*b d d"],
+    function: Callable[[Tensor], Tensor],
+    spectrum: tuple[Float[Tensor, "*b d"], Float[Tensor, "*b d d"]] | None = None,
+) -> Float[Tensor, "*b d d"]:
     """``Q diag(function(eigenvalues)) Q'`` of symmetric matrices, symmetric to the last bit.
 
     Continuous in the matrix wherever ``function`` is in the eigenvalue, though the axes Q jump where eigenvalues
@@ -154,6 +160,8 @@ def spectral_map(matrix: Float[Tensor, "*b d d"], function: Callable[[Tensor], T
         Symmetric; only the symmetric part is used.
     function : callable
         Maps eigenvalues (..., d) elementwise, differentiable by autograd.
+    spectrum : (Tensor of shape (..., d), Tensor of shape (..., d, d)), default=None
+        Eigenvalues and axes of the symmetric part, where they are known.
     """
-    result: Tensor = _SpectralMap.apply(symmetrize(matrix), function)
+    result: Tensor = _SpectralMap.apply(symmetrize(matrix), function, spectrum)
     return result

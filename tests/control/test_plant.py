@@ -14,7 +14,6 @@ from torch_pbd.control.simulation.filters import EnergyTank
 from torch_pbd.control.simulation.plant import AdmittancePlant
 from torch_pbd.control.simulation.position_loop import PositionLoop
 from torch_pbd.control.simulation.sensor import ForceSensor
-from torch_pbd.control.simulation.walls import Tunnel
 
 
 def tensor(*values):
@@ -66,6 +65,37 @@ def scipy_run(mass, dt, position0, velocity0, position_desired, velocity_desired
     return np.array(states)[:, :d], np.array(states)[:, d:]
 
 
+def usual_run(
+    integrator, mass, dt, position_desired, velocity_desired, stiffness, damping, force, position0, velocity0
+):
+    """Positions by the integrators of simulators: rk4 (order 4), trapezoid (2), semi-implicit Euler (1)."""
+    inverse, x, v, positions = torch.linalg.inv(mass), position0, velocity0, []
+    for desired, speed, stiff, damp, push in zip(
+        position_desired, velocity_desired, stiffness, damping, force, strict=True
+    ):
+        positions.append(x)
+
+        def acceleration(x, v, desired=desired, speed=speed, stiff=stiff, damp=damp, push=push):
+            return inverse @ (push + stiff @ (desired - x) + damp @ (speed - v))
+
+        if integrator == "semi_implicit_euler":
+            v = v + dt * acceleration(x, v)
+            x = x + dt * v
+        elif integrator == "trapezoid":
+            half = 0.5 * dt * inverse
+            left = torch.eye(len(x)).double() + half @ damp + 0.5 * dt * half @ stiff
+            faster = torch.linalg.solve(left, v + half @ (2.0 * push + stiff @ (2.0 * (desired - x) - 0.5 * dt * v)
+                                                          + damp @ (2.0 * speed - v)))  # fmt: skip
+            x, v = x + 0.5 * dt * (v + faster), faster
+        else:
+            x1, v1 = v, acceleration(x, v)
+            x2, v2 = v + 0.5 * dt * v1, acceleration(x + 0.5 * dt * x1, v + 0.5 * dt * v1)
+            x3, v3 = v + 0.5 * dt * v2, acceleration(x + 0.5 * dt * x2, v + 0.5 * dt * v2)
+            x4, v4 = v + dt * v3, acceleration(x + dt * x3, v + dt * v3)
+            x, v = x + dt / 6.0 * (x1 + 2.0 * (x2 + x3) + x4), v + dt / 6.0 * (v1 + 2.0 * (v2 + v3) + v4)
+    return torch.stack(positions)
+
+
 @pytest.mark.parametrize(("d", "dt"), [(1, 1e-3), (2, 1e-3), (2, 1e-2), (3, 1e-2)])
 def test_a_tick_is_exact_whatever_turns_in_it(d, dt):
     """To 1e-8 m against scipy, from 50 N/m to 1e4 N/m, where the usual integrator misses by far more than 0.1 mm."""
@@ -80,8 +110,8 @@ def test_a_tick_is_exact_whatever_turns_in_it(d, dt):
     # In full sight of what acts in the loop, none of which does: the other path through the code
     loop = AdmittancePlant(uneven(d), stiffness_filter=None, sensor=ForceSensor(range=math.inf))
     np.testing.assert_allclose(loop.simulate(**given, **start, dt=dt).position, position, rtol=0, atol=1e-8)
-    usual = AdmittancePlant(uneven(d), "semi_implicit_euler").simulate(**given, **start, dt=dt)
-    assert not (abs(usual.position.numpy() - position).max() < 1e-4)  # it may be infinite
+    usual = usual_run("semi_implicit_euler", uneven(d), dt, **given, **start)
+    assert not ((usual - torch.tensor(position)).abs().max() < 1e-4)  # it may be infinite
 
 
 @pytest.mark.parametrize("ratio", [0.3, 0.7, 1.0 - 1e-9, 1.0, 1.5, 20.0])
@@ -107,25 +137,18 @@ def test_free_motion_is_the_closed_form(ratio, dt):
 def test_other_integrators_converge_to_it_at_their_orders(integrator, order):
     """Inputs are held on a coarse grid of 20 ms; ticks are refined by repeating them."""
     given = task(50, 0.02, 2, stiffest=800.0)
+    still = {"position0": given["position_desired"][0], "velocity0": given["velocity_desired"][0]}
     exact = AdmittancePlant(uneven(2)).simulate(**given, dt=0.02).position
     errors, refinements = [], [4, 8, 16, 32]
     for times in refinements:
         finer = {name: value.repeat_interleave(times, dim=0) for name, value in given.items()}
-        run = AdmittancePlant(uneven(2), integrator).simulate(**finer, dt=0.02 / times)
-        errors.append((run.position[::times] - exact).abs().max().item())
+        positions = usual_run(integrator, uneven(2), 0.02 / times, **finer, **still)
+        errors.append((positions[::times] - exact).abs().max().item())
     fitted = -np.polyfit(np.log(refinements), np.log(errors), 1)[0]
     assert fitted == pytest.approx(order, abs=0.2)
     same = {name: value.repeat_interleave(8, dim=0) for name, value in given.items()}
     again = AdmittancePlant(uneven(2)).simulate(**same, dt=0.02 / 8).position[::8]
     torch.testing.assert_close(again, exact, rtol=0, atol=1e-12)
-
-
-def test_semi_implicit_euler_moves_by_the_new_velocity():
-    given = task(2, 0.01, 1)
-    run = AdmittancePlant(2.0, "semi_implicit_euler").simulate(**given, dt=0.01, velocity0=tensor(3.0))
-    pull = given["force"] + given["damping"][..., 0] * (given["velocity_desired"] - 3.0)  # it starts on the spot
-    torch.testing.assert_close(run.velocity[1], 3.0 + 0.01 * pull[0] / 2.0, rtol=1e-12, atol=0)
-    torch.testing.assert_close(run.position[1], run.position[0] + 0.01 * run.velocity[1], rtol=1e-12, atol=1e-15)
 
 
 @pytest.mark.parametrize("d", [1, 2, 3])
@@ -244,14 +267,22 @@ def test_a_biased_sensor_moves_the_axis_by_bias_over_stiffness():
     assert not run.saturated.any()
 
 
+class Wall:
+    """A wall of 1e5 N/m and 100 N s/m across the first axis, at 0.01 m."""
+
+    def force(self, position, velocity):
+        inside = position[..., 0] > 0.01
+        press = (1e5 * (position[..., 0] - 0.01) + 100.0 * velocity[..., 0]).clamp_min(0.0)
+        return torch.stack([torch.where(inside, -press, 0.0), torch.zeros_like(press)], dim=-1)
+
+
 def pressed(substeps, dt=2e-3, duration=0.06):
     """A robot that a force of 40 N drives into a wall of 1e5 N/m at 0.01 m."""
     n_ticks = round(duration / dt)
-    wall = Tunnel(1e5, 100.0, center=torch.zeros_like, half_width=lambda y: torch.full_like(y, 0.01))
     still = torch.zeros(n_ticks, 2).double()
     stiffness = (100.0 * torch.eye(2).double()).expand(n_ticks, 2, 2)
     force = tensor(40.0, 0.0).expand(n_ticks, 2)
-    plant = AdmittancePlant(1.0, environment=wall, substeps=substeps)
+    plant = AdmittancePlant(1.0, environment=Wall(), substeps=substeps)
     return plant.simulate(still, still, stiffness, damping_from_stiffness(stiffness), force, dt=dt)
 
 
@@ -281,18 +312,18 @@ def changed(name, index, value):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (changed("force", (3, 0), math.nan), "force has a value that is not finite, at tick 3"),
-        (changed("position_desired", (1, 1), math.inf), "position_desired has a value that is not finite, at tick 1"),
-        (changed("velocity_desired", (4, 0), math.nan), "velocity_desired has a value that is not finite, at tick 4"),
-        (changed("stiffness", (2, 0, 0), math.nan), "stiffness has an entry that is not finite, at index 2"),
-        (changed("stiffness", (2, 0, 1), 1e9), "stiffness must be symmetric; at index 2"),
-        (changed("damping", (1, 0, 0), -1e3), "damping must be positive semidefinite; at index 1"),
+        (changed("force", (3, 0), math.nan), "force[3, 0] is nan, must be finite"),
+        (changed("position_desired", (1, 1), math.inf), "position_desired[1, 1] is inf, must be finite"),
+        (changed("velocity_desired", (4, 0), math.nan), "velocity_desired[4, 0] is nan, must be finite"),
+        (changed("stiffness", (2, 0, 0), math.nan), "the largest entry of stiffness[2] is nan"),
+        (changed("stiffness", (2, 0, 1), 1e9), "the asymmetry of stiffness[2] is "),
+        (changed("damping", (1, 0, 0), -1e3), "the smallest eigenvalue of damping[1] is "),
         ({"force": GIVEN["force"][:4]}, "force has shape (4, 2)"),
         ({"force": GIVEN["force"][:, :1]}, "force has shape (5, 1)"),
         ({"damping": GIVEN["damping"][0]}, "damping has shape (2, 2)"),
         ({"stiffness": GIVEN["stiffness"][:4]}, "stiffness has shape (4, 2, 2)"),
         ({"position_desired": GIVEN["force"][:0]}, "position_desired has shape (0, 2)"),
-        ({"dt": 0.0}, "dt is 0 s"),
+        ({"dt": 0.0}, "dt is 0.0 s"),
         ({"dt": math.nan}, "dt is nan"),
         ({"position0": tensor(0.0, math.nan)}, "position0"),
         ({"velocity0": tensor(0.0, 1.0, 2.0)}, "velocity0"),
@@ -310,10 +341,13 @@ def test_inputs_are_refused_by_name_and_tick(arguments, words):
 @pytest.mark.parametrize(
     ("parameters", "words"),
     [
-        ({"mass": 0.0}, "mass is 0 kg"),
-        ({"mass": torch.diag(tensor(1.0, -1.0))}, "mass must be positive semidefinite"),
+        ({"mass": 0.0}, "mass is 0.0 kg"),
+        ({"mass": torch.diag(tensor(1.0, -1.0))}, "the smallest eigenvalue of mass is -1.0, must be above zero"),
         ({"substeps": 0}, "substeps is 0"),
-        ({"substeps": 2, "sensor": ForceSensor()}, "must be 1 with a sensor or a position loop"),
+        (
+            {"substeps": 2, "sensor": ForceSensor()},
+            "substeps is 2, must be an integer of at least 1 and at most 1: sensors, position loops",
+        ),
     ],
 )
 def test_parameters_are_checked(parameters, words):
@@ -322,7 +356,7 @@ def test_parameters_are_checked(parameters, words):
 
 
 @pytest.mark.parametrize(
-    ("parameters", "words"), [({"bandwidth": 0.0}, "bandwidth is 0 Hz"), ({"delay_steps": -1}, "delay_steps is -1")]
+    ("parameters", "words"), [({"bandwidth": 0.0}, "bandwidth is 0.0 Hz"), ({"delay_steps": -1}, "delay_steps is -1")]
 )
 def test_parameters_of_the_position_loop_are_checked(parameters, words):
     with pytest.raises(ValueError, match=re.escape(words)):
@@ -341,17 +375,17 @@ def test_as_arrays_it_is_the_same_run():
 @pytest.mark.parametrize(
     ("name", "part", "problem"),
     [
-        ("sensor", 3, "has no method"),
-        ("position_loop", 20.0, "has no method"),
-        ("environment", "wall", "has no method"),
-        ("stiffness_filter", 5, "has no method"),
-        ("stiffness_filter", EnergyTank, "is a class, must be an object of it"),
-        ("sensor", ForceSensor, "is a class, must be an object of it"),
+        ("sensor", 3, "must be a ForceSensor or None"),
+        ("position_loop", 20.0, "must be a PositionLoop or None"),
+        ("environment", "wall", "must be an Environment or None"),
+        ("stiffness_filter", 5, "must be a StiffnessFilter or None"),
+        ("stiffness_filter", EnergyTank, "must be a StiffnessFilter or None"),
+        ("sensor", ForceSensor, "must be a ForceSensor or None"),
     ],
 )
 def test_parts_of_other_kinds_are_refused_at_once(name, part, problem):
     unchecked = getattr(
         AdmittancePlant.__init__, "__wrapped__", AdmittancePlant.__init__
     )  # beartype would refuse first
-    with pytest.raises(ValueError, match=rf"{name}=.* {problem}"):
+    with pytest.raises(ValueError, match=rf"{name} is .* {problem}"):
         unchecked(AdmittancePlant.__new__(AdmittancePlant), **{name: part})

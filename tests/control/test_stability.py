@@ -13,10 +13,10 @@ import torch
 from torch_pbd import CholeskyCovRegressor, DMPController, load_demonstrations
 from torch_pbd.control.damping import damping_from_stiffness, required_damping_ratio
 from torch_pbd.control.simulation.plant import AdmittancePlant
-from torch_pbd.control.simulation.transitions import admittance_rate, transition
+from torch_pbd.control.simulation.ticks import admittance_rate, transition
 from torch_pbd.control.stability import certify as module
-from torch_pbd.control.stability.certify import _Knots, certify
-from torch_pbd.control.stability.lyapunov import has_common_function
+from torch_pbd.control.stability.certify import certify
+from torch_pbd.control.stability.lyapunov import has_common_function, knots_of
 from torch_pbd.data import make_tunnel_demonstrations
 
 N_KNOTS = 12
@@ -80,7 +80,7 @@ def maps_between_knots(time, stiffness, damping, mass, n_steps=80):
 def test_none_of_a_thousand_certified_schedules_grows(d, generator):
     """500 for each d: the growth over a period by the largest eigenvalue of its map, and V at every knot."""
     time, stiffness, damping, mass = periodic_schedules(500, d, generator)
-    found = [_Knots.of(*each).certificate() for each in zip(time, stiffness, damping, mass[:, 0], strict=True)]
+    found = [knots_of(*each).certificate() for each in zip(time, stiffness, damping, mass[:, 0], strict=True)]
     alpha, margin = torch.tensor([each[:2] for each in found], dtype=torch.float64).unbind(-1)
     maps = maps_between_knots(time, stiffness, damping, mass)
     over_period = torch.eye(2 * d).double()
@@ -179,7 +179,7 @@ def test_what_grows_with_its_gains_held_over_ticks_is_not_stable():
 
 
 @pytest.mark.parametrize(
-    ("options", "words"), [({"dt": 0.0}, "dt is 0 s"), ({"force_cutoff": -5.0}, "force_cutoff is -5 Hz")]
+    ("options", "words"), [({"dt": 0.0}, "dt is 0.0 s"), ({"force_cutoff": -5.0}, "force_cutoff is -5.0 Hz")]
 )
 def test_options_are_checked(options, words):
     with pytest.raises(ValueError, match=re.escape(words)):
@@ -478,8 +478,12 @@ def test_below_the_sharp_limit_there_is_a_schedule_that_grows(ratio, limit):
     [
         ({}, {"speed": 0.0}, "speed is 0"),
         ({}, {"speed": math.nan}, "speed is nan"),
-        ({}, {"mass": -1.0}, "mass is -1 kg"),
-        ({"stiffness": torch.zeros(60, 2, 2).double()}, {}, "stiffness must be positive definite"),
+        ({}, {"mass": -1.0}, "mass is -1.0 kg"),
+        (
+            {"stiffness": torch.zeros(60, 2, 2).double()},
+            {},
+            "smallest eigenvalue of schedule.stiffness[0] is 0.0, must be above zero",
+        ),
     ],
 )
 def test_what_cannot_be_certified_is_refused(changes, arguments, words):

@@ -176,13 +176,13 @@ def changed(index, value):
 @pytest.mark.parametrize(
     ("covariance", "words"),
     [
-        (changed((2, 0, 0), np.nan), "covariance has an entry that is not finite, at index 2"),
-        (changed((1, 1, 1), np.inf), "covariance has an entry that is not finite, at index 1"),
-        (changed((1, 0, 1), 1e-6), "covariance must be symmetric; at index 1"),
-        (changed((2, 0, 0), -1e-7), "covariance must be positive semidefinite; at index 2"),
+        (changed((2, 0, 0), np.nan), "the largest entry of covariance[2] is nan, must be finite"),
+        (changed((1, 1, 1), np.inf), "the largest entry of covariance[1] is inf, must be finite"),
+        (changed((1, 0, 1), 1e-6), "the asymmetry of covariance[1] is 1e-06, must be zero"),
+        (changed((2, 0, 0), -1e-7), "the smallest eigenvalue of covariance[2] is -1e-07"),
         (GOOD[0, 0], "covariance has shape (2,)"),
         (GOOD[:, :, :1], "covariance has shape (3, 2, 1)"),
-        (np.zeros((0, 2, 2)), "at least one covariance"),
+        (np.zeros((0, 2, 2)), "covariance is empty, must have at least one matrix"),
     ],
 )
 def test_what_is_not_a_covariance_is_refused_by_index(covariance, words):
@@ -199,12 +199,18 @@ def test_rounding_errors_are_no_errors():
     ("parameters", "words"),
     [
         ({"stiffness_min": 0.0}, "stiffness_min is 0"),
-        ({"stiffness_min": 2000.0}, "0 < stiffness_min <= stiffness_max"),
+        ({"stiffness_min": 2000.0}, "stiffness_max is 1000.0 N/m, must be a finite number of at least 2000"),
         ({"stiffness_max": math.nan}, "stiffness_max is nan"),
-        ({"bounds": "sigma", "sigma_low": 0.9, "sigma_high": 0.1}, "sigma_low=0.9 and sigma_high=0.1"),
+        (
+            {"bounds": "sigma", "sigma_low": 0.9, "sigma_high": 0.1},
+            "sigma_high is 0.1, must be a finite number above 0.9",
+        ),
         ({"sigma_low": 0.01, "sigma_high": 0.03}, "are standard deviations: give bounds='sigma' with them"),
-        ({"bounds": "sigma", "sigma_low": 0.1}, "needs sigma_low and sigma_high"),
-        ({"bounds": "variance", "sigma_low": -1e-3, "sigma_high": 1.0}, "0 <= sigma_low < sigma_high"),
+        ({"bounds": "sigma", "sigma_low": 0.1}, "sigma_high is None, must be a finite number above 0.1"),
+        (
+            {"bounds": "variance", "sigma_low": -1e-3, "sigma_high": 1.0},
+            "sigma_low is -0.001, must be a finite number of at least 0",
+        ),
         ({"bounds": "sigma", "sigma_low": 0.1, "sigma_high": math.inf}, "sigma_high is inf"),
     ],
 )

@@ -197,7 +197,7 @@ def test_weights_that_are_none_are_refused(weights):
 @pytest.mark.parametrize("value", [1e308, -1.0])
 def test_matrices_beyond_arithmetic_or_not_positive_are_refused_and_not_made_zero(value):
     for function in (LAW, damping_from_stiffness):
-        with pytest.raises(ValueError, match=r"overflow: use other units|must be positive semidefinite"):
+        with pytest.raises(ValueError, match=r"must be finite and at most 1e\+100 in size|must be at least zero"):
             function(value * np.eye(2))
 
 
@@ -243,22 +243,21 @@ CALLS = [
     (lambda: simulate_many("schedule"), "schedule is 'schedule', must be a Schedule"),
     (lambda: simulate_many(SCHEDULE, 10, plant="robot", duration=0.1), "plant is 'robot', must be an AdmittancePlant"),
     (lambda: simulate_many(SCHEDULE, 10, duration=0.1, random_state=-1), "random_state is -1"),
-    (lambda: simulate_many(SCHEDULE, 10, duration=0.1, device="warp"), "device is 'warp', which cannot be used here"),
-    (lambda: simulate_many(SCHEDULE, 10, duration=0.1, onset=0.1), "onset is 0.1, must be two numbers"),
-    (lambda: simulate_many(SCHEDULE, 10, duration=0.1, peak=1e300), r"peak is 1e\+300, must not be negative"),
+    (lambda: simulate_many(SCHEDULE, 10, duration=0.1, onset=0.1), "onset has shape .*, must have shape .2,"),
+    (lambda: simulate_many(SCHEDULE, 10, duration=0.1, peak=1e300), r"peak is 1e\+300 N, must be .* at most 1e\+100"),
     (lambda: simulate_many(SCHEDULE, 10, duration=0.1, quantiles="half"), "quantiles holds text"),
     (lambda: certify(SimpleNamespace(**{**ROWS, "time": TIME[::-1]})), "schedule.time has shape .* increase"),
     (lambda: certify(SimpleNamespace(**{**ROWS, "damping": DAMPING[:5]})), r"schedule.damping has shape \(5, 2, 2\)"),
     (lambda: certify(SCHEDULE, position_loop="slow"), "position_loop is 'slow', must be a PositionLoop"),
     (lambda: damping_from_stiffness(np.eye(2), np.eye(3)), r"mass has shape \(3, 3\), but stiffness has shape \(2,"),
     (lambda: damping_from_stiffness(np.ones((4, 1, 1)), np.ones((3, 1, 1))), r"mass has shape \(3, 1, 1\), but"),
-    (lambda: damping_from_stiffness(GAIN, 1.0, np.eye(2)), "(?s)damping_ratio is array.* must be a finite number"),
+    (lambda: damping_from_stiffness(GAIN, 1.0, np.eye(2)), "(?s)damping_ratio is array.* of at least 0"),
     (lambda: damping_from_stiffness(GAIN, 1.0, torch.ones(2)), "damping_ratio is tensor"),
-    (lambda: certify(SCHEDULE, mass="1"), "mass is '1', must be numbers"),
+    (lambda: certify(SCHEDULE, mass="1"), "mass holds text"),
     (lambda: SCHEDULE.resample(1e300), r"rate=1e\+300 Hz needs about more than"),
     (lambda: SCHEDULE.retime(1e-300), "speed is 1e-300, must be a finite number of at least"),
     (lambda: AdmittancePlant(sensor=ForceSensor(noise_scale=1.0)).simulate(
-        STILL, STILL, GAIN, DAMPING, dt=0.001, generator=np.random.default_rng(0)), "must be a torch.Generator"),
+        STILL, STILL, GAIN, DAMPING, dt=0.001, generator=np.random.default_rng(0)), "must be a Generator or None"),
     (lambda: rollout(forcing=lambda time: torch.zeros(3, 2), n_steps=5), r"forcing\(time\) has shape \(3, 2\)"),
     (lambda: rollout(forcing=lambda time: np.nan * np.ones((len(time), 2)), n_steps=5), "all of it finite"),
     (lambda: rollout(forcing=lambda time: time, n_steps=10**12), "n_steps=1000000000000 needs about"),

@@ -11,12 +11,12 @@ if TYPE_CHECKING:
     from torch_pbd.control.realtime import RealTimeAdmittance, TickStatus
     from torch_pbd.control.schedule.schedule import Schedule
     from torch_pbd.control.simulation.filters import EnergyTank, RateLimit
-    from torch_pbd.control.simulation.monte_carlo import simulate_many
     from torch_pbd.control.simulation.plant import AdmittancePlant
     from torch_pbd.control.simulation.position_loop import PositionLoop
     from torch_pbd.control.simulation.rollout import Rollout
+    from torch_pbd.control.simulation.rollouts import RolloutSummary
+    from torch_pbd.control.simulation.run import simulate_many
     from torch_pbd.control.simulation.sensor import ForceSensor
-    from torch_pbd.control.simulation.summary import RolloutSummary
     from torch_pbd.control.simulation.walls import Tunnel
     from torch_pbd.control.stability.certify import certify
     from torch_pbd.control.stability.report import StabilityReport
@@ -34,7 +34,7 @@ _HOMES = {
     "RateLimit": "simulation.filters",
     "RealTimeAdmittance": "realtime",
     "Rollout": "simulation.rollout",
-    "RolloutSummary": "simulation.summary",
+    "RolloutSummary": "simulation.rollouts",
     "Schedule": "schedule",
     "StabilityReport": "stability.report",
     "StiffnessLaw": "stiffness",
@@ -43,7 +43,7 @@ _HOMES = {
     "certify": "stability.certify",
     "damping_from_stiffness": "damping",
     "required_damping_ratio": "damping",
-    "simulate_many": "simulation.monte_carlo",
+    "simulate_many": "simulation.run",
 }
 
 __all__ = [

@@ -334,8 +334,7 @@ class DMPController(BaseEstimator):
             If the force has not one row for each tick.
         """
         schedule = self.schedule(rate)
-        robot = AdmittancePlant(self.mass) if plant is None else plant
-        return simulate_schedule(schedule, robot, force, rate, random_state, mass=self.mass)
+        return simulate_schedule(schedule, plant, force, rate, random_state)
 
     def reproduce(
         self,

@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torch_pbd.control.matrices import as_mass, as_semidefinite, check_finite
+from torch_pbd import checks
+from torch_pbd.control.matrices import as_mass, as_semidefinite, broadcasts
+from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.linalg import spectral_map, symmetrize
-
-_MOST_RATIO = 1e6
 
 
 def damping_from_stiffness(
@@ -39,31 +39,31 @@ def damping_from_stiffness(
     ValueError
         If a matrix is not symmetric and positive (semi)definite, or the ratio is negative.
     """
-    matrix = as_semidefinite(stiffness, "stiffness")
     if isinstance(damping_ratio, str) and damping_ratio == "paper":
-        return spectral_map(matrix, _root)
-    if isinstance(damping_ratio, str):
-        raise ValueError(f"damping_ratio is {damping_ratio!r}, must be a number or 'paper'.")
-    check_finite("damping_ratio", damping_ratio)
-    if damping_ratio < 0.0:
-        raise ValueError(f"damping_ratio is {damping_ratio:g}, must not be negative: the motion would gain energy.")
-    if damping_ratio > _MOST_RATIO:
-        raise ValueError(f"damping_ratio is {damping_ratio:g}, must be at most {_MOST_RATIO:g}; 1 is critical.")
+        damping_ratio, mass = 0.5, 1.0  # whose damping is K^1/2
+    # Above a million the damping overflows beside gains and masses that are still numbers.
+    remedy = "1 is critical, 'paper' is the root of the stiffness"
+    ratio = checks.number(damping_ratio, "damping_ratio", least=0.0, most=1e6, remedy=remedy)
+    matrix, spectrum = as_semidefinite(stiffness, "stiffness")
     mass = as_mass(mass)
     if not isinstance(mass, Tensor) or mass.ndim == 0:
-        return 2.0 * damping_ratio * mass**0.5 * spectral_map(matrix, _root)
-    _check_shapes(tuple(matrix.shape), tuple(mass.shape))
-    root = spectral_map(mass.to(matrix), torch.sqrt)
-    inverse = spectral_map(mass.to(matrix), torch.rsqrt)
-    return symmetrize(2.0 * damping_ratio * root @ spectral_map(inverse @ matrix @ inverse, _root) @ root)
+        return 2.0 * ratio * mass**0.5 * spectral_map(matrix, _root, spectrum)
+    if not broadcasts(mass, matrix):
+        raise InvalidParameterError(
+            f"mass has shape {tuple(mass.shape)}, but stiffness has shape {tuple(matrix.shape)}: give a number, or a "
+            "matrix (d, d) of as many axes for all of them."
+        )
+    mass = mass.to(matrix)
+    along_mass = torch.linalg.eigh(symmetrize(mass.detach()))
+    root, inverse = (spectral_map(mass, function, tuple(along_mass)) for function in (torch.sqrt, torch.rsqrt))
+    return symmetrize(2.0 * ratio * root @ spectral_map(inverse @ matrix @ inverse, _root) @ root)
 
 
 def required_damping_ratio(stiffness_ratio: float) -> float:
     """Damping ratio from which a robot is exponentially stable under any schedule of stiffness whatever.
 
-    Above it, for damping ``2 zeta (m K)^1/2``, however fast K changes and its axes turn, as long as its eigenvalues
-    stay between ``k`` and ``stiffness_ratio * k``. Both may change at any time, be held over ticks of any length, or
-    be blends of such pairs (linear between knots): the derivative below is linear in both.
+    For damping ``2 zeta (m K)^1/2``, however fast K changes and its axes turn, as long as its eigenvalues stay between
+    ``k`` and ``stiffness_ratio * k``; held over ticks of any length, or blends of such pairs (linear between knots).
 
     ``(R^(1/4) - R^(-1/4)) / 2`` up to R = 194: 0.82 for R = 20, and critical damping does up to 33.9. Above 194
     more is needed than this, and from 1154 on the proof gives no ratio: infinity.
@@ -86,25 +86,14 @@ def required_damping_ratio(stiffness_ratio: float) -> float:
     lies between 2 and ``R^(1/4) + R^(-1/4)``. The b that serves the most of these is ``zeta / (1 + zeta^2)^(1/2)`` up
     to ``zeta = 3^(1/2)``, and ``2 zeta / (1 + zeta^2)``, where u = 2 is the limit, above.
     """
-    check_finite("stiffness_ratio", stiffness_ratio)
-    if stiffness_ratio < 1.0:
-        raise ValueError(f"stiffness_ratio is {stiffness_ratio:g}, must be at least 1: largest over smallest.")
+    checks.number(stiffness_ratio, "stiffness_ratio", least=1.0, remedy="it is the largest over the smallest")
     root = stiffness_ratio**0.25
     largest = root + 1.0 / root
+    # Of u in the Notes. Up to 4 the b of zeta <= 3^(1/2) serves the interval [2, u], above it that of larger zeta.
     if largest <= 4.0:
         return (root - 1.0 / root) / 2.0
     share = (largest - 2.0) / 4.0
     return math.sqrt((1.0 + share) / (1.0 - share)) if share < 1.0 else math.inf
-
-
-def _check_shapes(stiffness: tuple[int, ...], mass: tuple[int, ...]) -> None:
-    """Check that a mass has the axes of a stiffness, and batches that go with its own."""
-    pairs = zip(reversed(stiffness[:-2]), reversed(mass[:-2]), strict=False)
-    if stiffness[-1] != mass[-1] or any(a != b and 1 not in (a, b) for a, b in pairs):
-        raise ValueError(
-            f"mass has shape {mass}, but stiffness has shape {stiffness}: give a number, or a matrix (d, d) of as many "
-            "axes for all of them."
-        )
 
 
 def _root(eigenvalue: Tensor) -> Tensor:

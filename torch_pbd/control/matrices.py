@@ -1,82 +1,38 @@
-"""Checks of the matrices and numbers that control is given."""
+"""Tensors of what control is given: motions, gains, masses."""
 
-import math
-from numbers import Integral, Real
+from numbers import Real
 from typing import Any
 
 import torch
 from torch import Tensor
 
-# An eigenvalue this far below zero, relative to the largest, is no rounding error.
-_NEGATIVE = 1e-9
-_LIGHTEST = 1e-50  # kg, of which products with gains are numbers
-_MANY = 2**53
+from torch_pbd import checks
+from torch_pbd.exceptions import InvalidParameterError
+from torch_pbd.linalg import symmetrize
 
-
-def check_mass(mass: Any) -> None:
-    """Check that a mass is a positive number, or symmetric positive definite matrices (..., d, d), in kg.
-
-    Raises
-    ------
-    ValueError
-        If it is not.
-    """
-    if not isinstance(mass, Tensor) or mass.ndim == 0:
-        check_positive("mass", float(mass) if isinstance(mass, Tensor) else mass, "kg")
-        if not _LIGHTEST <= float(mass) <= 1.0 / _LIGHTEST:
-            raise ValueError(f"mass is {float(mass):g} kg, must be from {_LIGHTEST:g} to {1.0 / _LIGHTEST:g} kg.")
-        return
-    mass = as_semidefinite(mass, "mass")
-    if not len(mass):
-        raise ValueError(f"mass has shape {tuple(mass.shape)}: give one matrix at least.")
-    smallest = float(torch.linalg.eigvalsh(mass.detach()).min())
-    if smallest < _LIGHTEST:
-        raise ValueError(f"mass must be positive definite; its smallest eigenvalue is {smallest:.3g} kg.")
-
-
-def as_mass(mass: Any) -> float | Tensor:
-    """A mass that :func:`check_mass` passes: a number, or a tensor that an array is copied to in float64."""
-    if isinstance(mass, Real):
-        check_mass(mass)
-        return float(mass)
-    value = as_tensor(mass, "mass")
-    check_mass(value)
-    return value
+# kg. Gains are at most 1e100, and float64 ends at 1e308: squares of gain over mass must be numbers still.
+_LIGHTEST = 1e-50
 
 
 def as_tensor(value: Any, name: str) -> Tensor:
-    """Tensor of real floats; arrays and integers are copied in float64.
+    """Tensor of real floats; what is no tensor is copied in float64.
 
     Raises
     ------
-    ValueError
+    ValueError, TypeError
         If it is not; the message has ``name``.
     """
     if not isinstance(value, Tensor):
-        return _copied(value, name)
-    if value.layout != torch.strided or value.is_meta:
-        raise ValueError(f"{name} is a sparse or an empty (meta) tensor: give a dense one.")
-    if value.is_complex():
-        raise ValueError(f"{name} is complex, must be real numbers.")
-    if not value.is_floating_point():
-        return value.double()
-    if value.dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"{name} is {value.dtype}, too coarse for a control law: give float32 or float64.")
-    return value
-
-
-def _copied(value: Any, name: str) -> Tensor:
-    mask = getattr(value, "mask", None)
-    if mask is not None and not callable(mask) and bool(mask.any()):
-        raise ValueError(f"{name} has masked entries: fill them in first.")
-    kind = getattr(getattr(value, "dtype", None), "kind", "f")
-    if kind not in "biuf":
-        raise ValueError(f"{name} has dtype {value.dtype}, must be real numbers.")
-    try:
-        # Torch takes no negative strides, which a copy has not.
-        return torch.tensor(value.copy() if hasattr(value, "strides") else value, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise ValueError(f"{name} is {value!r}, must be numbers of one shape ({error}).") from error
+        # A copy: torch must alias no read-only array, and takes no negative strides.
+        return torch.from_numpy(checks.real_floats(value, name).copy())
+    whole = not (value.is_floating_point() or value.is_complex())
+    dense = value.layout == torch.strided and not value.is_meta
+    if not (dense and (whole or value.dtype in (torch.float32, torch.float64))):
+        raise InvalidParameterError(
+            f"{name} is a tensor of {value.dtype}, {value.layout}, on {value.device}, must be dense, of real numbers, "
+            "in float32 or float64."
+        )
+    return value.double() if whole else value
 
 
 def as_rows(value: Any, name: str, n_dims: int) -> Tensor:
@@ -84,89 +40,60 @@ def as_rows(value: Any, name: str, n_dims: int) -> Tensor:
     rows = as_tensor(value, name)
     if rows.ndim < n_dims or not rows.numel():
         shape = ", ".join(["...", "T", "d"][-n_dims - 1 :] if n_dims > 1 else ["...", "d"])
-        raise ValueError(f"{name} has shape {tuple(rows.shape)}, must have shape ({shape}), none of it empty.")
-    sound = rows.detach().abs() <= torch.finfo(rows.dtype).max ** 0.75
-    if not bool(sound.all()):
-        index = tuple((~sound).nonzero()[0].tolist())
-        raise ValueError(f"{name} has a value that is not finite, or whose products are not, at index {index}.")
+        raise InvalidParameterError(
+            f"{name} has shape {tuple(rows.shape)}, must have shape ({shape}), none of it empty."
+        )
+    values = rows.detach().cpu()
+    # Products of what is larger overflow: 1e231 in float64, 1e28 in float32.
+    most = torch.finfo(rows.dtype).max ** 0.75
+    checks.require((values.abs() <= most).numpy(), values.numpy(), name, f"finite and at most {most:.0e} in size")
     return rows
 
 
-def as_semidefinite(value: Any, name: str) -> Tensor:
-    """Tensor (..., d, d) that is finite, symmetric and positive semidefinite; arrays are copied in float64.
+def as_mass(mass: Any) -> float | Tensor:
+    """Virtual mass in kg: a positive number, or a tensor of symmetric positive definite matrices (..., d, d)."""
+    value = mass if isinstance(mass, Real) else as_tensor(mass, "mass")
+    if isinstance(value, Tensor) and value.ndim:
+        checks.semidefinite(value.detach().cpu().numpy(), "mass", definite=True)
+        return value
+    number = value.item() if isinstance(value, Tensor) else value
+    checked = checks.number(number, "mass", least=_LIGHTEST, most=1.0 / _LIGHTEST, unit="kg")
+    return value if isinstance(value, Tensor) else checked
+
+
+def as_semidefinite(value: Any, name: str) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+    """Positive semidefinite matrices (..., d, d), and the eigenvalues (..., d) and axes that show that they are.
 
     Raises
     ------
     ValueError
-        If it is not; the message has ``name`` and the index.
+        If a matrix is not finite, symmetric and positive semidefinite; the message has ``name`` and the index.
     """
     matrix = as_tensor(value, name)
-    if matrix.ndim < 2 or matrix.shape[-1] != matrix.shape[-2] or not matrix.shape[-1]:
-        raise ValueError(f"{name} has shape {tuple(matrix.shape)}, must have shape (..., d, d).")
-    flat = matrix.detach().reshape(-1, *matrix.shape[-2:])
-    finite = torch.isfinite(flat).all(-1).all(-1)
-    if not bool(finite.all()):
-        raise ValueError(f"{name} has an entry that is not finite, at index {int((~finite).nonzero()[0])}.")
-    scale = flat.abs().amax((-2, -1)) if len(flat) else flat.new_zeros(0)
-    if bool((scale > torch.finfo(matrix.dtype).max ** 0.75).any()):
-        raise ValueError(f"{name} has an entry of {float(scale.max()):.3g}, whose products overflow: use other units.")
-    tolerance = max(_NEGATIVE, 100.0 * torch.finfo(matrix.dtype).eps)
-    skewed = (flat - flat.mT).abs().amax((-2, -1)) > tolerance * scale if len(flat) else scale > 0
-    if bool(skewed.any()):
-        raise ValueError(f"{name} must be symmetric; at index {int(skewed.nonzero()[0])} it is not: symmetrize it.")
-    smallest = torch.linalg.eigvalsh(flat)[:, 0] if len(flat) else scale
-    indefinite = smallest < -tolerance * scale
-    if bool(indefinite.any()):
-        index = int(indefinite.nonzero()[0])
-        raise ValueError(
-            f"{name} must be positive semidefinite; at index {index} its smallest eigenvalue is "
-            f"{float(smallest[index]):.3g}."
-        )
-    return matrix
+    plain = matrix.detach()
+    rounding = checks.symmetric(plain.cpu().numpy(), name)
+    eigenvalues, axes = torch.linalg.eigh(symmetrize(plain))
+    checks.positive(eigenvalues[..., 0].cpu().numpy(), name, rounding)
+    return matrix, (eigenvalues, axes)
 
 
+# The parameters of the primitive and of the controller are checked by these three until they go to checks.py.
 def check_finite(name: str, value: Any, *, optional: bool = False) -> None:
     """Check that a parameter is a finite number, or None where that is allowed."""
-    if optional and value is None:
-        return
-    if isinstance(value, bool) or not isinstance(value, Real) or not is_finite(value):
-        raise ValueError(f"{name} is {value!r}, must be a finite number.")
-
-
-def check_device(device: Any) -> None:
-    """Check that tensors can be put on a device; None is the CPU."""
-    try:
-        torch.empty(0, device=device)
-    except (AssertionError, OverflowError, RuntimeError, TypeError, ValueError) as error:
-        problem = str(error).partition("\n")[0].rstrip(".")
-        raise ValueError(f"device is {device!r}, which cannot be used here: {problem}. None is the CPU.") from error
-
-
-def is_finite(value: Any) -> bool:
-    """Whether a real number is one that a float can hold."""
-    try:
-        return math.isfinite(value)
-    except OverflowError:
-        return False
-
-
-def check_flag(name: str, value: Any) -> None:
-    """Check that a parameter is True or False; a text would count as True."""
-    if not isinstance(value, bool) and str(getattr(value, "dtype", "")) != "bool":
-        raise ValueError(f"{name} is {value!r}, must be True or False.")
+    if value is not None or not optional:
+        checks.number(value, name)
 
 
 def check_positive(name: str, value: Any, unit: str = "") -> None:
     """Check that a parameter is a positive finite number."""
-    check_finite(name, value)
+    checks.number(value, name)
     if value <= 0.0:
-        raise ValueError(f"{name} is {value:g}{unit and ' ' + unit}, must be positive.")
+        raise InvalidParameterError(f"{name} is {value:g}{unit and ' ' + unit}, must be positive.")
 
 
 def check_count(name: str, value: Any, least: int) -> None:
     """Check that a parameter is an integer not below ``least``."""
-    if isinstance(value, bool) or not isinstance(value, Integral) or not least <= int(value) < _MANY:
-        raise ValueError(f"{name} is {value!r}, must be an integer of at least {least}.")
+    checks.count(value, name, least=least)
 
 
 def broadcasts(value: Tensor, other: Tensor) -> bool:

@@ -23,7 +23,7 @@ from sklearn.base import clone
 from threadpoolctl import threadpool_limits
 
 from torch_pbd.control.schedule.schedule import Schedule
-from torch_pbd.control.simulation.monte_carlo import simulate_many
+from torch_pbd.control.simulation.run import simulate_many
 from torch_pbd.data import Demonstrations
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.experiments.resume import FinishedFits, fit_once

@@ -1,1 +1,1 @@
-"""The simulated robot: plant, walls, force sensor, pushes, and what becomes of them."""
+"""The simulated robot: plant, walls, force sensor, pushes, and runs of them."""

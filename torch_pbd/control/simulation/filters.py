@@ -6,50 +6,24 @@ share of the step that their invariant allows. Damping steps by the same share. 
 """
 
 from dataclasses import dataclass
-from typing import Any, Protocol, final
+from typing import Any, final
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torch_pbd.control.matrices import check_finite
-from torch_pbd.control.simulation.transitions import admittance_rate, transition
+from torch_pbd import checks
+from torch_pbd.control.simulation.ticks import ActiveFilter, Gains, State, StiffnessFilter, admittance_rate, transition
+from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.linalg import symmetrize
 
-_MARGIN = 1e-13  # of a share: what its own rounding may cost
-
-
-@dataclass(frozen=True)
-class Gains:
-    """Stiffness and damping in effect, (..., d, d), and the share (...) of the step towards the wanted ones."""
-
-    stiffness: Tensor
-    damping: Tensor
-    share: Tensor
-
-
-class StiffnessFilter(Protocol):
-    """What :class:`~torch_pbd.control.AdmittancePlant` asks of a filter."""
-
-    def start(self, stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> "ActiveFilter":
-        """Begin a run over the wanted gains (..., T, d, d)."""
-
-
-class ActiveFilter(Protocol):
-    """A filter in a run."""
-
-    tank_energy: Tensor | None
-
-    def select(self, stiffness: Tensor, damping: Tensor, deviation: Tensor, velocity: Tensor) -> Gains:
-        """Gains for this tick, of the wanted ones (..., d, d) and the state (..., d) at its start."""
-
-    def settle(self, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor], force: Tensor) -> None:
-        """Take note of the tick: (deviation, velocity) at its start and end, and the force held in it."""
+# A share is smaller by this than the largest allowed, which pays for its own rounding: 2.2e-16, a few hundred times.
+_MARGIN = 1e-13
 
 
 @final
 @dataclass(frozen=True)
-class RateLimit:
+class RateLimit(StiffnessFilter):
     """Raise the stiffness no faster than a common Lyapunov function allows.
 
     ``V = 1/2 (v + a y)' M (v + a y) + 1/2 y' (K + a D - a^2 M) y`` does not grow from one tick to the next
@@ -68,67 +42,63 @@ class RateLimit:
     alpha: float | None = None
 
     def __post_init__(self) -> None:
-        check_finite("alpha", self.alpha, optional=True)
+        checks.number(self.alpha, "alpha", above=0.0, unit="1/s", optional=True)
 
     def start(self, stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> "_RateLimited":
-        """Begin a run over the wanted gains (..., T, d, d).
-
-        Raises
-        ------
-        ValueError
-            If alpha is not below what the damping of the schedule allows, or the stiffness is not positive.
-        """
+        """Begin a run over the wanted gains (..., T, d, d), which must allow alpha and be positive definite."""
         inverse = torch.linalg.inv(torch.linalg.cholesky(mass))
         limit = float(torch.linalg.eigvalsh(symmetrize(inverse @ damping @ inverse.mT)).min())
         alpha = 0.5 * limit if self.alpha is None else self.alpha
         if not 0.0 < alpha < limit:
-            raise ValueError(
-                f"alpha is {alpha:g} /s, must be above 0 and below {limit:g} /s, the smallest damping over mass of "
-                "the schedule. Leave it None, or damp more."
+            raise InvalidParameterError(
+                f"alpha is {alpha:g} /s, must be above 0 and below {limit:g} /s, the smallest damping over mass of the "
+                "schedule: leave it None, or damp more."
             )
-        if float(torch.linalg.eigvalsh(stiffness).min()) <= 0.0:
-            raise ValueError("stiffness must be positive definite for a rate limit: a free axis has no equilibrium.")
+        softest = float(torch.linalg.eigvalsh(stiffness).min())
+        if softest <= 0.0:
+            raise InvalidParameterError(
+                f"the smallest eigenvalue of stiffness is {softest:g} N/m, must be above zero for a rate limit: a free "
+                "axis has no equilibrium."
+            )
         return _RateLimited(alpha, mass, dt)
 
 
-class _RateLimited:
-    tank_energy: Tensor | None = None
-
+class _RateLimited(ActiveFilter):
     def __init__(self, alpha: float, mass: Tensor, dt: float) -> None:
         self._alpha, self._mass, self._dt = alpha, mass, dt
         self._gains: Gains | None = None
 
     def select(self, stiffness: Tensor, damping: Tensor, deviation: Tensor, velocity: Tensor) -> Gains:
-        last = self._gains
-        if last is None:
+        if self._gains is None:
             self._gains = Gains(stiffness, damping, stiffness.new_ones(stiffness.shape[:-2]))
-            return self._gains
-        rise = stiffness - last.stiffness + self._alpha * (damping - last.damping)
-        self._gains = _partway(last, stiffness, damping, self._largest_share(last, rise))
+        else:
+            share = self._largest_share(stiffness, damping, self._gains)
+            self._gains = _partway(self._gains, stiffness, damping, share)
         return self._gains
 
-    def _largest_share(self, last: Gains, rise: Tensor) -> Tensor:
-        """Largest s in [0, 1] for which the tick that was pays for the step s dP of the function.
+    def _largest_share(self, stiffness: Tensor, damping: Tensor, last: Gains) -> Tensor:
+        """Largest s in [0, 1] for which the last tick pays for the step ``s dP`` of the function P.
 
         Whatever its state x at the start and its force f: ``E' (P + s dP) E <= P + W`` with E the map of (x, f) to
-        the state at the end, and W twice the work of f on ``v + a y``, by the equation of motion integrated.
+        the state at the end, and W twice the work of f on ``v + a y``.
         """
-        d = rise.shape[-1]
+        d = stiffness.shape[-1]
         end = transition(admittance_rate(last.stiffness, last.damping, self._mass), self._dt)[..., : 2 * d, :]
         start = torch.eye(3 * d).to(end)
         moved = end - start[: 2 * d]
+        # The equation of motion integrated over the tick, M dv = f h - K int(y) - D dy, gives int(y), of which the port
+        # is dy + a int(y).
         pull = self._dt * start[2 * d :] - self._mass @ moved[..., d:, :] - last.damping @ moved[..., :d, :]
         port = moved[..., :d, :] + self._alpha * torch.linalg.solve(last.stiffness, pull)
         function = lyapunov_matrix(last.stiffness, last.damping, self._mass, self._alpha)
         work = torch.nn.functional.pad(port, (0, 0, 2 * d, 0))
         paid = torch.nn.functional.pad(function, (0, d, 0, d)) + work + work.mT - end.mT @ function @ end
+        # dP = dK + a dD, of deviations. With F F' = paid, s is one over the largest eigenvalue of F^-1 E' dP E F'^-1.
+        rise = stiffness - last.stiffness + self._alpha * (damping - last.damping)
         factor = torch.linalg.cholesky(symmetrize(paid))
         half = torch.linalg.solve_triangular(factor, end[..., :d, :].mT, upper=False)
         needed = torch.linalg.eigvalsh(symmetrize(half @ rise @ half.mT))[..., -1]
         return torch.where(needed > 1.0, (1.0 - _MARGIN) / needed.clamp_min(1.0), 1.0)
-
-    def settle(self, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor], force: Tensor) -> None:
-        """Nothing: the limit holds for every state."""
 
 
 def lyapunov_matrix(
@@ -143,7 +113,7 @@ def lyapunov_matrix(
 
 @final
 @dataclass(frozen=True)
-class EnergyTank:
+class EnergyTank(StiffnessFilter):
     """Pay for every rise of the stiffness from a tank that dissipation fills.
 
     A rise at deviation y puts ``1/2 y' (K_new - K) y`` into the spring: it comes out of the tank, and where the
@@ -170,19 +140,16 @@ class EnergyTank:
     efficiency: float = 0.5
 
     def __post_init__(self) -> None:
-        for name in ("energy", "energy_max", "efficiency"):
-            check_finite(name, getattr(self, name))
-        if not 0.0 <= self.energy <= self.energy_max:
-            raise ValueError(f"energy={self.energy:g} J, must be from 0 to energy_max={self.energy_max:g} J.")
-        if not 0.0 <= self.efficiency < 1.0:
-            raise ValueError(f"efficiency is {self.efficiency:g}, must be at least 0 and less than 1.")
+        checks.number(self.energy_max, "energy_max", least=0.0, unit="J")
+        checks.number(self.energy, "energy", least=0.0, most=self.energy_max, unit="J")
+        checks.number(self.efficiency, "efficiency", least=0.0, below=1.0)
 
     def start(self, stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> "_Tank":
         """Begin a run over the wanted gains (..., T, d, d)."""
         return _Tank(self, mass)
 
 
-class _Tank:
+class _Tank(ActiveFilter):
     tank_energy: Tensor
 
     def __init__(self, tank: EnergyTank, mass: Tensor) -> None:
@@ -205,7 +172,7 @@ class _Tank:
         self.tank_energy = (self.tank_energy - paid).clamp(0.0, self._tank.energy_max)
         return self._gains
 
-    def settle(self, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor], force: Tensor) -> None:
+    def settle(self, before: State, after: State, force: Tensor) -> None:
         work = (force * (after[0] - before[0])).sum(-1)
         dissipated = self._energy(*before) + work - self._energy(*after)
         # What looks like negative dissipation is rounding: it is charged in full.

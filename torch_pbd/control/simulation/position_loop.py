@@ -1,4 +1,4 @@
-"""The robot's inner position loop: what it makes of a commanded position."""
+"""The robot's inner position loop, by which it follows a commanded position late."""
 
 import math
 from dataclasses import dataclass
@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torch_pbd.control.matrices import check_count, check_positive
+from torch_pbd import checks
 
 
 @final
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class PositionLoop:
     """A critically damped loop of second order behind a delay of whole ticks.
 
@@ -30,15 +30,19 @@ class PositionLoop:
     delay_steps: int = 1
 
     def __post_init__(self) -> None:
-        check_positive("bandwidth", self.bandwidth, "Hz")
-        check_count("delay_steps", self.delay_steps, 0)
+        checks.number(self.bandwidth, "bandwidth", above=0.0, unit="Hz")
+        checks.count(self.delay_steps, "delay_steps", least=0)
+
+    def __repr__(self) -> str:
+        return f"PositionLoop(bandwidth={self.bandwidth:g} Hz, delay_steps={self.delay_steps})"
 
     def lag(self, dt: float) -> float:
-        """How late the loop follows a ramp, in s: ``2 / w``, the delay, and half a tick of hold."""
+        """Time in s by which the loop follows a ramp late: ``2 / w``, the delay, and half a tick of hold."""
         return 1.0 / (math.pi * self.bandwidth) + (self.delay_steps + 0.5) * dt
 
     def transition(self, dt: float, like: Tensor) -> Float[Tensor, "2 3"]:
         """Exact map of ``[position, velocity, command]`` to the position and velocity a tick later."""
+        # For a held command c, x - c = e^-wt ((1 + w t) (x_0 - c) + t v_0): critical damping has one root, twice.
         w = 2.0 * math.pi * self.bandwidth
         decay = math.exp(-w * dt)
         rows = [

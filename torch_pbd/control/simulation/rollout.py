@@ -1,4 +1,4 @@
-"""What a simulated run was: states, forces and gains over time."""
+"""A simulated run: states, forces and gains over time."""
 
 from dataclasses import dataclass, fields
 from typing import Any, final
@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 @final
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Rollout:
     """States at the start of each tick of a simulated run, tensors or, by :meth:`numpy`, arrays.
 
@@ -19,12 +19,12 @@ class Rollout:
     force : (..., T, d), N
         External force on the robot, that of walls included.
     stiffness, damping : (..., T, d, d), N/m and N s/m
-        In effect during the tick: what a filter let through.
+        In effect during the tick, behind the filter.
     desired_position : (..., T, d), m
     commanded_position : (..., T, d), m
-        What the admittance asks of the robot's position loop; without such a loop, ``position``.
+        By the admittance, of the robot's position loop; without such a loop, ``position``.
     filter_share : (..., T) or None
-        How much of the step in stiffness a filter let through, 1 where it did not intervene.
+        Share of the step in stiffness that a filter let through, 1 where it did not intervene.
     tank_energy : (..., T) or None
         Energy in the tank during the tick, J.
     saturated : (..., T) of bool or None
@@ -43,8 +43,16 @@ class Rollout:
     tank_energy: Any = None
     saturated: Any = None
 
+    def __repr__(self) -> str:
+        *batch, n_ticks, d = self.position.shape
+        return (
+            f"Rollout({f'batch={tuple(batch)}, ' if batch else ''}n_ticks={n_ticks}, n_outputs={d}, "
+            f"time={float(self.time[0]):.6g}..{float(self.time[-1]):.6g} s, "
+            f"deviation up to {float(abs(self.deviation).max()):.3g} m)"
+        )
+
     def numpy(self) -> "Rollout":
-        """The same as NumPy arrays, on the CPU."""
+        """The run as NumPy arrays, on the CPU."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return Rollout(**{k: v.detach().cpu().numpy() if isinstance(v, Tensor) else v for k, v in values.items()})
 
@@ -59,5 +67,8 @@ class Rollout:
         if self.filter_share is None:
             return self.time[:0]
         if self.filter_share.ndim > 1:
-            raise ValueError(f"interventions are of one run; this is a batch of {tuple(self.filter_share.shape[:-1])}.")
+            batch = tuple(self.filter_share.shape[:-1])
+            raise ValueError(
+                f"interventions is of a batch {batch}, must be of one run: take filter_share of the batch."
+            )
         return self.time[self.filter_share < 1.0]

@@ -1,19 +1,72 @@
-"""Many rollouts of one task under pushes, a block of ticks at a time: no trajectory is kept."""
+"""Many rollouts of one task under pushes, a block of ticks at a time, of which only a summary is kept."""
 
 import math
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import final
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from numpy.typing import NDArray
 from torch import Tensor
 
-from torch_pbd.control.simulation.ticks import Hooks, Loop, State, Task, block_length, block_responses
-from torch_pbd.control.simulation.transitions import Integrator
+from torch_pbd.control.simulation.ticks import Hooks, Loop, State, Task, block_length, block_responses, nothing_acts
 
-_CHUNK = 4096  # rollouts moved on together on a CPU: what they need stays in its cache
+Floats = NDArray[np.float64]
+
+# Rollouts that move on together on a CPU: at d = 2 the forces, states and deviations of a block of them are 4 MB, which
+# stay in its cache.
+_CHUNK = 4096
+
+
+@final
+@dataclass(frozen=True, eq=False, repr=False)
+class RolloutSummary:
+    """Effect of R random pushes on a robot; NumPy arrays.
+
+    Attributes
+    ----------
+    time : (n,), s
+    quantiles : (n_quantiles,)
+    deviation : (n, n_quantiles), m
+        Quantiles over the rollouts of the distance from the reference at these times.
+    peak_deviation : (R,), m
+        Largest distance of each rollout; rollouts are in the order in which they are pushed.
+    peak_time : (R,), s
+    return_time : (R,), s
+        From the end of the push until the distance stays below the threshold; inf where it is above it at the end.
+    final_deviation : (R,), m
+    onset, duration : (R,), s
+        Of the push.
+    push : (R, d), N
+        Force at its peak.
+    """
+
+    time: Floats
+    quantiles: Floats
+    deviation: Floats
+    peak_deviation: Floats
+    peak_time: Floats
+    return_time: Floats
+    final_deviation: Floats
+    onset: Floats
+    duration: Floats
+    push: Floats
+
+    @property
+    def n_rollouts(self) -> int:
+        """Number of rollouts R."""
+        return len(self.onset)
+
+    def __repr__(self) -> str:
+        low, middle, high = np.quantile(self.peak_deviation, (0.05, 0.5, 0.95))
+        returned = np.isfinite(self.return_time)
+        return (
+            f"RolloutSummary(n_rollouts={self.n_rollouts}, peak deviation "
+            f"{1e3 * low:.3g}/{1e3 * middle:.3g}/{1e3 * high:.3g} mm at 5/50/95 %, {returned.mean():.0%} return)"
+        )
 
 
 @final
@@ -24,7 +77,7 @@ class Pushes:
     Attributes
     ----------
     onset, duration : Tensor of shape (R,), s
-        From the first tick on; onsets do not decrease.
+        From the first tick on; onsets do not decrease, so that the rollouts pushed in a block are neighbours.
     peak : Tensor of shape (d, R), N
     """
 
@@ -32,34 +85,20 @@ class Pushes:
     duration: Tensor
     peak: Tensor
 
+    def __getitem__(self, columns: slice) -> "Pushes":
+        return Pushes(self.onset[columns], self.duration[columns], self.peak[:, columns])
+
     def force(self, times: Float[Tensor, " l"]) -> Float[Tensor, "l d r"]:
         """Forces at times."""
         share = ((times[:, None] - self.onset) / self.duration).clamp(0.0, 1.0)
         return torch.sin(math.pi * share).square()[:, None] * self.peak
-
-    def within(self, columns: slice) -> "Pushes":
-        """Those of some rollouts."""
-        return Pushes(self.onset[columns], self.duration[columns], self.peak[:, columns])
-
-
-class _Timing:
-    """Which rollouts are pushed when: they are in the order of the onsets, so that those of a block are neighbours."""
-
-    def __init__(self, pushes: Pushes) -> None:
-        end = pushes.onset + pushes.duration
-        self._onsets, self._ends = pushes.onset.tolist(), end.cummax(0).values.tolist()
-        self.first_end = float(end.min())
-
-    def pushed(self, start: float, stop: float) -> slice:
-        """Rollouts from the first that is pushed between these times to the last, and none that is not before these."""
-        return slice(bisect_right(self._ends, start), bisect_left(self._onsets, stop))
 
 
 @dataclass(frozen=True)
 class Deviations:
     """Deviations (d, L, r) from the desired position at some ticks, of some rollouts.
 
-    ``over`` tells whether one of their pushes is over before the next ticks, or there are no more.
+    ``over`` is whether one of their pushes is over before the next ticks, or there are no more.
     """
 
     ticks: slice
@@ -68,7 +107,7 @@ class Deviations:
     over: bool
 
 
-def march(
+def simulate_blocks(
     task: Task, hooks: Hooks, pushes: Pushes, start: State, generators: Callable[[], torch.Generator]
 ) -> Iterator[Deviations]:
     """Deviations of R rollouts from states (R, d): blocks of ticks one after the other, of each all rollouts.
@@ -79,93 +118,85 @@ def march(
     """
     n_rollouts, d = start[0].shape
     chunk = _CHUNK if task.position.device.type == "cpu" else n_rollouts
-    chunks = [slice(first, min(first + chunk, n_rollouts)) for first in range(0, n_rollouts, chunk)]
-    parts = [pushes.within(columns) for columns in chunks]
+    columns = [slice(first, min(first + chunk, n_rollouts)) for first in range(0, n_rollouts, chunk)]
+    starts = [(start[0][each], start[1][each]) for each in columns]
+    runs = _Linear(task, starts, chunk) if nothing_acts(hooks) else _Looped(task, starts, hooks, generators)
+    parts = [pushes[each] for each in columns]
     timings = [_Timing(part) for part in parts]
-    states = [(start[0][columns], start[1][columns]) for columns in chunks]
-    acting = (hooks.sensor, hooks.position_loop, hooks.environment, hooks.stiffness_filter)
-    runs: Sequence[_Linear | _Looped]
-    if all(hook is None for hook in acting):
-        product = _Product(task, hooks.integrator, chunk)
-        runs = [_Linear(task, state, product) for state in states]
-    else:
-        runs = [_Looped(task, state, hooks, generators()) for state in states]
     length = block_length(d)
     for first in range(0, task.n_ticks, length):
         ticks = slice(first, min(first + length, task.n_ticks))
         times = task.dt * torch.arange(first, first + length).to(task.position)
-        since, until = task.dt * first, task.dt * ticks.stop
-        for columns, run, part, timing in zip(chunks, runs, parts, timings, strict=True):
-            pushed = timing.pushed(since, until)
-            over = timing.first_end < until or ticks.stop == task.n_ticks
-            values = run.move(ticks, pushed, part.within(pushed).force(times))
-            yield Deviations(ticks, columns, values, over)
+        for k, (part, timing) in enumerate(zip(parts, timings, strict=True)):
+            pushed = timing.pushed(task.dt * first, task.dt * ticks.stop)
+            over = timing.first_end < task.dt * ticks.stop or ticks.stop == task.n_ticks
+            yield Deviations(ticks, columns[k], runs.move(k, ticks, pushed, part[pushed].force(times)), over)
 
 
-class _Product:
-    """What a block does to a chunk of rollouts, in memory that is used again and again and so stays in the cache."""
+class _Timing:
+    """Times of the pushes of a chunk, which are in the order of their onsets."""
 
-    def __init__(self, task: Task, integrator: Integrator, chunk: int) -> None:
+    def __init__(self, pushes: Pushes) -> None:
+        end = pushes.onset + pushes.duration
+        self._onsets, self._ends = pushes.onset.tolist(), end.cummax(0).values.tolist()
+        self.first_end = float(end.min())
+
+    def pushed(self, start: float, stop: float) -> slice:
+        """Rollouts from the first whose push lasts beyond ``start`` to the last whose push begins before ``stop``."""
+        return slice(bisect_right(self._ends, start), bisect_left(self._onsets, stop))
+
+
+class _Linear:
+    """Chunks of rollouts of a linear task, columns of matrices whose memory is used again and so stays in the cache."""
+
+    def __init__(self, task: Task, starts: list[State], chunk: int) -> None:
         d, length = task.position.shape[-1], block_length(task.position.shape[-1])
-        self._responses, self._first = block_responses(task, integrator, length), -1
+        self._states = [torch.cat([p - task.position[0], v], dim=-1).mT.contiguous() for p, v in starts]
+        self._responses = block_responses(task, length)
         self._inputs = task.position.new_ones(2 * d + 1, chunk)
         self._outputs = task.position.new_empty(length * d + 2 * d, chunk)
 
-    def __call__(self, first: int, state: Tensor, pushed: slice, forces: Tensor) -> Tensor:
-        """Deviations (L d, r), axis by axis, in the block from a tick on, and then the state (2 d, r) after it."""
+    def move(self, k: int, ticks: slice, pushed: slice, forces: Tensor) -> Tensor:
+        """Deviations (d, L, r) of chunk k at a block of ticks, valid until the next call; forces (L, d, p) act on some.
+
+        All chunks are moved over a block, in their order, before the next one is.
+        """
+        state = self._states[k]
         size, r = state.shape
-        if first != self._first:
+        if k == 0:
             each = next(self._responses)
+            # Deviations axis by axis, and then the state after the block.
             response = torch.cat([each[:-1, : size // 2].transpose(0, 1).flatten(0, 1), each[-1]])
             self._free, self._forced = response[:, : size + 1].contiguous(), response[:, size + 1 :].contiguous()
-            self._first = first
         self._inputs[:size, :r] = state
         within = torch.mm(self._free, self._inputs[:, :r], out=self._outputs[:, :r])
         if forces.numel():
             within[:, pushed].addmm_(self._forced, forces.flatten(0, 1))
-        return within
-
-
-class _Linear:
-    """Rollouts of a linear task: columns of a matrix."""
-
-    def __init__(self, task: Task, start: State, product: _Product) -> None:
-        self._state = torch.cat([start[0] - task.position[0], start[1]], dim=-1).mT.contiguous()
-        self._product = product
-
-    def move(self, ticks: slice, pushed: slice, forces: Tensor) -> Tensor:
-        """Deviations (d, L, r) at a block of ticks, valid until another block is asked for of any rollouts.
-
-        Forces (L, d, p) act on some of them.
-        """
-        size = len(self._state)
-        within = self._product(ticks.start, self._state, pushed, forces)
-        self._state.copy_(within[-size:])
+        state.copy_(within[-size:])
         return within[:-size].unflatten(0, (size // 2, -1))[:, : ticks.stop - ticks.start]
 
 
 class _Looped:
-    """Rollouts in which something acts at every tick."""
+    """Chunks of rollouts in which something acts at every tick."""
 
-    def __init__(self, task: Task, start: State, hooks: Hooks, generator: torch.Generator) -> None:
-        self._task, self._loop = task, Loop(task, start, hooks, generator)
-        self._still = torch.zeros_like(start[0])
+    def __init__(
+        self, task: Task, starts: list[State], hooks: Hooks, generators: Callable[[], torch.Generator]
+    ) -> None:
+        self._task, self._loops = task, [Loop(task, start, hooks, generators()) for start in starts]
+        self._still = [torch.zeros_like(start[0]) for start in starts]
 
-    def move(self, ticks: slice, pushed: slice, forces: Tensor) -> Tensor:
-        """Deviations (d, L, r) at a block of ticks; forces (L, d, p) act on some of them."""
+    def move(self, k: int, ticks: slice, pushed: slice, forces: Tensor) -> Tensor:
+        """Deviations (d, L, r) of chunk k at a block of ticks; forces (L, d, p) act on some."""
         deviations = []
         for tick in range(ticks.start, ticks.stop):
-            force = self._still.clone()
+            force = self._still[k].clone()
             force[pushed] = forces[tick - ticks.start].mT
-            deviations.append(self._loop.run(tick, force)["position"] - self._task.position[tick])
+            deviations.append(self._loops[k].run(tick, force)["position"] - self._task.position[tick])
         return torch.stack(deviations).permute(2, 0, 1)
 
 
 class Tally:
-    """What is kept of each of R rollouts: peak of the deviation, when, and the last tick above a limit after the push.
-
-    The limit is ``threshold`` in m, or else ``share`` of the rollout's own peak.
-    """
+    """Squared peak of each of R rollouts, its tick, and the last above ``threshold`` m or ``share`` of the peak."""
 
     def __init__(self, n_rollouts: int, like: Tensor, *, threshold: float | None, share: float) -> None:
         zero = torch.zeros(n_rollouts, dtype=like.dtype, device=like.device)
@@ -174,7 +205,7 @@ class Tally:
         self._threshold, self._share = threshold, share
 
     def add(self, part: Deviations, squared: Float[Tensor, "l r"]) -> None:
-        """Squared deviations of a part."""
+        """Squared distances of a part."""
         columns = part.columns
         numbers = torch.arange(part.ticks.start, part.ticks.stop, dtype=squared.dtype, device=squared.device)[:, None]
         highest, peak, tick = squared.amax(0), self.squared_peak[columns], self.peak_tick[columns]
@@ -190,3 +221,41 @@ class Tally:
                 last = self.last_above[columns]
                 torch.maximum(last, torch.where(squared > limit, numbers, -1.0).amax(0), out=last)
         self.squared_last[columns] = squared[-1]
+
+
+def quantiles_in(
+    blocks: Iterator[Deviations], tally: Tally, levels: Floats, every: int, away: Tensor | None
+) -> Iterator[Floats]:
+    """Quantiles (L, n_quantiles) of the distances at each ``every``-th tick; all are noted in the tally."""
+    n_rollouts = len(tally.last_above)
+    scratch = rows = torch.empty(0)
+    for part in blocks:
+        values = part.values if away is None else part.values - away[:, part.ticks, None]
+        if not len(scratch):  # the first part is the largest
+            scratch, rows = torch.empty_like(values[0]), values.new_empty(values.shape[1], n_rollouts)
+        squared = scratch[: values.shape[1], : values.shape[2]]
+        torch.mul(values[0], values[0], out=squared)
+        for axis in values[1:]:
+            squared.addcmul_(axis, axis)
+        tally.add(part, squared)
+        chosen = squared[-part.ticks.start % every :: every]
+        rows[: len(chosen), part.columns] = chosen
+        if part.columns.stop == n_rollouts:
+            yield _quantiles(rows[: len(chosen)], levels)
+
+
+def _quantiles(squares: Tensor, levels: Floats) -> Floats:
+    """Quantiles (L, n_quantiles) of the roots of squares (L, R), whose rows are put in another order."""
+    n_rollouts = squares.shape[1]
+    place = levels * (n_rollouts - 1)
+    below = np.floor(place).astype(np.intp)
+    above = np.minimum(below + 1, n_rollouts - 1)
+    if squares.device.type == "cpu":
+        ordered = squares.numpy()
+        ordered.sort(axis=1)  # ten times as fast as torch's
+        ends = [ordered[:, below], ordered[:, above]]
+    else:
+        ranked = squares.sort(dim=1).values
+        ends = [ranked[:, rank.tolist()].cpu().numpy() for rank in (below, above)]
+    low, high = map(np.sqrt, ends)
+    return low + (place - below) * (high - low)

@@ -1,35 +1,36 @@
-"""A force-torque sensor between the simulated hand and the controller: what is read is not what is felt."""
+"""A force-torque sensor between the simulated hand and the controller."""
 
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
-from numbers import Integral, Real
+from dataclasses import dataclass, fields
 from typing import Any, NamedTuple, final
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torch_pbd.control.matrices import as_tensor, is_finite
+from torch_pbd import checks
+from torch_pbd.control.matrices import as_rows, as_tensor
+from torch_pbd.exceptions import InvalidParameterError
 
 
 class Reading(NamedTuple):
-    """What the sensor says: ``force`` (..., d) in N, and ``saturated`` (...), whether any axis was clipped."""
+    """Force read (..., d) in N, and whether any of its axes was clipped (...)."""
 
     force: Tensor
     saturated: Tensor
 
 
 @final
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ForceSensor:
     """Model of a 6-axis force-torque sensor; works for any number of axes, all treated alike.
 
     In this order: the true force plus ``bias``, low-pass, noise, saturation, quantization, delay, deadband. The
-    default is an ideal sensor of 200 N. The force is held over each tick and a reading is taken at its start
-    (control.md, section 4), so a filtered reading knows the forces before its tick only, and an unfiltered one
-    that of its own tick too. Before the first tick the force was zero and the filter had settled at the bias.
+    default is an ideal sensor of 200 N. The force is held over each tick and a reading is taken at its start, so a
+    filtered reading knows the forces before its tick only, and an unfiltered one that of its own tick too. Before the
+    first tick the force was zero and the filter had settled at the bias.
 
     A force that is not finite is a lost sample: its reading is NaN (after the delay), never zero, and the filter
     holds through it. What to do about it is the controller's to decide.
@@ -39,11 +40,10 @@ class ForceSensor:
     bias : float or sequence of d float, default=0.0
         Constant error [N].
     noise_scale : float, default=0.0
-        Standard deviation of white noise on the reading [N]; it is added behind the filter, which does not
-        lower it.
+        Standard deviation of white noise on the reading [N]; it is added behind the filter, which does not lower it.
     resolution : float, default=0.0
-        Quantization step [N]; 0 for none. A step that does not divide ``range`` may round a clipped reading to
-        half a step beyond it.
+        Quantization step [N], at most ``range``; 0 for none. A step that does not divide ``range`` may round a
+        clipped reading to half a step beyond it.
     range : float, default=200.0
         Force at which an axis saturates, either sign [N]; ``math.inf`` for never.
     cutoff : float or None, default=None
@@ -52,12 +52,7 @@ class ForceSensor:
         Ticks by which the reading is late, beside the filter.
     deadband : float, default=0.0
         Readings up to it are zero, those above are nearer to zero by it [N]: continuous. It acts on the bias too:
-        to remove that, read without a deadband, subtract what :func:`tare` says, then :func:`apply_deadband`.
-
-    Raises
-    ------
-    ValueError
-        If a parameter is not what is written above.
+        to remove that, read without a deadband, subtract the result of :func:`tare`, then :func:`apply_deadband`.
 
     Examples
     --------
@@ -80,41 +75,33 @@ class ForceSensor:
         if isinstance(self.bias, Sequence) and not isinstance(self.bias, str):
             object.__setattr__(self, "bias", tuple(self.bias))  # a list would be neither frozen nor hashable
         for value in self.bias if isinstance(self.bias, tuple) else [self.bias]:
-            _check_number("bias", value, -math.inf, "finite, in N")
-        for name in ("noise_scale", "resolution", "deadband"):
-            _check_number(name, getattr(self, name), 0.0, "finite and not negative, in N; 0 for none")
+            checks.number(value, "bias", unit="N")
         if self.range != math.inf:
-            _check_number("range", self.range, math.ulp(0.0), "above 0, in N; math.inf for a sensor without limit")
-        if self.resolution > self.range:
-            raise ValueError(f"resolution={self.resolution} N is coarser than range={self.range} N: make it smaller.")
-        if self.cutoff is not None:
-            _check_number("cutoff", self.cutoff, math.ulp(0.0), "finite and above 0, in Hz; None for no filter")
-        if not isinstance(self.delay_steps, Integral) or isinstance(self.delay_steps, bool) or self.delay_steps < 0:
-            raise ValueError(f"delay_steps={self.delay_steps!r} must be an integer of at least 0: a number of ticks.")
+            checks.number(self.range, "range", above=0.0, unit="N", remedy="math.inf is a sensor without limit")
+        for name, most in {"noise_scale": None, "resolution": self.range, "deadband": None}.items():
+            checks.number(getattr(self, name), name, least=0.0, most=most, unit="N", remedy="0 is none")
+        checks.number(self.cutoff, "cutoff", above=0.0, unit="Hz", optional=True)
+        checks.count(self.delay_steps, "delay_steps", least=0)
+
+    def __repr__(self) -> str:
+        chosen = {field.name: getattr(self, field.name) for field in fields(self)}
+        changed = {name: value for name, value in chosen.items() if value != getattr(ForceSensor, name)}
+        units = dict.fromkeys(chosen, " N") | {"cutoff": " Hz", "delay_steps": ""}
+        shown = ({"range": self.range} | changed).items()
+        return f"ForceSensor({', '.join(f'{name}={value}{units[name]}' for name, value in shown)})"
 
     @classmethod
     def jr3(cls, cutoff: float = 500.0, rate: float = 1000.0) -> "ForceSensor":
-        """A sensor like the paper's JR3. The figures are plausible ones, not from a data sheet or a measurement.
+        """A sensor like the paper's JR3, by plausible figures that are not from a data sheet or a measurement.
 
         A range of 200 N in 2^13 steps, noise of 0.05 N, a bias of 0.3 N on each axis (0.2 to 0.5 N of drift are
-        usual), and a delay of about ``1 / cutoff`` in all, rounded to ticks; what the first-order filter lacks of it
-        is ``delay_steps``.
-
-        Parameters
-        ----------
-        cutoff : float, default=500.0
-            The JR3's digital filters have 500, 125, 31.25, 7.813, 1.953 and 0.4883 Hz.
-        rate : float, default=1000.0
-            Ticks a second at which it will be read: the delay is a number of ticks.
-
-        Raises
-        ------
-        ValueError
-            If ``cutoff`` or ``rate`` is not finite and above zero.
+        usual), and a delay of about ``1 / cutoff`` in all, rounded to ticks of ``rate`` Hz; what the first-order filter
+        lacks of it is ``delay_steps``. The JR3's digital filters have 500, 125, 31.25, 7.813, 1.953 and 0.4883 Hz.
         """
-        _check_number("cutoff", cutoff, math.ulp(0.0), "finite and above 0, in Hz")
-        _check_number("rate", rate, math.ulp(0.0), "finite and above 0, in Hz")
-        lag = -1.0 / math.expm1(-2.0 * math.pi * cutoff / rate)  # of the sampled filter on slow forces, in ticks
+        checks.number(cutoff, "cutoff", above=0.0, unit="Hz")
+        checks.number(rate, "rate", above=0.0, unit="Hz")
+        # The sampled filter follows a ramp late by the mean of its response, a geometric series: in ticks.
+        lag = -1.0 / math.expm1(-2.0 * math.pi * cutoff / rate)
         delay_steps = max(0, round(rate / cutoff - lag))
         return cls(0.3, noise_scale=0.05, resolution=200.0 / 2**13, cutoff=cutoff, delay_steps=delay_steps)
 
@@ -126,79 +113,40 @@ class ForceSensor:
         Parameters
         ----------
         like : Tensor of shape (..., d)
-            Tells shape, dtype and device of the forces to come; its values do not matter.
+            Of the shape, dtype and device of the forces to come; its values do not matter.
         dt : float
             Length of a tick [s].
         generator : torch.Generator or None, default=None
-            Source of the noise.
-
-        Raises
-        ------
-        ValueError
-            If ``dt`` is not above zero, ``bias`` has not one value for each axis, or there is noise but no
-            generator.
+            Source of the noise, which must be given if there is any.
         """
-        _check_number("dt", dt, math.ulp(0.0), "finite and above 0: the length of a tick in s")
-        if not isinstance(like, Tensor) or not like.is_floating_point() or like.ndim == 0:
-            kind = f"{like.dtype} of shape {tuple(like.shape)}" if isinstance(like, Tensor) else type(like).__name__
-            raise ValueError(f"like is {kind}: forces are tensors of floats (..., d).")
+        checks.number(dt, "dt", above=0.0, unit="s")
         if isinstance(self.bias, tuple) and len(self.bias) != like.shape[-1]:
-            raise ValueError(
+            raise InvalidParameterError(
                 f"bias has {len(self.bias)} values, but the force has {like.shape[-1]} axes: give one for each axis, "
                 "or one number for all."
             )
-        if generator is not None and not isinstance(generator, torch.Generator):
-            raise ValueError(f"generator is {generator!r}, must be a torch.Generator or None.")
-        if self.noise_scale > 0 and generator is None:
-            raise ValueError(
-                f"noise_scale={self.noise_scale} needs a generator: pass torch.Generator().manual_seed(...), or set "
-                "noise_scale=0."
-            )
+        remedy = f"noise_scale is {self.noise_scale:g} N: pass torch.Generator().manual_seed(...), or set it to 0"
+        checks.instance(generator, "generator", torch.Generator, optional=self.noise_scale == 0, remedy=remedy)
         return ForceReader(self, like, dt, generator)
 
     def measure(
         self, force: Float[Tensor, "*b t d"] | Any, dt: float, generator: torch.Generator | Any = None
     ) -> Reading:
-        """Readings of a recorded force: equal to the bit to calling the reader once a tick.
+        """Readings (..., T, d) of a true force (..., T, d) in N: equal to the bit to those of a reader tick by tick.
 
-        Parameters
-        ----------
-        force : Tensor of shape (..., T, d)
-            True force at each tick [N].
-        dt : float
-            Length of a tick [s].
-        generator : torch.Generator or None, default=None
-            Source of the noise.
-
-        Returns
-        -------
-        Reading
-            ``force`` (..., T, d) and ``saturated`` (..., T).
-
-        Raises
-        ------
-        ValueError
-            If the recording has no tick, or as by :meth:`start`.
+        ``dt`` and ``generator`` are as for :meth:`start`.
         """
         force = as_tensor(force, "force")
         if force.ndim < 2 or force.shape[-2] == 0:
-            raise ValueError(
-                f"force has shape {tuple(force.shape)}: a recording is (..., T, d) with at least one tick."
-            )
+            raise InvalidParameterError(f"force has shape {tuple(force.shape)}, must have shape (..., T, d), T >= 1.")
         reader = self.start(force[..., 0, :], dt, generator)
-        readings = [reader(tick) for tick in force.unbind(-2)]
-        return Reading(
-            torch.stack([reading.force for reading in readings], dim=-2),
-            torch.stack([reading.saturated for reading in readings], dim=-1),
-        )
+        forces, saturated = zip(*(reader(tick) for tick in force.unbind(-2)), strict=True)
+        return Reading(torch.stack(forces, dim=-2), torch.stack(saturated, dim=-1))
 
 
 @final
 class ForceReader:
-    """A sensor in use: made by :meth:`ForceSensor.start`, called with the true force once a tick.
-
-    It keeps the state of the filter and the readings still under way, and nothing else.
-    """
+    """Sensor in use, called with the true force once a tick: state of the filter, and readings still under way."""
 
     def __init__(
         self, sensor: ForceSensor, like: Float[Tensor, "*b d"], dt: float, generator: torch.Generator | None
@@ -212,20 +160,9 @@ class ForceReader:
         self._under_way = deque(self._convert(self._bias) for _ in range(sensor.delay_steps))
 
     def __call__(self, force: Float[Tensor, "*b d"]) -> Reading:
-        """The reading at this tick.
-
-        Parameters
-        ----------
-        force : Tensor of shape (..., d)
-            True force, held over this tick [N].
-
-        Raises
-        ------
-        ValueError
-            If the force has not the shape and dtype that the sensor was started with.
-        """
+        """Reading at this tick, over which the true force (..., d) is held [N]; its shape and dtype stay the same."""
         if force.shape != self._bias.shape or force.dtype != self._bias.dtype:
-            raise ValueError(
+            raise InvalidParameterError(
                 f"force is {force.dtype} of shape {tuple(force.shape)}, but the sensor was started for "
                 f"{self._bias.dtype} of shape {tuple(self._bias.shape)}: start another one."
             )
@@ -236,7 +173,7 @@ class ForceReader:
         return self._under_way.popleft()
 
     def _low_pass(self, level: Tensor) -> Tensor:
-        """State of ``dx/dt = 2 pi cutoff (level - x)`` at the start of the tick, and step it over the tick."""
+        """State of ``dx/dt = 2 pi cutoff (level - x)`` at the start of the tick, over which it moves on."""
         if self._gain is None:
             return level
         before = self._filtered
@@ -267,31 +204,9 @@ def apply_deadband(force: Float[Tensor, "*b d"], deadband: float) -> Float[Tenso
 
 
 def tare(readings: Float[Tensor, "*b n d"] | Any) -> Float[Tensor, "*b d"]:
-    """The bias of a sensor from readings at rest: their mean, to be subtracted from later readings.
+    """Bias (..., d) of a sensor from readings at rest (..., n, d) [N]: their mean, to be subtracted from later ones.
 
-    Parameters
-    ----------
-    readings : Tensor of shape (..., n, d)
-        Readings while nothing touches the sensor [N], taken without a deadband, which would hide the bias. The
-        standard error of the result is the noise over sqrt(n).
-
-    Raises
-    ------
-    ValueError
-        If there is no reading, or one is not finite.
+    The readings are to be taken without a deadband, which would hide the bias, and to be finite: drop lost samples
+    first. The standard error is the noise over sqrt(n).
     """
-    readings = as_tensor(readings, "readings")
-    if readings.ndim < 2 or readings.shape[-2] == 0:
-        raise ValueError(
-            f"readings has shape {tuple(readings.shape)}: a tare needs (..., n, d) with at least one of n."
-        )
-    lost = ~torch.isfinite(readings)
-    if bool(lost.any()):
-        index = tuple(lost.nonzero()[0].tolist())
-        raise ValueError(f"readings is {readings[index].item()} at index {index}: drop lost samples before the tare.")
-    return readings.mean(-2)
-
-
-def _check_number(name: str, value: object, least: float, must: str) -> None:
-    if isinstance(value, bool) or not isinstance(value, Real) or not is_finite(value) or value < least:
-        raise ValueError(f"{name}={value!r} must be {must}.")
+    return as_rows(readings, "readings", 2).mean(-2)

@@ -1,5 +1,10 @@
-"""The ticks behind :class:`~torch_pbd.control.AdmittancePlant`, with and without what acts in the loop."""
+"""The ticks behind :class:`~torch_pbd.control.AdmittancePlant`, with and without what acts in the loop.
 
+With the deviation y from the desired position, ``M a = u - K y - D v``. Everything is held over a tick, in which the
+matrix exponential is then exact, whatever its length; at its end the desired position moves on.
+"""
+
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
@@ -8,23 +13,38 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torch_pbd.control.simulation.filters import ActiveFilter, StiffnessFilter
 from torch_pbd.control.simulation.position_loop import PositionLoop
 from torch_pbd.control.simulation.sensor import ForceSensor
-from torch_pbd.control.simulation.transitions import Integrator, admittance_rate, transition
-from torch_pbd.control.simulation.walls import Tunnel
 
-_MATRICES_AT_ONCE = (
-    2**13
-)  # transitions computed together: bounds the memory; a power of 2, as the lengths of blocks are
+# Transitions that are computed together, which bounds the memory; a power of 2, as the lengths of blocks are.
+_MATRICES_AT_ONCE = 2**13
 
 State = tuple[Tensor, Tensor]
 """Position and velocity (..., d)."""
 
 
+def admittance_rate(
+    stiffness: Float[Tensor, "*b d d"], damping: Float[Tensor, "*b d d"], mass: Float[Tensor, "*m d d"]
+) -> Float[Tensor, "*b n n"]:
+    """Matrix of ``[deviation, velocity, force]' = rate @ [deviation, velocity, force]`` of a held force, n = 3 d."""
+    d = stiffness.shape[-1]
+    inverse = torch.linalg.inv(mass).expand_as(stiffness)
+    rate = stiffness.new_zeros(*stiffness.shape[:-2], 3 * d, 3 * d)
+    rate[..., :d, d : 2 * d] = torch.eye(d).to(stiffness)
+    rate[..., d : 2 * d, :d] = -inverse @ stiffness
+    rate[..., d : 2 * d, d : 2 * d] = -inverse @ damping
+    rate[..., d : 2 * d, 2 * d :] = inverse
+    return rate
+
+
+def transition(rate: Float[Tensor, "*b n n"], dt: float) -> Float[Tensor, "*b n n"]:
+    """Map of ``[deviation, velocity, force]`` over a tick of ``dt`` s in which everything is held."""
+    return torch.linalg.matrix_exp(rate * dt)
+
+
 @dataclass(frozen=True)
 class Task:
-    """What a run is to follow, checked: motions (..., T, d), gains (..., T, d, d)."""
+    """Motions (..., T, d) and gains (..., T, d, d) of a run to come, checked."""
 
     position: Tensor
     velocity: Tensor
@@ -46,34 +66,77 @@ class Task:
 
     @property
     def steps(self) -> Tensor:
-        """How far the desired position moves at the end of each tick (..., T, d); 0 after the last."""
+        """Steps of the desired position at the end of each tick (..., T, d); 0 after the last."""
         return torch.cat([self.position.diff(dim=-2), torch.zeros_like(self.position[..., :1, :])], dim=-2)
+
+
+@dataclass(frozen=True)
+class Gains:
+    """Stiffness and damping in effect, (..., d, d), and the share (...) of the step towards the wanted ones."""
+
+    stiffness: Tensor
+    damping: Tensor
+    share: Tensor
+
+
+class ActiveFilter(ABC):
+    """Filter of the gains in a run."""
+
+    tank_energy: Tensor | None = None
+
+    @abstractmethod
+    def select(self, stiffness: Tensor, damping: Tensor, deviation: Tensor, velocity: Tensor) -> Gains:
+        """Gains for this tick, of the wanted ones (..., d, d) and the state (..., d) at its start."""
+
+    def settle(self, before: State, after: State, force: Tensor) -> None:  # noqa: B027 - most have nothing to note
+        """Take note of the tick: (deviation, velocity) at its start and end, and the force held in it."""
+
+
+class StiffnessFilter(ABC):
+    """Filter of the gains, as :class:`~torch_pbd.control.AdmittancePlant` takes it."""
+
+    @abstractmethod
+    def start(self, stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> ActiveFilter:
+        """Begin a run over the wanted gains (..., T, d, d)."""
+
+
+@runtime_checkable
+class Environment(Protocol):
+    """Surroundings of the robot."""
+
+    def force(self, position: Tensor, velocity: Tensor) -> Tensor:
+        """Force in N on a robot at these positions, in m, and velocities (..., d)."""
 
 
 @runtime_checkable
 class Hooks(Protocol):
-    """What acts within the loop; None where there is no such thing."""
+    """Parts that act within the loop, None where there is no such part."""
 
     sensor: ForceSensor | None
     position_loop: PositionLoop | None
-    environment: Tunnel | None
+    environment: Environment | None
     substeps: int
-    stiffness_filter: Any
-    integrator: Integrator
+    stiffness_filter: StiffnessFilter | None
 
 
-def open_loop(task: Task, force: Tensor, state: State, integrator: Integrator) -> State:
+def nothing_acts(hooks: Hooks) -> bool:
+    """Whether no part acts within the loop."""
+    parts = (hooks.sensor, hooks.position_loop, hooks.environment, hooks.stiffness_filter)
+    return all(part is None for part in parts)
+
+
+def open_loop(task: Task, force: Tensor, state: State) -> State:
     """Positions and velocities (..., T, d) under forces (..., T, d), where force and gains are known beforehand."""
     d = task.position.shape[-1]
     now = torch.cat([state[0] - task.position[..., 0, :], state[1]], dim=-1)
     # Blocks of ticks are matrices that all rollouts share, if these share their gains and desired motion.
     shared = task.stiffness.ndim == 3 and task.position.ndim == task.velocity.ndim == task.inertial_force.ndim == 2
-    trace = (_by_blocks if shared else _by_ticks)(task, force, now, integrator)
+    trace = (_by_blocks if shared else _by_ticks)(task, force, now)
     return trace[..., :d] + task.position, trace[..., d:]
 
 
-def _by_blocks(task: Task, force: Tensor, start: Tensor, integrator: Integrator) -> Tensor:
-    """Deviations and velocities (..., T, 2 d) from those at the start (..., 2 d)."""
+def _by_blocks(task: Task, force: Tensor, start: Tensor) -> Tensor:
+    """Deviations and velocities (..., T, 2 d) from those at the start (..., 2 d), of shared gains and motion."""
     batch, size = start.shape[:-1], start.shape[-1]
     length = block_length(size // 2, n_forces=32)
     surplus = -task.n_ticks % length
@@ -81,7 +144,7 @@ def _by_blocks(task: Task, force: Tensor, start: Tensor, integrator: Integrator)
     forces = forces.expand(*batch, -1).reshape(-1, forces.shape[-1]).mT
     now, states = start.reshape(-1, size).mT, []  # rollouts are columns
     blocks = forces.split(length * size // 2)
-    for response, held in zip(block_responses(task, integrator, length), blocks, strict=True):
+    for response, held in zip(block_responses(task, length), blocks, strict=True):
         of_start, drift, of_forces = response.flatten(0, 1).split([size, 1, len(held)], dim=1)
         within = torch.addmm(torch.addmm(drift, of_start, now), of_forces, held)
         states.append(within[:-size])
@@ -90,12 +153,12 @@ def _by_blocks(task: Task, force: Tensor, start: Tensor, integrator: Integrator)
     return trace.permute(2, 0, 1).unflatten(0, batch) if batch else trace[..., 0]
 
 
-def _by_ticks(task: Task, force: Tensor, now: Tensor, integrator: Integrator) -> Tensor:
-    """The same where each rollout has gains or a desired motion of its own."""
+def _by_ticks(task: Task, force: Tensor, now: Tensor) -> Tensor:
+    """Deviations and velocities (..., T, 2 d) where each rollout has gains or a desired motion of its own."""
     d = force.shape[-1]
     total, steps, states = force + task.push, task.steps, []
     deviation, velocity = now[..., :d], now[..., d:]
-    for ticks, maps in tick_maps(task, task.dt, integrator):
+    for ticks, maps in tick_maps(task, task.dt):
         for tick, each in enumerate(maps.unbind(-3), start=ticks.start):
             states.append(torch.cat([deviation, velocity], dim=-1))
             deviation, velocity = _moved(each, deviation, velocity, total[..., tick, :].expand_as(deviation))
@@ -111,17 +174,17 @@ def block_length(d: int, n_forces: int = 64) -> int:
     return 1 << max(2, (n_forces // d).bit_length() - 1)
 
 
-def block_responses(task: Task, integrator: Integrator, length: int) -> Iterator[Float[Tensor, "l1 m n"]]:
-    """What blocks of L ticks do, for a task (T, ...) without a batch: states at their ticks from what acts on them.
+def block_responses(task: Task, length: int) -> Iterator[Float[Tensor, "l1 m n"]]:
+    """States at the ticks of each block of L ticks, as a matrix on what acts there, for a task without a batch.
 
-    A matrix (L + 1, 2 d, 2 d + 1 + L d) for each block: of the deviation and velocity at its start, of 1, and of its
+    A matrix (L + 1, 2 d, 2 d + 1 + L d): of the deviation and velocity at the start of the block, of 1, and of its
     forces, tick by tick. The last of the L + 1 states is that at the start of the next block; ticks beyond the
     last one of the task are as that one.
     """
     d = task.position.shape[-1]
     unit = torch.eye(2 * d + 1 + length * d).to(task.position)
     push, steps = task.push, torch.nn.functional.pad(task.steps, (0, d))
-    for ticks, maps in tick_maps(task, task.dt, integrator):
+    for ticks, maps in tick_maps(task, task.dt):
         drift = maps[..., 2 * d :] @ push[ticks].unsqueeze(-1) - steps[ticks].unsqueeze(-1)
         each = torch.cat([maps[..., : 2 * d], drift, maps[..., 2 * d :]], dim=-1)
         surplus = -len(each) % length
@@ -133,18 +196,17 @@ def block_responses(task: Task, integrator: Integrator, length: int) -> Iterator
         yield from torch.stack(states, dim=1)
 
 
-def tick_maps(task: Task, dt: float, integrator: Integrator) -> Iterator[tuple[slice, Tensor]]:
+def tick_maps(task: Task, dt: float) -> Iterator[tuple[slice, Tensor]]:
     """Maps of stretches of ticks of the task's own gains over ``dt``, (..., n, 2 d, 3 d), and which ticks."""
     batch = max(1, task.stiffness[..., 0, 0, 0].numel())
     n_together = max(1, _MATRICES_AT_ONCE // batch)
     for first in range(0, task.n_ticks, n_together):
         ticks = slice(first, min(first + n_together, task.n_ticks))
-        stiffness, damping = task.stiffness[..., ticks, :, :], task.damping[..., ticks, :, :]
-        yield ticks, _tick_map(stiffness, damping, task.mass, dt, integrator)
+        yield ticks, _tick_map(task.stiffness[..., ticks, :, :], task.damping[..., ticks, :, :], task.mass, dt)
 
 
-def _tick_map(stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float, integrator: Integrator) -> Tensor:
-    return transition(admittance_rate(stiffness, damping, mass), dt, integrator)[..., : 2 * stiffness.shape[-1], :]
+def _tick_map(stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> Tensor:
+    return transition(admittance_rate(stiffness, damping, mass), dt)[..., : 2 * stiffness.shape[-1], :]
 
 
 def _moved(each: Float[Tensor, "*b m n"], deviation: Tensor, velocity: Tensor, force: Tensor) -> State:
@@ -158,7 +220,7 @@ def _moved(each: Float[Tensor, "*b m n"], deviation: Tensor, velocity: Tensor, f
 def closed_loop(
     task: Task, force: Tensor, state: State, hooks: Hooks, generator: torch.Generator | None
 ) -> dict[str, Any]:
-    """Fields of a Rollout where a sensor, walls, a position loop or a filter act within the loop."""
+    """Fields of a Rollout where parts act within the loop."""
     loop = Loop(task, state, hooks, generator)
     ticks = [loop.run(tick, force[..., tick, :]) for tick in range(task.n_ticks)]
     behind = {"position": 2, "velocity": 2, "force": 2, "commanded_position": 2, "stiffness": 3, "damping": 3}
@@ -166,71 +228,56 @@ def closed_loop(
 
 
 class Loop:
-    """State (..., d) of a closed-loop run, to be moved on tick by tick."""
+    """State (..., d) of a closed-loop run, which moves on tick by tick."""
 
     def __init__(self, task: Task, state: State, hooks: Hooks, generator: torch.Generator | None) -> None:
-        self._task, self._hooks = task, hooks
+        self._task, self._environment, self._substeps = task, hooks.environment, hooks.substeps
         self._deviation, self._velocity = state[0] - task.position[..., 0, :], state[1]
-        self._robot = None if hooks.position_loop is None else hooks.position_loop.start(*state, task.dt)
-        self._read = None if hooks.sensor is None else hooks.sensor.start(state[0], task.dt, generator)
-        wanted: StiffnessFilter | None = hooks.stiffness_filter
-        self._filter: ActiveFilter | None = None
-        if wanted is not None:
-            self._filter = wanted.start(task.stiffness, task.damping, task.mass, task.dt)
-        self._part = task.dt / hooks.substeps
-        stretches = tick_maps(task, self._part, hooks.integrator)
-        self._maps = (each for _, maps in stretches for each in maps.unbind(-3))
+        loop, sensor, wanted = hooks.position_loop, hooks.sensor, hooks.stiffness_filter
+        self._robot = None if loop is None else loop.start(*state, task.dt)
+        self._read = None if sensor is None else sensor.start(state[0], task.dt, generator)
+        gains = task.stiffness, task.damping, task.mass, task.dt
+        self._filter = None if wanted is None else wanted.start(*gains)
+        self._maps = (each for _, maps in tick_maps(task, task.dt / hooks.substeps) for each in maps.unbind(-3))
 
     def run(self, tick: int, force: Tensor) -> dict[str, Tensor]:
         """One tick under a force (..., d): measure, choose the gains, move; fields of a Rollout at its start."""
         task = self._task
-        desired, still = task.position[..., tick, :], tick + 1 == task.n_ticks
+        desired = task.position[..., tick, :]
+        stiffness, damping = task.stiffness[..., tick, :, :], task.damping[..., tick, :, :]
         commanded = self._deviation + desired
-        position, velocity = (commanded, self._velocity) if self._robot is None else (
-            self._robot.position, self._robot.velocity
-        )  # fmt: skip
-        felt = force + self._wall(position, velocity)
-        values = {"position": position, "velocity": velocity, "commanded_position": commanded, "force": felt}
-        stiffness, damping, said = self._gains(tick)
-        measured, saturated = self._measured(felt)
+        at = (commanded, self._velocity) if self._robot is None else (self._robot.position, self._robot.velocity)
+        total = force + self._wall(*at)
+        record = {"position": at[0], "velocity": at[1], "commanded_position": commanded, "force": total}
+        if self._filter is not None:
+            gains = self._filter.select(stiffness, damping, self._deviation, self._velocity)
+            stiffness, damping, record["filter_share"] = gains.stiffness, gains.damping, gains.share
+            if self._filter.tank_energy is not None:
+                record["tank_energy"] = self._filter.tank_energy
+        measured = total
+        if self._read is not None:
+            measured, record["saturated"] = self._read(total)
         push = (damping @ task.velocity[..., tick, :].unsqueeze(-1)).squeeze(-1) + task.inertial_force[..., tick, :]
         self._move(stiffness, damping, (force, measured), push, desired)
         if self._robot is not None:
             self._robot(commanded)
-        if not still:
+        if tick + 1 < task.n_ticks:
             self._deviation = self._deviation - (task.position[..., tick + 1, :] - desired)
-        return values | {"stiffness": stiffness, "damping": damping} | said | saturated
+        return record | {"stiffness": stiffness, "damping": damping}
 
     def _wall(self, position: Tensor, velocity: Tensor) -> Tensor:
-        environment = self._hooks.environment
-        return torch.zeros_like(position) if environment is None else environment.force(position, velocity)
-
-    def _measured(self, force: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        if self._read is None:
-            return force, {}
-        reading = self._read(force)
-        return reading.force, {"saturated": reading.saturated}
-
-    def _gains(self, tick: int) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-        stiffness, damping = self._task.stiffness[..., tick, :, :], self._task.damping[..., tick, :, :]
-        if self._filter is None:
-            return stiffness, damping, {}
-        gains = self._filter.select(stiffness, damping, self._deviation, self._velocity)
-        said = {"filter_share": gains.share}
-        if self._filter.tank_energy is not None:
-            said["tank_energy"] = self._filter.tank_energy
-        return gains.stiffness, gains.damping, said
+        return torch.zeros_like(position) if self._environment is None else self._environment.force(position, velocity)
 
     def _move(
         self, stiffness: Tensor, damping: Tensor, forces: tuple[Tensor, Tensor], push: Tensor, desired: Tensor
     ) -> None:
         """Move over the tick, by the measured force; the walls are evaluated anew in each of its parts."""
-        hooks, (outside, force) = self._hooks, forces
+        outside, force = forces
         if self._filter is None:
             each = next(self._maps)
         else:
-            each = _tick_map(stiffness, damping, self._task.mass, self._part, hooks.integrator)
-        for part in range(hooks.substeps):
+            each = _tick_map(stiffness, damping, self._task.mass, self._task.dt)
+        for part in range(self._substeps):
             before = self._deviation, self._velocity
             if part:
                 force = outside + self._wall(before[0] + desired, before[1])

@@ -1,1 +1,1 @@
-"""What is guaranteed of a schedule: exponential decay, passivity, stiff environments."""
+"""Guarantees of a schedule: exponential decay, passivity, stiff environments."""

@@ -1,29 +1,32 @@
-"""What is guaranteed of a stiffness schedule, and what is not: each statement by its name, checked.
+"""Guarantees of a stiffness schedule, each by its name, and what it may touch.
 
 With the deviation y from the desired motion, ``M y'' + D y' + K y = f``: a rise of K feeds energy in.
 """
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torch_pbd import checks
 from torch_pbd.control.damping import required_damping_ratio
-from torch_pbd.control.matrices import as_mass, as_rows, as_semidefinite, check_positive
-from torch_pbd.control.simulation.filters import lyapunov_matrix
+from torch_pbd.control.matrices import as_mass, as_rows, as_tensor
 from torch_pbd.control.simulation.position_loop import PositionLoop
-from torch_pbd.control.simulation.transitions import admittance_rate, transition
-from torch_pbd.control.stability.coupling import stiffest_environment
-from torch_pbd.control.stability.lyapunov import has_common_function, minimize_convex
-from torch_pbd.control.stability.report import GROWTH_ROUNDING, StabilityReport
+from torch_pbd.control.simulation.ticks import admittance_rate, transition
+from torch_pbd.control.stability.lyapunov import has_common_function, held_growth, knots_of
+from torch_pbd.control.stability.report import StabilityReport
+from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.linalg import spectral_map, symmetrize
 
-_MAX_BEGINNINGS = 400  # of parts of the schedule that are followed at a time for their gain
-_N_WORST = 32  # intervals at which a maximum over all is looked for; more change nothing, fewer are asked more often
+# Parts of the schedule that are followed at a time for their gain.
+_MAX_BEGINNINGS = 400
+# N/m; stiffer than anything there is.
+_STIFFEST = 1e9
+# Knots of a schedule that are coupled to an environment, each of which takes 60 eigenvalues of a matrix of 5 + delay.
+_MAX_KNOTS = 200
+_BISECTIONS = 60
 
 
 def certify(
@@ -40,7 +43,7 @@ def certify(
     Parameters
     ----------
     schedule : Schedule
-        Or anything with ``time`` (n,), ``stiffness`` and ``damping`` (n, d, d).
+        Or any object with ``time`` (n,), ``stiffness`` and ``damping`` (n, d, d).
     mass : float or array_like of shape (d, d), default=1.0
         Virtual mass of the admittance, kg.
     speed : float, default=1.0
@@ -52,10 +55,6 @@ def certify(
     dt : float, default=0.001
         Tick of the controller, s.
 
-    Returns
-    -------
-    StabilityReport
-
     Raises
     ------
     ValueError
@@ -64,26 +63,25 @@ def certify(
     References
     ----------
     K. Kronander, A. Billard, "Stability considerations for variable impedance control", IEEE Transactions on
-    Robotics 32, 2016. Its conditions are linear in time between knots where K and D are, so that holding at the
-    ends of every interval is holding throughout; and they are convex in alpha, which is found by golden section.
+    Robotics 32, 2016.
     """
-    check_positive("speed", speed)
-    check_positive("dt", dt, "s")
-    if force_cutoff is not None:
-        check_positive("force_cutoff", force_cutoff, "Hz")
-    if position_loop is not None and not isinstance(position_loop, PositionLoop):
-        raise ValueError(f"position_loop is {position_loop!r}, must be a PositionLoop or None.")
+    checks.number(speed, "speed", above=0.0)
+    checks.number(dt, "dt", above=0.0, unit="s")
+    checks.number(force_cutoff, "force_cutoff", above=0.0, unit="Hz", optional=True)
+    checks.instance(position_loop, "position_loop", PositionLoop, optional=True)
     time, stiffness, damping = _rows_of(schedule)
-    inertia = _door(as_mass(mass))
+    checked = as_mass(mass)
+    inertia = checked.detach().double() if isinstance(checked, Tensor) else torch.tensor(checked, dtype=torch.float64)
     is_number = not inertia.ndim
-    inertia = inertia if inertia.ndim else inertia * torch.eye(stiffness.shape[-1]).to(stiffness)
+    inertia = inertia * torch.eye(stiffness.shape[-1]).to(stiffness) if is_number else inertia
     if inertia.shape != stiffness.shape[1:]:
-        raise ValueError(f"mass has shape {tuple(inertia.shape)}, must be a number or {tuple(stiffness.shape[1:])}.")
-    if float(torch.linalg.eigvalsh(stiffness).min()) <= 0.0:
-        raise ValueError("stiffness must be positive definite to be certified: a free axis never returns.")
-    knots = _Knots.of(time / speed, stiffness, damping, inertia)
+        expected = tuple(stiffness.shape[1:])
+        raise InvalidParameterError(
+            f"mass has shape {tuple(inertia.shape)}, must be a number or have shape {expected}."
+        )
+    knots = knots_of(time / speed, stiffness, damping, inertia)
     alpha, margin, worst = knots.certificate()
-    ratio, required, lawful, smallest = _damping_rule(stiffness, damping, inertia)
+    ratio, required, at_any_schedule, smallest = _damping_rule(stiffness, damping, inertia)
     rate = admittance_rate(stiffness[:-1], damping[:-1], inertia)[..., : 2 * inertia.shape[0], : 2 * inertia.shape[0]]
     maps = transition(rate * (time / speed).diff()[:, None, None], 1.0)
     loop = PositionLoop() if position_loop is None else position_loop
@@ -91,11 +89,11 @@ def certify(
         damping_ratio=smallest,
         stiffness_ratio=ratio,
         required_damping_ratio=required,
-        stable_at_any_schedule=lawful,
+        stable_at_any_schedule=at_any_schedule,
         alpha=alpha,
         margin=margin,
         margin_time=float(time[worst]),
-        held_growth=_held_growth(maps, stiffness, damping, inertia, alpha),
+        held_growth=held_growth(maps, stiffness, damping, inertia, alpha),
         max_speed=speed * knots.max_speed(),
         gain=_gain(maps, stiffness, inertia),
         environment_stiffness=stiffest_environment(stiffness, damping, inertia, loop, force_cutoff, dt),
@@ -105,86 +103,26 @@ def certify(
 
 
 def _rows_of(schedule: Any) -> tuple[Tensor, Tensor, Tensor]:
-    """Times, stiffness and damping of what may be a schedule, checked as a schedule's are."""
+    """Times, stiffness and damping of what may be a schedule, checked, in float64."""
     missing = [name for name in ("time", "stiffness", "damping") if not hasattr(schedule, name)]
     if missing:
-        raise ValueError(f"schedule is a {type(schedule).__name__} without {', '.join(missing)}: give a Schedule.")
-    time = _door(as_rows(schedule.time, "schedule.time", 1))
+        raise InvalidParameterError(
+            f"schedule is a {type(schedule).__name__} without {', '.join(missing)}, must be a Schedule."
+        )
+    time = as_rows(schedule.time, "schedule.time", 1).detach().double()
     if time.ndim != 1 or len(time) < 2 or not bool((time.diff() > 0.0).all()):
-        raise ValueError(f"schedule.time has shape {tuple(time.shape)}, must be two or more times that increase.")
-    gains = [_door(as_semidefinite(getattr(schedule, name), f"schedule.{name}")) for name in ("stiffness", "damping")]
-    for name, gain in zip(("stiffness", "damping"), gains, strict=True):
-        if gain.ndim != 3 or gain.shape != gains[0].shape or len(gain) != len(time):
-            raise ValueError(
-                f"schedule.{name} has shape {tuple(gain.shape)}, must have shape (n, d, d) with n = {len(time)}, the "
-                "number of times."
-            )
+        shape = tuple(time.shape)
+        raise InvalidParameterError(f"schedule.time has shape {shape}, must be two or more times that increase.")
+    gains: list[Tensor] = []
+    for name in ("stiffness", "damping"):
+        gain = as_tensor(getattr(schedule, name), f"schedule.{name}").detach().double()
+        expected = tuple(gains[0].shape) if gains else (len(time), *gain.shape[-1:] * 2)
+        if gain.shape != expected:
+            raise InvalidParameterError(f"schedule.{name} has shape {tuple(gain.shape)}, must have shape {expected}.")
+        # An axis that is free never returns: nothing is to be certified of it.
+        checks.semidefinite(gain.cpu().numpy(), f"schedule.{name}", definite=name == "stiffness")
+        gains.append(gain)
     return time, gains[0], gains[1]
-
-
-def _door(values: Any) -> Tensor:
-    """Copy in float64; arrays of a schedule are read-only, which torch must not alias."""
-    return values.detach().double() if isinstance(values, Tensor) else torch.tensor(values, dtype=torch.float64)
-
-
-@dataclass(frozen=True)
-class _Knots:
-    """Gains at both ends of every interval (2, n - 1, d, d), their rates (n - 1, d, d), and the largest alpha."""
-
-    stiffness: Tensor
-    stiffness_rate: Tensor
-    damping_rate: Tensor
-    alpha_max: float
-
-    @classmethod
-    def of(cls, time: Tensor, stiffness: Tensor, damping: Tensor, mass: Tensor) -> "_Knots":
-        step = time.diff()[:, None, None]
-        inverse = torch.linalg.inv(torch.linalg.cholesky(mass))
-        alpha_max = float(torch.linalg.eigvalsh(symmetrize(inverse @ damping @ inverse.mT)).min())
-        ends = torch.stack([stiffness[:-1], stiffness[1:]])
-        return cls(ends, stiffness.diff(dim=0) / step, damping.diff(dim=0) / step, alpha_max)
-
-    def certificate(self) -> tuple[float, float, int]:
-        """Alpha with the largest margin, that margin, and the interval where it is smallest."""
-
-        def excess(alpha: float, rows: Any = slice(None)) -> Tensor:
-            matrix = self.stiffness_rate[rows] + alpha * (self.damping_rate[rows] - 2.0 * self.stiffness[:, rows])
-            return torch.linalg.eigvalsh(matrix)[..., -1].amax(0)
-
-        if self.alpha_max <= 0.0:  # no damping somewhere: no alpha will do
-            values = excess(0.0)
-            return 0.0, min(-float(values.max()), -math.ulp(0.0)), int(values.argmax())
-        alpha, values = _minimize_largest(excess, 1e-9 * self.alpha_max, self.alpha_max)
-        return alpha, -float(values.max()), int(values.argmax())
-
-    def max_speed(self) -> float:
-        """Largest factor on the rates for which some alpha has no negative margin."""
-        if self.alpha_max <= 0.0:
-            return 0.0
-        root = spectral_map(self.stiffness, torch.rsqrt)
-
-        def needed(log_inverse_alpha: float, rows: Any = slice(None)) -> Tensor:
-            rate = math.exp(log_inverse_alpha) * self.stiffness_rate[rows] + self.damping_rate[rows]
-            return 0.5 * torch.linalg.eigvalsh(symmetrize(root[:, rows] @ rate @ root[:, rows]))[..., -1].amax(0)
-
-        # By its logarithm, of which it still falls and then rises: where K falls and D rises alpha must be small.
-        slowest = -math.log(self.alpha_max)
-        best = float(_minimize_largest(needed, slowest, slowest + math.log(1e9))[1].max())
-        return 1.0 / best if best > 1e-12 else math.inf
-
-
-def _minimize_largest(function: Callable[..., Tensor], low: float, high: float) -> tuple[float, Tensor]:
-    """Where the largest of many convex functions of one variable is smallest, and the values of all of them there.
-
-    ``function(x, rows)`` has some of them. Most are never the largest: the search is among those that are so at an end
-    and at the minima of the ones that were, until these are the largest of all.
-    """
-    found, values, rows = low, function(high), torch.empty(0, dtype=torch.long)
-    while not len(rows) or values.max() > values[rows].max():
-        rows = torch.cat([rows, values.topk(min(_N_WORST, len(values))).indices]).unique()
-        found = minimize_convex(lambda x, rows=rows: float(function(x, rows).max()), low, high)
-        values = function(found)
-    return found, values
 
 
 def _damping_rule(stiffness: Tensor, damping: Tensor, mass: Tensor) -> tuple[float, float, bool, float]:
@@ -220,18 +158,65 @@ def _gain(maps: Float[Tensor, "m n n"], stiffness: Float[Tensor, "k d d"], mass:
     return math.sqrt(largest)
 
 
-def _held_growth(maps: Tensor, stiffness: Tensor, damping: Tensor, mass: Tensor, alpha: float) -> float:
-    """Largest eigenvalue of ``A' P_next A`` relative to P: A the exact map of an interval with its gains held.
+def stiffest_environment(
+    stiffness: Float[Tensor, "n d d"],
+    damping: Float[Tensor, "n d d"],
+    mass: Float[Tensor, "d d"],
+    position_loop: PositionLoop,
+    force_cutoff: float | None = 500.0,
+    dt: float = 0.001,
+) -> float:
+    """Stiffest spring, N/m, that the robot can press on without vibrating, the least over the gains given.
 
-    Of this alpha, or, where that grows, of a half or a quarter: at the largest some velocity does not damp V.
+    The robot reads the force through a low-pass of ``force_cutoff`` Hz, and follows the admittance by its
+    position loop: the closed loop along an axis of the damping, tick by tick, is a matrix, and the spring is the
+    stiffest up to which its eigenvalues stay within the unit circle; about ``damping / (lag of loop and sensor)``.
+    Gains are held, and axes taken one by one; of more than 200 knots, 200 are looked at and those with the least
+    damping and stiffness.
     """
-    least = math.nan
-    for each in (alpha, alpha / 2.0, alpha / 4.0) if alpha > 0.0 else ():
-        function = lyapunov_matrix(stiffness, damping, mass, each)
-        inverse = torch.linalg.inv(torch.linalg.cholesky(function[:-1]))
-        grown = inverse @ maps.mT @ function[1:] @ maps @ inverse.mT
-        growth = float(torch.linalg.eigvalsh(symmetrize(grown)).max())
-        least = growth if math.isnan(least) else min(least, growth)
-        if least <= 1.0 + GROWTH_ROUNDING:
-            break
-    return least
+    chosen = torch.linspace(0, len(stiffness) - 1, min(len(stiffness), _MAX_KNOTS)).round().long()
+    softest = [torch.linalg.eigvalsh(gain)[:, 0].argmin() for gain in (stiffness, damping)]
+    chosen = torch.cat([chosen.to(stiffness.device), torch.stack(softest)])
+    axes = torch.linalg.eigh(symmetrize(damping[chosen])).eigenvectors
+    along = [
+        (axes * (matrix @ axes)).sum(-2).reshape(-1, 1, 1) for matrix in (stiffness[chosen], damping[chosen], mass)
+    ]
+    ticks = transition(admittance_rate(*along), dt)[:, :2]
+    low, high = torch.zeros_like(along[0][:, 0, 0]), torch.full_like(along[0][:, 0, 0], 2.0 * _STIFFEST)
+    for _ in range(_BISECTIONS):
+        # By the logarithm while that is wide: the answer may lie anywhere between a feather and a wall.
+        middle = torch.where(high > 1e3 * low.clamp_min(1.0), (low.clamp_min(1.0) * high).sqrt(), 0.5 * (low + high))
+        closed = _closed_loop(ticks, position_loop, force_cutoff, dt, middle)
+        stable = torch.linalg.eigvals(closed).abs().amax(-1) < 1.0
+        low, high = torch.where(stable, middle, low), torch.where(stable, high, middle)
+        lasting = low <= high.min()  # the others are not the least
+        low, high, ticks = low[lasting], high[lasting], ticks[lasting]
+    least = float(low.min())
+    return math.inf if least > _STIFFEST else least
+
+
+def _closed_loop(
+    ticks: Float[Tensor, "n 2 3"],
+    position_loop: PositionLoop,
+    force_cutoff: float | None,
+    dt: float,
+    environment: Float[Tensor, " n"],
+) -> Float[Tensor, "n m m"]:
+    """Matrices of [admittance position, velocity; robot position, velocity; filtered force; commands waiting]."""
+    n_waiting = position_loop.delay_steps
+    closed = ticks.new_zeros(len(ticks), 5 + n_waiting, 5 + n_waiting)
+    robot, filtered, waiting = 2, 4, 5
+    if force_cutoff is None:
+        closed[:, :2, robot] = -environment[:, None] * ticks[:, :, 2]
+    else:
+        gain = -math.expm1(-2.0 * math.pi * force_cutoff * dt)
+        closed[:, :2, filtered] = ticks[:, :, 2]
+        closed[:, filtered, filtered] = 1.0 - gain
+        closed[:, filtered, robot] = -environment * gain
+    closed[:, :2, :2] = ticks[:, :, :2]
+    follow = position_loop.transition(dt, ticks)
+    closed[:, robot : robot + 2, robot : robot + 2] = follow[:, :2]
+    closed[:, robot : robot + 2, waiting if n_waiting else 0] = follow[:, 2]
+    for step in range(n_waiting):  # the oldest command comes first
+        closed[:, waiting + step, 0 if step == n_waiting - 1 else waiting + step + 1] = 1.0
+    return closed

@@ -1,17 +1,25 @@
-"""One function of the state that falls whatever the schedule does, found or shown not to exist."""
+"""Functions of the state that fall: whatever the schedule does, or along this very one."""
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torch_pbd.linalg import symmetrize
+from torch_pbd.control.simulation.filters import lyapunov_matrix
+from torch_pbd.control.stability.report import GROWTH_ROUNDING
+from torch_pbd.linalg import spectral_map, symmetrize
 
 _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
-_ROUNDING = 1e-10  # of the summands of the matrix whose smallest eigenvalue must be positive
-_ROUNDS = 8  # of cuts; where K and D commute one is enough, and three have been the most that was needed
+# Of the summands of the matrix whose smallest eigenvalue must be positive: a margin over rounding, 1e-13 of them.
+_ROUNDING = 1e-10
+# Of cuts; where K and D commute one is enough, and three have been the most that was needed.
+_ROUNDS = 8
+# Intervals among which a maximum over all is looked for at a time: more change nothing, fewer are asked more often.
+_N_WORST = 32
 
 
 def has_common_function(stiffness: Float[Tensor, "n d d"], damping: Float[Tensor, "n d d"]) -> bool:
@@ -74,6 +82,89 @@ def _monomials(log_a: float, log_b: float, like: Tensor) -> Tensor:
 
 def _along(terms: Float[Tensor, "k n d d"], vectors: Float[Tensor, "n d m"]) -> Float[Tensor, "k nm"]:
     return (vectors * (terms @ vectors)).sum(-2).flatten(1)
+
+
+@dataclass(frozen=True)
+class Knots:
+    """Gains at both ends of every interval (2, n - 1, d, d), their rates (n - 1, d, d), and the largest alpha.
+
+    They are the conditions of Kronander and Billard, ``K' + alpha D' <= 2 alpha K`` and ``alpha M <= D``: linear in
+    time where K and D are, so that holding at the ends of every interval is holding throughout, and convex in alpha.
+    """
+
+    stiffness: Tensor
+    stiffness_rate: Tensor
+    damping_rate: Tensor
+    alpha_max: float
+
+    def certificate(self) -> tuple[float, float, int]:
+        """Alpha with the largest margin, that margin, and the interval where it is smallest."""
+
+        def excess(alpha: float, rows: Any = slice(None)) -> Tensor:
+            matrix = self.stiffness_rate[rows] + alpha * (self.damping_rate[rows] - 2.0 * self.stiffness[:, rows])
+            return torch.linalg.eigvalsh(matrix)[..., -1].amax(0)
+
+        if self.alpha_max <= 0.0:  # no damping somewhere: no alpha will do
+            values = excess(0.0)
+            return 0.0, min(-float(values.max()), -math.ulp(0.0)), int(values.argmax())
+        alpha, values = _minimize_largest(excess, 1e-9 * self.alpha_max, self.alpha_max)
+        return alpha, -float(values.max()), int(values.argmax())
+
+    def max_speed(self) -> float:
+        """Largest factor on the rates for which some alpha has no negative margin."""
+        if self.alpha_max <= 0.0:
+            return 0.0
+        root = spectral_map(self.stiffness, torch.rsqrt)
+
+        # The speed is at most one over the largest eigenvalue of K^-1/2 (K' / alpha + D') K^-1/2 / 2.
+        def needed(log_inverse_alpha: float, rows: Any = slice(None)) -> Tensor:
+            rate = math.exp(log_inverse_alpha) * self.stiffness_rate[rows] + self.damping_rate[rows]
+            return 0.5 * torch.linalg.eigvalsh(symmetrize(root[:, rows] @ rate @ root[:, rows]))[..., -1].amax(0)
+
+        # By its logarithm, of which it still falls and then rises: where K falls and D rises alpha must be small.
+        slowest = -math.log(self.alpha_max)
+        best = float(_minimize_largest(needed, slowest, slowest + math.log(1e9))[1].max())
+        return 1.0 / best if best > 1e-12 else math.inf
+
+
+def knots_of(time: Tensor, stiffness: Tensor, damping: Tensor, mass: Tensor) -> Knots:
+    """Intervals between times (n,) of gains (n, d, d) that are linear in between."""
+    step = time.diff()[:, None, None]
+    inverse = torch.linalg.inv(torch.linalg.cholesky(mass))
+    alpha_max = float(torch.linalg.eigvalsh(symmetrize(inverse @ damping @ inverse.mT)).min())
+    ends = torch.stack([stiffness[:-1], stiffness[1:]])
+    return Knots(ends, stiffness.diff(dim=0) / step, damping.diff(dim=0) / step, alpha_max)
+
+
+def held_growth(maps: Tensor, stiffness: Tensor, damping: Tensor, mass: Tensor, alpha: float) -> float:
+    """Largest eigenvalue of ``A' P_next A`` relative to P: A the exact map of an interval with its gains held.
+
+    Of this alpha, or, where that grows, of a half or a quarter: at the largest some velocity does not damp V.
+    """
+    least = math.nan
+    for each in (alpha, alpha / 2.0, alpha / 4.0) if alpha > 0.0 else ():
+        function = lyapunov_matrix(stiffness, damping, mass, each)
+        inverse = torch.linalg.inv(torch.linalg.cholesky(function[:-1]))
+        grown = inverse @ maps.mT @ function[1:] @ maps @ inverse.mT
+        growth = float(torch.linalg.eigvalsh(symmetrize(grown)).max())
+        least = growth if math.isnan(least) else min(least, growth)
+        if least <= 1.0 + GROWTH_ROUNDING:
+            break
+    return least
+
+
+def _minimize_largest(function: Callable[..., Tensor], low: float, high: float) -> tuple[float, Tensor]:
+    """Where the largest of many convex functions of one variable is smallest, and the values of all of them there.
+
+    ``function(x, rows)`` has some of them. Most are never the largest: the search is among those that are so at an end
+    and at the minima of the ones that were, until these are the largest of all.
+    """
+    found, values, rows = low, function(high), torch.empty(0, dtype=torch.long)
+    while not len(rows) or values.max() > values[rows].max():
+        rows = torch.cat([rows, values.topk(min(_N_WORST, len(values))).indices]).unique()
+        found = minimize_convex(lambda x, rows=rows: float(function(x, rows).max()), low, high)
+        values = function(found)
+    return found, values
 
 
 def minimize_convex(function: Callable[[float], float], low: float, high: float, n_steps: int = 45) -> float:
