@@ -88,4 +88,5 @@ def restore_controller(controller: DMPController, covariance: Any, values: dict[
     controller.reproduction_ = Reproduction(dmp, phase, controller.goal == "each", time=time, **motion)
     controller.start_, controller.goal_ = motion["start"], motion["goal"]
     controller.law_ = values["law_"]
-    controller._impedance = Impedance(controller.law_, controller.mass, controller.damping_ratio, controller.on_unknown)
+    over = (covariance, phase, controller.duration_, controller.unsampled_, controller.law_)
+    controller._impedance = Impedance(*over, controller.mass, controller.damping_ratio, controller.on_unknown)
