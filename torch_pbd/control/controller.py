@@ -8,7 +8,7 @@ from sklearn.base import BaseEstimator
 from sklearn.utils.validation import check_is_fitted
 
 from torch_pbd import checks
-from torch_pbd.control import parameters as given
+from torch_pbd.control import parameters
 from torch_pbd.control.impedance import Impedance, OnUnknown, fit_covariance, fit_law
 from torch_pbd.control.primitive import units
 from torch_pbd.control.primitive.adaptation import Adaptation
@@ -112,9 +112,9 @@ class DMPController(BaseEstimator):
         tau: float = 1.0,
         adaptation: Adaptation = "safe",
         gate: Gate = "time",
-        phase_input: given.PhaseInput = "time",
-        variability: given.Variability = "position",
-        goal: given.Goals = "common",
+        phase_input: parameters.PhaseInput = "time",
+        variability: parameters.Variability = "position",
+        goal: parameters.Goals = "common",
         cutoff: float | Literal["auto"] | None = "auto",
         duration: float | None = None,
         n_steps: int = 100,
@@ -167,9 +167,9 @@ class DMPController(BaseEstimator):
             Of samples that were merged, as their times are too close; of holes, with their times.
         """
         self.__dict__.pop("_impedance", None)  # a fit that fails leaves no mixture of two
-        given.check_parameters(self)
-        # Recordings: samples that are one by their times are merged, and where none are is tabulated.
-        shown = merge_bursts(given.as_demonstrations(X, y, groups))
+        parameters.check_parameters(self)
+        # 1. Recordings. Samples whose times are one are merged; the table of holes is Type I uncertainty.
+        shown = merge_bursts(parameters.as_demonstrations(X, y, groups))
         self.names_, self.frame_, self.units_, self.time_unit_ = shown.names, shown.frame, shown.units, shown.time_unit
         self.n_demos_, self.n_outputs_ = len(shown), shown.n_outputs
         self.duration_, self.time_scale_ = units.duration_of(shown, self.duration)
@@ -177,26 +177,28 @@ class DMPController(BaseEstimator):
         seconds = units.in_seconds(self.time_unit_) is not None
         self.cutoff_ = automatic_cutoff(self.duration_, knows_seconds=seconds) if self.cutoff == "auto" else self.cutoff
         self.dmp_ = primitive(self)
-        given.check_against_duration(self)
-        given.check_steps(self.n_steps, self.n_demos_, self.n_outputs_, learned=True)
+        parameters.check_against_duration(self)
+        parameters.check_steps(self.n_steps, self.n_demos_, self.n_outputs_, learned=True)
         self.unsampled_ = tabulate_unsampled(shown, self.duration_ / self.time_scale_, self.on_unknown)
-        # Smoothing: positions, velocities and accelerations at common times of the movement.
+        # 2. Smoothing. Splines at the true times give positions, velocities and accelerations at common times.
         movements = smooth(shown, self.cutoff_, self.n_steps, self.duration_)
-        # Mean movement: eq. (16) under the mean of the forcings of eq. (18), a Gaussian process over the phase of (17).
+        # 3. Mean movement. Eq. (16) is driven by the mean over demonstrations of the forcing of eq. (18), through which
+        # goes a Gaussian process, eq. (5), over the phase of eq. (17) or another input that is a function of time.
         self.reproduction_ = Reproduction.learn(self.dmp_, movements, self.phase_input, own_goals=self.goal == "each")
         self.start_, self.goal_ = self.reproduction_.start, self.reproduction_.goal
         self.reproduction_error_ = self.reproduction_.check_against(movements)
         if seconds and units.counts_as_metres(self.units_):
             self.reproduction_.warn_if_cut(units.in_metres(self.units_))
-        # Variability: covariance over the phase of the positions, or of the forcings of eq. (18).
+        # 4. Variability. The regressor learns the covariance over the same input, of positions or of the forcing.
         varying, phase = self.varying(movements), self.reproduction_.phase
         self.covariance_ = fit_covariance(self.covariance, phase(movements.time), varying, movements.known)
-        # Noise: the share of the variance that white noise has after the smoothing which took as much away.
+        # White noise as large as what the smoothing took away, smoothed: its share of the variance is no variability.
         self.noise_scale_ = movements.noise_scale
         noise = noise_like(shown, self.noise_scale_)
         smoothed = smooth(noise, self.cutoff_, self.n_steps, self.duration_, noise=True)
         self.noise_share_ = variance_share(self.varying(smoothed), varying)
-        # Gains: the bounds of eq. (20) are deviations where samples are; eq. (19) is of the principal axes.
+        # 5. Gains. The bounds of eq. (20) are quantiles of the deviations where there are samples; eq. (19) then gives
+        # each principal axis its stiffness, and the damping follows from stiffness and mass.
         known = np.linspace(0.0, self.duration_, len(self.unsampled_))[self.unsampled_ <= UNKNOWN]
         self.law_ = fit_law(self.stiffness_law, self.covariance_.predict_cov(phase(known[::4])), varying)
         over = (self.covariance_, phase, self.duration_, self.unsampled_, self.law_)
@@ -260,7 +262,7 @@ class DMPController(BaseEstimator):
         speed = checks.number(speed, "speed", above=0.0)
         recorded = self.units_, self.time_unit_
         units.check_motion(limits, *recorded, duration=self.duration_ / speed)
-        time = given.as_tick_times(self.duration_ / speed, rate, settle, self.n_outputs_)
+        time = parameters.as_tick_times(self.duration_ / speed, rate, settle, self.n_outputs_)
         position, velocity, moved = self.reproduction_.plan(time, goal, start, speed)
         metres = units.in_metres(self.units_)
         distance = metres * float(np.linalg.norm(np.ptp(position, axis=0)))
@@ -268,7 +270,7 @@ class DMPController(BaseEstimator):
         units.check_motion(limits, *recorded, distance=distance, speed=fastest)
         gains = self._impedance(moved)
         rows = (time, metres * position, metres * velocity, gains.stiffness, gains.damping)
-        return Schedule(*rows, metres**2 * gains.covariance, gains.type1, **given.schedule_labels(self))
+        return Schedule(*rows, metres**2 * gains.covariance, gains.type1, **parameters.schedule_labels(self))
 
     def simulate(
         self,
@@ -290,11 +292,6 @@ class DMPController(BaseEstimator):
             Of the ticks, Hz. The last one, which may be later than the end of the movement, follows its last row.
         random_state : int, RandomState or None, default=None
             Of the noise of the plant's sensor.
-
-        Returns
-        -------
-        Rollout
-            NumPy arrays.
         """
         schedule = self.schedule(rate)
         robot = AdmittancePlant(self.mass) if plant is None else plant
@@ -324,8 +321,10 @@ class DMPController(BaseEstimator):
             How fast movement time passes, at each tick if it changes; it should change smoothly.
         """
         check_is_fitted(self)
-        paces = given.as_speed(1.0 if speed is None else speed)
-        time = given.as_tick_times(self.duration_, rate, settle, self.n_outputs_, len(paces) if paces.ndim else None)
+        paces = parameters.as_speed(1.0 if speed is None else speed)
+        time = parameters.as_tick_times(
+            self.duration_, rate, settle, self.n_outputs_, len(paces) if paces.ndim else None
+        )
         return time, *self.reproduction_.plan(time, goal, start, paces)[:2]
 
     def phase(self, time: ArrayLike) -> Floats:
@@ -340,11 +339,11 @@ class DMPController(BaseEstimator):
         if demonstrations.n_outputs != self.n_outputs_:
             raise ValueError(f"n_outputs of demonstrations is {demonstrations.n_outputs}, must be {self.n_outputs_}.")
         n_steps = self.n_steps if n_steps is None else checks.count(n_steps, "n_steps", least=2)
-        given.check_steps(n_steps, len(demonstrations), self.n_outputs_, learned=False)
+        parameters.check_steps(n_steps, len(demonstrations), self.n_outputs_, learned=False)
         return smooth(merge_bursts(demonstrations), self.cutoff_, n_steps, self.duration_)
 
     def varying(self, movements: Movements) -> Floats:
-        """What ``variability`` is of, (K, n, d), in smoothed movements of the same task."""
+        """Positions or forcings (K, n, d) of smoothed movements of the same task, by ``variability``."""
         checks.instance(movements, "movements", Movements, remedy="give what smooth(demonstrations) returns")
         return movements.position if self.variability == "position" else self.reproduction_.forcing_of(movements)
 
@@ -353,4 +352,4 @@ class DMPController(BaseEstimator):
 
     def _movement_time(self, X: ArrayLike) -> Floats:
         check_is_fitted(self)
-        return self.time_scale_ * (given.as_times(X) - self.start_time_)
+        return self.time_scale_ * (parameters.as_times(X) - self.start_time_)

@@ -106,8 +106,9 @@ def check_range(path: Floats, bounds: Floats, name: str) -> None:
 def _splines(demonstrations: Demonstrations, cutoff: float | None, bounds: Floats) -> list[BSpline]:
     """Spline of each demonstration over its time from its start."""
     times, margin = [time - time[0] for time in demonstrations.times], 0.5 * _MOST_BEYOND * np.ptp(bounds, axis=0)
-    splines = [_spline(*of_one, cutoff) for of_one in zip(times, demonstrations.positions, strict=True)]
+    splines = [_spline(*recording, cutoff) for recording in zip(times, demonstrations.positions, strict=True)]
     bridged = list(splines)
+    # Holes are filled at the recording's own spacing, by the splines before any was, so that no order matters.
     for number, (time, filled) in enumerate(zip(times, demonstrations.positions, strict=True)):
         samples = time
         for edges in [time[i : i + 2] for i in holes_of(time)]:
@@ -123,13 +124,15 @@ def _splines(demonstrations: Demonstrations, cutoff: float | None, bounds: Float
 def _through(splines: list[BSpline], times: list[Floats], number: int, edges: Floats, inner: Floats) -> Floats:
     """Path of one demonstration at times ``inner`` of its hole between ``edges``."""
     rates = [time[-1] / times[number][-1] for time in times]
-    knowing = [k for k, time in enumerate(times) if unsampled(time, rates[k] * inner).max() <= UNKNOWN]
+    sampled = [k for k, time in enumerate(times) if unsampled(time, rates[k] * inner).max() <= UNKNOWN]
 
-    def known(at: Floats, order: int = 0) -> Any:
-        return sum(splines[k](rates[k] * at, order) * rates[k] ** order for k in knowing) / max(1, len(knowing))
+    def mean(at: Floats, order: int = 0) -> Any:
+        return sum(splines[k](rates[k] * at, order) * rates[k] ** order for k in sampled) / max(1, len(sampled))
 
+    # The mean of the others, and the cubic that has the difference and its slope at both edges. Of no others, the mean
+    # is zero, and the cubic is all.
     own = splines[number]
-    return known(inner) + CubicHermiteSpline(edges, own(edges) - known(edges), own(edges, 1) - known(edges, 1))(inner)
+    return mean(inner) + CubicHermiteSpline(edges, own(edges) - mean(edges), own(edges, 1) - mean(edges, 1))(inner)
 
 
 def _spline(time: Floats, position: Floats, cutoff: float | None) -> BSpline:
@@ -151,12 +154,12 @@ def _spline(time: Floats, position: Floats, cutoff: float | None) -> BSpline:
 
 
 def automatic_cutoff(duration: float, *, knows_seconds: bool) -> float:
-    """40 cycles a movement of ``duration`` s; where the recordings tell seconds, not below 4 Hz."""
+    """Cutoff of 40 cycles a movement of ``duration`` s; where the times are in seconds, not below 4 Hz."""
     return max(CUTOFF_HZ if knows_seconds else 0.0, _CUTOFF_CYCLES / duration)
 
 
 def noise_like(demonstrations: Demonstrations, noise_scale: Floats) -> Demonstrations:
-    """White noise of that scale at the sampling times of the demonstrations: what smoothing makes of it is noise."""
+    """White noise of a scale (d,) at the sampling times of the demonstrations, which smoothing lets through in part."""
     random = np.random.default_rng(0)
     noise = [random.normal(size=(n, demonstrations.n_outputs)) * noise_scale for n in demonstrations.n_steps]
     return Demonstrations(demonstrations.times, noise, time_unit=demonstrations.time_unit)
