@@ -13,7 +13,16 @@ TORCH_CONTROL = [
     *(f"simulation.{part}" for part in (
         "walls", "filters", "plant", "sensor", "rollout", "rollouts", "position_loop", "ticks", "transitions")),
 ]  # fmt: skip
-TORCH_FLOORS = ["linalg", "kernels", "optim", "gp", "models", *(f"control.{part}" for part in TORCH_CONTROL)]
+TORCH_MOVEMENT = [f"movement.{part}" for part in ("joint", "conditioning", "time_kernel")]
+TORCH_FLOORS = [
+    "linalg",
+    "kernels",
+    "optim",
+    "gp",
+    "models",
+    *TORCH_MOVEMENT,
+    *(f"control.{part}" for part in TORCH_CONTROL),
+]
 install_import_hook([f"torch_pbd.{floor}" for floor in TORCH_FLOORS], "beartype.beartype")
 
 import numpy as np  # noqa: E402 - the hook must come first

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
     from torch_pbd.estimators.mixture import GMMBaseline
     from torch_pbd.estimators.wishart import WishartProcessRegressor
+    from torch_pbd.movement import KMPBaseline, ProMPBaseline, TrajectoryRegressor
     from torch_pbd.persistence import load, save
 
 __version__ = "0.1.0"
@@ -25,7 +26,19 @@ _HOMES = {
     "load": "torch_pbd.persistence",
     "save": "torch_pbd.persistence",
 }
-_MODULES = ("control", "data", "estimators", "gp", "kernels", "linalg", "metrics", "models", "optim", "plotting")
+_MODULES = (
+    "control",
+    "data",
+    "estimators",
+    "gp",
+    "kernels",
+    "linalg",
+    "metrics",
+    "models",
+    "movement",
+    "optim",
+    "plotting",
+)
 
 __all__ = [
     "CholeskyCovRegressor",
@@ -33,6 +46,9 @@ __all__ = [
     "Demonstrations",
     "GMMBaseline",
     "HeteroscedasticGPRegressor",
+    "KMPBaseline",
+    "ProMPBaseline",
+    "TrajectoryRegressor",
     "WishartProcessRegressor",
     "load",
     "load_demonstrations",

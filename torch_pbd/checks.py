@@ -27,6 +27,7 @@ ROUNDING = 1e-9
 """Relative: what is smaller counts as rounding of the caller's arithmetic. float64 itself makes errors of 1e-13 in
 matrices of a hundred rows; files of ten digits make 1e-10."""
 
+_SINGULAR = 1e-14  # an eigenvalue of correlations that rounding alone can make
 _MOST = 2**53  # whole numbers above it are not all floats
 _LONGEST = 80  # letters of a value that are shown
 
@@ -34,7 +35,8 @@ _LONGEST = 80  # letters of a value that are shown
 def refusal(value: Any, name: str, must: str, remedy: str = "", unit: str = "") -> InvalidParameterError:
     """Error to raise for an argument that cannot be used."""
     shown = repr(value.item() if isinstance(value, np.generic) else value)
-    shown = shown if len(shown) <= _LONGEST else f"{shown[:_LONGEST]}..."
+    if len(shown) > _LONGEST or "\n" in shown:
+        shown = f"a {type(value).__name__}"
     return InvalidParameterError(
         f"{name} is {shown}{unit and ' ' + unit}, must be {must}{remedy and ': ' + remedy.rstrip('.')}."
     )
@@ -204,15 +206,15 @@ def require(good: NDArray[np.bool_], values: NDArray[Any], name: str, must: str,
     """Refuse the first value of an array that is not good, by its index."""
     if not good.all():
         index = tuple(map(int, np.argwhere(~good)[0]))
-        value = values[index]
-        raise refusal(value, f"{name}[{', '.join(map(str, index))}]" if index else name, must, remedy)
+        where = f"{name}[{', '.join(map(str, index))}]" if index else name
+        raise refusal(values[index], where, must, remedy)
 
 
-def semidefinite(matrices: NDArray[Any], name: str, *, definite: bool = False) -> None:
-    """Check that matrices (..., d, d) of finite floats are symmetric and positive semidefinite, or definite.
+def semidefinite(matrices: NDArray[Any], name: str, *, definite: bool = False, remedy: str = "") -> None:
+    """Check that matrices (..., d, d) of floats are finite, symmetric and positive semidefinite, or definite.
 
-    Both to rounding, :data:`ROUNDING` of a matrix's largest entry, or a hundred times the resolution of its dtype.
-    A positive definite matrix has a Cholesky factor, which is what is asked of it.
+    Symmetric and semidefinite to rounding: :data:`ROUNDING` of a matrix's largest entry, or a hundred times the
+    resolution of its dtype. Definite is judged by the correlations, as outputs may have units that are far apart.
     """
     if matrices.ndim < 2 or matrices.shape[-1] != matrices.shape[-2] or not matrices.shape[-1]:
         raise InvalidParameterError(f"{name} has shape {matrices.shape}, must have shape (..., d, d).")
@@ -220,12 +222,19 @@ def semidefinite(matrices: NDArray[Any], name: str, *, definite: bool = False) -
     scale = np.abs(matrices).max(axis=(-2, -1), initial=0.0)
     require(scale <= LARGEST, scale, f"the largest entry of {name}", f"finite and at most {LARGEST:g} in size")
     skew = np.abs(matrices - np.swapaxes(matrices, -2, -1)).max(axis=(-2, -1), initial=0.0)
-    remedy = "symmetrize the matrix, (A + A') / 2"
-    require(skew <= tolerance * scale, skew, f"the asymmetry of {name}", "zero", remedy)
-    lowest = np.linalg.eigvalsh(matrices)[..., 0] if matrices.size else scale
-    must = "above zero (positive definite)" if definite else "at least zero (positive semidefinite)"
-    good = lowest > 0.0 if definite else lowest >= -tolerance * scale
-    require(good, lowest, f"the smallest eigenvalue of {name}", must, "build it as a product A A'")
+    require(skew <= tolerance * scale, skew, f"the asymmetry of {name}", "zero", "symmetrize it, (A + A') / 2")
+    judged = matrices
+    if definite:
+        deviation = np.sqrt(np.diagonal(matrices, axis1=-2, axis2=-1).clip(0.0))
+        product = deviation[..., :, np.newaxis] * deviation[..., np.newaxis, :]
+        # A variance of zero or less leaves zeros, which are not definite.
+        judged = np.divide(matrices, product, out=np.zeros_like(matrices), where=product > 0.0)
+    lowest = np.linalg.eigvalsh(judged)[..., 0] if matrices.size else scale
+    good = lowest > _SINGULAR if definite else lowest >= -tolerance * scale
+    if not good.all():
+        own = np.linalg.eigvalsh(matrices)[..., 0]
+        must = "above zero, positive definite" if definite else "zero or more, positive semidefinite"
+        require(good, own, f"the smallest eigenvalue of {name}", must, remedy or "build it as a product A A'")
 
 
 def warn(message: str, category: type[Warning] = UserWarning) -> None:

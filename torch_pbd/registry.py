@@ -11,7 +11,14 @@ REGRESSORS = {
 }
 """Covariance regressors, the recommended one first."""
 
-ESTIMATORS = {**REGRESSORS, "DMPController": "torch_pbd.control.controller"}
+MOVEMENTS = {
+    "TrajectoryRegressor": "torch_pbd.movement.trajectory",
+    "ProMPBaseline": "torch_pbd.movement.promp",
+    "KMPBaseline": "torch_pbd.movement.kmp",
+}
+"""Models of whole movements."""
+
+ESTIMATORS = {**REGRESSORS, **MOVEMENTS, "DMPController": "torch_pbd.control.controller"}
 
 
 def load_class(name: str) -> Any:

@@ -148,6 +148,6 @@ def test_rows_that_differ_by_rounding_are_no_different_samples():
     """Else k-means finds fewer clusters than it is asked for, and says so in its own words."""
     X = np.repeat([[-1.0], [0.0], [1.0]], 4, axis=0) + 1e-9 * np.arange(12.0)[:, np.newaxis]
     y = np.where(X > 0.5, 1.0, 0.0)
-    with pytest.raises(ValueError, match=r"n_components=5, .* distinct samples, which is 3 of n_samples = 12"):
+    with pytest.raises(ValueError, match=r"n_components is 5, .* distinct samples, which is 3 of n_samples = 12"):
         GMMBaseline(n_components=5).fit(X, y)
     assert fit(GMMBaseline(n_components=3), X, y).predict_cov(X).shape == (12, 1, 1)

@@ -25,7 +25,7 @@ def test_minus_zero_is_no_other_row_than_zero():
 def test_an_origin_far_away_changes_no_bit_of_standardized_numbers(offset, rng):
     """The same numbers with the offset and without: what float64 loses of them it has lost before."""
     X, y = rng.uniform(-1.0, 1.0, size=(50, 2)) + offset, rng.normal(size=(50, 3)) + offset
-    far, near = Standardization.of(X, y), Standardization.of(X - offset, y - offset)
+    far, near = Standardization.fit(X, y), Standardization.fit(X - offset, y - offset)
     np.testing.assert_array_equal(far.inputs(X), near.inputs(X - offset))
     np.testing.assert_array_equal(far.outputs(y), near.outputs(y - offset))
 
@@ -35,7 +35,7 @@ def test_rounding_in_a_constant_input_is_nothing_in_any_unit(unit, rng):
     """0.7 has a deviation of 1e-16 by NumPy; to divide by it made noise of an input."""
     X = np.column_stack([rng.normal(size=90), np.full(90, 0.7), 0.7 + 1e-13 * rng.normal(size=90)]) * unit
     assert X[:, 1:].std(axis=0).max() > 0.0
-    assert (Standardization.of(X, X).inputs(X)[:, 1:] == 0.0).all()
+    assert (Standardization.fit(X, X).inputs(X)[:, 1:] == 0.0).all()
     np.testing.assert_allclose(spread_of(X)[1:], 0.7 * unit, rtol=1e-12)
 
 
@@ -43,5 +43,5 @@ def test_rounding_in_a_constant_input_is_nothing_in_any_unit(unit, rng):
 def test_outputs_that_are_all_constant_have_a_scale_in_their_unit(unit):
     y = np.tile([0.0, -3.0], (5, 1))
     X = np.arange(5.0)[:, np.newaxis]
-    np.testing.assert_allclose(Standardization.of(X, unit * y).y_scale, unit * Standardization.of(X, y).y_scale)
-    assert Standardization.of(X, 0.0 * y).y_scale.tolist() == [1.0, 1.0]
+    np.testing.assert_allclose(Standardization.fit(X, unit * y).y_scale, unit * Standardization.fit(X, y).y_scale)
+    assert Standardization.fit(X, 0.0 * y).y_scale.tolist() == [1.0, 1.0]

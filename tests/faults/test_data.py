@@ -16,7 +16,7 @@ from sklearn import config_context
 import torch_pbd.files.memory
 from torch_pbd import CholeskyCovRegressor, DMPController, GMMBaseline, WishartProcessRegressor
 from torch_pbd.data import make_tunnel_demonstrations
-from torch_pbd.estimators.rows import by_chunks
+from torch_pbd.estimators.torch_estimator import by_chunks
 from torch_pbd.exceptions import DataRankWarning, UnimodalityWarning
 
 EMPIRICAL = [CholeskyCovRegressor(objective="empirical"), WishartProcessRegressor(objective="mse")]

@@ -161,6 +161,17 @@ def test_independent_draws_raise_no_alarm(aligned, seed):
     HeteroscedasticGPRegressor().fit(X, y)
 
 
+def test_doubts_about_a_sound_draw_change_nothing(monkeypatch):
+    """Of these 500 rows, much louder at one end, the first mean's residuals are not white; the KL rose by a half."""
+    X, y, _ = make_paper_simulation(500, 1, reading="printed", random_state=0)
+    fits = []
+    for follows in (False, True):
+        monkeypatch.setattr("torch_pbd.models.heteroscedastic.fit._follows", lambda *_, answer=follows: answer)
+        fits.append(HeteroscedasticGPRegressor().fit(X, y).predict(X, return_cov=True))
+    for looked_again, sure in zip(*fits, strict=True):
+        np.testing.assert_array_equal(looked_again, sure)
+
+
 def test_outputs_that_vary_together_raise_no_alarm():
     """Of the second nothing is left beyond the first but rounding, which is no signal that the mean misses."""
     time = np.linspace(0.0, 2.0, 100)

@@ -23,18 +23,21 @@ NEAR = np.linspace(-1.5, 1.5, 31)[:, np.newaxis]
 @pytest.mark.parametrize(
     ("prior", "message"),
     [
-        (-1.0, r"prior must be positive definite; its smallest eigenvalue is -1"),
-        (0.0, r"its smallest eigenvalue is 0"),
-        ([[1.0, 2.0], [2.0, 1.0]], r"its smallest eigenvalue is -1.*give every direction some variance"),
-        (np.ones((2, 2)), r"prior must be positive definite"),
-        ([[1.0, 0.5], [0.4, 1.0]], r"prior must be symmetric; at index 0 two entries differ by 0\.1"),
+        (-1.0, "the smallest eigenvalue of prior is -1.0, must be above zero, positive definite"),
+        (0.0, "the smallest eigenvalue of prior is 0.0"),
+        (
+            [[1.0, 2.0], [2.0, 1.0]],
+            r"smallest eigenvalue of prior is -1.*give every direction some variance",
+        ),
+        (np.ones((2, 2)), "the smallest eigenvalue of prior is .*, must be above zero"),
+        ([[1.0, 0.5], [0.4, 1.0]], r"the asymmetry of prior is 0\.\d+, must be zero: symmetrize it"),
         ([1.0, 2.0], r"prior has shape \(2,\), must have shape \(2, 2\)"),
-        (np.eye(3), r"prior has shape \(3, 3\), must have shape \(2, 2\): a covariance in squared units of y"),
-        (np.nan, r"prior has an entry that is not finite"),
+        (np.eye(3), r"prior has shape \(3, 3\), must have shape \(2, 2\)"),
+        (np.nan, r"prior\[0, 0\] is nan, must be finite"),
         ("papr", r"prior is 'papr', must be one of 'paper'"),
         ({}, r"prior is \{\}, must be numbers"),
         (lambda X: np.eye(2), r"prior\(X\) has shape \(2, 2\), must have shape \(8, 2, 2\)"),
-        (lambda X: -np.ones((len(X), 2, 2)), r"prior\(X\) must be positive definite; .* at index 0"),
+        (lambda X: -np.ones((len(X), 2, 2)), r"the smallest eigenvalue of prior\(X\)\[0\] is -2"),
         (lambda X: "wide", r"prior\(X\) is 'wide', must be numbers"),
     ],
     ids=lambda value: "callable" if callable(value) else str(value),
@@ -82,7 +85,7 @@ def test_22_a_callable_prior_is_held_to_it_when_it_predicts_too():
         return np.where(X[:, :, np.newaxis] < 2.0, 1.0, -1.0) * np.eye(2)
 
     model = fit(new("cholesky", prior=prior), *demonstrations())
-    with pytest.raises(ValueError, match=r"prior\(X\) must be positive definite; .* at index 1"):
+    with pytest.raises(ValueError, match=r"the smallest eigenvalue of prior\(X\)\[1\] is"):
         model.predict_cov([[0.0], [3.0]])
 
 
@@ -91,8 +94,8 @@ def test_22_a_callable_prior_is_held_to_it_when_it_predicts_too():
     [
         (1, ValueError, "df is 1, must be at least 2, the number of outputs"),
         (0, ValueError, "df is 0, must be an integer of at least 1"),
-        (2.5, TypeError, "df must be an instance of int"),
-        ("many", TypeError, "df must be an instance of int"),
+        (2.5, TypeError, "df is .*, must be an integer"),
+        ("many", TypeError, "df is .*, must be an integer"),
     ],
 )
 @pytest.mark.parametrize("objective", ["mse", "likelihood"])
@@ -137,7 +140,7 @@ def test_parameters_out_of_range_are_refused_by_name(name, parameter):
 
 def test_a_noise_beyond_numbers_and_a_device_without_them_are_refused():
     for name, parameter, value in [("cholesky", "noise_scale", 1e300), ("heteroscedastic", "device", "meta")]:
-        with pytest.raises(ValueError, match=f"{parameter} is "):
+        with pytest.raises(ValueError, match=f"{parameter}( is |=)"):
             new(name, **{parameter: value}).fit(*demonstrations())
 
 
@@ -169,7 +172,7 @@ NUMBERS = ["max_iter", "tol", "n_restarts", "n_components", "max_inputs", "reg_c
 @pytest.mark.parametrize("value", ["1", None, True, np.nan, -1, 10**400, [3], 2.5j])
 @pytest.mark.parametrize(("name", "parameter"), those_with(NUMBERS))
 def test_numbers_that_are_none_are_refused_by_name(name, parameter, value):
-    with pytest.raises((TypeError, ValueError), match=f"{parameter} (==|must be)"):
+    with pytest.raises((TypeError, ValueError), match=f"{parameter} is .*must be"):
         new(name, **{parameter: value}).fit(*demonstrations())
 
 

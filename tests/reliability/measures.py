@@ -60,7 +60,7 @@ def smallest_eigenvalues(covariance: Floats, y_scale: Floats) -> Smallest:
 
 def scale_of(X: Floats, y: Floats) -> Floats:
     """Deviation of each output, and of one that is constant what stands for it."""
-    return Standardization.of(X, y).y_scale
+    return Standardization.fit(X, y).y_scale
 
 
 def discrepancy(

@@ -13,7 +13,7 @@ from torch_pbd.control.damping import damping_from_stiffness
 from torch_pbd.control.primitive.coverage import UNKNOWN
 from torch_pbd.control.stiffness import StiffnessLaw
 from torch_pbd.estimators.base import CovarianceRegressor
-from torch_pbd.estimators.groups import fit_by_demonstration
+from torch_pbd.estimators.demonstrations import fit_with_groups
 from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
 from torch_pbd.estimators.prior import prior_covariance
 
@@ -115,7 +115,7 @@ def fit_covariance(
         # instead, at a distance to which the floors of regressors are relative.
         varying = extent + between
     groups, steps = np.nonzero(known & (known.sum(axis=0) > 1))
-    return fit_by_demonstration(fitted, inputs[steps], varying[groups, steps], groups)
+    return fit_with_groups(fitted, inputs[steps], varying[groups, steps], groups)
 
 
 def fit_law(law: StiffnessLaw | None, covariance: Floats, varying: Floats) -> StiffnessLaw:

@@ -1,13 +1,13 @@
 """What the covariance regressors share: the checks before a fit, and all that follows it."""
 
-import warnings
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from sklearn.base import MultiOutputMixin, RegressorMixin
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils._tags import Tags
@@ -15,17 +15,14 @@ from sklearn.utils.validation import check_is_fitted
 from torch import Tensor
 
 from torch_pbd import checks
+from torch_pbd.console import say
 from torch_pbd.estimators.demonstrations import check_groups
 from torch_pbd.estimators.prior import prior_covariance
-from torch_pbd.estimators.progress import printed_progress
-from torch_pbd.estimators.results import Fitted, Uncertainty
-from torch_pbd.estimators.rows import by_chunks
 from torch_pbd.estimators.scaling import Standardization, canonical_order
-from torch_pbd.estimators.torch_estimator import TorchEstimator
+from torch_pbd.estimators.torch_estimator import TorchEstimator, by_chunks
 from torch_pbd.estimators.validation import (
     Floats,
     check_inputs_vary,
-    check_number,
     check_squares,
     check_weights,
     checked_queries,
@@ -35,7 +32,26 @@ from torch_pbd.estimators.validation import (
 from torch_pbd.files.memory import require_much
 from torch_pbd.linalg import gaussian_log_density, safe_cholesky, student_log_density
 from torch_pbd.models.conditional import ConditionalNormal
-from torch_pbd.optim import Progress
+from torch_pbd.optim import FitReport, Progress
+
+Integers = NDArray[np.intp]
+
+
+class Uncertainty(NamedTuple):
+    """The two kinds of uncertainty of Section IV-C, at n inputs."""
+
+    type1: Floats
+    """(n,): missing data. 0 at training inputs, 1 where only the prior speaks."""
+    type2: Floats
+    """(n, d, d): variability of the data, with the prior taken out; squared units of y."""
+
+
+class Fitted(NamedTuple):
+    """Result of a subclass's ``_fit``."""
+
+    module: ConditionalNormal
+    report: FitReport
+    jitter: float
 
 
 class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator, ABC):
@@ -89,10 +105,10 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator, ABC)
         self.n_outputs_ = 1 if self._y_is_1d else targets.shape[1]
         targets = targets.reshape(len(inputs), -1, order="F")
         order = canonical_order(inputs, targets)
-        told = {"given": order.argsort()}
-        told |= {} if groups is None else {"groups": check_groups(groups, len(inputs))[order]}
+        numbers = None if groups is None else check_groups(groups, len(inputs))[order]
         with torch.inference_mode(False), torch.enable_grad():
-            fitted = self._fit(inputs.T.take(order, axis=1).T, targets.T.take(order, axis=1).T, **told)
+            rows = inputs.T.take(order, axis=1).T, targets.T.take(order, axis=1).T
+            fitted = self._fit(*rows, groups=numbers, recorded=order.argsort())
         self.module_ = fitted.module
         report = fitted.report
         self.n_iter_ = max(1, report.n_iter)
@@ -103,19 +119,18 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator, ABC)
         self._prepare()
         if not report.converged:
             more = f"max_iter (now {self.max_iter}) or " if report.status.is_limit else ""
-            warnings.warn(
+            checks.warn(
                 f"{type(self).__name__} stopped early: {report.message}. The best point found is kept; "
                 f"raise {more}tol (now {self.tol:g}).",
                 ConvergenceWarning,
-                stacklevel=3,
             )
         return self
 
     @abstractmethod
-    def _fit(self, X: Floats, y: Floats, **told: Any) -> Fitted:
+    def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, recorded: Integers) -> Fitted:
         """Fit on validated arrays (n, e) and (n, d).
 
-        ``told`` holds the rows in the order they were ``given``, and may hold the demonstrations' numbers (n,).
+        ``groups`` has the number of each row's demonstration, ``recorded`` the rows in the order of their recording.
         """
 
     def __sklearn_is_fitted__(self) -> bool:
@@ -123,11 +138,11 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator, ABC)
 
     def _check_parameters(self) -> None:
         """Check the parameters whose values do not depend on the data; subclasses check theirs too."""
-        check_number(self.max_iter, "max_iter", low=1, integer=True)
-        check_number(self.tol, "tol", low=0.0, strict=True)
-        check_number(self.n_restarts, "n_restarts", low=0, integer=True)
+        checks.count(self.max_iter, "max_iter", least=1)
+        checks.number(self.tol, "tol", above=0.0)
+        checks.count(self.n_restarts, "n_restarts", least=0)
         if not isinstance(self.verbose, bool):
-            check_number(self.verbose, "verbose", low=0, integer=True)
+            checks.count(self.verbose, "verbose", least=0)
         checks.seed(self.random_state)
         if problem := self._device_problem():
             raise ValueError(f"device is {self.device!r}, which cannot be used here: {problem}. None is the CPU.")
@@ -175,6 +190,12 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator, ABC)
         type1 = self._arrays(lambda x: (self.module_.type1(x),), inputs)[0]
         return Uncertainty(type1, self._variability(inputs))
 
+    def predict_df(self, X: ArrayLike) -> Floats:
+        """Degrees of freedom of the predictive density at X: (n_samples,), infinite where it is normal."""
+        x = self._query(X)
+        degrees = self._degrees(x)
+        return np.full(len(x), np.inf) if degrees is None else degrees.cpu().numpy()
+
     def log_likelihood(self, X: ArrayLike, y: ArrayLike) -> Floats:
         """Log density of each row of y at X, in nats: (n_samples,)."""
         x, mean, scale_tril, targets = self._scored(X, y)
@@ -208,7 +229,7 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator, ABC)
         -------
         ndarray of shape (n_samples_X, n_outputs, n_samples), or (n_samples_X, n_samples) if y was 1-D
         """
-        check_number(n_samples, "n_samples", low=1, integer=True)
+        checks.count(n_samples, "n_samples", least=1)
         generator = checks.seed(random_state)
         x = self._query(X)
         require_much(
@@ -275,8 +296,17 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator, ABC)
         return (safe_cholesky(self._door(covariance), name="prior(X)"),)
 
     def _progress(self) -> Callable[[Progress], None] | None:
-        """Callback that prints the loss, or None."""
-        return printed_progress(type(self).__name__, self.verbose) if self.verbose else None
+        """Callback that prints the loss to the error output, more often for higher ``verbose``; None if it is 0."""
+        if not self.verbose:
+            return None
+
+        def show(progress: Progress) -> None:
+            count = progress.n_evaluations
+            if count < 5 or count % max(1, 10 // self.verbose) in (0, 1):
+                text = f"evaluation {count:5d}  loss {progress.loss:14.6f}  {progress.elapsed:7.2f} s"
+                say(f"{type(self).__name__}: {text}", sys.stderr)
+
+        return show
 
     def _assemble(self, core: Any, scaling: Standardization) -> ConditionalNormal:
         parts = (scaling.x_shift, scaling.x_scale, scaling.y_shift, scaling.y_scale)

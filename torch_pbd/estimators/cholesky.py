@@ -5,6 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torch_pbd import checks
 from torch_pbd.estimators.latent import (
     LatentCovarianceRegressor,
     Problem,
@@ -12,9 +13,9 @@ from torch_pbd.estimators.latent import (
     residual_tril,
     warn_if_stretched,
 )
-from torch_pbd.estimators.mean import mean_that_repeats_allow
+from torch_pbd.estimators.mean import mean_consistent_with_repeats
 from torch_pbd.estimators.prior import Prior
-from torch_pbd.estimators.validation import check_choice, check_flag, check_number, check_solver
+from torch_pbd.estimators.validation import check_solver
 from torch_pbd.gp import LatentGP, LatentValues, Observations, condition, fit_together
 from torch_pbd.kernels import KernelName
 from torch_pbd.linalg import tril_to_vector
@@ -159,9 +160,9 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
 
     def _check_parameters(self) -> None:
         super()._check_parameters()
-        check_number(self.noise_scale, "noise_scale", low=0.0, optional=True)
-        check_flag(self.bias_correction, "bias_correction")
-        check_choice(self.diagonal, "diagonal", ("auto", "raw", "log"))
+        checks.number(self.noise_scale, "noise_scale", least=0.0, optional=True)
+        checks.flag(self.bias_correction, "bias_correction")
+        checks.choice(self.diagonal, "diagonal", ("auto", "raw", "log"))
         check_solver(self.solver, latent_prior=self.latent_prior)
 
     def _fit_empirical(self, problem: Problem) -> tuple[LatentGP, CholeskyCovariance, FitReport, float]:
@@ -179,15 +180,15 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
         noise_scale = self._entry_noise(problem)
         search = self._search(observations, longest_covariance(training.inputs), problem.length_scale, noise_scale)
         mean_job = self._mean_job(training)
-        of_mean, of_entries = fit_together([mean_job, (observations, search)])
-        amplitude = of_entries.hyperparameters.amplitude
+        mean_found, entries_found = fit_together([mean_job, (observations, search)])
+        amplitude = entries_found.hyperparameters.amplitude
         warn_if_stretched(amplitude, observations.targets, given=problem.length_scale is not None)
-        mean, of_mean_report = mean_that_repeats_allow(training, *mean_job, of_mean)
+        mean, mean_report = mean_consistent_with_repeats(training, *mean_job, mean_found)
         values = tril_to_vector(scale_tril).mT.contiguous()
-        found = (of_entries.hyperparameters, self.kernel, values)
-        latent, jitter = condition(observations, *found, basis=of_entries.basis)
+        found = (entries_found.hyperparameters, self.kernel, values)
+        latent, jitter = condition(observations, *found, basis=entries_found.basis)
         prior = problem.prior_tril if problem.prior_tril.ndim == 2 else problem.prior_tril[0]
-        report = of_entries.report.after(of_mean_report, "search of the mean")
+        report = entries_found.report.after(mean_report, "search of the mean")
         covariance = CholeskyCovariance(latent, prior, log_diagonal=log_diagonal, bounded=smoothed)
         return mean, covariance, report, jitter
 

@@ -1,13 +1,13 @@
 """Which rows are of one demonstration: their labels, and what is amiss with the demonstrations."""
 
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from sklearn.utils.validation import has_fit_parameter
 from torch import Tensor
 
 from torch_pbd import checks
@@ -16,18 +16,18 @@ from torch_pbd.estimators.validation import Floats
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.models.heteroscedastic import HeteroscedasticFit, are_copies
 
-_ways_told: ContextVar[bool] = ContextVar("_ways_told", default=False)
+_unimodality_reported: ContextVar[bool] = ContextVar("_unimodality_reported", default=False)
 _COVERED = 0.5  # of the range of the input, by a demonstration that is compared with others
 
 
 @contextmanager
-def ways_are_told() -> Iterator[None]:
+def unimodality_reported() -> Iterator[None]:
     """Let a fit in it not warn of several ways; what other threads are warned of stays as it is."""
-    token = _ways_told.set(True)
+    token = _unimodality_reported.set(True)
     try:
         yield
     finally:
-        _ways_told.reset(token)
+        _unimodality_reported.reset(token)
 
 
 def check_groups(groups: Any, n_samples: int) -> NDArray[np.intp]:
@@ -82,13 +82,12 @@ def check_demonstrations(X: Floats, y: Floats, groups: Any) -> None:
     """
     counts = np.bincount(groups)
     if len(counts) < 2:
-        warnings.warn(
+        checks.warn(
             "groups has one demonstration: how far its samples repeat each other cannot be told from it, and they "
             "count as independent. What is predicted is its noise, not how demonstrations differ.",
             DataRankWarning,
-            stacklevel=5,
         )
-    if _ways_told.get() or X.shape[1] > 1 or len(counts) < 2 or counts.min() < 2:
+    if _unimodality_reported.get() or X.shape[1] > 1 or len(counts) < 2 or counts.min() < 2:
         return
     times, positions = [], []
     for rows in np.split(np.argsort(groups, kind="stable"), np.cumsum(counts)[:-1]):
@@ -108,10 +107,21 @@ def warn_of_residuals(fit: HeteroscedasticFit, group: Tensor | None, given: Tens
             "each row, to fit; cross_val_score takes params={'groups': groups}, and a search passes them on where "
             "metadata routing is enabled and set_fit_request(groups=True) asks for them."
         )
-        warnings.warn(message, DataRankWarning, stacklevel=6)
+        checks.warn(message, DataRankWarning)
     elif bool((missed := fit.missed(group)).any()):
         message = (
             f"The mean does not follow y in outputs {missed.nonzero().flatten().tolist()}: what is left is no noise, "
             "but counts as such. Raise n_inducing and max_inputs; give groups if the rows are of demonstrations."
         )
-        warnings.warn(message, UserWarning, stacklevel=6)
+        checks.warn(message)
+
+
+def fit_with_groups(regressor: Any, X: ArrayLike, y: ArrayLike, groups: ArrayLike) -> Any:
+    """Regressor fitted with the demonstrations' numbers, if its ``fit`` takes them: what users bring along need not.
+
+    That the demonstrations follow several ways is not said here: whoever has them as demonstrations says it once.
+    """
+    if not has_fit_parameter(regressor, "groups"):
+        return regressor.fit(X, y)
+    with unimodality_reported():
+        return regressor.fit(X, y, groups=groups)

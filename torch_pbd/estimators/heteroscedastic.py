@@ -8,21 +8,13 @@ import torch
 from numpy.typing import ArrayLike
 
 from torch_pbd import checks
-from torch_pbd.estimators.base import CovarianceRegressor
+from torch_pbd.estimators.base import CovarianceRegressor, Fitted, Integers
 from torch_pbd.estimators.demonstrations import check_demonstrations, warn_of_residuals
-from torch_pbd.estimators.inducing import check_memory, numbers_to_try, warn_if_unresolved
+from torch_pbd.estimators.inducing import check_memory, inducing_sizes, warn_if_unresolved
 from torch_pbd.estimators.latent import default_prior_tril, warn_if_few, warn_if_identical
 from torch_pbd.estimators.prior import Prior, standardized_prior
-from torch_pbd.estimators.results import Fitted
 from torch_pbd.estimators.scaling import Standardization, distinct_rows
-from torch_pbd.estimators.validation import (
-    Floats,
-    check_choice,
-    check_flag,
-    check_length_scale,
-    check_number,
-    check_period,
-)
+from torch_pbd.estimators.validation import Floats, check_length_scale, check_period
 from torch_pbd.files.memory import require_much
 from torch_pbd.gp.inducing import FeatureMap, inducing_inputs
 from torch_pbd.kernels import KERNELS, KernelName
@@ -233,7 +225,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         -------
         ndarray of shape (n_samples_X, n_outputs, n_outputs, n_samples)
         """
-        check_number(n_samples, "n_samples", low=1, integer=True)
+        checks.count(n_samples, "n_samples", least=1)
         generator = checks.seed(random_state)
         x = self._query(X)
         core: Any = self.module_.core
@@ -254,16 +246,15 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
 
     def _check_parameters(self) -> None:
         super()._check_parameters()
-        check_choice(self.kernel, "kernel", (*KERNELS, "periodic"))
-        check_number(self.n_inducing, "n_inducing", low=2, integer=True, optional=True)
-        check_number(self.max_inputs, "max_inputs", low=2, integer=True)
-        check_flag(self.shared_length_scale, "shared_length_scale")
+        checks.choice(self.kernel, "kernel", (*KERNELS, "periodic"))
+        checks.count(self.n_inducing, "n_inducing", least=2, optional=True)
+        checks.count(self.max_inputs, "max_inputs", least=2)
+        checks.flag(self.shared_length_scale, "shared_length_scale")
 
-    def _fit(self, X: Floats, y: Floats, **told: Any) -> Fitted:
-        groups = told.get("groups")
+    def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, recorded: Integers) -> Fitted:
         if groups is not None:
             check_demonstrations(X, y, groups)
-        scaling = Standardization.of(X, y)
+        scaling = Standardization.fit(X, y)
         standardized = scaling.inputs(X)
         inputs, index = distinct_rows(standardized)
         check_memory(self.n_inducing, self.max_inputs, (*inputs.shape, y.shape[1]))
@@ -278,7 +269,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         group = None if groups is None else self._door(groups).long()
         options = SearchOptions(self.max_iter, self.tol, self.n_restarts, self._progress())
         kernel: KernelName = "squared_exponential" if self.kernel == "periodic" else self.kernel
-        to_try = numbers_to_try(self.n_inducing, X.shape[1], y.shape[1])
+        to_try = inducing_sizes(self.n_inducing, X.shape[1], y.shape[1])
         begin = None
         for sizes in to_try:
             inducing = [inducing_inputs(training.inputs, size) for size in sizes]
@@ -297,7 +288,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
                 break
         assert fit is not None
         warn_if_unresolved(held, features)
-        warn_of_residuals(fit, group, self._door(told["given"]).long())
+        warn_of_residuals(fit, group, self._door(recorded).long())
         self.effective_share_ = 1.0 if fit.correlation is None else float(fit.correlation.share.mean())
         report = options.outcome(tuple(-value for value in fit.log_evidence))
         return Fitted(self._assemble(HeteroscedasticModel(fit, prior_tril), scaling), report, features.jitter)

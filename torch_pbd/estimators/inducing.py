@@ -1,9 +1,8 @@
 """How many inducing inputs a fit takes, the memory that they need, and what they resolve."""
 
-import warnings
-
 from torch import Tensor
 
+from torch_pbd import checks
 from torch_pbd.files.memory import require_much
 from torch_pbd.gp.inducing import FeatureMap
 
@@ -12,7 +11,7 @@ from torch_pbd.gp.inducing import FeatureMap
 _OF_ONE, _OF_SEVERAL, _MOST, _TOGETHER = 48, 128, 128, (800, 400)
 
 
-def numbers_to_try(n_inducing: int | None, n_features: int, n_outputs: int) -> list[tuple[int, int]]:
+def inducing_sizes(n_inducing: int | None, n_features: int, n_outputs: int) -> list[tuple[int, int]]:
     """Inducing inputs of the mean's processes and of the covariance's, to be tried one after another."""
     if n_inducing is not None:
         return [(n_inducing, n_inducing)]
@@ -33,7 +32,7 @@ def check_memory(n_inducing: int | None, max_inputs: int, shape: tuple[int, int,
     """
     n_distinct, n_features, n_outputs = shape
     n_inputs = min(n_distinct, max_inputs)
-    size = min(n_inputs, max(max(pair) for pair in numbers_to_try(n_inducing, n_features, n_outputs)))
+    size = min(n_inputs, max(max(pair) for pair in inducing_sizes(n_inducing, n_features, n_outputs)))
     searched = 4 * (n_features + 1) * (n_features + 2) * n_outputs * size * (n_inputs + size)
     require_much(
         8.0 * (searched + 24 * (n_outputs * size) ** 2),
@@ -47,9 +46,7 @@ def warn_if_unresolved(length_scale: Tensor | None, features: FeatureMap) -> Non
     """Warn where a length scale that the user gave is shorter than the inputs can tell."""
     least = features.shortest_length_scale()
     if length_scale is not None and bool((length_scale < least).any()):
-        warnings.warn(
+        checks.warn(
             f"length_scale is below {least:.3g} of the range of X, which is what the inputs (or n_inducing of them) "
-            "resolve: between them the covariance says nothing. Give a longer one, or None to learn it.",
-            UserWarning,
-            stacklevel=5,
+            "resolve: between them the covariance says nothing. Give a longer one, or None to learn it."
         )

@@ -1,6 +1,5 @@
 """What the two regressors on latent Gaussian processes (CD and WP) share."""
 
-import warnings
 from abc import abstractmethod
 from dataclasses import dataclass
 from typing import Any
@@ -9,12 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torch_pbd.estimators.base import CovarianceRegressor
-from torch_pbd.estimators.mean import mean_that_repeats_allow
+from torch_pbd import checks
+from torch_pbd.estimators.base import CovarianceRegressor, Fitted
+from torch_pbd.estimators.mean import mean_consistent_with_repeats
 from torch_pbd.estimators.prior import standardized_prior
-from torch_pbd.estimators.results import Fitted
 from torch_pbd.estimators.scaling import Standardization, distinct_rows
-from torch_pbd.estimators.validation import Floats, check_choice, check_length_scale, check_number
+from torch_pbd.estimators.validation import Floats, check_length_scale
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.files.memory import require_much
 from torch_pbd.gp import EvidenceSearch, LatentGP, Observations, fit_together, resolved_length_scale, spacing
@@ -63,14 +62,14 @@ class LatentCovarianceRegressor(CovarianceRegressor):
 
     def _check_parameters(self) -> None:
         super()._check_parameters()
-        check_choice(self.objective, "objective", ("auto", self.aligned_objective, "likelihood"))
-        check_choice(self.kernel, "kernel", tuple(KERNELS))
-        check_number(self.max_inputs, "max_inputs", low=2, integer=True)
+        checks.choice(self.objective, "objective", ("auto", self.aligned_objective, "likelihood"))
+        checks.choice(self.kernel, "kernel", tuple(KERNELS))
+        checks.count(self.max_inputs, "max_inputs", least=2)
         if isinstance(self.prior, str):
-            check_choice(self.prior, "prior", ("paper",))
+            checks.choice(self.prior, "prior", ("paper",))
 
-    def _fit(self, X: Floats, y: Floats, **told: Any) -> Fitted:
-        scaling = Standardization.of(X, y)
+    def _fit(self, X: Floats, y: Floats, **_: Any) -> Fitted:
+        scaling = Standardization.fit(X, y)
         standardized = scaling.inputs(X)
         inputs, index = distinct_rows(standardized)
         self._check_memory(len(inputs), y.shape[1])
@@ -95,9 +94,9 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         if aligned:
             mean, covariance, report, jitter = self._fit_empirical(problem)
         else:
-            mean, of_mean = self._fit_mean(training)
+            mean, mean_report = self._fit_mean(training)
             covariance, report, jitter = self._fit_likelihood(problem, training.residual(mean))
-            report = report.after(of_mean, "search of the mean")
+            report = report.after(mean_report, "search of the mean")
         return Fitted(self._assemble(MeanAndCovariance(mean, covariance), scaling), report, jitter)
 
     @abstractmethod
@@ -112,12 +111,11 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         """Decide the objective; ``inputs`` are the distinct ones, with their counts."""
         fewest = int(counts.min())
         if self.objective == "likelihood" and 2 <= fewest <= n_outputs:
-            warnings.warn(
+            checks.warn(
                 f"y has {fewest} demonstrations at an input but {n_outputs} outputs: the likelihood then takes for "
                 f"certain what was only not seen to vary. {n_outputs + 1} or more demonstrations determine the "
                 "covariance; objective='auto' shrinks it.",
                 DataRankWarning,
-                stacklevel=5,
             )
         if self.objective == "likelihood" or (self.objective == "auto" and fewest < 2):
             return False
@@ -129,12 +127,11 @@ class LatentCovarianceRegressor(CovarianceRegressor):
                 "Align the demonstrations, record more, or use objective='likelihood'."
             )
         if fewest <= n_outputs:
-            warnings.warn(
+            checks.warn(
                 f"y has {fewest} demonstrations at an input but {n_outputs} outputs: that empirical covariance "
                 f"is singular, and is shrunk towards the pooled covariance. {n_outputs + 1} or more "
                 "demonstrations determine it.",
                 DataRankWarning,
-                stacklevel=5,
             )
         return True
 
@@ -149,7 +146,7 @@ class LatentCovarianceRegressor(CovarianceRegressor):
     def _fit_mean(self, training: TrainingSet) -> tuple[LatentGP, FitReport]:
         """Gaussian processes of the mean, by themselves."""
         job = self._mean_job(training)
-        return mean_that_repeats_allow(training, *job, *fit_together([job]))
+        return mean_consistent_with_repeats(training, *job, *fit_together([job]))
 
     def _mean_job(self, training: TrainingSet) -> tuple[Observations, EvidenceSearch]:
         """Means at the inputs, weighted by their counts, and the search for their hyperparameters."""
@@ -222,11 +219,10 @@ def default_prior_tril(y: Tensor) -> Tensor:
 def warn_if_few(n_rows: int, n_outputs: int) -> None:
     """Warn of no more rows than outputs, whose covariance is singular."""
     if n_rows <= n_outputs:
-        warnings.warn(
+        checks.warn(
             f"y has {n_rows} rows but {n_outputs} outputs: they leave directions of the covariance undetermined, "
             "which the prior decides. Record more.",
             DataRankWarning,
-            stacklevel=5,
         )
 
 
@@ -235,20 +231,17 @@ def warn_if_identical(training: TrainingSet) -> None:
     repeated = len(training.y) - len(training.inputs)
     mean = training.means()[training.index] if repeated else training.y.mean(0)
     if float((training.y - mean).square().sum(0).max()) < 1e-18 * max(1, repeated or len(training.y) - 1):
-        warnings.warn(
+        checks.warn(
             "The demonstrations are identical: their covariance is zero, and the smallest that can be told "
             "from it is used.",
             DataRankWarning,
-            stacklevel=5,
         )
 
 
 def warn_if_stretched(amplitude: Tensor, targets: Tensor, *, given: bool) -> None:
     """Warn where a length scale that the user gave is too long for what changes over the inputs."""
     if given and bool((amplitude > _STRETCHED * targets.square().mean(1).sqrt().clamp_min(1e-12)).any()):
-        warnings.warn(
+        checks.warn(
             "length_scale is so long that the covariance follows the data only as the difference of large numbers: "
-            "beside the data it will overshoot the prior. Give a shorter one, or None to learn it.",
-            UserWarning,
-            stacklevel=6,
+            "beside the data it will overshoot the prior. Give a shorter one, or None to learn it."
         )

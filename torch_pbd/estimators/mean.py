@@ -1,6 +1,5 @@
 """The mean of CD and WP, held against what repeated rows say of it."""
 
-import warnings
 from dataclasses import replace
 
 import torch
@@ -8,6 +7,7 @@ from jaxtyping import Bool, Float
 from scipy.special import fdtri, stdtrit
 from torch import Tensor
 
+from torch_pbd import checks
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.gp import EvidenceSearch, LatentGP, Observations, condition, fit_together
 from torch_pbd.gp.search import Found
@@ -22,7 +22,7 @@ _UNRESOLVED = 1e-10  # squared, of standardized outputs: what a smooth process m
 _SHARE, _LEAST_NOISE = 0.1, 1e-6  # of the smallest error of a mean, and of the outputs' deviation
 
 
-def mean_that_repeats_allow(
+def mean_consistent_with_repeats(
     training: TrainingSet, observations: Observations, search: EvidenceSearch, found: Found
 ) -> tuple[LatentGP, FitReport]:
     """The processes that the evidence found; or ones through the means, where rows that repeat inputs contradict them.
@@ -50,11 +50,10 @@ def mean_that_repeats_allow(
     swings = again.hyperparameters.amplitude > _STRETCHED * observations.targets.square().mean(1).sqrt()
     swings &= again.hyperparameters.length_scale.amin(1) < 1.0
     if bool(swings[wrong].any()):
-        warnings.warn(
+        checks.warn(
             "y has means at the inputs that differ by more than its scatter there, between inputs too near to each "
             "other for a smooth mean to follow: it does not. Make such rows of X equal, which pools them.",
             DataRankWarning,
-            stacklevel=6,
         )
         return mean, found.report
     return condition(observations, again.hyperparameters, search.kernel, basis=again.basis)[0], again.report

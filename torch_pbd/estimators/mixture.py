@@ -1,6 +1,5 @@
 """Gaussian mixture regression: the baseline of the paper, and what many use today."""
 
-import warnings
 from dataclasses import replace
 from typing import Any
 
@@ -11,12 +10,11 @@ from sklearn.cluster import KMeans
 from sklearn.neighbors import NearestNeighbors
 
 from torch_pbd import checks
-from torch_pbd.estimators.base import CovarianceRegressor
+from torch_pbd.estimators.base import CovarianceRegressor, Fitted
 from torch_pbd.estimators.regression import MixtureRegression
-from torch_pbd.estimators.results import Fitted
-from torch_pbd.estimators.rows import by_chunks
 from torch_pbd.estimators.scaling import Standardization, distinct_rows, spread_of
-from torch_pbd.estimators.validation import Floats, check_choice, check_number
+from torch_pbd.estimators.torch_estimator import by_chunks
+from torch_pbd.estimators.validation import Floats
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.files.memory import require_much
 from torch_pbd.models.mixture import GaussianMixture
@@ -106,11 +104,11 @@ class GMMBaseline(CovarianceRegressor):
 
     def _check_parameters(self) -> None:
         super()._check_parameters()
-        check_number(self.n_components, "n_components", low=1, integer=True)
-        check_choice(self.solver, "solver", ("em", "lbfgs"))
-        check_number(self.reg_covar, "reg_covar", low=0.0, strict=True)
+        checks.count(self.n_components, "n_components", least=1)
+        checks.choice(self.solver, "solver", ("em", "lbfgs"))
+        checks.number(self.reg_covar, "reg_covar", above=0.0)
 
-    def _fit(self, X: Floats, y: Floats, **told: Any) -> Fitted:
+    def _fit(self, X: Floats, y: Floats, **_: Any) -> Fitted:
         points = _points(X, y)
         n_distinct, n_components = len(distinct_rows(points)[0]), int(self.n_components)
         if n_distinct < self.n_components:
@@ -125,17 +123,15 @@ class GMMBaseline(CovarianceRegressor):
             remedy="Take fewer components.",
         )
         if not (np.ptp(y, axis=0) > 0).any():
-            warnings.warn(
+            checks.warn(
                 "y is constant: its covariance is zero, and the smallest that can be told from it is used.",
                 DataRankWarning,
-                stacklevel=4,
             )
         if n_distinct <= y.shape[1]:
-            warnings.warn(
+            checks.warn(
                 f"y has {n_distinct} distinct rows but {y.shape[1]} outputs: they leave directions of the covariance "
                 "undetermined, which reg_covar decides. Record more.",
                 DataRankWarning,
-                stacklevel=4,
             )
         scaling = _by_residual(X, y)
         data = self._door(np.hstack([scaling.exact_inputs(X), scaling.exact_outputs(y)]))
@@ -155,7 +151,7 @@ class GMMBaseline(CovarianceRegressor):
 
     def _prepare(self) -> None:
         if self.device is None:
-            self._regression = MixtureRegression.of(self.module_)
+            self._regression = MixtureRegression.from_module(self.module_)
 
     def __getstate__(self) -> dict[str, Any]:
         """As the base class gives it, without what follows from the module."""
@@ -165,7 +161,7 @@ class GMMBaseline(CovarianceRegressor):
 
     def _mean(self, X: Floats) -> Floats:
         regression = self._regression
-        if regression is None or not regression.is_of(self.module_):
+        if regression is None or not regression.matches(self.module_):
             return super()._mean(X)
         return by_chunks(lambda rows: (regression.mean(rows),), X)[0]
 
@@ -177,7 +173,7 @@ class GMMBaseline(CovarianceRegressor):
 
     def _moments(self, X: Floats) -> tuple[Floats, ...]:
         regression = self._regression
-        if regression is None or not regression.is_of(self.module_):
+        if regression is None or not regression.matches(self.module_):
             return super()._moments(X)
         return by_chunks(regression.moments, X)
 
@@ -211,7 +207,7 @@ def _by_residual(X: Floats, y: Floats) -> Standardization:
     So a regularization of the joint covariance is relative to what the covariance of y given x will be,
     and not to how far y moves.
     """
-    whole = Standardization.of(X, y)
+    whole = Standardization.fit(X, y)
     x_scale = spread_of(X)
     # Neighbours at equal distances are so in all units.
     scaled = replace(whole, x_scale=x_scale).inputs(X)

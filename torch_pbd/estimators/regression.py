@@ -45,7 +45,7 @@ class MixtureRegression:
     """(d^2,): the rest of it is the second of these times the sum of a covariance's entries weighted by the first."""
 
     @classmethod
-    def of(cls, module: ConditionalNormal) -> Self:
+    def from_module(cls, module: ConditionalNormal) -> Self:
         """Regression by a module, as its parameters are now."""
         core: Any = module.core
         scale_tril, mean = core.scale_tril.detach().numpy(), core.mean.detach().numpy()
@@ -89,8 +89,8 @@ class MixtureRegression:
         flat += (flat @ weights)[:, np.newaxis] * floor
         return self.units[2] + mean[:, 0], flat.reshape(spread.shape)
 
-    def is_of(self, module: ConditionalNormal) -> bool:
-        """Whether the module still is as it was."""
+    def matches(self, module: ConditionalNormal) -> bool:
+        """Whether the module is as it was when this was made from it."""
         places = [tensor.data_ptr() for tensor in _tensors(module)]
         return places == self.places and [array.tobytes() for array in self.arrays] == self.values
 

@@ -26,7 +26,7 @@ class Standardization:
     y_parts: tuple[Floats, Floats]
 
     @classmethod
-    def of(cls, X: Floats, y: Floats) -> "Standardization":
+    def fit(cls, X: Floats, y: Floats) -> "Standardization":
         """Standardization of the columns of X and y.
 
         A constant output gets the largest scale of the others, so that it is precise beside them; a

@@ -1,6 +1,6 @@
 """The door between NumPy and torch: arrays to the device, and a fitted module into pickles and back."""
 
-import warnings
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -8,8 +8,13 @@ import torch
 from sklearn.base import BaseEstimator
 from torch import Tensor
 
+from torch_pbd import checks
+from torch_pbd.estimators.validation import Floats
+from torch_pbd.files.memory import require_much
 from torch_pbd.models.conditional import ConditionalNormal
 from torch_pbd.models.spec import module_from_spec, module_spec
+
+_CHUNK = 1024  # rows: what a prediction needs on the way is then some tens of MB for ten outputs
 
 
 class TorchEstimator(BaseEstimator):
@@ -29,13 +34,7 @@ class TorchEstimator(BaseEstimator):
         """Why no tensor can be put on the device; empty if it can."""
         try:
             self._door(0.0).cpu()  # of a meta tensor there are no numbers
-        except (
-            AssertionError,
-            OverflowError,
-            RuntimeError,
-            TypeError,
-            ValueError,
-        ) as error:  # torch's, by build and by device
+        except (AssertionError, OverflowError, RuntimeError, TypeError, ValueError) as error:  # by build and by device
             return str(error).partition("\n")[0].rstrip(".")
         return ""
 
@@ -54,13 +53,27 @@ class TorchEstimator(BaseEstimator):
         super().__setstate__(state)
         if arrays is not None:
             if problem := self._device_problem():
-                warnings.warn(
+                checks.warn(
                     f"The model was fitted on device {self.device!r}, which this machine lacks ({problem}): it is now "
-                    "on the CPU.",
-                    stacklevel=2,
+                    "on the CPU."
                 )
                 self.device = None
             with torch.inference_mode(False):  # else autograd would refuse the module
                 tensors = {name: self._door(array) for name, array in arrays.items()}
                 self.module_ = module_from_spec(spec, tensors).requires_grad_(False)
             self._prepare()
+
+
+def by_chunks(function: Callable[[Any], Any], x: Tensor | Floats) -> Any:
+    """Tuple of arrays that a function of rows gives for x, called for a bounded number of rows at a time."""
+    if len(x) <= _CHUNK:
+        return function(x)
+    first = function(x[:_CHUNK])
+    require_much(
+        2.0 * len(x) / _CHUNK * sum(part.nbytes for part in first),  # in parts, and joined
+        what=f"what is predicted for {len(x)} rows",
+        remedy="Predict fewer at a time.",
+    )
+    others = (function(x[start : start + _CHUNK]) for start in range(_CHUNK, len(x), _CHUNK))
+    joined: Any = torch.cat if isinstance(x, Tensor) else np.concatenate
+    return tuple(joined(part) for part in zip(first, *others, strict=True))

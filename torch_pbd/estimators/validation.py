@@ -1,6 +1,5 @@
 """Checks of what users pass to an estimator, before any work starts."""
 
-import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -159,11 +158,10 @@ def check_inputs_vary(X: Floats) -> None:
     rank = np.linalg.matrix_rank(centred[:, ~constant], tol=1e-9 * np.sqrt(len(X)))
     if constant.any() or rank < X.shape[1] - constant.sum():
         what = f"column {int(np.argmax(constant))} is constant" if constant.any() else "its columns are collinear"
-        warnings.warn(
+        checks.warn(
             f"X has {X.shape[1]} columns but varies in {rank} directions only: {what}. The covariance is "
             "learned along these directions; leave the column out.",
             DataRankWarning,
-            stacklevel=4,
         )
 
 
@@ -189,46 +187,20 @@ def without_rounding(X: Floats) -> Floats:
         first = np.maximum.accumulate(np.where(np.append(False, near[:-1]), 0, np.arange(len(value))))
         column[:] = value[first[index]]
         if near.mean() > _MANY:
-            warnings.warn(
+            checks.warn(
                 f"X has {int(near.sum())} values in column {number} that differ from others by a rounding to float32, "
-                "and are taken for equal. Store all recordings in one precision.",
-                UserWarning,
-                stacklevel=4,
+                "and are taken for equal. Store all recordings in one precision."
             )
     return X
 
 
-def check_number(
-    value: Any, name: str, *, low: float, strict: bool = False, integer: bool = False, optional: bool = False
-) -> None:
-    """Check that a parameter is a number not below ``low`` (above it, if ``strict``)."""
-    if integer:
-        checks.count(value, name, least=int(low), optional=optional)
-    elif strict:
-        checks.number(value, name, above=low, optional=optional)
-    else:
-        checks.number(value, name, least=low, optional=optional)
-
-
-def check_choice(value: Any, name: str, choices: tuple[str, ...]) -> None:
-    """Check that a parameter is one of some strings."""
-    if not isinstance(value, str) or value not in choices:
-        raise ValueError(f"{name} is {value!r}, must be one of {', '.join(map(repr, choices))}.")
-
-
-def check_flag(value: Any, name: str) -> None:
-    """Check that a parameter is True or False; a text would count as True."""
-    if not isinstance(value, bool | np.bool_):
-        raise ValueError(f"{name} is {value!r}, must be True or False.")
-
-
 def check_solver(solver: str, *, latent_prior: bool) -> None:
     """Check what latent values are trained with."""
-    check_choice(solver, "solver", ("auto", "fisher", "lbfgs"))
-    check_flag(latent_prior, "latent_prior")
+    checks.choice(solver, "solver", ("auto", "fisher", "lbfgs"))
+    checks.flag(latent_prior, "latent_prior")
     if solver == "fisher" and not latent_prior:
         raise ValueError(
-            "solver == 'fisher' holds the hyperparameters, which latent_prior=False trains: use solver='auto' or "
+            "solver='fisher' holds the hyperparameters, which latent_prior=False trains: use solver='auto' or "
             "'lbfgs', or latent_prior=True."
         )
 

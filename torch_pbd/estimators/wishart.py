@@ -1,6 +1,5 @@
 """The Wishart process ("WP") of the paper, Section IV-A."""
 
-import warnings
 from dataclasses import replace
 from typing import Any
 
@@ -8,6 +7,7 @@ import torch
 from sklearn.utils import check_random_state
 from torch import Tensor
 
+from torch_pbd import checks
 from torch_pbd.estimators.latent import (
     LatentCovarianceRegressor,
     Problem,
@@ -15,9 +15,9 @@ from torch_pbd.estimators.latent import (
     residual_tril,
     warn_if_stretched,
 )
-from torch_pbd.estimators.mean import mean_that_repeats_allow
+from torch_pbd.estimators.mean import mean_consistent_with_repeats
 from torch_pbd.estimators.prior import Prior
-from torch_pbd.estimators.validation import check_choice, check_number, check_solver
+from torch_pbd.estimators.validation import check_solver
 from torch_pbd.exceptions import DataRankWarning, NotPositiveDefiniteError
 from torch_pbd.gp import (
     Hyperparameters,
@@ -158,10 +158,10 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
 
     def _check_parameters(self) -> None:
         super()._check_parameters()
-        check_choice(self.start, "start", tuple(_SPREAD))
+        checks.choice(self.start, "start", tuple(_SPREAD))
         check_solver(self.solver, latent_prior=self.latent_prior)
         if self.df not in (None, "auto"):
-            check_number(self.df, "df", low=1, integer=True)
+            checks.count(self.df, "df", least=1)
 
     def _n_processes(self, n_outputs: int) -> int:
         df = n_outputs + 1 if self.df in (None, "auto") else int(self.df)
@@ -182,7 +182,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
 
     def _fit_empirical(self, problem: Problem) -> tuple[LatentGP, WishartCovariance, FitReport, float]:
         job = self._mean_job(problem.training)
-        mean, of_mean = mean_that_repeats_allow(problem.training, *job, *fit_together([job]))
+        mean, mean_report = mean_consistent_with_repeats(problem.training, *job, *fit_together([job]))
         prior_root = self._prior_root(problem)
         target = empirical_tril(problem.training)
         if self.start == "random":
@@ -194,7 +194,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
             found, report, jitter = self._train(
                 problem, prior_root, prior_root, cost, prior_weight=0.0, tol=1e-4 * self.tol
             )
-            return mean, found, report.after(of_mean, "search of the mean"), jitter
+            return mean, found, report.after(mean_report, "search of the mean"), jitter
         inputs, matrix = problem.training.inputs, torch.eye(target.shape[-1]).to(target)
 
         def observed(root: Tensor) -> Observations:
@@ -214,7 +214,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         with torch.no_grad():
             latent.weight -= condition(priors, certain, self.kernel, basis=basis)[0].weight
             mse = float(covariance_mse(wishart_root(latent(inputs), prior_root, matrix), target))
-        report = replace(report, loss=mse, loss_curve=(mse,)).after(of_mean, "search of the mean")
+        report = replace(report, loss=mse, loss_curve=(mse,)).after(mean_report, "search of the mean")
         prior = prior_root.reshape(-1, *root.shape[1:])[0]  # a callable one is handed in at every prediction
         return mean, WishartCovariance(latent, prior, matrix, bounded=True), report, jitter
 
@@ -233,11 +233,10 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         try:
             return found(torch.zeros_like(observations.targets[:, 0]))
         except NotPositiveDefiniteError:
-            warnings.warn(
+            checks.warn(
                 "X has rows so near to each other that the empirical covariances at them cannot be interpolated: they "
                 "are smoothed, with a noise that is learned. Make such rows equal, which pools their covariances.",
                 DataRankWarning,
-                stacklevel=6,
             )
             return found(None)
 

@@ -16,7 +16,7 @@ import torch
 
 import torch_pbd
 from torch_pbd.data import Demonstrations
-from torch_pbd.estimators.groups import fit_by_demonstration
+from torch_pbd.estimators.demonstrations import fit_with_groups
 from torch_pbd.model_header import encode_parameters, is_ours
 from torch_pbd.persistence import load, save
 
@@ -85,7 +85,7 @@ def fit_once(model: Any, *data: Any, finished: FinishedFits | None = None) -> tu
 
 def _timed_fit(model: Any, *data: Any) -> tuple[Any, float]:
     start = time.perf_counter()
-    fitted = model.fit(*data) if isinstance(data[0], Demonstrations) else fit_by_demonstration(model, *data)
+    fitted = model.fit(*data) if isinstance(data[0], Demonstrations) else fit_with_groups(model, *data)
     return fitted, time.perf_counter() - start
 
 

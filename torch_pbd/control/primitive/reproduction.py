@@ -226,7 +226,7 @@ def _process_mean(X: Floats, forcing: Floats, n_demos: int, at: Floats) -> Float
 
     One process for each output, with hyperparameters by its evidence. Behind each mean are ``n_demos`` demonstrations.
     """
-    scaling = Standardization.of(X, forcing)
+    scaling = Standardization.fit(X, forcing)
     targets = torch.tensor(scaling.outputs(forcing)).mT.contiguous()
     counts = torch.full((len(X),), float(n_demos), dtype=torch.float64)
     observations = Observations(torch.tensor(scaling.inputs(X)), targets, counts)

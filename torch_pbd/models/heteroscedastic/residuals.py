@@ -6,10 +6,12 @@ from torch import Tensor
 
 from torch_pbd.models.training import TrainingSet
 
-_LAGS = 3
-# To look again, and to tell: a chi-squared number of three degrees of freedom is above them once in 20 and once in 10^6
-# times. Residuals whitened by a covariance of many outputs and few rows do so more often.
-DOUBTFUL, NOT_WHITE = 7.81, 30.7
+LAGS = 3
+"""Correlations between neighbours that tell a signal."""
+
+# To tell: a chi-squared number of three degrees of freedom is above it once in 10^6 times. Residuals whitened by a
+# covariance of many outputs and few rows are so more often.
+NOT_WHITE = 30.7
 # What residuals of K demonstrations have in common, of their variance, that is no chance: the mean square of means of
 # K would be four times what it should be. Smooth demonstrations have few independent places along the input.
 _MOST_COMMON, _COMMON = 0.5, 3.0
@@ -38,7 +40,7 @@ def is_signal(
     # A bounded score: a burst has few large residuals, but all of them are alike.
     value = value / (value.abs() + value.abs().median(0).values).clamp_min(1e-300)
     value = value - value.mean(0)
-    coloured = sum(_correlation(value[lag:], value[: len(value) - lag])[1] for lag in range(1, _LAGS + 1)) > least
+    coloured = sum(_correlation(value[lag:], value[: len(value) - lag])[1] for lag in range(1, LAGS + 1)) > least
     if group is None:
         n_demos, alike = float(training.counts.mean()), total.square().sum(0) - both.square().sum(0)
     else:

@@ -1,13 +1,15 @@
 """Where the mean begins if the first one does not follow the data: what the evidence finds together with the noise."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
+from jaxtyping import Float
 from torch import Tensor
 
-from torch_pbd.gp import EvidenceSearch, Observations, fit_together
+from torch_pbd.gp import EvidenceSearch, Hyperparameters, Observations, fit_hyperparameters, negative_log_evidence
 from torch_pbd.gp.inducing import inducing_inputs
 from torch_pbd.gp.neighbourhoods import resolved_length_scale
+from torch_pbd.models.heteroscedastic.mean import LatentMean
 from torch_pbd.models.heteroscedastic.processes import CLEAR, ProcessFamily
 from torch_pbd.models.heteroscedastic.search import Search, SearchOptions
 from torch_pbd.models.training import TrainingSet, pooled_tril
@@ -21,14 +23,38 @@ _MOST_ROWS, _TOGETHER = 16384, 2048  # inputs to fit at, and inducing ones, of a
 _CHEAP, _NONE = 0.025, 1e-4
 _LEAST_NOISE = 3e-5  # with less, kernel matrices are singular
 _LONGEST = 10.0  # length scale, in ranges of the inputs: a trend
+_CLEARLY = 5.0  # nats: 150 to one. Sound draws gain less than one, signals that were missed 25 and more
 
 
-def mean_start(rows: TrainingSet, family: ProcessFamily, options: SearchOptions) -> tuple[Search, Tensor, TrainingSet]:
-    """Start where ``family`` is too coarse for the means at the inputs, or their noise was taken for too large.
+@dataclass(frozen=True)
+class MeanStart:
+    """Where a mean begins, and the evidence for it under noise that is the same everywhere."""
 
-    That is hyperparameters found, on the inducing inputs that they need; the factor (d, d) of the noise of a row; and
-    the rows at as many inputs as are needed.
-    """
+    search: Search
+    """Holds the hyperparameters that were found, on the inducing inputs that they need."""
+    noise_tril: Float[Tensor, "d d"]
+    """Factor of the noise of a row."""
+    rows: TrainingSet
+    """At as many inputs as are needed."""
+    observations: Observations
+    loss: Float[Tensor, " d"]
+    """Negative log evidence, in nats."""
+
+    def improves(self, mean: LatentMean, noise_tril: Float[Tensor, "d d"]) -> bool:
+        """Whether the evidence is clearly higher, of any output, than that of ``mean`` under its noise.
+
+        Residuals that are not white by chance, or under noise that is louder in places, are no reason to begin here:
+        these hyperparameters stay, and noise that depends on the input would have led to others.
+        """
+        amplitude, rows_at_input = mean.processes.amplitude, len(self.rows.x) / len(self.observations.inputs)
+        noise_ratio = noise_tril.square().sum(1) / rows_at_input / amplitude.square()
+        first = Hyperparameters(mean.family.length_scale_of(mean.theta), amplitude, noise_ratio)
+        loss = negative_log_evidence(self.observations, first, mean.family.features.kernel)
+        return not bool((loss - self.loss < _CLEARLY).all())  # what is too smooth to be evaluated is no mean to keep
+
+
+def mean_start(rows: TrainingSet, family: ProcessFamily, options: SearchOptions) -> MeanStart:
+    """Start where ``family`` is too coarse for the means at the inputs, or their noise was taken for too large."""
     training = rows.merged(MOST_INPUTS)
     rows_at_input = training.counts.mean()
     observations = Observations(training.inputs, training.means().mT.contiguous(), training.counts / rows_at_input)
@@ -38,9 +64,9 @@ def mean_start(rows: TrainingSet, family: ProcessFamily, options: SearchOptions)
     least = resolved_length_scale(training.inputs)
     for shortest in (max(_CHEAP, least), least):
         bounds = (shortest, _LONGEST)
-        found = fit_together([(observations, EvidenceSearch(length_scale_bounds=bounds, noise_scale=known))])[
-            0
-        ].hyperparameters
+        found, loss, _ = fit_hyperparameters(
+            observations, EvidenceSearch(length_scale_bounds=bounds, noise_scale=known)
+        )
         noise_scale = found.amplitude * found.noise_ratio.sqrt()
         if bool((noise_scale < _NONE).all()):
             break
@@ -51,4 +77,5 @@ def mean_start(rows: TrainingSet, family: ProcessFamily, options: SearchOptions)
     exact = len(inducing) == len(rows.inputs)
     family = replace(family, features=replace(family.features, inducing=inducing, exact=exact))
     search = Search(family, n_outputs, n_features, options, family.theta_of(scale, found.amplitude), held=True)
-    return search, (noise_scale * rows_at_input.sqrt()).diag(), rows.merged(_MOST_ROWS // n_outputs)
+    noise_tril = (noise_scale * rows_at_input.sqrt()).diag()
+    return MeanStart(search, noise_tril, rows.merged(_MOST_ROWS // n_outputs), observations, loss)

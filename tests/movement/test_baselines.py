@@ -1,0 +1,153 @@
+"""ProMP and KMP against the published packages, and the laws that all models of movements share."""
+
+import pickle
+
+import numpy as np
+import pytest
+from lc_ns_kmp import LC_NS_KMP
+from movement_primitives.promp import ProMP
+from scipy.stats import multivariate_normal
+from sklearn.base import clone
+
+from movement.test_trajectory import GRID, gaussian_conditional, movements, stacked
+from torch_pbd import KMPBaseline, ProMPBaseline, load_demonstrations
+
+X = GRID[:, np.newaxis]
+
+
+def fit(model, demos):
+    inputs, y, groups = stacked(demos)
+    return model.fit(inputs, y, groups=groups)
+
+
+@pytest.fixture(scope="module")
+def promp():
+    return fit(ProMPBaseline(n_basis=10, overlap=0.7, ridge=0.0, shrinkage=0.0), movements(30))
+
+
+def published(promp):
+    """The same law in movement_primitives, which has the outputs first."""
+    d, n_basis = promp.n_outputs_, promp.n_basis_
+    covariance = promp.weight_covariance_.reshape(n_basis, d, n_basis, d).transpose(1, 0, 3, 2)
+    mean = promp.weight_mean_.T.ravel()
+    return ProMP(d, n_basis).from_weight_distribution(mean, covariance.reshape(d * n_basis, -1))
+
+
+def test_promp_is_the_published_one(promp):
+    demos, reference = movements(30), ProMP(2, 10)
+    weights = [reference.weights(GRID, demo).reshape(2, 10).T for demo in demos]
+    np.testing.assert_allclose(promp.weight_mean_, np.mean(weights, axis=0), atol=1e-6)
+    flat = np.reshape(weights, (30, -1))
+    np.testing.assert_allclose(promp.weight_covariance_, np.cov(flat.T), atol=1e-6)
+    mean, covariance = promp.predict_joint(X)
+    other = published(promp)
+    np.testing.assert_allclose(mean, other.mean_trajectory(GRID), atol=1e-6)
+    noise = np.kron(np.eye(len(GRID)), np.diag(promp.noise_scale_**2))
+    own = covariance.reshape(noise.shape) - noise
+    expected = other.cov_trajectory(GRID).reshape(2, len(GRID), 2, len(GRID)).transpose(1, 0, 3, 2)
+    np.testing.assert_allclose(own, expected.reshape(noise.shape), atol=1e-6)
+
+
+def test_promp_is_conditioned_as_the_published_one(promp):
+    value, noise = np.array([0.5, 0.3]), np.diag(promp.noise_scale_**2)
+    other = published(promp).condition_position(value, y_cov=noise + 0.1**2 * np.eye(2), t=GRID[12])
+    own = promp.condition(GRID[12:13, np.newaxis], [value], noise_scale=0.1)
+    # At the step itself ours has its own noise too, which was observed with it.
+    beside = np.arange(len(GRID)) != 12
+    np.testing.assert_allclose(own.predict(X)[beside], other.mean_trajectory(GRID)[beside], atol=1e-6)
+    variance = np.diagonal(own.predict_cov(X), axis1=1, axis2=2) - promp.noise_scale_**2
+    np.testing.assert_allclose(variance[beside], other.var_trajectory(GRID)[beside], atol=1e-6)
+
+
+def test_promp_reaches_what_it_should_on_letters(recordings):
+    demonstrations = load_demonstrations(recordings / "letter_G.npz").align(n=50)
+    y = demonstrations.to_array()
+    y = (y - y.mean((0, 1))) / y.std((0, 1))
+    grid = np.linspace(0.0, 1.0, 50)
+    scores = []
+    for left_out in range(4):
+        inputs, targets, groups = stacked(np.delete(y, left_out, axis=0), grid)
+        model = ProMPBaseline().fit(inputs, targets, groups=groups)
+        scores.append(model.score_demonstrations(grid[:, np.newaxis], y[left_out])[0])
+    assert np.mean(scores) > 150.0
+
+
+def test_kmp_has_the_mean_of_the_published_one():
+    model = fit(KMPBaseline(n_reference=40, length_scale=0.2, lambda_mean=2.0), movements(8))
+    time = np.linspace(0.0, 1.0, 40)[:, np.newaxis]
+    mean, covariance = model.regressor_.predict(time, return_cov=True)
+    rate = 0.5 / 0.2**2  # k = exp(-l r^2)
+    other = LC_NS_KMP(output_dim=2, horizon=40, lambda_=2.0, l=rate)
+    np.testing.assert_allclose(model.predict(time), other.predict(time, time, mean, covariance), atol=1e-6)
+
+
+def test_kmp_has_the_covariance_of_its_equation():
+    model = fit(KMPBaseline(n_reference=25, nugget=1e-6), movements(8))
+    reference = np.linspace(0.0, 1.0, 25)
+    _, covariances = model.regressor_.predict(reference[:, np.newaxis], return_cov=True)
+
+    def kernel(a, b):
+        return np.kron(np.exp(-0.5 * np.square((a[:, np.newaxis] - b) / 0.144)), np.eye(2))
+
+    noise = np.zeros((50, 50))
+    for i, block in enumerate(covariances):
+        noise[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = block
+    at = np.array([0.1, 0.52])
+    cross = kernel(at, reference)
+    expected = kernel(at, at) - cross @ np.linalg.solve(kernel(reference, reference) + 60.0 * noise, cross.T)
+    own = model.predict_joint(at[:, np.newaxis])[1].reshape(4, 4)
+    np.testing.assert_allclose(own, 25.0 / 60.0 * expected, atol=1e-5)
+
+
+def test_kmp_passes_its_via_points_and_keeps_the_outputs_that_are_not_given():
+    model = fit(KMPBaseline(), movements(8))
+    known = model.condition([[0.5]], [[0.4, np.nan]])
+    mean, before = known.predict([[0.5]])[0], model.predict([[0.5]])[0]
+    assert mean[0] == pytest.approx(0.4, abs=0.02)
+    assert mean[1] == pytest.approx(before[1], abs=0.05)
+    np.testing.assert_allclose(known.predict([[0.0]]), model.predict([[0.0]]), atol=0.05)
+    again = known.condition([[0.8]], [[0.1, 0.1]])
+    np.testing.assert_allclose(again.predict([[0.8]]), [[0.1, 0.1]], atol=0.03)
+    # The nearest time of the reference moved; the model that was conditioned is as it was.
+    np.testing.assert_array_equal(model.predict([[0.5]])[0], before)
+
+
+@pytest.mark.parametrize("make", [ProMPBaseline, KMPBaseline])
+def test_baselines_have_the_methods_of_a_movement(make):
+    demos = movements(6)
+    model = fit(make(), demos)
+    mean, covariance = model.predict_joint(X)
+    flat = covariance.reshape(mean.size, -1)
+    np.testing.assert_allclose(model.predict_cov(X), covariance[range(30), :, range(30)], atol=1e-10 * flat.max())
+    expected = multivariate_normal(mean.ravel(), flat).logpdf(demos[0].ravel())
+    assert model.score_demonstrations(X, demos[0])[0] == pytest.approx(expected, rel=1e-6)
+    draws = model.sample_demonstrations(X[::6], 20_000, random_state=0).reshape(20_000, -1)
+    part = covariance[::6][:, :, ::6].reshape(10, 10)
+    np.testing.assert_allclose(np.cov(draws.T), part, atol=0.05 * part.max())
+    assert np.isinf(model.predict_df(X)).all()
+    assert clone(model).get_params() == model.get_params()
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(model)).predict(X), model.predict(X))
+
+
+def test_promp_is_conditioned_by_the_normal_formulas():
+    model = fit(ProMPBaseline(), movements(6))
+    at = np.array([[0.0], [0.33], [0.71]])
+    mean, covariance = model.predict_joint(at)
+    expected = gaussian_conditional(mean.ravel(), covariance.reshape(6, 6), [2, 3], np.array([0.1, 0.9]), [0.0, 0.0])
+    known = model.condition(at[1:2], [[0.1, 0.9]])
+    np.testing.assert_allclose(known.predict_joint(at)[0].ravel(), expected[0], atol=1e-9)
+    np.testing.assert_allclose(known.predict_joint(at)[1].reshape(6, 6), expected[1], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        (ProMPBaseline(n_basis=1), "n_basis is 1, must be an integer of at least 2"),
+        (ProMPBaseline(overlap=1.0), "overlap is 1.0, must be a finite number above 0 and below 1"),
+        (ProMPBaseline(shrinkage=-0.1), "shrinkage is -0.1, must be a finite number of at least 0"),
+        (KMPBaseline(lambda_cov=0.0), "lambda_cov is 0.0, must be a finite number above 0"),
+    ],
+)
+def test_parameters_are_checked(model, message):
+    with pytest.raises(ValueError, match=message):
+        fit(model, movements())

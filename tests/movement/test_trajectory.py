@@ -1,0 +1,306 @@
+"""The joint law of whole movements: against dense algebra, a dense reference, and the laws of probability."""
+
+import importlib.util
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import multivariate_t
+from sklearn.base import clone
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import MinMaxScaler
+
+from torch_pbd import (
+    CholeskyCovRegressor,
+    Demonstrations,
+    GMMBaseline,
+    HeteroscedasticGPRegressor,
+    TrajectoryRegressor,
+    load_demonstrations,
+)
+from torch_pbd.movement.time_kernel import fit_time_kernel
+
+ORACLE = Path(__file__).parents[2].parent / "shared" / "oracles" / "trajectory_dense.py"
+GRID = np.linspace(0.0, 1.0, 30)
+
+
+def movements(n_demos=6, seed=0, grid=GRID):
+    """Smooth deviations of two outputs from a mean, wider in the middle: (n_demos, n, 2)."""
+    rng = np.random.default_rng(seed)
+    kernel = np.exp(-0.5 * np.square((grid[:, np.newaxis] - grid) / 0.2)) + 1e-6 * np.eye(len(grid))
+    root = np.linalg.cholesky(kernel)
+    width = 0.2 + np.sin(np.pi * grid)[:, np.newaxis]
+    mean = np.stack([np.sin(3.0 * grid), np.cos(2.0 * grid)], axis=1)
+    return mean + width * (root @ rng.standard_normal((n_demos, len(grid), 2)))
+
+
+def stacked(demos, grid=GRID):
+    n_demos, n, d = demos.shape
+    return np.tile(grid, n_demos)[:, np.newaxis], demos.reshape(-1, d), np.repeat(np.arange(n_demos), n)
+
+
+@pytest.fixture(scope="module")
+def model():
+    X, y, groups = stacked(movements())
+    return TrajectoryRegressor().fit(X, y, groups=groups)
+
+
+def dense(model, X):
+    """Mean (n d,) and covariance (n d, n d)."""
+    mean, covariance = model.predict_joint(X)
+    return mean.ravel(), covariance.reshape(mean.size, mean.size)
+
+
+def test_the_law_is_that_of_the_dense_reference(model):
+    if not ORACLE.is_file():
+        pytest.skip("no reference")
+    spec = importlib.util.spec_from_file_location("trajectory_dense", ORACLE)
+    oracle = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(oracle)
+    demos, X = movements(), GRID[:, np.newaxis]
+    X_fit, y, groups = stacked(demos)
+    own = TrajectoryRegressor(time_kernel="matern52").fit(X_fit, y, groups=groups)
+    moments = own.regressor_.predict(X, return_cov=True)
+    mean, covariance, df, found = oracle.joint(GRID, demos, *moments, own.regressor_.predict_df(X))
+    assert own.length_scale_ == pytest.approx(found["length"])
+    assert 1.0 - own.shrinkage_ == pytest.approx(found["weight"])
+    assert own.df_ == df
+    np.testing.assert_allclose(dense(own, X)[1], covariance, rtol=1e-6, atol=1e-8 * covariance.max())
+    np.testing.assert_allclose(dense(own, X)[0], mean, rtol=1e-12)
+
+
+def test_marginals_are_those_of_the_regressor(model):
+    X = np.linspace(-0.1, 1.1, 23)[:, np.newaxis]
+    mean, covariance = model.predict_joint(X)
+    own_mean, own = model.predict(X, return_cov=True)
+    np.testing.assert_array_equal(own, model.regressor_.predict_cov(X))
+    np.testing.assert_array_equal(own_mean, model.regressor_.predict(X))
+    np.testing.assert_allclose(mean, own_mean, rtol=1e-12)
+    blocks = covariance[np.arange(len(X)), :, np.arange(len(X))]
+    np.testing.assert_allclose(blocks, own, rtol=1e-10, atol=1e-10 * own.max())
+
+
+@pytest.mark.parametrize("known", [None, "steps", "entries"])
+def test_structured_algebra_is_the_dense(model, known):
+    X, y = GRID[1::2, np.newaxis], movements(1, seed=3)[0, 1::2]
+    if known == "steps":
+        model = model.condition([[0.2], [0.55]], [[0.3, 0.9], [0.8, 0.1]])
+    elif known == "entries":
+        model = model.condition([[0.2], [0.55]], [[0.3, np.nan], [0.8, 0.1]], noise_scale=[0.05, 0.1])
+    mean, covariance = dense(model, X)
+    scale = covariance * (model.df_ - 2.0) / model.df_
+    expected = multivariate_t(mean, scale, df=model.df_).logpdf(y.ravel())
+    np.testing.assert_allclose(model.score_demonstrations(X, y), [expected], rtol=1e-9)
+    assert model.score(X, y) == pytest.approx(expected / len(X), rel=1e-9)
+
+
+@pytest.mark.parametrize("known", [None, "steps", "entries", "both"])
+def test_draws_have_the_joint_covariance(model, known):
+    X = np.linspace(0.0, 1.0, 7)[:, np.newaxis]
+    if known in ("steps", "both"):
+        model = model.condition([[0.5]], [[0.9, 0.4]])
+    if known in ("entries", "both"):
+        model = model.condition([[0.2], [0.7]], [[0.3, np.nan], [0.8, 0.1]], noise_scale=0.1)
+    mean, covariance = dense(model, X)
+    n = 10_000
+    draws = model.sample_demonstrations(X, n, random_state=0).reshape(n, -1)
+    variance = np.diagonal(covariance).clip(0.0)
+    # Of a t with nu degrees of freedom the fourth moment is (nu - 2) / (nu - 4) times the normal one.
+    excess = (model.df_ - 2.0) / (model.df_ - 4.0)
+    error = np.sqrt((excess * (np.outer(variance, variance) + 2 * covariance**2) - covariance**2).clip(0.0) / n)
+    assert (np.abs(np.cov(draws.T) - covariance) <= 5.0 * error + 1e-12 * variance.max()).all()
+    assert (np.abs(draws.mean(0) - mean) <= 5.0 * np.sqrt(variance / n) + 1e-12).all()
+
+
+def gaussian_conditional(mean, covariance, rows, values, variances):
+    gain = np.linalg.solve(covariance[np.ix_(rows, rows)] + np.diag(variances), covariance[rows]).T
+    return mean + gain @ (values - mean[rows]), covariance - gain @ covariance[rows]
+
+
+def test_conditioning_is_that_of_a_normal_law(model):
+    # Whole steps, steps with an output that is not given, with noise, off the grid, and again.
+    times = np.array([0.113, 0.113 + 0.2, 0.42, 0.871])
+    values = np.array([[0.2, 0.9], [np.nan, 0.7], [0.9, 0.5], [0.4, np.nan]])
+    X = np.concatenate([np.linspace(0.0, 1.0, 9), times])[:, np.newaxis]
+    once = model.condition(times[:2, np.newaxis], values[:2])
+    twice = once.condition(times[2:, np.newaxis], values[2:], noise_scale=[0.1, 0.2])
+    given = [(9, 0, 0.0), (9, 1, 0.0), (10, 1, 0.0), (11, 0, 0.1), (11, 1, 0.2), (12, 0, 0.1)]
+    rows = [2 * step + output for step, output, _ in given]
+    flat = np.concatenate([np.zeros((9, 2)), values])[[g[0] for g in given], [g[1] for g in given]]
+    mean, covariance = gaussian_conditional(*dense(model, X), rows, flat, np.square([g[2] for g in given]))
+    size = np.abs(dense(model, X)[1]).max()
+    np.testing.assert_allclose(dense(twice, X)[0], mean, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(dense(twice, X)[1], covariance, rtol=1e-7, atol=1e-9 * size)
+    np.testing.assert_allclose(twice.predict(X).ravel(), mean, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(
+        twice.predict_cov(X), dense(twice, X)[1].reshape(13, 2, 13, 2)[range(13), :, range(13)], atol=1e-9 * size
+    )
+    np.testing.assert_allclose(once.predict(times[:1, np.newaxis]), values[:1], atol=1e-9)
+    np.testing.assert_allclose(once.sample_demonstrations(times[:1, np.newaxis], 5, 0), np.tile(values[:1], (5, 1, 1)))
+    # The original is as it was, and the order of what is given does not matter.
+    np.testing.assert_array_equal(model.predict(X), model.regressor_.predict(X))
+    other = model.condition(times[2:, np.newaxis], values[2:], noise_scale=[0.1, 0.2])
+    other = other.condition(times[:2, np.newaxis], values[:2])
+    np.testing.assert_allclose(dense(other, X)[1], covariance, rtol=1e-7, atol=1e-9 * size)
+
+
+def test_conditioning_keeps_what_is_missing_and_narrows_the_rest(model):
+    X = np.linspace(0.0, 1.0, 5)[:, np.newaxis]
+    known = model.condition([[0.5]], [[1.0, 0.5]])
+    np.testing.assert_array_equal(known.predict_uncertainty(X).type1, model.predict_uncertainty(X).type1)
+    before, after = model.predict_uncertainty(X).type2, known.predict_uncertainty(X).type2
+    assert (np.linalg.eigvalsh(before - after) >= -1e-9 * before.max()).all()
+    assert np.abs(after[2]).max() < 1e-9 * before.max()
+
+
+def test_a_movement_that_was_seen_halfway_is_foretold(recordings):
+    demonstrations = load_demonstrations(recordings / "letter_G.npz").align(n=50)
+    train, left_out = demonstrations.split(3)
+    fitted = TrajectoryRegressor().fit(train)
+    X, y, _ = left_out.stack()
+    known = fitted.condition(X[:25], y[:25])
+    ahead = slice(25, 30)
+    error = [np.square(model.predict(X[ahead]) - y[ahead]).mean() for model in (known, fitted)]
+    assert error[0] < 0.3 * error[1]
+    assert known.score_demonstrations(X[25:], y[25:])[0] > fitted.score_demonstrations(X[25:], y[25:])[0]
+    # Rows as if independent lose some nats a step.
+    assert fitted.score(X, y) > fitted.regressor_.score(X, y) + 2.0
+
+
+def test_steps_that_a_recording_has_not_are_left_out_of_it_not_drawn_through():
+    demos = movements(8)
+    time = [GRID] * 7 + [np.delete(GRID, slice(8, 20))]
+    hole = [*demos[:7], np.delete(demos[7], slice(8, 20), axis=0)]
+    without = TrajectoryRegressor(HeteroscedasticGPRegressor()).fit(Demonstrations([GRID] * 7, list(demos[:7])))
+    fitted = TrajectoryRegressor(HeteroscedasticGPRegressor()).fit(Demonstrations(time, hole))
+    # A straight line through the hole would be a far smoother series than the others, or a jump.
+    assert fitted.length_scale_ == pytest.approx(without.length_scale_, rel=0.4)
+    assert np.median(fitted.nugget_scale_) < 0.05
+
+
+def test_nuggets_take_missing_steps_for_missing():
+    residual = torch.from_numpy(movements(6, seed=2) - movements(6, seed=2).mean(0))
+    holed = residual.clone()
+    holed[0, 10:15] = torch.nan
+    grid = torch.from_numpy(GRID)
+    whole, part = (fit_time_kernel(grid, values, "squared_exponential", None) for values in (residual, holed))
+    assert part.length_scale == pytest.approx(whole.length_scale, rel=0.4)
+    assert not part.residual.isnan().any()
+    # What stands in the hole is near to what was cut out of it.
+    assert (part.residual[0, 10:15] - whole.residual[0, 10:15]).abs().max() < 0.3
+
+
+def test_a_kernel_that_made_the_movements_is_found():
+    residual = torch.from_numpy(movements(30, seed=5))
+    residual = residual - residual.mean(0)
+    found = fit_time_kernel(torch.from_numpy(GRID), residual / residual.std(0), None, None)
+    assert found.kernel == "squared_exponential"
+    assert found.length_scale == pytest.approx(0.2, rel=0.4)
+
+
+def test_the_module_is_differentiable_and_the_law_of_the_estimator(model):
+    x = torch.tensor([[0.1], [0.45], [0.8]], dtype=torch.float64, requires_grad=True)
+    mean, covariance = model.module_(x)
+    np.testing.assert_allclose(covariance.detach(), model.predict_joint(x.detach().numpy())[1], rtol=1e-9)
+    assert torch.autograd.gradcheck(lambda t: model.module_(t)[1], x, atol=1e-6)
+    mean.sum().backward()
+    assert torch.isfinite(x.grad).all()
+
+
+def test_it_is_an_estimator(model):
+    X, y, groups = stacked(movements())
+    again = pickle.loads(pickle.dumps(model))
+    np.testing.assert_array_equal(again.predict_joint(X[:5])[1], model.predict_joint(X[:5])[1])
+    assert clone(model).get_params() == model.get_params()
+    known = pickle.loads(pickle.dumps(model.condition([[0.5]], [[1.0, 0.5]])))
+    np.testing.assert_allclose(known.predict([[0.5]]), [[1.0, 0.5]])
+    pipe = make_pipeline(MinMaxScaler((0.0, 2.0)), TrajectoryRegressor(CholeskyCovRegressor(), shrinkage=0.0))
+    pipe.fit(X, y, trajectoryregressor__groups=groups)
+    assert pipe.predict(X).shape == y.shape
+    one = TrajectoryRegressor(CholeskyCovRegressor()).fit(X, y[:, 0], groups=groups)
+    assert one.predict(X[:4]).shape == (4,)
+    assert one.condition([[0.5]], [1.0]).predict([[0.5]]) == pytest.approx([1.0])
+
+
+def test_units_and_origin_of_time_are_no_matter():
+    demos = movements()
+    X, y, groups = stacked(demos)
+    first = TrajectoryRegressor(CholeskyCovRegressor()).fit(X, y, groups=groups)
+    second = TrajectoryRegressor(CholeskyCovRegressor()).fit(1e3 + 50.0 * X, 1e-3 * y, groups=groups)
+    assert second.length_scale_ == pytest.approx(50.0 * first.length_scale_)
+    at = np.array([[0.2], [0.6]])
+    np.testing.assert_allclose(
+        second.predict_joint(1e3 + 50.0 * at)[1], 1e-6 * first.predict_joint(at)[1], rtol=1e-4, atol=1e-10
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"groups": None}, "groups is None, must be the demonstration of each row"),
+        ({"y": None}, "y is None, must be the positions"),
+        ({"groups": np.zeros(180, dtype=int)}, "groups has one demonstration, must have two or more"),
+        ({"X": np.zeros((180, 2)) + GRID[:, np.newaxis].repeat(6, 0)}, "X has 2 columns, must have one"),
+        ({"X": np.tile(np.repeat(GRID[:15], 2), 6)[:, np.newaxis]}, "X has a time twice in demonstration 0"),
+    ],
+)
+def test_what_cannot_be_a_movement_is_refused(arguments, message):
+    X, y, groups = stacked(movements())
+    arguments = {"X": X, "y": y, "groups": groups, **arguments}
+    with pytest.raises(ValueError, match=message):
+        TrajectoryRegressor(CholeskyCovRegressor()).fit(arguments["X"], arguments["y"], groups=arguments["groups"])
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"time_kernel": "rbf"}, "time_kernel is 'rbf', must be one of 'auto'"),
+        ({"shrinkage": 1.5}, "shrinkage is 1.5, must be a finite number of at least 0"),
+        ({"timing": "dtw"}, "timing is 'dtw', must be one of"),
+        ({"regressor": "HGP"}, "regressor is 'HGP', must be a covariance regressor or None"),
+    ],
+)
+def test_parameters_are_checked(parameters, message):
+    X, y, groups = stacked(movements())
+    with pytest.raises(ValueError, match=message):
+        TrajectoryRegressor(**parameters).fit(X, y, groups=groups)
+
+
+def test_what_is_known_twice_is_refused(model):
+    known = model.condition([[0.5]], [[1.0, 0.5]])
+    with pytest.raises(ValueError, match="given twice, or is known already"):
+        known.condition([[0.5]], [[1.0, np.nan]])
+    with pytest.raises(ValueError, match="given twice"):
+        model.condition([[0.5], [0.5]], [[1.0, 0.5], [1.0, 0.5]])
+    known.condition([[0.5]], [[1.1, 0.5]], noise_scale=0.1)
+    with pytest.raises(ValueError, match="known without noise: leave it out"):
+        known.score_demonstrations([[0.4], [0.5]], [[1.0, 0.5], [1.0, 0.5]])
+    with pytest.raises(ValueError, match="y has shape"):
+        model.condition([[0.5]], [[1.0, 0.5, 2.0]])
+
+
+def test_a_thousand_steps_of_fourteen_outputs_need_no_matrix_of_all():
+    rng = np.random.default_rng(0)
+    grid, n_demos, d = np.linspace(0.0, 1.0, 1000), 6, 14
+    phases = rng.normal(size=(n_demos, 1, d)) * 0.1
+    demos = np.sin(2.0 * np.pi * (grid[:, np.newaxis] + phases)) + 0.1 * rng.normal(size=(n_demos, 1, d))
+    X, y, groups = stacked(demos, grid)
+    model = TrajectoryRegressor(GMMBaseline(n_components=3, n_restarts=0)).fit(X, y, groups=groups)
+    largest = 0
+
+    class Watch(torch.overrides.TorchFunctionMode):
+        def __torch_function__(self, function, types, args=(), kwargs=None):
+            nonlocal largest
+            result = function(*args, **(kwargs or {}))
+            largest = max(largest, result.numel() if isinstance(result, torch.Tensor) else 0)
+            return result
+
+    at = grid[:, np.newaxis]
+    with Watch():
+        model.sample_demonstrations(at, 2, 0)
+        known = model.condition(at[:500:2], demos[0, :500:2])
+        known.predict_cov(at)
+        model.score_demonstrations(at, demos[0])
+    assert largest <= 0.1 * (1000 * 14) ** 2

@@ -1,0 +1,186 @@
+"""Probabilistic movement primitives (ProMP): a normal law of the weights of basis functions."""
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from torch_pbd import checks
+from torch_pbd.estimators.validation import Floats
+from torch_pbd.movement.base import MovementRegressor, Recording
+from torch_pbd.movement.joint import JointNormal
+
+_N_BASES = (8, 12, 16, 20)  # tried by "auto", as far as recordings have samples for them
+_REACHES = (1.0, 2.0, 4.0)  # of the smooth prior, in bases
+_SHARES = (0.9, 0.7, 0.5, 0.3, 0.1, 0.03)  # of the smooth prior
+_OVERLAPS = (0.7, 0.85, 0.92)  # narrow bases follow bends, wide ones are smooth: 0.7 is movement_primitives'
+_LEAST_NOISE = 1e-4  # of an output's deviation: below it a law has no density to speak of
+_MOST_LEFT_OUT = 40  # demonstrations that are left out in turn
+
+
+class ProMPBaseline(MovementRegressor):
+    """Probabilistic movement primitive: x_t = Psi_t w + noise, with a normal law of the weights w.
+
+    Bases are normalized Gaussians over the time; the weights of each demonstration are found by ridge regression. Their
+    covariance is singular for fewer demonstrations than weights: it is shrunk towards a smooth one, a squared
+    exponential over the bases' numbers times the covariance of the outputs.
+
+    Parameters
+    ----------
+    n_basis : int or "auto", default="auto"
+        Bases; "auto" takes 8 to 20 by the likelihood of demonstrations left out in turn.
+    overlap : float or "auto", default="auto"
+        Of a basis with its neighbours, in the middle between two before they are normalized, 0 to 1; "auto" takes 0.7,
+        0.85 or 0.92 by that likelihood.
+    ridge : float, default=1e-6
+        Of the regression of the weights, relative to the mean diagonal of its matrix.
+    shrinkage : float or "auto", default="auto"
+        Weight of the smooth covariance, 0 to 1; "auto" takes it, and how far it reaches, by that likelihood too.
+    random_state : int, RandomState instance or None, default=0
+        Not used: the fit is deterministic.
+
+    Attributes
+    ----------
+    n_basis_ : int
+    overlap_ : float
+    shrinkage_, reach_ : float
+        Weight of the smooth covariance, and its length scale in bases.
+    weight_mean_ : ndarray of shape (n_basis, n_outputs)
+    weight_covariance_ : ndarray of shape (n_basis n_outputs, n_basis n_outputs)
+    noise_scale_ : ndarray of shape (n_outputs,)
+        Deviation of the samples from what the bases follow, in units of y.
+    df_ : float
+        Infinite: the law is normal.
+    n_features_in_, n_outputs_ : int
+
+    References
+    ----------
+    Paraschos, Daniel, Peters, Neumann, "Using probabilistic movement primitives in robotics", Autonomous Robots 42,
+    2018.
+    """
+
+    df_ = float("inf")
+
+    def __init__(
+        self,
+        *,
+        n_basis: int | str = "auto",
+        overlap: float | str = "auto",
+        ridge: float = 1e-6,
+        shrinkage: float | str = "auto",
+        random_state: Any = 0,
+    ) -> None:
+        self.n_basis = n_basis
+        self.overlap = overlap
+        self.ridge = ridge
+        self.shrinkage = shrinkage
+        self.random_state = random_state
+
+    def _check_parameters(self) -> None:
+        if self.n_basis != "auto":
+            checks.count(self.n_basis, "n_basis", least=2)
+        if self.overlap != "auto":
+            checks.number(self.overlap, "overlap", above=0.0, below=1.0)
+        checks.number(self.ridge, "ridge", least=0.0)
+        if self.shrinkage != "auto":
+            checks.number(self.shrinkage, "shrinkage", least=0.0, most=1.0)
+        checks.seed(self.random_state)
+
+    def _fit(self, recordings: list[Recording]) -> None:
+        low = min(recording.time[0] for recording in recordings)
+        high = max(recording.time[-1] for recording in recordings)
+        checks.number(high - low, "the range of X", above=0.0)
+        self._range = float(low), float(high - low)
+        scaled = [Recording(self._scaled(time), position) for time, position in recordings]
+        most = max(2, min(len(time) for time, _ in recordings) - 1)
+        sizes = _N_BASES if self.n_basis == "auto" else (int(self.n_basis),)
+        overlaps = _OVERLAPS if self.overlap == "auto" else (float(self.overlap),)
+        candidates = [
+            _Weights(scaled, size, overlap, float(self.ridge))
+            for size in sorted({min(size, most) for size in sizes})
+            for overlap in overlaps
+        ]
+        shares = _SHARES if self.shrinkage == "auto" else (float(self.shrinkage),)
+        choices = [(weights, reach, share) for weights in candidates for reach in _REACHES for share in shares]
+        weights, reach, share = max(choices, key=lambda choice: choice[0].left_out(*choice[1:]))
+        self.n_basis_, self.overlap_, self.reach_, self.shrinkage_ = weights.n_basis, weights.overlap, reach, share
+        self.weight_mean_ = weights.values.mean(axis=0)
+        self.weight_covariance_ = weights.covariance(weights.values, reach, share)
+        self.noise_scale_ = weights.noise_scale
+
+    def _scaled(self, time: Floats) -> Floats:
+        return np.asarray((time - self._range[0]) / self._range[1])
+
+    def _prior(self, time: Floats) -> JointNormal:
+        n, d = len(time), self.n_outputs_
+        bases = basis_functions(self._scaled(time), self.n_basis_, self.overlap_)
+        values, vectors = np.linalg.eigh(self.weight_covariance_)
+        root = (vectors * np.sqrt(values.clip(0.0))).reshape(self.n_basis_, d, -1)
+        loadings = np.einsum("nb,bdk->ndk", bases, root) / self.noise_scale_[:, np.newaxis]
+        tensors = map(torch.from_numpy, (bases @ self.weight_mean_, np.diag(self.noise_scale_), loadings))
+        mean, factor, loading = tensors
+        return JointNormal(mean, factor.expand(n, d, d), torch.eye(n).double(), loading, loading[:, :, :0])
+
+
+class _Weights:
+    """Weights of each demonstration, and what is needed to judge a covariance of them."""
+
+    def __init__(self, recordings: list[Recording], n_basis: int, overlap: float, ridge: float) -> None:
+        self.n_basis, self.overlap = n_basis, overlap
+        self._bases = [basis_functions(time, n_basis, overlap) for time, _ in recordings]
+        self._positions = [position for _, position in recordings]
+        weights, squares = [], []
+        for bases, position in zip(self._bases, self._positions, strict=True):
+            gram = bases.T @ bases
+            matrix = gram + ridge * gram.trace() / n_basis * np.eye(n_basis)
+            weights.append(np.linalg.solve(matrix, bases.T @ position))
+            squares.append(np.square(position - bases @ weights[-1]).sum(axis=0))
+        self.values: Floats = np.stack(weights)
+        """(K, n_basis, d)."""
+        positions = np.concatenate(self._positions)
+        deviation = positions.std(axis=0)
+        least = _LEAST_NOISE * np.where(deviation > 0.0, deviation, 1.0)
+        freedoms = max(1, len(positions) - n_basis * len(recordings))
+        self.noise_scale: Floats = np.maximum(np.sqrt(np.sum(squares, axis=0) / freedoms), least)
+
+    def covariance(self, values: Floats, reach: float, share: float) -> Floats:
+        """Covariance of weights (K, B, d), shrunk: (B d, B d)."""
+        centred = values - values.mean(axis=0)
+        flat = centred.reshape(len(values), -1)
+        own = flat.T @ flat / (len(values) - 1)
+        outputs = np.einsum("kbi,kbj->ij", centred, centred) / (len(values) - 1) / self.n_basis
+        number = np.arange(self.n_basis)
+        smooth = np.exp(-0.5 * np.square((number[:, np.newaxis] - number) / reach))
+        return np.asarray((1.0 - share) * own + share * np.kron(smooth, outputs))
+
+    def left_out(self, reach: float, share: float) -> float:
+        """Log likelihood of demonstrations under the law of the others, in nats.
+
+        With y = Psi w + noise, r = y - Psi mean, M = Psi' Psi / s^2, b = Psi' r / s^2 and the weights' covariance S, it
+        is -(log det(I + M S) + r' r / s^2 - b' S (I + M S)^-1 b + log det s^2 + n log 2 pi) / 2.
+        """
+        if len(self.values) < 3:
+            return -float(np.log(self.noise_scale).sum())  # one other demonstration has no covariance
+        total = 0.0
+        for k, (bases, position) in enumerate(zip(self._bases, self._positions, strict=True)):
+            if k == _MOST_LEFT_OUT:
+                break
+            others = np.delete(self.values, k, axis=0)
+            covariance = self.covariance(others, reach, share)
+            residual = (position - bases @ others.mean(axis=0)) / self.noise_scale
+            precision = np.kron(bases.T @ bases, np.diag(self.noise_scale**-2.0))
+            projected = (bases.T @ (residual / self.noise_scale)).ravel()
+            matrix = np.eye(len(precision)) + precision @ covariance
+            explained = projected @ covariance @ np.linalg.solve(matrix, projected)
+            log_det = np.linalg.slogdet(matrix).logabsdet + 2.0 * len(bases) * np.log(self.noise_scale).sum()
+            total -= 0.5 * (log_det + np.square(residual).sum() - explained + position.size * np.log(2.0 * np.pi))
+        return float(total)
+
+
+def basis_functions(time: Floats, n_basis: int, overlap: float) -> Floats:
+    """Normalized Gaussian bases (n, n_basis) at times from 0 to 1, by their centres evenly from 0 to 1."""
+    centres = np.linspace(0.0, 1.0, n_basis)
+    width = -1.0 / (8.0 * n_basis**2 * np.log(overlap))
+    exponent = -0.5 * np.square(time[:, np.newaxis] - centres) / width
+    values = np.exp(exponent - exponent.max(axis=1, keepdims=True))  # far away the nearest basis is left
+    return np.asarray(values / values.sum(axis=1, keepdims=True))

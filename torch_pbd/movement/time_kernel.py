@@ -1,0 +1,222 @@
+"""Correlation of a demonstration along its course: a kernel of time, a nugget at each step, and the loadings.
+
+Whitened residuals ``z`` of the demonstrations, of unit covariance at each step, are taken for ``g_t + eps_t``: g has a
+stationary kernel over time, eps_t is independent with a variance e_t, the nugget. One nugget for all steps would have
+to be as large as where movements start or end in one point, which marginals mistrack, and would spoil all others.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from typing import get_args
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torch_pbd.kernels import KernelName, correlation
+from torch_pbd.linalg import safe_cholesky, symmetrize
+
+# Length scales in ranges of the time, from the spacing of some fifty steps to a movement that bends once; and nuggets
+# shared by all steps.
+_LENGTHS = torch.logspace(math.log10(0.02), 0.0, 14, dtype=torch.float64)
+_NUGGETS = (1e-5, 1e-4, 1e-3, 1e-2, 0.1)
+_LEAST, _MOST, _FIRST = 1e-5, 1e3, 1e-2  # nuggets: smallest, largest, and where expectation maximization starts
+_N_STEPS, _TOLERANCE = 40, 0.02  # of expectation maximization: iterations, and change of a logarithm that ends it
+_SMOOTH = 1e-3  # nugget of a step that is told apart from noise: such steps decide on the length scale
+_USUAL = 2.0  # factor of the median, in which the size of a step's residuals lies
+_ROUNDS = 3  # of nuggets and length scale, which depend on each other
+_SHARES = (1.0, 0.9, 0.75, 0.6, 0.45, 0.3, 0.2, 0.1, 0.05)  # of the kernel, the rest being the demonstrations' own
+
+
+@dataclass(frozen=True)
+class TimeKernel:
+    """Correlation along the movement as it was found on a grid of T steps, from K demonstrations."""
+
+    grid: Float[Tensor, " T"]
+    kernel: KernelName
+    length_scale: float
+    nugget: Float[Tensor, " T"]
+    share: float
+    """Weight of the kernel's correlation; the rest is that of the demonstrations' own residuals."""
+    residual: Float[Tensor, "K T d"]
+    """Whitened residuals, without holes."""
+
+    def correlation(self, time: Float[Tensor, " n"]) -> Float[Tensor, "n n"]:
+        """Correlation of unit diagonal at any times: nuggets are linear between steps; equal times are one."""
+        nugget = _interpolated(self.grid, self.nugget[:, None], time)[:, 0]
+        same = time[:, None] == time
+        whole = self._kernel(time, time) + torch.where(same, nugget, 0.0)
+        root = (1.0 + nugget).rsqrt()
+        return root[:, None] * whole * root
+
+    def loadings(self, time: Float[Tensor, " n"]) -> Float[Tensor, "n d K"]:
+        """Residuals of the demonstrations at any times: smooth parts by the kernel, what is left of them linear."""
+        n_demos, n_steps, d = self.residual.shape
+        rows = self.residual.permute(1, 2, 0).reshape(n_steps, -1)
+        own = self._kernel(self.grid, self.grid)
+        root = safe_cholesky(own + torch.diag(self.nugget), name="the time kernel")
+        weights = torch.cholesky_solve(rows, root)
+        smooth = self._kernel(time, self.grid) @ weights
+        rest = _interpolated(self.grid, rows - own @ weights, time)
+        return (smooth + rest).reshape(len(time), d, n_demos)
+
+    def _kernel(self, time: Tensor, other: Tensor) -> Tensor:
+        length_scale = self.grid.new_tensor([self.length_scale])
+        return correlation(time[:, None], other[:, None], length_scale, self.kernel)
+
+
+def fit_time_kernel(
+    grid: Float[Tensor, " T"], residual: Float[Tensor, "K T d"], kernel: KernelName | None, share: float | None
+) -> TimeKernel:
+    """Time kernel of whitened residuals, NaN where a demonstration has no sample near.
+
+    Parameters
+    ----------
+    grid : Tensor of shape (T,)
+        Times, of a range of one.
+    residual : Tensor of shape (K, T, d)
+    kernel : str or None
+        None takes the likeliest of all.
+    share : float or None
+        None takes that with the highest likelihood of demonstrations left out in turn.
+    """
+    residual = _unit_rms(residual)
+    kernels = get_args(KernelName) if kernel is None else (kernel,)
+    sizes = residual.square().nanmean((0, 2)).sqrt()
+    usual = (sizes > sizes.nanmedian() / _USUAL) & (sizes < sizes.nanmedian() * _USUAL)
+    found = _search(grid, residual, usual, kernels)
+    nugget = _step_nuggets(grid, residual, found, _LEAST)
+    for _ in range(_ROUNDS):
+        smooth = nugget <= _SMOOTH
+        again = _search(grid, residual, smooth if 2 * smooth.sum() >= len(grid) else nugget <= nugget.median(), kernels)
+        if again == found:
+            break
+        found = again
+        nugget = _step_nuggets(grid, residual, found, min(found[2], 0.1 * _SMOOTH))
+    result = TimeKernel(grid, found[0], found[1], nugget, 1.0, _filled(grid, residual, found, nugget))
+    return replace(result, share=_best_share(result) if share is None else share)
+
+
+def _search(
+    grid: Tensor, residual: Tensor, steps: Bool[Tensor, " T"], kernels: tuple[KernelName, ...]
+) -> tuple[KernelName, float, float]:
+    """Kernel, length scale and shared nugget eta of the highest likelihood of ``(1 - eta) K + eta I``."""
+    steps = steps if 2 * int(steps.sum()) >= len(grid) else torch.ones_like(steps)
+    chosen = _unit_rms(residual[:, steps])
+    groups, time = list(_by_pattern(chosen)), grid[steps][:, None]
+    best: tuple[float, tuple[KernelName, float, float]] | None = None
+    for kernel in kernels:
+        unit = correlation(time, time, _LENGTHS[:, None].to(grid), kernel)  # (lengths, n, n)
+        for nugget in _NUGGETS:
+            whole = (1.0 - nugget) * unit + nugget * torch.eye(len(time)).to(grid)
+            values = sum(_log_likelihood(whole[:, seen][:, :, seen], rows) for seen, rows in groups)
+            index = int(torch.as_tensor(values).argmax())
+            value = float(torch.as_tensor(values)[index])
+            if best is None or value > best[0]:
+                best = value, (kernel, float(_LENGTHS[index]), nugget)
+    assert best is not None
+    return best[1]
+
+
+def _log_likelihood(covariance: Float[Tensor, "b n n"], rows: Float[Tensor, "n s"]) -> Float[Tensor, " b"]:
+    """Log density of the series in ``rows``, but for a constant; minus infinity where a matrix is singular."""
+    root, info = torch.linalg.cholesky_ex(covariance)
+    whitened = torch.linalg.solve_triangular(root, rows.expand(len(root), *rows.shape), upper=False)
+    value = -0.5 * whitened.square().sum((1, 2)) - rows.shape[1] * root.diagonal(dim1=1, dim2=2).log().sum(1)
+    return torch.where((info == 0) & torch.isfinite(value), value, -torch.inf)
+
+
+def _step_nuggets(
+    grid: Tensor, residual: Tensor, found: tuple[KernelName, float, float], least: float
+) -> Float[Tensor, " T"]:
+    """Nugget of each step, by expectation maximization over the independent parts of the residuals.
+
+    With ``S = K + diag e`` and ``a = S^-1 z`` an independent part has the mean ``e_t a_t`` and the variance
+    ``e_t - e_t^2 [S^-1]_tt``; their second moment is the next e_t.
+    """
+    unit = correlation(grid[:, None], grid[:, None], grid.new_tensor([found[1]]), found[0])
+    groups = list(_by_pattern(residual))
+    nugget = torch.full_like(grid, max(least, _FIRST))
+    for _ in range(_N_STEPS):
+        moment, count = torch.zeros_like(grid), torch.zeros_like(grid)
+        for seen, rows in groups:
+            own = nugget[seen]
+            inverse = torch.cholesky_inverse(
+                safe_cholesky(unit[seen][:, seen] + torch.diag(own), name="the time kernel")
+            )
+            second = (own[:, None] * (inverse @ rows)).square().sum(1)
+            moment[seen] += second + rows.shape[1] * (own - own.square() * inverse.diagonal())
+            count[seen] += rows.shape[1]
+        new = torch.where(count > 0, moment / count.clamp_min(1.0), nugget).clamp(least, _MOST)
+        change = (new / nugget).log().abs().max()
+        nugget = new
+        if float(change) < _TOLERANCE:
+            break
+    return nugget
+
+
+def _filled(
+    grid: Tensor, residual: Tensor, found: tuple[KernelName, float, float], nugget: Tensor
+) -> Float[Tensor, "K T d"]:
+    """Residuals with the kernel's expectation where there were none."""
+    if not bool(residual.isnan().any()):
+        return residual
+    unit = correlation(grid[:, None], grid[:, None], grid.new_tensor([found[1]]), found[0])
+    filled = residual.clone()
+    for k, own in enumerate(residual):
+        seen = ~own.isnan().any(1)
+        root = safe_cholesky(unit[seen][:, seen] + torch.diag(nugget[seen]), name="the time kernel")
+        filled[k, ~seen] = unit[~seen][:, seen] @ torch.cholesky_solve(own[seen], root)
+    return filled
+
+
+def _best_share(kernel: TimeKernel) -> float:
+    """Share of the kernel, by the likelihood of each demonstration under the others' and the kernel's correlation.
+
+    ``share R kron I + (1 - share) / (K - 1) sum z z'`` over the others: with G the Gram matrix of all under R^-1 and
+    ``M = G + a I``, ``a = share (K - 1) / (1 - share)``, the squared distance of one is ``1 / [M^-1]_kk - a`` over the
+    share, and the determinant of the others' M is that of all, times ``[M^-1]_kk``.
+    """
+    n_demos, n_steps, d = kernel.residual.shape
+    if n_demos < 3:
+        return 1.0
+    root = safe_cholesky(kernel.correlation(kernel.grid), name="the correlation along the movement")
+    rows = kernel.residual.permute(1, 2, 0).reshape(n_steps, -1)
+    whitened = torch.linalg.solve_triangular(root, rows, upper=False).reshape(n_steps * d, n_demos)
+    gram, size = symmetrize(whitened.mT @ whitened), n_steps * d
+
+    def left_out(share: float) -> float:
+        if share == 1.0:
+            return -0.5 * float(gram.trace())
+        ridge = share * (n_demos - 1) / (1.0 - share)
+        matrix = gram + ridge * torch.eye(n_demos).to(gram)
+        own = torch.linalg.inv(matrix).diagonal()
+        square = (1.0 / own - ridge) / share
+        # log det of I + G / a over the others
+        log_det = torch.logdet(matrix) + own.log() - (n_demos - 1) * torch.log(gram.new_tensor(ridge))
+        return -0.5 * float((square + log_det).sum()) - 0.5 * n_demos * size * float(gram.new_tensor(share).log())
+
+    return max(_SHARES, key=left_out)
+
+
+def _by_pattern(residual: Float[Tensor, "K T d"]) -> list[tuple[Tensor, Tensor]]:
+    """Steps that demonstrations have, and the series of those that have the same: ((T,), (n, series)) each."""
+    seen = ~residual.isnan().any(2)
+    patterns, index = torch.unique(seen, dim=0, return_inverse=True)
+    pairs = []
+    for number, pattern in enumerate(patterns):
+        if bool(pattern.any()):
+            rows = residual[index == number][:, pattern]
+            pairs.append((pattern, rows.permute(1, 0, 2).reshape(int(pattern.sum()), -1)))
+    return pairs
+
+
+def _unit_rms(residual: Tensor) -> Tensor:
+    return residual / residual.square().nanmean().sqrt()
+
+
+def _interpolated(grid: Float[Tensor, " T"], values: Float[Tensor, "T c"], time: Float[Tensor, " n"]) -> Tensor:
+    """Values at other times, linear between steps and constant beyond them."""
+    right = torch.searchsorted(grid, time.contiguous()).clamp(1, len(grid) - 1)
+    weight = ((time - grid[right - 1]) / (grid[right] - grid[right - 1])).clamp(0.0, 1.0)[:, None]
+    return torch.lerp(values[right - 1], values[right], weight)

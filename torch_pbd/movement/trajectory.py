@@ -1,0 +1,256 @@
+"""The joint law of a demonstration, on top of any covariance regressor."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+from sklearn.base import clone
+from torch import Tensor, nn
+
+from torch_pbd import checks
+from torch_pbd.estimators.base import Uncertainty
+from torch_pbd.estimators.demonstrations import fit_with_groups
+from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
+from torch_pbd.estimators.validation import Floats
+from torch_pbd.kernels import KERNELS, KernelName
+from torch_pbd.linalg import safe_cholesky
+from torch_pbd.movement.base import MovementRegressor, Recording
+from torch_pbd.movement.conditioning import Conditioned
+from torch_pbd.movement.joint import JointNormal
+from torch_pbd.movement.time_kernel import TimeKernel, fit_time_kernel
+
+# Steps on which the correlation is learned: the nuggets' iterations are cubic in them, and movements are smooth.
+_MOST_STEPS = 200
+_FEWEST_DF, _MOST_DF = 3.0, 200.0  # of the joint law: a variance must exist, and beyond it is normal to all purposes
+_GAP = 2.0  # sample spacings of a recording: a step farther than that from its samples was not seen in it
+
+
+class TrajectoryLaw(nn.Module):
+    """Joint law of a movement, as a torch module: differentiable in the times.
+
+    With marginals of mean m_t and covariance ``C_t = L_t L_t'``, the correlation R of the time kernel and the residuals
+    z_k of K demonstrations, the covariance is ``Sigma = A S A'``, ``S = w R kron I + (1 - w) / K sum_k z_k z_k'`` and
+    ``A_t = L_t chol(S_tt)^-1``: its blocks ``Sigma_tt`` are the marginals' C_t.
+    """
+
+    grid: Tensor
+    nugget: Tensor
+    residual: Tensor
+    length_scale: Tensor
+    share: Tensor
+    x_shift: Tensor
+    x_scale: Tensor
+
+    def __init__(self, marginals: nn.Module | None, time_kernel: TimeKernel, x_shift: float, x_scale: float) -> None:
+        super().__init__()
+        self.marginals = marginals
+        self.kernel: KernelName = time_kernel.kernel
+        for name in ("grid", "nugget", "residual"):
+            self.register_buffer(name, getattr(time_kernel, name))
+        for name, value in (
+            ("length_scale", time_kernel.length_scale),
+            ("share", time_kernel.share),
+            ("x_shift", x_shift),
+            ("x_scale", x_scale),
+        ):
+            self.register_buffer(name, torch.tensor(value, dtype=torch.float64))
+
+    def forward(self, x: Float[Tensor, "n 1"]) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d n d"]]:
+        """Joint mean and covariance at times that are all different."""
+        if self.marginals is None:
+            raise TypeError("module_ of a regressor that is no torch module has no marginals: use predict_joint.")
+        law = self.joint(x[:, 0], *self.marginals.moments(x))  # type: ignore[operator]
+        return law.mean, law.covariance()
+
+    def joint(
+        self, x: Float[Tensor, " n"], mean: Float[Tensor, "n d"], covariance: Float[Tensor, "n d d"]
+    ) -> JointNormal:
+        """Joint law at times that are all different, of these marginals."""
+        kernel = self.time_kernel()
+        time = (x - self.x_shift) / self.x_scale
+        correlation = self.share * kernel.correlation(time)
+        loadings = ((1.0 - self.share) / len(self.residual)).sqrt() * kernel.loadings(time)
+        own = loadings @ loadings.mT + self.share * torch.eye(mean.shape[1]).to(mean)
+        root = safe_cholesky(covariance, name="the covariance at a step")
+        factor = torch.linalg.solve_triangular(torch.linalg.cholesky(own), root, upper=False, left=False)
+        return JointNormal(mean, factor, correlation, loadings, loadings[:, :, :0])
+
+    def time_kernel(self) -> TimeKernel:
+        """Correlation along the movement, in ranges of the time."""
+        return TimeKernel(
+            self.grid, self.kernel, float(self.length_scale), self.nugget, float(self.share), self.residual
+        )
+
+
+class TrajectoryRegressor(MovementRegressor):
+    """Law of a whole demonstration: the marginals of a covariance regressor, and a correlation along the movement.
+
+    Marginals stay the regressor's. Demonstrations are smooth: what one deviates by now it deviates by soon after. The
+    correlation is a stationary kernel of time with a nugget at each step, shrunk towards that of the demonstrations
+    themselves. The law is one Student's t, with one chi-squared a movement, for draws and scores; it is conditioned by
+    the normal formulas. No matrix of all steps and outputs is formed but for :meth:`predict_joint`.
+
+    Parameters
+    ----------
+    regressor : covariance regressor or None, default=None
+        Cloned into ``regressor_``; None is ``HeteroscedasticGPRegressor()``. Its X has one column, time or phase.
+    time_kernel : {"auto", "squared_exponential", "matern32", "matern52"}, default="auto"
+        "auto" takes the likeliest.
+    shrinkage : float or "auto", default="auto"
+        Weight of the demonstrations' own correlation, 0 to 0.95; "auto" takes that under which demonstrations left
+        out in turn are likeliest.
+    timing : {"none"}, default="none"
+        The phase of a movement is taken for known.
+    random_state : int, RandomState instance or None, default=0
+        Not used: the fit is deterministic where the regressor's is. It is here so that models can be exchanged.
+
+    Attributes
+    ----------
+    regressor_ : covariance regressor
+        As fitted to the rows.
+    module_ : TrajectoryLaw
+        The fitted torch module: maps times (n, 1) to joint mean (n, d) and covariance (n, d, n, d), differentiably.
+    time_kernel_ : str
+    length_scale_ : float
+        Of the correlation along the movement, in units of X.
+    nugget_scale_ : ndarray of shape (n_steps,)
+        Standard deviation of the independent part of each step of the fit's grid, whose smooth part has 1.
+    shrinkage_ : float
+    df_ : float
+        Degrees of freedom of the joint law, the median of the regressor's, 3 to 200.
+    input_ : {"time", "phase", "array"}
+    n_features_in_, n_outputs_ : int
+
+    Examples
+    --------
+    >>> from torch_pbd.data import make_tunnel_demonstrations
+    >>> from torch_pbd.movement import TrajectoryRegressor
+    >>> demonstrations = make_tunnel_demonstrations(random_state=0).resample(50)
+    >>> model = TrajectoryRegressor().fit(demonstrations)
+    >>> via = model.condition([[5.0]], [[0.01, 0.3]])
+    >>> via.sample_demonstrations([[0.0], [5.0], [10.0]], n_samples=4, random_state=0).shape
+    (4, 3, 2)
+    """
+
+    module_: TrajectoryLaw
+
+    def __init__(
+        self,
+        regressor: Any = None,
+        *,
+        time_kernel: str = "auto",
+        shrinkage: float | str = "auto",
+        timing: str = "none",
+        random_state: Any = 0,
+    ) -> None:
+        self.regressor = regressor
+        self.time_kernel = time_kernel
+        self.shrinkage = shrinkage
+        self.timing = timing
+        self.random_state = random_state
+
+    def _check_parameters(self) -> None:
+        checks.choice(self.time_kernel, "time_kernel", ("auto", *KERNELS))
+        if self.shrinkage != "auto":
+            checks.number(self.shrinkage, "shrinkage", least=0.0, most=0.95)
+        checks.choice(self.timing, "timing", ("none",))
+        checks.seed(self.random_state)
+        if self.regressor is not None and (
+            isinstance(self.regressor, type) or not hasattr(self.regressor, "predict_cov")
+        ):
+            raise checks.refusal(self.regressor, "regressor", "a covariance regressor or None")
+
+    def _fit(self, recordings: list[Recording]) -> None:
+        for number, recording in enumerate(recordings):
+            if len(recording.time) < 2 or not (np.diff(recording.time) > 0.0).all():
+                raise ValueError(
+                    f"X has a time twice in demonstration {number}, or fewer than two: its samples must be in a row."
+                )
+        X = np.concatenate([recording.time for recording in recordings])[:, np.newaxis]
+        y = np.concatenate([recording.position for recording in recordings])
+        groups = np.repeat(np.arange(len(recordings)), [len(recording.time) for recording in recordings])
+        regressor = HeteroscedasticGPRegressor() if self.regressor is None else clone(self.regressor)
+        self.regressor_ = fit_with_groups(regressor, X, y.ravel() if self._y_is_1d else y, groups)
+
+        low, high = float(X.min()), float(X.max())
+        n_steps = min(_MOST_STEPS, round(float(np.median(np.bincount(groups)))))
+        grid = np.linspace(low, high, max(2, n_steps))
+        mean, covariance = self._regressor_marginals(grid)
+        residual = np.stack([_sampled(recording, grid) for recording in recordings]) - mean
+        whitened = np.linalg.solve(np.linalg.cholesky(covariance), residual[..., np.newaxis])[..., 0]
+        kernel = None if self.time_kernel == "auto" else self.time_kernel
+        share = None if self.shrinkage == "auto" else 1.0 - float(self.shrinkage)
+        scaled = torch.from_numpy((grid - low) / (high - low))
+        found = fit_time_kernel(scaled, torch.from_numpy(whitened), kernel, share)  # type: ignore[arg-type]
+        self.module_ = TrajectoryLaw(getattr(self.regressor_, "module_", None), found, low, high - low)
+        self.module_.requires_grad_(False)
+        degrees = self.regressor_.predict_df(grid[:, np.newaxis])
+        self.df_ = float(np.clip(np.median(degrees), _FEWEST_DF, _MOST_DF))
+        self.time_kernel_, self.length_scale_ = found.kernel, found.length_scale * (high - low)
+        self.nugget_scale_, self.shrinkage_ = np.sqrt(found.nugget.numpy()), 1.0 - found.share
+
+    def predict(self, X: ArrayLike, *, return_std: bool = False, return_cov: bool = False) -> Any:
+        """As the regressor predicts; given what is known, the mean and covariance of the rest of the movement."""
+        if self._known is None:
+            self._times(X)
+            return self.regressor_.predict(X, return_std=return_std, return_cov=return_cov)
+        return super().predict(X, return_std=return_std, return_cov=return_cov)
+
+    def predict_df(self, X: ArrayLike) -> Floats:
+        """Degrees of freedom of the marginals; given what is known, of the joint law."""
+        return self.regressor_.predict_df(X) if self._known is None else super().predict_df(X)
+
+    def predict_uncertainty(self, X: ArrayLike) -> Uncertainty:
+        """Both kinds of uncertainty at X, apart (Section IV-C).
+
+        Missing data are where they are for the regressor, whatever is known of this movement; ``type2`` is the
+        variability that what is known leaves.
+        """
+        time = self._times(X)
+        own = self.regressor_.predict_uncertainty(time[:, np.newaxis])
+        if self._known is None:
+            return Uncertainty(*own)
+        union, rows, places = self._union(time, self._known)
+        mean, type2 = self._regressor_marginals(union)[0], self.regressor_.predict_uncertainty(union[:, None]).type2
+        law = Conditioned(self._joint(union, mean, type2), self._observed(places)).law
+        return Uncertainty(own.type1, law.marginal()[torch.from_numpy(rows)].numpy())
+
+    def log_likelihood(self, X: ArrayLike, y: ArrayLike) -> Floats:
+        """Log density of each row of y at X, by itself, in nats: (n_samples,)."""
+        return self.regressor_.log_likelihood(X, y) if self._known is None else super().log_likelihood(X, y)
+
+    def sample_y(self, X: ArrayLike, n_samples: int = 1, random_state: Any = None) -> Floats:
+        """Draw y at X, independently for each row; whole movements are drawn by :meth:`sample_demonstrations`."""
+        if self._known is None:
+            return self.regressor_.sample_y(X, n_samples, random_state)
+        return super().sample_y(X, n_samples, random_state)
+
+    def _scaled(self, time: Floats) -> Floats:
+        return np.asarray((time - float(self.module_.x_shift)) / float(self.module_.x_scale))
+
+    def _prior(self, time: Floats) -> JointNormal:
+        mean, covariance = self._regressor_marginals(time)
+        return self._joint(time, mean, covariance)
+
+    def _joint(self, time: Floats, mean: Floats, covariance: Floats) -> JointNormal:
+        with torch.inference_mode():
+            return self.module_.joint(*map(torch.from_numpy, (time, mean, covariance)))
+
+    def _marginals(self, time: Floats) -> tuple[Floats, Floats]:
+        return self._regressor_marginals(time) if self._known is None else super()._marginals(time)
+
+    def _regressor_marginals(self, time: Floats) -> tuple[Floats, Floats]:
+        mean, covariance = self.regressor_.predict(time[:, np.newaxis], return_cov=True)
+        return np.ascontiguousarray(mean.reshape(len(time), -1)), np.ascontiguousarray(covariance)
+
+
+def _sampled(recording: Recording, grid: Floats) -> Floats:
+    """Positions of a recording at the steps of a grid, linear between samples; NaN where it has no sample near."""
+    time, position = recording
+    columns = [np.interp(grid, time, column) for column in position.T]
+    right = np.clip(np.searchsorted(time, grid), 1, len(time) - 1)
+    nearest = np.minimum(np.abs(grid - time[right - 1]), np.abs(time[right] - grid))
+    seen = nearest <= _GAP * np.median(np.diff(time))
+    return np.where(seen[:, np.newaxis], np.stack(columns, axis=1), np.nan)
