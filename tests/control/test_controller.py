@@ -274,7 +274,7 @@ def test_a_cutoff_that_takes_the_movement_away_is_told_of(tunnel):
 
 
 @pytest.mark.parametrize(
-    ("options", "message"), [({"goal": [np.nan, 0.0]}, "goal has a value"), ({"speed": np.inf}, "speed has a value")]
+    ("options", "message"), [({"goal": [np.nan, 0.0]}, r"goal\[0\] is nan"), ({"speed": np.inf}, "speed is inf")]
 )
 def test_what_cannot_be_reproduced_is_refused(controller, options, message):
     with pytest.raises(ValueError, match=message):
@@ -306,16 +306,16 @@ def test_simulation_follows_the_schedule_and_takes_any_plant(controller):
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
-        ({"alpha": 0.0}, "alpha is 0, must be positive"),
-        ({"beta": -1.0}, "beta is -1, must be positive"),
+        ({"alpha": 0.0}, "alpha is 0.0, must be a finite number above 0"),
+        ({"beta": -1.0}, "beta is -1.0, must be a finite number above 0"),
         ({"tau": 0.0}, "tau is 0"),
         ({"phase_input": "phase"}, "phase_input is 'phase', must be one of 'time', 'log_s', 's'"),
         ({"variability": "velocity"}, "variability is 'velocity'"),
         ({"on_unknown": "stiff"}, "on_unknown is 'stiff'"),
         ({"gate": "open"}, "gate is 'open'"),
-        ({"cutoff": -3.0}, "cutoff is -3, must be positive"),
+        ({"cutoff": -3.0}, "cutoff is -3.0 Hz, must be a finite number above 0"),
         ({"n_steps": 2}, "n_steps is 2"),
-        ({"mass": 0.0}, "mass is 0 kg"),
+        ({"mass": 0.0}, "mass is 0.0 kg"),
         ({"damping_ratio": -1.0}, "damping_ratio is -1"),
     ],
 )

@@ -270,13 +270,13 @@ STILL = torch.zeros(5, 2).double()
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"dt": 0.0}, "dt is 0 s"),
+        ({"dt": 0.0}, "dt is 0.0 s"),
         ({"dt": math.nan}, "dt is nan"),
         ({"speed": tensor(1.0, 1.0, -0.1, 1.0, 1.0)}, "speed"),
         ({"speed": tensor(1.0, 1.0, math.nan, 1.0, 1.0)}, "speed"),
         ({"speed": torch.zeros(5), "velocity0": torch.ones(2).double()}, "velocity0"),
-        ({"goal": torch.zeros(3).double()}, "goal is of 3 outputs"),
-        ({"goal": torch.zeros(4, 2).double()}, "goal is of 2 outputs and 4 ticks"),
+        ({"goal": torch.zeros(3).double()}, "'goal': (1, 3)"),
+        ({"goal": torch.zeros(4, 2).double()}, "'goal': (4, 2)"),
         ({"forcing": lambda time: time[:, None]}, "n_steps is None"),
     ],
 )

@@ -7,7 +7,7 @@ if TYPE_CHECKING:
     from torch_pbd.control.controller import DMPController
     from torch_pbd.control.damping import damping_from_stiffness, required_damping_ratio
     from torch_pbd.control.primitive.dmp import DMP
-    from torch_pbd.control.primitive.motion_limits import MotionLimits
+    from torch_pbd.control.primitive.units import MotionLimits
     from torch_pbd.control.realtime import RealTimeAdmittance, TickStatus
     from torch_pbd.control.schedule.schedule import Schedule
     from torch_pbd.control.simulation.filters import EnergyTank, RateLimit
@@ -29,7 +29,7 @@ _HOMES = {
     "DMPController": "controller",
     "EnergyTank": "simulation.filters",
     "ForceSensor": "simulation.sensor",
-    "MotionLimits": "primitive.motion_limits",
+    "MotionLimits": "primitive.units",
     "PositionLoop": "simulation.position_loop",
     "RateLimit": "simulation.filters",
     "RealTimeAdmittance": "realtime",

@@ -7,57 +7,36 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.base import BaseEstimator
 from sklearn.utils.validation import check_is_fitted
 
-from torch_pbd.control.impedance import Gains, Impedance, OnUnknown
-from torch_pbd.control.matrices import check_count, check_positive
-from torch_pbd.control.parameters import (
-    Goals,
-    PhaseInput,
-    Variability,
-    as_demonstrations,
-    as_movement_times,
-    as_places,
-    as_speed,
-    as_tick_times,
-    as_times,
-    check_against_duration,
-    check_parameters,
-    check_steps,
-    check_task,
-)
+from torch_pbd import checks
+from torch_pbd.control import parameters
+from torch_pbd.control.impedance import Impedance, OnUnknown, fit_covariance, fit_law
+from torch_pbd.control.primitive import units
 from torch_pbd.control.primitive.adaptation import Adaptation
 from torch_pbd.control.primitive.coverage import UNKNOWN, merge_bursts, tabulate_unsampled
 from torch_pbd.control.primitive.dmp import Gate
-from torch_pbd.control.primitive.motion_limits import MotionLimits, check_motion, counts_as_metres
 from torch_pbd.control.primitive.reproduction import Reproduction, primitive
 from torch_pbd.control.primitive.smoothing import Movements, automatic_cutoff, noise_like, smooth, variance_share
-from torch_pbd.control.primitive.units import common_start, duration_of, in_metres, in_seconds
-from torch_pbd.control.provenance import schedule_labels
+from torch_pbd.control.primitive.units import MotionLimits
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.plant import AdmittancePlant
 from torch_pbd.control.simulation.rollout import Rollout
 from torch_pbd.control.simulation.run import simulate_schedule
 from torch_pbd.control.stiffness import StiffnessLaw
-from torch_pbd.control.variability import fit_covariance, fit_law, with_holes
 from torch_pbd.data import Demonstrations
 from torch_pbd.estimators.base import CovarianceRegressor
 
 Floats = NDArray[np.float64]
 
-_FAR = 1e6  # ranges of the input: only the prior speaks there
 _LIMITS = MotionLimits()
-_AT_ONCE = 2**14  # times whose gains are computed together
 
 
 class DMPController(BaseEstimator):
     """Learn a movement and its variability from demonstrations, and how stiffly to follow it.
 
-    The mean movement is reproduced by a dynamic movement primitive, eq. (16) to (18), whose forcing is the mean of
-    a Gaussian process; a covariance regressor learns the variability; its principal axes get their stiffness
-    by eq. (19) and (20), and their damping from it.
-
-    Demonstrations may be of any lengths and sampling times: each is smoothed at its true times, and stretched
-    linearly to the median duration. Its first and last sample are the start and the end of the movement, whatever
-    their times: one that was cut short is stretched too. Where fewer than two have samples, nothing is known.
+    A dynamic movement primitive, eq. (16) to (18), whose forcing is the mean of a Gaussian process, reproduces the mean
+    movement; a covariance regressor learns the variability, whose principal axes get stiffness by eq. (19) and (20),
+    and damping from it. Demonstrations may be of any lengths and sampling times: each is smoothed at its true times,
+    and stretched linearly, from its first to its last sample, to the median duration: one that was cut short too.
 
     Parameters
     ----------
@@ -72,7 +51,7 @@ class DMPController(BaseEstimator):
         How the forcing ends after an "additive" movement, so that it comes to rest at the goal; "none" is the paper's.
         A "safe" one is over with its duration, see :meth:`schedule`.
     phase_input : {"time", "log_s", "s"}, default="time"
-        What the regressors see: movement time, or the phase s of eq. (17) or its logarithm, which is time in
+        Input of the regressors: movement time, or the phase s of eq. (17) or its logarithm, which is time in
         other units. "s" is the paper's; scripts/benchmarks/phase_input.py compares them.
     variability : {"position", "forcing"}, default="position"
         Covariance of what becomes stiffness: of positions, in their units; or of the forcing, which the paper
@@ -87,16 +66,15 @@ class DMPController(BaseEstimator):
     n_steps : int, default=100
         Points of a movement at which forcing and variability are learned.
     stiffness_law : StiffnessLaw, default=None
-        None is ``StiffnessLaw()``: 50 to 1000 N/m between the 10 % and 90 % quantiles of the standard deviations
-        along the movement.
+        None is ``StiffnessLaw()``: 50 to 1000 N/m between quantiles of the standard deviations along the movement.
     mass : float, default=1.0
         Virtual mass of the admittance, kg.
     damping_ratio : float or "paper", default=1.0
         See :func:`~torch_pbd.control.damping_from_stiffness`.
     on_unknown : {"soft", "prior", "raise"}, default="soft"
-        Where data are missing (Type I uncertainty u): "soft" takes the share u of the way to the least
-        stiffness; "prior" trusts the covariance there, which is the regressor's prior; "raise" raises where u
-        is above 0.5. Separate from variability (Type II), which people showed.
+        Where data are missing, fewer than two demonstrations having samples near (Type I uncertainty u): "soft" takes
+        the share u of the way to the least stiffness; "prior" trusts the covariance there, the regressor's prior;
+        "raise" raises where u is above 0.5. Separate from variability (Type II), which people showed.
 
     Attributes
     ----------
@@ -105,12 +83,10 @@ class DMPController(BaseEstimator):
     dmp_, law_ : DMP, StiffnessLaw
         With the duration, and the bounds, of this movement.
     duration_, start_time_, time_scale_ : float
-        Of the movement, in s; time at which all demonstrations start, 0 where they differ; seconds of movement in
-        one unit of their time.
+        Of the movement, in s; time at which all demonstrations start, 0 where they differ; s in a unit of their time.
     start_, goal_ : ndarray of shape (d,)
     noise_scale_, noise_share_ : ndarray of shape (d,)
-        Root mean square of what the smoothing took away; and, were that white noise, the share of the variance
-        that its rest behind the smoothing makes.
+        Root mean square of what the smoothing took away; share of the variance that white noise as large would make.
     unsampled_ : ndarray of shape (m,)
         Type I uncertainty of the recordings' times, at evenly spaced times of the movement: 0 up to 2.5 spacings from
         a sample, 1 from five (a 40th of the movement at least), in the recording that knows second most.
@@ -136,9 +112,9 @@ class DMPController(BaseEstimator):
         tau: float = 1.0,
         adaptation: Adaptation = "safe",
         gate: Gate = "time",
-        phase_input: PhaseInput = "time",
-        variability: Variability = "position",
-        goal: Goals = "common",
+        phase_input: parameters.PhaseInput = "time",
+        variability: parameters.Variability = "position",
+        goal: parameters.Goals = "common",
         cutoff: float | Literal["auto"] | None = "auto",
         duration: float | None = None,
         n_steps: int = 100,
@@ -179,10 +155,6 @@ class DMPController(BaseEstimator):
         groups : array-like of shape (n_samples,), default=None
             Demonstration of each sample.
 
-        Returns
-        -------
-        self
-
         Raises
         ------
         ValueError
@@ -195,36 +167,42 @@ class DMPController(BaseEstimator):
             Of samples that were merged, as their times are too close; of holes, with their times.
         """
         self.__dict__.pop("_impedance", None)  # a fit that fails leaves no mixture of two
-        check_parameters(self)
-        demonstrations = merge_bursts(as_demonstrations(X, y, groups))
-        labels = (demonstrations.names, demonstrations.frame, demonstrations.units, demonstrations.time_unit)
-        self.names_, self.frame_, self.units_, self.time_unit_ = labels
-        self.n_demos_, self.n_outputs_ = len(demonstrations), demonstrations.n_outputs
-        self.duration_, self.time_scale_ = duration_of(demonstrations, self.duration)
-        self.start_time_ = common_start(demonstrations)
-        knows_seconds = in_seconds(self.time_unit_) is not None
-        automatic = automatic_cutoff(self.duration_, knows_seconds=knows_seconds)
-        self.cutoff_ = automatic if self.cutoff == "auto" else self.cutoff
+        parameters.check_parameters(self)
+        # 1. Recordings. Samples whose times are one are merged; the table of holes is Type I uncertainty.
+        shown = merge_bursts(parameters.as_demonstrations(X, y, groups))
+        self.names_, self.frame_, self.units_, self.time_unit_ = shown.names, shown.frame, shown.units, shown.time_unit
+        self.n_demos_, self.n_outputs_ = len(shown), shown.n_outputs
+        self.duration_, self.time_scale_ = units.duration_of(shown, self.duration)
+        self.start_time_ = units.common_start(shown)
+        seconds = units.in_seconds(self.time_unit_) is not None
+        self.cutoff_ = automatic_cutoff(self.duration_, knows_seconds=seconds) if self.cutoff == "auto" else self.cutoff
         self.dmp_ = primitive(self)
-        check_against_duration(self)
-        check_steps(self.n_steps, self.n_demos_, self.n_outputs_, learned=True)
-        self.unsampled_ = tabulate_unsampled(demonstrations, self.duration_ / self.time_scale_, self.on_unknown)
-        movements = self.smooth(demonstrations)
+        parameters.check_against_duration(self)
+        parameters.check_steps(self.n_steps, self.n_demos_, self.n_outputs_, learned=True)
+        self.unsampled_ = tabulate_unsampled(shown, self.duration_ / self.time_scale_, self.on_unknown)
+        # 2. Smoothing. Splines at the true times give positions, velocities and accelerations at common times.
+        movements = smooth(shown, self.cutoff_, self.n_steps, self.duration_)
+        # 3. Mean movement. Eq. (16) is driven by the mean over demonstrations of the forcing of eq. (18), through which
+        # goes a Gaussian process, eq. (5), over the phase of eq. (17) or another input that is a function of time.
         self.reproduction_ = Reproduction.learn(self.dmp_, movements, self.phase_input, own_goals=self.goal == "each")
         self.start_, self.goal_ = self.reproduction_.start, self.reproduction_.goal
         self.reproduction_error_ = self.reproduction_.check_against(movements)
-        if knows_seconds and counts_as_metres(self.units_):
-            self.reproduction_.check_ends(in_metres(self.units_))
-        varying = self.varying(movements)
-        self.covariance_ = fit_covariance(self.covariance, self.phase(movements.time), varying, movements.known)
+        if seconds and units.counts_as_metres(self.units_):
+            self.reproduction_.warn_if_cut(units.in_metres(self.units_))
+        # 4. Variability. The regressor learns the covariance over the same input, of positions or of the forcing.
+        varying, phase = self.varying(movements), self.reproduction_.phase
+        self.covariance_ = fit_covariance(self.covariance, phase(movements.time), varying, movements.known)
+        # White noise as large as what the smoothing took away, smoothed: its share of the variance is no variability.
         self.noise_scale_ = movements.noise_scale
-        noise = smooth(
-            noise_like(demonstrations, movements.noise_scale), self.cutoff_, self.n_steps, self.duration_, noise=True
-        )
-        self.noise_share_ = variance_share(self.varying(noise), varying)
+        noise = noise_like(shown, self.noise_scale_)
+        smoothed = smooth(noise, self.cutoff_, self.n_steps, self.duration_, noise=True)
+        self.noise_share_ = variance_share(self.varying(smoothed), varying)
+        # 5. Gains. The bounds of eq. (20) are quantiles of the deviations where there are samples; eq. (19) then gives
+        # each principal axis its stiffness, and the damping follows from stiffness and mass.
         known = np.linspace(0.0, self.duration_, len(self.unsampled_))[self.unsampled_ <= UNKNOWN]
-        self.law_ = fit_law(self.stiffness_law, self.covariance_.predict_cov(self.phase(known[::4])), varying)
-        self._impedance = Impedance(self.law_, float(self.mass), self.damping_ratio, self.on_unknown)
+        self.law_ = fit_law(self.stiffness_law, self.covariance_.predict_cov(phase(known[::4])), varying)
+        over = (self.covariance_, phase, self.duration_, self.unsampled_, self.law_)
+        self._impedance = Impedance(*over, float(self.mass), self.damping_ratio, self.on_unknown)
         return self
 
     def predict(self, X: ArrayLike) -> Floats:
@@ -237,11 +215,13 @@ class DMPController(BaseEstimator):
 
     def predict_stiffness(self, X: ArrayLike) -> Floats:
         """Stiffness (n, d, d) in N/m (force per unit of position) at times X (n, 1)."""
-        return self._gains_at(self._movement_time(X)).stiffness
+        time = self._movement_time(X)
+        return self._impedance(time).stiffness
 
     def predict_damping(self, X: ArrayLike) -> Floats:
         """Damping (n, d, d) in N s/m at times X (n, 1)."""
-        return self._gains_at(self._movement_time(X)).damping
+        time = self._movement_time(X)
+        return self._impedance(time).damping
 
     def schedule(
         self,
@@ -260,7 +240,7 @@ class DMPController(BaseEstimator):
         Parameters
         ----------
         rate : float, default=1000.0
-            In Hz; the last row is at the end, and may follow sooner.
+            In Hz; the last row is at the end, ``duration_ / speed + settle``, and may follow sooner.
         settle : float, default=0.0
             How long to go on after the movement, in s: it then comes to rest at the goal. One that was cut while moving
             brakes on its own path, half before its end and half after. Of what comes after it nothing was shown, so
@@ -273,29 +253,24 @@ class DMPController(BaseEstimator):
             What no robot does, default 600 s, 10 m, 10 m/s; None is no limits. They hold for recordings in units of
             length, and such without units.
 
-        Returns
-        -------
-        Schedule
-            From 0, the start of the movement, to ``duration_ / speed + settle``.
-
         Raises
         ------
         ValueError
             If there are less than two ticks, they do not fit in memory, or the motion is beyond ``limits``.
         """
         check_is_fitted(self)
-        check_positive("speed", speed)
-        told = self.units_, self.time_unit_
-        check_motion(limits, *told, duration=self.duration_ / speed)
-        time = as_tick_times(self.duration_ / speed, rate, settle, self.n_outputs_)
-        position, velocity, moved = self._planned(time, goal, start, float(speed))
-        metres = in_metres(self.units_)
+        speed = checks.number(speed, "speed", above=0.0)
+        recorded = self.units_, self.time_unit_
+        units.check_motion(limits, *recorded, duration=self.duration_ / speed)
+        time = parameters.as_tick_times(self.duration_ / speed, rate, settle, self.n_outputs_)
+        position, velocity, moved = self.reproduction_.plan(time, goal, start, speed)
+        metres = units.in_metres(self.units_)
         distance = metres * float(np.linalg.norm(np.ptp(position, axis=0)))
         fastest = metres * float(np.linalg.norm(velocity, axis=1).max())
-        check_motion(limits, *told, distance=distance, speed=fastest)
-        gains = self._gains_at(moved)
+        units.check_motion(limits, *recorded, distance=distance, speed=fastest)
+        gains = self._impedance(moved)
         rows = (time, metres * position, metres * velocity, gains.stiffness, gains.damping)
-        return Schedule(*rows, metres**2 * gains.covariance, gains.type1, **schedule_labels(self))
+        return Schedule(*rows, metres**2 * gains.covariance, gains.type1, **parameters.schedule_labels(self))
 
     def simulate(
         self,
@@ -310,28 +285,13 @@ class DMPController(BaseEstimator):
         Parameters
         ----------
         plant : AdmittancePlant, default=None
-            None is ``AdmittancePlant(mass)`` with the mass of this controller.
+            None is ``AdmittancePlant(mass)`` with the mass of this controller; a warning tells of another mass.
         force : array-like of shape (T, d), default=None
-            External force in N at the schedule's ticks; None is none.
+            External force in N, one row for each of the schedule's ticks; None is none.
         rate : float, default=1000.0
             Of the ticks, Hz. The last one, which may be later than the end of the movement, follows its last row.
         random_state : int, RandomState or None, default=None
             Of the noise of the plant's sensor.
-
-        Returns
-        -------
-        Rollout
-            NumPy arrays.
-
-        Warns
-        -----
-        UserWarning
-            If the plant's mass is not that which the damping was computed for.
-
-        Raises
-        ------
-        ValueError
-            If the force has not one row for each tick.
         """
         schedule = self.schedule(rate)
         return simulate_schedule(schedule, plant, force, rate, random_state)
@@ -360,28 +320,30 @@ class DMPController(BaseEstimator):
             How fast movement time passes, at each tick if it changes; it should change smoothly.
         """
         check_is_fitted(self)
-        paces = as_speed(1.0 if speed is None else speed)
-        time = as_tick_times(self.duration_, rate, settle, self.n_outputs_, len(paces) if paces.ndim else None)
-        return time, *self._planned(time, goal, start, paces)[:2]
+        paces = parameters.as_speed(1.0 if speed is None else speed)
+        time = parameters.as_tick_times(
+            self.duration_, rate, settle, self.n_outputs_, len(paces) if paces.ndim else None
+        )
+        return time, *self.reproduction_.plan(time, goal, start, paces)[:2]
 
     def phase(self, time: ArrayLike) -> Floats:
         """Inputs (n, 1) of ``covariance_`` at movement times (n,), which start at 0: what ``phase_input`` says."""
-        check_is_fitted(self, "reproduction_")
-        return self.reproduction_.phase(as_movement_times(time))
+        check_is_fitted(self)
+        return self.reproduction_.phase(checks.array(time, "time", ("n",)))
 
     def smooth(self, demonstrations: Demonstrations, n_steps: int | None = None) -> Movements:
         """Demonstrations of this task as the controller sees them, smoothed and stretched to ``duration_``."""
-        check_task(demonstrations, getattr(self, "n_outputs_", None))
-        if n_steps is not None:
-            check_count("n_steps", n_steps, 2)
-            check_steps(n_steps, len(demonstrations), demonstrations.n_outputs, learned=False)
-        n_steps = self.n_steps if n_steps is None else n_steps
+        check_is_fitted(self)
+        checks.instance(demonstrations, "demonstrations", Demonstrations)
+        if demonstrations.n_outputs != self.n_outputs_:
+            raise ValueError(f"n_outputs of demonstrations is {demonstrations.n_outputs}, must be {self.n_outputs_}.")
+        n_steps = self.n_steps if n_steps is None else checks.count(n_steps, "n_steps", least=2)
+        parameters.check_steps(n_steps, len(demonstrations), self.n_outputs_, learned=False)
         return smooth(merge_bursts(demonstrations), self.cutoff_, n_steps, self.duration_)
 
     def varying(self, movements: Movements) -> Floats:
-        """What ``variability`` is of, (K, n, d), in smoothed movements of the same task."""
-        if not isinstance(movements, Movements):
-            raise ValueError(f"movements is {type(movements).__name__}, must be what smooth(demonstrations) returns.")
+        """Positions or forcings (K, n, d) of smoothed movements of the same task, by ``variability``."""
+        checks.instance(movements, "movements", Movements, remedy="give what smooth(demonstrations) returns")
         return movements.position if self.variability == "position" else self.reproduction_.forcing_of(movements)
 
     def __sklearn_is_fitted__(self) -> bool:
@@ -389,25 +351,4 @@ class DMPController(BaseEstimator):
 
     def _movement_time(self, X: ArrayLike) -> Floats:
         check_is_fitted(self)
-        return self.time_scale_ * (as_times(X) - self.start_time_)
-
-    def _planned(
-        self, time: Floats, goal: ArrayLike | None, start: ArrayLike | None, speed: float | Floats
-    ) -> tuple[Floats, Floats, Floats]:
-        goal = None if goal is None else as_places(goal, "goal", self.n_outputs_, len(time))
-        start = None if start is None else as_places(start, "start", self.n_outputs_)
-        return self.reproduction_.plan(time, goal=goal, start=start, speed=speed)
-
-    def _gains_at(self, time: Floats) -> Gains:
-        # In parts: a regressor may need a hundred times the memory of what it predicts.
-        parts = [self._gains_of(part) for part in np.split(time, range(_AT_ONCE, len(time), _AT_ONCE))]
-        return Gains(*map(np.concatenate, zip(*parts, strict=True)))
-
-    def _gains_of(self, time: Floats) -> Gains:
-        start, end = self.phase([0.0, self.duration_])
-        hole = np.interp(time, np.linspace(0.0, self.duration_, len(self.unsampled_)), self.unsampled_)
-        parts = with_holes(self.covariance_, self.phase(time), hole, (end + _FAR * (end - start))[np.newaxis])
-        # Softness counts the hole already; the wide prior would count it again.
-        known, covariance, type1 = parts
-        gains = self._impedance(known if self.on_unknown == "soft" else covariance, type1, time)
-        return gains._replace(covariance=covariance)
+        return self.time_scale_ * (parameters.as_times(X) - self.start_time_)

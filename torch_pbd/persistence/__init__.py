@@ -239,7 +239,8 @@ def _restore_controller(controller: Any, description: dict[str, Any], arrays: Ar
     phase, time = Phase(dmp, controller.phase_input), np.linspace(0.0, controller.duration_, len(own["forcing"]))
     controller.reproduction_ = Reproduction(dmp, phase, controller.goal == "each", time=time, **own)
     controller.start_, controller.goal_ = own["start"], own["goal"]
-    controller._impedance = Impedance(controller.law_, controller.mass, controller.damping_ratio, controller.on_unknown)
+    over = (controller.covariance_, phase, controller.duration_, controller.unsampled_, controller.law_)
+    controller._impedance = Impedance(*over, controller.mass, controller.damping_ratio, controller.on_unknown)
 
 
 def _check_movement(arrays: Arrays, n_outputs: int) -> None:

@@ -17,8 +17,8 @@ _QUINTICS = [
     [[0.0, -60.0, 180.0, -120.0, 0.0, 0.0], [0.0, -36.0, 96.0, -60.0, 0.0, 0.0], [1.0, -9.0, 18.0, -10.0, 0.0, 0.0]],
 ]
 _LEAST = 0.5  # of the duration, for a goal that changes late: four times the acceleration of one known at the start
-_BEYOND = 0.05  # of the hull: half of the 10 % that is promised, for what lies between the points looked at
-_WATCHED = 256  # points of the path that are looked at
+_BEYOND = 0.05  # of the hull: half of the 10 % that is promised, for what lies between the watched points
+_WATCHED = 256  # points of the path, of which none may leave the hull
 
 
 def adapt(
@@ -47,16 +47,13 @@ def adapt(
     rest = torch.zeros_like(start + own_goal + goals[..., 0, :])
     low, high = torch.minimum(shown.amin(-2), start), torch.maximum(shown.amax(-2), start)
     # The first tick has the speed of k u: the straight motion begins at rest.
-    state, own, keep, moved = (
-        _still(start - goals[..., 0, :]),
-        _still(rest + relative[..., 0, :, 0]),
-        rest + 1.0,
-        rest == 0.0,
-    )
+    state, own = _still(start - goals[..., 0, :]), _still(rest + relative[..., 0, :, 0])
+    keep, moved = rest + 1.0, rest == 0.0
     since, until, carry, parts = rest, rest, _still(rest), list[Tensor]()
     changes = (goals.diff(dim=-2) != 0.0).movedim(-2, 0).flatten(1).any(1).nonzero().flatten() + 1
     for first, last in pairwise([0, *changes.tolist(), len(time)]):
         now, goal = time[first], rest + goals[..., first, :]
+        # Where the goal changes, the motion under way is what the next part begins with.
         if first:
             own, state = relative[..., first, :, :], parts[-1][..., -1, :, :] - _still(goal)
             moved = goal != goals[..., first - 1, :]

@@ -1,14 +1,16 @@
 """Dynamic movement primitives: eq. (16) to (18)."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
-from typing import Any, Literal, final, get_args
+from typing import Any, Literal, final
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torch_pbd.control.matrices import as_rows, as_tensor, broadcasts, check_count, check_positive, run_shape
+from torch_pbd import checks
+from torch_pbd.control.matrices import as_rows, as_tensor
 from torch_pbd.control.primitive.adaptation import Adaptation, adapt
 from torch_pbd.files.memory import require_much
 
@@ -82,18 +84,13 @@ class DMP:
         gate: Gate = "time",
         adaptation: Adaptation = "safe",
     ) -> None:
-        check_positive("alpha", alpha)
-        beta = alpha / 4.0 if beta is None else beta
-        named = {"beta": beta, "gamma": gamma, "tau": tau}
-        if duration is not None:
-            named["duration"] = duration
-        for name, value in named.items():
-            check_positive(name, value)
-        for name, choice, kind in (("gate", gate, Gate), ("adaptation", adaptation, Adaptation)):
-            if choice not in get_args(kind):
-                raise ValueError(f"{name} is {choice!r}, must be one of {', '.join(map(repr, get_args(kind)))}.")
-        self.alpha, self.beta, self.gamma, self.tau = alpha, beta, gamma, tau
-        self.duration, self.gate, self.adaptation = duration, gate, adaptation
+        self.alpha = checks.number(alpha, "alpha", above=0.0)
+        self.beta = self.alpha / 4.0 if beta is None else checks.number(beta, "beta", above=0.0)
+        self.gamma = checks.number(gamma, "gamma", above=0.0)
+        self.tau = checks.number(tau, "tau", above=0.0, unit="s")
+        self.duration = checks.number(duration, "duration", above=0.0, unit="s", optional=True)
+        self.gate: Gate = checks.choice(gate, "gate", Gate)
+        self.adaptation: Adaptation = checks.choice(adaptation, "adaptation", Adaptation)
 
     def __repr__(self) -> str:
         return (
@@ -106,7 +103,7 @@ class DMP:
         return torch.exp(-self.gamma * as_tensor(time, "time") / self.tau)
 
     def gate_at(self, time: Tensor | Any) -> Tensor:
-        """What the forcing is multiplied by at ``time`` in s: 1 up to ``duration``."""
+        """Factor of the forcing at ``time`` in s: 1 up to ``duration``."""
         time = as_tensor(time, "time")
         if self.gate == "none" or self.duration is None:
             return torch.ones_like(time)
@@ -131,12 +128,12 @@ class DMP:
         """
         position, goal = as_rows(position, "position", 1), as_rows(goal, "goal", 1)
         velocity, acceleration = as_rows(velocity, "velocity", 1), as_rows(acceleration, "acceleration", 1)
-        for name, value in (("velocity", velocity), ("acceleration", acceleration), ("goal", goal)):
-            if not broadcasts(value, position) or (name != "goal" and value.shape != position.shape):
-                raise ValueError(
-                    f"{name} has shape {tuple(value.shape)}, but position has shape {tuple(position.shape)}: they must "
-                    "be of the same movements and outputs."
-                )
+        if not position.shape == velocity.shape == acceleration.shape:
+            raise ValueError(
+                f"velocity has shape {tuple(velocity.shape)} and acceleration {tuple(acceleration.shape)}, must have "
+                f"shape {tuple(position.shape)}, that of position."
+            )
+        _broadcast({"position": position, "goal": goal})
         spring = self.beta * (goal - position) - self.tau * velocity
         return self.tau**2 * acceleration - self.alpha * spring
 
@@ -183,58 +180,62 @@ class DMP:
         ValueError
             If a shape is wrong, a value is not finite, or a speed is negative.
         """
+        checks.choice(integrator, "integrator", ("exact", "rk4"))
         forcing, n_ticks = _checked_forcing(forcing, n_steps)
         goal = as_rows(goal, "goal", 1)
+        goals = goal if goal.ndim > 1 else goal[None]
         starts = {"position0": position0, "velocity0": velocity0}
         places = {**starts, "demonstrated_start": demonstrated_start, "demonstrated_goal": demonstrated_goal}
         given = {name: as_rows(place, name, 1) for name, place in places.items() if place is not None}
-        if integrator not in ("exact", "rk4"):
-            raise ValueError(f"integrator is {integrator!r}, must be 'exact' or 'rk4'.")
-        time, steps, passing = _movement_time(n_ticks, dt, speed, goal)
-        at_ticks = (_called(forcing, time) if callable(forcing) else forcing) * self.gate_at(time)[:, None]
-        goals = goal if goal.ndim > 1 else goal[None]
-        shape = run_shape(at_ticks, {"goal": goals, **{name: place[..., None, :] for name, place in given.items()}})
+        time, steps, passing = _movement_time(n_ticks, checks.number(dt, "dt", above=0.0, unit="s"), speed, goal)
+        at_ticks = self._gated(forcing, time)
+        rows = {"forcing": at_ticks, "goal": goals, **{name: place[..., None, :] for name, place in given.items()}}
+        shape = _broadcast(rows, n_ticks)
         at_ticks, goals = at_ticks.expand(shape), goals.expand(shape)
-        start, velocity = (given.get(name, goal.new_zeros(shape[-1])) for name in ("position0", "velocity0"))
+        start, velocity = (given.get(name, goal.new_zeros(shape[-1])) for name in starts)
         if passing[0] == 0.0 and bool((velocity != 0.0).any()):
             raise ValueError("velocity0 must be 0 where speed[0] is 0: no movement time passes there.")
         own_start, own_goal = given.get("demonstrated_start", start), given.get("demonstrated_goal", goals[..., 0, :])
+        # A safe adaptation drives the movement as it was demonstrated, and takes its path to the other start and goals.
         same = bool((own_start == start).all() and (goals == own_goal[..., None, :]).all())
         safe = self.adaptation == "safe" and not same
         driven = own_goal[..., None, :].expand(shape) if safe else goals
         scaled = self.tau * velocity / passing[0].clamp_min(1e-12)
         begin = torch.stack([each.expand(*shape[:-2], -1) for each in (own_start if safe else start, scaled)], dim=-1)
-        solve = (
-            self._exact if integrator == "exact" else partial(self._runge_kutta, self._midway(forcing, at_ticks, time))
-        )
+        solve = self._exact if integrator == "exact" else partial(self._runge_kutta, forcing, time)
         trace = solve(at_ticks, driven, steps, begin)
         position, rate = trace[..., 0], trace[..., 1] / self.tau
         if safe:
             spring = self.beta * (driven - position) - trace[..., 1]
-            path = position, rate, (self.alpha * spring + at_ticks) / self.tau**2
+            path = position, rate, (self.alpha * spring + at_ticks) / self.tau**2  # eq. (16)
             ends = {"own_goal": own_goal, "goals": goals, "start": start}
             position, rate = adapt(path, time, (position, time), **ends, duration=self.duration or self.tau)
         return position, rate * passing[:, None]
 
-    def _midway(self, forcing: Any, at_ticks: Tensor, time: Tensor) -> Tensor:
-        """Gated forcing in the middle of each tick."""
-        if not callable(forcing):
-            return 0.5 * (at_ticks[..., 1:, :] + at_ticks[..., :-1, :])
-        halfway = 0.5 * (time[1:] + time[:-1])
-        return _called(forcing, halfway) * self.gate_at(halfway)[:, None]
+    def _gated(self, forcing: Any, time: Tensor) -> Tensor:
+        """Gated forcing (..., m, d) at times (m,), of rows there or of a callable."""
+        if callable(forcing):
+            forcing = as_tensor(forcing(time), "forcing(time)")
+            if forcing.ndim < 2 or forcing.shape[-2] != len(time) or not bool(torch.isfinite(forcing.detach()).all()):
+                raise ValueError(
+                    f"forcing(time) has shape {tuple(forcing.shape)}, must be finite, of shape (..., {len(time)}, d)."
+                )
+        return forcing * self.gate_at(time)[:, None]
 
     def _rate(self, like: Tensor) -> Tensor:
-        """Matrix of ``[x, z]' = rate @ [x, z, goal, forcing]``."""
+        """Matrix of eq. (16): ``[x, z]' = rate @ [x, z, goal, forcing]``."""
         alpha, beta, tau = self.alpha, self.beta, self.tau
         rows = [[0.0, 1.0, 0.0, 0.0], [-alpha * beta, -alpha, alpha * beta, 1.0]]
         return torch.tensor(rows, dtype=like.dtype, device=like.device) / tau
 
     def _exact(self, forcing: Tensor, goals: Tensor, steps: Tensor, state: Tensor) -> Tensor:
-        """Exact for forcing that is linear between ticks and goals held over them."""
-        lengths, index = steps.unique(return_inverse=True)  # mostly one
+        """States at the ticks, exact for forcing that is linear between them and goals held over them."""
+        # Over a tick [x, z, goal, forcing, rise] has constant coefficients: the forcing grows by the rise, which like
+        # the goal stays. The matrix exponential of a tick is its map; most runs have ticks of one length.
+        lengths, index = steps.unique(return_inverse=True)
         rate = state.new_zeros(len(lengths), 5, 5)
         rate[:, :2, :4] = self._rate(state) * lengths[:, None, None]
-        rate[:, 3, 4] = 1.0  # the forcing rises by the last component
+        rate[:, 3, 4] = 1.0
         maps = torch.linalg.matrix_exp(rate)[:, :2]
         states = [state]
         for tick, kind in enumerate(index.tolist()):
@@ -244,46 +245,51 @@ class DMP:
             states.append(state)
         return torch.stack(states, dim=-3)
 
-    def _runge_kutta(self, midway: Tensor, forcing: Tensor, goals: Tensor, steps: Tensor, state: Tensor) -> Tensor:
+    def _runge_kutta(
+        self, forcing: Any, time: Tensor, at_ticks: Tensor, goals: Tensor, steps: Tensor, state: Tensor
+    ) -> Tensor:
+        """States at the ticks, by the classical method of order 4."""
         rate = self._rate(state).mT
+        midway = 0.5 * (at_ticks[..., 1:, :] + at_ticks[..., :-1, :])
+        if callable(forcing):
+            midway = self._gated(forcing, 0.5 * (time[1:] + time[:-1]))
 
         def slope(now: Tensor, force: Tensor, tick: int) -> Tensor:
             return torch.cat([now, torch.stack([goals[..., tick, :], force], dim=-1)], dim=-1) @ rate
 
         states = [state]
         for tick, step in enumerate(steps.tolist()):
-            k1 = slope(state, forcing[..., tick, :], tick)
+            k1 = slope(state, at_ticks[..., tick, :], tick)
             k2 = slope(state + 0.5 * step * k1, midway[..., tick, :], tick)
             k3 = slope(state + 0.5 * step * k2, midway[..., tick, :], tick)
-            k4 = slope(state + step * k3, forcing[..., tick + 1, :], tick)
+            k4 = slope(state + step * k3, at_ticks[..., tick + 1, :], tick)
             state = state + step / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
             states.append(state)
         return torch.stack(states, dim=-3)
 
 
 def _checked_forcing(forcing: Any, n_steps: Any) -> tuple[Any, int]:
-    """Forcing as it is to be asked for, and the number of ticks."""
+    """Forcing as rows or as the callable it is, and the number of ticks."""
     if not callable(forcing):
         rows = as_rows(forcing, "forcing", 2)
         return rows, rows.shape[-2]
-    check_count("n_steps", n_steps, 1)
-    require_much(100.0 * n_steps, what=f"n_steps={n_steps}", remedy="Take fewer.")
-    return forcing, n_steps
+    n_ticks = checks.count(n_steps, "n_steps")
+    require_much(100.0 * n_ticks, what=f"n_steps={n_ticks}", remedy="Take fewer.")
+    return forcing, n_ticks
 
 
-def _called(forcing: Callable[[Tensor], Any], time: Tensor) -> Tensor:
-    """Forcing (..., m, d) at times (m,), of a callable."""
-    value = as_tensor(forcing(time), "forcing(time)")
-    if value.ndim < 2 or value.shape[-2] != len(time) or not bool(torch.isfinite(value.detach()).all()):
-        raise ValueError(
-            f"forcing(time) has shape {tuple(value.shape)}, must have shape (..., {len(time)}, d), all of it finite."
-        )
-    return value
+def _broadcast(parts: dict[str, Tensor], n_ticks: int | None = None) -> torch.Size:
+    """Shape (..., d), or (..., n_ticks, d), to which all parts broadcast; outputs do not."""
+    shapes = {name: tuple(part.shape) for name, part in parts.items()}
+    with suppress(RuntimeError):
+        common = torch.broadcast_shapes(*shapes.values())
+        if n_ticks in (None, common[-2]) and all(shape[-1] == common[-1] for shape in shapes.values()):
+            return common
+    raise ValueError(f"shapes are {shapes}, must be of the same movements, ticks and outputs.")
 
 
 def _movement_time(n_ticks: int, dt: float, speed: Any, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Movement time at the ticks, from each to the next, and how fast it passes at them."""
-    check_positive("dt", dt, "s")
+    """Movement time at the ticks, its steps from each to the next, and how fast it passes at them."""
     if speed is None:
         return torch.arange(n_ticks).to(like) * dt, like.new_full((n_ticks - 1,), dt), like.new_ones(n_ticks)
     speed = as_tensor(speed, "speed")

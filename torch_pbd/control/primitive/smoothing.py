@@ -16,30 +16,18 @@ Floats = NDArray[np.float64]
 CUTOFF_HZ = 4.0
 """Cutoff of slow movements: hands move below it, and tremor (8 to 12 Hz) and encoders' steps are above."""
 
-CUTOFF_CYCLES = 40.0
-"""Least cutoff of any movement, in cycles a movement: fast ones have detail above 4 Hz."""
-
-_LEAST_SAMPLES = {True: 5, False: 3}
+_CUTOFF_CYCLES = 40.0  # in a movement, the least cutoff of any: fast ones have detail above 4 Hz
+_LEAST_SAMPLES = {True: 5, False: 3}  # with a cutoff, as the smoothing spline needs, and without one
 _MOST_BEYOND = 0.1  # of the range of an output in all recordings; paths through holes keep half of it
 
 
 @dataclass(frozen=True)
 class Movements:
-    """K movements at n common movement times, derivatives with respect to movement time.
+    """K movements at n common movement times (n,) in s, from 0 to the duration, to which each is stretched linearly.
 
-    Attributes
-    ----------
-    time : ndarray of shape (n,)
-        From 0 to the duration, s; each demonstration is stretched to it linearly.
-    position, velocity, acceleration : ndarray of shape (K, n, d)
-    recorded_mean : ndarray of shape (n, d)
-        Mean position as it was recorded, not smoothed, but for holes.
-    bounds : ndarray of shape (2, d)
-        Lowest and highest position of all recordings.
-    known : ndarray of shape (K, n)
-        Where each has samples near.
-    noise_scale : ndarray of shape (d,)
-        Root mean square of what the smoothing took away, in the units of position.
+    Positions and derivatives by movement time are (K, n, d), ``known`` (K, n) is where each has samples near, and
+    ``recorded_mean`` (n, d) the mean as recorded, not smoothed but for holes. ``bounds`` (2, d) are the lowest and
+    highest position of all recordings, ``noise_scale`` (d,) the root mean square of what the smoothing took away.
     """
 
     time: Floats
@@ -66,21 +54,8 @@ def smooth(
     In a hole it follows the mean of those that have none there, plus the least bent curve that joins the differences
     from it on both sides, a cubic; not beyond the recorded range by more than a twentieth of it.
 
-    Parameters
-    ----------
-    demonstrations : Demonstrations
-    cutoff : float or None
-        In Hz of movement time.
-    n_steps : int
-    duration : float
-        Of the movement, s: each demonstration is stretched to it, and a cutoff with the median of them.
-    noise : bool, default=False
-        Whether it is noise, which may leave its range.
-
-    Raises
-    ------
-    ValueError
-        If a demonstration has too few samples, or leaves the recorded range of an output by a tenth of it.
+    A cutoff in Hz is of the movement whose ``duration`` is the median of the demonstrations'. Refused are too few
+    samples and, unless it is ``noise``, a path that leaves the recorded range of an output by a tenth of it.
     """
     least = _LEAST_SAMPLES[cutoff is not None]
     for number, n_samples in enumerate(demonstrations.n_steps):
@@ -116,6 +91,7 @@ def smooth(
 
 def check_range(path: Floats, bounds: Floats, name: str) -> None:
     """Raise if a path (n, d) leaves the recorded bounds (2, d) of an output by more than a tenth of its range."""
+    # Rounding of positions far from their origin leaves no range.
     beyond = np.maximum(bounds[0] - path, path - bounds[1]).max(axis=0) - 1e-11 * np.abs(bounds).max(axis=0)
     ranges = np.ptp(bounds, axis=0)
     if (beyond > _MOST_BEYOND * ranges).any():
@@ -130,8 +106,9 @@ def check_range(path: Floats, bounds: Floats, name: str) -> None:
 def _splines(demonstrations: Demonstrations, cutoff: float | None, bounds: Floats) -> list[BSpline]:
     """Spline of each demonstration over its time from its start."""
     times, margin = [time - time[0] for time in demonstrations.times], 0.5 * _MOST_BEYOND * np.ptp(bounds, axis=0)
-    splines = [_spline(*of_one, cutoff) for of_one in zip(times, demonstrations.positions, strict=True)]
+    splines = [_spline(*recording, cutoff) for recording in zip(times, demonstrations.positions, strict=True)]
     bridged = list(splines)
+    # Holes are filled at the recording's own spacing, by the splines before any was, so that no order matters.
     for number, (time, filled) in enumerate(zip(times, demonstrations.positions, strict=True)):
         samples = time
         for edges in [time[i : i + 2] for i in holes_of(time)]:
@@ -147,13 +124,15 @@ def _splines(demonstrations: Demonstrations, cutoff: float | None, bounds: Float
 def _through(splines: list[BSpline], times: list[Floats], number: int, edges: Floats, inner: Floats) -> Floats:
     """Path of one demonstration at times ``inner`` of its hole between ``edges``."""
     rates = [time[-1] / times[number][-1] for time in times]
-    knowing = [k for k, time in enumerate(times) if unsampled(time, rates[k] * inner).max() <= UNKNOWN]
+    sampled = [k for k, time in enumerate(times) if unsampled(time, rates[k] * inner).max() <= UNKNOWN]
 
-    def known(at: Floats, order: int = 0) -> Any:
-        return sum(splines[k](rates[k] * at, order) * rates[k] ** order for k in knowing) / max(1, len(knowing))
+    def mean(at: Floats, order: int = 0) -> Any:
+        return sum(splines[k](rates[k] * at, order) * rates[k] ** order for k in sampled) / max(1, len(sampled))
 
+    # The mean of the others, and the cubic that has the difference and its slope at both edges. Of no others, the mean
+    # is zero, and the cubic is all.
     own = splines[number]
-    return known(inner) + CubicHermiteSpline(edges, own(edges) - known(edges), own(edges, 1) - known(edges, 1))(inner)
+    return mean(inner) + CubicHermiteSpline(edges, own(edges) - mean(edges), own(edges, 1) - mean(edges, 1))(inner)
 
 
 def _spline(time: Floats, position: Floats, cutoff: float | None) -> BSpline:
@@ -175,12 +154,12 @@ def _spline(time: Floats, position: Floats, cutoff: float | None) -> BSpline:
 
 
 def automatic_cutoff(duration: float, *, knows_seconds: bool) -> float:
-    """40 cycles a movement of ``duration`` s; where the recordings tell seconds, not below 4 Hz."""
-    return max(CUTOFF_HZ if knows_seconds else 0.0, CUTOFF_CYCLES / duration)
+    """Cutoff of 40 cycles a movement of ``duration`` s; where the times are in seconds, not below 4 Hz."""
+    return max(CUTOFF_HZ if knows_seconds else 0.0, _CUTOFF_CYCLES / duration)
 
 
 def noise_like(demonstrations: Demonstrations, noise_scale: Floats) -> Demonstrations:
-    """White noise of that scale at the sampling times of the demonstrations: what smoothing makes of it is noise."""
+    """White noise of a scale (d,) at the sampling times of the demonstrations, which smoothing lets through in part."""
     random = np.random.default_rng(0)
     noise = [random.normal(size=(n, demonstrations.n_outputs)) * noise_scale for n in demonstrations.n_steps]
     return Demonstrations(demonstrations.times, noise, time_unit=demonstrations.time_unit)

@@ -1,7 +1,8 @@
-"""From the units of recordings to metres and seconds, in which a robot's mass and forces are told."""
+"""From the units of recordings to metres and seconds, those of a robot; and what no robot does in them."""
 
-import warnings
 from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, final
 
 import numpy as np
 
@@ -9,19 +10,62 @@ from torch_pbd import checks
 from torch_pbd.data import Demonstrations
 from torch_pbd.data.units import ANGLES, LENGTHS, TIMES
 
+_UNITS = {"duration": "s", "distance": "m", "speed": "m/s"}
+
+
+@final
+@dataclass(frozen=True)
+class MotionLimits:
+    """What is beyond what robots do, so that a schedule is refused: its units cannot be right.
+
+    Parameters
+    ----------
+    duration : float, default=600.0
+        Of the movement, s.
+    distance : float, default=10.0
+        Diagonal of the box around the path, m; where it lies does not matter.
+    speed : float, default=10.0
+        In m/s.
+    """
+
+    duration: float = 600.0
+    distance: float = 10.0
+    speed: float = 10.0
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            checks.number(value, name, above=0.0, unit=_UNITS[name])
+
+
+def check_motion(limits: Any, units: Sequence[str] | None, time_unit: str, **found: float) -> None:
+    """Refuse a duration, distance or speed, by name, beyond the limits, in units of length or without units."""
+    checks.instance(limits, "limits", MotionLimits, optional=True)
+    for name, value in found.items() if limits is not None and counts_as_metres(units) else ():
+        most, unit = getattr(limits, name), _UNITS[name]
+        if value > most:
+            raise ValueError(
+                f"the {name} of the schedule is {value:.4g} {unit}, must be at most limits.{name}, {most:g} {unit}: "
+                f"correct units ({', '.join(units or ['none'])}) or time_unit ({time_unit}) of the recordings, or give "
+                f"limits=MotionLimits({name}=...) or None."
+            )
+
 
 def in_seconds(time_unit: str) -> float | None:
     """Seconds of one unit of time; None where it is no unit of time, as of a phase."""
     return TIMES.get(time_unit)
 
 
+def common_unit(units: Sequence[str] | None) -> str | None:
+    """The unit of all outputs; None if they have none, or several."""
+    return units[0] if units is not None and len(set(units)) == 1 else None
+
+
 def in_metres(units: Sequence[str] | None) -> float:
-    """Metres of one unit of position; 1 where units are not told, differ, or are no lengths.
+    """Metres of one unit of position; 1 where units are not known, differ, or are no lengths.
 
     Those are taken as they are: stiffness is then in N per unit, and mass in N s^2 per unit.
     """
-    common = common_unit(units)
-    return LENGTHS.get(common, 1.0) if common is not None else 1.0
+    return LENGTHS.get(common_unit(units) or "", 1.0)
 
 
 def robot_unit(units: Sequence[str] | None) -> str | None:
@@ -30,13 +74,13 @@ def robot_unit(units: Sequence[str] | None) -> str | None:
     return "m" if common in LENGTHS else common
 
 
-def common_unit(units: Sequence[str] | None) -> str | None:
-    """The unit of all outputs; None if they have none, or several."""
-    return units[0] if units is not None and len(set(units)) == 1 else None
+def counts_as_metres(units: Sequence[str] | None) -> bool:
+    """Whether schedules of recordings in these units are in m, or in what is taken for it where there are none."""
+    return units is None or robot_unit(units) == "m"
 
 
 def warn_of_units(units: Sequence[str] | None) -> None:
-    """Tell what is made of positions whose units are not told, differ, or are no lengths and no angles."""
+    """Warn of what becomes of positions whose units are not given, differ, or are no lengths and no angles."""
     common = common_unit(units)
     if units is None:
         text = "The demonstrations tell no units: positions are taken to be in m. Say so, or in what else: units='m'."
@@ -56,29 +100,18 @@ def warn_of_units(units: Sequence[str] | None) -> None:
 
 
 def duration_of(demonstrations: Demonstrations, duration: float | None) -> tuple[float, float]:
-    """Duration of a movement in s, and seconds of one unit of the demonstrations' time.
+    """Duration of a movement in s, None for the median of the demonstrations; and seconds of one unit of their time.
 
-    Parameters
-    ----------
-    demonstrations : Demonstrations
-        Their median lasts as long as the movement.
-    duration : float or None
-        In s; None is theirs.
-
-    Warns
-    -----
-    UserWarning
-        If it is None and their times are no seconds: one unit then counts as one.
+    Warns where it is None and their times are no seconds: one unit then counts as one.
     """
     own = float(np.median([time[-1] - time[0] for time in demonstrations.times]))
     if duration is not None:
         return float(duration), duration / own
     scale = in_seconds(demonstrations.time_unit)
     if scale is None:
-        warnings.warn(
+        checks.warn(
             f"The times of the demonstrations are in {demonstrations.time_unit!r}, not in s: the movement is taken to "
-            f"last {own:.3g} s. Give duration, in s.",
-            stacklevel=3,
+            f"last {own:.3g} s. Give duration, in s."
         )
         scale = 1.0
     return own * scale, scale
