@@ -1,9 +1,11 @@
 """The controller as an estimator: demonstrations in, a stiffness schedule out (Section V)."""
 
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline
 from sklearn.base import BaseEstimator
 from sklearn.utils.validation import check_is_fitted
 
@@ -22,6 +24,7 @@ from torch_pbd.control.simulation.plant import AdmittancePlant
 from torch_pbd.control.simulation.rollout import Rollout
 from torch_pbd.control.simulation.run import simulate_schedule
 from torch_pbd.control.stiffness import StiffnessLaw
+from torch_pbd.control.via import Bend, conditioned, planned
 from torch_pbd.data import Demonstrations
 from torch_pbd.estimators.base import CovarianceRegressor
 
@@ -40,8 +43,9 @@ class DMPController(BaseEstimator):
 
     Parameters
     ----------
-    covariance : covariance regressor, default=None
-        Cloned before it is fitted; None is ``HeteroscedasticGPRegressor()``.
+    covariance : covariance regressor or movement model, default=None
+        Cloned before it is fitted; None is ``HeteroscedasticGPRegressor()``. A model of whole movements, such as
+        ``TrajectoryRegressor()``, lets movements be bent: see :meth:`condition` and :meth:`schedule`.
     alpha, beta, gamma, tau : float, default=25.0, None, 0.7, 1.0
         Of the movement primitive, see :class:`~torch_pbd.control.DMP`; the paper's are 1, 1, 0.7, 1. With
         adaptation="safe" tau is that of a movement of 10 s, like the paper's, and goes with the duration.
@@ -101,6 +105,8 @@ class DMPController(BaseEstimator):
     >>> controller.schedule(rate=100.0).stiffness.shape
     (1001, 2, 2)
     """
+
+    _bend: Bend | None = None
 
     def __init__(
         self,
@@ -166,7 +172,8 @@ class DMPController(BaseEstimator):
         UserWarning
             Of samples that were merged, as their times are too close; of holes, with their times.
         """
-        self.__dict__.pop("_impedance", None)  # a fit that fails leaves no mixture of two
+        for name in ("_impedance", "_bend", "_shown"):  # a fit that fails leaves no mixture of two
+            self.__dict__.pop(name, None)
         parameters.check_parameters(self)
         # 1. Recordings. Samples whose times are one are merged; the table of holes is Type I uncertainty.
         shown = merge_bursts(parameters.as_demonstrations(X, y, groups))
@@ -210,8 +217,28 @@ class DMPController(BaseEstimator):
 
         From ``start_time_``; the movement is over ``duration_`` later, and then stays at the goal.
         """
-        time = self._movement_time(X)
-        return self.reproduction_.motion(time)[0]
+        return self._path(self._movement_time(X))
+
+    def condition(self, times: ArrayLike, positions: ArrayLike, *, noise_scale: ArrayLike = 0.0) -> Self:
+        """Fitted copy of a movement that passes there: where a robot was pushed to, what was seen so far, a via point.
+
+        The rest of the movement, and its gains, follow as demonstrations make likely. ``covariance`` must be a model of
+        whole movements, with variability="position". A copy can be conditioned again.
+
+        Parameters
+        ----------
+        times : array-like of shape (m,)
+            Times, which count as those of the demonstrations do.
+        positions : array-like of shape (m, d)
+            In their units; NaN where an output is not given.
+        noise_scale : float or array-like of shape (d,), default=0.0
+            Standard deviation of the error of positions.
+        """
+        time = self._movement_time(checks.array(times, "times", ("m",))[:, np.newaxis])
+        position = checks.real_floats(positions, "positions")
+        if position.shape != (len(time), self.n_outputs_):
+            raise ValueError(f"positions has shape {position.shape}, must have shape ({len(time)}, {self.n_outputs_}).")
+        return conditioned(self, time, position - self._path(time), noise_scale)
 
     def predict_stiffness(self, X: ArrayLike) -> Floats:
         """Stiffness (n, d, d) in N/m (force per unit of position) at times X (n, 1)."""
@@ -230,6 +257,7 @@ class DMPController(BaseEstimator):
         settle: float = 0.0,
         goal: ArrayLike | None = None,
         start: ArrayLike | None = None,
+        via: Sequence[tuple[float, ArrayLike]] | None = None,
         speed: float = 1.0,
         limits: MotionLimits | None = _LIMITS,
     ) -> Schedule:
@@ -247,6 +275,11 @@ class DMPController(BaseEstimator):
             that on_unknown="soft" makes the robot compliant there.
         goal, start : array-like of shape (d,), default=None
             In the units of the recordings; None are ``goal_`` and ``start_``. A goal (n, d) is that at each row.
+        via : sequence of (time, position), default=None
+            Points that the movement passes, with the stiffness of what must be met there: movement time in s from its
+            start, and position (d,) in the units of the recordings, NaN where an output is free. ``covariance`` must
+            be a model of whole movements: with one, goals and starts too bend the movement as far as demonstrations
+            make likely, and the primitive does the rest. A warning tells of points that they make unlikely.
         speed : float, default=1.0
             How fast movement time passes: at 0.5 the movement takes twice as long. Gains are those of movement time.
         limits : MotionLimits or None
@@ -263,12 +296,13 @@ class DMPController(BaseEstimator):
         recorded = self.units_, self.time_unit_
         units.check_motion(limits, *recorded, duration=self.duration_ / speed)
         time = parameters.as_tick_times(self.duration_ / speed, rate, settle, self.n_outputs_)
-        position, velocity, moved = self.reproduction_.plan(time, goal, start, speed)
+        bent, goal, start = planned(self, goal, start, via)
+        position, velocity, moved = bent._motion(time, goal, start, speed)
         metres = units.in_metres(self.units_)
         distance = metres * float(np.linalg.norm(np.ptp(position, axis=0)))
         fastest = metres * float(np.linalg.norm(velocity, axis=1).max())
         units.check_motion(limits, *recorded, distance=distance, speed=fastest)
-        gains = self._impedance(moved)
+        gains = bent._impedance(moved)
         rows = (time, metres * position, metres * velocity, gains.stiffness, gains.damping)
         return Schedule(*rows, metres**2 * gains.covariance, gains.type1, **parameters.schedule_labels(self))
 
@@ -324,7 +358,7 @@ class DMPController(BaseEstimator):
         time = parameters.as_tick_times(
             self.duration_, rate, settle, self.n_outputs_, len(paces) if paces.ndim else None
         )
-        return time, *self.reproduction_.plan(time, goal, start, paces)[:2]
+        return time, *self._motion(time, goal, start, paces)[:2]
 
     def phase(self, time: ArrayLike) -> Floats:
         """Inputs (n, 1) of ``covariance_`` at movement times (n,), which start at 0: what ``phase_input`` says."""
@@ -345,6 +379,26 @@ class DMPController(BaseEstimator):
         """Positions or forcings (K, n, d) of smoothed movements of the same task, by ``variability``."""
         checks.instance(movements, "movements", Movements, remedy="give what smooth(demonstrations) returns")
         return movements.position if self.variability == "position" else self.reproduction_.forcing_of(movements)
+
+    def _path(self, time: Floats) -> Floats:
+        """Reproduced position (n, d) at movement times (n,)."""
+        position = self.reproduction_.motion(time)[0]
+        return position if self._bend is None else position + self._bend(time)
+
+    def _planned_path(self, goal: ArrayLike | None, start: ArrayLike | None) -> Callable[[float], Floats]:
+        """Position (d,) at a movement time, of the way to another goal or from another start."""
+        time = np.linspace(0.0, self.duration_, 2 * self.n_steps)
+        return CubicSpline(time, self._motion(time, goal, start, 1.0)[0])
+
+    def _motion(
+        self, time: Floats, goal: ArrayLike | None, start: ArrayLike | None, speed: float | Floats
+    ) -> tuple[Floats, Floats, Floats]:
+        """Position and velocity (n, d) at times (n,), and the movement time of the gains there."""
+        position, velocity, moved = self.reproduction_.plan(time, goal, start, speed)
+        if self._bend is not None:
+            rate = np.gradient(moved, time)[:, np.newaxis]
+            position, velocity = position + self._bend(moved), velocity + rate * self._bend(moved, 1)
+        return position, velocity, moved
 
     def __sklearn_is_fitted__(self) -> bool:
         return "_impedance" in vars(self)

@@ -57,11 +57,15 @@ class Conditioned:
     def law(self) -> JointNormal:
         """Law of all steps; those that are known have no variance left."""
         prior, observed = self._prior, self._observed
+        correlation = symmetrize(prior.correlation - self._gain @ prior.correlation[observed.steps])
+        loadings = torch.linalg.solve_triangular(self._precision_root.mT, self._open, upper=True, left=False)
+        # What is known has no variance, not even of rounding, which may be below zero.
+        correlation = correlation.index_fill(0, observed.steps, 0.0).index_fill(1, observed.steps, 0.0)
         law = replace(
             prior,
             mean=prior.mean + self._from_steps((observed.values - prior.mean[observed.steps])[None])[0],
-            correlation=symmetrize(prior.correlation - self._gain @ prior.correlation[observed.steps]),
-            loadings=torch.linalg.solve_triangular(self._precision_root.mT, self._open, upper=True, left=False),
+            correlation=correlation,
+            loadings=loadings.index_fill(0, observed.steps, 0.0),
         )
         columns, root = self._entries(law)
         explained = torch.linalg.solve_triangular(root.mT, columns, upper=True, left=False)

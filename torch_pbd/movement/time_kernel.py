@@ -200,7 +200,8 @@ def _by_pattern(residual: Float[Tensor, "K T d"]) -> list[tuple[Tensor, Tensor]]
 
 
 def _unit_rms(residual: Tensor) -> Tensor:
-    return residual / residual.square().nanmean().sqrt()
+    # Demonstrations that are one have no residuals, and keep none.
+    return residual / residual.square().nanmean().sqrt().clamp_min(torch.finfo(residual.dtype).tiny)
 
 
 def _interpolated(grid: Float[Tensor, " T"], values: Float[Tensor, "T c"], time: Float[Tensor, " n"]) -> Tensor:

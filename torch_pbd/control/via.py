@@ -1,0 +1,146 @@
+"""Movements that are bent by what is known of them: through via points, to likely goals, on from where a robot is.
+
+A model of whole movements, conditioned, says how the rest of a movement changes. That change, over movement time, is
+added to the reproduced path; gains come from the conditioned covariance. What demonstrations make unlikely is left to
+the movement primitive, which reaches any goal.
+"""
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline
+from scipy.stats import chi2, f
+
+from torch_pbd import checks
+
+Floats = NDArray[np.float64]
+
+_N_KNOTS = 200  # of a change over a movement: length scales are no shorter than a fiftieth of it
+_LIKELY = 0.95  # of demonstrations: what deviates further is not what they make likely
+
+
+@dataclass(frozen=True)
+class Bend:
+    """Change of a movement's position over movement time, at knots (m,) and (m, d)."""
+
+    time: Floats
+    change: Floats
+
+    @cached_property
+    def _spline(self) -> CubicSpline:
+        return CubicSpline(self.time, self.change)
+
+    def __call__(self, time: Floats, order: int = 0) -> Floats:
+        """Change (n, d) at movement times (n,), or its derivative; constant beyond the movement."""
+        inside = np.clip(time, self.time[0], self.time[-1])
+        values: Floats = self._spline(inside, order)
+        return values if order == 0 else values * (inside == time)[:, np.newaxis]
+
+
+def conditioned(
+    controller: Any, time: Floats, change: Floats, noise_scale: Any = 0.0, pins: Sequence[float] = ()
+) -> Any:
+    """Copy of a fitted controller whose path changes by (m, d), NaN where free, at movement times (m,).
+
+    At the movement times ``pins`` the path stays, without a part in the gains. Changes are from the path, as it is not
+    the model's mean: they differ by the error of the reproduction.
+    """
+    model, phase = controller.covariance_, controller.reproduction_.phase
+    if not can_bend(controller):
+        must = "a model of whole movements, with variability='position', to be bent"
+        raise checks.refusal(controller.covariance, "covariance", must, "take DMPController(TrajectoryRegressor())")
+    shown, inputs, stays = getattr(controller, "_shown", model), phase(time), phase(np.array(pins))
+    bent = model.condition(inputs, model.predict(inputs) + change, noise_scale=noise_scale)
+    moved = bent.condition(stays, model.predict(stays)) if len(pins) else bent
+    # Even knots, but for those beside a time that is known, where the change is to be exact.
+    own = np.append(time, pins).clip(0.0, controller.duration_)
+    even = np.linspace(0.0, controller.duration_, _N_KNOTS)
+    far = np.abs(even[:, np.newaxis] - own).min(axis=1, initial=np.inf) > 0.25 * even[1]
+    knots = np.unique(np.append(even[far], own))
+    result = copy.copy(controller)
+    result.covariance_, result._shown = bent, shown
+    result._bend = Bend(knots, moved.predict(phase(knots)) - shown.predict(phase(knots)))
+    result._impedance = replace(controller._impedance, regressor=bent)
+    return result
+
+
+def can_bend(controller: Any) -> bool:
+    """Whether a controller's covariance is a model of whole movements, of positions."""
+    return hasattr(controller.covariance_, "condition") and controller.variability == "position"
+
+
+def planned(
+    controller: Any, goal: ArrayLike | None, start: ArrayLike | None, via: Sequence[tuple[float, ArrayLike]] | None
+) -> tuple[Any, Any, Any]:
+    """Controller of a movement to a goal, from a start, through points; and the goal and start left to its primitive.
+
+    Warns
+    -----
+    UserWarning
+        If a point deviates by more than 95 % of demonstrations do; it is passed all the same.
+    """
+    if via is None and (not can_bend(controller) or (goal is None and start is None)):
+        return controller, goal, start
+    rest, times, changes, pins = {"goal": goal, "start": start}, [], [], []
+    for name, at, own in (("start", 0.0, controller.start_), ("goal", controller.duration_, controller.goal_)):
+        target = rest[name]
+        if target is not None and np.ndim(target) != 1:
+            continue  # a goal that moves
+        change = own - own if target is None else checks.array(target, name, own.shape) - own
+        if not change.any():
+            pins.append(at)
+            continue
+        distance, limit = _distance(controller, at, change)
+        share = min(1.0, limit / distance)
+        rest[name] = None if share == 1.0 else own + (1.0 - share) * change
+        times.append(at)
+        changes.append(share * change)
+    path = controller._planned_path(rest["goal"], rest["start"])
+    for number, point in enumerate(via or ()):
+        at, position = _checked_point(point, number, controller.duration_, controller.n_outputs_)
+        change = position - path(at)
+        distance, limit = _distance(controller, at, change)
+        if distance > limit:
+            checks.warn(
+                f"via[{number}], at {at:g} s, is {distance:.3g} standard deviations from the movement, where "
+                f"{limit:.3g} hold {_LIKELY:.0%} of demonstrations: how people would pass there was not shown."
+            )
+        times.append(at)
+        changes.append(change)
+    pins = [at for at in pins if at not in times]
+    bent = conditioned(controller, np.array(times), np.reshape(changes, (-1, controller.n_outputs_)), pins=pins)
+    return bent, rest["goal"], rest["start"]
+
+
+def _checked_point(point: Any, number: int, duration: float, n_outputs: int) -> tuple[float, Floats]:
+    """Movement time and position of a via point, NaN where free."""
+    try:
+        at, position = point
+    except (TypeError, ValueError):
+        raise checks.refusal(point, f"via[{number}]", "a time in s and a position") from None
+    at = checks.number(at, f"the time of via[{number}]", least=0.0, most=duration, unit="s")
+    position = checks.real_floats(position, f"the position of via[{number}]")
+    if position.shape != (n_outputs,) or np.isinf(position).any() or np.isnan(position).all():
+        raise checks.refusal(
+            position.tolist(), f"the position of via[{number}]", f"{n_outputs} numbers, NaN where free"
+        )
+    return at, position
+
+
+def _distance(controller: Any, at: float, change: Floats) -> tuple[float, float]:
+    """Mahalanobis distance of a change of the outputs that are given, and how far 95 % of demonstrations deviate."""
+    given = ~np.isnan(change)
+    inputs, size = controller.reproduction_.phase(np.array([at])), int(given.sum())
+    covariance = controller.covariance_.predict_cov(inputs)[0][np.ix_(given, given)]
+    degrees = float(controller.covariance_.predict_df(inputs)[0])
+    square = float(change[given] @ np.linalg.solve(covariance, change[given]))
+    if np.isfinite(degrees):
+        limit = size * f.ppf(_LIKELY, size, degrees) * (degrees - 2.0) / degrees
+    else:
+        limit = chi2.ppf(_LIKELY, size)
+    return square**0.5, float(limit) ** 0.5
