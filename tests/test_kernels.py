@@ -1,9 +1,13 @@
+from typing import get_args
+
 import numpy as np
 import pytest
 import torch
 from sklearn.gaussian_process.kernels import RBF, ExpSineSquared, Matern
 
-from torch_pbd.kernels import KERNELS, correlation
+from torch_pbd import CholeskyCovRegressor, HeteroscedasticGPRegressor
+from torch_pbd.data import make_paper_simulation
+from torch_pbd.kernels import KERNELS, Kernel, KernelName, correlation
 
 ORACLES = {
     "squared_exponential": RBF,
@@ -124,3 +128,33 @@ def test_infinitely_many_periods_away_the_correlation_is_a_number(kernel, dtype)
     period, length_scale = torch.tensor([0.1], dtype=dtype), torch.ones(1, dtype=dtype)
     found = correlation(x, torch.zeros(1, 1, dtype=dtype), length_scale, kernel, period)
     assert ((found > 0) & (found <= 1)).all()
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_the_slope_is_the_derivative_of_the_value(kernel):
+    square_distance = torch.linspace(0.01, 30.0, 50, dtype=torch.float64, requires_grad=True)
+    value = KERNELS[kernel].value(square_distance)
+    (expected,) = torch.autograd.grad(value.sum(), square_distance)
+    found = KERNELS[kernel].slope(square_distance.detach(), value.detach())
+    torch.testing.assert_close(found, expected, rtol=1e-12, atol=0)
+
+
+def test_the_names_of_signatures_are_those_of_the_table():
+    assert set(get_args(KernelName)) == set(KERNELS)
+
+
+@pytest.mark.parametrize("estimator", [CholeskyCovRegressor, HeteroscedasticGPRegressor])
+def test_a_kernel_is_one_entry_of_the_table(estimator, monkeypatch):
+    """Another name gives the bits of the kernel behind it; another kernel, a rational quadratic, is fitted too."""
+    monkeypatch.setitem(KERNELS, "alias", KERNELS["matern52"])
+    monkeypatch.setitem(
+        KERNELS, "rational_quadratic", Kernel(lambda s: 1.0 / (1.0 + 0.5 * s), lambda _, k: -0.5 * k**2)
+    )
+    X, y, _ = make_paper_simulation(random_state=0)
+    kernels = ("squared_exponential", "matern52", "alias", "rational_quadratic")
+    smooth, rough, alias, other = (estimator(kernel=kernel).fit(X, y) for kernel in kernels)
+    np.testing.assert_array_equal(alias.predict_cov(X), rough.predict_cov(X))
+    assert other.converged_
+    assert not np.array_equal(other.predict_cov(X), rough.predict_cov(X))
+    ratio = np.linalg.slogdet(other.predict_cov(X))[1] - np.linalg.slogdet(smooth.predict_cov(X))[1]
+    assert np.abs(ratio).max() < 0.5  # the data tell the covariance, whatever the kernel

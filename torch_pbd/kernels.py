@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import reduce
 from operator import add
 from typing import Literal
@@ -10,47 +11,72 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-KernelName = Literal["squared_exponential", "matern32", "matern52"]
-
 # Beyond it every correlation here is zero in float64; keeps inf * 0 away from inputs at 1e300.
 _FARTHEST = 1e8
 
 
-def _squared_exponential(square_distance: Tensor) -> Tensor:
-    return torch.exp(-0.5 * square_distance)
+@dataclass(frozen=True)
+class Kernel:
+    """Correlation as a function of the squared distance in length scales."""
+
+    value: Callable[[Tensor], Tensor]
+    """Correlation at squared distances; differentiable by autograd at zero too."""
+    slope: Callable[[Tensor, Tensor], Tensor]
+    """Derivative of the correlation by the squared distance, from that distance and the correlation there."""
+    on_nodes: bool = False
+    """Whether ``4 / length_scale + 8`` Chebyshev nodes on a range of one carry it to rounding."""
+
+
+# A root has no gradient at zero, which 1e-30 keeps away from; the correlation differs from one there by 1e-15.
+_LEAST = 1e-30
 
 
 def _matern32(square_distance: Tensor) -> Tensor:
-    distance = (3.0 * square_distance).clamp_min(1e-30).sqrt()  # the root has no gradient at zero
+    distance = (3.0 * square_distance).clamp_min(_LEAST).sqrt()
     return (1.0 + distance) * torch.exp(-distance)
 
 
 def _matern52(square_distance: Tensor) -> Tensor:
-    distance = (5.0 * square_distance).clamp_min(1e-30).sqrt()
+    distance = (5.0 * square_distance).clamp_min(_LEAST).sqrt()
     return (1.0 + distance + distance.square() / 3.0) * torch.exp(-distance)
 
 
-def _matern32_slope(square_distance: Tensor) -> Tensor:
-    return -1.5 * torch.exp(-(3.0 * square_distance).sqrt())
-
-
-def _matern52_slope(square_distance: Tensor) -> Tensor:
+def _matern52_slope(square_distance: Tensor, _: Tensor) -> Tensor:
     distance = (5.0 * square_distance).sqrt()
     return (-5.0 / 6.0) * (1.0 + distance) * torch.exp(-distance)
 
 
-KERNELS: dict[str, Callable[[Tensor], Tensor]] = {
-    "squared_exponential": _squared_exponential,
-    "matern32": _matern32,
-    "matern52": _matern52,
+KernelName = Literal["squared_exponential", "matern32", "matern52"]
+"""Names for signatures of estimators; what is below takes any name of the table."""
+
+KERNELS: dict[str, Kernel] = {
+    "squared_exponential": Kernel(lambda s: torch.exp(-0.5 * s), lambda _, k: -0.5 * k, on_nodes=True),
+    "matern32": Kernel(_matern32, lambda s, _: -1.5 * torch.exp(-(3.0 * s).sqrt())),
+    "matern52": Kernel(_matern52, _matern52_slope),
 }
+"""All kernels by name: the one place to add another."""
+
+
+def differences(
+    x: Float[Tensor, "n e"], other: Float[Tensor, "m e"], period: Float[Tensor, " e"] | None = None
+) -> list[Float[Tensor, "n m"]]:
+    """Differences in each input dimension; chords of a circle where its period, the circumference, is finite."""
+    parts = []
+    for dimension in range(x.shape[1]):
+        difference = x[:, dimension : dimension + 1] - other[:, dimension]
+        if period is not None and bool(torch.isfinite(period[dimension])):
+            radius = period[dimension] / math.pi
+            largest = torch.finfo(x.dtype).max  # the sine of infinity, many small periods away, is no number
+            difference = radius * torch.sin((difference / radius).clamp(-largest, largest))
+        parts.append(difference)
+    return parts
 
 
 def correlation(
     x: Float[Tensor, "n e"],
     other: Float[Tensor, "m e"],
     length_scale: Float[Tensor, "*b e"],
-    kernel: KernelName = "squared_exponential",
+    kernel: str = "squared_exponential",
     period: Float[Tensor, " e"] | None = None,
 ) -> Float[Tensor, "*b n m"]:
     """Correlation of the latent values at two sets of inputs: eq. (4) with an amplitude of one.
@@ -67,26 +93,21 @@ def correlation(
         of it, which agree with the inputs' own where these are close: with the squared exponential this is
         the periodic kernel of MacKay (Rasmussen and Williams, eq. (4.31)).
     """
-
-    def square(dimension: int) -> Tensor:
-        difference = x[:, dimension : dimension + 1] - other[:, dimension]
-        if period is not None and bool(torch.isfinite(period[dimension])):
-            radius = period[dimension] / math.pi
-            largest = torch.finfo(x.dtype).max  # the sine of infinity, many small periods away, is no number
-            difference = radius * torch.sin((difference / radius).clamp(-largest, largest))
-        return (difference / length_scale[..., dimension, None, None]).square()
-
-    square_distance = reduce(add, map(square, range(x.shape[1])))
-    return KERNELS[kernel](square_distance.clamp_max(_FARTHEST))
+    scaled = (
+        (difference / length_scale[..., dimension, None, None]).square()
+        for dimension, difference in enumerate(differences(x, other, period))
+    )
+    return KERNELS[kernel].value(reduce(add, scaled).clamp_max(_FARTHEST))
 
 
 def value_and_slope(
-    square_distance: Float[Tensor, "*b n m"], kernel: KernelName = "squared_exponential"
-) -> tuple[Float[Tensor, "*b n m"], Float[Tensor, "*b n m"]]:
-    """Correlation at squared distances in length scales, and its derivative by them."""
+    square_differences: Float[Tensor, "e n m"], inverse_square: Float[Tensor, "b e"], kernel: str
+) -> tuple[Float[Tensor, "b n m"], Float[Tensor, "b n m"]]:
+    """Correlation, and its derivative by the squared distance in length scales, for b sets of length scales.
+
+    Both from squares of differences in each dimension and the inverse squares of the length scales.
+    """
+    square_distance = (inverse_square @ square_differences.flatten(1)).reshape(-1, *square_differences.shape[1:])
     square_distance = square_distance.clamp_max(_FARTHEST)
-    value = KERNELS[kernel](square_distance)
-    if kernel == "squared_exponential":
-        return value, -0.5 * value
-    slope = _matern32_slope if kernel == "matern32" else _matern52_slope
-    return value, slope(square_distance)
+    value = KERNELS[kernel].value(square_distance)
+    return value, KERNELS[kernel].slope(square_distance, value)

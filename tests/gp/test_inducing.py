@@ -28,7 +28,7 @@ def test_inner_products_of_features_are_the_kernel_at_the_inducing_inputs(kernel
     """And with any other input, whatever lies between."""
     x, other = (rng.uniform(-1.0, 1.0, size=(n, len(length_scale))) for n in (10, 7))
     features = FeatureMap(tensor(x), kernel)
-    first, second = (features(tensor(z), tensor(length_scale)) for z in (x, other))
+    first, second = (features(tensor(length_scale))(tensor(z)) for z in (x, other))
     expected = ORACLES[kernel](length_scale)
     # The jitter of 1e-10, times what is left of other directions of the kernel matrix.
     np.testing.assert_allclose(first @ first.mT, expected(x), rtol=0, atol=2e-10)
@@ -39,9 +39,9 @@ def test_each_length_scale_of_a_batch_is_on_its_own(generator):
     x = torch.rand(6, 2, dtype=torch.float64, generator=generator)
     length_scale = tensor([[0.3, 2.0], [1.0, 0.2], [0.5, 0.5]])
     features = FeatureMap(x[:4])
-    batch = features(x, length_scale)
+    batch = features(length_scale)(x)
     for i in range(3):
-        torch.testing.assert_close(batch[i], features(x, length_scale[i]), rtol=1e-9, atol=1e-11)
+        torch.testing.assert_close(batch[i], features(length_scale[i])(x), rtol=1e-9, atol=1e-11)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -49,7 +49,7 @@ def test_features_are_differentiable_in_inputs_and_length_scales(kernel, generat
     features = FeatureMap(torch.rand(5, 2, dtype=torch.float64, generator=generator), kernel)
     x = torch.rand(3, 2, dtype=torch.float64, generator=generator).requires_grad_()
     length_scale = tensor([[0.3, 0.8], [0.5, 0.4]]).requires_grad_()
-    assert torch.autograd.gradcheck(features, (x, length_scale))
+    assert torch.autograd.gradcheck(lambda x, length_scale: features(length_scale)(x), (x, length_scale))
 
 
 def test_periodic_predictions_are_those_of_scikit_learn(rng):
@@ -63,11 +63,11 @@ def test_periodic_predictions_are_those_of_scikit_learn(rng):
     features = FeatureMap(tensor(x), period=tensor([period]), exact=True)
 
     def predict(query):
-        design = features(tensor(query), tensor([length_scale]))
+        design = features(tensor([length_scale]))(tensor(query))
         root = design @ weights.root
         return (design @ weights.mean).numpy(), (1.0 - design.square().sum(1) + root.square().sum(1)).sqrt().numpy()
 
-    weights = weights_posterior(5.0 * features(tensor(x), tensor([length_scale])), tensor(5.0 * y))
+    weights = weights_posterior(5.0 * features(tensor([length_scale]))(tensor(x)), tensor(5.0 * y))
     query = rng.uniform(-2.0, 3.0, size=(20, 1))
     mean, std = peer.predict(query, return_std=True)
     np.testing.assert_allclose(predict(query)[0], mean, rtol=0, atol=1e-7)
@@ -79,14 +79,14 @@ def test_periodic_predictions_are_those_of_scikit_learn(rng):
 def test_an_input_without_a_period_does_not_repeat(generator):
     x = torch.rand(6, 2, dtype=torch.float64, generator=generator)
     features = FeatureMap(x, "matern32", tensor([0.8, torch.inf]))
-    start = features(x, tensor([0.3, 0.3]))
-    turned = features(x + tensor([0.8, 0.0]), tensor([0.3, 0.3]))
+    start = features(tensor([0.3, 0.3]))(x)
+    turned = features(tensor([0.3, 0.3]))(x + tensor([0.8, 0.0]))
     torch.testing.assert_close(turned, start, rtol=0, atol=1e-6)
-    assert (features(x + tensor([0.0, 0.8]), tensor([0.3, 0.3])) - start).abs().max() > 0.1
+    assert (features(tensor([0.3, 0.3]))(x + tensor([0.0, 0.8])) - start).abs().max() > 0.1
 
 
 def missing(features, x, length_scale):
-    return 1.0 - features(x, length_scale).square().sum(-1)
+    return 1.0 - features(length_scale)(x).square().sum(-1)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)

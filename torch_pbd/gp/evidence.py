@@ -14,11 +14,11 @@ from torch import Tensor
 
 from torch_pbd.gp.observations import Hyperparameters, Observations
 from torch_pbd.gp.projection import FULL, Basis, Projection
-from torch_pbd.kernels import KernelName, correlation, value_and_slope
+from torch_pbd.kernels import correlation, value_and_slope
 
 
 def negative_log_evidence(
-    observations: Observations, hyperparameters: Hyperparameters, kernel: KernelName = "squared_exponential"
+    observations: Observations, hyperparameters: Hyperparameters, kernel: str = "squared_exponential"
 ) -> Float[Tensor, " b"]:
     """Negative log marginal likelihood of each process, in nats (Rasmussen and Williams, eq. (2.30)).
 
@@ -62,13 +62,13 @@ class Evidence:
     """
 
     projection: Projection
-    kernel: KernelName
+    kernel: str
     noise_scale: Float[Tensor, " b"] | None
     square_difference: Float[Tensor, "e mm"]
     """Of the nodes, in each dimension."""
 
     @classmethod
-    def of(cls, projection: Projection, kernel: KernelName, noise_scale: Tensor | None) -> "Evidence":
+    def of(cls, projection: Projection, kernel: str, noise_scale: Tensor | None) -> "Evidence":
         """Evidence of observations; a ``noise_scale`` of zero is no noise, and leaves the amplitude free."""
         nodes = projection.basis.nodes.mT
         difference = (nodes[:, :, None] - nodes[:, None, :]).square().flatten(1)
@@ -85,8 +85,8 @@ class Evidence:
         """
         data, basis = self.projection, self.projection.basis
         n_nodes, inverse_square = len(basis.nodes), length_scale.square().reciprocal()
-        square_distance = (inverse_square @ self.square_difference).reshape(-1, n_nodes, n_nodes)
-        correlation, slope = value_and_slope(square_distance, self.kernel)
+        squares = self.square_difference.unflatten(1, (n_nodes, n_nodes))
+        correlation, slope = value_and_slope(squares, inverse_square, self.kernel)
         covariance = basis.covariance(correlation)
         covariance.diagonal(dim1=-2, dim2=-1).add_(noise_ratio[:, None])
         inverse, log_det = _inverse_and_log_det(covariance)
@@ -122,8 +122,8 @@ class Evidence:
         One eigendecomposition of a length scale serves all processes and all noise ratios.
         """
         data, n_nodes = self.projection, len(self.projection.basis.nodes)
-        square_distance = (length_scales.square().reciprocal() @ self.square_difference).reshape(-1, n_nodes, n_nodes)
-        correlation, _ = value_and_slope(square_distance, self.kernel)
+        squares = self.square_difference.unflatten(1, (n_nodes, n_nodes))
+        correlation, _ = value_and_slope(squares, length_scales.square().reciprocal(), self.kernel)
         eigenvalue, eigenvector = torch.linalg.eigh(data.basis.covariance(correlation))
         square = (data.targets @ eigenvector).square()  # (s, b, r)
         spectrum = eigenvalue.clamp_min(0.0).unsqueeze(1) + noise_ratios[:, None]  # (s, q, r)

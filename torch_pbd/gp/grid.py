@@ -11,7 +11,6 @@ from torch.nn.functional import max_pool2d
 from torch_pbd.gp.evidence import Evidence
 from torch_pbd.gp.observations import Observations
 from torch_pbd.gp.projection import Basis, Projection, resolutions
-from torch_pbd.kernels import KernelName
 
 MIN_NOISE_RATIO, MAX_NOISE_RATIO = 1e-10, 1e5
 """Bounds of a learned noise variance over the variance of the process; a fixed noise may be far lower."""
@@ -36,7 +35,7 @@ class EvidenceSearch:
 
     Parameters
     ----------
-    kernel : KernelName
+    kernel : str
     length_scale_bounds : (float, float)
         Smallest and largest length scale, in units of the range of the inputs. A lower bound at the spacing
         of the inputs keeps out "needles", which explain every point by itself and nothing between.
@@ -53,7 +52,7 @@ class EvidenceSearch:
         :func:`~torch_pbd.optim.minimize_batch`.
     """
 
-    kernel: KernelName = "squared_exponential"
+    kernel: str = "squared_exponential"
     length_scale_bounds: tuple[float, float] = (1e-3, 1e1)
     length_scale: Tensor | None = None
     noise_scale: Tensor | None = None

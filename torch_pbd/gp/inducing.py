@@ -1,20 +1,18 @@
 """Gaussian processes of low rank: weights of standard normal numbers on features of inducing inputs."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
 from torch_pbd.gp.neighbourhoods import neighbourhoods, spacing
-from torch_pbd.kernels import KernelName, correlation
+from torch_pbd.kernels import correlation, differences, value_and_slope
 from torch_pbd.linalg import safe_cholesky
-
-# Kernel matrices of smooth kernels have a condition number beyond float64: what this takes away from a
-# process of unit variance cannot be told from noise.
-JITTER = 1e-13
 
 _SHORTEST = 1e-3
 _EXACT_RESOLUTION = 0.75  # spacings of the inputs: shorter "needles" explain each input by itself
@@ -30,34 +28,24 @@ class FeatureMap:
     """
 
     inducing: Float[Tensor, "m e"]
-    kernel: KernelName = "squared_exponential"
+    kernel: str = "squared_exponential"
     period: Float[Tensor, " e"] | None = None
     exact: bool = False
     """Whether the inducing inputs are all the training inputs."""
+    # Kernel matrices of smooth kernels have a condition number beyond float64: what this takes away from a process of
+    # unit variance cannot be told from noise.
+    jitter: ClassVar[float] = 1e-13
+    """Added to the diagonal of kernel matrices, which is one."""
 
-    def __call__(self, x: Float[Tensor, "n e"], length_scale: Float[Tensor, "*b e"]) -> Float[Tensor, "*b n m"]:
-        """Features at x: their inner products are the kernel, wherever the inducing inputs resolve it."""
-        return self.prepared(length_scale)(x)
-
-    def prepared(self, length_scale: Float[Tensor, "*b e"]) -> "PreparedFeatures":
-        """Features for these length scales, at any inputs."""
+    def __call__(self, length_scale: Float[Tensor, "*b e"]) -> "Features":
+        """Features for these length scales."""
         gram = correlation(self.inducing, self.inducing, length_scale, self.kernel, self.period)
-        gram = gram + JITTER * torch.eye(len(self.inducing)).to(gram)
-        factor = safe_cholesky(gram, name="the kernel matrix of the inducing inputs")
-        return PreparedFeatures(self, length_scale, factor)
-
-    @property
-    def jitter(self) -> float:
-        """Added to the diagonal of the kernel matrix, which is one."""
-        return JITTER
+        gram = gram + self.jitter * torch.eye(len(self.inducing)).to(gram)
+        return Features(self, length_scale, safe_cholesky(gram, name="the kernel matrix of the inducing inputs"))
 
     def square_differences(self, x: Float[Tensor, "n e"], other: Float[Tensor, "m e"]) -> Float[Tensor, "e n m"]:
         """Squares of the differences in each dimension; along a circle of the chords."""
-        difference = x.mT.unsqueeze(2) - other.mT.unsqueeze(1)
-        if self.period is not None:
-            radius = self.period[:, None, None] / math.pi
-            difference = torch.where(radius.isfinite(), radius * torch.sin(difference / radius), difference)
-        return difference.square()
+        return torch.stack(differences(x, other, self.period), dim=-1).square().movedim(-1, 0)
 
     @cached_property
     def farthest_first(self) -> Int64[Tensor, " m"]:
@@ -86,22 +74,76 @@ class FeatureMap:
 
 
 @dataclass(frozen=True)
-class PreparedFeatures:
-    """Features whose length scales are known, with what does not depend on the inputs computed."""
+class Features:
+    """Features of a map for given length scales, at any inputs."""
 
     features: FeatureMap
     length_scale: Float[Tensor, "*b e"]
     factor: Float[Tensor, "*b m m"]
-    """Lower, of the kernel matrix of the inducing inputs."""
+    """Lower Cholesky factor of the kernel matrix of the inducing inputs."""
 
     def __call__(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "*b n m"]:
-        """Features at x."""
+        """Features at x: their inner products are the kernel, wherever the inducing inputs resolve it."""
         return torch.linalg.solve_triangular(self.factor, self.cross(x).mT, upper=False).mT
 
     def cross(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "*b n m"]:
         """Kernel between x and the inducing inputs."""
         features = self.features
         return correlation(x, features.inducing, self.length_scale, features.kernel, features.period)
+
+
+class FixedFeatures:
+    """Features of a map at inputs that stay, for one length scale after another.
+
+    The inducing inputs are taken each as far as possible from those before it, and no more of them than carry what
+    can be told: for a smooth kernel and a long length scale these are few. The features are those of the map but
+    for an orthogonal matrix, and so the same processes.
+
+    Parameters
+    ----------
+    features : FeatureMap
+    x : Tensor of shape (n, e)
+    """
+
+    def __init__(self, features: FeatureMap, x: Float[Tensor, "n e"]) -> None:
+        self._kernel = features.kernel
+        chosen = features.inducing[features.farthest_first]
+        self._gram = features.square_differences(chosen, chosen)
+        self._cross = features.square_differences(chosen, x)
+        self._jitter = features.jitter * torch.eye(len(chosen)).to(x)
+
+    def vjp(
+        self, length_scale: Float[Tensor, "b e"], negligible: Float[Tensor, " b"]
+    ) -> tuple[Float[Tensor, "b n r"], Callable[[Float[Tensor, "b n r"]], Float[Tensor, "b e"]]]:
+        """Features, and the product of a gradient in them with their derivative in the logarithms of length scales.
+
+        The gradient is to be that of a function of the features' inner products alone. Left out are features that
+        carry less than ``negligible`` of the variance, which is one.
+        """
+        inverse_square = length_scale.reciprocal().square()
+        gram, gram_slope = value_and_slope(self._gram, inverse_square, self._kernel)
+        factor = safe_cholesky(gram + self._jitter, name="the kernel matrix of the inducing inputs")
+        # The square of a diagonal entry is the variance at an inducing input given those before it, and given the
+        # first r of them none is farther from these than the next. One feature is left in any case.
+        carries = (factor.diagonal(dim1=-2, dim2=-1).square() > negligible[:, None]).any(0)
+        size = int(carries.nonzero().max()) + 1 if bool(carries.any()) else 1
+        factor, gram_slope = factor[:, :size, :size], gram_slope[:, :size, :size]
+        gram_squares, cross_squares = self._gram[:, :size, :size], self._cross[:, :size]
+        cross, cross_slope = value_and_slope(cross_squares, inverse_square, self._kernel)
+        values = torch.linalg.solve_triangular(factor, cross, upper=False).mT
+
+        # With K = L L' of the inducing inputs and C their kernel with the others the features are F' = inv(L) C, and
+        # dF' = inv(L) dC - P F', where P is the lower half of S = inv(L) dK inv(L)'. P and S / 2 differ by an
+        # antisymmetric matrix, a rotation of the features, which a function of inner products does not see:
+        # dF' = inv(L) (dC - dK inv(K) C / 2). For a squared distance s in length scales dk = -2 s k'(s) d log(scale).
+        def in_log_length_scale(gradient: Tensor) -> Tensor:
+            both = torch.cat([gradient.mT, values.mT], dim=-1)
+            adjoint, solved = torch.linalg.solve_triangular(factor.mT, both, upper=True).chunk(2, dim=-1)
+            in_cross = (adjoint * cross_slope).flatten(1) @ cross_squares.flatten(1).mT
+            in_gram = (adjoint @ solved.mT * gram_slope).flatten(1) @ gram_squares.flatten(1).mT
+            return (in_gram - 2.0 * in_cross) / length_scale.square()
+
+        return values, in_log_length_scale
 
 
 def inducing_inputs(inputs: Float[Tensor, "n e"], n_inducing: int) -> Float[Tensor, "m e"]:

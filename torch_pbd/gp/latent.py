@@ -6,7 +6,7 @@ from torch import Tensor, nn
 
 from torch_pbd.gp.observations import Hyperparameters, Observations
 from torch_pbd.gp.projection import Basis, basis_for
-from torch_pbd.kernels import KernelName, correlation
+from torch_pbd.kernels import correlation
 from torch_pbd.linalg import cholesky_with_jitter, safe_cholesky
 
 
@@ -26,7 +26,7 @@ class LatentGP(nn.Module):
         Of the b processes; ``length_scale`` of shape (1, e) where all share it.
     counts : Tensor of shape (n,)
         Observations behind each value; they divide the noise variance.
-    kernel : KernelName
+    kernel : str
     root : Tensor of shape (r, n), default=None
         Where the inputs are nodes: what was observed are r combinations of the values there.
     """
@@ -46,7 +46,7 @@ class LatentGP(nn.Module):
         value_weight: Float[Tensor, "b n"],
         hyperparameters: Hyperparameters,
         counts: Float[Tensor, " n"],
-        kernel: KernelName = "squared_exponential",
+        kernel: str = "squared_exponential",
         root: Float[Tensor, "r n"] | None = None,
     ) -> None:
         super().__init__()
@@ -111,7 +111,7 @@ class LatentGP(nn.Module):
 def condition(
     observations: Observations,
     hyperparameters: Hyperparameters,
-    kernel: KernelName = "squared_exponential",
+    kernel: str = "squared_exponential",
     values: Float[Tensor, "b n"] | None = None,
     *,
     basis: Basis | None = None,

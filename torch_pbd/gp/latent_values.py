@@ -6,7 +6,7 @@ from torch import Tensor, nn
 
 from torch_pbd.gp.latent import LatentGP
 from torch_pbd.gp.observations import Hyperparameters
-from torch_pbd.kernels import KERNELS, KernelName, correlation
+from torch_pbd.kernels import KERNELS, correlation
 from torch_pbd.linalg import cholesky_with_jitter
 
 # Directions of a kernel matrix with less than this of its largest eigenvalue carry no trained values.
@@ -14,7 +14,7 @@ _RANK_TOLERANCE = 1e-11
 _MAX_PIVOTS = 128
 
 
-def pivoted_root(inputs: Float[Tensor, "n e"], length_scale: Float[Tensor, " e"], kernel: KernelName) -> Tensor | None:
+def pivoted_root(inputs: Float[Tensor, "n e"], length_scale: Float[Tensor, " e"], kernel: str) -> Tensor | None:
     """Root (n, r) of the kernel matrix by Cholesky decomposition with pivots; None where r would be large.
 
     Only r columns of the matrix are ever computed. What is left of the diagonal bounds the rest: it is below a
@@ -29,7 +29,7 @@ def pivoted_root(inputs: Float[Tensor, "n e"], length_scale: Float[Tensor, " e"]
         largest = float(rest[pivot])
         if largest <= 0.1 * _RANK_TOLERANCE:
             return columns[:rank].mT
-        column = KERNELS[kernel]((scaled - scaled[pivot]).square().sum(1))
+        column = KERNELS[kernel].value((scaled - scaled[pivot]).square().sum(1))
         column = column.addmv_(columns[:rank].mT, columns[:rank, pivot], alpha=-1.0).div_(largest**0.5)
         columns[rank] = column
         rest.addcmul_(column, column, value=-1.0)
@@ -62,7 +62,7 @@ class LatentValues(nn.Module):
         Where training starts.
     amplitude : Tensor of shape (b,)
     length_scale : Tensor of shape (1, e) or (b, e)
-    kernel : KernelName
+    kernel : str
     train_hyperparameters : bool
         Whether amplitude and length scale, then one for each process, are trained with the values.
     """
@@ -77,7 +77,7 @@ class LatentValues(nn.Module):
         amplitude: Float[Tensor, " b"],
         length_scale: Float[Tensor, "g e"],
         *,
-        kernel: KernelName = "squared_exponential",
+        kernel: str = "squared_exponential",
         train_hyperparameters: bool = False,
     ) -> None:
         super().__init__()

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torch_pbd.gp.neighbourhoods import merge_observations, resolved_length_scale
 from torch_pbd.gp.observations import Observations
-from torch_pbd.kernels import KernelName
+from torch_pbd.kernels import KERNELS
 
 _N_NODES = (32, 48, 88, 168)
 _WORTH = 1.5  # inputs for each node, below which nothing is gained
@@ -34,7 +34,7 @@ FULL = Resolution(None, None, 0.0)
 
 
 def resolutions(
-    observations: Observations, kernel: KernelName, *, noisy: bool, max_inputs: int | None = None
+    observations: Observations, kernel: str, *, noisy: bool, max_inputs: int | None = None
 ) -> list[Resolution]:
     """Those to try, the coarsest first."""
     n_inputs, n_features = observations.inputs.shape
@@ -42,7 +42,7 @@ def resolutions(
     if noisy and max_inputs is not None and n_inputs > max_inputs:
         centres = merge_observations(replace(observations, targets=observations.targets[:0]), max_inputs).inputs
         finest = Resolution(None, max_inputs, resolved_length_scale(centres))
-    if not noisy or n_features > 1 or kernel != "squared_exponential":
+    if not noisy or n_features > 1 or not KERNELS[kernel].on_nodes:
         return [finest]
     extent = float(observations.inputs.max() - observations.inputs.min())
     sizes = [size for size in _N_NODES if min(n_inputs, max_inputs or n_inputs) >= _WORTH * size]
@@ -139,7 +139,7 @@ class Projection:
         return self.n_inputs - self.targets.shape[1]
 
 
-def basis_for(observations: Observations, length_scale: Tensor, noise_ratio: Tensor, kernel: KernelName) -> Basis:
+def basis_for(observations: Observations, length_scale: Tensor, noise_ratio: Tensor, kernel: str) -> Basis:
     """The coarsest basis that carries the length scales."""
     noisy = bool((noise_ratio >= _LEAST_NOISE_RATIO).all())
     levels = resolutions(observations, kernel, noisy=noisy)

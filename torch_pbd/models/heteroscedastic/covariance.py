@@ -6,12 +6,12 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from torch_pbd.gp.fixed_features import FixedFeatures
+from torch_pbd.gp.inducing import FixedFeatures
 from torch_pbd.models.heteroscedastic.correlation import NoiseCorrelation
 from torch_pbd.models.heteroscedastic.latent import LatentCovariance
 from torch_pbd.models.heteroscedastic.linear import LinearEvidence, Weights
 from torch_pbd.models.heteroscedastic.log_variance import LEAST_SQUARE, LogVariance, Squares, fit_log_variance
-from torch_pbd.models.heteroscedastic.processes import Design, ProcessFamily
+from torch_pbd.models.heteroscedastic.processes import ProcessFamily
 from torch_pbd.models.heteroscedastic.regression import Regression
 from torch_pbd.models.heteroscedastic.search import Gradient, Search, SearchOptions
 
@@ -113,14 +113,14 @@ def _fit_log_variance(search: Search, fixed: FixedFeatures, squares: Squares, ne
     near = (squares.log_pooled.expand_as(squares.total) if near is None else near).clone()
 
     def evidence(theta: Tensor, rows: Int64[Tensor, " a"]) -> tuple[Tensor, Gradient]:
-        design = Design.of(search.family, fixed, theta, information[rows])
-        found = fit_log_variance(squares.rows(rows), design.values, near[rows])
+        design, vjp = search.family.design_vjp(fixed, theta, information[rows])
+        found = fit_log_variance(squares.rows(rows), design, near[rows])
         if len(rows) <= len(near):
             near[rows] = found.location  # where the next evaluation starts
-        return found.evidence, lambda: design.pull(found.gradient())
+        return found.evidence, lambda: vjp(found.gradient())
 
     theta = search.run(evidence, squares.total)
-    return fit_log_variance(squares, Design.of(search.family, fixed, theta, information).values, near)
+    return fit_log_variance(squares, search.family.design_vjp(fixed, theta, information)[0], near)
 
 
 def _fit_coefficients(
@@ -135,7 +135,7 @@ def _fit_coefficients(
         known = Regression.of(scatter[:, : i + 1, : i + 1], tril, _of_output(noise.of_squares, i))
         precision = state.precision[i]
         design, linear = _fit_row(search, fixed, known, precision, anew=anew or search.theta is None)
-        features = design.values[0]
+        features = design[0]
         state.evidence -= float(linear.divergence_from_prior())
         state.regressions.append(known)
         state.expected.append(_sum(known.squares(features, linear.mean[0], linear.covariance[0])))
@@ -144,25 +144,23 @@ def _fit_coefficients(
 
 def _fit_row(
     search: Search, fixed: FixedFeatures, known: Regression, precision: Tensor, *, anew: bool
-) -> tuple[Design, LinearEvidence]:
-    """Features and posterior of the weights of the coefficients of one output."""
+) -> tuple[Tensor, LinearEvidence]:
+    """Features (1, n, p) and posterior of the weights of the coefficients of one output."""
     information = (precision * known.before.diagonal(dim1=1, dim2=2).sum(-1)).sum()
-
-    def fit(theta: Tensor) -> tuple[Design, LinearEvidence]:
-        design = Design.of(search.family, fixed, theta, information.expand(len(theta)))
-        return design, known.fit(design.values, precision)
-
-    latest: list[tuple[Design, LinearEvidence]] = []
+    latest: list[tuple[Tensor, Tensor, LinearEvidence]] = []
 
     def evidence(theta: Tensor, _: Int64[Tensor, " a"]) -> tuple[Tensor, Gradient]:
-        design, linear = fit(theta)
-        latest[:] = [(design, linear)]
-        return linear.value, lambda: design.pull(known.gradient(linear, design.values, precision))
+        design, vjp = search.family.design_vjp(fixed, theta, information.expand(len(theta)))
+        linear = known.fit(design, precision)
+        latest[:] = [(theta, design, linear)]
+        return linear.value, lambda: vjp(known.gradient(linear, design, precision))
 
     if anew:
         search.run(evidence, precision)
     assert search.theta is not None
-    return latest[0] if latest and torch.equal(latest[0][0].theta, search.theta) else fit(search.theta)
+    if not latest or not torch.equal(latest[0][0], search.theta):
+        evidence(search.theta, torch.arange(1))
+    return latest[0][1:]
 
 
 def _squares(scatter: Tensor, degrees: Tensor, noise: NoiseCorrelation, last: _Sweep) -> Squares:

@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from torch_pbd.gp.fixed_features import FixedFeatures
+from torch_pbd.gp.inducing import FixedFeatures
 from torch_pbd.models.heteroscedastic.linear import LinearEvidence, Weights, weights_posterior
-from torch_pbd.models.heteroscedastic.processes import Design, Processes, ProcessFamily
+from torch_pbd.models.heteroscedastic.processes import Processes, ProcessFamily
 from torch_pbd.models.heteroscedastic.search import Gradient, Search
 
 _CHUNK = 1024
@@ -77,13 +77,13 @@ def fit_mean(
 
     def evidence(theta: Tensor, rows: Int64[Tensor, " a"]) -> tuple[Tensor, Gradient]:
         chosen = None if whitener is None else whitener[rows]
-        design = Design.of(family, fixed, theta, information[rows])
-        whitened = _times(chosen, scale[rows] * design.values)
+        design, vjp = family.design_vjp(fixed, theta, information[rows])
+        whitened = _times(chosen, scale[rows] * design)
         linear = LinearEvidence.of(whitened, response[rows])
 
         def gradient() -> Tensor:
             of_whitened = linear.gradient(whitened, response[rows])
-            return design.pull(scale[rows] * _times(None if chosen is None else chosen.mT, of_whitened))
+            return vjp(scale[rows] * _times(None if chosen is None else chosen.mT, of_whitened))
 
         return linear.value, gradient
 

@@ -7,7 +7,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from torch_pbd.gp.inducing import FeatureMap
-from torch_pbd.kernels import KernelName
 from torch_pbd.linalg import safe_cholesky, symmetrize
 from torch_pbd.models.heteroscedastic.fit import HeteroscedasticFit
 from torch_pbd.models.heteroscedastic.latent import LatentCovariance
@@ -72,7 +71,7 @@ class HeteroscedasticModel(nn.Module):
             tensors["period"] = features.period
         for name, tensor in tensors.items():
             self.register_buffer(name, tensor.detach().clone().contiguous())
-        self.kernel: KernelName = features.kernel
+        self.kernel: str = features.kernel
         self.exact = [family.features.exact for family in families]
         self.medians = [(family.length_scale, family.amplitude, family.constant) for family in families]
 

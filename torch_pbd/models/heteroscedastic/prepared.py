@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torch_pbd.gp.inducing import PreparedFeatures
+from torch_pbd.gp.inducing import Features
 from torch_pbd.gp.neighbourhoods import spacing
 from torch_pbd.models.heteroscedastic.latent import LatentCovariance
 from torch_pbd.models.heteroscedastic.mean import LatentMean
@@ -26,9 +26,9 @@ class Prepared:
     versions: tuple[int, ...]
     mean: LatentMean
     covariance: LatentCovariance
-    nearness: PreparedFeatures
+    nearness: Features
     """Of the process that tells what is missing."""
-    together: list[tuple[list[int], list[int], PreparedFeatures]]
+    together: list[tuple[list[int], list[int], Features]]
     """Of mean (0), log variances (1), coefficients (2) and nearness (3) those on the same inducing inputs: which, how
     many processes each, and their features.
     """
@@ -46,7 +46,7 @@ class Prepared:
         weight = family.amplitude_of(theta).square()
         scale = ((weight / weight.sum()) @ family.length_scale_of(theta).log()).exp()
         scale = scale.clamp_max(_REACH * inducing.shape[1]).clamp_min(2.0 * spacing(inducing))
-        nearness = replace(family.features, kernel="squared_exponential").prepared(scale[None])
+        nearness = replace(family.features, kernel="squared_exponential")(scale[None])
         rows = covariance.rows.features if covariance.coefficients else None
         parts = [mean.processes.features, covariance.log_variances.features, rows, nearness]
         return cls(buffers, cls._versions(buffers), mean, covariance, nearness, _together(parts))
@@ -69,8 +69,8 @@ class Prepared:
         return tuple(-1 if buffer is None or buffer.is_inference() else buffer._version for buffer in buffers)
 
 
-def _together(parts: list[PreparedFeatures | None]) -> list[tuple[list[int], list[int], PreparedFeatures]]:
-    groups: list[tuple[list[int], list[PreparedFeatures]]] = []
+def _together(parts: list[Features | None]) -> list[tuple[list[int], list[int], Features]]:
+    groups: list[tuple[list[int], list[Features]]] = []
     for number, part in enumerate(parts):
         if part is None:
             continue
@@ -84,12 +84,12 @@ def _together(parts: list[PreparedFeatures | None]) -> list[tuple[list[int], lis
     return [(numbers, [len(part.factor) for part in own], _stacked(own)) for numbers, own in groups]
 
 
-def _same_inputs(part: PreparedFeatures, other: PreparedFeatures) -> bool:
+def _same_inputs(part: Features, other: Features) -> bool:
     return part.features.kernel == other.features.kernel and torch.equal(
         part.features.inducing, other.features.inducing
     )
 
 
-def _stacked(parts: list[PreparedFeatures]) -> PreparedFeatures:
+def _stacked(parts: list[Features]) -> Features:
     length_scale = torch.cat([part.length_scale for part in parts])
-    return PreparedFeatures(parts[0].features, length_scale, torch.cat([part.factor for part in parts]))
+    return Features(parts[0].features, length_scale, torch.cat([part.factor for part in parts]))

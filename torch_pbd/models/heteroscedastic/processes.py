@@ -1,14 +1,14 @@
 """Families of latent processes, and their features."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torch_pbd.gp.fixed_features import FeaturesAt, FixedFeatures
-from torch_pbd.gp.inducing import FeatureMap, PreparedFeatures
+from torch_pbd.gp.inducing import FeatureMap, Features, FixedFeatures
 
 CLEAR = 3.0
 """Times the shortest length scale, above which inducing inputs resolve one with room to spare."""
@@ -51,7 +51,33 @@ class ProcessFamily:
 
     def prepared(self, theta: Float[Tensor, "b q"]) -> "Processes":
         """Processes with these hyperparameters."""
-        return Processes(self, self.amplitude_of(theta), self.features.prepared(self.length_scale_of(theta)))
+        return Processes(self, self.amplitude_of(theta), self.features(self.length_scale_of(theta)))
+
+    def design_vjp(
+        self, fixed: FixedFeatures, theta: Float[Tensor, "b q"], information: Float[Tensor, " b"]
+    ) -> tuple[Float[Tensor, "b n p"], Callable[[Float[Tensor, "b n p"]], Float[Tensor, "b q"]]]:
+        """Design at inputs that stay, and the product of a gradient in it with its derivative in the hyperparameters.
+
+        The gradient is that of a function of the design's inner products. Its log evidence is that of all features,
+        but for what cannot be told: where features that carry a variance of at most v are left out, it changes by
+        about half of v times the ``information``, the sum of the precisions of what is observed.
+        """
+        amplitude = self.amplitude_of(theta)
+        negligible = 2.0 * _NEGLIGIBLE / (amplitude.square() * information)
+        values, vjp = fixed.vjp(self.length_scale_of(theta), negligible)
+        design = self.scaled(values, amplitude)
+
+        def in_theta(gradient: Tensor) -> Tensor:
+            gradient = gradient[..., : values.shape[-1]]  # the constant has no hyperparameters
+            in_amplitude = (gradient * design[..., : values.shape[-1]]).sum((-2, -1))
+            in_amplitude = in_amplitude * (1.0 - torch.tanh(theta[:, -1] / _WIDEST).square())
+            if self.fixed_length_scale is not None:
+                return torch.nn.functional.pad(in_amplitude[:, None], (theta.shape[1] - 1, 0))
+            in_scale = vjp(amplitude[:, None, None] * gradient)
+            in_scale = in_scale * torch.sigmoid(theta[:, :-1] - math.log(self.features.shortest_length_scale()))
+            return torch.cat([in_scale, in_amplitude[:, None]], dim=1)
+
+        return design, in_theta
 
     def scaled(self, features: Float[Tensor, "b n m"], amplitude: Float[Tensor, " b"]) -> Float[Tensor, "b n p"]:
         """Features times the amplitudes, and the constant."""
@@ -105,7 +131,7 @@ class Processes:
 
     family: ProcessFamily
     amplitude: Float[Tensor, " b"]
-    features: PreparedFeatures
+    features: Features
 
     def __call__(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "b n p"]:
         """Features at x, of which a process is the sum weighted by standard normal numbers."""
@@ -115,43 +141,3 @@ class Processes:
         """Prior variance that the features at x do not carry: none at the inducing inputs, all far from them."""
         carried = design[..., : self.features.factor.shape[-1]].square().sum(-1)
         return (self.amplitude.square().unsqueeze(-1) - carried).clamp_min(0.0)
-
-
-@dataclass(frozen=True)
-class Design:
-    """Features of b processes at inputs that stay, as few as their information needs."""
-
-    family: ProcessFamily
-    theta: Float[Tensor, "b q"]
-    amplitude: Float[Tensor, " b"]
-    features: FeaturesAt
-    values: Float[Tensor, "b n p"]
-
-    @classmethod
-    def of(
-        cls,
-        family: ProcessFamily,
-        fixed: FixedFeatures,
-        theta: Float[Tensor, "b q"],
-        information: Float[Tensor, " b"],
-    ) -> "Design":
-        """Design whose log evidence is that of all features, but for what cannot be told.
-
-        Where features that carry a variance of at most v are left out, it changes by about half of v times the
-        ``information``, the sum of the precisions of what is observed.
-        """
-        amplitude = family.amplitude_of(theta)
-        features = fixed.at(family.length_scale_of(theta), 2.0 * _NEGLIGIBLE / (amplitude.square() * information))
-        return cls(family, theta, amplitude, features, family.scaled(features.values, amplitude))
-
-    def pull(self, gradient: Float[Tensor, "b n p"]) -> Float[Tensor, "b q"]:
-        """Gradient in the hyperparameters, from that in the values of a function of their inner products."""
-        family, size = self.family, self.features.values.shape[-1]
-        gradient = gradient[..., :size]
-        in_amplitude = (gradient * self.values[..., :size]).sum((-2, -1))
-        in_amplitude = in_amplitude * (1.0 - torch.tanh(self.theta[:, -1] / _WIDEST).square())
-        if family.fixed_length_scale is not None:
-            return torch.nn.functional.pad(in_amplitude[:, None], (self.theta.shape[1] - 1, 0))
-        in_scale = self.features.pull(self.amplitude[:, None, None] * gradient)
-        in_scale = in_scale * torch.sigmoid(self.theta[:, :-1] - math.log(family.features.shortest_length_scale()))
-        return torch.cat([in_scale, in_amplitude[:, None]], dim=1)
