@@ -235,7 +235,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
             remedy="Draw fewer at a time.",
         )
         normal = [[self._door(generator.standard_normal(size)) for size in core.draw_sizes()] for _ in range(n_samples)]
-        drawn = [torch.stack(of_process) for of_process in zip(*normal, strict=True)]
+        drawn = [torch.stack(process) for process in zip(*normal, strict=True)]
         result = np.empty((len(x), self.n_outputs_, self.n_outputs_, n_samples))
         with torch.inference_mode():
             for rows in torch.arange(len(x)).split(max(1, _DRAWN // n_samples)):
@@ -273,8 +273,8 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         begin = None
         for sizes in to_try:
             inducing = [inducing_inputs(training.inputs, size) for size in sizes]
-            of_mean, features = (FeatureMap(z, kernel, circle, len(z) == len(inputs)) for z in inducing)
-            families = Families.of(of_mean, features, held, shared=self.shared_length_scale)
+            mean_features, features = (FeatureMap(z, kernel, circle, len(z) == len(inputs)) for z in inducing)
+            families = Families.build(mean_features, features, held, shared=self.shared_length_scale)
             begin = begin or cache(partial(mean_start, rows, families.mean, options))
             fit = fit_heteroscedastic(
                 training,
