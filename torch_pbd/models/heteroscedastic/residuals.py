@@ -166,7 +166,10 @@ class NoiseCorrelation:
         """Whiteners for rows of demonstrations ``group``, at ``inputs[index]``."""
         if group is None or correlation is None or not correlation.matters:
             return cls()
-        occurrences = _occurrences(index, group, len(inputs)).to(inputs)
+        # Rows of each demonstration at each distinct input.
+        names, number = group.unique(return_inverse=True)
+        occurrences = torch.bincount(number * len(inputs) + index, minlength=len(names) * len(inputs))
+        occurrences = occurrences.reshape(len(names), len(inputs)).to(inputs)
         means, squares = (correlation.matrix(inputs, occurrences, squares=squares) for squares in (False, True))
         return cls(_whitener(means), _whitener(squares), squares.diagonal(dim1=1, dim2=2))
 
@@ -180,12 +183,6 @@ def _whitener(matrix: Tensor) -> Tensor:
     """Inverses of lower factors."""
     factor = safe_cholesky(matrix, name="the correlation of the demonstrations")
     return torch.linalg.solve_triangular(factor, torch.eye(factor.shape[-1]).to(factor).expand_as(factor), upper=False)
-
-
-def _occurrences(index: Tensor, group: Tensor, n_inputs: int) -> Tensor:
-    """Rows of each demonstration at each distinct input."""
-    names, number = group.unique(return_inverse=True)
-    return torch.bincount(number * n_inputs + index, minlength=len(names) * n_inputs).reshape(len(names), n_inputs)
 
 
 def demonstration_correlation(
