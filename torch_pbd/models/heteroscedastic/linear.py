@@ -118,6 +118,7 @@ class Regression:
     ) -> "Regression":
         """Regression of the last output of a scatter; ``tril`` is the factor of the others' covariance."""
         size = tril.shape[-1]
+        # diag(inv(T), 1) S diag(inv(T), 1)': the outputs before get unit covariance, the last one keeps its unit.
         eye = torch.eye(size + 1).to(scatter)
         standardizing = eye.repeat(len(scatter), 1, 1)
         standardizing[:, :size, :size] = torch.linalg.solve_triangular(tril, eye[:size, :size], upper=False)
@@ -182,6 +183,7 @@ class Regression:
 
         ``mean`` and ``covariance`` are of the weights.
         """
+        # With coefficients b the sum of squares is (-b, 1) S (-b, 1)', and tr(before cov(b)) what their error adds.
         coefficients = features @ mean.reshape(self._shape(features)).mT
         direction = torch.cat([-coefficients, torch.ones_like(coefficients[:, :1])], dim=1)
         explained = (direction.unsqueeze(1) @ self.scatter @ direction.unsqueeze(2)).flatten()
@@ -195,6 +197,7 @@ class Regression:
     def _precision_of_weights(self, features: Tensor, precision: Tensor) -> Tensor:
         """Precision (b, i * p, i * p) of the weights where inputs are independent."""
         size, n_features = self._shape(features)
+        # Block (j, k) is F' diag(precision before_jk) F: of all products of two features, or pair by pair.
         weight = (precision[:, None, None] * self.before).flatten(1).mT
         if self._by_squares(features):
             blocks = weight @ _squares(features)
@@ -223,6 +226,7 @@ class Regression:
 
     def _design(self, features: Tensor, precision: Tensor) -> tuple[Tensor, Tensor]:
         """Design (b, n * i, i * p) of the rows of the root at each input, whitened, and the response."""
+        # Row a at an input holds root_ja F for each coefficient j: n i rows, of which the whitener mixes the inputs.
         weight = precision.sqrt()
         design = torch.einsum("n,nja,bnp->bnajp", weight, self.root, features).flatten(-2)
         response = weight[:, None] * self.response

@@ -139,6 +139,7 @@ def _fit_independent(squares: Squares, features: Tensor, start: Tensor) -> LogVa
     diag(r) A - diag(h) F Q with Q = A' diag(r) A.
     """
     half = 0.5 * squares.degrees
+    # P = 1 + F' diag(h) F, and the variances of the logarithms, the diagonal of F inv(P) F'.
     factor = weights_factor(half.sqrt().unsqueeze(-1) * features)
     spread = features @ torch.cholesky_inverse(factor, upper=True)
     variance = (spread * features).sum(-1)
@@ -149,6 +150,7 @@ def _fit_independent(squares: Squares, features: Tensor, start: Tensor) -> LogVa
     decay = torch.exp(-residual)
     deviance = 2.0 * (half * (residual + decay - 1.0)).sum(-1)
     log_det = -factor.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
+    # The constant: the likelihood of log variances that are the log mean squares, each by itself.
     saturated = (squares.degrees * (log_mean + 1.0 + math.log(2.0 * math.pi))).sum(-1)
     evidence = log_det - 0.5 * (deviance + mean.square().sum(-1) + saturated)
 
