@@ -9,7 +9,7 @@ from sklearn.gaussian_process.kernels import RBF, ExpSineSquared, Matern
 from torch_pbd.gp import spacing
 from torch_pbd.gp.inducing import FeatureMap, inducing_inputs
 from torch_pbd.kernels import KERNELS
-from torch_pbd.models.heteroscedastic.linear import weights_posterior
+from torch_pbd.models.heteroscedastic.linear import LinearEvidence
 
 ORACLES = {
     "squared_exponential": RBF,
@@ -67,7 +67,7 @@ def test_periodic_predictions_are_those_of_scikit_learn(rng):
         root = design @ weights.root
         return (design @ weights.mean).numpy(), (1.0 - design.square().sum(1) + root.square().sum(1)).sqrt().numpy()
 
-    weights = weights_posterior(5.0 * features(tensor([length_scale]))(tensor(x)), tensor(5.0 * y))
+    weights = LinearEvidence.fit(5.0 * features(tensor([length_scale]))(tensor(x)), tensor(5.0 * y)).weights()
     query = rng.uniform(-2.0, 3.0, size=(20, 1))
     mean, std = peer.predict(query, return_std=True)
     np.testing.assert_allclose(predict(query)[0], mean, rtol=0, atol=1e-7)

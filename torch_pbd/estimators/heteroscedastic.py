@@ -34,10 +34,10 @@ _DRAWN = 65536  # matrices drawn at a time: memory stays bounded
 class HeteroscedasticGPRegressor(CovarianceRegressor):
     """Mean and covariance by Gaussian processes, honest about what few demonstrations leave open.
 
-    The covariance is a lower factor whose diagonal entries are exponentials of Gaussian processes of the input,
-    and whose other entries are such processes; the mean is d more. Their values are integrated out, and
-    their length scales and amplitudes are those of the highest evidence. The mean is refitted under the
-    covariance learned, by generalized least squares.
+    The covariance has a lower factor whose diagonal entries are exponentials of Gaussian processes of the input, and
+    whose other entries are such processes; the mean is d more. Their values are integrated out; their length scales
+    and amplitudes maximize the evidence. The mean is refitted under the covariance learned, by generalized least
+    squares.
 
     What is predicted is Student's t. Its covariance contains the variability, the error of its estimate and
     that of the mean, and far from data it is ``prior``.
@@ -45,7 +45,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
     Parameters
     ----------
     kernel : {"squared_exponential", "matern32", "matern52", "periodic"}, default="squared_exponential"
-        Of all processes. "periodic" is the squared exponential of the chord on a circle.
+        Kernel of all processes; "periodic" is the squared exponential of the chord on a circle.
     period : float or array-like of shape (n_features,), default=None
         Circumference of that circle in units of X, such as 1.0 for a phase; ``inf`` for inputs that do not
         repeat. Needed for "periodic", and allowed with the other kernels.
@@ -53,10 +53,9 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         Covariance far from data, in squared units of y. A float stands for that times the unit matrix; a
         callable maps X (n, e) to (n, d, d). None learns a wide one: four times the covariance of all of y.
     length_scale : float, array-like of shape (n_features,) or None, default=None
-        Of the covariance's processes, in units of X; None learns it.
+        Length scale of the covariance's processes, in units of X; None learns it.
     shared_length_scale : bool, default=False
-        One length scale for the log variances of all outputs, and one for all outputs' means, instead of one
-        for each.
+        One length scale for the log variances of all outputs, and one for all means, instead of one for each.
     n_inducing : int or None, default=None
         Inputs on which the processes rest. None takes all distinct inputs up to 48 and of more the centres of as
         many neighbourhoods; if the length scales that are found come near their distances, 128; at once for
@@ -74,7 +73,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
     n_restarts : int, default=0
         Starts of the first searches beside the best of a small grid.
     random_state : int, RandomState instance or None, default=0
-        Not used: the fit is deterministic. It is here so that estimators can be exchanged.
+        Not used, as the fit is deterministic: it is here so that estimators can be exchanged.
     device : str or None, default=None
         Where the torch module lives.
     verbose : int, default=0
@@ -84,15 +83,14 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
     module_ : ConditionalNormal
         The fitted torch module: maps x (n, e) to mean (n, d) and Cholesky factor (n, d, d), differentiably.
     effective_share_ : float
-        Independent samples that a sample of a demonstration counts for, mean over the outputs; 1.0 without
-        ``groups``.
+        Independent samples that a sample of a demonstration counts for, mean of the outputs; 1.0 without ``groups``.
     n_features_in_, n_outputs_ : int
     loss_ : float
         Negative log evidence of the covariance's processes at the end, in nats, but for a constant.
     loss_curve_ : list of float
-        The same after each turn of mean and covariance. Each is of residuals from its own mean.
+        ``loss_`` after each turn of mean and covariance, of the residuals from that turn's mean.
     n_iter_ : int
-        Most iterations of one search.
+        Largest number of iterations of a search.
     converged_ : bool
     jitter_ : float
         Jitter of the kernel matrices, relative to their diagonal.
@@ -102,21 +100,19 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
     Rows that repeat an input enter as count, mean and scatter: after that the cost of a fit is in the number n
     of distinct inputs (at most ``max_inputs``), outputs d, and inducing inputs m, of which smooth processes take only
     the r that carry something: n d r^2 + n (d r)^2 + d (d r)^3 for each evaluation of the evidence, and once a turn
-    the same with m.
+    with m instead of r.
 
-    With ``groups`` the correlation of a demonstration's residuals is estimated and enters the likelihood:
-    neighbouring samples of a smooth demonstration are nearly copies. It is taken for exponential, whatever
-    its shape, with the integral of the one estimated: demonstrations are smoother than that, but a model that
-    trusts their smoothness takes it for signal.
+    With ``groups`` the correlation of a demonstration's residuals is estimated and enters the likelihood, as its
+    neighbouring samples are nearly copies. It is taken for exponential, with the integral of the one estimated:
+    demonstrations are smoother than that, but a model that trusts their smoothness takes it for signal.
 
-    The factor depends on the order of the outputs, and with it the fit: with six demonstrations a variance may
-    change by 20 %.
+    The factor, and with it the fit, depends on the order of the outputs: with six demonstrations a variance may change
+    by 20 %.
 
     References
     ----------
-    Umlauft, Fanger, Hirche, "Bayesian Uncertainty Modeling for Programming by Demonstration", ICRA 2017, for the
-    problem and the two kinds of uncertainty. Pourahmadi, "Joint mean-covariance models", Biometrika 86, 1999, for
-    regressions of outputs on those before them.
+    Umlauft, Fanger, Hirche, "Bayesian Uncertainty Modeling for Programming by Demonstration", ICRA 2017: the problem,
+    and the two kinds of uncertainty. Pourahmadi, "Joint mean-covariance models", Biometrika 86, 1999: the factor.
 
     Examples
     --------
@@ -174,8 +170,8 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
             What was recorded there.
         groups : array-like of shape (n_samples,), default=None
-            Demonstration of each sample. Without it rows count as independent, which makes recorded
-            demonstrations look more certain than they are.
+            Demonstration of each sample; without it rows count as independent, and recorded demonstrations look more
+            certain than they are.
 
         Returns
         -------
@@ -205,17 +201,16 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         ----------
         X : array-like of shape (n_samples, n_features)
         missing_knowledge : bool, default=True
-            False gives the variability alone, type2 of :meth:`predict_uncertainty`: no prior, and neither
-            the error of the mean nor that of the covariance.
+            False gives the variability alone, type2 of :meth:`predict_uncertainty`: without the prior and the errors
+            of mean and covariance.
         """
         return super().predict_cov(X) if missing_knowledge else self.predict_uncertainty(X).type2
 
     def sample_cov(self, X: ArrayLike, n_samples: int = 1, random_state: Any = None) -> Floats:
         """Draw covariance functions from their posterior, at X.
 
-        A draw is one function: its values at different inputs belong together. Where there are data, the spread of
-        the draws is what few demonstrations leave open; where data are missing each draw is the prior, which is
-        one matrix.
+        A draw is one function: its values at different inputs belong together. The spread of the draws is what few
+        demonstrations leave open; where data are missing each draw is the prior, which is one matrix.
 
         Parameters
         ----------
@@ -237,7 +232,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
             remedy="Draw fewer at a time.",
         )
         normal = [[self._door(generator.standard_normal(size)) for size in core.draw_sizes()] for _ in range(n_samples)]
-        drawn = [torch.stack(of_process) for of_process in zip(*normal, strict=True)]
+        drawn = [torch.stack(process) for process in zip(*normal, strict=True)]
         result = np.empty((len(x), self.n_outputs_, self.n_outputs_, n_samples))
         with torch.inference_mode():
             for rows in torch.arange(len(x)).split(max(1, _DRAWN // n_samples)):
@@ -275,16 +270,12 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         begin = None
         for sizes in to_try:
             inducing = [inducing_inputs(training.inputs, size) for size in sizes]
-            of_mean, features = (FeatureMap(z, kernel, circle, len(z) == len(inputs)) for z in inducing)
-            families = Families.of(of_mean, features, held, shared=self.shared_length_scale)
-            begin = begin or cache(partial(mean_start, rows, families.mean, options))
+            mean_features, features = (FeatureMap(z, kernel, circle, len(z) == len(inputs)) for z in inducing)
+            families = Families.build(mean_features, features, held, shared=self.shared_length_scale)
+            if self.n_inducing is None and begin is None:  # cached: looked for once, whatever sizes are tried
+                begin = cache(partial(mean_start, rows, families.mean, options))
             fit = fit_heteroscedastic(
-                training,
-                group,
-                families,
-                options,
-                needs_resolution=sizes != to_try[-1],
-                begin=begin if self.n_inducing is None else None,
+                training, group, families, options, needs_resolution=sizes != to_try[-1], begin=begin
             )
             if fit is not None:
                 break
@@ -296,7 +287,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         return Fitted(self._assemble(HeteroscedasticModel(fit, prior_tril), scaling), report, features.jitter)
 
     def _in_ranges(self, scaling: Standardization) -> tuple[torch.Tensor | None, torch.Tensor | None]:
-        """The length scale and the period that were given, in ranges of the inputs."""
+        """Length scale and period that the user gave, in ranges of the inputs."""
         length_scale = check_length_scale(self.length_scale, len(scaling.x_scale))
         period = check_period(self.period, self.kernel, scaling.x_scale)
         held = None if length_scale is None else self._door(length_scale / scaling.x_scale)

@@ -6,24 +6,25 @@ from torch_pbd import checks
 from torch_pbd.files.memory import require_much
 from torch_pbd.gp.inducing import FeatureMap
 
-# By default, for one column of X and for several, and where these do not resolve what is learned; and at most of
-# all outputs together, for the mean and for the covariance.
-_OF_ONE, _OF_SEVERAL, _MOST, _TOGETHER = 48, 128, 128, (800, 400)
+# By default, for one column of X and for several, and where these do not resolve what is learned. At most of all
+# outputs together, for the mean and for the covariance, as a fit takes the cube of these; but a dozen for each output.
+_OF_ONE, _OF_SEVERAL, _MOST, _TOGETHER, _FEWEST = 48, 128, 128, (800, 400), 12
 
 
 def inducing_sizes(n_inducing: int | None, n_features: int, n_outputs: int) -> list[tuple[int, int]]:
     """Inducing inputs of the mean's processes and of the covariance's, to be tried one after another."""
     if n_inducing is not None:
         return [(n_inducing, n_inducing)]
-    of_mean, of_covariance = (max(12, most // n_outputs) for most in _TOGETHER)
+    most_mean, most_covariance = (max(_FEWEST, most // n_outputs) for most in _TOGETHER)
     few = _OF_ONE if n_features == 1 else _OF_SEVERAL
-    return list(dict.fromkeys((min(size, of_mean), min(size, of_covariance)) for size in (few, _MOST)))
+    return list(dict.fromkeys((min(size, most_mean), min(size, most_covariance)) for size in (few, _MOST)))
 
 
 def check_memory(n_inducing: int | None, max_inputs: int, shape: tuple[int, int, int]) -> None:
     """Check that a fit of ``shape``, distinct inputs, their columns and outputs, has the memory that it needs.
 
-    Measured: of each output's features for the differences that start a search, and of all outputs' together.
+    Measured: each output's features for the differences that start a search take the most, and then all outputs'
+    together.
 
     Raises
     ------
@@ -43,7 +44,7 @@ def check_memory(n_inducing: int | None, max_inputs: int, shape: tuple[int, int,
 
 
 def warn_if_unresolved(length_scale: Tensor | None, features: FeatureMap) -> None:
-    """Warn where a length scale that the user gave is shorter than the inputs can tell."""
+    """Warn where a length scale that the user gave is shorter than the inputs resolve."""
     least = features.shortest_length_scale()
     if length_scale is not None and bool((length_scale < least).any()):
         checks.warn(

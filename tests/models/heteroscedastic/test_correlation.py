@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from torch_pbd.models.heteroscedastic.correlation import (
+from torch_pbd.models.heteroscedastic.residuals import (
     DemonstrationCorrelation,
     NoiseCorrelation,
     demonstration_correlation,
@@ -94,10 +94,10 @@ def test_the_whiteners_take_out_the_correlation_of_means_of_rows(rng):
     index = np.concatenate([np.arange(6), rng.integers(6, size=20)])
     group = np.concatenate([np.arange(6) % 4, rng.integers(4, size=20)])
     arguments = (torch.tensor(x)[:, None], torch.tensor(index), torch.tensor(group))
-    noise = NoiseCorrelation.of(known(0.2, 0.0), *arguments)
+    noise = NoiseCorrelation.build(known(0.2, 0.0), *arguments)
     average = (np.arange(6)[:, np.newaxis] == index) / np.sqrt(np.bincount(index))[:, np.newaxis]
     distance = np.abs(np.subtract.outer(x[index], x[index]))
-    for whitener, decay in ((noise.of_means, 0.4), (noise.of_squares, 0.2)):
+    for whitener, decay in ((noise.mean_whitener, 0.4), (noise.square_whitener, 0.2)):
         rows = np.exp(-distance / decay) * (group[:, np.newaxis] == group)
         covariance = average @ rows @ average.T
         whitened = whitener[0].numpy() @ covariance @ whitener[0].numpy().T
@@ -105,11 +105,11 @@ def test_the_whiteners_take_out_the_correlation_of_means_of_rows(rng):
         np.testing.assert_allclose(noise.copies[0], np.diag(covariance), rtol=1e-12)
         np.testing.assert_array_equal(whitener[1], np.eye(6))  # of the output whose samples are independent
     assert noise.copies[0].max() > 1.0  # some demonstration repeats an input
-    assert torch.equal(noise.rows(torch.tensor([1])).of_squares, noise.of_squares[1:])
+    assert torch.equal(noise.restrict(torch.tensor([1])).square_whitener, noise.square_whitener[1:])
 
 
 @pytest.mark.parametrize("correlation", [None, known(0.0, 0.0), known(0.2, 0.0)])
 def test_without_correlation_or_groups_there_is_nothing_to_take_out(correlation):
     group = None if correlation is not None and correlation.matters else torch.tensor([0, 0, 1])
-    noise = NoiseCorrelation.of(correlation, torch.zeros(3, 1).double(), torch.arange(3), group)
+    noise = NoiseCorrelation.build(correlation, torch.zeros(3, 1).double(), torch.arange(3), group)
     assert noise == NoiseCorrelation(None, None, None)

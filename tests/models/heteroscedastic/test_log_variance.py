@@ -7,9 +7,9 @@ from scipy.special import digamma, polygamma
 from scipy.stats import chi2, lognorm, multivariate_normal
 from torch.distributions import MultivariateNormal, kl_divergence
 
-from torch_pbd.models.heteroscedastic.correlation import NoiseCorrelation
 from torch_pbd.models.heteroscedastic.log_variance import Squares
 from torch_pbd.models.heteroscedastic.log_variance import fit_log_variance as fit
+from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation
 
 INDEPENDENT = NoiseCorrelation()
 
@@ -227,7 +227,7 @@ def test_processes_are_fitted_each_by_itself(family, inputs, rng):
     features = family.design(inputs, torch.tensor([[-1.0, 0.5], [0.3, -0.5]], dtype=torch.float64))
     weights, evidence = fit_log_variance(squares, features)
     for i in range(2):
-        alone, own = fit_log_variance(squares.rows(torch.tensor([i])), features[i : i + 1])
+        alone, own = fit_log_variance(squares.restrict(torch.tensor([i])), features[i : i + 1])
         torch.testing.assert_close(alone.mean[0], weights.mean[i], rtol=0, atol=1e-7)
         torch.testing.assert_close(own[0], evidence[i], rtol=1e-12, atol=1e-12)
 

@@ -4,7 +4,7 @@ import torch
 from scipy.linalg import block_diag
 from scipy.stats import multivariate_normal
 
-from torch_pbd.models.heteroscedastic.regression import Regression
+from torch_pbd.models.heteroscedastic.linear import Regression
 
 # A ridge of 1e-8 beside the standardized outputs' scatter keeps it regular, and moves results by as much.
 RTOL = 1e-6
@@ -20,7 +20,7 @@ class Rows:
         self.tril, self.before = factor[:, :-1, :-1], normal[..., :-1]
         self.last = self.residual[..., -1]
         scatter = torch.tensor(self.residual.transpose(0, 2, 1) @ self.residual)
-        self.regression = Regression.of(scatter, torch.tensor(self.tril), whitener)
+        self.regression = Regression.standardize(scatter, torch.tensor(self.tril), whitener)
 
 
 def fitted(regression, features, precision):

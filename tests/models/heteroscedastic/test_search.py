@@ -19,7 +19,7 @@ def evidence_of(family, inputs, response):
     def evidence(theta, rows):
         theta = theta.clone().requires_grad_()
         with torch.enable_grad():
-            value = LinearEvidence.of(5.0 * family.design(inputs, theta), 5.0 * response[rows]).value
+            value = LinearEvidence.fit(5.0 * family.design(inputs, theta), 5.0 * response[rows]).value
         return value.detach(), lambda: torch.autograd.grad(value, theta, torch.ones_like(value))[0]
 
     return evidence

@@ -1,11 +1,11 @@
 """Mean and covariance by latent Gaussian processes that are integrated out: the recommended model."""
 
 from torch_pbd.models.heteroscedastic.fit import Families, HeteroscedasticFit, fit_heteroscedastic
+from torch_pbd.models.heteroscedastic.mean import mean_start
 from torch_pbd.models.heteroscedastic.module import HeteroscedasticModel
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
 from torch_pbd.models.heteroscedastic.residuals import are_copies
 from torch_pbd.models.heteroscedastic.search import SearchOptions
-from torch_pbd.models.heteroscedastic.start import mean_start
 
 __all__ = [
     "Families",

@@ -1,57 +1,159 @@
-"""Fit of the covariance's latent processes to the scatter of the residuals."""
+"""Covariance by latent processes, the log variances and coefficients of its factor, and their fit to residuals."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
 from torch_pbd.gp.inducing import FixedFeatures
-from torch_pbd.models.heteroscedastic.correlation import NoiseCorrelation
-from torch_pbd.models.heteroscedastic.latent import LatentCovariance
-from torch_pbd.models.heteroscedastic.linear import LinearEvidence, Weights
-from torch_pbd.models.heteroscedastic.log_variance import LEAST_SQUARE, LogVariance, Squares, fit_log_variance
-from torch_pbd.models.heteroscedastic.processes import ProcessFamily
-from torch_pbd.models.heteroscedastic.regression import Regression
-from torch_pbd.models.heteroscedastic.search import Gradient, Search, SearchOptions
+from torch_pbd.models.heteroscedastic.linear import LinearEvidence, Regression, Weights
+from torch_pbd.models.heteroscedastic.log_variance import LEAST_SQUARE, Squares, fit_log_variance, search_log_variance
+from torch_pbd.models.heteroscedastic.processes import Processes, ProcessFamily
+from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation
+from torch_pbd.models.heteroscedastic.search import Gradient, Search
 
-_SWEEPS = 3
-_SEARCHES = 2  # sweeps that look for the coefficients' hyperparameters too
-# An input with at least so many degrees of freedom left tells a conditional variance by itself.
+# Sweeps over log variances and coefficients; and how many of them look for the coefficients' hyperparameters too: the
+# last one takes these as they are.
+_SWEEPS, _SEARCHES = 3, 2
+# An input with at least so many degrees of freedom left gives a conditional variance by itself.
 _ENOUGH_DEGREES = 2.0
 
 
 @dataclass(frozen=True)
+class LatentCovariance:
+    """Posterior of the lower factor of a covariance.
+
+    The diagonal is the root of the conditional variances, whose logarithms are d processes; row i below it
+    holds the coefficients of output i on the standardized outputs before it, which are i more.
+    """
+
+    log_variance_family: ProcessFamily
+    coefficient_family: ProcessFamily
+    log_variance_theta: Float[Tensor, "d q"]
+    log_variance: Weights
+    coefficient_theta: Float[Tensor, "d-1 q"]
+    coefficients: Sequence[Weights]
+    """Weights of one coefficient after another, of outputs 1, 2, ..."""
+
+    @property
+    def resolved(self) -> bool:
+        """Whether the inducing inputs resolve all length scales with room to spare, or are all the inputs."""
+        resolved = self.log_variance_family.resolved(self.log_variance_theta)
+        return resolved and self.coefficient_family.resolved(self.coefficient_theta)
+
+    @cached_property
+    def log_variances(self) -> Processes:
+        """Processes of the logarithms of the conditional variances."""
+        return self.log_variance_family.prepared(self.log_variance_theta)
+
+    @cached_property
+    def rows(self) -> Processes:
+        """Processes of the coefficients: those of one output, of each but the first, share one kernel."""
+        return self.coefficient_family.prepared(self.coefficient_theta)
+
+    def log_variance_at_features(
+        self, values: Float[Tensor, "d n m"]
+    ) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d"]]:
+        """Means and variances of the log variances, from the features of unit variance."""
+        features = self.log_variance_family.scaled(values, self.log_variances.amplitude)
+        mean = (features @ self.log_variance.mean.unsqueeze(-1)).squeeze(-1).mT
+        variance = (features @ self.log_variance.root).square().sum(-1)
+        return mean, (variance + self.log_variances.unexplained(features)).mT
+
+    def at(self, x: Float[Tensor, "n e"]) -> "FactorMoments":
+        """Moments of the entries of the factor at x."""
+        return self.at_features(self.log_variances.features(x), self.rows.features(x) if self.coefficients else None)
+
+    def at_features(
+        self, values: Float[Tensor, "d n m"], row_values: Float[Tensor, "d-1 n m"] | None
+    ) -> "FactorMoments":
+        """Moments of the entries, from the features of unit variance of the log variances and of the coefficients."""
+        mean, variance = self.log_variance_at_features(values)
+        below = torch.zeros(*mean.shape, mean.shape[1]).to(mean)
+        below_variance = torch.zeros_like(below)
+        if row_values is not None:
+            features = self.coefficient_family.scaled(row_values, self.rows.amplitude)
+            unexplained = self.rows.unexplained(features)
+            rows, variances = [], []
+            for i, weights in enumerate(self.coefficients, start=1):
+                pad = (0, mean.shape[1] - i)
+                own = features[i - 1]
+                rows.append(torch.nn.functional.pad(own @ weights.mean.reshape(i, -1).mT, pad))
+                blocks = weights.root.reshape(i, own.shape[1], -1)
+                known = (own @ blocks).square().sum(-1).mT
+                variances.append(torch.nn.functional.pad(known + unexplained[i - 1, :, None], pad))
+            below = torch.stack([below[:, 0], *rows], dim=1)
+            below_variance = torch.stack([below_variance[:, 0], *variances], dim=1)
+        return FactorMoments(mean, variance, below, below_variance)
+
+    def draw(self, x: Float[Tensor, "n e"], normal: Sequence[Float[Tensor, "*s _"]]) -> Float[Tensor, "*s n d d"]:
+        """Factors at x of functions drawn from the posterior, made of standard normal numbers.
+
+        Those of each output's log variance first, and then those of each output's coefficients.
+        """
+        n_outputs = len(self.log_variance.mean)
+        features = self.log_variances(x)
+        diagonal = []
+        for i in range(n_outputs):
+            weights = self.log_variance.mean[i] + normal[i] @ self.log_variance.root[i].mT
+            diagonal.append(torch.exp(0.5 * (weights @ features[i].mT)))
+        factor = torch.diag_embed(torch.stack(diagonal, dim=-1))
+        features = self.rows(x) if self.coefficients else features
+        for i, posterior in enumerate(self.coefficients, start=1):
+            weights = posterior.mean + normal[n_outputs + i - 1] @ posterior.root.mT
+            factor[..., i, :i] = features[i - 1] @ weights.unflatten(-1, (i, -1)).mT
+        return factor
+
+
+@dataclass(frozen=True)
+class FactorMoments:
+    """Moments of the entries of the lower factor of a covariance at n inputs, as independent normal numbers."""
+
+    log_variance: Float[Tensor, "n d"]
+    log_variance_variance: Float[Tensor, "n d"]
+    below: Float[Tensor, "n d d"]
+    """Entries below the diagonal."""
+    below_variance: Float[Tensor, "n d d"]
+
+    def tril(self) -> Float[Tensor, "n d d"]:
+        """The factor at the means of the latent processes."""
+        return self.below + torch.diag_embed(torch.exp(0.5 * self.log_variance))
+
+    def expected_root(self, most: float) -> Float[Tensor, "n d 2*d"]:
+        """Root of the expected covariance.
+
+        With a normal log variance of mean l and variance v the deviation's mean is exp(l / 2 + v / 8), and the variance
+        exceeds its square by a factor exp(v / 4). No v is above ``most`` in it, as where nothing is known an
+        expectation has little to say.
+        """
+        variance = self.log_variance_variance / (1.0 + self.log_variance_variance / most)
+        deviation = torch.exp(0.5 * self.log_variance + 0.125 * variance)
+        excess = deviation.square() * torch.expm1(0.25 * variance) + self.below_variance.sum(-1)
+        return torch.cat([self.below + torch.diag_embed(deviation), torch.diag_embed(excess.sqrt())], dim=-1)
+
+
+@dataclass(frozen=True)
 class CovarianceSearches:
-    """Searches of the hyperparameters of the log variances, and of the coefficients of outputs 1, 2, ..."""
+    """Searches of the hyperparameters of the log variances, and of the coefficients of outputs 1, 2, ..., if any."""
 
     log_variance: Search
     coefficients: list[Search]
     coefficient_family: ProcessFamily
 
-    @classmethod
-    def of(
-        cls, families: tuple[ProcessFamily, ProcessFamily], n_outputs: int, n_features: int, options: SearchOptions
-    ) -> "CovarianceSearches":
-        """Searches that have not begun."""
-        return cls(
-            Search(families[0], n_outputs, n_features, options),
-            [Search(families[1], 1, n_features, options) for _ in range(1, n_outputs)],
-            families[1],
-        )
-
 
 @dataclass
 class _Sweep:
-    """What a sweep leaves to the next."""
+    """State that a sweep leaves to the next: log variances and expected inverses of the conditional variances, both
+    (d, n); the regressions of outputs 1, 2, ..., and the expected squares (n,) of the residuals from each.
+    """
 
     location: Tensor | None = None
-    """Log variances (d, n)."""
     precision: Tensor | None = None
-    """Expected inverses of the conditional variances (d, n)."""
     regressions: list[Regression] = field(default_factory=list)
     expected: list[Tensor] = field(default_factory=list)
-    """Squared residuals (n,) of outputs 1, 2, ... from their regressions."""
     evidence: float = 0.0
 
 
@@ -63,21 +165,22 @@ def fit_covariance(
     noise: NoiseCorrelation,
     previous: LatentCovariance | None,
 ) -> tuple[LatentCovariance, float]:
-    """Posterior of the factor, and the log evidence in nats.
+    """Posterior of the factor, and the log evidence in nats, by coordinate ascent.
 
-    The log variances given the expected squares of the residuals, and the coefficients given the expected
-    precisions, by turns: each raises the same lower bound of the evidence where rows are independent.
+    With w_i = sum over j < i of phi_ij e_j + exp(l_i / 2) e_i: the log variances l given the expected squares of the
+    residuals from the regressions, and the coefficients phi given the expected precisions E[exp(-l)], by turns. Each
+    raises the same lower bound of the evidence where rows are independent.
 
     Parameters
     ----------
     searches : CovarianceSearches
-        Of processes on the same features.
+        Searches for processes on the same features.
     scatter : Tensor of shape (n, d, d)
         Sum of the outer products of the residuals at each input, whose pooled covariance is the unit matrix.
     degrees : Tensor of shape (d, n)
-        Their degrees of freedom; of each output given those before it.
+        Degrees of freedom of the scatters; of each output given those before it.
     noise : NoiseCorrelation
-        Of scatters at different inputs.
+        Correlation of scatters at different inputs.
     previous : LatentCovariance or None
         Where to start.
     """
@@ -88,7 +191,8 @@ def fit_covariance(
     last = _Sweep() if previous is None else _from_previous(previous, inputs, scatter, noise)
     for sweep in range(_SWEEPS if scatter.shape[1] > 1 else 1):
         squares = _squares(scatter, degrees, noise, last)
-        log_variance = _fit_log_variance(searches.log_variance, fixed, squares, last.location)
+        log_variance = search_log_variance(searches.log_variance, fixed, squares, last.location)
+        # E[exp(-l)] of a normal l: its mean and half its variance.
         precision = torch.exp(-log_variance.location + 0.5 * log_variance.variance)
         last = _Sweep(log_variance.location, precision, evidence=float(log_variance.evidence.sum()))
         _fit_coefficients(searches.coefficients, fixed, scatter, noise, last, anew=sweep < _SEARCHES)
@@ -96,50 +200,41 @@ def fit_covariance(
 
 
 def _from_previous(previous: LatentCovariance, inputs: Tensor, scatter: Tensor, noise: NoiseCorrelation) -> _Sweep:
+    """State of a posterior, under new scatters."""
     moments = previous.at(inputs)
     tril = moments.tril()
     regressions, expected = [], []
     for i, weights in enumerate(previous.coefficients, start=1):
-        known = Regression.of(scatter[:, : i + 1, : i + 1], tril[:, :i, :i], _of_output(noise.of_squares, i))
+        known = _regression(scatter, tril[:, :i, :i], noise)
         features = previous.coefficient_family.design(inputs, previous.coefficient_theta[i - 1 : i])[0]
         regressions.append(known)
-        expected.append(_sum(known.squares(features, weights.mean, weights.root @ weights.root.mT)))
+        explained, unknown = known.squares(features, weights.mean, weights.root @ weights.root.mT)
+        expected.append(explained + unknown)
     return _Sweep(moments.log_variance.mT, None, regressions, expected)
-
-
-def _fit_log_variance(search: Search, fixed: FixedFeatures, squares: Squares, near: Tensor | None) -> LogVariance:
-    """Posterior of the log variances, which are ``near`` those given."""
-    information = 0.5 * squares.degrees.sum(-1)
-    near = (squares.log_pooled.expand_as(squares.total) if near is None else near).clone()
-
-    def evidence(theta: Tensor, rows: Int64[Tensor, " a"]) -> tuple[Tensor, Gradient]:
-        design, vjp = search.family.design_vjp(fixed, theta, information[rows])
-        found = fit_log_variance(squares.rows(rows), design, near[rows])
-        if len(rows) <= len(near):
-            near[rows] = found.location  # where the next evaluation starts
-        return found.evidence, lambda: vjp(found.gradient())
-
-    theta = search.run(evidence, squares.total)
-    return fit_log_variance(squares, search.family.design_vjp(fixed, theta, information)[0], near)
 
 
 def _fit_coefficients(
     searches: list[Search], fixed: FixedFeatures, scatter: Tensor, noise: NoiseCorrelation, state: _Sweep, *, anew: bool
 ) -> None:
-    """One output after another, as each is regressed on those before it; ``anew`` searches their hyperparameters."""
+    """Coefficients of one output after another, each regressed on the outputs before it; their hyperparameters are
+    searched if ``anew``.
+    """
     assert state.location is not None
     assert state.precision is not None
     deviation = torch.exp(0.5 * state.location)
     tril = deviation[0][:, None, None]
     for i, search in enumerate(searches, start=1):
-        known = Regression.of(scatter[:, : i + 1, : i + 1], tril, _of_output(noise.of_squares, i))
+        known = _regression(scatter, tril, noise)
         precision = state.precision[i]
         design, linear = _fit_row(search, fixed, known, precision, anew=anew or search.theta is None)
         features = design[0]
         state.evidence -= float(linear.divergence_from_prior())
         state.regressions.append(known)
-        state.expected.append(_sum(known.squares(features, linear.mean[0], linear.covariance[0])))
-        tril = _with_row(tril, features @ linear.mean.reshape(i, -1).mT, deviation[i])
+        explained, unknown = known.squares(features, linear.mean[0], linear.covariance[0])
+        state.expected.append(explained + unknown)
+        # The factor of outputs 0, ..., i, on which the next one is regressed.
+        row = torch.cat([features @ linear.mean.reshape(i, -1).mT, deviation[i][:, None]], dim=1)
+        tril = torch.cat([torch.nn.functional.pad(tril, (0, 1)), row.unsqueeze(1)], dim=1)
 
 
 def _fit_row(
@@ -181,7 +276,7 @@ def _squares(scatter: Tensor, degrees: Tensor, noise: NoiseCorrelation, last: _S
 
 
 def _posterior(searches: CovarianceSearches, inputs: Tensor, squares: Squares, last: _Sweep) -> LatentCovariance:
-    """Of the weights of all features."""
+    """Posterior of the weights of all features, where the fit took only those that carry something."""
     theta = searches.log_variance.theta
     assert theta is not None
     assert last.precision is not None
@@ -197,15 +292,8 @@ def _posterior(searches: CovarianceSearches, inputs: Tensor, squares: Squares, l
     return LatentCovariance(family, searches.coefficient_family, theta, log_variance, coefficient_theta, coefficients)
 
 
-def _sum(parts: tuple[Tensor, Tensor]) -> Tensor:
-    return parts[0] + parts[1]
-
-
-def _with_row(tril: Tensor, row: Tensor, diagonal: Tensor) -> Tensor:
-    above = torch.nn.functional.pad(tril, (0, 1))
-    below = torch.cat([row, diagonal[:, None]], dim=1)
-    return torch.cat([above, below.unsqueeze(1)], dim=1)
-
-
-def _of_output(whiteners: Tensor | None, output: int) -> Tensor | None:
-    return None if whiteners is None else whiteners[output]
+def _regression(scatter: Tensor, tril: Tensor, noise: NoiseCorrelation) -> Regression:
+    """Regression of the output that follows those of which ``tril`` is the factor."""
+    i = tril.shape[-1]
+    whitener = None if noise.square_whitener is None else noise.square_whitener[i]
+    return Regression.standardize(scatter[:, : i + 1, : i + 1], tril, whitener)

@@ -2,22 +2,26 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
+from torch_pbd.gp.inducing import FixedFeatures
 from torch_pbd.linalg import safe_cholesky
-from torch_pbd.models.heteroscedastic.correlation import NoiseCorrelation
 from torch_pbd.models.heteroscedastic.linear import LinearEvidence, Weights, inverse, weights_factor
+from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation
+from torch_pbd.models.heteroscedastic.search import Gradient, Search
+
+LEAST_SQUARE = 1e-6
+"""Of the pooled variance: an exact zero, as where all recordings start at the origin, has no logarithm."""
 
 # Newton's steps (in the logarithm of a variance) end at this one: that after it is about its square.
 _MAX_ITER, _TOL = 60, 1e-5
-_LEAST_RESIDUAL = -40.0
-# Of the pooled variance: an exact zero, as where all recordings start at the origin, has no logarithm.
-LEAST_SQUARE = 1e-6
+_HALVINGS, _ROUNDING = 20, 1e-12  # of a step that does not descend, and what counts as none of a loss
+_LEAST_RESIDUAL = -40.0  # bounds exp(-x) where a start is far below its target
 
 
 @dataclass(frozen=True)
@@ -28,11 +32,11 @@ class Squares:
     degrees: Float[Tensor, "b n"]
     noise: NoiseCorrelation
 
-    def rows(self, index: Tensor) -> "Squares":
-        """Those of some of the outputs."""
-        if len(index) == len(self.total) and torch.equal(index, torch.arange(len(index), device=index.device)):
-            return self  # with what is known of it
-        return replace(self, total=self.total[index], degrees=self.degrees[index], noise=self.noise.rows(index))
+    def restrict(self, outputs: Int64[Tensor, " a"]) -> "Squares":
+        """Squares of the selected outputs."""
+        if len(outputs) == len(self.total) and torch.equal(outputs, torch.arange(len(outputs), device=outputs.device)):
+            return self  # with its cached properties
+        return Squares(self.total[outputs], self.degrees[outputs], self.noise.restrict(outputs))
 
     @cached_property
     def log_mean(self) -> Float[Tensor, "b n"]:
@@ -46,16 +50,17 @@ class Squares:
 
     @cached_property
     def logarithms(self) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b n"], Float[Tensor, "b n n"]]:
-        """Inverse deviations of the logarithms of mean squares, these without bias and whitened, and what whitens.
+        """Inverse deviations of the logarithms of mean squares; these without bias, whitened; and their whitener.
 
-        That of a chi-squared number over its degrees is below zero in the mean.
+        The logarithm of a chi-squared number over its degrees k has the mean digamma(k / 2) - log(k / 2), below zero,
+        and the variance trigamma(k / 2).
         """
-        assert self.noise.of_squares is not None
+        assert self.noise.square_whitener is not None
         assert self.noise.copies is not None
         half = 0.5 * self.degrees / self.noise.copies
         unbiased = self.log_mean - torch.digamma(half) + half.log()
         weight = (self.noise.copies / torch.polygamma(1, half)).sqrt()  # the whitener takes the copies out again
-        whitener = self.noise.of_squares * weight.unsqueeze(-2)
+        whitener = self.noise.square_whitener * weight.unsqueeze(-2)
         return weight, (whitener @ unbiased.unsqueeze(-1)).squeeze(-1), whitener
 
 
@@ -74,9 +79,9 @@ class LogVariance:
     location: Float[Tensor, "b n"]
     """Expected log variances."""
     variance: Float[Tensor, "b n"]
-    """Of the log variances."""
+    """Variances of the log variances."""
     gradient: Callable[[], Float[Tensor, "b n p"]]
-    """Computes that of the evidence in the features."""
+    """Computes the gradient of the evidence in the features."""
 
     @property
     def weights(self) -> Weights:
@@ -96,9 +101,27 @@ def fit_log_variance(
     start : Tensor of shape (b, n), default=None
         Log variances that are near the posterior's. None starts at the pooled variance.
     """
-    if squares.noise.of_squares is None or squares.noise.copies is None:
+    if squares.noise.square_whitener is None or squares.noise.copies is None:
         return _fit_independent(squares, features, squares.log_pooled if start is None else start)
     return _fit_correlated(squares, features)
+
+
+def search_log_variance(
+    search: Search, fixed: FixedFeatures, squares: Squares, near: Float[Tensor, "b n"] | None
+) -> LogVariance:
+    """Posterior with the hyperparameters of the highest evidence, of log variances that are ``near`` those given."""
+    information = 0.5 * squares.degrees.sum(-1)
+    near = (squares.log_pooled.expand_as(squares.total) if near is None else near).clone()
+
+    def evidence(theta: Tensor, rows: Int64[Tensor, " a"]) -> tuple[Tensor, Gradient]:
+        design, vjp = search.family.design_vjp(fixed, theta, information[rows])
+        found = fit_log_variance(squares.restrict(rows), design, near[rows])
+        if len(rows) <= len(near):
+            near[rows] = found.location  # where the next evaluation starts
+        return found.evidence, lambda: vjp(found.gradient())
+
+    theta = search.run(evidence, squares.total)
+    return fit_log_variance(squares, search.family.design_vjp(fixed, theta, information)[0], near)
 
 
 def _fit_independent(squares: Squares, features: Tensor, start: Tensor) -> LogVariance:
@@ -115,6 +138,7 @@ def _fit_independent(squares: Squares, features: Tensor, start: Tensor) -> LogVa
     diag(r) A - diag(h) F Q with Q = A' diag(r) A.
     """
     half = 0.5 * squares.degrees
+    # P = 1 + F' diag(h) F, and the variances of the logarithms, the diagonal of F inv(P) F'.
     factor = weights_factor(half.sqrt().unsqueeze(-1) * features)
     spread = features @ torch.cholesky_inverse(factor, upper=True)
     variance = (spread * features).sum(-1)
@@ -125,13 +149,15 @@ def _fit_independent(squares: Squares, features: Tensor, start: Tensor) -> LogVa
     decay = torch.exp(-residual)
     deviance = 2.0 * (half * (residual + decay - 1.0)).sum(-1)
     log_det = -factor.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
+    # The constant: the likelihood of log variances that are the log mean squares, each by itself.
     saturated = (squares.degrees * (log_mean + 1.0 + math.log(2.0 * math.pi))).sum(-1)
     evidence = log_det - 0.5 * (deviance + mean.square().sum(-1) + saturated)
 
     def gradient() -> Tensor:
         slope = (half * (1.0 - decay)).unsqueeze(-1)
-        pulled = features @ (spread.mT @ (slope * spread))
-        return (slope - half.unsqueeze(-1)) * spread - half.unsqueeze(-1) * pulled - slope * mean.unsqueeze(-2)
+        through_variance = features @ (spread.mT @ (slope * spread))  # F Q
+        in_log_det = (slope - half.unsqueeze(-1)) * spread
+        return in_log_det - half.unsqueeze(-1) * through_variance - slope * mean.unsqueeze(-2)
 
     return LogVariance(evidence, mean, factor, location, variance, gradient)
 
@@ -144,7 +170,7 @@ def _fit_correlated(squares: Squares, features: Tensor) -> LogVariance:
     """
     weight, response, whitener = squares.logarithms
     design = whitener @ features
-    linear = LinearEvidence.of(design, response)
+    linear = LinearEvidence.fit(design, response)
     evidence = linear.value + weight.log().sum(-1) - 0.5 * response.square().sum(-1)
     location = (features @ linear.mean.unsqueeze(-1)).squeeze(-1)
     variance = ((features @ linear.covariance) * features).sum(-1)
@@ -176,9 +202,9 @@ def _maximize(features: Tensor, target: Tensor, half: Tensor, pooled: Tensor, st
         new_mean, new_location = _least_squares(features, target, half, location)
         step, change = new_mean - mean, new_location - location
         share = torch.ones_like(value)
-        for _ in range(20):
+        for _ in range(_HALVINGS):
             new_value = _loss(new_location - target, half, new_mean)
-            worse = ~(new_value <= value + 1e-12 * value.abs())
+            worse = ~(new_value <= value + _ROUNDING * value.abs())
             if not bool(worse.any()):
                 break
             share = torch.where(worse, 0.5 * share, share)
@@ -206,4 +232,5 @@ def _least_squares(features: Tensor, target: Tensor, half: Tensor, location: Ten
 
 
 def _loss(residual: Tensor, half: Tensor, mean: Tensor) -> Tensor:
+    """Sum of h (x + exp(-x)) + m'm / 2."""
     return (half * (residual + torch.exp(-residual.clamp_min(_LEAST_RESIDUAL)))).sum(-1) + 0.5 * mean.square().sum(-1)

@@ -1,18 +1,35 @@
-"""Mean by generalized least squares: Gaussian processes under noise whose covariance depends on the input."""
+"""Mean by generalized least squares: Gaussian processes under noise whose covariance depends on the input.
 
-from dataclasses import dataclass
+Also where it begins if a first mean does not follow the data: at what the evidence finds together with the noise.
+"""
+
+import math
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from torch_pbd.gp.inducing import FixedFeatures
-from torch_pbd.models.heteroscedastic.linear import LinearEvidence, Weights, weights_posterior
-from torch_pbd.models.heteroscedastic.processes import Processes, ProcessFamily
-from torch_pbd.models.heteroscedastic.search import Gradient, Search
+from torch_pbd.gp import EvidenceSearch, Hyperparameters, Observations, fit_hyperparameters, negative_log_evidence
+from torch_pbd.gp.inducing import FixedFeatures, inducing_inputs
+from torch_pbd.gp.neighbourhoods import resolved_length_scale
+from torch_pbd.models.heteroscedastic.linear import LinearEvidence, Weights
+from torch_pbd.models.heteroscedastic.processes import CLEAR, Processes, ProcessFamily
+from torch_pbd.models.heteroscedastic.search import Gradient, Search, SearchOptions
+from torch_pbd.models.training import TrainingSet, pooled_tril
 
-_CHUNK = 1024
+MOST_INPUTS = 1024
+"""Inputs that short length scales are searched with, and that correlated rows are fitted at: some seconds."""
+
+_CHUNK = 1024  # rows at a time: bounds the memory
+_MOST_ROWS, _TOGETHER = 16384, 2048  # inputs to fit at, and inducing ones, of all outputs together
+# Length scale down to which a search takes a few matrices of 168 rows; and noise, of outputs of unit variance, below
+# which nothing is left to be found with shorter ones: a smooth signal's residual is never white.
+_CHEAP, _NONE = 0.025, 1e-4
+_LEAST_NOISE = 3e-5  # with less, kernel matrices are singular
+_LONGEST = 10.0  # length scale, in ranges of the inputs: a trend
+_CLEARLY = 5.0  # nats: 150 to one. Sound draws gain less than one, signals that were missed 25 and more
 
 
 @dataclass(frozen=True)
@@ -25,23 +42,22 @@ class LatentMean:
 
     @cached_property
     def processes(self) -> Processes:
-        """Of all outputs."""
+        """Processes of all outputs."""
         return self.family.prepared(self.theta)
 
     def at(self, x: Float[Tensor, "n e"]) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d d"]]:
         """Expected mean at x, and the covariance of its error between the outputs."""
-        return self.of_features(self.processes.features(x))
+        return self.at_features(self.processes.features(x))
 
-    def of_features(self, values: Float[Tensor, "d n m"]) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d d"]]:
-        """The same, from the features of unit variance there."""
+    def at_features(self, values: Float[Tensor, "d n m"]) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d d"]]:
+        """Expected mean and covariance of its error, from the features of unit variance."""
         features = self.family.scaled(values, self.processes.amplitude)
         n_outputs, _, size = features.shape
-        mean = self.expectation(values)
         root = (features @ self.weights.root.reshape(n_outputs, size, -1)).transpose(0, 1)
         unexplained = torch.diag_embed(self.processes.unexplained(features).mT)
-        return mean, root @ root.mT + unexplained
+        return self.expected_at_features(values), root @ root.mT + unexplained
 
-    def expectation(self, values: Float[Tensor, "d n m"]) -> Float[Tensor, "n d"]:
+    def expected_at_features(self, values: Float[Tensor, "d n m"]) -> Float[Tensor, "n d"]:
         """Expected mean, from the features of unit variance."""
         features = self.family.scaled(values, self.processes.amplitude)
         return (features @ self.weights.mean.reshape(len(features), -1, 1)).squeeze(-1).mT
@@ -50,7 +66,8 @@ class LatentMean:
         """Expected mean at x alone, a bounded number of rows at a time."""
         processes = self.processes
         weights = processes.amplitude[:, None] * self.weights.mean.reshape(len(self.theta), -1)
-        # Of the kernel with the inducing inputs, from those of the features: no equations are solved for each row.
+        # Weights of the kernel with the inducing inputs, from those of the features: no equations are solved for
+        # each row.
         weights = torch.linalg.solve_triangular(processes.features.factor.mT, weights.unsqueeze(-1), upper=True)
         return torch.cat([(processes.features.cross(part) @ weights).squeeze(-1).mT for part in x.split(_CHUNK)])
 
@@ -65,9 +82,10 @@ def fit_mean(
 ) -> LatentMean:
     """Posterior given means of ``counts`` rows, whose noise has the factor ``noise_tril``.
 
-    Hyperparameters are chosen for each output by its own evidence, as if the others did not tell of its
-    noise; the posterior is that of all outputs together.
+    Hyperparameters are chosen for each output by its own evidence, as if its noise were independent of the others';
+    the posterior is that of all outputs together. ``whitener`` makes the means at different inputs independent.
     """
+    # One output: its mean over the deviation of its noise is features times weights, and noise of unit variance.
     scale = (counts.sqrt()[:, None] / noise_tril.square().sum(-1).sqrt()).mT.unsqueeze(-1)
     noise_whitener = scale if whitener is None else whitener * scale.mT
     response = _times(whitener, scale * means.mT.unsqueeze(-1)).squeeze(-1)
@@ -79,15 +97,16 @@ def fit_mean(
         chosen = None if whitener is None else whitener[rows]
         design, vjp = family.design_vjp(fixed, theta, information[rows])
         whitened = _times(chosen, scale[rows] * design)
-        linear = LinearEvidence.of(whitened, response[rows])
+        linear = LinearEvidence.fit(whitened, response[rows])
 
         def gradient() -> Tensor:
-            of_whitened = linear.gradient(whitened, response[rows])
-            return vjp(scale[rows] * _times(None if chosen is None else chosen.mT, of_whitened))
+            in_whitened = linear.gradient(whitened, response[rows])
+            return vjp(scale[rows] * _times(None if chosen is None else chosen.mT, in_whitened))
 
         return linear.value, gradient
 
     theta = search.run(evidence, means)
+    # All outputs: sqrt(count) inv(T) mean, with T the factor of the noise, has independent entries at an input.
     features = family.design(inputs, theta)
     eye = torch.eye(means.shape[1]).to(means)
     whitening = torch.linalg.solve_triangular(noise_tril, eye.expand_as(noise_tril), upper=False)
@@ -97,8 +116,62 @@ def fit_mean(
     if whitener is not None:
         design = torch.einsum("imn,niq->miq", whitener, design)
         response = torch.einsum("imn,ni->mi", whitener, response)
-    return LatentMean(family, theta, weights_posterior(design.flatten(0, 1), response.flatten()))
+    return LatentMean(family, theta, LinearEvidence.fit(design.flatten(0, 1), response.flatten()).weights())
 
 
 def _times(matrix: Tensor | None, values: Tensor) -> Tensor:
     return values if matrix is None else matrix @ values
+
+
+@dataclass(frozen=True)
+class MeanStart:
+    """Where a mean begins, and the evidence for it under noise that is the same everywhere."""
+
+    search: Search
+    """Holds the hyperparameters that were found, on the inducing inputs that they need."""
+    noise_tril: Float[Tensor, "d d"]
+    """Factor of the noise of a row."""
+    rows: TrainingSet
+    """Rows at as many inputs as are needed."""
+    observations: Observations
+    loss: Float[Tensor, " d"]
+    """Negative log evidence, in nats."""
+
+    def improves(self, mean: LatentMean, noise_tril: Float[Tensor, "d d"]) -> bool:
+        """Whether the evidence is clearly higher, of any output, than that of ``mean`` under its noise.
+
+        Residuals that are not white by chance, or under noise that is louder in places, are no reason to begin here:
+        these hyperparameters stay, and noise that depends on the input would have led to others.
+        """
+        amplitude, rows_at_input = mean.processes.amplitude, len(self.rows.x) / len(self.observations.inputs)
+        noise_ratio = noise_tril.square().sum(1) / rows_at_input / amplitude.square()
+        first = Hyperparameters(mean.family.length_scale_of(mean.theta), amplitude, noise_ratio)
+        loss = negative_log_evidence(self.observations, first, mean.family.features.kernel)
+        return not bool((loss - self.loss < _CLEARLY).all())  # what is too smooth to be evaluated is no mean to keep
+
+
+def mean_start(rows: TrainingSet, family: ProcessFamily, options: SearchOptions) -> MeanStart:
+    """Start where ``family`` is too coarse for the means at the inputs, or their noise was taken for too large."""
+    training = rows.merged(MOST_INPUTS)
+    rows_at_input = training.counts.mean()
+    observations = Observations(training.inputs, training.means().mT.contiguous(), training.counts / rows_at_input)
+    noise = pooled_tril(rows).norm(dim=1) / rows_at_input.sqrt()
+    # Rows that repeat inputs show the noise, unless they are copies.
+    known = noise if 2 * len(rows.inputs) <= len(rows.x) and bool((noise > _LEAST_NOISE).all()) else None
+    least = resolved_length_scale(training.inputs)
+    for shortest in (max(_CHEAP, least), least):
+        search = EvidenceSearch(length_scale_bounds=(shortest, _LONGEST), noise_scale=known)
+        found, loss, _ = fit_hyperparameters(observations, search)
+        noise_scale = found.amplitude * found.noise_ratio.sqrt()
+        if bool((noise_scale < _NONE).all()):
+            break
+    scale = found.length_scale.amin(0).expand_as(found.length_scale) if family.shared else found.length_scale
+    n_outputs, n_features = scale.shape
+    # As many inducing inputs as resolve the shortest length scale with room to spare.
+    needed = math.ceil(min((CLEAR / float(scale.min())) ** n_features, len(training.inputs)))
+    inducing = inducing_inputs(training.inputs, max(len(family.features.inducing), min(needed, _TOGETHER // n_outputs)))
+    exact = len(inducing) == len(rows.inputs)
+    family = replace(family, features=replace(family.features, inducing=inducing, exact=exact))
+    held = Search(family, n_outputs, n_features, options, family.theta_of(scale, found.amplitude), held=True)
+    noise_tril = (noise_scale * rows_at_input.sqrt()).diag()
+    return MeanStart(held, noise_tril, rows.merged(_MOST_ROWS // n_outputs), observations, loss)

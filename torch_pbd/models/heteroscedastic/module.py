@@ -12,8 +12,8 @@ from torch_pbd.gp.inducing import FeatureMap
 from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky, symmetrize
 from torch_pbd.models.core import Core, Shapes, blank, size_of
+from torch_pbd.models.heteroscedastic.covariance import LatentCovariance
 from torch_pbd.models.heteroscedastic.fit import HeteroscedasticFit
-from torch_pbd.models.heteroscedastic.latent import LatentCovariance
 from torch_pbd.models.heteroscedastic.linear import Weights
 from torch_pbd.models.heteroscedastic.mean import LatentMean
 from torch_pbd.models.heteroscedastic.prepared import Prepared
@@ -142,20 +142,20 @@ class HeteroscedasticModel(Core):
     def _moments(self, x: Tensor, prior_tril: Tensor | None) -> tuple[Tensor, Tensor]:
         prior = self.prior_tril if prior_tril is None else prior_tril
         prepared = self._prepared()
-        of_mean, *of_covariance, of_nearness = prepared.features(x)
-        mean, error = prepared.mean.of_features(of_mean)
+        mean_values, *factor_values, nearness = prepared.features(x)
+        mean, error = prepared.mean.at_features(mean_values)
         # Where the data leave nothing to err about, rounding must not make it negative.
         least = 1e-12 * torch.diag_embed(1e-30 + error.diagonal(dim1=-2, dim2=-1))
         error_root = safe_cholesky(symmetrize(error) + least, name="the covariance of the mean's error")
-        missing = _missing(of_nearness)[:, None, None]
-        root = self.pooled_tril @ prepared.covariance.of_features(*of_covariance).expected_root(_MOST_LOG_VARIANCE)
+        missing = _missing(nearness)[:, None, None]
+        root = self.pooled_tril @ prepared.covariance.at_features(*factor_values).expected_root(_MOST_LOG_VARIANCE)
         known = _root_of_share(1.0 - missing) * torch.cat([root, error_root], dim=-1)
         return mean, torch.cat([known, _root_of_share(missing) * prior.expand(len(x), -1, -1)], dim=-1)
 
     def predict_mean(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d"]:
         """Mean alone, equal to the bit."""
         prepared = self._prepared()
-        return prepared.mean.expectation(prepared.features(x)[0])
+        return prepared.mean.expected_at_features(prepared.features(x)[0])
 
     def variability(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d d"]:
         """Root of the covariance at the means of the latent processes, without prior and without errors."""
@@ -171,10 +171,10 @@ class HeteroscedasticModel(Core):
         of those of the log variances, and ``trigamma(z)`` is taken for ``1 / z + 1 / (2 z^2)``.
         """
         prepared = self._prepared()
-        _, of_log_variance, _, of_nearness = prepared.features(x)
-        variance = prepared.covariance.log_variance_of(of_log_variance)[1].mean(-1)
+        _, log_variance_values, _, nearness = prepared.features(x)
+        variance = prepared.covariance.log_variance_at_features(log_variance_values)[1].mean(-1)
         degrees = (1.0 + (1.0 + 2.0 * variance).sqrt()) / variance
-        return degrees.clamp_min(_LEAST_DEGREES) / (1.0 - _missing(of_nearness)).clamp_min(1e-12)
+        return degrees.clamp_min(_LEAST_DEGREES) / (1.0 - _missing(nearness)).clamp_min(1e-12)
 
     def type1(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
         """Type I uncertainty: eq. (6) without noise over the prior variance, 0 at the inducing inputs."""

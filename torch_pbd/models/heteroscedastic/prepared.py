@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torch_pbd.gp.inducing import Features
 from torch_pbd.gp.neighbourhoods import spacing
-from torch_pbd.models.heteroscedastic.latent import LatentCovariance
+from torch_pbd.models.heteroscedastic.covariance import LatentCovariance
 from torch_pbd.models.heteroscedastic.mean import LatentMean
 
 # Longest length scale by which distance from the data is judged, in ranges of the input times the number of inputs;

@@ -1,44 +1,61 @@
-"""What residuals tell of the fit: a mean that does not follow the data, and rows that repeat each other."""
+"""Signals in residuals: a mean that does not follow the data, rows that repeat each other, and how far those of a
+demonstration do.
+"""
+
+import math
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+from torch_pbd.linalg import safe_cholesky
 from torch_pbd.models.training import TrainingSet
 
 LAGS = 3
-"""Correlations between neighbours that tell a signal."""
+"""Correlations between neighbours that show a signal."""
 
-# To tell: a chi-squared number of three degrees of freedom is above it once in 10^6 times. Residuals whitened by a
-# covariance of many outputs and few rows are so more often.
 NOT_WHITE = 30.7
+"""A chi-squared number of three degrees of freedom is above it once in 10^6 times, to warn. Residuals whitened by a
+covariance of many outputs and few rows are so more often."""
+
 # What residuals of K demonstrations have in common, of their variance, that is no chance: the mean square of means of
 # K would be four times what it should be. Smooth demonstrations have few independent places along the input.
 _MOST_COMMON, _COMMON = 0.5, 3.0
 # A number of one degree of freedom that is above it once in 10^4 times; the level of the test of smoothness, which
 # noise that is far louder in places exceeds by far.
 _ALIKE, _LEVEL = 15.1, 1e-5
-# Correlation of neighbours that is strong, and that of strangers, relative to it, where a mean would explain it.
-_STRONG, _OF_STRANGERS = 0.5, 0.5
+# Correlation of rows that follow each other that is strong, and of those beside each other along the inputs, relative
+# to it, where a mean would explain it.
+_STRONG, _OF_NEIGHBOURS = 0.5, 0.5
 _SMOOTH = 0.2  # of the variance of third differences of independent means
-_INDEPENDENT = 0.433  # independent ones among n third differences of white noise: 20^2 / (20^2 + 2 (15^2 + 6^2 + 1))
+_SHARE_OF_THIRD = 0.433  # independent ones among third differences of white noise: 20^2 / (20^2 + 2 (15^2 + 6^2 + 1))
 _CONSTANT = 1e-20  # variance of an output that does not vary
+_LEAST = 1e-300  # a divisor that is zero gives zero and not NaN
+
+_N_BINS = 50  # of the distance between samples, up to the range of the inputs
+_MAX_SAMPLES = 400  # of one demonstration; of longer ones a share
+_MAX_PAIRS = 100_000  # of samples that are compared at once: bounds the memory
+# Samples that count at least for half an independent one are taken for independent: so little correlation
+# cannot be known from none.
+_INDEPENDENT = 0.5
+_SHORTEST, _LONGEST, _HALVINGS = 1e-4, 1e2, 60  # decays, in ranges of the inputs, and bisections down to rounding
 
 
 def is_signal(
     whitened: Float[Tensor, "rows d"], training: TrainingSet, group: Int64[Tensor, " rows"] | None, least: float
 ) -> Bool[Tensor, " d"]:
-    """Whether residuals of unit variance have something in common along the inputs: not white (a test's statistic
-    is above ``least``), and of all rows there.
+    """Outputs whose residuals of unit variance have something in common along the inputs: they are not white (the
+    statistic of a test is above ``least``), and so are all rows there.
 
-    Rows of one demonstration may be alike; what tells are those of others at an input, and at the next.
+    Rows of one demonstration may be alike: a signal is what those of others at an input, and at the next, share too.
     """
     place = training.inputs[:, 0].argsort().argsort()[training.index]
     both = torch.cat([whitened, torch.ones_like(whitened[:, :1])], dim=1)
     total = both.new_zeros(len(training.inputs), both.shape[1]).index_add_(0, place, both)
     value = total[:, :-1] / total[:, -1:].sqrt()
     # A bounded score: a burst has few large residuals, but all of them are alike.
-    value = value / (value.abs() + value.abs().median(0).values).clamp_min(1e-300)
+    value = value / (value.abs() + value.abs().median(0).values).clamp_min(_LEAST)
     value = value - value.mean(0)
     coloured = sum(_correlation(value[lag:], value[: len(value) - lag])[1] for lag in range(1, LAGS + 1)) > least
     if group is None:
@@ -49,7 +66,7 @@ def is_signal(
         each = each.reshape(n_demos, *total.shape)
         alike = total.square().sum(0) - each.square().sum((0, 1))
         alike = alike + 2.0 * ((total[1:] * total[:-1]).sum(0) - (each[:, 1:] * each[:, :-1]).sum((0, 1)))
-    common = alike[:-1] / whitened.square().mean(0).clamp_min(1e-300)
+    common = alike[:-1] / whitened.square().mean(0).clamp_min(_LEAST)
     return coloured & ((alike[-1] <= 0) | (common > alike[-1] * min(_MOST_COMMON, _COMMON / max(n_demos - 1.0, 1.0))))
 
 
@@ -64,28 +81,191 @@ def are_copies(whitened: Float[Tensor, "rows d"], training: TrainingSet, order: 
     near = (step > 0) & (step <= 2.0 * step[step > 0].median())
     by_input = value[x[:, 0].argsort(stable=True)]
     alike, significance = _correlation(value[:-1][near], value[1:][near])
-    strangers, _ = _correlation(by_input[:-1], by_input[1:])
-    following = (alike > _STRONG) & (significance > _ALIKE) & (strangers < _OF_STRANGERS * alike)
+    neighbours, _ = _correlation(by_input[:-1], by_input[1:])
+    following = (alike > _STRONG) & (significance > _ALIKE) & (neighbours < _OF_NEIGHBOURS * alike)
     return bool((following | _too_smooth(training)).any())
 
 
 def _correlation(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """Of pairs of residuals, and the chi-squared number that it is if they are independent, whatever their variance."""
+    """Correlation of pairs of residuals, and the chi-squared number that it is of independent ones of any variance."""
     products = first * second
     total = products.sum(0)
-    size = (first.square().sum(0) * second.square().sum(0)).sqrt().clamp_min(1e-300)
-    return total / size, total.square() / products.square().sum(0).clamp_min(1e-300)
+    size = (first.square().sum(0) * second.square().sum(0)).sqrt().clamp_min(_LEAST)
+    return total / size, total.square() / products.square().sum(0).clamp_min(_LEAST)
 
 
 def _too_smooth(training: TrainingSet) -> Bool[Tensor, " d"]:
-    """Third differences of means at the inputs over what the rows' deviations there allow for: a signal only adds."""
+    """Outputs whose means at the inputs have third differences far below what the rows' deviations there allow for.
+
+    A signal only adds to them.
+    """
     order = training.inputs[:, 0].argsort()
     counts, means = training.counts[:, None], training.means()
     squares = torch.zeros_like(means).index_add_(0, training.index, (training.y - means[training.index]).square())
     variance = (squares / counts / (counts - 1.0).clamp_min(1.0))[order]
     expected = (variance[:-3] + 9.0 * variance[1:-2] + 9.0 * variance[2:-1] + variance[3:]).mean(0)
     ratio = means[order].diff(n=3, dim=0).square().mean(0) / expected.clamp_min(_CONSTANT)
-    half = torch.full_like(ratio, 0.5 * _INDEPENDENT * max(len(means) - 3, 0))
+    half = torch.full_like(ratio, 0.5 * _SHARE_OF_THIRD * max(len(means) - 3, 0))
     chance = torch.special.gammainc(half, half * ratio)
     repeated = torch.equal(training.inputs[training.index], training.x)
     return (chance < _LEVEL) & (ratio < _SMOOTH) & (expected > _CONSTANT) & repeated & (counts.min() > 1.0)
+
+
+@dataclass(frozen=True)
+class DemonstrationCorrelation:
+    """Correlation of the whitened residuals of one demonstration, ``exp(-distance / (2 * decay))``.
+
+    Their squares, which the covariance is learned from, have its square. The demonstrations of a person are smoother
+    than this kernel says. It has their integral, so it counts the same number of independent samples, but
+    its spectrum falls slowly, and so keeps a model from taking what is smoother than noise for signal.
+    """
+
+    decay: Float[Tensor, " d"]
+    """Distance over which the correlation of squared residuals falls by e, of standardized inputs; 0 if none does."""
+    share: Float[Tensor, " d"]
+    """Independent samples that a sample of each output counts for."""
+
+    @property
+    def matters(self) -> bool:
+        """Whether samples of any output are correlated."""
+        return bool((self.decay > 0).any())
+
+    def matrix(
+        self, inputs: Float[Tensor, "n e"], occurrences: Float[Tensor, "g n"], *, squares: bool
+    ) -> Float[Tensor, "d n n"]:
+        """Covariance of the means (or mean squares) at n inputs, were they of independent rows of unit variance.
+
+        ``occurrences`` are the rows of each of g demonstrations at each input: those of one demonstration at one
+        input are copies, so a diagonal entry is the number of rows that count for one.
+        """
+        distance = torch.cdist(inputs, inputs, compute_mode="donot_use_mm_for_euclid_dist")
+        decay = self.decay[:, None, None].clamp_min(_LEAST)
+        correlation = torch.exp(-distance / (decay if squares else 2.0 * decay))
+        counts = occurrences.sum(0)
+        shared = occurrences.mT @ occurrences / (counts[:, None] * counts).sqrt()
+        return torch.where(self.decay[:, None, None] > 0, correlation * shared, torch.eye(len(inputs)).to(inputs))
+
+
+@dataclass(frozen=True)
+class NoiseCorrelation:
+    """Whiteners of the means and the mean squares of each output at n inputs; None where these are independent."""
+
+    mean_whitener: Float[Tensor, "d n n"] | None = None
+    square_whitener: Float[Tensor, "d n n"] | None = None
+    copies: Float[Tensor, "d n"] | None = None
+    """Rows at each input that count for one."""
+
+    @classmethod
+    def build(
+        cls,
+        correlation: DemonstrationCorrelation | None,
+        inputs: Float[Tensor, "n e"],
+        index: Int64[Tensor, " rows"],
+        group: Int64[Tensor, " rows"] | None,
+    ) -> "NoiseCorrelation":
+        """Whiteners for rows of demonstrations ``group``, at ``inputs[index]``."""
+        if group is None or correlation is None or not correlation.matters:
+            return cls()
+        # Rows of each demonstration at each distinct input.
+        names, number = group.unique(return_inverse=True)
+        occurrences = torch.bincount(number * len(inputs) + index, minlength=len(names) * len(inputs))
+        occurrences = occurrences.reshape(len(names), len(inputs)).to(inputs)
+        means, squares = (correlation.matrix(inputs, occurrences, squares=squares) for squares in (False, True))
+        return cls(_whitener(means), _whitener(squares), squares.diagonal(dim1=1, dim2=2))
+
+    def restrict(self, outputs: Int64[Tensor, " b"]) -> "NoiseCorrelation":
+        """Whiteners of the selected outputs."""
+        parts = self.mean_whitener, self.square_whitener, self.copies
+        return NoiseCorrelation(*(None if part is None else part[outputs] for part in parts))
+
+
+def _whitener(matrix: Tensor) -> Tensor:
+    """Inverses of lower factors."""
+    factor = safe_cholesky(matrix, name="the correlation of the demonstrations")
+    return torch.linalg.solve_triangular(factor, torch.eye(factor.shape[-1]).to(factor).expand_as(factor), upper=False)
+
+
+def demonstration_correlation(
+    x: Float[Tensor, "rows e"], whitened: Float[Tensor, "rows d"], group: Int64[Tensor, " rows"]
+) -> DemonstrationCorrelation:
+    """Estimate the correlation along demonstrations from whitened residuals.
+
+    The square of the autocorrelation at a distance is estimated without bias by products over pairs of
+    different demonstrations, up to the distance where it first is not positive; the decay is that of the
+    exponential with the same sum over all pairs of samples.
+    """
+    limit = math.sqrt(x.shape[1])
+    scaled = whitened / whitened.square().mean(0).clamp_min(_LEAST).sqrt()
+    parts, n_chosen = [], 0
+    for rows in _chosen_rows(x, group):
+        together = max(1, _MAX_PAIRS // rows.shape[1] ** 2)
+        parts += [_products_by_distance(x[some], scaled[some], limit) for some in rows.split(together)]
+        n_chosen += rows.numel()
+    independent = torch.ones_like(whitened[0])
+    if sum(len(pairs) for _, pairs in parts) < 2:
+        return DemonstrationCorrelation(0.0 * independent, independent)
+    products, pairs = (torch.cat(part) for part in zip(*parts, strict=True))
+    total = pairs.sum(0)
+    sum_of_squares = (_squared_autocorrelation(products, pairs) * total[:, None]).sum(0)
+    # Of n samples all pairs but those of a sample with itself; were some left out, there are as many more of each.
+    share = 1.0 / (1.0 + 2.0 * sum_of_squares / n_chosen * len(x) / n_chosen)
+    correlated = share <= _INDEPENDENT
+    if not bool(correlated.any()):
+        return DemonstrationCorrelation(0.0 * independent, independent)
+    centre = (torch.arange(_N_BINS).to(x) + 0.5) * limit / _N_BINS
+    decay = _decay_of(sum_of_squares, centre, total)
+    return DemonstrationCorrelation(torch.where(correlated, decay, 0.0), torch.where(correlated, share, 1.0))
+
+
+def _chosen_rows(x: Tensor, group: Tensor) -> list[Int64[Tensor, "g t"]]:
+    """Rows of each demonstration along the first input, stacked for demonstrations of as many rows."""
+    counts = torch.bincount(group)
+    order = x[:, 0].argsort(stable=True)
+    order = order[group[order].argsort(stable=True)]
+    by_size: dict[int, list[Tensor]] = {}
+    for rows in order.split(counts.tolist()):
+        chosen = rows[:: math.ceil(len(rows) / _MAX_SAMPLES) or 1]
+        if len(rows) > 1:
+            by_size.setdefault(len(chosen), []).append(chosen)
+    return [torch.stack(same) for same in by_size.values()]
+
+
+def _products_by_distance(
+    x: Float[Tensor, "g t e"], values: Float[Tensor, "g t d"], limit: float
+) -> tuple[Float[Tensor, "g k d"], Float[Tensor, "g k"]]:
+    """Sums of the products of pairs of samples of each of g demonstrations, and the numbers of pairs, by distance."""
+    n_demos, n_outputs = len(x), values.shape[-1]
+    i, j = torch.triu_indices(x.shape[1], x.shape[1], offset=1, device=x.device)
+    distance = (x[:, i] - x[:, j]).norm(dim=-1)
+    edges = limit * torch.arange(1, _N_BINS).to(x) / _N_BINS + 1e-9
+    number = torch.bucketize(distance, edges)
+    number = torch.where(distance <= limit, number, _N_BINS)  # the last bin is of those that are too far apart
+    number = (number + (_N_BINS + 1) * torch.arange(n_demos, device=x.device)[:, None]).flatten()
+    size = n_demos * (_N_BINS + 1)
+    products = x.new_zeros(size, n_outputs).index_add_(0, number, (values[:, i] * values[:, j]).flatten(0, 1))
+    pairs = torch.bincount(number, minlength=size).to(x)
+    return products.reshape(n_demos, -1, n_outputs)[:, :-1], pairs.reshape(n_demos, -1)[:, :-1]
+
+
+def _squared_autocorrelation(products: Float[Tensor, "g k d"], pairs: Float[Tensor, "g k"]) -> Float[Tensor, "k d"]:
+    """Squared autocorrelation in each bin of distance; zero from where it first is not positive.
+
+    Means over ordered pairs of different demonstrations, (sum a)^2 - sum a^2, have no bias: their errors are
+    independent.
+    """
+    own = products / pairs.clamp_min(1.0).unsqueeze(-1)
+    present = (pairs > 0).sum(0).to(products)[:, None]
+    cross = own.sum(0).square() - own.square().sum(0)
+    square = (cross / (present * (present - 1.0)).clamp_min(1.0)).clamp(max=1.0)
+    ended = ((present > 1) & (square <= 0)).cumsum(0) > 0
+    return torch.where((present > 1) & ~ended, square, 0.0)
+
+
+def _decay_of(target: Float[Tensor, " d"], distance: Float[Tensor, " k"], pairs: Float[Tensor, " k"]) -> Tensor:
+    """Decays (d,) whose exponentials sum to the targets over the pairs, by bisection."""
+    low, high = torch.full_like(target, _SHORTEST), torch.full_like(target, _LONGEST)
+    for _ in range(_HALVINGS):
+        middle = (low * high).sqrt()
+        too_short = torch.exp(-distance / middle[:, None]) @ pairs < target
+        low, high = torch.where(too_short, middle, low), torch.where(too_short, high, middle)
+    return (low * high).sqrt()
