@@ -131,11 +131,11 @@ def count(
     """Whole number from ``least`` to ``most``; None too, if ``optional``."""
     if optional and value is None:
         return None
-    if isinstance(value, Integral) and not isinstance(value, bool | np.bool_) and least <= int(value) <= most:
+    is_whole = isinstance(value, Integral) and not isinstance(value, bool | np.bool_)
+    if is_whole and least <= int(value) <= most:
         return int(value)
-    upper = f" and at most {most}" if most < _MOST else ""
-    must = f"an integer of at least {least}{upper}{' or None' if optional else ''}"
-    raise refusal(value, name, must, remedy)
+    upper = f" and at most {most}" if most < _MOST or (is_whole and int(value) > most) else ""
+    raise refusal(value, name, f"an integer of at least {least}{upper}{' or None' if optional else ''}", remedy)
 
 
 def flag(value: Any, name: str) -> bool:

@@ -102,6 +102,14 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         """Joint law at times (n,), all different, before anything is known of the movement."""
 
     @abstractmethod
+    def _arrays(self) -> dict[str, Floats]:
+        """Arrays that the law consists of, beside the regressor, for model files."""
+
+    @abstractmethod
+    def _restore(self, arrays: dict[str, Floats]) -> None:
+        """Take up such arrays, whose numbers are finite; a ValueError tells of shapes that do not fit."""
+
+    @abstractmethod
     def _scaled(self, time: Floats) -> Floats:
         """Times in ranges of those of the fit."""
 

@@ -1,6 +1,6 @@
 """Kernelized movement primitives (KMP): a kernel through a reference of means and covariances."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -56,6 +56,8 @@ class KMPBaseline(MovementRegressor):
 
     df_ = float("inf")
 
+    _learned: ClassVar[Any] = {}
+
     def __init__(
         self,
         regressor: Any = None,
@@ -91,6 +93,24 @@ class KMPBaseline(MovementRegressor):
         self._scale = y.std(axis=0)
         time = np.linspace(X.min(), X.max(), int(self.n_reference))
         self._reference = time, *self.regressor_.predict(time[:, np.newaxis], return_cov=True)
+
+    def _arrays(self) -> dict[str, Floats]:
+        names = ("time", "mean", "covariance")
+        arrays = {f"reference.{name}": part for name, part in zip(names, self._reference, strict=True)}
+        return arrays | {"range": np.array(self._range), "deviation": self._scale}
+
+    def _restore(self, arrays: dict[str, Floats]) -> None:
+        n, d = len(np.atleast_1d(arrays["reference.time"])), self.n_outputs_
+        shapes: dict[str, tuple[int, ...]] = {
+            "reference.time": (n,), "reference.mean": (n, d), "reference.covariance": (n, d, d), "range": (2,),
+            "deviation": (d,),
+        }  # fmt: skip
+        if set(arrays) != set(shapes):
+            raise ValueError(f"its arrays are {', '.join(arrays)}, must be {', '.join(shapes)}")
+        *reference, span, self._scale = (checks.array(arrays[name], name, shape) for name, shape in shapes.items())
+        checks.semidefinite(reference[2], "reference.covariance", definite=True)
+        self._reference = reference[0], reference[1], reference[2]
+        self._range = float(span[0]), checks.number(float(span[1]), "the range of X", above=0.0)
 
     def _scaled(self, time: Floats) -> Floats:
         return np.asarray((time - self._range[0]) / self._range[1])

@@ -1,6 +1,7 @@
 """Probabilistic movement primitives (ProMP): a normal law of the weights of basis functions."""
 
-from typing import Any
+from functools import partial
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -61,6 +62,13 @@ class ProMPBaseline(MovementRegressor):
 
     df_ = float("inf")
 
+    _learned: ClassVar[Any] = {
+        "n_basis_": partial(checks.count, least=2),
+        "overlap_": partial(checks.number, above=0.0, below=1.0),
+        "reach_": partial(checks.number, above=0.0),
+        "shrinkage_": partial(checks.number, least=0.0, most=1.0),
+    }
+
     def __init__(
         self,
         *,
@@ -107,6 +115,27 @@ class ProMPBaseline(MovementRegressor):
         self.weight_mean_ = weights.values.mean(axis=0)
         self.weight_covariance_ = weights.covariance(weights.values, reach, share)
         self.noise_scale_ = weights.noise_scale
+
+    def _arrays(self) -> dict[str, Floats]:
+        names = ("weight_mean_", "weight_covariance_", "noise_scale_")
+        return {name: getattr(self, name) for name in names} | {"range": np.array(self._range)}
+
+    def _restore(self, arrays: dict[str, Floats]) -> None:
+        n_basis, d = self.n_basis_, self.n_outputs_
+        shapes: dict[str, tuple[int, ...]] = {
+            "weight_mean_": (n_basis, d),
+            "weight_covariance_": (n_basis * d, n_basis * d),
+            "noise_scale_": (d,),
+            "range": (2,),
+        }
+        if set(arrays) != set(shapes):
+            raise ValueError(f"its arrays are {', '.join(arrays)}, must be {', '.join(shapes)}")
+        own = {name: checks.array(arrays[name], name, shape) for name, shape in shapes.items()}
+        checks.semidefinite(own["weight_covariance_"], "weight_covariance_")
+        checks.require(own["noise_scale_"] > 0.0, own["noise_scale_"], "noise_scale_", "above 0")
+        low, width = own.pop("range").tolist()
+        self._range = low, checks.number(width, "the range of X", above=0.0)
+        self.__dict__.update(own)
 
     def _scaled(self, time: Floats) -> Floats:
         return np.asarray((time - self._range[0]) / self._range[1])

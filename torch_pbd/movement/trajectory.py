@@ -1,6 +1,7 @@
 """The joint law of a demonstration, on top of any covariance regressor."""
 
-from typing import Any
+from functools import partial
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -137,6 +138,13 @@ class TrajectoryRegressor(MovementRegressor):
 
     module_: TrajectoryLaw
 
+    _learned: ClassVar[Any] = {
+        "df_": partial(checks.number, least=_FEWEST_DF, most=_MOST_DF),
+        "time_kernel_": partial(checks.choice, choices=tuple(KERNELS)),
+        "length_scale_": partial(checks.number, above=0.0),
+        "shrinkage_": partial(checks.number, least=0.0, below=1.0),
+    }
+
     def __init__(
         self,
         regressor: Any = None,
@@ -227,6 +235,27 @@ class TrajectoryRegressor(MovementRegressor):
         if self._known is None:
             return self.regressor_.sample_y(X, n_samples, random_state)
         return super().sample_y(X, n_samples, random_state)
+
+    def _arrays(self) -> dict[str, Floats]:
+        state = self.module_.state_dict()
+        return {name: array.numpy() for name, array in state.items() if not name.startswith("marginals.")}
+
+    def _restore(self, arrays: dict[str, Floats]) -> None:
+        n_steps, scalars = len(np.atleast_1d(arrays["grid"])), ("length_scale", "share", "x_shift", "x_scale")
+        shapes: dict[str, tuple[int | str, ...]] = dict.fromkeys(scalars, ())
+        shapes |= {"grid": (n_steps,), "nugget": (n_steps,), "residual": ("K", n_steps, self.n_outputs_)}
+        if set(arrays) != set(shapes):
+            raise ValueError(f"its arrays are {', '.join(arrays)}, must be {', '.join(shapes)}")
+        own = {name: checks.array(arrays[name], name, shape) for name, shape in shapes.items()}
+        checks.require(own["nugget"] > 0.0, own["nugget"], "nugget", "above 0")
+        checks.require(np.diff(own["grid"]) > 0.0, own["grid"][1:], "grid", "increasing")
+        length, share, shift, scale = (float(own[name]) for name in scalars)
+        checks.number(share, "share", above=0.0, most=1.0)
+        grid, nugget, residual = (torch.from_numpy(own[name].copy()) for name in ("grid", "nugget", "residual"))
+        found = TimeKernel(grid, self.time_kernel_, length, nugget, share, residual)
+        self.module_ = TrajectoryLaw(self.regressor_.module_, found, shift, scale)
+        self.module_.requires_grad_(False)
+        self.nugget_scale_ = np.sqrt(own["nugget"])
 
     def _scaled(self, time: Floats) -> Floats:
         return np.asarray((time - float(self.module_.x_shift)) / float(self.module_.x_scale))

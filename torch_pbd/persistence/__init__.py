@@ -2,7 +2,8 @@
 
 A file of format 1 holds of a regressor its class, its parameters, what its fit learned ("fitted"), the ``config()`` of
 its model's core ("module"), and as arrays the ``state_dict`` of the model. Of a controller it holds class, parameters,
-what its fit learned, as arrays its movement, and under "covariance_" all that of its regressor.
+what its fit learned, as arrays its movement, and under "covariance_" all that of its regressor. A model of movements is
+written like a controller, with a regressor of its own, if it has one, under "regressor_".
 """
 
 import os
@@ -25,7 +26,6 @@ from torch_pbd.exceptions import ModelFileError
 from torch_pbd.files.atomic import LOADERS
 from torch_pbd.files.tensors import Arrays, read_checksummed, write_checksummed
 from torch_pbd.persistence.plain import (
-    SAVED,
     check_entries,
     decode_learned,
     decode_parameters,
@@ -34,11 +34,11 @@ from torch_pbd.persistence.plain import (
     is_ours,
     learned_checks,
 )
-from torch_pbd.registry import REGRESSORS
+from torch_pbd.registry import ESTIMATORS, MOVEMENTS, REGRESSORS
 
 FORMAT_VERSION = 1
 _KEY = "torch_pbd"
-_PART = "covariance_."  # before the names of the arrays of a controller's regressor
+_PARTS = {"DMPController": "covariance_", **dict.fromkeys(MOVEMENTS, "regressor_")}  # models that others consist of
 _FOREIGN = re.compile(
     r"\.(pkl|pickle|joblib|skops|pt|pth|ckpt|bin|onnx|np[yz]|h5|hdf5|mat|zip|json|ya?ml|toml|csv|txt|parquet)", re.I
 )
@@ -82,7 +82,7 @@ def save(estimator: CovarianceRegressor | DMPController, path: str | os.PathLike
         raise ValueError(f"path={str(path)!r} has the suffix of another format: take .safetensors.")
     name = type(estimator).__name__
     if not is_ours(estimator):
-        raise TypeError(f"estimator is a {name}; can save {', '.join(SAVED)}. In a pipeline, save that step.")
+        raise TypeError(f"estimator is a {name}; can save {', '.join(ESTIMATORS)}. In a pipeline, save that step.")
     check_is_fitted(estimator)
     description, arrays = _described(estimator)
     try:
@@ -119,8 +119,8 @@ def load(path: str | os.PathLike[str]) -> Any:
         if not _FOREIGN.fullmatch(path.suffix):
             raise
         raise ModelFileError(f"{error} {LOADERS} Pickles are never loaded.") from error
-    if header.get("class") not in list(SAVED):  # a list asks for no hash
-        raise ModelFileError(f"{path} holds a {header.get('class')!r:.80}; known are {', '.join(SAVED)}.")
+    if header.get("class") not in list(ESTIMATORS):  # a list asks for no hash
+        raise ModelFileError(f"{path} holds a {header.get('class')!r:.80}; known are {', '.join(ESTIMATORS)}.")
     try:
         if not isinstance(header.pop("versions", None), dict) or header.pop("format_version") != FORMAT_VERSION:
             raise ValueError("it does not say what wrote it")
@@ -135,14 +135,49 @@ def _brief(error: BaseException) -> str:
 
 def _described(estimator: Any) -> tuple[dict[str, Any], Arrays]:
     """Class, parameters and what was learned, as JSON can hold it; and the arrays."""
-    return _described_controller(estimator) if isinstance(estimator, DMPController) else _described_regressor(estimator)
+    if isinstance(estimator, CovarianceRegressor):
+        return _described_regressor(estimator)
+    if getattr(estimator, "_bend", None) is not None or getattr(estimator, "_known", None) is not None:
+        raise TypeError("estimator was conditioned, which a file cannot hold: save it before, or pickle it.")
+    own = _controller_arrays(estimator) if isinstance(estimator, DMPController) else estimator._arrays()
+    fitted = {name: encode(getattr(estimator, name), name) for name in learned_checks(estimator)}
+    description = {**encode_parameters(estimator), "fitted": fitted}
+    part = _PARTS[type(estimator).__name__]
+    if not hasattr(estimator, part):
+        return description, own
+    inner, arrays = _described(getattr(estimator, part))
+    return {**description, part: inner}, own | {f"{part}.{key}": value for key, value in arrays.items()}
 
 
 def _restored(description: Any, arrays: Arrays) -> Any:
     """Estimator of a description and its arrays."""
     estimator = decode_parameters(description)
-    restore = _restore_controller if isinstance(estimator, DMPController) else _restore_regressor
-    restore(estimator, description, arrays)
+    if isinstance(estimator, CovarianceRegressor):
+        _restore_regressor(estimator, description, arrays)
+        return estimator
+    part = _PARTS[description["class"]]
+    names = {"class", "params", "fitted"} | ({part} & set(description))
+    check_entries(description, names, "its header")
+    learned, prefix = decode_learned(estimator, description["fitted"]), f"{part}."
+    vars(estimator).update(learned)
+    if part in description:
+        inner = description[part]
+        if not isinstance(inner, dict) or inner.get("class") not in [*REGRESSORS, *MOVEMENTS]:
+            raise ValueError("its covariance is no regressor")
+        parts = {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
+        setattr(estimator, part, _restored(inner, parts))
+        own = getattr(estimator, part)
+        if (own.n_features_in_, own.n_outputs_) != (1, estimator.n_outputs_):
+            raise ValueError(f"its regressor must have 1 input, time, and {estimator.n_outputs_} outputs")
+    rest = {key: value for key, value in arrays.items() if not key.startswith(prefix)}
+    for name, array in rest.items():
+        _check_numbers(name, array)
+    if isinstance(estimator, DMPController):
+        _restore_controller(estimator, rest)
+    else:
+        estimator._check_parameters()
+        estimator._restore(rest)
+        estimator.predict_cov(np.zeros((1, 1)))  # of arrays that do not fit together
     return estimator
 
 
@@ -202,36 +237,25 @@ def _check_numbers(name: str, array: Any) -> None:
         raise ValueError(f"array {name!r:.80} must be the lower factor of a positive definite matrix")
 
 
-def _described_controller(controller: DMPController) -> tuple[dict[str, Any], Arrays]:
-    fitted = {name: encode(getattr(controller, name), name) for name in learned_checks(controller)}
+def _controller_arrays(controller: DMPController) -> Arrays:
     arrays = {name: getattr(controller, name) for name in _NOISE}
     arrays |= {name: getattr(controller.reproduction_, name) for name in _MOTION}
     if controller.unsampled_.any():
         arrays[_HOLES] = controller.unsampled_
-    regressor, parts = _described(controller.covariance_)
-    arrays |= {_PART + key: value for key, value in parts.items()}
-    return {**encode_parameters(controller), "fitted": fitted, "covariance_": regressor}, arrays
+    return arrays
 
 
-def _restore_controller(controller: Any, description: dict[str, Any], arrays: Arrays) -> None:
-    check_entries(description, {"class", "params", "fitted", "covariance_"}, "its header")
-    regressor = description["covariance_"]
-    if not isinstance(regressor, dict) or regressor.get("class") not in list(REGRESSORS):
+def _restore_controller(controller: Any, own: Arrays) -> None:
+    if not hasattr(controller, "covariance_"):
         raise ValueError("its covariance is no regressor")
-    parts = {key.removeprefix(_PART): value for key, value in arrays.items() if key.startswith(_PART)}
-    own = {key: value for key, value in arrays.items() if not key.startswith(_PART)}
-    learned = decode_learned(controller, description["fitted"])
-    vars(controller).update(learned)
     check_parameters(controller)
-    controller.covariance_, d = _restored(regressor, parts), controller.n_outputs_
-    if (controller.covariance_.n_features_in_, controller.covariance_.n_outputs_) != (1, d):
-        raise ValueError(f"its regressor must have 1 input, time, and {d} outputs")
+    d = controller.n_outputs_
     for name in ("names_", "units_"):
-        if learned[name] is not None:
-            if len(learned[name]) != d:
-                raise ValueError(f"{name} has {len(learned[name])} entries, must have {d}")
-            setattr(controller, name, tuple(learned[name]))
-    own.setdefault(_HOLES, np.zeros(2))  # none at the start, none at the end
+        if getattr(controller, name) is not None:
+            if len(getattr(controller, name)) != d:
+                raise ValueError(f"{name} has {len(getattr(controller, name))} entries, must have {d}")
+            setattr(controller, name, tuple(getattr(controller, name)))
+    own = {_HOLES: np.zeros(2), **own}  # none at the start, none at the end
     _check_movement(own, d)
     for name in (*_NOISE, _HOLES):
         setattr(controller, name, own.pop(name))
@@ -249,7 +273,6 @@ def _check_movement(arrays: Arrays, n_outputs: int) -> None:
     shapes |= {"forcing": ("m", n_outputs), _HOLES: ("m",)}
     check_entries(arrays, set(shapes), "its arrays")
     for name, array in arrays.items():
-        _check_numbers(name, array)
         checks.array(array, name, shapes[name])
     checks.require((arrays[_HOLES] >= 0.0) & (arrays[_HOLES] <= 1.0), arrays[_HOLES], _HOLES, "a share from 0 to 1")
     if min(len(arrays["forcing"]), len(arrays[_HOLES])) < 2:

@@ -14,9 +14,6 @@ from torch_pbd.registry import ESTIMATORS, MOVEMENTS, REGRESSORS, load_class
 
 Check = Callable[[Any, str], Any]
 
-SAVED = {name: module for name, module in ESTIMATORS.items() if name not in MOVEMENTS}
-"""Classes that files hold, and the modules in which they are."""
-
 _LAW = "stiffness_law"
 _INTEGERS = [f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)]
 _DTYPES = ["float64", "float32", "float16", *_INTEGERS, "bool", "object"]
@@ -24,7 +21,7 @@ _DTYPES = ["float64", "float32", "float16", *_INTEGERS, "bool", "object"]
 
 def is_ours(estimator: Any) -> bool:
     """Whether an object is of one of the classes, and not of a subclass that bears its name."""
-    return SAVED.get(type(estimator).__name__) == type(estimator).__module__
+    return ESTIMATORS.get(type(estimator).__name__) == type(estimator).__module__
 
 
 def encode_parameters(estimator: Any) -> dict[str, Any]:
@@ -38,7 +35,7 @@ def decode_parameters(description: Any) -> Any:
     if not isinstance(description, dict) or not {"class", "params"} <= set(description):
         raise ValueError("it has no class and parameters")
     name, parameters = description["class"], description["params"]
-    if name not in list(SAVED) or not isinstance(parameters, dict):  # a list asks for no hash
+    if name not in list(ESTIMATORS) or not isinstance(parameters, dict):  # a list asks for no hash
         raise ValueError(f"it holds a {name!r:.80}")
     if name == "DMPController":  # files from before there was a choice are of the printed equation
         parameters = {"adaptation": "additive", **parameters}
@@ -51,7 +48,10 @@ def decode_parameters(description: Any) -> Any:
 
 def learned_checks(estimator: Any) -> dict[str, Check]:
     """Attributes that a fit gives an estimator beside its module and arrays, and what each of them must be."""
-    return dict(_CONTROLLER if type(estimator).__name__ == "DMPController" else _REGRESSOR | estimator._learned)
+    name = type(estimator).__name__
+    if name in MOVEMENTS:
+        return _MOVEMENT | estimator._learned
+    return dict(_CONTROLLER if name == "DMPController" else _REGRESSOR | estimator._learned)
 
 
 def decode_learned(estimator: Any, values: Any) -> dict[str, Any]:
@@ -95,7 +95,9 @@ def encode(value: Any, name: str) -> Any:
 
 def _decoded(name: str, values: Mapping[str, Any]) -> dict[str, Any]:
     """Values of an estimator of class ``name``; laws and regressors only where a controller has them."""
-    nested = {"covariance": _regressor, _LAW: _law, "law_": _law} if name == "DMPController" else {}
+    nested: dict[str, Callable[[Any], Any]] = {"regressor": _regressor} if name in MOVEMENTS else {}
+    if name == "DMPController":
+        nested = {"covariance": _regressor, _LAW: _law, "law_": _law}
     return {key: nested.get(key, _decode)(value) for key, value in values.items()}
 
 
@@ -125,8 +127,8 @@ def _law(value: Any) -> StiffnessLaw | None:
 
 
 def _regressor(value: Any) -> Any:
-    """An unfitted regressor, or None."""
-    if isinstance(value, dict) and value.get("class") not in list(REGRESSORS):
+    """An unfitted regressor or movement model, or None."""
+    if isinstance(value, dict) and value.get("class") not in [*REGRESSORS, *MOVEMENTS]:
         raise ValueError("its covariance is no regressor")
     return decode_parameters(value) if isinstance(value, dict) else value
 
@@ -162,6 +164,12 @@ _REGRESSOR: Mapping[str, Check] = {
     "loss_curve_": _list_of(_REAL),
     "converged_": checks.flag,
     "jitter_": checks.number,
+}
+_MOVEMENT: Mapping[str, Check] = {
+    "n_features_in_": partial(checks.count, most=1),
+    "n_outputs_": checks.count,
+    "_y_is_1d": checks.flag,
+    "input_": partial(checks.choice, choices=("time", "phase", "array")),
 }
 _CONTROLLER: Mapping[str, Check] = {
     "names_": _list_of(_TEXT),
