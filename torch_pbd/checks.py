@@ -36,7 +36,7 @@ def refusal(value: Any, name: str, must: str, remedy: str = "", unit: str = "") 
     """Error to raise for an argument that cannot be used."""
     shown = repr(value.item() if isinstance(value, np.generic) else value)
     if len(shown) > _LONGEST or "\n" in shown:
-        shown = f"a {type(value).__name__}"
+        shown = f"of type {type(value).__name__}"
     return InvalidParameterError(
         f"{name} is {shown}{unit and ' ' + unit}, must be {must}{remedy and ': ' + remedy.rstrip('.')}."
     )
