@@ -78,39 +78,7 @@ def as_semidefinite(value: Any, name: str) -> tuple[Tensor, tuple[Tensor, Tensor
 
 
 # The parameters of the primitive and of the controller are checked by these three until they go to checks.py.
-def check_finite(name: str, value: Any, *, optional: bool = False) -> None:
-    """Check that a parameter is a finite number, or None where that is allowed."""
-    if value is not None or not optional:
-        checks.number(value, name)
-
-
-def check_positive(name: str, value: Any, unit: str = "") -> None:
-    """Check that a parameter is a positive finite number."""
-    checks.number(value, name)
-    if value <= 0.0:
-        raise InvalidParameterError(f"{name} is {value:g}{unit and ' ' + unit}, must be positive.")
-
-
-def check_count(name: str, value: Any, least: int) -> None:
-    """Check that a parameter is an integer not below ``least``."""
-    checks.count(value, name, least=least)
-
-
 def broadcasts(value: Tensor, other: Tensor) -> bool:
     """Whether shapes broadcast, of the same last size."""
     sizes = zip(reversed(value.shape), reversed(other.shape), strict=False)
     return value.shape[-1] == other.shape[-1] and all(1 in pair or pair[0] == pair[1] for pair in sizes)
-
-
-def run_shape(forcing: Tensor, others: dict[str, Tensor]) -> torch.Size:
-    """Shape (..., T, d) of a rollout: T and d are those of the forcing, the batch is that of all."""
-    shape = forcing.shape
-    n_ticks, d = shape[-2:]
-    for name, value in others.items():
-        if value.shape[-1] != d or value.shape[-2] not in (1, n_ticks):
-            raise ValueError(
-                f"{name} is of {value.shape[-1]} outputs and {value.shape[-2]} ticks, must be of {d} outputs, as "
-                f"forcing is, and one or {n_ticks} ticks."
-            )
-        shape = torch.broadcast_shapes(shape, value.shape)
-    return shape
