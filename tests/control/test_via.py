@@ -95,7 +95,7 @@ def test_a_movement_that_was_pushed_goes_on_from_where_it_is(controller):
     np.testing.assert_array_equal(controller.predict([[1.2]]), before[:1])
 
 
-@pytest.mark.parametrize("name", ["letter_G", "kuka_cshape_top"])
+@pytest.mark.parametrize("name", ["letter_G", pytest.param("kuka_cshape_top", marks=pytest.mark.slow)])
 @pytest.mark.filterwarnings("ignore")  # of the recordings: their units, and how they end
 def test_a_left_out_demonstration_is_nearer_to_what_goes_on_from_its_half(name, recordings):
     shown = load_demonstrations(recordings / f"{name}.npz").align(n=100)

@@ -109,7 +109,7 @@ def test_a_job_that_fails_is_a_row_with_its_error(tasks, serial):
 def test_a_campaign_of_pushes_goes_on_too(schedule):
     rows = push_campaign({"tunnel": schedule}, [0], duration=100.0)
     assert rows[0]["summary"] is None
-    assert "duration == 100.0 s" in rows[0]["error"]
+    assert "duration is 100.0 s" in rows[0]["error"]
 
 
 def test_the_table_is_paired():
