@@ -209,13 +209,17 @@ class ScheduleClock:
         d, time, last_pace = self._d, begin - self._origin, self._pace
         row, squared_limit = self._desired(time)
         motion = row[d : 2 * d]
+        # Most ticks of an approach: at a pace of 1 nothing changes it, for nothing is caught up.
+        if self._is_soft and last_pace == self._free == 1.0 <= squared_limit:
+            self.boost, self._spare = (), 0.0
+            row[d : 2 * d] = map(add, motion, self._slope)
+            return tuple(row)
         speed, last_free, gain = math.hypot(*motion), last_pace, self.gain
         if self._is_soft:
             slope, last_free = self._slope, self._free
             gain -= self._taken * last_free * last_free
             # Where the schedule is slower than its approach, `gain` is for the changes of both.
-            is_one = last_pace == last_free
-            speed = math.hypot(*map(add, motion, slope)) if is_one else speed + math.hypot(*slope)
+            speed = speed + math.hypot(*slope) if last_pace < last_free else math.hypot(*map(add, motion, slope))
         faster, free = self._freely(last_free, gain, speed, step)
         self._pace = pace = min(last_pace + faster, free, math.sqrt(squared_limit))
         # Where the pace is even nothing says what is spare, and the first tick of a rise finds out.
@@ -226,15 +230,13 @@ class ScheduleClock:
         row[d : 2 * d] = [pace * part for part in motion]
         if self._is_soft:
             if self.boost:
-                rise = (free - last_free) / step
-                self.boost = tuple([a + rise * b for a, b in zip(self.boost, slope, strict=True)])
+                self.boost = tuple([a + (free - last_free) / step * b for a, b in zip(self.boost, slope, strict=True)])
             self._ahead += 0.5 * step * (free + last_free - pace - last_pace)
             for i, part in enumerate(slope, start=d):
                 row[i] += free * part
         self._free = free if self._is_soft else pace
         lost = step - 0.5 * step * (pace + last_pace)
-        self._origin += lost
-        self._lag = max(0.0, self._lag + lost) if self._lag else 0.0
+        self._origin, self._lag = self._origin + lost, max(0.0, self._lag + lost) if self._lag else 0.0
         # Time is put onto a row where the ramp ends: without ramps a tick takes the nearest one.
         if pace == 1.0 != last_pace:
             self._origin += time + step - lost - round((time + step - lost) * self._rate) / self._rate
