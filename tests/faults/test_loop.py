@@ -28,6 +28,15 @@ def cut(duration=3.0, speed=SPEED, **more):
     return SimpleNamespace(time=time, stiffness=100 * gain, damping=20 * gain, stiffness_limits=None, **rows, **more)
 
 
+def wave(duration=3.0):
+    """A motion of 0.4 m/s and 1.6 m/s^2 at most, cut while moving; 100 N/m, critically damped, 1 kg."""
+    schedule = cut(duration)
+    schedule.position, schedule.velocity = (
+        a * f(4.0 * schedule.time)[:, None] for a, f in ((0.1, np.sin), (0.4, np.cos))
+    )
+    return schedule
+
+
 def went(controller, times, forces=None):
     """Positions, velocities and schedule times after ticks, with what was before them."""
     d = len(controller.position)
@@ -85,6 +94,38 @@ def test_73_a_start_within_the_schedule_has_no_jerk_either():
         assert passed[0] == at
         assert accelerations(ticks, positions, velocities)[0][:5].max() <= 0.3 * own
         controller.start(0.0, controller.position, at=controller.schedule_time)  # the end, where it stands
+
+
+@pytest.mark.parametrize("away", [-0.5, 0.01, 0.2])
+@pytest.mark.parametrize(
+    ("schedule", "limit"),
+    [(cut(), 3.0792 * RISE), (wave(), 1.25 * 1.6 + RISE)],  # what a soft start takes; what a schedule does with one
+    ids=["cut", "wave"],
+)
+def test_73_an_approach_and_its_schedule_stay_within_limits_together(schedule, limit, away):
+    controller = RealTimeAdmittance(schedule)
+    for at in (0.0, 0.35, 1.15, 2.9, 2.999):  # the last ones are at the end in mid-approach
+        row = round(1000 * at)
+        controller.start(0.0, schedule.position[row] + away, at=at)
+        ticks = np.arange(6001) / 1000
+        positions, velocities, passed = went(controller, ticks[1:])
+        for each in accelerations(ticks, positions, velocities):
+            assert each.max() <= limit, f"at {at}"
+        assert passed[-1] == 3.0
+        np.testing.assert_allclose(positions[-1], schedule.position[-1], rtol=0, atol=1e-4)
+
+
+def test_74_nothing_is_caught_up_while_an_approach_is_under_way():
+    controller = RealTimeAdmittance(wave(20.0), on_gap="resume")
+    controller.start(0.0, [0.2])
+    ticks = np.append(np.arange(201), np.arange(400, 15_000)) / 1000
+    positions, velocities, passed = went(controller, ticks[1:])
+    paces = np.diff(passed) / np.diff(ticks)
+    is_over = passed[:-1] >= 1.5  # 0.2 m by minimum jerk within 0.5 m/s^2: sqrt(10 / sqrt(3) 0.2 / 0.5) s
+    assert paces[~is_over].max() <= 1.0 + 1e-9
+    assert 1.1 < paces[is_over].max() <= 1.5 + 1e-9
+    np.testing.assert_allclose(ticks[-1] - passed[-1], ticks[200] - passed[200], rtol=0, atol=5e-3)
+    assert accelerations(ticks, positions, velocities)[0][202:].max() <= 1.25 * 1.6 + RISE
 
 
 @pytest.mark.parametrize("gap", [0.012, 0.05, 1.0, 4.0])

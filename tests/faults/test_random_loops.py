@@ -46,10 +46,12 @@ class Loop:
         self.dead = math.nan
         controller.start(0.0)
         self.trace = [(controller.position, controller.velocity)]
-        self.acting, self.steps = [], []
+        self.acting, self.steps, self.starts = [], [], {}
+        self.n_quiet = QUIET
 
     def run(self):
-        for i in range(self.n_ticks + QUIET):
+        i = -1
+        while (i := i + 1) < self.n_ticks + self.n_quiet:
             # While the clock is wrong nobody can know of a stall.
             is_sound = i < self.n_ticks and not self.n_dead and TickStatus.CLOCK not in self.status
             self.tick(self.rng.random() if is_sound else 1.0, is_quiet=i > self.n_ticks)
@@ -81,7 +83,11 @@ class Loop:
         is_at_rest = TickStatus.STOPPED in self.status and not any(self.controller.velocity)
         if is_at_rest and not is_quiet and self.rng.random() < 0.05:
             self.n_dead, self.told = 0, self.true + self.offset
-            self.controller.start(self.told, self.controller.position, at=self.controller.schedule_time)
+            self.starts[len(self.acting)] = self.controller.schedule_time
+            here, goal = self.controller.position, self.controller.desired_position
+            self.controller.start(self.told, here, at=self.controller.schedule_time)
+            # From where a push has held it the robot approaches by minimum jerk, at 0.5 m/s at most.
+            self.n_quiet = QUIET + round(1.875 * math.dist(here, goal) / 0.5 / STEP)
 
     def force(self, *, is_quiet):
         push = self.push * (not is_quiet) * math.sin(2.0 * self.true) ** 2
@@ -105,25 +111,41 @@ class Loop:
         return speed, max(np.linalg.norm(each, axis=1).max() for each in changes)
 
 
-def answer(schedule, forces):
-    """Largest speed and acceleration that the forces cause without faults, where nothing else moves."""
+def answer(schedule, forces, starts):
+    """Largest speed and acceleration that the forces cause without faults, where nothing else moves.
+
+    Also where it begins again when the loop did, at rest under a force that it stood against before: what follows is
+    not what would without, and on release can be more (seed 1145).
+    """
+    runs = [_answer(schedule, forces, each) for each in ({}, starts)]
+    return [max(values) for values in zip(*runs, strict=True)]
+
+
+def _answer(schedule, forces, starts):
     still = {name: np.zeros_like(schedule.position) for name in ("position", "velocity")}
     controller = RealTimeAdmittance(SimpleNamespace(**{**vars(schedule), **still}))
     controller.start(0.0)
-    velocities = [controller.velocity]
-    for i, force in enumerate(forces, start=1):
-        controller.tick(i * STEP, force)
-        velocities.append(controller.velocity)
-    change = np.diff(velocities, axis=0) / STEP
+    speeds, changes = [0.0], [0.0]
+    for i, force in enumerate(forces):
+        if i in starts:
+            controller.start(i * STEP, at=starts[i])
+        before = controller.velocity
+        controller.tick((i + 1) * STEP, force)
+        speeds.append(math.hypot(*controller.velocity))
+        changes.append(math.dist(before, controller.velocity) / STEP)
     at_once = np.linalg.norm(forces, axis=1).max()  # on 1 kg, where it is there when the robot begins again
-    return np.linalg.norm(velocities, axis=1).max(), max(np.linalg.norm(change, axis=1).max(), at_once)
+    return max(speeds), max(*changes, at_once)
 
 
 # A run takes a sixth of a second. All 10,000: --hypothesis-profile=thorough.
 ALL = 10_000 if settings.get_current_profile_name() == "thorough" else 600
+# Approaches that were caught up in or outlasted the schedule, and springs that pulled a robot after a stall.
+ONCE_TOO_FAST = [391, 718, 738, 749, 1018, 1145, 1183, 1333]
 
 
-@pytest.mark.parametrize("seeds", [range(24), pytest.param(range(24, ALL), marks=pytest.mark.slow)], ids=["few", "all"])
+@pytest.mark.parametrize(
+    "seeds", [[*range(24), *ONCE_TOO_FAST], pytest.param(range(24, ALL), marks=pytest.mark.slow)], ids=["few", "all"]
+)
 def test_73_to_76_random_faults_keep_the_command_within_its_limits(seeds):
     stopped = 0
     for seed in seeds:
@@ -138,7 +160,7 @@ def test_73_to_76_random_faults_keep_the_command_within_its_limits(seeds):
         own = np.linalg.norm(np.diff(schedule.velocity, axis=0), axis=1).max() / STEP
         soft = max(own_speed, 0.5) / soft_start  # what a soft start takes: 10 / sqrt(3) / (15 / 8) of it
         most = max(1.5 * own, 1.25 * own + soft, 3.0792 * soft, 5.0)
-        speed, acceleration = answer(schedule, loop.acting) if push.any() else (0.0, 0.0)
+        speed, acceleration = answer(schedule, loop.acting, loop.starts) if push.any() else (0.0, 0.0)
         reached = loop.extremes()
         assert reached[0] <= 1.5 * own_speed + 0.5 * 1.1 + speed, f"seed {seed}: speed"
         assert reached[1] <= (most + acceleration) * (1 + 1e-6), f"seed {seed}: acceleration"

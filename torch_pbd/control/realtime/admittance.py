@@ -26,7 +26,7 @@ class RealTimeAdmittance:
     to a table of rows ``1 / rate`` apart, as `Schedule.resample` makes them. A tick takes the row nearest to its
     beginning, and after the end the last one, with no velocity. Schedule time comes up to speed and slows down before
     the end, so that desired motion begins as fast as the robot moves and ends at rest, within 1.5 times the schedule's
-    own acceleration, or that of a soft start if it is more.
+    own acceleration, or that of a soft start if it is more: also where it does several of these at a time.
 
     Where damping shares the axes of stiffness in every row, as ``2 zeta sqrt(m K)`` does, a tick takes microseconds,
     else 0.1 ms, for a matrix exponential: interpolation between turned axes loses the sharing, so sample the schedule
@@ -59,9 +59,11 @@ class RealTimeAdmittance:
         most that the desired motion takes if that is more.
     soft_start, approach_speed : float, default=1.0, 0.5
         Time in s in which the desired position moves from the robot's at ``start`` to the schedule's, by minimum jerk;
-        longer where it would be faster than this, in units/s. At a soft_start of 0 the schedule begins at full speed.
+        longer where it would be faster than this, in units/s, or beyond the limit above. At 0 s the schedule begins at
+        full speed.
     on_gap : {"pause", "resume"}, default="pause"
-        After a tick longer than ``max_step`` the schedule goes on from where it was, or also catches up, within limits.
+        After a tick longer than ``max_step`` the schedule goes on from where it was, or also catches up, within limits
+        and not before the end of a soft start.
     force_rate_limit : float, default=None
         Fastest change of the force, in N/s: a spike of the sensor moves the robot less, and a contact is felt later.
 
@@ -121,8 +123,7 @@ class RealTimeAdmittance:
         self._clock = clock = ScheduleClock(table, soft_start, approach_speed, limits.acceleration, on_gap)
         stop = checks.number(stop_deceleration, "stop_deceleration", above=0.0, unit="units/s^2", optional=True)
         self._deceleration = min(stop or max(_DECELERATION, clock.acceleration), limits.acceleration)
-        # Velocity answers a force with an impulse response whose absolute values integrate to 2 / damping at most,
-        # whatever the mass.
+        # Impulse responses of velocity to force integrate, in absolute values, to 2 / damping at most, for any mass.
         damping = table.least_damping
         answer = 2.0 * (force_limit + pull) / damping if damping > 0.0 else math.inf
         self._speed_due = clock.speed + answer if velocity_limit is None else limits.speed
@@ -268,8 +269,11 @@ class RealTimeAdmittance:
         here, push = (self.position, self.velocity), self._channel.push
         row = clock.row(timer.last, step)
         if clock.boost:
-            push = tuple(map(add, push, clock.boost))
-        state, self._scale = self._table.advance(row, push, here, step, self._pull_limit)
+            boosted = tuple(map(add, push, clock.boost))
+            state, self._scale = self._table.advance(row, boosted, here, step, self._pull_limit)
+            clock.spare(push, here[1], state[1], step)
+        else:
+            state, self._scale = self._table.advance(row, push, here, step, self._pull_limit)
         status = FINE if self._scale == 1.0 else TickStatus.SPRING_LIMITED
         if limits.is_any or math.hypot(*state[1]) > self._top_speed:
             state, reached = limits.applied(state, here, step, self._top_speed)

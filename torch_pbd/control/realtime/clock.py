@@ -1,7 +1,7 @@
 """The two clocks of the real-time controller: that of the loop, and where it is in its schedule."""
 
 import math
-from operator import mul, sub
+from operator import add, mul, sub
 from typing import final
 
 import numpy as np
@@ -20,6 +20,8 @@ SMOOTHING = 0.1
 # The desired motion may be 1.5 times as fast as the schedule, and accelerate so much more: one half of that changes the
 # pace, the other is left for the square of the pace while it catches up.
 _SPEED, _SHARE = 1.5, 0.25
+# Share of `gain` that a rise of the pace may always take, so that nobody who shakes the robot makes its schedule stand.
+_LEAST_SPARE = 0.1
 # A minimum jerk of 1 over a time of 1 has a velocity of 15/8 and an acceleration of 10 / sqrt(3).
 _STEEPEST, _SHARPEST = 1.875, 5.7735
 
@@ -84,6 +86,11 @@ class ScheduleClock:
     also towards the end of a schedule that ends while moving: there r^2 <= 2 gain times the integral of dt / |x'| over
     what is left. ``boost`` is that term, to be fed forward, so that no change of pace displaces the robot. At a pace
     of 1 schedule time is a difference of two times of the loop's clock, which adds up no rounding.
+
+    The desired motion stays within ``acceleration``, and with it a robot that nobody pushes: an approach from elsewhere
+    takes what the schedule's own acceleration leaves, and a change of pace what both leave; nothing is caught up
+    meanwhile; and the pace rises no faster than the pull of the spring leaves room for (see `spare`). The end of the
+    schedule does not slow an approach, which has a pace of its own, ``_free``, and is ``_ahead`` of the schedule then.
     """
 
     def __init__(
@@ -101,14 +108,21 @@ class ScheduleClock:
         self.gain = min(max(_SHARE * own, soft), 0.5 * acceleration_limit)
         self.speed = _SPEED * fastest + approach_speed
         self.acceleration = max((1.0 + _SHARE) * own + self.gain, _SHARPEST / _STEEPEST * soft)
+        # What the schedule's own acceleration leaves to an approach; a critically damped spring overshoots it by 13 %.
+        self._room = max(self.gain, self.acceleration - (1.0 + _SHARE) * own)
         room = (self.acceleration - self.gain) / own if own else math.inf
         self._fastest = min(_SPEED, math.sqrt(room)) if self._catches_up else 1.0
         # Integral of dt / |x'| from each row to the end; where the schedule rests it is long, not endless.
         times = np.append(np.arange(table.last) / table.rate, table.end)
         speeds = np.maximum(0.5 * (table.speeds[1:] + table.speeds[:-1]), 1e-9 * self.speed)
         left = np.append(np.cumsum((np.diff(times) / speeds)[::-1])[::-1], 0.0)
-        self._squared_limits = 2.0 * self.gain * left
-        self._tail = int(np.count_nonzero(self._squared_limits >= self._fastest**2))
+        squared_limits = 2.0 * self.gain * left
+        self._tail = int(np.count_nonzero(squared_limits >= self._fastest**2))
+        # Where a schedule that ends while moving is slower if it may take one half of `gain` for that.
+        ends_moving = table.speeds[-1] * table.rate > self.gain
+        self._slow_from = float(times[np.count_nonzero(squared_limits >= 2.0) - 1]) if ends_moving else math.inf
+        # Items of a memoryview are floats, and a tick takes them faster than those of an array.
+        self._squared_limits = squared_limits.data
 
     def begin(self, now: float, at: float, position: Vector | None, velocity: Vector) -> Vector:
         """Start at a time of the schedule, whose row it is, as fast as the velocity of the robot is the desired one.
@@ -118,17 +132,29 @@ class ScheduleClock:
         d = self._d
         self._at, self._origin, self._lag, self._is_soft = at, now - at, 0.0, False
         self.boost: Vector = ()
+        self._spare, self._ahead, self._end_share = self.gain, 0.0, 1.0
         row, squared_limit = self._desired(at)
         self._distance: Vector = (0.0,) * d if position is None else tuple(map(sub, row, position))
-        self._blend = max(self._soft_start, _STEEPEST * math.hypot(*self._distance) / self._approach_speed)
+        way, room = math.hypot(*self._distance), self._room
+        self._blend = self._time_of(way, room)
+        # An approach that meets the slow end of its schedule leaves one half of `gain` to it.
+        if at + self._blend > self._slow_from:
+            room, self._end_share = room - 0.5 * self.gain, 0.5
+            self._blend = self._time_of(way, room)
+            squared_limit *= self._end_share
         self._is_soft = any(self._distance) and self._soft_start > 0.0
+        if self._is_soft:
+            # At a pace of 1 the approach leaves this much less than `gain` to changes of pace.
+            taken = self.gain + _SHARPEST * way / self._blend / self._blend - self._room
+            self._taken = min(max(taken, 0.0), self.gain)
         # The pace at which the desired motion is nearest to that of the robot.
         motion = row[d : 2 * d]
         square, along = sum(map(mul, motion, motion)), sum(map(mul, motion, velocity))
         pace = max(0.0, along / square) if square and self._soft_start else 1.0
-        self._pace = min(1.0, pace, math.sqrt(squared_limit))
+        self._free = min(1.0, pace)
+        self._pace = min(self._free, math.sqrt(squared_limit))
         self._is_steady = self._pace == 1.0 and not self._is_soft
-        return row
+        return tuple(row)
 
     def time_at(self, now: float) -> float:
         """Schedule time at the end of the last tick, in s."""
@@ -137,7 +163,10 @@ class ScheduleClock:
     def speed_at(self, now: float) -> float:
         """Desired speed at the end of the last tick."""
         row, _ = self._desired(now - self._origin)
-        return self._pace * math.hypot(*row[self._d : 2 * self._d])
+        motion = row[self._d : 2 * self._d]
+        if self._is_soft:
+            return math.hypot(*[self._pace * v + self._free * w for v, w in zip(motion, self._slope, strict=True)])
+        return self._pace * math.hypot(*motion)
 
     def row(self, begin: float, step: float) -> Vector:
         """Row of the table, with the desired motion, for a tick; without calls where nothing is ramped."""
@@ -154,11 +183,23 @@ class ScheduleClock:
         """Let schedule time, while ``passed`` s pass, brake at most so fast, and then stand."""
         speed, ran = self.speed_at(begin), 0.0
         if speed > 0.0:
-            slower = self._pace * max(0.0, 1.0 - deceleration * passed / speed)
-            ran, self._pace = 0.5 * min(passed, speed / deceleration) * (self._pace + slower), slower
+            left = max(0.0, 1.0 - deceleration * passed / speed)
+            slower, braking = self._pace * left, 0.5 * min(passed, speed / deceleration)
+            ran = braking * (self._pace + slower)
+            self._ahead += braking * (1.0 + left) * self._free - ran
+            self._pace, self._free = slower, self._free * left
         self.shift(passed - ran)
         self._lag = max(0.0, self._lag + self._catches_up * (passed - ran))
         self.boost, self._is_steady = (), False
+        # The spring pulls at the braked robot as hard as before, and a rise of the pace would add to it: the next tick
+        # tells how much it may.
+        self._spare = 0.0
+
+    def spare(self, push: Vector, before: Vector, after: Vector, step: float) -> None:
+        """Let the pace rise by what a tick's change of velocity leaves, where the boost and a push do not cause it."""
+        # While a push is not taken out, a robot that is shaken comes back to its schedule seconds later.
+        boosted = [v + step * part for v, part in zip(before, self.boost, strict=True)]
+        self._spare = self.acceleration + math.hypot(*push) - math.dist(after, boosted) / step
 
     def shift(self, time: float) -> None:
         """Let so much time of the loop's clock pass without schedule time."""
@@ -168,42 +209,84 @@ class ScheduleClock:
         d, time, last_pace = self._d, begin - self._origin, self._pace
         row, squared_limit = self._desired(time)
         motion = row[d : 2 * d]
-        speed = math.hypot(*motion)
-        # The pace changes by `rise` a second at most. From a pace of 1 + p, p^2 / (2 rise) of the lag is made up for by
-        # the time it is down to 1 again: the p of the whole lag is the one to go for.
-        rise = self.gain / speed if speed else math.inf
-        goal = min(self._fastest, 1.0 + math.sqrt(2.0 * rise * self._lag)) if self._lag else 1.0
-        change = rise * step
-        self._pace = pace = min(last_pace + change, max(goal, last_pace - change), math.sqrt(squared_limit))
-        self.boost = tuple([(pace - last_pace) / step * part for part in motion])
+        # Most ticks of an approach: at a pace of 1 nothing changes it, for nothing is caught up.
+        if self._is_soft and last_pace == self._free == 1.0 <= squared_limit:
+            self.boost, self._spare = (), 0.0
+            row[d : 2 * d] = map(add, motion, self._slope)
+            return tuple(row)
+        speed, last_free, gain = math.hypot(*motion), last_pace, self.gain
+        if self._is_soft:
+            slope, last_free = self._slope, self._free
+            gain -= self._taken * last_free * last_free
+            # Where the schedule is slower than its approach, `gain` is for the changes of both.
+            speed = speed + math.hypot(*slope) if last_pace < last_free else math.hypot(*map(add, motion, slope))
+        faster, free = self._freely(last_free, gain, speed, step)
+        self._pace = pace = min(last_pace + faster, free, math.sqrt(squared_limit))
+        # Where the pace is even nothing says what is spare, and the first tick of a rise finds out.
+        if pace == last_pace and (free == last_free or not self._is_soft):
+            self.boost, self._spare = (), 0.0
+        else:
+            self.boost = tuple([(pace - last_pace) / step * part for part in motion])
+        row[d : 2 * d] = [pace * part for part in motion]
+        if self._is_soft:
+            if self.boost:
+                self.boost = tuple([a + (free - last_free) / step * b for a, b in zip(self.boost, slope, strict=True)])
+            self._ahead += 0.5 * step * (free + last_free - pace - last_pace)
+            for i, part in enumerate(slope, start=d):
+                row[i] += free * part
+        self._free = free if self._is_soft else pace
         lost = step - 0.5 * step * (pace + last_pace)
-        self._origin += lost
-        self._lag = max(0.0, self._lag + lost) if self._lag else 0.0
+        self._origin, self._lag = self._origin + lost, max(0.0, self._lag + lost) if self._lag else 0.0
         # Time is put onto a row where the ramp ends: without ramps a tick takes the nearest one.
         if pace == 1.0 != last_pace:
             self._origin += time + step - lost - round((time + step - lost) * self._rate) / self._rate
         if not self._is_soft and (time >= self._table.end or (pace == last_pace == 1.0 and not self._lag)):
             self.boost, self._is_steady = (), True
-        return (*row[:d], *[pace * part for part in motion], *row[2 * d :])
+        return tuple(row)
 
-    def _desired(self, time: float) -> tuple[Vector, float]:
-        """Row at a time, its motion at a pace of 1 between it and the next, and the square of the largest pace."""
+    def _freely(self, pace: float, gain: float, speed: float, step: float) -> tuple[float, float]:
+        """Largest rise of the pace in a tick, and the pace after it where the end of the schedule does not limit it."""
+        # The pace changes by `rise` a second at most. From a pace of 1 + p, p^2 / (2 rise) of the lag is made up for by
+        # the time it is down to 1 again: the p of the whole lag is the one to go for, once an approach is over.
+        rise = gain / speed if speed else math.inf
+        goal = 1.0
+        if self._lag and not self._is_soft:
+            goal = min(self._fastest, 1.0 + math.sqrt(2.0 * rise * self._lag))
+        change = faster = rise * step
+        if self._spare < gain and speed:
+            faster = min(gain, max(_LEAST_SPARE * self.gain, self._spare)) / speed * step
+        return faster, min(pace + faster, max(goal, pace - change))
+
+    def _desired(self, time: float) -> tuple[list[float], float]:
+        """Row at a time, its motion at a pace of 1 between it and the next, and the square of the largest pace.
+
+        An approach under way changes the position, and its own velocity at a pace of 1 is ``_slope``.
+        """
         table, d, limits = self._table, self._d, self._squared_limits
         if time >= table.end:
-            self.index, row, squared_limit = table.last, table.row(table.last), math.inf
+            self.index, row, squared_limit = table.last, list(table.row(table.last)), math.inf
         else:
             self.index = index = min(int(time * self._rate), table.last - 1)
             start, stop = index / self._rate, table.end if index + 1 == table.last else (index + 1) / self._rate
-            share = min(1.0, (time - start) / (stop - start))
-            row, after = table.row(index), table.row(index + 1)
-            row = (*[a + share * (b - a) for a, b in zip(row[: 2 * d], after, strict=False)], *row[2 * d :])
-            squared_limit = float(limits[index] + share * (limits[index + 1] - limits[index]))
-        phase = (time - self._at) / self._blend if self._is_soft else 1.0
-        self._is_soft = phase < 1.0
+            share = (time - start) / (stop - start) if time < stop else 1.0
+            row = list(self._unpack(self._packed, index * self._row_size))
+            after = self._unpack(self._packed, (index + 1) * self._row_size)
+            for i in range(2 * d):
+                row[i] += share * (after[i] - row[i])
+            low, high = limits[index], limits[index + 1]
+            squared_limit = low + share * (high - low)
+        if self._is_soft:
+            phase = (time + self._ahead - self._at) / self._blend
+            self._is_soft = phase < 1.0
         if self._is_soft:
             left, slope = minimum_jerk(phase)
-            slope /= self._blend
-            position = [value - left * part for value, part in zip(row, self._distance, strict=False)]
-            velocity = [value - slope * part for value, part in zip(row[d:], self._distance, strict=False)]
-            row = (*position, *velocity, *row[2 * d :])
+            slope /= -self._blend
+            for i, part in enumerate(self._distance):
+                row[i] -= left * part
+            self._slope = [slope * part for part in self._distance]
+            squared_limit *= self._end_share
         return row, squared_limit
+
+    def _time_of(self, way: float, room: float) -> float:
+        """Time of an approach within its largest speed and this acceleration."""
+        return max(self._soft_start, _STEEPEST * way / self._approach_speed, math.sqrt(_SHARPEST * way / room))
