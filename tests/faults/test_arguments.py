@@ -251,7 +251,7 @@ CALLS = [
     (lambda: certify(SCHEDULE, position_loop="slow"), "position_loop is 'slow', must be a PositionLoop"),
     (lambda: damping_from_stiffness(np.eye(2), np.eye(3)), r"mass has shape \(3, 3\), but stiffness has shape \(2,"),
     (lambda: damping_from_stiffness(np.ones((4, 1, 1)), np.ones((3, 1, 1))), r"mass has shape \(3, 1, 1\), but"),
-    (lambda: damping_from_stiffness(GAIN, 1.0, np.eye(2)), "(?s)damping_ratio is of type ndarray, must be a finite number of at least 0"),
+    (lambda: damping_from_stiffness(GAIN, 1.0, np.eye(2)), "damping_ratio is of type ndarray, must be a finite number"),
     (lambda: damping_from_stiffness(GAIN, 1.0, torch.ones(2)), "damping_ratio is tensor"),
     (lambda: certify(SCHEDULE, mass="1"), "mass holds text"),
     (lambda: SCHEDULE.resample(1e300), r"rate=1e\+300 Hz needs about more than"),
@@ -273,7 +273,7 @@ CALLS = [
     (lambda: plotting.plot_stiffness(None, plt.gca()), "schedule is None"),
     (lambda: plotting.plot_stiffness(SCHEDULE, None), r"ax is \[None\], must be 1 matplotlib Axes"),
     (lambda: plotting.plot_std_band(TIME, TIME, -TIME - 1.0, plt.gca()), r"std\[0\] is -1.0, must be at least zero"),
-    (lambda: plotting.plot_covariance_ellipses([[0, 0]], [-np.eye(2)], plt.gca()), "must be zero or more, positive semidefinite"),
+    (lambda: plotting.plot_covariance_ellipses([[0, 0]], [-np.eye(2)], plt.gca()), "must be zero or more, positive"),
     (lambda: plotting.plot_covariance_ellipses([[0] * 3], [np.eye(3)], plt.gca()), "mean has shape .1, 3., must have"),
 ]  # fmt: skip
 

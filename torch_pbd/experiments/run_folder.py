@@ -181,10 +181,10 @@ def check_names(names: Iterable[str], argument: str) -> None:
         owners[file] = name
 
 
-def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
+def format_table(rows: Sequence[Mapping[str, Any]], width: int = _WIDTH) -> str:
     """Text table of rows with the same keys; numbers to three digits, and a dash for one that is not known.
 
-    A column of which nothing is known is left out. Where the table would be wider than a terminal, the headers take up
+    A column of which nothing is known is left out. Where the table would be wider than ``width``, the headers take up
     to three lines, and then the longest texts too.
     """
     columns = [column for column in rows[0] if any(row[column] == row[column] for row in rows)]
@@ -192,7 +192,7 @@ def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
     cells = {column: [_cell(row[column]) for row in rows] for column in columns}
     for n_lines in (1, 2, 3):
         widths = {column: max(_header_width(column, n_lines), *map(len, cells[column])) for column in columns}
-        spare = _WIDTH - sum(widths.values()) - 2 * (len(columns) - 1)
+        spare = width - sum(widths.values()) - 2 * (len(columns) - 1)
         if spare >= 0:
             break
     longest = max(texts, key=lambda column: widths[column], default=None)

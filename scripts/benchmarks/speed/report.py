@@ -22,6 +22,8 @@ _PACKAGES = ("torch", "scikit-learn", "numpy", "scipy", "gpytorch", "gmr")
 _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "u"), (1e-9, "n"))
 _MARKERS = "osD^vP*X"
 
+_WIDTH = 240  # of its tables, which are for wide windows: what is compared stays on one line
+
 
 def tables(found: Sequence[Findings]) -> str:
     """One table a group, and below it what was left out."""
@@ -29,9 +31,9 @@ def tables(found: Sequence[Findings]) -> str:
     for findings in found:
         lines = [findings.group]
         if findings.rows:
-            lines.append(format_table([_cells(row) for row in findings.rows]))
+            lines.append(format_table([_cells(row) for row in findings.rows], _WIDTH))
         if findings.growth:
-            lines.append(format_table([_growth_cells(growth) for growth in findings.growth]))
+            lines.append(format_table([_growth_cells(growth) for growth in findings.growth], _WIDTH))
         parts.append("\n".join([*lines, *(f"left out: {note}" for note in findings.left_out)]))
     verdicts = [row.held for findings in found for row in findings.rows if row.held is not None]
     return "\n\n".join([*parts, f"{sum(verdicts)} of {len(verdicts)} bars held"])
