@@ -298,7 +298,7 @@ BAD_CALLS = [
     ("schedule", {"settle": np.nan}, "settle is nan s, must be a finite number"),
     ("phase", {"time": 1.0}, r"time has shape \(\), must have shape \(n,\)"),
     ("phase", {"time": [np.nan]}, r"time\[0\] is nan, must be finite"),
-    ("smooth", {"demonstrations": np.zeros((4, 5, 2))}, "demonstrations is a ndarray, must be a Demonstrations"),
+    ("smooth", {"demonstrations": np.zeros((4, 5, 2))}, "demonstrations is of type ndarray, must be a Demonstrations"),
     ("smooth", {"demonstrations": recorded(), "n_steps": 0}, "n_steps is 0, must be an integer of at least 2"),
     (
         "varying",
