@@ -237,11 +237,16 @@ def table_of_sets(rows: list[dict[str, Any]]) -> str:
     for row in rows:
         values.setdefault((row["set"], row["model"]), []).append(row["joint"])
     lines = ["| set | " + " | ".join(MODELS) + " | ahead of ProMPBaseline |", "|" + " --- |" * (len(MODELS) + 2)]
+    ahead = []
     for name in names:
         difference = np.subtract(values[name, "TrajectoryRegressor"], values[name, "ProMPBaseline"])
         error = difference.std(ddof=1) / math.sqrt(len(difference)) if len(difference) > 1 else math.nan
         means = " | ".join(f"{np.mean(values[name, model]):.0f}" for model in MODELS)
         lines.append(f"| {name} | {means} | {difference.mean():.0f} +- {error:.0f} |")
+        ahead.append(difference.mean())
+    if len(ahead) > 1:
+        error = np.std(ahead, ddof=1) / math.sqrt(len(ahead))
+        lines.append(f"| mean of the sets {'| ' * len(MODELS)}| {np.mean(ahead):.0f} +- {error:.0f} |")
     return "\n".join(lines)
 
 
