@@ -2,7 +2,6 @@
 
 import importlib.util
 import pickle
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +21,6 @@ from torch_pbd import (
 )
 from torch_pbd.movement.time_kernel import fit_time_kernel
 
-ORACLE = Path(__file__).parents[2].parent / "shared" / "oracles" / "trajectory_dense.py"
 GRID = np.linspace(0.0, 1.0, 30)
 
 
@@ -53,10 +51,11 @@ def dense(model, X):
     return mean.ravel(), covariance.reshape(mean.size, mean.size)
 
 
-def test_the_law_is_that_of_the_dense_reference(model):
-    if not ORACLE.is_file():
-        pytest.skip("no reference")
-    spec = importlib.util.spec_from_file_location("trajectory_dense", ORACLE)
+def test_the_law_is_that_of_the_dense_reference(recordings):
+    file = recordings.parent / "oracles" / "trajectory_dense.py"
+    if not file.is_file():
+        pytest.skip("no dense reference beside the recordings")
+    spec = importlib.util.spec_from_file_location("trajectory_dense", file)
     oracle = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(oracle)
     demos, X = movements(), GRID[:, np.newaxis]
