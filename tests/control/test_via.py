@@ -112,6 +112,12 @@ def test_a_left_out_demonstration_is_nearer_to_what_goes_on_from_its_half(name, 
     assert np.exp(np.log(closer).mean()) < 0.9
 
 
+def test_a_movement_whose_start_is_known_still_meets_its_via_points(controller):
+    known = controller.condition([0.0], [controller.start_])
+    bent = known.schedule(rate=100.0, via=[(1.0, [0.22, 0.13])])
+    np.testing.assert_allclose(bent.position[[0, 100]], [controller.start_, [0.22, 0.13]], atol=1e-3)
+
+
 def test_any_model_of_movements_bends(controller):
     other = DMPController(ProMPBaseline()).fit(demonstrations())
     bent = other.schedule(rate=100.0, via=[(1.0, [0.22, 0.13])])

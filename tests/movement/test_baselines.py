@@ -125,6 +125,7 @@ def test_baselines_have_the_methods_of_a_movement(make):
     part = covariance[::6][:, :, ::6].reshape(10, 10)
     np.testing.assert_allclose(np.cov(draws.T), part, atol=0.05 * part.max())
     assert np.isinf(model.predict_df(X)).all()
+    np.testing.assert_array_equal(model.predict_uncertainty([[-0.1], [0.0], [1.0], [1.1]]).type1, [1.0, 0.0, 0.0, 1.0])
     assert clone(model).get_params() == model.get_params()
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(model)).predict(X), model.predict(X))
 

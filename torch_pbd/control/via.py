@@ -112,7 +112,9 @@ def planned(
             )
         times.append(at)
         changes.append(change)
-    pins = [at for at in pins if at not in times]
+    # A controller that was conditioned may know its start or its end already.
+    known, phase = controller.covariance_.known_times() if can_bend(controller) else [], controller.reproduction_.phase
+    pins = [at for at in pins if at not in times and not np.isclose(phase(np.array([at]))[0, 0], known).any()]
     bent = conditioned(controller, np.array(times), np.reshape(changes, (-1, controller.n_outputs_)), pins=pins)
     return bent, rest["goal"], rest["start"]
 

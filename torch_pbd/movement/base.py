@@ -147,9 +147,14 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         return np.full(len(self._times(X)), self.df_)
 
     def predict_uncertainty(self, X: ArrayLike) -> Uncertainty:
-        """Both kinds of uncertainty at X, apart (Section IV-C); type2 is that of the movement, given what is known."""
+        """Both kinds of uncertainty at X, apart (Section IV-C); type2 is that of the movement, given what is known.
+
+        Basis functions know nothing of missing data: type1 is 0 within the times of the fit, and 1 beyond them.
+        """
         time = self._times(X)
-        return Uncertainty(np.zeros(len(time)), self._marginals(time)[1])
+        scaled = np.round(self._scaled(time), _RESOLUTION)
+        beyond = (scaled < 0.0) | (scaled > 1.0)
+        return Uncertainty(beyond.astype(np.float64), self._marginals(time)[1])
 
     def predict_joint(self, X: ArrayLike) -> tuple[Floats, Floats]:
         """Joint mean and covariance of a new demonstration at the rows of X.
@@ -187,7 +192,7 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         generator = checks.seed(random_state)
         time = self._times(X)
         require_much(
-            6 * 8.0 * n_samples * (len(time) + len(self._known_times())) * self.n_outputs_,
+            6 * 8.0 * n_samples * (len(time) + len(self.known_times())) * self.n_outputs_,
             what=f"n_samples={n_samples} at {len(time)} rows",
             remedy="Draw fewer at a time.",
         )
@@ -305,7 +310,8 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         check_is_fitted(self)
         return np.ascontiguousarray(checked_queries(self, X)[:, 0])
 
-    def _known_times(self) -> Floats:
+    def known_times(self) -> Floats:
+        """Times (m,) at which something is known of the movement."""
         return np.empty(0) if self._known is None else self._known.time
 
     def _union(self, time: Floats, known: Known | None) -> tuple[Floats, NDArray[np.intp], NDArray[np.intp]]:
