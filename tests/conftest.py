@@ -6,7 +6,7 @@ from pathlib import Path
 os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small: threads only wait for each other
 
-from jaxtyping import install_import_hook
+import shapes
 
 TORCH_CONTROL = [
     "damping", "matrices", "stiffness", "primitive.dmp", "stability.certify", "stability.lyapunov",
@@ -23,7 +23,7 @@ TORCH_FLOORS = [
     *TORCH_MOVEMENT,
     *(f"control.{part}" for part in TORCH_CONTROL),
 ]
-install_import_hook([f"torch_pbd.{floor}" for floor in TORCH_FLOORS], "beartype.beartype")
+shapes.install([f"torch_pbd.{floor}" for floor in TORCH_FLOORS])
 
 import numpy as np  # noqa: E402 - the hook must come first
 import pytest  # noqa: E402
@@ -38,6 +38,10 @@ def pytest_configure(config):
     # A worker that has no test left takes some of the other's: the longest files would leave one idle for a minute.
     if getattr(config.option, "dist", "no") == "load":
         config.option.dist = "worksteal"
+
+
+def pytest_runtest_setup(item):
+    shapes.begin_test(slow=item.get_closest_marker("slow") is not None)
 
 
 @pytest.fixture
