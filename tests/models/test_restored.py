@@ -1,5 +1,6 @@
 import io
 import json
+import sys
 
 import pytest
 import torch
@@ -47,6 +48,14 @@ def model_of(kind, rng):
 
 def outputs(model, x):
     return [*model(x), *model.moments(x), model.type1(x), model.type2(x)]
+
+
+def test_a_skeleton_does_not_load_the_compiler(monkeypatch):
+    """Arithmetic on tensors without numbers does, which takes seconds."""
+    monkeypatch.setitem(sys.modules, "torch._dynamo", None)  # as if it were not there
+    core = GaussianMixture.skeleton({}, {"log_weight": torch.Size([3])}, 1, 2)
+    assert core.strict_lower.is_meta
+    assert core.log_diagonal.shape == (3, 3)
 
 
 @pytest.mark.parametrize("kind", MODELS)

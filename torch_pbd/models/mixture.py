@@ -72,13 +72,15 @@ class GaussianMixture(Core):
     ) -> None:
         super().__init__()
         self.n_features = checks.count(n_features, "n_features", most=mean.shape[-1] - 1)
-        diagonal = scale_tril.diagonal(dim1=-2, dim2=-1)
-        if not diagonal.is_meta and not (diagonal > 0).all():  # a skeleton holds no numbers
-            raise InvalidParameterError("scale_tril has a diagonal entry that is not positive.")
+        diagonal, lower = scale_tril.detach().diagonal(dim1=-2, dim2=-1), scale_tril.detach()
+        if not lower.is_meta:  # a skeleton holds no numbers, and arithmetic on it loads torch's compiler, for seconds
+            if not (diagonal > 0).all():
+                raise InvalidParameterError("scale_tril has a diagonal entry that is not positive.")
+            diagonal, lower = diagonal.log(), lower.tril(-1)
         self.log_weight = nn.Parameter(log_weight.detach().clone())
         self.mean = nn.Parameter(mean.detach().clone())
-        self.log_diagonal = nn.Parameter(diagonal.detach().log())
-        self.strict_lower = nn.Parameter(scale_tril.detach().tril(-1))
+        self.log_diagonal = nn.Parameter(diagonal.clone())
+        self.strict_lower = nn.Parameter(lower)
         self.register_buffer("log_density_floor", torch.full_like(mean[:1, 0], -math.inf))
 
     @property
