@@ -190,6 +190,9 @@ def test_the_demo_runs(tmp_path, capsys):
     robot = {"hgp_figure6_task.png", "hgp_figure7_variability.png", "hgp_figure8_pushes.png"}
     figures = {path.name for path in (tmp_path / "figures").iterdir()}
     assert figures == {"hgp.png", "cd.png", "wp.png", "gmm_5.png", "tunnel.png"} | robot
+    models = {path.stem for path in (tmp_path / "model").iterdir()}
+    assert models == {"hgp", "cd", "wp", "gmm_5", "hgp_controller"}
+    assert max(map(len, shown.out.replace(str(tmp_path), "").splitlines())) <= 80
     assert Schedule.load(tmp_path / "schedule" / "hgp.npz").duration == 10.0
     with (tmp_path / "pushes.csv").open() as file:
         (row,) = csv.DictReader(file)

@@ -118,6 +118,7 @@ def test_the_unstable_example_is_flagged():
     assert report.max_speed < 1.0
     for words in ("NOT GUARANTEED", "DOES NOT HOLD", "disturbances grow"):
         assert words in str(report)
+    assert max(map(len, str(report).splitlines())) <= 80
     calm = certify(unstable(), mass=10.0, speed=0.5 * report.max_speed)
     assert calm.certified
     assert "margin" in str(calm)

@@ -47,6 +47,6 @@ def test_a_run_of_any_dimension_leaves_its_figures_schedules_and_models(d, tmp_p
     schedule = Schedule.load(tmp_path / "schedule" / "a_b.npz")
     assert schedule.stiffness.shape == (201, d, d)
     assert Schedule.load(tmp_path / "schedule" / "a_b_100hz.csv").duration == pytest.approx(2.0)
-    assert (tmp_path / "model" / "a_b.safetensors").is_file()
+    assert (tmp_path / "model" / "a_b_controller.safetensors").is_file()
     assert "guaranteed" in (tmp_path / "stability.txt").read_text()
     assert kept.read_text() == "of the last run"  # the new report took its place whole

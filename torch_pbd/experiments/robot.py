@@ -142,7 +142,7 @@ def _write(run: Run, name: str, demonstrations: Demonstrations, folder: RunFolde
     folder.write_figure(task, f"{file}_figure6_task")
     folder.write_figure(variability_figure(run, demonstrations, name), f"{file}_figure7_variability")
     folder.write_figure(pushes_figure(run, name), f"{file}_figure8_pushes")
-    folder.write_model(run.controller, file)
+    folder.write_model(run.controller, f"{file}_controller")  # the regressor may have a file of the name
     target = folder.path / "schedule"
     target.mkdir(exist_ok=True)
     run.schedule.save(target / f"{file}.npz")

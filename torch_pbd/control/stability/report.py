@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from textwrap import fill
 from typing import final
 
 # Gain of a schedule above which its report warns. The paper's own, with the roots of its bounds, has 1.53 at 1 kg and
@@ -93,15 +94,17 @@ class StabilityReport:
         remedy = "slow down" if self.margin < 0.0 else "resample it finer"
         verdict = "guaranteed" if self.stable else f"NOT GUARANTEED: {remedy}, damp more, or use a filter"
         mass = f"{self.mass:g} kg" if isinstance(self.mass, float) else "a mass matrix"
+        rows = {
+            "exact and without lag": verdict,
+            "any-schedule rule": f"{any_schedule}: damping ratio {self.damping_ratio:.3g}; one of "
+            f"{self.required_damping_ratio:.3g} will do for stiffness ratio {self.stiffness_ratio:.3g}",
+            "certificate of this one": f"{certificate}: margin {self.margin:.4g} N/m/s at t = "
+            f"{self.margin_time:.3g} s, alpha {self.alpha:.3g} /s{held}",
+            "replay speed limit": speed,
+            "gain from any state": f"{self.gain:.3g}{warning}",
+            "stiffest environment": f"{self.environment_stiffness:.4g} N/m in the softest phase",
+        }
+        head = f"stability of the admittance at {mass}, replay speed {self.speed:g}"
         return "\n".join(
-            [
-                f"stability of the admittance at {mass}, exact and without lag, replay speed {self.speed:g}: {verdict}",
-                f"  any-schedule rule        {any_schedule}: damping ratio {self.damping_ratio:.3g}; one of "
-                f"{self.required_damping_ratio:.3g} will do for stiffness ratio {self.stiffness_ratio:.3g}",
-                f"  certificate of this one  {certificate}: margin {self.margin:.4g} N/m/s at t = "
-                f"{self.margin_time:.3g} s, alpha {self.alpha:.3g} /s{held}",
-                f"  replay speed limit       {speed}",
-                f"  gain from any state      {self.gain:.3g}{warning}",
-                f"  stiffest environment     {self.environment_stiffness:.4g} N/m in the softest phase",
-            ]
+            [head, *(fill(f"  {name:<25}{text}", 80, subsequent_indent=27 * " ") for name, text in rows.items())]
         )
