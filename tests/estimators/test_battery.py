@@ -204,6 +204,23 @@ def test_a_prior_may_depend_on_the_input(name):
     assert model.log_likelihood(X[-1:], mean[-1:] + 1.0)[0] == pytest.approx(score, rel=1e-9, abs=error)
 
 
+@pytest.mark.parametrize("name", ["cholesky", "wishart", "heteroscedastic"])
+def test_a_prior_that_writes_into_its_argument_changes_no_prediction(name):
+    def prior(X):
+        covariance = changing_prior(X)
+        X[:] = 1e3
+        return covariance
+
+    X = queries(1)
+    for mine, theirs in zip(
+        fit(new(name, prior=prior), *demonstrations()).predict(X, return_cov=True),
+        fit(new(name, prior=changing_prior), *demonstrations()).predict(X, return_cov=True),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(mine, theirs)
+    np.testing.assert_array_equal(X, queries(1))
+
+
 @pytest.mark.parametrize(("name", "d", "e", "aligned"), PLAIN)
 def test_predictions_are_continuous(name, d, e, aligned):
     """Halving the step halves the largest change, on the training inputs as between them."""

@@ -16,6 +16,7 @@ from sklearn import config_context
 import torch_pbd.files.memory
 from torch_pbd import CholeskyCovRegressor, DMPController, GMMBaseline, WishartProcessRegressor
 from torch_pbd.data import make_tunnel_demonstrations
+from torch_pbd.estimators.inducing import check_memory
 from torch_pbd.estimators.torch_estimator import by_chunks
 from torch_pbd.exceptions import DataRankWarning, UnimodalityWarning
 
@@ -413,6 +414,19 @@ def test_20_memory_of_inducing_inputs_components_draws_and_predictions_is_counte
     ]:
         with pytest.raises(ValueError, match=rf"{words}.* needs about .* GiB of memory"):
             refused()
+
+
+@pytest.mark.parametrize("n_outputs", [1, 2, 6, 12])
+def test_20_memory_is_counted_by_the_squares_of_inducing_inputs_and_what_fits_is_fitted(n_outputs, monkeypatch):
+    """Features take 8 bytes times their outputs, squared, times 24: of 128 inducing inputs 3 MiB an output, squared."""
+    features = 8 * 24 * (128 * n_outputs) ** 2
+    monkeypatch.setattr(torch_pbd.files.memory, "available_bytes", lambda: 10 * features + 2**27)
+    check_memory(128, 256, (256, 1, n_outputs))
+    check_memory(128, 10**9, (256, 1, n_outputs))
+    monkeypatch.setattr(torch_pbd.files.memory, "available_bytes", lambda: features)
+    if features > 2**26:  # less is not worth the question
+        with pytest.raises(ValueError, match="lets 256 distinct inputs and 128 inducing ones"):
+            check_memory(128, 256, (256, 1, n_outputs))
 
 
 def test_20_what_predicts_many_rows_holds_few_at_a_time(monkeypatch):
