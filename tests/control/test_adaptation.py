@@ -153,7 +153,7 @@ def test_goals_and_starts_are_in_the_units_of_the_recordings():
 
 
 def test_the_primitive_takes_start_and_goal_along():
-    """A straight blend where the demonstration is one: closed form, in a batch, by either integrator."""
+    """A straight blend where the demonstration is one: closed form, in a batch."""
     time = torch.arange(1001).double() / 500.0
     rise = torch.tensor(minimum_jerk(time.numpy() / 2.0))[:, None]
     rate = 30.0 * ((time / 2.0) * (1.0 - time / 2.0))[:, None] ** 2 / 2.0
@@ -161,14 +161,11 @@ def test_the_primitive_takes_start_and_goal_along():
     dmp, goal = DMP(duration=2.0), torch.ones(1).double()
     forcing = dmp.forcing(rise, rate, change, goal)
     starts, goals = (torch.tensor(ends).double() for ends in ([[0.0], [1.0], [-2.0]], [[[0.5]], [[1.0]], [[-2.0]]]))
-    for integrator in ("exact", "rk4"):
-        position, velocity = dmp.rollout(
-            forcing, 0.002, goal=goals, position0=starts, integrator=integrator,
-            demonstrated_start=torch.zeros(1).double(), demonstrated_goal=goal,
-        )  # fmt: skip
-        expected = starts[:, None] + (goals - starts[:, None]) * rise
-        torch.testing.assert_close(position, expected, rtol=0, atol=1e-5)
-        torch.testing.assert_close(velocity, (goals - starts[:, None]) * rate, rtol=0, atol=1e-4)
+    shown = {"demonstrated_start": torch.zeros(1).double(), "demonstrated_goal": goal}
+    position, velocity = dmp.rollout(forcing, 0.002, goal=goals, position0=starts, **shown)
+    expected = starts[:, None] + (goals - starts[:, None]) * rise
+    torch.testing.assert_close(position, expected, rtol=0, atol=1e-5)
+    torch.testing.assert_close(velocity, (goals - starts[:, None]) * rate, rtol=0, atol=1e-4)
 
 
 def test_an_adapted_rollout_is_differentiable_and_a_batch_is_its_members(rng):

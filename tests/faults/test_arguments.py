@@ -258,9 +258,6 @@ CALLS = [
     (lambda: SCHEDULE.retime(1e-300), "speed is 1e-300, must be a finite number of at least"),
     (lambda: AdmittancePlant(sensor=ForceSensor(noise_scale=1.0)).simulate(
         STILL, STILL, GAIN, DAMPING, dt=0.001, generator=np.random.default_rng(0)), "must be a Generator or None"),
-    (lambda: rollout(forcing=lambda time: torch.zeros(3, 2), n_steps=5), r"forcing\(time\) has shape \(3, 2\)"),
-    (lambda: rollout(forcing=lambda time: np.nan * np.ones((len(time), 2)), n_steps=5), "must be finite"),
-    (lambda: rollout(forcing=lambda time: time, n_steps=10**12), "n_steps=1000000000000 needs about"),
     (lambda: DMP().forcing(STILL.T, STILL, STILL, np.ones(2)), "velocity has shape .* that of position"),
     (lambda: check_unimodal([1, 2]), r"demonstrations is \[1, 2\], must be a Demonstrations"),
     (lambda: make_tunnel_demonstrations(duration="10"), "duration is '10' s, must be a finite number above 0"),

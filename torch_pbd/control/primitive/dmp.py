@@ -1,8 +1,6 @@
 """Dynamic movement primitives: eq. (16) to (18)."""
 
-from collections.abc import Callable
 from contextlib import suppress
-from functools import partial
 from typing import Any, Literal, final
 
 import torch
@@ -12,7 +10,6 @@ from torch import Tensor
 from torch_pbd import checks
 from torch_pbd.control.matrices import as_rows, as_tensor
 from torch_pbd.control.primitive.adaptation import Adaptation, adapt
-from torch_pbd.files.memory import require_much
 
 Gate = Literal["time", "phase", "none"]
 
@@ -139,7 +136,7 @@ class DMP:
 
     def rollout(
         self,
-        forcing: Float[Tensor, "*b t d"] | Callable[[Tensor], Tensor] | Any,
+        forcing: Float[Tensor, "*b t d"] | Any,
         dt: float | Any,
         *,
         goal: Tensor | Any,
@@ -148,16 +145,13 @@ class DMP:
         demonstrated_start: Float[Tensor, "*s d"] | Any = None,
         demonstrated_goal: Float[Tensor, "*s d"] | Any = None,
         speed: Float[Tensor, " t"] | Any = None,
-        n_steps: int | Any = None,
-        integrator: Literal["exact", "rk4"] | Any = "exact",
     ) -> tuple[Float[Tensor, "*o t d"], Float[Tensor, "*o t d"]]:
-        """Position and velocity at ticks of ``dt`` seconds.
+        """Position and velocity at ticks of ``dt`` seconds, exact for forcing that is linear between them.
 
         Parameters
         ----------
-        forcing : Tensor of shape (..., T, d), or callable
-            At the ticks, before the gate; "exact" solves for forcing that is linear between ticks (first-order
-            hold). A callable maps movement times (m,) in s to (..., m, d), and needs ``n_steps``.
+        forcing : Tensor of shape (..., T, d)
+            At the ticks, before the gate.
         dt : float
             In s.
         goal : Tensor of shape (d,), (..., 1, d) or (..., T, d)
@@ -170,25 +164,20 @@ class DMP:
             How fast movement time passes at each tick, linear between: 0.5 takes twice as long. The path is the
             same at every speed, so the duration changes at run time without overshoot; a speed that jumps makes
             the velocity jump. ``velocity0`` is that at speed[0].
-        n_steps : int, default=None
-            T, where ``forcing`` is a callable.
-        integrator : {"exact", "rk4"}, default="exact"
-            "rk4" is Runge and Kutta's, of order 4 where ``forcing`` is a smooth callable.
 
         Raises
         ------
         ValueError
             If a shape is wrong, a value is not finite, or a speed is negative.
         """
-        checks.choice(integrator, "integrator", ("exact", "rk4"))
-        forcing, n_ticks = _checked_forcing(forcing, n_steps)
-        goal = as_rows(goal, "goal", 1)
+        forcing, goal = as_rows(forcing, "forcing", 2), as_rows(goal, "goal", 1)
+        n_ticks = forcing.shape[-2]
         goals = goal if goal.ndim > 1 else goal[None]
         starts = {"position0": position0, "velocity0": velocity0}
         places = {**starts, "demonstrated_start": demonstrated_start, "demonstrated_goal": demonstrated_goal}
         given = {name: as_rows(place, name, 1) for name, place in places.items() if place is not None}
         time, steps, passing = _movement_time(n_ticks, checks.number(dt, "dt", above=0.0, unit="s"), speed, goal)
-        at_ticks = self._gated(forcing, time)
+        at_ticks = forcing * self.gate_at(time)[:, None]
         rows = {"forcing": at_ticks, "goal": goals, **{name: place[..., None, :] for name, place in given.items()}}
         shape = _broadcast(rows, n_ticks)
         at_ticks, goals = at_ticks.expand(shape), goals.expand(shape)
@@ -202,8 +191,7 @@ class DMP:
         driven = own_goal[..., None, :].expand(shape) if safe else goals
         scaled = self.tau * velocity / passing[0].clamp_min(1e-12)
         begin = torch.stack([each.expand(*shape[:-2], -1) for each in (own_start if safe else start, scaled)], dim=-1)
-        solve = self._exact if integrator == "exact" else partial(self._runge_kutta, forcing, time)
-        trace = solve(at_ticks, driven, steps, begin)
+        trace = self._solve(at_ticks, driven, steps, begin)
         position, rate = trace[..., 0], trace[..., 1] / self.tau
         if safe:
             spring = self.beta * (driven - position) - trace[..., 1]
@@ -212,29 +200,14 @@ class DMP:
             position, rate = adapt(path, time, (position, time), **ends, duration=self.duration or self.tau)
         return position, rate * passing[:, None]
 
-    def _gated(self, forcing: Any, time: Tensor) -> Tensor:
-        """Gated forcing (..., m, d) at times (m,), of rows there or of a callable."""
-        if callable(forcing):
-            forcing = as_tensor(forcing(time), "forcing(time)")
-            if forcing.ndim < 2 or forcing.shape[-2] != len(time) or not bool(torch.isfinite(forcing.detach()).all()):
-                raise ValueError(
-                    f"forcing(time) has shape {tuple(forcing.shape)}, must be finite, of shape (..., {len(time)}, d)."
-                )
-        return forcing * self.gate_at(time)[:, None]
-
-    def _rate(self, like: Tensor) -> Tensor:
-        """Matrix of eq. (16): ``[x, z]' = rate @ [x, z, goal, forcing]``."""
-        alpha, beta, tau = self.alpha, self.beta, self.tau
-        rows = [[0.0, 1.0, 0.0, 0.0], [-alpha * beta, -alpha, alpha * beta, 1.0]]
-        return torch.tensor(rows, dtype=like.dtype, device=like.device) / tau
-
-    def _exact(self, forcing: Tensor, goals: Tensor, steps: Tensor, state: Tensor) -> Tensor:
+    def _solve(self, forcing: Tensor, goals: Tensor, steps: Tensor, state: Tensor) -> Tensor:
         """States at the ticks, exact for forcing that is linear between them and goals held over them."""
         # Over a tick [x, z, goal, forcing, rise] has constant coefficients: the forcing grows by the rise, which like
         # the goal stays. The matrix exponential of a tick is its map; most runs have ticks of one length.
         lengths, index = steps.unique(return_inverse=True)
         rate = state.new_zeros(len(lengths), 5, 5)
-        rate[:, :2, :4] = self._rate(state) * lengths[:, None, None]
+        eq16 = [[0.0, 1.0, 0.0, 0.0], [-self.alpha * self.beta, -self.alpha, self.alpha * self.beta, 1.0]]
+        rate[:, :2, :4] = state.new_tensor(eq16) / self.tau * lengths[:, None, None]
         rate[:, 3, 4] = 1.0
         maps = torch.linalg.matrix_exp(rate)[:, :2]
         states = [state]
@@ -244,38 +217,6 @@ class DMP:
             state = torch.cat([state, inputs], dim=-1) @ maps[kind].mT
             states.append(state)
         return torch.stack(states, dim=-3)
-
-    def _runge_kutta(
-        self, forcing: Any, time: Tensor, at_ticks: Tensor, goals: Tensor, steps: Tensor, state: Tensor
-    ) -> Tensor:
-        """States at the ticks, by the classical method of order 4."""
-        rate = self._rate(state).mT
-        midway = 0.5 * (at_ticks[..., 1:, :] + at_ticks[..., :-1, :])
-        if callable(forcing):
-            midway = self._gated(forcing, 0.5 * (time[1:] + time[:-1]))
-
-        def slope(now: Tensor, force: Tensor, tick: int) -> Tensor:
-            return torch.cat([now, torch.stack([goals[..., tick, :], force], dim=-1)], dim=-1) @ rate
-
-        states = [state]
-        for tick, step in enumerate(steps.tolist()):
-            k1 = slope(state, at_ticks[..., tick, :], tick)
-            k2 = slope(state + 0.5 * step * k1, midway[..., tick, :], tick)
-            k3 = slope(state + 0.5 * step * k2, midway[..., tick, :], tick)
-            k4 = slope(state + step * k3, at_ticks[..., tick + 1, :], tick)
-            state = state + step / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
-            states.append(state)
-        return torch.stack(states, dim=-3)
-
-
-def _checked_forcing(forcing: Any, n_steps: Any) -> tuple[Any, int]:
-    """Forcing as rows or as the callable it is, and the number of ticks."""
-    if not callable(forcing):
-        rows = as_rows(forcing, "forcing", 2)
-        return rows, rows.shape[-2]
-    n_ticks = checks.count(n_steps, "n_steps")
-    require_much(100.0 * n_ticks, what=f"n_steps={n_ticks}", remedy="Take fewer.")
-    return forcing, n_ticks
 
 
 def _broadcast(parts: dict[str, Tensor], n_ticks: int | None = None) -> torch.Size:

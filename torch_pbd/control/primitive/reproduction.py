@@ -102,11 +102,6 @@ class Reproduction:
                 "needs a ramp at the start, and settle > 0 at the end."
             )
 
-    def forcing_at(self, time: Tensor) -> Tensor:
-        """Forcing (m, d), before the gate, at times (m,)."""
-        columns = [np.interp(time.numpy(), self.time, column) for column in self.forcing.T]
-        return torch.tensor(np.stack(columns, axis=1))
-
     def motion(self, time: Floats) -> tuple[Floats, Floats]:
         """Position and velocity (n, d) at any times (n,): at rest at the start before 0, and long after the end.
 
@@ -126,8 +121,10 @@ class Reproduction:
             slowest = max(2.0 * dmp.tau / dmp.alpha, dmp.tau / dmp.gamma if dmp.gate == "phase" else 0.0)
             n_ticks = len(time) + int((_SETTLE * slowest + 0.1 * time[-1]) / step)
             time = np.array(step * np.arange(n_ticks), dtype=np.float64)
-        goal, start, velocity = map(_tensor, (self.goal, self.start, self.velocity))
-        run = dmp.rollout(self.forcing_at, step, goal=goal, position0=start, velocity0=velocity, n_steps=len(time))
+        ticks = step * np.arange(len(time))
+        held = np.stack([np.interp(ticks, self.time, column) for column in self.forcing.T], axis=1)
+        forcing, goal, start, velocity = map(_tensor, (held, self.goal, self.start, self.velocity))
+        run = dmp.rollout(forcing, step, goal=goal, position0=start, velocity0=velocity)
         positions, velocities = (part.numpy() for part in run)
         if dmp.adaptation == "safe":
             # What is left at the end is taken out by minimum jerk, as a change of the goal is.
