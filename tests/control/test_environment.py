@@ -186,12 +186,10 @@ def test_a_report_of_a_path_made_by_hand(straight):
     assert report.n_contacts.item() == 2
     values = [report.max_penetration, report.time_in_wall, report.impulse]
     torch.testing.assert_close(torch.stack(values), tensor(0.03, 0.3, 0.1 * (20 + 35 + 0)), rtol=1e-12, atol=0)
-    assert str(report) == "2 contacts, 0.3 s in the wall, at most 30 mm deep, impulse 5.5 N s"
     virtual = Tunnel(virtual=True)
     drawn = virtual.report(*path)
     assert (virtual.force(*path[:2]) == 0).all()
-    assert str(drawn) == "2 contacts, 0.3 s in the wall, at most 30 mm deep, impulse 0 N s"
-    assert drawn.impulse == 0
+    assert drawn == (*report[:2], 0.0, 2)
 
 
 def test_a_report_has_a_value_for_each_rollout(rng):
@@ -202,7 +200,6 @@ def test_a_report_has_a_value_for_each_rollout(rng):
         single = Tunnel().report(position[i, j], velocity[i, j], 0.01)
         for name in ("max_penetration", "time_in_wall", "impulse", "n_contacts"):
             torch.testing.assert_close(getattr(batch, name)[i, j], getattr(single, name), rtol=1e-12, atol=0)
-    assert len(str(batch).splitlines()) == 6
 
 
 def test_what_is_not_finite_never_becomes_a_force_of_zero():

@@ -21,7 +21,6 @@ from torch_pbd.control import (
     damping_from_stiffness,
     simulate_many,
 )
-from torch_pbd.control.simulation.sensor import tare
 from torch_pbd.data import check_unimodal, make_paper_simulation, make_tunnel_demonstrations, paper_mean
 from torch_pbd.data.alignment import dtw_path
 from torch_pbd.metrics import (
@@ -89,8 +88,6 @@ DOORS = {
     "certify time": (lambda value: certify(SimpleNamespace(**{**ROWS, "time": value})), TIME, "schedule.time"),
     "real time": (lambda value: real_time(stiffness=value), GAIN, "schedule.stiffness"),
     "real time path": (lambda value: real_time(position=value), STILL, "schedule.position"),
-    "readings": (tare, STILL, "readings"),
-    "sensor": (lambda value: ForceSensor().measure(value, 0.001), STILL, "force"),
     "tunnel": (Tunnel().penetration, STILL, "position"),
     "dtw": (lambda value: dtw_path(value, STILL), STILL, "a"),
     "positions": (lambda value: Demonstrations(TIME, value), np.stack([STILL] * 3), "positions"),

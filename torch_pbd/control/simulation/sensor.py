@@ -4,14 +4,13 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any, NamedTuple, final
+from typing import NamedTuple, final
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torch_pbd import checks
-from torch_pbd.control.matrices import as_rows, as_tensor
 from torch_pbd.exceptions import InvalidParameterError
 
 
@@ -51,16 +50,16 @@ class ForceSensor:
     delay_steps : int, default=0
         Ticks by which the reading is late, beside the filter.
     deadband : float, default=0.0
-        Readings up to it are zero, those above are nearer to zero by it [N]: continuous. It acts on the bias too:
-        to remove that, read without a deadband, subtract the result of :func:`tare`, then :func:`apply_deadband`.
+        Readings up to it are zero, those above are nearer to zero by it [N]: continuous. It acts on the bias too.
 
     Examples
     --------
     >>> import torch
     >>> from torch_pbd.control import ForceSensor
-    >>> reading = ForceSensor(resolution=0.5, range=10.0).measure(torch.tensor([[1.2, -3.0], [0.0, 25.0]]), dt=1e-3)
-    >>> reading.force.tolist(), reading.saturated.tolist()
-    ([[1.0, -3.0], [0.0, 10.0]], [False, True])
+    >>> read = ForceSensor(resolution=0.5, range=10.0).start(torch.zeros(2), dt=1e-3)
+    >>> force, saturated = read(torch.tensor([1.2, -25.0]))
+    >>> force.tolist(), bool(saturated)
+    ([1.0, -10.0], True)
     """
 
     bias: float | Sequence[float] = 0.0
@@ -105,21 +104,11 @@ class ForceSensor:
         delay_steps = max(0, round(rate / cutoff - lag))
         return cls(0.3, noise_scale=0.05, resolution=200.0 / 2**13, cutoff=cutoff, delay_steps=delay_steps)
 
-    def start(
-        self, like: Float[Tensor, "*b d"] | Any, dt: float, generator: torch.Generator | Any = None
-    ) -> "ForceReader":
-        """A sensor at rest, to be called with the true force once a tick.
+    def start(self, like: Float[Tensor, "*b d"], dt: float, generator: torch.Generator | None = None) -> "ForceReader":
+        """Sensor at rest, to be called with the true force (..., d) in N once a tick of ``dt`` s.
 
-        Parameters
-        ----------
-        like : Tensor of shape (..., d)
-            Of the shape, dtype and device of the forces to come; its values do not matter.
-        dt : float
-            Length of a tick [s].
-        generator : torch.Generator or None, default=None
-            Source of the noise, which must be given if there is any.
+        The forces to come are of the shape, dtype and device of ``like``; noise is drawn from the ``generator``.
         """
-        checks.number(dt, "dt", above=0.0, unit="s")
         if isinstance(self.bias, tuple) and len(self.bias) != like.shape[-1]:
             raise InvalidParameterError(
                 f"bias has {len(self.bias)} values, but the force has {like.shape[-1]} axes: give one for each axis, "
@@ -129,20 +118,6 @@ class ForceSensor:
         checks.instance(generator, "generator", torch.Generator, optional=self.noise_scale == 0, remedy=remedy)
         return ForceReader(self, like, dt, generator)
 
-    def measure(
-        self, force: Float[Tensor, "*b t d"] | Any, dt: float, generator: torch.Generator | Any = None
-    ) -> Reading:
-        """Readings (..., T, d) of a true force (..., T, d) in N: equal to the bit to those of a reader tick by tick.
-
-        ``dt`` and ``generator`` are as for :meth:`start`.
-        """
-        force = as_tensor(force, "force")
-        if force.ndim < 2 or force.shape[-2] == 0:
-            raise InvalidParameterError(f"force has shape {tuple(force.shape)}, must have shape (..., T, d), T >= 1.")
-        reader = self.start(force[..., 0, :], dt, generator)
-        forces, saturated = zip(*(reader(tick) for tick in force.unbind(-2)), strict=True)
-        return Reading(torch.stack(forces, dim=-2), torch.stack(saturated, dim=-1))
-
 
 @final
 class ForceReader:
@@ -151,8 +126,7 @@ class ForceReader:
     def __init__(
         self, sensor: ForceSensor, like: Float[Tensor, "*b d"], dt: float, generator: torch.Generator | None
     ) -> None:
-        self._sensor = sensor
-        self._generator = generator
+        self._sensor, self._generator = sensor, generator
         self._bias = torch.zeros_like(like) + like.new_tensor(sensor.bias)
         self._gain = None if sensor.cutoff is None else -math.expm1(-2.0 * math.pi * sensor.cutoff * dt)
         self._filtered = self._bias
@@ -160,25 +134,15 @@ class ForceReader:
         self._under_way = deque(self._convert(self._bias) for _ in range(sensor.delay_steps))
 
     def __call__(self, force: Float[Tensor, "*b d"]) -> Reading:
-        """Reading at this tick, over which the true force (..., d) is held [N]; its shape and dtype stay the same."""
-        if force.shape != self._bias.shape or force.dtype != self._bias.dtype:
-            raise InvalidParameterError(
-                f"force is {force.dtype} of shape {tuple(force.shape)}, but the sensor was started for "
-                f"{self._bias.dtype} of shape {tuple(self._bias.shape)}: start another one."
-            )
+        """Reading at this tick, over which the true force (..., d) is held [N]."""
         lost = ~torch.isfinite(force)
-        level = self._low_pass(torch.where(lost, self._filtered, force + self._bias))
+        level = torch.where(lost, self._filtered, force + self._bias)
+        if self._gain is not None:
+            # The state of dx/dt = 2 pi cutoff (level - x) at the start of the tick, over which it moves on.
+            level, self._filtered = self._filtered, torch.lerp(self._filtered, level, self._gain)
         reading = self._convert(level + self._noise())
         self._under_way.append(Reading(reading.force.masked_fill(lost, math.nan), reading.saturated))
         return self._under_way.popleft()
-
-    def _low_pass(self, level: Tensor) -> Tensor:
-        """State of ``dx/dt = 2 pi cutoff (level - x)`` at the start of the tick, over which it moves on."""
-        if self._gain is None:
-            return level
-        before = self._filtered
-        self._filtered = torch.lerp(before, level, self._gain)
-        return before
 
     def _noise(self) -> Tensor | float:
         generator, scale = self._generator, self._sensor.noise_scale
@@ -195,18 +159,4 @@ class ForceReader:
         level = level.clamp(-sensor.range, sensor.range)
         if sensor.resolution > 0:
             level = sensor.resolution * torch.round(level / sensor.resolution)
-        return Reading(apply_deadband(level, sensor.deadband), saturated)
-
-
-def apply_deadband(force: Float[Tensor, "*b d"], deadband: float) -> Float[Tensor, "*b d"]:
-    """Zero up to ``deadband`` [N] on each axis, and nearer to zero by it above: continuous."""
-    return force - force.clamp(-deadband, deadband)
-
-
-def tare(readings: Float[Tensor, "*b n d"] | Any) -> Float[Tensor, "*b d"]:
-    """Bias (..., d) of a sensor from readings at rest (..., n, d) [N]: their mean, to be subtracted from later ones.
-
-    The readings are to be taken without a deadband, which would hide the bias, and to be finite: drop lost samples
-    first. The standard error is the noise over sqrt(n).
-    """
-    return as_rows(readings, "readings", 2).mean(-2)
+        return Reading(level - level.clamp(-sensor.deadband, sensor.deadband), saturated)

@@ -1,8 +1,7 @@
 """The walls of the tunnel task, around the simulated robot."""
 
 import math
-from dataclasses import dataclass
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import torch
 from jaxtyping import Float, Int
@@ -125,9 +124,7 @@ class Tunnel:
         return depth, torch.stack([-side, side * slope], dim=-1) / steepness.unsqueeze(-1)
 
 
-@final
-@dataclass(frozen=True, eq=False)
-class ContactReport:
+class ContactReport(NamedTuple):
     """Contacts of a rollout with the walls; a batch of rollouts has a value for each.
 
     Attributes
@@ -146,13 +143,3 @@ class ContactReport:
     time_in_wall: Float[Tensor, "*b"]
     impulse: Float[Tensor, "*b"]
     n_contacts: Int[Tensor, "*b"]
-
-    def __str__(self) -> str:
-        """One line for each rollout."""
-        columns = (self.max_penetration, self.time_in_wall, self.impulse, self.n_contacts)
-        rows = zip(*(column.flatten().tolist() for column in columns), strict=True)
-        return "\n".join(
-            f"{count} contact{'s' * (count != 1)}, {time:.3g} s in the wall, "
-            f"at most {1e3 * depth:.3g} mm deep, impulse {impulse:.3g} N s"
-            for depth, time, impulse, count in rows
-        )
