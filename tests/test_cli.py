@@ -47,6 +47,35 @@ def test_fit_leaves_a_folder_from_which_the_run_can_be_repeated(recording, tmp_p
     assert json.loads((first / "env.json").read_text())["torch_pbd"] == torch_pbd.__version__
 
 
+@pytest.mark.parametrize("name", ["TrajectoryRegressor", "ProMPBaseline", "KMPBaseline"])
+def test_models_of_movements_are_fitted_and_load(name, recording, tmp_path, capsys):
+    config = tmp_path / "fit.yaml"
+    own = "init_args: {regressor: {class_path: GMMBaseline, init_args: {n_components: 3}}}" if name[0] != "P" else ""
+    config.write_text(f"data: {recording}\noutput: {tmp_path / 'out'}\nmodel:\n  class_path: {name}\n  {own}\n")
+    assert main(["fit", "--config", str(config)]) == 0
+    assert f"{name} learned 5 movements; joint log-likelihood " in capsys.readouterr().out
+    model = torch_pbd.load(tmp_path / "out" / "model" / f"{name.lower()}.safetensors")
+    X, y, groups = torch_pbd.load_demonstrations(recording).stack()
+    with (tmp_path / "out" / "metrics.csv").open() as file:
+        assert float(next(csv.DictReader(file))["LL"]) == pytest.approx(model.score(X, y, groups=groups))
+    if own:
+        assert model.regressor_.n_components == 3
+
+
+def test_a_controller_of_a_config_bends_by_a_model_of_movements(recording, tmp_path):
+    config = tmp_path / "robot.yaml"
+    config.write_text(
+        "controllers:\n  mine:\n    init_args:\n      covariance: {class_path: TrajectoryRegressor, init_args:"
+        " {regressor: {class_path: GMMBaseline}}}\n"
+    )
+    arguments = ["--data", str(recording), "--rate", "100", "--output", str(tmp_path / "out")]
+    assert main(["experiment", "--config", str(config), *arguments]) == 0
+    controller = torch_pbd.load(tmp_path / "out" / "model" / "mine.safetensors")
+    point = controller.predict([[5.0]])[0] + [0.01, 0.0]
+    schedule = controller.schedule(100.0, via=[(5.0, point)])
+    np.testing.assert_allclose(schedule.position[500], point, atol=1e-6)
+
+
 def test_compare_reports_every_model_and_every_fold(recording, tmp_path, capsys):
     config = tmp_path / "compare.yaml"
     config.write_text(
@@ -87,6 +116,8 @@ def test_compare_without_data_is_table_1(tmp_path, capsys):
             "Did you mean 'n_components'",
         ),
         (["fit", "--data", "x.npz", "--model", "GMMBaseline", "--model.tol", "soon"], "soon"),
+        (["fit", "--data", "x.npz", "--model", "KMPBaseline", "--model.regressor", "ProMPBaseline"], "not a class"),
+        (["compare", "--models", '{"mine": "ProMPBaseline"}'], "models.mine: ProMPBaseline learns whole movements"),
         (
             [
                 "experiment",

@@ -9,10 +9,14 @@ from torch_pbd.cli import options
 from torch_pbd.cli.options import Option, made
 from torch_pbd.console import say
 from torch_pbd.exceptions import ConfigError
+from torch_pbd.registry import MOVEMENTS
 
 if TYPE_CHECKING:
     from torch_pbd.control.controller import DMPController
     from torch_pbd.estimators.base import CovarianceRegressor
+    from torch_pbd.movement.base import MovementRegressor
+
+    Model = CovarianceRegressor | MovementRegressor
 
 COMMANDS = {
     "demo": "learn from six made demonstrations of the tunnel task; the main job, no data needed",
@@ -52,7 +56,7 @@ OPTIONS: dict[str, dict[str, Option]] = {
     "fit": {
         **_FILE,
         "data": Option(str | None, None, "file of demonstrations, .npz or .csv", required=True),
-        "model": Option("CovarianceRegressor", _MODELS["HGP"], f"estimator {_CLASS_HELP} --model.help NAME"),
+        "model": Option("Model", _MODELS["HGP"], f"estimator {_CLASS_HELP} --model.help NAME"),
         **_GRID,
     },
     "experiment": {
@@ -69,7 +73,7 @@ OPTIONS: dict[str, dict[str, Option]] = {
     },
     "compare": {
         **_FILE,
-        "models": Option(dict[str, "CovarianceRegressor"], _MODELS, f"estimators {_CLASS_HELP} --models.help NAME"),
+        "models": Option(dict[str, "Model"], _MODELS, f"estimators {_CLASS_HELP} --models.help NAME"),
         "max_folds": Option(Annotated[int, (0, math.inf)], 10, "demonstrations to leave out, one by one"),
         "n_jobs": Option(
             Annotated[int, (-math.inf, -1)] | _Count | None, None, "fits at the same time; -1: all cores"
@@ -129,13 +133,17 @@ def fit(options: Any, folder: Any) -> str:
     model, _ = fit_once(options.model, X, y, groups, finished=folder.finished)
     name = type(model).__name__
     model_path, figure_path = write_fitted(model, demonstrations, folder, name, options.input)
-    likelihood = model.score(X, y)
-    learned = {key: getattr(model, f"{key}_") for key in ("n_iter", "loss", "converged", "jitter")}
+    if hasattr(model, "score_demonstrations"):
+        learned, likelihood = {}, model.score(X, y, groups=groups)
+        settled, of_what = f"learned {len(demonstrations)} movements", "joint log-likelihood"
+    else:
+        learned = {key: getattr(model, f"{key}_") for key in ("n_iter", "loss", "converged", "jitter")}
+        likelihood, of_what = model.score(X, y), "log-likelihood"
+        settled = f"{'converged' if model.converged_ else 'did not converge'} after {model.n_iter_} iterations"
     folder.write_metrics([{"model": name, **learned, "LL": likelihood}])
-    settled = "converged" if model.converged_ else "did not converge"
     return (
-        f"{name} {settled} after {model.n_iter_} iterations; log-likelihood {likelihood:.3f} nats per sample of the "
-        f"data it was fitted to\nmodel:   {model_path}\nfigure:  {figure_path}"
+        f"{name} {settled}; {of_what} {likelihood:.3f} nats per sample of the data it was fitted to\n"
+        f"model:   {model_path}\nfigure:  {figure_path}"
     )
 
 
@@ -171,6 +179,12 @@ def compare(options: Any, folder: Any) -> str:
         return f"{run_recordings(options.models, demonstrations, folder, options.input, **how)}\n\n{_FOLDS_LEGEND}"
     from torch_pbd.experiments.simulation import run_simulation
 
+    for name, model in options.models.items():
+        if type(model).__name__ in MOVEMENTS:
+            raise ConfigError(
+                f"models.{name}: {type(model).__name__} learns whole movements, and the simulation has none: it draws "
+                "at each input anew. Give --data FILE."
+            )
     say(f"eq. (14): {options.n_inputs} inputs x {options.n_draws} draws, medians over {options.n_seeds} seeds\n")
     sizes = {"n_seeds": options.n_seeds, "n_inputs": options.n_inputs, "n_demos": options.n_draws}
     return run_simulation(options.models, folder, options.readings, **sizes, **how)

@@ -19,10 +19,12 @@ from torch_pbd.cli.words import Place, alternatives, described, remedy, shown, u
 from torch_pbd.cli.yaml import read_yaml, read_yaml_file
 from torch_pbd.console import say
 from torch_pbd.exceptions import ConfigError
-from torch_pbd.registry import ESTIMATORS, REGRESSORS
+from torch_pbd.registry import ESTIMATORS, MOVEMENTS, REGRESSORS
 
 CLASSES: Mapping[str, Mapping[str, str]] = {
     "CovarianceRegressor": REGRESSORS,
+    "MovementRegressor": MOVEMENTS,
+    "Model": {**REGRESSORS, **MOVEMENTS},
     "DMPController": {"DMPController": ESTIMATORS["DMPController"]},
     "StiffnessLaw": {"StiffnessLaw": "torch_pbd.control.stiffness"},
 }
@@ -191,10 +193,11 @@ def _take(value: Any, hint: Any, place: Place, before: Any = None) -> Any:
     """Value as its type has it; ``before`` is what it adds to, where a class is changed in part."""
     if isinstance(value, _Text):
         value = _read_text(value, hint, place)
+    names = (part if isinstance(part, str) else getattr(part, "__name__", "") for part in alternatives(hint))
+    table = dict(entry for name in names for entry in CLASSES.get(name, {}).items())
+    if table and value is not None:
+        return _take_class(value, table, place, before)
     for part in alternatives(hint):
-        table = CLASSES.get(part if isinstance(part, str) else getattr(part, "__name__", ""))
-        if table and value is not None:
-            return _take_class(value, table, place, before)
         if get_origin(part) is dict and isinstance(value, dict) and value:
             kept = before if isinstance(value, _Dotted) else {}
             inner = get_args(part)[1]

@@ -27,6 +27,7 @@ from torch_pbd.control.stiffness import StiffnessLaw
 from torch_pbd.control.via import Bend, conditioned, planned
 from torch_pbd.data import Demonstrations
 from torch_pbd.estimators.base import CovarianceRegressor
+from torch_pbd.movement.base import MovementRegressor
 
 Floats = NDArray[np.float64]
 
@@ -110,7 +111,7 @@ class DMPController(BaseEstimator):
 
     def __init__(
         self,
-        covariance: CovarianceRegressor | None = None,
+        covariance: CovarianceRegressor | MovementRegressor | None = None,
         *,
         alpha: float = 25.0,
         beta: float | None = None,

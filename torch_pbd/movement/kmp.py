@@ -8,6 +8,7 @@ from scipy.linalg import block_diag
 from sklearn.base import clone
 
 from torch_pbd import checks
+from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.estimators.demonstrations import fit_with_groups
 from torch_pbd.estimators.mixture import GMMBaseline
 from torch_pbd.estimators.validation import Floats
@@ -60,7 +61,7 @@ class KMPBaseline(MovementRegressor):
 
     def __init__(
         self,
-        regressor: Any = None,
+        regressor: CovarianceRegressor | None = None,
         *,
         n_reference: int = 100,
         length_scale: float = 0.144,

@@ -11,7 +11,7 @@ from sklearn.base import clone
 from torch import Tensor, nn
 
 from torch_pbd import checks
-from torch_pbd.estimators.base import Uncertainty
+from torch_pbd.estimators.base import CovarianceRegressor, Uncertainty
 from torch_pbd.estimators.demonstrations import fit_with_groups
 from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
 from torch_pbd.estimators.validation import Floats
@@ -147,7 +147,7 @@ class TrajectoryRegressor(MovementRegressor):
 
     def __init__(
         self,
-        regressor: Any = None,
+        regressor: CovarianceRegressor | None = None,
         *,
         time_kernel: str = "auto",
         shrinkage: float | str = "auto",
