@@ -23,7 +23,7 @@ from torch_pbd.movement.conditioning import Conditioned, Observed
 from torch_pbd.movement.joint import JointNormal
 
 _MOST_ENTRIES = 4096  # conditioned on one by one: a matrix of their size squared is factorized
-_AT_ONCE = 512  # rows whose marginals are found together
+_AT_ONCE = 1024  # rows whose marginals are found together, and whose law is kept
 _RESOLUTION = 10  # decimals of a time, in ranges of those of the fit: nearer ones are equal
 
 
@@ -53,6 +53,7 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
     n_outputs_: int
     input_: str
     _known: Known | None = None
+    _kept: dict[bytes, JointNormal]  # law at the last times, which conditioned copies share
     _y_is_1d: bool
 
     def fit(self, X: Any, y: ArrayLike | None = None, *, groups: ArrayLike | None = None) -> Self:
@@ -78,7 +79,8 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
             If X has more than one column, y or groups are missing, there is one demonstration only, or a parameter
             cannot be used.
         """
-        self.__dict__.pop("_known", None)
+        for name in ("_known", "_kept"):
+            self.__dict__.pop(name, None)
         self._check_parameters()
         recordings = self._recordings(X, y, groups, is_fit=True)
         if len(recordings) < 2:
@@ -301,7 +303,7 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         if self._known is not None:
             known = Known(*(np.concatenate(pair) for pair in zip(self._known, known, strict=True)))
         copied = copy.copy(self)
-        copied._known = known
+        copied._known, copied._kept = known, self.__dict__.setdefault("_kept", {})
         copied._observed(self._union(known.time[:0], known)[2])  # refuses what cannot be conditioned on
         return copied
 
@@ -351,7 +353,15 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
     def _conditioned(self, time: Floats) -> tuple[Conditioned, Tensor]:
         """Law of all times that matter, given what is known, and the places of ``time`` among them."""
         union, rows, places = self._union(time, self._known)
-        return Conditioned(self._prior(union), self._observed(places)), torch.from_numpy(rows)
+        kept, key = self.__dict__.setdefault("_kept", {}), union.tobytes()
+        prior = kept.get(key) or self._prior(union)
+        if len(union) <= _AT_ONCE:
+            kept.clear()
+            kept[key] = prior
+        return Conditioned(prior, self._observed(places)), torch.from_numpy(rows)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in super().__getstate__().items() if name != "_kept"}
 
     def _law(self, time: Floats) -> tuple[JointNormal, Tensor]:
         conditioned, rows = self._conditioned(time)

@@ -40,6 +40,8 @@ class Conditioned:
     def __init__(self, prior: JointNormal, observed: Observed) -> None:
         self._prior, self._observed = prior, observed
         steps, n_loadings = observed.steps, prior.loadings.shape[-1]
+        if not len(steps):
+            return
         self._root = safe_cholesky(prior.correlation[steps][:, steps], name="the correlation of the steps given")
         self._gain = torch.cholesky_solve(prior.correlation[steps], self._root).mT
         loadings = prior.loadings[steps]
@@ -56,22 +58,29 @@ class Conditioned:
     @cached_property
     def law(self) -> JointNormal:
         """Law of all steps; those that are known have no variance left."""
-        prior, observed = self._prior, self._observed
-        correlation = symmetrize(prior.correlation - self._gain @ prior.correlation[observed.steps])
-        loadings = torch.linalg.solve_triangular(self._precision_root.mT, self._open, upper=True, left=False)
-        # What is known has no variance, not even of rounding, which may be below zero.
-        correlation = correlation.index_fill(0, observed.steps, 0.0).index_fill(1, observed.steps, 0.0)
-        law = replace(
-            prior,
-            mean=prior.mean + self._from_steps((observed.values - prior.mean[observed.steps])[None])[0],
-            correlation=correlation,
-            loadings=loadings.index_fill(0, observed.steps, 0.0),
-        )
+        law, observed = self._from_whole_steps(), self._observed
+        if not len(observed.entry_steps):
+            return law
         columns, root = self._entries(law)
         explained = torch.linalg.solve_triangular(root.mT, columns, upper=True, left=False)
         error = observed.entry_values - law.mean[observed.entry_steps, observed.entry_outputs]
         whitened = torch.linalg.solve_triangular(root, error[:, None], upper=False)[:, 0]
         return replace(law, mean=law.mean + explained @ whitened, explained=explained)
+
+    def _from_whole_steps(self) -> JointNormal:
+        prior, observed = self._prior, self._observed
+        if not len(observed.steps):
+            return prior
+        correlation = symmetrize(prior.correlation - self._gain @ prior.correlation[observed.steps])
+        loadings = torch.linalg.solve_triangular(self._precision_root.mT, self._open, upper=True, left=False)
+        # What is known has no variance, not even of rounding, which may be below zero.
+        correlation = correlation.index_fill(0, observed.steps, 0.0).index_fill(1, observed.steps, 0.0)
+        return replace(
+            prior,
+            mean=prior.mean + self._from_steps((observed.values - prior.mean[observed.steps])[None])[0],
+            correlation=correlation,
+            loadings=loadings.index_fill(0, observed.steps, 0.0),
+        )
 
     def deviations(
         self, correlated: Float[Tensor, "n s"], common: Float[Tensor, "k t"], noise: Float[Tensor, "p t"]
@@ -83,7 +92,10 @@ class Conditioned:
         """
         observed = self._observed
         drawn = self._prior.deviations(correlated, common)
-        drawn = drawn - self._from_steps(drawn[:, observed.steps])
+        if len(observed.steps):
+            drawn = drawn - self._from_steps(drawn[:, observed.steps])
+        if not len(observed.entry_steps):
+            return drawn
         columns, root = self._entries(self.law)
         errors = drawn[:, observed.entry_steps, observed.entry_outputs].mT
         errors = errors + observed.entry_variances.sqrt()[:, None] * noise
