@@ -6,7 +6,10 @@ to be as large as where movements start or end in one point, which marginals mis
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -18,8 +21,8 @@ from torch_pbd.linalg import safe_cholesky, symmetrize
 # Length scales in ranges of the time, from the spacing of some fifty steps to a movement that bends once; and nuggets
 # shared by all steps.
 _LENGTHS = torch.logspace(math.log10(0.02), 0.0, 14, dtype=torch.float64)
-_NUGGETS = (1e-5, 1e-4, 1e-3, 1e-2, 0.1)
-_LEAST, _MOST, _FIRST = 1e-5, 1e3, 1e-2  # nuggets: smallest, largest, and where expectation maximization starts
+_NUGGETS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1)
+_LEAST, _MOST, _FIRST = 1e-6, 1e3, 1e-2  # nuggets: smallest, largest, and where expectation maximization starts
 _N_STEPS, _TOLERANCE = 40, 0.02  # of expectation maximization: iterations, and change of a logarithm that ends it
 _SMOOTH = 1e-3  # nugget of a step that is told apart from noise: such steps decide on the length scale
 _USUAL = 2.0  # factor of the median, in which the size of a step's residuals lies
@@ -50,14 +53,22 @@ class TimeKernel:
 
     def loadings(self, time: Float[Tensor, " n"]) -> Float[Tensor, "n d K"]:
         """Residuals of the demonstrations at any times: smooth parts by the kernel, what is left of them linear."""
-        n_demos, n_steps, d = self.residual.shape
-        rows = self.residual.permute(1, 2, 0).reshape(n_steps, -1)
-        own = self._kernel(self.grid, self.grid)
-        root = safe_cholesky(own + torch.diag(self.nugget), name="the time kernel")
-        weights = torch.cholesky_solve(rows, root)
-        smooth = self._kernel(time, self.grid) @ weights
-        rest = _interpolated(self.grid, rows - own @ weights, time)
-        return (smooth + rest).reshape(len(time), d, n_demos)
+        n_demos, _, d = self.residual.shape
+        weights, left = self._parts
+        whole = self._kernel(time, self.grid) @ weights + _interpolated(self.grid, left, time)
+        return whole.reshape(len(time), d, n_demos)
+
+    @cached_property
+    def _parts(self) -> tuple[Float[Tensor, "T c"], Float[Tensor, "T c"]]:
+        """Weights of the smooth parts of all residuals, and what these leave of them."""
+        with torch.inference_mode(mode=False):  # others may take derivatives through them later
+            rows = self.residual.permute(1, 2, 0).reshape(len(self.grid), -1)
+            own = self._kernel(self.grid, self.grid)
+            weights = torch.cholesky_solve(rows, safe_cholesky(own + torch.diag(self.nugget), name="the time kernel"))
+            return weights, rows - own @ weights
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_parts"}
 
     def _kernel(self, time: Tensor, other: Tensor) -> Tensor:
         length_scale = self.grid.new_tensor([self.length_scale])
@@ -65,7 +76,7 @@ class TimeKernel:
 
 
 def fit_time_kernel(
-    grid: Float[Tensor, " T"], residual: Float[Tensor, "K T d"], kernel: str, share: float | None
+    grid: Float[Tensor, " T"], residual: Float[Tensor, "K T d"], kernels: Sequence[str], share: float | None
 ) -> TimeKernel:
     """Time kernel of whitened residuals, NaN where a demonstration has no sample near.
 
@@ -74,19 +85,23 @@ def fit_time_kernel(
     grid : Tensor of shape (T,)
         Times, of a range of one.
     residual : Tensor of shape (K, T, d)
-    kernel : str
+    kernels : sequence of str
+        Of which the likeliest is taken.
     share : float or None
         None takes that with the highest likelihood of demonstrations left out in turn.
     """
     residual = _unit_rms(residual)
     sizes = residual.square().nanmean((0, 2)).sqrt()
     usual = (sizes > sizes.nanmedian() / _USUAL) & (sizes < sizes.nanmedian() * _USUAL)
-    found = _search(grid, residual, usual, kernel)
+    first = [_search(grid, residual, usual, kernel) for kernel in kernels]
+    best = max(range(len(kernels)), key=lambda i: first[i][0])
+    kernel, (_, *found) = kernels[best], first[best]
     unit = _unit_kernel(grid, found[0], kernel)
     nugget = _step_nuggets(unit, residual, _LEAST)
     for _ in range(_ROUNDS):
         smooth = nugget <= _SMOOTH
-        again = _search(grid, residual, smooth if 2 * smooth.sum() >= len(grid) else nugget <= nugget.median(), kernel)
+        steps = smooth if 2 * smooth.sum() >= len(grid) else nugget <= nugget.median()
+        _, *again = _search(grid, residual, steps, kernel)
         if again == found:
             break
         found, unit = again, _unit_kernel(grid, again[0], kernel)
@@ -99,8 +114,8 @@ def _unit_kernel(grid: Float[Tensor, " T"], length_scale: float, kernel: str) ->
     return correlation(grid[:, None], grid[:, None], grid.new_tensor([length_scale]), kernel)
 
 
-def _search(grid: Tensor, residual: Tensor, steps: Bool[Tensor, " T"], kernel: str) -> tuple[float, float]:
-    """Length scale and shared nugget eta of the highest likelihood of ``(1 - eta) K + eta I``."""
+def _search(grid: Tensor, residual: Tensor, steps: Bool[Tensor, " T"], kernel: str) -> tuple[float, float, float]:
+    """Highest log likelihood of ``(1 - eta) K + eta I``, and its length scale and shared nugget eta."""
     steps = steps if 2 * int(steps.sum()) >= len(grid) else torch.ones_like(steps)
     chosen = _unit_rms(residual[:, steps])
     groups, time = _by_pattern(chosen), grid[steps][:, None]
@@ -110,8 +125,9 @@ def _search(grid: Tensor, residual: Tensor, steps: Bool[Tensor, " T"], kernel: s
         whole = (1.0 - nugget) * unit + nugget * torch.eye(len(time)).to(grid)
         each = [_log_likelihood(whole[:, seen][:, :, seen], rows) for seen, rows in groups]
         values.append(torch.stack(each).sum(0))
-    best = int(torch.stack(values).argmax())
-    return float(_LENGTHS[best % len(_LENGTHS)]), _NUGGETS[best // len(_LENGTHS)]
+    table = torch.stack(values)
+    best = int(table.argmax())
+    return float(table.max()), float(_LENGTHS[best % len(_LENGTHS)]), _NUGGETS[best // len(_LENGTHS)]
 
 
 def _log_likelihood(covariance: Float[Tensor, "b n n"], rows: Float[Tensor, "n s"]) -> Float[Tensor, " b"]:
@@ -159,30 +175,38 @@ def _filled(unit: Float[Tensor, "T T"], residual: Float[Tensor, "K T d"], nugget
 
 
 def _best_share(kernel: TimeKernel) -> float:
-    """Share of the kernel, by the likelihood of each demonstration under the others' and the kernel's correlation.
+    """Share of the kernel, by the likelihood of each demonstration under the law that the others' residuals give.
 
-    ``share R kron I + (1 - share) / (K - 1) sum z z'`` over the others: with G the Gram matrix of all under R^-1 and
-    ``M = G + a I``, ``a = share (K - 1) / (1 - share)``, the squared distance of one is ``1 / [M^-1]_kk - a`` over the
-    share, and the determinant of the others' M is that of all, times ``[M^-1]_kk``.
+    Their law is ``z = C^-1 y``, y of the covariance ``S = share R kron I + (1 - share) / (K - 1) sum z z'`` over the
+    others and ``C_t = chol S_tt``, which keeps the marginals: it bends the smooth part, and costs where that has little
+    variance. With the Gram matrix G of all under R^-1, ``M = G + a I``, ``a = share (K - 1) / (1 - share)`` and
+    ``c = Z' R^-1 y``, the squared distance is ``(y' R^-1 y - c' M^-1 c) / share`` and the determinant that of M over
+    the others, whose inverse is that of all without what one row of it adds.
     """
     n_demos, n_steps, d = kernel.residual.shape
     if n_demos < 3:
         return 1.0
     root = safe_cholesky(kernel.correlation(kernel.grid), name="the correlation along the movement")
-    rows = kernel.residual.permute(1, 2, 0).reshape(n_steps, -1)
-    whitened = torch.linalg.solve_triangular(root, rows, upper=False).reshape(n_steps * d, n_demos)
-    gram, size = symmetrize(whitened.mT @ whitened), n_steps * d
+    residual = kernel.residual
+    whitened = torch.linalg.solve_triangular(root, residual, upper=False).flatten(1)
+    gram, outer = symmetrize(whitened @ whitened.mT), residual[..., None] * residual[..., None, :]
+    unit, others = torch.eye(d).to(gram), (outer.sum(0) - outer) / (n_demos - 1)
 
     def left_out(share: float) -> float:
         if share == 1.0:
             return -0.5 * float(gram.trace())
+        factor = torch.linalg.cholesky(share * unit + (1.0 - share) * others)
+        inner = torch.linalg.solve_triangular(root, (factor @ residual[..., None])[..., 0], upper=False).flatten(1)
         ridge = share * (n_demos - 1) / (1.0 - share)
-        matrix = gram + ridge * torch.eye(n_demos).to(gram)
-        own = torch.linalg.inv(matrix).diagonal()
-        square = (1.0 / own - ridge) / share
-        # log det of I + G / a over the others
-        log_det = torch.logdet(matrix) + own.log() - (n_demos - 1) * torch.log(gram.new_tensor(ridge))
-        return -0.5 * float((square + log_det).sum()) - 0.5 * n_demos * size * float(gram.new_tensor(share).log())
+        inverse = torch.linalg.inv(gram + ridge * torch.eye(n_demos).to(gram))
+        own = inverse.diagonal()
+        cross = (inner @ whitened.mT).fill_diagonal_(0.0)  # one row a demonstration, without itself
+        solved = cross @ inverse
+        explained = (cross * solved).sum(1) - solved.diagonal().square() / own
+        square = (inner.square().sum(1) - explained) / share
+        # log det of share (I + G / a) over the others
+        log_det = n_steps * d * math.log(share) - (n_demos - 1) * math.log(ridge) + own.log() - torch.logdet(inverse)
+        return float((factor.diagonal(dim1=-2, dim2=-1).log().sum((1, 2)) - 0.5 * (square + log_det)).sum())
 
     return max(_SHARES, key=left_out)
 

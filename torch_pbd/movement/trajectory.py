@@ -47,7 +47,7 @@ class TrajectoryLaw(nn.Module):
     def __init__(self, marginals: nn.Module | None, time_kernel: TimeKernel, x_shift: float, x_scale: float) -> None:
         super().__init__()
         self.marginals = marginals
-        self.kernel = time_kernel.kernel
+        self.kernel, self._time_kernel = time_kernel.kernel, time_kernel
         for name in ("grid", "nugget", "residual"):
             self.register_buffer(name, getattr(time_kernel, name))
         for name, value in (
@@ -80,9 +80,10 @@ class TrajectoryLaw(nn.Module):
 
     def time_kernel(self) -> TimeKernel:
         """Correlation along the movement, in ranges of the time."""
-        return TimeKernel(
-            self.grid, self.kernel, float(self.length_scale), self.nugget, float(self.share), self.residual
-        )
+        if self._time_kernel.grid is not self.grid:  # the module was moved, or its buffers were loaded
+            length_scale, share = float(self.length_scale), float(self.share)
+            self._time_kernel = TimeKernel(self.grid, self.kernel, length_scale, self.nugget, share, self.residual)
+        return self._time_kernel
 
 
 class TrajectoryRegressor(MovementRegressor):
@@ -98,8 +99,7 @@ class TrajectoryRegressor(MovementRegressor):
     regressor : covariance regressor or None, default=None
         Cloned into ``regressor_``; None is ``HeteroscedasticGPRegressor()``. Its X has one column, time or phase.
     time_kernel : {"auto", "squared_exponential", "matern32", "matern52"}, default="auto"
-        "auto" is "matern52": it was the likeliest on most recordings, and a new demonstration of smoother movements
-        still meets its small variances, which it does not those of a squared exponential.
+        "auto" takes "matern52" or "squared_exponential", whichever is likelier.
     shrinkage : float or "auto", default="auto"
         Weight of the demonstrations' own correlation, 0 to 0.95; "auto" takes that under which demonstrations left
         out in turn are likeliest.
@@ -189,10 +189,10 @@ class TrajectoryRegressor(MovementRegressor):
         mean, covariance = self._regressor_marginals(grid)
         residual = np.stack([_sampled(recording, grid) for recording in recordings]) - mean
         whitened = np.linalg.solve(np.linalg.cholesky(covariance), residual[..., np.newaxis])[..., 0]
-        kernel = "matern52" if self.time_kernel == "auto" else self.time_kernel
+        kernels = ("matern52", "squared_exponential") if self.time_kernel == "auto" else (self.time_kernel,)
         share = None if self.shrinkage == "auto" else 1.0 - float(self.shrinkage)
         scaled = torch.from_numpy((grid - low) / (high - low))
-        found = fit_time_kernel(scaled, torch.from_numpy(whitened), kernel, share)
+        found = fit_time_kernel(scaled, torch.from_numpy(whitened), kernels, share)
         self.module_ = TrajectoryLaw(getattr(self.regressor_, "module_", None), found, low, high - low)
         self.module_.requires_grad_(False)
         degrees = self.regressor_.predict_df(grid[:, np.newaxis])
