@@ -13,7 +13,7 @@ TORCH_CONTROL = [
     *(f"simulation.{part}" for part in (
         "walls", "filters", "plant", "sensor", "rollout", "rollouts", "position_loop", "ticks")),
 ]  # fmt: skip
-TORCH_MOVEMENT = [f"movement.{part}" for part in ("joint", "conditioning", "time_kernel")]
+TORCH_MOVEMENT = [f"movement.{part}" for part in ("joint", "conditioning", "time_kernel", "timing")]
 TORCH_FLOORS = [
     "linalg",
     "kernels",

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torch_pbd import checks
 from torch_pbd.data import Demonstrations
+from torch_pbd.data.alignment import TIMING_REMOVED
 from torch_pbd.estimators.base import Uncertainty
 from torch_pbd.estimators.demonstrations import check_groups
 from torch_pbd.estimators.validation import Floats, checked_queries, checked_rows
@@ -396,14 +397,24 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         exact = ((self._known.noise == 0.0) & ~np.isnan(self._known.value)).any(axis=1)
         return [int(place) for place in places[exact]]
 
+    def _stacked(self, X: Demonstrations, *, is_fit: bool) -> tuple[Floats, Floats, NDArray[np.intp]]:
+        """Rows of demonstrations, over what ``input_`` says."""
+        timed = getattr(self, "timing", "none") != "none"
+        if is_fit:
+            self.input_ = "time" if timed or X.is_aligned else "phase"
+            if X.alignment == "dtw":
+                checks.warn(TIMING_REMOVED)
+        if not timed:
+            return X.stack(input=self.input_)  # type: ignore[arg-type]
+        _, y, groups = X.stack(input="phase")  # durations may have little in common
+        return np.concatenate(X.from_start().times)[:, np.newaxis], y, groups
+
     def _recordings(self, X: Any, y: Any, groups: Any, *, is_fit: bool) -> list[Recording]:
         """Demonstrations of what was passed, each in the order of its times."""
         if isinstance(X, Demonstrations):
             if y is not None or groups is not None:
                 raise ValueError("y and groups must be None beside Demonstrations, which have both.")
-            if is_fit:
-                self.input_ = "time" if X.is_aligned else "phase"
-            X, y, groups = X.stack(input=self.input_)  # type: ignore[arg-type]
+            X, y, groups = self._stacked(X, is_fit=is_fit)
         elif is_fit:
             self.input_ = "array"
             if groups is None:

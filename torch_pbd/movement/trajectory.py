@@ -17,10 +17,11 @@ from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
 from torch_pbd.estimators.validation import Floats
 from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky
-from torch_pbd.movement.base import MovementRegressor, Recording
+from torch_pbd.movement.base import Recording
 from torch_pbd.movement.conditioning import Conditioned
 from torch_pbd.movement.joint import JointNormal
 from torch_pbd.movement.time_kernel import TimeKernel, fit_time_kernel
+from torch_pbd.movement.timed import TimedMovement
 
 # Steps on which the correlation is learned: the nuggets' iterations are cubic in them, and movements are smooth.
 _MOST_STEPS = 200
@@ -86,7 +87,7 @@ class TrajectoryLaw(nn.Module):
         return self._time_kernel
 
 
-class TrajectoryRegressor(MovementRegressor):
+class TrajectoryRegressor(TimedMovement):
     """Law of a whole demonstration: the marginals of a covariance regressor, and a correlation along the movement.
 
     Marginals stay the regressor's. Demonstrations are smooth: what one deviates by now it deviates by soon after. The
@@ -103,8 +104,12 @@ class TrajectoryRegressor(MovementRegressor):
     shrinkage : float or "auto", default="auto"
         Weight of the demonstrations' own correlation, 0 to 0.95; "auto" takes that under which demonstrations left
         out in turn are likeliest.
-    timing : {"none"}, default="none"
-        The phase of a movement is taken for known.
+    timing : {"none", "warp", "auto"}, default="none"
+        "none" takes the phase of a movement for known. With "warp", X is the time since the start of a movement whose
+        duration and pace are not known but as demonstrations vary in them, four or more: what is given to
+        :meth:`condition` says how far it is (:meth:`predict_phase`), and the rest is foretold over all that is left
+        possible. "auto" takes "warp" if left-out demonstrations are likelier so than by the mean duration at an even
+        pace, which costs ten fits; X is time in both cases.
     random_state : int, RandomState instance or None, default=0
         Not used: the fit is deterministic where the regressor's is. It is here so that models can be exchanged.
 
@@ -122,6 +127,10 @@ class TrajectoryRegressor(MovementRegressor):
     shrinkage_ : float
     df_ : float
         Degrees of freedom of the joint law, the median of the regressor's, 3 to 200.
+    timing_ : {"none", "warp"}
+    timing_gain_ : float
+        With timing="auto": nats a step by which "warp" makes left-out demonstrations likelier, at steps a twelfth of a
+        movement apart.
     input_ : {"time", "phase", "array"}
     n_features_in_, n_outputs_ : int
 
@@ -164,7 +173,7 @@ class TrajectoryRegressor(MovementRegressor):
         checks.choice(self.time_kernel, "time_kernel", ("auto", *KERNELS))
         if self.shrinkage != "auto":
             checks.number(self.shrinkage, "shrinkage", least=0.0, most=0.95)
-        checks.choice(self.timing, "timing", ("none",))
+        checks.choice(self.timing, "timing", ("none", "warp", "auto"))
         checks.seed(self.random_state)
         if self.regressor is not None and (
             isinstance(self.regressor, type) or not hasattr(self.regressor, "predict_cov")
@@ -172,11 +181,21 @@ class TrajectoryRegressor(MovementRegressor):
             raise checks.refusal(self.regressor, "regressor", "a covariance regressor or None")
 
     def _fit(self, recordings: list[Recording]) -> None:
+        self._timing = self._nodes = None
+        self.timing_ = self.timing
         for number, recording in enumerate(recordings):
             if len(recording.time) < 2 or not (np.diff(recording.time) > 0.0).all():
                 raise ValueError(
                     f"X has a time twice in demonstration {number}, or fewer than two: its samples must be in a row."
                 )
+        if self.timing == "auto":
+            self.timing_gain_ = self._gain(recordings)
+            self.timing_ = "warp" if self.timing_gain_ > 0.0 else "none"
+        if self.timing != "none":
+            recordings = self._phased(recordings, self.timing_)
+        self._fit_law(recordings)
+
+    def _fit_law(self, recordings: list[Recording]) -> None:
         X = np.concatenate([recording.time for recording in recordings])[:, np.newaxis]
         y = np.concatenate([recording.position for recording in recordings])
         groups = np.repeat(np.arange(len(recordings)), [len(recording.time) for recording in recordings])
@@ -202,14 +221,14 @@ class TrajectoryRegressor(MovementRegressor):
 
     def predict(self, X: ArrayLike, *, return_std: bool = False, return_cov: bool = False) -> Any:
         """As the regressor predicts; given what is known, the mean and covariance of the rest of the movement."""
-        if self._known is None:
+        if self._is_regressor:
             self._times(X)
             return self.regressor_.predict(X, return_std=return_std, return_cov=return_cov)
         return super().predict(X, return_std=return_std, return_cov=return_cov)
 
     def predict_df(self, X: ArrayLike) -> Floats:
         """Degrees of freedom of the marginals; given what is known, of the joint law."""
-        return self.regressor_.predict_df(X) if self._known is None else super().predict_df(X)
+        return self.regressor_.predict_df(X) if self._is_regressor else super().predict_df(X)
 
     def predict_uncertainty(self, X: ArrayLike) -> Uncertainty:
         """Both kinds of uncertainty at X, apart (Section IV-C).
@@ -218,6 +237,8 @@ class TrajectoryRegressor(MovementRegressor):
         variability that what is known leaves.
         """
         time = self._times(X)
+        if self._timing is not None:
+            return self._mixed_uncertainty(time)
         own = self.regressor_.predict_uncertainty(time[:, np.newaxis])
         if self._known is None:
             return Uncertainty(*own)
@@ -228,19 +249,26 @@ class TrajectoryRegressor(MovementRegressor):
 
     def log_likelihood(self, X: ArrayLike, y: ArrayLike) -> Floats:
         """Log density of each row of y at X, by itself, in nats: (n_samples,)."""
-        return self.regressor_.log_likelihood(X, y) if self._known is None else super().log_likelihood(X, y)
+        return self.regressor_.log_likelihood(X, y) if self._is_regressor else super().log_likelihood(X, y)
 
     def sample_y(self, X: ArrayLike, n_samples: int = 1, random_state: Any = None) -> Floats:
         """Draw y at X, independently for each row; whole movements are drawn by :meth:`sample_demonstrations`."""
-        if self._known is None:
+        if self._is_regressor:
             return self.regressor_.sample_y(X, n_samples, random_state)
         return super().sample_y(X, n_samples, random_state)
 
+    @property
+    def _is_regressor(self) -> bool:
+        """Whether marginals are the regressor's, at X."""
+        return self._known is None and self._timing is None
+
     def _arrays(self) -> dict[str, Floats]:
         state = self.module_.state_dict()
-        return {name: array.numpy() for name, array in state.items() if not name.startswith("marginals.")}
+        own = {name: array.numpy() for name, array in state.items() if not name.startswith("marginals.")}
+        return own | self._timing_arrays()
 
     def _restore(self, arrays: dict[str, Floats]) -> None:
+        arrays = self._restore_timing(arrays)
         n_steps, scalars = len(np.atleast_1d(arrays["grid"])), ("length_scale", "share", "x_shift", "x_scale")
         shapes: dict[str, tuple[int | str, ...]] = dict.fromkeys(scalars, ())
         shapes |= {"grid": (n_steps,), "nugget": (n_steps,), "residual": ("K", n_steps, self.n_outputs_)}
@@ -269,7 +297,7 @@ class TrajectoryRegressor(MovementRegressor):
             return self.module_.joint(*map(torch.from_numpy, (time, mean, covariance)))
 
     def _marginals(self, time: Floats) -> tuple[Floats, Floats]:
-        return self._regressor_marginals(time) if self._known is None else super()._marginals(time)
+        return self._regressor_marginals(time) if self._is_regressor else super()._marginals(time)
 
     def _regressor_marginals(self, time: Floats) -> tuple[Floats, Floats]:
         mean, covariance = self.regressor_.predict(time[:, np.newaxis], return_cov=True)

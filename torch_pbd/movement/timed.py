@@ -1,0 +1,279 @@
+"""Movements whose duration and pace are not known: mixtures over both of models of phase."""
+
+import copy
+from typing import Any, Self
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from torch_pbd import checks
+from torch_pbd.estimators.base import Uncertainty
+from torch_pbd.estimators.validation import Floats
+from torch_pbd.linalg import safe_cholesky, student_log_density
+from torch_pbd.movement.base import Known, MovementRegressor, Recording
+from torch_pbd.movement.timing import Likelihood, Nodes, Timing, phase_of, register
+
+_FEWEST = 4  # demonstrations that say how two numbers vary together
+_N_STEPS = 100  # of a curve whose pace is found
+# Samples a movement by which its timing is found. Nearer ones repeat each other but for their smoothness, of which the
+# law knows little: with 25 and 50 the posterior was two and three times too narrow.
+_SEEN = 12.0
+_MOST_FOLDS = 5
+
+
+class TimedMovement(MovementRegressor):
+    """Model of movements whose law is over phase and whose input is time, where ``timing`` is not "none"."""
+
+    timing: str
+    timing_: str
+    timing_gain_: float
+    _timing: Timing | None = None
+    _nodes: Nodes | None = None
+
+    def predict_phase(self, X: ArrayLike) -> tuple[Floats, Floats]:
+        """Phase estimation: how far the movement is at times X, given what is known of it.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, 1)
+            Times since the start of the movement.
+
+        Returns
+        -------
+        mean, std : ndarray of shape (n_samples,)
+            Of the phase: 0 at the start, 1 from the end on.
+
+        Raises
+        ------
+        ValueError
+            If timing is "none".
+        """
+        time = self._times(X)
+        if self._timing is None:
+            raise checks.refusal(self.timing, "timing", "'warp' or 'auto' where phases are to be estimated")
+        weight, phases = self._posterior().weight.numpy(), self._phases(time)
+        mean = weight @ phases
+        return mean, np.sqrt(weight @ np.square(phases - mean))
+
+    def condition(self, X: ArrayLike, y: ArrayLike, *, noise_scale: ArrayLike = 0.0) -> Self:
+        """Fitted copy, of a movement that is at y at X; see :meth:`MovementRegressor.condition`.
+
+        With timing, X is the time of the running movement, and it runs at the last of them.
+        """
+        copied = super().condition(X, y, noise_scale=noise_scale)
+        if copied._timing is not None:
+            assert copied._known is not None
+            last = copied._last(copied._known.time)
+            copied._nodes = copied._timing.posterior(copied._log_likelihood(copied._known), last)
+        return copied
+
+    def predict_joint(self, X: ArrayLike) -> tuple[Floats, Floats]:
+        """Joint mean and covariance at the rows of X; with timing, those of the mixture over durations and paces."""
+        if self._timing is None:
+            return super().predict_joint(X)
+        laws = [model.predict_joint(phases[:, np.newaxis]) for model, phases in self._models(self._times(X))]
+        mean, covariance = zip(*laws, strict=True)
+        return self._matched(np.stack(mean), np.stack(covariance), "kia,kjb->iajb")
+
+    def sample_demonstrations(self, X: ArrayLike, n_samples: int = 1, random_state: Any = None) -> Floats:
+        """Draw whole demonstrations at the rows of X; with timing, each has a duration and pace of its own."""
+        if self._timing is None:
+            return super().sample_demonstrations(X, n_samples, random_state)
+        checks.count(n_samples, "n_samples")
+        generator = checks.seed(random_state)
+        counts = generator.multinomial(n_samples, self._posterior().weight.numpy())
+        parts = [
+            model.sample_demonstrations(phases[:, np.newaxis], count, generator)
+            for (model, phases), count in zip(self._models(self._times(X)), counts, strict=True)
+            if count
+        ]
+        return np.asarray(generator.permutation(np.concatenate(parts)))
+
+    def _mixed_uncertainty(self, time: Floats) -> Uncertainty:
+        parts = [
+            (model._marginals(phases)[0], *model.predict_uncertainty(phases[:, np.newaxis]))
+            for model, phases in self._models(time)
+        ]
+        mean, type1, type2 = map(np.stack, zip(*parts, strict=True))
+        return Uncertainty(self._posterior().weight.numpy() @ type1, self._matched(mean, type2, "kia,kib->iab")[1])
+
+    def _marginals(self, time: Floats) -> tuple[Floats, Floats]:
+        if self._timing is None:
+            return super()._marginals(time)
+        mean, covariance = zip(*(model._marginals(phases) for model, phases in self._models(time)), strict=True)
+        return self._matched(np.stack(mean), np.stack(covariance), "kia,kib->iab")
+
+    def _score(self, recording: Recording) -> float:
+        """Log of the mean density over the posterior, restricted to movements that still run."""
+        if self._timing is None:
+            return super()._score(recording)
+        empty = Known(recording.time[:0], recording.position[:0], recording.position[:0])
+        known = empty if self._known is None else self._known
+        new = Known(*recording, np.zeros_like(recording.position))
+        before, whole = self._log_likelihood(known), Known(*map(np.concatenate, zip(known, new, strict=True)))
+
+        def exact(duration: Tensor, pace: Tensor) -> Tensor:
+            models = [self._model(*node) for node in zip(duration, pace, strict=True)]
+            phases = phase_of(torch.from_numpy(recording.time) / duration[:, None], pace[:, None]).numpy()
+            scores = [m._score(Recording(s, recording.position)) for m, s in zip(models, phases, strict=True)]
+            return before(duration, pace) + torch.tensor(scores, dtype=torch.float64)
+
+        return self._log_ratio(self._log_likelihood(whole), before, self._last(whole.time), exact)
+
+    def _log_ratio(self, above: Likelihood, below: Likelihood, last: float, exact: Likelihood | None = None) -> float:
+        """Log of the ratio of two mean likelihoods of movements that run at the time ``last``."""
+        assert self._timing is not None
+        over = self._timing.posterior(above, last, exact=exact).log_integral
+        return over - self._timing.posterior(below, last).log_integral
+
+    def _phased(self, recordings: list[Recording], timing: str) -> list[Recording]:
+        """Recordings over phase, after their timing was learned."""
+        duration = np.array([recording.time[-1] for recording in recordings])
+        first = np.array([recording.time[0] for recording in recordings])
+        good = (first >= 0.0) & (first < 0.5 * duration)
+        checks.require(good, first, "the first time of a demonstration", "0 or a little later", "count from its start")
+        if timing == "warp" and len(recordings) < _FEWEST:
+            raise ValueError(
+                f"groups has {len(recordings)} demonstrations, must have {_FEWEST} or more to learn how timing varies: "
+                "record more, or take timing='none'."
+            )
+        grid = np.linspace(0.0, 1.0, _N_STEPS)
+        curves = np.stack([
+            np.stack([np.interp(grid * time[-1], time, column) for column in position.T], axis=1)
+            for time, position in recordings
+        ])  # fmt: skip
+        size = curves.std((0, 1))
+        units, durations = torch.from_numpy(curves / np.where(size > 0.0, size, 1.0)), torch.from_numpy(duration)
+        pace = register(units) if timing == "warp" else torch.zeros_like(durations)
+        self._timing = Timing.learn(durations, pace) if timing == "warp" else Timing.even(durations)
+        return [
+            Recording(phase_of(torch.from_numpy(time / time[-1]), own).numpy(), position)
+            for (time, position), own in zip(recordings, pace, strict=True)
+        ]
+
+    def _gain(self, recordings: list[Recording]) -> float:
+        """Nats a step by which a warp makes left-out demonstrations likelier than the mean duration at an even pace.
+
+        Of steps a twelfth of a movement apart, as far as both have the movement run.
+        """
+        n_folds, mean = min(_MOST_FOLDS, len(recordings)), np.mean([recording.time[-1] for recording in recordings])
+        gain, n_steps = 0.0, 0
+        for fold in range(n_folds):
+            train = [recording for number, recording in enumerate(recordings) if number % n_folds != fold]
+            warp, none = (self._fitted(train, timing) for timing in ("warp", "none"))
+            for time, position in recordings[fold::n_folds]:
+                seen = time <= min(mean, warp._timing.longest(), none._timing.longest())
+                known = Known(time[seen], position[seen], np.zeros_like(position[seen]))
+                own, other = (m._log_ratio(m._log_likelihood(known), _flat, time[seen][-1]) for m in (warp, none))
+                gain += own - other
+                n_steps += len(self._spread(known.time, float(mean)))
+        return gain / n_steps
+
+    def _timing_arrays(self) -> dict[str, Floats]:
+        """Arrays of model files; none where timing is "none"."""
+        if self._timing is None:
+            return {}
+        arrays = {"timing_location": self._timing.location, "timing_root": self._timing.root}
+        own = {name: array.numpy() for name, array in arrays.items()} | {"timing_df": np.array(self._timing.df)}
+        return own | ({"timing_gain": np.array(self.timing_gain_)} if self.timing == "auto" else {})
+
+    def _restore_timing(self, arrays: dict[str, Floats]) -> dict[str, Floats]:
+        """Take up such arrays; the others are returned."""
+        self.timing_ = self.timing
+        if self.timing == "none":
+            return arrays
+        location, root, df = (
+            checks.array(arrays.get(f"timing_{name}"), f"timing_{name}", shape)
+            for name, shape in (("location", (2,)), ("root", (2, 2)), ("df", ()))
+        )
+        checks.require((root >= 0.0) | ~np.eye(2, dtype=bool), root, "timing_root", "at least 0 on its diagonal")
+        checks.number(float(df), "timing_df", above=0.0)
+        self._timing = Timing(torch.from_numpy(location.copy()), torch.from_numpy(root.copy()), float(df))
+        if self.timing == "auto":
+            self.timing_gain_ = float(checks.array(arrays.get("timing_gain"), "timing_gain", ()))
+            self.timing_ = "warp" if self.timing_gain_ > 0.0 else "none"
+        return {name: array for name, array in arrays.items() if not name.startswith("timing_")}
+
+    def _fitted(self, recordings: list[Recording], timing: str) -> Any:
+        """Copy that has learned from some of the recordings only."""
+        model: Any = copy.copy(self)
+        model._fit_law(model._phased(recordings, timing))
+        return model
+
+    def _last(self, time: Floats) -> float:
+        assert self._timing is not None
+        last, longest = float(time.max(initial=0.0)), self._timing.longest()
+        if last > longest:
+            raise ValueError(
+                f"X reaches {last:.6g}, must be at most {longest:.6g}: no movement like those shown lasts longer. "
+                "Leave out what comes after its end."
+            )
+        return last
+
+    def _posterior(self) -> Nodes:
+        assert self._timing is not None
+        return self._timing.posterior(_flat) if self._nodes is None else self._nodes
+
+    def _phases(self, time: Floats) -> Floats:
+        nodes = self._posterior()
+        return phase_of(torch.from_numpy(time) / nodes.duration[:, None], nodes.pace[:, None]).numpy()
+
+    def _models(self, time: Floats) -> list[tuple[Self, Floats]]:
+        """Models of phase of each node, and the phases (n,) of times."""
+        nodes = self._posterior()
+        models = [self._model(*node) for node in zip(nodes.duration, nodes.pace, strict=True)]
+        return list(zip(models, self._phases(time), strict=True))
+
+    def _model(self, duration: Tensor, pace: Tensor) -> Self:
+        """Model of phase, of a movement of this duration and pace."""
+        model = copy.copy(self)
+        model._timing = None
+        if self._known is not None:
+            model._known = self._known._replace(
+                time=phase_of(torch.from_numpy(self._known.time) / duration, pace).numpy()
+            )
+        return model
+
+    def _matched(self, mean: Floats, covariance: Floats, outer: str) -> tuple[Floats, Floats]:
+        """Mean and covariance of a mixture whose components have these."""
+        weight = self._posterior().weight.numpy()
+        whole = np.tensordot(weight, mean, 1)
+        deviation = np.sqrt(weight)[:, np.newaxis, np.newaxis] * (mean - whole)
+        spread = np.tensordot(weight, covariance, 1) + np.einsum(outer, deviation, deviation)
+        return whole, spread
+
+    def _log_likelihood(self, known: Known) -> Likelihood:
+        """Log density of what is known, at samples a twelfth of a movement apart, given durations and paces."""
+        assert self._timing is not None
+        rows = self._spread(known.time, float(self._timing.location[0].exp()))
+        time, value, noise = (torch.from_numpy(each[rows]) for each in known)
+        given = ~value.flatten().isnan()
+        if not bool(given.any()):
+            return _flat
+
+        def log_likelihood(duration: Tensor, pace: Tensor) -> Tensor:
+            phases = phase_of(time / duration[:, None], pace[:, None])
+            law = self._prior(phases.flatten().numpy())
+            steps = torch.arange(phases.numel()).reshape(phases.shape)
+            mean = law.mean[steps].flatten(1)[:, given]
+            size = steps.shape[1] * law.mean.shape[1]
+            whole = torch.stack([law.at(own).covariance().reshape(size, size) for own in steps])
+            whole = whole[:, given][:, :, given] + torch.diag(noise.square().flatten()[given])
+            root = safe_cholesky(whole, name="the covariance of what is known")
+            degrees = torch.full_like(duration, self.df_)
+            return student_log_density(value.flatten()[given] - mean, root, degrees)
+
+        return log_likelihood
+
+    def _spread(self, time: Floats, duration: float) -> Any:
+        """Rows whose times are nearest to even ones, back from the last."""
+        if not len(time):
+            return np.empty(0, dtype=np.intp)
+        even = np.arange(time.max(), time.min() - 0.5 * duration / _SEEN, -duration / _SEEN)
+        return np.unique(np.abs(time[:, np.newaxis] - even).argmin(axis=0))
+
+
+def _flat(duration: Tensor, pace: Tensor) -> Tensor:
+    return torch.zeros_like(duration)

@@ -1,0 +1,143 @@
+"""Timing of movements: how long one takes and how its pace changes, learned from demonstrations, found while it runs.
+
+A movement passes its phase s, 0 to 1, in the time u = t / T since its start over its duration T:
+
+    ``s = (1 - exp(-a u)) / (1 - exp(-a))``, so that ``exp(a)`` is its pace at the start over that at the end.
+
+That increases for every a, and a = 0 is an even pace. What is learned is the law of ``(log T, a)``.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+_PACES = torch.linspace(-3.0, 3.0, 121, dtype=torch.float64)  # exp(3): twenty times as fast at the start as at the end
+_ROUNDS = 10  # of registration: the mean and the paces depend on each other
+_EVEN = 1e-5  # below it the series in a is exact to rounding
+_SAME = 1e-4  # spread of log durations that counts as none: of sampling
+# Nodes along a side of each lattice, laid by the moments that the one before found. They reach over four standard
+# deviations: a sum over nodes 4/3 of them apart is a normal integral to 1e-4, and the last has few, as all predict.
+_SIDES, _SIDES_EXACT, _REACH = (13, 13, 13, 7), (13, 7), 4.0
+_RARE = 7.0  # nats below the density of the middle, where the first lattice ends
+
+
+Likelihood = Callable[[Tensor, Tensor], Tensor]
+
+
+class Nodes(NamedTuple):
+    """Posterior of duration and pace, as weights of nodes, and log of the integral of prior times likelihood."""
+
+    duration: Float[Tensor, " b"]
+    pace: Float[Tensor, " b"]
+    weight: Float[Tensor, " b"]
+    log_integral: float
+
+
+def phase_of(time: Tensor, pace: Tensor) -> Tensor:
+    """Phase at times over the duration; after the end it is 1."""
+    u, even = time.clamp(max=1.0), pace.abs() < _EVEN
+    safe = torch.where(even, 1.0, pace)
+    return torch.where(even, u + 0.5 * pace * u * (1.0 - u), torch.expm1(-safe * u) / torch.expm1(-safe))
+
+
+def time_of(phase: Tensor, pace: Tensor) -> Tensor:
+    """Time over the duration at which a phase is passed: the inverse of :func:`phase_of`."""
+    even = pace.abs() < _EVEN
+    safe = torch.where(even, 1.0, pace)
+    series = phase - 0.5 * pace * phase * (1.0 - phase)
+    return torch.where(even, series, -torch.log1p(phase * torch.expm1(-safe)) / safe)
+
+
+def register(curves: Float[Tensor, "K n d"]) -> Float[Tensor, " K"]:
+    """Paces under which curves, sampled evenly over their durations, are nearest to their mean; zero in the mean.
+
+    Curves are in comparable units. Least squares over a grid of paces, in turn with the mean.
+    """
+    n_demos, n, _ = curves.shape
+    paces, each = _PACES.to(curves), torch.arange(n_demos)
+    place = time_of(torch.linspace(0.0, 1.0, n).to(curves), paces[:, None]) * (n - 1)
+    left = place.long().clamp(0, n - 2)
+    warped = torch.lerp(curves[:, left], curves[:, left + 1], (place - left)[:, :, None])
+    chosen = torch.full((n_demos,), len(paces) // 2)
+    for _ in range(_ROUNDS):
+        before, mean = chosen, warped[each, chosen].mean(0)
+        chosen = (warped - mean).square().sum((2, 3)).argmin(1)
+        # The mean curve has no pace of its own: all may be shifted.
+        chosen = (chosen + len(paces) // 2 - chosen.double().mean().round().long()).clamp(0, len(paces) - 1)
+        if torch.equal(chosen, before):
+            break
+    return paces[chosen] - paces[chosen].mean()
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Student's t of (log T, a): what K demonstrations, normal in both, say of the next."""
+
+    location: Float[Tensor, " 2"]
+    root: Float[Tensor, "2 2"]
+    """Lower factor of its scale matrix; a column of zeros where demonstrations do not differ."""
+    df: float
+
+    @classmethod
+    def learn(cls, duration: Float[Tensor, " K"], pace: Float[Tensor, " K"]) -> "Timing":
+        """Predictive law of more than two demonstrations, whose mean and covariance (2, 2) are estimates.
+
+        With mean m and sums of squares S of K normal pairs, the next is a t of K - 2 degrees of freedom around m, with
+        the scale matrix ``(1 + 1 / K) S / (K - 2)``, under Jeffreys' prior.
+        """
+        values = torch.stack([duration.log(), pace], dim=1)
+        n_demos = len(values)
+        residual = values - values.mean(0)
+        scale = (1.0 + 1.0 / n_demos) / (n_demos - 2) * residual.mT @ residual
+        root = torch.zeros_like(scale)
+        if float(scale[0, 0].sqrt()) > _SAME:
+            root[:, 0] = scale[:, 0] / scale[0, 0].sqrt()
+        root[1, 1] = (scale[1, 1] - root[1, 0].square()).clamp_min(0.0).sqrt()
+        return cls(values.mean(0), root, float(n_demos - 2))
+
+    @classmethod
+    def even(cls, duration: Float[Tensor, " K"]) -> "Timing":
+        """Movements that all take the mean duration, at an even pace."""
+        return cls(torch.stack([duration.mean().log(), duration.new_zeros(())]), torch.zeros(2, 2).to(duration), 1.0)
+
+    def longest(self) -> float:
+        """Duration that movements do not exceed."""
+        return float((self.location[0] + self._reach() * self.root[0, 0]).exp())
+
+    def posterior(self, log_likelihood: Likelihood, last: float = 0.0, *, exact: Likelihood | None = None) -> Nodes:
+        """Posterior of duration and pace, given a log likelihood of durations (b,) and paces (b,).
+
+        The movement still runs at the time ``last``, at most :meth:`longest`: it takes no less. A likelihood that costs
+        more, ``exact``, counts on last lattices of its own.
+        """
+        varies = (self.root.diagonal() > 0.0).to(self.root)
+        center, root = torch.zeros_like(self.location), self._reach() / _REACH * torch.eye(2).to(self.root)
+        stages = [(side, log_likelihood) for side in _SIDES] + [(side, exact) for side in _SIDES_EXACT if exact]
+        for side, likelihood in stages:
+            along = torch.linspace(-_REACH, _REACH, side).to(self.root)
+            lattice = torch.cartesian_prod(*(along if on else along[:1] * 0.0 for on in varies))
+            z = center + lattice @ root.mT
+            values = self.location + z @ self.root.mT
+            duration, pace = values[:, 0].exp(), values[:, 1]
+            log_weight = -0.5 * (self.df + 2.0) * torch.log1p(z.square().sum(1) / self.df)
+            runs = duration >= last * (1.0 - 1e-9)
+            log_weight[~runs] = -math.inf
+            log_weight[runs] += likelihood(duration[runs], pace[runs])
+            weight = log_weight.softmax(0)
+            cell = root * (along[1] - along[0])
+            volume = float(torch.where(varies > 0.0, cell.diagonal(), 1.0).log().sum())
+            # The next lattice is no finer than half of this one's cells, in which the posterior may hide.
+            center = weight @ z
+            spread = z - center
+            root = torch.linalg.cholesky(spread.mT @ (weight[:, None] * spread) + 0.25 * cell @ cell.mT)
+        kept = weight > 1e-3 * weight.max()
+        weight = weight[kept] / weight[kept].sum()
+        return Nodes(duration[kept], pace[kept], weight, float(log_weight.logsumexp(0)) + volume)
+
+    def _reach(self) -> float:
+        return math.sqrt(self.df * math.expm1(2.0 * _RARE / (self.df + 2.0)))
