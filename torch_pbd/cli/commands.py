@@ -23,6 +23,7 @@ COMMANDS = {
     "fit": "fit one model to a file of demonstrations",
     "experiment": "learn a skill, reproduce it on a simulated robot and push it (Figures 5 to 8)",
     "compare": "compare models: on the paper's simulation (Table I, Figures 1 to 3), or on a file",
+    "playground": "draw strokes in the browser, see their covariance, bend the movement, push the robot",
 }
 
 _MODELS = {
@@ -86,6 +87,10 @@ OPTIONS: dict[str, dict[str, Option]] = {
         "n_draws": Option(_Count, 50, "draws at each input of the simulation"),
         **_GRID,
     },
+    "playground": {
+        "port": Option(Annotated[int, (0, 65535)], 0, "of this machine to serve the page at; 0: a free one"),
+        "browse": Option(bool, True, "open the page in a browser"),
+    },
 }  # fmt: skip
 
 OPENINGS = {
@@ -108,11 +113,24 @@ eigenvalue of the predicted correlations"""
 
 def parse(command: str, arguments: Sequence[str]) -> tuple[Namespace, str]:
     """Options of a command, and the YAML that gives them again."""
+    if command == "playground":  # which has no results
+        return options.parse(f"torch-pbd {command}", COMMANDS[command], OPTIONS[command], arguments)
     run = {
         "output": Option(str, f"runs/{command}", "folder of the results"),
         "resume": Option(bool, False, "go on with the finished fits in the folder of results"),
     }
     return options.parse(f"torch-pbd {command}", COMMANDS[command], run | OPTIONS[command], arguments)
+
+
+def playground(options: Any) -> None:
+    """A page in the browser, until Ctrl-C."""
+    try:
+        from torch_pbd.playground.server import serve
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"playground needs {error.name}, which is not installed: pip install 'torch_pbd[playground]'."
+        ) from error
+    serve(options.port, browse=options.browse)
 
 
 def demo(options: Any, folder: Any) -> str:

@@ -88,6 +88,9 @@ def _answer(arguments: Sequence[str]) -> int:
 
 def _run(command: str, arguments: Sequence[str]) -> int:
     options, config = commands.parse(command, arguments)
+    if command == "playground":
+        commands.playground(options)
+        return 0
     from torch_pbd.experiments.resume import finished_fits
     from torch_pbd.experiments.run_folder import check_names
 

@@ -1,0 +1,213 @@
+"""What the page asks of the library: models of strokes, movements that are bent, schedules, files to take home."""
+
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from sklearn.frozen import FrozenEstimator
+
+from torch_pbd.control import DMPController, Schedule, StiffnessLaw
+from torch_pbd.data import Demonstrations, load_demonstrations, save_demonstrations
+from torch_pbd.playground.messages import Settings, Stroke
+from torch_pbd.registry import MOVEMENTS, load_class
+
+_STEPS = 50  # at which a movement is learned and drawn: a stroke's bends are a tenth of it
+_DRAWS = 5  # made movements that are shown
+_RATE = 1000.0  # Hz of the robot's loop
+_AT_ONCE = 20  # rows of a schedule in a row of the strip chart
+
+Answer = dict[str, Any]
+
+
+@dataclass
+class Learned:
+    """Controllers of the strokes of a page, by the name of their model, and what was asked of the first."""
+
+    strokes: Demonstrations
+    settings: Settings
+    controllers: dict[str, DMPController] = field(default_factory=dict)
+    via: list[tuple[float, float, float]] = field(default_factory=list)
+    bent: DMPController | None = None
+    schedule: Schedule | None = None
+
+
+def learn(strokes: list[Stroke], settings: Settings) -> Iterator[tuple[Learned, Answer]]:
+    """Models of two strokes or more, the schedule of the first, and last how likely left-out strokes are.
+
+    It stops between two answers where newer strokes have come: whoever asks goes on to the next answer, or does not.
+    """
+    learned = Learned(_demonstrations(strokes), settings)
+    for name in settings.models:
+        begun = time.perf_counter()
+        learned.controllers[name] = _controller(_model(name), settings).fit(learned.strokes)
+        took = time.perf_counter() - begun
+        yield learned, {**picture(learned.controllers[name], name, drawn=True), "seconds": took}
+    yield learned, follow(learned)
+    for name in settings.models:
+        if len(learned.strokes) > 2:
+            yield learned, {"type": "score", "model": name, "nats": _left_out(learned, name)}
+
+
+def adjust(learned: Learned, settings: Settings) -> Answer:
+    """Schedule with other limits, mass or speed: the model stays as it is."""
+    learned.settings = settings
+    for name, fitted in learned.controllers.items():
+        learned.controllers[name] = _controller(FrozenEstimator(fitted.covariance_), settings).fit(learned.strokes)
+    learned.bent = _bent(learned)
+    return follow(learned)
+
+
+def bend(learned: Learned, via: list[tuple[float, float, float]]) -> Answer:
+    """Movement of the first model through points: rows of time in s and position in m."""
+    learned.via, learned.schedule = via, None
+    learned.bent = _bent(learned)
+    return picture(learned.bent, next(iter(learned.controllers)), drawn=False)
+
+
+def follow(learned: Learned) -> Answer:
+    """Schedule of the first model, for the robot, and what is guaranteed of it."""
+    controller = learned.bent or next(iter(learned.controllers.values()))
+    schedule = controller.schedule(rate=_RATE, speed=learned.settings.speed)
+    learned.schedule = schedule
+    report = schedule.certify(mass=learned.settings.mass)
+    along = np.linalg.eigvalsh(schedule.stiffness[::_AT_ONCE])
+    return {
+        "type": "schedule",
+        "schedule": schedule,  # for the robot; the page gets the rest
+        "duration": schedule.duration,
+        "stiffness": along.round(1).tolist(),
+        "is_guaranteed": report.stable,
+        "report": str(report),
+    }
+
+
+def picture(controller: DMPController, name: str, *, drawn: bool) -> Answer:
+    """Path, covariances and made movements of a controller, at even times."""
+    times = np.linspace(0.0, controller.duration_, _STEPS)[:, np.newaxis]
+    path, model = controller.predict(times), controller.covariance_
+    covariance = model.predict_cov(times)
+    draws = model.sample_demonstrations(times, _DRAWS, random_state=0) if drawn else np.empty((0, _STEPS, 2))
+    return {
+        "type": "picture",
+        "model": name,
+        "time": times[:, 0].tolist(),
+        "path": path.round(5).tolist(),
+        "covariance": covariance[:, [0, 0, 1], [0, 1, 1]].tolist(),
+        "draws": draws.round(5).tolist(),
+    }
+
+
+def take_home(learned: Learned, name: str) -> bytes:
+    """Content of a file: the strokes, the schedule, or the lines that make the schedule of the strokes."""
+    if name == "skill.py":
+        return _python(learned).encode()
+    if name == "skill.yaml":
+        return _yaml(learned).encode()
+    if learned.schedule is None:
+        follow(learned)
+    assert learned.schedule is not None
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, name)
+        if name == "demonstrations.csv":
+            save_demonstrations(learned.strokes, path)
+        else:
+            learned.schedule.save(path)
+        return path.read_bytes()
+
+
+def read_file(name: str, content: bytes) -> list[Stroke]:
+    """Strokes of a file of demonstrations, .csv or .npz, of two outputs; its name is used for its ending alone."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, f"dropped{Path(name).suffix.lower()}")
+        path.write_bytes(content)
+        demonstrations = load_demonstrations(path)
+    if demonstrations.n_outputs != 2:
+        raise ValueError(f"{name} has {demonstrations.n_outputs} outputs, must have 2: leave the others out.")
+    return [Stroke(each.time - each.time[0], each.position) for each in demonstrations]
+
+
+def _demonstrations(strokes: list[Stroke]) -> Demonstrations:
+    return Demonstrations(
+        [stroke.time for stroke in strokes], [stroke.position for stroke in strokes], names=["x", "y"], units="m"
+    )
+
+
+def _model(name: str) -> Any:
+    """Model of whole movements: by itself, or of a regressor."""
+    return load_class(name)() if name in MOVEMENTS else load_class("TrajectoryRegressor")(load_class(name)())
+
+
+def _controller(covariance: Any, settings: Settings) -> DMPController:
+    law = StiffnessLaw(settings.stiffness_min, settings.stiffness_max, smooth=settings.smooth)
+    return DMPController(
+        covariance, n_steps=_STEPS, stiffness_law=law, mass=settings.mass, damping_ratio=settings.damping_ratio
+    )
+
+
+def _bent(learned: Learned) -> DMPController:
+    controller = next(iter(learned.controllers.values()))
+    if not learned.via:
+        return controller
+    points = np.array(learned.via)
+    return controller.condition(points[:, 0], points[:, 1:])
+
+
+def _left_out(learned: Learned, name: str) -> float:
+    """Mean log-likelihood of left-out strokes under their joint law, in nats a sample."""
+    aligned = learned.strokes.align("phase", n=_STEPS)
+    scores = []
+    for k in range(len(aligned)):
+        train, test = aligned.split([k])
+        scores.append(float(_model(name).fit(train).score_demonstrations(test)[0]) / _STEPS)
+    return float(np.mean(scores))
+
+
+def _python(learned: Learned) -> str:
+    settings, name = learned.settings, next(iter(learned.controllers))
+    model = f"{name}()" if name in MOVEMENTS else f"TrajectoryRegressor({name}())"
+    around = [] if name in MOVEMENTS else ["TrajectoryRegressor"]
+    names = ", ".join(sorted(["DMPController", "load_demonstrations", name, *around]))
+    lines = [
+        f"from torch_pbd import {names}",
+        "from torch_pbd.control import StiffnessLaw",
+        "",
+        'strokes = load_demonstrations("demonstrations.csv", units="m")',
+        f"law = StiffnessLaw({settings.stiffness_min!r}, {settings.stiffness_max!r}, smooth={settings.smooth})",
+        "controller = DMPController(",
+        f"    {model}, n_steps={_STEPS}, stiffness_law=law, mass={settings.mass!r},",
+        f"    damping_ratio={settings.damping_ratio!r},",
+        ").fit(strokes)",
+    ]
+    if learned.via:
+        times = [at for at, *_ in learned.via]
+        lines.append(f"controller = controller.condition({times}, {[list(point) for _, *point in learned.via]})")
+    lines += [
+        f"schedule = controller.schedule(rate={_RATE:g}, speed={settings.speed!r})",
+        f"print(schedule.certify(mass={settings.mass!r}))",
+        'schedule.save("schedule.npz")',
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _yaml(learned: Learned) -> str:
+    settings, name = learned.settings, next(iter(learned.controllers))
+    law = {
+        "class_path": "StiffnessLaw",
+        "init_args": {
+            "stiffness_min": settings.stiffness_min, "stiffness_max": settings.stiffness_max, "smooth": settings.smooth
+        },
+    }  # fmt: skip
+    arguments = {
+        "covariance": {"class_path": name}, "n_steps": _STEPS, "stiffness_law": law, "mass": settings.mass,
+        "damping_ratio": settings.damping_ratio,
+    }  # fmt: skip
+    content = {
+        "data": "demonstrations.csv",
+        "controllers": {"mine": {"class_path": "DMPController", "init_args": arguments}},
+    }
+    return "# torch-pbd experiment --config skill.yaml\n" + str(yaml.safe_dump(content, sort_keys=False))

@@ -1,0 +1,87 @@
+"""The robot of the page: it follows a schedule at 1 kHz, and a spring to the pointer, or the keys, pull at it."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from torch_pbd.control.realtime import RealTimeAdmittance
+from torch_pbd.control.schedule import Schedule
+
+_TICK = 0.001  # s
+_LONGEST = 0.1  # s of ticks at a time: after a page that was hidden the robot goes on from where it stood
+_REST = 0.8  # s at the end, before the movement begins again
+_HAND = 150.0  # N/m of the spring between hand and robot: a hand's own, between relaxed and firm
+_STRONGEST = 25.0  # N: what people push robots with
+
+
+class Robot:
+    """Point that moves as :class:`~torch_pbd.control.realtime.RealTimeAdmittance` says, over and over."""
+
+    def __init__(self) -> None:
+        self._schedule: Schedule | None = None
+        self._controller: RealTimeAdmittance | None = None
+        self._now = self._rest = self._left = 0.0
+
+    def follow(self, schedule: Schedule) -> None:
+        """Take up a schedule from where the robot is, at the same share of the movement."""
+        here, at = None, 0.0
+        if self._controller is not None and self._schedule is not None:
+            here = self._controller.position
+            at = min(1.0, self._controller.schedule_time / self._schedule.duration) * schedule.duration
+        self._schedule = schedule
+        self._controller = RealTimeAdmittance(schedule, soft_start=0.5)
+        self._controller.start(self._now, here, at=at)
+
+    def advance(self, elapsed: float, hand: tuple[float, float] | None, push: tuple[float, float]) -> dict[str, Any]:
+        """State after ``elapsed`` s in which a hand held the robot by a spring, or let go, and keys pushed it.
+
+        Parameters
+        ----------
+        elapsed : float
+            In s, at most 0.1 of which count.
+        hand : (float, float) or None
+            Where the hand is, in m.
+        push : (float, float)
+            Force of the keys, in N.
+
+        Returns
+        -------
+        dict
+            As the page draws it: times in s, positions in m, forces in N, stiffness in N/m as (xx, xy, yy).
+        """
+        controller, schedule = self._controller, self._schedule
+        if controller is None or schedule is None:
+            return {"type": "robot", "is_there": False}
+        self._left += min(elapsed, _LONGEST)
+        force = push
+        while self._left >= _TICK:
+            self._left -= _TICK
+            self._now += _TICK
+            force = _pull(controller.position, hand, push)
+            controller.tick(self._now, force)
+            self._rest = self._rest + _TICK if controller.schedule_time >= schedule.duration else 0.0
+            if self._rest > _REST:
+                self._rest = 0.0
+                controller.start(self._now, controller.position)
+        stiffness = np.asarray(controller.stiffness)
+        return {
+            "type": "robot",
+            "is_there": True,
+            "time": controller.schedule_time,
+            "position": controller.position,
+            "desired": controller.desired_position,
+            "force": force,
+            "stiffness": [stiffness[0, 0], stiffness[0, 1], stiffness[1, 1]],
+            "deviation": math.dist(controller.position, controller.desired_position),
+            "faults": str(controller.faults) if controller.faults else "",
+        }
+
+
+def _pull(position: Any, hand: tuple[float, float] | None, push: tuple[float, float]) -> tuple[float, float]:
+    """Force of the hand's spring and of the keys, no stronger than a person."""
+    x, y = push
+    if hand is not None:
+        x, y = x + _HAND * (hand[0] - position[0]), y + _HAND * (hand[1] - position[1])
+    share = min(1.0, _STRONGEST / (math.hypot(x, y) or 1.0))
+    return share * x, share * y

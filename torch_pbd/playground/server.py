@@ -1,0 +1,235 @@
+"""The page's server: loopback only, one secret address, small messages; the robot moves as frames are asked for."""
+
+import asyncio
+import contextlib
+import json
+import secrets
+import socket
+import time
+import webbrowser
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.responses import FileResponse, PlainTextResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from torch_pbd.console import say
+from torch_pbd.playground import messages
+from torch_pbd.playground.robot import Robot
+from torch_pbd.playground.worker import Worker
+
+_PAGE = Path(__file__).with_name("page")
+_TABS = 4  # open at a time
+_PATIENCE = 60.0  # s for a file to be made
+_LOOPBACK = "127.0.0.1"
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'self'; frame-ancestors 'none'",
+    "Cache-Control": "no-store",
+    "Referrer-Policy": "no-referrer",  # the address is the secret
+    "X-Content-Type-Options": "nosniff",
+}
+
+
+class Tab:
+    """One page in a browser: its robot, and the socket that answers go to."""
+
+    def __init__(self, page: WebSocket, worker: Worker, number: int) -> None:
+        self._page, self._worker, self._number = page, worker, number
+        self._robot, self._last = Robot(), time.perf_counter()
+
+    async def answer(self, message: dict[str, Any]) -> None:
+        """Do what a message asks for; a ValueError says what is wrong with it."""
+        kind = message["type"]
+        if kind == "frame":
+            await self._frame(message)
+        elif kind == "learn":
+            settings = messages.as_settings(message.get("settings", {}))
+            self._ask(type="learn", strokes=messages.as_strokes(message.get("strokes")), settings=settings)
+        elif kind == "adjust":
+            self._ask(type="adjust", settings=messages.as_settings(message.get("settings", {})))
+        elif kind == "bend":
+            self._ask(type="bend", points=messages.as_points(message.get("points")), follow=bool(message.get("follow")))
+        elif kind == "read":
+            name, content = messages.as_file(message)
+            self._ask(type="read", name=name, content=content)
+        else:
+            raise ValueError(f"the page asks for {kind!r:.40}, which is not known here")
+
+    async def deliver(self, answer: dict[str, Any]) -> None:
+        """Hand an answer of the worker on to the page, and its schedule to the robot."""
+        follow = answer.pop("then", None)
+        if "schedule" in answer:
+            self._robot.follow(answer.pop("schedule"))
+        await self.send(answer)
+        if follow is not None:
+            await self.deliver(follow)
+
+    async def send(self, answer: dict[str, Any]) -> None:
+        """Send to the page, if it is still there."""
+        with contextlib.suppress(RuntimeError, WebSocketDisconnect):
+            await self._page.send_text(json.dumps(answer))
+
+    def _ask(self, **request: Any) -> None:
+        self._worker.ask(self._number, request)
+
+    async def _frame(self, message: dict[str, Any]) -> None:
+        hand = messages.as_pair(message.get("hand"), "hand", 10.0)
+        push = messages.as_pair(message.get("push"), "push", 100.0)
+        now = time.perf_counter()
+        elapsed, self._last = now - self._last, now
+        if message.get("is_paused"):
+            elapsed = 0.0
+        state = self._robot.advance(elapsed, hand, push or (0.0, 0.0))
+        await self.send({**state, "frame": message.get("frame")})
+
+
+class Playground:
+    """All pages of one server, its worker, and its secret.
+
+    Parameters
+    ----------
+    port : int
+        That the server listens at, on the loopback interface.
+    """
+
+    def __init__(self, port: int) -> None:
+        self.token = secrets.token_urlsafe(16)
+        self._hosts = {f"{name}:{port}" for name in (_LOOPBACK, "localhost")}
+        self.address = f"http://{_LOOPBACK}:{port}/{self.token}/"
+        self._tabs: dict[int, Tab] = {}
+        self._files: dict[int, asyncio.Future[Any]] = {}
+        self._n_tabs = self._n_files = 0
+
+    def application(self) -> Any:
+        """ASGI application, which refuses what other pages of the same browser send."""
+        routes = [
+            Route("/{token}/", self._page),
+            Route("/{token}/take/{tab:int}/{name}", self._take),
+            Route("/{token}/{name}", self._page),
+            WebSocketRoute("/{token}/live", self._live),
+        ]
+        inner = Starlette(routes=routes, lifespan=self._lifespan)
+
+        async def guarded(scope: Any, receive: Any, send: Any) -> None:
+            if scope["type"] == "lifespan" or self._is_ours(scope):
+                await inner(scope, receive, send)
+            elif scope["type"] == "websocket":
+                await receive()
+                await send({"type": "websocket.close", "code": 1008})
+            else:
+                await PlainTextResponse("refused: not the address that was printed.", 403)(scope, receive, send)
+
+        return guarded
+
+    def _is_ours(self, scope: Any) -> bool:
+        """Whether a request is to our host, of our page, with our secret.
+
+        A page of another site can send requests here, by any name that leads to this machine: its Origin or its Host
+        tell. Sockets have an Origin in every browser.
+        """
+        headers = {key.decode("latin-1").lower(): value.decode("latin-1") for key, value in scope["headers"]}
+        origin = headers.get("origin", "" if scope["type"] == "websocket" else None)
+        is_from_us = origin is None or origin.removeprefix("http://") in self._hosts
+        token = scope["path"].lstrip("/").partition("/")[0]
+        return headers.get("host") in self._hosts and is_from_us and secrets.compare_digest(
+            token.encode(), self.token.encode()
+        )  # fmt: skip
+
+    @contextlib.asynccontextmanager
+    async def _lifespan(self, _: Starlette) -> AsyncIterator[None]:
+        loop = asyncio.get_running_loop()
+
+        def deliver(tab: int, answer: dict[str, Any]) -> None:
+            loop.call_soon_threadsafe(self._deliver, tab, answer)
+
+        self._worker = Worker(deliver)
+        self._sending: set[asyncio.Task[None]] = set()
+        try:
+            yield
+        finally:
+            self._worker.close()
+
+    def _deliver(self, number: int, answer: dict[str, Any]) -> None:
+        if answer["type"] == "file":
+            future = self._files.pop(answer["ask"], None)
+            if future is not None and not future.done():
+                future.set_result(answer)
+            return
+        for tab in [self._tabs[number]] if number in self._tabs else list(self._tabs.values()) * (number == -1):
+            task = asyncio.ensure_future(tab.deliver(dict(answer)))
+            self._sending.add(task)
+            task.add_done_callback(self._sending.discard)
+
+    async def _page(self, request: Request) -> Response:
+        name = request.path_params.get("name", "index.html")
+        if name not in {path.name for path in _PAGE.iterdir()}:
+            raise HTTPException(404)
+        return FileResponse(_PAGE / name, headers=_HEADERS)
+
+    async def _take(self, request: Request) -> Response:
+        name, tab = request.path_params["name"], request.path_params["tab"]
+        if name not in messages.FILES or tab not in self._tabs:
+            raise HTTPException(404)
+        self._n_files += 1
+        future = self._files[self._n_files] = asyncio.get_running_loop().create_future()
+        self._worker.ask(tab, {"type": "take", "name": name, "ask": self._n_files})
+        answer = await asyncio.wait_for(future, _PATIENCE)
+        if "text" in answer:
+            return PlainTextResponse(answer["text"], 409)
+        headers = {**_HEADERS, "Content-Disposition": f'attachment; filename="{name}"'}
+        return Response(answer["content"], media_type="application/octet-stream", headers=headers)
+
+    async def _live(self, page: WebSocket) -> None:
+        await page.accept()
+        if len(self._tabs) >= _TABS:
+            text = f"{_TABS} pages are open already: close one, and reload this."
+            await page.send_text(json.dumps({"type": "error", "text": text}))
+            await page.close()
+            return
+        self._n_tabs += 1
+        number = self._n_tabs
+        tab = self._tabs[number] = Tab(page, self._worker, number)
+        await tab.send({"type": "hello", "tab": number, "models": messages.MODELS, "files": messages.FILES})
+        try:
+            while True:
+                message = await page.receive()
+                if message["type"] == "websocket.disconnect":
+                    break
+                try:
+                    await tab.answer(messages.parse(message.get("text")))
+                except (ValueError, TypeError) as error:
+                    await tab.send({"type": "error", "text": str(error)})
+        finally:
+            del self._tabs[number]
+            self._worker.ask(number, {"type": "close"})
+
+
+def serve(port: int = 0, *, browse: bool = True) -> None:
+    """Serve the page until Ctrl-C.
+
+    Parameters
+    ----------
+    port : int, default=0
+        Of the loopback interface; 0 takes a free one.
+    browse : bool, default=True
+        Open the page in a browser.
+    """
+    with socket.socket() as listening:
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listening.bind((_LOOPBACK, port))
+        listening.listen()  # whoever opens the address before the first request is answered waits
+        playground = Playground(listening.getsockname()[1])
+        say(f"playground: {playground.address}\nCtrl-C ends it.")
+        config = uvicorn.Config(
+            playground.application(), ws="websockets-sansio", ws_max_size=messages.MOST_BYTES, ws_max_queue=64,
+            log_level="error", timeout_graceful_shutdown=1,
+        )  # fmt: skip
+        if browse:
+            webbrowser.open(playground.address)
+        uvicorn.Server(config).run(sockets=[listening])
