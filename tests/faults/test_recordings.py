@@ -291,9 +291,9 @@ CSV = "demo,time,x,y\na,0.0,1,2\na,0.5,3,4\nb,0.0,5,6\nb,0.5,7,8\n"
 @pytest.mark.parametrize(
     ("text", "options", "message"),
     [
-        (CSV.partition("\n")[2], {}, "line 1: no column 'demo' among [a, 0.0, 1, 2]"),  # no header
-        ("", {}, "line 1: no column 'demo'"),
-        ("\n\n" + CSV, {}, "line 1: no column 'demo'"),
+        (CSV.partition("\n")[2], {}, "line 1: no column 'time' among [a, 0.0, 1, 2]"),  # no header
+        ("", {}, "line 1: no column 'time'"),
+        ("\n\n" + CSV, {}, "line 1: no column 'time'"),
         (CSV, {"outputs": ["z"]}, "line 1: no column 'z' among [demo, time, x, y]"),
         (CSV, {"time": "t"}, "line 1: no column 't'"),
         (CSV.replace("0.5", "0,5"), {"decimal": ","}, "line 1: no column"),  # one mark for two things

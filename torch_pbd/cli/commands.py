@@ -3,6 +3,7 @@
 import math
 from argparse import Namespace
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from torch_pbd.cli import options
@@ -41,8 +42,10 @@ _MADE = {
     "n_demos": Option(_Count, 6, "demonstrations to make"),
     "seed": Option(_Seed, 0, "seed of the demonstrations"),
 }
+_DATA = "file or folder of demonstrations, several, or a pattern such as 'trial_*.csv'"
 _FILE = {
-    "data": Option(str | None, None, "file of demonstrations, .npz or .csv; none: made or simulated ones"),
+    "data": Option(str | list[str] | None, None, f"{_DATA}; none: made or simulated ones"),
+    "loader": Option(dict[str, Any] | None, None, "options of load_demonstrations: --loader.outputs [x, y]"),
     "missing": Option(Literal["raise", "drop"], "raise", "of the file's samples: refuse, or leave out"),
     "from_start": Option(bool, False, "count the times of each of the file's demonstrations from 0"),
 }
@@ -56,7 +59,7 @@ OPTIONS: dict[str, dict[str, Option]] = {
     "demo": _MADE,
     "fit": {
         **_FILE,
-        "data": Option(str | None, None, "file of demonstrations, .npz or .csv", required=True),
+        "data": Option(str | list[str] | None, None, _DATA, required=True),
         "model": Option("Model", _MODELS["HGP"], f"estimator {_CLASS_HELP} --model.help NAME"),
         **_GRID,
     },
@@ -167,7 +170,7 @@ def fit(options: Any, folder: Any) -> str:
 
 def experiment(options: Any, folder: Any) -> str:
     """A skill, learned and reproduced on a simulated robot that is pushed."""
-    from torch_pbd.data import load_demonstrations, make_tunnel_demonstrations
+    from torch_pbd.data import make_tunnel_demonstrations
     from torch_pbd.experiments.recordings import describe
     from torch_pbd.experiments.robot import framework_figure, run_robot
 
@@ -177,8 +180,8 @@ def experiment(options: Any, folder: Any) -> str:
             options.n_demos, random_state=options.seed, common_start=options.common_start
         )
     else:
-        demonstrations = load_demonstrations(options.data, missing=options.missing, from_start=options.from_start)
-    say(describe(demonstrations, "tunnel task" if made else options.data.name))
+        demonstrations = _loaded(options)
+    say(describe(demonstrations, "tunnel task" if made else _name(options.data)))
     where = f"along {demonstrations.names[0]}, at 20 % and 80 % of the movement; K is the stiffness there, N/m"
     say(f"pushes of {options.push:g} N {where}\n")
     folder.write_figure(framework_figure(), "figure5_framework")
@@ -211,14 +214,29 @@ def compare(options: Any, folder: Any) -> str:
 WORK = {"demo": demo, "fit": fit, "experiment": experiment, "compare": compare}
 
 
+def _loaded(options: Any) -> Any:
+    from torch_pbd.data import load_demonstrations
+
+    loader = {"missing": options.missing, "from_start": options.from_start, **(options.loader or {})}
+    try:
+        return load_demonstrations(options.data, **loader)
+    except TypeError as error:
+        raise ConfigError(f"loader: {error}") from error
+
+
+def _name(files: Sequence[Path]) -> str:
+    """Where demonstrations come from, in short."""
+    return files[0].name if len(files) == 1 else f"{files[0].name} to {files[-1].name}, {len(files)} files"
+
+
 def _demonstrations(options: Any) -> Any:
     from torch_pbd import checks
-    from torch_pbd.data import check_unimodal, load_demonstrations
+    from torch_pbd.data import check_unimodal
     from torch_pbd.data.alignment import TIMING_REMOVED
     from torch_pbd.experiments.recordings import describe, prepare
 
-    recorded = load_demonstrations(options.data, missing=options.missing, from_start=options.from_start)
-    say(describe(recorded, options.data.name))
+    recorded = _loaded(options)
+    say(describe(recorded, _name(options.data)))
     if len(recorded) == 1:
         checks.warn("There is one demonstration: what varies between demonstrations cannot be told from how one moves.")
     check_unimodal(recorded)

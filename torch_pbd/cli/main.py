@@ -95,9 +95,7 @@ def _run(command: str, arguments: Sequence[str]) -> int:
     from torch_pbd.experiments.run_folder import check_names
 
     if getattr(options, "data", None) is not None:
-        options.data = Path(options.data)
-        if not options.data.is_file():
-            raise ConfigError(f"data: there is no file {str(options.data)!r}; give one with --data FILE.")
+        options.data = _files(options.data)
     for argument in ("models", "controllers"):
         check_names(getattr(options, argument, ()), argument)
     with _run_folder(options.output, command) as folder, warnings.catch_warnings():
@@ -118,6 +116,20 @@ def _run(command: str, arguments: Sequence[str]) -> int:
             raise
     say(f"\nresults: {folder.path}")
     return 0
+
+
+def _files(data: Any) -> list[Path]:
+    """Files of demonstrations, which are there."""
+    from torch_pbd.data.io import find_files
+
+    try:
+        files = find_files(data)
+    except (FileNotFoundError, ValueError) as error:
+        raise ConfigError(f"data: {error}") from error
+    for file in files:
+        if not file.exists():
+            raise ConfigError(f"data: there is no file {str(file)!r}; give one with --data FILE.")
+    return files
 
 
 def _run_folder(path: str, command: str) -> Any:

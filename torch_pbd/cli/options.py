@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, NamedTuple, NoReturn, get_args, get_
 import yaml
 
 from torch_pbd.cli.words import Place, alternatives, described, remedy, shown, unknown, visible
-from torch_pbd.cli.yaml import read_yaml, read_yaml_file
+from torch_pbd.cli.yaml import next_value, read_yaml, read_yaml_file
 from torch_pbd.console import say
 from torch_pbd.exceptions import ConfigError
 from torch_pbd.registry import ESTIMATORS, MOVEMENTS, REGRESSORS
@@ -160,7 +160,7 @@ class _Values:
             elif name == "config" and (equals or rest):
                 self._read_file(text if equals else rest.pop(0))
             elif equals or (rest and not rest[0].startswith("--")):
-                self._set(name, text if equals else rest.pop(0))
+                self._set(name, text if equals else next_value(rest))
             elif name != "config" and self._option(name.split(".")[0], Place(keys=(f"--{name}",))).type is bool:
                 self.values[name] = True
             else:
@@ -199,7 +199,7 @@ def _take(value: Any, hint: Any, place: Place, before: Any = None) -> Any:
         return _take_class(value, table, place, before)
     for part in alternatives(hint):
         if get_origin(part) is dict and isinstance(value, dict) and value:
-            kept = before if isinstance(value, _Dotted) else {}
+            kept = (before or {}) if isinstance(value, _Dotted) else {}
             inner = get_args(part)[1]
             return kept | {key: _take(v, inner, place.below(key), kept.get(key)) for key, v in value.items()}
         if get_origin(part) is list and isinstance(value, list) and value:

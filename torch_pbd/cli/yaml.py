@@ -141,3 +141,11 @@ def _content(loader: _Loader, node: yaml.Node, keys: Keys, lines: dict[Keys, int
         lines[*keys, name] = key.start_mark.line + 1
         content[name] = _content(loader, value, (*keys, name), lines)
     return content
+
+
+def next_value(rest: list[str]) -> str:
+    """Next argument; a list that the shell took apart, as [x, y] without quotes, is one."""
+    text = rest.pop(0)
+    while text.startswith("[") and not text.endswith("]") and any(argument.endswith("]") for argument in rest):
+        text = f"{text} {rest.pop(0)}"
+    return text

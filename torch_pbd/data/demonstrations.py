@@ -10,13 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.data.alignment import check_overlap, interpolate, on_common_phases, times_from_start, unit_phases
-from torch_pbd.data.recordings import MIN_SAMPLES, as_names, as_recordings, as_time_unit, as_units, preview
+from torch_pbd.data.editing import Editing
+from torch_pbd.data.recordings import MIN_SAMPLES, Missing, as_names, as_recordings, as_time_unit, as_units, preview
 from torch_pbd.data.units import find_suspects
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.files.memory import require_much
 
 Alignment = Literal["phase", "dtw"]
-Missing = Literal["raise", "drop"]
 
 MAX_DEFAULT_STEPS = 200
 """Most points `Demonstrations.align` takes of its own accord: dynamic time warping takes time in their square."""
@@ -31,7 +31,7 @@ class Demonstration(NamedTuple):
 
 @final
 @dataclass(frozen=True, init=False, eq=False, repr=False)
-class Demonstrations:
+class Demonstrations(Editing):
     """K recordings of one task, of any lengths and sampling times, with the same d outputs.
 
     The container is immutable: its arrays are read-only float64 copies, and every method returns a new one.

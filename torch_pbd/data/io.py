@@ -1,75 +1,109 @@
 """Demonstrations from files and to files: the doors; each format has its own module, named in one table."""
 
+import difflib
 import inspect
 import os
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType
-from typing import Any
+from typing import Any, Literal
 
 from torch_pbd import checks
-from torch_pbd.data.demonstrations import Demonstrations, Missing
-from torch_pbd.exceptions import DataFormatError
+from torch_pbd.data.demonstrations import Demonstrations
+from torch_pbd.data.recordings import Missing
+from torch_pbd.data.wanted import MAX_BYTES, Wanted, natural
+from torch_pbd.exceptions import ConfigError, DataFormatError
 from torch_pbd.files.atomic import LOADERS, replacing
 from torch_pbd.files.memory import require_memory
 
-MAX_BYTES = 512 * 2**20
+Source = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
+
 # Bytes in memory for each of a file that is read; of a CSV 4.5 are measured, twice that with shorter numbers.
 _COPIES = 10
 
-# Each module has read(path, max_bytes, missing, **options), of which what it raises gets the path here, and
+# Each module has read(path, wanted, **options), of which what it raises gets the path here; two have
 # write(demonstrations, handle). It is imported when a file of its kind is met, and what it needs from extras with it.
-_FORMATS = {".npz": "torch_pbd.data.formats.npz", ".csv": "torch_pbd.data.formats.csv"}
+_FORMATS = {
+    ".npz": "npz.read",
+    ".npy": "npz.read_array_file",
+    ".csv": "csv.read",
+    ".txt": "csv.read",
+    ".tsv": "csv.read",
+}
+_WRITTEN = {".npz": "npz.write", ".csv": "csv.write"}
+_FOLDERS: dict[str, str] = {}
+"""Formats that are folders, by a file that is in them."""
 
 
 def load_demonstrations(
-    path: str | os.PathLike[str],
+    source: Source,
     *,
-    max_bytes: int = MAX_BYTES,
+    outputs: str | Sequence[str] | None = None,
+    demo: str | None = None,
+    time: str | None = None,
+    rotation: None = None,
+    units: str | Sequence[str] | None = None,
+    time_unit: str | None = None,
+    frame: str | None = None,
+    rate: float | None = None,
     missing: Missing = "raise",
+    cut: Literal["pauses"] | Sequence[tuple[float, float]] | None = None,
+    trim: Literal["still"] | None = None,
     from_start: bool = False,
+    max_bytes: int = MAX_BYTES,
     **options: Any,
 ) -> Demonstrations:
-    """Demonstrations from a file, in the format that its suffix says.
+    """Demonstrations from a file, a folder, or several files, in the format that the suffix says.
 
     ``.npz``: either ``t`` (T,) and ``x`` (K, T, d), where all demonstrations share one grid of
     times, or ``t_0`` (T_0,), ``x_0`` (T_0, d), ``t_1``, ``x_1``, ...; and, if it is there, ``meta``, a 0-d
     string with a JSON object, of which ``dims`` (names of the outputs), ``units`` or ``unit``, ``time_unit``
-    or ``t_unit`` and ``frame`` are read, and ``K`` and ``d`` checked. Other arrays are ignored. Pickled
-    objects are never loaded.
+    or ``t_unit`` and ``frame`` are read, and ``K`` and ``d`` checked. Other arrays are ignored. Arrays of other names
+    are (K, T, d), or (T, d) for each recording; their columns are y0, y1, ... or the array's name, _0, _1, ...
+    Pickled objects are never loaded.
 
     ``.csv``: a header, then one line a sample. Lines of different demonstrations may be mixed; each
-    demonstration's own must be in order of time.
+    demonstration's own must be in order of time. Comments (#) may stand above the header.
 
     Parameters
     ----------
-    path : str or path-like
-    max_bytes : int, default=512 MiB
-        Larger files (.npz: unpacked) are refused before they are read.
+    source : str, path-like, or sequence of them
+        A file; a folder; several files or a pattern such as "trial_*.csv", in which demonstrations follow each other.
+        Numbers in the names of a folder or a pattern are sorted as numbers.
+    outputs : str or sequence of str, default=None
+        Columns of the outputs, in the order wanted; None takes what the format means, or all the others, if each has a
+        name, and none is a count of rows (``frame_index``) or a number of its demonstration (``task_index``).
+    demo : str, default=None
+        Column that tells the demonstrations apart, by any text. None takes "demo", if there is such a column; without
+        it a table is one demonstration.
+    time : str, default=None
+        Column of times; None takes "time", or what the format says.
+    rate : float, default=None
+        Samples a second, where the samples are evenly spaced: times are counted from it, and those of the file ignored.
+    units, time_unit, frame
+        As in `Demonstrations`; None takes those in the file, if it holds them. Dates and times of day become seconds
+        from the first of all.
     missing : {"raise", "drop"}, default="raise"
         "drop" leaves out samples with NaN (CSV: and blank cells), and warns of how many, as `Demonstrations` does.
+    cut : "pauses" or sequence of (start, end), default=None
+        Make several demonstrations of one long recording: `Demonstrations.cut`.
+    trim : "still", default=None
+        Leave out what is still at both ends: `Demonstrations.trim`.
     from_start : bool, default=False
         Count the times of each demonstration from its start: `Demonstrations.from_start`.
-    units, time_unit
-        As in `Demonstrations`; None takes those in the file, if it holds them.
-    demo : str or None, default="demo"
-        CSV: column that tells the demonstrations apart, by any text. None: the file is one demonstration.
-    time : str, default="time"
-        CSV: column of times.
-    outputs : sequence of str, default=None
-        CSV: columns of the outputs, in the order wanted; None takes all the others, if each has a name, and none is a
-        count of rows (``frame_index``) or a number of its demonstration (``task_index``).
-    delimiter : str, default=None
-        CSV: None finds it among comma, semicolon and tab.
-    decimal : {".", ","}, default="."
-        CSV: decimal mark.
-    frame
-        CSV: as in `Demonstrations`.
+    rotation : None
+        Rotations are not read yet: name other outputs.
+    max_bytes : int, default=512 MiB
+        Larger files (.npz: unpacked) are refused before they are read.
+    **options
+        Of a format. CSV: ``delimiter`` (None finds it among comma, semicolon and tab), ``decimal`` ("." or ",").
 
     Raises
     ------
     FileNotFoundError
         If there is no such file.
+    ModuleNotFoundError
+        If the format needs a library that is not installed; names the command that does.
     ValueError
         If the suffix is not known, or an option is not as described.
     TypeError
@@ -78,26 +112,77 @@ def load_demonstrations(
         If the file is not what its suffix says; names the array, or the line and the column. Or if it is too large
         for the memory.
     """
-    checks.count(max_bytes, "max_bytes", remedy="the bytes of the largest file to read")
-    file = Path(path)
-    reader = _format(file).read
-    known = list(inspect.signature(reader).parameters)[3:]
-    unknown = [option for option in options if option not in known]
-    if unknown:
-        raise TypeError(f"{file.suffix} files have no option {unknown[0]!r}; they have: {', '.join(known) or 'none'}.")
-    if not file.is_file():
-        raise FileNotFoundError(f"{file} does not exist, or is not a file.")
-    if file.stat().st_size > max_bytes:
-        raise DataFormatError(
-            f"{file} has {file.stat().st_size} bytes, more than max_bytes={max_bytes}: raise it to read this."
-        )
-    try:
-        needed = _COPIES * file.stat().st_size
-        require_memory(needed, what="reading it", remedy="Split the file, or leave samples out.")
-        demonstrations: Demonstrations = reader(file, max_bytes, missing, **options)
-    except (ValueError, TypeError) as error:
-        raise DataFormatError(f"{file}: {error}") from error
+    checks.flag(from_start, "from_start")
+    if rotation is not None:
+        raise checks.refusal(rotation, "rotation", "None", "poses are not learned yet; name outputs= without rotations")
+    wanted = Wanted(
+        outputs=outputs,
+        demo=demo,
+        time=time,
+        units=units,
+        time_unit=time_unit,
+        frame=frame,
+        rate=rate,
+        missing=missing,
+        max_bytes=max_bytes,
+    )
+    each = [_load(file, wanted, options) for file in find_files(source)]
+    demonstrations = each[0] if len(each) == 1 else Demonstrations.concatenate(each)
+    demonstrations = demonstrations if cut is None else demonstrations.cut(cut)
+    demonstrations = demonstrations if trim is None else demonstrations.trim(trim)
     return demonstrations.from_start() if from_start else demonstrations
+
+
+def find_files(source: Source) -> list[Path]:
+    """Files, or folders that are one recording, of a source as `load_demonstrations` takes it.
+
+    Raises FileNotFoundError if there is none of them.
+    """
+    if isinstance(source, Sequence) and not isinstance(source, str):
+        if not source:
+            raise checks.refusal(source, "source", "a path, or a list of some")
+        return [file for entry in source for file in find_files(entry)]
+    path = Path(source)
+    if any(mark in path.name for mark in "*?[") and not path.exists():
+        found = sorted(path.parent.glob(path.name), key=lambda file: natural(file.name))
+        if not found:
+            raise FileNotFoundError(f"{path} matches no file.")
+        return found
+    if not path.is_dir() or _folder_format(path):
+        return [path]
+    within = [file for file in path.iterdir() if file.suffix.lower() in _FORMATS or _folder_format(file)]
+    kinds = sorted({file.suffix.lower() for file in within})
+    if len(kinds) != 1:
+        what = f"files of several formats, {', '.join(kinds)}" if kinds else f"no file of a known format ({_known()})"
+        raise FileNotFoundError(f"the folder {path} has {what}: name those to read, as by {str(path / '*.csv')!r}.")
+    return sorted(within, key=lambda file: natural(file.name))
+
+
+def _load(file: Path, wanted: Wanted, options: dict[str, Any]) -> Demonstrations:
+    reader = _function(file, _FORMATS)
+    known = list(inspect.signature(reader).parameters)[2:]
+    every = [
+        *(n for n, p in inspect.signature(load_demonstrations).parameters.items() if p.kind is p.KEYWORD_ONLY),
+        *known,
+    ]
+    for option in options:
+        if option not in known:
+            close = difflib.get_close_matches(option, every, n=1)
+            meant = f"did you mean {close[0]!r}?" if close else f"they have: {', '.join(every)}."
+            raise TypeError(f"{file.suffix or file.name} files have no option {option!r}; {meant}")
+    if not file.exists():
+        raise FileNotFoundError(f"{file} does not exist, or is not a file.")
+    n_bytes = file.stat().st_size
+    try:
+        if file.is_file() and n_bytes > wanted.max_bytes:
+            raise ValueError(f"it has {n_bytes} bytes, more than max_bytes={wanted.max_bytes}: raise it to read this.")
+        require_memory(_COPIES * n_bytes, what="reading it", remedy="Split the file, or leave samples out.")
+        return Demonstrations(**reader(file, wanted, **options))
+    except (ConfigError, ModuleNotFoundError, MemoryError):
+        raise
+    except Exception as error:  # parsers of bytes that are not what they claim to be raise errors of all kinds
+        what = str(error) if isinstance(error, ValueError | TypeError) else f"{type(error).__name__}: {error}"
+        raise DataFormatError(f"{file}: {what}") from error
 
 
 def save_demonstrations(demonstrations: Demonstrations, path: str | os.PathLike[str]) -> None:
@@ -121,15 +206,26 @@ def save_demonstrations(demonstrations: Demonstrations, path: str | os.PathLike[
         If the folder does not exist.
     """
     file = Path(path)
-    write = _format(file).write
+    write = _function(file, _WRITTEN)
     with replacing(file) as handle:
         write(demonstrations, handle)
 
 
-def _format(file: Path) -> ModuleType:
+def _folder_format(path: Path) -> str | None:
+    """Module of the format that a folder is in, by a file that only such folders have; None for others."""
+    return next((module for mark, module in _FOLDERS.items() if (path / mark).is_file()), None)
+
+
+def _function(file: Path, table: dict[str, str]) -> Callable[..., Any]:
     suffix = file.suffix.lower()
-    if suffix not in _FORMATS:
+    place = _folder_format(file) if table is _FORMATS else None
+    if place is None and suffix not in table:
         raise ValueError(
-            f"{file} has the suffix {file.suffix!r}; known formats of demonstrations: {', '.join(_FORMATS)}. {LOADERS}"
+            f"{file} has the suffix {file.suffix!r}; known formats of demonstrations: {_known(table)}. {LOADERS}"
         )
-    return import_module(_FORMATS[suffix])
+    module, name = (place or table[suffix]).split(".")
+    return getattr(import_module(f"torch_pbd.data.formats.{module}"), name)
+
+
+def _known(table: dict[str, str] = _FORMATS) -> str:
+    return ", ".join(table)

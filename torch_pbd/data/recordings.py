@@ -1,7 +1,7 @@
 """Recordings before they become ``Demonstrations``: rows of finite samples at times that rise, and their labels."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from torch_pbd.checks import Floats
 from torch_pbd.data.units import ANGLES, LENGTHS, TIMES, check_unit, exact, nanoseconds_hint
 from torch_pbd.exceptions import InvalidParameterError, MissingDataWarning
 
+Missing = Literal["raise", "drop"]
 MIN_SAMPLES = 2
 # Times further apart would have infinite durations, and phases of NaN. Quarters have finite differences.
 _LONGEST = 0.25 * float(np.finfo(np.float64).max)
@@ -22,7 +23,7 @@ def as_recordings(times: Any, positions: Any, missing: str) -> tuple[tuple[Float
 
     Messages number the samples as they were before.
     """
-    drop = checks.choice(missing, "missing", ("raise", "drop")) == "drop"
+    drop = checks.choice(missing, "missing", Missing) == "drop"
     samples = [_samples(entry, f"positions[{k}]", drop) for k, entry in enumerate(_as_list(positions, "positions"))]
     grids, shared = _grids(times, len(samples), drop)
     names = ["times" if shared else f"times[{k}]" for k in range(len(grids))]

@@ -5,7 +5,7 @@ import io
 import re
 from array import array
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from math import inf, isfinite, isnan, nan
 from pathlib import Path
@@ -15,47 +15,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torch_pbd import checks
-from torch_pbd.data.demonstrations import Demonstrations, Missing
-from torch_pbd.data.recordings import as_texts, preview
+from torch_pbd.data.demonstrations import Demonstrations
+from torch_pbd.data.recordings import preview
 from torch_pbd.data.units import nanoseconds_hint
+from torch_pbd.data.wanted import Arguments, Chosen, Wanted, rows_of
 from torch_pbd.files.atomic import LOADERS
 
 DELIMITERS = (",", ";", "\t")
 _LONGEST_HEADER = 2**17  # characters, of thousands of columns; a file without line ends would be one header
-_FEWEST_COUNTED = 5  # rows; fewer rise by one by chance
+_MOST_COMMENTS = 1000  # lines before the header
+_MISSING = ("", "nan", "+nan", "-nan", "na", "null", "none")
+_CLOCK = re.compile(r"(?:(\d{4}-\d\d-\d\d)[T ])?(\d{1,2}):(\d\d)(?::(\d\d)(?:[.,](\d{1,9}))?)?(?:Z|\+00:?00)?")
 
 
-def read(
-    path: Path,
-    max_bytes: int,
-    missing: Missing,
-    demo: str | None = "demo",
-    time: str = "time",
-    outputs: Sequence[str] | None = None,
-    delimiter: str | None = None,
-    decimal: str = ".",
-    units: str | Sequence[str] | None = None,
-    frame: str | None = None,
-    time_unit: str = "s",
-) -> Demonstrations:
+def read(path: Path, wanted: Wanted, delimiter: str | None = None, decimal: str = ".") -> Arguments:
     """Read the format of `torch_pbd.data.load_demonstrations`, which describes the options."""
     checks.choice(decimal, "decimal", (".", ","))
-    checks.text(demo, "demo", optional=True)
-    checks.text(time, "time")
-    named = None if outputs is None else as_texts(outputs, "outputs")
     if delimiter is not None and (not isinstance(delimiter, str) or len(delimiter) != 1 or delimiter == decimal):
         raise checks.refusal(delimiter, "delimiter", f"one character, and not the decimal mark {decimal!r}")
-    wanted = [time] if demo is None else [demo, time]
     with path.open(encoding="utf-8-sig", newline="") as file:
         try:
-            table = _open_table(file, delimiter, decimal, missing, wanted)
-            names = table.output_names(named, wanted)
-            times, positions = table.recordings(demo, [time, *names])
+            table = _open_table(file, delimiter, decimal, wanted)
+            times, positions = table.recordings_at_once() or table.recordings()
         except UnicodeDecodeError as error:
             raise ValueError(f"it is not text in UTF-8: {error}.") from error
-    if outputs is None and positions:
-        _check_movements(names, positions)
-    return Demonstrations(times, positions, names=names, units=units, frame=frame, time_unit=time_unit, missing=missing)
+    return wanted.arguments(times if table.chosen.time else None, positions, table.chosen.names)
 
 
 def write(demonstrations: Demonstrations, handle: BinaryIO) -> None:
@@ -78,58 +62,96 @@ class _Table:
 
     file: TextIO
     header: list[str]
+    n_before: int  # lines up to the header
     delimiter: str
     decimal: str
-    missing: Missing
+    chosen: Chosen
+    wanted: Wanted
 
-    def output_names(self, outputs: Sequence[str] | None, taken: Sequence[str]) -> list[str]:
-        """Columns of the outputs, in their order."""
-        names = [name for name in self.header if name not in taken] if outputs is None else list(outputs)
-        if outputs is None and "" in names:
-            raise ValueError(
-                f"line 1: column {self.header.index('') + 1} has no name, as the index of a table that was written "
-                f"without index=False. Leave it out, or say outputs={[*filter(None, names)]}."
+    def recordings_at_once(self) -> tuple[list[NDArray[Any]], list[NDArray[Any]]] | None:
+        """What :meth:`recordings` gives, in a sixth of the time; None where a line needs to be looked at."""
+        start = self.file.tell()
+        first = next(csv.reader([self.file.readline(_LONGEST_HEADER)], delimiter=self.delimiter), [])
+        self.file.seek(start)
+        demo, time, outputs = self._columns()
+        kinds = dict.fromkeys(range(len(self.header)), "S1") | dict.fromkeys(outputs, "f8")
+        if time is not None:
+            if len(first) != len(self.header) or _is_clock(first[time]):
+                return None
+            kinds[time] = "i8" if re.fullmatch(r"[+-]?\d{16,19}", first[time].strip()) else "f8"
+        if demo is not None:
+            kinds[demo] = "S16"
+        lines = self.file if self.decimal == "." else (line.translate({44: ".", 46: "!"}) for line in self.file)
+        try:
+            rows = np.loadtxt(
+                lines,
+                dtype=[(str(i), kinds[i]) for i in range(len(self.header))],
+                delimiter=self.delimiter,
+                quotechar='"',
+                comments=None,
+                ndmin=1,
             )
-        known = set(self.header)
-        absent = [name for name in names if name not in known]
-        if absent or not names:
-            what = f"no column {absent[0]!r}" if absent else "no column of outputs"
-            raise ValueError(f"line 1: {what} among {preview(self.header)}.")
-        return names
+        except ValueError:
+            rows = np.empty(0)
+        self.file.seek(start)
+        if not len(rows):
+            return None
+        labels = np.char.strip(rows[str(demo)]) if demo is not None else np.zeros(len(rows), dtype=bool)
+        lengths = np.char.str_len(labels) if demo is not None else np.ones(1)
+        if not (0 < lengths.min() <= lengths.max() < 16):  # 16: cut short
+            return None
+        groups = rows_of(labels)
+        times = [rows[str(time)][own] if time is not None else np.arange(float(len(own))) for own in groups]
+        positions = [np.column_stack([rows[str(i)][own] for i in outputs]) for own in groups]
+        sound = all(map(np.all, map(np.isfinite, (*times, *positions))))
+        return (times, positions) if sound and all((np.diff(own) > 0).all() for own in times) else None
 
-    def recordings(self, demo: str | None, columns: Sequence[str]) -> tuple[list[NDArray[Any]], list[NDArray[Any]]]:
+    def recordings(self) -> tuple[list[NDArray[Any]], list[NDArray[Any]]]:
         """Times, as integers where all are, and the other columns of each demonstration, as they first appear."""
-        places = {name: place for place, name in enumerate(self.header)}
-        indices = [places[name] for name in columns]
+        demo, time, outputs = self._columns()
         recorded: dict[str, array[float]] = {}
         stamps: dict[str, array[int]] = {}
         last: dict[str, float] = {}
+        n_rows = clocks = 0
         for line, cells in self._rows():
-            label = "" if demo is None else cells[places[demo]].strip()
+            label = "" if demo is None else cells[demo].strip()
             if demo is not None and not label:
-                raise ValueError(f"line {line}, column {demo!r}: the cell is blank.")
-            row = [self._number(cells[i], line, self.header[i]) for i in indices]
-            now, before = _exact_time(cells[indices[0]], row[0]), last.get(label, -inf)
+                raise ValueError(f"line {line}, column {self.header[demo]!r}: the cell is blank.")
+            row = [self._number(cells[i], line, self.header[i]) for i in outputs]
+            before = last.get(label, -inf)
+            now = n_rows if time is None else self._time(cells[time], line, self.header[time])
+            n_rows, clocks = n_rows + 1, clocks + (time is not None and _is_clock(cells[time]))
             if now <= before:
                 raise ValueError(
-                    f"line {line}, column {columns[0]!r}: {now!r} comes after {before!r} in demonstration {label!r}: "
-                    "times must increase strictly. Sort the lines by time and drop repeated ones."
+                    f"line {line}, column {self.header[time or 0]!r}: {now!r} comes after {before!r} in demonstration "
+                    f"{label!r}: times must increase strictly. Sort the lines by time and drop repeated ones"
+                    f"{', or name the column that tells the demonstrations apart, demo=' if demo is None else ''}."
                     f"{nanoseconds_hint(now)}"
                 )
             # Arrays of numbers take 8 bytes for each, where lists take 32.
-            recorded.setdefault(label, array("d")).extend(row)
+            recorded.setdefault(label, array("d")).extend([float(now), *row])
             whole = stamps.setdefault(label, array("q"))
             if isinstance(now, int):
                 whole.append(now)
             last[label] = before if isnan(now) else now
-        rows = {label: np.array(values).reshape(-1, len(columns)) for label, values in recorded.items()}
+        rows = {label: np.array(values).reshape(-1, 1 + len(outputs)) for label, values in recorded.items()}
         times = [np.array(stamps[k]) if len(stamps[k]) == len(values) else values[:, 0] for k, values in rows.items()]
+        if clocks:
+            if clocks < n_rows:
+                raise ValueError(f"column {self.header[time or 0]!r}: {clocks} of {n_rows} times are dates or clocks.")
+            times = [own.astype("M8[ns]") for own in times]
         return times, [values[:, 1:] for values in rows.values()]
+
+    def _columns(self) -> tuple[int | None, int | None, list[int]]:
+        """Numbers of the columns of demonstration, time and outputs."""
+        place, chosen = self.header.index, self.chosen
+        time = None if chosen.time is None else place(chosen.time[0])
+        return None if chosen.demo is None else place(chosen.demo), time, [place(name) for name in chosen.names]
 
     def _rows(self) -> Iterator[tuple[int, list[str]]]:
         reader = csv.reader(self.file, delimiter=self.delimiter)
         while True:
-            line = reader.line_num + 2  # of its beginning: a quoted cell may go on for several
+            line = reader.line_num + self.n_before + 1  # of its beginning: a quoted cell may go on for several
             try:
                 cells = next(reader, None)
             except csv.Error as error:
@@ -144,9 +166,17 @@ class _Table:
             if cells:
                 yield line, cells
 
+    def _time(self, cell: str, line: int, column: str) -> float | int:
+        """Time of a cell: an integer where float64 does not hold it, as of stamps in ns, and of dates and clocks."""
+        if _is_clock(cell):
+            return _clock_ns(cell, line, column)
+        time = self._number(cell, line, column)
+        stamp = int(cell) if abs(time) >= 2**53 and re.fullmatch(r"\s*[+-]?\d{16,19}\s*", cell) else 0
+        return stamp if 2**53 <= abs(stamp) < 2**63 else time
+
     def _number(self, cell: str, line: int, column: str) -> float:
         text, foreign = cell.strip(), "_" if self.decimal == "." else "_."
-        if self.missing == "drop" and text.lower() in ("", "nan", "+nan", "-nan"):
+        if self.wanted.missing == "drop" and text.lower() in _MISSING:
             return nan
         try:
             # Python reads 1_0 as ten.
@@ -157,51 +187,68 @@ class _Table:
             what = f"{text!r} is not a finite number" if text else "the cell is blank"
             raise ValueError(
                 f"line {line}, column {column!r}: {what} (decimal mark {self.decimal!r}). Drop the line "
-                "(missing='drop' does, where the cell is blank or nan), or fill the value in."
+                "(missing='drop' does, where the cell is blank or nan), fill the value in, or leave the column out by "
+                "outputs=."
             )
         return value
 
 
-def _open_table(file: TextIO, delimiter: str | None, decimal: str, missing: Missing, wanted: list[str]) -> _Table:
+def _open_table(file: TextIO, delimiter: str | None, decimal: str, wanted: Wanted) -> _Table:
     """Read the header; the delimiter is the one that finds the columns wanted, and most columns."""
-    first = file.readline(_LONGEST_HEADER)
+    first, n_before = _header_line(file)
     if len(first) == _LONGEST_HEADER:
-        raise ValueError(f"line 1: it is longer than {_LONGEST_HEADER} characters; it must name the columns.")
+        raise ValueError(f"line {n_before}: it is longer than {_LONGEST_HEADER} characters; it must name the columns.")
     candidates = [delimiter] if delimiter else [mark for mark in DELIMITERS if mark != decimal]
     try:
         headers = [[name.strip() for name in next(csv.reader([first], delimiter=c), [])] for c in candidates]
     except csv.Error as error:
-        raise ValueError(f"line 1: {error}.") from error
+        raise ValueError(f"line {n_before}: {error}.") from error
     # A mark that is not the delimiter finds one column, or cuts names that hold it.
-    header = max(headers, key=lambda names: (set(wanted) <= set(names), len(names)))
-    absent = [name for name in wanted if name not in header]
-    if absent:
-        raise ValueError(
-            f"line 1: no column {absent[0]!r} among {preview(header)}. Name the columns by the options demo=, time= "
-            "and outputs= (demo=None: one demonstration), or give the delimiter."
-            f"{' ' + LOADERS if first.startswith('# format:') else ''}"
-        )
+    sought = {name for name in (wanted.demo, wanted.time or "time", *(wanted.outputs or ())) if name is not None}
+    header = max(headers, key=lambda names: (len(sought & set(names)), len(names)))
+    if first.startswith("# format:"):
+        raise ValueError(f"line 1: no columns of demonstrations, but {first.strip()!r:.80}. {LOADERS}")
     twice = [name for name, count in Counter(header).items() if name and count > 1]
     if twice:
-        raise ValueError(f"line 1: there are two columns {twice[0]!r}.")
-    return _Table(file, header, candidates[headers.index(header)], decimal, missing)
+        raise ValueError(f"line {n_before}: there are two columns {twice[0]!r}.")
+    try:
+        chosen = wanted.choose({name: (name,) for name in header}, demo="demo", time="time")
+    except ValueError as error:
+        raise ValueError(f"line {n_before}: {error}") from error
+    if chosen.names and [*filter(_is_number, header)]:
+        raise ValueError(f"line {n_before}: it must name the columns, and has numbers: {preview(header)}.")
+    return _Table(file, header, n_before, candidates[headers.index(header)], decimal, chosen, wanted)
 
 
-def _exact_time(cell: str, time: float) -> float | int:
-    """Time of a cell, an integer where float64 does not hold it, as of stamps in ns."""
-    stamp = int(cell) if abs(time) >= 2**53 and re.fullmatch(r"\s*[+-]?\d{16,19}\s*", cell) else 0
-    return stamp if 2**53 <= abs(stamp) < 2**63 else time
+def _header_line(file: TextIO) -> tuple[str, int]:
+    """The line that names the columns, and its number: the first that is no comment, or the comment above numbers."""
+    comment, number = "", 0
+    while number < _MOST_COMMENTS:
+        here = file.tell()
+        line, number = file.readline(_LONGEST_HEADER), number + 1
+        if not line.startswith(("#", "%")) or line.startswith("# format:"):
+            if comment and _is_number(re.split(r"[,;\t]", line)[0]):
+                file.seek(here)
+                return comment.lstrip("#% "), number - 1
+            return line, number
+        comment = line
+    raise ValueError(f"its first {_MOST_COMMENTS} lines are comments.")
 
 
-def _check_movements(names: Sequence[str], positions: Sequence[NDArray[np.float64]]) -> None:
-    """Refuse columns that count rows or number tasks, which nobody named as outputs."""
-    steps, rows = np.vstack([np.diff(position, axis=0) for position in positions]), np.vstack(positions)
-    for name, step, values in zip(names, steps.T, np.sort(rows, axis=0).T, strict=True):
-        # A count of all rows is so too where rows of several demonstrations are mixed.
-        counts = (step == 1.0).all() or ((step > 0.0).all() and (np.diff(values) == 1.0).all())
-        numbers = name.endswith(("_index", "_id")) and not step.any()
-        if len(values) >= _FEWEST_COUNTED and (values == np.round(values)).all() and (counts or numbers):
-            raise ValueError(
-                f"column {name!r}: it {'counts rows' if counts else 'numbers demonstrations'}, and is no movement. "
-                f"Leave it out, or say which columns are: outputs={[n for n in names if n != name]}."
-            )
+def _is_number(cell: str) -> bool:
+    return re.fullmatch(r"\s*[+-]?[\d.]+(e[+-]?\d+)?\s*", cell, re.IGNORECASE) is not None
+
+
+def _is_clock(cell: str) -> bool:
+    return _CLOCK.fullmatch(cell.strip()) is not None
+
+
+def _clock_ns(cell: str, line: int, column: str) -> int:
+    """Nanoseconds of a date and time of day, since 1970, or of a time of day, since midnight."""
+    day, hours, minutes, seconds, fraction = _CLOCK.fullmatch(cell.strip()).groups()  # type: ignore[union-attr]
+    try:
+        days = int(np.datetime64(day or "1970-01-01", "D").astype(int))
+    except ValueError as error:
+        raise ValueError(f"line {line}, column {column!r}: {error}.") from error
+    whole = days * 86_400 + int(hours) * 3600 + int(minutes) * 60 + int(seconds or 0)
+    return whole * 10**9 + int((fraction or "0").ljust(9, "0"))

@@ -10,18 +10,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torch_pbd import checks
-from torch_pbd.data.demonstrations import Demonstrations, Missing
-from torch_pbd.data.recordings import preview
+from torch_pbd.data.demonstrations import Demonstrations
+from torch_pbd.data.recordings import as_names, as_units, preview
+from torch_pbd.data.wanted import Arguments, Wanted, natural
 from torch_pbd.files.archives import read_array, read_members
 from torch_pbd.files.atomic import LOADERS
 from torch_pbd.files.memory import parsed_bytes, require_memory
 
+_NUMBERED = r"[tx]_(\d+)"
 
-def read(
-    path: Path, max_bytes: int, missing: Missing, units: Any = None, time_unit: str | None = None
-) -> Demonstrations:
+
+def read(path: Path, wanted: Wanted) -> Arguments:
     """Read the format of `torch_pbd.data.load_demonstrations`."""
-    members = read_members(path.read_bytes(), max_bytes, remedy=f"Raise max_bytes={max_bytes} to read it.")
+    members = read_members(
+        path.read_bytes(), wanted.max_bytes, remedy=f"Raise max_bytes={wanted.max_bytes} to read it."
+    )
+    if not ({"meta", "x"} & set(members) or [*members] == ["t"] or any(re.fullmatch(_NUMBERED, m) for m in members)):
+        return _of_laboratory({name: _read(members, name) for name in members}, wanted)
     meta = _read_meta(members)
     # One grid of times for all demonstrations, or a grid for each.
     if "t" in members:
@@ -33,21 +38,71 @@ def read(
         numbers = range(_count(members))
         times = [_read(members, f"t_{k}") for k in numbers]
         positions = [_read(members, f"x_{k}") for k in numbers]
-    # Public recordings say unit and t_unit, with a remark in brackets: "s (100 Hz)".
-    demonstrations = Demonstrations(
-        times,
-        positions,
-        names=meta.get("dims"),
-        units=_units(meta) if units is None else units,
-        frame=_text(meta, "frame"),
-        time_unit=time_unit or _text(meta, "time_unit") or _without_remark(_text(meta, "t_unit")) or "s",
-        alignment=meta.get("alignment"),
-        missing=missing,
-    )
-    for key, count in {"K": len(demonstrations), "d": demonstrations.n_outputs}.items():
+    n_demos, n_outputs = len(positions), np.shape(positions[0])[-1] if len(positions) else 0
+    for key, count in {"K": n_demos, "d": n_outputs}.items():
         if meta.get(key, count) != count:
             raise ValueError(f"meta says {key} = {meta[key]}, but the arrays have {count}.")
-    return demonstrations
+    for option in ("demo", "time", "rate"):
+        if getattr(wanted, option) is not None:
+            raise ValueError(f"{option} is {getattr(wanted, option)!r}, but arrays t and x say it: leave it out.")
+    # Public recordings say unit and t_unit, with a remark in brackets: "s (100 Hz)".
+    found = {
+        "times": times,
+        "positions": positions,
+        "names": meta.get("dims"),
+        "units": _units(meta),
+        "frame": wanted.frame or _text(meta, "frame"),
+        "time_unit": wanted.time_unit or _text(meta, "time_unit") or _without_remark(_text(meta, "t_unit")) or "s",
+        "alignment": meta.get("alignment"),
+        "missing": wanted.missing,
+    }
+    if wanted.outputs is not None:
+        names = as_names(found["names"], n_outputs)
+        outputs = wanted.choose({name: (name,) for name in names}).names
+        kept = [names.index(name) for name in outputs]
+        units = as_units(found["units"], n_outputs)
+        found |= {"positions": [position[:, kept] for position in positions], "names": outputs}
+        found |= {"units": units and [units[i] for i in kept]}
+    return found | ({} if wanted.units is None else {"units": wanted.units})
+
+
+def read_array_file(path: Path, wanted: Wanted) -> Arguments:
+    """Read .npy: one array (T, d), or (K, T, d)."""
+    return _of_laboratory({"y": read_array("it", path.read_bytes())}, wanted)
+
+
+def _of_laboratory(arrays: Mapping[str, NDArray[Any]], wanted: Wanted) -> Arguments:
+    """Arrays by names that mean nothing to us: (K, T, d), or a recording (T, d) each, or columns of one recording."""
+    arrays = {name: array for name, array in arrays.items() if array.dtype.kind in "biuf" and 1 <= array.ndim <= 3}
+    names = sorted(arrays, key=natural)
+    deep = [arrays[name] for name in names if arrays[name].ndim == 3]
+    flat = [name for name in names if arrays[name].ndim == 2]
+    if deep:
+        shape = deep[0].shape[:2]
+        # A grid (T,) that all share, columns (K, T), signals (K, T, d).
+        signals = {n: np.broadcast_to(a, shape) if a.shape == shape[1:] else a for n, a in arrays.items()}
+        signals = {n: a for n, a in signals.items() if a.shape[:2] == shape}
+        recordings = [{name: array[k] for name, array in signals.items()} for k in range(shape[0])]
+    elif flat == names and len({arrays[name].shape[1] for name in names}) == 1:
+        recordings = [{"y": arrays[name]} for name in names]
+    else:
+        recordings = [arrays]
+        if len({len(array) for array in arrays.values()}) != 1:
+            shapes = preview([f"{name} {arrays[name].shape}" for name in names])
+            raise ValueError(
+                f"its arrays fit no layout, (K, T, d), or (T, d) each of equal d, or (T,): {shapes}. {LOADERS}"
+            )
+    columns = {
+        name: (name,)
+        if array.ndim == 1
+        else tuple(f"{name}{'' if name == 'y' else '_'}{i}" for i in range(array.shape[1]))
+        for name, array in recordings[0].items()
+    }
+    time = next((name for name in ("time", "t") if columns.get(name) == (name,)), "time")
+    try:
+        return wanted.read_each(wanted.choose(columns, time=time), recordings)
+    except ValueError as error:
+        raise ValueError(f"{error} {LOADERS}") from error
 
 
 def write(demonstrations: Demonstrations, handle: BinaryIO) -> None:
@@ -99,7 +154,7 @@ def _read_meta(members: Mapping[str, bytes]) -> dict[str, Any]:
 
 
 def _count(names: Iterable[str]) -> int:
-    numbers = {int(match[1]) for name in names if (match := re.fullmatch(r"[tx]_(\d+)", name))}
+    numbers = {int(match[1]) for name in names if (match := re.fullmatch(_NUMBERED, name))}
     if not numbers:
         raise ValueError(f"it has neither arrays t and x nor t_0, x_0, ...; it has: {_listed(names)}. {LOADERS}")
     missing = set(range(len(numbers))) - numbers

@@ -1,0 +1,218 @@
+"""What is wanted of a file, whatever its format: columns by their names, times, units; the one way out of files."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torch_pbd import checks
+from torch_pbd.checks import Floats
+from torch_pbd.data.recordings import Missing, as_texts, preview
+from torch_pbd.files.memory import require_memory
+
+_FEWEST_COUNTED = 5  # rows; fewer rise by one by chance
+MAX_BYTES = 512 * 2**20
+_UNNAMED = ("", "__index_level_0__")  # what pandas calls the index of a table in files
+_DATE_UNITS = {"h": "h", "min": "m", "s": "s", "ms": "ms", "us": "us", "ns": "ns"}
+Arguments = dict[str, Any]
+
+
+class Chosen(NamedTuple):
+    """Columns to read, each as the name of its signal and its place in it; None where there is none."""
+
+    demo: str | None
+    time: tuple[str, int] | None
+    outputs: list[tuple[str, int]]
+    names: list[str]
+
+    @property
+    def signals(self) -> list[str]:
+        """Signals to read, each once."""
+        places = [*([(self.demo, 0)] if self.demo is not None else []), *([self.time] if self.time else [])]
+        return list(dict.fromkeys(signal for signal, _ in (*places, *self.outputs)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wanted:
+    """The options that all formats have, as `torch_pbd.data.load_demonstrations` describes them."""
+
+    outputs: Sequence[str] | None = None
+    demo: str | None = None
+    time: str | None = None
+    rate: float | None = None
+    units: str | Sequence[str] | None = None
+    time_unit: str | None = None
+    frame: str | None = None
+    missing: Missing = "raise"
+    max_bytes: int = MAX_BYTES
+
+    def __post_init__(self) -> None:
+        checks.text(self.demo, "demo", optional=True)
+        checks.text(self.time, "time", optional=True)
+        checks.number(self.rate, "rate", above=0.0, unit="Hz", optional=True)
+        checks.choice(self.missing, "missing", Missing)
+        checks.count(self.max_bytes, "max_bytes", remedy="the bytes of the largest file to read")
+        if self.outputs is not None:
+            object.__setattr__(self, "outputs", as_texts(self.outputs, "outputs"))
+
+    def choose(
+        self,
+        signals: Mapping[str, Sequence[str]],
+        *,
+        demo: str | None = None,
+        time: str | None = None,
+        outputs: str | None = None,
+    ) -> Chosen:
+        """Columns wanted of ``signals``, which give the names of the columns of each.
+
+        A signal of several columns may be named for all of them. ``demo``, ``time`` and ``outputs`` are the signals
+        that the format means by default; an absent one is no fault but of the time, where no ``rate`` is given.
+        """
+        places = {column: (signal, i) for signal, columns in signals.items() for i, column in enumerate(columns)}
+        demo = demo if self.demo is None and demo in places else self.demo
+        time = self.time or time
+        if self.rate is not None:
+            time = time if time in places else None
+        taken = [name for name in (demo, time) if name is not None]
+        names = self._output_names(signals, places, [name for name in taken if name in places], outputs)
+        absent = [name for name in (*taken, *names) if name not in places]
+        if absent or not names:
+            what = f"no column {absent[0]!r}" if absent else "no column of outputs"
+            raise ValueError(
+                f"{what} among {preview([*places])}. Name the columns by the options demo=, time= (or rate=, in Hz, "
+                "where there are no times) and outputs=."
+            )
+        moment = None if time is None or self.rate is not None else places[time]
+        return Chosen(demo, moment, [places[name] for name in names], names)
+
+    def _output_names(
+        self,
+        signals: Mapping[str, Sequence[str]],
+        places: Mapping[str, Any],
+        taken: Sequence[str],
+        default: str | None,
+    ) -> list[str]:
+        wanted = self.outputs if self.outputs is not None or default not in signals else [str(default)]
+        if wanted is not None:
+            return [column for name in wanted for column in ([name] if name in places else signals.get(name, [name]))]
+        names = [name for name in places if name not in taken]
+        unnamed = [name for name in names if name in _UNNAMED]
+        if unnamed:
+            raise ValueError(
+                f"column {list(places).index(unnamed[0]) + 1} has no name, as the index of a table that was written "
+                f"without index=False. Leave it out, or say outputs={[n for n in names if n not in _UNNAMED]}."
+            )
+        return names
+
+    def require(self, n_bytes: float, what: str) -> None:
+        """Refuse what unpacks to more than ``max_bytes`` or than the memory takes, before it is read."""
+        if n_bytes > self.max_bytes:
+            raise ValueError(f"{what} unpacks to {n_bytes:.0f} bytes, more than max_bytes={self.max_bytes}: raise it.")
+        require_memory(3.0 * n_bytes, what=what, remedy="Name fewer outputs=, or split the file.")
+
+    def arguments(
+        self,
+        times: Sequence[NDArray[Any]] | None,
+        positions: Sequence[NDArray[Any]],
+        names: Sequence[str],
+        **labels: Any,
+    ) -> Arguments:
+        """Arguments of ``Demonstrations``, of each recording's arrays; ``labels`` are the file's, if none are given."""
+        if self.outputs is None and positions:
+            check_movements(names, positions)
+        unit = self.time_unit or labels.get("time_unit") or "s"
+        if self.rate is not None:
+            times, unit = [np.arange(len(position)) / self.rate for position in positions], "s"
+        elif times is None:
+            raise ValueError("it holds no times: give rate=, the samples a second (robosuite records 20).")
+        elif times and all(np.asarray(time).dtype.kind in "mM" for time in times):
+            times = _numbers_of_dates(times, checks.choice(unit, "time_unit", _DATE_UNITS))
+        given = {"units": self.units, "frame": self.frame}
+        labels |= {name: value for name, value in given.items() if value is not None}
+        labels |= {"names": names, "time_unit": unit, "missing": self.missing}
+        return {"times": times, "positions": positions, **labels}
+
+    def read_each(self, chosen: Chosen, recordings: Sequence[Mapping[str, NDArray[Any]]], **labels: Any) -> Arguments:
+        """:meth:`arguments` of the signals of each recording."""
+        parts = [self._columns(chosen, signals) for signals in recordings]
+        times = [time for time, _ in parts if time is not None]
+        return self.arguments(times or None, [position for _, position in parts], chosen.names, **labels)
+
+    def read_rows(self, chosen: Chosen, signals: Mapping[str, NDArray[Any]], **labels: Any) -> Arguments:
+        """:meth:`arguments` of a long table, whose rows tell theirs; in the order of their first rows."""
+        demo = np.zeros(len(signals[chosen.signals[0]]), bool) if chosen.demo is None else signals[chosen.demo]
+        each = [{name: values[own] for name, values in signals.items()} for own in rows_of(demo)]
+        return self.read_each(chosen, each, **labels)
+
+    def _columns(self, chosen: Chosen, signals: Mapping[str, NDArray[Any]]) -> tuple[NDArray[Any] | None, NDArray[Any]]:
+        """Times (T,), where there are any, and positions (T, d) of one recording."""
+
+        def column(place: tuple[str, int]) -> NDArray[Any]:
+            values = signals[place[0]]
+            return values if values.ndim == 1 else values[:, place[1]]
+
+        outputs = [column(place) for place in chosen.outputs]
+        for name, values in zip(chosen.names, outputs, strict=True):
+            if values.dtype.kind not in "biuf":
+                raise ValueError(f"column {name!r} holds {values.dtype}, no numbers: leave it out by outputs=.")
+        return column(chosen.time) if chosen.time else None, np.column_stack([o.astype(np.float64) for o in outputs])
+
+
+def _numbers_of_dates(times: Sequence[NDArray[Any]], unit: str) -> list[Floats]:
+    """Times since the first of all, which are exact where dates would not be."""
+    step = np.array(1, dtype=f"m8[{_DATE_UNITS[unit]}]")
+    origin = min((time.min() for time in times), default=None)
+    return [(time - origin).astype("m8[ns]") / step for time in times]
+
+
+def rows_of(demo: NDArray[Any]) -> list[NDArray[np.intp]]:
+    """Numbers of the rows of each demonstration, in the order of their first ones."""
+    if not len(demo):
+        return []
+    # Most tables have a run of rows for each: runs are sorted, not rows.
+    heads = np.flatnonzero(np.r_[True, demo[1:] != demo[:-1]])
+    _, first, inverse = np.unique(demo[heads], return_index=True, return_inverse=True)
+    rank = np.repeat(np.argsort(np.argsort(first))[inverse], np.diff(np.r_[heads, len(demo)]))
+    return np.split(np.argsort(rank, kind="stable"), np.cumsum(np.bincount(rank))[:-1])
+
+
+def check_movements(names: Sequence[str], positions: Sequence[Floats]) -> None:
+    """Refuse columns that count rows or number demonstrations, which nobody named as outputs."""
+    steps, rows = np.vstack([np.diff(position, axis=0) for position in positions]), np.vstack(positions)
+    for name, step, values in zip(names, steps.T, rows.T, strict=True):
+        if len(values) < _FEWEST_COUNTED or not (values == np.round(values)).all():
+            continue
+        # A count of all rows is so too where rows of several demonstrations are mixed.
+        counts = (step == 1.0).all() or ((step > 0.0).all() and (np.diff(np.sort(values)) == 1.0).all())
+        rises = np.flatnonzero(step)
+        # A number of the trial stays for a while, and then is the next one; a gripper that closes goes from 0 to 1.
+        numbers = (name.endswith(("_index", "_id")) and not len(rises)) or (
+            2 <= len(rises) <= len(step) / _FEWEST_COUNTED and (step[rises] == 1.0).all()
+        )
+        if counts or numbers:
+            remedy = f"say which columns are: outputs={[n for n in names if n != name]}"
+            remedy += f", and demo={name!r} if it tells the demonstrations apart" if numbers else ""
+            raise ValueError(
+                f"column {name!r}: it {'counts rows' if counts else 'numbers demonstrations'}, and is no movement. "
+                f"Leave it out, or {remedy}."
+            )
+
+
+def optional(module: str, extra: str, what: str) -> Any:
+    """A library that only some formats need, imported when one of them is read."""
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        package = module.partition(".")[0]
+        raise ModuleNotFoundError(
+            f"{what} is read by {package}, which is not installed: pip install 'torch_pbd[{extra}]'"
+        ) from error
+
+
+def natural(name: str) -> list[tuple[int, str]]:
+    """Key that sorts demo_10 after demo_9."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
