@@ -117,7 +117,8 @@ def test_45_unknown_keys_get_the_nearest_that_is_valid_there(refused, command, t
         (
             "fit",
             "data: 7",
-            "data is the number 7, must be text or null: text that looks like something else stands in quotes.",
+            "data is the number 7, must be text or a list, each entry text or null: text that looks "
+            "like something else stands in quotes.",
         ),
         ("fit", "data: [a, b]", "data is a list, must be text or null."),
         ("fit", "data: a\nalign: dwt", "must be one of auto, none, phase, dtw: did you mean 'dtw'?"),

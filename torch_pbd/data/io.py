@@ -29,9 +29,22 @@ _FORMATS = {
     ".csv": "csv.read",
     ".txt": "csv.read",
     ".tsv": "csv.read",
+    ".parquet": "parquet.read",
+    ".hdf5": "hdf5.read",
+    ".h5": "hdf5.read",
+    ".mat": "mat.read",
+    ".zip": "zarr.read",
+    ".bag": "rosbag.read",
+    ".mcap": "rosbag.read",
+    ".db3": "rosbag.read",
 }
 _WRITTEN = {".npz": "npz.write", ".csv": "csv.write"}
-_FOLDERS: dict[str, str] = {}
+_FOLDERS = {
+    "meta/info.json": "lerobot.read",
+    ".zgroup": "zarr.read",
+    "zarr.json": "zarr.read",
+    "metadata.yaml": "rosbag.read",
+}
 """Formats that are folders, by a file that is in them."""
 
 

@@ -216,3 +216,9 @@ def optional(module: str, extra: str, what: str) -> Any:
 def natural(name: str) -> list[tuple[int, str]]:
     """Key that sorts demo_10 after demo_9."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
+
+
+def column_names(signal: str, n: int) -> tuple[str, ...]:
+    """Names of the columns of a signal that has none for them; those of positions are x, y, z."""
+    is_position = signal.endswith(("pos", "position")) and n in (2, 3)
+    return (signal,) if n == 1 else tuple(f"{signal}_{'xyz'[i] if is_position else i}" for i in range(n))

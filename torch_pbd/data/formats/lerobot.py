@@ -1,0 +1,88 @@
+"""LeRobot's data sets, versions 2 and 3: a folder of Parquet files, and what they hold in meta/."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torch_pbd.data.formats.parquet import read_columns
+from torch_pbd.data.recordings import preview
+from torch_pbd.data.wanted import Arguments, Wanted, column_names, natural, optional, rows_of
+
+_LARGEST_INFO = 2**22  # bytes
+
+
+def read(path: Path, wanted: Wanted) -> Arguments:
+    """Read the format of `torch_pbd.data.load_demonstrations`."""
+    parquet = optional("pyarrow.parquet", "lerobot", f"{path.name}, as all of LeRobot,")
+    info = _read_info(path / "meta" / "info.json")
+    signals = {name: _columns(name, feature) for name, feature in info["features"].items() if _is_number(feature)}
+    chosen = wanted.choose(signals, demo="episode_index", time="timestamp", outputs="observation.state")
+    if wanted.units is None:
+        shown = preview(chosen.names, 6)
+        raise ValueError(
+            f"it does not tell the units of {shown}: give units=, 'deg' or 'rad' of joints, 'percent' where they go "
+            "from -100 to 100, or one for each."
+        )
+    # Several episodes a file in version 3, one in version 2; the numbers in the names are in order.
+    files = sorted((path / "data").rglob("*.parquet"), key=lambda file: natural(file.relative_to(path).as_posix()))
+    if not files:
+        raise ValueError("it has no Parquet files in data/.")
+    parts = []
+    for name in files:
+        with parquet.ParquetFile(name) as file:
+            parts.append(read_columns(file, list(dict.fromkeys(["episode_index", *chosen.signals])), wanted))
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    _check_lengths(path, columns["episode_index"], parquet, wanted)
+    return wanted.read_rows(chosen, columns)
+
+
+def _read_info(path: Path) -> dict[str, Any]:
+    if path.stat().st_size > _LARGEST_INFO:
+        raise ValueError(f"meta/info.json has more than {_LARGEST_INFO} bytes.")
+    info = json.loads(path.read_text(encoding="utf-8"))
+    version = info.get("codebase_version") if isinstance(info, dict) else None
+    if not str(version).startswith(("v2", "v3")) or not isinstance(info.get("features"), dict):
+        raise ValueError(f"meta/info.json is of version {version!s:.20}, must be v2 or v3, with features.")
+    return info
+
+
+def _is_number(feature: Any) -> bool:
+    """Whether a feature is a number or a vector of some, and no image."""
+    return str(feature["dtype"]).startswith(("float", "int", "bool")) and len(feature["shape"]) == 1
+
+
+def _columns(name: str, feature: dict[str, Any]) -> tuple[str, ...]:
+    n, names = feature["shape"][0], feature.get("names")
+    if isinstance(names, dict):  # {"motors": [...]}
+        names = [entry for entries in names.values() for entry in (entries if isinstance(entries, list) else [entries])]
+    # "x" of the state and "x" of the action are two columns.
+    if isinstance(names, list) and len(names) == n > 1:
+        return tuple(f"{name}.{entry}" for entry in names)
+    return column_names(name, n)
+
+
+def _check_lengths(path: Path, episode: Any, parquet: Any, wanted: Wanted) -> None:
+    """Check that the episodes are as long as meta/ says: a missing file would be fewer demonstrations."""
+    found = {int(episode[rows[0]]): len(rows) for rows in rows_of(episode)}
+    said = dict(_said_lengths(path, parquet, wanted))
+    for number in sorted(said.keys() | found.keys()):
+        if said.get(number) != found.get(number) and said:
+            raise ValueError(
+                f"episode {number} has {found.get(number, 0)} samples in data/, but {said.get(number, 0)} by "
+                "meta/episodes: files are missing or cut."
+            )
+
+
+def _said_lengths(path: Path, parquet: Any, wanted: Wanted) -> Iterator[tuple[int, int]]:
+    for name in (path / "meta" / "episodes").rglob("*.parquet"):
+        with parquet.ParquetFile(name) as file:
+            columns = read_columns(file, ["episode_index", "length"], wanted)
+            yield from zip(columns["episode_index"].tolist(), columns["length"].tolist(), strict=True)
+    lines = path / "meta" / "episodes.jsonl"
+    if lines.is_file():
+        for line in lines.read_text(encoding="utf-8").splitlines():
+            entry = json.loads(line)
+            yield int(entry["episode_index"]), int(entry["length"])

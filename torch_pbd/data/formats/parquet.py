@@ -1,0 +1,36 @@
+"""Demonstrations as Parquet: a long table, a row a sample."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from torch_pbd.data.wanted import Arguments, Wanted, optional
+
+
+def read(path: Path, wanted: Wanted) -> Arguments:
+    """Read the format of `torch_pbd.data.load_demonstrations`."""
+    parquet = optional("pyarrow.parquet", "parquet", f"{path.name}, as all of Parquet,")
+    with parquet.ParquetFile(path) as file:
+        chosen = wanted.choose({name: (name,) for name in file.schema_arrow.names}, demo="demo", time="time")
+        return wanted.read_rows(chosen, read_columns(file, chosen.signals, wanted))
+
+
+def read_columns(file: Any, names: Sequence[str], wanted: Wanted) -> dict[str, NDArray[Any]]:
+    """Columns of an open Parquet file by name; lists of one length are rows of a matrix."""
+    metadata = file.metadata
+    groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
+    wanted.require(sum(group.total_byte_size for group in groups), "it")
+    wanted.require(8.0 * metadata.num_rows * len(names), "it")
+    table = file.read(columns=list(names))
+    return {name: _array(table.column(name)) for name in names}
+
+
+def _array(column: Any) -> NDArray[Any]:
+    if hasattr(column.type, "value_type") and not hasattr(column.type, "index_type"):
+        rows, values = len(column), column.combine_chunks().flatten().to_numpy(zero_copy_only=False)
+        if column.null_count or not rows or len(values) % rows:
+            raise ValueError(f"it has lists of {column.type}, which are absent in some rows or differ in length.")
+        return values.reshape(rows, -1)
+    return column.to_numpy()
