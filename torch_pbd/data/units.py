@@ -73,16 +73,21 @@ def nanoseconds_hint(times: Any) -> str:
 
 def find_suspects(positions: Sequence[Floats], names: Sequence[str], units: Sequence[str] | None) -> tuple[str, ...]:
     """Sentences on outputs that are no coordinates, with the remedy; without units, an angle may be in rad or deg."""
-    within = [np.clip(position, -_LARGEST_ANGLE, _LARGEST_ANGLE) for position in positions]
-    return (*_quaternions(np.concatenate(within), names), *_wrapped(within, names, units))
+    return (*_quaternions(positions, names), *_wrapped(positions, names, units))
 
 
-def _quaternions(samples: Floats, names: Sequence[str]) -> Iterator[str]:
-    extent, first = np.ptp(samples, axis=0), 0
+def _column(positions: Sequence[Floats], i: int) -> Floats:
+    """One output of all demonstrations, within what differences can be taken of."""
+    return np.concatenate([position[:, i] for position in positions]).clip(-_LARGEST_ANGLE, _LARGEST_ANGLE)
+
+
+def _quaternions(positions: Sequence[Floats], names: Sequence[str]) -> Iterator[str]:
+    first = 0
     while first + 4 <= len(names):
         four = slice(first, first + 4)
-        off = np.abs(np.square(samples[:, four]).sum(axis=1) - 1.0)
-        spread = extent[four].max()
+        columns = [_column(positions, i) for i in range(first, first + 4)]
+        off = np.abs(sum(map(np.square, columns)) - 1.0)
+        spread = max(map(np.ptp, columns))
         found = spread > 0.0 and np.mean(off <= min(_OFF_SPHERE, _OFF_SPHERE_SHARE * spread)) >= _SAMPLES_ON_SPHERE
         first += 4 if found else 1
         if found:
@@ -94,10 +99,11 @@ def _quaternions(samples: Floats, names: Sequence[str]) -> Iterator[str]:
 
 
 def _wrapped(positions: Sequence[Floats], names: Sequence[str], units: Sequence[str] | None) -> Iterator[str]:
-    steps = np.abs(np.concatenate([np.diff(position, axis=0) for position in positions]))
-    extent = np.ptp(np.concatenate(positions), axis=0)
     known: Sequence[str | None] = units or [None] * len(names)
-    for name, unit, step, whole in zip(names, known, steps.T, extent, strict=True):
+    within = np.cumsum([len(position) for position in positions])[:-1] - 1  # steps from one demonstration to the next
+    for i, (name, unit) in enumerate(zip(names, known, strict=True)):
+        values = _column(positions, i)
+        step, whole = np.delete(np.abs(np.diff(values)), within), np.ptp(values)
         for angle in ANGLES if unit is None else {unit} & set(ANGLES):
             turn = 2.0 * math.pi / ANGLES[angle]
             jumps = np.abs(step - turn) <= _QUARTER * turn

@@ -1,7 +1,7 @@
 """What is wanted of a file, whatever its format: columns by their names, times, units; the one way out of files."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, NamedTuple
@@ -136,7 +136,7 @@ class Wanted:
         labels |= {"names": names, "time_unit": unit, "missing": self.missing}
         return {"times": times, "positions": positions, **labels}
 
-    def read_each(self, chosen: Chosen, recordings: Sequence[Mapping[str, NDArray[Any]]], **labels: Any) -> Arguments:
+    def read_each(self, chosen: Chosen, recordings: Iterable[Mapping[str, NDArray[Any]]], **labels: Any) -> Arguments:
         """:meth:`arguments` of the signals of each recording."""
         parts = [self._columns(chosen, signals) for signals in recordings]
         times = [time for time, _ in parts if time is not None]
@@ -145,7 +145,7 @@ class Wanted:
     def read_rows(self, chosen: Chosen, signals: Mapping[str, NDArray[Any]], **labels: Any) -> Arguments:
         """:meth:`arguments` of a long table, whose rows tell theirs; in the order of their first rows."""
         demo = np.zeros(len(signals[chosen.signals[0]]), bool) if chosen.demo is None else signals[chosen.demo]
-        each = [{name: values[own] for name, values in signals.items()} for own in rows_of(demo)]
+        each = ({name: values[own] for name, values in signals.items()} for own in rows_of(demo))
         return self.read_each(chosen, each, **labels)
 
     def _columns(self, chosen: Chosen, signals: Mapping[str, NDArray[Any]]) -> tuple[NDArray[Any] | None, NDArray[Any]]:
@@ -182,10 +182,11 @@ def rows_of(demo: NDArray[Any]) -> list[NDArray[np.intp]]:
 
 def check_movements(names: Sequence[str], positions: Sequence[Floats]) -> None:
     """Refuse columns that count rows or number demonstrations, which nobody named as outputs."""
-    steps, rows = np.vstack([np.diff(position, axis=0) for position in positions]), np.vstack(positions)
-    for name, step, values in zip(names, steps.T, rows.T, strict=True):
+    for i, name in enumerate(names):
+        values = np.concatenate([position[:, i] for position in positions])
         if len(values) < _FEWEST_COUNTED or not (values == np.round(values)).all():
             continue
+        step = np.concatenate([np.diff(position[:, i]) for position in positions])
         # A count of all rows is so too where rows of several demonstrations are mixed.
         counts = (step == 1.0).all() or ((step > 0.0).all() and (np.diff(np.sort(values)) == 1.0).all())
         rises = np.flatnonzero(step)

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from torch_pbd.data.wanted import Arguments, Wanted, optional
@@ -23,14 +24,18 @@ def read_columns(file: Any, names: Sequence[str], wanted: Wanted) -> dict[str, N
     groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
     wanted.require(sum(group.total_byte_size for group in groups), "it")
     wanted.require(8.0 * metadata.num_rows * len(names), "it")
-    table = file.read(columns=list(names))
-    return {name: _array(table.column(name)) for name in names}
+    # Piece by piece: what is packed and unpacked at a time would be several times the numbers.
+    pieces: dict[str, list[NDArray[Any]]] = {name: [] for name in names}
+    for batch in file.iter_batches(columns=list(names), use_threads=False):
+        for name in names:
+            pieces[name].append(_array(batch.column(name)))
+    return {name: np.concatenate(pieces.pop(name) or [np.empty(0)]) for name in names}
 
 
 def _array(column: Any) -> NDArray[Any]:
     if hasattr(column.type, "value_type") and not hasattr(column.type, "index_type"):
-        rows, values = len(column), column.combine_chunks().flatten().to_numpy(zero_copy_only=False)
-        if column.null_count or not rows or len(values) % rows:
+        values = column.flatten().to_numpy(zero_copy_only=False)
+        if column.null_count or len(values) % len(column):
             raise ValueError(f"it has lists of {column.type}, which are absent in some rows or differ in length.")
-        return values.reshape(rows, -1)
-    return column.to_numpy()
+        return values.reshape(len(column), -1).copy()
+    return np.array(column.to_numpy(zero_copy_only=False))

@@ -1,5 +1,6 @@
 """Recordings of ROS: rosbag2 (SQLite or MCAP) and ROS 1 bags; one topic, a sample a message."""
 
+from array import array
 from collections.abc import Callable, Iterator
 from itertools import chain
 from operator import attrgetter
@@ -64,8 +65,10 @@ def read(path: Path, wanted: Wanted, topic: str | None = None, child: str | None
         info = reader.topics[name]
         # A sample is 8 bytes for each of its stamp and, with room for joints, 31 outputs.
         wanted.require(256.0 * info.msgcount, f"topic {name!r}")
-        messages = ((stamp, reader.deserialize(raw, c.msgtype)) for c, stamp, raw in reader.messages(info.connections))
-        return _read_messages(info.msgtype, messages, wanted, child)
+        typestore, is_2, kind = reader.typestore, reader.is2, info.msgtype
+        deserialize = typestore.deserialize_cdr if is_2 else typestore.deserialize_ros1
+        messages = ((stamp, deserialize(raw, kind)) for _, stamp, raw in reader.messages(info.connections))
+        return _read_messages(kind, messages, wanted, child)
 
 
 def _topic(topics: dict[str, Any], topic: str | None) -> str:
@@ -98,16 +101,20 @@ def _read_messages(kind: str, messages: Iterator[tuple[int, Any]], wanted: Wante
         raise ValueError("the topic has no messages.")
     signals, units, get = _joints(first[1]) if kind == _JOINTS else _parts(*_PARTS[kind])
     chosen = wanted.choose({**signals, "time": ("time",)}, time="time", outputs=next(iter(signals)))
-    row = get(chosen.outputs)
-    stamps, rows = [], []
+    row, has_header = get(chosen.outputs), hasattr(first[1], "header")
+    # Arrays of numbers take 8 bytes for each, where lists of tuples take 60.
+    stamps, rows = array("q"), array("d")
     for stamp, message in chain([first], messages):
-        header = getattr(message, "header", None)
-        stamps.append(stamp if header is None else header.stamp.sec * 10**9 + header.stamp.nanosec)
-        rows.append(row(message))
-    times, positions = _in_order(np.array(stamps, dtype="M8[ns]"), np.array(rows, dtype=np.float64))
+        if has_header:
+            time = message.header.stamp
+            stamp = time.sec * 10**9 + time.nanosec
+        stamps.append(stamp)
+        rows.extend(row(message))
+    positions = np.array(rows).reshape(len(stamps), len(chosen.names))
+    times, positions = _in_order(np.array(stamps).view("M8[ns]"), positions)
     frame = getattr(getattr(first[1], "header", None), "frame_id", "") or None
     labels = {"units": [units[signal] for signal, _ in chosen.outputs], "frame": frame}
-    return wanted.arguments([times], [positions.reshape(len(times), -1)], chosen.names, **labels)
+    return wanted.arguments([times], [positions], chosen.names, **labels)
 
 
 def _of_child(messages: Iterator[tuple[int, Any]], child: str | None) -> Iterator[tuple[int, Any]]:
@@ -135,7 +142,8 @@ def _parts(kind: str, part: str) -> tuple[dict[str, tuple[str, ...]], dict[str, 
 
     def get(places: list[tuple[str, int]]) -> Callable[[Any], Any]:
         paths = [".".join(filter(None, (part, fields[s].path, fields[s].components[i]))) for s, i in places]
-        return attrgetter(*paths)
+        get_all = attrgetter(*paths)
+        return get_all if len(paths) > 1 else lambda message: (get_all(message),)
 
     return signals, {name: field.unit for name, field in fields.items()}, get
 
