@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from torch_pbd.data import (
+    make_handwriting_demonstrations,
     make_paper_simulation,
     make_tunnel_demonstrations,
     paper_covariance,
@@ -61,7 +62,14 @@ def test_paper_arguments_are_checked():
         make_paper_simulation(n_demos=0)
 
 
-@pytest.mark.parametrize("make", [make_paper_simulation, lambda **seed: make_tunnel_demonstrations(**seed).stack()])
+@pytest.mark.parametrize(
+    "make",
+    [
+        make_paper_simulation,
+        lambda **seed: make_tunnel_demonstrations(**seed).stack(),
+        lambda **seed: make_handwriting_demonstrations(timing=0.0, **seed).stack(),
+    ],
+)
 @pytest.mark.parametrize("seeded", [lambda: 3, lambda: np.random.default_rng(3), lambda: np.random.RandomState(3)])
 def test_draws_depend_on_their_seed_only(make, seeded):
     before = np.random.get_state()[1].copy()  # noqa: NPY002

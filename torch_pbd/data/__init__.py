@@ -1,6 +1,7 @@
 """Demonstrations: the container, files, alignment, and made ones."""
 
 from torch_pbd.data.demonstrations import Demonstrations
+from torch_pbd.data.handwriting import handwriting_covariance, handwriting_mean, make_handwriting_demonstrations
 from torch_pbd.data.io import load_demonstrations, save_demonstrations
 from torch_pbd.data.synthetic import (
     make_paper_simulation,
@@ -15,7 +16,10 @@ from torch_pbd.data.unimodality import check_unimodal
 __all__ = [
     "Demonstrations",
     "check_unimodal",
+    "handwriting_covariance",
+    "handwriting_mean",
     "load_demonstrations",
+    "make_handwriting_demonstrations",
     "make_paper_simulation",
     "make_tunnel_demonstrations",
     "paper_covariance",

@@ -84,7 +84,7 @@ def make_paper_simulation(
     require_much(80.0 * n_inputs * n_demos, what=f"n_inputs={n_inputs}, n_demos={n_demos}", remedy="Make fewer.")
     xi = np.linspace(-100.0, 100.0, n_inputs)
     scale = np.sqrt(np.diagonal(paper_covariance(xi, reading), axis1=1, axis2=2))
-    y = paper_mean(xi) + scale * _generator(random_state).normal(size=(n_demos, n_inputs, 2))
+    y = paper_mean(xi) + scale * generator(random_state).normal(size=(n_demos, n_inputs, 2))
     return np.tile(xi, n_demos)[:, np.newaxis], y.reshape(-1, 2), np.repeat(np.arange(n_demos), n_inputs)
 
 
@@ -149,7 +149,7 @@ def make_tunnel_demonstrations(
     checks.number(rate, "rate", above=0.0, unit="Hz")
     checks.number(duration * rate, "duration * rate, the number of steps,", above=0.5)  # rounded, it is one
     require_much(400.0 * n_demos * duration * rate, what=f"n_demos={n_demos}", remedy="Make fewer samples.")
-    random = _generator(random_state)
+    random = generator(random_state)
     lanes = _lanes(n_demos, variant, random)
     times, positions = [], []
     for lane in lanes:
@@ -185,7 +185,7 @@ def _sample_times(duration: float, rate: float, variant: Variant, random: Random
 
 def _tunnel_path(time: Floats, duration: float, lane: float, common_start: bool, random: Random) -> Floats:
     wander, correction, tremor = (
-        _band_noise(time, low, high, random) for low, high in [(0.0, 0.25), (0.25, 1.0), (8.0, 12.0)]
+        band_noise(time, low, high, random) for low, high in [(0.0, 0.25), (0.25, 1.0), (8.0, 12.0)]
     )
     # The lane is between the walls, whatever its noise adds: tanh keeps it within 0.85 of the half-width.
     along = PATH_LENGTH * time / duration
@@ -198,7 +198,7 @@ def _tunnel_path(time: Floats, duration: float, lane: float, common_start: bool,
     return np.column_stack([x, along + _NOISE * random.normal(size=len(time))])
 
 
-def _band_noise(time: Floats, low: float, high: float, random: Random, n_waves: int = 32) -> Floats:
+def band_noise(time: Floats, low: float, high: float, random: Random, n_waves: int = 32) -> Floats:
     """Stationary noise of unit variance with frequencies between ``low`` and ``high``, in Hz.
 
     A sum of cosines with random frequencies and phases, which is exact at any times, evenly spaced or not
@@ -209,7 +209,8 @@ def _band_noise(time: Floats, low: float, high: float, random: Random, n_waves: 
     return np.sqrt(2.0 / n_waves) * np.cos(2.0 * np.pi * np.outer(time, frequency) + shift).sum(axis=1)
 
 
-def _generator(random_state: Seed) -> Random:
+def generator(random_state: Seed) -> Random:
+    """Source of random numbers of a seed; a Generator is taken as it is."""
     return random_state if isinstance(random_state, np.random.Generator) else checks.seed(random_state)
 
 
