@@ -1,16 +1,30 @@
+from dataclasses import replace
+
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 
-from torch_pbd import CholeskyCovRegressor, Demonstrations, DMPController
-from torch_pbd.data import make_paper_simulation
+from torch_pbd import CholeskyCovRegressor, Demonstrations, DMPController, GMMBaseline, ProMPBaseline
+from torch_pbd.data import (
+    handwriting_covariance,
+    handwriting_mean,
+    make_handwriting_demonstrations,
+    make_paper_simulation,
+)
 from torch_pbd.plotting import (
+    DATA,
+    EMPIRICAL,
+    FORCE,
+    MODEL,
+    OTHER,
+    SERIES,
+    TRUTH,
+    MovementDisplay,
     plot_covariance_ellipses,
     plot_demonstrations,
     plot_model_bands,
-    plot_pushes,
     plot_std_band,
-    plot_stiffness,
 )
 
 
@@ -69,18 +83,111 @@ def test_a_model_is_drawn_beyond_the_data_beside_the_empirical_deviations():
     plt.close(figure)
 
 
-@pytest.mark.filterwarnings("ignore:The movement starts at")  # as a random walk does
-def test_pushes_and_stiffness_are_drawn_in_readable_units(rng):
-    recorded = Demonstrations(np.linspace(0.0, 2.0, 50), 0.01 * rng.normal(size=(4, 50, 2)).cumsum(axis=1), units="m")
-    controller = DMPController(CholeskyCovRegressor()).fit(recorded)
-    schedule, run = controller.schedule(100.0), controller.simulate(rate=100.0)
-    figure, axes = plt.subplots(4, 1)
-    plot_pushes(run, schedule, 1, axes[:3], unpushed=run)
-    drawn, dashed = axes[0].get_lines()[:2]
-    np.testing.assert_allclose(drawn.get_ydata(), 1e3 * run.deviation[:, 1])
-    np.testing.assert_allclose(dashed.get_ydata(), drawn.get_ydata())
-    assert axes[0].get_ylabel() == "y1 - desired [mm]"
-    lines = plot_stiffness(schedule, axes[3])
-    np.testing.assert_allclose(lines[1].get_ydata(), schedule.stiffness[:, 1, 1])
-    assert axes[3].get_ylabel() == "stiffness [N/m]"
-    plt.close(figure)
+@pytest.fixture(scope="module")
+def strokes():
+    return make_handwriting_demonstrations(timing=0.0, rate=25.0, random_state=0)
+
+
+@pytest.fixture(scope="module")
+def run(strokes):
+    controller = DMPController(GMMBaseline()).fit(strokes)
+    schedule = controller.schedule(100.0)
+    force = np.zeros_like(schedule.position)
+    force[50:80, 1] = 2.0
+    return schedule, controller.simulate(force=force, rate=100.0), controller.simulate(rate=100.0)
+
+
+@pytest.fixture(autouse=True)
+def no_figure_is_left():
+    yield
+    plt.close("all")
+
+
+def labelled(figure):
+    """Colours and dashes of the legend of a figure."""
+    return {(to_rgb(line.get_color()), line.get_linestyle()) for line in figure.legends[0].get_lines()}
+
+
+def drawn(figure):
+    lines = [line for ax in figure.axes for line in ax.lines if line.get_zorder() > 0]
+    return {(to_rgb(line.get_color()), line.get_linestyle()) for line in lines}
+
+
+def test_pushes_and_stiffness_are_drawn_in_readable_units(run):
+    schedule, pushed, unpushed = run
+    axes = pushed.plot(unpushed=unpushed, names=schedule.names)
+    expected = [1e3 * pushed.deviation, pushed.force, np.diagonal(pushed.stiffness, axis1=1, axis2=2)]
+    for ax, columns, label in zip(
+        axes, expected, ["deviation [mm]", "external force [N]", "stiffness [N/m]"], strict=True
+    ):
+        np.testing.assert_allclose(np.stack([line.get_ydata() for line in ax.lines[:2]], axis=1), columns)
+        assert ax.get_ylabel() == label
+    np.testing.assert_allclose(axes[0].lines[3].get_ydata(), 1e3 * unpushed.deviation[:, 1])
+    *_, spread, stiffness = schedule.plot()
+    np.testing.assert_allclose(spread.lines[1].get_ydata() ** 2, 1e6 * schedule.covariance[:, 1, 1], rtol=1e-9)
+    np.testing.assert_allclose(stiffness.lines[1].get_ydata(), schedule.stiffness[:, 1, 1])
+
+
+def test_a_batch_of_runs_is_refused(run):
+    _, pushed, _ = run
+    batch = replace(pushed, position=np.stack([pushed.position] * 3))
+    with pytest.raises(ValueError, match=r"must be of one run, .*take one of the batch"):
+        batch.plot()
+
+
+@pytest.mark.parametrize(("n_outputs", "n_axes", "kind"), [(1, 1, "rectilinear"), (3, 1, "3d"), (7, 7, "rectilinear")])
+def test_demonstrations_of_any_number_of_outputs_are_drawn(n_outputs, n_axes, kind, rng):
+    recorded = Demonstrations(np.arange(5.0), rng.normal(size=(3, 5, n_outputs)), units="mm")
+    axes = np.ravel(recorded.plot())
+    assert [ax.name for ax in axes] == [kind] * n_axes
+    assert axes[-1].get_ylabel() == ("y1 [mm]" if kind == "3d" else f"y{n_outputs - 1} [mm]")
+
+
+def test_outputs_are_given_by_name_or_number_and_others_refused(strokes):
+    assert strokes.plot(["y"]).get_ylabel() == strokes.plot([1]).get_ylabel() == "y [m]"
+    for wrong in (["z"], [2], [], [True, 0.5]):
+        with pytest.raises(ValueError, match=r"outputs is .*must be one to 9 of 'x', 'y', or their numbers"):
+            strokes.plot(wrong)
+
+
+@pytest.mark.parametrize("input", ["time", "phase"])
+def test_a_display_has_the_law_of_the_model(strokes, input):
+    model = GMMBaseline().fit(*strokes.stack(input))
+    display = MovementDisplay.from_estimator(model, strokes, input=input, n_std=1.5, n_ellipses=5)
+    at = np.linspace(0.0, 2.0 if input == "time" else 1.0, 5)
+    mean, covariance = model.predict(at[:, np.newaxis], return_cov=True)
+    for path, centre, matrix in zip(display.ax_.collections[0].get_paths(), mean, covariance, strict=True):
+        away = path.vertices - centre
+        distance = np.einsum("ni,ij,nj->n", away, np.linalg.inv(matrix), away)
+        np.testing.assert_allclose(distance, 1.5**2, rtol=1e-6)
+    band = display.axes_[2].collections[0].get_paths()[0].vertices
+    top = mean[:, 1] + 1.5 * np.sqrt(covariance[:, 1, 1])
+    np.testing.assert_allclose([band[np.isclose(band[:, 0], x), 1].max() for x in at], top, rtol=1e-9)
+
+
+def test_a_display_draws_whole_movements_over_what_they_learned(strokes):
+    model = ProMPBaseline(n_basis=5).fit(make_handwriting_demonstrations(rate=25.0, random_state=0))
+    assert MovementDisplay.from_estimator(model, strokes).axes_[1].get_xlabel() == "phase"
+    with pytest.raises(ValueError, match=r"estimator is .*of a controller take its covariance_"):
+        MovementDisplay.from_estimator(DMPController(), strokes)
+
+
+def test_every_line_of_a_figure_is_in_its_legend(strokes, run):
+    schedule, pushed, unpushed = run
+    model = GMMBaseline().fit(*strokes.stack())
+    truth = handwriting_mean(np.linspace(0, 1, 201)), handwriting_covariance(np.linspace(0, 1, 201))
+    display = MovementDisplay.from_estimator(model, strokes, other=model, names=["a", "b"], truth=lambda _: truth)
+    figures = [
+        strokes.plot().figure,
+        display.figure_,
+        schedule.plot()[0].figure,
+        pushed.plot(unpushed=unpushed)[0].figure,
+    ]
+    for figure in figures:
+        assert drawn(figure) - labelled(figure) == set()
+
+
+def test_one_colour_means_one_thing():
+    colours = [DATA, MODEL, EMPIRICAL, FORCE, TRUTH, OTHER]
+    assert len(set(colours)) == 6
+    assert not set(colours[:4]) & set(SERIES)

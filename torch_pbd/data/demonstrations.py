@@ -278,6 +278,24 @@ class Demonstrations(Editing):
             )
         return self[~held_out], self[held_out]
 
+    def plot(self, outputs: Sequence[int | str] | None = None, *, ax: Any = None) -> Any:
+        """Draw every demonstration: two or three outputs against each other, one or more than three over time.
+
+        Parameters
+        ----------
+        outputs : sequence of int or str, default=None
+            Numbers or names of at most nine outputs; None is the first nine.
+        ax : matplotlib.axes.Axes, default=None
+            None makes a figure of pyplot. Of projection "3d" for three outputs.
+
+        Returns
+        -------
+        matplotlib.axes.Axes, or a list of them
+        """
+        from torch_pbd.plotting import plot_movements  # here: matplotlib takes a while to import
+
+        return plot_movements(self, outputs, ax)
+
     def _replace(self, times: Any, positions: Any, **changes: Any) -> "Demonstrations":
         return _rebuild(times, positions, {**vars(self), **changes})
 

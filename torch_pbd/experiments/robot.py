@@ -21,7 +21,6 @@ from torch_pbd.experiments.resume import FinishedFits, fit_once
 from torch_pbd.experiments.run_folder import RunFolder, format_table, slug
 from torch_pbd.plotting import (
     DATA,
-    EMPIRICAL,
     MODEL,
     draw_edges,
     equal_scales,
@@ -30,7 +29,7 @@ from torch_pbd.plotting import (
     output_label,
     plot_covariance_ellipses,
     plot_demonstrations,
-    plot_pushes,
+    plot_rollout,
     plot_std_band,
     plot_stiffness,
     readable_unit,
@@ -196,7 +195,7 @@ def task_figure(
         some = np.linspace(0.0, controller.duration_, _N_ELLIPSES)
         covariance = controller.covariance_.predict_cov(controller.phase(some))[:, :2, :2]
         centres = controller.reproduction_.motion(some)[0][:, :2]
-        plot_covariance_ellipses(centres, covariance, ax, color=EMPIRICAL, label="inferred: 2 sd")
+        plot_covariance_ellipses(centres, covariance, ax, label="inferred: 2 sd")
     ax.set_title(name, fontsize=10)
     if in_plane and not in_tunnel:
         equal_scales(ax)
@@ -237,15 +236,16 @@ def variability_figure(run: Run, demonstrations: Demonstrations, name: str) -> F
         name_of = demonstrations.names[output]
         ax.set_ylabel(output_label(demonstrations, output) if in_position else f"forcing {name_of}")
     plot_stiffness(run.schedule.resample(200.0 / controller.duration_), axes[-1])
-    axes[-1].legend(fontsize=8, ncols=3)
     axes[0].set_title(name, fontsize=10)
-    legend_below(figure, axes[0])
+    legend_below(figure, [axes[0], axes[-1]])
     return figure
 
 
 def pushes_figure(run: Run, name: str) -> Figure:
     """Deviation, force and stiffness along the first output over time: Figure 8."""
     figure, axes = figure_grid(3, 1, (6.4, 6.0), sharex=True)
-    plot_pushes(run.rollout, run.schedule, 0, axes[:, 0], unpushed=run.unpushed)
+    names, unit = schedule_names(run.schedule), run.schedule.units
+    plot_rollout(run.rollout, axes[:, 0], outputs=[0], names=names, unit=unit, unpushed=run.unpushed)
     axes[0, 0].set_title(name, fontsize=10)
+    legend_below(figure, axes[:, 0])
     return figure

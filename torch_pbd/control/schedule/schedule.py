@@ -223,6 +223,12 @@ class Schedule:
         )
         return replace(self, stiffness=stiffness, damping=damping), loss
 
+    def plot(self) -> Any:
+        """Draw motion, standard deviation and stiffness; returns the list of matplotlib Axes of a new figure."""
+        from torch_pbd.plotting import plot_schedule  # here: it needs matplotlib, a schedule does not
+
+        return plot_schedule(self)
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write one file, in the format of its suffix: .npz, .json or .csv.
 

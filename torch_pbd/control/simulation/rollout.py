@@ -1,5 +1,6 @@
 """A simulated run: states, forces and gains over time."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, final
 
@@ -55,6 +56,29 @@ class Rollout:
         """The run as NumPy arrays, on the CPU."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         return Rollout(**{k: v.detach().cpu().numpy() if isinstance(v, Tensor) else v for k, v in values.items()})
+
+    def plot(self, *, unpushed: "Rollout | None" = None, names: Sequence[str] | None = None) -> Any:
+        """Draw deviation, external force and stiffness over time, below each other in a new figure.
+
+        Parameters
+        ----------
+        unpushed : Rollout, default=None
+            The same run without pushes, drawn behind.
+        names : sequence of d str, default=None
+            Names of the outputs; None calls them y0, y1, ...
+
+        Returns
+        -------
+        list of three matplotlib Axes
+
+        Raises
+        ------
+        ValueError
+            If this is a batch of runs.
+        """
+        from torch_pbd.plotting import plot_pushes  # here: it needs matplotlib, a run does not
+
+        return plot_pushes(self, unpushed, names)
 
     @property
     def deviation(self) -> Any:

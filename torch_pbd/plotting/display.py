@@ -1,0 +1,291 @@
+"""Whole figures: what a model learned of a movement, demonstrations, schedules."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, Self, final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from torch_pbd import checks
+from torch_pbd.checks import Floats
+from torch_pbd.plotting.parts import (
+    draw_edges,
+    plot_covariance_ellipses,
+    plot_demonstrations,
+    plot_outputs,
+    plot_rollout,
+    plot_std_band,
+    plot_stiffness,
+)
+from torch_pbd.plotting.style import (
+    MODEL,
+    OTHER,
+    TRUTH,
+    chosen_outputs,
+    equal_scales,
+    legend_below,
+    mark_ends,
+    readable_unit,
+    schedule_names,
+    short_unit,
+    shown_figure,
+    time_label,
+)
+
+Law = tuple[Floats, Floats]
+"""Means (n, d) and covariances (n, d, d) over a grid of n times."""
+
+_N_STEPS = 201  # of the grid: bands and paths look smooth
+_MOST = 9  # outputs, in a grid of 3 x 3
+_COLORS = (MODEL, OTHER)
+
+
+@final
+class MovementDisplay:
+    """What models learned of a movement: bands over time, and ellipses along the path of two outputs.
+
+    It is made by `from_estimator`; `plot` draws it again.
+
+    Parameters
+    ----------
+    demonstrations : Demonstrations
+        Drawn behind, grey.
+    grid : ndarray of shape (n,)
+        Times or phases.
+    laws : dict of str to (ndarray of shape (n, d), ndarray of shape (n, d, d))
+        Mean and covariance by the name of the model, one or two; the first is blue.
+    truth : (ndarray of shape (n, d), ndarray of shape (n, d, d)), default=None
+        Where it is known: dashed, black.
+    outputs : list of int, default=None
+        Outputs to draw; None is the first nine.
+    input : {"time", "phase"}, default="time"
+    n_std : float, default=2.0
+        Half the width of bands and ellipses, in standard deviations.
+    n_ellipses : int, default=21
+
+    Attributes
+    ----------
+    figure_ : matplotlib.figure.Figure
+    ax_ : matplotlib.axes.Axes
+        The path of two or three outputs; of other numbers the first band.
+    axes_ : list of matplotlib.axes.Axes
+        All of them, ``ax_`` first.
+
+    Examples
+    --------
+    >>> from torch_pbd import GMMBaseline
+    >>> from torch_pbd.data import make_handwriting_demonstrations
+    >>> from torch_pbd.plotting import MovementDisplay
+    >>> strokes = make_handwriting_demonstrations(timing=0.0, rate=25.0, random_state=0)
+    >>> display = MovementDisplay.from_estimator(GMMBaseline().fit(*strokes.stack()), strokes)
+    >>> [ax.get_ylabel() for ax in display.axes_]
+    ['y [m]', 'x [m]', 'y [m]']
+    """
+
+    def __init__(
+        self,
+        demonstrations: Any,
+        grid: Floats,
+        laws: dict[str, Law],
+        *,
+        truth: Law | None = None,
+        outputs: Sequence[int | str] | None = None,
+        input: Literal["time", "phase"] = "time",
+        n_std: float = 2.0,
+        n_ellipses: int = 21,
+    ) -> None:
+        self.demonstrations = demonstrations
+        self.grid = grid
+        self.laws = laws
+        self.truth = truth
+        self.outputs = chosen_outputs(outputs, demonstrations.names, _MOST)
+        self.input = input
+        self.n_std = checks.number(n_std, "n_std", above=0.0)
+        self.n_ellipses = checks.count(n_ellipses, "n_ellipses", most=_N_STEPS)
+
+    @classmethod
+    def from_estimator(
+        cls,
+        estimator: Any,
+        demonstrations: Any,
+        *,
+        other: Any = None,
+        names: Sequence[str] | None = None,
+        truth: Callable[[Floats], Law] | None = None,
+        input: Literal["auto", "time", "phase"] = "auto",
+        ax: Axes | None = None,
+        **options: Any,
+    ) -> Self:
+        """Draw what a fitted model learned of demonstrations.
+
+        Parameters
+        ----------
+        estimator : fitted covariance regressor, or model of whole movements
+            Of one input, time or phase.
+        demonstrations : Demonstrations
+        other : the same, default=None
+            A second model, on the same axes.
+        names : sequence of str, default=None
+            Names of the models; None takes those of their classes.
+        truth : callable, default=None
+            Maps the grid (n,) to (mean, covariance), where the truth is known.
+        input : {"auto", "time", "phase"}, default="auto"
+            What the model was fitted on. "auto" is what a model of whole movements learned over, and time for others.
+        ax : matplotlib.axes.Axes, default=None
+            Draws the path, or the band of one output, there only. None makes a figure.
+        **options
+            ``outputs`` (numbers or names), ``n_std`` and ``n_ellipses`` of `MovementDisplay`.
+
+        Returns
+        -------
+        MovementDisplay
+        """
+        models = [model for model in (estimator, other) if model is not None]
+        for model in models:
+            if not hasattr(model, "predict_cov"):
+                remedy = "of a controller take its covariance_"
+                raise checks.refusal(model, "estimator", "a covariance regressor or model of movements", remedy)
+        names = names or [type(model).__name__ for model in models]
+        checks.choice(input, "input", ("auto", "time", "phase"))
+        of_model: Any = getattr(estimator, "input_", "time") if input == "auto" else input
+        times = demonstrations.stack(of_model)[0]
+        grid = np.linspace(times.min(), times.max(), _N_STEPS)
+        d = demonstrations.n_outputs
+        laws = {}
+        for name, model in zip(names, models, strict=True):
+            mean, covariance = model.predict(grid[:, np.newaxis], return_cov=True)
+            laws[name] = np.reshape(mean, (-1, d)), covariance
+        known = None if truth is None else truth(grid)
+        return cls(demonstrations, grid, laws, truth=known, input=of_model, **options).plot(ax)
+
+    def plot(self, ax: Axes | None = None) -> Self:
+        """Draw into ``ax``, the path or the band of one output only, or into a new figure."""
+        shown = self.outputs
+        in_space = len(shown) in (2, 3)
+        if ax is not None:
+            self.axes_: list[Any] = [ax]
+            if not in_space:
+                self._plot_band(ax, shown[0])
+        else:
+            figure, plane, bands = _panels(len(shown), n_space=len(shown) if in_space else 0)
+            for band, output in zip(bands, shown, strict=True):
+                self._plot_band(band, output)
+            self.axes_ = plane + bands
+        self.ax_ = self.axes_[0]
+        self.figure_ = self.ax_.figure
+        if in_space:
+            self._plot_path(self.ax_)
+        if ax is None:
+            legend_below(figure, self.axes_)
+        return self
+
+    def _plot_band(self, ax: Axes, output: int) -> None:
+        time_unit = "1" if self.input == "phase" else self.demonstrations.time_unit
+        plot_demonstrations(
+            self.demonstrations if self.input == "time" else _in_phase(self.demonstrations), [output], ax
+        )
+        for (name, (mean, covariance)), color in zip(self.laws.items(), _COLORS, strict=False):
+            std = np.sqrt(covariance[:, output, output])
+            plot_std_band(self.grid, mean[:, output], std, ax, n_std=self.n_std, color=color, label=self._label(name))
+        if self.truth is not None:
+            mean, covariance = self.truth
+            std = 0.5 * self.n_std * np.sqrt(covariance[:, output, output])
+            draw_edges(self.grid, mean[:, output], std, ax, f"truth: {self.n_std:g} sd", TRUTH)
+        ax.set_xlabel(time_label(time_unit))
+        ax.margins(x=0.0)
+
+    def _plot_path(self, ax: Any) -> None:
+        plot_demonstrations(self.demonstrations, self.outputs, ax)
+        for (name, law), color in zip(self.laws.items(), _COLORS, strict=False):
+            ax.plot(*law[0].T[self.outputs], color=color, lw=1.5, label=self._label(name), zorder=3)
+            self._plot_ellipses(ax, law, color)
+        if self.truth is not None:
+            self._plot_ellipses(ax, self.truth, TRUTH, "--")
+        mean, _ = next(iter(self.laws.values()))
+        mark_ends(ax, mean[:, self.outputs])
+        equal_scales(ax)
+
+    def _plot_ellipses(self, ax: Any, law: Law, color: str, linestyle: str = "-") -> None:
+        if len(self.outputs) != 2:
+            return
+        some = np.linspace(0, len(self.grid) - 1, self.n_ellipses).round().astype(int)
+        mean, covariance = law[0][some][:, self.outputs], law[1][some][:, self.outputs][:, :, self.outputs]
+        plot_covariance_ellipses(mean, covariance, ax, n_std=self.n_std, color=color, linestyle=linestyle)
+
+    def _label(self, name: str) -> str:
+        return f"{name}: mean, {self.n_std:g} sd"
+
+
+def plot_movements(demonstrations: Any, outputs: Sequence[int | str] | None = None, ax: Axes | None = None) -> Any:
+    """Draw demonstrations: what `Demonstrations.plot` does."""
+    shown = chosen_outputs(outputs, demonstrations.names, _MOST)
+    in_space = len(shown) in (2, 3)
+    figure: Figure | None = None
+    axes: list[Any] = [ax]
+    if ax is None:
+        figure, plane, bands = _panels(0 if in_space else len(shown), n_space=len(shown) if in_space else 0)
+        axes = plane or bands
+    for panel, panel_outputs in zip(axes, [shown] if in_space else [[output] for output in shown], strict=True):
+        plot_demonstrations(demonstrations, panel_outputs, panel)
+        for k, (time, position) in enumerate(demonstrations):
+            drawn = position[:, shown] if in_space else np.column_stack([time, position[:, panel_outputs]])
+            mark_ends(panel, drawn, label=k == 0)
+        if in_space:
+            equal_scales(panel)
+    if figure is not None:
+        legend_below(figure, axes)
+    return axes[0] if len(axes) == 1 else axes
+
+
+def plot_schedule(schedule: Any) -> list[Axes]:
+    """Draw a schedule: what `Schedule.plot` does."""
+    figure, plane, bands = _panels(3 - (schedule.n_outputs == 2), n_space=2 if schedule.n_outputs == 2 else 0)
+    names, (unit, scale) = schedule_names(schedule), readable_unit(schedule.units)
+    position = [f"{name} [{short_unit(schedule.units)}]" for name in names]
+    if plane:
+        path, some = schedule.position, np.linspace(0, len(schedule) - 1, 21).round().astype(int)
+        plane[0].plot(*path.T, color=MODEL, lw=1.5, label="planned: position, 2 sd")
+        plot_covariance_ellipses(path[some], schedule.covariance[some], plane[0])
+        mark_ends(plane[0], path)
+        plane[0].set(xlabel=position[0], ylabel=position[1])
+        equal_scales(plane[0])
+    else:
+        plot_outputs(schedule.time, schedule.position, bands[0], position)
+        bands[0].set_ylabel(f"position [{short_unit(schedule.units)}]")
+    deviation = scale * np.sqrt(np.diagonal(schedule.covariance, axis1=1, axis2=2))
+    plot_outputs(schedule.time, deviation, bands[-2], [f"along {name}" for name in names])
+    bands[-2].set(ylabel=f"1 sd [{unit}]", ylim=(0.0, None))
+    plot_stiffness(schedule, bands[-1])
+    bands[-1].set_ylim(0.0, None)
+    legend_below(figure, [*plane, *bands[1:]])
+    return [*plane, *bands]
+
+
+def plot_pushes(rollout: Any, unpushed: Any = None, names: Sequence[str] | None = None) -> list[Axes]:
+    """Draw a simulated run: what `Rollout.plot` does."""
+    figure, _, axes = _panels(3, n_space=0)
+    plot_rollout(rollout.numpy(), axes, names=names, unpushed=None if unpushed is None else unpushed.numpy())
+    for ax in axes[:-1]:
+        ax.tick_params(labelbottom=False)
+    legend_below(figure, axes)
+    return axes
+
+
+def _panels(n_bands: int, n_space: int) -> tuple[Figure, list[Any], list[Axes]]:
+    """Figure with the Axes of a path in two or three dimensions, if any, and those of bands, in a column or 3 x 3."""
+    if n_space:
+        figure = shown_figure((9.6 if n_bands else 5.6, 4.8))
+        columns = figure.add_gridspec(
+            max(n_bands, 1), 2 if n_bands else 1, width_ratios=(1.0, 1.3) if n_bands else None
+        )
+        plane = [figure.add_subplot(columns[:, 0], projection="3d" if n_space == 3 else None)]
+        return figure, plane, [figure.add_subplot(columns[i, 1]) for i in range(n_bands)]
+    n_columns = 3 if n_bands > 3 else 1
+    n_rows = -(-n_bands // n_columns)
+    figure = shown_figure((3.4 * n_columns if n_columns > 1 else 6.4, max(3.6, 2.0 * n_rows + 0.6)))
+    return figure, [], [figure.add_subplot(n_rows, n_columns, i + 1) for i in range(n_bands)]
+
+
+def _in_phase(demonstrations: Any) -> Any:
+    return demonstrations if demonstrations.time_unit == "1" else demonstrations.align(n=_N_STEPS)

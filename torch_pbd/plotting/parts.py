@@ -1,0 +1,257 @@
+"""What figures are made of; each function takes data and the Axes to draw into."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.lines import Line2D
+from numpy.typing import ArrayLike
+
+from torch_pbd import checks
+from torch_pbd.checks import Floats
+from torch_pbd.plotting.style import (
+    DATA,
+    EMPIRICAL,
+    FORCE,
+    LINES,
+    MODEL,
+    SERIES,
+    TRUTH,
+    check_axes,
+    chosen_outputs,
+    output_label,
+    readable_unit,
+    schedule_names,
+    short_unit,
+    time_label,
+)
+
+_N_BARS = 30  # inputs up to which error bars are drawn; of more they would touch, and lines are
+
+
+def plot_demonstrations(
+    demonstrations: Any, outputs: Sequence[int | str], ax: Axes, *, label: str | None = "demonstrations"
+) -> list[Line2D]:
+    """Draw every demonstration: one output over time, or two or three outputs against each other.
+
+    Parameters
+    ----------
+    demonstrations : Demonstrations
+    outputs : sequence of one to three int or str
+        Outputs by number or by name.
+    ax : matplotlib.axes.Axes
+        Of projection "3d" for three outputs.
+    label : str or None, default="demonstrations"
+        In the legend, once.
+
+    Returns
+    -------
+    list of Line2D, one a demonstration
+    """
+    chosen = chosen_outputs(outputs, demonstrations.names, 3)
+    check_axes("ax", [ax])
+    lines: list[Line2D] = []
+    for time, position in demonstrations:
+        columns = position[:, chosen].T
+        drawn = (time, *columns) if len(chosen) == 1 else columns
+        lines += ax.plot(*drawn, color=DATA, lw=1.0, alpha=0.8, label=None if lines else label, zorder=1)
+    labels = [time_label(demonstrations.time_unit), *(output_label(demonstrations, one) for one in chosen)]
+    labels = labels if len(chosen) == 1 else labels[1:]
+    ax.set(**dict(zip(("xlabel", "ylabel", "zlabel"), labels, strict=False)))
+    return lines
+
+
+def plot_std_band(
+    x: ArrayLike,
+    mean: ArrayLike,
+    std: ArrayLike,
+    ax: Axes,
+    *,
+    n_std: float = 2.0,
+    color: str = MODEL,
+    label: str | None = None,
+) -> tuple[Line2D, PolyCollection]:
+    """Draw a mean (n,) over x (n,) with a band of ``n_std`` standard deviations (n,) on either side."""
+    check_axes("ax", [ax])
+    across, middle, half = (checks.finite(*named).ravel() for named in ((x, "x"), (mean, "mean"), (std, "std")))
+    checks.require(half >= 0.0, half, "std", "at least zero", "give standard deviations")
+    (line,) = ax.plot(across, middle, color=color, lw=1.5, label=label, zorder=3)
+    band = ax.fill_between(
+        across, middle - n_std * half, middle + n_std * half, color=color, alpha=0.22, lw=0, zorder=2
+    )
+    return line, band
+
+
+def plot_covariance_ellipses(
+    mean: ArrayLike,
+    covariance: ArrayLike,
+    ax: Axes,
+    *,
+    n_std: float = 2.0,
+    color: str = MODEL,
+    label: str | None = None,
+    linestyle: str = "-",
+) -> LineCollection:
+    """Draw the ``n_std`` ellipses of covariances (n, 2, 2) around means (n, 2)."""
+    check_axes("ax", [ax])
+    centres = checks.array(mean, "mean", ("n", 2))
+    matrices = checks.array(covariance, "covariance", (len(centres), 2, 2))
+    checks.semidefinite(matrices, "covariance")
+    angle = np.linspace(0.0, 2.0 * np.pi, 73)
+    circle = np.stack([np.cos(angle), np.sin(angle)])
+    values, axes = np.linalg.eigh(matrices)
+    roots = axes * np.sqrt(np.clip(values, 0.0, None))[:, np.newaxis, :]
+    curves = centres[:, np.newaxis, :] + n_std * (roots @ circle).transpose(0, 2, 1)
+    ellipses = LineCollection(list(curves), colors=color, linewidths=1.1, linestyles=linestyle, label=label, zorder=3)
+    ax.add_collection(ellipses)
+    ax.autoscale_view()
+    return ellipses
+
+
+def plot_model_bands(
+    model: Any,
+    X: ArrayLike,
+    y: ArrayLike,
+    axes: Sequence[Axes],
+    *,
+    beyond: float = 0.25,
+    true_std: Any = None,
+) -> None:
+    """Draw what a model of one input learned, over the data and beyond their range: one Axes an output.
+
+    The empirical mean and two standard deviations at repeated inputs are drawn beside it.
+
+    Parameters
+    ----------
+    model : fitted covariance regressor
+    X : array-like of shape (n_samples, 1)
+    y : array-like of shape (n_samples, n_outputs)
+    axes : sequence of n_outputs matplotlib Axes
+    beyond : float, default=0.25
+        How far to draw on either side, in ranges of X.
+    true_std : callable, default=None
+        Maps x (n, 1) to (mean, std), both (n, n_outputs), where the truth is known.
+    """
+    inputs, targets = checks.array(X, "X", ("n", 1)), checks.finite(y, "y")
+    targets = targets.reshape(len(inputs), -1)
+    check_axes("axes", axes, targets.shape[1])
+    beyond = checks.number(beyond, "beyond", remedy="how far to draw, in ranges of X")
+    low, high = inputs.min(), inputs.max()
+    query = np.linspace(low - beyond * (high - low), high + beyond * (high - low), 401)[:, np.newaxis]
+    mean, covariance = model.predict(query, return_cov=True)
+    mean = mean.reshape(len(query), -1)
+    std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    position, empirical_mean, empirical_std = _empirical_bands(inputs[:, 0], targets)
+    for output, ax in enumerate(axes):
+        plot_std_band(query, mean[:, output], std[:, output], ax, label="model: mean, 2 sd")
+        if true_std is not None:
+            centre, deviation = true_std(query)
+            draw_edges(query[:, 0], centre[:, output], deviation[:, output], ax, "truth: 2 sd", TRUTH)
+        if 0 < len(position) <= _N_BARS:
+            style: dict[str, Any] = {"fmt": ".", "ms": 4, "capsize": 2, "lw": 1.2, "label": "empirical: mean, 2 sd"}
+            middle, half = empirical_mean[:, output], 2.0 * empirical_std[:, output]
+            ax.errorbar(position, middle, half, color=EMPIRICAL, zorder=4, **style)
+        elif len(position):
+            draw_edges(position, empirical_mean[:, output], empirical_std[:, output], ax, "empirical: 2 sd")
+        for edge in (low, high):
+            ax.axvline(edge, color=DATA, lw=0.8, ls=":", label="end of the data" if edge == low else None)
+
+
+def draw_edges(x: Floats, mean: Floats, std: Floats, ax: Axes, label: str, color: str = EMPIRICAL) -> None:
+    """Draw lines two standard deviations above and below a mean."""
+    style = "--" if color == TRUTH else "-"
+    lines = ax.plot(x, np.stack([mean + 2.0 * std, mean - 2.0 * std], axis=1), style, color=color, lw=1.0, zorder=2.5)
+    lines[0].set_label(label)
+
+
+def _empirical_bands(position: Floats, targets: Floats) -> tuple[Floats, Floats, Floats]:
+    """Mean and standard deviation at the inputs that repeat."""
+    distinct, index, counts = np.unique(position, return_inverse=True, return_counts=True)
+    means = np.stack([np.bincount(index, column) / counts for column in targets.T], axis=1)
+    squares = np.stack([np.bincount(index, column) for column in ((targets - means[index]) ** 2).T], axis=1)
+    repeated = counts > 1
+    std = np.sqrt(squares[repeated] / (counts[repeated, np.newaxis] - 1))
+    return distinct[repeated], means[repeated], std
+
+
+def plot_stiffness(schedule: Any, ax: Axes) -> list[Line2D]:
+    """Draw the stiffness of each output over time, the diagonal of the matrix, within its limits.
+
+    Parameters
+    ----------
+    schedule : Schedule
+    ax : matplotlib.axes.Axes
+
+    Returns
+    -------
+    list of Line2D, one an output
+    """
+    check_axes("ax", [ax])
+    gains = np.diagonal(schedule.stiffness, axis1=1, axis2=2)
+    lines = plot_outputs(schedule.time, gains, ax, [f"along {name}" for name in schedule_names(schedule)])
+    for limit in schedule.stiffness_limits or ():
+        is_first = limit == schedule.stiffness_limits[0]
+        ax.axhline(limit, color=DATA, lw=0.8, ls=":", label="limits of the stiffness" if is_first else None)
+    ax.set(xlabel="time [s]", ylabel=f"stiffness [N/{short_unit(schedule.units)}]")
+    return lines
+
+
+def plot_rollout(
+    rollout: Any,
+    axes: Sequence[Axes],
+    *,
+    outputs: Sequence[int | str] | None = None,
+    names: Sequence[str] | None = None,
+    unit: str | None = "m",
+    unpushed: Any = None,
+) -> None:
+    """Draw what pushes did: deviation, external force and stiffness over time, the paper's Figure 8.
+
+    Parameters
+    ----------
+    rollout : Rollout
+        One run, as NumPy arrays.
+    axes : sequence of three matplotlib Axes, one above the other
+    outputs : sequence of int or str, default=None
+        Outputs to draw, by number or by name; None is the first six.
+    names : sequence of str, default=None
+        Names of the outputs; None calls them y0, y1, ...
+    unit : str, default="m"
+        Unit of the schedule's positions; None where it is not known.
+    unpushed : Rollout, default=None
+        The same run without pushes, drawn thin: how far the robot lags behind by itself.
+    """
+    check_axes("axes", axes, 3)
+    if np.ndim(rollout.position) != 2:
+        must = "of one run, (n_ticks, n_outputs): take one of the batch"
+        raise checks.refusal(tuple(np.shape(rollout.position)), "the shape of the rollout's position", must)
+    names = names or [f"y{i}" for i in range(rollout.position.shape[-1])]
+    chosen = chosen_outputs(outputs, names, 6)
+    labels = [names[output] for output in chosen]
+    shown_unit, scale = readable_unit(unit)
+    above, middle, below = axes
+    plot_outputs(rollout.time, scale * rollout.deviation[:, chosen], above, [f"along {name}" for name in labels])
+    if unpushed is not None:
+        own = scale * unpushed.deviation[:, chosen]
+        above.plot(unpushed.time, own, color=DATA, lw=1.0)[0].set_label("without pushes")
+    above.set_ylabel(f"deviation [{shown_unit}]")
+    plot_outputs(rollout.time, rollout.force[:, chosen], middle, [f"force {name}" for name in labels], [FORCE])
+    middle.set_ylabel("external force [N]")
+    gains = np.diagonal(rollout.stiffness, axis1=1, axis2=2)[:, chosen]
+    plot_outputs(rollout.time, gains, below, [f"along {name}" for name in labels])
+    below.set(xlabel="time [s]", ylabel=f"stiffness [N/{short_unit(unit)}]", ylim=(0.0, None))
+    for ax in (above, middle):
+        ax.axhline(0.0, color=DATA, lw=0.6, zorder=0)
+
+
+def plot_outputs(
+    time: Floats, columns: Floats, ax: Axes, labels: Sequence[str], colors: Sequence[str] = SERIES
+) -> list[Line2D]:
+    """Draw a line for each column (n, d) over time (n,), which differ by their dashes too."""
+    lines: list[Line2D] = []
+    for i, (column, label) in enumerate(zip(columns.T, labels, strict=True)):
+        lines += ax.plot(time, column, LINES[i % len(LINES)], color=colors[i % len(colors)], lw=1.5, label=label)
+    ax.margins(x=0.0)
+    return lines

@@ -1,0 +1,111 @@
+"""What all figures share: one colour for one meaning, labels with units, grids and legends."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from torch_pbd import checks
+
+# Okabe and Ito's colours, which colour-blind readers tell apart; the truth is drawn dashed too.
+DATA, MODEL, EMPIRICAL, FORCE, TRUTH = "#999999", "#0072B2", "#E69F00", "#D55E00", "#000000"
+OTHER, ROBOT = "#CC79A7", "#009E73"
+"""A second model beside the first; the simulated robot."""
+SERIES = (ROBOT, "#332288", "#56B4E9", "#882255", "#999933", "#44AA99", "#000000")
+"""Colours of what differs by output only: none of demonstrations, models and forces."""
+LINES = ("-", "--", ":", "-.")
+
+_LONGEST_UNIT = 8  # letters; a longer one is a description
+_FLAT = 3.0  # ratio of the sides of a plane from which on equal scales would leave a sliver
+
+
+def figure_grid(n_rows: int, n_columns: int, size: tuple[float, float], **options: Any) -> tuple[Figure, Any]:
+    """Figure of ``size`` in inches and its Axes (n_rows, n_columns); pyplot does not know it, so nothing needs closing.
+
+    ``options`` are those of ``Figure.subplots``.
+    """
+    figure = Figure(figsize=size)
+    return figure, figure.subplots(n_rows, n_columns, squeeze=False, **options)
+
+
+def shown_figure(size: tuple[float, float]) -> Figure:
+    """Figure of ``size`` in inches that pyplot shows: what ``plot()`` draws into where no Axes are given."""
+    from matplotlib import pyplot  # chooses a window system: only where one may be wanted
+
+    return pyplot.figure(figsize=size, layout="constrained")
+
+
+def legend_below(figure: Figure, axes: Axes | Sequence[Axes], n_columns: int = 4) -> None:
+    """Draw one legend below the figure: each label of the Axes once."""
+    entries: dict[str, Any] = {}
+    for ax in np.ravel(np.asarray(axes, dtype=object)):
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
+    figure.legend(entries.values(), entries, loc="outside lower center", ncols=n_columns, fontsize=9)
+
+
+def equal_scales(ax: Any) -> None:
+    """Give the axes of a plane or a space one scale, unless a plane is so long that nothing would be seen across it."""
+    if ax.name == "3d":
+        ax.set_box_aspect([abs(high - low) for low, high in (ax.get_xlim(), ax.get_ylim(), ax.get_zlim())], zoom=0.85)
+        ax.locator_params(nbins=4)  # more would touch
+        return
+    width, height = (abs(high - low) for low, high in (ax.get_xlim(), ax.get_ylim()))
+    if width < _FLAT * height and height < _FLAT * width:
+        ax.set_aspect("equal", adjustable="box")
+
+
+def mark_ends(ax: Axes, path: Any, *, label: bool = True) -> None:
+    """Mark the start of a path (n, 2) or (n, 3) by a circle and its goal by a star."""
+    for place, marker, name in ((path[0], "o", "start"), (path[-1], "*", "goal")):
+        size = 6 if marker == "o" else 10
+        style: dict[str, Any] = {"ls": "", "marker": marker, "ms": size, "color": "black", "mfc": "white", "zorder": 6}
+        ax.plot(*np.reshape(place, (-1, 1)), label=name if label else None, **style)
+
+
+def readable_unit(unit: str | None) -> tuple[str, float]:
+    """Unit of a deviation, and what to multiply it by: metres are shown in millimetres."""
+    return ("mm", 1000.0) if unit == "m" else (short_unit(unit), 1.0)
+
+
+def short_unit(unit: str | None) -> str:
+    """Unit for a label or a column; "unit" where there is none, or only a description."""
+    return unit if unit and len(unit) <= _LONGEST_UNIT else "unit"
+
+
+def schedule_names(schedule: Any) -> Sequence[str]:
+    """Names of the outputs of a schedule."""
+    return schedule.names or [f"y{i}" for i in range(schedule.position.shape[1])]
+
+
+def output_label(demonstrations: Any, output: int) -> str:
+    """Name of an output for an axis, with its unit in brackets if it has one."""
+    unit = demonstrations.units[output] if demonstrations.units is not None else "1"
+    in_brackets = f" [{unit}]" if 0 < len(unit) <= _LONGEST_UNIT and unit != "1" else ""
+    return f"{demonstrations.names[output]}{in_brackets}"
+
+
+def time_label(time_unit: str) -> str:
+    """Label of an axis of time, or of phase."""
+    return "phase" if time_unit == "1" else f"time [{time_unit}]"
+
+
+def chosen_outputs(outputs: Any, names: Sequence[str], most: int) -> list[int]:
+    """Numbers of one to ``most`` outputs, given by number or by name; None is the first ``most``."""
+    if outputs is None:
+        return list(range(len(names)))[:most]
+    wanted = list(outputs) if isinstance(outputs, Sequence | np.ndarray) and not isinstance(outputs, str) else [outputs]
+    found = [list(names).index(one) if isinstance(one, str) and one in names else one for one in wanted]
+    known = all(isinstance(one, int | np.integer) and 0 <= one < len(names) for one in found)
+    if not known or not 1 <= len(found) <= most:
+        raise checks.refusal(outputs, "outputs", f"one to {most} of {', '.join(map(repr, names))}, or their numbers")
+    return [int(one) for one in found]
+
+
+def check_axes(name: str, axes: Any, n_axes: int = 1) -> None:
+    """Check that there are as many Axes as will be drawn into."""
+    known = np.ndim(axes) == 1 and all(hasattr(ax, "plot") for ax in axes)
+    if not known or len(axes) < n_axes:
+        raise ValueError(f"{name} is {axes!r}, must be {n_axes} matplotlib Axes.")
