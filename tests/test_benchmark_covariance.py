@@ -158,8 +158,8 @@ def test_command_line_writes_every_seed_and_fold_and_the_table(tmp_path, capsys)
         assert {row["method"] for row in rows} == set(methods)
         assert all(float(row["fit_seconds"]) > 0 for row in rows)
     table = (out / "table.md").read_text(encoding="utf-8")
-    assert "### bell-aligned" in table
-    assert "### tunnel" in table
+    assert "## bell-aligned" in table
+    assert "## tunnel" in table
     assert table in capsys.readouterr().out
 
 

@@ -22,6 +22,15 @@ from sklearn.pipeline import Pipeline
 from torch_pbd import checks
 from torch_pbd.exceptions import InvalidParameterError
 
+__all__ = [
+    "covariance_mse",
+    "gaussian_kl",
+    "log_likelihood_scorer",
+    "mahalanobis_coverage",
+    "negative_log_likelihood",
+    "relative_frobenius_error",
+]
+
 Floats = NDArray[np.floating[Any]]
 _Scorer = Callable[[Any, ArrayLike, ArrayLike], float]
 # A pivot of a Cholesky factorization below it is rounding, relative to the diagonal: float64 makes errors of 1e-16, of

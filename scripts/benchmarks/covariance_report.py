@@ -46,7 +46,7 @@ def report(made: Sequence[Row], recorded: Sequence[Row], pen: Sequence[Row]) -> 
 
 def _section(title: str, rows: Sequence[Row], cells: Callable[[str, Sequence[Row], Sequence[Row]], Row]) -> str:
     table = _table([cells(method, own, rows) for method, own in _by(rows, "method").items()])
-    return f"### {title}\n\n{table}\n{_notes(rows)}"
+    return f"## {title}\n\n{table}\n{_notes(rows)}"
 
 
 def _made_row(method: str, own: Sequence[Row], rows: Sequence[Row]) -> Row:

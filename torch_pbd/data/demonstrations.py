@@ -244,7 +244,7 @@ class Demonstrations(Editing):
         ----------
         method : {"phase", "dtw"}, default="phase"
             "phase" is linear time normalization. "dtw" then takes differences of timing out by dynamic time warping
-            (`torch_pbd.data.alignment.dtw_warps`), keeping the ends of each demonstration and the mean timing of all.
+            (``torch_pbd.data.alignment.dtw_warps``), keeping the ends of each demonstration and the mean timing of all.
             It also takes for timing what only looks like it: use it where the shape is what matters, and not to predict
             new demonstrations, in which the timing comes back (measured: 3.7 nats a step worse). It compares positions
             in their units; outputs whose ``units`` differ are compared in standard deviations.

@@ -10,7 +10,7 @@ from torch import Tensor
 @final
 @dataclass(frozen=True, eq=False, repr=False)
 class Rollout:
-    """States at the start of each tick of a simulated run, tensors or, by :meth:`numpy`, arrays.
+    """States at the start of each tick of a simulated run, tensors or, by ``numpy()``, arrays.
 
     Attributes
     ----------

@@ -1,0 +1,33 @@
+"""Settings of the documentation; `python docs/build.py` builds it."""
+
+import torch_pbd
+
+project = "torch_pbd"
+author = "The torch_pbd developers"
+release = version = torch_pbd.__version__
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "numpydoc",
+    "sphinx_copybutton",
+]
+exclude_patterns = ["_build"]
+templates_path = ["templates"]
+default_role = "autolink"  # names that are public become links, others stay as they are
+nitpicky = True
+
+autosummary_generate = True
+autodoc_typehints = "none"  # the docstrings say more
+autodoc_class_signature = "separated"
+numpydoc_show_class_members = False  # the template of classes shows them
+myst_heading_anchors = 3
+myst_url_schemes = ["http", "https"]
+
+html_theme = "pydata_sphinx_theme"
+html_title = "torch_pbd"
+html_show_sourcelink = False
+html_theme_options = {"show_prev_next": False, "navigation_with_keys": False, "secondary_sidebar_items": ["page-toc"]}
+html_sidebars = {"**": ["sidebar-nav-bs"]}
+copybutton_prompt_text = ">>> "

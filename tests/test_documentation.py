@@ -1,0 +1,57 @@
+"""The documentation names every public name, its code runs, and its links lead somewhere."""
+
+import re
+from importlib import import_module
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import pytest
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = sorted(path.name for path in DOCS.glob("*.md"))
+WITH_CODE = [name for name in PAGES if "```python" in (DOCS / name).read_text(encoding="utf-8")]
+
+
+def documented():
+    """Objects on the page of the API."""
+    module, found = None, set()
+    for line in (DOCS / "api.rst").read_text(encoding="utf-8").splitlines():
+        if line.startswith(".. currentmodule:: "):
+            module = import_module(line.split()[-1])
+        elif re.fullmatch(r"   \w+", line):
+            found.add(getattr(module, line.strip()))
+    return found
+
+
+@pytest.mark.parametrize(
+    "name", ["torch_pbd", "torch_pbd.control", "torch_pbd.data", "torch_pbd.metrics", "torch_pbd.movement"]
+)
+def test_every_public_name_is_in_the_api(name):
+    module = import_module(name)
+    assert [public for public in module.__all__ if getattr(module, public) not in documented()] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", WITH_CODE)
+def test_the_python_of_a_page_runs(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = {"__name__": "page"}
+    for block in re.findall(r"```python\n(.*?)```", (DOCS / name).read_text(encoding="utf-8"), re.DOTALL):
+        exec(compile(block, name, "exec"), names)
+    plt.close("all")
+
+
+@pytest.mark.parametrize("path", [ROOT / "README.md", *(DOCS / name for name in PAGES)], ids=lambda path: path.name)
+def test_links_and_files_are_there(path):
+    text = path.read_text(encoding="utf-8")
+    linked = [link.partition("#")[0] for link in re.findall(r"\]\((?!https?:)([^)\s]+)\)", text)]
+    missing = [link for link in linked if link and not (path.parent / link).is_file()]
+    assert missing == []
+    assert [name for name in re.findall(r"--config ([\w/.]+)", text) if not (ROOT / name).is_file()] == []
+
+
+def test_pictures_are_small():
+    sizes = {path.name: path.stat().st_size for path in (DOCS / "pictures").iterdir()}
+    assert max(sizes.values()) < 1e6, sizes
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 1200
