@@ -68,7 +68,9 @@ def test_the_yaml_is_a_configuration_of_experiment(learned, tmp_path):
     path = tmp_path / "skill.yaml"
     path.write_bytes(learning.take_home(learned, "skill.yaml"))
     options, _ = parse("experiment", ["--config", str(path)])
-    assert options.controllers["mine"].mass == 1.0
+    mine = options.controllers["mine"].fit(learned.strokes)
+    schedule = learning.follow(learned)["schedule"]
+    np.testing.assert_array_equal(mine.schedule(rate=1000.0).stiffness, schedule.stiffness)
     assert yaml.safe_load(path.read_text())["data"] == "demonstrations.csv"
 
 

@@ -202,8 +202,11 @@ def _yaml(learned: Learned) -> str:
             "stiffness_min": settings.stiffness_min, "stiffness_max": settings.stiffness_max, "smooth": settings.smooth
         },
     }  # fmt: skip
+    model: Any = {"class_path": name}
+    if name not in MOVEMENTS:
+        model = {"class_path": "TrajectoryRegressor", "init_args": {"regressor": model}}
     arguments = {
-        "covariance": {"class_path": name}, "n_steps": _STEPS, "stiffness_law": law, "mass": settings.mass,
+        "covariance": model, "n_steps": _STEPS, "stiffness_law": law, "mass": settings.mass,
         "damping_ratio": settings.damping_ratio,
     }  # fmt: skip
     content = {
