@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 import torch_pbd
 from torch_pbd.cli.main import main
@@ -21,7 +22,16 @@ def recording(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "arguments", [["--help"], ["fit", "--help"], ["compare", "--help"], ["demo", "--help"], ["experiment", "--help"]]
+    "arguments",
+    [
+        ["--help"],
+        ["fit", "--help"],
+        ["compare", "--help"],
+        ["demo", "--help"],
+        ["experiment", "--help"],
+        ["help"],
+        ["help", "fit"],
+    ],
 )
 def test_help_does_not_wait_for_torch(arguments):
     program = (
@@ -45,6 +55,18 @@ def test_fit_leaves_a_folder_from_which_the_run_can_be_repeated(recording, tmp_p
     np.testing.assert_array_equal(models[0].predict_cov(query), models[1].predict_cov(query))
     assert (first / "figures" / "choleskycovregressor.png").stat().st_size > 10_000
     assert json.loads((first / "env.json").read_text())["torch_pbd"] == torch_pbd.__version__
+
+
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [("HGP", "HeteroscedasticGPRegressor"), ("CD", "CholeskyCovRegressor"), ("GMM 8", "GMMBaseline")],
+)
+def test_models_have_the_names_that_tables_print(name, found, capsys):
+    with pytest.raises(SystemExit):
+        main(["fit", "--data", "x.csv", "--model", name, "--print_config=skip_default"])
+    shown = yaml.safe_load(capsys.readouterr().out).get("model", {"class_path": f"torch_pbd.{found}"})
+    assert shown["class_path"] == f"torch_pbd.{found}"
+    assert shown.get("init_args", {}).get("n_components") == (8 if name == "GMM 8" else None)
 
 
 @pytest.mark.parametrize("name", ["TrajectoryRegressor", "ProMPBaseline", "KMPBaseline"])

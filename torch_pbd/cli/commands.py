@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from torch_pbd.cli import options
-from torch_pbd.cli.options import Option, made
+from torch_pbd.cli.options import MODELS, Option, made
 from torch_pbd.console import say
 from torch_pbd.exceptions import ConfigError
 from torch_pbd.registry import MOVEMENTS
@@ -26,15 +26,6 @@ COMMANDS = {
     "compare": "compare models: on the paper's simulation (Table I, Figures 1 to 3), or on a file",
     "playground": "draw strokes in the browser, see their covariance, bend the movement, push the robot",
 }
-
-_MODELS = {
-    "HGP": "HeteroscedasticGPRegressor",
-    "CD": "CholeskyCovRegressor",
-    "WP": "WishartProcessRegressor",
-    "GMM 5": {"class_path": "GMMBaseline", "init_args": {"n_components": 5}},
-    "GMM 8": {"class_path": "GMMBaseline", "init_args": {"n_components": 8}},
-}
-"""The models that are compared by default; a mixture has as many components as in the paper's Table I."""
 
 _Count = Annotated[int, (1, math.inf)]
 _Seed = Annotated[int, (0, 2**32 - 2)]  # NumPy's seeds end at 2**32 - 1, and the demo takes the next one too
@@ -60,7 +51,7 @@ OPTIONS: dict[str, dict[str, Option]] = {
     "fit": {
         **_FILE,
         "data": Option(str | list[str] | None, None, _DATA, required=True),
-        "model": Option("Model", _MODELS["HGP"], f"estimator {_CLASS_HELP} --model.help NAME"),
+        "model": Option("Model", MODELS["HGP"], f"estimator {_CLASS_HELP} --model.help NAME"),
         **_GRID,
     },
     "experiment": {
@@ -77,7 +68,7 @@ OPTIONS: dict[str, dict[str, Option]] = {
     },
     "compare": {
         **_FILE,
-        "models": Option(dict[str, "Model"], _MODELS, f"estimators {_CLASS_HELP} --models.help NAME"),
+        "models": Option(dict[str, "Model"], MODELS, f"estimators {_CLASS_HELP} --models.help NAME"),
         "max_folds": Option(Annotated[int, (0, math.inf)], 10, "demonstrations to leave out, one by one"),
         "n_jobs": Option(
             Annotated[int, (-math.inf, -1)] | _Count | None, None, "fits at the same time; -1: all cores"
@@ -140,7 +131,7 @@ def demo(options: Any, folder: Any) -> str:
     """The main job: made demonstrations of the tunnel task, four models, a robot that is pushed."""
     from torch_pbd.experiments.demo import run_demo
 
-    models = made({name: _MODELS[name] for name in ("HGP", "CD", "WP", "GMM 5")}, OPTIONS["compare"]["models"].type)
+    models = made({name: MODELS[name] for name in ("HGP", "CD", "WP", "GMM 5")}, OPTIONS["compare"]["models"].type)
     return f"{run_demo(models, folder, n_demos=options.n_demos, seed=options.seed)}\n\n{_DEMO_LEGEND}"
 
 

@@ -70,7 +70,7 @@ def _signals() -> Iterator[None]:
 
 
 def _answer(arguments: Sequence[str]) -> int:
-    if not arguments or arguments[0] in ("-h", "--help"):
+    if not arguments or arguments[0] in ("-h", "--help") or arguments == ["help"]:
         say("torch-pbd: learn how precise people are from demonstrations\n")
         say("usage: torch-pbd COMMAND [--config FILE] [--option VALUE ...]\n")
         for name, about in commands.COMMANDS.items():
@@ -81,6 +81,8 @@ def _answer(arguments: Sequence[str]) -> int:
     if command == "--version":
         say(torch_pbd.__version__)
         return 0
+    if command == "help" and rest:
+        command, rest = rest[0], ["--help"]
     if command not in commands.COMMANDS:
         raise ConfigError(f"{command!r} {unknown(command, commands.COMMANDS, 'a command')}")
     return _run(command, rest)

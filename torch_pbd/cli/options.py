@@ -30,6 +30,17 @@ CLASSES: Mapping[str, Mapping[str, str]] = {
 }
 """The closed table: the classes that a value of a type can be of, and their modules. No other is ever imported."""
 
+MODELS = {
+    "HGP": "HeteroscedasticGPRegressor",
+    "CD": "CholeskyCovRegressor",
+    "WP": "WishartProcessRegressor",
+    "GMM 5": {"class_path": "GMMBaseline", "init_args": {"n_components": 5}},
+    "GMM 8": {"class_path": "GMMBaseline", "init_args": {"n_components": 8}},
+}
+"""Models by the names that tables print: those that are compared by default, and what options take as well as a class.
+
+A mixture has as many components as in the paper's Table I."""
+
 _CLASS_KEYS = ("class_path", "init_args")
 _HELP_WIDTH = 80  # of the terminals that people start with
 
@@ -101,7 +112,7 @@ def _help(usage: str, about: str, options: Mapping[str, Option]) -> str:
 def _class_help(text: str, place: Place) -> str:
     """Parameters of a class, and what its docstring says of them."""
     table = {name: module for known in CLASSES.values() for name, module in known.items()}
-    spec = _Spec(_find_class(text, table, place), table, {})
+    spec = _take_class(text, table, place, None)
     lines = [f"  {name}: {described(hint)}; default {default}" for name, (hint, default) in spec.parameters().items()]
     return "\n".join([f"parameters of {spec.name}:", *lines, "", inspect.getdoc(spec.load()) or ""])
 
@@ -246,6 +257,8 @@ def _find_class(name: Any, table: Mapping[str, str], place: Place) -> str:
 
 def _take_class(value: Any, table: Mapping[str, str], place: Place, before: _Spec | None) -> _Spec:
     inside, only = place.below("init_args"), next(iter(table)) if len(table) == 1 else None
+    if isinstance(value, str):
+        value = MODELS.get(value, value)
     if isinstance(value, str):
         name, value = _find_class(value, table, place), {}
     elif not isinstance(value, dict):
