@@ -37,10 +37,11 @@ def schedule(tasks):
 
 
 @pytest.fixture(scope="module")
-def dask():
+def dask(tmp_path_factory):
     """joblib on the workers of a scheduler of this machine."""
+    workers = {"n_workers": 2, "processes": True, "threads_per_worker": 1}
     with (
-        LocalCluster(n_workers=2, processes=True, threads_per_worker=1, dashboard_address=None) as cluster,
+        LocalCluster(**workers, dashboard_address=None, local_directory=tmp_path_factory.mktemp("dask")) as cluster,
         Client(cluster),
     ):
         yield lambda: joblib.parallel_config("dask")

@@ -127,10 +127,12 @@ PASSES = {  # what is a value there, and what it means is in the docstring
 
 @pytest.mark.parametrize("kind", NO_NUMBERS)
 @pytest.mark.parametrize("door", DOORS)
-def test_what_is_no_number_is_refused_by_name(door, kind):
+def test_what_is_no_number_is_refused_by_name_or_means_something(door, kind):
     function, sound, name = DOORS[door]
     if (door, kind) in PASSES:
-        pytest.skip("allowed here")
+        function(NO_NUMBERS[kind](sound))
+        plt.close("all")
+        return
     if (door, kind) == ("sensor", "none"):
         kind = "one text"
     with pytest.raises((TypeError, ValueError), match=name.replace(".", r"\.")):

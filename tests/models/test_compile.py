@@ -1,6 +1,7 @@
 """``torch.compile`` of fitted modules; in processes of their own, for there shapes are not checked in passing."""
 
 import json
+import os
 import subprocess
 import sys
 
@@ -30,9 +31,10 @@ print(json.dumps(found))
 
 @pytest.mark.slow
 def test_a_compiled_module_gives_what_the_module_does(tmp_path):
+    environment = {**os.environ, "TORCHINDUCTOR_CACHE_DIR": str(tmp_path / "cache"), "TMPDIR": str(tmp_path)}
     ran = subprocess.run(
-        [sys.executable, "-c", PROGRAM], cwd=tmp_path, capture_output=True, text=True, check=False
-    )  # in a folder of its own: the compiler writes there
+        [sys.executable, "-c", PROGRAM], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
     assert ran.returncode == 0, ran.stderr[-2000:]
     found = json.loads(ran.stdout.splitlines()[-1])
     assert len(found) == 8
