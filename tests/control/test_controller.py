@@ -345,7 +345,10 @@ def test_identical_demonstrations_are_stiff_and_told_of(scale, noise, rng):
     np.testing.assert_allclose(stiffness, np.tile(1000.0 * np.eye(2), (5, 1, 1)), rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["letter_G", "kuka_cube_pick", "snooker_skilled", "gait_hip_knee", "pen_a"])
+MORE = [pytest.param(name, marks=pytest.mark.slow) for name in ("snooker_skilled", "gait_hip_knee", "pen_a")]
+
+
+@pytest.mark.parametrize("name", ["letter_G", "kuka_cube_pick", *MORE])
 def test_recorded_skills_are_learned(name, recordings):
     from torch_pbd import load_demonstrations
 
