@@ -64,6 +64,10 @@ def check_parameters(controller: Any) -> None:
     regressor = controller.covariance
     if regressor is not None and (isinstance(regressor, type) or not all(hasattr(regressor, need) for need in _NEEDED)):
         raise checks.refusal(regressor, "covariance", "a covariance regressor, not yet fitted or fitted, or None")
+    if (timing := getattr(regressor, "timing", "none")) != "none":
+        raise checks.refusal(
+            timing, "timing of covariance", "'none'", "a controller sets the time of its movement itself"
+        )
     checks.instance(controller.stiffness_law, "stiffness_law", StiffnessLaw, optional=True)
     damping_from_stiffness(np.eye(1), float(controller.mass), controller.damping_ratio)  # checks what is its own
 

@@ -13,14 +13,18 @@ from torch_pbd.estimators.base import Uncertainty
 from torch_pbd.estimators.validation import Floats
 from torch_pbd.linalg import safe_cholesky, student_log_density
 from torch_pbd.movement.base import Known, MovementRegressor, Recording
-from torch_pbd.movement.timing import Likelihood, Nodes, Timing, phase_of, register
+from torch_pbd.movement.timing import Likelihood, Nodes, Timing, phase_of, register, time_of
 
-_FEWEST = 4  # demonstrations that say how two numbers vary together
+# Steps on which the correlation is learned: the nuggets' iterations are cubic in them, and movements are smooth.
+_MOST_STEPS = 200
+_GAP = 2.0  # sample spacings of a recording: a step farther than that from its samples was not seen in it
+FEWEST_TIMED = 4  # demonstrations that say how two numbers vary together
 _N_STEPS = 100  # of a curve whose pace is found
 # Samples a movement by which its timing is found. Nearer ones repeat each other but for their smoothness, of which the
 # law knows little: with 25 and 50 the posterior was two and three times too narrow.
 _SEEN = 12.0
 _MOST_FOLDS = 5
+_SLACK = 1e-3  # of a duration: where all last equally long, the last sample may be later by rounding
 
 
 class TimedMovement(MovementRegressor):
@@ -134,11 +138,6 @@ class TimedMovement(MovementRegressor):
         first = np.array([recording.time[0] for recording in recordings])
         good = (first >= 0.0) & (first < 0.5 * duration)
         checks.require(good, first, "the first time of a demonstration", "0 or a little later", "count from its start")
-        if timing == "warp" and len(recordings) < _FEWEST:
-            raise ValueError(
-                f"groups has {len(recordings)} demonstrations, must have {_FEWEST} or more to learn how timing varies: "
-                "record more, or take timing='none'."
-            )
         grid = np.linspace(0.0, 1.0, _N_STEPS)
         curves = np.stack([
             np.stack([np.interp(grid * time[-1], time, column) for column in position.T], axis=1)
@@ -148,10 +147,14 @@ class TimedMovement(MovementRegressor):
         units, durations = torch.from_numpy(curves / np.where(size > 0.0, size, 1.0)), torch.from_numpy(duration)
         pace = register(units) if timing == "warp" else torch.zeros_like(durations)
         self._timing = Timing.learn(durations, pace) if timing == "warp" else Timing.even(durations)
-        return [
-            Recording(phase_of(torch.from_numpy(time / time[-1]), own).numpy(), position)
-            for (time, position), own in zip(recordings, pace, strict=True)
-        ]
+        # On phases that all share, as of aligned demonstrations.
+        shared = np.linspace(0.0, 1.0, n_grid_steps(recordings))
+        phased = []
+        for (time, position), own in zip(recordings, pace, strict=True):
+            values = sampled(Recording(time / time[-1], position), time_of(torch.from_numpy(shared), own).numpy())
+            seen = ~np.isnan(values).any(axis=1)
+            phased.append(Recording(shared[seen], values[seen]))
+        return phased
 
     def _gain(self, recordings: list[Recording]) -> float:
         """Nats a step by which a warp makes left-out demonstrations likelier than the mean duration at an even pace.
@@ -205,12 +208,12 @@ class TimedMovement(MovementRegressor):
     def _last(self, time: Floats) -> float:
         assert self._timing is not None
         last, longest = float(time.max(initial=0.0)), self._timing.longest()
-        if last > longest:
+        if last > (1.0 + _SLACK) * longest:
             raise ValueError(
                 f"X reaches {last:.6g}, must be at most {longest:.6g}: no movement like those shown lasts longer. "
                 "Leave out what comes after its end."
             )
-        return last
+        return min(last, longest)
 
     def _posterior(self) -> Nodes:
         assert self._timing is not None
@@ -277,3 +280,18 @@ class TimedMovement(MovementRegressor):
 
 def _flat(duration: Tensor, pace: Tensor) -> Tensor:
     return torch.zeros_like(duration)
+
+
+def n_grid_steps(recordings: list[Recording]) -> int:
+    """Steps of the grid on which recordings are compared: their median number of samples, at most 200."""
+    return max(2, min(_MOST_STEPS, round(float(np.median([len(recording.time) for recording in recordings])))))
+
+
+def sampled(recording: Recording, grid: Floats) -> Floats:
+    """Positions of a recording at the steps of a grid, linear between samples; NaN where it has no sample near."""
+    time, position = recording
+    columns = [np.interp(grid, time, column) for column in position.T]
+    right = np.clip(np.searchsorted(time, grid), 1, len(time) - 1)
+    nearest = np.minimum(np.abs(grid - time[right - 1]), np.abs(time[right] - grid))
+    seen = nearest <= _GAP * np.median(np.diff(time))
+    return np.where(seen[:, np.newaxis], np.stack(columns, axis=1), np.nan)

@@ -20,9 +20,9 @@ _PACES = torch.linspace(-3.0, 3.0, 121, dtype=torch.float64)  # exp(3): twenty t
 _ROUNDS = 10  # of registration: the mean and the paces depend on each other
 _EVEN = 1e-5  # below it the series in a is exact to rounding
 _SAME = 1e-4  # spread of log durations that counts as none: of sampling
-# Nodes along a side of each lattice, laid by the moments that the one before found. They reach over four standard
-# deviations: a sum over nodes 4/3 of them apart is a normal integral to 1e-4, and the last has few, as all predict.
-_SIDES, _SIDES_EXACT, _REACH = (13, 13, 13, 7), (13, 7), 4.0
+# Nodes along a side of lattices that follow each other until they shrink no more, and of the last, whose nodes all
+# predict. They reach over four standard deviations: a sum over nodes 4/3 of them apart is a normal integral to 1e-4.
+_SIDE, _SIDE_LAST, _REACH, _MOST_LATTICES = 13, 6, 4.0, 8
 _RARE = 7.0  # nats below the density of the middle, where the first lattice ends
 
 
@@ -115,29 +115,49 @@ class Timing:
         The movement still runs at the time ``last``, at most :meth:`longest`: it takes no less. A likelihood that costs
         more, ``exact``, counts on last lattices of its own.
         """
-        varies = (self.root.diagonal() > 0.0).to(self.root)
         center, root = torch.zeros_like(self.location), self._reach() / _REACH * torch.eye(2).to(self.root)
-        stages = [(side, log_likelihood) for side in _SIDES] + [(side, exact) for side in _SIDES_EXACT if exact]
-        for side, likelihood in stages:
-            along = torch.linspace(-_REACH, _REACH, side).to(self.root)
-            lattice = torch.cartesian_prod(*(along if on else along[:1] * 0.0 for on in varies))
-            z = center + lattice @ root.mT
-            values = self.location + z @ self.root.mT
-            duration, pace = values[:, 0].exp(), values[:, 1]
-            log_weight = -0.5 * (self.df + 2.0) * torch.log1p(z.square().sum(1) / self.df)
-            runs = duration >= last * (1.0 - 1e-9)
-            log_weight[~runs] = -math.inf
-            log_weight[runs] += likelihood(duration[runs], pace[runs])
-            weight = log_weight.softmax(0)
-            cell = root * (along[1] - along[0])
-            volume = float(torch.where(varies > 0.0, cell.diagonal(), 1.0).log().sum())
-            # The next lattice is no finer than half of this one's cells, in which the posterior may hide.
-            center = weight @ z
-            spread = z - center
-            root = torch.linalg.cholesky(spread.mT @ (weight[:, None] * spread) + 0.25 * cell @ cell.mT)
-        kept = weight > 1e-3 * weight.max()
-        weight = weight[kept] / weight[kept].sum()
-        return Nodes(duration[kept], pace[kept], weight, float(log_weight.logsumexp(0)) + volume)
+        cut = (
+            (math.log(last) - self.location[0]) / self.root[0, 0] if last > 0.0 and self.root[0, 0] > 0.0 else -math.inf
+        )
+        for _ in range(_MOST_LATTICES):
+            nodes, center, finer = self._lattice(log_likelihood, center, root, float(cut), _SIDE)
+            is_last = bool(finer.det() > 0.5 * root.det())
+            root = finer
+            if is_last:
+                break
+        for side in (_SIDE, _SIDE_LAST) if exact else (_SIDE_LAST,):
+            nodes, center, root = self._lattice(exact or log_likelihood, center, root, float(cut), side)
+        kept = nodes.weight > 1e-3 * nodes.weight.max()
+        weight = nodes.weight[kept] / nodes.weight[kept].sum()
+        return Nodes(nodes.duration[kept], nodes.pace[kept], weight, nodes.log_integral)
+
+    def _lattice(
+        self, log_likelihood: Likelihood, center: Tensor, root: Tensor, cut: float, side: int
+    ) -> tuple[Nodes, Tensor, Tensor]:
+        """Midpoints of the cells of a lattice, and center and root of the next; ``root`` is a lower factor.
+
+        Durations depend on the first axis alone, which is cut where movements would have ended.
+        """
+        low = min(max(float((cut - center[0]) / root[0, 0]), -_REACH), 0.9 * _REACH)
+        axes, cell = [], root.new_ones(2)
+        for axis, start in enumerate((low, -_REACH)):
+            edges = torch.linspace(start, _REACH, side + 1).to(root)
+            varies = bool(self.root[axis, axis] > 0.0)
+            axes.append(0.5 * (edges[1:] + edges[:-1]) if varies else edges[:1] * 0.0)
+            cell[axis] = edges[1] - edges[0] if varies else 1.0
+        z = center + torch.cartesian_prod(*axes) @ root.mT
+        values = self.location + z @ self.root.mT
+        duration, pace = values[:, 0].exp(), values[:, 1]
+        log_prior = -0.5 * (self.df + 2.0) * torch.log1p(z.square().sum(1) / self.df)
+        log_weight = log_prior + log_likelihood(duration, pace)
+        weight = log_weight.softmax(0)
+        center = weight @ z
+        spread = z - center
+        # The next lattice is no finer than half of this one's cells, in which the posterior may hide.
+        scale = root * cell
+        finer = torch.linalg.cholesky(spread.mT @ (weight[:, None] * spread) + 0.25 * scale @ scale.mT)
+        volume = float(scale.diagonal().log().sum())
+        return Nodes(duration, pace, weight, float(log_weight.logsumexp(0)) + volume), center, finer
 
     def _reach(self) -> float:
         return math.sqrt(self.df * math.expm1(2.0 * _RARE / (self.df + 2.0)))

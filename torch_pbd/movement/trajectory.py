@@ -21,12 +21,9 @@ from torch_pbd.movement.base import Recording
 from torch_pbd.movement.conditioning import Conditioned
 from torch_pbd.movement.joint import JointNormal
 from torch_pbd.movement.time_kernel import TimeKernel, fit_time_kernel
-from torch_pbd.movement.timed import TimedMovement
+from torch_pbd.movement.timed import FEWEST_TIMED, TimedMovement, n_grid_steps, sampled
 
-# Steps on which the correlation is learned: the nuggets' iterations are cubic in them, and movements are smooth.
-_MOST_STEPS = 200
 _FEWEST_DF, _MOST_DF = 3.0, 200.0  # of the joint law: a variance must exist, and beyond it is normal to all purposes
-_GAP = 2.0  # sample spacings of a recording: a step farther than that from its samples was not seen in it
 
 
 class TrajectoryLaw(nn.Module):
@@ -188,6 +185,12 @@ class TrajectoryRegressor(TimedMovement):
                 raise ValueError(
                     f"X has a time twice in demonstration {number}, or fewer than two: its samples must be in a row."
                 )
+        fewest = {"none": 2, "warp": FEWEST_TIMED, "auto": FEWEST_TIMED + 1}[self.timing]
+        if len(recordings) < fewest:
+            raise ValueError(
+                f"groups has {len(recordings)} demonstrations, must have {fewest} or more to learn how timing varies: "
+                "record more, or take timing='none'."
+            )
         if self.timing == "auto":
             self.timing_gain_ = self._gain(recordings)
             self.timing_ = "warp" if self.timing_gain_ > 0.0 else "none"
@@ -203,10 +206,9 @@ class TrajectoryRegressor(TimedMovement):
         self.regressor_ = fit_with_groups(regressor, X, y.ravel() if self._y_is_1d else y, groups)
 
         low, high = float(X.min()), float(X.max())
-        n_steps = min(_MOST_STEPS, round(float(np.median(np.bincount(groups)))))
-        grid = np.linspace(low, high, max(2, n_steps))
+        grid = np.linspace(low, high, n_grid_steps(recordings))
         mean, covariance = self._regressor_marginals(grid)
-        residual = np.stack([_sampled(recording, grid) for recording in recordings]) - mean
+        residual = np.stack([sampled(recording, grid) for recording in recordings]) - mean
         whitened = np.linalg.solve(np.linalg.cholesky(covariance), residual[..., np.newaxis])[..., 0]
         kernels = ("matern52", "squared_exponential") if self.time_kernel == "auto" else (self.time_kernel,)
         share = None if self.shrinkage == "auto" else 1.0 - float(self.shrinkage)
@@ -302,13 +304,3 @@ class TrajectoryRegressor(TimedMovement):
     def _regressor_marginals(self, time: Floats) -> tuple[Floats, Floats]:
         mean, covariance = self.regressor_.predict(time[:, np.newaxis], return_cov=True)
         return np.ascontiguousarray(mean.reshape(len(time), -1)), np.ascontiguousarray(covariance)
-
-
-def _sampled(recording: Recording, grid: Floats) -> Floats:
-    """Positions of a recording at the steps of a grid, linear between samples; NaN where it has no sample near."""
-    time, position = recording
-    columns = [np.interp(grid, time, column) for column in position.T]
-    right = np.clip(np.searchsorted(time, grid), 1, len(time) - 1)
-    nearest = np.minimum(np.abs(grid - time[right - 1]), np.abs(time[right] - grid))
-    seen = nearest <= _GAP * np.median(np.diff(time))
-    return np.where(seen[:, np.newaxis], np.stack(columns, axis=1), np.nan)
