@@ -107,9 +107,11 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2)
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
-    jobs = (delayed(fold)(name, k, options.retime) for name in options.sets for k in range(options.folds))
-    rows = Parallel(n_jobs=options.jobs)(jobs)
-    write(options.output / f"phases_{options.retime:g}.csv", rows)
+    jobs = (delayed(fold)(name, k, options.retime) for k in range(options.folds) for name in options.sets)
+    rows: list[dict[str, Any]] = []
+    for row in Parallel(n_jobs=options.jobs, return_as="generator")(jobs):
+        rows.append(row)
+        write(options.output / f"phases_{options.retime:g}.csv", rows)
     keys = [key for key in ("place", "share", "rest") if any(row[f"{key}_clock"] > 1e-9 for row in rows)]
     print("| set | chosen on | " + " | ".join(f"{key}: clock | warp | change" for key in keys) + " | errors in sd |")
     print("|" + " --- |" * (3 * len(keys) + 3))

@@ -93,6 +93,22 @@ def test_the_posterior_is_that_of_a_fine_grid(width):
     assert nodes.log_integral - below == pytest.approx(float((weight.sum() / of_prior).log()), abs=0.05)
 
 
+def test_where_durations_do_not_differ_the_posterior_is_of_the_pace():
+    timing = Timing.learn(torch.full((6,), 2.0).double(), torch.tensor([-0.5, -0.2, 0.0, 0.1, 0.2, 0.4]).double())
+
+    def likelihood(_, pace):
+        return -0.5 * ((pace - 0.3) / 0.05).square()
+
+    nodes, below = (timing.posterior(each, 2.0) for each in (likelihood, lambda _, pace: torch.zeros_like(pace)))
+    pace = torch.linspace(-20.0, 20.0, 400001).double()
+    prior = (1.0 + (pace / timing.root[1, 1]).square() / timing.df) ** (-0.5 * (timing.df + 1.0))
+    weight = prior * likelihood(None, pace).exp()
+    np.testing.assert_allclose(nodes.duration, 2.0)
+    assert float(nodes.weight @ nodes.pace) == pytest.approx(float(weight @ pace / weight.sum()), abs=0.002)
+    expected = float((weight.sum() / prior.sum()).log())
+    assert nodes.log_integral - below.log_integral == pytest.approx(expected, abs=0.05)
+
+
 def test_the_posterior_of_a_model_is_that_of_a_dense_grid(model):
     time, y = movement(31, 2.3, -0.2)
     # Five samples, a twelfth of the mean duration and more apart: all count.

@@ -144,11 +144,12 @@ class Timing:
             edges = torch.linspace(start, _REACH, side + 1).to(root)
             varies = bool(self.root[axis, axis] > 0.0)
             axes.append(0.5 * (edges[1:] + edges[:-1]) if varies else edges[:1] * 0.0)
-            cell[axis] = edges[1] - edges[0] if varies else 1.0
+            cell[axis] = edges[1] - edges[0] if varies else 2.0  # whose half keeps the root as it is
         z = center + torch.cartesian_prod(*axes) @ root.mT
         values = self.location + z @ self.root.mT
         duration, pace = values[:, 0].exp(), values[:, 1]
-        log_prior = -0.5 * (self.df + 2.0) * torch.log1p(z.square().sum(1) / self.df)
+        n_varying = int((self.root.diagonal() > 0.0).sum())
+        log_prior = -0.5 * (self.df + n_varying) * torch.log1p(z.square().sum(1) / self.df)
         log_weight = log_prior + log_likelihood(duration, pace)
         weight = log_weight.softmax(0)
         center = weight @ z
