@@ -69,6 +69,16 @@ def test_models_have_the_names_that_tables_print(name, found, capsys):
     assert shown.get("init_args", {}).get("n_components") == (8 if name == "GMM 8" else None)
 
 
+def test_where_one_of_two_is_left_out_models_of_movements_are_not_compared(tmp_path, capsys):
+    path = tmp_path / "two.csv"
+    torch_pbd.save_demonstrations(make_tunnel_demonstrations(2, rate=4.0, random_state=0), path)
+    arguments = ["compare", "--data", str(path), "--output", str(tmp_path / "out"), "--models"]
+    assert main([*arguments, '{"whole": "ProMPBaseline"}']) == 2
+    assert "how whole movements differ is not seen in one" in capsys.readouterr().err
+    assert main([*arguments, '{"whole": "ProMPBaseline", "rows": "GMMBaseline"}']) == 0
+    assert "whole" not in capsys.readouterr().out.partition("joint LL:")[0]
+
+
 @pytest.mark.parametrize("name", ["TrajectoryRegressor", "ProMPBaseline", "KMPBaseline"])
 def test_models_of_movements_are_fitted_and_load(name, recording, tmp_path, capsys):
     config = tmp_path / "fit.yaml"
@@ -104,12 +114,19 @@ def test_compare_reports_every_model_and_every_fold(recording, tmp_path, capsys)
         f"data: {recording}\nmax_folds: 3\noutput: {tmp_path / 'out'}\nmodels:\n"
         "  mine: {class_path: CholeskyCovRegressor, init_args: {noise_scale: 1e-4}}\n"
         "  mixture: {class_path: torch_pbd.GMMBaseline, init_args: {n_components: 2}}\n"
+        "  whole: {class_path: TrajectoryRegressor, init_args: {regressor:"
+        " {class_path: GMMBaseline, init_args: {n_components: 2}}}}\n"
     )
     assert main(["compare", "--config", str(config)]) == 0
-    assert "held-out LL" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "held-out LL" in shown
+    assert max(map(len, shown[: shown.index("results:")].splitlines())) <= 80
     with (tmp_path / "out" / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert [row["model"] for row in rows] == ["mine", "mixture"]
+    assert [row["model"] for row in rows] == ["mine", "mixture", "whole"]
+    # The same marginals, with and without the correlation along the movement.
+    assert rows[2]["held-out LL"] == rows[1]["held-out LL"]
+    assert float(rows[2]["joint LL"]) > float(rows[1]["joint LL"])
     folds = [float(rows[0][f"LL {i}"]) for i in (1, 2, 3)]
     assert float(rows[0]["held-out LL"]) == pytest.approx(np.mean(folds))
     assert torch_pbd.load(tmp_path / "out" / "model" / "mine.safetensors").noise_scale == 1e-4
@@ -139,7 +156,7 @@ def test_compare_without_data_is_table_1(tmp_path, capsys):
         ),
         (["fit", "--data", "x.npz", "--model", "GMMBaseline", "--model.tol", "soon"], "soon"),
         (["fit", "--data", "x.npz", "--model", "KMPBaseline", "--model.regressor", "ProMPBaseline"], "not a class"),
-        (["compare", "--models", '{"mine": "ProMPBaseline"}'], "models.mine: ProMPBaseline learns whole movements"),
+        (["compare", "--models", '{"mine": "ProMPBaseline"}'], "models: there are only such of whole movements"),
         (
             [
                 "experiment",

@@ -20,6 +20,7 @@ from scipy.stats import multivariate_normal, multivariate_t
 
 from torch_pbd import KMPBaseline, ProMPBaseline, TrajectoryRegressor, load_demonstrations
 from torch_pbd.metrics import gaussian_kl
+from torch_pbd.movement import MOVEMENT_STATISTICS, movement_statistics
 
 Floats = Any
 DATA = Path(__file__).parents[3] / "shared" / "data"
@@ -37,7 +38,6 @@ MODELS = {
     "rows independent": None,
     "movement_primitives": None,
 }
-REGIONS = ("deviation", "offset", "length", "largest")
 
 
 def load(name: str) -> tuple[Floats, Floats]:
@@ -126,20 +126,6 @@ def judge_conditioning(joint: tuple[Floats, Floats, float], seen: Floats, x: Flo
     }
 
 
-def statistics(x: Floats, mean: Floats, deviation: Floats) -> Floats:
-    """Whole-movement statements of movements (s, n, d): (s, 4), as ``REGIONS``."""
-    standardized = (x - mean) / deviation
-    return np.stack(
-        [
-            np.square(standardized).mean((1, 2)),
-            np.sqrt(np.square(standardized.mean(1)).sum(1)),
-            np.sqrt(np.square(np.diff(x, axis=1)).sum(2)).sum(1),
-            np.abs(standardized).max((1, 2)),
-        ],
-        axis=1,
-    )
-
-
 def judge(joint: tuple[Floats, Floats, float], x: Floats, train: Floats, draws: Floats) -> dict[str, float]:
     """Everything that one left-out movement says of one model."""
     mean, covariance, df = joint
@@ -154,9 +140,9 @@ def judge(joint: tuple[Floats, Floats, float], x: Floats, train: Floats, draws: 
     for name, (seen, steps) in cases.items():
         row |= {f"{name}_{key}": value for key, value in judge_conditioning(joint, seen, x, steps).items()}
     deviation = np.sqrt(np.einsum("nini->ni", covariance))
-    own, of_draws = statistics(x[None], mean, deviation)[0], statistics(draws, mean, deviation)
+    own, of_draws = (movement_statistics(part, mean, deviation) for part in (x[None], draws))
     low, high = np.quantile(of_draws, [0.05, 0.95], axis=0)
-    row |= {f"region_{name}": float(low[i] <= own[i] <= high[i]) for i, name in enumerate(REGIONS)}
+    row |= {f"region_{name}": float(low[i] <= own[0, i] <= high[i]) for i, name in enumerate(MOVEMENT_STATISTICS)}
     rough = [np.sqrt(np.square(np.diff(part, 2, axis=1)).mean()) for part in (draws, train)]
     return row | {"roughness": float(rough[0] / rough[1])}
 

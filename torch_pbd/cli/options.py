@@ -32,6 +32,7 @@ CLASSES: Mapping[str, Mapping[str, str]] = {
 
 MODELS = {
     "HGP": "HeteroscedasticGPRegressor",
+    "Trajectory": "TrajectoryRegressor",
     "CD": "CholeskyCovRegressor",
     "WP": "WishartProcessRegressor",
     "GMM 5": {"class_path": "GMMBaseline", "init_args": {"n_components": 5}},
@@ -39,7 +40,7 @@ MODELS = {
 }
 """Models by the names that tables print: those that are compared by default, and what options take as well as a class.
 
-A mixture has as many components as in the paper's Table I."""
+A mixture has as many components as in the paper's Table I. Models of whole movements are compared on files alone."""
 
 _CLASS_KEYS = ("class_path", "init_args")
 _HELP_WIDTH = 80  # of the terminals that people start with

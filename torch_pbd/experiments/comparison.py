@@ -13,6 +13,7 @@ from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.experiments.resume import FinishedFits, fit_once
 from torch_pbd.experiments.sweep import left_out, mean_and_error, score_fold
 from torch_pbd.metrics import covariance_mse, relative_frobenius_error
+from torch_pbd.movement import MOVEMENT_STATISTICS
 
 Floats = NDArray[np.float64]
 
@@ -35,6 +36,8 @@ class Score:
     fit_seconds: float
     smallest_eigenvalue: float
     """Smallest eigenvalue of the predicted correlations, over the data."""
+    fold_movement: tuple[dict[str, float], ...] = ()
+    """Of each demonstration left out as a whole, what :func:`~torch_pbd.movement.judge_movement` returns."""
 
     @property
     def log_likelihood(self) -> float:
@@ -62,6 +65,12 @@ class Score:
             "fit [s]": self.fit_seconds,
         }
 
+    def movement_row(self) -> dict[str, Any]:
+        """Row of a table of whole movements."""
+        joint, error = mean_and_error([fold["joint"] for fold in self.fold_movement])
+        holds = {name: mean_and_error([fold[name] for fold in self.fold_movement])[0] for name in MOVEMENT_STATISTICS}
+        return {"model": self.model, "joint LL": joint, "+- ": error, **holds}
+
 
 def compare_models(
     models: Mapping[str, CovarianceRegressor],
@@ -73,6 +82,7 @@ def compare_models(
     max_folds: int = 10,
     n_jobs: int | None = None,
     finished: FinishedFits | None = None,
+    whole_movements: bool = False,
 ) -> list[Score]:
     """Fit every model on all the data, and once more without each of some demonstrations.
 
@@ -90,6 +100,8 @@ def compare_models(
         Fits that run at the same time, as in scikit-learn. Times are measured before, one by one.
     finished : FinishedFits, default=None
         Where fits are kept, and not repeated if they are there.
+    whole_movements : bool, default=False
+        Judge the demonstrations left out as a whole too.
 
     Returns
     -------
@@ -99,7 +111,9 @@ def compare_models(
     folds = left_out(groups, max_folds)
     fits = {name: fit_once(clone(model), X, y, groups, finished=finished) for name, model in models.items()}
     jobs = (
-        delayed(score_fold)(clone(model), X, y, groups, fold, finished) for model in models.values() for fold in folds
+        delayed(score_fold)(clone(model), X, y, groups, fold, finished, whole=whole_movements)
+        for model in models.values()
+        for fold in folds
     )
     results = iter(Parallel(n_jobs=n_jobs)(jobs))
     scores = []
@@ -115,6 +129,7 @@ def compare_models(
                 frobenius=float("nan") if truth is None else relative_frobenius_error(covariance, truth(inputs)),
                 fold_log_likelihood=tuple(row["log_likelihood"] for row in held_out),
                 fold_coverage=tuple(row["coverage"] for row in held_out),
+                fold_movement=tuple(held_out) if whole_movements else (),
                 fit_seconds=seconds,
                 smallest_eigenvalue=float(
                     np.linalg.eigvalsh(covariance / scale[:, :, np.newaxis] / scale[:, np.newaxis]).min()

@@ -83,15 +83,16 @@ def run_recordings(
 ) -> str:
     """Compare models on demonstrations, with options of ``compare_models``.
 
-    Writes metrics, folds, models and figures; returns the table as text.
+    Writes metrics, folds, models and figures; returns the tables, of rows and of whole movements, as text.
     """
-    scores = compare_models(models, *demonstrations.stack(input), finished=folder.finished, **options)
-    rows = [score.row() for score in scores]
+    data = demonstrations.stack(input)
+    scores = compare_models(models, *data, finished=folder.finished, whole_movements=True, **options)
+    rows, whole = [score.row() for score in scores], [score.movement_row() for score in scores]
     folds = [{f"LL {i + 1}": value for i, value in enumerate(score.fold_log_likelihood)} for score in scores]
-    folder.write_metrics([row | own for row, own in zip(rows, folds, strict=True)])
+    folder.write_metrics([row | own | each for row, own, each in zip(rows, whole, folds, strict=True)])
     for score in scores:
         write_fitted(score.fitted, demonstrations, folder, score.model, input)
-    return format_table(rows)
+    return "\n\n".join(map(format_table, [rows, whole] if scores[0].fold_movement else [rows]))
 
 
 def write_fitted(

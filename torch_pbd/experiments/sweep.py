@@ -27,7 +27,8 @@ from torch_pbd.control.simulation.run import simulate_many
 from torch_pbd.data import Demonstrations
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.experiments.resume import FinishedFits, fit_once
-from torch_pbd.metrics import mahalanobis_coverage
+from torch_pbd.metrics import mahalanobis_coverage, negative_log_likelihood
+from torch_pbd.movement import judge_movement
 
 Floats = NDArray[np.float64]
 Row = dict[str, Any]
@@ -121,15 +122,21 @@ def score_fold(
     groups: NDArray[np.intp],
     demonstration: int,
     finished: FinishedFits | None = None,
+    *,
+    whole: bool = False,
 ) -> dict[str, float]:
-    """Fit without a demonstration, and score how well it is predicted."""
+    """Fit without a demonstration, and score how well its rows are predicted, and if asked for it as a whole."""
     left = groups == demonstration
     start = time.thread_time()
     model, _ = fit_once(model, X[~left], y[~left], groups[~left], finished=finished)
     seconds = time.thread_time() - start
     mean, covariance = model.predict(X[left], return_cov=True)
     coverage = mahalanobis_coverage(mean.reshape(len(mean), -1), covariance, y[left], level=0.95)
-    return {"log_likelihood": model.score(X[left], y[left]), "coverage": float(coverage), "fit_seconds": seconds}
+    # The score of a model of movements is that of the whole: here its rows are compared with those of regressors.
+    is_movement = hasattr(model, "score_demonstrations")
+    likelihood = -negative_log_likelihood(model, X[left], y[left]) if is_movement else model.score(X[left], y[left])
+    row = {"log_likelihood": likelihood, "coverage": float(coverage), "fit_seconds": seconds}
+    return row | judge_movement(model, X[left], y[left]) if whole else row
 
 
 def summarize(rows: Sequence[Row]) -> list[Row]:
