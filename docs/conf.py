@@ -12,6 +12,7 @@ extensions = [
     "sphinx.ext.autosummary",
     "numpydoc",
     "sphinx_copybutton",
+    "sphinx_gallery.gen_gallery",
 ]
 exclude_patterns = ["_build"]
 templates_path = ["templates"]
@@ -20,7 +21,7 @@ nitpicky = True
 
 autosummary_generate = True
 autodoc_typehints = "none"  # the docstrings say more
-autodoc_class_signature = "separated"
+toc_object_entries_show_parents = "hide"
 numpydoc_show_class_members = False  # the template of classes shows them
 myst_heading_anchors = 3
 myst_url_schemes = ["http", "https"]
@@ -28,6 +29,18 @@ myst_url_schemes = ["http", "https"]
 html_theme = "pydata_sphinx_theme"
 html_title = "torch_pbd"
 html_show_sourcelink = False
-html_theme_options = {"show_prev_next": False, "navigation_with_keys": False, "secondary_sidebar_items": ["page-toc"]}
+html_theme_options = {"show_prev_next": False, "navigation_with_keys": False, "header_links_before_dropdown": 4}
 html_sidebars = {"**": ["sidebar-nav-bs"]}
 copybutton_prompt_text = ">>> "
+
+sphinx_gallery_conf = {
+    "examples_dirs": "../examples",
+    "gallery_dirs": "gallery",
+    "download_all_examples": False,
+    "write_computation_times": False,  # its page loads a script of another host
+    "show_signature": False,
+    "abort_on_example_error": True,
+    "min_reported_time": 10.0,
+    "image_scrapers": ("matplotlib",),
+    "within_subsection_order": "FileNameSortKey",
+}

@@ -1,6 +1,7 @@
 """The documentation names every public name, its code runs, and its links lead somewhere."""
 
 import re
+import runpy
 from importlib import import_module
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 PAGES = sorted(path.name for path in DOCS.glob("*.md"))
 WITH_CODE = [name for name in PAGES if "```python" in (DOCS / name).read_text(encoding="utf-8")]
 
@@ -42,11 +44,26 @@ def test_the_python_of_a_page_runs(name, tmp_path, monkeypatch):
     plt.close("all")
 
 
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_an_example_is_short(path):
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= 60
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_an_example_runs_and_shows_one_figure(path):
+    runpy.run_path(str(path))
+    assert len(plt.get_fignums()) == 1
+    plt.close("all")
+
+
 @pytest.mark.parametrize("path", [ROOT / "README.md", *(DOCS / name for name in PAGES)], ids=lambda path: path.name)
 def test_links_and_files_are_there(path):
     text = path.read_text(encoding="utf-8")
     linked = [link.partition("#")[0] for link in re.findall(r"\]\((?!https?:)([^)\s]+)\)", text)]
-    missing = [link for link in linked if link and not (path.parent / link).is_file()]
+    # Pages of the gallery are made of the examples.
+    sources = [re.sub(r"^gallery/(.*)\.rst$", r"../examples/\1.py", link) for link in linked]
+    missing = [link for link in sources if link and not (path.parent / link).is_file()]
     assert missing == []
     assert [name for name in re.findall(r"--config ([\w/.]+)", text) if not (ROOT / name).is_file()] == []
 
