@@ -62,7 +62,7 @@ class TimedMovement(MovementRegressor):
         return mean, np.sqrt(weight @ np.square(phases - mean))
 
     def condition(self, X: ArrayLike, y: ArrayLike, *, noise_scale: ArrayLike = 0.0) -> Self:
-        """Fitted copy, of a movement that is at y at X; see :meth:`MovementRegressor.condition`.
+        """Fitted copy, of a movement that is at y at X; see ``MovementRegressor.condition``.
 
         With timing, X is the time of the running movement, and it runs at the last of them.
         """
