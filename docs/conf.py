@@ -1,5 +1,7 @@
 """Settings of the documentation; `python docs/build.py` builds it."""
 
+from pathlib import Path
+
 import torch_pbd
 
 project = "torch_pbd"
@@ -30,7 +32,10 @@ html_theme = "pydata_sphinx_theme"
 html_title = "torch_pbd"
 html_show_sourcelink = False
 html_theme_options = {"show_prev_next": False, "navigation_with_keys": False, "header_links_before_dropdown": 4}
-html_sidebars = {"**": ["sidebar-nav-bs"]}
+# Pages without pages below them have no list of those.
+html_sidebars = {page.stem: [] for page in Path(__file__).parent.glob("*.md")}
+html_static_path = ["static"]
+html_css_files = ["tables.css"]
 copybutton_prompt_text = ">>> "
 
 sphinx_gallery_conf = {
