@@ -1,8 +1,10 @@
 """Commands: the options of each, and its work in a folder of results, which ends with a text."""
 
+import json
 import math
 from argparse import Namespace
 from collections.abc import Sequence
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
 COMMANDS = {
     "demo": "learn from six made demonstrations of the tunnel task; the main job, no data needed",
     "fit": "fit one model to a file of demonstrations",
+    "inspect": "what is in a file of demonstrations, and what is likely wrong with it: torch-pbd inspect FILE",
     "experiment": "learn a skill, reproduce it on a simulated robot and push it (Figures 5 to 8)",
     "compare": "compare models: on the paper's simulation (Table I, Figures 1 to 3), or on a file",
     "playground": "draw strokes in the browser, see their covariance, bend the movement, push the robot",
@@ -54,6 +57,7 @@ OPTIONS: dict[str, dict[str, Option]] = {
         "model": Option("Model", MODELS["HGP"], f"estimator {_CLASS_HELP} --model.help NAME"),
         **_GRID,
     },
+    "inspect": {**_FILE, "data": Option(str | list[str] | None, None, _DATA, required=True)},
     "experiment": {
         **_FILE,
         **_MADE,
@@ -118,6 +122,8 @@ def parse(command: str, arguments: Sequence[str]) -> tuple[Namespace, str]:
         "output": Option(str, f"runs/{command}", "folder of the results"),
         "resume": Option(bool, False, "go on with the finished fits in the folder of results"),
     }
+    if command == "inspect":
+        arguments = _named_files(arguments)
     return options.parse(f"torch-pbd {command}", COMMANDS[command], run | OPTIONS[command], arguments)
 
 
@@ -130,6 +136,13 @@ def playground(options: Any) -> None:
             f"playground needs {error.name}, which is not installed: pip install 'torch_pbd[playground]'."
         ) from error
     serve(options.port, browse=options.browse)
+
+
+def _named_files(arguments: Sequence[str]) -> list[str]:
+    """Arguments in which the files that stand first are an option, as ``inspect trial_*.csv`` of a shell needs it."""
+    files = list(takewhile(lambda argument: not argument.startswith("-"), arguments))
+    rest = list(arguments[len(files) :])
+    return ["--data", files[0] if len(files) == 1 else json.dumps(files), *rest] if files else rest
 
 
 def demo(options: Any, folder: Any) -> str:
@@ -162,6 +175,16 @@ def fit(options: Any, folder: Any) -> str:
         f"{name} {settled}; {of_what} {likelihood:.3f} nats per sample of the data it was fitted to\n"
         f"model:   {model_path}\nfigure:  {figure_path}"
     )
+
+
+def inspect(options: Any, folder: Any) -> str:
+    """What is in recordings, before anything is fitted."""
+    from torch_pbd.experiments.recordings import figure_of_recordings
+
+    demonstrations, description = _loaded(options, inspect=True)
+    say(f"{_name(options.data)}: {demonstrations}\n")
+    figure = folder.write_figure(figure_of_recordings(demonstrations, _name(options.data)), "recordings")
+    return f"{description}\n\nfigure:  {figure}"
 
 
 def experiment(options: Any, folder: Any) -> str:
@@ -205,15 +228,15 @@ def compare(options: Any, folder: Any) -> str:
     return run_simulation(models, folder, options.readings, **sizes, **how)
 
 
-WORK = {"demo": demo, "fit": fit, "experiment": experiment, "compare": compare}
+WORK = {"demo": demo, "fit": fit, "inspect": inspect, "experiment": experiment, "compare": compare}
 
 
-def _loaded(options: Any) -> Any:
-    from torch_pbd.data import load_demonstrations
+def _loaded(options: Any, *, inspect: bool = False) -> Any:
+    from torch_pbd.data import inspect_demonstrations, load_demonstrations
 
     loader = {"missing": options.missing, "from_start": options.from_start, **(options.loader or {})}
     try:
-        return load_demonstrations(options.data, **loader)
+        return (inspect_demonstrations if inspect else load_demonstrations)(options.data, **loader)
     except TypeError as error:
         raise ConfigError(f"loader: {error}") from error
 

@@ -2,7 +2,7 @@
 
 from torch_pbd.data.demonstrations import Demonstrations
 from torch_pbd.data.handwriting import handwriting_covariance, handwriting_mean, make_handwriting_demonstrations
-from torch_pbd.data.io import load_demonstrations, save_demonstrations
+from torch_pbd.data.io import inspect_demonstrations, load_demonstrations, save_demonstrations
 from torch_pbd.data.synthetic import (
     make_paper_simulation,
     make_tunnel_demonstrations,
@@ -18,6 +18,7 @@ __all__ = [
     "check_unimodal",
     "handwriting_covariance",
     "handwriting_mean",
+    "inspect_demonstrations",
     "load_demonstrations",
     "make_handwriting_demonstrations",
     "make_paper_simulation",

@@ -1,20 +1,20 @@
 """What makes other demonstrations of some: from and to tables, other units, selected, joined, cut."""
 
 from collections.abc import Iterable, Sequence
-from typing import Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
+from torch_pbd.data.pauses import still
 from torch_pbd.data.recordings import MIN_SAMPLES, Missing, as_texts, preview
 from torch_pbd.data.units import ANGLES, LENGTHS, TIMES, check_unit, find_suspects
 from torch_pbd.data.wanted import Wanted
 from torch_pbd.exceptions import InvalidParameterError
 
-# Within a pause all outputs stay within this share of their extent in the recording: a hand that waits trembles.
-_STILL = 0.02
+if TYPE_CHECKING:
+    from torch_pbd.data.description import Description
 
 
 class Editing:
@@ -210,28 +210,11 @@ class Editing:
         times = [time[span] for time, span in zip(self.times, spans, strict=True)]
         return self._replace(times, [position[span] for position, span in zip(self.positions, spans, strict=True)])
 
+    def describe(self) -> "Description":
+        """What is in the recordings, and what is likely wrong with them: tables to print, and ``mistakes``."""
+        from torch_pbd.data.description import describe
 
-def still(time: Floats, position: Floats, pause: float) -> NDArray[np.bool_]:
-    """Whether each sample belongs to a stretch of at least ``pause`` in which no output leaves 2 % of its extent."""
-    extent = np.ptp(position, axis=0)
-    result = np.zeros(len(time), dtype=bool)
-    if not extent.any() or time[-1] - time[0] < pause:
-        return result
-    # Evenly spaced, as windows are of samples; ten of them in a pause.
-    n = int(min(max(np.ceil(10.0 * (time[-1] - time[0]) / pause), len(time)), 100_000))
-    grid = np.linspace(time[0], time[-1], n)
-    width = max(2, int(np.ceil(pause / (grid[1] - grid[0]))) + 1)
-    if width > n:
-        return result
-    quiet = np.ones(n - width + 1, dtype=bool)
-    for values, whole in zip(position.T, extent, strict=True):
-        windows = np.lib.stride_tricks.sliding_window_view(np.interp(grid, time, values), width)
-        quiet &= np.ptp(windows, axis=1) <= _STILL * whole
-    # A sample is still where any of the windows that hold it is quiet.
-    marks = np.zeros(n + 1)
-    np.add.at(marks, np.flatnonzero(quiet), 1.0)
-    np.add.at(marks, np.flatnonzero(quiet) + width, -1.0)
-    return np.interp(time, grid, np.cumsum(marks[:-1]) > 0.0) > 0.5
+        return describe(self)
 
 
 def _span(time: Floats, start_end: Any, i: int) -> tuple[int, int]:

@@ -3,13 +3,16 @@
 import difflib
 import inspect
 import os
+import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
 from torch_pbd import checks
 from torch_pbd.data.demonstrations import Demonstrations
+from torch_pbd.data.description import Description, describe
 from torch_pbd.data.recordings import Missing
 from torch_pbd.data.wanted import MAX_BYTES, Wanted, natural
 from torch_pbd.exceptions import ConfigError, DataFormatError
@@ -139,6 +142,30 @@ def load_demonstrations(
         missing=missing,
         max_bytes=max_bytes,
     )
+    return _load_all(source, wanted, options, cut=cut, trim=trim, from_start=from_start)
+
+
+def inspect_demonstrations(source: Source, **options: Any) -> tuple[Demonstrations, Description]:
+    """What can be read of a source, and its description; takes the options of `load_demonstrations`.
+
+    What that function would refuse is left out or guessed, if there is a way, and told among the ``mistakes``.
+    """
+    notes: list[str] = []
+    shared = {field.name for field in fields(Wanted)}
+    own = {name: value for name, value in options.items() if name not in shared}
+    whole = {name: own.pop(name, None) for name in ("cut", "trim", "from_start")}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        wanted = Wanted(**{name: value for name, value in options.items() if name in shared}, notes=notes)
+        demonstrations = _load_all(source, wanted, own, **whole)
+    told = [str(warning.message) for warning in caught]
+    suspects = " ".join(demonstrations.suspects)
+    return demonstrations, describe(demonstrations, [*dict.fromkeys(notes), *(t for t in told if t != suspects)])
+
+
+def _load_all(
+    source: Source, wanted: Wanted, options: dict[str, Any], *, cut: Any, trim: Any, from_start: bool | None
+) -> Demonstrations:
     each = [_load(file, wanted, options) for file in find_files(source)]
     demonstrations = each[0] if len(each) == 1 else Demonstrations.concatenate(each)
     demonstrations = demonstrations if cut is None else demonstrations.cut(cut)

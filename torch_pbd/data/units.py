@@ -81,21 +81,26 @@ def _column(positions: Sequence[Floats], i: int) -> Floats:
     return np.concatenate([position[:, i] for position in positions]).clip(-_LARGEST_ANGLE, _LARGEST_ANGLE)
 
 
-def _quaternions(positions: Sequence[Floats], names: Sequence[str]) -> Iterator[str]:
-    first = 0
-    while first + 4 <= len(names):
-        four = slice(first, first + 4)
+def quaternions(positions: Sequence[Floats], n_outputs: int) -> list[int]:
+    """Places of the outputs with which four that are unit quaternions begin."""
+    found, first = [], 0
+    while first + 4 <= n_outputs:
         columns = [_column(positions, i) for i in range(first, first + 4)]
         off = np.abs(sum(map(np.square, columns)) - 1.0)
         spread = max(map(np.ptp, columns))
-        found = spread > 0.0 and np.mean(off <= min(_OFF_SPHERE, _OFF_SPHERE_SHARE * spread)) >= _SAMPLES_ON_SPHERE
-        first += 4 if found else 1
-        if found:
-            yield (
-                f"Outputs {', '.join(names[four])} have the squared sum 1, as unit quaternions do: q and -q are the "
-                "same rotation, so their mean and their covariance are not those of rotations. Leave them out, as by "
-                "outputs=[...] of load_demonstrations."
-            )
+        if spread > 0.0 and np.mean(off <= min(_OFF_SPHERE, _OFF_SPHERE_SHARE * spread)) >= _SAMPLES_ON_SPHERE:
+            found.append(first)
+        first += 4 if first in found else 1
+    return found
+
+
+def _quaternions(positions: Sequence[Floats], names: Sequence[str]) -> Iterator[str]:
+    for first in quaternions(positions, len(names)):
+        yield (
+            f"Outputs {', '.join(names[first : first + 4])} have the squared sum 1, as unit quaternions do: q and -q "
+            "are the same rotation, so their mean and their covariance are not those of rotations. Leave them out, as "
+            "by outputs=[...] of load_demonstrations."
+        )
 
 
 def _wrapped(positions: Sequence[Floats], names: Sequence[str], units: Sequence[str] | None) -> Iterator[str]:

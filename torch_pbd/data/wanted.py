@@ -49,6 +49,8 @@ class Wanted:
     frame: str | None = None
     missing: Missing = "raise"
     max_bytes: int = MAX_BYTES
+    notes: list[str] | None = None
+    """Where a list, what would be refused and has a way around is told there."""
 
     def __post_init__(self) -> None:
         checks.text(self.demo, "demo", optional=True)
@@ -75,6 +77,8 @@ class Wanted:
         places = {column: (signal, i) for signal, columns in signals.items() for i, column in enumerate(columns)}
         demo = demo if self.demo is None and demo in places else self.demo
         time = self.time or time
+        if time is not None and time not in places and self.rate is None and self.notes is not None:
+            time = self._likely_time(time, places)
         if self.rate is not None:
             time = time if time in places else None
         taken = [name for name in (demo, time) if name is not None]
@@ -102,11 +106,24 @@ class Wanted:
         names = [name for name in places if name not in taken]
         unnamed = [name for name in names if name in _UNNAMED]
         if unnamed:
-            raise ValueError(
+            self.refuse(
                 f"column {list(places).index(unnamed[0]) + 1} has no name, as the index of a table that was written "
                 f"without index=False. Leave it out, or say outputs={[n for n in names if n not in _UNNAMED]}."
             )
-        return names
+        return [name for name in names if name not in _UNNAMED]
+
+    def _likely_time(self, time: str, places: Mapping[str, Any]) -> str:
+        """The only column whose name is one of times."""
+        likely = [name for name in places if re.search(r"(?i)time|stamp|^t$|^sec|^t_", name)]
+        if len(likely) == 1:
+            self.refuse(f"no column {time!r}: say time={likely[0]!r}, if that is it.")
+        return likely[0] if len(likely) == 1 else time
+
+    def refuse(self, message: str) -> None:
+        """Raise ValueError, or note the message where notes are taken and the caller knows a way around."""
+        if self.notes is None:
+            raise ValueError(message)
+        self.notes.append(message)
 
     def require(self, n_bytes: float, what: str) -> None:
         """Refuse what unpacks to more than ``max_bytes`` or than the memory takes, before it is read."""
@@ -123,16 +140,24 @@ class Wanted:
     ) -> Arguments:
         """Arguments of ``Demonstrations``, of each recording's arrays; ``labels`` are the file's, if none are given."""
         if self.outputs is None and positions:
-            check_movements(names, positions)
+            counts = check_movements(names, positions)
+            for message in counts.values():
+                self.refuse(message)
+            kept = [i for i, name in enumerate(names) if name not in counts]
+            if counts and kept:
+                names, positions = [names[i] for i in kept], [position[:, kept] for position in positions]
+                labels |= {"units": [labels["units"][i] for i in kept]} if isinstance(labels.get("units"), list) else {}
         unit = self.time_unit or labels.get("time_unit") or "s"
         if self.rate is not None:
             times, unit = [np.arange(len(position)) / self.rate for position in positions], "s"
         elif times is None:
-            raise ValueError("it holds no times: give rate=, the samples a second (robosuite records 20).")
+            self.refuse(f"it holds no times: give rate=, the samples a second{labels.pop('rate_hint', '')}.")
+            times, unit = [np.arange(len(position)) for position in positions], "samples"
         elif times and all(np.asarray(time).dtype.kind in "mM" for time in times):
             times = _numbers_of_dates(times, checks.choice(unit, "time_unit", _DATE_UNITS))
         given = {"units": self.units, "frame": self.frame}
         labels |= {name: value for name, value in given.items() if value is not None}
+        labels.pop("rate_hint", None)
         labels |= {"names": names, "time_unit": unit, "missing": self.missing}
         return {"times": times, "positions": positions, **labels}
 
@@ -180,8 +205,9 @@ def rows_of(demo: NDArray[Any]) -> list[NDArray[np.intp]]:
     return np.split(np.argsort(rank, kind="stable"), np.cumsum(np.bincount(rank))[:-1])
 
 
-def check_movements(names: Sequence[str], positions: Sequence[Floats]) -> None:
-    """Refuse columns that count rows or number demonstrations, which nobody named as outputs."""
+def check_movements(names: Sequence[str], positions: Sequence[Floats]) -> dict[str, str]:
+    """Sentences on the columns that count rows or number demonstrations, which nobody named as outputs."""
+    found = {}
     for i, name in enumerate(names):
         values = np.concatenate([position[:, i] for position in positions])
         if len(values) < _FEWEST_COUNTED or not (values == np.round(values)).all():
@@ -197,10 +223,11 @@ def check_movements(names: Sequence[str], positions: Sequence[Floats]) -> None:
         if counts or numbers:
             remedy = f"say which columns are: outputs={[n for n in names if n != name]}"
             remedy += f", and demo={name!r} if it tells the demonstrations apart" if numbers else ""
-            raise ValueError(
+            found[name] = (
                 f"column {name!r}: it {'counts rows' if counts else 'numbers demonstrations'}, and is no movement. "
                 f"Leave it out, or {remedy}."
             )
+    return found
 
 
 def optional(module: str, extra: str, what: str) -> Any:

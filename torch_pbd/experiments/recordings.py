@@ -74,6 +74,20 @@ def figure_of(model: CovarianceRegressor, demonstrations: Demonstrations, name: 
     return figure
 
 
+def figure_of_recordings(demonstrations: Demonstrations, name: str) -> Figure:
+    """Every output over the time, at most nine of them."""
+    n = min(demonstrations.n_outputs, 9)
+    n_columns = min(3, n)
+    n_rows = -(-n // n_columns)
+    figure, grid = figure_grid(n_rows, n_columns, (4.0 * n_columns, 2.6 * n_rows))
+    for output, ax in enumerate(grid.flat):
+        ax.set_visible(output < n)
+        if output < n:
+            plot_demonstrations(demonstrations, [output], ax)
+    figure.suptitle(name if n == demonstrations.n_outputs else f"{name}: 9 of {demonstrations.n_outputs} outputs")
+    return figure
+
+
 def run_recordings(
     models: Mapping[str, CovarianceRegressor],
     demonstrations: Demonstrations,

@@ -28,15 +28,14 @@ def read(path: Path, wanted: Wanted, mask: str | None = None) -> Arguments:
         each = {name: _datasets(data[name], h5py) for name in names}
         signals = {key: _columns(key, found.shape[1:]) for key, found in each[names[0]].items()}
         chosen = wanted.choose(signals, outputs="robot0_eef_pos" if "robot0_eef_pos" in signals else None)
-        if chosen.time is None and wanted.rate is None:
-            raise ValueError(f"it holds no times: give rate=, the samples a second{_control_rate(data)}.")
+        hint = _control_rate(data)
         for name in names:
             _check(name, data[name], each[name], chosen.signals)
         wanted.require(sum(found[key].nbytes for found in each.values() for key in chosen.signals), "it")
         recordings = [{key: found[key][()] for key in chosen.signals} for found in each.values()]
     # Positions of robosuite's end effectors are in m.
     units = "m" if all(signal.endswith("eef_pos") for signal, _ in chosen.outputs) else None
-    return wanted.read_each(chosen, recordings, units=units)
+    return wanted.read_each(chosen, recordings, units=units, rate_hint=hint)
 
 
 def _masked(file: Any, mask: str) -> list[str]:

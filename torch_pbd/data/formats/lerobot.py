@@ -22,7 +22,7 @@ def read(path: Path, wanted: Wanted) -> Arguments:
     chosen = wanted.choose(signals, demo="episode_index", time="timestamp", outputs="observation.state")
     if wanted.units is None:
         shown = preview(chosen.names, 6)
-        raise ValueError(
+        wanted.refuse(
             f"it does not tell the units of {shown}: give units=, 'deg' or 'rad' of joints, 'percent' where they go "
             "from -100 to 100, or one for each."
         )

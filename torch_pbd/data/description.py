@@ -1,0 +1,199 @@
+"""What is in recordings, and what is likely wrong with them, each with its remedy."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from torch_pbd.checks import Floats
+from torch_pbd.data.alignment import check_overlap
+from torch_pbd.data.pauses import still
+from torch_pbd.data.units import ANGLES, LENGTHS, TIMES, quaternions
+from torch_pbd.exceptions import InvalidParameterError
+
+_MOST_ROWS = 20
+_PAUSE = 0.5  # s; shorter stillness is part of a movement
+_GAP = 5.0  # median steps: two lost samples are no gap, a second of a sensor's silence is
+_ENDS = 0.2  # of the largest speed: a recording that is cut while moving
+_UNIX = 1e8  # s: no recording is three years long
+_RATES = 4.0, 5000.0  # Hz, in which hands and robots are recorded
+_LONGEST, _FURTHEST = 600.0, 10.0  # s and m of one movement
+
+
+@dataclass(frozen=True, repr=False)
+class Description:
+    """Tables of recordings and outputs, and sentences on likely mistakes.
+
+    Attributes
+    ----------
+    recordings : list of dict
+        Number, samples, start, duration, rate, largest gap, and stillness at both ends, of each recording.
+    outputs : list of dict
+        Name, unit, least, largest and extent of each output.
+    mistakes : tuple of str
+        Each with its remedy; empty where nothing looks wrong.
+    """
+
+    recordings: list[dict[str, Any]] = field(default_factory=list)
+    outputs: list[dict[str, Any]] = field(default_factory=list)
+    mistakes: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        rows = _table(self.recordings[:_MOST_ROWS])
+        if len(self.recordings) > _MOST_ROWS:
+            rows += f"\n... {len(self.recordings)} recordings in all"
+        told = [f"{i + 1}. {sentence}" for i, sentence in enumerate(self.mistakes)] or ["Nothing looks wrong."]
+        return "\n\n".join([rows, _table(self.outputs), "\n".join(told)])
+
+    __repr__ = __str__
+
+
+def describe(demonstrations: Any, notes: Sequence[str] = ()) -> Description:
+    """Description of `torch_pbd.data.Demonstrations`; ``notes`` are mistakes that were found on the way to them."""
+    second = 1.0 / TIMES.get(demonstrations.time_unit, 1.0)
+    unit = demonstrations.time_unit
+    recordings = []
+    for k, (time, position) in enumerate(demonstrations):
+        steps = np.diff(time)
+        first, last = _still_ends(time, position, _PAUSE * second)
+        row = {"#": k, "samples": len(time), f"start [{unit}]": time[0], f"lasts [{unit}]": time[-1] - time[0]}
+        row |= {"rate [Hz]": second / np.median(steps), f"gap [{unit}]": steps.max()}
+        recordings.append(row | {"rest before": first, "rest after": last})
+    whole = [_column(demonstrations, i) for i in range(demonstrations.n_outputs)]
+    units = demonstrations.units or ["none"] * demonstrations.n_outputs
+    outputs = [
+        {"output": name, "unit": own, "least": y.min(), "largest": y.max(), "extent": np.ptp(y)}
+        for name, own, y in zip(demonstrations.names, units, whole, strict=True)
+    ]
+    mistakes = (*notes, *_of_times(demonstrations, second), *_of_ends(demonstrations, recordings, unit))
+    return Description(recordings, outputs, (*mistakes, *_of_outputs(demonstrations, outputs)))
+
+
+def _column(demonstrations: Any, i: int) -> Floats:
+    return np.concatenate([position[:, i] for position in demonstrations.positions])
+
+
+def _still_ends(time: Floats, position: Floats, pause: float) -> tuple[float, float]:
+    """How long nothing moves at the beginning and at the end."""
+    moving = np.flatnonzero(~still(time, position, pause))
+    return (time[moving[0]] - time[0], time[-1] - time[moving[-1]]) if len(moving) else (time[-1] - time[0], 0.0)
+
+
+def _of_times(demonstrations: Any, second: float) -> Iterator[str]:
+    times, unit = demonstrations.times, demonstrations.time_unit
+    starts = np.array([time[0] for time in times]) / second
+    steps = np.concatenate([np.diff(time) for time in times])
+    rate = 1.0 / np.median(steps)
+    apart = False
+    try:
+        check_overlap(times, unit)
+    except InvalidParameterError:
+        apart = True
+    if unit in TIMES and not _RATES[0] <= rate * second <= _RATES[1]:
+        meant = [other for other, size in TIMES.items() if _RATES[0] <= rate / size <= _RATES[1]]
+        if meant and meant[-1] != unit:
+            yield (
+                f"A sample every {1 / rate:.4g} {unit} is {rate * second:.3g} Hz: the times look like {meant[-1]}. Say "
+                f"time_unit={meant[-1]!r}."
+            )
+    elif unit in TIMES and max(time[-1] - time[0] for time in times) / second > _LONGEST:
+        yield "A recording is longer than ten minutes. Cut it into demonstrations: cut='pauses' or [[start, end]]."
+    if np.abs(starts).max() > _UNIX:
+        yield f"Times start at {starts[0]:.0f} s, as stamps since 1970 do. Count from the start: from_start=True."
+    if apart and len(times) > 1:
+        yield "The recordings do not overlap in time. Count each from its start, from_start=True, or take a phase."
+    for k, time in enumerate(times):
+        step = np.diff(time)
+        i = int(step.argmax())
+        if step[i] > _GAP * np.median(step):
+            yield (
+                f"Recording {k} has a gap of {step[i]:.3g} {unit} at {time[i]:.6g}, {step[i] / np.median(step):.0f} "
+                "times the usual step. Where others have samples they are used; else leave it out, or cut= there."
+            )
+
+
+def _of_ends(demonstrations: Any, recordings: list[dict[str, Any]], unit: str) -> Iterator[str]:
+    for end, rest in (("start", "rest before"), ("end", "rest after")):
+        held = [row["#"] for row in recordings if row[rest] > 0.0]
+        if held:
+            longest = max(row[rest] for row in recordings)
+            yield f"Nothing moves at the {end} of {_numbers(held)}, for up to {longest:.3g} {unit}: say trim='still'."
+    cut: dict[str, list[int]] = {"start": [], "end": []}
+    for k, (time, position) in enumerate(demonstrations):
+        scale = np.where(np.ptp(position, axis=0) > 0, np.ptp(position, axis=0), np.inf)
+        speed = np.linalg.norm(np.diff(position / scale, axis=0), axis=1) / np.diff(time)
+        few = max(1, len(speed) // 50)  # one step alone is mostly noise
+        for end, own in (("start", speed[:few]), ("end", speed[-few:])):
+            if len(speed) >= 10 and np.median(own) > _ENDS * np.quantile(speed, 0.95):
+                cut[end].append(k)
+    for end, numbers in cut.items():
+        if numbers:
+            yield (
+                f"At the {end}, {_numbers(numbers)} {'is' if len(numbers) == 1 else 'are'} moving: it was cut there. "
+                "Record from rest to rest, or give settle= to schedule()."
+            )
+
+
+def _of_outputs(demonstrations: Any, outputs: list[dict[str, Any]]) -> Iterator[str]:
+    yield from demonstrations.suspects
+    yield from _flips(demonstrations)
+    extents = {row["output"]: row["extent"] for row in outputs}
+    if demonstrations.units is None:
+        largest = max(extents, key=lambda name: extents[name])
+        far = (
+            f" Output {largest} covers {extents[largest]:.4g}: as metres that is far, 'mm'?"
+            if extents[largest] > _FURTHEST
+            else ""
+        )
+        yield f"The outputs have no units: give units=, as 'm', 'mm', 'rad', or one for each.{far}"
+    else:
+        for row in outputs:
+            metres = LENGTHS.get(row["unit"], 0.0) * row["extent"]
+            if metres > _FURTHEST or ANGLES.get(row["unit"], 0.0) * row["extent"] > 100.0:
+                yield f"Output {row['output']} covers {row['extent']:.4g} {row['unit']}: another unit? Give units=."
+    constant = [name for name, extent in extents.items() if extent == 0.0]
+    if constant:
+        yield f"{', '.join(constant)} never changes: leave it out, outputs={[n for n in extents if n not in constant]}."
+
+
+def _flips(demonstrations: Any) -> Iterator[str]:
+    """Unit quaternions, of which nobody named the order, or of which some are -q where others are q."""
+    for place in quaternions(demonstrations.positions, demonstrations.n_outputs):
+        columns = demonstrations.names[place : place + 4]
+        name = f"Quaternion {', '.join(columns)}"
+        if {column[-1] for column in columns} != set("wxyz"):
+            yield f"{name} has an order that nobody named: w may be first or last. Name its columns."
+        each = [position[:, place : place + 4] for position in demonstrations.positions]
+        for k, q in enumerate(each):
+            turned = np.flatnonzero((q[1:] * q[:-1]).sum(axis=1) < 0.0)
+            if len(turned):
+                when = demonstrations.times[k][turned[0] + 1]
+                yield f"{name} of recording {k} flips its sign at {when:.6g}: negate it from there."
+        other = [k for k, q in enumerate(each) if q[0] @ each[0][0] < 0.0]
+        if other:
+            yield f"{name} of {_numbers(other)} has the sign of -q where recording 0 has q: negate it."
+
+
+def _numbers(numbers: list[int]) -> str:
+    shown = ", ".join(map(str, numbers[:6])) + (f", ... ({len(numbers)} in all)" if len(numbers) > 6 else "")
+    return f"recording{'' if len(numbers) == 1 else 's'} {shown}"
+
+
+def _table(rows: list[dict[str, Any]]) -> str:
+    """Text of rows with the same keys, at most 80 letters wide."""
+    cells = [[*rows[0]], *([_cell(value) for value in row.values()] for row in rows)]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
+    spare = 80 - sum(widths[1:]) - 2 * (len(widths) - 1)
+    widths[0] = min(widths[0], max(spare, 8))
+    return "\n".join(
+        "  ".join(
+            cell[:width].ljust(width) if i == 0 else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in cells
+    )
+
+
+def _cell(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
