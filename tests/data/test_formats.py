@@ -139,7 +139,7 @@ def write_robomimic(path, **skip):
 def test_robomimic_files(tmp_path):
     path = tmp_path / "lift.hdf5"
     write_robomimic(path)
-    with pytest.raises(DataFormatError, match=r"no times: give rate=.*control_freq 20"):
+    with pytest.raises(DataFormatError, match=r"no times: give rate=.*robosuite records 20"):
         load_demonstrations(path)
     names = [f"robot0_eef_pos_{letter}" for letter in "xyz"]
     assert load_demonstrations(path, rate=20) == wanted(names, units="m")  # demo_10 after demo_9

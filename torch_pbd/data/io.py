@@ -15,7 +15,7 @@ from torch_pbd.data.demonstrations import Demonstrations
 from torch_pbd.data.description import Description, describe
 from torch_pbd.data.recordings import Missing
 from torch_pbd.data.wanted import MAX_BYTES, Wanted, natural
-from torch_pbd.exceptions import ConfigError, DataFormatError
+from torch_pbd.exceptions import DataFormatError
 from torch_pbd.files.atomic import LOADERS, replacing
 from torch_pbd.files.memory import require_memory
 
@@ -218,7 +218,7 @@ def _load(file: Path, wanted: Wanted, options: dict[str, Any]) -> Demonstrations
             raise ValueError(f"it has {n_bytes} bytes, more than max_bytes={wanted.max_bytes}: raise it to read this.")
         require_memory(_COPIES * n_bytes, what="reading it", remedy="Split the file, or leave samples out.")
         return Demonstrations(**reader(file, wanted, **options))
-    except (ConfigError, ModuleNotFoundError, MemoryError):
+    except ModuleNotFoundError:
         raise
     except Exception as error:  # parsers of bytes that are not what they claim to be raise errors of all kinds
         what = str(error) if isinstance(error, ValueError | TypeError) else f"{type(error).__name__}: {error}"

@@ -151,13 +151,12 @@ class Wanted:
         if self.rate is not None:
             times, unit = [np.arange(len(position)) / self.rate for position in positions], "s"
         elif times is None:
-            self.refuse(f"it holds no times: give rate=, the samples a second{labels.pop('rate_hint', '')}.")
+            self.refuse("it holds no times: give rate=, the samples a second (robosuite records 20).")
             times, unit = [np.arange(len(position)) for position in positions], "samples"
         elif times and all(np.asarray(time).dtype.kind in "mM" for time in times):
             times = _numbers_of_dates(times, checks.choice(unit, "time_unit", _DATE_UNITS))
         given = {"units": self.units, "frame": self.frame}
         labels |= {name: value for name, value in given.items() if value is not None}
-        labels.pop("rate_hint", None)
         labels |= {"names": names, "time_unit": unit, "missing": self.missing}
         return {"times": times, "positions": positions, **labels}
 

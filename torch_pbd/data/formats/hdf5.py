@@ -1,7 +1,5 @@
 """Demonstrations of robomimic and robosuite: HDF5 with a group data/demo_k for each."""
 
-import json
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +26,13 @@ def read(path: Path, wanted: Wanted, mask: str | None = None) -> Arguments:
         each = {name: _datasets(data[name], h5py) for name in names}
         signals = {key: _columns(key, found.shape[1:]) for key, found in each[names[0]].items()}
         chosen = wanted.choose(signals, outputs="robot0_eef_pos" if "robot0_eef_pos" in signals else None)
-        hint = _control_rate(data)
         for name in names:
             _check(name, data[name], each[name], chosen.signals)
         wanted.require(sum(found[key].nbytes for found in each.values() for key in chosen.signals), "it")
         recordings = [{key: found[key][()] for key in chosen.signals} for found in each.values()]
     # Positions of robosuite's end effectors are in m.
     units = "m" if all(signal.endswith("eef_pos") for signal, _ in chosen.outputs) else None
-    return wanted.read_each(chosen, recordings, units=units, rate_hint=hint)
+    return wanted.read_each(chosen, recordings, units=units)
 
 
 def _masked(file: Any, mask: str) -> list[str]:
@@ -69,6 +66,8 @@ def _columns(key: str, shape: tuple[int, ...]) -> tuple[str, ...]:
     return tuple(f"{key}_{letter}" for letter in order) if order else column_names(key, shape[0] if shape else 1)
 
 
+# Texts of variable length, as the environment's arguments with their rate, are not read: from damaged files the HDF5
+# library may not come back.
 def _check(name: str, group: Any, found: dict[str, Any], signals: list[str]) -> None:
     said = group.attrs.get("num_samples")
     for key in signals:
@@ -78,10 +77,3 @@ def _check(name: str, group: Any, found: dict[str, Any], signals: list[str]) -> 
             raise ValueError(f"data/{name} says num_samples = {said}, but {key} has {len(found[key])}.")
         if found[key].id.get_storage_size() == 0:
             raise ValueError(f"data/{name}/{key} of shape {found[key].shape} was never written.")
-
-
-def _control_rate(data: Any) -> str:
-    """What the environment's settings say of the rate, in brackets."""
-    with suppress(ValueError, KeyError, TypeError, AttributeError):
-        return f" (its env_args say control_freq {json.loads(data.attrs['env_args'])['env_kwargs']['control_freq']})"
-    return " (robosuite records 20)"
