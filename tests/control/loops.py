@@ -1,11 +1,10 @@
 """Schedules and loops for the tests of the real-time controller."""
 
-from types import SimpleNamespace
-
 import numpy as np
 from scipy.linalg import expm
 
 from torch_pbd.control.realtime import RealTimeAdmittance
+from torch_pbd.control.schedule import Schedule
 
 MASS = 0.5
 
@@ -15,6 +14,13 @@ USED = {
     "position": "desired_position",
     "velocity": "desired_velocity",
 }
+
+
+def as_schedule(time, stiffness, damping, position=None, velocity=None, **labels):
+    """Schedule of these rows, at rest at the origin where no motion is given."""
+    still = np.zeros(np.shape(stiffness)[:2])
+    motion = still if position is None else position, still if velocity is None else velocity
+    return Schedule(time, *motion, stiffness, damping, stiffness, np.zeros(len(still)), **labels)
 
 
 def make_schedule(d=2, *, rate=1000.0, duration=0.3, coupled=0.0, offset=0.0):
@@ -27,14 +33,14 @@ def make_schedule(d=2, *, rate=1000.0, duration=0.3, coupled=0.0, offset=0.0):
     damping = damping + coupled * np.diag(30.0 * np.arange(d))
     gains = {"stiffness": 0.5 * (stiffness + stiffness.mT), "damping": 0.5 * (damping + damping.mT)}
     position, velocity = 0.1 * np.cumsum(swing, axis=0) / rate, 0.1 * swing
-    return SimpleNamespace(time=offset + time, position=position, velocity=velocity, stiffness_limits=None, **gains)
+    return as_schedule(offset + time, position=position, velocity=velocity, **gains)
 
 
 def constant(stiffness, damping, *, position=0.0, velocity=0.0, duration=1.0):
     stiffness, damping = np.atleast_2d(stiffness), np.atleast_2d(damping)
     rows = {"stiffness": np.stack([stiffness] * 2), "damping": np.stack([damping] * 2)}
     motion = {"position": np.full((2, len(damping)), position), "velocity": np.full((2, len(damping)), velocity)}
-    return SimpleNamespace(time=np.array([0.0, duration]), stiffness_limits=None, **rows, **motion)
+    return as_schedule([0.0, duration], **rows, **motion)
 
 
 def one_axis(**options):

@@ -21,8 +21,7 @@ from torch_pbd import (
     HeteroscedasticGPRegressor,
     WishartProcessRegressor,
 )
-from torch_pbd.control.primitive.coverage import merge_bursts, tabulate_unsampled, unsampled
-from torch_pbd.control.primitive.smoothing import smooth
+from torch_pbd.control.primitive.smoothing import merge_bursts, smooth, tabulate_unsampled, unsampled
 
 HOLE = (1.5, 3.2)  # of 4 s
 BURSTS = np.repeat(np.arange(0.0, 2.01, 0.05), 5)

@@ -5,11 +5,11 @@ Numbers in the names are those of the list of faults that the project keeps.
 
 import math
 import warnings
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from control.loops import MASS, constant, make_schedule, one_axis
+from control.loops import MASS, as_schedule, constant, make_schedule, one_axis
 
 from torch_pbd import DMPController, GMMBaseline
 from torch_pbd.control import AdmittancePlant
@@ -25,16 +25,14 @@ def cut(duration=3.0, speed=SPEED, **more):
     time = np.arange(round(1000 * duration) + 1) / 1000
     gain = np.ones((len(time), 1, 1))
     rows = {"position": speed * time[:, None], "velocity": np.full((len(time), 1), speed)}
-    return SimpleNamespace(time=time, stiffness=100 * gain, damping=20 * gain, stiffness_limits=None, **rows, **more)
+    return as_schedule(time, 100 * gain, 20 * gain, **rows, **more)
 
 
 def wave(duration=3.0):
     """A motion of 0.4 m/s and 1.6 m/s^2 at most, cut while moving; 100 N/m, critically damped, 1 kg."""
     schedule = cut(duration)
-    schedule.position, schedule.velocity = (
-        a * f(4.0 * schedule.time)[:, None] for a, f in ((0.1, np.sin), (0.4, np.cos))
-    )
-    return schedule
+    position, velocity = (a * f(4.0 * schedule.time)[:, None] for a, f in ((0.1, np.sin), (0.4, np.cos)))
+    return replace(schedule, position=position, velocity=velocity)
 
 
 def went(controller, times, forces=None):
@@ -179,9 +177,7 @@ def test_74_the_command_never_outgrows_what_force_and_schedule_can_cause():
     _, velocities, _ = went(controller, times, 1e3 * np.sign(np.sin(10.0 * times))[:, None])
     assert 12.0 < np.abs(velocities).max() < 13.0
     assert controller.faults == TickStatus.FORCE_SATURATED
-    controller = RealTimeAdmittance(
-        SimpleNamespace(**{**vars(swing), "stiffness": 100.0 * np.array([[[1.0]], [[1e9]]])})
-    )
+    controller = RealTimeAdmittance(replace(swing, stiffness=100.0 * np.array([[[1.0]], [[1e9]]])))
     controller.start(0.0, velocity=[1.0])
     _, velocities, _ = went(controller, times, np.full((6000, 1), 200.0))
     assert np.abs(velocities).max() <= 2.0 * 400.0 / 2.0 + 0.5 + 1.0

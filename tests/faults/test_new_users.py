@@ -19,8 +19,9 @@ from torch_pbd import Demonstrations, DMPController, GMMBaseline
 from torch_pbd.cli.main import main
 from torch_pbd.control import Schedule
 from torch_pbd.control.parameters import as_demonstrations
-from torch_pbd.control.primitive.units import common_unit, duration_of, in_metres, in_seconds
+from torch_pbd.control.primitive.units import common_unit, duration_of, in_metres
 from torch_pbd.data import load_demonstrations, make_tunnel_demonstrations, save_demonstrations
+from torch_pbd.data.units import TIMES
 from torch_pbd.exceptions import DataFormatError, ModelFileError
 
 UNIX = 1_700_000_000
@@ -180,7 +181,7 @@ def test_65_a_schedule_of_stamps_in_ns_is_that_in_s():
     ("unit", "seconds"), [("ns", 1e-9), ("us", 1e-6), ("ms", 1e-3), ("s", 1), ("min", 60), ("h", 3600)]
 )
 def test_65_units_of_time_are_known(unit, seconds):
-    assert in_seconds(unit) == seconds
+    assert TIMES[unit] == seconds
     recorded = Demonstrations([t / seconds for t in tunnel().times], tunnel().positions, units="m", time_unit=unit)
     assert duration_of(recorded, None) == pytest.approx((2.0, seconds), rel=1e-12)
 

@@ -4,10 +4,10 @@ Numbers in the names are those of the list of faults that the project keeps.
 """
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from control.loops import as_schedule
 from hypothesis import settings
 from scipy.linalg import expm
 
@@ -32,7 +32,7 @@ def random_schedule(rng):
         damping = damping + np.diag(10.0 * np.arange(d))
     gains = {"stiffness": 0.5 * (stiffness + stiffness.mT), "damping": 0.5 * (damping + damping.mT)}
     motion = {"position": size * np.sin(angle), "velocity": size * frequency * np.cos(angle)}
-    return SimpleNamespace(time=time, stiffness_limits=None, **motion, **gains)
+    return as_schedule(time, **motion, **gains)
 
 
 class Loop:
@@ -122,8 +122,7 @@ def answer(schedule, forces, starts):
 
 
 def _answer(schedule, forces, starts):
-    still = {name: np.zeros_like(schedule.position) for name in ("position", "velocity")}
-    controller = RealTimeAdmittance(SimpleNamespace(**{**vars(schedule), **still}))
+    controller = RealTimeAdmittance(as_schedule(schedule.time, schedule.stiffness, schedule.damping))
     controller.start(0.0)
     speeds, changes = [0.0], [0.0]
     for i, force in enumerate(forces):

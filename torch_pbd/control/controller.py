@@ -11,13 +11,21 @@ from sklearn.utils.validation import check_is_fitted
 
 from torch_pbd import checks
 from torch_pbd.control import parameters
-from torch_pbd.control.impedance import Impedance, OnUnknown, fit_covariance, fit_law
+from torch_pbd.control.impedance import OnUnknown, fit_covariance, fit_law, gains_at
 from torch_pbd.control.primitive import units
 from torch_pbd.control.primitive.adaptation import Adaptation
-from torch_pbd.control.primitive.coverage import UNKNOWN, merge_bursts, tabulate_unsampled
 from torch_pbd.control.primitive.dmp import Gate
 from torch_pbd.control.primitive.reproduction import Reproduction, primitive
-from torch_pbd.control.primitive.smoothing import Movements, automatic_cutoff, noise_like, smooth, variance_share
+from torch_pbd.control.primitive.smoothing import (
+    UNKNOWN,
+    Movements,
+    automatic_cutoff,
+    merge_bursts,
+    noise_like,
+    smooth,
+    tabulate_unsampled,
+    variance_share,
+)
 from torch_pbd.control.primitive.units import MotionLimits
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.plant import AdmittancePlant
@@ -26,6 +34,7 @@ from torch_pbd.control.simulation.run import simulate_schedule
 from torch_pbd.control.stiffness import StiffnessLaw
 from torch_pbd.control.via import Bend, conditioned, planned
 from torch_pbd.data import Demonstrations
+from torch_pbd.data.units import TIMES
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.movement.base import MovementRegressor
 
@@ -173,7 +182,7 @@ class DMPController(BaseEstimator):
         UserWarning
             Of samples that were merged, as their times are too close; of holes, with their times.
         """
-        for name in ("_impedance", "_bend", "_shown"):  # a fit that fails leaves no mixture of two
+        for name in ("law_", "_bend", "_shown"):  # a fit that fails leaves no mixture of two
             self.__dict__.pop(name, None)
         parameters.check_parameters(self)
         # 1. Recordings. Samples whose times are one are merged; the table of holes is Type I uncertainty.
@@ -182,7 +191,7 @@ class DMPController(BaseEstimator):
         self.n_demos_, self.n_outputs_ = len(shown), shown.n_outputs
         self.duration_, self.time_scale_ = units.duration_of(shown, self.duration)
         self.start_time_ = units.common_start(shown)
-        seconds = units.in_seconds(self.time_unit_) is not None
+        seconds = self.time_unit_ in TIMES
         self.cutoff_ = automatic_cutoff(self.duration_, knows_seconds=seconds) if self.cutoff == "auto" else self.cutoff
         self.dmp_ = primitive(self)
         parameters.check_against_duration(self)
@@ -209,8 +218,6 @@ class DMPController(BaseEstimator):
         # each principal axis its stiffness, and the damping follows from stiffness and mass.
         known = np.linspace(0.0, self.duration_, len(self.unsampled_))[self.unsampled_ <= UNKNOWN]
         self.law_ = fit_law(self.stiffness_law, self.covariance_.predict_cov(phase(known[::4])), varying)
-        over = (self.covariance_, phase, self.duration_, self.unsampled_, self.law_)
-        self._impedance = Impedance(*over, float(self.mass), self.damping_ratio, self.on_unknown)
         return self
 
     def predict(self, X: ArrayLike) -> Floats:
@@ -243,13 +250,11 @@ class DMPController(BaseEstimator):
 
     def predict_stiffness(self, X: ArrayLike) -> Floats:
         """Stiffness (n, d, d) in N/m (force per unit of position) at times X (n, 1)."""
-        time = self._movement_time(X)
-        return self._impedance(time).stiffness
+        return gains_at(self, self._movement_time(X)).stiffness
 
     def predict_damping(self, X: ArrayLike) -> Floats:
         """Damping (n, d, d) in N s/m at times X (n, 1)."""
-        time = self._movement_time(X)
-        return self._impedance(time).damping
+        return gains_at(self, self._movement_time(X)).damping
 
     def schedule(
         self,
@@ -303,7 +308,7 @@ class DMPController(BaseEstimator):
         distance = metres * float(np.linalg.norm(np.ptp(position, axis=0)))
         fastest = metres * float(np.linalg.norm(velocity, axis=1).max())
         units.check_motion(limits, *recorded, distance=distance, speed=fastest)
-        gains = bent._impedance(moved)
+        gains = gains_at(bent, moved)
         rows = (time, metres * position, metres * velocity, gains.stiffness, gains.damping)
         return Schedule(*rows, metres**2 * gains.covariance, gains.type1, **parameters.schedule_labels(self))
 
@@ -402,7 +407,7 @@ class DMPController(BaseEstimator):
         return position, velocity, moved
 
     def __sklearn_is_fitted__(self) -> bool:
-        return "_impedance" in vars(self)
+        return "law_" in vars(self)
 
     def _movement_time(self, X: ArrayLike) -> Floats:
         check_is_fitted(self)

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torch_pbd import checks
-from torch_pbd.control.matrices import as_mass, as_semidefinite, broadcasts
+from torch_pbd.control.matrices import as_mass, as_semidefinite
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.linalg import spectral_map, symmetrize
 
@@ -48,7 +48,8 @@ def damping_from_stiffness(
     mass = as_mass(mass)
     if not isinstance(mass, Tensor) or mass.ndim == 0:
         return 2.0 * ratio * mass**0.5 * spectral_map(matrix, _root, spectrum)
-    if not broadcasts(mass, matrix):
+    sizes = zip(reversed(mass.shape), reversed(matrix.shape), strict=False)
+    if mass.shape[-1] != matrix.shape[-1] or not all(1 in pair or pair[0] == pair[1] for pair in sizes):
         raise InvalidParameterError(
             f"mass has shape {tuple(mass.shape)}, but stiffness has shape {tuple(matrix.shape)}: give a number, or a "
             "matrix (d, d) of as many axes for all of them."

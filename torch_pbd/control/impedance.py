@@ -1,8 +1,6 @@
 """Variability of demonstrations, learned; and stiffness and damping from what is known of it, and what is not."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -10,7 +8,7 @@ from numpy.typing import NDArray
 from sklearn.base import clone
 
 from torch_pbd.control.damping import damping_from_stiffness
-from torch_pbd.control.primitive.coverage import UNKNOWN
+from torch_pbd.control.primitive.smoothing import UNKNOWN
 from torch_pbd.control.stiffness import StiffnessLaw
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.estimators.demonstrations import fit_with_groups
@@ -35,70 +33,57 @@ class Gains(NamedTuple):
     type1: Floats
 
 
-@dataclass(frozen=True)
-class Impedance:
-    """Gains over movement time, of a fitted regressor; see the parameters of :class:`~torch_pbd.control.DMPController`.
+def gains_at(controller: Any, time: Floats) -> Gains:
+    """Gains of a fitted :class:`~torch_pbd.control.DMPController` at movement times (n,).
 
-    ``phase`` makes inputs of the regressor (n, 1) of times (n,); ``unsampled`` (m,) is the Type I uncertainty of where
-    samples are, at even times of the duration.
+    Raises
+    ------
+    ValueError
+        With on_unknown="raise", if the Type I uncertainty is above 0.5 somewhere.
     """
+    parts = [_gains(controller, part) for part in np.split(time, range(_AT_ONCE, len(time), _AT_ONCE))]
+    return Gains(*map(np.concatenate, zip(*parts, strict=True)))
 
-    regressor: CovarianceRegressor
-    phase: Callable[[Floats], Floats]
-    duration: float
-    unsampled: Floats
-    law: StiffnessLaw
-    mass: float
-    damping_ratio: float | Literal["paper"]
-    on_unknown: OnUnknown
 
-    def __call__(self, time: Floats) -> Gains:
-        """Gains at movement times (n,).
+def _gains(controller: Any, time: Floats) -> Gains:
+    sampled, covariance, type1 = _covariances(controller, time)
+    on_unknown, law = controller.on_unknown, controller.law_
+    if on_unknown == "raise" and (type1 > UNKNOWN).any():
+        index = int(np.argmax(type1 > UNKNOWN))
+        raise ValueError(
+            f"There are no data at time {time[index]:g}: the Type I uncertainty is {type1[index]:.2f}. Ask within "
+            "the demonstrations, or let on_unknown='soft' make the robot compliant there."
+        )
+    if on_unknown == "soft":
+        # The share u of the way to the least stiffness counts holes already; their prior would count them again.
+        stiffness = law(sampled)
+        softest = law.stiffness_min * torch.eye(stiffness.shape[-1]).to(stiffness)
+        stiffness = softest + torch.tensor(1.0 - type1)[:, None, None] * (stiffness - softest)
+    else:
+        stiffness = law(covariance)
+    damping = damping_from_stiffness(stiffness, float(controller.mass), controller.damping_ratio)
+    return Gains(stiffness.numpy(), damping.numpy(), covariance, type1)
 
-        Raises
-        ------
-        ValueError
-            With on_unknown="raise", if the Type I uncertainty is above 0.5 somewhere.
-        """
-        parts = [self._gains(part) for part in np.split(time, range(_AT_ONCE, len(time), _AT_ONCE))]
-        return Gains(*map(np.concatenate, zip(*parts, strict=True)))
 
-    def _gains(self, time: Floats) -> Gains:
-        sampled, covariance, type1 = self._covariances(time)
-        if self.on_unknown == "raise" and (type1 > UNKNOWN).any():
-            index = int(np.argmax(type1 > UNKNOWN))
-            raise ValueError(
-                f"There are no data at time {time[index]:g}: the Type I uncertainty is {type1[index]:.2f}. Ask within "
-                "the demonstrations, or let on_unknown='soft' make the robot compliant there."
-            )
-        if self.on_unknown == "soft":
-            # The share u of the way to the least stiffness counts holes already; their prior would count them again.
-            stiffness = self.law(sampled)
-            softest = self.law.stiffness_min * torch.eye(stiffness.shape[-1]).to(stiffness)
-            stiffness = softest + torch.tensor(1.0 - type1)[:, None, None] * (stiffness - softest)
-        else:
-            stiffness = self.law(covariance)
-        damping = damping_from_stiffness(stiffness, self.mass, self.damping_ratio)
-        return Gains(stiffness.numpy(), damping.numpy(), covariance, type1)
+def _covariances(controller: Any, time: Floats) -> tuple[Floats, Floats, Floats]:
+    """Covariances (n, d, d) without and with holes, and Type I uncertainty (n,), at times (n,).
 
-    def _covariances(self, time: Floats) -> tuple[Floats, Floats, Floats]:
-        """Covariances (n, d, d) without and with holes, and Type I uncertainty (n,), at times (n,).
-
-        A regressor bridges holes that are short beside its length scale. Of the share of the time that is unsampled,
-        the covariance is therefore its prior, at the input, or if that is the same everywhere, far from all inputs.
-        """
-        hole = np.interp(time, np.linspace(0.0, self.duration, len(self.unsampled)), self.unsampled)
-        inputs, regressor = self.phase(time), self.regressor
-        sampled, type1 = regressor.predict_cov(inputs), regressor.predict_uncertainty(inputs).type1
-        if not hole.any():
-            return sampled, sampled, type1
-        prior, share = getattr(regressor, "prior", None), hole[:, np.newaxis, np.newaxis]
-        if callable(prior):
-            wide = prior_covariance(prior, inputs, sampled.shape[-1])
-        else:
-            start, end = self.phase(np.array([0.0, self.duration]))
-            wide = regressor.predict_cov((end + _FAR * (end - start))[np.newaxis])
-        return sampled, (1.0 - share) * sampled + share * wide, 1.0 - (1.0 - hole) * (1.0 - type1)
+    A regressor bridges holes that are short beside its length scale. Of the share of the time that is unsampled,
+    the covariance is therefore its prior, at the input, or if that is the same everywhere, far from all inputs.
+    """
+    regressor, phase, duration = controller.covariance_, controller.reproduction_.phase, controller.duration_
+    hole = np.interp(time, np.linspace(0.0, duration, len(controller.unsampled_)), controller.unsampled_)
+    inputs = phase(time)
+    sampled, type1 = regressor.predict_cov(inputs), regressor.predict_uncertainty(inputs).type1
+    if not hole.any():
+        return sampled, sampled, type1
+    prior, share = getattr(regressor, "prior", None), hole[:, np.newaxis, np.newaxis]
+    if callable(prior):
+        wide = prior_covariance(prior, inputs, sampled.shape[-1])
+    else:
+        start, end = phase(np.array([0.0, duration]))
+        wide = regressor.predict_cov((end + _FAR * (end - start))[np.newaxis])
+    return sampled, (1.0 - share) * sampled + share * wide, 1.0 - (1.0 - hole) * (1.0 - type1)
 
 
 def fit_covariance(

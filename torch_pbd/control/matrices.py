@@ -61,6 +61,17 @@ def as_mass(mass: Any) -> float | Tensor:
     return value if isinstance(value, Tensor) else checked
 
 
+def mass_matrix(mass: float | Tensor, like: Tensor) -> Tensor:
+    """Virtual mass as a matrix (d, d), of the size, dtype and device of gains (..., d, d)."""
+    identity = torch.eye(like.shape[-1]).to(like)
+    matrix = torch.as_tensor(mass, dtype=like.dtype, device=like.device)
+    matrix = matrix if matrix.ndim else matrix * identity
+    if matrix.shape != identity.shape:
+        expected = tuple(identity.shape)
+        raise InvalidParameterError(f"mass has shape {tuple(matrix.shape)}, must be a number or have shape {expected}.")
+    return matrix
+
+
 def as_semidefinite(value: Any, name: str) -> tuple[Tensor, tuple[Tensor, Tensor]]:
     """Positive semidefinite matrices (..., d, d), and the eigenvalues (..., d) and axes that show that they are.
 
@@ -75,10 +86,3 @@ def as_semidefinite(value: Any, name: str) -> tuple[Tensor, tuple[Tensor, Tensor
     eigenvalues, axes = torch.linalg.eigh(symmetrize(plain))
     checks.positive(eigenvalues[..., 0].cpu().numpy(), name, rounding)
     return matrix, (eigenvalues, axes)
-
-
-# The parameters of the primitive and of the controller are checked by these three until they go to checks.py.
-def broadcasts(value: Tensor, other: Tensor) -> bool:
-    """Whether shapes broadcast, of the same last size."""
-    sizes = zip(reversed(value.shape), reversed(other.shape), strict=False)
-    return value.shape[-1] == other.shape[-1] and all(1 in pair or pair[0] == pair[1] for pair in sizes)

@@ -7,7 +7,7 @@ the movement primitive, which reaches any goal.
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -65,7 +65,6 @@ def conditioned(
     result = copy.copy(controller)
     result.covariance_, result._shown = bent, shown
     result._bend = Bend(knots, moved.predict(phase(knots)) - shown.predict(phase(knots)))
-    result._impedance = replace(controller._impedance, regressor=bent)
     return result
 
 

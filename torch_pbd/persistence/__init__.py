@@ -18,9 +18,8 @@ from sklearn.utils.validation import check_is_fitted
 
 from torch_pbd import checks
 from torch_pbd.control.controller import DMPController
-from torch_pbd.control.impedance import Impedance
 from torch_pbd.control.parameters import check_parameters
-from torch_pbd.control.primitive.reproduction import Phase, Reproduction, primitive
+from torch_pbd.control.primitive.reproduction import Reproduction, primitive
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.exceptions import ModelFileError
 from torch_pbd.files.atomic import LOADERS
@@ -260,11 +259,9 @@ def _restore_controller(controller: Any, own: Arrays) -> None:
     for name in (*_NOISE, _HOLES):
         setattr(controller, name, own.pop(name))
     controller.dmp_ = dmp = primitive(controller)
-    phase, time = Phase(dmp, controller.phase_input), np.linspace(0.0, controller.duration_, len(own["forcing"]))
-    controller.reproduction_ = Reproduction(dmp, phase, controller.goal == "each", time=time, **own)
+    time = np.linspace(0.0, controller.duration_, len(own["forcing"]))
+    controller.reproduction_ = Reproduction(dmp, controller.phase_input, controller.goal == "each", time=time, **own)
     controller.start_, controller.goal_ = own["start"], own["goal"]
-    over = (controller.covariance_, phase, controller.duration_, controller.unsampled_, controller.law_)
-    controller._impedance = Impedance(*over, controller.mass, controller.damping_ratio, controller.on_unknown)
 
 
 def _check_movement(arrays: Arrays, n_outputs: int) -> None:

@@ -6,19 +6,18 @@ import random
 import time
 import tracemalloc
 from collections.abc import Callable, Iterable
-from types import SimpleNamespace
 
 import numpy as np
 import torch
 
-from torch_pbd.control import RealTimeAdmittance
+from torch_pbd.control import RealTimeAdmittance, Schedule
 
 RATE, MASS, BLOCK = 1000.0, 1.0, 10_000
 
 Tick = tuple[float, tuple[float, float]]
 
 
-def turning_schedule() -> SimpleNamespace:
+def turning_schedule() -> Schedule:
     """11 s of a curve, the last of which no block reaches; 200..1000 N/m, axes turning at 1 rad/s, critical damping."""
     phase = np.arange(1.1 * BLOCK + 1) / RATE
     axes = np.moveaxis(np.array([[np.cos(phase), -np.sin(phase)], [np.sin(phase), np.cos(phase)]]), -1, 0)
@@ -28,9 +27,7 @@ def turning_schedule() -> SimpleNamespace:
     )
     position = np.stack([0.1 * phase, np.sin(phase)], axis=1)
     velocity = np.stack([0.1 + 0 * phase, np.cos(phase)], axis=1)
-    return SimpleNamespace(
-        time=phase, position=position, velocity=velocity, stiffness=stiffness, damping=damping, stiffness_limits=None
-    )
+    return Schedule(phase, position, velocity, stiffness, damping, covariance=stiffness, type1=0.0 * phase)
 
 
 def ticks(seed: int, n_ticks: int = BLOCK) -> list[Tick]:

@@ -37,12 +37,12 @@ class Reproduction:
     """Movement primitive with its forcing, and the motion that follows from them.
 
     From ``start`` (d,) with ``velocity`` (d,) to ``goal`` (d,), by the ``forcing`` (m, d), which is linear between its
-    times (m,) from 0 to the duration, held after it, and was learned over ``phase``. With ``own_goals`` the goal in
-    eq. (18) is the end of each movement, else the common one.
+    times (m,) from 0 to the duration, held after it, and was learned over what ``phase_input`` says. With ``own_goals``
+    the goal in eq. (18) is the end of each movement, else the common one.
     """
 
     dmp: DMP
-    phase: "Phase"
+    phase_input: str
     own_goals: bool
     start: Floats
     velocity: Floats
@@ -53,13 +53,21 @@ class Reproduction:
     @classmethod
     def learn(cls, dmp: DMP, movements: Movements, phase_input: str, *, own_goals: bool) -> "Reproduction":
         """Fit the forcing of the mean movement, eq. (18), and tabulate it over the duration."""
-        phase, position = Phase(dmp, phase_input), movements.position
+        position = movements.position
         start, velocity = position[:, 0].mean(axis=0), movements.velocity[:, 0].mean(axis=0)
         goal = position[:, -1].mean(axis=0)
         time = np.linspace(0.0, movements.time[-1], _TICKS + 1)
-        known = cls(dmp, phase, own_goals, start, velocity, goal, time, np.zeros((len(time), len(goal))))
+        known = cls(dmp, phase_input, own_goals, start, velocity, goal, time, np.zeros((len(time), len(goal))))
         mean = known.forcing_of(movements).mean(axis=0)
-        return replace(known, forcing=_process_mean(phase(movements.time), mean, len(position), phase(time)))
+        X, at = known.phase(movements.time), known.phase(time)
+        return replace(known, forcing=_process_mean(X, mean, len(position), at))
+
+    def phase(self, time: Floats) -> Floats:
+        """Inputs (n, 1) of the regressors at movement times (n,): the phase, its logarithm, or the time itself."""
+        if self.phase_input == "s":
+            return self.dmp.phase(_tensor(time)).numpy()[:, np.newaxis]
+        seen = time if self.phase_input == "time" else -self.dmp.gamma * time / self.dmp.tau
+        return seen[:, np.newaxis]
 
     def forcing_of(self, movements: Movements) -> Floats:
         """Forcing (K, n, d) that would reproduce each movement: eq. (18)."""
@@ -81,7 +89,7 @@ class Reproduction:
         extent = float(np.linalg.norm(np.ptp(movements.bounds, axis=0)))
         rounding = _ROUNDING * float(np.abs(mean).max())
         if error > _FAR * extent + rounding:
-            remedy = "phase_input='time'" if self.phase.kind == "s" else "a higher cutoff, or more n_steps"
+            remedy = "phase_input='time'" if self.phase_input == "s" else "a higher cutoff, or more n_steps"
             checks.warn(
                 f"The reproduced movement is {error:.3g} off the mean of the demonstrations, {error / extent:.1%} of "
                 f"its extent: try {remedy}."
@@ -192,22 +200,6 @@ class Reproduction:
         moved = np.minimum(passed, end - 0.5 * brake) + brake * (share - share**3 + 0.5 * share**4)
         rate = 1.0 - share**2 * (3.0 - 2.0 * share)
         return np.minimum(moved, end), rate, np.maximum(moved, passed - 0.5 * brake)
-
-
-@dataclass(frozen=True)
-class Phase:
-    """Movement time as the regressors see it: a column of the phase, its logarithm, or the time itself."""
-
-    dmp: DMP
-    kind: str
-
-    def __call__(self, time: Floats) -> Floats:
-        """Inputs (n, 1) at times (n,)."""
-        if self.kind == "time":
-            return time[:, np.newaxis]
-        if self.kind == "log_s":
-            return (-self.dmp.gamma * time / self.dmp.tau)[:, np.newaxis]
-        return self.dmp.phase(_tensor(time)).numpy()[:, np.newaxis]
 
 
 def primitive(controller: Any) -> DMP:

@@ -50,11 +50,6 @@ def check_motion(limits: Any, units: Sequence[str] | None, time_unit: str, **fou
             )
 
 
-def in_seconds(time_unit: str) -> float | None:
-    """Seconds of one unit of time; None where it is no unit of time, as of a phase."""
-    return TIMES.get(time_unit)
-
-
 def common_unit(units: Sequence[str] | None) -> str | None:
     """The unit of all outputs; None if they have none, or several."""
     return units[0] if units is not None and len(set(units)) == 1 else None
@@ -107,7 +102,7 @@ def duration_of(demonstrations: Demonstrations, duration: float | None) -> tuple
     own = float(np.median([time[-1] - time[0] for time in demonstrations.times]))
     if duration is not None:
         return float(duration), duration / own
-    scale = in_seconds(demonstrations.time_unit)
+    scale = TIMES.get(demonstrations.time_unit)  # none of a phase
     if scale is None:
         checks.warn(
             f"The times of the demonstrations are in {demonstrations.time_unit!r}, not in s: the movement is taken to "

@@ -3,7 +3,7 @@
 import math
 import threading
 from operator import add
-from typing import Any, Literal, final
+from typing import Literal, final
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
@@ -35,9 +35,8 @@ class RealTimeAdmittance:
     Parameters
     ----------
     schedule : Schedule
-        Or any object with its arrays of time, position, velocity, stiffness and damping, and its stiffness_limits.
     mass : float, default=None
-        Virtual mass in kg, the same in all directions; None takes the schedule's, or 1 kg if it has none.
+        Virtual mass in kg, the same in all directions; None takes the schedule's, or 1 kg. Another one is told.
     rate, max_step : float, default=1000.0, 0.01
         Rate of the loop in 1/s and longest tick in s. Over a longer one the robot has braked, or rests at its last
         command if there was time to be back; after three on end it stops.
@@ -77,7 +76,7 @@ class RealTimeAdmittance:
     Raises
     ------
     ValueError
-        If a parameter is not as described, or the schedule not as `Schedule` describes it.
+        If a parameter is not as described.
 
     Examples
     --------
@@ -95,7 +94,7 @@ class RealTimeAdmittance:
 
     def __init__(
         self,
-        schedule: Schedule | Any,
+        schedule: Schedule,
         *,
         mass: float | None = None,
         rate: float = 1000.0,
@@ -113,7 +112,8 @@ class RealTimeAdmittance:
         max_bad_ticks: int = 10,
         force_rate_limit: float | None = None,
     ) -> None:
-        self._mass = virtual_mass(schedule, mass)
+        checks.instance(schedule, "schedule", Schedule)
+        self._mass = virtual_mass(schedule.mass, mass)
         self._timer = TickTimer(rate, max_step, max_bad_ticks)
         self._channel = ForceChannel(self._mass, force_limit, deadband, force_rate_limit, hold_ticks)
         pull = force_limit if spring_limit is None else spring_limit
@@ -179,7 +179,7 @@ class RealTimeAdmittance:
             self._turn.release()
 
     def tick(self, now: float, force: Numbers) -> TickStatus:
-        """Move on to ``now``; ``position`` and ``velocity`` are then the command.
+        """Move on to ``now``, and tell the faults, 0 if none; ``position`` and ``velocity`` are then the command.
 
         Parameters
         ----------
@@ -187,11 +187,6 @@ class RealTimeAdmittance:
             Time of the clock that ``start`` was given, in s.
         force : sequence of d floats
             External force in N as measured now; it acts over the time since the last tick.
-
-        Returns
-        -------
-        TickStatus
-            Faults of the tick; 0 if none.
 
         Raises
         ------

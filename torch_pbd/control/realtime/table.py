@@ -2,7 +2,7 @@
 
 import struct
 from collections.abc import Callable
-from typing import Any, final
+from typing import final
 
 import numpy as np
 
@@ -10,23 +10,18 @@ from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control.realtime.steps import State, Vector, advance_coupled, advance_modal, advance_plane
 from torch_pbd.control.schedule import Schedule
-from torch_pbd.control.schedule.contents import checked_arrays
 from torch_pbd.control.schedule.rows import Between, count_rows, row_times
-from torch_pbd.exceptions import InvalidParameterError
 
 Advance = Callable[[Vector, Vector, State, float, float], tuple[State, float]]
 
-_READ = ("time", "position", "velocity", "stiffness", "damping")
-# Products of gains with masses from this one to its inverse, in kg, are numbers.
-_LIGHTEST = 1e-50
+_LIGHTEST = 1e-50  # kg: products of gains with masses from this one to its inverse are numbers
 _MAX_ROWS = 4_000_000  # an hour at 1 kHz, which takes 670 MB for d = 2
 
 
-def virtual_mass(schedule: Schedule | Any, mass: float | None) -> float:
-    """Virtual mass in kg, that of the schedule if None; a warning where it is another."""
-    own = getattr(schedule, "mass", None)
-    given = (own or 1.0) if mass is None else mass
-    value = checks.number(given, "mass", least=_LIGHTEST, most=1.0 / _LIGHTEST, unit="kg")
+def virtual_mass(own: float | None, given: float | None) -> float:
+    """Virtual mass in kg, that of the schedule if None is given; a warning where it is another."""
+    mass = (own or 1.0) if given is None else given
+    value = checks.number(mass, "mass", least=_LIGHTEST, most=1.0 / _LIGHTEST, unit="kg")
     if own is not None and value != own:
         checks.warn(f"mass is {mass}, but damping_ratio was met for mass={own:g} kg: give both the same.")
     return value
@@ -42,17 +37,16 @@ class ScheduleTable:
     the desired motion those before the last row was stopped.
     """
 
-    def __init__(self, schedule: Schedule | Any, mass: float, rate: float) -> None:
-        time, *values = _rows_of(schedule)
-        duration = float(time[-1] - time[0])
+    def __init__(self, schedule: Schedule, mass: float, rate: float) -> None:
+        duration = schedule.duration
         if count_rows(duration, rate) > _MAX_ROWS:
             must = f"at most {_MAX_ROWS / duration:g} for a schedule of {duration:g} s, a table of {_MAX_ROWS} rows"
             raise checks.refusal(rate, "rate", must, "lower it", unit="1/s")
         # A schedule shorter than a tick of the loop is begun and ended.
         grid = row_times(duration, rate) if count_rows(duration, rate) > 1 else np.array([0.0, duration])
-        between = Between(time - time[0], grid)
-        position, velocity = between.hermite(*values[:2])
-        self.stiffness, self.damping = map(between.linear, values[2:])
+        between = Between(schedule.time - schedule.time[0], grid)
+        position, velocity = between.hermite(schedule.position, schedule.velocity)
+        self.stiffness, self.damping = between.linear(schedule.stiffness), between.linear(schedule.damping)
         self.rate, self.last, self.end, self.n_axes = rate, len(grid) - 1, duration, position.shape[1]
         self.speeds = np.linalg.norm(velocity, axis=1)
         accelerations = np.linalg.norm(np.diff(velocity, axis=0), axis=1) / np.diff(grid)
@@ -67,19 +61,6 @@ class ScheduleTable:
     def row(self, index: int) -> Vector:
         """One row, unpacked."""
         return self.layout.unpack_from(self.packed, index * self.layout.size)
-
-
-def _rows_of(schedule: Schedule | Any) -> list[Floats]:
-    """Time, position, velocity, stiffness and damping that a robot can follow; a Schedule is checked already."""
-    if isinstance(schedule, Schedule):
-        return [getattr(schedule, name) for name in _READ]
-    missing = [name for name in (*_READ, "stiffness_limits") if not hasattr(schedule, name)]
-    if missing:
-        raise InvalidParameterError(
-            f"schedule is a {type(schedule).__name__} without {', '.join(missing)}, must be a Schedule."
-        )
-    fields = {name: getattr(schedule, name) for name in _READ}
-    return list(checked_arrays(fields, schedule.stiffness_limits, within="schedule.").values())
 
 
 def _gains(stiffness: Floats, damping: Floats) -> tuple[Advance, float, list[Floats]]:

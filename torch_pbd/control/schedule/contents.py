@@ -26,51 +26,38 @@ Labels = Mapping[str, Any]
 
 
 def checked_fields(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of a schedule that are sound: read-only copies in float64, and labels that cannot change."""
+    """Fields of a schedule that a robot can follow: read-only copies in float64, and labels that cannot change.
+
+    Matrices are symmetric to the last bit.
+    """
     limits = fields["stiffness_limits"]
     if limits is not None:
         low, high = checks.array(limits, "stiffness_limits", (2,)).tolist()
         low = checks.number(low, "stiffness_limits[0]", least=0.0, unit="N/m")
         limits = low, checks.number(high, "stiffness_limits[1]", above=0.0, least=low, unit="N/m")
-    arrays = checked_arrays({name: fields[name] for name in ARRAY_DIMS}, limits)
-    arrays = {name: array.copy() for name, array in arrays.items()}
+    position = checks.array(fields["position"], "position", ("n", "d"))
+    n, d = position.shape
+    if n < 2 or not d:
+        raise InvalidParameterError(f"position has shape {position.shape}, must have at least 2 rows, 1 column.")
+    arrays = {name: checks.array(fields[name], name, (n, d, d)[:n_dims]).copy() for name, n_dims in ARRAY_DIMS.items()}
+    later = np.diff(arrays["time"], prepend=-np.inf) > 0.0
+    remedy = "sort the rows by time and drop repeated ones"
+    checks.require(later, arrays["time"], "time", "later than the time before it", remedy)
+    type1 = arrays["type1"]
+    checks.require((type1 >= 0.0) & (type1 <= 1.0), type1, "type1", "from 0 (on data) to 1 (the prior alone)")
+    for name in [name for name, n_dims in ARRAY_DIMS.items() if n_dims == 3]:
+        checks.semidefinite(arrays[name], name)
+        arrays[name] = 0.5 * (arrays[name] + arrays[name].swapaxes(1, 2))
+    if limits is not None:
+        _check_limits(arrays["stiffness"], limits)
+    _check_held(arrays["stiffness"], arrays["damping"])
     for array in arrays.values():
         array.setflags(write=False)
-    labels = _checked_labels({name: fields[name] for name in LABELS}, n_outputs=arrays["position"].shape[1])
+    labels = _checked_labels({name: fields[name] for name in LABELS}, n_outputs=d)
     return {**arrays, **labels, "stiffness_limits": limits}
 
 
-def checked_arrays(
-    fields: Mapping[str, Any], limits: tuple[float, float] | None, within: str = ""
-) -> dict[str, Floats]:
-    """Arrays of a schedule in float64, with covariance and type1 or without, that a robot can follow.
-
-    Matrices are symmetric to the last bit; the other arrays are no copies where they need not be. ``within`` goes
-    before their names in messages.
-    """
-    position = checks.array(fields["position"], f"{within}position", ("n", "d"))
-    n, d = position.shape
-    if n < 2 or not d:
-        raise InvalidParameterError(
-            f"{within}position has shape {position.shape}, must have at least 2 rows, 1 column."
-        )
-    arrays = {name: checks.array(fields[name], within + name, (n, d, d)[: ARRAY_DIMS[name]]) for name in fields}
-    later = np.diff(arrays["time"], prepend=-np.inf) > 0.0
-    remedy = "sort the rows by time and drop repeated ones"
-    checks.require(later, arrays["time"], f"{within}time", "later than the time before it", remedy)
-    if "type1" in arrays:
-        type1 = arrays["type1"]
-        checks.require((type1 >= 0.0) & (type1 <= 1.0), type1, "type1", "from 0 (on data) to 1 (the prior alone)")
-    for name in [name for name in arrays if ARRAY_DIMS[name] == 3]:
-        checks.semidefinite(arrays[name], within + name)
-        arrays[name] = 0.5 * (arrays[name] + arrays[name].swapaxes(1, 2))
-    if limits is not None:
-        _check_limits(arrays["stiffness"], limits, within)
-    _check_held(arrays["stiffness"], arrays["damping"], within)
-    return arrays
-
-
-def _check_limits(stiffness: Floats, limits: tuple[float, float], within: str) -> None:
+def _check_limits(stiffness: Floats, limits: tuple[float, float]) -> None:
     """Refuse eigenvalues of the stiffness beyond the limits, to rounding."""
     low, high = limits
     least, most = low - checks.ROUNDING * high, high + checks.ROUNDING * high
@@ -79,20 +66,18 @@ def _check_limits(stiffness: Floats, limits: tuple[float, float], within: str) -
     eigenvalues = np.linalg.eigvalsh(stiffness)
     good = (eigenvalues >= least) & (eigenvalues <= most)
     must = f"within stiffness_limits, {low:g} and {high:g} N/m"
-    name = f"the eigenvalue of {within}stiffness"
-    checks.require(good, eigenvalues, name, must, "limit the stiffness to them, or widen them")
+    checks.require(good, eigenvalues, "the eigenvalue of stiffness", must, "limit the stiffness to them, or widen them")
 
 
-def _check_held(stiffness: Floats, damping: Floats, within: str) -> None:
+def _check_held(stiffness: Floats, damping: Floats) -> None:
     """Refuse rows in which neither stiffness nor damping acts along some axis: nothing else would stop the robot."""
     scales = [checks.ROUNDING * np.abs(gain).max(axis=(1, 2)) for gain in (stiffness, damping)]
     if checks.eigenvalues_above(stiffness, scales[0]):
         return
     lowest = [np.linalg.eigvalsh(gain)[:, 0] for gain in (stiffness, damping)]
     must = "above zero where the stiffness is singular, for nothing else stops the robot"
-    name = f"the smallest eigenvalue of {within}damping"
     good = (lowest[0] > scales[0]) | (lowest[1] > scales[1])
-    checks.require(good, lowest[1], name, must, "raise one of the two")
+    checks.require(good, lowest[1], "the smallest eigenvalue of damping", must, "raise one of the two")
 
 
 def _checked_labels(labels: Labels, n_outputs: int) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torch_pbd import checks
-from torch_pbd.control.matrices import as_mass, as_tensor
+from torch_pbd.control.matrices import as_mass, as_tensor, mass_matrix
 from torch_pbd.control.simulation.position_loop import PositionLoop
 from torch_pbd.control.simulation.rollout import Rollout
 from torch_pbd.control.simulation.sensor import ForceSensor
@@ -152,14 +152,7 @@ class AdmittancePlant:
     ) -> Task:
         """Task of arguments of :meth:`simulate` that were checked, as this plant is to follow it."""
         stiffness, damping = torch.broadcast_tensors(stiffness, damping)
-        identity = torch.eye(position_desired.shape[-1]).to(stiffness)
-        mass = self.mass.to(stiffness) if isinstance(self.mass, Tensor) else self.mass * identity
-        mass = mass if mass.ndim else mass * identity
-        if mass.shape != identity.shape:
-            expected = tuple(identity.shape)
-            raise InvalidParameterError(
-                f"mass has shape {tuple(mass.shape)}, must be a number or have shape {expected}."
-            )
+        mass = mass_matrix(self.mass, stiffness)
         inertial = torch.zeros_like(position_desired)
         if self.feed_forward:
             if acceleration_desired is None:  # that which takes the velocity of each tick to that of the next
@@ -186,14 +179,14 @@ class AdmittancePlant:
         batch = torch.broadcast_shapes(*(value.shape[:-2] for value in parts), start.shape[:-1], speed.shape[:-1])
         self._check_memory(batch, task)
         state = start.expand(*batch, -1), speed.expand(*batch, -1)
-        if nothing_acts(self):
+        if nothing_acts(self) and task.is_shared:
             position, velocity = open_loop(task, force, state)
-            gains = (*batch, *task.stiffness.shape[-3:])
             record: dict[str, Any] = {"position": position, "velocity": velocity, "commanded_position": position}
-            record |= {"stiffness": task.stiffness.expand(gains), "damping": task.damping.expand(gains)}
-            record |= {"force": force.expand_as(position)}
+            record |= {"force": force.expand_as(position), "stiffness": task.stiffness, "damping": task.damping}
         else:
             record = closed_loop(task, force, state, self, generator)
+        for name in ("stiffness", "damping"):
+            record[name] = record[name].expand(*batch, *record[name].shape[-3:])
         _check_finished(record["position"], record["velocity"])
         time = torch.arange(task.n_ticks, dtype=force.dtype, device=force.device) * task.dt
         return Rollout(time, desired_position=task.position, **record)

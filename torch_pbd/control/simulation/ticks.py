@@ -60,14 +60,10 @@ class Task:
         return self.position.shape[-2]
 
     @property
-    def push(self) -> Tensor:
-        """Force of the desired motion (..., T, d), where no filter changes the damping."""
-        return (self.damping @ self.velocity.unsqueeze(-1)).squeeze(-1) + self.inertial_force
-
-    @property
-    def steps(self) -> Tensor:
-        """Steps of the desired position at the end of each tick (..., T, d); 0 after the last."""
-        return torch.cat([self.position.diff(dim=-2), torch.zeros_like(self.position[..., :1, :])], dim=-2)
+    def is_shared(self) -> bool:
+        """Whether all rollouts of a batch have the same gains and desired motion."""
+        motion = (self.position, self.velocity, self.inertial_force)
+        return self.stiffness.ndim == 3 and all(part.ndim == 2 for part in motion)
 
 
 @dataclass(frozen=True)
@@ -126,44 +122,25 @@ def nothing_acts(hooks: Hooks) -> bool:
 
 
 def open_loop(task: Task, force: Tensor, state: State) -> State:
-    """Positions and velocities (..., T, d) under forces (..., T, d), where force and gains are known beforehand."""
+    """Positions and velocities (..., T, d) where nothing acts in the loop and all rollouts share the task.
+
+    Blocks of ticks are then matrices on the states, and on forces (..., T, d), of all rollouts.
+    """
     d = task.position.shape[-1]
-    now = torch.cat([state[0] - task.position[..., 0, :], state[1]], dim=-1)
-    # Blocks of ticks are matrices that all rollouts share, if these share their gains and desired motion.
-    shared = task.stiffness.ndim == 3 and task.position.ndim == task.velocity.ndim == task.inertial_force.ndim == 2
-    trace = (_by_blocks if shared else _by_ticks)(task, force, now)
-    return trace[..., :d] + task.position, trace[..., d:]
-
-
-def _by_blocks(task: Task, force: Tensor, start: Tensor) -> Tensor:
-    """Deviations and velocities (..., T, 2 d) from those at the start (..., 2 d), of shared gains and motion."""
-    batch, size = start.shape[:-1], start.shape[-1]
-    length = block_length(size // 2, n_forces=32)
+    start = torch.cat([state[0] - task.position[0], state[1]], dim=-1)
+    length = block_length(d, n_forces=32)
     surplus = -task.n_ticks % length
     forces = torch.nn.functional.pad(force, (0, 0, 0, surplus)).flatten(-2)
-    forces = forces.expand(*batch, -1).reshape(-1, forces.shape[-1]).mT
-    now, states = start.reshape(-1, size).mT, []  # rollouts are columns
-    blocks = forces.split(length * size // 2)
-    for response, held in zip(block_responses(task, length), blocks, strict=True):
-        of_start, drift, of_forces = response.flatten(0, 1).split([size, 1, len(held)], dim=1)
+    forces = forces.expand(*start.shape[:-1], -1).reshape(-1, forces.shape[-1]).mT
+    now, states = start.reshape(-1, 2 * d).mT, []  # rollouts are columns
+    for response, held in zip(block_responses(task, length), forces.split(length * d), strict=True):
+        of_start, drift, of_forces = response.flatten(0, 1).split([2 * d, 1, len(held)], dim=1)
         within = torch.addmm(torch.addmm(drift, of_start, now), of_forces, held)
-        states.append(within[:-size])
-        now = within[-size:]
-    trace = torch.cat(states).unflatten(0, (-1, size))[: task.n_ticks]
-    return trace.permute(2, 0, 1).unflatten(0, batch) if batch else trace[..., 0]
-
-
-def _by_ticks(task: Task, force: Tensor, now: Tensor) -> Tensor:
-    """Deviations and velocities (..., T, 2 d) where each rollout has gains or a desired motion of its own."""
-    d = force.shape[-1]
-    total, steps, states = force + task.push, task.steps, []
-    deviation, velocity = now[..., :d], now[..., d:]
-    for ticks, maps in tick_maps(task, task.dt):
-        for tick, each in enumerate(maps.unbind(-3), start=ticks.start):
-            states.append(torch.cat([deviation, velocity], dim=-1))
-            deviation, velocity = _moved(each, deviation, velocity, total[..., tick, :].expand_as(deviation))
-            deviation = deviation - steps[..., tick, :]
-    return torch.stack(states, dim=-2)
+        states.append(within[: -2 * d])
+        now = within[-2 * d :]
+    trace = torch.cat(states).unflatten(0, (-1, 2 * d))[: task.n_ticks].permute(2, 0, 1)
+    trace = trace.reshape(*start.shape[:-1], task.n_ticks, 2 * d)
+    return trace[..., :d] + task.position, trace[..., d:]
 
 
 def block_length(d: int, n_forces: int = 64) -> int:
@@ -183,7 +160,8 @@ def block_responses(task: Task, length: int) -> Iterator[Float[Tensor, "l1 m n"]
     """
     d = task.position.shape[-1]
     unit = torch.eye(2 * d + 1 + length * d).to(task.position)
-    push, steps = task.push, torch.nn.functional.pad(task.steps, (0, d))
+    push = (task.damping @ task.velocity.unsqueeze(-1)).squeeze(-1) + task.inertial_force
+    steps = torch.nn.functional.pad(task.position.diff(dim=0), (0, d, 0, 1))  # none after the last tick
     for ticks, maps in tick_maps(task, task.dt):
         drift = maps[..., 2 * d :] @ push[ticks].unsqueeze(-1) - steps[ticks].unsqueeze(-1)
         each = torch.cat([maps[..., : 2 * d], drift, maps[..., 2 * d :]], dim=-1)

@@ -12,12 +12,12 @@ from torch import Tensor
 
 from torch_pbd import checks
 from torch_pbd.control.damping import required_damping_ratio
-from torch_pbd.control.matrices import as_mass, as_rows, as_tensor
+from torch_pbd.control.matrices import as_mass, mass_matrix
+from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.position_loop import PositionLoop
 from torch_pbd.control.simulation.ticks import admittance_rate, transition
-from torch_pbd.control.stability.lyapunov import has_common_function, held_growth, knots_of
+from torch_pbd.control.stability.lyapunov import Knots, has_common_function, held_growth
 from torch_pbd.control.stability.report import StabilityReport
-from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.linalg import spectral_map, symmetrize
 
 # Parts of the schedule that are followed at a time for their gain.
@@ -30,7 +30,7 @@ _BISECTIONS = 60
 
 
 def certify(
-    schedule: Any,
+    schedule: Schedule | Any,
     *,
     mass: Any = 1.0,
     speed: float = 1.0,
@@ -43,7 +43,7 @@ def certify(
     Parameters
     ----------
     schedule : Schedule
-        Or any object with ``time`` (n,), ``stiffness`` and ``damping`` (n, d, d).
+        Whose times and gains are checked.
     mass : float or array_like of shape (d, d), default=1.0
         Virtual mass of the admittance, kg.
     speed : float, default=1.0
@@ -69,17 +69,13 @@ def certify(
     checks.number(dt, "dt", above=0.0, unit="s")
     checks.number(force_cutoff, "force_cutoff", above=0.0, unit="Hz", optional=True)
     checks.instance(position_loop, "position_loop", PositionLoop, optional=True)
-    time, stiffness, damping = _rows_of(schedule)
+    checks.instance(schedule, "schedule", Schedule)
+    # An axis that is free never returns: nothing is to be certified of it.
+    checks.semidefinite(schedule.stiffness, "stiffness", definite=True)
+    time, stiffness, damping = map(torch.tensor, (schedule.time, schedule.stiffness, schedule.damping))
     checked = as_mass(mass)
-    inertia = checked.detach().double() if isinstance(checked, Tensor) else torch.tensor(checked, dtype=torch.float64)
-    is_number = not inertia.ndim
-    inertia = inertia * torch.eye(stiffness.shape[-1]).to(stiffness) if is_number else inertia
-    if inertia.shape != stiffness.shape[1:]:
-        expected = tuple(stiffness.shape[1:])
-        raise InvalidParameterError(
-            f"mass has shape {tuple(inertia.shape)}, must be a number or have shape {expected}."
-        )
-    knots = knots_of(time / speed, stiffness, damping, inertia)
+    inertia, is_number = mass_matrix(checked, stiffness).detach(), not (isinstance(checked, Tensor) and checked.ndim)
+    knots = Knots(time / speed, stiffness, damping, inertia)
     alpha, margin, worst = knots.certificate()
     ratio, required, at_any_schedule, smallest = _damping_rule(stiffness, damping, inertia)
     rate = admittance_rate(stiffness[:-1], damping[:-1], inertia)[..., : 2 * inertia.shape[0], : 2 * inertia.shape[0]]
@@ -100,29 +96,6 @@ def certify(
         speed=float(speed),
         mass=float(inertia[0, 0]) if is_number else tuple(map(tuple, inertia.tolist())),
     )
-
-
-def _rows_of(schedule: Any) -> tuple[Tensor, Tensor, Tensor]:
-    """Times, stiffness and damping of what may be a schedule, checked, in float64."""
-    missing = [name for name in ("time", "stiffness", "damping") if not hasattr(schedule, name)]
-    if missing:
-        raise InvalidParameterError(
-            f"schedule is a {type(schedule).__name__} without {', '.join(missing)}, must be a Schedule."
-        )
-    time = as_rows(schedule.time, "schedule.time", 1).detach().double()
-    if time.ndim != 1 or len(time) < 2 or not bool((time.diff() > 0.0).all()):
-        shape = tuple(time.shape)
-        raise InvalidParameterError(f"schedule.time has shape {shape}, must be two or more times that increase.")
-    gains: list[Tensor] = []
-    for name in ("stiffness", "damping"):
-        gain = as_tensor(getattr(schedule, name), f"schedule.{name}").detach().double()
-        expected = tuple(gains[0].shape) if gains else (len(time), *gain.shape[-1:] * 2)
-        if gain.shape != expected:
-            raise InvalidParameterError(f"schedule.{name} has shape {tuple(gain.shape)}, must have shape {expected}.")
-        # An axis that is free never returns: nothing is to be certified of it.
-        checks.semidefinite(gain.cpu().numpy(), f"schedule.{name}", definite=name == "stiffness")
-        gains.append(gain)
-    return time, gains[0], gains[1]
 
 
 def _damping_rule(stiffness: Tensor, damping: Tensor, mass: Tensor) -> tuple[float, float, bool, float]:

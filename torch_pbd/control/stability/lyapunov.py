@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -84,18 +83,19 @@ def _along(terms: Float[Tensor, "k n d d"], vectors: Float[Tensor, "n d m"]) -> 
     return (vectors * (terms @ vectors)).sum(-2).flatten(1)
 
 
-@dataclass(frozen=True)
 class Knots:
-    """Gains at both ends of every interval (2, n - 1, d, d), their rates (n - 1, d, d), and the largest alpha.
+    """Gains (n, d, d), linear between times (n,), and what Kronander and Billard ask of them.
 
-    They are the conditions of Kronander and Billard, ``K' + alpha D' <= 2 alpha K`` and ``alpha M <= D``: linear in
-    time where K and D are, so that holding at the ends of every interval is holding throughout, and convex in alpha.
+    Their conditions, ``K' + alpha D' <= 2 alpha K`` and ``alpha M <= D``, are linear in time where K and D are, so that
+    holding at both ends of every interval is holding throughout; and convex in alpha.
     """
 
-    stiffness: Tensor
-    stiffness_rate: Tensor
-    damping_rate: Tensor
-    alpha_max: float
+    def __init__(self, time: Tensor, stiffness: Tensor, damping: Tensor, mass: Tensor) -> None:
+        step = time.diff()[:, None, None]
+        inverse = torch.linalg.inv(torch.linalg.cholesky(mass))
+        self.alpha_max = float(torch.linalg.eigvalsh(symmetrize(inverse @ damping @ inverse.mT)).min())
+        self.stiffness = torch.stack([stiffness[:-1], stiffness[1:]])  # at both ends of every interval
+        self.stiffness_rate, self.damping_rate = stiffness.diff(dim=0) / step, damping.diff(dim=0) / step
 
     def certificate(self) -> tuple[float, float, int]:
         """Alpha with the largest margin, that margin, and the interval where it is smallest."""
@@ -125,15 +125,6 @@ class Knots:
         slowest = -math.log(self.alpha_max)
         best = float(_minimize_largest(needed, slowest, slowest + math.log(1e9))[1].max())
         return 1.0 / best if best > 1e-12 else math.inf
-
-
-def knots_of(time: Tensor, stiffness: Tensor, damping: Tensor, mass: Tensor) -> Knots:
-    """Intervals between times (n,) of gains (n, d, d) that are linear in between."""
-    step = time.diff()[:, None, None]
-    inverse = torch.linalg.inv(torch.linalg.cholesky(mass))
-    alpha_max = float(torch.linalg.eigvalsh(symmetrize(inverse @ damping @ inverse.mT)).min())
-    ends = torch.stack([stiffness[:-1], stiffness[1:]])
-    return Knots(ends, stiffness.diff(dim=0) / step, damping.diff(dim=0) / step, alpha_max)
 
 
 def held_growth(maps: Tensor, stiffness: Tensor, damping: Tensor, mass: Tensor, alpha: float) -> float:
