@@ -242,7 +242,7 @@ CALLS = [
     (lambda: damping_from_stiffness(GAIN, 1.0, np.eye(2)), "damping_ratio is of type ndarray, must be a finite number"),
     (lambda: damping_from_stiffness(GAIN, 1.0, torch.ones(2)), "damping_ratio is tensor"),
     (lambda: certify(SCHEDULE, mass="1"), "mass holds text"),
-    (lambda: SCHEDULE.resample(1e300), r"rate=1e\+300 Hz needs about more than"),
+    (lambda: SCHEDULE.resample(1e300), r"a schedule of .* ticks of 2 axes needs about more than"),
     (lambda: SCHEDULE.retime(1e-300), "speed is 1e-300, must be a finite number of at least"),
     (lambda: AdmittancePlant(sensor=ForceSensor(noise_scale=1.0)).simulate(
         STILL, STILL, GAIN, DAMPING, dt=0.001, generator=np.random.default_rng(0)), "must be a Generator or None"),

@@ -1,32 +1,21 @@
 """The controller as an estimator: demonstrations in, a stiffness schedule out (Section V)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import CubicSpline
 from sklearn.base import BaseEstimator
 from sklearn.utils.validation import check_is_fitted
 
 from torch_pbd import checks
 from torch_pbd.control import parameters
 from torch_pbd.control.impedance import OnUnknown, fit_covariance, fit_law, gains_at
-from torch_pbd.control.primitive import units
+from torch_pbd.control.primitive import smoothing, units
 from torch_pbd.control.primitive.adaptation import Adaptation
 from torch_pbd.control.primitive.dmp import Gate
 from torch_pbd.control.primitive.reproduction import Reproduction, primitive
-from torch_pbd.control.primitive.smoothing import (
-    UNKNOWN,
-    Movements,
-    automatic_cutoff,
-    merge_bursts,
-    noise_like,
-    smooth,
-    tabulate_unsampled,
-    variance_share,
-)
-from torch_pbd.control.primitive.units import MotionLimits
+from torch_pbd.control.schedule.rows import tick_times
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.plant import AdmittancePlant
 from torch_pbd.control.simulation.rollout import Rollout
@@ -40,7 +29,7 @@ from torch_pbd.movement.base import MovementRegressor
 
 Floats = NDArray[np.float64]
 
-_LIMITS = MotionLimits()
+_LIMITS = units.MotionLimits()
 
 
 class DMPController(BaseEstimator):
@@ -186,19 +175,20 @@ class DMPController(BaseEstimator):
             self.__dict__.pop(name, None)
         parameters.check_parameters(self)
         # 1. Recordings. Samples whose times are one are merged; the table of holes is Type I uncertainty.
-        shown = merge_bursts(parameters.as_demonstrations(X, y, groups))
+        shown = smoothing.merge_bursts(parameters.as_demonstrations(X, y, groups))
         self.names_, self.frame_, self.units_, self.time_unit_ = shown.names, shown.frame, shown.units, shown.time_unit
         self.n_demos_, self.n_outputs_ = len(shown), shown.n_outputs
         self.duration_, self.time_scale_ = units.duration_of(shown, self.duration)
         self.start_time_ = units.common_start(shown)
         seconds = self.time_unit_ in TIMES
-        self.cutoff_ = automatic_cutoff(self.duration_, knows_seconds=seconds) if self.cutoff == "auto" else self.cutoff
+        automatic = smoothing.automatic_cutoff(self.duration_, knows_seconds=seconds)
+        self.cutoff_ = automatic if self.cutoff == "auto" else self.cutoff
         self.dmp_ = primitive(self)
         parameters.check_against_duration(self)
         parameters.check_steps(self.n_steps, self.n_demos_, self.n_outputs_, learned=True)
-        self.unsampled_ = tabulate_unsampled(shown, self.duration_ / self.time_scale_, self.on_unknown)
+        self.unsampled_ = smoothing.tabulate_unsampled(shown, self.duration_ / self.time_scale_, self.on_unknown)
         # 2. Smoothing. Splines at the true times give positions, velocities and accelerations at common times.
-        movements = smooth(shown, self.cutoff_, self.n_steps, self.duration_)
+        movements = smoothing.smooth(shown, self.cutoff_, self.n_steps, self.duration_)
         # 3. Mean movement. Eq. (16) is driven by the mean over demonstrations of the forcing of eq. (18), through which
         # goes a Gaussian process, eq. (5), over the phase of eq. (17) or another input that is a function of time.
         self.reproduction_ = Reproduction.learn(self.dmp_, movements, self.phase_input, own_goals=self.goal == "each")
@@ -211,12 +201,12 @@ class DMPController(BaseEstimator):
         self.covariance_ = fit_covariance(self.covariance, phase(movements.time), varying, movements.known)
         # White noise as large as what the smoothing took away, smoothed: its share of the variance is no variability.
         self.noise_scale_ = movements.noise_scale
-        noise = noise_like(shown, self.noise_scale_)
-        smoothed = smooth(noise, self.cutoff_, self.n_steps, self.duration_, noise=True)
-        self.noise_share_ = variance_share(self.varying(smoothed), varying)
+        noise = smoothing.noise_like(shown, self.noise_scale_)
+        smoothed = smoothing.smooth(noise, self.cutoff_, self.n_steps, self.duration_, noise=True)
+        self.noise_share_ = smoothing.variance_share(self.varying(smoothed), varying)
         # 5. Gains. The bounds of eq. (20) are quantiles of the deviations where there are samples; eq. (19) then gives
         # each principal axis its stiffness, and the damping follows from stiffness and mass.
-        known = np.linspace(0.0, self.duration_, len(self.unsampled_))[self.unsampled_ <= UNKNOWN]
+        known = np.linspace(0.0, self.duration_, len(self.unsampled_))[self.unsampled_ <= smoothing.UNKNOWN]
         self.law_ = fit_law(self.stiffness_law, self.covariance_.predict_cov(phase(known[::4])), varying)
         return self
 
@@ -265,7 +255,7 @@ class DMPController(BaseEstimator):
         start: ArrayLike | None = None,
         via: Sequence[tuple[float, ArrayLike]] | None = None,
         speed: float = 1.0,
-        limits: MotionLimits | None = _LIMITS,
+        limits: units.MotionLimits | None = _LIMITS,
     ) -> Schedule:
         """Motion and gains at ``rate``, for a robot: in s and m, if the demonstrations tell units of length.
 
@@ -301,7 +291,7 @@ class DMPController(BaseEstimator):
         speed = checks.number(speed, "speed", above=0.0)
         recorded = self.units_, self.time_unit_
         units.check_motion(limits, *recorded, duration=self.duration_ / speed)
-        time = parameters.as_tick_times(self.duration_ / speed, rate, settle, self.n_outputs_)
+        time = tick_times(self.duration_ / speed, rate, self.n_outputs_, settle=settle)
         bent, goal, start = planned(self, goal, start, via)
         position, velocity, moved = bent._motion(time, goal, start, speed)
         metres = units.in_metres(self.units_)
@@ -361,9 +351,10 @@ class DMPController(BaseEstimator):
         """
         check_is_fitted(self)
         paces = parameters.as_speed(1.0 if speed is None else speed)
-        time = parameters.as_tick_times(
-            self.duration_, rate, settle, self.n_outputs_, len(paces) if paces.ndim else None
-        )
+        if paces.ndim:
+            time = np.arange(len(paces)) / checks.number(rate, "rate", above=0.0, unit="Hz")
+        else:
+            time = tick_times(self.duration_, rate, self.n_outputs_, settle=settle)
         return time, *self._motion(time, goal, start, paces)[:2]
 
     def phase(self, time: ArrayLike) -> Floats:
@@ -371,7 +362,7 @@ class DMPController(BaseEstimator):
         check_is_fitted(self)
         return self.reproduction_.phase(checks.array(time, "time", ("n",)))
 
-    def smooth(self, demonstrations: Demonstrations, n_steps: int | None = None) -> Movements:
+    def smooth(self, demonstrations: Demonstrations, n_steps: int | None = None) -> smoothing.Movements:
         """Demonstrations of this task as the controller sees them, smoothed and stretched to ``duration_``."""
         check_is_fitted(self)
         checks.instance(demonstrations, "demonstrations", Demonstrations)
@@ -379,22 +370,17 @@ class DMPController(BaseEstimator):
             raise ValueError(f"n_outputs of demonstrations is {demonstrations.n_outputs}, must be {self.n_outputs_}.")
         n_steps = self.n_steps if n_steps is None else checks.count(n_steps, "n_steps", least=2)
         parameters.check_steps(n_steps, len(demonstrations), self.n_outputs_, learned=False)
-        return smooth(merge_bursts(demonstrations), self.cutoff_, n_steps, self.duration_)
+        return smoothing.smooth(smoothing.merge_bursts(demonstrations), self.cutoff_, n_steps, self.duration_)
 
-    def varying(self, movements: Movements) -> Floats:
+    def varying(self, movements: smoothing.Movements) -> Floats:
         """Positions or forcings (K, n, d) of smoothed movements of the same task, by ``variability``."""
-        checks.instance(movements, "movements", Movements, remedy="give what smooth(demonstrations) returns")
+        checks.instance(movements, "movements", smoothing.Movements, remedy="give what smooth(demonstrations) returns")
         return movements.position if self.variability == "position" else self.reproduction_.forcing_of(movements)
 
     def _path(self, time: Floats) -> Floats:
         """Reproduced position (n, d) at movement times (n,)."""
         position = self.reproduction_.motion(time)[0]
         return position if self._bend is None else position + self._bend(time)
-
-    def _planned_path(self, goal: ArrayLike | None, start: ArrayLike | None) -> Callable[[float], Floats]:
-        """Position (d,) at a movement time, of the way to another goal or from another start."""
-        time = np.linspace(0.0, self.duration_, 2 * self.n_steps)
-        return CubicSpline(time, self._motion(time, goal, start, 1.0)[0])
 
     def _motion(
         self, time: Floats, goal: ArrayLike | None, start: ArrayLike | None, speed: float | Floats

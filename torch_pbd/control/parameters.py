@@ -18,14 +18,13 @@ from torch_pbd.control.primitive.adaptation import Adaptation
 from torch_pbd.control.primitive.dmp import Gate
 from torch_pbd.control.primitive.smoothing import CUTOFF_HZ
 from torch_pbd.control.primitive.units import robot_unit, warn_of_units
-from torch_pbd.control.schedule.rows import row_times
 from torch_pbd.control.stiffness import StiffnessLaw
 from torch_pbd.data import Demonstrations, check_unimodal
 from torch_pbd.data.alignment import TIMING_REMOVED
 from torch_pbd.data.units import TIMES
 from torch_pbd.estimators.demonstrations import check_groups
 from torch_pbd.estimators.validation import check_squares, checked_values
-from torch_pbd.files.memory import require_memory, require_much
+from torch_pbd.files.memory import require_much
 
 Floats = NDArray[np.float64]
 PhaseInput = Literal["time", "log_s", "s"]
@@ -162,22 +161,6 @@ def as_speed(values: ArrayLike) -> Floats:
         raise ValueError(f"speed has shape {speed.shape}, must be a number, or have shape (n,): one for each tick.")
     checks.require(np.isfinite(speed) & (speed >= 0.0), speed, "speed", "finite and at least 0: time runs forwards")
     return speed
-
-
-def as_tick_times(duration: float, rate: float, settle: float, d: int, n_ticks: int | None = None) -> Floats:
-    """Times (n,) of the rows of a schedule of d outputs that ends ``settle`` after the movement, or of ``n_ticks``."""
-    rate = checks.number(rate, "rate", above=0.0, unit="Hz")
-    lasting = duration + checks.number(settle, "settle", least=0.0, unit="s")
-    counted = lasting * rate + 1.0 if n_ticks is None else float(n_ticks)
-    require_memory(  # its arrays, and twice as much while they are made
-        3 * 8 * counted * (2 + 2 * d + 3 * d * d),
-        what=f"a schedule of {counted:.7g} ticks of {d} axes",
-        remedy="Lower rate, and let the robot interpolate between its rows.",
-    )
-    times = row_times(lasting, rate) if n_ticks is None else np.arange(n_ticks) / rate
-    if len(times) < 2:
-        raise ValueError(f"rate is {rate:g} Hz, less than a tick in {lasting:g} s, must give at least 2 ticks.")
-    return times
 
 
 def check_steps(n_steps: int, n_demos: int, d: int, *, learned: bool) -> None:

@@ -93,18 +93,6 @@ class StiffnessLaw:
         low, high = self._quantiles(torch.linalg.eigvalsh(matrix.detach()), resolution) if quantile else self._scales()
         return replace(self, sigma_low=low, sigma_high=high, bounds="sigma")
 
-    def lipschitz(self) -> float:
-        """Largest change of the stiffness for a change of the covariance, both in the Frobenius norm.
-
-        Of a law with bounds="sigma" or "variance": (k_max - k_min) / (s_high - s_low) / (2 s_low), half as much
-        again if ``smooth`` (F. Kittaneh, Linear Algebra and its Applications 71, 1985, of spectral functions).
-        """
-        if self.bounds == "quantile":
-            raise ValueError("bounds == 'quantile' depends on the covariances: call fitted(covariance) first.")
-        low, high = self._scales()
-        slope = (self.stiffness_max - self.stiffness_min) / (high - low) / (2.0 * low) if low else math.inf
-        return 1.5 * slope if self.smooth else slope
-
     def _stiffness(self, variance: Tensor, low: float, high: float) -> Tensor:
         """Stiffness (..., d) along axes of these variances: eq. (20)."""
         # The root is taken of what is above the lower bound, so its gradient at zero is never asked for.

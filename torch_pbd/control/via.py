@@ -99,7 +99,8 @@ def planned(
         rest[name] = None if share == 1.0 else own + (1.0 - share) * change
         times.append(at)
         changes.append(share * change)
-    path = controller._planned_path(rest["goal"], rest["start"])
+    even = np.linspace(0.0, controller.duration_, 2 * controller.n_steps)
+    path = CubicSpline(even, controller._motion(even, rest["goal"], rest["start"], 1.0)[0])
     for number, point in enumerate(via or ()):
         at, position = _checked_point(point, number, controller.duration_, controller.n_outputs_)
         change = position - path(at)

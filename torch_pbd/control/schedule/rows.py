@@ -4,7 +4,9 @@ import math
 
 import numpy as np
 
+from torch_pbd import checks
 from torch_pbd.checks import Floats
+from torch_pbd.files.memory import require_memory
 
 # Of a tick: 10 s at 1 kHz are 10001 rows, however 10 * 1000 is rounded; and stamps tell a duration to the thousandth of
 # their spacing, beyond which they count as one, so that a last interval shorter than that is none.
@@ -20,6 +22,24 @@ def count_rows(duration: float, rate: float) -> int:
 def row_times(duration: float, rate: float) -> Floats:
     """Times (n,) of these rows: the last interval may be shorter."""
     return np.append(np.arange(count_rows(duration, rate) - 1) / rate, duration)
+
+
+def tick_times(duration: float, rate: float, d: int, *, settle: float = 0.0) -> Floats:
+    """Times (n,), n >= 2, of the rows of a schedule of d axes at a rate in Hz, if they fit in memory.
+
+    Rate, and the time in s by which the schedule ends after the duration, are checked.
+    """
+    rate = checks.number(rate, "rate", above=0.0, unit="Hz")
+    duration += checks.number(settle, "settle", least=0.0, unit="s")
+    counted = duration * rate + 1.0
+    require_memory(  # its arrays, and twice as much while they are made
+        3 * 8 * counted * (2 + 2 * d + 3 * d * d),
+        what=f"a schedule of {counted:.7g} ticks of {d} axes",
+        remedy="Lower rate, and let the robot interpolate between its rows.",
+    )
+    if count_rows(duration, rate) < 2:
+        raise checks.refusal(rate, "rate", f"at least {1 / duration:g}, for two rows", unit="Hz")
+    return row_times(duration, rate)
 
 
 def blend(start: Floats, end: Floats, share: Floats) -> Floats:

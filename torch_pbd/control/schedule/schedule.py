@@ -14,9 +14,8 @@ from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control.schedule.contents import ARRAY_DIMS, LABELS, checked_fields
 from torch_pbd.control.schedule.files import read_schedule, write_schedule
-from torch_pbd.control.schedule.rows import Between, count_rows, row_times
+from torch_pbd.control.schedule.rows import Between, tick_times
 from torch_pbd.exceptions import InvalidParameterError
-from torch_pbd.files.memory import require_much
 
 if TYPE_CHECKING:
     from torch_pbd.control.stability.report import StabilityReport
@@ -165,8 +164,11 @@ class Schedule:
         """
         if (rate is None) == (times is None):
             raise InvalidParameterError(f"give either rate or times; got rate={rate!r} and times={times!r}.")
-        grid = self._ticks(rate) if rate is not None else checks.array(times, "times", ("m",))
         first, last = self.time[0], self.time[-1]
+        if rate is not None:
+            grid = np.append(first + tick_times(self.duration, rate, self.n_outputs)[:-1], last)
+        else:
+            grid = checks.array(times, "times", ("m",))
         checks.require((grid >= first) & (grid <= last), grid, "times", f"from {first!s} to {last!s} s")
         between = Between(self.time, grid)
         position, velocity = between.hermite(self.position, self.velocity)
@@ -262,14 +264,6 @@ class Schedule:
 
     def _labels(self) -> dict[str, Any]:
         return {**{name: getattr(self, name) for name in LABELS}, "provenance": dict(self.provenance)}
-
-    def _ticks(self, rate: float) -> Floats:
-        rate = checks.number(rate, "rate", above=0.0, unit="Hz")
-        d, rows = self.n_outputs, self.duration * rate + 1.0
-        require_much(3 * 8.0 * rows * (2 + 2 * d + 3 * d * d), what=f"rate={rate:g} Hz", remedy="Lower rate.")
-        if count_rows(self.duration, rate) < 2:
-            raise checks.refusal(rate, "rate", f"at least {1 / self.duration:g}, for two rows", unit="Hz")
-        return np.append(self.time[0] + row_times(self.duration, rate)[:-1], self.time[-1])
 
 
 def _relative_loss(matrices: Floats, diagonal: Floats) -> tuple[float, float]:
