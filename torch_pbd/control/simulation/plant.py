@@ -10,9 +10,11 @@ from torch_pbd.control.matrices import as_mass, as_tensor, mass_matrix
 from torch_pbd.control.simulation.position_loop import PositionLoop
 from torch_pbd.control.simulation.rollout import Rollout
 from torch_pbd.control.simulation.sensor import ForceSensor
-from torch_pbd.control.simulation.ticks import Environment, StiffnessFilter, Task, closed_loop, nothing_acts, open_loop
+from torch_pbd.control.simulation.ticks import Environment, StiffnessFilter, Task, closed_loop, open_loop
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.files.memory import require_memory
+
+_PARTS = ("sensor", "position_loop", "environment", "stiffness_filter")
 
 
 @final
@@ -80,8 +82,7 @@ class AdmittancePlant:
 
     def __repr__(self) -> str:
         mass = tuple(self.mass.shape) if isinstance(self.mass, Tensor) and self.mass.ndim else float(self.mass)
-        parts = ("sensor", "position_loop", "environment", "stiffness_filter")
-        acting = [f"{name}={part}" for name in parts if (part := getattr(self, name)) is not None]
+        acting = [f"{name}={part}" for name in _PARTS if (part := getattr(self, name)) is not None]
         return f"AdmittancePlant({', '.join([f'mass={mass} kg', *acting])})"
 
     def simulate(
@@ -138,7 +139,7 @@ class AdmittancePlant:
         tensors = {name: as_tensor(value, name) for name, value in given.items()}
         _check_given(tensors)
         acting = {name: tensors.pop(name, None) for name in ("force", "position0", "velocity0")}
-        return self.run(self.task(**tensors, dt=dt), **acting, generator=generator)
+        return run_task(self.task(**tensors, dt=dt), **acting, generator=generator)
 
     def task(
         self,
@@ -160,47 +161,49 @@ class AdmittancePlant:
                 still = torch.zeros_like(velocity_desired[..., :1, :])
                 acceleration_desired = torch.cat([difference, still], dim=-2)
             inertial = acceleration_desired @ mass.mT
-        return Task(position_desired, velocity_desired, inertial, stiffness, damping, mass, dt)
+        acting = {name: getattr(self, name) for name in ("substeps", *_PARTS)}
+        return Task(position_desired, velocity_desired, inertial, stiffness, damping, mass, dt, **acting)
 
-    def run(
-        self,
-        task: Task,
-        force: Tensor | None = None,
-        position0: Tensor | None = None,
-        velocity0: Tensor | None = None,
-        *,
-        generator: torch.Generator | None = None,
-    ) -> Rollout:
-        """Run of a task under a force (..., T, d) and from a start (..., d) that were checked."""
-        force = torch.zeros_like(task.position) if force is None else force
-        start = task.position[..., 0, :] if position0 is None else position0
-        speed = task.velocity[..., 0, :] if velocity0 is None else velocity0
-        parts = (task.position, task.velocity, task.inertial_force, force, task.stiffness[..., 0])
-        batch = torch.broadcast_shapes(*(value.shape[:-2] for value in parts), start.shape[:-1], speed.shape[:-1])
-        self._check_memory(batch, task)
-        state = start.expand(*batch, -1), speed.expand(*batch, -1)
-        if nothing_acts(self) and task.is_shared:
-            position, velocity = open_loop(task, force, state)
-            record: dict[str, Any] = {"position": position, "velocity": velocity, "commanded_position": position}
-            record |= {"force": force.expand_as(position), "stiffness": task.stiffness, "damping": task.damping}
-        else:
-            record = closed_loop(task, force, state, self, generator)
-        for name in ("stiffness", "damping"):
-            record[name] = record[name].expand(*batch, *record[name].shape[-3:])
-        _check_finished(record["position"], record["velocity"])
-        time = torch.arange(task.n_ticks, dtype=force.dtype, device=force.device) * task.dt
-        return Rollout(time, desired_position=task.position, **record)
 
-    def _check_memory(self, batch: torch.Size, task: Task) -> None:
-        # Measured: five motions are held, and where rollouts differ in their gains, twelve matrices.
-        d = task.position.shape[-1]
-        of_each = 5 * d + (12 * d * d if task.stiffness.ndim > 3 or self.stiffness_filter is not None else 0)
-        if task.position.device.type == "cpu":  # elsewhere torch raises by itself
-            require_memory(
-                of_each * batch.numel() * task.n_ticks * task.position.element_size(),
-                what=f"a simulation of {batch.numel()} rollouts of {task.n_ticks} ticks",
-                remedy="Simulate fewer at a time, or take simulate_many, which keeps no trajectories.",
-            )
+def run_task(
+    task: Task,
+    force: Tensor | None = None,
+    position0: Tensor | None = None,
+    velocity0: Tensor | None = None,
+    *,
+    generator: torch.Generator | None = None,
+) -> Rollout:
+    """Run of a task under a force (..., T, d) and from a start (..., d) that were checked."""
+    force = torch.zeros_like(task.position) if force is None else force
+    start = task.position[..., 0, :] if position0 is None else position0
+    speed = task.velocity[..., 0, :] if velocity0 is None else velocity0
+    parts = (task.position, task.velocity, task.inertial_force, force, task.stiffness[..., 0])
+    batch = torch.broadcast_shapes(*(value.shape[:-2] for value in parts), start.shape[:-1], speed.shape[:-1])
+    _check_memory(batch, task)
+    state = start.expand(*batch, -1), speed.expand(*batch, -1)
+    if task.is_open and task.is_shared:
+        position, velocity = open_loop(task, force, state)
+        record: dict[str, Any] = {"position": position, "velocity": velocity, "commanded_position": position}
+        record |= {"force": force.expand_as(position), "stiffness": task.stiffness, "damping": task.damping}
+    else:
+        record = closed_loop(task, force, state, generator)
+    for name in ("stiffness", "damping"):
+        record[name] = record[name].expand(*batch, *record[name].shape[-3:])
+    _check_finished(record["position"], record["velocity"])
+    time = torch.arange(task.n_ticks, dtype=force.dtype, device=force.device) * task.dt
+    return Rollout(time, desired_position=task.position, **record)
+
+
+def _check_memory(batch: torch.Size, task: Task) -> None:
+    # Measured: five motions are held, and where rollouts differ in their gains, twelve matrices.
+    d = task.position.shape[-1]
+    of_each = 5 * d + (12 * d * d if task.stiffness.ndim > 3 or task.stiffness_filter is not None else 0)
+    if task.position.device.type == "cpu":  # elsewhere torch raises by itself
+        require_memory(
+            of_each * batch.numel() * task.n_ticks * task.position.element_size(),
+            what=f"a simulation of {batch.numel()} rollouts of {task.n_ticks} ticks",
+            remedy="Simulate fewer at a time, or take simulate_many, which keeps no trajectories.",
+        )
 
 
 def _check_given(given: dict[str, Tensor]) -> None:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torch_pbd.control.simulation.ticks import Hooks, Loop, State, Task, block_length, block_responses, nothing_acts
+from torch_pbd.control.simulation.ticks import Loop, State, Task, block_length, block_responses
 
 Floats = NDArray[np.float64]
 
@@ -108,7 +108,7 @@ class Deviations:
 
 
 def simulate_blocks(
-    task: Task, hooks: Hooks, pushes: Pushes, start: State, generators: Callable[[], torch.Generator]
+    task: Task, pushes: Pushes, start: State, generators: Callable[[], torch.Generator]
 ) -> Iterator[Deviations]:
     """Deviations of R rollouts from states (R, d): blocks of ticks one after the other, of each all rollouts.
 
@@ -120,7 +120,7 @@ def simulate_blocks(
     chunk = _CHUNK if task.position.device.type == "cpu" else n_rollouts
     columns = [slice(first, min(first + chunk, n_rollouts)) for first in range(0, n_rollouts, chunk)]
     starts = [(start[0][each], start[1][each]) for each in columns]
-    runs = _Linear(task, starts, chunk) if nothing_acts(hooks) else _Looped(task, starts, hooks, generators)
+    runs = _Linear(task, starts, chunk) if task.is_open else _Looped(task, starts, generators)
     parts = [pushes[each] for each in columns]
     timings = [_Timing(part) for part in parts]
     length = block_length(d)
@@ -179,10 +179,8 @@ class _Linear:
 class _Looped:
     """Chunks of rollouts in which something acts at every tick."""
 
-    def __init__(
-        self, task: Task, starts: list[State], hooks: Hooks, generators: Callable[[], torch.Generator]
-    ) -> None:
-        self._task, self._loops = task, [Loop(task, start, hooks, generators()) for start in starts]
+    def __init__(self, task: Task, starts: list[State], generators: Callable[[], torch.Generator]) -> None:
+        self._task, self._loops = task, [Loop(task, start, generators()) for start in starts]
         self._still = [torch.zeros_like(start[0]) for start in starts]
 
     def move(self, k: int, ticks: slice, pushed: slice, forces: Tensor) -> Tensor:

@@ -1,6 +1,5 @@
 """A schedule on a simulated robot: once under a given force, or thousands of times under random pushes."""
 
-import copy
 from dataclasses import replace
 from typing import Any, Literal
 
@@ -11,10 +10,10 @@ from torch import Tensor
 
 from torch_pbd import checks
 from torch_pbd.control.schedule.schedule import Schedule
-from torch_pbd.control.simulation.plant import AdmittancePlant
+from torch_pbd.control.simulation.plant import AdmittancePlant, run_task
 from torch_pbd.control.simulation.rollout import Rollout
 from torch_pbd.control.simulation.rollouts import Pushes, RolloutSummary, Tally, quantiles_in, simulate_blocks
-from torch_pbd.control.simulation.ticks import block_length
+from torch_pbd.control.simulation.ticks import Task, block_length
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.files.memory import require_memory
 
@@ -38,7 +37,7 @@ def simulate_schedule(
     noisy = getattr(robot.sensor, "noise_scale", 0.0) != 0.0  # else nothing is drawn: None is the caller's global state
     generator = torch.Generator().manual_seed(int(draw.randint(2**31 - 1))) if noisy else None
     task = robot.task(*_motion_of(schedule), dt=1.0 / rate)
-    return robot.run(task, torch.tensor(push), generator=generator).numpy()
+    return run_task(task, torch.tensor(push), generator=generator).numpy()
 
 
 def simulate_many(
@@ -136,9 +135,9 @@ def simulate_many(
         task = robot.task(*motion, dt=dt)
         start = task.position[0] + offset, task.velocity[0].expand(n_rollouts, -1)
         pushes = Pushes(*(torch.tensor(part, device=device) for part in (begin, lasting, np.ascontiguousarray(push.T))))
-        blocks = simulate_blocks(task, robot, pushes, start, lambda: torch.Generator().manual_seed(next(seeds)))
+        blocks = simulate_blocks(task, pushes, start, lambda: torch.Generator().manual_seed(next(seeds)))
         tally = Tally(n_rollouts, task.position, threshold=threshold, share=_SHARE)
-        away = None if reference == "desired" else _undisturbed(robot, motion, dt)
+        away = None if reference == "desired" else _undisturbed(task)
         deviation = np.concatenate(list(quantiles_in(blocks, tally, levels, every, away)))
     squared_peak, squared_last, peak_tick, last_above = (
         values.cpu().numpy() for values in (tally.squared_peak, tally.squared_last, tally.peak_tick, tally.last_above)
@@ -232,9 +231,7 @@ def _robot(schedule: Schedule, plant: AdmittancePlant | None) -> AdmittancePlant
     return plant
 
 
-def _undisturbed(robot: AdmittancePlant, motion: list[Tensor], dt: float) -> Tensor:
+def _undisturbed(task: Task) -> Tensor:
     """Deviation (d, T) of one run without push and without noise."""
-    silent = copy.copy(robot)
-    if robot.sensor is not None:
-        silent.sensor = replace(robot.sensor, noise_scale=0.0)
-    return silent.run(silent.task(*motion, dt=dt)).deviation.mT
+    silent = None if task.sensor is None else replace(task.sensor, noise_scale=0.0)
+    return run_task(replace(task, sensor=silent)).deviation.mT

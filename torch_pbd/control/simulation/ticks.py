@@ -43,30 +43,6 @@ def transition(rate: Float[Tensor, "*b n n"], dt: float) -> Float[Tensor, "*b n 
 
 
 @dataclass(frozen=True)
-class Task:
-    """Motions (..., T, d) and gains (..., T, d, d) of a run to come, checked."""
-
-    position: Tensor
-    velocity: Tensor
-    inertial_force: Tensor
-    stiffness: Tensor
-    damping: Tensor
-    mass: Tensor
-    dt: float
-
-    @property
-    def n_ticks(self) -> int:
-        """Number of ticks T."""
-        return self.position.shape[-2]
-
-    @property
-    def is_shared(self) -> bool:
-        """Whether all rollouts of a batch have the same gains and desired motion."""
-        motion = (self.position, self.velocity, self.inertial_force)
-        return self.stiffness.ndim == 3 and all(part.ndim == 2 for part in motion)
-
-
-@dataclass(frozen=True)
 class Gains:
     """Stiffness and damping in effect, (..., d, d), and the share (...) of the step towards the wanted ones."""
 
@@ -104,21 +80,39 @@ class Environment(Protocol):
         """Force in N on a robot at these positions, in m, and velocities (..., d)."""
 
 
-@runtime_checkable
-class Hooks(Protocol):
-    """Parts that act within the loop, None where there is no such part."""
+@dataclass(frozen=True)
+class Task:
+    """Run to come, checked: motions (..., T, d), gains (..., T, d, d), and the parts that act in the loop, or None."""
 
+    position: Tensor
+    velocity: Tensor
+    inertial_force: Tensor
+    stiffness: Tensor
+    damping: Tensor
+    mass: Tensor
+    dt: float
     sensor: ForceSensor | None
     position_loop: PositionLoop | None
     environment: Environment | None
     substeps: int
     stiffness_filter: StiffnessFilter | None
 
+    @property
+    def n_ticks(self) -> int:
+        """Number of ticks T."""
+        return self.position.shape[-2]
 
-def nothing_acts(hooks: Hooks) -> bool:
-    """Whether no part acts within the loop."""
-    parts = (hooks.sensor, hooks.position_loop, hooks.environment, hooks.stiffness_filter)
-    return all(part is None for part in parts)
+    @property
+    def is_open(self) -> bool:
+        """Whether nothing acts in the loop."""
+        parts = (self.sensor, self.position_loop, self.environment, self.stiffness_filter)
+        return all(part is None for part in parts)
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether all rollouts of a batch have the same gains and desired motion."""
+        motion = (self.position, self.velocity, self.inertial_force)
+        return self.stiffness.ndim == 3 and all(part.ndim == 2 for part in motion)
 
 
 def open_loop(task: Task, force: Tensor, state: State) -> State:
@@ -195,11 +189,9 @@ def _moved(each: Float[Tensor, "*b m n"], deviation: Tensor, velocity: Tensor, f
     return after[..., :d], after[..., d:]
 
 
-def closed_loop(
-    task: Task, force: Tensor, state: State, hooks: Hooks, generator: torch.Generator | None
-) -> dict[str, Any]:
-    """Fields of a Rollout where parts act within the loop."""
-    loop = Loop(task, state, hooks, generator)
+def closed_loop(task: Task, force: Tensor, state: State, generator: torch.Generator | None) -> dict[str, Any]:
+    """Fields of a Rollout, tick by tick."""
+    loop = Loop(task, state, generator)
     ticks = [loop.run(tick, force[..., tick, :]) for tick in range(task.n_ticks)]
     behind = {"position": 2, "velocity": 2, "force": 2, "commanded_position": 2, "stiffness": 3, "damping": 3}
     return {name: torch.stack([each[name] for each in ticks], dim=-behind.get(name, 1)) for name in ticks[0]}
@@ -208,15 +200,15 @@ def closed_loop(
 class Loop:
     """State (..., d) of a closed-loop run, which moves on tick by tick."""
 
-    def __init__(self, task: Task, state: State, hooks: Hooks, generator: torch.Generator | None) -> None:
-        self._task, self._environment, self._substeps = task, hooks.environment, hooks.substeps
+    def __init__(self, task: Task, state: State, generator: torch.Generator | None) -> None:
+        self._task = task
         self._deviation, self._velocity = state[0] - task.position[..., 0, :], state[1]
-        loop, sensor, wanted = hooks.position_loop, hooks.sensor, hooks.stiffness_filter
+        loop, sensor, wanted = task.position_loop, task.sensor, task.stiffness_filter
         self._robot = None if loop is None else loop.start(*state, task.dt)
         self._read = None if sensor is None else sensor.start(state[0], task.dt, generator)
         gains = task.stiffness, task.damping, task.mass, task.dt
         self._filter = None if wanted is None else wanted.start(*gains)
-        self._maps = (each for _, maps in tick_maps(task, task.dt / hooks.substeps) for each in maps.unbind(-3))
+        self._maps = (each for _, maps in tick_maps(task, task.dt / task.substeps) for each in maps.unbind(-3))
 
     def run(self, tick: int, force: Tensor) -> dict[str, Tensor]:
         """One tick under a force (..., d): measure, choose the gains, move; fields of a Rollout at its start."""
@@ -244,7 +236,8 @@ class Loop:
         return record | {"stiffness": stiffness, "damping": damping}
 
     def _wall(self, position: Tensor, velocity: Tensor) -> Tensor:
-        return torch.zeros_like(position) if self._environment is None else self._environment.force(position, velocity)
+        walls = self._task.environment
+        return torch.zeros_like(position) if walls is None else walls.force(position, velocity)
 
     def _move(
         self, stiffness: Tensor, damping: Tensor, forces: tuple[Tensor, Tensor], push: Tensor, desired: Tensor
@@ -255,7 +248,7 @@ class Loop:
             each = next(self._maps)
         else:
             each = _tick_map(stiffness, damping, self._task.mass, self._task.dt)
-        for part in range(self._substeps):
+        for part in range(self._task.substeps):
             before = self._deviation, self._velocity
             if part:
                 force = outside + self._wall(before[0] + desired, before[1])
