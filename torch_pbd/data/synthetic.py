@@ -18,8 +18,12 @@ Seed = int | Random | None
 PATH_LENGTH = 0.6
 """Distance that the tunnel task covers along y, in m."""
 
-# Of a good optical tracker: resolution of the recorded positions and noise along the path, in m.
-_QUANTUM, _NOISE = 5e-6, 2e-6
+# Of a good optical tracker: resolution of the recorded positions and noise along the path, in m; and of a hand.
+_QUANTUM, _NOISE, _TREMOR = 5e-6, 2e-6, 1e-4
+# The wandering and the correcting that a lane has, normal numbers of unit variance times these; and the share of the
+# half-width that it leaves.
+_WANDER, _CORRECTION, _WITHIN = 0.12, 0.04, 0.85
+_BLENDED = 0.15  # of the path, next to an end that is common
 
 
 def paper_mean(xi: ArrayLike) -> Floats:
@@ -102,6 +106,22 @@ def tunnel_half_width(y: ArrayLike) -> Floats:
     return 0.12 - 0.11 * s**2 * (3.0 - 2.0 * s)
 
 
+def tunnel_deviation(y: ArrayLike, *, common_start: bool = False, common_goal: bool = False) -> Floats:
+    """Standard deviation of x over demonstrations of the tunnel task, in m, at y in m.
+
+    That of the law of `make_tunnel_demonstrations` with equal durations: ``0.85 tunnel_half_width(y)`` times the blends
+    at the ends, times the deviation of tanh of a lane with its wandering and correcting; and the tremor.
+    """
+    # Mean square of tanh over the uniform lanes, by the midpoint rule, and the normal numbers, by Gauss and Hermite.
+    lanes = (np.arange(400) + 0.5) / 400 * 1.2 - 0.6
+    node, weight = np.polynomial.hermite_e.hermegauss(40)
+    lane = lanes[:, np.newaxis] + np.hypot(_WANDER, _CORRECTION) * node
+    square = np.square(np.tanh(lane)).mean(axis=0) @ weight / weight.sum()
+    along = checks.real_floats(y, "y")
+    across = _WITHIN * tunnel_half_width(along) * _blend(along, common_start, common_goal)
+    return np.sqrt(np.square(across) * square + _TREMOR**2)
+
+
 def make_tunnel_demonstrations(
     n_demos: int = 6,
     duration: float = 10.0,
@@ -110,6 +130,7 @@ def make_tunnel_demonstrations(
     random_state: Seed = None,
     variant: Variant = "plain",
     common_start: bool = False,
+    common_goal: bool = False,
 ) -> Demonstrations:
     """A hand that moves through a tunnel which narrows: free where it is wide, precise where it is narrow.
 
@@ -137,6 +158,9 @@ def make_tunnel_demonstrations(
     common_start : bool, default=False
         Start all demonstrations on the centre line; they reach their lanes by a minimum-jerk blend in the
         first 15 % of the duration.
+    common_goal : bool, default=False
+        End all demonstrations on the centre line, which they reach from their lanes by the same blend in the last 15 %.
+        See `tunnel_deviation`.
 
     Returns
     -------
@@ -156,7 +180,7 @@ def make_tunnel_demonstrations(
         lasting = duration * random.uniform(0.8, 1.25) if variant == "unequal" else duration
         time = _sample_times(lasting, rate, variant, random)
         times.append(time)
-        positions.append(_tunnel_path(time, lasting, lane, common_start, random))
+        positions.append(_tunnel_path(time, lasting, lane, (common_start, common_goal), random))
     if variant == "outlier":
         positions[-1][:, 0] += 0.1 * np.exp(-(((positions[-1][:, 1] - 0.5) / 0.05) ** 2))
     quantized = [np.round(position / _QUANTUM) * _QUANTUM for position in positions]
@@ -183,19 +207,26 @@ def _sample_times(duration: float, rate: float, variant: Variant, random: Random
     return time
 
 
-def _tunnel_path(time: Floats, duration: float, lane: float, common_start: bool, random: Random) -> Floats:
+def _tunnel_path(time: Floats, duration: float, lane: float, common: tuple[bool, bool], random: Random) -> Floats:
     wander, correction, tremor = (
         band_noise(time, low, high, random) for low, high in [(0.0, 0.25), (0.25, 1.0), (8.0, 12.0)]
     )
     # The lane is between the walls, whatever its noise adds: tanh keeps it within 0.85 of the half-width.
     along = PATH_LENGTH * time / duration
-    across = 0.85 * tunnel_half_width(along) * np.tanh(lane + 0.12 * wander + 0.04 * correction)
-    if common_start:
-        # Minimum jerk (Flash, Hogan 1985): velocity and acceleration vanish at both ends of the blend.
-        s = np.clip(time / (0.15 * duration), 0.0, 1.0)
-        across *= s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
-    x = tunnel_center(along) + across + 1e-4 * tremor
+    across = _WITHIN * tunnel_half_width(along) * np.tanh(lane + _WANDER * wander + _CORRECTION * correction)
+    across *= _blend(along, *common)
+    x = tunnel_center(along) + across + _TREMOR * tremor
     return np.column_stack([x, along + _NOISE * random.normal(size=len(time))])
+
+
+def _blend(along: Floats, common_start: bool, common_goal: bool) -> Floats:
+    """Share of the lanes that the ends leave, by minimum jerk (Flash, Hogan 1985): smooth where it becomes one."""
+    result = np.ones_like(along)
+    for is_common, distance in ((common_start, along), (common_goal, PATH_LENGTH - along)):
+        if is_common:
+            s = np.clip(distance / (_BLENDED * PATH_LENGTH), 0.0, 1.0)
+            result = result * (s**3 * (10.0 - 15.0 * s + 6.0 * s**2))
+    return result
 
 
 def band_noise(time: Floats, low: float, high: float, random: Random, n_waves: int = 32) -> Floats:

@@ -1,6 +1,6 @@
 """The recommended regressor: covariance by latent Gaussian processes that are integrated out."""
 
-from functools import cache, partial
+from functools import partial
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -266,20 +266,16 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         group = None if groups is None else self._door(groups).long()
         options = SearchOptions(self.max_iter, self.tol, self.n_restarts, self._progress())
         kernel: KernelName = "squared_exponential" if self.kernel == "periodic" else self.kernel
-        to_try = inducing_sizes(self.n_inducing, X.shape[1], y.shape[1])
-        begin = None
-        for sizes in to_try:
+        to_try = []
+        for sizes in inducing_sizes(self.n_inducing, X.shape[1], y.shape[1]):
             inducing = [inducing_inputs(training.inputs, size) for size in sizes]
-            mean_features, features = (FeatureMap(z, kernel, circle, len(z) == len(inputs)) for z in inducing)
-            families = Families.build(mean_features, features, held, shared=self.shared_length_scale)
-            if self.n_inducing is None and begin is None:  # cached: looked for once, whatever sizes are tried
-                begin = cache(partial(mean_start, rows, families.mean, options))
-            fit = fit_heteroscedastic(
-                training, group, families, options, needs_resolution=sizes != to_try[-1], begin=begin
-            )
-            if fit is not None:
-                break
-        assert fit is not None
+            mean_map, covariance_map = (FeatureMap(z, kernel, circle, len(z) == len(inputs)) for z in inducing)
+            to_try.append(Families.build(mean_map, covariance_map, held, shared=self.shared_length_scale))
+        families = to_try[0]
+        begin = partial(mean_start, rows, families.mean, options) if self.n_inducing is None else None
+        larger = to_try[1] if len(to_try) > 1 else None
+        fit = fit_heteroscedastic(training, group, families, options, larger=larger, begin=begin)
+        features = fit.covariance.log_variance_family.features
         warn_if_unresolved(held, features)
         warn_of_residuals(fit, group, self._door(recorded).long())
         self.effective_share_ = 1.0 if fit.correlation is None else float(fit.correlation.share.mean())

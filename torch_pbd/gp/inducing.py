@@ -32,6 +32,8 @@ class FeatureMap:
     period: Float[Tensor, " e"] | None = None
     exact: bool = False
     """Whether the inducing inputs are all the training inputs."""
+    stretch: Float[Tensor, "2 2"] | None = None
+    """Length added next to the first and the last input, and the distance from it over which most of it is."""
     # Kernel matrices of smooth kernels have a condition number beyond float64: what this takes away from a process of
     # unit variance cannot be told from noise.
     jitter: ClassVar[float] = 1e-13
@@ -39,13 +41,22 @@ class FeatureMap:
 
     def __call__(self, length_scale: Float[Tensor, "*b e"]) -> "Features":
         """Features for these length scales."""
-        gram = correlation(self.inducing, self.inducing, length_scale, self.kernel, self.period)
+        inducing = self.warped(self.inducing)
+        gram = correlation(inducing, inducing, length_scale, self.kernel, self.period)
         gram = gram + self.jitter * torch.eye(len(self.inducing)).to(gram)
         return Features(self, length_scale, safe_cholesky(gram, name="the kernel matrix of the inducing inputs"))
 
     def square_differences(self, x: Float[Tensor, "n e"], other: Float[Tensor, "m e"]) -> Float[Tensor, "e n m"]:
         """Squares of the differences in each dimension; along a circle of the chords."""
-        return torch.stack(differences(x, other, self.period), dim=-1).square().movedim(-1, 0)
+        return torch.stack(differences(self.warped(x), self.warped(other), self.period), dim=-1).square().movedim(-1, 0)
+
+    def warped(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n e"]:
+        """Inputs with length added next to the ends of their range, within which alone it is."""
+        if self.stretch is None:
+            return x
+        (first, first_width), (last, last_width) = self.stretch
+        from_first, from_last = (x + 0.5).clamp_min(0.0), (0.5 - x).clamp_min(0.0)
+        return x - first * torch.expm1(-from_first / first_width) + last * torch.expm1(-from_last / last_width)
 
     @cached_property
     def farthest_first(self) -> Int64[Tensor, " m"]:
@@ -70,7 +81,7 @@ class FeatureMap:
         if len(self.inducing) < 2:
             return _SHORTEST
         share = _EXACT_RESOLUTION if self.exact else _RESOLUTION
-        return max(_SHORTEST, min(0.5, share * spacing(self.inducing)))
+        return max(_SHORTEST, min(0.5, share * spacing(self.warped(self.inducing))))
 
 
 @dataclass(frozen=True)
@@ -89,7 +100,8 @@ class Features:
     def cross(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "*b n m"]:
         """Kernel between x and the inducing inputs."""
         features = self.features
-        return correlation(x, features.inducing, self.length_scale, features.kernel, features.period)
+        inducing = features.warped(features.inducing)
+        return correlation(features.warped(x), inducing, self.length_scale, features.kernel, features.period)
 
 
 class FixedFeatures:

@@ -1,6 +1,7 @@
 """Mean and covariance by latent Gaussian processes that are integrated out: the recommended model."""
 
-from torch_pbd.models.heteroscedastic.fit import Families, HeteroscedasticFit, fit_heteroscedastic
+from torch_pbd.models.heteroscedastic.families import Families
+from torch_pbd.models.heteroscedastic.fit import HeteroscedasticFit, fit_heteroscedastic
 from torch_pbd.models.heteroscedastic.mean import mean_start
 from torch_pbd.models.heteroscedastic.module import HeteroscedasticModel
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily

@@ -9,14 +9,14 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from torch_pbd.gp.inducing import FixedFeatures
-from torch_pbd.models.heteroscedastic.linear import LinearEvidence, Regression, Weights
+from torch_pbd.models.heteroscedastic.linear import LinearEvidence, Weights
 from torch_pbd.models.heteroscedastic.log_variance import LEAST_SQUARE, Squares, fit_log_variance, search_log_variance
 from torch_pbd.models.heteroscedastic.processes import Processes, ProcessFamily
+from torch_pbd.models.heteroscedastic.regression import Regression
 from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation
 from torch_pbd.models.heteroscedastic.search import Gradient, Search
 
-# Sweeps over log variances and coefficients; and how many of them look for the coefficients' hyperparameters too: the
-# last one takes these as they are.
+# Sweeps over log variances and coefficients; and how many of them look for the coefficients' hyperparameters too.
 _SWEEPS, _SEARCHES = 3, 2
 # An input with at least so many degrees of freedom left gives a conditional variance by itself.
 _ENOUGH_DEGREES = 2.0
@@ -164,6 +164,8 @@ def fit_covariance(
     degrees: Float[Tensor, "d n"],
     noise: NoiseCorrelation,
     previous: LatentCovariance | None,
+    *,
+    cautious: bool = False,
 ) -> tuple[LatentCovariance, float]:
     """Posterior of the factor, and the log evidence in nats, by coordinate ascent.
 
@@ -181,15 +183,16 @@ def fit_covariance(
         Degrees of freedom of the scatters; of each output given those before it.
     noise : NoiseCorrelation
         Correlation of scatters at different inputs.
-    previous : LatentCovariance or None
-        Where to start.
+    previous : LatentCovariance or None, where to start
+    cautious : bool, default=False
+        One sweep, where a part of the rows counts.
     """
     # An output that is constant is noise of the least variance too where later ones are regressed on it: to zeros
     # any coefficient would fit, and its uncertainty would count as their variance.
     scatter = scatter + LEAST_SQUARE * torch.diag_embed(degrees.mT)
     fixed = FixedFeatures(searches.log_variance.family.features, inputs)
     last = _Sweep() if previous is None else _from_previous(previous, inputs, scatter, noise)
-    for sweep in range(_SWEEPS if scatter.shape[1] > 1 else 1):
+    for sweep in range(_SWEEPS if scatter.shape[1] > 1 and not cautious else 1):
         squares = _squares(scatter, degrees, noise, last)
         log_variance = search_log_variance(searches.log_variance, fixed, squares, last.location)
         # E[exp(-l)] of a normal l: its mean and half its variance.
@@ -261,9 +264,8 @@ def _fit_row(
 def _squares(scatter: Tensor, degrees: Tensor, noise: NoiseCorrelation, last: _Sweep) -> Squares:
     """Squared residuals of each output from its regression on those before it.
 
-    Where samples of a demonstration are correlated and there are enough of them at an input, from the
-    regression at that input by itself: an error of the processes of its coefficients, as smooth as the
-    demonstrations, would else count as residual.
+    Where samples are correlated and enough at an input, from the regression there by itself: an error of the
+    coefficients' processes, as smooth as the demonstrations, would else count as residual.
     """
     totals, kept = list(scatter.diagonal(dim1=1, dim2=2).mT), list(degrees)
     for i, (known, total) in enumerate(zip(last.regressions, last.expected, strict=True), start=1):
@@ -277,10 +279,9 @@ def _squares(scatter: Tensor, degrees: Tensor, noise: NoiseCorrelation, last: _S
 
 def _posterior(searches: CovarianceSearches, inputs: Tensor, squares: Squares, last: _Sweep) -> LatentCovariance:
     """Posterior of the weights of all features, where the fit took only those that carry something."""
-    theta = searches.log_variance.theta
+    theta, family = searches.log_variance.theta, searches.log_variance.family
     assert theta is not None
     assert last.precision is not None
-    family = searches.log_variance.family
     log_variance = fit_log_variance(squares, family.design(inputs, theta), last.location).weights
     coefficients, coefficient_theta = [], theta[:0]
     if last.regressions:
@@ -295,5 +296,5 @@ def _posterior(searches: CovarianceSearches, inputs: Tensor, squares: Squares, l
 def _regression(scatter: Tensor, tril: Tensor, noise: NoiseCorrelation) -> Regression:
     """Regression of the output that follows those of which ``tril`` is the factor."""
     i = tril.shape[-1]
-    whitener = None if noise.square_whitener is None else noise.square_whitener[i]
-    return Regression.standardize(scatter[:, : i + 1, : i + 1], tril, whitener)
+    own = None if noise.square_whitener is None else noise.square_whitener[i]
+    return Regression.standardize(scatter[:, : i + 1, : i + 1], tril, own)

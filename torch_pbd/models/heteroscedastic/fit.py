@@ -17,11 +17,10 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from torch_pbd.gp.inducing import FeatureMap
 from torch_pbd.linalg import scale_tril_from_root
-from torch_pbd.models.heteroscedastic.covariance import CovarianceSearches, LatentCovariance, fit_covariance
+from torch_pbd.models.heteroscedastic.covariance import LatentCovariance, fit_covariance
+from torch_pbd.models.heteroscedastic.families import Families
 from torch_pbd.models.heteroscedastic.mean import MOST_INPUTS, LatentMean, MeanStart, fit_mean
-from torch_pbd.models.heteroscedastic.processes import ProcessFamily
 from torch_pbd.models.heteroscedastic.residuals import (
     LAGS,
     NOT_WHITE,
@@ -32,12 +31,6 @@ from torch_pbd.models.heteroscedastic.residuals import (
 )
 from torch_pbd.models.heteroscedastic.search import Search, SearchOptions
 from torch_pbd.models.training import TrainingSet, pooled_tril
-
-# Prior medians of length scale (in ranges of the input) and amplitude, and prior deviation of the constant. Means
-# are of outputs with unit variance, log variances and coefficients of residuals with a pooled unit covariance.
-_MEAN = (0.3, 1.2, 0.0)
-_LOG_VARIANCE = (0.5, 1.0, 2.0)
-_COEFFICIENT = (0.5, 0.3, 1.0)
 
 # Rows at an input whose mean is all their own still count for this share of a degree of freedom, or nothing there
 # would be known of the variance.
@@ -57,38 +50,6 @@ _LEAST_OWN = 1e-4
 # that share of y's variance, which is a mean of nothing and doubtful in few rows too.
 _MUCH_LESS, _NEARLY_ALL = 0.25, 0.9
 _WORTH_A_WARNING = 0.03  # of y's variance: what a smooth mean misses of a corner is less
-
-
-@dataclass(frozen=True)
-class Families:
-    """Families of the processes of the mean, the log variances and the coefficients."""
-
-    mean: ProcessFamily
-    log_variance: ProcessFamily
-    coefficients: ProcessFamily
-
-    @classmethod
-    def build(
-        cls,
-        mean_features: FeatureMap,
-        covariance_features: FeatureMap,
-        length_scale: Float[Tensor, " e"] | None = None,
-        *,
-        shared: bool = False,
-    ) -> "Families":
-        """Families of the recommended model on these features; ``length_scale`` holds the covariance's."""
-        return cls(
-            ProcessFamily(mean_features, *_MEAN, shared=shared),
-            ProcessFamily(covariance_features, *_LOG_VARIANCE, length_scale, shared),
-            ProcessFamily(covariance_features, *_COEFFICIENT, length_scale),
-        )
-
-    def searches(self, training: TrainingSet, options: SearchOptions) -> tuple[Search, CovarianceSearches]:
-        """Searches of the mean's and the covariance's hyperparameters that have not begun."""
-        (n_outputs, n_features), family = (training.y.shape[1], training.x.shape[1]), self.coefficients
-        log_variance = Search(self.log_variance, n_outputs, n_features, options)
-        rows = [Search(family, 1, n_features, options) for _ in range(1, n_outputs)]
-        return Search(self.mean, n_outputs, n_features, options), CovarianceSearches(log_variance, rows, family)
 
 
 @dataclass(frozen=True)
@@ -124,9 +85,9 @@ def fit_heteroscedastic(
     options: SearchOptions,
     *,
     n_turns: int = 3,
-    needs_resolution: bool = False,
+    larger: Families | None = None,
     begin: Callable[[], MeanStart] | None = None,
-) -> HeteroscedasticFit | None:
+) -> HeteroscedasticFit:
     """Mean under the noise learned so far, then covariance of the residuals from it, ``n_turns`` times.
 
     Parameters
@@ -138,65 +99,115 @@ def fit_heteroscedastic(
     families : Families
     options : SearchOptions
     n_turns : int, default=3
-    needs_resolution : bool, default=False
-        Give the fit up, and return None, at the end of the first turn in which the inducing inputs do not resolve a
-        length scale with room to spare, unless they are all the inputs.
+    larger : Families, default=None
+        On more inducing inputs, to go on with where these do not resolve a length scale with room to spare: in the next
+        turn, and in one more after the last.
     begin : callable, default=None
         Looks for another mean, :func:`mean_start`, where the first one does not follow the data.
     """
-    covariance: LatentCovariance | None = None
-    correlation: DemonstrationCorrelation | None = None
-    pooled, rows = _start_tril(training), training  # rows, of the mean
-    mean_search, searches = families.searches(training, options)
+    at = _State(training, group, families, options, larger, training, _start_tril(training))
     evidences: list[float] = []
-    started = time.perf_counter()
-    for turn in range(n_turns):
+    started, turn = time.perf_counter(), 0
+    while turn < n_turns:
         options.slack = _SLACK if turn < n_turns - 1 else 1.0
         # mu given C and L, by generalized least squares.
-        mean = _fit_mean(mean_search, rows, group, pooled, covariance, correlation)
-        start = None if turn or begin is None or _follows(training, group, mean, pooled) else begin()
-        if start is not None and start.improves(mean, pooled):
-            mean_search, pooled, rows = start.search, start.noise_tril, start.rows
-            mean = _fit_mean(mean_search, rows, group, pooled, None, None)
+        mean = at.fit_mean(begin if turn == 0 else None)
         # Residuals r = y - mu, and the share 1 - h of a degree of freedom that fitting mu has left of each.
-        residual, share = _residual(training, mean, _noise_tril(training.inputs, pooled, covariance))
+        residual, share = _residual(at.training, mean, _noise_tril(at.training.inputs, at.pooled, at.covariance))
         # C C' = sum of r r' / sum of (1 - h), once: what changes later is L's.
-        pooled = pooled if turn else _pooled_tril(residual, share)
+        at.pooled = at.pooled if turn else _pooled_tril(residual, share)
         # w = inv(C) r of each row; at each input their scatter S, the sum of w w', and its degrees of freedom.
-        normal = _solve(pooled, residual)
-        scatter, degrees = _scatter(training, normal, share, 1.0 if turn else _first_part(training, group))
-        # l and phi given S, whose likelihood is that of a Wishart distribution. What the first turn took for
-        # independent is no place to start from where it is not.
-        if turn == 1 and correlation is not None and correlation.matters:
-            covariance, (_, searches) = None, families.searches(training, options)
-        noise = NoiseCorrelation.build(correlation, training.inputs, training.index, group)
-        covariance, evidence = fit_covariance(searches, training.inputs, scatter, degrees, noise, covariance)
-        if needs_resolution and not (covariance.resolved and (mean_search.held or mean.family.resolved(mean.theta))):
-            return None
+        normal = _solve(at.pooled, residual)
+        scatter, degrees = _scatter(at.training, normal, share, 1.0 if turn else _first_part(at.training, group))
+        noise = NoiseCorrelation.build(at.correlation, at.training.inputs, at.training.index, group)
+        if turn == 1:
+            at.stretch_ends(normal, noise)
+        # l and phi given S, whose likelihood is that of a Wishart distribution.
+        fitted = at.training
+        at.covariance, evidence = fit_covariance(
+            at.searches, fitted.inputs, scatter, degrees, noise, at.covariance, cautious=turn == 0
+        )
         evidences.append(evidence)
         options.report(len(evidences), -evidence, time.perf_counter() - started)
-        # e = inv(L) w of the samples of a demonstration, and how far they repeat each other.
-        if group is not None and turn < n_turns - 1:
-            correlation = demonstration_correlation(training.x, _whiten(training, normal, covariance), group)
-            if correlation.matters:
-                training = training.merged(_n_inputs(training, group))
-                rows = rows.merged(MOST_INPUTS) if mean_search.held else training
-    assert covariance is not None
-    return HeteroscedasticFit(mean, covariance, pooled, correlation, tuple(evidences), training, residual)
+        if at.refine(mean):
+            n_turns = max(n_turns, turn + 2)
+        if turn < n_turns - 1:
+            at.correlate(normal)
+        turn += 1
+    assert at.covariance is not None
+    return HeteroscedasticFit(mean, at.covariance, at.pooled, at.correlation, tuple(evidences), fitted, residual)
 
 
-def _fit_mean(
-    search: Search,
-    training: TrainingSet,
-    group: Tensor | None,
-    pooled: Tensor,
-    covariance: LatentCovariance | None,
-    correlation: DemonstrationCorrelation | None,
-) -> LatentMean:
-    """Mean under the noise so far."""
-    whitener = NoiseCorrelation.build(correlation, training.inputs, training.index, group).mean_whitener
-    tril = _noise_tril(training.inputs, pooled, covariance)
-    return fit_mean(search, training.inputs, training.means(), training.counts, tril, whitener)
+@dataclass
+class _State:
+    """What one turn leaves to the next."""
+
+    training: TrainingSet
+    group: Tensor | None
+    families: Families
+    options: SearchOptions
+    larger: Families | None
+    rows: TrainingSet
+    """Rows of the mean."""
+    pooled: Tensor
+    covariance: LatentCovariance | None = None
+    correlation: DemonstrationCorrelation | None = None
+
+    def __post_init__(self) -> None:
+        self.mean_search = Search(self.families.mean, *self._shape, self.options)
+        self.searches = self.families.covariance_searches(*self._shape, self.options)
+
+    def fit_mean(self, begin: Callable[[], MeanStart] | None) -> LatentMean:
+        """Mean under the noise so far; or from another beginning, where this one does not follow the data."""
+        mean = self._mean()
+        start = None if begin is None or _follows(self.training, self.group, mean, self.pooled) else begin()
+        if start is None or not start.improves(mean, self.pooled):
+            return mean
+        self.mean_search, self.pooled, self.rows = start.search, start.noise_tril, start.rows
+        return self._mean()
+
+    def stretch_ends(self, normal: Tensor, noise: NoiseCorrelation) -> None:
+        """Stretch the ends where the covariance collapses; and begin its searches anew if what the first turn took for
+        independent is not, or has other features: that is no place to start from.
+        """
+        before = self.families
+        self.families = before.stretched(self.training, normal, noise, self.options)
+        if self.families is not before or (self.correlation is not None and self.correlation.matters):
+            self.covariance, self.searches = None, self.families.covariance_searches(*self._shape, self.options)
+
+    def refine(self, mean: LatentMean) -> bool:
+        """Go on with more inducing inputs where these do not resolve what was found; whether there is need to."""
+        if self.larger is None or self.covariance is None:
+            return False
+        coarse_mean = not self.mean_search.held and not mean.family.resolved(mean.theta)
+        if coarse_mean:
+            self.mean_search = Search(self.larger.mean, *self._shape, self.options)
+        coarse = not self.covariance.resolved
+        if coarse:
+            self.families = self.families.refined(self.larger, self.training.inputs)
+            self.searches = self.families.covariance_searches(*self._shape, self.options)
+        self.larger = None if coarse or coarse_mean else self.larger
+        return coarse or coarse_mean
+
+    def correlate(self, normal: Tensor) -> None:
+        """How far samples of a demonstration repeat each other, by e = inv(L) w."""
+        if self.group is None or self.covariance is None:
+            return
+        whitened = _whiten(self.training, normal, self.covariance)
+        self.correlation = demonstration_correlation(self.training.x, whitened, self.group)
+        if self.correlation.matters:
+            self.training = self.training.merged(_n_inputs(self.training, self.group))
+            self.rows = self.rows.merged(MOST_INPUTS) if self.mean_search.held else self.training
+
+    @property
+    def _shape(self) -> tuple[int, int]:
+        return self.training.y.shape[1], self.training.x.shape[1]
+
+    def _mean(self) -> LatentMean:
+        rows = self.rows
+        whitener = NoiseCorrelation.build(self.correlation, rows.inputs, rows.index, self.group).mean_whitener
+        tril = _noise_tril(rows.inputs, self.pooled, self.covariance)
+        return fit_mean(self.mean_search, rows.inputs, rows.means(), rows.counts, tril, whitener)
 
 
 def _follows(training: TrainingSet, group: Tensor | None, mean: LatentMean, pooled: Tensor) -> bool:

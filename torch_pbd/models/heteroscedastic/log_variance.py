@@ -12,8 +12,9 @@ from torch import Tensor
 from torch_pbd.gp.inducing import FixedFeatures
 from torch_pbd.linalg import safe_cholesky
 from torch_pbd.models.heteroscedastic.linear import LinearEvidence, Weights, inverse, weights_factor
+from torch_pbd.models.heteroscedastic.processes import ProcessFamily
 from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation
-from torch_pbd.models.heteroscedastic.search import Gradient, Search
+from torch_pbd.models.heteroscedastic.search import Evidence, Gradient, Search
 
 LEAST_SQUARE = 1e-6
 """Of the pooled variance: an exact zero, as where all recordings start at the origin, has no logarithm."""
@@ -110,18 +111,27 @@ def search_log_variance(
     search: Search, fixed: FixedFeatures, squares: Squares, near: Float[Tensor, "b n"] | None
 ) -> LogVariance:
     """Posterior with the hyperparameters of the highest evidence, of log variances that are ``near`` those given."""
+    near = squares.log_pooled.expand_as(squares.total).clone() if near is None else near.clone()
+    theta = search.run(log_variance_evidence(search.family, fixed, squares, near), squares.total)
     information = 0.5 * squares.degrees.sum(-1)
-    near = (squares.log_pooled.expand_as(squares.total) if near is None else near).clone()
+    return fit_log_variance(squares, search.family.design_vjp(fixed, theta, information)[0], near)
+
+
+def log_variance_evidence(
+    family: ProcessFamily, fixed: FixedFeatures, squares: Squares, near: Float[Tensor, "b n"] | None = None
+) -> Evidence:
+    """Log evidence of hyperparameters; the log variances are looked for ``near`` those given, which it updates."""
+    near = squares.log_pooled.expand_as(squares.total).clone() if near is None else near
+    information = 0.5 * squares.degrees.sum(-1)
 
     def evidence(theta: Tensor, rows: Int64[Tensor, " a"]) -> tuple[Tensor, Gradient]:
-        design, vjp = search.family.design_vjp(fixed, theta, information[rows])
+        design, vjp = family.design_vjp(fixed, theta, information[rows])
         found = fit_log_variance(squares.restrict(rows), design, near[rows])
         if len(rows) <= len(near):
             near[rows] = found.location  # where the next evaluation starts
         return found.evidence, lambda: vjp(found.gradient())
 
-    theta = search.run(evidence, squares.total)
-    return fit_log_variance(squares, search.family.design_vjp(fixed, theta, information)[0], near)
+    return evidence
 
 
 def _fit_independent(squares: Squares, features: Tensor, start: Tensor) -> LogVariance:

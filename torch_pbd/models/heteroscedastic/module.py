@@ -75,6 +75,8 @@ class HeteroscedasticModel(Core):
             tensors[f"coefficient_root_{i}"] = weights.root
         if features.period is not None:
             tensors["period"] = features.period
+        if (stretch := covariance.log_variance_family.features.stretch) is not None:
+            tensors["stretch"] = stretch
         for name, tensor in tensors.items():
             self.register_buffer(name, tensor.detach().clone().contiguous())
         self.kernel: str = features.kernel
@@ -120,6 +122,8 @@ class HeteroscedasticModel(Core):
         for i in range(1, d):
             sizes |= {f"coefficient_weights_{i}": (i * in_row,), f"coefficient_root_{i}": (i * in_row, i * in_row)}
         optional = ("period", *(f"{name}_length_scale" for name in _FAMILIES))
+        if "stretch" in shapes:
+            sizes["stretch"] = (2, 2)
         model = cls.__new__(cls)
         nn.Module.__init__(model)
         for name, size in (sizes | {name: (e,) for name in optional if name in shapes}).items():
@@ -243,7 +247,8 @@ class HeteroscedasticModel(Core):
 
     def _family(self, number: int) -> ProcessFamily:
         inducing = self.inducing if number else self.mean_inducing
-        features = FeatureMap(inducing, self.kernel, getattr(self, "period", None), self.exact[number])
+        stretch = getattr(self, "stretch", None) if number else None
+        features = FeatureMap(inducing, self.kernel, getattr(self, "period", None), self.exact[number], stretch)
         length_scale = getattr(self, f"{_FAMILIES[number]}_length_scale", None)
         return ProcessFamily(features, *self.medians[number], length_scale)
 

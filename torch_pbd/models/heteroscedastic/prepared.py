@@ -46,7 +46,7 @@ class Prepared:
         weight = family.amplitude_of(theta).square()
         scale = ((weight / weight.sum()) @ family.length_scale_of(theta).log()).exp()
         scale = scale.clamp_max(_REACH * inducing.shape[1]).clamp_min(2.0 * spacing(inducing))
-        nearness = replace(family.features, kernel="squared_exponential")(scale[None])
+        nearness = replace(family.features, kernel="squared_exponential", stretch=None)(scale[None])
         rows = covariance.rows.features if covariance.coefficients else None
         parts = [mean.processes.features, covariance.log_variances.features, rows, nearness]
         return cls(buffers, cls._versions(buffers), mean, covariance, nearness, _together(parts))
@@ -85,9 +85,8 @@ def _together(parts: list[Features | None]) -> list[tuple[list[int], list[int], 
 
 
 def _same_inputs(part: Features, other: Features) -> bool:
-    return part.features.kernel == other.features.kernel and torch.equal(
-        part.features.inducing, other.features.inducing
-    )
+    mine, its = part.features, other.features
+    return mine.kernel == its.kernel and mine.stretch is its.stretch and torch.equal(mine.inducing, its.inducing)
 
 
 def _stacked(parts: list[Features]) -> Features:

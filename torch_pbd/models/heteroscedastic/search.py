@@ -126,7 +126,20 @@ class Search:
     def _starts(
         self, value: Evidence, objective: _Objective, every: Tensor, like: Tensor
     ) -> list[tuple[Tensor, Tensor]]:
-        """Best points of the grid for each problem, and inverse Hessians there.
+        """Best points of the grid for each problem, and inverse Hessians there."""
+        points, table = self.family.starts(like, self.n_features), -self._table(value, every, like)
+        starts = [points[rank] for rank in table.argsort(0)[: 1 + self.options.n_restarts]]
+        if self.family.shared:
+            starts = [torch.cat([start[:, :-1], start[:, -1:].expand(-1, len(every))], dim=1) for start in starts]
+        return [(start, _inverse_hessian(objective, start)) for start in starts]
+
+    def best_of_grid(self, evidence: Evidence, like: Tensor) -> Float[Tensor, ""]:
+        """Highest log evidence times prior that a search would start from, of all processes together."""
+        every = torch.arange(self.n_processes, device=like.device)
+        return self._table(evidence, every, like).amax(0).sum()
+
+    def _table(self, value: Evidence, every: Tensor, like: Tensor) -> Float[Tensor, "s b"]:
+        """Log evidence times prior at the points of the grid; of all processes together where they share one scale.
 
         Those of one length scale are tried together, as they take as many features; all, where calls cost more.
         """
@@ -136,14 +149,8 @@ class Search:
             value(pair.repeat_interleave(len(every), dim=0), every.repeat(len(pair)))[0].reshape(-1, len(every))
             for pair in points.split(len(points) if small else 2)
         ]
-        table = -torch.cat(parts) - self.family.log_prior(points)[0][:, None]
-        table = table.nan_to_num(nan=math.inf)
-        if self.family.shared:
-            table = table.sum(1, keepdim=True)
-        starts = [points[rank] for rank in table.argsort(0)[: 1 + self.options.n_restarts]]
-        if self.family.shared:
-            starts = [torch.cat([start[:, :-1], start[:, -1:].expand(-1, len(every))], dim=1) for start in starts]
-        return [(start, _inverse_hessian(objective, start)) for start in starts]
+        table = (torch.cat(parts) + self.family.log_prior(points)[0][:, None]).nan_to_num(nan=-math.inf)
+        return table.sum(1, keepdim=True) if self.family.shared else table
 
     def _spread_out(self, together: Float[Tensor, "s r"]) -> Float[Tensor, "sb q"]:
         """Hyperparameters of each process from the length scales of all and the amplitude of each."""

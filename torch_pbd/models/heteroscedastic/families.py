@@ -1,0 +1,129 @@
+"""The model's families of processes, and the features that they rest on: as many as needed, dense where needed.
+
+Movements that start or end at one point have deviations that collapse there. One process has one length scale, and that
+of a deviation which is even for nineteen twentieths of a movement and falls by thirty in the last is neither the one
+nor the other. Where the evidence is clearly higher so the inputs of the covariance's processes are stretched at an end.
+"""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torch_pbd.gp.inducing import FeatureMap, FixedFeatures
+from torch_pbd.gp.neighbourhoods import spacing
+from torch_pbd.models.heteroscedastic.covariance import CovarianceSearches
+from torch_pbd.models.heteroscedastic.log_variance import Squares, log_variance_evidence
+from torch_pbd.models.heteroscedastic.processes import ProcessFamily
+from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation
+from torch_pbd.models.heteroscedastic.search import Search, SearchOptions
+from torch_pbd.models.training import TrainingSet
+
+# Prior medians of length scale (in ranges of the input) and amplitude, and prior deviation of the constant. Means
+# are of outputs with unit variance, log variances and coefficients of residuals with a pooled unit covariance.
+_MEAN = (0.3, 1.2, 0.0)
+_LOG_VARIANCE = (0.5, 1.0, 2.0)
+_COEFFICIENT = (0.5, 0.3, 1.0)
+
+# An end gets as much length as the whole range has, most of it within the first of these shares of the range (a spacing
+# of the inputs at least) or the second: a process of a usual length scale is then as free there as elsewhere in all.
+_LENGTH, _WIDTHS = 1.0, (0.02, 0.06)
+# Nats: the best points of a grid, by which it is decided, are some below the maxima; an end that falls by thirty gains
+# some seventy from six demonstrations.
+_CLEARLY = 10.0
+
+
+@dataclass(frozen=True)
+class Families:
+    """Families of the processes of the mean, the log variances and the coefficients."""
+
+    mean: ProcessFamily
+    log_variance: ProcessFamily
+    coefficients: ProcessFamily
+
+    @classmethod
+    def build(
+        cls,
+        mean_features: FeatureMap,
+        covariance_features: FeatureMap,
+        length_scale: Float[Tensor, " e"] | None = None,
+        *,
+        shared: bool = False,
+    ) -> "Families":
+        """Families of the recommended model on these features; ``length_scale`` holds the covariance's."""
+        return cls(
+            ProcessFamily(mean_features, *_MEAN, shared=shared),
+            ProcessFamily(covariance_features, *_LOG_VARIANCE, length_scale, shared),
+            ProcessFamily(covariance_features, *_COEFFICIENT, length_scale),
+        )
+
+    def covariance_searches(self, n_outputs: int, n_features: int, options: SearchOptions) -> CovarianceSearches:
+        """Searches of the covariance's hyperparameters that have not begun."""
+        log_variance = Search(self.log_variance, n_outputs, n_features, options)
+        rows = [Search(self.coefficients, 1, n_features, options) for _ in range(1, n_outputs)]
+        return CovarianceSearches(log_variance, rows, self.coefficients)
+
+    def with_covariance(self, features: FeatureMap) -> "Families":
+        """Families whose covariance rests on other features."""
+        log_variance = replace(self.log_variance, features=features)
+        return Families(self.mean, log_variance, replace(self.coefficients, features=features))
+
+    def refined(self, larger: "Families", inputs: Float[Tensor, "n e"]) -> "Families":
+        """Families whose covariance rests on the inducing inputs of larger ones, stretched as it is."""
+        features, stretch = larger.log_variance.features, self.log_variance.features.stretch
+        return self.with_covariance(features if stretch is None else _stretch(features, inputs, stretch))
+
+    def stretched(
+        self, training: TrainingSet, normal: Float[Tensor, "rows d"], noise: NoiseCorrelation, options: SearchOptions
+    ) -> "Families":
+        """Families with the ends stretched at which the evidence for the log variances of residuals is higher so.
+
+        Each end is tried by itself, and the last also with the first, by the best points of the searches' grid.
+        """
+        plain, inputs = self.log_variance.features, training.inputs
+        if inputs.shape[1] > 1 or plain.period is not None or self.log_variance.fixed_length_scale is not None:
+            return self
+        squares = _within(training, normal, noise)
+
+        def evidence(families: Families) -> float:
+            family = families.log_variance
+            of_theta = log_variance_evidence(family, FixedFeatures(family.features, inputs), squares)
+            return float(Search(family, len(squares.total), 1, options).best_of_grid(of_theta, squares.total))
+
+        highest, result, stretch = evidence(self), self, inputs.new_tensor([[0.0, 1.0], [0.0, 1.0]])
+        widths = [max(width, width / _WIDTHS[0] * spacing(inputs)) for width in _WIDTHS]
+        for end in range(2):
+            stretches = [_with_end(stretch, end, width) for width in widths]
+            tried = [self.with_covariance(_stretch(plain, inputs, each)) for each in stretches]
+            found = [evidence(each) for each in tried]
+            best = max(range(len(found)), key=found.__getitem__)
+            if found[best] > highest + _CLEARLY:
+                highest, result, stretch = found[best], tried[best], stretches[best]
+        return result
+
+
+def _with_end(stretch: Tensor, end: int, width: float) -> Tensor:
+    row = stretch.new_tensor([_LENGTH, width])
+    return torch.stack([row, stretch[1]] if end == 0 else [stretch[0], row])
+
+
+def _stretch(features: FeatureMap, inputs: Float[Tensor, "n e"], stretch: Float[Tensor, "2 2"]) -> FeatureMap:
+    """Features with as many inducing inputs, evenly over the stretched range."""
+    features = replace(features, stretch=stretch)
+    if features.exact:
+        return features
+    chosen = replace(features, inducing=inputs).farthest_first[: len(features.inducing)]
+    return replace(features, inducing=inputs[chosen.sort().values])
+
+
+def _within(training: TrainingSet, normal: Tensor, noise: NoiseCorrelation) -> Squares:
+    """Squares of each output around its mean at each input, which an error of the mean does not change; around zero at
+    inputs of one row.
+    """
+    counts = training.counts
+    means = torch.zeros_like(training.means()).index_add_(0, training.index, normal) / counts[:, None]
+    means = torch.where(counts[:, None] > 1.0, means, 0.0)
+    squares = torch.zeros_like(means).index_add_(0, training.index, (normal - means[training.index]).square())
+    degrees = torch.where(counts > 1.0, counts - 1.0, counts).expand(normal.shape[1], -1)
+    return Squares(squares.mT, degrees, noise)
