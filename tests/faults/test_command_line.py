@@ -121,27 +121,30 @@ def test_48_nobody_who_reads_is_no_error(arguments, closed, data, tmp_path):
         torch_pbd.load(tmp_path / "out" / "model" / "gmmbaseline.safetensors")
 
 
-def test_letters_that_a_terminal_has_not_are_no_error(data, tmp_path):
-    """The encoding of the terminal is not that of the file system; nothing is lost because of what is printed."""
-    environment = os.environ | {"PYTHONIOENCODING": "ascii"}
-    arguments = ["fit", "--data", str(data), *GMM, "--output", "ü"]
-    done = subprocess.run(
-        [*COMMAND, *arguments], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120
+@pytest.fixture(scope="module")
+def bare(data, tmp_path_factory):
+    """Folder and process of a fit without a display, of a terminal that shows ASCII."""
+    folder = tmp_path_factory.mktemp("bare")
+    environment = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    environment |= {"PYTHONIOENCODING": "ascii", "MPLBACKEND": "TkAgg"}
+    command = [*COMMAND, "fit", "--data", str(data), *GMM, "--output", "ü"]
+    return folder / "ü", subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, timeout=120, check=False
     )
+
+
+def test_letters_that_a_terminal_has_not_are_no_error(bare):
+    """The encoding of the terminal is not that of the file system; nothing is lost because of what is printed."""
+    folder, done = bare
     assert done.returncode == 0, done.stderr
     assert done.stdout.endswith("results: ?\n")
-    torch_pbd.load(tmp_path / "ü" / "model" / "gmmbaseline.safetensors")
+    torch_pbd.load(folder / "model" / "gmmbaseline.safetensors")
 
 
-def test_49_without_a_display_figures_are_drawn(data, tmp_path):
-    environment = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY")}
-    arguments = ["fit", "--data", str(data), *GMM, "--output", str(tmp_path)]
-    command = [*COMMAND, *arguments]
-    done = subprocess.run(
-        command, env=environment | {"MPLBACKEND": "TkAgg"}, capture_output=True, text=True, timeout=120
-    )
+def test_49_without_a_display_figures_are_drawn(bare):
+    folder, done = bare
     assert done.returncode == 0, done.stderr
-    assert (tmp_path / "figures" / "gmmbaseline.png").read_bytes().startswith(b"\x89PNG")
+    assert (folder / "figures" / "gmmbaseline.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
