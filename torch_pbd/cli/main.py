@@ -93,6 +93,7 @@ def _run(command: str, arguments: Sequence[str]) -> int:
     if command == "playground":
         commands.playground(options)
         return 0
+    from torch_pbd.experiments.report import write_report
     from torch_pbd.experiments.resume import finished_fits
     from torch_pbd.experiments.run_folder import check_names
 
@@ -111,12 +112,14 @@ def _run(command: str, arguments: Sequence[str]) -> int:
                 import torch
 
                 torch.set_num_threads(1)  # the matrices are small: threads would only wait for each other
-                say(commands.WORK[command](options, folder))
+                text = commands.WORK[command](options, folder)
+                say(text)
+                report = write_report(folder, command, text)
         except (KeyboardInterrupt, _Terminated) as stop:
             if folder.finished and folder.finished.files():
                 stop.args = (f"torch-pbd {command} --config {folder.path / 'config.yaml'} --resume goes on",)
             raise
-    say(f"\nresults: {folder.path}")
+    say(f"\nreport:  {report}\nresults: {folder.path}")
     return 0
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from torch_pbd.control.controller import DMPController
-from torch_pbd.data import Demonstrations, make_tunnel_demonstrations
+from torch_pbd.data import Demonstrations, make_tunnel_demonstrations, save_demonstrations
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.experiments.comparison import compare_models
 from torch_pbd.experiments.recordings import write_fitted
@@ -26,6 +26,7 @@ def run_demo(models: Mapping[str, CovarianceRegressor], folder: RunFolder, *, n_
     No demonstration is left out: there are fresh ones to predict. Returns the tables and the stability report as text.
     """
     demonstrations = make_tunnel_demonstrations(n_demos, rate=_RATE, random_state=seed)
+    save_demonstrations(demonstrations, folder.path / "demonstrations.csv")
     fresh = make_tunnel_demonstrations(_N_FRESH, rate=_RATE, random_state=seed + 1).to_array()
     true_covariance = np.einsum("kti,ktj->tij", *(2 * [fresh - fresh.mean(axis=0)])) / (_N_FRESH - 1)
     data = demonstrations.stack()

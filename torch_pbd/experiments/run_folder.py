@@ -27,7 +27,7 @@ from torch_pbd.files.atomic import remove_drafts, replacing
 
 _PACKAGES = ("torch", "scikit-learn", "numpy", "matplotlib")
 _PARTS = ("figures", "model", "schedule", "finished")
-_SUFFIXES = (".csv", ".json", ".npz", ".png", ".safetensors", ".txt", ".yaml")  # of the files of results
+_SUFFIXES = (".csv", ".html", ".json", ".npz", ".png", ".safetensors", ".txt", ".yaml")  # of the files of results
 _LONGEST = 180  # bytes of a name, to which titles, suffixes and marks of drafts are added: file systems take 255
 _DPI = 110  # a figure of 12 inches fills a screen
 _WIDTH = 80  # columns of the terminals that people start with
@@ -58,6 +58,7 @@ class RunFolder:
     def __init__(self, path: str | Path, settings: Mapping[str, Any]) -> None:
         self.path = Path(path)
         self.finished: FinishedFits | None = None  # where the run keeps its fits, if it does
+        self.figures: list[Path] = []  # that the run has written so far
         self.path.mkdir(parents=True, exist_ok=True)
         # The operating system frees the lock of a process that is killed.
         self._lock = FileLock(self.path / ".lock", timeout=0)
@@ -110,6 +111,7 @@ class RunFolder:
             ConstrainedLayoutEngine().execute(figure)
         with replacing(target) as file:
             figure.savefig(file, format="png", dpi=_DPI)
+        self.figures.append(target)
         return target
 
     def write_model(self, model: Any, name: str) -> Path:
