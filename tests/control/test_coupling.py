@@ -66,7 +66,7 @@ def test_the_limits_are_about_damping_over_lag(bandwidth, ratio, expected):
     loop = PositionLoop(bandwidth)
     limit = stiffest_environment(stiffness, damping, torch.eye(1).double(), loop, 500.0, DT)
     assert limit == pytest.approx(expected, rel=0.1)
-    lag = loop.lag(DT) + 1.0 / (2.0 * math.pi * 500.0)
+    lag = 1.0 / (math.pi * bandwidth) + 1.5 * DT + 1.0 / (2.0 * math.pi * 500.0)
     assert limit == pytest.approx(damping.item() / lag, rel=0.2)
 
 

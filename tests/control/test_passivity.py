@@ -172,7 +172,7 @@ def test_the_worst_force_cannot_break_the_rate_limit_nor_is_a_share_too_small(dt
     alpha = 0.03
     limit = RateLimit(alpha).start(stiffness, damping, MASS, dt)
     nowhere = torch.zeros(200, 2).double()
-    before, after = (limit.select(stiffness[:, k], damping[:, k], nowhere, nowhere) for k in (0, 1))
+    before, after = (limit.select(stiffness[:, k], damping[:, k], nowhere) for k in (0, 1))
     rate = torch.zeros(200, 8, 8).double()
     rate[:, :6, :6] = admittance_rate(before.stiffness, before.damping, MASS)
     rate[:, 6:, :2] = torch.eye(2)

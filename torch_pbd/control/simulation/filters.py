@@ -68,7 +68,7 @@ class _RateLimited(ActiveFilter):
         self._alpha, self._mass, self._dt = alpha, mass, dt
         self._gains: Gains | None = None
 
-    def select(self, stiffness: Tensor, damping: Tensor, deviation: Tensor, velocity: Tensor) -> Gains:
+    def select(self, stiffness: Tensor, damping: Tensor, deviation: Tensor) -> Gains:
         if self._gains is None:
             self._gains = Gains(stiffness, damping, stiffness.new_ones(stiffness.shape[:-2]))
         else:
@@ -156,7 +156,7 @@ class _Tank(ActiveFilter):
         self._tank, self._mass = tank, mass
         self._gains: Gains | None = None
 
-    def select(self, stiffness: Tensor, damping: Tensor, deviation: Tensor, velocity: Tensor) -> Gains:
+    def select(self, stiffness: Tensor, damping: Tensor, deviation: Tensor) -> Gains:
         last = self._gains
         share = deviation.new_ones(deviation.shape[:-1])
         if last is None:

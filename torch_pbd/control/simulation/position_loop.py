@@ -16,7 +16,8 @@ from torch_pbd import checks
 class PositionLoop:
     """A critically damped loop of second order behind a delay of whole ticks.
 
-    ``x'' = w^2 (x_commanded - x) - 2 w x'`` with ``w = 2 pi bandwidth``: it follows a ramp 2 / w late.
+    ``x'' = w^2 (x_commanded - x) - 2 w x'`` with ``w = 2 pi bandwidth``: it follows a ramp ``2 / w``, the
+    delay, and half a tick of hold late.
 
     Parameters
     ----------
@@ -35,10 +36,6 @@ class PositionLoop:
 
     def __repr__(self) -> str:
         return f"PositionLoop(bandwidth={self.bandwidth:g} Hz, delay_steps={self.delay_steps})"
-
-    def lag(self, dt: float) -> float:
-        """Time in s by which the loop follows a ramp late: ``2 / w``, the delay, and half a tick of hold."""
-        return 1.0 / (math.pi * self.bandwidth) + (self.delay_steps + 0.5) * dt
 
     def transition(self, dt: float, like: Tensor) -> Float[Tensor, "2 3"]:
         """Exact map of ``[position, velocity, command]`` to the position and velocity a tick later."""

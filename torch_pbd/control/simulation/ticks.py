@@ -57,8 +57,8 @@ class ActiveFilter(ABC):
     tank_energy: Tensor | None = None
 
     @abstractmethod
-    def select(self, stiffness: Tensor, damping: Tensor, deviation: Tensor, velocity: Tensor) -> Gains:
-        """Gains for this tick, of the wanted ones (..., d, d) and the state (..., d) at its start."""
+    def select(self, stiffness: Tensor, damping: Tensor, deviation: Tensor) -> Gains:
+        """Gains for this tick, of the wanted ones (..., d, d) and the deviation (..., d) at its start."""
 
     def settle(self, before: State, after: State, force: Tensor) -> None:  # noqa: B027 - most have nothing to note
         """Take note of the tick: (deviation, velocity) at its start and end, and the force held in it."""
@@ -220,7 +220,7 @@ class Loop:
         total = force + self._wall(*at)
         record = {"position": at[0], "velocity": at[1], "commanded_position": commanded, "force": total}
         if self._filter is not None:
-            gains = self._filter.select(stiffness, damping, self._deviation, self._velocity)
+            gains = self._filter.select(stiffness, damping, self._deviation)
             stiffness, damping, record["filter_share"] = gains.stiffness, gains.damping, gains.share
             if self._filter.tank_energy is not None:
                 record["tank_energy"] = self._filter.tank_energy
