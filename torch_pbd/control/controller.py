@@ -4,11 +4,12 @@ from collections.abc import Sequence
 from typing import Any, Literal, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from sklearn.base import BaseEstimator
 from sklearn.utils.validation import check_is_fitted
 
 from torch_pbd import checks
+from torch_pbd.checks import Floats
 from torch_pbd.control import parameters
 from torch_pbd.control.impedance import OnUnknown, fit_covariance, fit_law, gains_at
 from torch_pbd.control.primitive import smoothing, units
@@ -26,8 +27,6 @@ from torch_pbd.data import Demonstrations
 from torch_pbd.data.units import TIMES
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.movement.base import MovementRegressor
-
-Floats = NDArray[np.float64]
 
 _LIMITS = units.MotionLimits()
 

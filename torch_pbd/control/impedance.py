@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 from sklearn.base import clone
 
+from torch_pbd.checks import Floats
 from torch_pbd.control.damping import damping_from_stiffness
 from torch_pbd.control.primitive.smoothing import UNKNOWN
 from torch_pbd.control.stiffness import StiffnessLaw
@@ -15,7 +16,6 @@ from torch_pbd.estimators.demonstrations import fit_with_groups
 from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
 from torch_pbd.estimators.prior import prior_covariance
 
-Floats = NDArray[np.float64]
 OnUnknown = Literal["soft", "prior", "raise"]
 
 _RESOLUTION = 1e-5  # of the extent of a movement: smaller standard deviations count as none

@@ -6,12 +6,13 @@ from importlib.metadata import version
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.sparse import issparse
 from sklearn.base import BaseEstimator
 from sklearn.utils.validation import check_array, check_X_y
 
 from torch_pbd import checks
+from torch_pbd.checks import Floats
 from torch_pbd.control.damping import damping_from_stiffness
 from torch_pbd.control.impedance import OnUnknown
 from torch_pbd.control.primitive.adaptation import Adaptation
@@ -26,7 +27,6 @@ from torch_pbd.estimators.demonstrations import check_groups
 from torch_pbd.estimators.validation import check_squares, checked_values
 from torch_pbd.files.memory import require_much
 
-Floats = NDArray[np.float64]
 PhaseInput = Literal["time", "log_s", "s"]
 Variability = Literal["position", "forcing"]
 Goals = Literal["common", "each"]

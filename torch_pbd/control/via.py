@@ -12,13 +12,12 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 from scipy.stats import chi2, f
 
 from torch_pbd import checks
-
-Floats = NDArray[np.float64]
+from torch_pbd.checks import Floats
 
 _N_KNOTS = 200  # of a change over a movement: length scales are no shorter than a fiftieth of it
 _LIKELY = 0.95  # of demonstrations: what deviates further is not what they make likely

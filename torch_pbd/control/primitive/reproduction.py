@@ -6,19 +6,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.integrate import cumulative_trapezoid
 from scipy.interpolate import CubicHermiteSpline
 from torch import Tensor
 
 from torch_pbd import checks
+from torch_pbd.checks import Floats
 from torch_pbd.control.primitive.adaptation import adapt
 from torch_pbd.control.primitive.dmp import DMP
 from torch_pbd.control.primitive.smoothing import Movements, check_range
 from torch_pbd.estimators.scaling import Standardization
 from torch_pbd.gp import EvidenceSearch, Observations, condition, fit_together
-
-Floats = NDArray[np.float64]
 
 # Ticks within the duration: with forcing that is linear between them eq. (16) reproduces 10 s to 1e-6 m.
 _TICKS = 4000

@@ -8,11 +8,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline, CubicHermiteSpline, make_interp_spline, make_smoothing_spline
 
 from torch_pbd import checks
+from torch_pbd.checks import Floats
 from torch_pbd.data import Demonstrations
 from torch_pbd.data.alignment import interpolate
 from torch_pbd.data.recordings import preview
-
-Floats = NDArray[np.float64]
 
 UNKNOWN = 0.5
 """Type I uncertainty above which nothing is known: ``on_unknown="raise"`` raises."""

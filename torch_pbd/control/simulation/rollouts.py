@@ -9,12 +9,10 @@ from typing import final
 import numpy as np
 import torch
 from jaxtyping import Float
-from numpy.typing import NDArray
 from torch import Tensor
 
+from torch_pbd.checks import Floats
 from torch_pbd.control.simulation.ticks import Loop, State, Task, block_length, block_responses
-
-Floats = NDArray[np.float64]
 
 # Rollouts that move on together on a CPU: at d = 2 the forces, states and deviations of a block of them are 4 MB, which
 # stay in its cache.

@@ -5,10 +5,11 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from torch_pbd import checks
+from torch_pbd.checks import Floats
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.plant import AdmittancePlant, run_task
 from torch_pbd.control.simulation.rollout import Rollout
@@ -17,7 +18,6 @@ from torch_pbd.control.simulation.ticks import Task, block_length
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.files.memory import require_memory
 
-Floats = NDArray[np.float64]
 Reference = Literal["desired", "undisturbed"]
 Range = float | tuple[float, float]
 
