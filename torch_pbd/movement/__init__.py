@@ -1,12 +1,11 @@
 """Whole movements: the joint law of a demonstration, drawn from, judged by, and conditioned."""
 
-from torch_pbd.movement.judging import MOVEMENT_STATISTICS, judge_movement, movement_statistics
+from torch_pbd.movement.judging import judge_movement, movement_statistics
 from torch_pbd.movement.kmp import KMPBaseline
 from torch_pbd.movement.promp import ProMPBaseline
 from torch_pbd.movement.trajectory import TrajectoryRegressor
 
 __all__ = [
-    "MOVEMENT_STATISTICS",
     "KMPBaseline",
     "ProMPBaseline",
     "TrajectoryRegressor",
