@@ -9,16 +9,15 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from torch_pbd import checks
+from torch_pbd.console import say
 from torch_pbd.estimators.base import Uncertainty
 from torch_pbd.estimators.validation import Floats
 from torch_pbd.linalg import safe_cholesky, student_log_density
 from torch_pbd.movement.base import Known, MovementRegressor, Recording
+from torch_pbd.movement.grid import n_grid_steps, sampled
 from torch_pbd.movement.timing import Likelihood, Nodes, Timing, phase_of, register, time_of
 
-# Steps on which the correlation is learned: the nuggets' iterations are cubic in them, and movements are smooth.
-_MOST_STEPS = 200
-_GAP = 2.0  # sample spacings of a recording: a step farther than that from its samples was not seen in it
-FEWEST_TIMED = 4  # demonstrations that say how two numbers vary together
+_FEWEST = 4  # demonstrations that say how two numbers vary together
 _N_STEPS = 100  # of a curve whose pace is found
 # Samples a movement by which its timing is found. Nearer ones repeat each other but for their smoothness, of which the
 # law knows little: with 25 and 50 the posterior was two and three times too narrow.
@@ -30,6 +29,7 @@ _SLACK = 1e-3  # of a duration: where all last equally long, the last sample may
 class TimedMovement(MovementRegressor):
     """Model of movements whose law is over phase and whose input is time, where ``timing`` is not "none"."""
 
+    regressor: Any
     timing: str
     timing_: str
     timing_gain_: float
@@ -132,10 +132,28 @@ class TimedMovement(MovementRegressor):
         over = self._timing.posterior(above, last, exact=exact).log_integral
         return over - self._timing.posterior(below, last).log_integral
 
+    def _timed(self, recordings: list[Recording]) -> list[Recording]:
+        """Recordings over the input of the law, after it was decided whether their timing varies."""
+        self._timing = self._nodes = None
+        self.timing_ = self.timing
+        if self.timing == "none":
+            return recordings
+        fewest = _FEWEST + (self.timing == "auto")
+        if len(recordings) < fewest:
+            raise ValueError(
+                f"groups has {len(recordings)} demonstrations, must have {fewest} or more to learn how timing varies: "
+                "record more, or take timing='none'."
+            )
+        if self.timing == "auto":
+            self.timing_gain_ = self._gain(recordings)
+            self.timing_ = "warp" if self.timing_gain_ > 0.0 else "none"
+            if getattr(self.regressor, "verbose", 0):
+                say(f"timing: a warp gains {self.timing_gain_:.3g} nats a step, taken is {self.timing_!r}")
+        return self._phased(recordings, self.timing_)
+
     def _phased(self, recordings: list[Recording], timing: str) -> list[Recording]:
         """Recordings over phase, after their timing was learned."""
-        duration = np.array([recording.time[-1] for recording in recordings])
-        first = np.array([recording.time[0] for recording in recordings])
+        first, duration = (np.array([recording.time[i] for recording in recordings]) for i in (0, -1))
         good = (first >= 0.0) & (first < 0.5 * duration)
         checks.require(good, first, "the first time of a demonstration", "0 or a little later", "count from its start")
         grid = np.linspace(0.0, 1.0, _N_STEPS)
@@ -280,18 +298,3 @@ class TimedMovement(MovementRegressor):
 
 def _flat(duration: Tensor, pace: Tensor) -> Tensor:
     return torch.zeros_like(duration)
-
-
-def n_grid_steps(recordings: list[Recording]) -> int:
-    """Steps of the grid on which recordings are compared: their median number of samples, at most 200."""
-    return max(2, min(_MOST_STEPS, round(float(np.median([len(recording.time) for recording in recordings])))))
-
-
-def sampled(recording: Recording, grid: Floats) -> Floats:
-    """Positions of a recording at the steps of a grid, linear between samples; NaN where it has no sample near."""
-    time, position = recording
-    columns = [np.interp(grid, time, column) for column in position.T]
-    right = np.clip(np.searchsorted(time, grid), 1, len(time) - 1)
-    nearest = np.minimum(np.abs(grid - time[right - 1]), np.abs(time[right] - grid))
-    seen = nearest <= _GAP * np.median(np.diff(time))
-    return np.where(seen[:, np.newaxis], np.stack(columns, axis=1), np.nan)

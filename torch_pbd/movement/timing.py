@@ -116,17 +116,17 @@ class Timing:
         more, ``exact``, counts on last lattices of its own.
         """
         center, root = torch.zeros_like(self.location), self._reach() / _REACH * torch.eye(2).to(self.root)
-        cut = (
-            (math.log(last) - self.location[0]) / self.root[0, 0] if last > 0.0 and self.root[0, 0] > 0.0 else -math.inf
-        )
+        cut = -math.inf
+        if last > 0.0 and self.root[0, 0] > 0.0:
+            cut = float((math.log(last) - self.location[0]) / self.root[0, 0])
         for _ in range(_MOST_LATTICES):
-            nodes, center, finer = self._lattice(log_likelihood, center, root, float(cut), _SIDE)
+            nodes, center, finer = self._lattice(log_likelihood, center, root, cut, _SIDE)
             is_last = bool(finer.det() > 0.5 * root.det())
             root = finer
             if is_last:
                 break
         for side in (_SIDE, _SIDE_LAST) if exact else (_SIDE_LAST,):
-            nodes, center, root = self._lattice(exact or log_likelihood, center, root, float(cut), side)
+            nodes, center, root = self._lattice(exact or log_likelihood, center, root, cut, side)
         kept = nodes.weight > 1e-3 * nodes.weight.max()
         weight = nodes.weight[kept] / nodes.weight[kept].sum()
         return Nodes(nodes.duration[kept], nodes.pace[kept], weight, nodes.log_integral)

@@ -19,9 +19,10 @@ from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky
 from torch_pbd.movement.base import Recording
 from torch_pbd.movement.conditioning import Conditioned
+from torch_pbd.movement.grid import n_grid_steps, sampled
 from torch_pbd.movement.joint import JointNormal
 from torch_pbd.movement.time_kernel import TimeKernel, fit_time_kernel
-from torch_pbd.movement.timed import FEWEST_TIMED, TimedMovement, n_grid_steps, sampled
+from torch_pbd.movement.timed import TimedMovement
 
 _FEWEST_DF, _MOST_DF = 3.0, 200.0  # of the joint law: a variance must exist, and beyond it is normal to all purposes
 
@@ -178,25 +179,12 @@ class TrajectoryRegressor(TimedMovement):
             raise checks.refusal(self.regressor, "regressor", "a covariance regressor or None")
 
     def _fit(self, recordings: list[Recording]) -> None:
-        self._timing = self._nodes = None
-        self.timing_ = self.timing
         for number, recording in enumerate(recordings):
             if len(recording.time) < 2 or not (np.diff(recording.time) > 0.0).all():
                 raise ValueError(
                     f"X has a time twice in demonstration {number}, or fewer than two: its samples must be in a row."
                 )
-        fewest = {"none": 2, "warp": FEWEST_TIMED, "auto": FEWEST_TIMED + 1}[self.timing]
-        if len(recordings) < fewest:
-            raise ValueError(
-                f"groups has {len(recordings)} demonstrations, must have {fewest} or more to learn how timing varies: "
-                "record more, or take timing='none'."
-            )
-        if self.timing == "auto":
-            self.timing_gain_ = self._gain(recordings)
-            self.timing_ = "warp" if self.timing_gain_ > 0.0 else "none"
-        if self.timing != "none":
-            recordings = self._phased(recordings, self.timing_)
-        self._fit_law(recordings)
+        self._fit_law(self._timed(recordings))
 
     def _fit_law(self, recordings: list[Recording]) -> None:
         X = np.concatenate([recording.time for recording in recordings])[:, np.newaxis]
