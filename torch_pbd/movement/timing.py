@@ -20,9 +20,10 @@ _PACES = torch.linspace(-3.0, 3.0, 121, dtype=torch.float64)  # exp(3): twenty t
 _ROUNDS = 10  # of registration: the mean and the paces depend on each other
 _EVEN = 1e-5  # below it the series in a is exact to rounding
 _SAME = 1e-4  # spread of log durations that counts as none: of sampling
-# Nodes along a side of lattices that follow each other until they shrink no more, and of the last, whose nodes all
-# predict. They reach over four standard deviations: a sum over nodes 4/3 of them apart is a normal integral to 1e-4.
-_SIDE, _SIDE_LAST, _REACH, _MOST_LATTICES = 13, 6, 4.0, 8
+# Nodes along a side of lattices that follow each other until the posterior is wider than their cells, and of the last,
+# whose nodes all predict. They reach over four standard deviations: a sum over nodes 4/3 of them apart is a normal
+# integral to 1e-4. A normal density 0.7 cells wide has the weight of 2.5 nodes along each axis.
+_SIDE, _SIDE_LAST, _REACH, _MOST_LATTICES, _FEW = 13, 6, 4.0, 20, 2.5
 _RARE = 7.0  # nats below the density of the middle, where the first lattice ends
 
 
@@ -119,24 +120,23 @@ class Timing:
         cut = -math.inf
         if last > 0.0 and self.root[0, 0] > 0.0:
             cut = float((math.log(last) - self.location[0]) / self.root[0, 0])
-        for _ in range(_MOST_LATTICES):
-            nodes, center, finer = self._lattice(log_likelihood, center, root, cut, _SIDE)
-            is_last = bool(finer.det() > 0.5 * root.det())
-            root = finer
-            if is_last:
-                break
-        for side in (_SIDE, _SIDE_LAST) if exact else (_SIDE_LAST,):
-            nodes, center, root = self._lattice(exact or log_likelihood, center, root, cut, side)
+        for likelihood in filter(None, (log_likelihood, exact)):
+            for _ in range(_MOST_LATTICES):
+                nodes, center, root, is_resolved = self._lattice(likelihood, center, root, cut, _SIDE)
+                if is_resolved:
+                    break
+        nodes, *_ = self._lattice(exact or log_likelihood, center, root, cut, _SIDE_LAST)
         kept = nodes.weight > 1e-3 * nodes.weight.max()
         weight = nodes.weight[kept] / nodes.weight[kept].sum()
         return Nodes(nodes.duration[kept], nodes.pace[kept], weight, nodes.log_integral)
 
     def _lattice(
         self, log_likelihood: Likelihood, center: Tensor, root: Tensor, cut: float, side: int
-    ) -> tuple[Nodes, Tensor, Tensor]:
-        """Midpoints of the cells of a lattice, and center and root of the next; ``root`` is a lower factor.
+    ) -> tuple[Nodes, Tensor, Tensor, bool]:
+        """Midpoints of the cells of a lattice, center and root of the next, and whether this one is fine enough.
 
-        Durations depend on the first axis alone, which is cut where movements would have ended.
+        Durations depend on the first axis alone, as ``root`` is a lower factor; it is cut where movements would have
+        ended. Where too few nodes carry the weight a power of the likelihood lays the next lattice.
         """
         low = min(max(float((cut - center[0]) / root[0, 0]), -_REACH), 0.9 * _REACH)
         axes, cell = [], root.new_ones(2)
@@ -144,21 +144,23 @@ class Timing:
             edges = torch.linspace(start, _REACH, side + 1).to(root)
             varies = bool(self.root[axis, axis] > 0.0)
             axes.append(0.5 * (edges[1:] + edges[:-1]) if varies else edges[:1] * 0.0)
-            cell[axis] = edges[1] - edges[0] if varies else 2.0  # whose half keeps the root as it is
+            cell[axis] = edges[1] - edges[0] if varies else 12.0**0.5  # which keeps the root as it is
         z = center + torch.cartesian_prod(*axes) @ root.mT
         values = self.location + z @ self.root.mT
         duration, pace = values[:, 0].exp(), values[:, 1]
         n_varying = int((self.root.diagonal() > 0.0).sum())
         log_prior = -0.5 * (self.df + n_varying) * torch.log1p(z.square().sum(1) / self.df)
-        log_weight = log_prior + log_likelihood(duration, pace)
-        weight = log_weight.softmax(0)
-        center = weight @ z
-        spread = z - center
-        # The next lattice is no finer than half of this one's cells, in which the posterior may hide.
+        value, power = log_likelihood(duration, pace), 1.0
+        while float((wide := (log_prior + power * value).softmax(0)).square().sum()) > _FEW**-n_varying:
+            power *= 0.5
         scale = root * cell
-        finer = torch.linalg.cholesky(spread.mT @ (weight[:, None] * spread) + 0.25 * scale @ scale.mT)
-        volume = float(scale.diagonal().log().sum())
-        return Nodes(duration, pace, weight, float(log_weight.logsumexp(0)) + volume), center, finer
+        center = wide @ z
+        spread = z - center
+        # A node stands for its cell, in which the variance is a twelfth of its square.
+        finer = torch.linalg.cholesky(spread.mT @ (wide[:, None] * spread) + scale @ scale.mT / 12.0)
+        log_weight = log_prior + value
+        log_integral = float(log_weight.logsumexp(0) + scale.diagonal().log().sum())
+        return Nodes(duration, pace, log_weight.softmax(0), log_integral), center, finer, power == 1.0
 
     def _reach(self) -> float:
         return math.sqrt(self.df * math.expm1(2.0 * _RARE / (self.df + 2.0)))
