@@ -1,5 +1,7 @@
 """Recordings by one door: files as people have them, tables, what is made of demonstrations, the command line."""
 
+import subprocess
+import sys
 import warnings
 
 import numpy as np
@@ -228,3 +230,14 @@ def test_nothing_is_said_of_good_files(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert load_text(tmp_path, "time,x,y\n" + lines(0, 0.5, 1)) == PLAIN
+
+
+def test_no_library_of_a_format_is_loaded_until_its_format_is_read(tmp_path):
+    load_text(tmp_path, "time,x,y\n" + lines(0, 0.5, 1))
+    program = (
+        "import sys, torch_pbd\n"
+        f"torch_pbd.load_demonstrations({str(tmp_path / 'set.csv')!r})\n"
+        "print(*{'h5py', 'pyarrow', 'zarr', 'rosbags', 'narwhals', 'pandas', 'scipy.io', 'torch'} & set(sys.modules))"
+    )
+    shown = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert shown.stdout.strip() == ""

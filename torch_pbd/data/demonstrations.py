@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.data.alignment import check_overlap, interpolate, on_common_phases, times_from_start, unit_phases
+from torch_pbd.data.alignment import check_overlap, interpolate, on_common_phases, unit_phases
 from torch_pbd.data.editing import Editing
 from torch_pbd.data.recordings import MIN_SAMPLES, Missing, as_names, as_recordings, as_time_unit, as_units, preview
 from torch_pbd.data.units import find_suspects
@@ -222,13 +222,6 @@ class Demonstrations(Editing):
             )
         return np.stack(self.positions)
 
-    def from_start(self) -> "Demonstrations":
-        """These demonstrations with the times of each counted from its start.
-
-        Grids that then differ by no more than their stamps resolve become one, as in ``stack("phase")``.
-        """
-        return self._replace(times_from_start(self.times), self.positions)
-
     def resample(self, n: int) -> "Demonstrations":
         """Each demonstration at ``n`` points evenly spaced over its own time, by linear interpolation.
 
@@ -263,20 +256,6 @@ class Demonstrations(Editing):
         # Timing that was taken out stays out, whatever is done to the demonstrations afterwards.
         alignment = "dtw" if "dtw" in (method, self.alignment) else "phase"
         return self._replace(grid, positions, time_unit="1", alignment=alignment)
-
-    def split(self, k: int | Sequence[int]) -> tuple["Demonstrations", "Demonstrations"]:
-        """Leave demonstrations out: ``(train, test)``, where ``test`` has those numbered ``k``, and ``train`` some."""
-        held_out = np.zeros(len(self), dtype=bool)
-        try:
-            held_out[np.asarray(k)] = True
-        except IndexError as error:
-            must = f"the number of a demonstration, or a list of them, numbered 0 to {len(self) - 1}"
-            raise checks.refusal(k, "k", must) from error
-        if held_out.all():
-            raise InvalidParameterError(
-                f"k leaves out {len(self)} of {len(self)} demonstrations: both parts need some."
-            )
-        return self[~held_out], self[held_out]
 
     def plot(self, outputs: Sequence[int | str] | None = None, *, ax: Any = None) -> Any:
         """Draw every demonstration: two or three outputs against each other, one or more than three over time.

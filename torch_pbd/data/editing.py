@@ -7,6 +7,7 @@ import numpy as np
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
+from torch_pbd.data.alignment import times_from_start
 from torch_pbd.data.pauses import still
 from torch_pbd.data.recordings import MIN_SAMPLES, Missing, as_texts, preview
 from torch_pbd.data.units import ANGLES, LENGTHS, TIMES, check_unit, find_suspects
@@ -28,6 +29,9 @@ class Editing:
     time_unit: str
 
     def _replace(self, times: Any, positions: Any, **changes: Any) -> Self:
+        raise NotImplementedError
+
+    def __getitem__(self, index: Any) -> Any:
         raise NotImplementedError
 
     @classmethod
@@ -209,6 +213,27 @@ class Editing:
             spans.append(slice(max(moving[0] - 1, 0), moving[-1] + 2) if len(moving) else slice(None))
         times = [time[span] for time, span in zip(self.times, spans, strict=True)]
         return self._replace(times, [position[span] for position, span in zip(self.positions, spans, strict=True)])
+
+    def from_start(self) -> Self:
+        """These demonstrations with the times of each counted from its start.
+
+        Grids that then differ by no more than their stamps resolve become one, as in ``stack("phase")``.
+        """
+        return self._replace(times_from_start(self.times), self.positions)
+
+    def split(self, k: int | Sequence[int]) -> tuple[Self, Self]:
+        """Leave demonstrations out: ``(train, test)``, where ``test`` has those numbered ``k``, and ``train`` some."""
+        held_out = np.zeros(len(self.times), dtype=bool)
+        try:
+            held_out[np.asarray(k)] = True
+        except IndexError as error:
+            must = f"the number of a demonstration, or a list of them, numbered 0 to {len(self.times) - 1}"
+            raise checks.refusal(k, "k", must) from error
+        if held_out.all():
+            raise InvalidParameterError(
+                f"k leaves out {len(self.times)} of {len(self.times)} demonstrations: both parts need some."
+            )
+        return self[~held_out], self[held_out]
 
     def describe(self) -> "Description":
         """What is in the recordings, and what is likely wrong with them: tables to print, and ``mistakes``."""

@@ -78,8 +78,13 @@ def load_demonstrations(
     are (K, T, d), or (T, d) for each recording; their columns are y0, y1, ... or the array's name, _0, _1, ...
     Pickled objects are never loaded.
 
-    ``.csv``: a header, then one line a sample. Lines of different demonstrations may be mixed; each
-    demonstration's own must be in order of time. Comments (#) may stand above the header.
+    ``.csv``, ``.txt``, ``.tsv``, ``.parquet``: a header, then a row a sample. Rows of different demonstrations may be
+    mixed; each demonstration's own must be in order of time. Comments (#) may stand above the header of a text.
+
+    Folders of LeRobot (v2, v3): ``observation.state``, or other features by name. ``.hdf5``: robomimic's
+    ``data/demo_k/obs/...``. Folders of rosbag2, ``.mcap``, ``.db3``, ``.bag``: messages of one topic, at their headers'
+    stamps, counted from the first. ``.mat``: cells ``demos{k}`` with ``pos`` (d, T), or ``data{k}`` (2 d, T). Folders
+    ``.zarr``, and ``.zip`` of one: ``data/<key>`` and ``meta/episode_ends``.
 
     Parameters
     ----------
@@ -113,6 +118,8 @@ def load_demonstrations(
         Larger files (.npz: unpacked) are refused before they are read.
     **options
         Of a format. CSV: ``delimiter`` (None finds it among comma, semicolon and tab), ``decimal`` ("." or ",").
+        ROS: ``topic``, and ``child``, the frame of transforms. HDF5: ``mask``, a list of demonstrations in the file.
+        MATLAB: ``variable`` that holds the recordings.
 
     Raises
     ------
