@@ -120,7 +120,7 @@ def test_45_unknown_keys_get_the_nearest_that_is_valid_there(refused, command, t
             "data is the number 7, must be text or a list, each entry text or null: text that looks "
             "like something else stands in quotes.",
         ),
-        ("fit", "data: [a, b]", "data is a list, must be text or null."),
+        ("fit", "data: {a: b}", "data is a mapping, must be text or a list, each entry text or null."),
         ("fit", "data: a\nalign: dwt", "must be one of auto, none, phase, dtw: did you mean 'dtw'?"),
         ("fit", "data: a\nn_steps: None", "must be a whole number of at least 1 or null: write null."),
         ("fit", "data: a\nn_steps: 2.5", "n_steps is the number 2.5, must be a whole number of at least 1 or null."),
@@ -510,7 +510,7 @@ def test_what_print_config_shows_can_be_read(command, tmp_path, capsys):
     assert stop.value.code == 0
     shown = capsys.readouterr().out
     (tmp_path / "c.yaml").write_text(shown)
-    data = ["--data", "x"] if command == "fit" else []
+    data = ["--data", "x"] if command in ("fit", "inspect") else []
     assert parse(command, ["--config", str(tmp_path / "c.yaml"), *data])[1] == parse(command, data)[1]
 
 
