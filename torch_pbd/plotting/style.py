@@ -13,8 +13,8 @@ from torch_pbd import checks
 DATA, MODEL, EMPIRICAL, FORCE, TRUTH = "#999999", "#0072B2", "#E69F00", "#D55E00", "#000000"
 OTHER, ROBOT = "#CC79A7", "#009E73"
 """A second model beside the first; the simulated robot."""
-SERIES = (ROBOT, "#332288", "#56B4E9", "#882255", "#999933", "#44AA99", "#000000")
-"""Colours of what differs by output only: none of demonstrations, models and forces."""
+SERIES = (ROBOT, "#332288", "#56B4E9", "#882255", "#999933", "#44AA99", "#661100")
+"""Colours of what differs by output only: none of demonstrations, models, forces and the truth."""
 LINES = ("-", "--", ":", "-.")
 
 _LONGEST_UNIT = 8  # letters; a longer one is a description
