@@ -124,9 +124,8 @@ def _via_law(shape: Shape, via_precision: ArrayLike | None) -> tuple[Floats, Flo
     means, across = 1e-2 * table[:, :2], 1e-3 * table[:, 2]
     if via_precision is not None:
         given = checks.real_floats(via_precision, "via_precision")
-        across = checks.array(
-            np.broadcast_to(given, len(means)) if given.ndim == 0 else given, "via_precision", (len(means),)
-        )
+        given = np.broadcast_to(given, len(means)) if given.ndim == 0 else given
+        across = checks.array(given, "via_precision", (len(means),))
         checks.require(across > 0.0, across, "via_precision", "above zero", "a standard deviation in m")
     # The direction of the path is that of the chord between the neighbours.
     chord = np.gradient(means, axis=0)
