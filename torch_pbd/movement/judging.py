@@ -13,7 +13,7 @@ MOVEMENT_STATISTICS = ("deviation", "offset", "length", "largest")
 
 
 def movement_statistics(movements: ArrayLike, mean: ArrayLike, std: ArrayLike) -> Floats:
-    """What people say of whole movements: (s, 4), in the order of :data:`MOVEMENT_STATISTICS`.
+    """What people say of whole movements: (s, 4), in the order of ``MOVEMENT_STATISTICS``.
 
     The mean squared deviation and the length of the time-averaged offset, in standard deviations of each step and
     output; the length of the path, in units of the outputs; the largest deviation, in standard deviations.
@@ -46,7 +46,7 @@ def judge_movement(
     X, y : array_like of shapes (n, 1) and (n, d) or (n,)
         The demonstration, in the order of its times.
     level : float, default=0.9
-        Share of draws that lie in a region, as many below it as above, for each of :data:`MOVEMENT_STATISTICS`.
+        Share of draws that lie in a region, as many below it as above, for each of ``MOVEMENT_STATISTICS``.
     n_draws : int, default=500
     random_state : int, RandomState instance or None, default=0
 
