@@ -224,7 +224,7 @@ def test_the_likelier_kernel_is_that_of_the_movements(kernel):
 def test_the_share_is_the_likeliest_of_demonstrations_left_out(kernel):
     # Dense: the law of z under the others, with the blocks of the diagonal brought to one.
     found = fit_time_kernel(torch.from_numpy(GRID), sample_series("matern52", 0.4, n_demos=4), [kernel], None)
-    along, residual = found.correlation(found.grid).numpy(), found.residual.numpy()
+    along, residual = found.correlation(found.grid, found.grid).numpy(), found.residual.numpy()
     (n_demos, n, d), shares = residual.shape, np.array([1.0, 0.9, 0.75, 0.6, 0.45, 0.3, 0.2, 0.1, 0.05])
     values = []
     for share in shares:
@@ -355,5 +355,13 @@ def test_what_is_kept_of_a_law_is_of_this_fit_and_not_pickled():
     np.testing.assert_array_equal(bent.predict(at), own.condition([[0.5]], [[1.0, 0.5]]).predict(at[::-1])[::-1])
     assert len(pickle.dumps(own)) == size
     np.testing.assert_array_equal(own.sample_demonstrations(at, random_state=0), first)
+    # Of times that are partly new, half the law is worked out, and the same.
+    times = np.linspace(0.2, 0.9, 22)[:, np.newaxis]
+    own.predict_joint(at)
+    for mixed in (np.concatenate([at, times[:3]]), at[3:9], times):
+        for part, fresh in zip(
+            own.predict_joint(mixed), pickle.loads(pickle.dumps(own)).predict_joint(mixed), strict=True
+        ):
+            np.testing.assert_allclose(part, fresh, rtol=1e-12, atol=1e-14)
     own.fit(X, 2.0 * y, groups=groups)
     np.testing.assert_allclose(own.sample_demonstrations(at, random_state=0), 2.0 * first, rtol=1e-6, atol=1e-8)

@@ -54,7 +54,7 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
     n_outputs_: int
     input_: str
     _known: Known | None = None
-    _kept: dict[bytes, JointNormal]  # law at the last times, which conditioned copies share
+    _kept: dict[str, tuple[Floats, JointNormal]]  # law at the last times, which conditioned copies share
     _y_is_1d: bool
 
     def fit(self, X: Any, y: ArrayLike | None = None, *, groups: ArrayLike | None = None) -> Self:
@@ -103,6 +103,10 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
     @abstractmethod
     def _prior(self, time: Floats) -> JointNormal:
         """Joint law at times (n,), all different, before anything is known of the movement."""
+
+    def _between(self, time: Floats, other: Floats) -> Tensor:
+        """Correlation between other times, that of :class:`JointNormal`: noise has none."""
+        return torch.zeros(len(time), len(other), dtype=torch.float64)
 
     @abstractmethod
     def _arrays(self) -> dict[str, Floats]:
@@ -354,12 +358,25 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
     def _conditioned(self, time: Floats) -> tuple[Conditioned, Tensor]:
         """Law of all times that matter, given what is known, and the places of ``time`` among them."""
         union, rows, places = self._union(time, self._known)
-        kept, key = self.__dict__.setdefault("_kept", {}), union.tobytes()
-        prior = kept.get(key) or self._prior(union)
-        if len(union) <= _AT_ONCE:
-            kept.clear()
-            kept[key] = prior
-        return Conditioned(prior, self._observed(places)), torch.from_numpy(rows)
+        return Conditioned(self._prior_of_last(union), self._observed(places)), torch.from_numpy(rows)
+
+    def _prior_of_last(self, time: Floats) -> JointNormal:
+        """Joint law at increasing times; those that were asked for last, with others or not, take no work again."""
+        kept, scaled = self.__dict__.setdefault("_kept", {}), np.round(self._scaled(time), _RESOLUTION)
+        if kept and len(time):
+            known, law = kept["last"]
+            place = np.searchsorted(known, scaled).clip(max=len(known) - 1)
+            old = known[place] == scaled
+            if old.all():
+                return law if len(old) == len(known) else law.at(torch.from_numpy(place))
+            if 2 * old.sum() > len(old):
+                law, new = law.at(torch.from_numpy(place[old])), self._prior(time[~old])
+                order = np.argsort(np.concatenate([np.flatnonzero(old), np.flatnonzero(~old)]))
+                return law.joined(new, self._between(time[old], time[~old])).at(torch.from_numpy(order))
+        law = self._prior(time)
+        if 0 < len(time) <= _AT_ONCE:
+            kept["last"] = scaled, law
+        return law
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in super().__getstate__().items() if name != "_kept"}

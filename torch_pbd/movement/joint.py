@@ -39,6 +39,17 @@ class JointNormal:
             self.explained[steps],
         )
 
+    def joined(self, other: "JointNormal", between: Float[Tensor, "n m"]) -> "JointNormal":
+        """Law of the steps of both, which are correlated between each other."""
+        upper = torch.cat([self.correlation, between], dim=1)
+        return JointNormal(
+            torch.cat([self.mean, other.mean]),
+            torch.cat([self.factor, other.factor]),
+            torch.cat([upper, torch.cat([between.mT, other.correlation], dim=1)]),
+            torch.cat([self.loadings, other.loadings]),
+            torch.cat([self.explained, other.explained]),
+        )
+
     def covariance(self) -> Float[Tensor, "n d n d"]:
         """Whole covariance: n d squared numbers."""
         n, d = self.mean.shape

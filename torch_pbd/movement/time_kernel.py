@@ -43,13 +43,11 @@ class TimeKernel:
     residual: Float[Tensor, "K T d"]
     """Whitened residuals, without holes."""
 
-    def correlation(self, time: Float[Tensor, " n"]) -> Float[Tensor, "n n"]:
-        """Correlation of unit diagonal at any times: nuggets are linear between steps; equal times are one."""
-        nugget = _interpolated(self.grid, self.nugget[:, None], time)[:, 0]
-        same = time[:, None] == time
-        whole = self._kernel(time, time) + torch.where(same, nugget, 0.0)
-        root = (1.0 + nugget).rsqrt()
-        return root[:, None] * whole * root
+    def correlation(self, time: Float[Tensor, " n"], other: Float[Tensor, " m"]) -> Float[Tensor, "n m"]:
+        """Correlation between any times: nuggets are linear between steps; equal times are one."""
+        own, nugget = (_interpolated(self.grid, self.nugget[:, None], part)[:, 0] for part in (time, other))
+        whole = self._kernel(time, other) + torch.where(time[:, None] == other, nugget, 0.0)
+        return (1.0 + own).rsqrt()[:, None] * whole * (1.0 + nugget).rsqrt()
 
     def loadings(self, time: Float[Tensor, " n"]) -> Float[Tensor, "n d K"]:
         """Residuals of the demonstrations at any times: smooth parts by the kernel, what is left of them linear."""
@@ -186,7 +184,7 @@ def _best_share(kernel: TimeKernel) -> float:
     n_demos, n_steps, d = kernel.residual.shape
     if n_demos < 3:
         return 1.0
-    root = safe_cholesky(kernel.correlation(kernel.grid), name="the correlation along the movement")
+    root = safe_cholesky(kernel.correlation(kernel.grid, kernel.grid), name="the correlation along the movement")
     residual = kernel.residual
     whitened = torch.linalg.solve_triangular(root, residual, upper=False).flatten(1)
     gram, outer = symmetrize(whitened @ whitened.mT), residual[..., None] * residual[..., None, :]

@@ -73,7 +73,7 @@ class TrajectoryLaw(nn.Module):
         """Joint law at times that are all different, of these marginals."""
         kernel = self.time_kernel()
         time = (x - self.x_shift) / self.x_scale
-        correlation = self.share * kernel.correlation(time)
+        correlation = self.share * kernel.correlation(time, time)
         loadings = ((1.0 - self.share) / len(self.residual)).sqrt() * kernel.loadings(time)
         own = loadings @ loadings.mT + self.share * torch.eye(mean.shape[1]).to(mean)
         root = safe_cholesky(covariance, name="the covariance at a step")
@@ -284,6 +284,12 @@ class TrajectoryRegressor(TimedMovement):
     def _prior(self, time: Floats) -> JointNormal:
         mean, covariance = self._regressor_marginals(time)
         return self._joint(time, mean, covariance)
+
+    def _between(self, time: Floats, other: Floats) -> Tensor:
+        with torch.inference_mode():
+            return self.module_.share * self.module_.time_kernel().correlation(
+                *(torch.from_numpy(self._scaled(part)) for part in (time, other))
+            )
 
     def _joint(self, time: Floats, mean: Floats, covariance: Floats) -> JointNormal:
         with torch.inference_mode():
