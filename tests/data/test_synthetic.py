@@ -10,6 +10,7 @@ from torch_pbd.data import (
     paper_covariance,
     paper_mean,
     tunnel_center,
+    tunnel_deviation,
     tunnel_half_width,
 )
 
@@ -124,6 +125,21 @@ def test_common_start_has_no_spread_but_the_tremor():
     np.testing.assert_allclose(x[:, 0].std(), 1e-4, rtol=0.25)  # standard error 4 %, waves are few
     free = make_tunnel_demonstrations(300, rate=10.0, random_state=0).to_array()[:, :, 0]
     np.testing.assert_array_equal(x[:, 15:], free[:, 15:])
+
+
+@pytest.mark.parametrize("ends", [{}, {"common_goal": True}, {"common_start": True, "common_goal": True}])
+def test_the_deviation_is_that_of_many_demonstrations(ends):
+    demonstrations = make_tunnel_demonstrations(3000, rate=10.0, random_state=0, **ends).to_array()
+    found, at = demonstrations[:, :, 0].std(axis=0), demonstrations[0, :, 1].clip(0.0, 0.6)
+    np.testing.assert_allclose(found, tunnel_deviation(at, **ends), rtol=0.06)  # standard error 1.3 %, 101 steps
+
+
+def test_a_common_goal_has_no_spread_but_the_tremor():
+    assert tunnel_deviation(0.6, common_goal=True) == pytest.approx(1e-4)
+    assert tunnel_deviation(0.6) / tunnel_deviation(0.6, common_goal=True) > 25.0
+    x = make_tunnel_demonstrations(6, rate=10.0, random_state=0, common_goal=True).to_array()[:, :, 0]
+    free = make_tunnel_demonstrations(6, rate=10.0, random_state=0).to_array()[:, :, 0]
+    np.testing.assert_array_equal(x[:, :85], free[:, :85])
 
 
 @pytest.mark.parametrize("variant", VARIANTS)

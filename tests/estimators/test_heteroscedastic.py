@@ -13,9 +13,16 @@ from sklearn.model_selection import GridSearchCV, GroupKFold
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
+import torch_pbd
 from estimators.zoo import assert_covariances, assert_same_model, demonstrations, fit, fitted, new, queries, truth
 from torch_pbd import HeteroscedasticGPRegressor
-from torch_pbd.data import load_demonstrations, make_paper_simulation, paper_covariance, paper_mean
+from torch_pbd.data import (
+    load_demonstrations,
+    make_paper_simulation,
+    make_tunnel_demonstrations,
+    paper_covariance,
+    paper_mean,
+)
 from torch_pbd.exceptions import DataRankWarning, UnimodalityWarning
 from torch_pbd.metrics import gaussian_kl, relative_frobenius_error
 
@@ -107,6 +114,70 @@ def test_half_the_inducing_inputs_change_little():
     deviation = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     assert np.abs((other - mean) / deviation).max() < 0.1
     assert gaussian_kl(covariance, other_covariance) < 0.005
+
+
+# --- ends where the covariance collapses
+
+
+def collapsing(end, n_demos, n_steps, seed=0):
+    """Curves (K, n, 2) whose deviations fall by 33 in the last twentieth, and these deviations; or rise in the first.
+
+    Matern 5/2 of length .1 along them.
+    """
+    grid = np.linspace(0.0, 1.0, n_steps)
+    share = np.clip((grid - 0.95) / 0.05, 0.0, 1.0)
+    falling = 1.0 - 0.97 * share**2 * (3.0 - 2.0 * share)
+    deviation = {"goal": falling, "start": falling[::-1], None: np.ones(n_steps)}[end]
+    distance = 5.0**0.5 * np.abs(np.subtract.outer(grid, grid)) / 0.1
+    gram = (1.0 + distance + distance**2 / 3.0) * np.exp(-distance) + 1e-6 * np.eye(n_steps)
+    z = np.linalg.cholesky(gram) @ np.random.default_rng(seed).normal(size=(n_demos, n_steps, 2))
+    return np.column_stack([np.sin(3.0 * grid), np.cos(2.0 * grid)]) + deviation[:, np.newaxis] * z, deviation
+
+
+@cache
+def fitted_to_collapsing(end, n_steps):
+    """The model of six curves, and the whitened rms of 200 others at each step."""
+    curves, _ = collapsing(end, 206, n_steps)
+    grid = np.linspace(0.0, 1.0, n_steps)[:, np.newaxis]
+    groups = np.repeat(np.arange(6), n_steps)
+    model = HeteroscedasticGPRegressor().fit(np.tile(grid, (6, 1)), curves[:6].reshape(-1, 2), groups=groups)
+    mean, covariance = model.predict(grid, return_cov=True)
+    whitened = np.linalg.solve(np.linalg.cholesky(covariance), (curves[6:] - mean)[..., np.newaxis])
+    return model, np.sqrt(np.square(whitened).mean((0, 2, 3)))
+
+
+@pytest.mark.parametrize(("end", "n_steps"), [("goal", 50), ("goal", 100), ("start", 100), ("goal", 200)])
+def test_a_covariance_that_collapses_at_an_end_is_followed(end, n_steps):
+    model, rms = fitted_to_collapsing(end, n_steps)
+    at_end = rms[:10] if end == "start" else rms[-10:]
+    assert at_end.min() > 0.5
+    assert at_end.max() < 2.0
+    stretched = model.module_.core.stretch[:, 0].tolist()
+    assert stretched == ([1.0, 0.0] if end == "start" else [0.0, 1.0])
+
+
+def test_a_goal_of_the_tunnel_is_followed():
+    x = make_tunnel_demonstrations(206, rate=10.0, random_state=0, common_goal=True).to_array()[:, :, :1]
+    grid = np.linspace(0.0, 1.0, 101)[:, np.newaxis]
+    groups = np.repeat(np.arange(6), 101)
+    model = HeteroscedasticGPRegressor().fit(np.tile(grid, (6, 1)), x[:6].reshape(-1, 1), groups=groups)
+    mean, covariance = model.predict(grid, return_cov=True)
+    rms = np.sqrt(np.square(x[6:] - mean[:, None]).mean((0, 2)) / covariance[:, 0, 0])[-10:]
+    assert rms.min() > 0.5
+    assert rms.max() < 2.0
+
+
+def test_no_end_is_stretched_without_need():
+    model, _ = fitted_to_collapsing(None, 100)
+    assert not hasattr(model.module_.core, "stretch")
+    X, y, groups = make_paper_simulation(random_state=0)
+    assert not hasattr(HeteroscedasticGPRegressor().fit(X, y, groups=groups).module_.core, "stretch")
+
+
+def test_a_model_with_a_stretched_end_is_saved_as_it_is(tmp_path):
+    model, _ = fitted_to_collapsing("goal", 50)
+    torch_pbd.save(model, tmp_path / "model.safetensors")
+    assert_same_model(torch_pbd.load(tmp_path / "model.safetensors"), model, np.linspace(-0.2, 1.2, 15)[:, np.newaxis])
 
 
 # --- groups

@@ -7,7 +7,7 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ExpSineSquared, Matern
 
 from torch_pbd.gp import spacing
-from torch_pbd.gp.inducing import FeatureMap, inducing_inputs
+from torch_pbd.gp.inducing import FeatureMap, FixedFeatures, inducing_inputs
 from torch_pbd.kernels import KERNELS
 from torch_pbd.models.heteroscedastic.linear import LinearEvidence
 
@@ -118,3 +118,21 @@ def test_inducing_inputs_are_the_inputs_or_the_means_of_runs_of_them(rng):
     runs = x[:, 0].sort().values.reshape(16, 4).mean(1)
     torch.testing.assert_close(inducing_inputs(x, 16)[:, 0].sort().values, runs, rtol=1e-12, atol=0)
     assert len(inducing_inputs(x, 20)) == 20
+
+
+def test_stretched_features_are_those_of_inputs_with_more_length_at_the_ends():
+    x = tensor(np.linspace(-0.5, 0.5, 41)[:, np.newaxis])
+    stretched = FeatureMap(x[::4], stretch=tensor([[0.4, 0.1], [1.0, 0.02]]))
+    at = stretched.warped(x)
+    assert float(at.diff(dim=0).min()) > 0.0
+    # Of the length one that is added at the end exp(-1) is more than the width away from it, and of .4 at the start.
+    np.testing.assert_allclose(at[[0, 4, -1], 0] - at[20, 0], [-0.9, -0.5 + 0.1 - 0.4 * np.exp(-1), 1.5], atol=0.01)
+    plain = FeatureMap(stretched.warped(x[::4]))
+    np.testing.assert_array_equal(stretched(tensor([0.3]))(x), plain(tensor([0.3]))(at))
+    values, _ = FixedFeatures(stretched, x).vjp(tensor([[0.3]]), tensor([0.0]))
+    expected = stretched(tensor([0.3]))(x)
+    torch.testing.assert_close(values[0] @ values[0].mT, expected @ expected.mT, rtol=0, atol=1e-6)
+    assert stretched.shortest_length_scale() == plain.shortest_length_scale()
+    # Beyond the ends no length is added.
+    beyond = stretched.warped(tensor([[-0.5], [-0.8], [0.5], [0.7]])).diff(dim=0).flatten()
+    np.testing.assert_allclose(beyond[[0, 2]], [-0.3, 0.2], atol=1e-4)

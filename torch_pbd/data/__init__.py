@@ -9,6 +9,7 @@ from torch_pbd.data.synthetic import (
     paper_covariance,
     paper_mean,
     tunnel_center,
+    tunnel_deviation,
     tunnel_half_width,
 )
 from torch_pbd.data.unimodality import check_unimodal
@@ -27,5 +28,6 @@ __all__ = [
     "paper_mean",
     "save_demonstrations",
     "tunnel_center",
+    "tunnel_deviation",
     "tunnel_half_width",
 ]

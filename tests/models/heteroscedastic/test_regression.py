@@ -43,12 +43,23 @@ def test_free_coefficients_are_those_of_least_squares_at_each_input(i, rng):
         np.testing.assert_allclose(covariance[:, t, :, t], inverse, rtol=1e-5, atol=1e-5 * inverse.max())
 
 
-@pytest.mark.parametrize("whitened", [False, True])
+def correlations(whitened, n=3):
+    """Along a line: of a Markov process, whose inverse is zero but for neighbours, and of one that is none."""
+    distance = np.abs(np.subtract.outer(range(n), range(n)))
+    return np.exp(-distance / 2.0) if whitened != "smooth" else np.exp(-np.square(distance / 2.0))
+
+
+def whitener_of(whitened):
+    """Inverse factor of the correlation; None for independent inputs."""
+    return torch.tensor(np.linalg.inv(np.linalg.cholesky(correlations(whitened)))) if whitened else None
+
+
+@pytest.mark.parametrize("whitened", [None, "markov", "smooth"])
 def test_log_evidence_is_the_density_of_the_rows_but_for_what_no_features_change(whitened, rng):
     """With a whitener the mean of one row a time: the roots' rows stand for the directions at an input."""
-    correlation = np.exp(-np.abs(np.subtract.outer(range(3), range(3))) / 2.0)
-    whitener = torch.tensor(np.linalg.inv(np.linalg.cholesky(correlation))) if whitened else None
-    rows = Rows(rng, whitener=whitener)
+    correlation = correlations(whitened)
+    rows = Rows(rng, whitener=whitener_of(whitened))
+    assert (rows.regression.couplings is None) == (whitened == "smooth")
     precision = np.array([0.5, 2.0, 5.0])
     features = rng.normal(size=(4, 3, 5)) * np.geomspace(0.1, 3.0, 4)[:, np.newaxis, np.newaxis]
     root = rows.regression.root.numpy()
@@ -105,12 +116,10 @@ def test_fewer_rows_than_outputs_leave_no_squares_and_do_not_fail(i, k, rng):
     np.testing.assert_allclose(weights.mean, np.linalg.solve(gram, cross), rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("whitened", [False, True])
+@pytest.mark.parametrize("whitened", [None, "markov", "smooth"])
 @pytest.mark.parametrize("i", [1, 3])
 def test_gradient_of_the_log_evidence_is_that_of_autograd(i, whitened, rng):
-    correlation = np.exp(-np.abs(np.subtract.outer(range(3), range(3))) / 2.0)
-    whitener = torch.tensor(np.linalg.inv(np.linalg.cholesky(correlation))) if whitened else None
-    known = Rows(rng, i=i, whitener=whitener).regression
+    known = Rows(rng, i=i, whitener=whitener_of(whitened)).regression
     precision = torch.tensor([0.5, 2.0, 5.0], dtype=torch.float64)
     features = torch.tensor(rng.normal(size=(2, 3, 4))).requires_grad_()
     (expected,) = torch.autograd.grad(known.fit(features, precision).value.sum(), features)

@@ -16,8 +16,9 @@ from torch_pbd.models.heteroscedastic.regression import Regression
 from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation
 from torch_pbd.models.heteroscedastic.search import Gradient, Search
 
-# Sweeps over log variances and coefficients; and how many of them look for the coefficients' hyperparameters too.
-_SWEEPS, _SEARCHES = 3, 2
+# Sweeps over log variances and coefficients; and how many of them look for the coefficients' hyperparameters too. With
+# one of each more the evidence rises by less than a nat.
+_SWEEPS, _SEARCHES = 2, 1
 # An input with at least so many degrees of freedom left gives a conditional variance by itself.
 _ENOUGH_DEGREES = 2.0
 
@@ -178,14 +179,15 @@ def fit_covariance(
     searches : CovarianceSearches
         Searches for processes on the same features.
     scatter : Tensor of shape (n, d, d)
-        Sum of the outer products of the residuals at each input, whose pooled covariance is the unit matrix.
+        Sum of the outer products of residuals at each input, whose pooled covariance is the unit matrix.
     degrees : Tensor of shape (d, n)
         Degrees of freedom of the scatters; of each output given those before it.
     noise : NoiseCorrelation
         Correlation of scatters at different inputs.
-    previous : LatentCovariance or None, where to start
+    previous : LatentCovariance or None
+        Where to start.
     cautious : bool, default=False
-        One sweep, where a part of the rows counts.
+        Sweep once, where a part of the rows counts.
     """
     # An output that is constant is noise of the least variance too where later ones are regressed on it: to zeros
     # any coefficient would fit, and its uncertainty would count as their variance.

@@ -15,7 +15,7 @@ CLEAR = 3.0
 
 _WIDEST = 4.0  # amplitudes stay within a factor of exp(4) of their prior median
 _SPREAD_LENGTH_SCALE, _SPREAD_AMPLITUDE = 1.0, 1.5  # prior deviations of the logarithms
-_NEGLIGIBLE = 1e-8  # nats of the log evidence, that features which are left out may be worth
+_NEGLIGIBLE = 1e-5  # nats of the log evidence, that features which are left out may be worth; searches end at 1e-3
 
 
 @dataclass(frozen=True)
