@@ -99,8 +99,12 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
     -----
     Rows that repeat an input enter as count, mean and scatter: after that the cost of a fit is in the number n
     of distinct inputs (at most ``max_inputs``), outputs d, and inducing inputs m, of which smooth processes take only
-    the r that carry something: n d r^2 + n (d r)^2 + d (d r)^3 for each evaluation of the evidence, and once a turn
-    with m instead of r.
+    the r that carry something: n d (d r)^2 + d (d r)^3 for each evaluation of the evidence, and once a turn with m
+    instead of r. As d m is bounded by default, it grows linearly with many outputs.
+
+    Where demonstrations start or end at one point, and the evidence says so, the input of the covariance's processes
+    is stretched there: their length scale is then short next to that end alone. With one column of X, and unless
+    ``length_scale`` or ``period`` is given.
 
     With ``groups`` the correlation of a demonstration's residuals is estimated and enters the likelihood, as its
     neighbouring samples are nearly copies. It is taken for exponential, with the integral of the one estimated:

@@ -16,8 +16,8 @@ from torch_pbd.models.heteroscedastic.regression import Regression
 from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation
 from torch_pbd.models.heteroscedastic.search import Gradient, Search
 
-# Sweeps over log variances and coefficients; and how many of them look for the coefficients' hyperparameters too. With
-# one of each more the evidence rises by less than a nat.
+# Sweeps over log variances and coefficients, and how many search the coefficients' hyperparameters: one of each more
+# gains less than a nat.
 _SWEEPS, _SEARCHES = 2, 1
 # An input with at least so many degrees of freedom left gives a conditional variance by itself.
 _ENOUGH_DEGREES = 2.0
@@ -221,9 +221,7 @@ def _from_previous(previous: LatentCovariance, inputs: Tensor, scatter: Tensor, 
 def _fit_coefficients(
     searches: list[Search], fixed: FixedFeatures, scatter: Tensor, noise: NoiseCorrelation, state: _Sweep, *, anew: bool
 ) -> None:
-    """Coefficients of one output after another, each regressed on the outputs before it; their hyperparameters are
-    searched if ``anew``.
-    """
+    """Coefficients of one output after another, regressed on those before it; searched for anew or as they are."""
     assert state.location is not None
     assert state.precision is not None
     deviation = torch.exp(0.5 * state.location)
@@ -256,7 +254,7 @@ def _fit_row(
         return linear.value, lambda: vjp(known.gradient(linear, design, precision))
 
     if anew:
-        search.run(evidence, precision)
+        search.run(evidence, known.response)
     assert search.theta is not None
     if not latest or not torch.equal(latest[0][0], search.theta):
         evidence(search.theta, torch.arange(1))
