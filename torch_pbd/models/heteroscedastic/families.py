@@ -86,21 +86,27 @@ class Families:
             return self
         squares = _within(training, normal, noise)
 
-        def evidence(families: Families) -> float:
-            family = families.log_variance
-            of_theta = log_variance_evidence(family, FixedFeatures(family.features, inputs), squares)
-            return float(Search(family, len(squares.total), 1, options).best_of_grid(of_theta, squares.total))
+        def evidence(features: FeatureMap, *, at_once: bool) -> float:
+            family = replace(self.log_variance, features=features)
+            of_theta = log_variance_evidence(family, FixedFeatures(features, inputs), squares)
+            search = Search(family, len(squares.total), 1, options)
+            return float((search.best_of_grid if at_once else search.maximum)(of_theta, squares.total))
 
-        highest, result, stretch = evidence(self), self, inputs.new_tensor([[0.0, 1.0], [0.0, 1.0]])
+        result, stretch = plain, inputs.new_tensor([[0.0, 1.0], [0.0, 1.0]])
+        lowest, highest = evidence(plain, at_once=True), None
         widths = [max(width, width / _WIDTHS[0] * spacing(inputs)) for width in _WIDTHS]
         for end in range(2):
             stretches = [_with_end(stretch, end, width) for width in widths]
-            tried = [self.with_covariance(_stretch(plain, inputs, each)) for each in stretches]
-            found = [evidence(each) for each in tried]
+            tried = [_stretch(plain, inputs, each) for each in stretches]
+            found = [evidence(each, at_once=True) for each in tried]
             best = max(range(len(found)), key=found.__getitem__)
-            if found[best] > highest + _CLEARLY:
-                highest, result, stretch = found[best], tried[best], stretches[best]
-        return result
+            if found[best] < lowest + _CLEARLY:
+                continue
+            highest = evidence(result, at_once=False) if highest is None else highest
+            now = evidence(tried[best], at_once=False)
+            if now > highest + _CLEARLY:
+                lowest, highest, result, stretch = found[best], now, tried[best], stretches[best]
+        return self if result is plain else self.with_covariance(result)
 
 
 def _with_end(stretch: Tensor, end: int, width: float) -> Tensor:

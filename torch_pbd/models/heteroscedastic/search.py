@@ -138,6 +138,12 @@ class Search:
         every = torch.arange(self.n_processes, device=like.device)
         return self._table(evidence, every, like).amax(0).sum()
 
+    def maximum(self, evidence: Evidence, like: Tensor) -> Float[Tensor, ""]:
+        """Highest log evidence times prior that a search finds, of all processes together."""
+        theta = self.run(evidence, like)
+        value, _ = evidence(theta, torch.arange(self.n_processes, device=like.device))
+        return (value + self.family.log_prior(theta)[0]).sum()
+
     def _table(self, value: Evidence, every: Tensor, like: Tensor) -> Float[Tensor, "s b"]:
         """Log evidence times prior at the points of the grid; of all processes together where they share one scale.
 
