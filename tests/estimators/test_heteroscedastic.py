@@ -156,13 +156,15 @@ def test_a_covariance_that_collapses_at_an_end_is_followed(end, n_steps):
     assert stretched == ([1.0, 0.0] if end == "start" else [0.0, 1.0])
 
 
+@pytest.mark.filterwarnings("ignore::torch_pbd.exceptions.UnimodalityWarning")
 def test_a_goal_of_the_tunnel_is_followed():
-    x = make_tunnel_demonstrations(206, rate=10.0, random_state=0, common_goal=True).to_array()[:, :, :1]
+    """Of twelve demonstrations: the lanes of six leave the level itself open by a factor of two."""
+    x = make_tunnel_demonstrations(212, rate=10.0, random_state=2, common_goal=True).to_array()[:, :, :1]
     grid = np.linspace(0.0, 1.0, 101)[:, np.newaxis]
-    groups = np.repeat(np.arange(6), 101)
-    model = HeteroscedasticGPRegressor().fit(np.tile(grid, (6, 1)), x[:6].reshape(-1, 1), groups=groups)
+    groups = np.repeat(np.arange(12), 101)
+    model = HeteroscedasticGPRegressor().fit(np.tile(grid, (12, 1)), x[:12].reshape(-1, 1), groups=groups)
     mean, covariance = model.predict(grid, return_cov=True)
-    rms = np.sqrt(np.square(x[6:] - mean[:, None]).mean((0, 2)) / covariance[:, 0, 0])[-10:]
+    rms = np.sqrt(np.square(x[12:] - mean).mean((0, 2)) / covariance[:, 0, 0])[-10:]
     assert rms.min() > 0.5
     assert rms.max() < 2.0
 
