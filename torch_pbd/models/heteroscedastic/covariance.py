@@ -11,6 +11,7 @@ from torch import Tensor
 from torch_pbd.gp.inducing import FixedFeatures
 from torch_pbd.models.heteroscedastic.linear import LinearEvidence, Weights
 from torch_pbd.models.heteroscedastic.log_variance import LEAST_SQUARE, Squares, fit_log_variance, search_log_variance
+from torch_pbd.models.heteroscedastic.predictive import FactorMoments
 from torch_pbd.models.heteroscedastic.processes import Processes, ProcessFamily
 from torch_pbd.models.heteroscedastic.regression import Regression
 from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation
@@ -64,13 +65,11 @@ class LatentCovariance:
         variance = (features @ self.log_variance.root).square().sum(-1)
         return mean, (variance + self.log_variances.unexplained(features)).mT
 
-    def at(self, x: Float[Tensor, "n e"]) -> "FactorMoments":
+    def at(self, x: Float[Tensor, "n e"]) -> FactorMoments:
         """Moments of the entries of the factor at x."""
         return self.at_features(self.log_variances.features(x), self.rows.features(x) if self.coefficients else None)
 
-    def at_features(
-        self, values: Float[Tensor, "d n m"], row_values: Float[Tensor, "d-1 n m"] | None
-    ) -> "FactorMoments":
+    def at_features(self, values: Float[Tensor, "d n m"], row_values: Float[Tensor, "d-1 n m"] | None) -> FactorMoments:
         """Moments of the entries, from the features of unit variance of the log variances and of the coefficients."""
         mean, variance = self.log_variance_at_features(values)
         below = torch.zeros(*mean.shape, mean.shape[1]).to(mean)
@@ -107,33 +106,6 @@ class LatentCovariance:
             weights = posterior.mean + normal[n_outputs + i - 1] @ posterior.root.mT
             factor[..., i, :i] = features[i - 1] @ weights.unflatten(-1, (i, -1)).mT
         return factor
-
-
-@dataclass(frozen=True)
-class FactorMoments:
-    """Moments of the entries of the lower factor of a covariance at n inputs, as independent normal numbers."""
-
-    log_variance: Float[Tensor, "n d"]
-    log_variance_variance: Float[Tensor, "n d"]
-    below: Float[Tensor, "n d d"]
-    """Entries below the diagonal."""
-    below_variance: Float[Tensor, "n d d"]
-
-    def tril(self) -> Float[Tensor, "n d d"]:
-        """The factor at the means of the latent processes."""
-        return self.below + torch.diag_embed(torch.exp(0.5 * self.log_variance))
-
-    def expected_root(self, most: float) -> Float[Tensor, "n d 2*d"]:
-        """Root of the expected covariance.
-
-        With a normal log variance of mean l and variance v the deviation's mean is exp(l / 2 + v / 8), and the variance
-        exceeds its square by a factor exp(v / 4). No v is above ``most`` in it, as where nothing is known an
-        expectation has little to say.
-        """
-        variance = self.log_variance_variance / (1.0 + self.log_variance_variance / most)
-        deviation = torch.exp(0.5 * self.log_variance + 0.125 * variance)
-        excess = deviation.square() * torch.expm1(0.25 * variance) + self.below_variance.sum(-1)
-        return torch.cat([self.below + torch.diag_embed(deviation), torch.diag_embed(excess.sqrt())], dim=-1)
 
 
 @dataclass(frozen=True)

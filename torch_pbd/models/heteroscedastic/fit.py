@@ -66,6 +66,8 @@ class HeteroscedasticFit:
     """Log evidence of the covariance's processes at the end of each turn, in nats."""
     training: TrainingSet
     residual: Float[Tensor, "rows d"]
+    n_demos: int
+    """Demonstrations, where rows are known to be of some; else 1."""
 
     def whitened(self) -> Float[Tensor, "rows d"]:
         """Residuals of unit covariance."""
@@ -135,7 +137,9 @@ def fit_heteroscedastic(
             at.correlate(normal)
         turn += 1
     assert at.covariance is not None
-    return HeteroscedasticFit(mean, at.covariance, at.pooled, at.correlation, tuple(evidences), fitted, residual)
+    n_demos = 1 if group is None else int(group.max()) + 1
+    kept = mean, at.covariance, at.pooled, at.correlation
+    return HeteroscedasticFit(*kept, tuple(evidences), fitted, residual, n_demos)
 
 
 @dataclass

@@ -1,6 +1,8 @@
 """The fitted model as a module: everything that predicts is in its buffers."""
 
+import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -16,17 +18,26 @@ from torch_pbd.models.heteroscedastic.covariance import LatentCovariance
 from torch_pbd.models.heteroscedastic.fit import HeteroscedasticFit
 from torch_pbd.models.heteroscedastic.linear import Weights
 from torch_pbd.models.heteroscedastic.mean import LatentMean
+from torch_pbd.models.heteroscedastic.predictive import (
+    FactorMoments,
+    as_inverse_gamma,
+    degrees_of_freedom,
+    log_correlation_variance,
+    shrink_correlation,
+    under_expected_noise,
+)
 from torch_pbd.models.heteroscedastic.prepared import Prepared
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
 
 # Far from data a log variance may be anything: of its variance no more than this enters an expectation.
 _MOST_LOG_VARIANCE = 2.0
-_LEAST_DEGREES = 3.0  # below two, Student's t has no covariance
 _FAMILIES = ("mean", "log_variance", "coefficient")
 
 
 class HeteroscedasticModel(Core):
     """Predictive density in standardized units: Student's t, its moments from the latent processes.
+
+    Where samples of demonstrations are correlated it is that of ``predictive.py``.
 
     Parameters
     ----------
@@ -82,6 +93,10 @@ class HeteroscedasticModel(Core):
         self.kernel: str = features.kernel
         self.exact = [family.features.exact for family in families]
         self.medians = [(family.length_scale, family.amplitude, family.constant) for family in families]
+        if fit.correlation is not None and fit.correlation.matters:
+            n_places = float(fit.correlation.share.mean()) * len(fit.training.x) / fit.n_demos
+            root, degrees = self._root_of_demonstrations(*self._known(fit.training.inputs)[1:3])
+            self.register_buffer("correlation_variance", log_correlation_variance(root, degrees, n_places))
 
     def config(self) -> dict[str, Any]:
         """Kernel, and what the three families of processes are but for their length scales."""
@@ -121,12 +136,11 @@ class HeteroscedasticModel(Core):
         }
         for i in range(1, d):
             sizes |= {f"coefficient_weights_{i}": (i * in_row,), f"coefficient_root_{i}": (i * in_row, i * in_row)}
-        optional = ("period", *(f"{name}_length_scale" for name in _FAMILIES))
-        if "stretch" in shapes:
-            sizes["stretch"] = (2, 2)
+        optional: dict[str, tuple[int, ...]] = {f"{name}_length_scale": (e,) for name in _FAMILIES}
+        optional |= {"period": (e,), "stretch": (2, 2), "correlation_variance": ()}
         model = cls.__new__(cls)
         nn.Module.__init__(model)
-        for name, size in (sizes | {name: (e,) for name in optional if name in shapes}).items():
+        for name, size in (sizes | {name: size for name, size in optional.items() if name in shapes}).items():
             model.register_buffer(name, blank(*size))
         model.kernel = checks.choice(config["kernel"], "kernel", KERNELS)
         model.exact = [checks.flag(exact, "exact") for exact in config["exact"]]
@@ -145,16 +159,35 @@ class HeteroscedasticModel(Core):
 
     def _moments(self, x: Tensor, prior_tril: Tensor | None) -> tuple[Tensor, Tensor]:
         prior = self.prior_tril if prior_tril is None else prior_tril
+        mean, factor, error_root, missing = self._known(x)
+        if self._correlation_variance is None:
+            root = torch.cat([self.pooled_tril @ factor.expected_root(_MOST_LOG_VARIANCE), error_root], dim=-1)
+        else:
+            root = shrink_correlation(*self._root_of_demonstrations(factor, error_root), self._correlation_variance)
+        known = _root_of_share(1.0 - missing) * root
+        return mean, torch.cat([known, _root_of_share(missing) * prior.expand(len(x), -1, -1)], dim=-1)
+
+    def _known(self, x: Tensor) -> tuple[Tensor, FactorMoments, Tensor, Tensor]:
+        """Mean, moments of the factor, root of the covariance of the mean's error, and share (n, 1, 1) of the prior."""
         prepared = self._prepared()
         mean_values, *factor_values, nearness = prepared.features(x)
         mean, error = prepared.mean.at_features(mean_values)
         # Where the data leave nothing to err about, rounding must not make it negative.
         least = 1e-12 * torch.diag_embed(1e-30 + error.diagonal(dim1=-2, dim2=-1))
         error_root = safe_cholesky(symmetrize(error) + least, name="the covariance of the mean's error")
-        missing = _missing(nearness)[:, None, None]
-        root = self.pooled_tril @ prepared.covariance.at_features(*factor_values).expected_root(_MOST_LOG_VARIANCE)
-        known = _root_of_share(1.0 - missing) * torch.cat([root, error_root], dim=-1)
-        return mean, torch.cat([known, _root_of_share(missing) * prior.expand(len(x), -1, -1)], dim=-1)
+        return mean, prepared.covariance.at_features(*factor_values), error_root, _missing(nearness)[:, None, None]
+
+    def _root_of_demonstrations(self, factor: FactorMoments, error_root: Tensor) -> tuple[Tensor, Tensor]:
+        """Root of the expected covariance of correlated samples before its correlations are shrunk, and degrees."""
+        degrees = factor.degrees
+        factor = replace(factor, log_variance_variance=as_inverse_gamma(factor.log_variance_variance))
+        error_root = under_expected_noise(error_root, degrees, self.mean_process.processes.amplitude.square())
+        return torch.cat([self.pooled_tril @ factor.expected_root(math.inf), error_root], dim=-1), degrees
+
+    @property
+    def _correlation_variance(self) -> Tensor | None:
+        """Prior variance of the logarithms of the correlations; None where samples were independent."""
+        return getattr(self, "correlation_variance", None)
 
     def predict_mean(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d"]:
         """Mean alone, equal to the bit."""
@@ -163,22 +196,23 @@ class HeteroscedasticModel(Core):
 
     def variability(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d d"]:
         """Root of the covariance at the means of the latent processes, without prior and without errors."""
-        return _root_of_share(1.0 - self.type1(x))[:, None, None] * (
-            self.pooled_tril @ self.covariance_process.at(x).tril()
-        )
+        factor = self.covariance_process.at(x)
+        root = self.pooled_tril @ factor.tril()
+        if self._correlation_variance is not None:
+            root = shrink_correlation(root, factor.degrees, self._correlation_variance)
+        return _root_of_share(1.0 - self.type1(x))[:, None, None] * root
 
     def degrees(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
         """Degrees of freedom of the predictive density; infinite (a normal distribution) where only the prior
         speaks.
 
-        A variance known from as many squares has a logarithm of variance trigamma(degrees / 2); here it is the mean
-        of those of the log variances, and ``trigamma(z)`` is taken for ``1 / z + 1 / (2 z^2)``.
+        A variance known from as many squares has a logarithm whose variance is here the mean of those of the log
+        variances.
         """
         prepared = self._prepared()
         _, log_variance_values, _, nearness = prepared.features(x)
         variance = prepared.covariance.log_variance_at_features(log_variance_values)[1].mean(-1)
-        degrees = (1.0 + (1.0 + 2.0 * variance).sqrt()) / variance
-        return degrees.clamp_min(_LEAST_DEGREES) / (1.0 - _missing(nearness)).clamp_min(1e-12)
+        return degrees_of_freedom(variance) / (1.0 - _missing(nearness)).clamp_min(1e-12)
 
     def type1(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
         """Type I uncertainty: eq. (6) without noise over the prior variance, 0 at the inducing inputs."""
@@ -194,6 +228,10 @@ class HeteroscedasticModel(Core):
         prior = self.prior_tril if prior_tril is None else prior_tril
         missing = self.type1(x)[:, None, None]
         root = self.pooled_tril @ self.covariance_process.draw(x, normal)
+        if self._correlation_variance is not None:
+            factor = self.covariance_process.at(x)
+            expected = self.pooled_tril @ factor.tril()
+            root = shrink_correlation(expected, factor.degrees, self._correlation_variance, root)
         share = (_root_of_share(missing) * prior).expand_as(root)
         return torch.cat([_root_of_share(1.0 - missing) * root, share], dim=-1)
 
