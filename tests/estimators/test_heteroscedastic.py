@@ -380,14 +380,18 @@ def test_missing_knowledge_widens_the_covariance_and_the_less_the_more_is_known(
 
 @pytest.mark.parametrize(("d", "n_demos"), [(9, 2), (9, 5), (2, 2), (1, 2)])
 def test_fewer_demonstrations_than_outputs_are_enough(d, n_demos):
+    """Where they are fewer than three the t is of three degrees of freedom, and its scale what is near the truth."""
     X, y = demonstrations(d, n_demos=n_demos)
-    model = HeteroscedasticGPRegressor().fit(X, y, groups=np.repeat(np.arange(n_demos), 8))
+    few = nullcontext() if n_demos > d else pytest.warns(DataRankWarning, match=f"{n_demos} demonstrations but {d} out")
+    with few:
+        model = HeteroscedasticGPRegressor().fit(X, y, groups=np.repeat(np.arange(n_demos), 8))
     assert_covariances(model.predict_cov(queries(1)), 45, d)
-    deviation = np.sqrt(np.diagonal(model.predict_cov(X), axis1=1, axis2=2))
+    scale = (1.0 - 2.0 / model.predict_df(X))[:, np.newaxis] ** 0.5
+    deviation = scale * np.sqrt(np.diagonal(model.predict_cov(X), axis1=1, axis2=2))
     factor = truth(X, d)[1]
-    ratio = deviation / np.sqrt(np.square(factor).sum(2))  # measured: 0.5 to 2.1
+    ratio = deviation / np.sqrt(np.square(factor).sum(2))  # measured: 0.5 to 2.2
     assert ratio.min() > 0.3
-    assert ratio.max() < 3.0
+    assert ratio.max() < 2.5
 
 
 @pytest.mark.parametrize("first", [True, False])

@@ -1,13 +1,18 @@
-"""Fault 85: every regressor takes the demonstrations' labels, and refuses wrong ones."""
+"""Faults 82 and 85: regressors take the demonstrations' labels, refuse wrong ones, and tell of too few."""
+
+import copy
+import warnings
 
 import numpy as np
 import pytest
 import sklearn
+from scipy.stats import f, multivariate_t
 from sklearn.model_selection import GridSearchCV, GroupKFold
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from torch_pbd import CholeskyCovRegressor, GMMBaseline, HeteroscedasticGPRegressor, WishartProcessRegressor
+from torch_pbd.exceptions import DataRankWarning
 
 REGRESSORS = {
     "choleskycovregressor": CholeskyCovRegressor(),
@@ -52,3 +57,74 @@ def test_85_groups_are_routed_through_pipeline_and_search(name):
         search = GridSearchCV(pipeline, {f"{name}__tol": [1e-3]}, cv=GroupKFold(2), error_score="raise")
         search.fit(X, Y, groups=GROUPS)
     assert np.isfinite(search.cv_results_["mean_test_score"]).all()
+
+
+def smooth(n_demos, n_outputs, seed):
+    """Demonstrations (K, 40, d) of one covariance, whose deviations have the correlation length of a tenth."""
+    rng = np.random.default_rng(seed)
+    x = np.linspace(0.0, 1.0, 40)
+    along = np.linalg.cholesky(np.exp(-0.5 * np.square(np.subtract.outer(x, x) / 0.1)) + 1e-8 * np.eye(40))
+    factor = np.tril(np.random.default_rng(1).normal(size=(n_outputs, n_outputs)), -1) + np.eye(n_outputs)
+    y = np.sin(3.0 * x)[:, np.newaxis] + along @ rng.normal(size=(n_demos, 40, n_outputs)) @ factor.T
+    return x[:, np.newaxis], y
+
+
+def messages(regressor, X, y, groups):
+    """What a fit warns of, told where it was called."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        regressor.fit(X, y, groups=groups)
+    caught = [warning for warning in caught if issubclass(warning.category, DataRankWarning)]
+    assert {warning.filename for warning in caught} <= {__file__}
+    return [str(warning.message) for warning in caught]
+
+
+@pytest.mark.parametrize("repeats", [True, False])
+@pytest.mark.parametrize("name", REGRESSORS)
+def test_82_no_more_demonstrations_than_outputs_are_told_once(name, repeats):
+    x, y = smooth(3, 3, seed=0)
+    X = np.tile(x[::4], (3, 1)) + (0.0 if repeats else 0.01 * np.repeat(np.arange(3), 10)[:, np.newaxis])
+    regressor, rows, groups = sklearn.clone(REGRESSORS[name]), y[:, ::4].reshape(-1, 3), np.repeat(np.arange(3), 10)
+    (message,) = messages(regressor, X, rows, groups)
+    assert message.startswith("y has 3 demonstrations")
+    assert "but 3 outputs" in message
+    assert "4 or more" in message
+    assert messages(regressor, X, rows[:, :2], groups) == []
+
+
+def test_82_regions_of_three_demonstrations_of_six_outputs_hold_what_they_say():
+    """Of a hundred others, in the mean of four draws; the law of independent samples held .33 and .90."""
+    held, before = [], []
+    for seed in range(4):
+        x, y = smooth(103, 6, seed)
+        with pytest.warns(DataRankWarning, match="3 demonstrations but 6 outputs"):
+            model = HeteroscedasticGPRegressor().fit(
+                np.tile(x, (3, 1)), y[:3].reshape(-1, 6), groups=np.repeat(np.arange(3), 40)
+            )
+        plain = copy.deepcopy(model)
+        plain.module_.core._buffers.pop("correlation_variance")
+        for one, found in ((model, held), (plain, before)):
+            mean, covariance = one.predict(x, return_cov=True)
+            df, deviation = one.predict_df(x), (y[3:] - mean)[..., np.newaxis]
+            square = (deviation * np.linalg.solve(covariance, deviation)).sum((2, 3)) * df / (df - 2.0)
+            found.append([(square / 6.0 <= f(6, df).ppf(level)).mean() for level in (0.5, 0.95)])
+    (half, most), (half_before, most_before) = np.mean(held, axis=0), np.mean(before, axis=0)
+    assert half > 0.42 > half_before
+    assert 0.98 > most > 0.93 > most_before
+
+
+def test_82_the_law_of_few_demonstrations_is_one():
+    """Density, covariance, degrees of freedom and draws are of the same Student's t."""
+    x, y = smooth(4, 2, seed=0)
+    model = HeteroscedasticGPRegressor().fit(np.tile(x, (4, 1)), y.reshape(-1, 2), groups=np.repeat(np.arange(4), 40))
+    assert float(model.module_.core.correlation_variance) > 0.0
+    at, points = x[[7]], y[:, 7] + 0.3
+    (mean,), (covariance,) = model.predict(at, return_cov=True)
+    (df,) = model.predict_df(at)
+    law = multivariate_t(mean, covariance * (df - 2.0) / df, df=df)
+    np.testing.assert_allclose(model.log_likelihood(np.tile(at, (4, 1)), points), law.logpdf(points), rtol=1e-10)
+    drawn = model.sample_y(at, 20_000, random_state=0)[0].T - mean
+    square = (drawn * np.linalg.solve(law.shape, drawn.T).T).sum(1) / 2.0
+    assert (square <= f(2, df).ppf(0.9)).mean() == pytest.approx(0.9, abs=5.0 * (0.09 / 20_000) ** 0.5)
+    whole, known = model.predict_cov(at)[0], model.predict_uncertainty(at).type2[0]
+    assert (np.linalg.eigvalsh(whole - known) > 0.0).all()

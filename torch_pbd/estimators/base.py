@@ -78,7 +78,7 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator, ABC)
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
             What was recorded there.
         groups : array-like of shape (n_samples,), default=None
-            Demonstration of each sample: checked, and not used; rows count as independent.
+            Demonstration of each sample: counted, to warn of too few; rows are taken for independent.
 
         Returns
         -------

@@ -76,7 +76,7 @@ def _check_labels(labels: NDArray[Any]) -> None:
 
 
 def check_demonstrations(X: Floats, y: Floats, groups: Any) -> None:
-    """Warn where demonstrations are too few to tell their correlation, or seem to follow several ways.
+    """Warn where demonstrations are too few to tell their correlation or covariance, or seem to follow several ways.
 
     The ways are looked for along one input, among demonstrations that cover most of it.
     """
@@ -87,6 +87,8 @@ def check_demonstrations(X: Floats, y: Floats, groups: Any) -> None:
             "count as independent. What is predicted is its noise, not how demonstrations differ.",
             DataRankWarning,
         )
+    elif len(y) > y.shape[1]:
+        warn_if_few_demonstrations(groups, y.shape[1])
     if _unimodality_reported.get() or X.shape[1] > 1 or len(counts) < 2 or counts.min() < 2:
         return
     times, positions = [], []
@@ -96,6 +98,16 @@ def check_demonstrations(X: Floats, y: Floats, groups: Any) -> None:
         positions.append(y[rows][first])
     if min(len(time) for time in times) > 1 and min(np.ptp(time) for time in times) > _COVERED * np.ptp(X):
         check_unimodal(Demonstrations(times, positions))
+
+
+def warn_if_few_demonstrations(groups: NDArray[np.intp] | None, n_outputs: int) -> None:
+    """Warn of no more demonstrations than outputs: samples of one repeat each other, however many there are."""
+    if groups is not None and (n_demos := int(groups.max()) + 1) <= n_outputs:
+        checks.warn(
+            f"y has {n_demos} demonstrations but {n_outputs} outputs: they leave open how the outputs vary together. "
+            f"Record {n_outputs + 1} or more, or learn fewer outputs at a time.",
+            DataRankWarning,
+        )
 
 
 def warn_of_residuals(fit: HeteroscedasticFit, group: Tensor | None, given: Tensor) -> None:

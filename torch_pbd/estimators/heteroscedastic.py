@@ -73,7 +73,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
     n_restarts : int, default=0
         Starts of the first searches beside the best of a small grid.
     random_state : int, RandomState instance or None, default=0
-        Not used, as the fit is deterministic: it is here so that estimators can be exchanged.
+        Not used: the fit is deterministic. It is here so that estimators can be exchanged.
     device : str or None, default=None
         Where the torch module lives.
     verbose : int, default=0
@@ -108,10 +108,10 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
 
     With ``groups`` the correlation of a demonstration's residuals is estimated and enters the likelihood, as its
     neighbouring samples are nearly copies. It is taken for exponential, with the integral of the one estimated:
-    demonstrations are smoother than that, but a model that trusts their smoothness takes it for signal.
+    demonstrations are smoother than that, but a model that trusts their smoothness takes it for signal. The law then
+    has the mean's error, of the same unknown covariance, in its tails, and correlations shrunk by their own errors.
 
-    The factor, and with it the fit, depends on the order of the outputs: with six demonstrations a variance may change
-    by 20 %.
+    The fit depends on the order of the outputs, as its factor does: with six demonstrations a variance by up to 20 %.
 
     References
     ----------
@@ -191,8 +191,8 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         UnimodalityWarning
             If demonstrations (of one input) seem to follow several ways.
         DataRankWarning
-            If no groups are given and rows nearly repeat those beside them, as samples of a demonstration do. Rows in
-            the order of their recording are recognized, and rows that repeat inputs in any order.
+            If there are no more demonstrations than outputs. If no groups are given and rows nearly repeat those beside
+            them, as samples of a demonstration do: in the order of their recording, or repeating inputs in any order.
         UserWarning
             If the mean does not follow the data.
         """

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from torch_pbd import checks
-from torch_pbd.estimators.base import CovarianceRegressor, Fitted
+from torch_pbd.estimators.base import CovarianceRegressor, Fitted, Integers
+from torch_pbd.estimators.demonstrations import warn_if_few_demonstrations
 from torch_pbd.estimators.mean import mean_consistent_with_repeats
 from torch_pbd.estimators.prior import standardized_prior
 from torch_pbd.estimators.scaling import Standardization, distinct_rows
@@ -69,7 +70,7 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         if isinstance(self.prior, str):
             checks.choice(self.prior, "prior", ("paper",))
 
-    def _fit(self, X: Floats, y: Floats, **_: Any) -> Fitted:
+    def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, recorded: Integers) -> Fitted:
         scaling = Standardization.fit(X, y)
         standardized = scaling.inputs(X)
         inputs, index = distinct_rows(standardized)
@@ -83,7 +84,8 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         aligned = self._works_on_empirical(scaling.x_shift + scaling.x_scale * inputs, np.bincount(index), y.shape[1])
         length_scale = check_length_scale(self.length_scale, X.shape[1])
         if not aligned:
-            warn_if_few(len(y), y.shape[1])
+            # Those that repeat inputs have been counted.
+            warn_if_few(len(y), y.shape[1], groups if np.bincount(index).min() < 2 else None)
             training = training.merged(self.max_inputs)
         problem = Problem(
             training,
@@ -217,14 +219,16 @@ def default_prior_tril(y: Tensor) -> Tensor:
     return 2.0 * scale_tril_from_root(torch.cat([centred, 0.001**0.5 * torch.eye(y.shape[1]).to(y)], dim=1))
 
 
-def warn_if_few(n_rows: int, n_outputs: int) -> None:
-    """Warn of no more rows than outputs, whose covariance is singular."""
+def warn_if_few(n_rows: int, n_outputs: int, groups: Integers | None = None) -> None:
+    """Warn of no more rows than outputs, whose covariance is singular; or of no more demonstrations."""
     if n_rows <= n_outputs:
         checks.warn(
             f"y has {n_rows} rows but {n_outputs} outputs: they leave directions of the covariance undetermined, "
             "which the prior decides. Record more.",
             DataRankWarning,
         )
+    else:
+        warn_if_few_demonstrations(groups, n_outputs)
 
 
 def warn_if_identical(training: TrainingSet) -> None:

@@ -10,7 +10,8 @@ from sklearn.cluster import KMeans
 from sklearn.neighbors import NearestNeighbors
 
 from torch_pbd import checks
-from torch_pbd.estimators.base import CovarianceRegressor, Fitted
+from torch_pbd.estimators.base import CovarianceRegressor, Fitted, Integers
+from torch_pbd.estimators.demonstrations import warn_if_few_demonstrations
 from torch_pbd.estimators.regression import MixtureRegression
 from torch_pbd.estimators.scaling import Standardization, distinct_rows, spread_of
 from torch_pbd.estimators.torch_estimator import by_chunks
@@ -108,7 +109,7 @@ class GMMBaseline(CovarianceRegressor):
         checks.choice(self.solver, "solver", ("em", "lbfgs"))
         checks.number(self.reg_covar, "reg_covar", above=0.0)
 
-    def _fit(self, X: Floats, y: Floats, **_: Any) -> Fitted:
+    def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, recorded: Integers) -> Fitted:
         points = _points(X, y)
         n_distinct, n_components = len(distinct_rows(points)[0]), int(self.n_components)
         if n_distinct < self.n_components:
@@ -133,6 +134,8 @@ class GMMBaseline(CovarianceRegressor):
                 "undetermined, which reg_covar decides. Record more.",
                 DataRankWarning,
             )
+        else:
+            warn_if_few_demonstrations(groups, y.shape[1])
         scaling = _by_residual(X, y)
         data = self._door(np.hstack([scaling.exact_inputs(X), scaling.exact_outputs(y)]))
         generator = checks.seed(self.random_state)
