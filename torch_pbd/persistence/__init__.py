@@ -48,7 +48,7 @@ _UNSOUND = (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeEr
 # factors whose squares are no numbers.
 _MAY_BE_INFINITE = ("period", "log_density_floor")
 _POSITIVE = ("x_scale", "y_scale", "length_scale", "counts", "period")
-_NOT_NEGATIVE = ("amplitude", "noise_ratio")
+_NOT_NEGATIVE = ("amplitude", "noise_ratio", "correlation_variance")
 _FACTORS = ("prior_tril", "pooled_tril")
 _LARGEST_LOGARITHM = 300.0
 
