@@ -58,6 +58,7 @@ class HeteroscedasticModel(Core):
     coefficient_theta: Tensor
     pooled_tril: Tensor
     prior_tril: Tensor
+    correlation_variance: Tensor
     _kept: Prepared | None = None
 
     def __init__(self, fit: HeteroscedasticFit, prior_tril: Float[Tensor, "d d"]) -> None:
@@ -160,10 +161,10 @@ class HeteroscedasticModel(Core):
     def _moments(self, x: Tensor, prior_tril: Tensor | None) -> tuple[Tensor, Tensor]:
         prior = self.prior_tril if prior_tril is None else prior_tril
         mean, factor, error_root, missing = self._known(x)
-        if self._correlation_variance is None:
-            root = torch.cat([self.pooled_tril @ factor.expected_root(_MOST_LOG_VARIANCE), error_root], dim=-1)
+        if hasattr(self, "correlation_variance"):
+            root = self._shrunk(*self._root_of_demonstrations(factor, error_root))
         else:
-            root = shrink_correlation(*self._root_of_demonstrations(factor, error_root), self._correlation_variance)
+            root = torch.cat([self.pooled_tril @ factor.expected_root(_MOST_LOG_VARIANCE), error_root], dim=-1)
         known = _root_of_share(1.0 - missing) * root
         return mean, torch.cat([known, _root_of_share(missing) * prior.expand(len(x), -1, -1)], dim=-1)
 
@@ -184,10 +185,11 @@ class HeteroscedasticModel(Core):
         error_root = under_expected_noise(error_root, degrees, self.mean_process.processes.amplitude.square())
         return torch.cat([self.pooled_tril @ factor.expected_root(math.inf), error_root], dim=-1), degrees
 
-    @property
-    def _correlation_variance(self) -> Tensor | None:
-        """Prior variance of the logarithms of the correlations; None where samples were independent."""
-        return getattr(self, "correlation_variance", None)
+    def _shrunk(self, root: Tensor, degrees: Tensor, draws: Tensor | None = None) -> Tensor:
+        """Root, or draws around it, with correlations shrunk where samples of demonstrations are correlated."""
+        if not hasattr(self, "correlation_variance"):
+            return root if draws is None else draws
+        return shrink_correlation(root, degrees, self.correlation_variance, draws)
 
     def predict_mean(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d"]:
         """Mean alone, equal to the bit."""
@@ -197,9 +199,7 @@ class HeteroscedasticModel(Core):
     def variability(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d d"]:
         """Root of the covariance at the means of the latent processes, without prior and without errors."""
         factor = self.covariance_process.at(x)
-        root = self.pooled_tril @ factor.tril()
-        if self._correlation_variance is not None:
-            root = shrink_correlation(root, factor.degrees, self._correlation_variance)
+        root = self._shrunk(self.pooled_tril @ factor.tril(), factor.degrees)
         return _root_of_share(1.0 - self.type1(x))[:, None, None] * root
 
     def degrees(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
@@ -227,11 +227,8 @@ class HeteroscedasticModel(Core):
         """Roots of posterior draws of the covariance function at x, with the prior's share in them."""
         prior = self.prior_tril if prior_tril is None else prior_tril
         missing = self.type1(x)[:, None, None]
-        root = self.pooled_tril @ self.covariance_process.draw(x, normal)
-        if self._correlation_variance is not None:
-            factor = self.covariance_process.at(x)
-            expected = self.pooled_tril @ factor.tril()
-            root = shrink_correlation(expected, factor.degrees, self._correlation_variance, root)
+        factor, draws = self.covariance_process.at(x), self.pooled_tril @ self.covariance_process.draw(x, normal)
+        root = self._shrunk(self.pooled_tril @ factor.tril(), factor.degrees, draws)
         share = (_root_of_share(missing) * prior).expand_as(root)
         return torch.cat([_root_of_share(1.0 - missing) * root, share], dim=-1)
 
