@@ -127,7 +127,8 @@ def collapsing(end, n_demos, n_steps, seed=0):
     grid = np.linspace(0.0, 1.0, n_steps)
     share = np.clip((grid - 0.95) / 0.05, 0.0, 1.0)
     falling = 1.0 - 0.97 * share**2 * (3.0 - 2.0 * share)
-    deviation = {"goal": falling, "start": falling[::-1], None: np.ones(n_steps)}[end]
+    both = np.minimum(falling, falling[::-1])
+    deviation = {"goal": falling, "start": falling[::-1], "both": both, None: np.ones(n_steps)}[end]
     distance = 5.0**0.5 * np.abs(np.subtract.outer(grid, grid)) / 0.1
     gram = (1.0 + distance + distance**2 / 3.0) * np.exp(-distance) + 1e-6 * np.eye(n_steps)
     z = np.linalg.cholesky(gram) @ np.random.default_rng(seed).normal(size=(n_demos, n_steps, 2))
@@ -146,14 +147,16 @@ def fitted_to_collapsing(end, n_steps):
     return model, np.sqrt(np.square(whitened).mean((0, 2, 3)))
 
 
-@pytest.mark.parametrize(("end", "n_steps"), [("goal", 50), ("goal", 100), ("start", 100), ("goal", 200)])
+@pytest.mark.parametrize(
+    ("end", "n_steps"), [("goal", 50), ("goal", 100), ("start", 100), ("both", 100), ("goal", 200)]
+)
 def test_a_covariance_that_collapses_at_an_end_is_followed(end, n_steps):
     model, rms = fitted_to_collapsing(end, n_steps)
-    at_end = rms[:10] if end == "start" else rms[-10:]
+    at_end = {"start": rms[:10], "goal": rms[-10:], "both": np.r_[rms[:10], rms[-10:]]}[end]
     assert at_end.min() > 0.5
     assert at_end.max() < 2.0
     stretched = model.module_.core.stretch[:, 0].tolist()
-    assert stretched == ([1.0, 0.0] if end == "start" else [0.0, 1.0])
+    assert stretched == {"start": [1.0, 0.0], "goal": [0.0, 1.0], "both": [1.0, 1.0]}[end]
 
 
 @pytest.mark.filterwarnings("ignore::torch_pbd.exceptions.UnimodalityWarning")

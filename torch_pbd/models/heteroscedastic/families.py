@@ -79,7 +79,8 @@ class Families:
     ) -> "Families":
         """Families with the ends stretched at which the evidence for the log variances of residuals is higher so.
 
-        Each end is tried by itself, and the last also with the first, by the best points of the searches' grid.
+        Each end is tried by itself and both together, by the best points of the searches' grid and, where these say so,
+        by what searches find.
         """
         plain, inputs = self.log_variance.features, training.inputs
         if inputs.shape[1] > 1 or plain.period is not None or self.log_variance.fixed_length_scale is not None:
@@ -93,25 +94,25 @@ class Families:
             return float((search.best_of_grid if at_once else search.maximum)(of_theta, squares.total))
 
         result, stretch = plain, inputs.new_tensor([[0.0, 1.0], [0.0, 1.0]])
-        lowest, highest = evidence(plain, at_once=True), None
+        on_grid, highest = evidence(plain, at_once=True), None
         widths = [max(width, width / _WIDTHS[0] * spacing(inputs)) for width in _WIDTHS]
-        for end in range(2):
-            stretches = [_with_end(stretch, end, width) for width in widths]
+        for ends in ((0,), (1,), (0, 1)):
+            stretches = [_with_ends(stretch, ends, width) for width in widths]
             tried = [_stretch(plain, inputs, each) for each in stretches]
             found = [evidence(each, at_once=True) for each in tried]
             best = max(range(len(found)), key=found.__getitem__)
-            if found[best] < lowest + _CLEARLY:
+            if found[best] < on_grid + _CLEARLY:
                 continue
             highest = evidence(result, at_once=False) if highest is None else highest
             now = evidence(tried[best], at_once=False)
             if now > highest + _CLEARLY:
-                lowest, highest, result, stretch = found[best], now, tried[best], stretches[best]
+                on_grid, highest, result, stretch = found[best], now, tried[best], stretches[best]
         return self if result is plain else self.with_covariance(result)
 
 
-def _with_end(stretch: Tensor, end: int, width: float) -> Tensor:
+def _with_ends(stretch: Tensor, ends: tuple[int, ...], width: float) -> Tensor:
     row = stretch.new_tensor([_LENGTH, width])
-    return torch.stack([row, stretch[1]] if end == 0 else [stretch[0], row])
+    return torch.stack([row if end in ends else own for end, own in enumerate(stretch)])
 
 
 def _stretch(features: FeatureMap, inputs: Float[Tensor, "n e"], stretch: Float[Tensor, "2 2"]) -> FeatureMap:
