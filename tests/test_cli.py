@@ -26,6 +26,7 @@ def recording(tmp_path):
     [
         ["--help"],
         ["fit", "--help"],
+        ["inspect", "--help"],
         ["compare", "--help"],
         ["demo", "--help"],
         ["experiment", "--help"],
