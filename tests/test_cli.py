@@ -103,7 +103,7 @@ def test_a_controller_of_a_config_bends_by_a_model_of_movements(recording, tmp_p
     )
     arguments = ["--data", str(recording), "--rate", "100", "--output", str(tmp_path / "out")]
     assert main(["experiment", "--config", str(config), *arguments]) == 0
-    controller = torch_pbd.load(tmp_path / "out" / "model" / "mine.safetensors")
+    controller = torch_pbd.load(tmp_path / "out" / "model" / "mine_controller.safetensors")
     point = controller.predict([[5.0]])[0] + [0.01, 0.0]
     schedule = controller.schedule(100.0, via=[(5.0, point)])
     np.testing.assert_allclose(schedule.position[500], point, atol=1e-6)
@@ -121,7 +121,7 @@ def test_compare_reports_every_model_and_every_fold(recording, tmp_path, capsys)
     assert main(["compare", "--config", str(config)]) == 0
     shown = capsys.readouterr().out
     assert "held-out LL" in shown
-    assert max(map(len, shown[: shown.index("results:")].splitlines())) <= 80
+    assert max(map(len, shown[: shown.index("report:")].splitlines())) <= 80
     with (tmp_path / "out" / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["model"] for row in rows] == ["mine", "mixture", "whole"]

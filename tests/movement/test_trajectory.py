@@ -321,6 +321,7 @@ def test_what_is_known_twice_is_refused(model):
         model.condition([[0.5]], [[1.0, 0.5, 2.0]])
 
 
+@pytest.mark.filterwarnings("ignore:y has 6 demonstrations")
 def test_a_thousand_steps_of_fourteen_outputs_need_no_matrix_of_all():
     rng = np.random.default_rng(0)
     grid, n_demos, d = np.linspace(0.0, 1.0, 1000), 6, 14

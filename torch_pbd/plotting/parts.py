@@ -20,6 +20,7 @@ from torch_pbd.plotting.style import (
     SERIES,
     TRUTH,
     check_axes,
+    check_kind,
     chosen_outputs,
     output_label,
     readable_unit,
@@ -50,6 +51,7 @@ def plot_demonstrations(
     -------
     list of Line2D, one a demonstration
     """
+    check_kind(demonstrations, "demonstrations", "Demonstrations")
     chosen = chosen_outputs(outputs, demonstrations.names, 3)
     check_axes("ax", [ax])
     lines: list[Line2D] = []
@@ -190,6 +192,7 @@ def plot_stiffness(schedule: Any, ax: Axes) -> list[Line2D]:
     -------
     list of Line2D, one an output
     """
+    check_kind(schedule, "schedule", "Schedule")
     check_axes("ax", [ax])
     gains = np.diagonal(schedule.stiffness, axis1=1, axis2=2)
     lines = plot_outputs(schedule.time, gains, ax, [f"along {name}" for name in schedule_names(schedule)])
@@ -225,6 +228,7 @@ def plot_rollout(
     unpushed : Rollout, default=None
         The same run without pushes, drawn thin: how far the robot lags behind by itself.
     """
+    check_kind(rollout, "rollout", "Rollout")
     check_axes("axes", axes, 3)
     if np.ndim(rollout.position) != 2:
         must = "of one run, (n_ticks, n_outputs): take one of the batch"

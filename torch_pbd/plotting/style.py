@@ -109,3 +109,9 @@ def check_axes(name: str, axes: Any, n_axes: int = 1) -> None:
     known = np.ndim(axes) == 1 and all(hasattr(ax, "plot") for ax in axes)
     if not known or len(axes) < n_axes:
         raise ValueError(f"{name} is {axes!r}, must be {n_axes} matplotlib Axes.")
+
+
+def check_kind(value: Any, name: str, kind: str) -> None:
+    """Check that an object is of a class by the name of it: those that draw themselves stand above this floor."""
+    if type(value).__name__ != kind:
+        raise checks.refusal(value, name, f"a {kind}")
