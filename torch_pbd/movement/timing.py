@@ -136,7 +136,7 @@ class Timing:
         """Midpoints of the cells of a lattice, center and root of the next, and whether this one is fine enough.
 
         Durations depend on the first axis alone, as ``root`` is a lower factor; it is cut where movements would have
-        ended. Where too few nodes carry the weight a power of the likelihood lays the next lattice.
+        ended. Where too few nodes carry the weight a power of the density lays the next lattice.
         """
         low = min(max(float((cut - center[0]) / root[0, 0]), -_REACH), 0.9 * _REACH)
         axes, cell = [], root.new_ones(2)
@@ -150,15 +150,14 @@ class Timing:
         duration, pace = values[:, 0].exp(), values[:, 1]
         n_varying = int((self.root.diagonal() > 0.0).sum())
         log_prior = -0.5 * (self.df + n_varying) * torch.log1p(z.square().sum(1) / self.df)
-        value, power = log_likelihood(duration, pace), 1.0
-        while float((wide := (log_prior + power * value).softmax(0)).square().sum()) > _FEW**-n_varying:
+        log_weight, power = log_prior + log_likelihood(duration, pace), 1.0
+        while float((wide := (power * log_weight).softmax(0)).square().sum()) > _FEW**-n_varying:
             power *= 0.5
         scale = root * cell
         center = wide @ z
         spread = z - center
         # A node stands for its cell, in which the variance is a twelfth of its square.
         finer = torch.linalg.cholesky(spread.mT @ (wide[:, None] * spread) + scale @ scale.mT / 12.0)
-        log_weight = log_prior + value
         log_integral = float(log_weight.logsumexp(0) + scale.diagonal().log().sum())
         return Nodes(duration, pace, log_weight.softmax(0), log_integral), center, finer, power == 1.0
 
