@@ -24,6 +24,7 @@ _SAME = 1e-4  # spread of log durations that counts as none: of sampling
 # whose nodes all predict. They reach over four standard deviations: a sum over nodes 4/3 of them apart is a normal
 # integral to 1e-4. A normal density 0.7 cells wide has the weight of 2.5 nodes along each axis.
 _SIDE, _SIDE_LAST, _REACH, _MOST_LATTICES, _FEW = 13, 6, 4.0, 20, 2.5
+_LEAST_POWER = 1e-9
 _RARE = 7.0  # nats below the density of the middle, where the first lattice ends
 
 
@@ -136,7 +137,7 @@ class Timing:
         """Midpoints of the cells of a lattice, center and root of the next, and whether this one is fine enough.
 
         Durations depend on the first axis alone, as ``root`` is a lower factor; it is cut where movements would have
-        ended. Where too few nodes carry the weight a power of the density lays the next lattice.
+        ended. Where too few nodes carry the weight a power of the likelihood lays the next lattice.
         """
         low = min(max(float((cut - center[0]) / root[0, 0]), -_REACH), 0.9 * _REACH)
         axes, cell = [], root.new_ones(2)
@@ -150,9 +151,11 @@ class Timing:
         duration, pace = values[:, 0].exp(), values[:, 1]
         n_varying = int((self.root.diagonal() > 0.0).sum())
         log_prior = -0.5 * (self.df + n_varying) * torch.log1p(z.square().sum(1) / self.df)
-        log_weight, power = log_prior + log_likelihood(duration, pace), 1.0
-        while float((wide := (power * log_weight).softmax(0)).square().sum()) > _FEW**-n_varying:
-            power *= 0.5
+        value, power = log_likelihood(duration, pace), 1.0
+        # Of the prior alone, at the least: it may be narrow itself on a first lattice.
+        while float((wide := (log_prior + power * value).softmax(0)).square().sum()) > _FEW**-n_varying and power:
+            power = 0.5 * power if power > _LEAST_POWER else 0.0
+        log_weight = log_prior + value
         scale = root * cell
         center = wide @ z
         spread = z - center
