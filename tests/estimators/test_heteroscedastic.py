@@ -153,7 +153,7 @@ def fitted_to_collapsing(end, n_steps):
 def test_a_covariance_that_collapses_at_an_end_is_followed(end, n_steps):
     model, rms = fitted_to_collapsing(end, n_steps)
     at_end = {"start": rms[:10], "goal": rms[-10:], "both": np.r_[rms[:10], rms[-10:]]}[end]
-    # No step is taken for surer than it is. The law of six demonstrations is wider than theirs, and at single steps more.
+    # No step is taken for surer than it is; the law of six demonstrations is wider, and at single steps more than that.
     assert at_end.max() < 2.0
     assert np.sqrt(np.square(at_end).mean()) > 0.5
     stretched = model.module_.core.stretch[:, 0].tolist()
