@@ -3,7 +3,7 @@
 import copy
 import math
 from abc import ABC, abstractmethod
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -14,33 +14,15 @@ from sklearn.utils.validation import check_is_fitted
 from torch import Tensor
 
 from torch_pbd import checks
-from torch_pbd.data import Demonstrations
-from torch_pbd.data.alignment import TIMING_REMOVED
 from torch_pbd.estimators.base import Uncertainty
-from torch_pbd.estimators.demonstrations import check_groups
 from torch_pbd.estimators.validation import Floats, checked_queries, checked_rows
 from torch_pbd.files.memory import require_much
 from torch_pbd.movement.conditioning import Conditioned, Observed
 from torch_pbd.movement.joint import JointNormal
+from torch_pbd.movement.recordings import Known, Recording, as_recordings
 
-_MOST_ENTRIES = 4096  # conditioned on one by one: a matrix of their size squared is factorized
 _AT_ONCE = 1024  # rows whose marginals are found together, and whose law is kept
 _RESOLUTION = 10  # decimals of a time, in ranges of those of the fit: nearer ones are equal
-
-
-class Recording(NamedTuple):
-    """One demonstration: increasing times (T,) and positions (T, d)."""
-
-    time: Floats
-    position: Floats
-
-
-class Known(NamedTuple):
-    """What a conditioned movement passes: times (m,), values (m, d), NaN where not given, and noise (m, d)."""
-
-    time: Floats
-    value: Floats
-    noise: Floats
 
 
 class MovementRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
@@ -83,7 +65,7 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         for name in ("_known", "_kept"):
             self.__dict__.pop(name, None)
         self._check_parameters()
-        recordings = self._recordings(X, y, groups, is_fit=True)
+        recordings = as_recordings(self, X, y, groups, is_fit=True)
         if len(recordings) < 2:
             raise ValueError(
                 "groups has one demonstration, must have two or more: how whole movements differ is not seen in one. "
@@ -267,11 +249,11 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
             If a demonstration has a time twice, or one that is known without noise, where it has no density.
         """
         check_is_fitted(self)
-        return np.array([self._score(recording) for recording in self._recordings(X, y, groups, is_fit=False)])
+        return np.array([self._score(recording) for recording in as_recordings(self, X, y, groups, is_fit=False)])
 
     def score(self, X: Any, y: ArrayLike | None = None, *, groups: ArrayLike | None = None) -> float:
         """Joint log density of the demonstrations over their number of steps: nats a step, higher is better."""
-        recordings = self._recordings(X, y, groups, is_fit=False)
+        recordings = as_recordings(self, X, y, groups, is_fit=False)
         return float(sum(map(self._score, recordings)) / sum(len(recording.time) for recording in recordings))
 
     def condition(self, X: ArrayLike, y: ArrayLike, *, noise_scale: ArrayLike = 0.0) -> Self:
@@ -329,31 +311,9 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
 
     def _observed(self, places: NDArray[np.intp]) -> Observed:
         """What is known, by the places of its times in a union of times."""
-        empty = np.empty((0, self.n_outputs_))
-        known = Known(np.empty(0), empty, empty) if self._known is None else self._known
-        exact = (known.noise == 0.0).all(axis=1) & ~np.isnan(known.value).any(axis=1)
-        single = ~np.isnan(known.value) & ~exact[:, np.newaxis]
-        entry_steps, entry_outputs = np.nonzero(single)
-        values, noise = known.value[single], known.noise[single]
-        noiseless = {(int(place), j) for place in places[exact] for j in range(self.n_outputs_)}
-        pairs = [
-            (int(places[i]), int(j)) for i, j, s in zip(entry_steps, entry_outputs, noise, strict=True) if s == 0.0
-        ]
-        if len(noiseless) < exact.sum() * self.n_outputs_ or len(noiseless.union(pairs)) < len(noiseless) + len(pairs):
-            raise ValueError("X has a time that is given twice, or is known already, without noise: leave it out.")
-        if len(values) > _MOST_ENTRIES:
-            raise ValueError(
-                f"y has {len(values)} entries with noise or beside NaN, must be at most {_MOST_ENTRIES} with those "
-                "known already: give fewer times, or whole rows with noise_scale=0."
-            )
-        return Observed(
-            torch.from_numpy(places[exact]),
-            torch.from_numpy(known.value[exact]),
-            torch.from_numpy(places[entry_steps]),
-            torch.from_numpy(entry_outputs),
-            torch.from_numpy(values),
-            torch.from_numpy(np.square(noise)),
-        )
+        nothing = np.empty((0, self.n_outputs_))
+        known = Known(np.empty(0), nothing, nothing) if self._known is None else self._known
+        return known.observed(places)
 
     def _conditioned(self, time: Floats) -> tuple[Conditioned, Tensor]:
         """Law of all times that matter, given what is known, and the places of ``time`` among them."""
@@ -413,51 +373,6 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         places = self._union(time, self._known)[2]
         exact = ((self._known.noise == 0.0) & ~np.isnan(self._known.value)).any(axis=1)
         return [int(place) for place in places[exact]]
-
-    def _stacked(self, X: Demonstrations, *, is_fit: bool) -> tuple[Floats, Floats, NDArray[np.intp]]:
-        """Rows of demonstrations, over what ``input_`` says."""
-        timed = getattr(self, "timing", "none") != "none"
-        if is_fit:
-            self.input_ = "time" if timed or X.is_aligned else "phase"
-            if X.alignment == "dtw":
-                checks.warn(TIMING_REMOVED)
-        if not timed:
-            return X.stack(input=self.input_)  # type: ignore[arg-type]
-        _, y, groups = X.stack(input="phase")  # durations may have little in common
-        return np.concatenate(X.from_start().times)[:, np.newaxis], y, groups
-
-    def _recordings(self, X: Any, y: Any, groups: Any, *, is_fit: bool) -> list[Recording]:
-        """Demonstrations of what was passed, each in the order of its times."""
-        if isinstance(X, Demonstrations):
-            if y is not None or groups is not None:
-                raise ValueError("y and groups must be None beside Demonstrations, which have both.")
-            X, y, groups = self._stacked(X, is_fit=is_fit)
-        elif is_fit:
-            self.input_ = "array"
-            if groups is None:
-                raise ValueError(
-                    "groups is None, must be the demonstration of each row of X: whole movements are learned."
-                )
-        if y is None:
-            raise ValueError("y is None, must be the positions (n_samples, n_outputs) at the rows of X.")
-        inputs, targets = checked_rows(self, X, y, reset=is_fit, ensure_min_samples=1)
-        if inputs.shape[1] != 1:
-            raise ValueError(
-                f"X has {inputs.shape[1]} columns, must have one, the time or phase: a movement runs along one input."
-            )
-        if is_fit:
-            self._y_is_1d = targets.ndim == 1
-            self.n_outputs_ = 1 if self._y_is_1d else targets.shape[1]
-        targets = targets.reshape(len(inputs), -1)
-        if targets.shape[1] != self.n_outputs_:
-            raise ValueError(f"y has {targets.shape[1]} outputs, but the model was fitted with {self.n_outputs_}.")
-        numbers = np.zeros(len(inputs), dtype=np.intp) if groups is None else check_groups(groups, len(inputs))
-        recordings = []
-        for number in range(numbers.max() + 1):
-            rows = np.flatnonzero(numbers == number)
-            rows = rows[np.argsort(inputs[rows, 0], kind="stable")]
-            recordings.append(Recording(inputs[rows, 0], targets[rows]))
-        return recordings
 
 
 def student_log_density(square: Floats, log_det: Any, size: int, df: float) -> Floats:

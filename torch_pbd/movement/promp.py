@@ -8,8 +8,9 @@ import torch
 
 from torch_pbd import checks
 from torch_pbd.estimators.validation import Floats
-from torch_pbd.movement.base import MovementRegressor, Recording
+from torch_pbd.movement.base import MovementRegressor
 from torch_pbd.movement.joint import JointNormal
+from torch_pbd.movement.recordings import Recording
 
 _N_BASES = (8, 12, 16, 20)  # tried by "auto", as far as recordings have samples for them
 _REACHES = (1.0, 2.0, 4.0)  # of the smooth prior, in bases

@@ -13,8 +13,8 @@ from torch_pbd.console import say
 from torch_pbd.estimators.base import Uncertainty
 from torch_pbd.estimators.validation import Floats
 from torch_pbd.linalg import safe_cholesky, student_log_density
-from torch_pbd.movement.base import Known, MovementRegressor, Recording
-from torch_pbd.movement.grid import n_grid_steps, sampled
+from torch_pbd.movement.base import MovementRegressor
+from torch_pbd.movement.recordings import Known, Recording, n_grid_steps, sampled
 from torch_pbd.movement.timing import Likelihood, Nodes, Timing, phase_of, register, time_of
 
 _FEWEST = 4  # demonstrations that say how two numbers vary together
