@@ -52,6 +52,7 @@ def test_an_example_is_short(path):
 @pytest.mark.slow
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_an_example_runs_and_shows_one_figure(path):
+    plt.close("all")  # of other tests
     runpy.run_path(str(path))
     assert len(plt.get_fignums()) == 1
     plt.close("all")
