@@ -16,7 +16,7 @@ from torch_pbd.data import Demonstrations, load_demonstrations, save_demonstrati
 from torch_pbd.playground.messages import Settings, Stroke
 from torch_pbd.registry import MOVEMENTS, load_class
 
-_STEPS = 50  # at which a movement is learned and drawn: a stroke's bends are a tenth of it
+_STEPS, _DRAWN = 40, 50  # at which a movement is learned and drawn: the bends of strokes are a tenth of them
 _DRAWS = 5  # made movements that are shown
 _RATE = 1000.0  # Hz of the robot's loop
 _AT_ONCE = 20  # rows of a schedule in a row of the strip chart
@@ -36,10 +36,10 @@ class Learned:
     schedule: Schedule | None = None
 
 
-def learn(strokes: list[Stroke], settings: Settings) -> Iterator[tuple[Learned, Answer]]:
+def learn(strokes: list[Stroke], settings: Settings) -> Iterator[tuple[Learned, Answer | None]]:
     """Models of two strokes or more, the schedule of the first, and last how likely left-out strokes are.
 
-    It stops between two answers where newer strokes have come: whoever asks goes on to the next answer, or does not.
+    It stops after each fit, with an answer or none: whoever asks goes on, or turns to newer strokes.
     """
     learned = Learned(_demonstrations(strokes), settings)
     for name in settings.models:
@@ -48,9 +48,12 @@ def learn(strokes: list[Stroke], settings: Settings) -> Iterator[tuple[Learned, 
         took = time.perf_counter() - begun
         yield learned, {**picture(learned.controllers[name], name, drawn=True), "seconds": took}
     yield learned, follow(learned)
-    for name in settings.models:
-        if len(learned.strokes) > 2:
-            yield learned, {"type": "score", "model": name, "nats": _left_out(learned, name)}
+    for name in settings.models if len(learned.strokes) > 2 else ():
+        scores = []
+        for score in _left_out(learned, name):
+            scores.append(score)
+            yield learned, None
+        yield learned, {"type": "score", "model": name, "nats": float(np.mean(scores))}
 
 
 def adjust(learned: Learned, settings: Settings) -> Answer:
@@ -88,10 +91,10 @@ def follow(learned: Learned) -> Answer:
 
 def picture(controller: DMPController, name: str, *, drawn: bool) -> Answer:
     """Path, covariances and made movements of a controller, at even times."""
-    times = np.linspace(0.0, controller.duration_, _STEPS)[:, np.newaxis]
+    times = np.linspace(0.0, controller.duration_, _DRAWN)[:, np.newaxis]
     path, model = controller.predict(times), controller.covariance_
     covariance = model.predict_cov(times)
-    draws = model.sample_demonstrations(times, _DRAWS, random_state=0) if drawn else np.empty((0, _STEPS, 2))
+    draws = model.sample_demonstrations(times, _DRAWS, random_state=0) if drawn else np.empty((0, _DRAWN, 2))
     return {
         "type": "picture",
         "model": name,
@@ -157,14 +160,12 @@ def _bent(learned: Learned) -> DMPController:
     return controller.condition(points[:, 0], points[:, 1:])
 
 
-def _left_out(learned: Learned, name: str) -> float:
-    """Mean log-likelihood of left-out strokes under their joint law, in nats a sample."""
+def _left_out(learned: Learned, name: str) -> Iterator[float]:
+    """Log-likelihood of each stroke, left out, under its joint law, in nats a sample."""
     aligned = learned.strokes.align("phase", n=_STEPS)
-    scores = []
     for k in range(len(aligned)):
         train, test = aligned.split([k])
-        scores.append(float(_model(name).fit(train).score_demonstrations(test)[0]) / _STEPS)
-    return float(np.mean(scores))
+        yield float(_model(name).fit(train).score_demonstrations(test)[0]) / _STEPS
 
 
 def _python(learned: Learned) -> str:

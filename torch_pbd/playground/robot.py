@@ -23,14 +23,19 @@ class Robot:
         self._controller: RealTimeAdmittance | None = None
         self._now = self._rest = self._left = 0.0
 
-    def follow(self, schedule: Schedule) -> None:
-        """Take up a schedule from where the robot is, at the same share of the movement."""
+    @staticmethod
+    def prepare(schedule: Schedule) -> RealTimeAdmittance:
+        """Loop of a schedule, whose table takes longer to lay out than a frame."""
+        return RealTimeAdmittance(schedule, soft_start=0.5)
+
+    def follow(self, schedule: Schedule, controller: RealTimeAdmittance | None = None) -> None:
+        """Take up a schedule, and its loop, from where the robot is, at the same share of the movement."""
         here, at = None, 0.0
         if self._controller is not None and self._schedule is not None:
             here = self._controller.position
             at = min(1.0, self._controller.schedule_time / self._schedule.duration) * schedule.duration
         self._schedule = schedule
-        self._controller = RealTimeAdmittance(schedule, soft_start=0.5)
+        self._controller = controller or self.prepare(schedule)
         self._controller.start(self._now, here, at=at)
 
     def advance(self, elapsed: float, hand: tuple[float, float] | None, push: tuple[float, float]) -> dict[str, Any]:

@@ -65,7 +65,8 @@ class Tab:
         """Hand an answer of the worker on to the page, and its schedule to the robot."""
         follow = answer.pop("then", None)
         if "schedule" in answer:
-            self._robot.follow(answer.pop("schedule"))
+            schedule = answer.pop("schedule")
+            self._robot.follow(schedule, await asyncio.to_thread(self._robot.prepare, schedule))
         await self.send(answer)
         if follow is not None:
             await self.deliver(follow)

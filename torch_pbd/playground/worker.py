@@ -1,10 +1,12 @@
 """The process that learns, so that the robot of the page is never kept waiting; torch is loaded there alone."""
 
 import multiprocessing
+import os
 import signal
 import threading
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any
@@ -64,12 +66,14 @@ class Worker:
 def work(connection: Connection) -> None:
     """Answer requests until the other end closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the page's process, which ends this one
+    with suppress(AttributeError):  # not on Windows
+        os.nice(5)  # the robot's frames come first
     import torch
 
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     learned: dict[int, Any] = {}
-    fits: dict[int, Iterator[tuple[Any, Answer]]] = {}
+    fits: dict[int, Iterator[tuple[Any, Answer | None]]] = {}
     connection.send((-1, {"type": "ready"}))
     try:
         while True:
