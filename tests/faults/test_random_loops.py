@@ -138,8 +138,9 @@ def _answer(schedule, forces, starts):
 
 # A run takes a sixth of a second. All 10,000: --hypothesis-profile=thorough.
 ALL = 10_000 if settings.get_current_profile_name() == "thorough" else 600
-# Approaches that were caught up in or outlasted the schedule, and springs that pulled a robot after a stall.
-ONCE_TOO_FAST = [391, 718, 738, 749, 1018, 1145, 1183, 1333]
+# Approaches that were caught up in or outlasted the schedule, and springs that pulled a robot after a stall, also
+# where the schedule had gone on faster than the robot meanwhile.
+ONCE_TOO_FAST = [391, 718, 738, 749, 1018, 1145, 1183, 1333, 4766]
 
 
 @pytest.mark.parametrize(

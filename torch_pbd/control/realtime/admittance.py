@@ -295,6 +295,6 @@ class RealTimeAdmittance:
         return status
 
     def _brake(self, now: float, passed: float, deceleration: float) -> None:
-        self._clock.brake(self._timer.last, passed, deceleration)
+        self._clock.brake(self._timer.last, passed, deceleration, math.hypot(*self.velocity))
         self.position, self.velocity = braked((self.position, self.velocity), deceleration, passed)
         self._timer.last = now

@@ -179,15 +179,20 @@ class ScheduleClock:
                 return self._unpack(self._packed, self.index * self._row_size)
         return self._ramped(begin, step)
 
-    def brake(self, begin: float, passed: float, deceleration: float) -> None:
-        """Let schedule time, while ``passed`` s pass, brake at most so fast, and then stand."""
-        speed, ran = self.speed_at(begin), 0.0
-        if speed > 0.0:
-            left = max(0.0, 1.0 - deceleration * passed / speed)
-            slower, braking = self._pace * left, 0.5 * min(passed, speed / deceleration)
-            ran = braking * (self._pace + slower)
-            self._ahead += braking * (1.0 + left) * self._free - ran
-            self._pace, self._free = slower, self._free * left
+    def brake(self, begin: float, passed: float, deceleration: float, robot_speed: float) -> None:
+        """Let schedule time, while ``passed`` s pass, brake at most so fast, and then stand.
+
+        From the robot's speed, where that is lower: a desired position that went on faster would pull the spring.
+        """
+        desired, ran = self.speed_at(begin), 0.0
+        speed = min(desired, robot_speed)
+        if desired > 0.0:
+            pace, free = self._pace * speed / desired, self._free * speed / desired
+            left = max(0.0, 1.0 - deceleration * passed / speed) if speed else 0.0
+            braking = 0.5 * min(passed, speed / deceleration)
+            ran = braking * (1.0 + left) * pace
+            self._ahead += braking * (1.0 + left) * free - ran
+            self._pace, self._free = pace * left, free * left
         self.shift(passed - ran)
         self._lag = max(0.0, self._lag + self._catches_up * (passed - ran))
         self.boost, self._is_steady = (), False
