@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from covariance_methods import METHODS, available
 from covariance_peers import CannotError, Floats, log_normal
-from covariance_report import report
+from covariance_report import changes, report
 from covariance_tasks import TASKS, Recording, Task, load_recordings
 from joblib import Parallel, delayed
 from threadpoolctl import threadpool_limits
@@ -229,6 +229,12 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
         nargs="+",
         help="run nothing: the table of what runs have written into these folders (of recordings: of --sets)",
     )
+    parser.add_argument(
+        "--since",
+        type=Path,
+        nargs="+",
+        help="run nothing: what runs of another version, in these folders, and those of --table-of differ in",
+    )
     parser.add_argument("--out", type=Path, default=Path("covariance_benchmark"), help="folder of what is written")
     return parser.parse_args(arguments)
 
@@ -236,6 +242,13 @@ def parse(arguments: list[str] | None) -> argparse.Namespace:
 def main(arguments: list[str] | None = None) -> None:
     options = parse(arguments)
     options.out.mkdir(parents=True, exist_ok=True)
+    if options.since:
+        parts = [
+            [read(own, f"{name}.csv", 3) for name in ("made", "recorded")] for own in (options.since, options.table_of)
+        ]
+        for method in options.methods:
+            print(f"\n{method}\n\n{changes(*parts, method)}")
+        return
     if options.table_of:
         made, recorded, pen = (read(options.table_of, f"{name}.csv", 3) for name in ("made", "recorded", "pen"))
         if options.sets is not None:

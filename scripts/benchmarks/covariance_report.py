@@ -44,6 +44,33 @@ def report(made: Sequence[Row], recorded: Sequence[Row], pen: Sequence[Row]) -> 
     return "\n".join(part for part in parts if part)
 
 
+def changes(before: Sequence[Sequence[Row]], after: Sequence[Sequence[Row]], method: str) -> str:
+    """Table of one method in two versions, of made and of recorded rows that both have; paired over seeds and folds."""
+    lines = []
+    for old, new, value, key in zip(before, after, ("kl_all", "log_likelihood"), ("seed", "fold"), strict=True):
+        name = "task" if key == "seed" else "set"
+        kept = {(row[name], row[key]): row for row in old if row["method"] == method and value in row}
+        for title, rows in _by(new, name).items():
+            pairs = [
+                (kept[title, row[key]], row) for row in rows if row["method"] == method and (title, row[key]) in kept
+            ]
+            if not pairs:
+                continue
+            gain = np.array([(b[value] - a[value]) * (1 if key == "seed" else -1) for b, a in pairs])
+            error = gain.std(ddof=1) / math.sqrt(len(gain)) if len(gain) > 1 else math.nan
+            holds = [np.mean([row["holds_90"] for row in own]) for own in zip(*pairs, strict=True)]
+            seconds = [_median([row["fit_seconds"] for row in own]) for own in zip(*pairs, strict=True)]
+            lines.append(
+                {
+                    "data": title,
+                    "gain, nats": f"{gain.mean():+.3f} +- {error:.3f}",
+                    "90 % holds": "{:.3f} -> {:.3f}".format(*holds),
+                    "fit [s]": "{:.2f} -> {:.2f}".format(*seconds),
+                }
+            )
+    return _table(lines)
+
+
 def _section(title: str, rows: Sequence[Row], cells: Callable[[str, Sequence[Row], Sequence[Row]], Row]) -> str:
     table = _table([cells(method, own, rows) for method, own in _by(rows, "method").items()])
     return f"## {title}\n\n{table}\n{_notes(rows)}"
