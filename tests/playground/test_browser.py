@@ -165,6 +165,19 @@ def test_a_stroke_of_a_finger_counts(browser, address):
         wait(page, "state.strokes.length == 1")
 
 
+@pytest.mark.parametrize(("scale", "told"), [(1.0, "count as metres"), (1000.0, "not for its robot")])
+def test_a_file_that_does_not_fit_is_scaled_and_that_is_told(page, scale, told, tmp_path):
+    rows = [(k, 0.02 * i, 0.1 + 0.01 * i, 0.2 + 0.02 * k + 0.001 * i) for k in range(3) for i in range(40)]
+    lines = [f"{k},{t},{scale * x},{scale * y}" for k, t, x, y in rows]
+    (tmp_path / "own.csv").write_text("\n".join(["demo,time,x,y", *lines]) + "\n")
+    page.set_input_files("#open", tmp_path / "own.csv")
+    wait(page, "state.strokes.length == 3")
+    shown = page.locator("#note").text_content()
+    assert told in shown
+    first = state(page, "state.strokes[0].rows[0].slice(1)")
+    assert (first == pytest.approx([0.1, 0.2])) == (scale == 1.0)
+
+
 def test_two_tabs_learn_each_their_own(browser, address):
     for first in opened(browser, address):
         for second in opened(browser, address):

@@ -73,20 +73,25 @@ function receive(answer) {
     const which = state.settings.models.indexOf(answer.model);
     if (which >= 0) find(`score-${which}`).textContent = `left-out strokes: ${answer.nats.toFixed(2)} nats a sample`;
   } else if (answer.type === "strokes") {
-    state.strokes = answer.strokes.map((rows) => ({ rows: placed(rows, answer.strokes), hidden: false }));
+    const { place, note } = placement(answer.strokes);
+    state.strokes = answer.strokes.map((rows) => ({ rows: rows.map(place), hidden: false }));
     changed();
+    find("note").textContent = note; // what is taken home is not in the file's coordinates
   } else if (answer.type === "error") {
     isBending = false;
     fail(answer.text);
   }
 }
 
-// A file's movements may be anywhere and of any size: they are moved and scaled into the picture, all alike.
-function placed(rows, all) {
+// A file's movements may be anywhere and of any size: where they do not fit they are moved and scaled, all alike.
+function placement(all) {
   const flat = all.flat(), low = [1, 2].map((k) => Math.min(...flat.map((row) => row[k])));
-  const span = [1, 2].map((k) => Math.max(...flat.map((row) => row[k])) - low[k - 1]);
-  const scale = Math.min(0.8 * WORLD.width / (span[0] || 1), 0.8 * WORLD.height / (span[1] || 1));
-  return rows.map(([t, x, y]) => [t, 0.1 * WORLD.width + scale * (x - low[0]), 0.1 * WORLD.height + scale * (y - low[1])]);
+  const high = [1, 2].map((k) => Math.max(...flat.map((row) => row[k])));
+  if (low[0] >= 0 && low[1] >= 0 && high[0] <= WORLD.width && high[1] <= WORLD.height)
+    return { place: (row) => row, note: "The file's numbers count as metres." };
+  const scale = Math.min(0.8 * WORLD.width / (high[0] - low[0] || 1), 0.8 * WORLD.height / (high[1] - low[1] || 1));
+  const place = ([t, x, y]) => [t, 0.1 * WORLD.width + scale * (x - low[0]), 0.1 * WORLD.height + scale * (y - low[1])];
+  return { place, note: `The file was moved, and scaled by ${scale.toPrecision(3)}: these files are not for its robot.` };
 }
 
 function say(text) { find("status").textContent = text; find("error").hidden = true; }
@@ -96,6 +101,7 @@ export function fail(text) { find("error").textContent = text; find("error").hid
 const visible = () => state.strokes.filter((stroke) => !stroke.hidden);
 
 export function changed() {
+  find("note").textContent = "";
   listStrokes();
   learn();
 }
