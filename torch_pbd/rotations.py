@@ -1,0 +1,182 @@
+"""Rotations as unit quaternions w x y z, and the chart in which they are learned as three numbers.
+
+Quaternions (..., 4) turn vectors of the body, a tool, into vectors of the world; rotation vectors (..., 3) are in rad.
+NumPy alone, for schedules and the control loop: tests compare it with ``scipy.spatial.transform``, which has the same.
+"""
+
+import math
+from typing import final
+
+import numpy as np
+
+from torch_pbd import checks
+from torch_pbd.checks import Floats
+
+# Coefficients of a rotation vector v of length t. Where a difference cancels, its error is relative to what the term of
+# v that it belongs to leaves of it, so that only t = 0 itself needs care: below these, the next term is below 1e-16.
+_TINY, _SMALL = 1e-4, 1e-3
+_MAX_STEPS = 100
+
+
+def multiply(first: Floats, second: Floats) -> Floats:
+    """Product of quaternions: the rotation by ``second``, then by ``first``."""
+    a, b = np.moveaxis(first, -1, 0), np.moveaxis(second, -1, 0)
+    return np.stack(
+        [
+            a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
+            a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
+            a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
+            a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
+        ],
+        axis=-1,
+    )
+
+
+def conjugate(quaternion: Floats) -> Floats:
+    """Inverse rotation."""
+    return quaternion * np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def exp(vector: Floats) -> Floats:
+    """Quaternion (..., 4) of a rotation vector (..., 3)."""
+    half = 0.5 * np.linalg.norm(vector, axis=-1, keepdims=True)
+    return np.concatenate([np.cos(half), 0.5 * np.sinc(half / math.pi) * vector], axis=-1)
+
+
+def log(quaternion: Floats) -> Floats:
+    """Rotation vector (..., 3) of a quaternion (..., 4), the shorter way: at most pi long."""
+    shorter = np.where(quaternion[..., :1] < 0.0, -quaternion, quaternion)
+    w, xyz = shorter[..., :1], shorter[..., 1:]
+    length = np.linalg.norm(xyz, axis=-1, keepdims=True)
+    tiny = length < np.finfo(float).tiny
+    return np.where(tiny, 2.0, 2.0 * np.arctan2(length, w) / np.where(tiny, 1.0, length)) * xyz
+
+
+def matrix(quaternion: Floats) -> Floats:
+    """Rotation matrix (..., 3, 3) of a quaternion (..., 4)."""
+    w, v = quaternion[..., :1, np.newaxis], quaternion[..., 1:]
+    turned = 2.0 * (v[..., :, np.newaxis] * v[..., np.newaxis, :] + w * cross_matrix(v))
+    return turned + (2.0 * w * w - 1.0) * np.eye(3)
+
+
+def from_matrix(rotation: Floats) -> Floats:
+    """Quaternion (..., 4) with w >= 0 of a rotation matrix (..., 3, 3).
+
+    4 q q' is linear in the matrix; its largest column is q times a number that is far from zero (S. W. Shepperd,
+    "Quaternion from rotation matrix", Journal of Guidance and Control 1, 1978).
+    """
+    r = np.moveaxis(rotation, (-2, -1), (0, 1))
+    diagonal = np.stack([r[0, 0], r[1, 1], r[2, 2]])
+    outer = np.empty((4, 4, *r.shape[2:]))
+    outer[0, 0] = 1.0 + diagonal.sum(axis=0)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        outer[i + 1, i + 1] = 1.0 + 2.0 * diagonal[i] - diagonal.sum(axis=0)
+        outer[0, i + 1] = outer[i + 1, 0] = r[k, j] - r[j, k]
+        outer[i + 1, j + 1] = outer[j + 1, i + 1] = r[i, j] + r[j, i]
+    outer = np.moveaxis(outer, (0, 1), (-2, -1))
+    largest = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
+    column = np.take_along_axis(outer, largest[..., np.newaxis, np.newaxis], axis=-1)[..., 0]
+    quaternion = column / np.linalg.norm(column, axis=-1, keepdims=True)
+    return np.where(quaternion[..., :1] < 0.0, -quaternion, quaternion)
+
+
+def cross_matrix(vector: Floats) -> Floats:
+    """Matrix (..., 3, 3) of the cross product with a vector (..., 3) from the left."""
+    x, y, z = np.moveaxis(vector, -1, 0)
+    zero = np.zeros_like(x)
+    rows = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1)
+    return rows.reshape(*vector.shape, 3)
+
+
+def left_jacobian(vector: Floats) -> Floats:
+    """Matrix (..., 3, 3) from the rate of a rotation vector to the angular velocity in world axes.
+
+    ``I + b [v] + c [v]^2`` with ``b = (1 - cos t) / t^2``, ``c = (t - sin t) / t^3``; F. Bullo, R. M. Murray,
+    "Proportional derivative (PD) control on the Euclidean group", ECC 1995.
+    """
+    b, c = (value[..., np.newaxis, np.newaxis] for value in _coefficients(vector)[:2])
+    cross = cross_matrix(vector)
+    return np.eye(3) + b * cross + c * cross @ cross
+
+
+def right_jacobian(vector: Floats) -> Floats:
+    """Matrix (..., 3, 3) from the rate of a rotation vector to the angular velocity in body axes."""
+    return left_jacobian(-vector)
+
+
+def continuous(quaternion: Floats) -> Floats:
+    """Quaternions (n, ..., 4) with signs that make each the nearer one to that before it."""
+    turns = np.sum(quaternion[1:] * quaternion[:-1], axis=-1) < 0.0
+    signs = np.cumprod(np.where(turns, -1.0, 1.0), axis=0)
+    return np.concatenate([quaternion[:1], signs[..., np.newaxis] * quaternion[1:]])
+
+
+def mean(quaternion: Floats) -> Floats:
+    """Rotation (4,), with w >= 0, that has the least sum of squared angles to those given (n, 4): the Frechet mean.
+
+    From the mean in the chordal metric, an eigenvector and so blind to signs, by Karcher's iteration.
+    """
+    found = np.linalg.eigh(quaternion.T @ quaternion)[1][:, -1]
+    for _ in range(_MAX_STEPS):
+        step = log(multiply(conjugate(found), quaternion)).mean(axis=0)
+        found = multiply(found, exp(step))
+        found /= np.linalg.norm(found)
+        if float(np.linalg.norm(step)) < 1e-15:
+            break
+    return -found if found[0] < 0.0 else found
+
+
+@final
+class Chart:
+    """Rotations as three numbers y = Log(R0' R) around a reference R0: R = R0 Exp(y).
+
+    Parameters
+    ----------
+    reference : array_like of shape (4,)
+        R0, a unit quaternion w x y z.
+    """
+
+    def __init__(self, reference: Floats) -> None:
+        self.reference = checks.array(reference, "reference", (4,))
+        self._turn = matrix(self.reference)
+
+    def log(self, quaternion: Floats) -> Floats:
+        """Coordinates y (..., 3) of quaternions (..., 4), in rad."""
+        return log(multiply(conjugate(self.reference), quaternion))
+
+    def exp(self, coordinates: Floats) -> Floats:
+        """Quaternions (..., 4) at coordinates y (..., 3)."""
+        return multiply(self.reference, exp(coordinates))
+
+    def to_world(self, coordinates: Floats) -> Floats:
+        """Matrix (..., 3, 3) from small changes of y, at y, to rotation vectors in world axes: ``R0 Jl(y) = R Jr(y)``.
+
+        Covariances of y become those in world axes by it, from both sides.
+        """
+        return self._turn @ left_jacobian(coordinates)
+
+    def velocity(self, coordinates: Floats, rate: Floats) -> Floats:
+        """Angular velocity (..., 3) in world axes, rad/s, of y that changes at a rate (..., 3)."""
+        return (self.to_world(coordinates) @ rate[..., np.newaxis])[..., 0]
+
+    def acceleration(self, coordinates: Floats, rate: Floats, second: Floats) -> Floats:
+        """Angular acceleration (..., 3) in world axes, rad/s^2: ``R0 (Jl y'' + Jl' y')``."""
+        c, slope_b, slope_c = (value[..., np.newaxis] for value in _coefficients(coordinates)[1:])
+        # (Jl)' y' = b' v x y' + c' v x (v x y') + c y' x (v x y'), and b' is its slope by t, over t, times v'y'.
+        along = np.sum(coordinates * rate, axis=-1, keepdims=True)
+        normal = np.cross(coordinates, rate)
+        turning = (
+            slope_b * along * normal + slope_c * along * np.cross(coordinates, normal) + c * np.cross(rate, normal)
+        )
+        return self.velocity(coordinates, second) + turning @ self._turn.T
+
+
+def _coefficients(vector: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Coefficients b and c of the left Jacobian (...), and their slopes by t, over t."""
+    angle = np.linalg.norm(vector, axis=-1)
+    t, short = np.where(angle < _SMALL, 1.0, angle), angle < _SMALL
+    b = 0.5 * np.sinc(0.5 * angle / math.pi) ** 2
+    c = np.where(angle < _TINY, 1.0 / 6.0, (angle - np.sin(angle)) / np.where(angle < _TINY, 1.0, angle) ** 3)
+    slope_b = np.where(short, -1.0 / 12.0 + angle**2 / 180.0, (np.sin(t) - 2.0 * t * b) / t**3)
+    slope_c = np.where(short, -1.0 / 60.0 + angle**2 / 1260.0, (b - 3.0 * c) / t**2)
+    return b, c, slope_b, slope_c
