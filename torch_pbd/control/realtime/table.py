@@ -11,6 +11,7 @@ from torch_pbd.checks import Floats
 from torch_pbd.control.realtime.steps import State, Vector, advance_coupled, advance_modal, advance_plane
 from torch_pbd.control.schedule import Schedule
 from torch_pbd.control.schedule.rows import Between, count_rows, row_times
+from torch_pbd.exceptions import InvalidParameterError
 
 Advance = Callable[[Vector, Vector, State, float, float], tuple[State, float]]
 
@@ -18,8 +19,12 @@ _LIGHTEST = 1e-50  # kg: products of gains with masses from this one to its inve
 _MAX_ROWS = 4_000_000  # an hour at 1 kHz, which takes 670 MB for d = 2
 
 
-def virtual_mass(own: float | None, given: float | None) -> float:
+def virtual_mass(own: float | Floats | None, given: float | None) -> float:
     """Virtual mass in kg, that of the schedule if None is given; a warning where it is another."""
+    if isinstance(own, np.ndarray):
+        raise InvalidParameterError(
+            "the schedule has a mass matrix, must have one virtual mass in kg: schedule.with_inertia(mass)."
+        )
     mass = (own or 1.0) if given is None else given
     value = checks.number(mass, "mass", least=_LIGHTEST, most=1.0 / _LIGHTEST, unit="kg")
     if own is not None and value != own:

@@ -9,20 +9,36 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torch_pbd import checks
+from torch_pbd import checks, rotations
 from torch_pbd.checks import Floats
 from torch_pbd.exceptions import InvalidParameterError
 
-ARRAY_DIMS = {"time": 1, "position": 2, "velocity": 2, "stiffness": 3, "damping": 3, "covariance": 3, "type1": 1}
-"""Every array of a schedule with its number of axes: (n,), (n, d) or (n, d, d)."""
+SHAPES: dict[str, tuple[int | str, ...]] = {
+    "time": ("n",),
+    "position": ("n", "p"),
+    "velocity": ("n", "d"),
+    "stiffness": ("n", "d", "d"),
+    "damping": ("n", "d", "d"),
+    "covariance": ("n", "d", "d"),
+    "type1": ("n",),
+    "acceleration": ("n", "d"),
+    "orientation": ("n", 4),
+    "mass": ("n", "d", "d"),
+}
+"""Every array of a schedule with its shape: d is the number p of positions, or p + 3 with an orientation."""
+
+OPTIONAL = frozenset({"acceleration", "orientation", "mass"})
 
 LABELS = ("names", "units", "frame", "stiffness_limits", "covariance_of", "mass", "provenance")
 
+# Of the squared norm: quaternions rounded to seven digits count as unit ones, and are made so to rounding.
+_NEARLY_UNIT, _UNIT = 1e-6, 1e-14
 # JSON's reader and Python's own stack take more levels than this, on every system.
 _DEEPEST = 100
 
 Arrays = Mapping[str, NDArray[Any]]
 Labels = Mapping[str, Any]
+Limits = tuple[float, float] | tuple[tuple[float, ...], tuple[float, ...]]
 
 
 def checked_fields(fields: Mapping[str, Any]) -> dict[str, Any]:
@@ -30,43 +46,93 @@ def checked_fields(fields: Mapping[str, Any]) -> dict[str, Any]:
 
     Matrices are symmetric to the last bit.
     """
-    limits = fields["stiffness_limits"]
-    if limits is not None:
-        low, high = checks.array(limits, "stiffness_limits", (2,)).tolist()
-        low = checks.number(low, "stiffness_limits[0]", least=0.0, unit="N/m")
-        limits = low, checks.number(high, "stiffness_limits[1]", above=0.0, least=low, unit="N/m")
-    position = checks.array(fields["position"], "position", ("n", "d"))
-    n, d = position.shape
-    if n < 2 or not d:
+    position = checks.array(fields["position"], "position", ("n", "p"))
+    n, p = position.shape
+    if n < 2 or not p:
         raise InvalidParameterError(f"position has shape {position.shape}, must have at least 2 rows, 1 column.")
-    arrays = {name: checks.array(fields[name], name, (n, d, d)[:n_dims]).copy() for name, n_dims in ARRAY_DIMS.items()}
+    sizes = {"n": n, "p": p, "d": p if fields["orientation"] is None else p + 3}
+    given = [
+        name for name in SHAPES if name not in OPTIONAL or not (fields[name] is None or np.ndim(fields[name]) == 0)
+    ]
+    if np.ndim(fields["mass"]) == 2:  # one for all rows
+        fields = {**fields, "mass": np.broadcast_to(fields["mass"], (n, *np.shape(fields["mass"])))}
+    arrays = {
+        name: checks.array(fields[name], name, [sizes.get(str(size), size) for size in SHAPES[name]]).copy()
+        for name in given
+    }
     later = np.diff(arrays["time"], prepend=-np.inf) > 0.0
     remedy = "sort the rows by time and drop repeated ones"
     checks.require(later, arrays["time"], "time", "later than the time before it", remedy)
     type1 = arrays["type1"]
     checks.require((type1 >= 0.0) & (type1 <= 1.0), type1, "type1", "from 0 (on data) to 1 (the prior alone)")
-    for name in [name for name, n_dims in ARRAY_DIMS.items() if n_dims == 3]:
-        checks.semidefinite(arrays[name], name)
+    for name in [name for name in arrays if len(SHAPES[name]) == 3]:
+        checks.semidefinite(arrays[name], name, definite=name == "mass")
         arrays[name] = 0.5 * (arrays[name] + arrays[name].swapaxes(1, 2))
+    if "orientation" in arrays:
+        arrays["orientation"] = _checked_orientation(arrays["orientation"])
+    limits = _checked_limits(fields["stiffness_limits"], sizes["d"])
     if limits is not None:
         _check_limits(arrays["stiffness"], limits)
     _check_held(arrays["stiffness"], arrays["damping"])
     for array in arrays.values():
         array.setflags(write=False)
-    labels = _checked_labels({name: fields[name] for name in LABELS}, n_outputs=d)
-    return {**arrays, **labels, "stiffness_limits": limits}
+    mass = fields["mass"]
+    labels = _checked_labels(
+        {name: fields[name] for name in LABELS} | {"mass": mass if "mass" not in arrays else None}, sizes["d"]
+    )
+    return {**labels, **arrays, "stiffness_limits": limits}
 
 
-def _check_limits(stiffness: Floats, limits: tuple[float, float]) -> None:
-    """Refuse eigenvalues of the stiffness beyond the limits, to rounding."""
-    low, high = limits
-    least, most = low - checks.ROUNDING * high, high + checks.ROUNDING * high
-    if checks.eigenvalues_above(stiffness, least) and checks.eigenvalues_above(-stiffness, -most):
+def _checked_orientation(orientation: Floats) -> Floats:
+    squared = np.sum(orientation**2, axis=1)
+    remedy = "give unit quaternions w x y z"
+    checks.require(np.abs(squared - 1.0) <= _NEARLY_UNIT, squared, "the squared norm of orientation", "1", remedy)
+    off = np.abs(squared - 1.0) > _UNIT
+    orientation[off] /= np.sqrt(squared[off])[:, np.newaxis]
+    return rotations.continuous(orientation)
+
+
+def _checked_limits(limits: Any, d: int) -> Limits | None:
+    """Two numbers, or two tuples of one for each of d axes; None stays None."""
+    if limits is None:
+        return None
+    if not isinstance(limits, list | tuple | np.ndarray) or len(limits) != 2:
+        raise checks.refusal(limits, "stiffness_limits", "the least and the largest stiffness, or None")
+    of_each = any(np.ndim(limit) for limit in limits)
+    low, high = (
+        np.broadcast_to(checks.real_floats(limit, "stiffness_limits"), (d,) if of_each else ()) for limit in limits
+    )
+    unit = "" if of_each else "N/m"
+    for i, (least, most) in enumerate(zip(low.reshape(-1), high.reshape(-1), strict=True)):
+        axis = f"[{i}]" if of_each else ""
+        lowest = checks.number(float(least), f"stiffness_limits[0]{axis}", least=0.0, unit=unit)
+        checks.number(float(most), f"stiffness_limits[1]{axis}", above=0.0, least=lowest, unit=unit)
+    return (tuple(low.tolist()), tuple(high.tolist())) if of_each else (float(low), float(high))
+
+
+def _check_limits(stiffness: Floats, limits: Limits) -> None:
+    """Refuse a stiffness beyond the limits, as matrices and to rounding.
+
+    ``K_min <= K <= K_max``, diagonal both, in units of K_max: those of lengths and angles then do not matter.
+    """
+    low, high = map(np.asarray, limits)
+    scale = 1.0 / np.sqrt(high * np.ones(stiffness.shape[1]))
+    relative = scale[:, np.newaxis] * stiffness * scale
+    least = low / high * np.eye(stiffness.shape[1])
+    if checks.eigenvalues_above(relative - least, -checks.ROUNDING) and checks.eigenvalues_above(
+        -relative, -1.0 - checks.ROUNDING
+    ):
         return
+    remedy = "limit the stiffness to them, or widen them"
+    if low.ndim:
+        beyond = np.maximum(np.linalg.eigvalsh(least - relative)[:, -1], np.linalg.eigvalsh(relative)[:, -1] - 1.0)
+        checks.require(
+            beyond <= checks.ROUNDING, beyond, "the share of stiffness beyond stiffness_limits", "none", remedy
+        )
     eigenvalues = np.linalg.eigvalsh(stiffness)
-    good = (eigenvalues >= least) & (eigenvalues <= most)
+    good = (eigenvalues >= low - checks.ROUNDING * high) & (eigenvalues <= high + checks.ROUNDING * high)
     must = f"within stiffness_limits, {low:g} and {high:g} N/m"
-    checks.require(good, eigenvalues, "the eigenvalue of stiffness", must, "limit the stiffness to them, or widen them")
+    checks.require(good, eigenvalues, "the eigenvalue of stiffness", must, remedy)
 
 
 def _check_held(stiffness: Floats, damping: Floats) -> None:

@@ -9,7 +9,7 @@ import io
 import json
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from itertools import chain, combinations_with_replacement
@@ -18,18 +18,20 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from torch_pbd.control.schedule.contents import ARRAY_DIMS, LABELS, Arrays, Labels
+from torch_pbd.control.schedule.contents import LABELS, OPTIONAL, SHAPES, Arrays, Labels
 from torch_pbd.exceptions import InvalidParameterError, ModelFileError
 from torch_pbd.files.archives import read_array, read_members
 from torch_pbd.files.atomic import LOADERS, replacing
 from torch_pbd.files.memory import parsed_bytes, require_memory
 
 FORMAT = "torch_pbd.schedule"
-VERSION = 1
+VERSION = 2
+"""Version 1 had no acceleration, no orientation and no mass that is a matrix, and loads."""
 MAX_BYTES = 2**30
 """Largest file (.npz: unpacked) that is written or read: 1 GiB, as .json 24 minutes at 1 kHz with d = 3."""
 
 Built = TypeVar("Built")
+Column = tuple[str, str, tuple[int, ...]]
 # A decoder gives the header, and then, once that is known to be of a version that can be read, the arrays.
 Decoder = Callable[[bytes], Iterator[Any]]
 
@@ -66,14 +68,18 @@ def read_schedule(path: Path, build: Callable[..., Built]) -> Built:
         header = next(parts)
         _check_header(header, optional={"sha256"} if suffix == ".csv" else set())
         arrays = next(parts)
-        if set(arrays) != set(ARRAY_DIMS):
-            raise ValueError(f"its arrays are {', '.join(arrays) or 'none'}, must be {', '.join(ARRAY_DIMS)}.")
+        required = [name for name in SHAPES if name not in OPTIONAL]
+        if not set(required) <= set(arrays) <= set(SHAPES):
+            raise ValueError(
+                f"its arrays are {', '.join(arrays) or 'none'}, must be {', '.join(required)}, and may be "
+                f"{', '.join(sorted(OPTIONAL))}."
+            )
         rest = {key: value for key, value in header.items() if key != "sha256"}
         if "sha256" in header and header["sha256"] != _digest(rest, arrays):
             line = "delete the line that starts with '# sha256:' to accept it"
             remedy = line if suffix == ".csv" else "save it again"
             raise ValueError(f"it does not match its checksum: it is damaged, or, if edited on purpose, {remedy}.")
-        return build(**arrays, **{key: header[key] for key in LABELS})
+        return build(**{key: header[key] for key in LABELS} | dict(arrays))
     except _DAMAGE as error:
         raise ModelFileError(f"{path} cannot be read as a schedule: {error}") from error
 
@@ -88,8 +94,8 @@ def _check_header(header: Any, optional: set[str]) -> None:
     found = header.get("format") if isinstance(header, dict) else None
     if found != FORMAT:
         raise ValueError(f"its format is {found!r}, must be {FORMAT!r}. {LOADERS}")
-    if header.get("version") != VERSION:
-        raise ValueError(f"it has version {header.get('version')!r}, must have {VERSION}: upgrade torch_pbd.")
+    if header.get("version") not in (1, VERSION):
+        raise ValueError(f"it has version {header.get('version')!r}, must have {VERSION} or 1: upgrade torch_pbd.")
     known = {"format", "version", "sha256", *LABELS}
     for words, keys in [("has no", known - optional - set(header)), ("has an unknown", set(header) - known)]:
         if keys:
@@ -99,7 +105,7 @@ def _check_header(header: Any, optional: set[str]) -> None:
 def _digest(header: Labels, arrays: Arrays) -> str:
     """SHA-256 of what the file says, not of how it is written: line ends and spelling of numbers are free."""
     digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
-    for name in ARRAY_DIMS:
+    for name in (name for name in SHAPES if name in arrays):
         digest.update(f"{name} {arrays[name].shape} ".encode())
         digest.update(arrays[name].astype("<f8").tobytes())
     return digest.hexdigest()
@@ -116,7 +122,7 @@ _parse_json = partial(json.loads, object_pairs_hook=_unique)
 
 
 def _encode_json(header: Labels, arrays: Arrays) -> bytes:
-    return json.dumps({**header, "arrays": {name: arrays[name].tolist() for name in ARRAY_DIMS}}).encode()
+    return json.dumps({**header, "arrays": {name: array.tolist() for name, array in arrays.items()}}).encode()
 
 
 def _decode_json(content: bytes) -> Iterator[Any]:
@@ -128,7 +134,7 @@ def _decode_json(content: bytes) -> Iterator[Any]:
 
 def _encode_npz(header: Labels, arrays: Arrays) -> bytes:
     stream = io.BytesIO()
-    little_endian: dict[str, Any] = {name: arrays[name].astype("<f8") for name in ARRAY_DIMS}
+    little_endian: dict[str, Any] = {name: array.astype("<f8") for name, array in arrays.items()}
     np.savez(stream, header=np.array(json.dumps(header)).astype("<U"), **little_endian)
     return stream.getvalue()
 
@@ -146,21 +152,22 @@ def _decode_npz(content: bytes) -> Iterator[Any]:
     yield arrays
 
 
-def _columns(
-    names: Sequence[str] | None, n_outputs: int, between: str = "]["
-) -> list[tuple[str, str, tuple[int, ...]]]:
-    """Title, array and place in its rows of each column; of symmetric matrices the upper triangle."""
-    labels = names or [str(i) for i in range(n_outputs)]
-    places = {n_dims: [*combinations_with_replacement(range(n_outputs), n_dims - 1)] for n_dims in (1, 2, 3)}
-    return [
-        (f"{name}[{between.join(labels[i] for i in place)}]" if place else name, name, place)
-        for name, n_dims in ARRAY_DIMS.items()
-        for place in places[n_dims]
-    ]
+def _columns(names: Sequence[str] | None, sizes: Mapping[str, int], between: str = "][") -> list[Column]:
+    """Title, array and place in its rows of each column; of symmetric matrices the upper triangle.
+
+    ``sizes`` has the number of columns of every array that is there, of matrices that of their columns.
+    """
+    named = names or [str(i) for i in range(sizes["velocity"])]
+    columns: list[Column] = []
+    for name, d in sizes.items():
+        labels = "wxyz" if name == "orientation" else named
+        for place in combinations_with_replacement(range(d), len(SHAPES[name]) - 1):
+            columns.append((f"{name}[{between.join(labels[i] for i in place)}]" if place else name, name, place))
+    return columns
 
 
 def _encode_csv(header: Labels, arrays: Arrays) -> bytes:
-    columns = _columns(header["names"], arrays["position"].shape[1])
+    columns = _columns(header["names"], {name: array.shape[-1] for name, array in arrays.items()})
     table = np.column_stack([arrays[name].T[place] for _, name, place in columns])
     text = io.StringIO(newline="")
     text.writelines(f"# {key}: {json.dumps(value)}\n" for key, value in header.items())
@@ -188,20 +195,27 @@ def _decode_csv(content: bytes) -> Iterator[Any]:
 def _read_table(names: Any, lines: Iterator[str], n_lines_before: int) -> Arrays:
     reader = csv.reader(lines)
     titles = next(reader, [])
-    d = sum(title.startswith("position[") for title in titles)
+    p, d = (sum(title.startswith(f"{name}[") for title in titles) for name in ("position", "velocity"))
     if names is not None and (not isinstance(names, list) or len(names) != d):
-        raise ValueError(f"names is {names}, but there are {d} columns of positions.")
+        raise ValueError(f"names is {names}, but there are {d} columns of velocities.")
+    there = {name for name in OPTIONAL if any(title.startswith(f"{name}[") for title in titles)}
+    sizes = {
+        name: {"n": 1, "p": p, "d": d, 4: 4}[shape[-1]]
+        for name, shape in SHAPES.items()
+        if name not in OPTIONAL or name in there
+    }
     # Counted before they are named, for titles of thousands of outputs would take gigabytes.
-    n_columns, line = 2 + 2 * d + 3 * d * (d + 1) // 2, n_lines_before + 1
+    n_columns = sum((1, size, size * (size + 1) // 2)[len(SHAPES[name]) - 1] for name, size in sizes.items())
+    line = n_lines_before + 1
     if len(titles) != n_columns:
-        raise ValueError(f"line {line} names {len(titles)} columns, of which {d} are positions, must name {n_columns}.")
-    columns = _columns(names, d)
+        raise ValueError(f"line {line} names {len(titles)} columns, of which {p} are positions, must name {n_columns}.")
+    columns = _columns(names, sizes)
     # Files once had titles with commas, stiffness[x,y], which must be quoted.
-    if not any(titles == [title for title, *_ in _columns(names, d, between)] for between in ("][", ",")):
+    if not any(titles == [title for title, *_ in _columns(names, sizes, between)] for between in ("][", ",")):
         raise ValueError(f"line {line} must name the columns {','.join(title for title, *_ in columns)}.")
     rows = [_numbers(cells, titles, n_lines_before + reader.line_num) for cells in reader if cells]
     table = np.reshape(rows, (-1, n_columns))
-    arrays: Arrays = {name: np.empty((len(table), *[d] * (n_dims - 1))) for name, n_dims in ARRAY_DIMS.items()}
+    arrays = {name: np.empty((len(table), *[size] * (len(SHAPES[name]) - 1))) for name, size in sizes.items()}
     for values, (_, name, place) in zip(table.T, columns, strict=True):
         arrays[name].T[place] = values
         arrays[name].T[place[::-1]] = values

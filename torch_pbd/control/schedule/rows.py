@@ -1,10 +1,11 @@
 """Rows of a schedule between its own: how many at a rate, and what motion and gains are there."""
 
 import math
+from typing import Any
 
 import numpy as np
 
-from torch_pbd import checks
+from torch_pbd import checks, rotations
 from torch_pbd.checks import Floats
 from torch_pbd.files.memory import require_memory
 
@@ -60,12 +61,39 @@ class Between:
         """Values (n, ...) on straight lines, (m, ...)."""
         return blend(values[self._row], values[self._row + 1], self._share)
 
+    def motion(self, schedule: Any) -> tuple[Floats, Floats, Floats | None]:
+        """Position (m, p), velocity (m, d) and orientation (m, 4), or None, of a schedule whose rows these are."""
+        p = schedule.position.shape[1]
+        position, velocity = self.hermite(schedule.position, schedule.velocity[:, :p])
+        if schedule.orientation is None:
+            return position, velocity, None
+        orientation, turning = self.hermite_rotation(schedule.orientation, schedule.velocity[:, p:])
+        return position, np.concatenate([velocity, turning], axis=1), orientation
+
     def hermite(self, position: Floats, velocity: Floats) -> tuple[Floats, Floats]:
         """Cubic through positions (n, d) with these velocities (n, d), and its derivative."""
-        row, s, h = self._row, self._share[:, np.newaxis], self._step[:, np.newaxis]
-        start, end = velocity[row], velocity[row + 1]
-        cubic = blend(position[row], position[row + 1], self._share**2 * (3.0 - 2.0 * self._share))
+        row = self._row
+        return self._cubic(position[row], position[row + 1], velocity[row], velocity[row + 1])
+
+    def hermite_rotation(self, orientation: Floats, velocity: Floats) -> tuple[Floats, Floats]:
+        """Quaternions (m, 4) between those of the rows (n, 4), and angular velocities, in world axes (n, 3) as given.
+
+        The cubic of each interval is that of the rotation vector y from its first row, ``R = R_row Exp(y)``.
+        """
+        row = self._row
+        start = orientation[row]
+        turn = rotations.log(rotations.multiply(rotations.conjugate(start), orientation[row + 1]))
+        to_body = rotations.matrix(start).swapaxes(1, 2)
+        begins = (to_body @ velocity[row, :, np.newaxis])[..., 0]
+        ends = np.linalg.solve(rotations.left_jacobian(turn), to_body @ velocity[row + 1, :, np.newaxis])[..., 0]
+        vector, rate = self._cubic(np.zeros_like(turn), turn, begins, ends.astype(float))
+        turning = to_body.swapaxes(1, 2) @ rotations.left_jacobian(vector) @ rate[..., np.newaxis]
+        return rotations.multiply(start, rotations.exp(vector)), turning[..., 0]
+
+    def _cubic(self, first: Floats, last: Floats, start: Floats, end: Floats) -> tuple[Floats, Floats]:
+        """Cubic from the first to the last values (m, d) with the rates at start and end, and its derivative."""
+        s, h = self._share[:, np.newaxis], self._step[:, np.newaxis]
+        cubic = blend(first, last, self._share**2 * (3.0 - 2.0 * self._share))
         bend = h * s * (1.0 - s) * ((1.0 - s) * start - s * end)
-        secant = (position[row + 1] - position[row]) / h
-        slope = blend(start, end, self._share) + 3.0 * s * (1.0 - s) * (2.0 * secant - start - end)
+        slope = blend(start, end, self._share) + 3.0 * s * (1.0 - s) * (2.0 * (last - first) / h - start - end)
         return cubic + bend, slope

@@ -1,7 +1,7 @@
 """The schedule of a controller: position, velocity, stiffness and damping over time, and how sure the model was."""
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.control.schedule.contents import ARRAY_DIMS, LABELS, checked_fields
+from torch_pbd.control.schedule.adapted import DiagonalLoss, damping_with, diagonal_gains, turned_rows
+from torch_pbd.control.schedule.contents import LABELS, SHAPES, Limits, checked_fields
 from torch_pbd.control.schedule.files import read_schedule, write_schedule
 from torch_pbd.control.schedule.rows import Between, tick_times
 from torch_pbd.exceptions import InvalidParameterError
@@ -25,64 +26,45 @@ _SLOWEST = 1e-9
 
 
 @final
-@dataclass(frozen=True)
-class DiagonalLoss:
-    """Loss of a controller that takes the diagonals of stiffness and damping only; all 0 if they are all there is.
-
-    Attributes
-    ----------
-    stiffness_max, stiffness_median, damping_max, damping_median : float
-        Frobenius norm of the entries off the diagonal over that of the whole; largest and median over time.
-    displacement, time : float
-        Largest ||x - x_diagonal|| / ||x|| over all forces and times, where the force displaces the robot by x
-        with the whole stiffness, and when that is, in s. 1 is an error as large as the displacement.
-    """
-
-    stiffness_max: float
-    stiffness_median: float
-    damping_max: float
-    damping_median: float
-    displacement: float
-    time: float
-
-    def __str__(self) -> str:
-        return (
-            f"diagonal gains lose {self.stiffness_max:.1%} of the stiffness (median {self.stiffness_median:.1%}), "
-            f"{self.damping_max:.1%} of the damping (median {self.damping_median:.1%}); displacements under a force "
-            f"are off by up to {self.displacement:.1%}, at {self.time:.6g} s"
-        )
-
-
-@final
 @dataclass(frozen=True, eq=False, repr=False)
 class Schedule:
     """Position, velocity, stiffness and damping over time, with the covariance they come from.
 
-    Between its rows it is what `resample` says. It is immutable; its arrays are read-only float64 copies.
+    Of positions alone, d = p; or of poses, d = p + 3: twists, wrenches and gains then have the positions first and
+    rotations last, all in world axes. The stiffness acts on the deviation ``(x - x_d, Log(R R_d'))``, whose last three
+    are a rotation vector in rad. Between its rows it is what `resample` says. It is immutable; its arrays are read-only
+    float64 copies.
 
     Parameters
     ----------
     time : array_like of shape (n,)
         In s, strictly increasing, n >= 2.
-    position, velocity : array_like of shape (n, d)
-        Desired, in ``units`` and ``units``/s.
+    position : array_like of shape (n, p)
+        Desired, in ``units``.
+    velocity : array_like of shape (n, d)
+        Desired, in ``units``/s; of rotations in rad/s.
     stiffness, damping : array_like of shape (n, d, d)
-        In N/m and N s/m, symmetric and positive semidefinite. Where the stiffness is singular, the damping
-        must be positive definite: nothing else would stop the robot.
+        In N/m and N s/m, and for rotations Nm/rad and Nm s/rad; symmetric and positive semidefinite. Where the
+        stiffness is singular, the damping must be positive definite: nothing else would stop the robot.
     covariance : array_like of shape (n, d, d)
-        Covariance of the demonstrations; symmetric and positive semidefinite.
+        Covariance of the demonstrations, at the desired pose; symmetric and positive semidefinite.
     type1 : array_like of shape (n,)
         How little the model knows: 0 (on data) to 1 (the prior alone).
+    acceleration : array_like of shape (n, d), default=None
+        Desired, in ``units``/s^2 and rad/s^2; None where it is not known.
+    orientation : array_like of shape (n, 4), default=None
+        Desired, as unit quaternions w x y z that turn the tool's vectors into the world's. Signs are made continuous.
     names : sequence of d str, default=None
         Names of the outputs.
     units, frame : str, default="m", None
         Unit of the position, name of the coordinate frame; None where it is not known.
-    stiffness_limits : (float, float), default=None
-        Least and largest eigenvalue that the stiffness may have, in N/m.
+    stiffness_limits : (low, high), default=None
+        Least and largest stiffness, each a number for all axes, in N/m, or d numbers: ``diag(low) <= K <= diag(high)``.
     covariance_of : {"position", "forcing"}, default="position"
         Quantity that the covariance belongs to: a forcing is that of eq. (18).
-    mass : float, default=None
-        Virtual mass of the admittance that the damping was computed for, kg.
+    mass : float, or array_like of shape (d, d) or (n, d, d), default=None
+        Inertia that the damping was computed for: the virtual mass of an admittance in kg, or that of an arm along the
+        schedule in kg, kg m and kg m^2, symmetric and positive definite.
     provenance : mapping, default={}
         Whatever JSON can hold about where the schedule comes from.
 
@@ -100,12 +82,14 @@ class Schedule:
     covariance: Floats
     type1: Floats
     _: KW_ONLY
+    acceleration: Floats | None = None
+    orientation: Floats | None = None
     names: tuple[str, ...] | None = None
     units: str | None = "m"
     frame: str | None = None
-    stiffness_limits: tuple[float, float] | None = None
+    stiffness_limits: Limits | None = None
     covariance_of: str = "position"
-    mass: float | None = None
+    mass: float | Floats | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -114,8 +98,14 @@ class Schedule:
 
     @property
     def n_outputs(self) -> int:
-        """Number of outputs d."""
-        return self.position.shape[1]
+        """Number of outputs d: of positions, and three of an orientation."""
+        return self.velocity.shape[1]
+
+    @property
+    def blocks(self) -> tuple[slice, ...]:
+        """Outputs that share a unit: the positions, and the rotation if there is an orientation."""
+        p, d = self.position.shape[1], self.n_outputs
+        return (slice(0, p), slice(p, d)) if d > p else (slice(0, p),)
 
     @property
     def duration(self) -> float:
@@ -128,27 +118,36 @@ class Schedule:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Schedule):
             return NotImplemented
-        arrays = zip(self._arrays().values(), other._arrays().values(), strict=True)
-        return self._labels() == other._labels() and all(np.array_equal(*pair) for pair in arrays)
+        mine, theirs = self._arrays(), other._arrays()
+        return (
+            self._labels() == other._labels()
+            and set(mine) == set(theirs)
+            and all(np.array_equal(array, theirs[name]) for name, array in mine.items())
+        )
 
     def __repr__(self) -> str:
-        eigenvalues = np.linalg.eigvalsh(self.stiffness)
         outputs = f"names={self.names}" if self.names else f"n_outputs={self.n_outputs}"
+        units = ["Nm/rad" if self.units == "rad" else "N/m", "Nm/rad"]
+        ranges = []
+        for block, unit in zip(self.blocks, units, strict=False):
+            eigenvalues = np.linalg.eigvalsh(self.stiffness[:, block, block])
+            ranges.append(f"{eigenvalues.min():.4g}..{eigenvalues.max():.4g} {unit}")
         return (
             f"Schedule(n={len(self)}, {outputs}, time={self.time[0]:.6g}..{self.time[-1]:.6g} s, "
-            f"stiffness={eigenvalues.min():.4g}..{eigenvalues.max():.4g} N/m, frame={self.frame!r})"
+            f"stiffness={' and '.join(ranges)}, frame={self.frame!r})"
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Copies go through the constructor: NumPy forgets that an array is read-only when it is pickled or copied.
-        return partial(Schedule, **self._arrays(), **self._labels()), ()
+        return partial(Schedule, **self._labels() | self._arrays()), ()
 
     def resample(self, rate: float | None = None, *, times: ArrayLike | None = None) -> "Schedule":
         """Rows at other times, all within the schedule.
 
-        Stiffness, damping, covariance and type1 are piecewise linear, so they stay symmetric, positive semidefinite
-        and within their limits. The position is the cubic of each interval through positions and velocities of its
-        ends (Hermite), the velocity its derivative: damping acts on no motion that the position does not make.
+        Stiffness, damping, covariance, mass, acceleration and type1 are piecewise linear, so that matrices stay
+        symmetric, positive semidefinite and within their limits. The position is the cubic of each interval through
+        positions and velocities of its ends (Hermite), the velocity its derivative: damping acts on no motion that the
+        position does not make. Orientations are such cubics of the rotation vector from the row before.
 
         Parameters
         ----------
@@ -171,19 +170,18 @@ class Schedule:
             grid = checks.array(times, "times", ("m",))
         checks.require((grid >= first) & (grid <= last), grid, "times", f"from {first!s} to {last!s} s")
         between = Between(self.time, grid)
-        position, velocity = between.hermite(self.position, self.velocity)
         rows: dict[str, Any] = {name: between.linear(array) for name, array in self._arrays().items()}
-        rows |= {"time": grid, "position": position, "velocity": velocity}
+        rows |= {"time": grid} | dict(zip(("position", "velocity", "orientation"), between.motion(self), strict=True))
         return replace(self, **rows)
 
     def retime(self, speed: float, *, mass: Any = None) -> "Schedule":
-        """Schedule that is ``speed`` times as fast: time / speed, velocity * speed, gains as they are.
+        """Schedule that is ``speed`` times as fast: time / speed, velocity * speed, gains and masses as they are.
 
         Parameters
         ----------
         speed : float
             From 1e-9 to 1e9; the stiffness rises that much faster too.
-        mass : float or array_like of shape (d, d), default=None
+        mass : float, or array_like of shape (d, d) or (n, d, d), default=None
             Mass of the admittance in kg, to certify the stability at the new speed. None: not checked.
 
         Raises
@@ -199,30 +197,63 @@ class Schedule:
                 remedy = f"held between rows, its gains let V grow by {report.held_growth - 1.0:.2g}; resample it finer"
             remedy = f"{remedy}, or filter the stiffness and give no mass here"
             raise checks.refusal(speed, "speed", "certified to be stable", remedy)
-        return replace(self, time=self.time / speed, velocity=self.velocity * speed)
+        acceleration = None if self.acceleration is None else self.acceleration * speed**2
+        return replace(self, time=self.time / speed, velocity=self.velocity * speed, acceleration=acceleration)
+
+    def with_inertia(self, mass: ArrayLike | Callable[[Floats], ArrayLike], damping_ratio: float = 1.0) -> "Schedule":
+        """Schedule for a robot of this inertia: with it, and with the damping that gives all modes this ratio.
+
+        ``D = 2 zeta M^1/2 (M^-1/2 K M^-1/2)^1/2 M^1/2`` at every row, as
+        :func:`~torch_pbd.control.damping_from_stiffness`. A torque-controlled arm moves with its operational inertia:
+        damping made for 1 kg leaves a Panda with a ratio of 0.26.
+
+        Parameters
+        ----------
+        mass : float, array_like of shape (d, d) or (n, d, d), or callable
+            In kg, for poses also kg m and kg m^2, in world axes; or a function of time (n,), in s, that returns it.
+        damping_ratio : float, default=1.0
+            Ratio zeta; 1 is critical.
+
+        Raises
+        ------
+        ValueError
+            If a matrix is not symmetric and positive definite, or the ratio is negative.
+        """
+        damping, inertia = damping_with(mass(self.time) if callable(mass) else mass, self.stiffness, damping_ratio)
+        return replace(self, damping=damping, mass=inertia)
+
+    def transform(
+        self, rotation: ArrayLike, translation: ArrayLike | None = None, *, frame: str | None = None
+    ) -> "Schedule":
+        """Schedule in another frame of the world, into which ``R x + t`` brings the positions x.
+
+        Parameters
+        ----------
+        rotation : array_like of shape (p, p) or (4,)
+            Matrix R, or for p = 3 a unit quaternion w x y z.
+        translation : array_like of shape (p,), default=None
+            In ``units``; None is none.
+        frame : str, default=None
+            Name of the new frame.
+
+        Raises
+        ------
+        ValueError
+            If the matrix is no rotation, positions are joint angles, or axes have limits of their own.
+        """
+        rows: dict[str, Any] = turned_rows(self, rotation, translation)
+        return replace(self, **rows, frame=frame)
 
     def certify(self, *, mass: Any = None, **options: Any) -> "StabilityReport":
         """`torch_pbd.control.certify` of this schedule, whose options it takes; no mass is its own, or 1 kg."""
         from torch_pbd.control.stability.certify import certify  # here: it needs torch, a schedule does not
 
-        return certify(self, mass=(self.mass or 1.0) if mass is None else mass, **options)
+        own: Any = 1.0 if self.mass is None else self.mass
+        return certify(self, mass=own if mass is None else mass, **options)
 
     def diagonal(self) -> tuple["Schedule", DiagonalLoss]:
         """Schedule with diagonal stiffness and damping, for controllers that take no other, and what that loses."""
-        # The nearest diagonal matrix, in the Frobenius norm, is the diagonal itself. It lies between the least and the
-        # largest eigenvalue, so within the limits too; rounding may leave it below zero.
-        stiffness, damping = (np.eye(self.n_outputs) * np.maximum(gain, 0.0) for gain in (self.stiffness, self.damping))
-        # x = K^-1 f and x_diagonal = D^-1 f differ by (I - D^-1 K) x: by its spectral norm, for the worst x.
-        gains = np.diagonal(stiffness, axis1=1, axis2=2)[..., np.newaxis]
-        coupling = (stiffness - self.stiffness) / np.where(gains > 0.0, gains, 1.0)
-        displacement = np.linalg.norm(coupling, ord=2, axis=(1, 2))
-        worst = int(displacement.argmax())
-        loss = DiagonalLoss(
-            *_relative_loss(self.stiffness, stiffness),
-            *_relative_loss(self.damping, damping),
-            displacement=float(displacement[worst]),
-            time=float(self.time[worst]),
-        )
+        stiffness, damping, loss = diagonal_gains(self)
         return replace(self, stiffness=stiffness, damping=damping), loss
 
     def plot(self) -> Any:
@@ -260,14 +291,10 @@ class Schedule:
         return read_schedule(Path(path), build=cls)
 
     def _arrays(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in ARRAY_DIMS}
+        arrays = {name: getattr(self, name) for name in SHAPES}
+        return {name: array for name, array in arrays.items() if isinstance(array, np.ndarray)}
 
     def _labels(self) -> dict[str, Any]:
-        return {**{name: getattr(self, name) for name in LABELS}, "provenance": dict(self.provenance)}
-
-
-def _relative_loss(matrices: Floats, diagonal: Floats) -> tuple[float, float]:
-    """Frobenius norm of the entries lost relative to the whole, 0 where all is zero: largest and median over time."""
-    whole = np.linalg.norm(matrices, axis=(1, 2))
-    loss = np.linalg.norm(matrices - diagonal, axis=(1, 2)) / np.where(whole > 0.0, whole, 1.0)
-    return float(loss.max()), float(np.median(loss))
+        labels = {name: getattr(self, name) for name in LABELS}
+        mass = None if isinstance(self.mass, np.ndarray) else self.mass
+        return {**labels, "mass": mass, "provenance": dict(self.provenance)}
