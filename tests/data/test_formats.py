@@ -25,7 +25,9 @@ RATE = 20.0
 LENGTHS = [5, 7, 4, 6, 5, 5, 6, 4, 7, 5, 6, 5]  # twelve: the last three come after the tenth
 RANDOM = np.random.default_rng(0)
 PATHS = [np.cumsum(RANDOM.normal(size=(n, 3)), axis=0) for n in LENGTHS]
-TURNS = [q / np.linalg.norm(q, axis=1, keepdims=True) for q in (RANDOM.normal(size=(n, 4)) for n in LENGTHS)]
+# x y z w, within a turn that three numbers hold.
+TURNS = [np.array([0.0, 0.0, 0.0, 4.0]) + 0.5 * RANDOM.normal(size=(n, 4)) for n in LENGTHS]
+TURNS = [q / np.linalg.norm(q, axis=1, keepdims=True) for q in TURNS]
 TIMES = [np.arange(n) / RATE for n in LENGTHS]
 
 
@@ -148,6 +150,10 @@ def test_robomimic_files(tmp_path):
     np.testing.assert_array_equal(actions[11].position, np.tanh(PATHS[11]))
     real = load_demonstrations(path, rate=20, outputs=["robot0_eef_quat_w"])  # x y z w: the real part is the last
     np.testing.assert_array_equal(real[4].position[:, 0], TURNS[4][:, 3])
+    quaternion = [f"robot0_eef_quat_{letter}" for letter in "wxyz"]
+    pose = load_demonstrations(path, rate=20, outputs="robot0_eef_pos", rotation=quaternion)
+    assert pose.units == ("m", "m", "m", "rad", "rad", "rad")
+    np.testing.assert_allclose(pose.to_poses()[1][4], np.roll(TURNS[4], 1, axis=1), atol=1e-14)
     with pytest.raises(DataFormatError, match=r"no column 'robot0_eef_vel' among \[actions_0"):
         load_demonstrations(path, rate=20, outputs="robot0_eef_vel")
     with pytest.raises(DataFormatError, match=r"mask is 'test', must be one of \[train\]"):
@@ -367,6 +373,9 @@ def test_bags_of_ros(tmp_path, store, kind):
     if kind == "PoseStamped":  # x y z w: the real part is the last
         turn = load_demonstrations(path, outputs=["qw", "x"])
         np.testing.assert_array_equal(turn[0].position[:, 0], TURNS[0][:, 3])
+        pose = load_demonstrations(path, rotation=["qw", "qx", "qy", "qz"])
+        assert (pose.names, pose.units) == (("x", "y", "z", "rx", "ry", "rz"), ("m",) * 3 + ("rad",) * 3)
+        np.testing.assert_allclose(pose.to_poses()[1][0], np.roll(TURNS[0], 1, axis=1), atol=1e-14)
         assert turn.units == ("1", "m")
 
 

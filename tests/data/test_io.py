@@ -241,7 +241,7 @@ def test_csv_that_cannot_be_read_is_refused_with_its_place(tmp_path, text, optio
         ({"demo": 5}, "demo is 5, must be text or None"),
         ({"time": 5}, "time is 5, must be text or None"),
         ({"rate": 0}, "rate is 0 Hz, must be a finite number above 0"),
-        ({"rotation": ("qw", "qx", "qy", "qz")}, "poses are not learned yet"),
+        ({"rotation": ("qw", "qx", "qy", "qz")}, "must be four different ones of [x], in the order w x y z"),
         ({"outputs": 3}, "outputs is 3, must be strings"),
         ({"outputs": ["x", 3]}, "outputs[1] is 3, must be text"),
         ({"delimiter": 5}, "delimiter is 5, must be one character"),

@@ -132,10 +132,14 @@ def dtw_warps(curves: Floats) -> Floats:
 
 
 def _comparable_scale(curves: Floats, units: Sequence[str] | None) -> Floats:
-    """Divisor (d,) of each output of curves (K, n, d), after which distances over all of them mean something."""
+    """Divisor (d,) of each output of curves (K, n, d), after which distances over all of them mean something.
+
+    One for all outputs of a unit, among which distances mean something before: axes may be turned.
+    """
     if units is None or len(set(units)) == 1:
         return np.ones(curves.shape[2])
-    scale = curves.std(axis=(0, 1))
+    same = np.equal.outer(np.array(units), np.array(units))
+    scale = np.sqrt(same @ curves.var(axis=(0, 1)) / same.sum(axis=1))
     # An output that is constant but for rounding tells nothing about timing: 1e-12 is what sums of thousands of samples
     # leave of float64's 1e-16.
     rounding = 1e-12 * np.abs(curves).max(axis=(0, 1))

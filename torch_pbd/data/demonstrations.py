@@ -9,17 +9,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.data.alignment import check_overlap, interpolate, on_common_phases, unit_phases
-from torch_pbd.data.editing import Editing
-from torch_pbd.data.recordings import MIN_SAMPLES, Missing, as_names, as_recordings, as_time_unit, as_units, preview
+from torch_pbd.data.alignment import check_overlap, unit_phases
+from torch_pbd.data.editing import Alignment, Editing
+from torch_pbd.data.poses import as_outputs, frozen, same_reference, unwrapped
+from torch_pbd.data.recordings import Missing, as_recordings, as_time_unit, preview
 from torch_pbd.data.units import find_suspects
 from torch_pbd.exceptions import InvalidParameterError
-from torch_pbd.files.memory import require_much
-
-Alignment = Literal["phase", "dtw"]
-
-MAX_DEFAULT_STEPS = 200
-"""Most points `Demonstrations.align` takes of its own accord: dynamic time warping takes time in their square."""
 
 
 class Demonstration(NamedTuple):
@@ -43,12 +38,12 @@ class Demonstrations(Editing):
         Strictly increasing times of the samples, or one array that all demonstrations share. Whole numbers beyond
         2**53 (stamps in ns since 1970), which float64 cannot hold, are counted from the first of all: steps are exact.
     positions : sequence of K array_like of shape (T_k, d), or array_like of shape (K, T, d)
-        What was recorded. Demonstrations of one output may be 1-D.
+        What was recorded, in d columns. Demonstrations of one output may be 1-D.
     names : sequence of d str, default=None
         Names of the outputs; None calls them y0, y1, ...
     units : str or sequence of d str, default=None
         Units of the outputs; one string is the unit of all of them. Known are km, m, dm, cm, mm, um, rad and deg;
-        other words ("pixels") are units of their own.
+        other words ("pixels") are units of their own. With ``rotation``, those of the other columns.
     frame : str, default=None
         Name of the coordinate frame.
     time_unit : str, default="s"
@@ -58,11 +53,19 @@ class Demonstrations(Editing):
     missing : {"raise", "drop"}, default="raise"
         "drop" leaves out samples of which the time or a position is NaN or masked, and warns
         (`MissingDataWarning`) of how many; each demonstration then has its own times. Infinity is an error.
+    rotation : sequence of 4 str, default=None
+        Columns of a unit quaternion, in the order w x y z, wherever they stand: nothing in recordings tells x y z w
+        from it. They become three outputs rx, ry, rz in rad, the last ones: y = Log(R0' R), around the Frechet mean R0
+        of all samples at common phases.
+    angles : str or sequence of str, default=None
+        Outputs in rad or deg that may jump by a turn: they go on over it, along time and between demonstrations.
+    rotation_reference : array_like of shape (4,), default=None
+        R0, of recordings whose last three outputs are such a rotation already.
 
     Attributes
     ----------
-    times, positions, names, units, frame, time_unit, alignment
-        As above: tuples of K read-only arrays, tuples of d strings.
+    times, positions, names, units, frame, time_unit, alignment, rotation_reference
+        As above: tuples of K read-only arrays, tuples of d strings; None where there is no rotation.
     suspects : tuple of str
         Sentences on outputs that have no mean as they are, each with its remedy.
 
@@ -71,12 +74,14 @@ class Demonstrations(Editing):
     ValueError
         If there is no demonstration, lengths or numbers of outputs disagree, a demonstration has (left) fewer than two
         samples, a value is not a finite real number, times do not increase strictly or are stored too coarsely to tell
-        samples apart, a name has control characters, or a unit is a known one in another spelling ("MM", "sec").
+        samples apart, a name has control characters, or a unit is a known one in another spelling ("MM", "sec"). If a
+        quaternion is not of norm 1 to the rounding of files, or further than 150 degrees from the mean.
 
     Warns
     -----
     UserWarning
         If four outputs are unit quaternions, or one is an angle that jumps by a turn: these have no mean as they are.
+        If a rotation is further than 120 degrees from the mean.
 
     Examples
     --------
@@ -97,6 +102,7 @@ class Demonstrations(Editing):
     frame: str | None
     time_unit: str
     alignment: Alignment | None
+    rotation_reference: Floats | None
     suspects: tuple[str, ...]
 
     def __init__(
@@ -110,20 +116,21 @@ class Demonstrations(Editing):
         time_unit: str = "s",
         alignment: Alignment | None = None,
         missing: Missing = "raise",
+        rotation: Sequence[str] | None = None,
+        angles: str | Sequence[str] | None = None,
+        rotation_reference: ArrayLike | None = None,
     ) -> None:
-        times_, positions_ = as_recordings(times, positions, missing)
-        d = positions_[0].shape[1]
-        names_, units_ = as_names(names, d), as_units(units, d)
+        outputs = as_outputs(times, positions, names, units, rotation, rotation_reference, missing)
+        if angles is not None:
+            turned = unwrapped(*outputs[:4], angles)
+            outputs = outputs._replace(positions=as_recordings(outputs.times, turned, "raise")[1])
         # A frozen class sets its attributes by its dictionary.
         vars(self).update(
-            times=times_,
-            positions=positions_,
-            names=names_,
-            units=units_,
+            outputs._asdict(),
             frame=checks.text(frame, "frame", optional=True),
             time_unit=as_time_unit(time_unit),
             alignment=alignment if alignment is None else checks.choice(alignment, "alignment", Alignment),
-            suspects=find_suspects(positions_, names_, units_),
+            suspects=find_suspects(outputs.positions, outputs.names, outputs.units),
         )
         if self.suspects:
             checks.warn(" ".join(self.suspects))
@@ -167,9 +174,9 @@ class Demonstrations(Editing):
             return NotImplemented
         labels = ("n_steps", "names", "units", "frame", "time_unit")
         arrays = zip((*self.times, *self.positions), (*other.times, *other.positions), strict=True)
-        return all(getattr(self, name) == getattr(other, name) for name in labels) and all(
-            np.array_equal(mine, theirs) for mine, theirs in arrays
-        )
+        same = all(getattr(self, name) == getattr(other, name) for name in labels)
+        same = same and same_reference(self.rotation_reference, other.rotation_reference)
+        return same and all(np.array_equal(mine, theirs) for mine, theirs in arrays)
 
     def __repr__(self) -> str:
         shortest, longest = min(self.n_steps), max(self.n_steps)
@@ -222,41 +229,6 @@ class Demonstrations(Editing):
             )
         return np.stack(self.positions)
 
-    def resample(self, n: int) -> "Demonstrations":
-        """Each demonstration at ``n`` points evenly spaced over its own time, by linear interpolation.
-
-        Demonstrations that start and end at the same times are aligned afterwards.
-        """
-        grids = [np.linspace(time[0], time[-1], _checked_n(n)) for time in self.times]
-        return self._replace(grids, list(map(interpolate, self.times, self.positions, grids)))
-
-    def align(self, method: Literal["phase", "dtw"] = "phase", n: int | None = None) -> "Demonstrations":
-        """All demonstrations on one grid of phases, evenly spaced over 0..1; ``time_unit`` becomes "1".
-
-        Parameters
-        ----------
-        method : {"phase", "dtw"}, default="phase"
-            "phase" is linear time normalization. "dtw" then takes differences of timing out by dynamic time warping
-            (``torch_pbd.data.alignment.dtw_warps``), keeping the ends of each demonstration and the mean timing of all.
-            It also takes for timing what only looks like it: use it where the shape is what matters, and not to predict
-            new demonstrations, in which the timing comes back (measured: 3.7 nats a step worse). It compares positions
-            in their units; outputs whose ``units`` differ are compared in standard deviations.
-        n : int, default=None
-            Number of phases; None takes the median number of samples, at most 200. "dtw" takes time and memory in
-            proportion to its square.
-
-        Returns
-        -------
-        Demonstrations
-            Aligned.
-        """
-        checks.choice(method, "method", Alignment)
-        n = _checked_n(min(round(float(np.median(self.n_steps))), MAX_DEFAULT_STEPS) if n is None else n)
-        grid, positions = on_common_phases(self.times, self.positions, method, n, self.units)
-        # Timing that was taken out stays out, whatever is done to the demonstrations afterwards.
-        alignment = "dtw" if "dtw" in (method, self.alignment) else "phase"
-        return self._replace(grid, positions, time_unit="1", alignment=alignment)
-
     def plot(self, outputs: Sequence[int | str] | None = None, *, ax: Any = None) -> Any:
         """Draw every demonstration: two or three outputs against each other, one or more than three over time.
 
@@ -283,11 +255,6 @@ def _rebuild(times: Any, positions: Any, attributes: dict[str, Any]) -> Demonstr
     """Demonstrations made of others, whose labels were checked and whose suspects were warned of."""
     rebuilt = object.__new__(Demonstrations)
     times, positions = as_recordings(times, positions, "raise")
-    vars(rebuilt).update(attributes, times=times, positions=positions)
+    reference = frozen(attributes["rotation_reference"])
+    vars(rebuilt).update(attributes, times=times, positions=positions, rotation_reference=reference)
     return rebuilt
-
-
-def _checked_n(n: int) -> int:
-    checks.count(n, "n", least=MIN_SAMPLES)
-    require_much(64.0 * n, what=f"n={n} points", remedy="Lower it.")
-    return n

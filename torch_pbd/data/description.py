@@ -8,7 +8,7 @@ import numpy as np
 
 from torch_pbd.checks import Floats
 from torch_pbd.data.alignment import check_overlap
-from torch_pbd.data.pauses import still
+from torch_pbd.data.pauses import extents, still
 from torch_pbd.data.units import ANGLES, LENGTHS, TIMES, quaternions
 from torch_pbd.exceptions import InvalidParameterError
 
@@ -33,18 +33,21 @@ class Description:
         Name, unit, least, largest and extent of each output.
     mistakes : tuple of str
         Each with its remedy; empty where nothing looks wrong.
+    rotation : str
+        Sentence on the chart of the rotations; empty where there are none.
     """
 
     recordings: list[dict[str, Any]] = field(default_factory=list)
     outputs: list[dict[str, Any]] = field(default_factory=list)
     mistakes: tuple[str, ...] = ()
+    rotation: str = ""
 
     def __str__(self) -> str:
         rows = _table(self.recordings[:_MOST_ROWS])
         if len(self.recordings) > _MOST_ROWS:
             rows += f"\n... {len(self.recordings)} recordings in all"
         told = [f"{i + 1}. {sentence}" for i, sentence in enumerate(self.mistakes)] or ["Nothing looks wrong."]
-        return "\n\n".join([rows, _table(self.outputs), "\n".join(told)])
+        return "\n\n".join([rows, _table(self.outputs), *([self.rotation] if self.rotation else []), "\n".join(told)])
 
     __repr__ = __str__
 
@@ -56,7 +59,7 @@ def describe(demonstrations: Any, notes: Sequence[str] = ()) -> Description:
     recordings = []
     for k, (time, position) in enumerate(demonstrations):
         steps = np.diff(time)
-        first, last = _still_ends(time, position, _PAUSE * second)
+        first, last = _still_ends(time, position, extents(position, demonstrations), _PAUSE * second)
         row = {"#": k, "samples": len(time), f"start [{unit}]": time[0], f"lasts [{unit}]": time[-1] - time[0]}
         row |= {"rate [Hz]": second / np.median(steps), f"gap [{unit}]": steps.max()}
         recordings.append(row | {"rest before": first, "rest after": last})
@@ -67,16 +70,28 @@ def describe(demonstrations: Any, notes: Sequence[str] = ()) -> Description:
         for name, own, y in zip(demonstrations.names, units, whole, strict=True)
     ]
     mistakes = (*notes, *_of_times(demonstrations, second), *_of_ends(demonstrations, recordings, unit))
-    return Description(recordings, outputs, (*mistakes, *_of_outputs(demonstrations, outputs)))
+    mistakes = (*mistakes, *_of_outputs(demonstrations, outputs))
+    return Description(recordings, outputs, mistakes, _rotation(demonstrations))
+
+
+def _rotation(demonstrations: Any) -> str:
+    if demonstrations.rotation_reference is None:
+        return ""
+    furthest = max(np.linalg.norm(position[:, -3:], axis=1).max() for position in demonstrations.positions)
+    reference = ", ".join(f"{number:.4f}" for number in demonstrations.rotation_reference)
+    return (
+        f"Rotations are {', '.join(demonstrations.names[-3:])} around the quaternion w x y z of {reference}; the "
+        f"furthest is {np.degrees(furthest):.0f} degrees from it."
+    )
 
 
 def _column(demonstrations: Any, i: int) -> Floats:
     return np.concatenate([position[:, i] for position in demonstrations.positions])
 
 
-def _still_ends(time: Floats, position: Floats, pause: float) -> tuple[float, float]:
+def _still_ends(time: Floats, position: Floats, extent: Floats, pause: float) -> tuple[float, float]:
     """How long nothing moves at the beginning and at the end."""
-    moving = np.flatnonzero(~still(time, position, pause))
+    moving = np.flatnonzero(~still(time, position, extent, pause))
     return (time[moving[0]] - time[0], time[-1] - time[moving[-1]]) if len(moving) else (time[-1] - time[0], 0.0)
 
 
@@ -121,7 +136,8 @@ def _of_ends(demonstrations: Any, recordings: list[dict[str, Any]], unit: str) -
             yield f"Nothing moves at the {end} of {_numbers(held)}, for up to {longest:.3g} {unit}: say trim='still'."
     cut: dict[str, list[int]] = {"start": [], "end": []}
     for k, (time, position) in enumerate(demonstrations):
-        scale = np.where(np.ptp(position, axis=0) > 0, np.ptp(position, axis=0), np.inf)
+        extent = extents(position, demonstrations)
+        scale = np.where(extent > 0, extent, np.inf)
         speed = np.linalg.norm(np.diff(position / scale, axis=0), axis=1) / np.diff(time)
         few = max(1, len(speed) // 50)  # one step alone is mostly noise
         for end, own in (("start", speed[:few]), ("end", speed[-few:])):
@@ -163,7 +179,7 @@ def _flips(demonstrations: Any) -> Iterator[str]:
         columns = demonstrations.names[place : place + 4]
         name = f"Quaternion {', '.join(columns)}"
         if {column[-1] for column in columns} != set("wxyz"):
-            yield f"{name} has an order that nobody named: w may be first or last. Name its columns."
+            yield f"{name} has an order that nobody named: w may be first or last. Say it by rotation=, w x y z."
         each = [position[:, place : place + 4] for position in demonstrations.positions]
         for k, q in enumerate(each):
             turned = np.flatnonzero((q[1:] * q[:-1]).sum(axis=1) < 0.0)

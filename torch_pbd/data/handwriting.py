@@ -9,7 +9,7 @@ from scipy.interpolate import BSpline, make_interp_spline
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.data.demonstrations import Demonstrations
-from torch_pbd.data.synthetic import Seed, band_noise, generator
+from torch_pbd.data.synthetic import Random, Seed, band_noise, generator
 from torch_pbd.files.memory import require_much
 
 Shape = Literal["C", "G", "J", "S", "W", "Z"]
@@ -30,7 +30,7 @@ _TREMOR = 2e-4  # rms in m, up to 2 Hz: no output is ever free of it
 def handwriting_mean(phase: ArrayLike, shape: Shape = "S") -> Floats:
     """Mean (n, 2) of a letter in m, at phases (n,) or (n, 1) from 0, its start, to 1, its end."""
     via_points, _ = _via_law(shape, None)
-    return _minimum_jerk(via_points)(_phases(phase)) @ via_points
+    return minimum_jerk(via_points)(phases(phase)) @ via_points
 
 
 def handwriting_covariance(phase: ArrayLike, shape: Shape = "S", *, via_precision: ArrayLike | None = None) -> Floats:
@@ -40,7 +40,7 @@ def handwriting_covariance(phase: ArrayLike, shape: Shape = "S", *, via_precisio
     """
     via_points, covariances = _via_law(shape, via_precision)
     # A movement is linear in its via points, which are independent: x = sum_k b_k p_k, so C = sum_k b_k^2 C_k.
-    weights = _minimum_jerk(via_points)(_phases(phase)) ** 2
+    weights = minimum_jerk(via_points)(phases(phase)) ** 2
     return np.einsum("nk,kij->nij", weights, covariances) + _TREMOR**2 * np.eye(2)
 
 
@@ -94,27 +94,38 @@ def make_handwriting_demonstrations(
     Demonstrations(n_demos=6, n_steps=201, outputs=('x', 'y'), time_unit='s', aligned=True)
     """
     via_points, covariances = _via_law(shape, via_precision)
+    check_recording(n_demos, duration, rate, timing)
+    random = generator(random_state)
+    roots, weights = np.linalg.cholesky(covariances), minimum_jerk(via_points)
+    times, positions = [], []
+    for _ in range(n_demos):
+        time, phase = paced(duration, rate, timing, random)
+        passed = via_points + np.einsum("kij,kj->ki", roots, random.normal(size=via_points.shape))
+        tremor = np.stack([band_noise(time, 0.0, 2.0, random) for _ in range(2)], axis=1)
+        times.append(time)
+        positions.append(weights(phase) @ passed + _TREMOR * tremor)
+    return Demonstrations(times, positions, names=("x", "y"), units="m")
+
+
+def check_recording(n_demos: int, duration: float, rate: float, timing: float) -> None:
+    """Check what makers of demonstrations are told of their number and times."""
     checks.count(n_demos, "n_demos")
     checks.number(duration, "duration", above=0.0, unit="s")
     checks.number(rate, "rate", above=0.0, unit="Hz")
     checks.number(timing, "timing", least=0.0, below=0.5)
     checks.number(duration * rate, "duration * rate, the number of steps,", least=2.0)
     require_much(400.0 * n_demos * duration * rate, what=f"n_demos={n_demos}", remedy="Make fewer samples.")
-    random = generator(random_state)
-    roots, weights = np.linalg.cholesky(covariances), _minimum_jerk(via_points)
-    times, positions = [], []
-    for _ in range(n_demos):
-        longer, pace = timing * random.normal(size=2)
-        lasting = duration * np.exp(longer)
-        time = np.arange(max(2, round(lasting * rate)) + 1) / rate
-        # phase' = 1 + a cos(2 pi t / T) > 0: early slower and late faster, or the reverse, with the same ends.
-        even = time / time[-1]
-        phase = even + np.tanh(2.0 * pace) * np.sin(2.0 * np.pi * even) / (2.0 * np.pi)
-        passed = via_points + np.einsum("kij,kj->ki", roots, random.normal(size=via_points.shape))
-        tremor = np.stack([band_noise(time, 0.0, 2.0, random) for _ in range(2)], axis=1)
-        times.append(time)
-        positions.append(weights(phase.clip(0.0, 1.0)) @ passed + _TREMOR * tremor)
-    return Demonstrations(times, positions, names=("x", "y"), units="m")
+
+
+def paced(duration: float, rate: float, timing: float, random: Random) -> tuple[Floats, Floats]:
+    """Times (T,) of a demonstration, and its phases: both its duration and its pace vary by ``timing``."""
+    longer, pace = timing * random.normal(size=2)
+    lasting = duration * np.exp(longer)
+    time = np.arange(max(2, round(lasting * rate)) + 1) / rate
+    # phase' = 1 + a cos(2 pi t / T) > 0: early slower and late faster, or the reverse, with the same ends.
+    even = time / time[-1]
+    phase = even + np.tanh(2.0 * pace) * np.sin(2.0 * np.pi * even) / (2.0 * np.pi)
+    return time, phase.clip(0.0, 1.0)
 
 
 def _via_law(shape: Shape, via_precision: ArrayLike | None) -> tuple[Floats, Floats]:
@@ -135,7 +146,7 @@ def _via_law(shape: Shape, via_precision: ArrayLike | None) -> tuple[Floats, Flo
     return means, across[:, np.newaxis, np.newaxis] ** 2 * (_ALONG**2 * outer[0] + outer[1])
 
 
-def _minimum_jerk(via_points: Floats) -> BSpline:
+def minimum_jerk(via_points: Floats) -> BSpline:
     """Weights (n, k) of the via points over phases (n,), in the movement of least jerk from rest to rest."""
     # Passed at phases by the square root of the distance: slower in narrow turns, as hands are.
     passes = np.append(0.0, np.linalg.norm(np.diff(via_points, axis=0), axis=1) ** 0.5).cumsum()
@@ -143,7 +154,8 @@ def _minimum_jerk(via_points: Floats) -> BSpline:
     return make_interp_spline(passes / passes[-1], np.eye(len(via_points)), k=5, bc_type=(rest, rest))
 
 
-def _phases(phase: ArrayLike) -> Floats:
+def phases(phase: ArrayLike) -> Floats:
+    """Phases (n,) from 0 to 1 of what was given as (n,) or (n, 1)."""
     at = checks.real_floats(phase, "phase")
     at = checks.array(at.reshape(-1, 1) if at.ndim < 2 else at, "phase", ("n", 1))[:, 0]
     checks.require((at >= 0.0) & (at <= 1.0), at, "phase", "from 0 to 1")

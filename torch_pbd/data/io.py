@@ -57,7 +57,8 @@ def load_demonstrations(
     outputs: str | Sequence[str] | None = None,
     demo: str | None = None,
     time: str | None = None,
-    rotation: None = None,
+    rotation: Sequence[str] | None = None,
+    angles: str | Sequence[str] | None = None,
     units: str | Sequence[str] | None = None,
     time_unit: str | None = None,
     frame: str | None = None,
@@ -112,8 +113,11 @@ def load_demonstrations(
         Leave out what is still at both ends: `Demonstrations.trim`.
     from_start : bool, default=False
         Count the times of each demonstration from its start: `Demonstrations.from_start`.
-    rotation : None
-        Rotations are not read yet: name other outputs.
+    rotation : sequence of 4 str, default=None
+        Columns of a unit quaternion in the order w x y z, wherever they stand, outputs beside those of ``outputs``. As
+        in `Demonstrations`: nothing in a file tells w x y z from x y z w, so look it up (ROS and robosuite: x y z w).
+    angles : str or sequence of str, default=None
+        Outputs that may jump by a turn, as in `Demonstrations`.
     max_bytes : int, default=512 MiB
         Larger files (.npz: unpacked) are refused before they are read.
     **options
@@ -136,12 +140,12 @@ def load_demonstrations(
         for the memory.
     """
     checks.flag(from_start, "from_start")
-    if rotation is not None:
-        raise checks.refusal(rotation, "rotation", "None", "poses are not learned yet; name outputs= without rotations")
     wanted = Wanted(
         outputs=outputs,
         demo=demo,
         time=time,
+        rotation=rotation,
+        angles=angles,
         units=units,
         time_unit=time_unit,
         frame=frame,
@@ -175,6 +179,8 @@ def _load_all(
 ) -> Demonstrations:
     each = [_load(file, wanted, options) for file in find_files(source)]
     demonstrations = each[0] if len(each) == 1 else Demonstrations.concatenate(each)
+    if len(each) > 1 and wanted.angles is not None:
+        demonstrations = demonstrations.unwrap(wanted.angles)
     demonstrations = demonstrations if cut is None else demonstrations.cut(cut)
     demonstrations = demonstrations if trim is None else demonstrations.trim(trim)
     return demonstrations.from_start() if from_start else demonstrations
@@ -237,7 +243,8 @@ def save_demonstrations(demonstrations: Demonstrations, path: str | os.PathLike[
 
     All numbers come back to the last bit. A CSV file does not hold units and frame, nor a checksum: one that somebody
     cuts or changes may be read as what it is not. An .npz file holds one of each array. The file appears complete or
-    not at all, and replaces one that is there.
+    not at all, and replaces one that is there. Rotations stand in CSV files as quaternions, columns qw, qx, qy, qz,
+    which are named by ``rotation`` to be read; in .npz files as they are, with their reference.
 
     Parameters
     ----------

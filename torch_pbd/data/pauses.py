@@ -1,5 +1,7 @@
 """Where nothing moves."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,9 +11,19 @@ from torch_pbd.checks import Floats
 _STILL = 0.02
 
 
-def still(time: Floats, position: Floats, pause: float) -> NDArray[np.bool_]:
-    """Whether each sample belongs to a stretch of at least ``pause`` in which no output leaves 2 % of its extent."""
+def extents(position: Floats, demonstrations: Any) -> Floats:
+    """How far each output (d,) goes in a recording; those of a rotation all as far as the furthest of them.
+
+    A tool that turns about one axis trembles about the others, and all axes are as good.
+    """
     extent = np.ptp(position, axis=0)
+    if demonstrations.rotation_reference is not None:
+        extent[-3:] = extent[-3:].max()
+    return extent
+
+
+def still(time: Floats, position: Floats, extent: Floats, pause: float) -> NDArray[np.bool_]:
+    """Whether each sample is in a stretch of at least ``pause`` in which no output leaves 2 % of its extent (d,)."""
     result = np.zeros(len(time), dtype=bool)
     if not extent.any() or time[-1] - time[0] < pause:
         return result

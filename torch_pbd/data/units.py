@@ -29,7 +29,7 @@ _LIKE_NS = 1e14
 
 # Four numbers rounded to three decimals: their squared sum is off by up to 2 sum |q| 0.0005, at most 0.002. What varies
 # little around a point of norm 1 is a quaternion only if it keeps to the sphere far better than it varies.
-_OFF_SPHERE, _OFF_SPHERE_SHARE = 2.5e-3, 0.1
+OFF_SPHERE, _OFF_SPHERE_SHARE = 2.5e-3, 0.1
 _SAMPLES_ON_SPHERE = 0.9  # what is interpolated between q and -q is off it
 # In turns: how far off one a jump may be, and how large other steps of an angle that was sampled densely enough.
 _QUARTER = 0.25
@@ -88,7 +88,7 @@ def quaternions(positions: Sequence[Floats], n_outputs: int) -> list[int]:
         columns = [_column(positions, i) for i in range(first, first + 4)]
         off = np.abs(sum(map(np.square, columns)) - 1.0)
         spread = max(map(np.ptp, columns))
-        if spread > 0.0 and np.mean(off <= min(_OFF_SPHERE, _OFF_SPHERE_SHARE * spread)) >= _SAMPLES_ON_SPHERE:
+        if spread > 0.0 and np.mean(off <= min(OFF_SPHERE, _OFF_SPHERE_SHARE * spread)) >= _SAMPLES_ON_SPHERE:
             found.append(first)
         first += 4 if first in found else 1
     return found
@@ -96,10 +96,14 @@ def quaternions(positions: Sequence[Floats], n_outputs: int) -> list[int]:
 
 def _quaternions(positions: Sequence[Floats], names: Sequence[str]) -> Iterator[str]:
     for first in quaternions(positions, len(names)):
+        four = names[first : first + 4]
+        order = sorted(four, key=lambda name: name[-1:])
+        known = [name[-1:] for name in order] == [*"wxyz"]
+        columns = tuple(order) if known else "(w, x, y, z), of which only you know the names"
         yield (
-            f"Outputs {', '.join(names[first : first + 4])} have the squared sum 1, as unit quaternions do: q and -q "
-            "are the same rotation, so their mean and their covariance are not those of rotations. Leave them out, as "
-            "by outputs=[...] of load_demonstrations."
+            f"Outputs {', '.join(four)} have the squared sum 1, as unit quaternions do: q and -q are one rotation, so "
+            "their mean and their covariance are not those of rotations. Say which they are, in the order w x y z, "
+            f"rotation={columns}, or leave them out, as by outputs=[...] of load_demonstrations."
         )
 
 
@@ -119,6 +123,6 @@ def _wrapped(positions: Sequence[Floats], names: Sequence[str], units: Sequence[
             if dense and smooth.all() and (unit is not None or whole <= 1.01 * turn):
                 yield (
                     f"Output {name} jumps by a turn, {turn:.4g} {angle}, between two samples: means of such recordings "
-                    "are no angles, and a robot would turn back the long way. Unwrap each recording first, by "
-                    f"numpy.unwrap({name}{'' if angle == 'rad' else ', period=360'})."
+                    f"are no angles, and a robot would turn back the long way. Say angles=[{name!r}], and "
+                    f"that its unit is {angle!r}."
                 )

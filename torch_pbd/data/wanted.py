@@ -43,6 +43,8 @@ class Wanted:
     outputs: Sequence[str] | None = None
     demo: str | None = None
     time: str | None = None
+    rotation: Sequence[str] | None = None
+    angles: str | Sequence[str] | None = None
     rate: float | None = None
     units: str | Sequence[str] | None = None
     time_unit: str | None = None
@@ -60,6 +62,7 @@ class Wanted:
         checks.count(self.max_bytes, "max_bytes", remedy="the bytes of the largest file to read")
         if self.outputs is not None:
             object.__setattr__(self, "outputs", as_texts(self.outputs, "outputs"))
+        object.__setattr__(self, "rotation", None if self.rotation is None else as_texts(self.rotation, "rotation"))
 
     def choose(
         self,
@@ -102,7 +105,8 @@ class Wanted:
     ) -> list[str]:
         wanted = self.outputs if self.outputs is not None or default not in signals else [str(default)]
         if wanted is not None:
-            return [column for name in wanted for column in ([name] if name in places else signals.get(name, [name]))]
+            names = [column for name in wanted for column in ([name] if name in places else signals.get(name, [name]))]
+            return [*names, *(name for name in self.rotation or () if name not in names)]
         names = [name for name in places if name not in taken]
         unnamed = [name for name in names if name in _UNNAMED]
         if unnamed:
@@ -155,7 +159,7 @@ class Wanted:
             times, unit = [np.arange(len(position)) for position in positions], "samples"
         elif times and all(np.asarray(time).dtype.kind in "mM" for time in times):
             times = _numbers_of_dates(times, checks.choice(unit, "time_unit", _DATE_UNITS))
-        given = {"units": self.units, "frame": self.frame}
+        given = {"units": self.units, "frame": self.frame, "rotation": self.rotation, "angles": self.angles}
         labels |= {name: value for name, value in given.items() if value is not None}
         labels |= {"names": names, "time_unit": unit, "missing": self.missing}
         return {"times": times, "positions": positions, **labels}

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from torch_pbd import checks
 from torch_pbd.data.demonstrations import Demonstrations
+from torch_pbd.data.poses import as_columns
 from torch_pbd.data.recordings import preview
 from torch_pbd.data.units import nanoseconds_hint
 from torch_pbd.data.wanted import Arguments, Chosen, Wanted, rows_of
@@ -44,15 +45,16 @@ def read(path: Path, wanted: Wanted, delimiter: str | None = None, decimal: str 
 
 def write(demonstrations: Demonstrations, handle: BinaryIO) -> None:
     """Write columns ``demo,time,<names>``; the shortest decimals that come back to the last bit."""
-    unusable = [name for name in demonstrations.names if name in ("demo", "time") or name != name.strip()]
+    names, columns = as_columns(demonstrations)
+    unusable = [name for name in names if name in ("demo", "time") or name != name.strip()]
     if unusable:
         raise ValueError(f"an output named {unusable[0]!r} cannot be told from the other columns: rename it.")
     text = io.TextIOWrapper(handle, encoding="utf-8", newline="")
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["demo", "time", *demonstrations.names])
-    for k, (time, position) in enumerate(demonstrations):
-        rows = zip(time.tolist(), position.tolist(), strict=True)
-        writer.writerows([k, t, *values] for t, values in rows)
+    writer.writerow(["demo", "time", *names])
+    for k, (time, values) in enumerate(zip(demonstrations.times, columns, strict=True)):
+        rows = zip(time.tolist(), values.tolist(), strict=True)
+        writer.writerows([k, t, *row] for t, row in rows)
     text.detach()
 
 

@@ -31,7 +31,7 @@ def read(path: Path, wanted: Wanted, mask: str | None = None) -> Arguments:
         wanted.require(sum(found[key].nbytes for found in each.values() for key in chosen.signals), "it")
         recordings = [{key: found[key][()] for key in chosen.signals} for found in each.values()]
     # Positions of robosuite's end effectors are in m.
-    units = "m" if all(signal.endswith("eef_pos") for signal, _ in chosen.outputs) else None
+    units = "m" if all(signal.endswith(("eef_pos", "eef_quat")) for signal, _ in chosen.outputs) else None
     return wanted.read_each(chosen, recordings, units=units)
 
 

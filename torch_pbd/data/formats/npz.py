@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from torch_pbd import checks
 from torch_pbd.data.demonstrations import Demonstrations
+from torch_pbd.data.poses import with_whole_rotation
 from torch_pbd.data.recordings import as_names, as_units, preview
 from torch_pbd.data.wanted import Arguments, Wanted, natural
 from torch_pbd.files.archives import read_array, read_members
@@ -55,10 +56,14 @@ def read(path: Path, wanted: Wanted) -> Arguments:
         "time_unit": wanted.time_unit or _text(meta, "time_unit") or _without_remark(_text(meta, "t_unit")) or "s",
         "alignment": meta.get("alignment"),
         "missing": wanted.missing,
+        "rotation": wanted.rotation,
+        "angles": wanted.angles,
+        "rotation_reference": meta.get("rotation_reference"),
     }
     if wanted.outputs is not None:
         names = as_names(found["names"], n_outputs)
-        outputs = wanted.choose({name: (name,) for name in names}).names
+        chosen = wanted.choose({name: (name,) for name in names}).names
+        outputs, found["rotation_reference"] = with_whole_rotation(chosen, names, found["rotation_reference"])
         kept = [names.index(name) for name in outputs]
         units = as_units(found["units"], n_outputs)
         found |= {"positions": [position[:, kept] for position in positions], "names": outputs}
@@ -119,6 +124,8 @@ def write(demonstrations: Demonstrations, handle: BinaryIO) -> None:
         "frame": demonstrations.frame,
         "alignment": demonstrations.alignment,
     }
+    if demonstrations.rotation_reference is not None:
+        meta["rotation_reference"] = demonstrations.rotation_reference.tolist()
     arrays: dict[str, Any] = {"meta": np.array(json.dumps(meta))}
     if aligned:
         arrays |= {"t": demonstrations.times[0], "x": demonstrations.to_array()}

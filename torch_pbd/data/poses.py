@@ -1,0 +1,200 @@
+"""Outputs that turn: four columns of a quaternion as three in a chart around the mean rotation, and back; angles."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from torch_pbd import checks
+from torch_pbd.checks import Floats
+from torch_pbd.data.alignment import interpolate, unit_phases
+from torch_pbd.data.recordings import as_names, as_recordings, as_texts, as_units, preview
+from torch_pbd.data.units import ANGLES, OFF_SPHERE
+from torch_pbd.exceptions import InvalidParameterError
+from torch_pbd.rotations import Chart, continuous, mean
+
+ROTATION = ("rx", "ry", "rz")
+QUATERNION = ("qw", "qx", "qy", "qz")
+
+# Degrees from the reference. The chart ends at 180, where y and -y are one rotation; a normal distribution in it that
+# is 15 degrees wide has two standard deviations left at 150.
+_FAR, _FURTHEST = 120.0, 150.0
+_N_PHASES = 201  # of each recording in the mean: it does not hang on how long or how densely each was sampled
+
+
+class Outputs(NamedTuple):
+    """What `torch_pbd.data.Demonstrations` holds of recordings."""
+
+    times: tuple[Floats, ...]
+    positions: tuple[Floats, ...]
+    names: tuple[str, ...]
+    units: tuple[str, ...] | None
+    rotation_reference: Floats | None
+
+
+def as_outputs(
+    times: Any, positions: Any, names: Any, units: Any, rotation: Any, rotation_reference: Any, missing: Any
+) -> Outputs:
+    """Recordings with their labels; a rotation is three outputs in the last places."""
+    times_, positions_ = as_recordings(times, positions, missing)
+    names_ = as_names(names, positions_[0].shape[1])
+    if rotation is None:
+        outputs = Outputs(times_, positions_, names_, as_units(units, len(names_)), None)
+        return outputs if rotation_reference is None else _in_chart(outputs, rotation_reference)
+    if rotation_reference is not None:
+        must = "None where rotation= names quaternions, whose mean it is"
+        raise checks.refusal(rotation_reference, "rotation_reference", must)
+    chosen = as_texts(rotation, "rotation")
+    if len(chosen) != 4 or len(set(chosen)) < 4 or not set(chosen) <= set(names_):
+        must = f"four different ones of {preview(names_)}, in the order w x y z, wherever these stand"
+        raise checks.refusal(rotation, "rotation", must)
+    columns = [names_.index(name) for name in chosen]
+    if missing == "drop":
+        times_, positions_ = _without_zeros(times_, positions_, columns)
+    turns = [_unit(position[:, columns], k, chosen) for k, position in enumerate(positions_)]
+    kept = [i for i in range(len(names_)) if i not in columns]
+    one_each = units is not None and not isinstance(units, str)
+    if one_each and len(units) == len(names_):
+        units = [units[i] for i in kept]
+    own = () if units is not None and not kept else as_units(units, len(kept))
+    labels = (*(names_[i] for i in kept), *ROTATION)
+    reference = mean_rotation(times_, turns)
+    return Outputs(
+        *as_recordings(times_, charted(times_, [y[:, kept] for y in positions_], turns, reference), "raise"),
+        as_names(labels, len(labels)),
+        own if own is None else (*own, "rad", "rad", "rad"),
+        frozen(reference),
+    )
+
+
+def mean_rotation(times: Sequence[Floats], quaternions: Sequence[Floats]) -> Floats:
+    """Frechet mean (4,) of recorded rotations (T_k, 4), each at evenly spaced phases."""
+    phases, turns = np.linspace(0.0, 1.0, _N_PHASES), map(continuous, quaternions)
+    even = [interpolate(own, turn, phases) for own, turn in zip(unit_phases(times), turns, strict=True)]
+    together = np.concatenate(even)
+    return mean(together / np.linalg.norm(together, axis=1, keepdims=True))
+
+
+def charted(
+    times: Sequence[Floats], places: Sequence[Floats], quaternions: Sequence[Floats], reference: Floats
+) -> list[Floats]:
+    """Outputs (T_k, p + 3) of poses, the rotations in the chart around a reference; refuses those far from it."""
+    turns = list(map(Chart(reference).log, quaternions))
+    _check_reach(times, turns)
+    return [np.column_stack([place, turn]) for place, turn in zip(places, turns, strict=True)]
+
+
+def poses(positions: Sequence[Floats], reference: Floats | None) -> tuple[list[Floats], list[Floats]]:
+    """Positions (T_k, p) and quaternions (T_k, 4) of outputs; w >= 0 against the reference, so that signs go on."""
+    if reference is None:
+        raise InvalidParameterError("the demonstrations have no rotation: name its columns by rotation=, w x y z.")
+    chart = Chart(reference)
+    return [position[:, :-3] for position in positions], [chart.exp(position[:, -3:]) for position in positions]
+
+
+def as_columns(demonstrations: Any) -> tuple[tuple[str, ...], Sequence[Floats]]:
+    """Names and columns (T_k, ...) for tables: what other programs read, a rotation as its quaternion."""
+    if demonstrations.rotation_reference is None:
+        return demonstrations.names, demonstrations.positions
+    names = (*demonstrations.names[:-3], *QUATERNION)
+    return as_names(names, len(names)), list(map(np.hstack, zip(*demonstrations.to_poses(), strict=True)))
+
+
+def with_whole_rotation(chosen: Sequence[str], names: Sequence[str], reference: Any) -> tuple[tuple[str, ...], Any]:
+    """Chosen outputs, those of a rotation last, and its reference; None where it is not among them."""
+    own = names[-3:] if reference is not None else ()
+    if not set(own) & set(chosen):
+        return tuple(chosen), None
+    absent = [name for name in own if name not in chosen]
+    if absent:
+        must = f"with all of {', '.join(own)} or none of them, which are one rotation"
+        raise checks.refusal([*chosen], "outputs", must, f"{absent[0]!r} is lacking")
+    return (*(name for name in chosen if name not in own), *own), reference
+
+
+def same_reference(one: Floats | None, other: Floats | None) -> bool:
+    """Whether two references, if there are any, are one to the last bit."""
+    return one is other if one is None or other is None else np.array_equal(one, other)
+
+
+def frozen(reference: Any) -> Floats | None:
+    """Read-only copy of a reference."""
+    if reference is None:
+        return None
+    copy = np.array(reference, dtype=np.float64)
+    copy.setflags(write=False)
+    return copy
+
+
+def unwrapped(times: Any, positions: Any, names: Any, units: Any, angles: Any) -> list[Floats]:
+    """Outputs (T_k, d) of which the named angles go on over a turn, along time, and from one recording to the next.
+
+    Recordings are brought to the turn nearest to the direction that their means have in common. All of them are then
+    turned back together by what the median recording was turned by: joints keep the turn that a robot knows.
+    """
+    positions = [np.array(position) for position in positions]
+    for name in as_texts(angles, "angles"):
+        if name not in names:
+            raise checks.refusal(name, "angles", f"among {preview(names)}")
+        i = names.index(name)
+        unit = None if units is None else units[i]
+        if unit not in ANGLES:
+            raise checks.refusal(name, "angles", f"in rad or deg, and is in {unit}", "give units=, one for each output")
+        turn = 2.0 * math.pi / ANGLES[unit]
+        curves = [np.unwrap(position[:, i], period=turn) for position in positions]
+        middle = np.array([np.trapezoid(y, t) / (t[-1] - t[0]) for t, y in zip(times, curves, strict=True)])
+        common = np.angle(np.exp(2j * math.pi * middle / turn).mean()) / (2.0 * math.pi) * turn
+        turns = np.round((middle - common) / turn)
+        turns -= np.sort(turns)[(len(turns) - 1) // 2]
+        for position, curve, n in zip(positions, curves, turns, strict=True):
+            position[:, i] = curve - n * turn
+    return positions
+
+
+def _in_chart(outputs: Outputs, rotation_reference: Any) -> Outputs:
+    """Outputs whose last three were in the chart around a reference before, as in a file."""
+    reference = checks.array(rotation_reference, "rotation_reference", (4,))
+    if abs(float(reference @ reference) - 1.0) > checks.ROUNDING:
+        raise checks.refusal(rotation_reference, "rotation_reference", "a unit quaternion w x y z")
+    if len(outputs.names) < 3 or (outputs.units is not None and set(outputs.units[-3:]) != {"rad"}):
+        must = f"given for outputs that end with three of a rotation in rad, and not for {preview(outputs.names)}"
+        raise checks.refusal(rotation_reference, "rotation_reference", must)
+    _check_reach(outputs.times, [position[:, -3:] for position in outputs.positions])
+    return outputs._replace(rotation_reference=frozen(reference))
+
+
+def _without_zeros(times: Any, positions: Any, columns: list[int]) -> tuple[tuple[Floats, ...], tuple[Floats, ...]]:
+    """Recordings without the samples in which a tracker that saw nothing wrote a quaternion of zeros."""
+    lost = [~position[:, columns].any(axis=1, keepdims=True) for position in positions]
+    holes = [np.where(gone, np.nan, position) for gone, position in zip(lost, positions, strict=True)]
+    return as_recordings(times, holes, "drop") if any(map(np.any, lost)) else (times, positions)
+
+
+def _unit(quaternion: Floats, k: int, names: Sequence[str]) -> Floats:
+    """Quaternions (T, 4) of norm one of recorded ones, which are rounded."""
+    square = np.square(quaternion).sum(axis=1)
+    wrong = np.flatnonzero(np.abs(square - 1.0) > OFF_SPHERE)
+    if len(wrong):
+        i = int(wrong[0])
+        lost = "missing='drop' leaves such samples out" if square[i] == 0.0 else "divide quaternions by their norm"
+        raise InvalidParameterError(
+            f"the quaternion {', '.join(names)} has norm {math.sqrt(square[i]):.4g} at sample {i} of recording {k}, "
+            f"must have 1: name the columns of a rotation, in the order w x y z, or {lost}."
+        )
+    return quaternion / np.sqrt(square)[:, np.newaxis]
+
+
+def _check_reach(times: Sequence[Floats], turns: Sequence[Floats]) -> None:
+    angles = [np.degrees(np.linalg.norm(turn, axis=1)) for turn in turns]
+    k = int(np.argmax([angle.max() for angle in angles]))
+    i = int(np.argmax(angles[k]))
+    what = f"ecording {k} is {angles[k][i]:.1f} degrees from the mean rotation at {times[k][i]:.6g}"
+    remedy = (
+        "Three numbers for a rotation end at 180. Leave a wrong sample out; where the task turns so far, as screws do, "
+        "learn deviations from the mean rotation of each time: multiply its inverse with that of each recording."
+    )
+    if angles[k][i] > _FURTHEST:
+        raise InvalidParameterError(f"r{what}, must be at most {_FURTHEST:.0f}. {remedy}")
+    if angles[k][i] > _FAR:
+        checks.warn(f"R{what}, and {_FURTHEST:.0f} are refused. {remedy}")
