@@ -9,7 +9,7 @@ from sklearn.gaussian_process.kernels import RBF, ExpSineSquared, Matern
 from torch_pbd.gp import spacing
 from torch_pbd.gp.inducing import FeatureMap, FixedFeatures, inducing_inputs
 from torch_pbd.kernels import KERNELS
-from torch_pbd.models.heteroscedastic.linear import LinearEvidence
+from torch_pbd.models.heteroscedastic.regression import LinearEvidence
 
 ORACLES = {
     "squared_exponential": RBF,
@@ -103,13 +103,13 @@ def test_the_more_inducing_inputs_the_less_variance_is_missing(kernel):
 def test_at_the_shortest_length_scale_features_carry_nearly_all_of_the_variance_between():
     z = torch.linspace(-0.5, 0.5, 21, dtype=torch.float64)[:, None]
     features = FeatureMap(z)
-    shortest = features.shortest_length_scale()
+    shortest = features.shortest_length_scale
     assert shortest == pytest.approx(spacing(z), rel=1e-9)
     between = torch.linspace(-0.5, 0.5, 401, dtype=torch.float64)[:, None]
     lacking = missing(features, between, tensor([shortest]))
     assert float(lacking[80:-80].max()) < 5.5e-3
     assert float(lacking.max()) < 1.5e-2  # between the last two, which have neighbours on one side
-    assert FeatureMap(z, exact=True).shortest_length_scale() == pytest.approx(0.75 * spacing(z), rel=1e-9)
+    assert FeatureMap(z, exact=True).shortest_length_scale == pytest.approx(0.75 * spacing(z), rel=1e-9)
 
 
 def test_inducing_inputs_are_the_inputs_or_the_means_of_runs_of_them(rng):
@@ -132,7 +132,7 @@ def test_stretched_features_are_those_of_inputs_with_more_length_at_the_ends():
     values, _ = FixedFeatures(stretched, x).vjp(tensor([[0.3]]), tensor([0.0]))
     expected = stretched(tensor([0.3]))(x)
     torch.testing.assert_close(values[0] @ values[0].mT, expected @ expected.mT, rtol=0, atol=1e-6)
-    assert stretched.shortest_length_scale() == plain.shortest_length_scale()
+    assert stretched.shortest_length_scale == plain.shortest_length_scale
     # Beyond the ends no length is added.
     beyond = stretched.warped(tensor([[-0.5], [-0.8], [0.5], [0.7]])).diff(dim=0).flatten()
     np.testing.assert_allclose(beyond[[0, 2]], [-0.3, 0.2], atol=1e-4)

@@ -7,9 +7,8 @@ from gp.oracle import negative_log_evidence
 from sklearn.gaussian_process.kernels import RBF
 
 from torch_pbd.gp import Hyperparameters, Observations, condition
-from torch_pbd.gp.evidence import Evidence
-from torch_pbd.gp.neighbourhoods import neighbourhoods
-from torch_pbd.gp.projection import FULL, Basis, Resolution, resolutions
+from torch_pbd.gp.latent import Evidence
+from torch_pbd.gp.observations import FULL, Basis, Resolution, neighbourhoods, resolutions
 from torch_pbd.kernels import correlation
 
 

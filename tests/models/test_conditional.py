@@ -6,8 +6,7 @@ import torch
 
 from torch_pbd.gp import Hyperparameters, Observations, condition
 from torch_pbd.models.cholesky import CholeskyCovariance, MeanAndCholesky
-from torch_pbd.models.conditional import ConditionalNormal
-from torch_pbd.models.core import VARIANCE_FLOOR
+from torch_pbd.models.conditional import VARIANCE_FLOOR, ConditionalNormal
 from torch_pbd.models.mixture import GaussianMixture
 from torch_pbd.models.wishart import MeanAndWishart, WishartCovariance, padded
 

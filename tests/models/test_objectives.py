@@ -8,7 +8,7 @@ from sklearn.gaussian_process.kernels import RBF
 
 from torch_pbd.gp import LatentValues
 from torch_pbd.models.cholesky import CholeskyLink
-from torch_pbd.models.core import VARIANCE_FLOOR, with_floor
+from torch_pbd.models.conditional import VARIANCE_FLOOR, with_floor
 from torch_pbd.models.costs import FactorDistance, Likelihood
 from torch_pbd.models.training import TrainingSet
 from torch_pbd.models.wishart import WishartLink, padded, wishart_root

@@ -6,7 +6,7 @@ from scipy.optimize import minimize as scipy_minimize
 from torch_pbd.gp import LatentValues
 from torch_pbd.linalg import scale_tril_from_root, tril_to_vector
 from torch_pbd.models.cholesky import CholeskyLink, tril_deviation
-from torch_pbd.models.core import with_floor
+from torch_pbd.models.conditional import with_floor
 from torch_pbd.models.costs import Covariances, FactorDistance, Likelihood
 from torch_pbd.models.scoring import train_by_scoring
 from torch_pbd.models.training import TrainingSet

@@ -45,7 +45,7 @@ def check_memory(n_inducing: int | None, max_inputs: int, shape: tuple[int, int,
 
 def warn_if_unresolved(length_scale: Tensor | None, features: FeatureMap) -> None:
     """Warn where a length scale that the user gave is shorter than the inputs resolve."""
-    least = features.shortest_length_scale()
+    least = features.shortest_length_scale
     if length_scale is not None and bool((length_scale < least).any()):
         checks.warn(
             f"length_scale is below {least:.3g} of the range of X, which is what the inputs (or n_inducing of them) "

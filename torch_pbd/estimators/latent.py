@@ -20,7 +20,7 @@ from torch_pbd.files.memory import require_much
 from torch_pbd.gp import EvidenceSearch, LatentGP, Observations, fit_together, resolved_length_scale, spacing
 from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky, scale_tril_from_root
-from torch_pbd.models.core import MeanAndCovariance
+from torch_pbd.models.conditional import MeanAndCovariance
 from torch_pbd.models.training import TrainingSet
 from torch_pbd.optim import FitReport
 

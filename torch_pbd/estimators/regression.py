@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torch_pbd.estimators.validation import Floats
-from torch_pbd.models.conditional import ConditionalNormal
-from torch_pbd.models.core import VARIANCE_FLOOR
+from torch_pbd.models.conditional import VARIANCE_FLOOR, ConditionalNormal
 
 # Of standardized inputs: squares of what follows stay finite.
 _LIMIT = np.finfo(np.float64).max ** (1 / 6)

@@ -11,8 +11,7 @@ from torch import Tensor
 from torch_pbd import checks
 from torch_pbd.estimators.validation import Floats
 from torch_pbd.files.memory import require_much
-from torch_pbd.models.conditional import ConditionalNormal
-from torch_pbd.models.core import Core
+from torch_pbd.models.conditional import ConditionalNormal, Core
 
 _CHUNK = 1024  # rows: what a prediction needs on the way is then some tens of MB for ten outputs
 

@@ -29,7 +29,7 @@ from torch_pbd.gp import (
     fit_together,
     merge_observations,
 )
-from torch_pbd.gp.projection import FULL, Basis
+from torch_pbd.gp.observations import FULL, Basis
 from torch_pbd.kernels import KernelName
 from torch_pbd.models.costs import Cost, FactorDistance, Likelihood
 from torch_pbd.models.scoring import Solver, train_by_scoring

@@ -1,10 +1,9 @@
 """Batches of independent Gaussian processes over the same inputs: eq. (3) to (6), and their evidence."""
 
-from torch_pbd.gp.evidence import negative_log_evidence
 from torch_pbd.gp.grid import EvidenceSearch
-from torch_pbd.gp.latent import LatentGP, condition
+from torch_pbd.gp.latent import LatentGP, condition, negative_log_evidence
 from torch_pbd.gp.latent_values import LatentValues
-from torch_pbd.gp.neighbourhoods import (
+from torch_pbd.gp.observations import (
     Hyperparameters,
     Observations,
     merge_observations,

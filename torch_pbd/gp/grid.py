@@ -8,9 +8,8 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from torch_pbd.gp.evidence import Evidence
-from torch_pbd.gp.neighbourhoods import Observations
-from torch_pbd.gp.projection import Basis, Resolution, resolutions
+from torch_pbd.gp.latent import Evidence
+from torch_pbd.gp.observations import Basis, Observations, Resolution, resolutions
 
 # Bounds of a learned noise variance over the variance of the process; a fixed noise may be far lower.
 _MIN_NOISE_RATIO, _MAX_NOISE_RATIO = 1e-10, 1e5

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from torch_pbd.gp.neighbourhoods import neighbourhoods, spacing
+from torch_pbd.gp.observations import neighbourhoods, spacing
 from torch_pbd.kernels import correlation, differences, value_and_slope
 from torch_pbd.linalg import safe_cholesky
 
@@ -72,12 +72,9 @@ class FeatureMap:
             number = int(nearest.argmax())
         return torch.tensor(order, device=distance.device)
 
+    @cached_property
     def shortest_length_scale(self) -> float:
         """Length scale below which the inducing inputs no longer resolve what is between them."""
-        return self._shortest
-
-    @cached_property
-    def _shortest(self) -> float:
         if len(self.inducing) < 2:
             return _SHORTEST
         share = _EXACT_RESOLUTION if self.exact else _RESOLUTION

@@ -5,7 +5,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from torch_pbd.gp.latent import LatentGP
-from torch_pbd.gp.neighbourhoods import Hyperparameters
+from torch_pbd.gp.observations import Hyperparameters
 from torch_pbd.kernels import KERNELS, correlation
 from torch_pbd.linalg import cholesky_with_jitter
 

@@ -1,10 +1,10 @@
 """Hyperparameters of Gaussian processes by their evidence: a grid, then BFGS from its deepest valleys.
 
 What is maximized is the evidence in length scales and noise ratio; the best amplitude is known in closed form
-(:mod:`~torch_pbd.gp.evidence`). The steps, in :func:`_maximize`:
+(:mod:`~torch_pbd.gp.latent`). The steps, in :func:`_maximize`:
 
 1. the evidence on a grid of length scales that a few nodes carry, at a cost that does not grow with the inputs
-   (:mod:`~torch_pbd.gp.projection`);
+   (:mod:`~torch_pbd.gp.observations`);
 2. which processes may be better with shorter length scales than these (:meth:`EvidenceGrid.unsettled`);
 3. for the others, BFGS from the deepest valleys of the grid;
 4. for the rest, and those that BFGS led to the shortest length scale, the next grid, with more nodes.
@@ -21,8 +21,7 @@ from torch import Tensor
 
 from torch_pbd.exceptions import NotPositiveDefiniteError
 from torch_pbd.gp.grid import EvidenceGrid, EvidenceSearch, together
-from torch_pbd.gp.neighbourhoods import Hyperparameters, Observations
-from torch_pbd.gp.projection import Basis
+from torch_pbd.gp.observations import Basis, Hyperparameters, Observations
 from torch_pbd.optim import FitReport, Status, first_failure, minimize_batch
 
 # Nats for each input that polishing may be worth: an optimum deeper than that below its start on the grid would, on

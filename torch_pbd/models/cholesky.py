@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from torch_pbd.gp import LatentGP
 from torch_pbd.linalg import tril_to_vector, vector_to_tril
-from torch_pbd.models.core import MeanAndCovariance, Shapes, beside_prior, blank, latent_skeleton
+from torch_pbd.models.conditional import MeanAndCovariance, Shapes, beside_prior, blank, latent_skeleton
 
 _LARGEST_LOGARITHM = 300.0  # of a diagonal entry: its square is still a number
 _LEAST_DIAGONAL = 1e-6  # in standardized units: an entry of zero has no logarithm, and the floor is of this size

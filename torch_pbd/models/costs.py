@@ -14,7 +14,7 @@ from torch.autograd.function import once_differentiable
 
 from torch_pbd.linalg import scale_tril_from_root, tril_to_vector
 from torch_pbd.models.cholesky import CholeskyLink
-from torch_pbd.models.core import VARIANCE_FLOOR, with_floor
+from torch_pbd.models.conditional import VARIANCE_FLOOR, with_floor
 from torch_pbd.models.wishart import WishartLink
 
 Link = CholeskyLink | WishartLink

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch_pbd import checks
 from torch_pbd.exceptions import InvalidParameterError, NotPositiveDefiniteError
 from torch_pbd.linalg import scale_tril_from_root
-from torch_pbd.models.core import Core, Shapes, blank, size_of
+from torch_pbd.models.conditional import Core, Shapes, blank, size_of
 from torch_pbd.optim import FitReport, Progress, Status, minimize
 
 _BLOCK = 1 << 13  # rows that an E step holds at a time: what it makes of them stays in the cache

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from torch_pbd.gp import LatentGP
-from torch_pbd.models.core import MeanAndCovariance, Shapes, beside_prior, blank, latent_skeleton, size_of
+from torch_pbd.models.conditional import MeanAndCovariance, Shapes, beside_prior, blank, latent_skeleton, size_of
 
 
 def wishart_root(

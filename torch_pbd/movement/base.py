@@ -17,8 +17,7 @@ from torch_pbd import checks
 from torch_pbd.estimators.base import Uncertainty
 from torch_pbd.estimators.validation import Floats, checked_queries, checked_rows
 from torch_pbd.files.memory import require_much
-from torch_pbd.movement.conditioning import Conditioned, Observed
-from torch_pbd.movement.joint import JointNormal
+from torch_pbd.movement.joint import Conditioned, JointNormal, Observed
 from torch_pbd.movement.recordings import Known, Recording, as_recordings
 
 _AT_ONCE = 1024  # rows whose marginals are found together, and whose law is kept

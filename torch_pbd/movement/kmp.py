@@ -14,8 +14,7 @@ from torch_pbd.estimators.mixture import GMMBaseline
 from torch_pbd.estimators.validation import Floats
 from torch_pbd.files.memory import require_much
 from torch_pbd.movement.base import MovementRegressor
-from torch_pbd.movement.conditioning import Conditioned, Observed
-from torch_pbd.movement.joint import JointNormal
+from torch_pbd.movement.joint import Conditioned, JointNormal, Observed
 from torch_pbd.movement.recordings import Known, Recording
 
 

@@ -11,7 +11,7 @@ from torch_pbd.data import Demonstrations
 from torch_pbd.data.alignment import TIMING_REMOVED
 from torch_pbd.estimators.demonstrations import check_groups
 from torch_pbd.estimators.validation import Floats, checked_rows
-from torch_pbd.movement.conditioning import Observed
+from torch_pbd.movement.joint import Observed
 
 # Steps on which the correlation is learned: the nuggets' iterations are cubic in them, and movements are smooth.
 _MOST_STEPS = 200

@@ -17,8 +17,7 @@ from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
 from torch_pbd.estimators.validation import Floats
 from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky
-from torch_pbd.movement.conditioning import Conditioned
-from torch_pbd.movement.joint import JointNormal
+from torch_pbd.movement.joint import Conditioned, JointNormal
 from torch_pbd.movement.recordings import Recording, n_grid_steps, sampled
 from torch_pbd.movement.time_kernel import TimeKernel, fit_time_kernel
 from torch_pbd.movement.timed import TimedMovement

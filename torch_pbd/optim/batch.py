@@ -1,14 +1,16 @@
-"""Many small unrelated optimizations side by side."""
+"""Many small unrelated optimizations side by side, and how optimizations end."""
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from enum import Enum
 
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from torch_pbd.optim.report import FAILURES, Status
+FAILURES = (ArithmeticError, ValueError, RuntimeError, IndexError)
+"""Exceptions of an evaluation at a bad point: Cholesky and eigenvalues, overflow. Others are mistakes, passed on."""
 
 _LONGEST_STEP = 1e3  # in steps of BFGS
 _DIFFERENCE = 1e-4  # of parameters of order one, for the first Hessian: errors of 1e-4 of it, or 1e-12 by rounding
@@ -20,6 +22,68 @@ _HALVINGS = 25  # down to 3e-8 of a step at most
 ValueAndGradient = Callable[
     [Float[Tensor, "a p"], Int64[Tensor, " a"]], tuple[Float[Tensor, " a"], Float[Tensor, "a p"]]
 ]
+
+
+class Status(Enum):
+    """How an optimization ended; the value is the phrase for it."""
+
+    CONVERGED = "converged"
+    MAX_ITER = "stopped at max_iter iterations"
+    MAX_EVALUATIONS = "stopped at the most evaluations for max_iter iterations"
+    LINE_SEARCH_FAILED = "no step lowers the loss, though its slope says so"
+    NOT_FINITE = "the loss or its gradient is not finite"
+
+    @property
+    def is_limit(self) -> bool:
+        """Whether more iterations would have gone on."""
+        return self in (Status.MAX_ITER, Status.MAX_EVALUATIONS)
+
+
+def first_failure(statuses: Iterable[Status]) -> Status:
+    """Status of the first of several optimizations that did not converge; CONVERGED if all did."""
+    return next((status for status in statuses if status is not Status.CONVERGED), Status.CONVERGED)
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Argument of a progress callback, after each evaluation that improved the loss."""
+
+    n_evaluations: int
+    loss: float
+    elapsed: float
+    """Seconds since the start."""
+
+
+Callback = Callable[[Progress], None] | None
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """How an optimization ended, and what it came to."""
+
+    loss: float
+    loss_curve: tuple[float, ...]
+    """Best loss so far, at each evaluation that improved it; the first is the loss at the start."""
+    n_iter: int
+    status: Status
+    detail: str = ""
+    """Message of an exception, or name of a search, where the status alone does not tell."""
+
+    @property
+    def converged(self) -> bool:
+        """Whether it ended by itself."""
+        return self.status is Status.CONVERGED
+
+    @property
+    def message(self) -> str:
+        """How it ended, in words."""
+        return self.detail or self.status.value
+
+    def after(self, other: "FitReport", name: str) -> "FitReport":
+        """Report with the status of the optimization before it, of this name, where that has not converged."""
+        if other.converged or not self.converged:
+            return self
+        return replace(self, status=other.status, detail=f"{name}: {other.message}")
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from torch_pbd.models.heteroscedastic.covariance import FactorMoments, LatentCovariance
-from torch_pbd.models.heteroscedastic.linear import Weights
+from torch_pbd.models.heteroscedastic.regression import Weights
 
 
 @pytest.fixture

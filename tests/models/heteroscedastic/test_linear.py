@@ -6,7 +6,7 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import DotProduct
 from torch.distributions import MultivariateNormal, kl_divergence
 
-from torch_pbd.models.heteroscedastic.linear import LinearEvidence, weights_factor
+from torch_pbd.models.heteroscedastic.regression import LinearEvidence, weights_factor
 
 SIZES = [(12, 3), (3, 12), (1, 1)]  # rows and features
 

@@ -40,7 +40,7 @@ def lower_bound(mean, covariance, features, total, degrees):
 @pytest.mark.parametrize("theta", [[-1.0, 0.0], [0.5, 0.0], [-1.0, 1.5], [-3.0, -2.0]])
 def test_the_evidence_is_the_lower_bound(theta, family, inputs, rng):
     squares = squares_at(9, rng)
-    features = family.design(inputs, torch.tensor([theta] * 2, dtype=torch.float64))
+    features = family.prepared(torch.tensor([theta] * 2, dtype=torch.float64))(inputs)
     weights, evidence = fit_log_variance(squares, features)
     covariance = (weights.root @ weights.root.mT).numpy()
     parts = (weights.mean.numpy(), covariance, features.numpy(), squares.total.numpy(), squares.degrees.numpy())
@@ -53,7 +53,7 @@ def test_the_posterior_mean_maximizes_the_lower_bound(scale, family, inputs, rng
     """The bound is concave in the mean: where its gradient is zero is its maximum."""
     squares = squares_at(9, rng)
     squares = Squares(scale * squares.total, squares.degrees, INDEPENDENT)
-    features = family.design(inputs, torch.tensor([[-1.0, 0.5]] * 2, dtype=torch.float64))
+    features = family.prepared(torch.tensor([[-1.0, 0.5]] * 2, dtype=torch.float64))(inputs)
     weights, _ = fit_log_variance(squares, features)
     mean = weights.mean.requires_grad_()
     location = (features @ mean.unsqueeze(-1)).squeeze(-1)
@@ -85,14 +85,14 @@ def test_gradient_of_the_evidence(correlated, family, inputs, rng):
     whitener = torch.tensor(np.tril(rng.normal(size=(2, 9, 9)), -1) + np.eye(9))
     squares = squares_at(9, rng, noise=NoiseCorrelation(None, whitener, copies) if correlated else INDEPENDENT)
     theta = torch.tensor([[-1.0, 0.3], [-0.4, -0.6]], dtype=torch.float64)
-    features = family.design(inputs, theta).requires_grad_()
+    features = family.prepared(theta)(inputs).requires_grad_()
     assert torch.autograd.gradcheck(lambda features: Evidence.apply(features, squares), features, atol=1e-4)
 
 
 @pytest.mark.parametrize("start", [-30.0, 0.0, 30.0])
 def test_the_posterior_does_not_depend_on_where_it_starts(start, family, inputs, rng):
     squares = squares_at(9, rng, degrees=1.0)
-    features = family.design(inputs, torch.tensor([[-1.0, 0.5]] * 2, dtype=torch.float64))
+    features = family.prepared(torch.tensor([[-1.0, 0.5]] * 2, dtype=torch.float64))(inputs)
     expected, found = fit(squares, features), fit(squares, features, torch.full((2, 9), start).double())
     torch.testing.assert_close(found.location, expected.location, rtol=0, atol=1e-7)
     torch.testing.assert_close(found.evidence, expected.evidence, rtol=1e-12, atol=1e-12)
@@ -167,7 +167,7 @@ def test_the_posterior_is_near_the_exact_one_and_that_of_laplace(degrees, bars):
 def test_the_posterior_covariance_is_of_the_fisher_information(family, inputs, rng):
     """Minus the expected second derivative of the log density of a chi-squared sum, in its log variance."""
     squares = squares_at(9, rng)
-    features = family.design(inputs, torch.tensor([[-1.0, 0.5]] * 2, dtype=torch.float64))
+    features = family.prepared(torch.tensor([[-1.0, 0.5]] * 2, dtype=torch.float64))(inputs)
     weights, _ = fit_log_variance(squares, features)
     quantile = (np.arange(20_000) + 0.5) / 20_000
     for i in range(2):
@@ -192,7 +192,7 @@ def test_correlated_squares_are_a_gaussian_process_regression_of_their_logarithm
     squares = squares_at(
         9, rng, noise=NoiseCorrelation(None, *(torch.tensor(np.stack([part, part])) for part in (whitener, copies)))
     )
-    features = family.design(inputs, torch.tensor([[-1.0, 0.5], [0.3, -0.5]], dtype=torch.float64))
+    features = family.prepared(torch.tensor([[-1.0, 0.5], [0.3, -0.5]], dtype=torch.float64))(inputs)
     weights, evidence = fit_log_variance(squares, features)
     for i in range(2):
         half, phi = 0.5 * squares.degrees[i].numpy() / copies, features[i].numpy()
@@ -224,7 +224,7 @@ def test_correlated_squares_have_no_bias(degrees, rng):
 
 def test_processes_are_fitted_each_by_itself(family, inputs, rng):
     squares = squares_at(9, rng)
-    features = family.design(inputs, torch.tensor([[-1.0, 0.5], [0.3, -0.5]], dtype=torch.float64))
+    features = family.prepared(torch.tensor([[-1.0, 0.5], [0.3, -0.5]], dtype=torch.float64))(inputs)
     weights, evidence = fit_log_variance(squares, features)
     for i in range(2):
         alone, own = fit_log_variance(squares.restrict(torch.tensor([i])), features[i : i + 1])
@@ -233,7 +233,7 @@ def test_processes_are_fitted_each_by_itself(family, inputs, rng):
 
 
 def test_squares_of_zero_have_a_finite_posterior(family, inputs):
-    features = family.design(inputs, torch.tensor([[-1.0, 0.5]], dtype=torch.float64))
+    features = family.prepared(torch.tensor([[-1.0, 0.5]], dtype=torch.float64))(inputs)
     total = torch.ones(1, 9, dtype=torch.float64)
     total[0, 4] = 0.0
     weights, evidence = fit_log_variance(Squares(total, 5.0 * torch.ones_like(total), INDEPENDENT), features)

@@ -7,7 +7,7 @@ from torch_pbd.gp.inducing import FeatureMap
 from torch_pbd.kernels import correlation
 from torch_pbd.models.heteroscedastic import ProcessFamily, SearchOptions
 from torch_pbd.models.heteroscedastic.mean import fit_mean
-from torch_pbd.models.heteroscedastic.search import Search
+from torch_pbd.models.heteroscedastic.processes import Search
 
 
 def search_of(family, d):

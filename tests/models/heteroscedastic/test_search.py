@@ -6,8 +6,8 @@ from scipy.optimize import minimize
 from torch_pbd.exceptions import NotPositiveDefiniteError
 from torch_pbd.gp.inducing import FeatureMap
 from torch_pbd.models.heteroscedastic import ProcessFamily, SearchOptions
-from torch_pbd.models.heteroscedastic.linear import LinearEvidence
-from torch_pbd.models.heteroscedastic.search import Search
+from torch_pbd.models.heteroscedastic.processes import Search
+from torch_pbd.models.heteroscedastic.regression import LinearEvidence
 from torch_pbd.optim import Status
 
 
@@ -19,7 +19,7 @@ def evidence_of(family, inputs, response):
     def evidence(theta, rows):
         theta = theta.clone().requires_grad_()
         with torch.enable_grad():
-            value = LinearEvidence.fit(5.0 * family.design(inputs, theta), 5.0 * response[rows]).value
+            value = LinearEvidence.fit(5.0 * family.prepared(theta)(inputs), 5.0 * response[rows]).value
         return value.detach(), lambda: torch.autograd.grad(value, theta, torch.ones_like(value))[0]
 
     return evidence

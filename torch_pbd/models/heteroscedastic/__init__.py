@@ -4,9 +4,8 @@ from torch_pbd.models.heteroscedastic.families import Families
 from torch_pbd.models.heteroscedastic.fit import HeteroscedasticFit, fit_heteroscedastic
 from torch_pbd.models.heteroscedastic.mean import mean_start
 from torch_pbd.models.heteroscedastic.module import HeteroscedasticModel
-from torch_pbd.models.heteroscedastic.processes import ProcessFamily
+from torch_pbd.models.heteroscedastic.processes import ProcessFamily, SearchOptions
 from torch_pbd.models.heteroscedastic.residuals import are_copies
-from torch_pbd.models.heteroscedastic.search import SearchOptions
 
 __all__ = [
     "Families",

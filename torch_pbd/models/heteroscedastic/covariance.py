@@ -9,13 +9,11 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from torch_pbd.gp.inducing import FixedFeatures
-from torch_pbd.models.heteroscedastic.linear import LinearEvidence, Weights
 from torch_pbd.models.heteroscedastic.log_variance import LEAST_SQUARE, Squares, fit_log_variance, search_log_variance
 from torch_pbd.models.heteroscedastic.predictive import FactorMoments
-from torch_pbd.models.heteroscedastic.processes import Processes, ProcessFamily
-from torch_pbd.models.heteroscedastic.regression import Regression
+from torch_pbd.models.heteroscedastic.processes import Gradient, Processes, ProcessFamily, Search
+from torch_pbd.models.heteroscedastic.regression import LinearEvidence, Regression, Weights
 from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation
-from torch_pbd.models.heteroscedastic.search import Gradient, Search
 
 # Sweeps over log variances and coefficients, and how many search the coefficients' hyperparameters: one of each more
 # gains less than a nat.
@@ -183,7 +181,7 @@ def _from_previous(previous: LatentCovariance, inputs: Tensor, scatter: Tensor, 
     regressions, expected = [], []
     for i, weights in enumerate(previous.coefficients, start=1):
         known = _regression(scatter, tril[:, :i, :i], noise)
-        features = previous.coefficient_family.design(inputs, previous.coefficient_theta[i - 1 : i])[0]
+        features = previous.coefficient_family.prepared(previous.coefficient_theta[i - 1 : i])(inputs)[0]
         regressions.append(known)
         explained, unknown = known.squares(features, weights.mean, weights.root @ weights.root.mT)
         expected.append(explained + unknown)
@@ -254,11 +252,11 @@ def _posterior(searches: CovarianceSearches, inputs: Tensor, squares: Squares, l
     theta, family = searches.log_variance.theta, searches.log_variance.family
     assert theta is not None
     assert last.precision is not None
-    log_variance = fit_log_variance(squares, family.design(inputs, theta), last.location).weights
+    log_variance = fit_log_variance(squares, family.prepared(theta)(inputs), last.location).weights
     coefficients, coefficient_theta = [], theta[:0]
     if last.regressions:
         coefficient_theta = torch.cat([search.theta for search in searches.coefficients if search.theta is not None])
-        features = searches.coefficient_family.design(inputs, coefficient_theta)
+        features = searches.coefficient_family.prepared(coefficient_theta)(inputs)
         for known, own, precision in zip(last.regressions, features, last.precision[1:], strict=True):
             weights = known.fit(own[None], precision).weights()
             coefficients.append(Weights(weights.mean[0], weights.root[0]))

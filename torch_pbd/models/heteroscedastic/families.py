@@ -12,12 +12,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torch_pbd.gp.inducing import FeatureMap, FixedFeatures
-from torch_pbd.gp.neighbourhoods import spacing
+from torch_pbd.gp.observations import spacing
 from torch_pbd.models.heteroscedastic.covariance import CovarianceSearches
 from torch_pbd.models.heteroscedastic.log_variance import Squares, log_variance_evidence
-from torch_pbd.models.heteroscedastic.processes import ProcessFamily
+from torch_pbd.models.heteroscedastic.processes import ProcessFamily, Search, SearchOptions
 from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation
-from torch_pbd.models.heteroscedastic.search import Search, SearchOptions
 from torch_pbd.models.training import TrainingSet
 
 # Prior medians of length scale (in ranges of the input) and amplitude, and prior deviation of the constant. Means

@@ -21,6 +21,7 @@ from torch_pbd.linalg import scale_tril_from_root
 from torch_pbd.models.heteroscedastic.covariance import LatentCovariance, fit_covariance
 from torch_pbd.models.heteroscedastic.families import Families
 from torch_pbd.models.heteroscedastic.mean import MOST_INPUTS, LatentMean, MeanStart, fit_mean
+from torch_pbd.models.heteroscedastic.processes import Search, SearchOptions
 from torch_pbd.models.heteroscedastic.residuals import (
     LAGS,
     NOT_WHITE,
@@ -29,7 +30,6 @@ from torch_pbd.models.heteroscedastic.residuals import (
     demonstration_correlation,
     is_signal,
 )
-from torch_pbd.models.heteroscedastic.search import Search, SearchOptions
 from torch_pbd.models.training import TrainingSet, pooled_tril
 
 # Rows at an input whose mean is all their own still count for this share of a degree of freedom, or nothing there

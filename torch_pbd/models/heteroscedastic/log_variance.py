@@ -11,10 +11,9 @@ from torch import Tensor
 
 from torch_pbd.gp.inducing import FixedFeatures
 from torch_pbd.linalg import safe_cholesky
-from torch_pbd.models.heteroscedastic.linear import LinearEvidence, Weights, inverse, weights_factor
-from torch_pbd.models.heteroscedastic.processes import ProcessFamily
+from torch_pbd.models.heteroscedastic.processes import Evidence, Gradient, ProcessFamily, Search
+from torch_pbd.models.heteroscedastic.regression import LinearEvidence, Weights, inverse, weights_factor
 from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation
-from torch_pbd.models.heteroscedastic.search import Evidence, Gradient, Search
 
 LEAST_SQUARE = 1e-6
 """Of the pooled variance: an exact zero, as where all recordings start at the origin, has no logarithm."""

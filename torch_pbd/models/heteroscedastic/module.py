@@ -13,10 +13,9 @@ from torch_pbd import checks
 from torch_pbd.gp.inducing import FeatureMap
 from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky, symmetrize
-from torch_pbd.models.core import Core, Shapes, blank, size_of
+from torch_pbd.models.conditional import Core, Shapes, blank, size_of
 from torch_pbd.models.heteroscedastic.covariance import LatentCovariance
 from torch_pbd.models.heteroscedastic.fit import HeteroscedasticFit
-from torch_pbd.models.heteroscedastic.linear import Weights
 from torch_pbd.models.heteroscedastic.mean import LatentMean
 from torch_pbd.models.heteroscedastic.predictive import (
     FactorMoments,
@@ -28,6 +27,7 @@ from torch_pbd.models.heteroscedastic.predictive import (
 )
 from torch_pbd.models.heteroscedastic.prepared import Prepared
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
+from torch_pbd.models.heteroscedastic.regression import Weights
 
 # Far from data a log variance may be anything: of its variance no more than this enters an expectation.
 _MOST_LOG_VARIANCE = 2.0

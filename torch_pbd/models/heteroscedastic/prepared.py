@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torch_pbd.gp.inducing import Features
-from torch_pbd.gp.neighbourhoods import spacing
+from torch_pbd.gp.observations import spacing
 from torch_pbd.models.heteroscedastic.covariance import LatentCovariance
 from torch_pbd.models.heteroscedastic.mean import LatentMean
 

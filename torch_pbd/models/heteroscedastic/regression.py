@@ -1,18 +1,102 @@
-"""Regressions of an output on those before it, with coefficients that are linear in features."""
+"""Linear models whose weights are standard normal numbers a priori, and regressions of an output on those before it."""
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
 from torch_pbd.linalg import safe_cholesky, symmetrize
-from torch_pbd.models.heteroscedastic.linear import LARGEST_PRECISION, LinearEvidence
+
+# Of a weight; that of its prior is one, of which a sum with a larger one keeps fewer than seven digits.
+_LARGEST_PRECISION = 1e9
 
 # Beside the scatter of standardized samples, which is one in every direction: keeps K <= d demonstrations regular.
 _RIDGE = 1e-8
 _NO_NEIGHBOUR = 1e-9  # of an inverse correlation's diagonal: rounding, of inputs that are no neighbours
+
+
+class Weights(NamedTuple):
+    """Normal distribution of the weights of features."""
+
+    mean: Float[Tensor, "*b p"]
+    root: Float[Tensor, "*b p p"]
+    """Upper triangular; the covariance is ``root @ root.mT``."""
+
+
+@dataclass(frozen=True)
+class LinearEvidence:
+    """Log density of ``response = design @ weights + noise`` with the weights integrated out, in nats.
+
+    But for what no design changes. The noise is independent and of variance one. With the design D the posterior of the
+    weights has the precision P = I + D'D and the mean m = inv(P) D'y, and the value is m'P m / 2 - log|P| / 2.
+    """
+
+    value: Float[Tensor, "*b"]
+    mean: Float[Tensor, "*b p"]
+    """Posterior mean of the weights."""
+    factor: Float[Tensor, "*b p p"]
+    """Upper triangular; ``factor.mT @ factor`` is the precision of the weights' posterior."""
+
+    @classmethod
+    def fit(cls, design: Float[Tensor, "*b n p"], response: Float[Tensor, "*b n"]) -> "LinearEvidence":
+        """Evidence of b designs."""
+        return cls.from_factor(*_triangular(design, response))
+
+    @classmethod
+    def from_factor(cls, factor: Float[Tensor, "*b p p"], projected: Float[Tensor, "*b p"]) -> "LinearEvidence":
+        """Evidence of b designs, where ``factor @ mean = projected``."""
+        mean = torch.linalg.solve_triangular(factor, projected.unsqueeze(-1), upper=True).squeeze(-1)
+        log_det = factor.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
+        return cls(0.5 * projected.square().sum(-1) - log_det, mean, factor)
+
+    @cached_property
+    def covariance(self) -> Float[Tensor, "*b p p"]:
+        """Posterior covariance of the weights."""
+        return torch.cholesky_inverse(self.factor, upper=True)
+
+    def gradient(self, design: Float[Tensor, "*b n p"], response: Float[Tensor, "*b n"]) -> Float[Tensor, "*b n p"]:
+        """Gradient of the value in the design: (y - D m) m' - D inv(P)."""
+        residual = response.unsqueeze(-1) - design @ self.mean.unsqueeze(-1)
+        return residual * self.mean.unsqueeze(-2) - design @ self.covariance
+
+    def weights(self) -> Weights:
+        """The posterior."""
+        return Weights(self.mean, inverse(self.factor))
+
+    def divergence_from_prior(self) -> Float[Tensor, "*b"]:
+        """Kullback-Leibler divergence of the weights' posterior from standard normal numbers, in nats."""
+        trace = self.covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
+        log_det = 2.0 * self.factor.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
+        return 0.5 * (trace + self.mean.square().sum(-1) - self.mean.shape[-1] + log_det)
+
+
+def weights_factor(design: Float[Tensor, "*b n p"]) -> Float[Tensor, "*b p p"]:
+    """Upper factor of the precision of the weights, which does not depend on the response."""
+    return _triangular(design, torch.zeros_like(design[..., 0]))[0]
+
+
+def _triangular(design: Tensor, response: Tensor) -> tuple[Tensor, Tensor]:
+    """Upper factor R of the precision ``R' R``, and the response projected: ``R mean = projected``.
+
+    Where the noise is small beside what the features carry the precision, one on its diagonal beside their
+    squares, cannot be formed in floating point; then by a QR decomposition, which is slower.
+    """
+    precision = design.mT @ design + torch.eye(design.shape[-1]).to(design)
+    if float(precision.diagonal(dim1=-2, dim2=-1).detach().amax()) < _LARGEST_PRECISION:
+        lower = safe_cholesky(precision, name="the precision of the latent weights")
+        projected = torch.linalg.solve_triangular(lower, design.mT @ response.unsqueeze(-1), upper=False)
+        return lower.mT, projected.squeeze(-1)
+    eye = torch.eye(design.shape[-1]).to(design).expand(*design.shape[:-2], -1, -1)
+    orthogonal, upper = torch.linalg.qr(torch.cat([design, eye], dim=-2))
+    return upper, (orthogonal[..., : design.shape[-2], :].mT @ response.unsqueeze(-1)).squeeze(-1)
+
+
+def inverse(upper: Float[Tensor, "*b p p"]) -> Float[Tensor, "*b p p"]:
+    """Inverse of upper triangular matrices."""
+    return torch.linalg.solve_triangular(upper, torch.eye(upper.shape[-1]).to(upper).expand_as(upper), upper=True)
 
 
 @dataclass(frozen=True)
@@ -68,9 +152,8 @@ class Regression:
         """
         every = torch.arange(len(self.scatter), device=self.scatter.device)
         if self.whitener is None:
-            return Couplings(
-                every, every, 0.5 * self.before, 0.5 * self.scatter[:, :-1, -1], 0.5 * self.scatter[:, :-1, -1]
-            )
+            across = 0.5 * self.scatter[:, :-1, -1]
+            return Couplings(every, every, 0.5 * self.before, across, across)
         inverse = self.whitener.mT @ self.whitener
         if float(inverse.tril(-2).abs().max()) > _NO_NEIGHBOUR * float(inverse.diagonal().min()):
             return None
@@ -90,7 +173,7 @@ class Regression:
         """
         if self.couplings is not None:
             blocks = self._precision_of_weights(self.couplings, features, precision)
-            if float(blocks.detach().diagonal(dim1=-2, dim2=-1).amax()) < LARGEST_PRECISION:
+            if float(blocks.detach().diagonal(dim1=-2, dim2=-1).amax()) < _LARGEST_PRECISION:
                 factor = safe_cholesky(blocks, name="the precision of the coefficients' weights")
                 cross = self.couplings.cross(precision).mT @ features
                 projected = torch.linalg.solve_triangular(factor, cross.flatten(1).unsqueeze(-1), upper=False)
@@ -142,10 +225,10 @@ class Regression:
     def _precision_of_weights(self, couplings: "Couplings", features: Tensor, precision: Tensor) -> Tensor:
         """Precision (b, i * p, i * p) of the weights."""
         size, n_features = self._shape(features)
-        # Of all products of two features, or pair by pair of coefficients.
+        # Pair by pair of coefficients; where there are more of these than features, by all products of two features.
         weight = couplings.weight(precision).flatten(1).mT
         left, right = features[:, couplings.left], features[:, couplings.right]
-        if self._by_squares(features):
+        if size * size > n_features:
             blocks = weight @ (left.unsqueeze(-1) * right.unsqueeze(-2)).flatten(2)
         else:
             blocks = left.mT.unsqueeze(1) @ (weight.unsqueeze(-1) * right.unsqueeze(1))
@@ -161,18 +244,13 @@ class Regression:
         blocks = covariance.reshape(-1, size, n_features, size, n_features).transpose(2, 3)
         blocks = blocks.reshape(-1, size * size, n_features, n_features)
         weight = weight.flatten(1)
-        if self._by_squares(left):
+        if size * size > n_features:  # as there
             total = (weight @ blocks.flatten(2)).unflatten(-1, (n_features, n_features))
             onto_right = (left.unsqueeze(-2) @ total).squeeze(-2)
             return (total @ right.unsqueeze(-1)).squeeze(-1), onto_right
         weight = weight.mT.unsqueeze(-1)
         onto_left = (weight * (right.unsqueeze(1) @ blocks.mT)).sum(1)
         return onto_left, (weight * (left.unsqueeze(1) @ blocks)).sum(1)
-
-    def _by_squares(self, features: Tensor) -> bool:
-        """Whether there are more pairs of coefficients than features: one large product is then the faster way."""
-        size, n_features = self._shape(features)
-        return size * size > n_features
 
     def _shape(self, features: Tensor) -> tuple[int, int]:
         return self.scatter.shape[-1] - 1, features.shape[-1]
