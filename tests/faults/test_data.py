@@ -16,9 +16,9 @@ from sklearn import config_context
 import torch_pbd.files.memory
 from torch_pbd import CholeskyCovRegressor, DMPController, GMMBaseline, WishartProcessRegressor
 from torch_pbd.data import make_tunnel_demonstrations
-from torch_pbd.estimators.inducing import check_memory
-from torch_pbd.estimators.torch_estimator import by_chunks
+from torch_pbd.estimators.base import by_chunks
 from torch_pbd.exceptions import DataRankWarning, UnimodalityWarning
+from torch_pbd.models.heteroscedastic.families import check_memory
 
 EMPIRICAL = [CholeskyCovRegressor(objective="empirical"), WishartProcessRegressor(objective="mse")]
 LIKELIHOOD = ["cholesky-likelihood", "wishart-likelihood"]

@@ -14,7 +14,7 @@ from torch_pbd.control.stiffness import StiffnessLaw
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.estimators.demonstrations import fit_with_groups
 from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
-from torch_pbd.estimators.prior import prior_covariance
+from torch_pbd.estimators.validation import prior_covariance
 
 OnUnknown = Literal["soft", "prior", "raise"]
 

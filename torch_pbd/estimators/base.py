@@ -1,40 +1,21 @@
-"""What the covariance regressors share: the checks before a fit, and all that follows it."""
+"""Predictions of the covariance regressors, as scikit-learn's interface has them and beyond it."""
 
-import sys
-from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
-from sklearn.base import MultiOutputMixin, RegressorMixin
-from sklearn.exceptions import ConvergenceWarning
-from sklearn.utils._tags import Tags
+from numpy.typing import ArrayLike
 from sklearn.utils.validation import check_is_fitted
 from torch import Tensor
 
 from torch_pbd import checks
-from torch_pbd.console import say
-from torch_pbd.estimators.demonstrations import check_groups
-from torch_pbd.estimators.prior import prior_covariance
-from torch_pbd.estimators.scaling import Standardization, canonical_order
-from torch_pbd.estimators.torch_estimator import TorchEstimator, by_chunks
-from torch_pbd.estimators.validation import (
-    Floats,
-    check_inputs_vary,
-    check_squares,
-    check_weights,
-    checked_queries,
-    checked_rows,
-    without_rounding,
-)
+from torch_pbd.estimators.torch_estimator import TorchEstimator
+from torch_pbd.estimators.validation import Floats, check_weights, checked_queries, checked_rows, prior_covariance
 from torch_pbd.files.memory import require_much
 from torch_pbd.linalg import gaussian_log_density, safe_cholesky, student_log_density
-from torch_pbd.models.conditional import ConditionalNormal
-from torch_pbd.optim import FitReport, Progress
 
-Integers = NDArray[np.intp]
+_CHUNK = 1024  # rows: what a prediction needs on the way is then some tens of MB for ten outputs
 
 
 class Uncertainty(NamedTuple):
@@ -46,106 +27,8 @@ class Uncertainty(NamedTuple):
     """(n, d, d): variability of the data, with the prior taken out; squared units of y."""
 
 
-class Fitted(NamedTuple):
-    """Result of a subclass's ``_fit``."""
-
-    module: ConditionalNormal
-    report: FitReport
-    jitter: float
-
-
-class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator, ABC):
+class CovarianceRegressor(TorchEstimator):
     """Base of the regressors whose covariance depends on the input; not for direct use."""
-
-    max_iter: int
-    tol: float
-    verbose: int
-    n_restarts: int
-    random_state: Any
-
-    def __sklearn_tags__(self) -> Tags:
-        tags = super().__sklearn_tags__()
-        tags.regressor_tags.poor_score = True  # score is a log-likelihood, not R^2
-        return tags
-
-    def fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None = None) -> Self:
-        """Learn mean and covariance.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_samples, n_features)
-            Time, phase or position of each sample. Rows that repeat exactly are aligned demonstrations.
-        y : array-like of shape (n_samples,) or (n_samples, n_outputs)
-            What was recorded there.
-        groups : array-like of shape (n_samples,), default=None
-            Demonstration of each sample: counted, to warn of too few; rows are taken for independent.
-
-        Returns
-        -------
-        self
-
-        Raises
-        ------
-        ValueError
-            If X, y, groups or a parameter cannot be used; the message names it and says what to do.
-        """
-        return self._learn(X, y, groups)
-
-    def _learn(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None = None) -> Self:
-        """Check everything, fit, and keep what was learned."""
-        self.__dict__.pop("module_", None)  # a fit that fails leaves no mixture of two
-        self._check_parameters()
-        # Columns side by side: what is asked of each is many times as fast.
-        inputs, targets = map(np.asfortranarray, checked_rows(self, X, y, ensure_min_samples=2))
-        check_squares(inputs, "X")
-        check_squares(targets, "y")
-        check_inputs_vary(inputs)
-        inputs = without_rounding(inputs)
-        self._y_is_1d = targets.ndim == 1
-        self.n_outputs_ = 1 if self._y_is_1d else targets.shape[1]
-        targets = targets.reshape(len(inputs), -1, order="F")
-        order = canonical_order(inputs, targets)
-        numbers = None if groups is None else check_groups(groups, len(inputs))[order]
-        with torch.inference_mode(False), torch.enable_grad():
-            rows = inputs.T.take(order, axis=1).T, targets.T.take(order, axis=1).T
-            fitted = self._fit(*rows, groups=numbers, recorded=order.argsort())
-        self.module_ = fitted.module
-        report = fitted.report
-        self.n_iter_ = max(1, report.n_iter)
-        self.loss_ = report.loss
-        self.loss_curve_ = list(report.loss_curve)
-        self.converged_ = report.converged
-        self.jitter_ = fitted.jitter
-        self._prepare()
-        if not report.converged:
-            more = f"max_iter (now {self.max_iter}) or " if report.status.is_limit else ""
-            checks.warn(
-                f"{type(self).__name__} stopped early: {report.message}. The best point found is kept; "
-                f"raise {more}tol (now {self.tol:g}).",
-                ConvergenceWarning,
-            )
-        return self
-
-    @abstractmethod
-    def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, recorded: Integers) -> Fitted:
-        """Fit on validated arrays (n, e) and (n, d).
-
-        ``groups`` has the number of each row's demonstration, ``recorded`` the rows in the order of their recording.
-        """
-
-    def __sklearn_is_fitted__(self) -> bool:
-        return "module_" in vars(self)
-
-    def _check_parameters(self) -> None:
-        """Check the parameters whose values do not depend on the data; subclasses check theirs too."""
-        checks.count(self.max_iter, "max_iter", least=1)
-        checks.number(self.tol, "tol", above=0.0)
-        checks.count(self.n_restarts, "n_restarts", least=0)
-        if not isinstance(self.verbose, bool):
-            checks.count(self.verbose, "verbose", least=0)
-        checks.seed(self.random_state)
-        if problem := self._device_problem():
-            raise ValueError(f"device is {self.device!r}, which cannot be used here: {problem}. None is the CPU.")
 
     def predict(self, X: ArrayLike, *, return_std: bool = False, return_cov: bool = False) -> Any:
         """Mean of y at X, and with it the standard deviations or the covariances.
@@ -295,19 +178,17 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator, ABC)
         covariance = prior_covariance(prior, x.cpu().numpy(), self.n_outputs_)
         return (safe_cholesky(self._door(covariance), name="prior(X)"),)
 
-    def _progress(self) -> Callable[[Progress], None] | None:
-        """Callback that prints the loss to the error output, more often for higher ``verbose``; None if it is 0."""
-        if not self.verbose:
-            return None
 
-        def show(progress: Progress) -> None:
-            count = progress.n_evaluations
-            if count < 5 or count % max(1, 10 // self.verbose) in (0, 1):
-                text = f"evaluation {count:5d}  loss {progress.loss:14.6f}  {progress.elapsed:7.2f} s"
-                say(f"{type(self).__name__}: {text}", sys.stderr)
-
-        return show
-
-    def _assemble(self, core: Any, scaling: Standardization) -> ConditionalNormal:
-        parts = (scaling.x_shift, scaling.x_scale, scaling.y_shift, scaling.y_scale)
-        return ConditionalNormal(core, *map(self._door, parts)).requires_grad_(False)
+def by_chunks(function: Callable[[Any], Any], x: Tensor | Floats) -> Any:
+    """Tuple of arrays that a function of rows gives for x, called for a bounded number of rows at a time."""
+    if len(x) <= _CHUNK:
+        return function(x)
+    first = function(x[:_CHUNK])
+    require_much(
+        2.0 * len(x) / _CHUNK * sum(part.nbytes for part in first),  # in parts, and joined
+        what=f"what is predicted for {len(x)} rows",
+        remedy="Predict fewer at a time.",
+    )
+    others = (function(x[start : start + _CHUNK]) for start in range(_CHUNK, len(x), _CHUNK))
+    joined: Any = torch.cat if isinstance(x, Tensor) else np.concatenate
+    return tuple(joined(part) for part in zip(first, *others, strict=True))

@@ -10,12 +10,11 @@ from torch_pbd.estimators.latent import (
     LatentCovarianceRegressor,
     Problem,
     longest_covariance,
+    mean_consistent_with_repeats,
     residual_tril,
     warn_if_stretched,
 )
-from torch_pbd.estimators.mean import mean_consistent_with_repeats
-from torch_pbd.estimators.prior import Prior
-from torch_pbd.estimators.validation import check_solver
+from torch_pbd.estimators.validation import Prior
 from torch_pbd.gp import LatentGP, LatentValues, Observations, condition, fit_together
 from torch_pbd.kernels import KernelName
 from torch_pbd.linalg import tril_to_vector
@@ -164,7 +163,6 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
         checks.number(self.noise_scale, "noise_scale", least=0.0, optional=True)
         checks.flag(self.bias_correction, "bias_correction")
         checks.choice(self.diagonal, "diagonal", ("auto", "raw", "log"))
-        check_solver(self.solver, latent_prior=self.latent_prior)
 
     def _fit_empirical(self, problem: Problem) -> tuple[LatentGP, CholeskyCovariance, FitReport, float]:
         training, smoothed = problem.training, self.noise_scale is None

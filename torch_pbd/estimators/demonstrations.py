@@ -100,6 +100,18 @@ def check_demonstrations(X: Floats, y: Floats, groups: Any) -> None:
         check_unimodal(Demonstrations(times, positions))
 
 
+def warn_if_few(n_rows: int, n_outputs: int, groups: NDArray[np.intp] | None = None) -> None:
+    """Warn of no more rows than outputs, whose covariance is singular; or of no more demonstrations."""
+    if n_rows <= n_outputs:
+        checks.warn(
+            f"y has {n_rows} rows but {n_outputs} outputs: they leave directions of the covariance undetermined, "
+            "which the prior decides. Record more.",
+            DataRankWarning,
+        )
+    else:
+        warn_if_few_demonstrations(groups, n_outputs)
+
+
 def warn_if_few_demonstrations(groups: NDArray[np.intp] | None, n_outputs: int) -> None:
     """Warn of no more demonstrations than outputs: samples of one repeat each other, however many there are."""
     if groups is not None and (n_demos := int(groups.max()) + 1) <= n_outputs:

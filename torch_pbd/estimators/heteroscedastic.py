@@ -8,15 +8,11 @@ import torch
 from numpy.typing import ArrayLike
 
 from torch_pbd import checks
-from torch_pbd.estimators.base import CovarianceRegressor, Fitted, Integers
-from torch_pbd.estimators.demonstrations import check_demonstrations, warn_of_residuals
-from torch_pbd.estimators.inducing import check_memory, inducing_sizes, warn_if_unresolved
-from torch_pbd.estimators.latent import default_prior_tril, warn_if_few, warn_if_identical
-from torch_pbd.estimators.prior import Prior, standardized_prior
-from torch_pbd.estimators.scaling import Standardization, distinct_rows
-from torch_pbd.estimators.validation import Floats, check_length_scale, check_period
+from torch_pbd.estimators.base import CovarianceRegressor
+from torch_pbd.estimators.demonstrations import check_demonstrations, warn_if_few, warn_of_residuals
+from torch_pbd.estimators.torch_estimator import Fitted, Integers, Standardization, warn_if_identical
+from torch_pbd.estimators.validation import Floats, Prior, check_length_scale, check_period, standardized_prior
 from torch_pbd.files.memory import require_much
-from torch_pbd.gp.inducing import FeatureMap, inducing_inputs
 from torch_pbd.kernels import KERNELS, KernelName
 from torch_pbd.linalg import safe_cholesky
 from torch_pbd.models.heteroscedastic import (
@@ -26,7 +22,8 @@ from torch_pbd.models.heteroscedastic import (
     fit_heteroscedastic,
     mean_start,
 )
-from torch_pbd.models.training import TrainingSet
+from torch_pbd.models.heteroscedastic.families import check_memory, inducing_sizes
+from torch_pbd.models.training import TrainingSet, default_prior_tril
 
 _DRAWN = 65536  # matrices drawn at a time: memory stays bounded
 
@@ -196,7 +193,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         UserWarning
             If the mean does not follow the data.
         """
-        return self._learn(X, y, groups)
+        return super().fit(X, y, groups)
 
     def predict_cov(self, X: ArrayLike, *, missing_knowledge: bool = True) -> Floats:
         """Covariances of the outputs at X: (n_samples, n_outputs, n_outputs), also for one output.
@@ -255,36 +252,34 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
     def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, recorded: Integers) -> Fitted:
         if groups is not None:
             check_demonstrations(X, y, groups)
-        scaling = Standardization.fit(X, y)
-        standardized = scaling.inputs(X)
-        inputs, index = distinct_rows(standardized)
-        check_memory(self.n_inducing, self.max_inputs, (*inputs.shape, y.shape[1]))
+        scaling, training = self._training_set(X, y)
         held, circle = self._in_ranges(scaling)
-        prior_tril = self._prior_tril(X, y, scaling)
-        training = TrainingSet(
-            self._door(standardized), self._door(scaling.outputs(y)), self._door(inputs), self._door(index).long()
-        )
+        prior_tril = self._prior_tril(X, training, scaling)
         warn_if_few(len(y), y.shape[1])
         warn_if_identical(training)
         rows, training = training, training.merged(self.max_inputs)
         group = None if groups is None else self._door(groups).long()
         options = SearchOptions(self.max_iter, self.tol, self.n_restarts, self._progress())
         kernel: KernelName = "squared_exponential" if self.kernel == "periodic" else self.kernel
-        to_try = []
-        for sizes in inducing_sizes(self.n_inducing, X.shape[1], y.shape[1]):
-            inducing = [inducing_inputs(training.inputs, size) for size in sizes]
-            mean_map, covariance_map = (FeatureMap(z, kernel, circle, len(z) == len(inputs)) for z in inducing)
-            to_try.append(Families.build(mean_map, covariance_map, held, shared=self.shared_length_scale))
-        families = to_try[0]
-        begin = partial(mean_start, rows, families.mean, options) if self.n_inducing is None else None
-        larger = to_try[1] if len(to_try) > 1 else None
-        fit = fit_heteroscedastic(training, group, families, options, larger=larger, begin=begin)
+        sizes = inducing_sizes(self.n_inducing, X.shape[1], y.shape[1])
+        of_all: dict[str, Any] = {"period": circle, "length_scale": held, "shared": self.shared_length_scale}
+        to_try = Families.candidates(training.inputs, len(rows.inputs), sizes, kernel=kernel, **of_all)
+        begin = partial(mean_start, rows, to_try[0].mean, options) if self.n_inducing is None else None
+        fit = fit_heteroscedastic(training, group, to_try, options, begin=begin)
         features = fit.covariance.log_variance_family.features
-        warn_if_unresolved(held, features)
+        least = features.shortest_length_scale
+        if held is not None and bool((held < least).any()):
+            checks.warn(
+                f"length_scale is below {least:.3g} of the range of X, which is what the inputs (or n_inducing of "
+                "them) resolve: between them the covariance says nothing. Give a longer one, or None to learn it."
+            )
         warn_of_residuals(fit, group, self._door(recorded).long())
         self.effective_share_ = 1.0 if fit.correlation is None else float(fit.correlation.share.mean())
         report = options.outcome(tuple(-value for value in fit.log_evidence))
         return Fitted(self._assemble(HeteroscedasticModel(fit, prior_tril), scaling), report, features.jitter)
+
+    def _check_memory(self, n_distinct: int, n_features: int, n_outputs: int) -> None:
+        check_memory(self.n_inducing, self.max_inputs, (n_distinct, n_features, n_outputs))
 
     def _in_ranges(self, scaling: Standardization) -> tuple[torch.Tensor | None, torch.Tensor | None]:
         """Length scale and period that the user gave, in ranges of the inputs."""
@@ -293,8 +288,8 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         held = None if length_scale is None else self._door(length_scale / scaling.x_scale)
         return held, None if period is None else self._door(period / scaling.x_scale)
 
-    def _prior_tril(self, X: Floats, y: Floats, scaling: Standardization) -> torch.Tensor:
+    def _prior_tril(self, X: Floats, training: TrainingSet, scaling: Standardization) -> torch.Tensor:
         if self.prior is None:
-            return default_prior_tril(self._door(scaling.outputs(y)))
+            return default_prior_tril(training.y)
         tril = safe_cholesky(self._door(standardized_prior(self.prior, X, scaling.y_scale)), name="prior")
         return tril if tril.ndim == 2 else tril[0]  # a callable is asked again at every prediction

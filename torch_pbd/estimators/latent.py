@@ -1,36 +1,45 @@
-"""What the two regressors on latent Gaussian processes (CD and WP) share."""
+"""What the two regressors on latent Gaussian processes (CD and WP) share, and the mean that both have."""
 
 from abc import abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
+from scipy.special import fdtri, stdtrit
 from torch import Tensor
 
 from torch_pbd import checks
-from torch_pbd.estimators.base import CovarianceRegressor, Fitted, Integers
-from torch_pbd.estimators.demonstrations import warn_if_few_demonstrations
-from torch_pbd.estimators.mean import mean_consistent_with_repeats
-from torch_pbd.estimators.prior import standardized_prior
-from torch_pbd.estimators.scaling import Standardization, distinct_rows
-from torch_pbd.estimators.validation import Floats, check_length_scale
+from torch_pbd.estimators.base import CovarianceRegressor
+from torch_pbd.estimators.demonstrations import warn_if_few
+from torch_pbd.estimators.torch_estimator import Fitted, Integers, Standardization, warn_if_identical
+from torch_pbd.estimators.validation import Floats, check_length_scale, standardized_prior
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.files.memory import require_much
-from torch_pbd.gp import EvidenceSearch, LatentGP, Observations, fit_together, resolved_length_scale, spacing
+from torch_pbd.gp import EvidenceSearch, LatentGP, Observations, condition, fit_together, resolved_length_scale, spacing
+from torch_pbd.gp.search import Found
 from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky, scale_tril_from_root
 from torch_pbd.models.conditional import MeanAndCovariance
-from torch_pbd.models.training import TrainingSet
+from torch_pbd.models.scoring import Solver
+from torch_pbd.models.training import TrainingSet, default_prior_tril
 from torch_pbd.optim import FitReport
 
-_STRETCHED = 10.0  # an amplitude of so many times the values
+# An amplitude of so many times the values: where a process can follow them it is up to 2.
+_STRETCHED = 10.0
 # Spacings of the inputs that an interpolating process may be as short as, and ranges that others may be as long as:
 # with longer ones the prior of a covariance would never take over.
 _SHORTEST, _LONGEST_MEAN, _LONGEST_COVARIANCE = 0.75, 10.0, 0.35
 # A hole among inputs on a line, of the range and in spacings of the others. It is to hold so many length scales: a
 # smooth process without noise claims to know what is two to three of them from many inputs.
 _HOLE, _SPACINGS, _IN_HOLE = 0.25, 5.0, 6.0
+
+_LEVEL = 1e-4  # of the tests: how often a mean that is right is taken for wrong
+_CLEAR = 5.0  # standard errors of the means, however few rows tell them: of twice two the test would allow for 100
+_LEAST_SPREAD = 0.03  # of the pooled one: how small that at an input is believed to be
+_UNRESOLVED = 1e-10  # squared, of standardized outputs: what a smooth process may be off by in any case
+_SHARE, _LEAST_NOISE = 0.1, 1e-6  # of the smallest error of a mean, and of the outputs' deviation
 
 
 @dataclass(frozen=True)
@@ -61,6 +70,7 @@ class LatentCovarianceRegressor(CovarianceRegressor):
     length_scale: Any
     max_inputs: int
     latent_prior: bool
+    solver: Solver
 
     def _check_parameters(self) -> None:
         super()._check_parameters()
@@ -69,23 +79,21 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         checks.count(self.max_inputs, "max_inputs", least=2)
         if isinstance(self.prior, str):
             checks.choice(self.prior, "prior", ("paper",))
+        checks.choice(self.solver, "solver", ("auto", "fisher", "lbfgs"))
+        if not checks.flag(self.latent_prior, "latent_prior") and self.solver == "fisher":
+            raise ValueError(
+                "solver='fisher' holds the hyperparameters, which latent_prior=False trains: use solver='auto' or "
+                "'lbfgs', or latent_prior=True."
+            )
 
     def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, recorded: Integers) -> Fitted:
-        scaling = Standardization.fit(X, y)
-        standardized = scaling.inputs(X)
-        inputs, index = distinct_rows(standardized)
-        self._check_memory(len(inputs), y.shape[1])
-        training = TrainingSet(
-            self._door(standardized),
-            self._door(scaling.outputs(y)),
-            self._door(inputs),
-            self._door(index).long(),
-        )
-        aligned = self._works_on_empirical(scaling.x_shift + scaling.x_scale * inputs, np.bincount(index), y.shape[1])
+        scaling, training = self._training_set(X, y)
+        counts = training.counts.cpu().numpy()
+        aligned = self._works_on_empirical(_in_units(training, scaling), counts, y.shape[1])
         length_scale = check_length_scale(self.length_scale, X.shape[1])
         if not aligned:
             # Those that repeat inputs have been counted.
-            warn_if_few(len(y), y.shape[1], groups if np.bincount(index).min() < 2 else None)
+            warn_if_few(len(y), y.shape[1], groups if counts.min() < 2 else None)
             training = training.merged(self.max_inputs)
         problem = Problem(
             training,
@@ -143,8 +151,8 @@ class LatentCovarianceRegressor(CovarianceRegressor):
             return default_prior_tril(training.y)
         if isinstance(self.prior, str):  # "paper": the entries of the factor are in the units of y
             return torch.diag(1.0 / self._door(scaling.y_scale))
-        X = scaling.x_shift + scaling.x_scale * training.inputs.cpu().numpy()
-        return safe_cholesky(self._door(standardized_prior(self.prior, X, scaling.y_scale)), name="prior")
+        prior = standardized_prior(self.prior, _in_units(training, scaling), scaling.y_scale)
+        return safe_cholesky(self._door(prior), name="prior")
 
     def _fit_mean(self, training: TrainingSet) -> tuple[LatentGP, FitReport]:
         """Gaussian processes of the mean, by themselves."""
@@ -179,7 +187,7 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         longest = longest_covariance(problem.training.inputs)
         return problem.training.inputs.new_full((1, n_features), min(0.2, longest) * n_features**0.5)
 
-    def _check_memory(self, n_distinct: int, n_outputs: int) -> None:
+    def _check_memory(self, n_distinct: int, n_features: int, n_outputs: int) -> None:
         n_inputs = min(n_distinct, self.max_inputs)
         n_processes = self._n_processes(n_outputs)
         require_much(
@@ -192,6 +200,11 @@ class LatentCovarianceRegressor(CovarianceRegressor):
     def _n_processes(self, n_outputs: int) -> int:
         """Processes of the mean and the covariance, at most."""
         return (n_outputs + 1) ** 2
+
+
+def _in_units(training: TrainingSet, scaling: Standardization) -> Floats:
+    """Distinct inputs in the units of X."""
+    return scaling.x_shift + scaling.x_scale * training.inputs.cpu().numpy()
 
 
 def longest_covariance(inputs: Tensor) -> float:
@@ -209,40 +222,6 @@ def residual_tril(residual: Tensor) -> Tensor:
     return scale_tril_from_root(torch.cat([residual.mT / len(residual) ** 0.5, floor], dim=1))
 
 
-def default_prior_tril(y: Tensor) -> Tensor:
-    """Factor of a wide prior: four times the covariance of all of y around its mean.
-
-    A thousandth of the unit matrix is mixed in: outputs that move together, or do not move at all, have
-    some freedom of their own where nothing is known.
-    """
-    centred = (0.999 / (len(y) - 1)) ** 0.5 * (y - y.mean(0)).mT
-    return 2.0 * scale_tril_from_root(torch.cat([centred, 0.001**0.5 * torch.eye(y.shape[1]).to(y)], dim=1))
-
-
-def warn_if_few(n_rows: int, n_outputs: int, groups: Integers | None = None) -> None:
-    """Warn of no more rows than outputs, whose covariance is singular; or of no more demonstrations."""
-    if n_rows <= n_outputs:
-        checks.warn(
-            f"y has {n_rows} rows but {n_outputs} outputs: they leave directions of the covariance undetermined, "
-            "which the prior decides. Record more.",
-            DataRankWarning,
-        )
-    else:
-        warn_if_few_demonstrations(groups, n_outputs)
-
-
-def warn_if_identical(training: TrainingSet) -> None:
-    """Warn of outputs that never vary where inputs repeat."""
-    repeated = len(training.y) - len(training.inputs)
-    mean = training.means()[training.index] if repeated else training.y.mean(0)
-    if float((training.y - mean).square().sum(0).max()) < 1e-18 * max(1, repeated or len(training.y) - 1):
-        checks.warn(
-            "The demonstrations are identical: their covariance is zero, and the smallest that can be told "
-            "from it is used.",
-            DataRankWarning,
-        )
-
-
 def warn_if_stretched(amplitude: Tensor, targets: Tensor, *, given: bool) -> None:
     """Warn where a length scale that the user gave is too long for what changes over the inputs."""
     if given and bool((amplitude > _STRETCHED * targets.square().mean(1).sqrt().clamp_min(1e-12)).any()):
@@ -250,3 +229,70 @@ def warn_if_stretched(amplitude: Tensor, targets: Tensor, *, given: bool) -> Non
             "length_scale is so long that the covariance follows the data only as the difference of large numbers: "
             "beside the data it will overshoot the prior. Give a shorter one, or None to learn it."
         )
+
+
+def mean_consistent_with_repeats(
+    training: TrainingSet, observations: Observations, search: EvidenceSearch, found: Found
+) -> tuple[LatentGP, FitReport]:
+    """The processes that the evidence found; or ones through the means, where rows that repeat inputs contradict them.
+
+    The evidence sees the mean at each input, not how far the rows there differ. With few inputs, or jumps between them,
+    it may take for noise what all demonstrations agree on.
+
+    Warns
+    -----
+    DataRankWarning
+        If the means can be followed by a process only that swings far beyond them between the inputs: it is not taken.
+    """
+    mean, _ = condition(observations, found.hyperparameters, search.kernel, basis=found.basis)
+    if int(training.counts.min()) < 2 or not torch.equal(training.inputs[training.index], training.x):
+        return mean, found.report
+    spread = _Spread(training)
+    with torch.no_grad():
+        wrong = spread.contradicts(observations.targets - mean(training.inputs).mT)
+    if not bool(wrong.any()):
+        return mean, found.report
+    learned = found.hyperparameters.amplitude * found.hyperparameters.noise_ratio.sqrt()
+    noise_scale = torch.where(wrong, _SHARE * spread.least_error(), learned).clamp_min(_LEAST_NOISE)
+    (again,) = fit_together([(observations, replace(search, noise_scale=noise_scale))])
+    # Over a range or more a large amplitude is a trend.
+    swings = again.hyperparameters.amplitude > _STRETCHED * observations.targets.square().mean(1).sqrt()
+    swings &= again.hyperparameters.length_scale.amin(1) < 1.0
+    if bool(swings[wrong].any()):
+        checks.warn(
+            "y has means at the inputs that differ by more than its scatter there, between inputs too near to each "
+            "other for a smooth mean to follow: it does not. Make such rows of X equal, which pools them.",
+            DataRankWarning,
+        )
+        return mean, found.report
+    return condition(observations, again.hyperparameters, search.kernel, basis=again.basis)[0], again.report
+
+
+class _Spread:
+    """How far rows that repeat an input differ, (n, d), and what of it the mean at that input may be off by."""
+
+    def __init__(self, training: TrainingSet) -> None:
+        counts, means = training.counts, training.means()
+        squares = torch.zeros_like(means)
+        squares.index_add_(0, training.index, (training.y - means[training.index]).square())
+        self._counts, self._degrees = counts, counts - 1.0
+        self._pooled = squares.sum(0) / self._degrees.sum()
+        local = squares / self._degrees[:, None]
+        self._local = torch.maximum(local, _LEAST_SPREAD**2 * self._pooled)
+
+    def least_error(self) -> Float[Tensor, " d"]:
+        """Smallest standard error of a mean, of rows that are counted as in the evidence."""
+        return (self._local.amin(0) / self._counts.mean()).sqrt()
+
+    def contradicts(self, residual: Float[Tensor, "d n"]) -> Bool[Tensor, " d"]:
+        """Whether the means at the inputs are too far from where a process has them.
+
+        Together, by the F test of lack of fit; or at one input, by Student's t.
+        """
+        squared = residual.mT.square() * self._counts[:, None]
+        n_inputs, degrees = len(squared), float(self._degrees.sum())
+        limit = min(float(fdtri(n_inputs, degrees, 1.0 - _LEVEL)), _CLEAR**2)
+        together = squared.mean(0) > limit * self._pooled + _UNRESOLVED
+        each = squared.new_tensor(stdtrit(self._degrees.cpu().numpy(), 0.5 * _LEVEL / n_inputs))
+        alone = squared > each.square()[:, None] * self._local + _UNRESOLVED
+        return together | alone.any(0)

@@ -1,31 +1,248 @@
-"""The door between NumPy and torch: arrays to the device, and a fitted module into pickles and back."""
+"""Fits of torch modules to NumPy arrays: rows checked, ordered and standardized, and a module into pickles and back."""
 
+import sys
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from typing import Any, ClassVar
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 import torch
-from sklearn.base import BaseEstimator
+from numpy.typing import ArrayLike, NDArray
+from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.utils._tags import Tags
 from torch import Tensor
 
 from torch_pbd import checks
-from torch_pbd.estimators.validation import Floats
-from torch_pbd.files.memory import require_much
+from torch_pbd.checks import Floats
+from torch_pbd.console import say
+from torch_pbd.estimators.demonstrations import check_groups
+from torch_pbd.estimators.validation import CONSTANT, check_inputs_vary, check_squares, checked_rows, without_rounding
+from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.models.conditional import ConditionalNormal, Core
+from torch_pbd.models.training import TrainingSet, is_constant
+from torch_pbd.optim import FitReport, Progress
 
-_CHUNK = 1024  # rows: what a prediction needs on the way is then some tens of MB for ten outputs
+# Standardized numbers keep this many decimals, so that other units are the same numbers: an optimizer with flat
+# directions would turn a difference in the last bit into digits.
+_DECIMALS = 10
+
+Integers = NDArray[np.intp]
 
 
-class TorchEstimator(BaseEstimator):
-    """Base of estimators that keep what they learned in a torch module, ``module_``, on ``device``."""
+@dataclass(frozen=True)
+class Standardization:
+    """Shift and scale of each column: inputs get a range of one, outputs a standard deviation of one."""
+
+    x_shift: Floats
+    x_scale: Floats
+    y_shift: Floats
+    y_scale: Floats
+    x_parts: tuple[Floats, Floats]
+    """A value that the column has, and the shift less that value. A difference of values is exact, so that what is
+    made of these two is the same numbers wherever the origin is."""
+    y_parts: tuple[Floats, Floats]
+
+    @classmethod
+    def fit(cls, X: Floats, y: Floats) -> "Standardization":
+        """Standardization of the columns of X and y.
+
+        A constant output gets the largest scale of the others, so that it is precise beside them; a
+        constant input its magnitude, beside which rounding is nothing, in all units.
+        """
+        low, high = X.min(axis=0), X.max(axis=0)
+        span = high - low
+        x_scale = _or_magnitude(span, np.maximum(np.abs(low), np.abs(high)))
+        y_shift = y.mean(axis=0)
+        y_scale = (y - y_shift).std(axis=0)
+        largest = np.abs(y).max(axis=0)
+        varies = y_scale > CONSTANT * largest
+        if not varies.all():
+            y_scale = np.where(varies, y_scale, y_scale[varies].max() if varies.any() else largest)
+            y_scale = np.where(y_scale > 0, y_scale, y_scale.max() or 1.0)
+        parts = (low, 0.5 * span), (y[0], (y - y[0]).mean(axis=0))
+        return cls(low + 0.5 * span, x_scale, y_shift, y_scale, *parts)
+
+    def inputs(self, X: Floats) -> Floats:
+        """Inputs standardized."""
+        return np.asarray(np.round(self.exact_inputs(X), _DECIMALS))
+
+    def outputs(self, y: Floats) -> Floats:
+        """Outputs standardized."""
+        return np.asarray(np.round(self.exact_outputs(y), _DECIMALS))
+
+    def exact_inputs(self, X: Floats) -> Floats:
+        """Inputs standardized with all their digits."""
+        return (X - self.x_parts[0] - self.x_parts[1]) / self.x_scale
+
+    def exact_outputs(self, y: Floats) -> Floats:
+        """Outputs standardized with all their digits."""
+        return (y - self.y_parts[0] - self.y_parts[1]) / self.y_scale
+
+
+def spread_of(columns: Floats) -> Floats:
+    """Standard deviation of each column; the magnitude of one that is constant but for rounding."""
+    return _or_magnitude(columns.std(axis=0), np.abs(columns).max(axis=0))
+
+
+def _or_magnitude(spread: Floats, magnitude: Floats) -> Floats:
+    return np.where(spread > CONSTANT * magnitude, spread, np.where(magnitude > 0, magnitude, 1.0))
+
+
+def canonical_order(X: Floats, y: Floats) -> NDArray[np.intp]:
+    """Order of the rows that does not depend on the one they come in, so that no result does."""
+    order = y[:, -1].argsort()
+    ordered = y[order, -1]
+    if (ordered[1:] > ordered[:-1]).all():
+        return order
+    return np.lexsort(np.hstack([X, y]).T)  # where values repeat the other columns decide, which takes longer
+
+
+def distinct_rows(X: Floats) -> tuple[Floats, NDArray[np.intp]]:
+    """Distinct rows of X in lexicographic order, and the index of each row's own among them."""
+    X = X + 0.0  # minus zero is zero
+    order = X[:, 0].argsort() if X.shape[1] == 1 else np.lexsort(X.T[::-1])
+    ordered = X[order]
+    is_first = np.append(True, (ordered[1:] != ordered[:-1]).any(axis=1))
+    index = np.empty(len(X), dtype=np.intp)
+    index[order] = is_first.cumsum() - 1
+    return ordered[is_first], index
+
+
+class Fitted(NamedTuple):
+    """Result of a subclass's ``_fit``."""
+
+    module: ConditionalNormal
+    report: FitReport
+    jitter: float
+
+
+class TorchEstimator(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
+    """Base of regressors that keep what they learned in a torch module, ``module_``, on ``device``."""
 
     device: str | None
+    max_iter: int
+    tol: float
+    verbose: int
+    n_restarts: int
+    random_state: Any
     module_: ConditionalNormal
 
     _core_class: ClassVar[type[Core]]
     """Class of the core of ``module_``."""
     _learned: ClassVar[Mapping[str, Callable[[Any, str], Any]]] = {}
     """Attributes that only fits of this class learn, and how model files check them."""
+
+    def __sklearn_tags__(self) -> Tags:
+        tags = super().__sklearn_tags__()
+        tags.regressor_tags.poor_score = True  # score is a log-likelihood, not R^2
+        return tags
+
+    def fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None = None) -> Self:
+        """Learn mean and covariance.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_features)
+            Time, phase or position of each sample. Rows that repeat exactly are aligned demonstrations.
+        y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+            What was recorded there.
+        groups : array-like of shape (n_samples,), default=None
+            Demonstration of each sample: counted, to warn of too few; rows are taken for independent.
+
+        Returns
+        -------
+        self
+
+        Raises
+        ------
+        ValueError
+            If X, y, groups or a parameter cannot be used; the message names it and says what to do.
+        """
+        self.__dict__.pop("module_", None)  # a fit that fails leaves no mixture of two
+        self._check_parameters()
+        # Columns side by side: what is asked of each is many times as fast.
+        inputs, targets = map(np.asfortranarray, checked_rows(self, X, y, ensure_min_samples=2))
+        check_squares(inputs, "X")
+        check_squares(targets, "y")
+        check_inputs_vary(inputs)
+        inputs = without_rounding(inputs)
+        self._y_is_1d = targets.ndim == 1
+        self.n_outputs_ = 1 if self._y_is_1d else targets.shape[1]
+        targets = targets.reshape(len(inputs), -1, order="F")
+        order = canonical_order(inputs, targets)
+        numbers = None if groups is None else check_groups(groups, len(inputs))[order]
+        with torch.inference_mode(False), torch.enable_grad():
+            rows = inputs.T.take(order, axis=1).T, targets.T.take(order, axis=1).T
+            fitted = self._fit(*rows, groups=numbers, recorded=order.argsort())
+        self.module_ = fitted.module
+        report = fitted.report
+        self.n_iter_ = max(1, report.n_iter)
+        self.loss_ = report.loss
+        self.loss_curve_ = list(report.loss_curve)
+        self.converged_ = report.converged
+        self.jitter_ = fitted.jitter
+        self._prepare()
+        if not report.converged:
+            more = f"max_iter (now {self.max_iter}) or " if report.status.is_limit else ""
+            checks.warn(
+                f"{type(self).__name__} stopped early: {report.message}. The best point found is kept; "
+                f"raise {more}tol (now {self.tol:g}).",
+                ConvergenceWarning,
+            )
+        return self
+
+    @abstractmethod
+    def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, recorded: Integers) -> Fitted:
+        """Fit on validated arrays (n, e) and (n, d).
+
+        ``groups`` has the number of each row's demonstration, ``recorded`` the rows in the order of their recording.
+        """
+
+    def __sklearn_is_fitted__(self) -> bool:
+        return "module_" in vars(self)
+
+    def _check_parameters(self) -> None:
+        """Check the parameters whose values do not depend on the data; subclasses check theirs too."""
+        checks.count(self.max_iter, "max_iter", least=1)
+        checks.number(self.tol, "tol", above=0.0)
+        checks.count(self.n_restarts, "n_restarts", least=0)
+        if not isinstance(self.verbose, bool):
+            checks.count(self.verbose, "verbose", least=0)
+        checks.seed(self.random_state)
+        if problem := self._device_problem():
+            raise ValueError(f"device is {self.device!r}, which cannot be used here: {problem}. None is the CPU.")
+
+    def _training_set(self, X: Floats, y: Floats) -> tuple[Standardization, TrainingSet]:
+        """Standardization of validated arrays, and the rows with their distinct inputs found."""
+        scaling = Standardization.fit(X, y)
+        standardized = scaling.inputs(X)
+        inputs, index = distinct_rows(standardized)
+        self._check_memory(len(inputs), X.shape[1], y.shape[1])
+        outputs = self._door(scaling.outputs(y))
+        rows = TrainingSet(self._door(standardized), outputs, self._door(inputs), self._door(index).long())
+        return scaling, rows
+
+    def _check_memory(self, n_distinct: int, n_features: int, n_outputs: int) -> None:
+        """Check that a fit of so many distinct inputs has the memory that it needs."""
+
+    def _progress(self) -> Callable[[Progress], None] | None:
+        """Callback that prints the loss to the error output, more often for higher ``verbose``; None if it is 0."""
+        if not self.verbose:
+            return None
+
+        def show(progress: Progress) -> None:
+            count = progress.n_evaluations
+            if count < 5 or count % max(1, 10 // self.verbose) in (0, 1):
+                text = f"evaluation {count:5d}  loss {progress.loss:14.6f}  {progress.elapsed:7.2f} s"
+                say(f"{type(self).__name__}: {text}", sys.stderr)
+
+        return show
+
+    def _assemble(self, core: Any, scaling: Standardization) -> ConditionalNormal:
+        parts = (scaling.x_shift, scaling.x_scale, scaling.y_shift, scaling.y_scale)
+        return ConditionalNormal(core, *map(self._door, parts)).requires_grad_(False)
 
     def _prepare(self) -> None:
         """Work out what predictions need of the module alone."""
@@ -68,16 +285,11 @@ class TorchEstimator(BaseEstimator):
             self._prepare()
 
 
-def by_chunks(function: Callable[[Any], Any], x: Tensor | Floats) -> Any:
-    """Tuple of arrays that a function of rows gives for x, called for a bounded number of rows at a time."""
-    if len(x) <= _CHUNK:
-        return function(x)
-    first = function(x[:_CHUNK])
-    require_much(
-        2.0 * len(x) / _CHUNK * sum(part.nbytes for part in first),  # in parts, and joined
-        what=f"what is predicted for {len(x)} rows",
-        remedy="Predict fewer at a time.",
-    )
-    others = (function(x[start : start + _CHUNK]) for start in range(_CHUNK, len(x), _CHUNK))
-    joined: Any = torch.cat if isinstance(x, Tensor) else np.concatenate
-    return tuple(joined(part) for part in zip(first, *others, strict=True))
+def warn_if_identical(training: TrainingSet) -> None:
+    """Warn of outputs that never vary where inputs repeat."""
+    if is_constant(training):
+        checks.warn(
+            "The demonstrations are identical: their covariance is zero, and the smallest that can be told "
+            "from it is used.",
+            DataRankWarning,
+        )

@@ -1,6 +1,6 @@
-"""Checks of what users pass to an estimator, before any work starts."""
+"""Checks of what users pass to an estimator, before any work starts: rows, parameters, the prior."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,13 @@ _NEAR, _MANY = 1e-3, 0.1
 _SHORTEST_PERIOD = 1e-8  # of the range: standardized inputs have ten decimals, and so this phase two
 # Of a value, so that its square, and a thousand of them added up, is a number.
 _LARGEST = 1e140
+
+Prior = (
+    float | list[list[float]] | str | Callable[[Any], Any] | None
+)  # or any array-like; the type is what YAML can say
+
+# Of the variance of y: beyond these the floor under variances shows far from data, or the prior near them.
+_LOWEST, _HIGHEST = 1e-6, 1e6
 
 
 def as_plain_array(values: Any, name: str) -> Any:
@@ -194,17 +201,6 @@ def without_rounding(X: Floats) -> Floats:
     return X
 
 
-def check_solver(solver: str, *, latent_prior: bool) -> None:
-    """Check what latent values are trained with."""
-    checks.choice(solver, "solver", ("auto", "fisher", "lbfgs"))
-    checks.flag(latent_prior, "latent_prior")
-    if solver == "fisher" and not latent_prior:
-        raise ValueError(
-            "solver='fisher' holds the hyperparameters, which latent_prior=False trains: use solver='auto' or "
-            "'lbfgs', or latent_prior=True."
-        )
-
-
 def check_length_scale(value: Any, n_features: int) -> Floats | None:
     """Length scales as an array (n_features,), or None where they are to be learned."""
     if value is None:
@@ -242,3 +238,51 @@ def parameter_floats(value: Any, name: str) -> Floats:
         return array.astype(np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} is {value!r}, must be numbers ({error}).") from error
+
+
+def standardized_prior(prior: Prior, X: Floats, y_scale: Floats) -> Floats:
+    """What :func:`prior_covariance` gives, in units in which the outputs have the deviations ``y_scale`` (d,).
+
+    Warns
+    -----
+    UserWarning
+        If its variances are so far from those of y, or from each other, that float64 does not hold them beside those.
+    """
+    covariance = prior_covariance(prior, X, len(y_scale)) / y_scale[:, np.newaxis] / y_scale
+    eigenvalues = np.linalg.eigvalsh(covariance)
+    lowest, highest = float(eigenvalues.min()), float(eigenvalues.max())
+    if lowest < _LOWEST * max(1.0, highest) or highest > _HIGHEST:
+        checks.warn(
+            f"prior has variances of {lowest:.3g} to {highest:.3g} times those of y. Below {_LOWEST:g} of these, or of "
+            f"the largest, they come out larger; above {_HIGHEST:g} they show where there are data. Give the prior in "
+            "squared units of y."
+        )
+    return np.asarray(covariance)
+
+
+def prior_covariance(prior: Prior, X: Floats, n_outputs: int) -> Floats:
+    """Covariances (n, d, d) or (d, d) that a float, array or callable prior stands for.
+
+    Raises
+    ------
+    ValueError
+        If they are not of that shape, finite, symmetric and positive definite.
+    """
+    shape: tuple[int, ...] = (n_outputs, n_outputs)
+    if callable(prior):
+        try:
+            value = prior(X.copy())
+        except Exception as error:
+            error.add_note(f"Raised by prior(X), which was asked for covariances at X of shape {X.shape}.")
+            raise
+        covariance = parameter_floats(value, "prior(X)")
+        name, shape = "prior(X)", (len(X), *shape)
+    else:
+        covariance = parameter_floats(prior, "prior")
+        name = "prior"
+        if covariance.ndim == 0:
+            covariance = covariance * np.eye(n_outputs)
+    covariance = checks.array(covariance, name, shape)
+    remedy = "far from data it is the covariance, so give every direction some variance"
+    checks.semidefinite(covariance, name, definite=True, remedy=remedy)
+    return covariance

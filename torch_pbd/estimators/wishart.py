@@ -12,12 +12,11 @@ from torch_pbd.estimators.latent import (
     LatentCovarianceRegressor,
     Problem,
     longest_covariance,
+    mean_consistent_with_repeats,
     residual_tril,
     warn_if_stretched,
 )
-from torch_pbd.estimators.mean import mean_consistent_with_repeats
-from torch_pbd.estimators.prior import Prior
-from torch_pbd.estimators.validation import check_solver
+from torch_pbd.estimators.validation import Prior
 from torch_pbd.exceptions import DataRankWarning, NotPositiveDefiniteError
 from torch_pbd.gp import (
     Hyperparameters,
@@ -159,7 +158,6 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
     def _check_parameters(self) -> None:
         super()._check_parameters()
         checks.choice(self.start, "start", tuple(_SPREAD))
-        check_solver(self.solver, latent_prior=self.latent_prior)
         if self.df not in (None, "auto"):
             checks.count(self.df, "df", least=1)
 

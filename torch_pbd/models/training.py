@@ -100,6 +100,23 @@ def pooled_tril(training: TrainingSet) -> Float[Tensor, "d d"]:
     return scale_tril_from_root(residual.mT) / degrees**0.5
 
 
+def default_prior_tril(y: Tensor) -> Tensor:
+    """Factor of a wide prior: four times the covariance of all of y around its mean.
+
+    A thousandth of the unit matrix is mixed in: outputs that move together, or do not move at all, have
+    some freedom of their own where nothing is known.
+    """
+    centred = (0.999 / (len(y) - 1)) ** 0.5 * (y - y.mean(0)).mT
+    return 2.0 * scale_tril_from_root(torch.cat([centred, 0.001**0.5 * torch.eye(y.shape[1]).to(y)], dim=1))
+
+
+def is_constant(training: TrainingSet) -> bool:
+    """Whether outputs never vary where inputs repeat, or nowhere if none does; but for rounding."""
+    repeated = len(training.y) - len(training.inputs)
+    mean = training.means()[training.index] if repeated else training.y.mean(0)
+    return float((training.y - mean).square().sum(0).max()) < 1e-18 * max(1, repeated or len(training.y) - 1)
+
+
 def empirical_tril(training: TrainingSet, *, bias_correction: bool = False) -> Float[Tensor, "n d d"]:
     """Factor of the empirical covariance at each distinct input; its divisor is the count less one.
 

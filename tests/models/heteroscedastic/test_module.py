@@ -36,7 +36,7 @@ def fitted(d=2, *, period=None, length_scale=None, n=12, n_demos=8, seed=0):
         ProcessFamily(features, 0.5, 1.0, 2.0, length_scale),
         ProcessFamily(features, 0.5, 0.3, 1.0, length_scale),
     )
-    fit = fit_heteroscedastic(training, None, families, SearchOptions(), n_turns=2)
+    fit = fit_heteroscedastic(training, None, [families], SearchOptions(), n_turns=2)
     return HeteroscedasticModel(fit, PRIOR * torch.eye(d, dtype=torch.float64))
 
 

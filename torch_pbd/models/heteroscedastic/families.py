@@ -11,7 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torch_pbd.gp.inducing import FeatureMap, FixedFeatures
+from torch_pbd.files.memory import require_much
+from torch_pbd.gp.inducing import FeatureMap, FixedFeatures, inducing_inputs
 from torch_pbd.gp.observations import spacing
 from torch_pbd.models.heteroscedastic.covariance import CovarianceSearches
 from torch_pbd.models.heteroscedastic.log_variance import Squares, log_variance_evidence
@@ -35,6 +36,10 @@ _FALLS = 1.0 / 3.0
 # eleven, and lost a tenth of a nat a step of what was left out.
 _CLEARLY = 20.0
 
+# By default, for one column of X and for several, and where these do not resolve what is learned. At most of all
+# outputs together, for the mean and for the covariance, as a fit takes the cube of these; but a dozen for each output.
+_OF_ONE, _OF_SEVERAL, _MOST, _TOGETHER, _FEWEST = 48, 128, 128, (800, 400), 12
+
 
 @dataclass(frozen=True)
 class Families:
@@ -45,20 +50,30 @@ class Families:
     coefficients: ProcessFamily
 
     @classmethod
-    def build(
+    def candidates(
         cls,
-        mean_features: FeatureMap,
-        covariance_features: FeatureMap,
-        length_scale: Float[Tensor, " e"] | None = None,
+        inputs: Float[Tensor, "n e"],
+        n_distinct: int,
+        sizes: list[tuple[int, int]],
         *,
-        shared: bool = False,
-    ) -> "Families":
-        """Families of the recommended model on these features; ``length_scale`` holds the covariance's."""
-        return cls(
-            ProcessFamily(mean_features, *_MEAN, shared=shared),
-            ProcessFamily(covariance_features, *_LOG_VARIANCE, length_scale, shared),
-            ProcessFamily(covariance_features, *_COEFFICIENT, length_scale),
-        )
+        kernel: str,
+        period: Float[Tensor, " e"] | None,
+        length_scale: Float[Tensor, " e"] | None,
+        shared: bool,
+    ) -> list["Families"]:
+        """Families of the recommended model on as many inducing inputs as :func:`inducing_sizes` says.
+
+        With as many as the ``n_distinct`` inputs that there were they are exact. ``length_scale`` holds the
+        covariance's; means share one and log variances share one where it is ``shared``.
+        """
+        found = []
+        for pair in sizes:
+            inducing = [inducing_inputs(inputs, size) for size in pair]
+            of_mean, of_covariance = (FeatureMap(z, kernel, period, len(z) == n_distinct) for z in inducing)
+            mean = ProcessFamily(of_mean, *_MEAN, shared=shared)
+            log_variance = ProcessFamily(of_covariance, *_LOG_VARIANCE, length_scale, shared)
+            found.append(cls(mean, log_variance, ProcessFamily(of_covariance, *_COEFFICIENT, length_scale)))
+        return found
 
     def covariance_searches(self, n_outputs: int, n_features: int, options: SearchOptions) -> CovarianceSearches:
         """Searches of the covariance's hyperparameters that have not begun."""
@@ -149,3 +164,35 @@ def _within(training: TrainingSet, normal: Tensor, noise: NoiseCorrelation) -> S
     squares = torch.zeros_like(means).index_add_(0, training.index, (normal - means[training.index]).square())
     degrees = torch.where(counts > 1.0, counts - 1.0, counts).expand(normal.shape[1], -1)
     return Squares(squares.mT, degrees, noise)
+
+
+def inducing_sizes(n_inducing: int | None, n_features: int, n_outputs: int) -> list[tuple[int, int]]:
+    """Inducing inputs of the mean's processes and of the covariance's, to be tried one after another."""
+    if n_inducing is not None:
+        return [(n_inducing, n_inducing)]
+    most_mean, most_covariance = (max(_FEWEST, most // n_outputs) for most in _TOGETHER)
+    few = _OF_ONE if n_features == 1 else _OF_SEVERAL
+    return list(dict.fromkeys((min(size, most_mean), min(size, most_covariance)) for size in (few, _MOST)))
+
+
+def check_memory(n_inducing: int | None, max_inputs: int, shape: tuple[int, int, int]) -> None:
+    """Check that a fit of ``shape``, distinct inputs, their columns and outputs, has the memory that it needs.
+
+    Measured: each output's features for the differences that start a search take the most, and then all outputs'
+    together.
+
+    Raises
+    ------
+    ValueError
+        If it has not.
+    """
+    n_distinct, n_features, n_outputs = shape
+    n_inputs = min(n_distinct, max_inputs)
+    size = min(n_inputs, max(max(pair) for pair in inducing_sizes(n_inducing, n_features, n_outputs)))
+    searched = 4 * (n_features + 1) * (n_features + 2) * n_outputs * size * (n_inputs + size)
+    require_much(
+        8.0 * (searched + 24 * (n_outputs * size) ** 2),
+        what=f"max_inputs={max_inputs} with n_inducing={n_inducing} lets {n_inputs} distinct "
+        f"inputs and {size} inducing ones into the fit, which",
+        remedy="Lower them, n_inducing first.",
+    )

@@ -10,7 +10,7 @@ modified Cholesky decomposition of a covariance that depends on x (Pourahmadi, 1
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -83,11 +83,10 @@ class HeteroscedasticFit:
 def fit_heteroscedastic(
     training: TrainingSet,
     group: Int64[Tensor, " rows"] | None,
-    families: Families,
+    to_try: Sequence[Families],
     options: SearchOptions,
     *,
     n_turns: int = 3,
-    larger: Families | None = None,
     begin: Callable[[], MeanStart] | None = None,
 ) -> HeteroscedasticFit:
     """Mean under the noise learned so far, then covariance of the residuals from it, ``n_turns`` times.
@@ -98,15 +97,15 @@ def fit_heteroscedastic(
     group : Tensor of shape (rows,), or None
         Demonstration of each row. What a turn leaves of each, whitened, shows how far its samples are correlated, which
         the next turn takes into account.
-    families : Families
+    to_try : sequence of one or two Families
+        The second ones, on more inducing inputs, are to go on with where the first do not resolve a length scale with
+        room to spare: in the next turn, and in one more after the last.
     options : SearchOptions
     n_turns : int, default=3
-    larger : Families, default=None
-        On more inducing inputs, to go on with where these do not resolve a length scale with room to spare: in the next
-        turn, and in one more after the last.
     begin : callable, default=None
         Looks for another mean, :func:`mean_start`, where the first one does not follow the data.
     """
+    families, larger = to_try[0], to_try[1] if len(to_try) > 1 else None
     at = _State(training, group, families, options, larger, training, _start_tril(training))
     evidences: list[float] = []
     started, turn = time.perf_counter(), 0
