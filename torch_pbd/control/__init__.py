@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from torch_pbd.control.simulation.walls import Tunnel
     from torch_pbd.control.stability.certify import certify
     from torch_pbd.control.stability.report import StabilityReport
-    from torch_pbd.control.stiffness import StiffnessLaw
+    from torch_pbd.control.stiffness import RotationLimits, StiffnessLaw, lqt
 
 # Where each name lives: the controller of the control loop must load without torch.
 _HOMES = {
@@ -35,6 +35,7 @@ _HOMES = {
     "RealTimeAdmittance": "realtime",
     "Rollout": "simulation.rollout",
     "RolloutSummary": "simulation.rollouts",
+    "RotationLimits": "stiffness",
     "Schedule": "schedule",
     "StabilityReport": "stability.report",
     "StiffnessLaw": "stiffness",
@@ -42,6 +43,7 @@ _HOMES = {
     "Tunnel": "simulation.walls",
     "certify": "stability.certify",
     "damping_from_stiffness": "damping",
+    "lqt": "stiffness",
     "required_damping_ratio": "damping",
     "simulate_many": "simulation.run",
 }
@@ -58,6 +60,7 @@ __all__ = [
     "RealTimeAdmittance",
     "Rollout",
     "RolloutSummary",
+    "RotationLimits",
     "Schedule",
     "StabilityReport",
     "StiffnessLaw",
@@ -65,6 +68,7 @@ __all__ = [
     "Tunnel",
     "certify",
     "damping_from_stiffness",
+    "lqt",
     "required_damping_ratio",
     "simulate_many",
 ]

@@ -57,7 +57,9 @@ def _gains(controller: Any, time: Floats) -> Gains:
     if on_unknown == "soft":
         # The share u of the way to the least stiffness counts holes already; their prior would count them again.
         stiffness = law(sampled)
-        softest = law.stiffness_min * torch.eye(stiffness.shape[-1]).to(stiffness)
+        softest = stiffness.new_tensor(law.limits(stiffness.shape[-1])[0]) * torch.eye(stiffness.shape[-1]).to(
+            stiffness
+        )
         stiffness = softest + torch.tensor(1.0 - type1)[:, None, None] * (stiffness - softest)
     else:
         stiffness = law(covariance)

@@ -186,7 +186,7 @@ def schedule_labels(controller: Any) -> dict[str, Any]:
         "names": controller.names_,
         "units": robot_unit(controller.units_),
         "frame": controller.frame_,
-        "stiffness_limits": (law.stiffness_min, law.stiffness_max),
+        "stiffness_limits": law.limits(controller.n_outputs_),
         "covariance_of": controller.variability,
         "mass": float(controller.mass),
         "provenance": {

@@ -9,12 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torch_pbd import checks
-from torch_pbd.control.stiffness import StiffnessLaw
+from torch_pbd.control.stiffness import RotationLimits, StiffnessLaw
 from torch_pbd.registry import ESTIMATORS, MOVEMENTS, REGRESSORS, load_class
 
 Check = Callable[[Any, str], Any]
 
 _LAW = "stiffness_law"
+# What files say nothing of that are from before there were other laws.
+_LAW_OF_POSITIONS = {"kind": "linear", "rotation": None, "cross_terms": False, "effort": "match"}
 _INTEGERS = [f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)]
 _DTYPES = ["float64", "float32", "float16", *_INTEGERS, "bool", "object"]
 
@@ -122,8 +124,12 @@ def _law(value: Any) -> StiffnessLaw | None:
     if value is None:
         return None
     check_entries(value, {_LAW}, "its stiffness law")
-    check_entries(value[_LAW], {field.name for field in fields(StiffnessLaw)}, "its stiffness law")
-    return StiffnessLaw(**value[_LAW])
+    own = {**_LAW_OF_POSITIONS, **value[_LAW]} if isinstance(value[_LAW], dict) else value[_LAW]
+    check_entries(own, {field.name for field in fields(StiffnessLaw)}, "its stiffness law")
+    if (rotation := own["rotation"]) is not None:
+        check_entries(rotation, {field.name for field in fields(RotationLimits)}, "its limits of rotation")
+        own["rotation"] = RotationLimits(**rotation)
+    return StiffnessLaw(**own)
 
 
 def _regressor(value: Any) -> Any:
