@@ -27,7 +27,8 @@ def documented():
 
 
 @pytest.mark.parametrize(
-    "name", ["torch_pbd", "torch_pbd.control", "torch_pbd.data", "torch_pbd.metrics", "torch_pbd.movement"]
+    "name",
+    ["torch_pbd", "torch_pbd.control", "torch_pbd.data", "torch_pbd.metrics", "torch_pbd.movement", "torch_pbd.robots"],
 )
 def test_every_public_name_is_in_the_api(name):
     module = import_module(name)

@@ -1,0 +1,257 @@
+"""Where the tool of an arm is, how it moves and what it weighs at given joint angles: by MuJoCo or Pinocchio."""
+
+from typing import Any, NamedTuple, Protocol, final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from torch_pbd import checks, rotations
+from torch_pbd.checks import Floats
+from torch_pbd.exceptions import InvalidParameterError
+from torch_pbd.robots.extra import required
+
+# Of a row: by Newton's steps the error is squared, so that what remains is rounding.
+_MAX_STEPS, _REACHED, _SETTLED = 200, 1e-9, 1e-7
+# In rad a step, as linear goes so far; and the share of the easiest direction at which another counts as lost.
+_LONGEST_STEP, _SINGULAR = 0.3, 1e-4
+
+
+class ToolState(NamedTuple):
+    """Tool of an arm at joint angles, in world axes, translation before rotation."""
+
+    position: Floats  # (3,), m
+    orientation: Floats  # (4,), w x y z
+    jacobian: Floats  # (6, n), from joint velocities to the twist
+    mass_matrix: Floats  # (n, n), of the joints
+
+
+class Arm(Protocol):
+    """Joints that carry a tool, in the order from the base on; others of the model are locked."""
+
+    limits: Floats  # (2, n), lowest and highest angles
+
+    def at(self, joints: Floats) -> ToolState:
+        """State of the tool at joint angles (n,)."""
+
+
+def arm(model: Any, tool: str) -> Arm:
+    """Arm of a ``mujoco.MjModel`` or ``pinocchio.Model``; ``tool`` is the name of a site, body or frame."""
+    kinds: dict[str, Any] = {"mujoco": MujocoArm, "pinocchio": _PinocchioArm}
+    library = type(model).__module__.partition(".")[0]
+    if library not in kinds:
+        raise checks.refusal(model, "model", "a mujoco.MjModel or a pinocchio.Model", "load one, or take panda()")
+    chain: Arm = kinds[library](model, checks.text(tool, "tool"))
+    return chain
+
+
+def operational_inertia(model: Any, joints: ArrayLike, tool: str) -> Floats:
+    """Inertia that is felt at the tool of an arm, ``Lambda = (J M^-1 J')^-1``, in world axes.
+
+    What :meth:`Schedule.with_inertia` takes: a torque-controlled arm that is pushed moves with it, not with 1 kg.
+
+    Parameters
+    ----------
+    model : mujoco.MjModel or pinocchio.Model
+        Of an arm with six joints or more before the tool; joints beside them, of fingers, are locked.
+    joints : array_like of shape (..., n)
+        Joint angles in rad, from the base to the tool.
+    tool : str
+        Name of a site or body (MuJoCo), or of a frame (Pinocchio).
+
+    Returns
+    -------
+    ndarray of shape (..., 6, 6)
+        Symmetric; kg, kg m and kg m^2, translation before rotation.
+
+    Raises
+    ------
+    ValueError
+        If the model has no such tool, or the arm is singular: it then cannot be moved in some direction.
+
+    References
+    ----------
+    O. Khatib, "A unified approach for motion and force control of robot manipulators", IEEE Journal of Robotics and
+    Automation 3(1), 1987, eq. (12).
+    """
+    chain = arm(model, tool)
+    n = chain.limits.shape[1]
+    angles = checks.real_floats(joints, "joints")
+    rows = checks.array(angles.reshape(-1, angles.shape[-1] if angles.ndim else 1), "joints", ("rows", n))
+    mobility = np.stack([_mobility(chain.at(row)) for row in rows])
+    checks.semidefinite(mobility, "J M^-1 J'", definite=True, remedy="keep the arm away from its singularities")
+    inertia = np.linalg.inv(mobility)
+    return (0.5 * (inertia + inertia.swapaxes(-1, -2))).reshape(*angles.shape[:-1], 6, 6)
+
+
+def inverse_kinematics(
+    model: Any,
+    position: ArrayLike,
+    orientation: ArrayLike,
+    tool: str,
+    *,
+    start: ArrayLike,
+    posture: ArrayLike | None = None,
+) -> Floats:
+    """Joint angles along a path of the tool, of all that reach it those nearest to a posture.
+
+    Newton's steps of least length, from row to row; what is redundant goes to the posture, so that angles depend on
+    the pose alone and not on the way to it.
+
+    Parameters
+    ----------
+    model : mujoco.MjModel or pinocchio.Model
+    position : array_like of shape (T, 3)
+        Of the tool, m, as ``schedule.position``.
+    orientation : array_like of shape (T, 4)
+        Unit quaternions w x y z, as ``schedule.orientation``.
+    tool : str
+        Name of a site or body (MuJoCo), or of a frame (Pinocchio).
+    start : array_like of shape (n,)
+        Joint angles in rad from which the first row is searched.
+    posture : array_like of shape (n,), default=None
+        Joint angles to stay near; None is ``start``.
+
+    Returns
+    -------
+    ndarray of shape (T, n)
+        In rad, the pose met to 1e-9 m and rad.
+
+    Raises
+    ------
+    ValueError
+        If the tool cannot come there, or only beyond the limits of a joint.
+    """
+    chain = arm(model, tool)
+    n = chain.limits.shape[1]
+    path = checks.array(position, "position", ("rows", 3))
+    turns = checks.array(orientation, "orientation", (len(path), 4))
+    last = joints = checks.array(start, "start", (n,))
+    near = joints if posture is None else checks.array(posture, "posture", (n,))
+    found = np.empty((len(path), n))
+    for row, (place, turn) in enumerate(zip(path, turns, strict=True)):
+        guess = 2.0 * joints - last if row > 1 else joints  # on along the path
+        last, joints = joints, _reach(chain, guess, place, turn, near, row)
+        found[row] = joints
+    low, high = chain.limits
+    must = "within the limits of its joint"
+    checks.require(
+        (found >= low) & (found <= high), found, "joints", must, "move the path, or change start and posture"
+    )
+    return found
+
+
+def pose_error(state: ToolState, position: Floats, orientation: Floats) -> Floats:
+    """What takes the tool to a pose: translation and rotation vector (6,), in world axes."""
+    turn = rotations.multiply(orientation, rotations.conjugate(state.orientation))
+    return np.concatenate([position - state.position, rotations.log(turn)])
+
+
+def _reach(chain: Arm, joints: Floats, position: Floats, orientation: Floats, near: Floats, row: int) -> Floats:
+    for _ in range(_MAX_STEPS):
+        state = chain.at(joints)
+        error, jacobian = pose_error(state, position, orientation), state.jacobian
+        inverse, rest = np.linalg.pinv(jacobian, rcond=_SINGULAR), near - joints
+        step = inverse @ error + rest - inverse @ (jacobian @ rest)
+        longest = float(np.abs(step).max())
+        if float(np.abs(error).max()) < _REACHED and longest < _SETTLED:
+            return joints
+        joints = joints + step * min(1.0, _LONGEST_STEP / longest)
+    distance, angle = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
+    raise InvalidParameterError(
+        f"row {row} of the path, at {position.round(4).tolist()} m, is {1e3 * distance:.3g} mm and {angle:.3g} rad out "
+        "of reach: move it nearer to the base with schedule.transform, or start from other joint angles."
+    )
+
+
+def _mobility(state: ToolState) -> Floats:
+    mobility: Floats = state.jacobian @ np.linalg.solve(state.mass_matrix, state.jacobian.T)
+    return 0.5 * (mobility + mobility.T)
+
+
+@final
+class MujocoArm:
+    """The :class:`Arm` of a ``mujoco.MjModel``."""
+
+    def __init__(self, model: Any, tool: str) -> None:
+        self._library = mujoco = required("mujoco")
+        self._model, self._data = model, mujoco.MjData(model)
+        kinds = mujoco.mjtObj
+        site = mujoco.mj_name2id(model, kinds.mjOBJ_SITE, tool)
+        body = model.site_bodyid[site] if site >= 0 else mujoco.mj_name2id(model, kinds.mjOBJ_BODY, tool)
+        if body < 0:
+            sites = [model.site(i).name for i in range(model.nsite)]
+            bodies = [model.body(i).name for i in range(model.nbody)]
+            raise checks.refusal(tool, "tool", f"a site ({', '.join(sites)}) or a body ({', '.join(bodies)})")
+        self._site, self._body = site, body
+        carrying: list[int] = []
+        while body > 0:
+            first = int(model.body_jntadr[body])
+            carrying = [*range(first, first + int(model.body_jntnum[body])), *carrying]
+            body = model.body_parentid[body]
+        turning = np.isin(model.jnt_type[carrying], [mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE])
+        if not carrying or not turning.all():
+            raise checks.refusal(tool, "tool", "carried by hinges and slides alone", "fix the base of the arm")
+        self._angles, self._rates = model.jnt_qposadr[carrying], model.jnt_dofadr[carrying]
+        bounds = np.where(model.jnt_limited[carrying][:, np.newaxis], model.jnt_range[carrying], [-np.inf, np.inf])
+        self.limits: Floats = bounds.T
+
+    def at(self, joints: Floats) -> ToolState:
+        """State of the tool at joint angles (n,)."""
+        self._data.qpos[self._angles] = joints
+        self._library.mj_fwdPosition(self._model, self._data)
+        return self.measure(self._data)
+
+    def bias(self, data: Any) -> Floats:
+        """Acceleration (6,) of the tool in a simulation while its joints keep their speed."""
+        rate = np.empty((6, self._model.nv))
+        point = data.site_xpos[self._site] if self._site >= 0 else data.xpos[self._body]
+        self._library.mj_jacDot(self._model, data, rate[:3], rate[3:], point, self._body)
+        change: Floats = rate @ data.qvel
+        return change
+
+    def measure(self, data: Any) -> ToolState:
+        """State of the tool in a simulation whose positions are up to date."""
+        mujoco, model = self._library, self._model
+        jacobian, mass, turn = np.empty((6, model.nv)), np.empty((model.nv, model.nv)), np.empty(4)
+        if self._site >= 0:
+            mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], self._site)
+            place = data.site_xpos[self._site].copy()
+            mujoco.mju_mat2Quat(turn, data.site_xmat[self._site])
+        else:
+            mujoco.mj_jacBody(model, data, jacobian[:3], jacobian[3:], self._body)
+            place, turn = data.xpos[self._body].copy(), data.xquat[self._body].copy()
+        # The order of arguments is that of the version: until 3, inertia lay in data.qM.
+        mujoco.mj_fullM(model, *((mass, data.qM) if hasattr(data, "qM") else (data, mass)))
+        return ToolState(place, turn, jacobian[:, self._rates], mass[np.ix_(self._rates, self._rates)])
+
+
+@final
+class _PinocchioArm:
+    """The :class:`Arm` of a ``pinocchio.Model``."""
+
+    def __init__(self, model: Any, tool: str) -> None:
+        self._library = pin = required("pinocchio", "pin")
+        self._model, self._data, self._neutral = model, model.createData(), pin.neutral(model)
+        if not model.existFrame(tool):
+            raise checks.refusal(
+                tool, "tool", f"a frame of the model, one of {', '.join(f.name for f in model.frames)}"
+            )
+        self._frame = model.getFrameId(tool)
+        joint = model.frames[self._frame].parentJoint
+        carrying = [model.joints[i] for i in list(model.supports[joint]) if i > 0]
+        if not carrying or any(part.nq != 1 for part in carrying):
+            raise checks.refusal(tool, "tool", "carried by joints with one angle each", "fix the base of the arm")
+        self._angles, self._rates = [part.idx_q for part in carrying], [part.idx_v for part in carrying]
+        self.limits: Floats = np.stack([model.lowerPositionLimit, model.upperPositionLimit])[:, self._angles]
+
+    def at(self, joints: Floats) -> ToolState:
+        pin, model, data = self._library, self._model, self._data
+        every = self._neutral.copy()
+        every[self._angles] = joints
+        axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        jacobian = pin.computeFrameJacobian(model, data, every, self._frame, axes)[:, self._rates]
+        upper = np.triu(pin.crba(model, data, every))  # the lower half is not always filled
+        mass = (upper + np.triu(upper, 1).T)[np.ix_(self._rates, self._rates)]
+        pin.forwardKinematics(model, data, every)
+        pose = pin.updateFramePlacement(model, data, self._frame)
+        return ToolState(pose.translation.copy(), rotations.from_matrix(pose.rotation), jacobian, mass)

@@ -1,0 +1,199 @@
+"""A schedule on a torque-controlled arm in MuJoCo: impedance control with the arm's own inertia, and pushes."""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple, final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from torch_pbd import checks
+from torch_pbd.checks import Floats
+from torch_pbd.control.schedule import Schedule
+from torch_pbd.exceptions import InvalidParameterError
+from torch_pbd.robots.extra import required
+from torch_pbd.robots.kinematics import MujocoArm, ToolState, pose_error
+from torch_pbd.robots.session import RobotStoppedError, check_start, poses
+
+# A tick as a whole number of steps of the simulation, to what rounding leaves of both.
+_UNEVEN = 1e-6
+_MEASURED = ("position", "orientation", "twist", "deviation", "joints", "torque", "mass", "saturated")
+
+
+@final
+@dataclass(frozen=True, eq=False, repr=False)
+class ArmRun:
+    """States of an arm at the start of each tick, and what acted during it; in world axes.
+
+    Attributes
+    ----------
+    time : (T,), s
+    position, orientation : (T, 3) in m and (T, 4), w x y z
+        Of the tool.
+    twist : (T, 6), m/s and rad/s
+    deviation : (T, 6), m and rad
+        From the schedule: translation, and the rotation vector that turns the desired orientation into the true one.
+    wrench : (T, 6), N and Nm
+        External, at the tool.
+    joints, torque : (T, n), rad and Nm
+        Torques as commanded; ``saturated`` where a motor gives less.
+    mass : (T, 6, 6), kg, kg m and kg m^2
+        Inertia at the tool, where the arm really is.
+    saturated : (T,) of bool
+    """
+
+    time: Floats
+    position: Floats
+    orientation: Floats
+    twist: Floats
+    deviation: Floats
+    wrench: Floats
+    joints: Floats
+    torque: Floats
+    mass: Floats
+    saturated: Any
+
+    def __repr__(self) -> str:
+        farthest, widest = (np.linalg.norm(part, axis=1).max() for part in np.split(self.deviation, 2, axis=1))
+        return (
+            f"ArmRun(n_ticks={len(self.time)}, n_joints={self.joints.shape[1]}, time={self.time[0]:.6g}.."
+            f"{self.time[-1]:.6g} s, deviation up to {farthest:.3g} m, {widest:.3g} rad)"
+        )
+
+
+def run(
+    model: Any,
+    schedule: Schedule,
+    joints: ArrayLike,
+    *,
+    tool: str = "tool",
+    wrench: ArrayLike | None = None,
+    posture_rate: float = 5.0,
+) -> ArmRun:
+    """Follow a schedule of poses by torques, ``J' (Lambda a_d - K e - D e') + h + N' M (...)``.
+
+    The arm keeps its inertia Lambda(q) and feels gravity and Coriolis forces h compensated: pushed by f at the tool it
+    moves as ``Lambda (v' - a_d) + D (v - v_d) + K e = f``, which is the plant of a schedule that was made
+    `with_inertia` of that arm. What the six axes leave free follows ``joints``, by ``N'`` without effect on the tool.
+
+    Parameters
+    ----------
+    model : mujoco.MjModel
+        With one torque motor for each joint, in their order; `torch_pbd.robots.panda` is one.
+    schedule : Schedule
+        Of poses, its rows the ticks of the controller: evenly spaced, at 1 kHz for stiff gains
+        (``schedule.resample(1000.0)``), a whole number of the model's time steps apart.
+    joints : array_like of shape (T, n)
+        Joint angles in rad along the schedule, from `inverse_kinematics`: the arm starts at the first, at the
+        schedule's velocity.
+    tool : str, default="tool"
+        Name of a site or body.
+    wrench : array_like of shape (T, 6), default=None
+        External force and torque at the tool in N and Nm, world axes; None is none.
+    posture_rate : float, default=5.0
+        Rate in 1/s at which the free joint motion returns to ``joints``, critically damped.
+
+    Returns
+    -------
+    ArmRun
+
+    Raises
+    ------
+    ValueError
+        If the schedule has no orientations, is uneven, or begins elsewhere than the arm.
+    RobotStoppedError
+        If a joint reaches its limit.
+
+    References
+    ----------
+    O. Khatib, IEEE Journal of Robotics and Automation 3(1), 1987, eq. (27) and (50); C. Ott, "Cartesian impedance
+    control of redundant and flexible-joint robots", Springer 2008, section 3.2, for the inertia that is kept.
+    """
+    simulation = _Simulation(model, tool, posture_rate)
+    position, orientation = poses(schedule)
+    n, n_joints = len(schedule), simulation.chain.limits.shape[1]
+    n_steps = _steps_a_tick(schedule.time, model.opt.timestep)
+    path = checks.array(joints, "joints", (n, n_joints))
+    pushes = np.zeros((n, 6)) if wrench is None else checks.array(wrench, "wrench", (n, 6))
+    start = simulation.begin(path[0], schedule.velocity[0])
+    check_start(schedule, start.position, start.orientation)
+    acceleration, speed = schedule.acceleration, np.gradient(path, schedule.time, axis=0)
+    if acceleration is None:
+        acceleration = np.gradient(schedule.velocity, schedule.time, axis=0)
+    motion = (position, orientation, schedule.velocity, acceleration, schedule.stiffness, schedule.damping)
+    posture = (path, speed, np.gradient(speed, schedule.time, axis=0))
+    rows = map(_Row._make, zip(*motion, *posture, pushes, strict=True))
+    columns = map(np.stack, zip(*[simulation.tick(row, n_steps) for row in rows], strict=True))
+    return ArmRun(time=schedule.time, wrench=pushes, **dict(zip(_MEASURED, columns, strict=True)))
+
+
+def _steps_a_tick(time: Floats, timestep: float) -> int:
+    steps = np.diff(time)
+    count = round(steps[0] / timestep)
+    uneven = np.ptp(steps[:-1]) > _UNEVEN * steps[0] or steps[-1] > (1.0 + _UNEVEN) * steps[0]  # it may be shorter
+    if uneven or not count or abs(count * timestep - steps[0]) > _UNEVEN * steps[0]:
+        raise InvalidParameterError(
+            f"schedule has steps from {steps.min():g} to {steps.max():g} s, must have equal ones, a multiple of the "
+            f"model's {timestep:g} s: resample it."
+        )
+    return count
+
+
+class _Row(NamedTuple):
+    """What is wanted at a tick, and what pushes during it."""
+
+    position: Floats
+    orientation: Floats
+    velocity: Floats
+    acceleration: Floats
+    stiffness: Floats
+    damping: Floats
+    joints: Floats
+    speed: Floats
+    rise: Floats
+    push: Floats
+
+
+@final
+class _Simulation:
+    """An arm in MuJoCo, its controller, and what is measured at a tick."""
+
+    def __init__(self, model: Any, tool: str, posture_rate: float) -> None:
+        self._mujoco = required("mujoco")
+        checks.instance(model, "model", self._mujoco.MjModel)
+        self.chain = chain = MujocoArm(model, checks.text(tool, "tool"))
+        if model.nu != chain.limits.shape[1] or model.nv != model.nu:
+            raise InvalidParameterError(
+                f"model has {model.nu} motors and {model.nv} degrees of freedom for the {chain.limits.shape[1]} joints "
+                f"before {tool!r}, must have one motor for each and no others: lock fingers and leave out objects."
+            )
+        self._model, self._data = model, self._mujoco.MjData(model)
+        self._rate = checks.number(posture_rate, "posture_rate", least=0.0, unit="1/s")
+
+    def begin(self, joints: Floats, twist: Floats) -> ToolState:
+        """Put the arm at joint angles, the tool moving as told."""
+        state = self.chain.at(joints)
+        self._data.qpos[:], self._data.qvel[:] = joints, np.linalg.pinv(state.jacobian) @ twist
+        return state
+
+    def tick(self, row: _Row, n_steps: int) -> tuple[Any, ...]:
+        """All that is known at the start of a tick, which is then taken."""
+        data = self._data
+        self._mujoco.mj_forward(self._model, data)  # of positions and velocities that the last step left
+        state = self.chain.measure(data)
+        if np.any(data.qpos <= self.chain.limits[0]) or np.any(data.qpos >= self.chain.limits[1]):
+            raise RobotStoppedError(f"a joint reached its limit, at {data.qpos.round(3).tolist()} rad")
+        twist = state.jacobian @ data.qvel
+        error = -pose_error(state, row.position, row.orientation)
+        inverse = np.linalg.solve(state.mass_matrix, state.jacobian.T)
+        mass = np.linalg.inv(state.jacobian @ inverse)
+        # Khatib (27), with the inertia kept: forces of the arm's own motion are cancelled, and its inertia is not.
+        wrench = mass @ (row.acceleration - self.chain.bias(data))
+        wrench -= row.stiffness @ error + row.damping @ (twist - row.velocity)
+        drift = self._rate**2 * (row.joints - data.qpos) + 2.0 * self._rate * (row.speed - data.qvel) + row.rise
+        # N' M drift, N = I - M^-1 J' Lambda J (50): an acceleration of the joints that the tool does not feel.
+        free = state.mass_matrix @ (drift - inverse @ (mass @ (state.jacobian @ drift)))
+        torque = state.jacobian.T @ wrench + data.qfrc_bias + free
+        data.ctrl[:], data.qfrc_applied[:] = torque, state.jacobian.T @ row.push
+        reached = (state.position, state.orientation, twist, error, data.qpos.copy(), torque, mass)
+        self._mujoco.mj_step(self._model, data, nstep=n_steps)
+        return *reached, bool(np.any(np.abs(data.actuator_force - torque) > 1e-9 * np.abs(torque).max()))

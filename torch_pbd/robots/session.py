@@ -1,0 +1,104 @@
+"""What all robots have in common: checks before the first tick, and a stop whatever happens."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, final
+
+import numpy as np
+
+from torch_pbd import checks, rotations
+from torch_pbd.checks import Floats
+from torch_pbd.control.schedule import Schedule
+from torch_pbd.exceptions import InvalidParameterError
+
+
+class RobotStoppedError(RuntimeError):
+    """A robot could not go on; it was stopped."""
+
+
+@final
+@dataclass(frozen=True)
+class RobotLimits:
+    """What a robot can follow; a schedule beyond it is refused before the first tick.
+
+    Defaults are those of the Franka Panda's interface.
+
+    Parameters
+    ----------
+    speed, acceleration : float, default=1.7, 13.0
+        Of the tool, m/s and m/s^2.
+    angular_speed, angular_acceleration : float, default=2.5, 25.0
+        In rad/s and rad/s^2.
+    stiffness, rotational_stiffness : (float, float), default=(10.0, 3000.0), (1.0, 300.0)
+        Smallest and largest eigenvalue of the blocks, N/m and Nm/rad.
+    """
+
+    speed: float = 1.7
+    acceleration: float = 13.0
+    angular_speed: float = 2.5
+    angular_acceleration: float = 25.0
+    stiffness: tuple[float, float] = (10.0, 3000.0)
+    rotational_stiffness: tuple[float, float] = (1.0, 300.0)
+
+
+def poses(schedule: Any) -> tuple[Floats, Floats]:
+    """Positions (n, 3) in m and orientations (n, 4) of a schedule that has both."""
+    checks.instance(schedule, "schedule", Schedule)
+    if schedule.orientation is None or schedule.position.shape[1] != 3 or schedule.units not in (None, "m"):
+        raise InvalidParameterError(
+            f"schedule has {schedule.n_outputs} outputs in {schedule.units}, must have positions (n, 3) in m and "
+            "orientations (n, 4): learn from demonstrations with rotation=, or give Schedule(..., orientation=)."
+        )
+    return schedule.position, schedule.orientation
+
+
+def check_limits(schedule: Schedule, limits: Any) -> None:
+    """Refuse a schedule of poses that is beyond limits, by row."""
+    poses(schedule)
+    checks.instance(limits, "limits", RobotLimits)
+    parts = [("velocity", schedule.velocity, (limits.speed, limits.angular_speed))]
+    if schedule.acceleration is not None:
+        parts.append(("acceleration", schedule.acceleration, (limits.acceleration, limits.angular_acceleration)))
+    for name, values, most in parts:
+        for what, part, bound in zip(("", "angular "), (values[:, :3], values[:, 3:]), most, strict=True):
+            length = np.linalg.norm(part, axis=1)
+            checks.require(length <= bound, length, f"the {what}{name}", f"at most {bound:g}", "slow down: retime it")
+    blocks = ((slice(3), limits.stiffness, "N/m"), (slice(3, 6), limits.rotational_stiffness, "Nm/rad"))
+    for block, (low, high), unit in blocks:
+        eigenvalues = np.linalg.eigvalsh(schedule.stiffness[:, block, block])
+        slack = checks.ROUNDING * high
+        good = (eigenvalues >= low - slack) & (eigenvalues <= high + slack)
+        checks.require(good, eigenvalues, "the eigenvalue of stiffness", f"from {low:g} to {high:g} {unit}")
+
+
+def check_start(
+    schedule: Schedule, position: Floats, orientation: Floats, *, distance: float = 0.01, angle: float = 0.05
+) -> None:
+    """Refuse a start in m and rad away from where the robot is: it would jump."""
+    first, turned = poses(schedule)
+    away = float(np.linalg.norm(first[0] - position))
+    turn = float(np.linalg.norm(rotations.log(rotations.multiply(turned[0], rotations.conjugate(orientation)))))
+    if not (away <= distance and turn <= angle):
+        raise InvalidParameterError(
+            f"the robot is {1e3 * away:.3g} mm and {turn:.3g} rad from the first pose of schedule, must be within "
+            f"{1e3 * distance:g} mm and {angle:g} rad: bring it there first."
+        )
+
+
+@contextmanager
+def stopping(stop: Callable[[], Any], on_fault: Callable[[RobotStoppedError], Any] | None) -> Iterator[None]:
+    """Stop a robot at the end, and at whatever goes wrong; then tell ``on_fault``, or raise where it is None."""
+    try:
+        yield
+    except Exception as error:
+        stop()
+        fault = error if isinstance(error, RobotStoppedError) else RobotStoppedError(f"{type(error).__name__}: {error}")
+        if on_fault is None:
+            raise fault from error
+        on_fault(fault)
+    except BaseException:  # the user's own stop, by the keyboard
+        stop()
+        raise
+    else:
+        stop()
