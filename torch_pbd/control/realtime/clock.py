@@ -22,6 +22,8 @@ SMOOTHING = 0.1
 _SPEED, _SHARE = 1.5, 0.25
 # Share of `gain` that a rise of the pace may always take, so that nobody who shakes the robot makes its schedule stand.
 _LEAST_SPARE = 0.1
+# Share of a row: time that was put onto a row takes that row, to whichever side it was rounded.
+_ON_ROW = 1e-6
 # A minimum jerk of 1 over a time of 1 has a velocity of 15/8 and an acceleration of 10 / sqrt(3).
 _STEEPEST, _SHARPEST = 1.875, 5.7735
 
@@ -271,7 +273,7 @@ class ScheduleClock:
         if time >= table.end:
             self.index, row, squared_limit = table.last, list(table.row(table.last)), math.inf
         else:
-            self.index = index = min(int(time * self._rate), table.last - 1)
+            self.index = index = min(int(time * self._rate + _ON_ROW), table.last - 1)
             start, stop = index / self._rate, table.end if index + 1 == table.last else (index + 1) / self._rate
             share = (time - start) / (stop - start) if time < stop else 1.0
             row = list(self._unpack(self._packed, index * self._row_size))
