@@ -339,8 +339,8 @@ def test_43_text_that_is_costly_to_parse_is_refused(kind, hostile, tmp_path, mon
 def test_43_a_schedule_of_thousands_of_outputs_in_name_only_is_refused(tmp_path):
     kind = next(kind for kind in KINDS if (kind.name, kind.suffix) == ("schedule", ".csv"))
     head, _, _ = kind.content.partition(b"\ntime,")
-    path = kind.file(tmp_path, head.replace(b'["x", "y"]', b"null") + b"\ntime" + b",position[0]" * 1500 + b"\n")
-    with pytest.raises(ModelFileError, match="of which 1500 are positions, must name 3380252"):
+    path = kind.file(tmp_path, head.replace(b'["x", "y"]', b"null") + b"\ntime" + b",velocity[0]" * 1500 + b"\n")
+    with pytest.raises(ModelFileError, match="of which 1500 are velocities, must name 3378752"):
         kind.read(path)
 
 
