@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from torch_pbd import checks
-from torch_pbd.estimators.validation import Floats
+from torch_pbd.checks import Floats
 
 MOVEMENT_STATISTICS = ("deviation", "offset", "length", "largest")
 """Statistics of whole movements, of :func:`movement_statistics`."""

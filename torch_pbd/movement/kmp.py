@@ -8,14 +8,14 @@ from scipy.linalg import block_diag
 from sklearn.base import clone
 
 from torch_pbd import checks
+from torch_pbd.checks import Floats
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.estimators.demonstrations import fit_with_groups
 from torch_pbd.estimators.mixture import GMMBaseline
-from torch_pbd.estimators.validation import Floats
 from torch_pbd.files.memory import require_much
 from torch_pbd.movement.base import MovementRegressor
 from torch_pbd.movement.joint import Conditioned, JointNormal, Observed
-from torch_pbd.movement.recordings import Known, Recording
+from torch_pbd.movement.recordings import Known, Recording, as_rows
 
 
 class KMPBaseline(MovementRegressor):
@@ -85,9 +85,7 @@ class KMPBaseline(MovementRegressor):
         checks.seed(self.random_state)
 
     def _fit(self, recordings: list[Recording]) -> None:
-        X = np.concatenate([recording.time for recording in recordings])[:, np.newaxis]
-        y = np.concatenate([recording.position for recording in recordings])
-        groups = np.repeat(np.arange(len(recordings)), [len(recording.time) for recording in recordings])
+        X, y, groups = as_rows(recordings)
         regressor = GMMBaseline() if self.regressor is None else clone(self.regressor)
         self.regressor_ = fit_with_groups(regressor, X, y, groups)
         self._range = float(X.min()), float(np.ptp(X))
@@ -102,19 +100,14 @@ class KMPBaseline(MovementRegressor):
 
     def _restore(self, arrays: dict[str, Floats]) -> None:
         n, d = len(np.atleast_1d(arrays["reference.time"])), self.n_outputs_
-        shapes: dict[str, tuple[int, ...]] = {
+        shapes: dict[str, tuple[int | str, ...]] = {
             "reference.time": (n,), "reference.mean": (n, d), "reference.covariance": (n, d, d), "range": (2,),
             "deviation": (d,),
         }  # fmt: skip
-        if set(arrays) != set(shapes):
-            raise ValueError(f"its arrays are {', '.join(arrays)}, must be {', '.join(shapes)}")
-        *reference, span, self._scale = (checks.array(arrays[name], name, shape) for name, shape in shapes.items())
+        *reference, span, self._scale = self._restored(arrays, shapes).values()
         checks.semidefinite(reference[2], "reference.covariance", definite=True)
         self._reference = reference[0], reference[1], reference[2]
         self._range = float(span[0]), checks.number(float(span[1]), "the range of X", above=0.0)
-
-    def _scaled(self, time: Floats) -> Floats:
-        return np.asarray((time - self._range[0]) / self._range[1])
 
     def _prior(self, time: Floats) -> JointNormal:
         n, d = len(time), self.n_outputs_

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from torch_pbd import checks
-from torch_pbd.estimators.validation import Floats
+from torch_pbd.checks import Floats
 from torch_pbd.movement.base import MovementRegressor
 from torch_pbd.movement.joint import JointNormal
 from torch_pbd.movement.recordings import Recording
@@ -123,23 +123,18 @@ class ProMPBaseline(MovementRegressor):
 
     def _restore(self, arrays: dict[str, Floats]) -> None:
         n_basis, d = self.n_basis_, self.n_outputs_
-        shapes: dict[str, tuple[int, ...]] = {
+        shapes: dict[str, tuple[int | str, ...]] = {
             "weight_mean_": (n_basis, d),
             "weight_covariance_": (n_basis * d, n_basis * d),
             "noise_scale_": (d,),
             "range": (2,),
         }
-        if set(arrays) != set(shapes):
-            raise ValueError(f"its arrays are {', '.join(arrays)}, must be {', '.join(shapes)}")
-        own = {name: checks.array(arrays[name], name, shape) for name, shape in shapes.items()}
+        own = self._restored(arrays, shapes)
         checks.semidefinite(own["weight_covariance_"], "weight_covariance_")
         checks.require(own["noise_scale_"] > 0.0, own["noise_scale_"], "noise_scale_", "above 0")
         low, width = own.pop("range").tolist()
         self._range = low, checks.number(width, "the range of X", above=0.0)
         self.__dict__.update(own)
-
-    def _scaled(self, time: Floats) -> Floats:
-        return np.asarray((time - self._range[0]) / self._range[1])
 
     def _prior(self, time: Floats) -> JointNormal:
         n, d = len(time), self.n_outputs_

@@ -7,10 +7,11 @@ import torch
 from numpy.typing import NDArray
 
 from torch_pbd import checks
+from torch_pbd.checks import Floats
 from torch_pbd.data import Demonstrations
 from torch_pbd.data.alignment import TIMING_REMOVED
 from torch_pbd.estimators.demonstrations import check_groups
-from torch_pbd.estimators.validation import Floats, checked_rows
+from torch_pbd.estimators.validation import checked_rows
 from torch_pbd.movement.joint import Observed
 
 # Steps on which the correlation is learned: the nuggets' iterations are cubic in them, and movements are smooth.
@@ -110,6 +111,13 @@ def _stacked(model: Any, X: Demonstrations, *, is_fit: bool) -> tuple[Floats, Fl
         return X.stack(input=model.input_)
     _, y, groups = X.stack(input="phase")  # durations may have little in common
     return np.concatenate(X.from_start().times)[:, np.newaxis], y, groups
+
+
+def as_rows(recordings: list[Recording]) -> tuple[Floats, Floats, NDArray[np.intp]]:
+    """Rows of recordings for a regressor: X (n, 1), y (n, d) and their numbers (n,)."""
+    X = np.concatenate([recording.time for recording in recordings])[:, np.newaxis]
+    y = np.concatenate([recording.position for recording in recordings])
+    return X, y, np.repeat(np.arange(len(recordings)), [len(recording.time) for recording in recordings])
 
 
 def n_grid_steps(recordings: list[Recording]) -> int:

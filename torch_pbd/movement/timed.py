@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from torch_pbd import checks
+from torch_pbd.checks import Floats
 from torch_pbd.console import say
 from torch_pbd.estimators.base import Uncertainty
-from torch_pbd.estimators.validation import Floats
 from torch_pbd.linalg import safe_cholesky, student_log_density
 from torch_pbd.movement.base import MovementRegressor
 from torch_pbd.movement.recordings import Known, Recording, n_grid_steps, sampled

@@ -11,14 +11,14 @@ from sklearn.base import clone
 from torch import Tensor, nn
 
 from torch_pbd import checks
+from torch_pbd.checks import Floats
 from torch_pbd.estimators.base import CovarianceRegressor, Uncertainty
 from torch_pbd.estimators.demonstrations import fit_with_groups
 from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
-from torch_pbd.estimators.validation import Floats
 from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky
 from torch_pbd.movement.joint import Conditioned, JointNormal
-from torch_pbd.movement.recordings import Recording, n_grid_steps, sampled
+from torch_pbd.movement.recordings import Recording, as_rows, n_grid_steps, sampled
 from torch_pbd.movement.time_kernel import TimeKernel, fit_time_kernel
 from torch_pbd.movement.timed import TimedMovement
 
@@ -188,9 +188,7 @@ class TrajectoryRegressor(TimedMovement):
         self._fit_law(self._timed(recordings))
 
     def _fit_law(self, recordings: list[Recording]) -> None:
-        X = np.concatenate([recording.time for recording in recordings])[:, np.newaxis]
-        y = np.concatenate([recording.position for recording in recordings])
-        groups = np.repeat(np.arange(len(recordings)), [len(recording.time) for recording in recordings])
+        X, y, groups = as_rows(recordings)
         regressor = HeteroscedasticGPRegressor() if self.regressor is None else clone(self.regressor)
         self.regressor_ = fit_with_groups(regressor, X, y.ravel() if self._y_is_1d else y, groups)
 
@@ -263,9 +261,7 @@ class TrajectoryRegressor(TimedMovement):
         n_steps, scalars = len(np.atleast_1d(arrays["grid"])), ("length_scale", "share", "x_shift", "x_scale")
         shapes: dict[str, tuple[int | str, ...]] = dict.fromkeys(scalars, ())
         shapes |= {"grid": (n_steps,), "nugget": (n_steps,), "residual": ("K", n_steps, self.n_outputs_)}
-        if set(arrays) != set(shapes):
-            raise ValueError(f"its arrays are {', '.join(arrays)}, must be {', '.join(shapes)}")
-        own = {name: checks.array(arrays[name], name, shape) for name, shape in shapes.items()}
+        own = self._restored(arrays, shapes)
         checks.require(own["nugget"] > 0.0, own["nugget"], "nugget", "above 0")
         checks.require(np.diff(own["grid"]) > 0.0, own["grid"][1:], "grid", "increasing")
         length, share, shift, scale = (float(own[name]) for name in scalars)
