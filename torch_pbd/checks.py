@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from numbers import Integral, Real
-from typing import Any, Literal, get_args, overload
+from typing import Any, Literal, TypedDict, Unpack, get_args, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,32 +42,21 @@ def refusal(value: Any, name: str, must: str, remedy: str = "", unit: str = "") 
     )
 
 
+class _Bounds(TypedDict, total=False):
+    """What a number is held to, and what a message says beside."""
+
+    above: float | None
+    least: float | None
+    below: float | None
+    most: float | None
+    unit: str
+    remedy: str
+
+
 @overload
-def number(
-    value: Any,
-    name: str,
-    *,
-    above: float | None = ...,
-    least: float | None = ...,
-    below: float | None = ...,
-    most: float | None = ...,
-    unit: str = ...,
-    optional: Literal[False] = ...,
-    remedy: str = ...,
-) -> float: ...
+def number(value: Any, name: str, *, optional: Literal[False] = ..., **bounds: Unpack[_Bounds]) -> float: ...
 @overload
-def number(
-    value: Any,
-    name: str,
-    *,
-    above: float | None = ...,
-    least: float | None = ...,
-    below: float | None = ...,
-    most: float | None = ...,
-    unit: str = ...,
-    optional: Literal[True],
-    remedy: str = ...,
-) -> float | None: ...
+def number(value: Any, name: str, *, optional: Literal[True], **bounds: Unpack[_Bounds]) -> float | None: ...
 def number(
     value: Any,
     name: str,

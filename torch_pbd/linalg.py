@@ -34,6 +34,12 @@ def vector_to_tril(vector: Float[Tensor, "*b p"]) -> Float[Tensor, "*b d d"]:
     return scale_tril
 
 
+def triangular_inverse(factor: Float[Tensor, "*b d d"], *, upper: bool = False) -> Float[Tensor, "*b d d"]:
+    """Inverses of triangular matrices."""
+    identity = torch.eye(factor.shape[-1]).to(factor).expand_as(factor)
+    return torch.linalg.solve_triangular(factor, identity, upper=upper)
+
+
 def scale_tril_from_root(root: Float[Tensor, "*b d r"]) -> Float[Tensor, "*b d d"]:
     """Lower Cholesky factor of ``root @ root.mT``, its diagonal not negative.
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from torch_pbd.experiments.report import write_report
-from torch_pbd.experiments.run_folder import RunFolder
+from torch_pbd.experiments.run_folder import RunFolder, write_report
 
 
 class Page(HTMLParser):

@@ -93,9 +93,8 @@ def _run(command: str, arguments: Sequence[str]) -> int:
     if command == "playground":
         commands.playground(options)
         return 0
-    from torch_pbd.experiments.report import write_report
     from torch_pbd.experiments.resume import finished_fits
-    from torch_pbd.experiments.run_folder import check_names
+    from torch_pbd.experiments.run_folder import check_names, write_report
 
     if getattr(options, "data", None) is not None:
         options.data = _files(options.data)

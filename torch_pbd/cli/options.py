@@ -11,11 +11,11 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Annotated, Any, Literal, NamedTuple, NoReturn, get_args, get_origin, get_type_hints
+from typing import Any, NamedTuple, NoReturn, get_args, get_origin, get_type_hints
 
 import yaml
 
-from torch_pbd.cli.words import Place, alternatives, described, remedy, shown, unknown, visible
+from torch_pbd.cli.words import Place, alternatives, described, is_of, remedy, shown, unknown, visible
 from torch_pbd.cli.yaml import next_value, read_yaml, read_yaml_file
 from torch_pbd.console import say
 from torch_pbd.exceptions import ConfigError
@@ -219,21 +219,9 @@ def _take(value: Any, hint: Any, place: Place, before: Any = None) -> Any:
     if value in ([], {}):
         raise place.error(f"is empty, must be {described(hint)}.")
     for part in sorted(alternatives(hint), key=lambda part: part is float):  # a whole number stays one where it may
-        if _is_of(value, part):
+        if is_of(value, part):
             return float(value) if part is float or get_args(part)[:1] == (float,) else value
     raise place.error(f"is {shown(value)}, must be {described(hint)}{remedy(value, hint)}")
-
-
-def _is_of(value: Any, part: Any) -> bool:
-    """Whether a value that is no list and no mapping is of a type that is no union."""
-    if get_origin(part) is Literal:
-        return isinstance(value, str) and value in get_args(part)
-    if get_origin(part) is Annotated:
-        kind, (least, most) = get_args(part)
-        return _is_of(value, kind) and bool(least <= value <= most)
-    if part is float:
-        return (type(value) is float and value == value) or (type(value) is int and abs(value) < 1e300)
-    return part is Any or type(value) is part
 
 
 def _read_text(text: str, hint: Any, place: Place) -> Any:
@@ -242,7 +230,7 @@ def _read_text(text: str, hint: Any, place: Place) -> Any:
     if str in parts and not (text.startswith("[") and any(get_origin(part) is list for part in parts)):
         with suppress(ConfigError):
             value = read_yaml(text, "").content
-            if any(_is_of(value, part) for part in parts if part is not str):
+            if any(is_of(value, part) for part in parts if part is not str):
                 return value
         return str(text)
     return read_yaml(text, ".".join(map(str, place.keys))).content

@@ -1,4 +1,4 @@
-"""Words of messages about options: places, values and types, and the remedies that can be guessed."""
+"""Types of options, and words of messages: places, values and types, and the remedies that can be guessed."""
 
 import difflib
 import math
@@ -74,6 +74,18 @@ def alternatives(hint: Any) -> tuple[Any, ...]:
     if get_origin(hint) in (Union, UnionType):
         return tuple(part for argument in get_args(hint) for part in alternatives(argument))
     return (hint,)
+
+
+def is_of(value: Any, part: Any) -> bool:
+    """Whether a value that is no list and no mapping is of a type that is no union."""
+    if get_origin(part) is Literal:
+        return isinstance(value, str) and value in get_args(part)
+    if get_origin(part) is Annotated:
+        kind, (least, most) = get_args(part)
+        return is_of(value, kind) and bool(least <= value <= most)
+    if part is float:
+        return (type(value) is float and value == value) or (type(value) is int and abs(value) < 1e300)
+    return part is Any or type(value) is part
 
 
 def described(hint: Any) -> str:

@@ -245,7 +245,7 @@ def mean_consistent_with_repeats(
         If the means can be followed by a process only that swings far beyond them between the inputs: it is not taken.
     """
     mean, _ = condition(observations, found.hyperparameters, search.kernel, basis=found.basis)
-    if int(training.counts.min()) < 2 or not torch.equal(training.inputs[training.index], training.x):
+    if int(training.counts.min()) < 2 or not training.repeats_inputs:
         return mean, found.report
     spread = _Spread(training)
     with torch.no_grad():
@@ -272,9 +272,7 @@ class _Spread:
     """How far rows that repeat an input differ, (n, d), and what of it the mean at that input may be off by."""
 
     def __init__(self, training: TrainingSet) -> None:
-        counts, means = training.counts, training.means()
-        squares = torch.zeros_like(means)
-        squares.index_add_(0, training.index, (training.y - means[training.index]).square())
+        counts, squares = training.counts, training.squares()
         self._counts, self._degrees = counts, counts - 1.0
         self._pooled = squares.sum(0) / self._degrees.sum()
         local = squares / self._degrees[:, None]

@@ -9,13 +9,12 @@ from joblib import Parallel, delayed
 from numpy.typing import NDArray
 from sklearn.base import clone
 
+from torch_pbd.checks import Floats
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.experiments.resume import FinishedFits, fit_once
 from torch_pbd.experiments.sweep import left_out, mean_and_error, score_fold
 from torch_pbd.metrics import covariance_mse, relative_frobenius_error
 from torch_pbd.movement.judging import MOVEMENT_STATISTICS
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
-from numpy.typing import NDArray
 from sklearn.base import clone
 
+from torch_pbd.checks import Floats
 from torch_pbd.control.controller import DMPController
 from torch_pbd.control.primitive.units import in_metres
 from torch_pbd.control.schedule.schedule import Schedule
@@ -35,8 +35,6 @@ from torch_pbd.plotting import (
     readable_unit,
     schedule_names,
 )
-
-Floats = NDArray[np.float64]
 
 _PUSHES = (0.2, 0.8)  # of the duration: 2 s and 8 s of the paper's 10 s
 _PUSH_LENGTH = 0.08  # of the duration: 0.8 s

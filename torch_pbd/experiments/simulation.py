@@ -6,11 +6,11 @@ from typing import Any, Self
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from scipy.stats import multivariate_normal
 from sklearn.base import BaseEstimator
 from sklearn.mixture import GaussianMixture
 
+from torch_pbd.checks import Floats
 from torch_pbd.data import make_paper_simulation, paper_covariance, paper_mean
 from torch_pbd.data.synthetic import Reading
 from torch_pbd.estimators.base import CovarianceRegressor
@@ -27,8 +27,6 @@ from torch_pbd.plotting import (
     plot_covariance_ellipses,
     plot_model_bands,
 )
-
-Floats = NDArray[np.float64]
 
 # Table I: mean squared error on Cholesky entries, and seconds on "a standard laptop in Matlab".
 PAPER_TABLE_1 = {"CD": (3.54e-13, 0.167), "WP": (0.0206, 8.64), "GMM 8": (1.05, 0.515), "GMM 5": (7.71, 0.237)}

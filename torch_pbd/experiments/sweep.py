@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.base import clone
 from threadpoolctl import threadpool_limits
 
+from torch_pbd.checks import Floats
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.run import simulate_many
 from torch_pbd.data import Demonstrations
@@ -30,7 +31,6 @@ from torch_pbd.experiments.resume import FinishedFits, fit_once
 from torch_pbd.metrics import mahalanobis_coverage, negative_log_likelihood
 from torch_pbd.movement import judge_movement
 
-Floats = NDArray[np.float64]
 Row = dict[str, Any]
 
 

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, final
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -44,7 +44,6 @@ class Components:
         return self.log_joint(self.whiten(data)).logsumexp(0)
 
 
-@final
 class GaussianMixture(Core):
     """Gaussian mixture over the joint vector [x, y], inputs first; as a core, Gaussian mixture regression.
 
@@ -184,8 +183,7 @@ def expectation_maximization(
         if loss < curve[-1]:
             best, curve = components, [*curve, loss]
     mixture = _with_density_floor(best, data[:, :n_features])
-    status = Status.CONVERGED if converged else Status.MAX_ITER
-    return mixture, FitReport(curve[-1], tuple(curve), n_iter, status)
+    return mixture, FitReport(curve[-1], tuple(curve), n_iter, Status.CONVERGED if converged else Status.MAX_ITER)
 
 
 def refine(

@@ -31,9 +31,22 @@ class TrainingSet:
         """Rows at each distinct input."""
         return torch.bincount(self.index, minlength=len(self.inputs)).to(self.y)
 
+    @property
+    def repeats_inputs(self) -> bool:
+        """Whether rows are at the inputs themselves, which are no centres of neighbourhoods."""
+        return torch.equal(self.inputs[self.index], self.x)
+
+    def sums(self, values: Float[Tensor, "rows d"]) -> Float[Tensor, "n d"]:
+        """Sum at each distinct input of what rows have."""
+        return _sum_by(values, self.index, len(self.inputs))
+
     def means(self) -> Float[Tensor, "n d"]:
         """Mean of y at each distinct input."""
-        return _sum_by(self.y, self.index, len(self.inputs)) / self.counts[:, None]
+        return self.sums(self.y) / self.counts[:, None]
+
+    def squares(self) -> Float[Tensor, "n d"]:
+        """Sum at each distinct input of the squares of y around its mean there."""
+        return self.sums((self.y - self.means()[self.index]).square())
 
     def merged(self, max_inputs: int) -> "TrainingSet":
         """Rows with at most ``max_inputs`` distinct inputs: neighbours are taken together."""
@@ -49,7 +62,7 @@ class TrainingSet:
 
         It is evaluated for a bounded number of inputs at a time, and where rows repeat an input for that alone.
         """
-        repeated = torch.equal(self.inputs[self.index], self.x)
+        repeated = self.repeats_inputs
         at = self.inputs if repeated else self.x
         with torch.no_grad():
             values = torch.cat([mean(chunk) for chunk in at.split(_CHUNK)])

@@ -6,12 +6,10 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torch_pbd import checks
+from torch_pbd.checks import Floats
 from torch_pbd.registry import MOVEMENTS, REGRESSORS
-
-Floats = NDArray[np.float64]
 
 MODELS = [*REGRESSORS, *(name for name in MOVEMENTS if name != "TrajectoryRegressor")]
 """Models that a page can choose: regressors become whole movements by TrajectoryRegressor."""

@@ -159,9 +159,8 @@ def _within(training: TrainingSet, normal: Tensor, noise: NoiseCorrelation) -> S
     inputs of one row.
     """
     counts = training.counts
-    means = torch.zeros_like(training.means()).index_add_(0, training.index, normal) / counts[:, None]
-    means = torch.where(counts[:, None] > 1.0, means, 0.0)
-    squares = torch.zeros_like(means).index_add_(0, training.index, (normal - means[training.index]).square())
+    means = torch.where(counts[:, None] > 1.0, training.sums(normal) / counts[:, None], 0.0)
+    squares = training.sums((normal - means[training.index]).square())
     degrees = torch.where(counts > 1.0, counts - 1.0, counts).expand(normal.shape[1], -1)
     return Squares(squares.mT, degrees, noise)
 

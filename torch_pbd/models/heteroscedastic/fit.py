@@ -221,7 +221,7 @@ def _follows(training: TrainingSet, group: Tensor | None, mean: LatentMean, pool
     # By Schwarz's criterion: of 20 inputs once in 30 times by chance, of 500, which tell more, once in 3,000.
     wrong = is_signal(whitened, training, group, LAGS * math.log(len(training.inputs))) & ~less
     # The noise was estimated from neighbours, unless rows repeat inputs.
-    if training.counts.mean() < 2.0 or not _repeats_inputs(training):
+    if training.counts.mean() < 2.0 or not training.repeats_inputs:
         wrong = wrong | less | (residual.square().mean(0) > _NEARLY_ALL)
     return not bool(wrong.any())
 
@@ -251,7 +251,7 @@ def _residual(training: TrainingSet, mean: LatentMean, tril: Tensor) -> tuple[Te
     inv(T) V inv(T)': of output i, that of the part of it which the outputs before do not explain.
     """
     expected, error = mean.at(training.inputs)
-    expected = expected[training.index] if _repeats_inputs(training) else mean.expected(training.x)
+    expected = expected[training.index] if training.repeats_inputs else mean.expected(training.x)
     half = torch.linalg.solve_triangular(tril, error, upper=False)
     leverage = torch.linalg.solve_triangular(tril, half.mT, upper=False).diagonal(dim1=-2, dim2=-1)
     return training.y - expected, (1.0 - leverage).clamp(_LEAST_SHARE, 1.0)[training.index]
@@ -260,13 +260,7 @@ def _residual(training: TrainingSet, mean: LatentMean, tril: Tensor) -> tuple[Te
 def _scatter(training: TrainingSet, normal: Tensor, share: Tensor, part: float) -> tuple[Tensor, Tensor]:
     """Scatter (n, d, d) and degrees of freedom (d, n) at each input, of a part of the rows."""
     root = training.scatter_root(normal)
-    degrees = torch.zeros_like(training.means()).index_add_(0, training.index, share)
-    return part * (root @ root.mT), part * degrees.mT
-
-
-def _repeats_inputs(training: TrainingSet) -> bool:
-    """Whether rows are at the inputs themselves, which are no centres of neighbourhoods."""
-    return torch.equal(training.inputs[training.index], training.x)
+    return part * (root @ root.mT), part * training.sums(share).mT
 
 
 def _pooled_tril(residual: Tensor, share: Tensor) -> Tensor:

@@ -10,9 +10,9 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from torch_pbd.gp.inducing import FixedFeatures
-from torch_pbd.linalg import safe_cholesky
+from torch_pbd.linalg import safe_cholesky, triangular_inverse
 from torch_pbd.models.heteroscedastic.processes import Evidence, Gradient, ProcessFamily, Search
-from torch_pbd.models.heteroscedastic.regression import LinearEvidence, Weights, inverse, weights_factor
+from torch_pbd.models.heteroscedastic.regression import LinearEvidence, Weights, weights_factor
 from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation
 
 LEAST_SQUARE = 1e-6
@@ -86,7 +86,7 @@ class LogVariance:
     @property
     def weights(self) -> Weights:
         """Posterior of the weights."""
-        return Weights(self.weights_mean, inverse(self.factor))
+        return Weights(self.weights_mean, triangular_inverse(self.factor, upper=True))
 
 
 def fit_log_variance(

@@ -14,6 +14,7 @@ from torch import Tensor
 from torch_pbd.gp import EvidenceSearch, Hyperparameters, Observations, fit_hyperparameters, negative_log_evidence
 from torch_pbd.gp.inducing import FixedFeatures, inducing_inputs
 from torch_pbd.gp.observations import resolved_length_scale
+from torch_pbd.linalg import triangular_inverse
 from torch_pbd.models.heteroscedastic.processes import CLEAR, Gradient, Processes, ProcessFamily, Search, SearchOptions
 from torch_pbd.models.heteroscedastic.regression import LinearEvidence, Weights
 from torch_pbd.models.training import TrainingSet, pooled_tril
@@ -107,9 +108,7 @@ def fit_mean(
     theta = search.run(evidence, means)
     # All outputs: sqrt(count) inv(T) mean, with T the factor of the noise, has independent entries at an input.
     features = family.prepared(theta)(inputs)
-    eye = torch.eye(means.shape[1]).to(means)
-    whitening = torch.linalg.solve_triangular(noise_tril, eye.expand_as(noise_tril), upper=False)
-    whitening = counts.sqrt()[:, None, None] * whitening
+    whitening = counts.sqrt()[:, None, None] * triangular_inverse(noise_tril)
     design = torch.einsum("nij,jnp->nijp", whitening, features).flatten(2)
     response = (whitening @ means.unsqueeze(-1)).squeeze(-1)
     if whitener is not None:

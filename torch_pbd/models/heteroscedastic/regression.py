@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from torch_pbd.linalg import safe_cholesky, symmetrize
+from torch_pbd.linalg import safe_cholesky, symmetrize, triangular_inverse
 
 # Of a weight; that of its prior is one, of which a sum with a larger one keeps fewer than seven digits.
 _LARGEST_PRECISION = 1e9
@@ -64,7 +64,7 @@ class LinearEvidence:
 
     def weights(self) -> Weights:
         """The posterior."""
-        return Weights(self.mean, inverse(self.factor))
+        return Weights(self.mean, triangular_inverse(self.factor, upper=True))
 
     def divergence_from_prior(self) -> Float[Tensor, "*b"]:
         """Kullback-Leibler divergence of the weights' posterior from standard normal numbers, in nats."""
@@ -94,11 +94,6 @@ def _triangular(design: Tensor, response: Tensor) -> tuple[Tensor, Tensor]:
     return upper, (orthogonal[..., : design.shape[-2], :].mT @ response.unsqueeze(-1)).squeeze(-1)
 
 
-def inverse(upper: Float[Tensor, "*b p p"]) -> Float[Tensor, "*b p p"]:
-    """Inverse of upper triangular matrices."""
-    return torch.linalg.solve_triangular(upper, torch.eye(upper.shape[-1]).to(upper).expand_as(upper), upper=True)
-
-
 @dataclass(frozen=True)
 class Regression:
     """Regression of an output on the i standardized outputs before it, at n inputs, with coefficients (n, i).
@@ -124,7 +119,7 @@ class Regression:
         # diag(inv(T), 1) S diag(inv(T), 1)': the outputs before get unit covariance, the last one keeps its unit.
         eye = torch.eye(size + 1).to(scatter)
         standardizing = eye.repeat(len(scatter), 1, 1)
-        standardizing[:, :size, :size] = torch.linalg.solve_triangular(tril, eye[:size, :size], upper=False)
+        standardizing[:, :size, :size] = triangular_inverse(tril)
         return cls(symmetrize(standardizing @ scatter @ standardizing.mT), whitener)
 
     @cached_property

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from torch_pbd.linalg import safe_cholesky
+from torch_pbd.linalg import safe_cholesky, triangular_inverse
 from torch_pbd.models.training import TrainingSet
 
 LAGS = 3
@@ -101,14 +101,13 @@ def _too_smooth(training: TrainingSet) -> Bool[Tensor, " d"]:
     """
     order = training.inputs[:, 0].argsort()
     counts, means = training.counts[:, None], training.means()
-    squares = torch.zeros_like(means).index_add_(0, training.index, (training.y - means[training.index]).square())
-    variance = (squares / counts / (counts - 1.0).clamp_min(1.0))[order]
+    variance = (training.squares() / counts / (counts - 1.0).clamp_min(1.0))[order]
     expected = (variance[:-3] + 9.0 * variance[1:-2] + 9.0 * variance[2:-1] + variance[3:]).mean(0)
     ratio = means[order].diff(n=3, dim=0).square().mean(0) / expected.clamp_min(_CONSTANT)
     half = torch.full_like(ratio, 0.5 * _SHARE_OF_THIRD * max(len(means) - 3, 0))
     chance = torch.special.gammainc(half, half * ratio)
-    repeated = torch.equal(training.inputs[training.index], training.x)
-    return (chance < _LEVEL) & (ratio < _SMOOTH) & (expected > _CONSTANT) & repeated & (counts.min() > 1.0)
+    smooth = (chance < _LEVEL) & (ratio < _SMOOTH) & (expected > _CONSTANT)
+    return smooth & training.repeats_inputs & (counts.min() > 1.0)
 
 
 @dataclass(frozen=True)
@@ -181,8 +180,7 @@ class NoiseCorrelation:
 
 def _whitener(matrix: Tensor) -> Tensor:
     """Inverses of lower factors."""
-    factor = safe_cholesky(matrix, name="the correlation of the demonstrations")
-    return torch.linalg.solve_triangular(factor, torch.eye(factor.shape[-1]).to(factor).expand_as(factor), upper=False)
+    return triangular_inverse(safe_cholesky(matrix, name="the correlation of the demonstrations"))
 
 
 def demonstration_correlation(
