@@ -43,7 +43,7 @@ def refusal(value: Any, name: str, must: str, remedy: str = "", unit: str = "") 
 
 
 class _Bounds(TypedDict, total=False):
-    """What a number is held to, and what a message says beside."""
+    """Bounds of a number, and additions to the message that refuses one."""
 
     above: float | None
     least: float | None

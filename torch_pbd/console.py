@@ -1,4 +1,4 @@
-"""What is said on a terminal, or to nobody."""
+"""Output to a terminal, or to nobody."""
 
 import os
 import sys
@@ -33,7 +33,7 @@ class Notes:
         self._shown: set[str] = set()
 
     def __call__(self, message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
-        """As ``warnings.showwarning`` is called."""
+        """Show a warning, in the place of ``warnings.showwarning``."""
         if str(message) not in self._shown:
             self._shown.add(str(message))
             say(f"note ({category.__name__}): {message}", sys.stderr)

@@ -178,7 +178,7 @@ def fit(options: Any, folder: Any) -> str:
 
 
 def inspect(options: Any, folder: Any) -> str:
-    """What is in recordings, before anything is fitted."""
+    """Description of recordings, before anything is fitted."""
     from torch_pbd.experiments.recordings import figure_of_recordings
 
     demonstrations, description = _loaded(options, inspect=True)
@@ -242,7 +242,7 @@ def _loaded(options: Any, *, inspect: bool = False) -> Any:
 
 
 def _name(files: Sequence[Path]) -> str:
-    """Where demonstrations come from, in short."""
+    """Origin of demonstrations, in short."""
     return files[0].name if len(files) == 1 else f"{files[0].name} to {files[-1].name}, {len(files)} files"
 
 

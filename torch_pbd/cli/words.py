@@ -28,7 +28,7 @@ _TRUTH = {"yes": "true", "on": "true", "y": "true", "no": "false", "off": "false
 
 @dataclass(frozen=True)
 class Place:
-    """Where a value stands: a file or the command line, the keys below it, and the line of each."""
+    """Place of a value: a file or the command line, the keys below it, and the line of each."""
 
     source: str = ""
     keys: Keys = ()

@@ -1,4 +1,4 @@
-"""Which rows are of one demonstration: their labels, and what is amiss with the demonstrations."""
+"""Demonstrations among rows: their labels, and warnings where something is amiss with them."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

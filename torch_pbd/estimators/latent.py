@@ -1,4 +1,4 @@
-"""What the two regressors on latent Gaussian processes (CD and WP) share, and the mean that both have."""
+"""Base of the two regressors on latent Gaussian processes (CD and WP), and the mean that both have."""
 
 from abc import abstractmethod
 from dataclasses import dataclass, replace

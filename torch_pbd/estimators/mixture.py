@@ -156,7 +156,7 @@ class GMMBaseline(CovarianceRegressor):
             self._regression = MixtureRegression.from_module(self.module_)
 
     def __getstate__(self) -> dict[str, Any]:
-        """As the base class gives it, without what follows from the module."""
+        """State of the base class, without the regression that follows from the module."""
         state = super().__getstate__()
         state.pop("_regression", None)
         return state

@@ -16,13 +16,13 @@ _LIMIT = np.finfo(np.float64).max ** (1 / 6)
 
 @dataclass(frozen=True)
 class MixtureRegression:
-    """What the module of a mixture does, with all that depends on its parameters alone worked out before.
+    """Regression of a mixture's module, with all that depends on its parameters alone worked out before.
 
     Of k components, e standardized inputs and d outputs in units of the data, less their shift.
     """
 
     arrays: list[NDArray[Any]]
-    """Of the module, sharing its memory, which so is used for nothing else;"""
+    """Arrays of the module, sharing its memory, which so is used for nothing else;"""
     values: list[bytes]
     """and what they were."""
     places: list[int]

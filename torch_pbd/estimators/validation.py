@@ -241,7 +241,7 @@ def parameter_floats(value: Any, name: str) -> Floats:
 
 
 def standardized_prior(prior: Prior, X: Floats, y_scale: Floats) -> Floats:
-    """What :func:`prior_covariance` gives, in units in which the outputs have the deviations ``y_scale`` (d,).
+    """Covariances of a prior, as :func:`prior_covariance`, over the outputs' deviations ``y_scale`` (d,).
 
     Warns
     -----

@@ -1,1 +1,1 @@
-"""What the paper reports, as functions."""
+"""Experiments of the paper, and the demo, as functions."""

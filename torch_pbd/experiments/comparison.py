@@ -36,7 +36,7 @@ class Score:
     smallest_eigenvalue: float
     """Smallest eigenvalue of the predicted correlations, over the data."""
     fold_movement: tuple[dict[str, float], ...] = ()
-    """Of each demonstration left out as a whole, what :func:`~torch_pbd.movement.judge_movement` returns."""
+    """Judgement of each demonstration left out as a whole, as :func:`~torch_pbd.movement.judge_movement` returns it."""
 
     @property
     def log_likelihood(self) -> float:

@@ -45,7 +45,7 @@ _CAPTIONS = {
     "recordings": "The recordings, output by output.",
     "figure": "What the model learned, over the data.",
 }
-"""What a figure shows, by the part of its name; the last is of all others."""
+"""Caption of a figure, by a part of its name; the last is of all others."""
 
 _STYLE = """
 :root { color-scheme: light dark; --line: #8886; }

@@ -1,4 +1,4 @@
-"""Where the evidence of Gaussian processes is searched: a grid, and the coordinates between its points."""
+"""Grid on which the evidence of Gaussian processes is searched, and coordinates between its points."""
 
 import math
 from dataclasses import dataclass, replace
@@ -34,7 +34,7 @@ _LAGS, _NOT_WHITE = 3, 21.1
 
 @dataclass(frozen=True)
 class EvidenceSearch:
-    """What a search for hyperparameters looks for, and where.
+    """Bounds, held values and limits of a search for hyperparameters.
 
     Parameters
     ----------

@@ -21,7 +21,7 @@ _RESOLUTION = 1.0  # spacings: at this length scale features carry 0.995 of the 
 
 @dataclass(frozen=True)
 class FeatureMap:
-    """What spans a family of processes, but for their length scale.
+    """Inducing inputs and kernel of a family of processes: all but their length scale.
 
     With the inducing inputs at all training inputs the processes are the exact ones; with fewer they are the
     "deterministic training conditional" approximation, which is exact at the inducing inputs.

@@ -76,7 +76,7 @@ class LatentGP(nn.Module):
         return self._weighted(x, self.value_weight)[0]
 
     def both(self, x: Float[Tensor, "m e"]) -> list[Float[Tensor, "m b"]]:
-        """What :meth:`forward` and :meth:`values` give, by one matrix of correlations."""
+        """Results of :meth:`forward` and :meth:`values`, by one matrix of correlations."""
         return self._weighted(x, self.weight, self.value_weight)
 
     def _weighted(self, x: Tensor, *weights: Tensor) -> list[Tensor]:

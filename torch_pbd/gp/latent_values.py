@@ -168,6 +168,6 @@ class LatentValues(nn.Module):
         return (self.basis @ (whitened.unsqueeze(-1) / self._square())).squeeze(-1).contiguous()
 
     def _square(self) -> Tensor:
-        """Of each column of the basis, which are orthogonal; one for those that do not matter and are zero."""
+        """Squared norm of each column of the basis, which are orthogonal; one for those that are zero."""
         square = self.basis.square().sum(-2).unsqueeze(-1)
         return square.where(square > 0, 1.0)

@@ -118,7 +118,7 @@ def _fit_group(jobs: list[tuple[Observations, EvidenceSearch]]) -> list[Found]:
 
 @dataclass
 class _Ends:
-    """Where the descents of processes ended."""
+    """Ends of the descents of processes."""
 
     length_scale: Float[Tensor, "b e"]
     noise_ratio: Float[Tensor, " b"]

@@ -147,7 +147,7 @@ class JointNormal:
 
 @dataclass(frozen=True)
 class Observed:
-    """What is known of a movement, at steps of a joint law.
+    """Observations of a movement, at steps of a joint law.
 
     Steps known whole and without noise keep the structure of the law; other entries are conditioned on one by one.
     """

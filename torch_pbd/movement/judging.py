@@ -1,4 +1,4 @@
-"""What a law of whole movements is judged by: a demonstration that was left out, and statements on all of it."""
+"""Judgement of laws of whole movements: a demonstration that was left out, and statements on all of it."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ MOVEMENT_STATISTICS = ("deviation", "offset", "length", "largest")
 
 
 def movement_statistics(movements: ArrayLike, mean: ArrayLike, std: ArrayLike) -> Floats:
-    """What people say of whole movements: (s, 4), in the order of ``MOVEMENT_STATISTICS``.
+    """Statistics of whole movements: (s, 4), in the order of ``MOVEMENT_STATISTICS``.
 
     The mean squared deviation and the length of the time-averaged offset, in standard deviations of each step and
     output; the length of the path, in units of the outputs; the largest deviation, in standard deviations.

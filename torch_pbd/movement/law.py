@@ -119,7 +119,7 @@ class MovementLaw(BaseEstimator, ABC):
         return both[first], index[: len(time)], index[len(time) :]
 
     def _observed(self, places: NDArray[np.intp]) -> Observed:
-        """What is known, by the places of its times in a union of times."""
+        """Observations of the movement, by the places of their times in a union of times."""
         nothing = np.empty((0, self.n_outputs_))
         known = Known(np.empty(0), nothing, nothing) if self._known is None else self._known
         return known.observed(places)

@@ -1,4 +1,4 @@
-"""What people pass to models of movements: demonstrations to learn from, and what is known of a movement."""
+"""Arguments of models of movements: demonstrations to learn from, and observations of a movement."""
 
 from typing import Any, NamedTuple
 
@@ -28,14 +28,14 @@ class Recording(NamedTuple):
 
 
 class Known(NamedTuple):
-    """What a conditioned movement passes: times (m,), values (m, d), NaN where not given, and noise (m, d)."""
+    """Observations of a movement: times (m,), values (m, d), NaN where not given, and noise (m, d)."""
 
     time: Floats
     value: Floats
     noise: Floats
 
     def observed(self, places: NDArray[np.intp]) -> Observed:
-        """What is known, as a joint law takes it, by the places of its times among the steps of the law.
+        """Observations as a joint law takes them, by the places of their times among the steps of the law.
 
         Raises ValueError if an entry is known twice without noise, or too many are known one by one.
         """

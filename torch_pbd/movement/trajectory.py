@@ -209,7 +209,7 @@ class TrajectoryRegressor(TimedMovement):
         self.nugget_scale_, self.shrinkage_ = np.sqrt(found.nugget.numpy()), 1.0 - found.share
 
     def predict(self, X: ArrayLike, *, return_std: bool = False, return_cov: bool = False) -> Any:
-        """As the regressor predicts; given what is known, the mean and covariance of the rest of the movement."""
+        """Prediction of the regressor; given what is known, mean and covariance of the rest of the movement."""
         if self._is_regressor:
             self._times(X)
             return self.regressor_.predict(X, return_std=return_std, return_cov=return_cov)

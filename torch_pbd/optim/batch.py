@@ -177,7 +177,7 @@ def _guarded(objective: ValueAndGradient) -> ValueAndGradient:
 
 @dataclass
 class _Problems:
-    """Where optimizations are, and Newton's step from there."""
+    """Present points of optimizations, and Newton's step from there."""
 
     rows: Int64[Tensor, " a"]
     x: Float[Tensor, "a p"]

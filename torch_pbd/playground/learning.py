@@ -1,4 +1,4 @@
-"""What the page asks of the library: models of strokes, movements that are bent, schedules, files to take home."""
+"""Answers to a page: models of strokes, movements that are bent, schedules, files to take home."""
 
 import tempfile
 import time

@@ -1,4 +1,4 @@
-"""What a page may say: plain JSON, held to types, sizes and ranges before anything is done with it."""
+"""Messages of a page: plain JSON, held to types, sizes and ranges before anything is done with it."""
 
 import base64
 import json
@@ -34,7 +34,7 @@ class Stroke(NamedTuple):
 
 @dataclass(frozen=True)
 class Settings:
-    """What the page's selectors and sliders say; one model, or two to compare."""
+    """Choices of the page's selectors and sliders; one model, or two to compare."""
 
     models: tuple[str, ...] = ("HeteroscedasticGPRegressor",)
     stiffness_min: float = 50.0

@@ -43,7 +43,7 @@ _COLORS = (MODEL, OTHER)
 
 @final
 class MovementDisplay:
-    """What models learned of a movement: bands over time, and ellipses along the path of two outputs.
+    """Laws of a movement that models have learned: bands over time, and ellipses along the path of two outputs.
 
     It is made by `from_estimator`; `plot` draws it again.
 

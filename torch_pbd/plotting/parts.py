@@ -1,4 +1,4 @@
-"""What figures are made of; each function takes data and the Axes to draw into."""
+"""Parts of figures; each function takes data and the Axes to draw into."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,4 +1,4 @@
-"""What all figures share: one colour for one meaning, labels with units, grids and legends."""
+"""Style of all figures: one colour for one meaning, labels with units, grids and legends."""
 
 from collections.abc import Sequence
 from typing import Any

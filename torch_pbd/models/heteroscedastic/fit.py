@@ -143,7 +143,7 @@ def fit_heteroscedastic(
 
 @dataclass
 class _State:
-    """What one turn leaves to the next."""
+    """State that one turn leaves to the next."""
 
     training: TrainingSet
     group: Tensor | None

@@ -16,7 +16,8 @@ from torch_pbd.models.heteroscedastic.regression import LinearEvidence, Weights,
 from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation
 
 LEAST_SQUARE = 1e-6
-"""Of the pooled variance: an exact zero, as where all recordings start at the origin, has no logarithm."""
+"""Least mean square, of the pooled variance: an exact zero, as where all recordings start at the origin, has no
+logarithm."""
 
 # Newton's steps (in the logarithm of a variance) end at this one: that after it is about its square.
 _MAX_ITER, _TOL = 60, 1e-5

@@ -123,7 +123,7 @@ def _times(matrix: Tensor | None, values: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class MeanStart:
-    """Where a mean begins, and the evidence for it under noise that is the same everywhere."""
+    """Beginning of a mean, and the evidence for it under noise that is the same everywhere."""
 
     search: Search
     """Holds the hyperparameters that were found, on the inducing inputs that they need."""

@@ -1,4 +1,4 @@
-"""What few demonstrations leave open of a covariance, where samples of a demonstration are correlated.
+"""Uncertainty that few demonstrations leave of a covariance, where samples of a demonstration are correlated.
 
 Student's t is the law of a new deviation where the covariance Sigma is known from n independent ones: at an input n is
 told by the posterior of the log variances, which knows of K demonstrations at independent places.

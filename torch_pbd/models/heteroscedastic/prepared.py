@@ -1,4 +1,4 @@
-"""What the fitted model computes once for all its predictions."""
+"""Parts of the fitted model that are computed once for all its predictions."""
 
 import operator
 from dataclasses import dataclass, replace
@@ -27,15 +27,15 @@ class Prepared:
     mean: LatentMean
     covariance: LatentCovariance
     nearness: Features
-    """Of the process that tells what is missing."""
+    """Features of the process that tells how far data are."""
     together: list[tuple[list[int], list[int], Features]]
-    """Of mean (0), log variances (1), coefficients (2) and nearness (3) those on the same inducing inputs: which, how
-    many processes each, and their features.
+    """Groups of mean (0), log variances (1), coefficients (2) and nearness (3) on the same inducing inputs: which they
+    are, how many processes each has, and their features.
     """
 
     @classmethod
     def of(cls, buffers: tuple[Tensor | None, ...], mean: LatentMean, covariance: LatentCovariance) -> "Prepared":
-        """Of these processes.
+        """Parts of these processes that do not depend on the inputs.
 
         What is missing is told by one with the length scale of the log variances (their mean, weighted by squared
         amplitudes), as far as that does not reach too far: a smooth process without noise claims to know what is

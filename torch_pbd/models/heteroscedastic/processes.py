@@ -170,7 +170,7 @@ class SearchOptions:
             self.callback(Progress(turn, loss, elapsed))
 
     def outcome(self, losses: tuple[float, ...]) -> FitReport:
-        """What became of a fit with these losses, by how its searches ended."""
+        """Report of a fit with these losses, by how its searches ended."""
         status = first_failure(status for _, status in self.ends)
         return FitReport(losses[-1], losses, max(n for n, _ in self.ends), status)
 

@@ -140,7 +140,7 @@ class Regression:
 
     @cached_property
     def couplings(self) -> "Couplings | None":
-        """What inputs have to do with themselves and their neighbours; None where it is more than with these.
+        """Couplings of inputs with themselves and their neighbours; None where they are coupled with others too.
 
         The inverse W'W of an exponential correlation along a line is zero but for neighbours, as that of a Markov
         process.
@@ -271,11 +271,11 @@ class Couplings:
     left: Int64[Tensor, " m"]
     right: Int64[Tensor, " m"]
     scatter: Float[Tensor, "m i i"]
-    """Of the outputs on the left with those on the right."""
+    """Scatter of the outputs on the left with those on the right."""
     across: Float[Tensor, "m i"]
-    """Of the outputs on the left with the response on the right."""
+    """Inner products of the outputs on the left with the response on the right."""
     back: Float[Tensor, "m i"]
-    """Of the outputs on the right with the response on the left."""
+    """Inner products of the outputs on the right with the response on the left."""
 
     def weight(self, precision: Float[Tensor, " n"]) -> Float[Tensor, "m i i"]:
         """Scatter times the root of the precisions on both sides."""
