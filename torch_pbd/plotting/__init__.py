@@ -10,6 +10,7 @@ from torch_pbd.plotting.parts import (
     plot_std_band,
     plot_stiffness,
 )
+from torch_pbd.plotting.poses import plot_covariance_ellipsoids, plot_frames
 from torch_pbd.plotting.style import (
     DATA,
     EMPIRICAL,
@@ -48,7 +49,9 @@ __all__ = [
     "mark_ends",
     "output_label",
     "plot_covariance_ellipses",
+    "plot_covariance_ellipsoids",
     "plot_demonstrations",
+    "plot_frames",
     "plot_model_bands",
     "plot_movements",
     "plot_pushes",

@@ -1,7 +1,7 @@
 """Parts of figures; each function takes data and the Axes to draw into."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
+from torch_pbd.plotting.poses import AXES, POSE_NAMES, principal
 from torch_pbd.plotting.style import (
     DATA,
     EMPIRICAL,
@@ -180,13 +181,17 @@ def _empirical_bands(position: Floats, targets: Floats) -> tuple[Floats, Floats,
     return distinct[repeated], means[repeated], std
 
 
-def plot_stiffness(schedule: Any, ax: Axes) -> list[Line2D]:
+def plot_stiffness(schedule: Any, ax: Axes, block: slice | None = None) -> list[Line2D]:
     """Draw the stiffness of each output over time, the diagonal of the matrix, within its limits.
+
+    Of poses, whose tool turns, that of the principal axes of a block.
 
     Parameters
     ----------
     schedule : Schedule
     ax : matplotlib.axes.Axes
+    block : slice, default=None
+        One of ``schedule.blocks``; None is the first, the positions.
 
     Returns
     -------
@@ -194,12 +199,18 @@ def plot_stiffness(schedule: Any, ax: Axes) -> list[Line2D]:
     """
     check_kind(schedule, "schedule", "Schedule")
     check_axes("ax", [ax])
-    gains = np.diagonal(schedule.stiffness, axis1=1, axis2=2)
-    lines = plot_outputs(schedule.time, gains, ax, [f"along {name}" for name in schedule_names(schedule)])
-    for limit in schedule.stiffness_limits or ():
-        is_first = limit == schedule.stiffness_limits[0]
-        ax.axhline(limit, color=DATA, lw=0.8, ls=":", label="limits of the stiffness" if is_first else None)
-    ax.set(xlabel="time [s]", ylabel=f"stiffness [N/{short_unit(schedule.units)}]")
+    block = schedule.blocks[0] if block is None else block
+    if len(schedule.blocks) > 1:
+        gains = principal(schedule.stiffness[:, block, block], descending=True)
+        lines = plot_outputs(schedule.time, gains, ax, AXES[: gains.shape[1]], [MODEL])
+    else:
+        gains = np.diagonal(schedule.stiffness, axis1=1, axis2=2)
+        lines = plot_outputs(schedule.time, gains, ax, [f"along {name}" for name in schedule_names(schedule)])
+    limits = [np.broadcast_to(limit, schedule.n_outputs)[block] for limit in schedule.stiffness_limits or ()]
+    for i, limit in enumerate(np.unique(limits)):
+        ax.axhline(limit, color=DATA, lw=0.8, ls=":", label=None if i else "limits of the stiffness")
+    unit = "Nm/rad" if block.start else f"N/{short_unit(schedule.units)}"
+    ax.set(xlabel="time [s]", ylabel=f"stiffness [{unit}]")
     return lines
 
 
@@ -219,35 +230,59 @@ def plot_rollout(
     rollout : Rollout
         One run, as NumPy arrays.
     axes : sequence of three matplotlib Axes, one above the other
+        Of poses six: three of positions, then three of rotations.
     outputs : sequence of int or str, default=None
         Outputs to draw, by number or by name; None is the first six.
     names : sequence of str, default=None
-        Names of the outputs; None calls them y0, y1, ...
+        Names of the outputs; None calls them y0, y1, ..., and of poses x, y, z, rx, ry, rz.
     unit : str, default="m"
         Unit of the schedule's positions; None where it is not known.
     unpushed : Rollout, default=None
         The same run without pushes, drawn thin: how far the robot lags behind by itself.
     """
     check_kind(rollout, "rollout", "Rollout")
-    check_axes("axes", axes, 3)
     if np.ndim(rollout.position) != 2:
         must = "of one run, (n_ticks, n_outputs): take one of the batch"
         raise checks.refusal(tuple(np.shape(rollout.position)), "the shape of the rollout's position", must)
-    names = names or [f"y{i}" for i in range(rollout.position.shape[-1])]
-    chosen = chosen_outputs(outputs, names, 6)
-    labels = [names[output] for output in chosen]
-    shown_unit, scale = readable_unit(unit)
+    p, d = rollout.position.shape[-1], rollout.velocity.shape[-1]
+    check_axes("axes", axes, 3 if p == d else 6)
+    names = names or (POSE_NAMES if d == p + 3 == 6 else [f"y{i}" for i in range(d)])
+    chosen, stiffness_unit = chosen_outputs(outputs, names, 6), f"N/{short_unit(unit)}"
+    kinds = [_Kind("along", "force", "N", *readable_unit(unit), stiffness_unit)]
+    kinds += [_Kind("about", "torque", "Nm", "deg", 180.0 / np.pi, "Nm/rad")] if d > p else []
+    for i, kind in enumerate(kinds):
+        own = [output for output in chosen if (output >= p) == bool(i)]
+        labels = [names[output].removeprefix("r") if i else names[output] for output in own]
+        _plot_pushed(rollout, unpushed, axes[3 * i : 3 * i + 3], own, labels, kind)
+
+
+class _Kind(NamedTuple):
+    """Words and units of outputs that are positions, or rotations."""
+
+    where: str
+    push: str
+    push_unit: str
+    unit: str
+    scale: float
+    stiffness_unit: str
+
+
+def _plot_pushed(
+    rollout: Any, unpushed: Any, axes: Sequence[Axes], chosen: list[int], labels: list[str], kind: _Kind
+) -> None:
     above, middle, below = axes
-    plot_outputs(rollout.time, scale * rollout.deviation[:, chosen], above, [f"along {name}" for name in labels])
+    along = [f"{kind.where} {label}" for label in labels]
+    plot_outputs(rollout.time, kind.scale * rollout.deviation[:, chosen], above, along)
     if unpushed is not None:
-        own = scale * unpushed.deviation[:, chosen]
-        above.plot(unpushed.time, own, color=DATA, lw=1.0)[0].set_label("without pushes")
-    above.set_ylabel(f"deviation [{shown_unit}]")
-    plot_outputs(rollout.time, rollout.force[:, chosen], middle, [f"force {name}" for name in labels], [FORCE])
-    middle.set_ylabel("external force [N]")
+        own = kind.scale * unpushed.deviation[:, chosen]
+        for line in above.plot(unpushed.time, own, color=DATA, lw=1.0)[:1]:
+            line.set_label("without pushes")
+    above.set_ylabel(f"deviation [{kind.unit}]")
+    plot_outputs(rollout.time, rollout.force[:, chosen], middle, [f"{kind.push} {label}" for label in labels], [FORCE])
+    middle.set_ylabel(f"external {kind.push} [{kind.push_unit}]")
     gains = np.diagonal(rollout.stiffness, axis1=1, axis2=2)[:, chosen]
-    plot_outputs(rollout.time, gains, below, [f"along {name}" for name in labels])
-    below.set(xlabel="time [s]", ylabel=f"stiffness [N/{short_unit(unit)}]", ylim=(0.0, None))
+    plot_outputs(rollout.time, gains, below, along)
+    below.set(xlabel="time [s]", ylabel=f"stiffness [{kind.stiffness_unit}]", ylim=(0.0, None))
     for ax in (above, middle):
         ax.axhline(0.0, color=DATA, lw=0.6, zorder=0)
 

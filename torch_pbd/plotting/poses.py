@@ -1,0 +1,159 @@
+"""Poses in space: frames of a tool along a path, and how far its position and its axes spread."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d.art3d import Line3DCollection
+from numpy.typing import ArrayLike
+
+from torch_pbd import checks
+from torch_pbd.checks import Floats
+from torch_pbd.plotting.style import DATA, MODEL, SERIES, check_axes, equal_scales, mark_ends, shown_figure
+from torch_pbd.rotations import matrix
+
+_LENGTH = 0.1  # of a frame's axes: share of the longest side of the path
+_CIRCLE = np.stack([np.cos(np.linspace(0.0, 2.0 * np.pi, 49)), np.sin(np.linspace(0.0, 2.0 * np.pi, 49))])
+_DEGREES = 180.0 / np.pi
+POSE_NAMES = ("x", "y", "z", "rx", "ry", "rz")
+AXES = ("most precise axis", "middle axis", "freest axis")
+
+
+def plot_frames(
+    position: ArrayLike,
+    orientation: ArrayLike,
+    ax: Axes,
+    *,
+    length: float,
+    covariance: ArrayLike | None = None,
+    n_std: float = 2.0,
+    label: str | None = "tool",
+) -> list[Line3DCollection]:
+    """Draw the axes of a tool in space, and around their tips where ``n_std`` standard deviations take them.
+
+    Parameters
+    ----------
+    position : array_like of shape (n, 3)
+    orientation : array_like of shape (n, 4)
+        Unit quaternions w x y z.
+    ax : matplotlib.axes.Axes
+        Of projection "3d".
+    length : float
+        Of the axes, in the unit of the position.
+    covariance : array_like of shape (n, 3, 3), default=None
+        Of rotation vectors in world axes, in rad^2.
+    n_std : float, default=2.0
+    label : str or None, default="tool"
+        In the legend, before x, y and z.
+
+    Returns
+    -------
+    list of three Line3DCollection, of the axes x, y and z
+    """
+    check_axes("ax", [ax])
+    places = checks.array(position, "position", ("n", 3))
+    turns = matrix(checks.array(orientation, "orientation", (len(places), 4)))
+    drawn = []
+    for axis, color in enumerate(SERIES[:3]):
+        tips = turns[:, :, axis]
+        lines = np.stack([places, places + length * tips], axis=1)
+        name = None if label is None else f"{label}: {'xyz'[axis]}"
+        drawn.append(_lines(ax, lines, color, 1.4, name))
+        if covariance is not None:
+            spread = checks.array(covariance, "covariance", (len(places), 3, 3))
+            # A small rotation e moves the tip a by e x a, and the tip stays on its sphere.
+            arm = -np.cross(np.eye(3), tips[:, np.newaxis, :]).swapaxes(1, 2)
+            moved = tips[:, np.newaxis, :] + n_std * _great_circles(arm @ spread @ arm.swapaxes(1, 2))[:, 0]
+            on_sphere = moved / np.linalg.norm(moved, axis=-1, keepdims=True)
+            _lines(ax, places[:, np.newaxis, :] + length * on_sphere, color, 0.8, None)
+    return drawn
+
+
+def plot_covariance_ellipsoids(
+    mean: ArrayLike,
+    covariance: ArrayLike,
+    ax: Axes,
+    *,
+    n_std: float = 2.0,
+    color: str = MODEL,
+    label: str | None = None,
+) -> Line3DCollection:
+    """Draw the ``n_std`` ellipsoids of covariances (n, 3, 3) around means (n, 3), by an ellipse in each main plane.
+
+    The axes are of projection "3d".
+    """
+    check_axes("ax", [ax])
+    centres = checks.array(mean, "mean", ("n", 3))
+    matrices = checks.array(covariance, "covariance", (len(centres), 3, 3))
+    checks.semidefinite(matrices, "covariance")
+    curves = centres[:, np.newaxis, np.newaxis, :] + n_std * _great_circles(matrices)
+    return _lines(ax, curves.reshape(-1, *curves.shape[2:]), color, 0.7, label)
+
+
+def pose_panels(n_bands: int, make: Any = shown_figure) -> tuple[Figure, list[Any], list[Axes]]:
+    """Figure that ``make(size)`` makes, with the Axes of a space, and bands beside it that share their times."""
+    figure = make((11.0, max(5.2, 1.7 * n_bands)))
+    columns = figure.add_gridspec(n_bands, 2, width_ratios=(1.25, 1.0))
+    space = figure.add_subplot(columns[:, 0], projection="3d")
+    bands = [figure.add_subplot(columns[i, 1]) for i in range(n_bands)]
+    for band in bands[:-1]:
+        band.sharex(bands[-1])
+        band.tick_params(labelbottom=False)
+    return figure, [space], bands
+
+
+def draw_recorded_poses(demonstrations: Any, ax: Axes, bands: Sequence[Axes], n_frames: int = 4) -> None:
+    """Draw demonstrated poses: paths in space with frames at a few phases, and rotations over time."""
+    places, turns = demonstrations.to_poses()
+    length = _LENGTH * float(np.ptp(np.concatenate(places), axis=0).max())
+    for k, (path, turn) in enumerate(zip(places, turns, strict=True)):
+        ax.plot(*path.T, color=DATA, lw=1.0, alpha=0.8, label=None if k else "demonstrations", zorder=1)
+        some = np.linspace(0, len(path) - 1, n_frames).round().astype(int)
+        plot_frames(path[some], turn[some], ax, length=length, label=None if k else "tool")
+        mark_ends(ax, path, label=k == 0)
+    for i, (band, name) in enumerate(zip(bands, demonstrations.names[-3:], strict=True)):
+        for time, position in demonstrations:
+            band.plot(time, _DEGREES * position[:, i - 3], color=DATA, lw=1.0, alpha=0.8)
+        band.set_ylabel(f"{name} [deg]")
+        band.margins(x=0.0)
+    label_space(ax, demonstrations.names[:3], None if demonstrations.units is None else demonstrations.units[0])
+
+
+def draw_planned_poses(schedule: Any, ax: Axes, n_poses: int = 7) -> None:
+    """Draw the path of a schedule of poses, with ellipsoids, frames, and where the axes of the tool spread."""
+    length = _LENGTH * float(np.ptp(schedule.position, axis=0).max())
+    some = np.linspace(0, len(schedule) - 1, n_poses).round().astype(int)
+    path, spread = schedule.position[some], schedule.covariance[some]
+    ax.plot(*schedule.position.T, color=MODEL, lw=1.8, label="planned path", zorder=3)
+    plot_covariance_ellipsoids(path, spread[:, :3, :3], ax, label="position: 2 sd")
+    plot_frames(path, schedule.orientation[some], ax, length=length, covariance=spread[:, 3:, 3:], label="tool, 2 sd")
+    mark_ends(ax, schedule.position)
+    label_space(ax, (schedule.names or POSE_NAMES)[:3], schedule.units)
+
+
+def label_space(ax: Any, names: Sequence[str], unit: str | None) -> None:
+    """Name the axes of a space, on one scale."""
+    ax.set(**{f"{axis}label": f"{name} [{unit or 'unit'}]" for axis, name in zip("xyz", names, strict=True)})
+    equal_scales(ax, zoom=0.88)
+    ax.view_init(elev=22.0, azim=-35.0)
+
+
+def principal(matrices: Floats, *, descending: bool = False) -> Floats:
+    """Eigenvalues (n, d) of symmetric matrices (n, d, d), in order."""
+    values = np.linalg.eigvalsh(matrices).clip(0.0)
+    return values[:, ::-1] if descending else values
+
+
+def _great_circles(covariance: Floats) -> Floats:
+    """Ellipses (n, 3, m, 3) of one standard deviation in the planes of two principal axes each, the widest first."""
+    values, axes = np.linalg.eigh(covariance)
+    roots = axes * np.sqrt(values.clip(0.0))[:, np.newaxis, :]
+    return np.stack([(roots[:, :, pair] @ _CIRCLE).swapaxes(1, 2) for pair in ([2, 1], [2, 0], [1, 0])], axis=1)
+
+
+def _lines(ax: Any, curves: Floats, color: str, width: float, label: str | None) -> Line3DCollection:
+    collection = Line3DCollection(list(curves), colors=color, linewidths=width, label=label, zorder=4)
+    ax.add_collection3d(collection, autolim=True)
+    return collection
