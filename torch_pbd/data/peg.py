@@ -54,7 +54,7 @@ def pose_covariance(phase: ArrayLike) -> Floats:
 
 
 def make_pose_demonstrations(
-    n_demos: int = 6,
+    n_demos: int = 8,
     duration: float = 4.0,
     rate: float = 100.0,
     *,
@@ -70,7 +70,8 @@ def make_pose_demonstrations(
 
     Parameters
     ----------
-    n_demos : int, default=6
+    n_demos : int, default=8
+        Six and fewer leave open how six outputs vary together.
     duration : float, default=4.0
         In s; of each demonstration where ``timing`` is 0.
     rate : float, default=100.0
@@ -93,7 +94,7 @@ def make_pose_demonstrations(
     --------
     >>> from torch_pbd.data import make_pose_demonstrations
     >>> make_pose_demonstrations(timing=0.0, random_state=0)
-    Demonstrations(n_demos=6, n_steps=401, outputs=('x', 'y', 'z', 'rx', 'ry', 'rz'), time_unit='s', aligned=True)
+    Demonstrations(n_demos=8, n_steps=401, outputs=('x', 'y', 'z', 'rx', 'ry', 'rz'), time_unit='s', aligned=True)
     """
     check_recording(n_demos, duration, rate, timing)
     random = generator(random_state)

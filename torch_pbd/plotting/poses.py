@@ -124,7 +124,9 @@ def draw_recorded_poses(demonstrations: Any, ax: Axes, bands: Sequence[Axes], n_
 def draw_planned_poses(schedule: Any, ax: Axes, n_poses: int = 7) -> None:
     """Draw the path of a schedule of poses, with ellipsoids, frames, and where the axes of the tool spread."""
     length = _LENGTH * float(np.ptp(schedule.position, axis=0).max())
-    some = np.linspace(0, len(schedule) - 1, n_poses).round().astype(int)
+    # At equal distances: at its ends a tool is slow.
+    way = np.append(0.0, np.linalg.norm(np.diff(schedule.position, axis=0), axis=1)).cumsum()
+    some = np.searchsorted(way, np.linspace(0.0, way[-1], n_poses)).clip(max=len(schedule) - 1)
     path, spread = schedule.position[some], schedule.covariance[some]
     ax.plot(*schedule.position.T, color=MODEL, lw=1.8, label="planned path", zorder=3)
     plot_covariance_ellipsoids(path, spread[:, :3, :3], ax, label="position: 2 sd")
