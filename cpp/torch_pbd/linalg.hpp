@@ -1,0 +1,173 @@
+/// Vectors and small symmetric matrices of fixed size: nothing here allocates.
+#pragma once
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstddef>
+#include <utility>
+
+namespace torch_pbd {
+
+template <std::size_t N>
+using Vector = std::array<double, N>;
+/// Rows of a square matrix.
+template <std::size_t N>
+using Matrix = std::array<Vector<N>, N>;
+
+namespace linalg {
+
+template <std::size_t N>
+double dot(const Vector<N>& a, const Vector<N>& b) {
+    double sum = 0.0;
+    for (std::size_t i = 0; i < N; ++i) sum += a[i] * b[i];
+    return sum;
+}
+
+template <std::size_t N>
+Vector<N> sum(const Vector<N>& a, const Vector<N>& b) {
+    Vector<N> result;
+    for (std::size_t i = 0; i < N; ++i) result[i] = a[i] + b[i];
+    return result;
+}
+
+template <std::size_t N>
+Vector<N> difference(const Vector<N>& a, const Vector<N>& b) {
+    Vector<N> result;
+    for (std::size_t i = 0; i < N; ++i) result[i] = a[i] - b[i];
+    return result;
+}
+
+template <std::size_t N>
+Vector<N> scaled(double factor, const Vector<N>& a) {
+    Vector<N> result;
+    for (std::size_t i = 0; i < N; ++i) result[i] = factor * a[i];
+    return result;
+}
+
+template <std::size_t N>
+bool is_zero(const Vector<N>& a) {
+    return std::all_of(a.begin(), a.end(), [](double part) { return part == 0.0; });
+}
+
+/// Length of a vector; infinite or NaN only where a part is.
+template <std::size_t N>
+double norm(const Vector<N>& a) {
+    const double square = dot(a, a);
+    if (1e-280 < square && square < 1e280) return std::sqrt(square);
+    double scale = 0.0;  // squares have overflown, or lost digits
+    for (const double part : a) scale = std::abs(part) > scale || std::isnan(part) ? std::abs(part) : scale;
+    if (scale == 0.0 || !std::isfinite(scale)) return scale;
+    double sum = 0.0;
+    for (const double part : a) sum += (part / scale) * (part / scale);
+    return scale * std::sqrt(sum);
+}
+
+template <std::size_t N>
+double distance(const Vector<N>& a, const Vector<N>& b) {
+    return norm(difference(a, b));
+}
+
+template <std::size_t N>
+Vector<N> product(const Matrix<N>& a, const Vector<N>& x) {
+    Vector<N> result;
+    for (std::size_t i = 0; i < N; ++i) result[i] = dot(a[i], x);
+    return result;
+}
+
+template <std::size_t N>
+Matrix<N> product(const Matrix<N>& a, const Matrix<N>& b) {
+    Matrix<N> result{};
+    for (std::size_t i = 0; i < N; ++i)
+        for (std::size_t k = 0; k < N; ++k)
+            for (std::size_t j = 0; j < N; ++j) result[i][j] += a[i][k] * b[k][j];
+    return result;
+}
+
+template <std::size_t N>
+Matrix<N> scaled(double factor, const Matrix<N>& a) {
+    Matrix<N> result;
+    for (std::size_t i = 0; i < N; ++i) result[i] = scaled(factor, a[i]);
+    return result;
+}
+
+/// Largest entry of a matrix, in size.
+template <std::size_t N>
+double largest(const Matrix<N>& a) {
+    double most = 0.0;
+    for (const Vector<N>& row : a)
+        for (const double entry : row) most = std::max(most, std::abs(entry));
+    return most;
+}
+
+template <std::size_t N>
+struct Eigen {
+    Vector<N> values;
+    Matrix<N> axes;  ///< each row an eigenvector of length 1
+};
+
+/// Eigenvalues, in no order, and eigenvectors of a symmetric matrix by cyclic Jacobi rotations.
+template <std::size_t N>
+Eigen<N> eigh(Matrix<N> a) {
+    Matrix<N> axes{};
+    for (std::size_t i = 0; i < N; ++i) axes[i][i] = 1.0;
+    const double negligible = 1e-17 * largest(a);
+    for (bool is_diagonal = false; !is_diagonal;) {
+        is_diagonal = true;
+        for (std::size_t p = 0; p < N; ++p) {
+            for (std::size_t q = p + 1; q < N; ++q) {
+                if (!(std::abs(a[p][q]) > negligible)) continue;
+                is_diagonal = false;
+                // Tangent of the smaller of the two angles that make this entry zero (Golub and Van Loan, 8.5.2).
+                const double tau = (a[q][q] - a[p][p]) / (2.0 * a[p][q]);
+                const double tangent = std::copysign(1.0, tau) / (std::abs(tau) + std::hypot(1.0, tau));
+                const double cosine = 1.0 / std::hypot(1.0, tangent), sine = tangent * cosine;
+                for (Vector<N>& row : a) {
+                    const double left = row[p], right = row[q];
+                    row[p] = cosine * left - sine * right;
+                    row[q] = sine * left + cosine * right;
+                }
+                for (Matrix<N>* turned : {&a, &axes}) {
+                    for (std::size_t i = 0; i < N; ++i) {
+                        const double left = (*turned)[p][i], right = (*turned)[q][i];
+                        (*turned)[p][i] = cosine * left - sine * right;
+                        (*turned)[q][i] = sine * left + cosine * right;
+                    }
+                }
+                a[p][q] = a[q][p] = 0.0;
+            }
+        }
+    }
+    Eigen<N> result{{}, axes};
+    for (std::size_t i = 0; i < N; ++i) result.values[i] = a[i][i];
+    return result;
+}
+
+/// exp(matrix) - 1 by Taylor series and doubling: without the 1, slow motions keep their digits beside fast ones.
+template <std::size_t N>
+Matrix<N> expm1(const Matrix<N>& matrix) {
+    double size = 0.0;
+    for (const Vector<N>& row : matrix) {
+        double sum = 0.0;
+        for (const double entry : row) sum += std::abs(entry);
+        size = std::max(size, sum);
+    }
+    int exponent = 0;
+    std::frexp(size, &exponent);
+    const int doublings = std::max(0, exponent + 1);
+    // The norm is now 1/2 at most, for which 14 terms have all digits.
+    const Matrix<N> small = scaled(std::ldexp(1.0, -doublings), matrix);
+    Matrix<N> power = scaled(1.0 / 14.0, small);
+    for (int order = 13; order > 0; --order) {
+        power = product(small, power);
+        for (std::size_t i = 0; i < N; ++i) power[i] = scaled(1.0 / order, sum(small[i], power[i]));
+    }
+    for (int i = 0; i < doublings; ++i) {
+        const Matrix<N> square = product(power, power);
+        for (std::size_t j = 0; j < N; ++j) power[j] = sum(scaled(2.0, power[j]), square[j]);
+    }
+    return power;
+}
+
+}  // namespace linalg
+}  // namespace torch_pbd

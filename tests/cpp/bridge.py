@@ -1,0 +1,139 @@
+"""The controller in C++ as an object of Python, and both of them at once."""
+
+import ctypes
+import functools
+import math
+import shutil
+import subprocess
+import tempfile
+from ctypes import POINTER, c_bool, c_char_p, c_double, c_long, c_uint, c_void_p, create_string_buffer
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from torch_pbd.control.realtime import RealTimeAdmittance
+
+ROOT = Path(__file__).parents[2]
+COMPILER = shutil.which("g++")
+needs_compiler = pytest.mark.skipif(COMPILER is None, reason="no g++ here: the C++ header is not tested")
+WARNINGS = ["-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Werror"]
+
+OPTIONS = [
+    "mass", "rate", "max_step", "force_limit", "deadband", "spring_limit", "velocity_limit", "acceleration_limit",
+    "hold_ticks", "max_bad_ticks", "stop_deceleration", "soft_start", "approach_speed", "on_gap", "force_rate_limit",
+]  # fmt: skip
+ROUNDING = 1e-12
+
+
+def compiled(source, *options):
+    """Path of what g++ makes of a source in this folder."""
+    path = Path(tempfile.mkdtemp(prefix="torch_pbd_cpp")) / "program"
+    command = [COMPILER, "-std=c++17", *WARNINGS, f"-I{ROOT / 'cpp'}", *options]
+    ran = subprocess.run([*command, str(source), "-o", str(path)], capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    return path
+
+
+@functools.cache
+def library():
+    path = compiled(Path(__file__).with_name("bridge.cpp"), "-O1", "-shared", "-fPIC")
+    loaded = ctypes.CDLL(str(path))
+    shutil.rmtree(path.parent)
+    numbers = POINTER(c_double)
+    for name, result, arguments in [
+        ("create", c_void_p, [c_char_p, numbers, c_char_p]),
+        ("read_array", c_long, [c_char_p, c_char_p, numbers, c_char_p]),
+        ("destroy", None, [c_void_p]),
+        ("start", c_bool, [c_void_p, c_double, numbers, numbers, c_double, numbers, c_char_p]),
+        ("tick", c_uint, [c_void_p, c_double, numbers, numbers]),
+    ]:
+        function = getattr(loaded, name)
+        function.restype, function.argtypes = result, arguments
+    return loaded
+
+
+def read_array(path, name):
+    """Values of an array of a file as C++ reads them, flat; None where it has none."""
+    text = create_string_buffer(500)
+    size = library().read_array(bytes(path), name.encode(), None, text)
+    if text.value:
+        raise ValueError(text.value.decode())
+    values = (c_double * size)()
+    library().read_array(bytes(path), name.encode(), values, text)
+    return np.array(values) if size else None
+
+
+class CppAdmittance:
+    """`torch_pbd::Admittance` with the names of `RealTimeAdmittance`."""
+
+    def __init__(self, path, n_axes, **options):
+        assert set(options) <= set(OPTIONS)
+        options = {**options, "on_gap": float(options.get("on_gap") == "resume")}
+        values = [math.nan if options.get(name) is None else options[name] for name in OPTIONS]
+        self._library, self._d = library(), n_axes
+        self._text = create_string_buffer(500)
+        self._numbers, d = c_double * n_axes, n_axes
+        self._loop = self._library.create(bytes(path), (c_double * len(values))(*values), self._text)
+        self._check(self._loop)
+        self._force, self._out = self._numbers(), (c_double * (1 + 5 * d + 2 * d * d))()
+
+    def __del__(self):
+        if getattr(self, "_loop", None):
+            self._library.destroy(self._loop)
+
+    def start(self, now, position=None, velocity=None, *, at=0.0, force_bias=None):
+        given = [None if each is None else self._numbers(*each) for each in (position, velocity, force_bias)]
+        self._check(self._library.start(self._loop, now, given[0], given[1], at, given[2], self._text))
+
+    def tick(self, now, force):
+        self._force[:] = force
+        return self._library.tick(self._loop, now, self._force, self._out)
+
+    @property
+    def told(self):
+        """Schedule time, position, velocity, force, desired position and velocity of the last tick."""
+        return self._out[: 1 + 5 * self._d]
+
+    @property
+    def gains(self):
+        """Stiffness and damping of the last tick, (2, d, d)."""
+        return np.reshape(self._out[1 + 5 * self._d :], (2, self._d, self._d))
+
+    def _check(self, succeeded):
+        if not succeeded:
+            raise ValueError(self._text.value.decode())
+
+
+class Both:
+    """The two controllers, which must say the same in each tick; a `RealTimeAdmittance` for those who ask."""
+
+    def __init__(self, schedule, folder, **options):
+        path = Path(folder) / "schedule.csv"
+        schedule.save(path)
+        self.python = RealTimeAdmittance(schedule, **options)
+        self.cpp = CppAdmittance(path, schedule.n_outputs, **options)
+        d = schedule.n_outputs
+        # Lengths and speeds are compared with the largest of the motion, forces with the largest force.
+        reach, speed = np.abs(schedule.position).max(), np.abs(schedule.velocity).max()
+        self._scales = np.repeat([schedule.duration, reach, speed, 1.0, reach, speed], [1, d, d, d, d, d])
+        self.worst = 0.0
+
+    def __getattr__(self, name):
+        return getattr(self.python, name)
+
+    def start(self, *arguments, **options):
+        self.python.start(*arguments, **options)
+        self.cpp.start(*arguments, **options)
+
+    def tick(self, now, force):
+        status, faults = self.python.tick(now, force), self.cpp.tick(now, force)
+        assert faults == status, f"at {now}"
+        loop, cpp = self.python, self.cpp.told
+        told = [loop.schedule_time, *loop.position, *loop.velocity, *loop.force]
+        told += [*loop.desired_position, *loop.desired_velocity]
+        for i, (left, right) in enumerate(zip(told, cpp, strict=True)):
+            scale = self._scales[i] = max(self._scales[i], abs(left))
+            self.worst = max(self.worst, abs(left - right) / scale)
+        assert self.worst <= ROUNDING, f"at {now}: {told} and {cpp}"
+        return status

@@ -1,0 +1,186 @@
+"""The controller in C++ against that of Python, tick by tick, whatever the ticks are."""
+
+import re
+import subprocess
+
+import numpy as np
+import pytest
+from control.loops import MASS, as_schedule, constant, make_schedule
+from cpp.bridge import ROOT, Both, CppAdmittance, compiled, needs_compiler
+from faults.test_random_loops import Loop, random_schedule
+
+from torch_pbd.control.realtime import RealTimeAdmittance, TickStatus
+
+pytestmark = needs_compiler
+
+BUSY = {
+    "deadband": 0.1,
+    "spring_limit": 5.0,
+    "velocity_limit": 2.0,
+    "acceleration_limit": 15.0,
+    "force_rate_limit": 5000.0,
+    "hold_ticks": 3,
+    "max_bad_ticks": 4,
+    "stop_deceleration": 2.0,
+    "approach_speed": 0.2,
+    "on_gap": "resume",
+}
+
+
+@pytest.mark.parametrize("options", [{}, BUSY], ids=["defaults", "every option"])
+@pytest.mark.parametrize(("d", "coupled"), [(1, 0.0), (2, 0.0), (2, 1.0), (3, 0.0), (6, 0.0), (6, 1.0)])
+def test_ticks_are_those_of_python(d, coupled, options, rng, tmp_path):
+    schedule = make_schedule(d, coupled=coupled, offset=7.0, rate=400.0)
+    both = Both(schedule, tmp_path, mass=MASS, soft_start=0.1, **options)
+    both.start(3.0, schedule.position[0] + 0.01, np.full(d, 0.02), at=0.013, force_bias=[0.3] * d)
+    for now in 3.0 + np.cumsum(rng.uniform(1e-4, 1.9e-3, size=400)):
+        both.tick(now, 20.0 * rng.normal(size=d))
+        gains = np.stack([both.stiffness, both.damping])
+        np.testing.assert_allclose(both.cpp.gains, gains, rtol=0, atol=1e-12 * np.abs(gains).max())
+    assert not options or both.faults & TickStatus.ACCELERATION_LIMITED
+
+
+@pytest.mark.parametrize("rate", [1000.0, 100.0, 3.0])
+def test_rows_between_those_of_the_schedule_are_the_same(rate, tmp_path):
+    schedule = make_schedule(2, rate=130.0, duration=0.2538)
+    both = Both(schedule, tmp_path, mass=MASS, rate=rate, soft_start=0.0, max_step=5.0 / rate)
+    both.start(1.7e9)
+    for i in range(1, 40):
+        both.tick(1.7e9 + i / rate, [0.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    "seeds", [range(12), pytest.param(range(12, 120), marks=pytest.mark.slow)], ids=["few", "many"]
+)
+def test_random_faults_do_the_same(seeds, tmp_path):
+    seen = TickStatus(0)
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        schedule, soft_start = random_schedule(rng), rng.uniform(0.2, 0.4)
+        d = schedule.n_outputs
+        push = rng.uniform(0.0, 20.0) * rng.normal(size=d) / np.sqrt(d) * (seed % 2)
+        on_gap = "resume" if seed % 4 > 1 else "pause"
+        loop = Loop(rng, Both(schedule, tmp_path, on_gap=on_gap, soft_start=soft_start), 800, push)
+        loop.run()
+        seen |= loop.controller.faults
+    assert seen & TickStatus.CLOCK
+    assert seen & TickStatus.LATE
+
+
+def served(both, schedule, n_ticks, rng):
+    """Ticks with jitter and every fault, begun again after a stop and after the end."""
+    d, now, n_starts, faults = schedule.n_outputs, 0.0, 0, TickStatus(0)
+    push, lost, stuck = np.zeros(d), 0, 0
+    for i in range(n_ticks):
+        if not i or both.schedule_time >= schedule.duration or TickStatus.STOPPED in status:
+            if i and rng.random() < 0.99:  # goes on for some time as it is
+                pass
+            else:
+                n_starts += 1
+                here = None if rng.random() < 0.3 else schedule.position[0] + 0.02 * rng.normal(size=d)
+                both.start(now, here, 0.05 * rng.normal(size=d), at=rng.uniform(0.0, schedule.duration))
+                status = TickStatus(0)
+        luck = rng.random()
+        now += 10.0 ** rng.uniform(-2.0, 0.5) if luck < 1e-3 else 1e-3 * rng.uniform(0.5, 1.5)
+        lost = int(rng.integers(1, 16)) if 1e-3 < luck < 2e-3 else max(0, lost - 1)
+        stuck = int(rng.integers(1, 13)) if 2e-3 < luck < 3e-3 else max(0, stuck - 1)
+        if luck > 0.99:
+            push = 10.0 ** rng.uniform(-1.0, 2.5) * rng.normal(size=d)
+        told = rng.choice([np.nan, np.inf, now - 1.0]) if stuck else now
+        status = both.tick(told, [np.nan] * d if lost else push)
+        faults |= status
+    return n_starts, faults
+
+
+@pytest.mark.parametrize(
+    ("d", "n_ticks"),
+    [(2, 20_000), *(pytest.param(d, n, marks=pytest.mark.slow) for d, n in [(2, 1_000_000), (6, 200_000)])],
+)
+def test_a_long_run_with_every_fault_stays_the_same(d, n_ticks, rng, tmp_path):
+    schedule = make_schedule(d, duration=5.0)
+    both = Both(schedule, tmp_path, mass=MASS, deadband=0.05, velocity_limit=3.0, force_rate_limit=1e5, on_gap="resume")
+    n_starts, faults = served(both, schedule, n_ticks, rng)
+    assert n_starts > 5
+    assert faults | TickStatus.ACCELERATION_LIMITED == sum(TickStatus)
+    print(f"largest difference after {n_ticks} ticks: {both.worst:.2g}")
+
+
+def test_a_loop_that_is_too_slow_stops(tmp_path):
+    both = Both(constant(100.0, 10.0), tmp_path)
+    both.start(0.0)
+    assert both.cpp.tick(0.02, [1.0]) == both.cpp.tick(0.04, [1.0]) == TickStatus.LATE
+    assert both.cpp.tick(0.06, [1.0]) == TickStatus.LATE | TickStatus.STOPPED
+
+
+def test_before_start_it_stands(tmp_path):
+    cpp = Both(constant(100.0, 10.0), tmp_path).cpp
+    assert cpp.tick(0.001, [1.0]) == TickStatus.STOPPED
+    assert cpp.told[1:3] == [0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("mass", 0.0),
+        ("mass", 1e60),
+        ("rate", -1.0),
+        ("rate", 1e9),
+        ("max_step", 1e-3),
+        ("force_limit", 0.0),
+        ("deadband", -1.0),
+        ("spring_limit", 0.0),
+        ("velocity_limit", 0.0),
+        ("acceleration_limit", float("inf")),
+        ("hold_ticks", -1),
+        ("max_bad_ticks", 0),
+        ("stop_deceleration", 0.0),
+        ("soft_start", -1.0),
+        ("approach_speed", 0.0),
+        ("force_rate_limit", 0.0),
+    ],
+)
+def test_what_python_refuses_is_refused(name, value, tmp_path):
+    schedule = constant(100.0, 10.0)
+    schedule.save(tmp_path / "schedule.csv")
+    with pytest.raises(ValueError, match=f"^{name} is "):
+        RealTimeAdmittance(schedule, **{name: value})
+    with pytest.raises(ValueError, match=f"^{name} is .*, must be .*\\.$"):
+        CppAdmittance(tmp_path / "schedule.csv", 1, **{name: value})
+
+
+@pytest.mark.parametrize(
+    ("start", "name"),
+    [
+        ({"now": float("nan")}, "now"),
+        ({"now": 1e18}, "now"),
+        ({"position": [float("inf")]}, "position"),
+        ({"velocity": [3.0]}, "the speed"),
+        ({"force_bias": [float("nan")]}, "force_bias"),
+        ({"at": 1e306}, "at"),
+        ({"at": -0.1}, "at"),
+    ],
+)
+def test_a_start_that_python_refuses_is_refused(start, name, tmp_path):
+    both = Both(constant(100.0, 10.0), tmp_path, velocity_limit=2.0)
+    for controller in (both.python, both.cpp):
+        with pytest.raises(ValueError, match=f"^{name}"):
+            controller.start(**{"now": 0.0, **start})
+
+
+def test_another_mass_than_that_of_the_damping_is_refused(tmp_path):
+    as_schedule([0.0, 1.0], [[[100.0]]] * 2, [[[20.0]]] * 2, mass=2.0).save(tmp_path / "schedule.csv")
+    with pytest.raises(ValueError, match="mass is 1, must be that of the schedule's damping"):
+        CppAdmittance(tmp_path / "schedule.csv", 1, mass=1.0)
+    CppAdmittance(tmp_path / "schedule.csv", 1, mass=2.0)
+
+
+@pytest.mark.slow
+def test_the_example_serves_a_loop_and_allocates_nothing(tmp_path):
+    make_schedule(2, duration=1.0).save(tmp_path / "schedule.csv")
+    program = compiled(ROOT / "cpp" / "examples" / "loop.cpp", "-O2")
+    ran = subprocess.run([program, tmp_path / "schedule.csv"], capture_output=True, text=True, check=True)
+    assert re.match(r"1001 rows read in [\d.]+ ms\n3000 ticks of 2 axes: median [\d.]+ us", ran.stdout)
+    assert ran.stdout.endswith("0 allocations; faults 0\n")
+    failed = subprocess.run([program, tmp_path / "missing.csv"], capture_output=True, text=True, check=False)
+    assert failed.returncode == 1
+    assert "missing.csv cannot be opened" in failed.stderr
