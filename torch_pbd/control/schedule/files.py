@@ -208,7 +208,9 @@ def _read_table(names: Any, lines: Iterator[str], n_lines_before: int) -> Arrays
     n_columns = sum((1, size, size * (size + 1) // 2)[len(SHAPES[name]) - 1] for name, size in sizes.items())
     line = n_lines_before + 1
     if len(titles) != n_columns:
-        raise ValueError(f"line {line} names {len(titles)} columns, of which {d} are velocities, must name {n_columns}.")
+        raise ValueError(
+            f"line {line} names {len(titles)} columns, of which {d} are velocities, must name {n_columns}."
+        )
     columns = _columns(names, sizes)
     # Files once had titles with commas, stiffness[x,y], which must be quoted.
     if not any(titles == [title for title, *_ in _columns(names, sizes, between)] for between in ("][", ",")):
