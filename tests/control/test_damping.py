@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.stats
 import torch
 
 from torch_pbd.control.damping import damping_from_stiffness, required_damping_ratio
@@ -48,6 +49,33 @@ def test_every_mode_of_an_uneven_mass_has_the_damping_ratio(d, ratio, generator)
     order = [abs(roots - each).argmin() for each in expected]
     assert sorted(order) == list(range(2 * d))
     np.testing.assert_allclose(roots[order], expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("ratio", [0.3, 0.7, 1.0, 1.6])
+def test_every_mode_of_an_arm_has_the_damping_ratio_along_its_way(ratio, rng):
+    """Poses in N/m and Nm/rad, an inertia for each row: 6-19 kg and 0.1-0.9 kg m2, coupled; to 1e-9.
+
+    ``x' D x / (2 sqrt(x' M x x' K x))`` of the modes ``K x = w^2 M x``, and no coupling between them.
+    """
+    scale = np.repeat([[6.0, 19.0], [0.1, 0.9]], 3, axis=0)
+    axes = scipy.stats.special_ortho_group.rvs(6, size=40, random_state=0)
+    shared = axes * rng.uniform(0.4, 1.0, size=(40, 1, 6)) @ axes.swapaxes(1, 2)
+    sizes = np.sqrt(np.exp(rng.uniform(*np.log(scale.T), size=(40, 6))))
+    mass = sizes[:, :, None] * shared * sizes[:, None]
+    stiffness = np.zeros((40, 6, 6))
+    turned = scipy.stats.special_ortho_group.rvs(3, size=80, random_state=1)
+    for block, (low, high), turn in (
+        (slice(0, 3), (10.0, 3000.0), turned[:40]),
+        (slice(3, 6), (1.0, 300.0), turned[40:]),
+    ):
+        values = np.exp(rng.uniform(*np.log([low, high]), size=(40, 1, 3)))
+        stiffness[:, block, block] = turn * values @ turn.swapaxes(1, 2)
+    mass, stiffness = (0.5 * (matrix + matrix.swapaxes(1, 2)) for matrix in (mass, stiffness))
+    damping = damping_from_stiffness(stiffness, mass, ratio).numpy()
+    for each, inertia, spring in zip(damping, mass, stiffness, strict=True):
+        squared, modes = scipy.linalg.eigh(spring, inertia)  # x' M x = 1
+        modal = modes.T @ each @ modes / (2.0 * np.sqrt(np.sqrt(np.outer(squared, squared))))
+        np.testing.assert_allclose(modal, ratio * np.eye(6), rtol=0, atol=1e-9)
 
 
 def test_the_papers_damping_is_the_root_of_the_stiffness_whatever_the_mass(generator):
