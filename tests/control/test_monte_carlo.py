@@ -9,6 +9,7 @@ import torch
 
 import torch_pbd.control.simulation.rollouts
 import torch_pbd.files.memory
+from torch_pbd import rotations
 from torch_pbd.control import (
     AdmittancePlant,
     EnergyTank,
@@ -253,3 +254,92 @@ def test_too_many_rollouts_are_refused_before_they_are_drawn(monkeypatch):
         ValueError, match=r"n_rollouts=100000 needs about 0\.\d+ GiB of memory, but 0\.000781 GiB can be"
     ):
         simulate_many(turning_schedule(), 100_000)
+
+
+def pose_schedule(n_ticks=121):
+    """The curve in space, of a tool that turns by 2 rad/s, with an inertia that doubles on the way."""
+    plain = turning_schedule(n_ticks, d=3)
+    time, d = plain.time, 6
+    turning = np.stack([0.0 * time, 1.2 * time, 1.6 * time], axis=1)
+    rows = [np.zeros((n_ticks, d, d)) for _ in range(3)]
+    for row, block in zip(rows, (plain.stiffness, plain.damping, plain.covariance), strict=True):
+        row[:, :3, :3], row[:, 3:, 3:] = block, 0.02 * block
+    mass = np.linspace(1.0, 2.0, n_ticks)[:, None, None] * (np.diag([1.0] * 3 + [0.02] * 3) + 0.004)
+    velocity = np.c_[plain.velocity, np.tile([0.0, 1.2, 1.6], (n_ticks, 1))]
+    return Schedule(
+        time,
+        plain.position,
+        velocity,
+        *rows,
+        plain.type1,
+        acceleration=np.c_[-4.0 * plain.position, np.zeros((n_ticks, 3))],
+        orientation=rotations.exp(turning),
+        mass=mass,
+    )
+
+
+@pytest.mark.parametrize("feed_forward", [False, True])
+def test_of_poses_it_is_each_rollout_by_itself_in_its_units(feed_forward):
+    """Force and torque at once; distances in m and angles in rad apart; the inertia is the schedule's."""
+    schedule = pose_schedule()
+    plant = AdmittancePlant(None, feed_forward=feed_forward)
+    options = {"peak": (2.0, 9.0), "torque": (0.1, 0.4), "duration": (0.1, 0.3), "quantiles": (0.3, 1.0)}
+    summary = simulate_many(schedule, 9, plant=plant, **options, random_state=0)
+    wrench = np.c_[summary.push, summary.rotation.push]
+    share = (schedule.time - summary.onset[:, None]) / summary.duration[:, None]
+    forces = np.sin(np.pi * share.clip(0.0, 1.0))[..., None] ** 2 * wrench[:, None]
+    given = {name: getattr(schedule, name) for name in ("stiffness", "damping")}
+    given |= {f"{name}_desired": getattr(schedule, name) for name in ("position", "velocity", "orientation")}
+    given["acceleration_desired"] = schedule.acceleration
+    robot = AdmittancePlant(schedule.mass, feed_forward=feed_forward)
+    runs = np.stack([robot.simulate(**given, force=force, dt=1.0 / RATE).deviation.numpy() for force in forces])
+    for part, block in ((summary, slice(0, 3)), (summary.rotation, slice(3, 6))):
+        distance = np.linalg.norm(runs[..., block], axis=-1)
+        check_against(distance, schedule, part, rtol=1e-11)
+        limit = 0.1 * distance.max(axis=1, keepdims=True)
+        assert (np.isinf(part.return_time) == (distance[:, -1:] > limit)[:, 0]).all()
+    strength = np.linalg.norm(summary.rotation.push, axis=1)
+    assert ((strength >= 0.1) & (strength <= 0.4)).all()
+    assert re.search(r"mm at 5/50/95 %, \d+% return; .* degrees at 5/50/95 %", repr(summary))
+    (alone,) = [simulate_many(schedule, 9, plant=robot, **options, random_state=0)]
+    np.testing.assert_array_equal(alone.deviation, summary.deviation)
+
+
+def test_poses_start_and_return_by_blocks():
+    options = {"peak": 0.0, "duration": 0.1, "reference": "undisturbed", "quantiles": (0.5,), "random_state": 0}
+    spread = simulate_many(pose_schedule(), 3000, start_scale=(0.01, 0.1), **options)
+    for part, scale in ((spread, 0.01), (spread.rotation, 0.1)):  # in 3-D the median is 1.538 standard deviations
+        assert part.deviation[0, 0] == pytest.approx(1.538 * scale, rel=0.05)
+    sooner = simulate_many(pose_schedule(), 30, torque=0.2, threshold=(1e-3, 1.0), duration=0.2, random_state=0)
+    assert (sooner.rotation.return_time == 0.0).all()
+    assert (sooner.return_time > 0.0).any()
+    noisy = AdmittancePlant(None, sensor=ForceSensor(noise_scale=(0.5,) * 3 + (0.01,) * 3))
+    pushed = simulate_many(pose_schedule(21), 3, plant=noisy, duration=0.05, reference="undisturbed", random_state=0)
+    assert (pushed.rotation.peak_deviation > 0.0).all()
+
+
+def test_a_schedules_inertia_is_compared_with_that_of_the_plant():
+    schedule = pose_schedule(31)
+    for mass in (None, schedule.mass, lambda time: schedule.mass):
+        simulate_many(schedule, 2, plant=AdmittancePlant(mass), duration=0.1, random_state=0)  # warnings are errors
+    with pytest.warns(UserWarning, match="mass is of shape .* was met for that of the schedule, off by up to 10%"):
+        simulate_many(schedule, 2, plant=AdmittancePlant(1.1 * schedule.mass), duration=0.1)
+    with pytest.warns(UserWarning, match="mass is a function, but"):
+        simulate_many(schedule, 2, plant=AdmittancePlant(lambda time: 2.0), duration=0.1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"torque": -1.0}, "torque is -1.0 Nm, must be a finite number of at least 0"),
+        ({"start_scale": 0.1}, "start_scale is 0.1, must be (float, float), in m and rad, for poses, or 0.0"),
+        ({"threshold": 0.1}, "threshold is 0.1, must be (float, float), in m and rad, for poses, or None"),
+        ({"threshold": (0.1, 0.0)}, "threshold is 0.0 rad, must be a finite number above 0"),
+        ({"plant": AdmittancePlant(None, stiffness_filter=RateLimit())}, "but the mass varies, (31, 6, 6)"),
+    ],
+)
+def test_arguments_for_poses_are_checked(arguments, words):
+    with pytest.raises(ValueError, match=re.escape(words)):
+        simulate_many(pose_schedule(31), **{"n_rollouts": 5, "duration": 0.1, "random_state": 0, **arguments})
+    with pytest.raises(ValueError, match=re.escape("torque is 0.5 Nm, must be 0 for a schedule without orientation")):
+        simulate_many(turning_schedule(), 5, torque=0.5)

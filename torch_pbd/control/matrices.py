@@ -72,6 +72,23 @@ def mass_matrix(mass: float | Tensor, like: Tensor) -> Tensor:
     return matrix
 
 
+def mass_rows(mass: float | Tensor, like: Tensor) -> Tensor:
+    """Inertia as a matrix (d, d), or as one for each tick, that broadcast with gains (..., T, d, d)."""
+    if not isinstance(mass, Tensor) or mass.ndim < 3:
+        return mass_matrix(mass, like)
+    rows = mass.to(like)
+    sizes = zip(reversed(rows.shape), reversed(like.shape), strict=False)
+    if rows.shape[-3:] != like.shape[-3:] or not all(1 in pair or pair[0] == pair[1] for pair in sizes):
+        one, each = tuple(like.shape[-2:]), ", ".join(map(str, like.shape[-3:]))
+        raise InvalidParameterError(
+            f"mass has shape {tuple(rows.shape)}, must be a number or have shape {one} or (..., {each}), one for each "
+            "tick: a function of time fits ticks of any rate."
+        )
+    # Rows that are all the same are one mass; those that want gradients get them row by row.
+    is_one = rows.ndim == 3 and not rows.requires_grad and bool((rows == rows[0]).all())
+    return rows[0] if is_one else rows
+
+
 def as_semidefinite(value: Any, name: str) -> tuple[Tensor, tuple[Tensor, Tensor]]:
     """Positive semidefinite matrices (..., d, d), and the eigenvalues (..., d) and axes that show that they are.
 

@@ -3,6 +3,9 @@
 Both stand between the stiffness that is asked for and the one in effect, at every tick, and take the largest
 share of the step that their invariant allows. Damping steps by the same share. State and gains are those of
 ``M a = u - K y - D v`` held over a tick, y the deviation from the desired position.
+
+Both are of one mass M. One that varies, such as the inertia of an arm along its path, changes the kinetic energy by
+``1/2 v' dM v`` from tick to tick, which no stiffness that is held back takes out again: neither invariant would hold.
 """
 
 from dataclasses import dataclass
@@ -31,6 +34,7 @@ class RateLimit(StiffnessFilter):
     the conditions of K. Kronander and A. Billard, "Stability considerations for variable impedance control",
     IEEE Transactions on Robotics 32, 2016. It needs no measurement. The admittance is passive with respect to
     ``v + a y`` and a force that is held over each tick; behind a position loop that lags, a robot need not be.
+    The proof is of one mass, and of a desired orientation that stands still: others are refused.
 
     Parameters
     ----------
@@ -44,8 +48,16 @@ class RateLimit(StiffnessFilter):
     def __post_init__(self) -> None:
         checks.number(self.alpha, "alpha", above=0.0, unit="1/s", optional=True)
 
-    def start(self, stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> "_RateLimited":
+    def start(
+        self, stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float, *, is_turning: bool = False
+    ) -> "_RateLimited":
         """Begin a run over the wanted gains (..., T, d, d), which must allow alpha and be positive definite."""
+        _check_mass(mass, self)
+        if is_turning:
+            raise InvalidParameterError(
+                "stiffness_filter is a RateLimit, but the desired orientation turns, and the deviation with it: its "
+                "proof does not hold there. Take EnergyTank(), or filter positions alone."
+            )
         inverse = torch.linalg.inv(torch.linalg.cholesky(mass))
         limit = float(torch.linalg.eigvalsh(symmetrize(inverse @ damping @ inverse.mT)).min())
         alpha = 0.5 * limit if self.alpha is None else self.alpha
@@ -120,7 +132,9 @@ class EnergyTank(StiffnessFilter):
     tank has less, only that share of the rise is made; the stiffness may always fall. With the energy H of
     spring and mass, T of the tank and the work W of external force and desired motion,
     ``H + T - W <= H_0 + T_0`` at every tick, to rounding. What a falling stiffness takes out of the spring goes into
-    the tank whole. As for :class:`RateLimit`, this is of the admittance, not of a robot that lags behind it. After
+    the tank whole. Where a desired orientation turns, what that does to the energy of the spring is work of the desired
+    motion too. As for :class:`RateLimit`, this is of the admittance, not of a robot that lags behind it, and of one
+    mass: one that varies is refused. After
     F. Ferraguti, C. Secchi, C. Fantuzzi, "A tank-based approach to impedance control with variable stiffness",
     ICRA 2013, made exact for gains that switch at ticks.
 
@@ -144,8 +158,11 @@ class EnergyTank(StiffnessFilter):
         checks.number(self.energy, "energy", least=0.0, most=self.energy_max, unit="J")
         checks.number(self.efficiency, "efficiency", least=0.0, below=1.0)
 
-    def start(self, stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> "_Tank":
+    def start(
+        self, stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float, *, is_turning: bool = False
+    ) -> "_Tank":
         """Begin a run over the wanted gains (..., T, d, d)."""
+        _check_mass(mass, self)
         return _Tank(self, mass)
 
 
@@ -182,6 +199,14 @@ class _Tank(ActiveFilter):
     def _energy(self, deviation: Tensor, velocity: Tensor) -> Tensor:
         assert self._gains is not None
         return 0.5 * (_quadratic(self._gains.stiffness, deviation) + _quadratic(self._mass, velocity))
+
+
+def _check_mass(mass: Tensor, wanted: StiffnessFilter) -> None:
+    if mass.ndim > 2:
+        raise InvalidParameterError(
+            f"stiffness_filter is {wanted}, but the mass varies, {tuple(mass.shape)}: the energy that this brings is "
+            "not the filter's to hold back. Give one mass, or no filter, and certify the schedule."
+        )
 
 
 def _partway(last: Gains, stiffness: Tensor, damping: Tensor, share: Tensor) -> Gains:

@@ -1,17 +1,20 @@
 """The simulated robot under admittance control: eq. (15) with a mass, tick by tick."""
 
+from collections.abc import Callable
 from typing import Any, Literal, final
 
 import torch
 from torch import Tensor
 
 from torch_pbd import checks
-from torch_pbd.control.matrices import as_mass, as_tensor, mass_matrix
+from torch_pbd.checks import Floats
+from torch_pbd.control.matrices import as_mass, as_tensor, mass_rows
+from torch_pbd.control.simulation.given import check_given
+from torch_pbd.control.simulation.poses import exp, multiply, rotation_between, turning
 from torch_pbd.control.simulation.position_loop import PositionLoop
 from torch_pbd.control.simulation.rollout import Rollout
 from torch_pbd.control.simulation.sensor import ForceSensor
 from torch_pbd.control.simulation.ticks import Environment, StiffnessFilter, Task, closed_loop, open_loop
-from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.files.memory import require_memory
 
 _PARTS = ("sensor", "position_loop", "environment", "stiffness_filter")
@@ -22,12 +25,16 @@ class AdmittancePlant:
     """A mass on a spring and a damper that a desired motion drags along, in d axes, batched over rollouts.
 
     ``M a = f + K (x_d - x) + D (v_d - v)``, eq. (15) as admittance. All inputs are held over a tick (zero-order hold),
-    in which the desired position stands still; states are those at the start of ticks.
+    in which the desired position stands still; states are those at the start of ticks. Of poses, ``x - x_d`` is
+    ``(p - p_d, Log(R R_d'))`` in world axes, v the twist. That is linear in the rotation away from the desired
+    orientation, so for small ones, while the desired orientation itself may turn as it likes.
 
     Parameters
     ----------
-    mass : float or Tensor of shape (d, d), default=1.0
-        Virtual mass in kg; a matrix must be symmetric and positive definite.
+    mass : float, Tensor of shape (d, d) or (..., T, d, d), callable or None, default=1.0
+        Virtual mass in kg, or inertia of the robot, for poses in kg, kg m and kg m^2, at all ticks or at each: it
+        does not change the velocity when it changes. Matrices must be symmetric and positive definite. A function
+        maps times (T,) in s to such matrices. None is the mass of the schedule, or 1 kg where there is none.
     integrator : {"exact"}, default="exact"
         It solves the tick, whatever its length.
     feed_forward : bool, default=False
@@ -58,7 +65,7 @@ class AdmittancePlant:
 
     def __init__(
         self,
-        mass: float | Tensor | Any = 1.0,
+        mass: float | Tensor | Callable[[Floats], Any] | Any | None = 1.0,
         integrator: Literal["exact"] = "exact",
         *,
         feed_forward: bool = False,
@@ -68,7 +75,7 @@ class AdmittancePlant:
         substeps: int = 1,
         stiffness_filter: StiffnessFilter | None = None,
     ) -> None:
-        self.mass = as_mass(mass)
+        self.mass = mass if mass is None or callable(mass) else as_mass(mass)
         self.integrator = checks.choice(integrator, "integrator", ("exact",))
         self.feed_forward = checks.flag(feed_forward, "feed_forward")
         self.sensor = checks.instance(sensor, "sensor", ForceSensor, optional=True)
@@ -81,9 +88,13 @@ class AdmittancePlant:
             checks.count(substeps, "substeps", most=1, remedy=remedy)
 
     def __repr__(self) -> str:
-        mass = tuple(self.mass.shape) if isinstance(self.mass, Tensor) and self.mass.ndim else float(self.mass)
+        mass: Any = self.mass
+        is_matrix = isinstance(mass, Tensor) and mass.ndim
+        shown = (
+            f"{tuple(mass.shape)} kg" if is_matrix else mass if mass is None or callable(mass) else f"{float(mass)} kg"
+        )
         acting = [f"{name}={part}" for name in _PARTS if (part := getattr(self, name)) is not None]
-        return f"AdmittancePlant({', '.join([f'mass={mass} kg', *acting])})"
+        return f"AdmittancePlant({', '.join([f'mass={shown}', *acting])})"
 
     def simulate(
         self,
@@ -97,24 +108,33 @@ class AdmittancePlant:
         position0: Tensor | Any = None,
         velocity0: Tensor | Any = None,
         acceleration_desired: Tensor | Any = None,
+        orientation_desired: Tensor | Any = None,
+        orientation0: Tensor | Any = None,
         generator: torch.Generator | Any = None,
     ) -> Rollout:
         """Run T ticks of ``dt`` seconds.
 
+        Of positions, d = p; or with ``orientation_desired`` of poses, d = p + 3: the last three of all axes are then
+        of rotation, in world axes, in rad/s, rad/s^2, Nm, Nm/rad and Nm s/rad.
+
         Parameters
         ----------
-        position_desired, velocity_desired : Tensor of shape (..., T, d)
-            In m and m/s.
+        position_desired : Tensor of shape (..., T, p)
+            In m.
+        velocity_desired : Tensor of shape (..., T, d)
+            In m/s.
         stiffness, damping : Tensor of shape (..., T, d, d)
             In N/m and N s/m, symmetric and positive semidefinite; they need not commute.
         force : Tensor of shape (..., T, d), default=None
             External force in N; None is none. Leading dimensions are those of the batch, and broadcast.
         dt : float
             In s.
-        position0, velocity0 : Tensor of shape (..., d), default=None
+        position0, velocity0, orientation0 : Tensor of shape (..., p), (..., d) and (..., 4), default=None
             State at the start; None is the desired one.
         acceleration_desired : Tensor of shape (..., T, d), default=None
             In m/s^2, for ``feed_forward``; None takes the differences of ``velocity_desired``.
+        orientation_desired : Tensor of shape (..., T, 4), default=None
+            Unit quaternions w x y z, for poses.
         generator : torch.Generator, default=None
             For the noise of the sensor.
 
@@ -133,13 +153,22 @@ class AdmittancePlant:
         checks.instance(generator, "generator", torch.Generator, optional=True)
         required = {"position_desired": position_desired, "velocity_desired": velocity_desired}
         gains = {"stiffness": stiffness, "damping": damping}
-        optional = {"acceleration_desired": acceleration_desired, "force": force}
-        optional |= {"position0": position0, "velocity0": velocity0}
+        optional = {"acceleration_desired": acceleration_desired, "orientation_desired": orientation_desired}
+        optional |= {"force": force, "position0": position0, "velocity0": velocity0, "orientation0": orientation0}
         given = required | gains | {name: value for name, value in optional.items() if value is not None}
         tensors = {name: as_tensor(value, name) for name, value in given.items()}
-        _check_given(tensors)
-        acting = {name: tensors.pop(name, None) for name in ("force", "position0", "velocity0")}
-        return run_task(self.task(**tensors, dt=dt), **acting, generator=generator)
+        check_given(tensors)
+        acting = {name: tensors.pop(name, None) for name in ("force", "position0", "velocity0", "orientation0")}
+        times = dt * torch.arange(tensors["stiffness"].shape[-3]).double()
+        mass = self.inertia(tensors["stiffness"], times.numpy())
+        return run_task(self.task(**tensors, mass=mass, dt=dt), **acting, generator=generator)
+
+    def inertia(self, like: Tensor, times: Any, own: Any = None) -> Tensor:
+        """Mass (d, d) or (..., T, d, d) at times (T,) in s, for gains (..., T, d, d); None is a schedule's own."""
+        mass = self.mass(times) if callable(self.mass) else self.mass
+        if mass is None:
+            mass = 1.0 if own is None else own
+        return mass_rows(as_mass(mass), like)
 
     def task(
         self,
@@ -148,21 +177,28 @@ class AdmittancePlant:
         stiffness: Tensor,
         damping: Tensor,
         *,
+        mass: Tensor,
         dt: float,
         acceleration_desired: Tensor | None = None,
+        orientation_desired: Tensor | None = None,
     ) -> Task:
         """Task of arguments of :meth:`simulate` that were checked, as this plant is to follow it."""
-        stiffness, damping = torch.broadcast_tensors(stiffness, damping)
-        mass = mass_matrix(self.mass, stiffness)
-        inertial = torch.zeros_like(position_desired)
+        if mass.ndim > 2:
+            stiffness, damping, mass = torch.broadcast_tensors(stiffness, damping, mass)
+        else:
+            stiffness, damping = torch.broadcast_tensors(stiffness, damping)
+        inertial = torch.zeros_like(velocity_desired)
         if self.feed_forward:
             if acceleration_desired is None:  # that which takes the velocity of each tick to that of the next
                 difference = velocity_desired.diff(dim=-2) / dt
                 still = torch.zeros_like(velocity_desired[..., :1, :])
                 acceleration_desired = torch.cat([difference, still], dim=-2)
-            inertial = acceleration_desired @ mass.mT
+            along = acceleration_desired
+            inertial = along @ mass.mT if mass.ndim == 2 else (mass @ along.unsqueeze(-1)).squeeze(-1)
+        turns = None if orientation_desired is None else turning(orientation_desired)
+        pose = position_desired if turns is None else torch.nn.functional.pad(position_desired, (0, 3))
         acting = {name: getattr(self, name) for name in ("substeps", *_PARTS)}
-        return Task(position_desired, velocity_desired, inertial, stiffness, damping, mass, dt, **acting)
+        return Task(pose, velocity_desired, inertial, stiffness, damping, mass, dt, **acting, turning=turns)
 
 
 def run_task(
@@ -170,14 +206,15 @@ def run_task(
     force: Tensor | None = None,
     position0: Tensor | None = None,
     velocity0: Tensor | None = None,
+    orientation0: Tensor | None = None,
     *,
     generator: torch.Generator | None = None,
 ) -> Rollout:
     """Run of a task under a force (..., T, d) and from a start (..., d) that were checked."""
-    force = torch.zeros_like(task.position) if force is None else force
-    start = task.position[..., 0, :] if position0 is None else position0
-    speed = task.velocity[..., 0, :] if velocity0 is None else velocity0
-    parts = (task.position, task.velocity, task.inertial_force, force, task.stiffness[..., 0])
+    force = torch.zeros_like(task.velocity) if force is None else force
+    start, speed = _start(task, position0, orientation0), task.velocity[..., 0, :] if velocity0 is None else velocity0
+    parts = [task.position, task.velocity, task.inertial_force, force, task.stiffness[..., 0]]
+    parts += [] if task.turning is None else [task.turning.turns]
     batch = torch.broadcast_shapes(*(value.shape[:-2] for value in parts), start.shape[:-1], speed.shape[:-1])
     _check_memory(batch, task)
     state = start.expand(*batch, -1), speed.expand(*batch, -1)
@@ -191,43 +228,47 @@ def run_task(
         record[name] = record[name].expand(*batch, *record[name].shape[-3:])
     _check_finished(record["position"], record["velocity"])
     time = torch.arange(task.n_ticks, dtype=force.dtype, device=force.device) * task.dt
-    return Rollout(time, desired_position=task.position, **record)
+    return Rollout(time, **_poses(task, record))
+
+
+def _start(task: Task, position0: Tensor | None, orientation0: Tensor | None) -> Tensor:
+    """Pose at the start, as :class:`Task` has them."""
+    start = task.position[..., 0, :] if position0 is None else position0
+    if task.turning is None:
+        return start
+    desired = task.turning.orientation[..., 0, :]
+    rotation = torch.zeros_like(desired[..., 1:]) if orientation0 is None else rotation_between(desired, orientation0)
+    position = start[..., : task.n_positions]
+    batch = torch.broadcast_shapes(position.shape[:-1], rotation.shape[:-1])
+    return torch.cat([position.expand(*batch, -1), rotation.expand(*batch, -1)], dim=-1)
+
+
+def _poses(task: Task, record: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Fields of a Rollout, whose poses are positions and orientations."""
+    record |= {"desired_position": task.position, "deviation": record["position"] - task.position}
+    if task.turning is None:
+        return record
+    desired, p = task.turning.orientation, task.n_positions
+    rotation, commanded = (record[name][..., p:] for name in ("position", "commanded_position"))
+    record |= {name: record[name][..., :p] for name in ("position", "commanded_position")}
+    record |= {"desired_position": task.position[..., :p], "desired_orientation": desired}
+    turned = {
+        "orientation": multiply(exp(rotation), desired),
+        "commanded_orientation": multiply(exp(commanded), desired),
+    }
+    return record | turned
 
 
 def _check_memory(batch: torch.Size, task: Task) -> None:
-    # Measured: five motions are held, and where rollouts differ in their gains, twelve matrices.
+    # Measured: six motions are held, and where rollouts differ in their gains, twelve matrices.
     d = task.position.shape[-1]
-    of_each = 5 * d + (12 * d * d if task.stiffness.ndim > 3 or task.stiffness_filter is not None else 0)
+    of_each = 6 * d + (12 * d * d if task.stiffness.ndim > 3 or task.stiffness_filter is not None else 0)
     if task.position.device.type == "cpu":  # elsewhere torch raises by itself
         require_memory(
             of_each * batch.numel() * task.n_ticks * task.position.element_size(),
             what=f"a simulation of {batch.numel()} rollouts of {task.n_ticks} ticks",
             remedy="Simulate fewer at a time, or take simulate_many, which keeps no trajectories.",
         )
-
-
-def _check_given(given: dict[str, Tensor]) -> None:
-    """Check the tensors that :meth:`AdmittancePlant.simulate` was given; T and d are those of the desired position."""
-    kinds = sorted({f"{value.dtype} on {value.device}" for value in given.values()})
-    if len(kinds) > 1:
-        raise InvalidParameterError(
-            f"the inputs are of {', '.join(kinds)}, must be of one dtype and device: convert them."
-        )
-    shape = given["position_desired"].shape
-    for name, value in given.items():
-        is_gain = name in ("stiffness", "damping")
-        sizes = shape[-1:] if name.endswith("0") else (*shape[-2:], *shape[-1:]) if is_gain else shape[-2:]
-        if len(shape) < 2 or not value.numel() or value.shape[-len(sizes) :] != sizes:
-            letters = "d" if name.endswith("0") else "T, d, d" if is_gain else "T, d"
-            raise InvalidParameterError(
-                f"{name} has shape {tuple(value.shape)}, must have shape (..., {letters}), none of it empty, with T "
-                f"and d those of position_desired, {tuple(shape)}."
-            )
-        plain = value.detach().cpu()
-        if is_gain:
-            checks.semidefinite(plain.numpy(), name)
-        else:
-            checks.require(torch.isfinite(plain).numpy(), plain.numpy(), name, "finite")
 
 
 def _check_finished(position: Tensor, velocity: Tensor) -> None:

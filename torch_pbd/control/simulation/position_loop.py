@@ -1,6 +1,7 @@
 """The robot's inner position loop, by which it follows a commanded position late."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import final
 
@@ -59,6 +60,10 @@ class _Following:
     def __init__(self, transition: Tensor, position: Tensor, velocity: Tensor, waiting: list[Tensor]) -> None:
         self.position, self.velocity = position, velocity
         self._transition, self._waiting = transition, list(waiting)
+
+    def carry(self, change: Callable[[Tensor], Tensor]) -> None:
+        """Count position and waiting commands from another origin."""
+        self.position, self._waiting = change(self.position), [change(each) for each in self._waiting]
 
     def __call__(self, command: Tensor) -> None:
         self._waiting.append(command)

@@ -12,17 +12,23 @@ from torch import Tensor
 class Rollout:
     """States at the start of each tick of a simulated run, tensors or, by ``numpy()``, arrays.
 
+    Of positions alone p = d. Of poses p = d - 3, and the last three of velocity, force and gains are of rotation, in
+    world axes: rad/s, Nm, Nm/rad and Nm s/rad.
+
     Attributes
     ----------
     time : (T,), s
-    position, velocity : (..., T, d)
-        Of the robot, in m and m/s.
+    position : (..., T, p), m
+        Of the robot.
+    velocity : (..., T, d), m/s
     force : (..., T, d), N
         External force on the robot, that of walls included.
     stiffness, damping : (..., T, d, d), N/m and N s/m
         In effect during the tick, behind the filter.
-    desired_position : (..., T, d), m
-    commanded_position : (..., T, d), m
+    desired_position : (..., T, p), m
+    deviation : (..., T, d), m
+        Position less desired position; and the rotation vector e from the desired orientation, ``R = exp([e]) R_d``.
+    commanded_position : (..., T, p), m
         By the admittance, of the robot's position loop; without such a loop, ``position``.
     filter_share : (..., T) or None
         Share of the step in stiffness that a filter let through, 1 where it did not intervene.
@@ -30,6 +36,8 @@ class Rollout:
         Energy in the tank during the tick, J.
     saturated : (..., T) of bool or None
         Whether the force sensor was out of its range.
+    orientation, desired_orientation, commanded_orientation : (..., T, 4) or None
+        Of poses, as unit quaternions w x y z.
     """
 
     time: Any
@@ -39,17 +47,23 @@ class Rollout:
     stiffness: Any
     damping: Any
     desired_position: Any
+    deviation: Any
     commanded_position: Any
     filter_share: Any = None
     tank_energy: Any = None
     saturated: Any = None
+    orientation: Any = None
+    desired_orientation: Any = None
+    commanded_orientation: Any = None
 
     def __repr__(self) -> str:
-        *batch, n_ticks, d = self.position.shape
+        *batch, n_ticks, d = self.velocity.shape
+        p = self.position.shape[-1]
+        turned = "" if d == p else f" and {float(abs(self.deviation[..., p:]).max()):.3g} rad"
         return (
             f"Rollout({f'batch={tuple(batch)}, ' if batch else ''}n_ticks={n_ticks}, n_outputs={d}, "
             f"time={float(self.time[0]):.6g}..{float(self.time[-1]):.6g} s, "
-            f"deviation up to {float(abs(self.deviation).max()):.3g} m)"
+            f"deviation up to {float(abs(self.deviation[..., :p]).max()):.3g} m{turned})"
         )
 
     def numpy(self) -> "Rollout":
@@ -58,7 +72,7 @@ class Rollout:
         return Rollout(**{k: v.detach().cpu().numpy() if isinstance(v, Tensor) else v for k, v in values.items()})
 
     def plot(self, *, unpushed: "Rollout | None" = None, names: Sequence[str] | None = None) -> Any:
-        """Draw deviation, external force and stiffness over time, below each other in a new figure.
+        """Draw deviation, external force and stiffness over time, below each other in a new figure; rotations beside.
 
         Parameters
         ----------
@@ -69,7 +83,7 @@ class Rollout:
 
         Returns
         -------
-        list of three matplotlib Axes
+        list of three matplotlib Axes, or of six of poses: three of positions, three of rotations
 
         Raises
         ------
@@ -79,11 +93,6 @@ class Rollout:
         from torch_pbd.plotting import plot_pushes  # here: it needs matplotlib, a run does not
 
         return plot_pushes(self, unpushed, names)
-
-    @property
-    def deviation(self) -> Any:
-        """Position less desired position, (..., T, d)."""
-        return self.position - self.desired_position
 
     @property
     def interventions(self) -> Any:

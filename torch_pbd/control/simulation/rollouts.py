@@ -2,7 +2,7 @@
 
 import math
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import final
 
@@ -24,6 +24,8 @@ _CHUNK = 4096
 class RolloutSummary:
     """Effect of R random pushes on a robot; NumPy arrays.
 
+    Of poses, these are of the positions; ``rotation`` is the same of the rotation vectors, with rad for m and Nm for N.
+
     Attributes
     ----------
     time : (n,), s
@@ -38,8 +40,9 @@ class RolloutSummary:
     final_deviation : (R,), m
     onset, duration : (R,), s
         Of the push.
-    push : (R, d), N
+    push : (R, p), N
         Force at its peak.
+    rotation : RolloutSummary or None
     """
 
     time: Floats
@@ -52,6 +55,7 @@ class RolloutSummary:
     onset: Floats
     duration: Floats
     push: Floats
+    rotation: "RolloutSummary | None" = None
 
     @property
     def n_rollouts(self) -> int:
@@ -59,12 +63,13 @@ class RolloutSummary:
         return len(self.onset)
 
     def __repr__(self) -> str:
-        low, middle, high = np.quantile(self.peak_deviation, (0.05, 0.5, 0.95))
-        returned = np.isfinite(self.return_time)
-        return (
-            f"RolloutSummary(n_rollouts={self.n_rollouts}, peak deviation "
-            f"{1e3 * low:.3g}/{1e3 * middle:.3g}/{1e3 * high:.3g} mm at 5/50/95 %, {returned.mean():.0%} return)"
-        )
+        parts = [(self, 1e3, "mm")] + ([] if self.rotation is None else [(self.rotation, 180.0 / math.pi, "degrees")])
+        shown = [
+            f"{'/'.join(f'{scale * peak:.3g}' for peak in np.quantile(part.peak_deviation, (0.05, 0.5, 0.95)))} {unit} "
+            f"at 5/50/95 %, {np.isfinite(part.return_time).mean():.0%} return"
+            for part, scale, unit in parts
+        ]
+        return f"RolloutSummary(n_rollouts={self.n_rollouts}, peak deviation {'; '.join(shown)})"
 
 
 @final
@@ -76,7 +81,7 @@ class Pushes:
     ----------
     onset, duration : Tensor of shape (R,), s
         From the first tick on; onsets do not decrease, so that the rollouts pushed in a block are neighbours.
-    peak : Tensor of shape (d, R), N
+    peak : Tensor of shape (d, R), N and Nm
     """
 
     onset: Tensor
@@ -192,13 +197,16 @@ class _Looped:
 
 
 class Tally:
-    """Squared peak of each of R rollouts, its tick, and the last above ``threshold`` m or ``share`` of the peak."""
+    """Squared peak of each of R rollouts in some axes, its tick, and the last above a threshold.
 
-    def __init__(self, n_rollouts: int, like: Tensor, *, threshold: float | None, share: float) -> None:
+    It is in m or rad, as the axes, or a ``share`` of the peak.
+    """
+
+    def __init__(self, n_rollouts: int, like: Tensor, axes: slice, threshold: float | None, *, share: float) -> None:
         zero = torch.zeros(n_rollouts, dtype=like.dtype, device=like.device)
         self.squared_peak, self.peak_tick, self.last_above = zero, torch.zeros_like(zero), torch.full_like(zero, -1.0)
         self.squared_last = torch.zeros_like(zero)
-        self._threshold, self._share = threshold, share
+        self.axes, self._threshold, self._share = axes, threshold, share
 
     def add(self, part: Deviations, squared: Float[Tensor, "l r"]) -> None:
         """Squared distances of a part."""
@@ -220,24 +228,28 @@ class Tally:
 
 
 def quantiles_in(
-    blocks: Iterator[Deviations], tally: Tally, levels: Floats, every: int, away: Tensor | None
-) -> Iterator[Floats]:
-    """Quantiles (L, n_quantiles) of the distances at each ``every``-th tick; all are noted in the tally."""
-    n_rollouts = len(tally.last_above)
-    scratch = rows = torch.empty(0)
+    blocks: Iterator[Deviations], tallies: Sequence[Tally], levels: Floats, every: int, away: Tensor | None
+) -> Iterator[list[Floats]]:
+    """Quantiles (L, n_quantiles) of the distances in the axes of each tally at each ``every``-th tick, noted in it."""
+    n_rollouts = len(tallies[0].last_above)
+    scratch, rows = torch.empty(0), list[Tensor]()
     for part in blocks:
         values = part.values if away is None else part.values - away[:, part.ticks, None]
-        if not len(scratch):  # the first part is the largest
-            scratch, rows = torch.empty_like(values[0]), values.new_empty(values.shape[1], n_rollouts)
+        if not rows:  # the first part is the largest
+            scratch = torch.empty_like(values[0])
+            rows = [values.new_empty(values.shape[1], n_rollouts) for _ in tallies]
         squared = scratch[: values.shape[1], : values.shape[2]]
-        torch.mul(values[0], values[0], out=squared)
-        for axis in values[1:]:
-            squared.addcmul_(axis, axis)
-        tally.add(part, squared)
-        chosen = squared[-part.ticks.start % every :: every]
-        rows[: len(chosen), part.columns] = chosen
+        first = -part.ticks.start % every
+        n_chosen = len(range(first, len(squared), every))
+        for tally, row in zip(tallies, rows, strict=True):
+            own = values[tally.axes]
+            torch.mul(own[0], own[0], out=squared)
+            for axis in own[1:]:
+                squared.addcmul_(axis, axis)
+            tally.add(part, squared)
+            row[:n_chosen, part.columns] = squared[first::every]
         if part.columns.stop == n_rollouts:
-            yield _quantiles(rows[: len(chosen)], levels)
+            yield [_quantiles(row[:n_chosen], levels) for row in rows]
 
 
 def _quantiles(squares: Tensor, levels: Floats) -> Floats:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
+from torch_pbd.control.matrices import as_mass, mass_rows
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.plant import AdmittancePlant, run_task
 from torch_pbd.control.simulation.rollout import Rollout
@@ -25,18 +26,20 @@ Range = float | tuple[float, float]
 _SHARE = 0.1
 # Of a tick: rounding of times; those of an hour at 1 kHz are off by 5e-10 of it in float64.
 _UNEVEN = 1e-6
+# Of a mass: a function of time is not linear between rows 10 ms apart, and a ratio that is off by half as much no harm.
+_SAME_MASS = 1e-3
 
 
 def simulate_schedule(
     schedule: Schedule, plant: AdmittancePlant | None, force: ArrayLike | None, rate: float, random_state: Any
 ) -> Rollout:
-    """Run a schedule whose rows are ticks of ``1 / rate`` s under an external force (T, d) in N."""
-    shape = schedule.position.shape
+    """Run a schedule whose rows are ticks of ``1 / rate`` s under an external force (T, d) in N, and of poses Nm."""
+    shape = schedule.velocity.shape
     push = checks.array(np.zeros(shape) if force is None else force, "force", shape)
-    robot, draw = _robot(schedule, plant), checks.seed(random_state)
-    noisy = getattr(robot.sensor, "noise_scale", 0.0) != 0.0  # else nothing is drawn: None is the caller's global state
+    draw = checks.seed(random_state)
+    task = _task_of(schedule, plant, 1.0 / rate)
+    noisy = task.sensor is not None and task.sensor.is_noisy  # else nothing is drawn: None is the caller's global state
     generator = torch.Generator().manual_seed(int(draw.randint(2**31 - 1))) if noisy else None
-    task = robot.task(*_motion_of(schedule), dt=1.0 / rate)
     return run_task(task, torch.tensor(push), generator=generator).numpy()
 
 
@@ -46,12 +49,13 @@ def simulate_many(
     *,
     plant: AdmittancePlant | None = None,
     peak: Range = 5.0,
+    torque: Range = 0.0,
     duration: Range = 0.8,
     onset: tuple[float, float] | None = None,
-    start_scale: float = 0.0,
+    start_scale: float | tuple[float, float] = 0.0,
     rate: float | None = None,
     reference: Reference = "desired",
-    threshold: float | None = None,
+    threshold: float | tuple[float, float] | None = None,
     quantiles: tuple[float, ...] = (0.05, 0.5, 0.95),
     every: int = 1,
     random_state: Any = None,
@@ -59,9 +63,10 @@ def simulate_many(
 ) -> RolloutSummary:
     """Push a robot at random, many times over, while it follows a schedule.
 
-    Each rollout gets one push: a squared sine over its duration, in a direction that is uniform on the sphere of
-    the d axes. Trajectories are not kept, so that memory goes with ``n_rollouts`` and not with their length.
-    The result depends on the arguments and ``random_state`` only; pushes do not depend on ``rate``.
+    Each rollout gets one push: a squared sine over its duration, in a direction that is uniform on the sphere of the
+    axes of position; and of poses, by a torque at the same time, in a direction of its own. Trajectories are not kept,
+    so that memory goes with ``n_rollouts`` and not with their length. The result depends on the arguments and
+    ``random_state`` only; pushes do not depend on ``rate``.
 
     Parameters
     ----------
@@ -70,23 +75,25 @@ def simulate_many(
     n_rollouts : int, default=1000
         Number of rollouts R.
     plant : AdmittancePlant, default=None
-        None is ``AdmittancePlant(mass)`` with the mass of the schedule, or 1 kg where it tells none. With a sensor or
+        None is ``AdmittancePlant(None)``, with the mass of the schedule, or 1 kg where it tells none. With a sensor or
         walls, thousands of rollouts take five to ten times longer; with a filter, ten to two hundred times.
     peak : float or (float, float), default=5.0
         Largest force of a push, N; of two numbers, uniform between them.
+    torque : float or (float, float), default=0.0
+        Largest torque of a push, Nm, of poses: ``peak=0.0`` leaves pushes by torque alone.
     duration : float or (float, float), default=0.8
         Of a push, s; of two numbers, uniform between them.
     onset : (float, float), default=None
         Time at which pushes begin, uniform between these, s; None is so that they end within the schedule.
-    start_scale : float, default=0.0
-        Standard deviation, in every axis, of the start around the desired one, m.
+    start_scale : float, or of poses (float, float), default=0.0
+        Standard deviation, in every axis, of the start around the desired one, m; of poses, m and rad.
     rate : float, default=None
         Of the ticks, Hz; None takes the rows of the schedule, which must then be evenly spaced.
     reference : {"desired", "undisturbed"}, default="desired"
         Deviation from the desired position, or from where the robot would be without push, noise and spread of the
         start: it lags behind the desired position.
-    threshold : float, default=None
-        Below which a deviation is over, m; None is a tenth of the rollout's own peak.
+    threshold : float, or of poses (float, float), default=None
+        Below which a deviation is over, m, and of poses m and rad; None is a tenth of the rollout's own peak.
     quantiles : tuple of float, default=(0.05, 0.5, 0.95)
         Of the deviations at a tick, by linear interpolation.
     every : int, default=1
@@ -119,79 +126,105 @@ def simulate_many(
     checks.count(n_rollouts, "n_rollouts")
     checks.count(every, "every")
     checks.choice(reference, "reference", Reference)
-    checks.number(threshold, "threshold", above=0.0, most=checks.LARGEST, unit="m", optional=True)
+    limits = _of_blocks(threshold, "threshold", schedule, None, above=0.0)
+    scales = _of_blocks(start_scale, "start_scale", schedule, 0.0, least=0.0)
     levels = checks.array(quantiles, "quantiles", ("n_quantiles",)).copy()
     checks.require((levels >= 0.0) & (levels <= 1.0), levels, "quantiles", "from 0 to 1")
     schedule = _evenly(schedule, rate)
     _check_memory(n_rollouts, schedule, len(levels))
-    robot, draw = _robot(schedule, plant), checks.seed(random_state)
-    begin, lasting, push = _draw_pushes(draw, n_rollouts, schedule, peak, duration, onset)
-    scale = checks.number(start_scale, "start_scale", least=0.0, most=checks.LARGEST, unit="m")
-    offset = torch.tensor(scale * draw.standard_normal(push.shape), device=device)
+    draw = checks.seed(random_state)
+    begin, lasting, push = _draw_pushes(draw, n_rollouts, schedule, [peak, torque], duration, onset)
+    offset = draw.standard_normal(push.shape)
+    for block, scale in zip(schedule.blocks, scales, strict=True):
+        offset[:, block] *= scale
     seeds = iter(draw.randint(2**31 - 1, size=n_rollouts).tolist())  # at most so many sensors
-    motion = [part.to(device) for part in _motion_of(schedule)]
     dt = float(schedule.time[1] - schedule.time[0])
     with torch.no_grad():
-        task = robot.task(*motion, dt=dt)
-        start = task.position[0] + offset, task.velocity[0].expand(n_rollouts, -1)
+        task = _task_of(schedule, plant, dt, device)
+        start = task.position[0] + torch.tensor(offset, device=device), task.velocity[0].expand(n_rollouts, -1)
         pushes = Pushes(*(torch.tensor(part, device=device) for part in (begin, lasting, np.ascontiguousarray(push.T))))
         blocks = simulate_blocks(task, pushes, start, lambda: torch.Generator().manual_seed(next(seeds)))
-        tally = Tally(n_rollouts, task.position, threshold=threshold, share=_SHARE)
+        tallies = [
+            Tally(n_rollouts, task.position, block, limit, share=_SHARE)
+            for block, limit in zip(schedule.blocks, limits, strict=True)
+        ]
         away = None if reference == "desired" else _undisturbed(task)
-        deviation = np.concatenate(list(quantiles_in(blocks, tally, levels, every, away)))
+        deviations = zip(*quantiles_in(blocks, tallies, levels, every, away), strict=True)
+        summaries = [
+            RolloutSummary(
+                schedule.time[::every],
+                levels,
+                np.concatenate(rows),
+                **_effect(tally, schedule, dt, begin, lasting),
+                onset=schedule.time[0] + begin,
+                duration=lasting,
+                push=push[:, tally.axes],
+            )
+            for tally, rows in zip(tallies, deviations, strict=True)
+        ]
+    return summaries[0] if len(summaries) == 1 else replace(summaries[0], rotation=summaries[1])
+
+
+def _effect(tally: Tally, schedule: Schedule, dt: float, begin: Floats, lasting: Floats) -> dict[str, Any]:
+    """Fields of a summary that a tally tells; pushes begin and last (R,), from the start of the schedule on."""
     squared_peak, squared_last, peak_tick, last_above = (
         values.cpu().numpy() for values in (tally.squared_peak, tally.squared_last, tally.peak_tick, tally.last_above)
     )
     returned = np.maximum(dt * (last_above + 1.0) - begin - lasting, 0.0)
-    return RolloutSummary(
-        schedule.time[::every],
-        levels,
-        deviation,
-        peak_deviation=np.sqrt(squared_peak),
-        peak_time=schedule.time[peak_tick.astype(np.intp)],
-        return_time=np.where(last_above < len(schedule) - 1, returned, np.inf),
-        final_deviation=np.sqrt(squared_last),
-        onset=schedule.time[0] + begin,
-        duration=lasting,
-        push=push,
-    )
+    return {
+        "peak_deviation": np.sqrt(squared_peak),
+        "peak_time": schedule.time[peak_tick.astype(np.intp)],
+        "return_time": np.where(last_above < len(schedule) - 1, returned, np.inf),
+        "final_deviation": np.sqrt(squared_last),
+    }
 
 
 def _draw_pushes(
     draw: np.random.RandomState,
     n_rollouts: int,
     schedule: Schedule,
-    peak: Range,
+    peaks: list[Range],
     duration: Range,
     onset: tuple[float, float] | None,
 ) -> tuple[Floats, Floats, Floats]:
-    """Onsets, from the start of the schedule on and in order, durations (R,) and forces at the peak (R, d)."""
+    """Onsets, from the start of the schedule on and in order, durations (R,), and forces and torques (R, d)."""
     longest, (start, end) = schedule.duration, schedule.time[[0, -1]].tolist()
-    lasting = np.asarray(draw.uniform(*_ends(duration, "duration", above=0.0, most=longest, unit="s"), size=n_rollouts))
+    lasting = np.asarray(draw.uniform(*_ends(duration, "duration", "s", above=0.0, most=longest), size=n_rollouts))
     share = draw.uniform(size=n_rollouts)
     if onset is None:
         begin = share * (longest - lasting)
     else:
-        first, last = _ends(onset, "onset", pair=True, least=start, most=end, unit="s")
+        first, last = _ends(onset, "onset", "s", pair=True, least=start, most=end)
         begin = first + share * (last - first) - start
-    direction = draw.standard_normal((n_rollouts, schedule.n_outputs))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    strength = np.asarray(draw.uniform(*_ends(peak, "peak", least=0.0, most=checks.LARGEST, unit="N"), size=n_rollouts))
+    names = [("peak", "N"), ("torque", "Nm")]
+    limits = [_ends(of, *named, least=0.0, most=checks.LARGEST) for of, named in zip(peaks, names, strict=True)]
+    if len(schedule.blocks) == 1 and limits[1] != (0.0, 0.0):
+        raise checks.refusal(peaks[1], "torque", "0 for a schedule without orientation", unit="Nm")
+    push = np.zeros((n_rollouts, schedule.n_outputs))
+    for block, ends in zip(schedule.blocks, limits, strict=False):
+        direction = draw.standard_normal((n_rollouts, block.stop - block.start))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        push[:, block] = np.asarray(draw.uniform(*ends, size=n_rollouts))[:, np.newaxis] * direction
     order = np.argsort(begin, kind="stable")  # rollouts of a chunk are pushed at about the same time
-    return begin[order], lasting[order], (strength[:, np.newaxis] * direction)[order]
+    return begin[order], lasting[order], push[order]
 
 
-def _ends(limits: Range, name: str, *, pair: bool = False, **bounds: Any) -> tuple[float, float]:
+def _ends(limits: Range, name: str, unit: str, *, pair: bool = False, **bounds: Any) -> tuple[float, float]:
     """Least and largest of a range within bounds; one number is both, unless a pair is asked for."""
     low, high = checks.array(limits, name, (2,)) if pair or np.ndim(limits) else (limits, limits)
-    low = checks.number(low, name, **bounds)
-    return low, checks.number(high, name, **(bounds | {"least": low}))
+    low = checks.number(low, name, unit=unit, **bounds)
+    return low, checks.number(high, name, unit=unit, **(bounds | {"least": low}))
 
 
-def _motion_of(schedule: Schedule) -> list[Tensor]:
-    """Position, velocity, stiffness and damping of a schedule, whose own arrays are read-only."""
-    parts = (schedule.position, schedule.velocity, schedule.stiffness, schedule.damping)
-    return [torch.tensor(part) for part in parts]
+def _of_blocks(value: Any, name: str, schedule: Schedule, nothing: float | None, **bounds: Any) -> list[Any]:
+    """Number of each block of outputs, in m and rad, within bounds; ``nothing`` is that of all."""
+    units = ["m", "rad"][: len(schedule.blocks)]
+    several = len(units) > 1 and value != nothing
+    if several and np.shape(value) != (2,):
+        raise checks.refusal(value, name, f"(float, float), in m and rad, for poses, or {nothing}")
+    bounds |= {"most": checks.LARGEST, "optional": nothing is None}
+    numbers = value if several else [value] * len(units)
+    return [checks.number(one, name, unit=unit, **bounds) for one, unit in zip(numbers, units, strict=True)]
 
 
 def _check_memory(n_rollouts: int, schedule: Schedule, n_levels: int) -> None:
@@ -218,17 +251,31 @@ def _evenly(schedule: Schedule, rate: float | None) -> Schedule:
     return schedule
 
 
-def _robot(schedule: Schedule, plant: AdmittancePlant | None) -> AdmittancePlant:
-    """Plant to simulate, with a warning where its mass is not that which the damping was computed for."""
-    if plant is None:
-        return AdmittancePlant(schedule.mass or 1.0)
-    checks.instance(plant, "plant", AdmittancePlant, optional=True)
-    if schedule.mass is not None and (np.ndim(plant.mass) or float(plant.mass) != schedule.mass):
+def _task_of(schedule: Schedule, plant: AdmittancePlant | None, dt: float, device: str | None = None) -> Task:
+    """Task of a plant that follows a schedule, row by row; warns where its mass is not that of the schedule."""
+    plant = AdmittancePlant(None) if plant is None else checks.instance(plant, "plant", AdmittancePlant)
+    rows = (schedule.position, schedule.velocity, schedule.stiffness, schedule.damping)
+    motion = [torch.tensor(row, device=device) for row in rows]  # of copies: its own are read-only
+    mass = plant.inertia(motion[2], schedule.time, schedule.mass)
+    if schedule.mass is not None and plant.mass is not None:
+        _compare(mass, mass_rows(as_mass(schedule.mass), motion[2]), plant, schedule)
+    more = {"acceleration_desired": schedule.acceleration, "orientation_desired": schedule.orientation}
+    given = {name: torch.tensor(row, device=device) for name, row in more.items() if row is not None}
+    return plant.task(*motion, mass=mass, dt=dt, **given)
+
+
+def _compare(mass: Tensor, own: Tensor, plant: AdmittancePlant, schedule: Schedule) -> None:
+    """Warn where a mass is not that which the damping was computed for: by entries, in units of their axes."""
+    root = own.diagonal(dim1=-2, dim2=-1).sqrt()
+    off = float(((mass - own).abs() / (root.unsqueeze(-1) * root.unsqueeze(-2))).max())
+    if off > _SAME_MASS:
+        given: Any = plant.mass
+        shown = "a function" if callable(given) else given if not np.ndim(given) else f"of shape {tuple(given.shape)}"
+        met = f"mass={schedule.mass:g} kg" if isinstance(schedule.mass, float) else "that of the schedule"
         checks.warn(
-            f"The plant's mass is {plant.mass}, but damping_ratio was met for mass={schedule.mass:g} kg: give both the "
-            "same."
+            f"The plant's mass is {shown}, but damping_ratio was met for {met}, off by up to {off:.0%}: give both the "
+            "same, or mass=None, which is the schedule's."
         )
-    return plant
 
 
 def _undisturbed(task: Task) -> Tensor:

@@ -13,9 +13,15 @@ from torch import Tensor
 from torch_pbd import checks
 from torch_pbd.exceptions import InvalidParameterError
 
+_OF_AXES = ("bias", "noise_scale", "resolution", "range", "deadband")
+
+
+def _each(value: float | Sequence[float]) -> Sequence[float]:
+    return value if isinstance(value, tuple) else (value,)
+
 
 class Reading(NamedTuple):
-    """Force read (..., d) in N, and whether any of its axes was clipped (...)."""
+    """Force read (..., d) in N, and of torques in Nm, and whether any of its axes was clipped (...)."""
 
     force: Tensor
     saturated: Tensor
@@ -24,7 +30,7 @@ class Reading(NamedTuple):
 @final
 @dataclass(frozen=True, repr=False)
 class ForceSensor:
-    """Model of a 6-axis force-torque sensor; works for any number of axes, all treated alike.
+    """Model of a 6-axis force-torque sensor; works for any number of axes.
 
     In this order: the true force plus ``bias``, low-pass, noise, saturation, quantization, delay, deadband. The
     default is an ideal sensor of 200 N. The force is held over each tick and a reading is taken at its start, so a
@@ -34,22 +40,24 @@ class ForceSensor:
     A force that is not finite is a lost sample: its reading is NaN (after the delay), never zero, and the filter
     holds through it. What to do about it is the controller's to decide.
 
+    Quantities in N are of all axes, or d numbers of each: of a pose three in N, then three in Nm.
+
     Parameters
     ----------
     bias : float or sequence of d float, default=0.0
         Constant error [N].
-    noise_scale : float, default=0.0
+    noise_scale : float or sequence of d float, default=0.0
         Standard deviation of white noise on the reading [N]; it is added behind the filter, which does not lower it.
-    resolution : float, default=0.0
+    resolution : float or sequence of d float, default=0.0
         Quantization step [N], at most ``range``; 0 for none. A step that does not divide ``range`` may round a
         clipped reading to half a step beyond it.
-    range : float, default=200.0
+    range : float or sequence of d float, default=200.0
         Force at which an axis saturates, either sign [N]; ``math.inf`` for never.
     cutoff : float or None, default=None
         Corner frequency of the first-order low-pass [Hz], discretized exactly; None for none.
     delay_steps : int, default=0
         Ticks by which the reading is late, beside the filter.
-    deadband : float, default=0.0
+    deadband : float or sequence of d float, default=0.0
         Readings up to it are zero, those above are nearer to zero by it [N]: continuous. It acts on the bias too.
 
     Examples
@@ -63,22 +71,28 @@ class ForceSensor:
     """
 
     bias: float | Sequence[float] = 0.0
-    noise_scale: float = 0.0
-    resolution: float = 0.0
-    range: float = 200.0
+    noise_scale: float | Sequence[float] = 0.0
+    resolution: float | Sequence[float] = 0.0
+    range: float | Sequence[float] = 200.0
     cutoff: float | None = None
     delay_steps: int = 0
-    deadband: float = 0.0
+    deadband: float | Sequence[float] = 0.0
 
     def __post_init__(self) -> None:
-        if isinstance(self.bias, Sequence) and not isinstance(self.bias, str):
-            object.__setattr__(self, "bias", tuple(self.bias))  # a list would be neither frozen nor hashable
-        for value in self.bias if isinstance(self.bias, tuple) else [self.bias]:
+        for name in _OF_AXES:
+            value = getattr(self, name)
+            if isinstance(value, Sequence) and not isinstance(value, str):
+                object.__setattr__(self, name, tuple(value))  # a list would be neither frozen nor hashable
+        for value in _each(self.bias):
             checks.number(value, "bias", unit="N")
-        if self.range != math.inf:
-            checks.number(self.range, "range", above=0.0, unit="N", remedy="math.inf is a sensor without limit")
-        for name, most in {"noise_scale": None, "resolution": self.range, "deadband": None}.items():
-            checks.number(getattr(self, name), name, least=0.0, most=most, unit="N", remedy="0 is none")
+        for value in _each(self.range):
+            if value != math.inf:
+                checks.number(value, "range", above=0.0, unit="N", remedy="math.inf is a sensor without limit")
+        for name in ("noise_scale", "resolution", "deadband"):
+            values, most = _each(getattr(self, name)), _each(self.range)
+            each = most if len(most) == len(values) else [min(most)] * len(values)
+            for value, top in zip(values, each if name == "resolution" else [None] * len(values), strict=True):
+                checks.number(value, name, least=0.0, most=top, unit="N", remedy="0 is none")
         checks.number(self.cutoff, "cutoff", above=0.0, unit="Hz", optional=True)
         checks.count(self.delay_steps, "delay_steps", least=0)
 
@@ -88,6 +102,11 @@ class ForceSensor:
         units = dict.fromkeys(chosen, " N") | {"cutoff": " Hz", "delay_steps": ""}
         shown = ({"range": self.range} | changed).items()
         return f"ForceSensor({', '.join(f'{name}={value}{units[name]}' for name, value in shown)})"
+
+    @property
+    def is_noisy(self) -> bool:
+        """Whether readings are drawn."""
+        return any(value != 0.0 for value in _each(self.noise_scale))
 
     @classmethod
     def jr3(cls, cutoff: float = 500.0, rate: float = 1000.0) -> "ForceSensor":
@@ -109,13 +128,15 @@ class ForceSensor:
 
         The forces to come are of the shape, dtype and device of ``like``; noise is drawn from the ``generator``.
         """
-        if isinstance(self.bias, tuple) and len(self.bias) != like.shape[-1]:
-            raise InvalidParameterError(
-                f"bias has {len(self.bias)} values, but the force has {like.shape[-1]} axes: give one for each axis, "
-                "or one number for all."
-            )
-        remedy = f"noise_scale is {self.noise_scale:g} N: pass torch.Generator().manual_seed(...), or set it to 0"
-        checks.instance(generator, "generator", torch.Generator, optional=self.noise_scale == 0, remedy=remedy)
+        for name in _OF_AXES:
+            value = getattr(self, name)
+            if isinstance(value, tuple) and len(value) != like.shape[-1]:
+                raise InvalidParameterError(
+                    f"{name} has {len(value)} values, but the force has {like.shape[-1]} axes: give one for each axis, "
+                    "or one number for all."
+                )
+        remedy = f"noise_scale is {self.noise_scale} N: pass torch.Generator().manual_seed(...), or set it to 0"
+        checks.instance(generator, "generator", torch.Generator, optional=not self.is_noisy, remedy=remedy)
         return ForceReader(self, like, dt, generator)
 
 
@@ -126,8 +147,10 @@ class ForceReader:
     def __init__(
         self, sensor: ForceSensor, like: Float[Tensor, "*b d"], dt: float, generator: torch.Generator | None
     ) -> None:
-        self._sensor, self._generator = sensor, generator
-        self._bias = torch.zeros_like(like) + like.new_tensor(sensor.bias)
+        self._generator = generator if sensor.is_noisy else None
+        of_axes = (like.new_tensor(getattr(sensor, name)) for name in _OF_AXES)
+        bias, self._noise_scale, self._resolution, self._range, self._deadband = of_axes
+        self._bias = torch.zeros_like(like) + bias
         self._gain = None if sensor.cutoff is None else -math.expm1(-2.0 * math.pi * sensor.cutoff * dt)
         self._filtered = self._bias
         # Each its own: whoever subtracts a bias in place must not change the next one.
@@ -145,18 +168,17 @@ class ForceReader:
         return self._under_way.popleft()
 
     def _noise(self) -> Tensor | float:
-        generator, scale = self._generator, self._sensor.noise_scale
-        if generator is None or scale == 0:
+        generator = self._generator
+        if generator is None:
             return 0.0
         # Drawn where the generator lives: the same seed is the same noise on every device.
         noise = torch.randn(self._bias.shape, generator=generator, dtype=self._bias.dtype, device=generator.device)
-        return scale * noise.to(self._bias.device)
+        return self._noise_scale * noise.to(self._bias.device)
 
     def _convert(self, level: Tensor) -> Reading:
         """Clip, round, and take the deadband off, which may come before the delay: it has no memory."""
-        sensor = self._sensor
-        saturated = (level.abs() >= sensor.range).any(-1)
-        level = level.clamp(-sensor.range, sensor.range)
-        if sensor.resolution > 0:
-            level = sensor.resolution * torch.round(level / sensor.resolution)
-        return Reading(level - level.clamp(-sensor.deadband, sensor.deadband), saturated)
+        saturated = (level.abs() >= self._range).any(-1)
+        level = level.clamp(-self._range, self._range)
+        step = torch.where(self._resolution > 0.0, self._resolution, 1.0)
+        level = torch.where(self._resolution > 0.0, step * torch.round(level / step), level)
+        return Reading(level - level.clamp(-self._deadband, self._deadband), saturated)

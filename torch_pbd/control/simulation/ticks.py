@@ -1,18 +1,21 @@
 """The ticks behind :class:`~torch_pbd.control.AdmittancePlant`, with and without what acts in the loop.
 
 With the deviation y from the desired position, ``M a = u - K y - D v``. Everything is held over a tick, in which the
-matrix exponential is then exact, whatever its length; at its end the desired position moves on.
+matrix exponential is then exact, whatever its length; at its end the desired position moves on. Of poses, y is the
+position and the rotation from the desired orientation, and that moves on as :mod:`poses` says.
 """
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torch_pbd.control.simulation.poses import Turning
 from torch_pbd.control.simulation.position_loop import PositionLoop
 from torch_pbd.control.simulation.sensor import ForceSensor
 
@@ -68,8 +71,10 @@ class StiffnessFilter(ABC):
     """Filter of the gains, as :class:`~torch_pbd.control.AdmittancePlant` takes it."""
 
     @abstractmethod
-    def start(self, stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> ActiveFilter:
-        """Begin a run over the wanted gains (..., T, d, d)."""
+    def start(
+        self, stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float, *, is_turning: bool = False
+    ) -> ActiveFilter:
+        """Begin a run over the wanted gains (..., T, d, d), along a desired orientation that turns or not."""
 
 
 @runtime_checkable
@@ -77,12 +82,16 @@ class Environment(Protocol):
     """Surroundings of the robot."""
 
     def force(self, position: Tensor, velocity: Tensor) -> Tensor:
-        """Force in N on a robot at these positions, in m, and velocities (..., d)."""
+        """Force in N on a robot at these positions, in m, and velocities (..., p); of a pose its position alone."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """Run to come, checked: motions (..., T, d), gains (..., T, d, d), and the parts that act in the loop, or None."""
+    """Run to come, checked: motions (..., T, d), gains (..., T, d, d), and the parts that act in the loop, or None.
+
+    The mass is one (d, d), or one for each tick (..., T, d, d). Positions of poses end in zeros: their rotations are
+    counted from the desired orientation, in ``turning``.
+    """
 
     position: Tensor
     velocity: Tensor
@@ -96,6 +105,7 @@ class Task:
     environment: Environment | None
     substeps: int
     stiffness_filter: StiffnessFilter | None
+    turning: Turning | None = None
 
     @property
     def n_ticks(self) -> int:
@@ -111,12 +121,26 @@ class Task:
     @property
     def is_shared(self) -> bool:
         """Whether all rollouts of a batch have the same gains and desired motion."""
-        motion = (self.position, self.velocity, self.inertial_force)
+        motion = [self.position, self.velocity, self.inertial_force]
+        motion += [] if self.turning is None else [self.turning.turns]
         return self.stiffness.ndim == 3 and all(part.ndim == 2 for part in motion)
+
+    @property
+    def n_positions(self) -> int:
+        """Number of positions p among the d axes."""
+        return self.position.shape[-1] - (0 if self.turning is None else 3)
+
+    def carry(self, tick: int, pose: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
+        """Positions, and rotations counted from the desired orientation after a tick instead of that before it."""
+        if self.turning is None:
+            return pose
+        transport, turn = self.turning.transport[..., tick, :, :], self.turning.turns[..., tick, :]
+        rotation = (transport @ pose[..., -3:].unsqueeze(-1)).squeeze(-1) - turn
+        return torch.cat([pose[..., :-3].expand(*rotation.shape[:-1], -1), rotation], dim=-1)
 
 
 def open_loop(task: Task, force: Tensor, state: State) -> State:
-    """Positions and velocities (..., T, d) where nothing acts in the loop and all rollouts share the task.
+    """Poses and velocities (..., T, d) where nothing acts in the loop and all rollouts share the task.
 
     Blocks of ticks are then matrices on the states, and on forces (..., T, d), of all rollouts.
     """
@@ -156,7 +180,12 @@ def block_responses(task: Task, length: int) -> Iterator[Float[Tensor, "l1 m n"]
     unit = torch.eye(2 * d + 1 + length * d).to(task.position)
     push = (task.damping @ task.velocity.unsqueeze(-1)).squeeze(-1) + task.inertial_force
     steps = torch.nn.functional.pad(task.position.diff(dim=0), (0, d, 0, 1))  # none after the last tick
+    if task.turning is not None:
+        steps[:, d - 3 : d] += task.turning.turns
     for ticks, maps in tick_maps(task, task.dt):
+        if task.turning is not None:
+            position, rotation, velocity = maps.split([d - 3, 3, d], dim=-2)
+            maps = torch.cat([position, task.turning.transport[ticks] @ rotation, velocity], dim=-2)
         drift = maps[..., 2 * d :] @ push[ticks].unsqueeze(-1) - steps[ticks].unsqueeze(-1)
         each = torch.cat([maps[..., : 2 * d], drift, maps[..., 2 * d :]], dim=-1)
         surplus = -len(each) % length
@@ -174,7 +203,8 @@ def tick_maps(task: Task, dt: float) -> Iterator[tuple[slice, Tensor]]:
     n_together = max(1, _MATRICES_AT_ONCE // batch)
     for first in range(0, task.n_ticks, n_together):
         ticks = slice(first, min(first + n_together, task.n_ticks))
-        yield ticks, _tick_map(task.stiffness[..., ticks, :, :], task.damping[..., ticks, :, :], task.mass, dt)
+        mass = task.mass if task.mass.ndim == 2 else task.mass[..., ticks, :, :]
+        yield ticks, _tick_map(task.stiffness[..., ticks, :, :], task.damping[..., ticks, :, :], mass, dt)
 
 
 def _tick_map(stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> Tensor:
@@ -207,7 +237,8 @@ class Loop:
         self._robot = None if loop is None else loop.start(*state, task.dt)
         self._read = None if sensor is None else sensor.start(state[0], task.dt, generator)
         gains = task.stiffness, task.damping, task.mass, task.dt
-        self._filter = None if wanted is None else wanted.start(*gains)
+        is_turning = task.turning is not None and bool(task.turning.turns.any())
+        self._filter = None if wanted is None else wanted.start(*gains, is_turning=is_turning)
         self._maps = (each for _, maps in tick_maps(task, task.dt / task.substeps) for each in maps.unbind(-3))
 
     def run(self, tick: int, force: Tensor) -> dict[str, Tensor]:
@@ -232,12 +263,17 @@ class Loop:
         if self._robot is not None:
             self._robot(commanded)
         if tick + 1 < task.n_ticks:
-            self._deviation = self._deviation - (task.position[..., tick + 1, :] - desired)
+            self._deviation = task.carry(tick, self._deviation) - (task.position[..., tick + 1, :] - desired)
+            if self._robot is not None:
+                self._robot.carry(partial(task.carry, tick))
         return record | {"stiffness": stiffness, "damping": damping}
 
     def _wall(self, position: Tensor, velocity: Tensor) -> Tensor:
-        walls = self._task.environment
-        return torch.zeros_like(position) if walls is None else walls.force(position, velocity)
+        walls, p = self._task.environment, self._task.n_positions
+        if walls is None:
+            return torch.zeros_like(position)
+        force = walls.force(position[..., :p], velocity[..., :p])
+        return torch.nn.functional.pad(force, (0, position.shape[-1] - p))  # on a point: without a torque
 
     def _move(
         self, stiffness: Tensor, damping: Tensor, forces: tuple[Tensor, Tensor], push: Tensor, desired: Tensor
