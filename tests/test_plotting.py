@@ -6,6 +6,7 @@ import pytest
 from matplotlib.colors import to_rgb
 
 from torch_pbd import CholeskyCovRegressor, Demonstrations, DMPController, GMMBaseline, ProMPBaseline
+from torch_pbd.control import AdmittancePlant
 from torch_pbd.data import (
     handwriting_covariance,
     handwriting_mean,
@@ -126,6 +127,30 @@ def test_pushes_and_stiffness_are_drawn_in_readable_units(run):
     *_, spread, stiffness = schedule.plot()
     np.testing.assert_allclose(spread.lines[1].get_ydata() ** 2, 1e6 * schedule.covariance[:, 1, 1], rtol=1e-9)
     np.testing.assert_allclose(stiffness.lines[1].get_ydata(), schedule.stiffness[:, 1, 1])
+
+
+def test_pushes_on_a_pose_are_drawn_in_the_units_of_each_block():
+    time = 0.01 * np.arange(50)
+    turned = np.stack([np.cos(time), 0.0 * time, np.sin(time), 0.0 * time], axis=1)
+    gain = np.tile(np.diag([100.0, 200.0, 300.0, 4.0, 5.0, 6.0]), (50, 1, 1))
+    still, force = np.zeros((50, 3)), np.tile(np.arange(1.0, 7.0), (50, 1))
+    twist = np.tile([0.0, 0.0, 0.0, 0.0, 2.0, 0.0], (50, 1))
+    run = AdmittancePlant().simulate(still, twist, gain, 0.2 * gain, force, dt=0.01, orientation_desired=turned)
+    axes = run.plot(names=list("xyzabc"))
+    assert [ax.get_ylabel() for ax in axes] == [
+        "deviation [mm]",
+        "external force [N]",
+        "stiffness [N/m]",
+        "deviation [deg]",
+        "external torque [Nm]",
+        "stiffness [Nm/rad]",
+    ]
+    arrays = run.numpy()
+    rows = [1e3 * arrays.deviation, arrays.force, np.diagonal(arrays.stiffness, axis1=1, axis2=2)]
+    for ax, columns in zip(axes, [*rows, np.degrees(arrays.deviation), *rows[1:]], strict=True):
+        block = slice(0, 3) if ax in axes[:3] else slice(3, 6)
+        np.testing.assert_allclose(np.stack([line.get_ydata() for line in ax.lines[:3]], axis=1), columns[:, block])
+    assert {text.get_text() for text in run.plot()[0].figure.legends[0].get_texts()} >= {"force x", "torque z"}
 
 
 def test_a_batch_of_runs_is_refused(run):
