@@ -19,7 +19,7 @@ from torch_pbd import Demonstrations, DMPController, GMMBaseline
 from torch_pbd.cli.main import main
 from torch_pbd.control import Schedule
 from torch_pbd.control.parameters import as_demonstrations
-from torch_pbd.control.primitive.units import common_unit, duration_of, in_metres
+from torch_pbd.control.primitive.units import common_unit, duration_of, in_si
 from torch_pbd.data import load_demonstrations, make_tunnel_demonstrations, save_demonstrations
 from torch_pbd.data.units import TIMES
 from torch_pbd.exceptions import DataFormatError, ModelFileError
@@ -260,7 +260,7 @@ def test_66_known_units_and_words_that_are_none_stay():
         assert Demonstrations([0.0, 1.0], np.zeros((1, 2, 1)), units=unit).units == (unit,)
     for unit in ("h", "min", "s", "ms", "us", "ns", "1", "phase", "frames", "normalized time in [0,1]"):
         assert Demonstrations([0.0, 1.0], np.zeros((1, 2, 1)), time_unit=unit).time_unit == unit
-    assert (in_metres(["mm", "mm"]), in_metres(["deg"]), in_metres(["rad"]), in_metres(None)) == (1e-3, 1, 1, 1)
+    assert (in_si(["mm", "mm"]), in_si(["deg"]), in_si(["rad"]), in_si(None)) == (1e-3, np.pi / 180.0, 1, 1)
     assert (common_unit(["mm", "mm"]), common_unit(["mm", "m"]), common_unit(None)) == ("mm", None, None)
 
 

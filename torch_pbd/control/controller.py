@@ -11,7 +11,7 @@ from sklearn.utils.validation import check_is_fitted
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control import parameters
-from torch_pbd.control.impedance import OnUnknown, fit_covariance, fit_law, gains_at
+from torch_pbd.control.impedance import OnUnknown, fit_covariance, fit_law, gains_at, outputs_under
 from torch_pbd.control.primitive import smoothing, units
 from torch_pbd.control.primitive.adaptation import Adaptation
 from torch_pbd.control.primitive.dmp import Gate
@@ -38,6 +38,10 @@ class DMPController(BaseEstimator):
     movement; a covariance regressor learns the variability, whose principal axes get stiffness by eq. (19) and (20),
     and damping from it. Demonstrations may be of any lengths and sampling times: each is smoothed at its true times,
     and stretched linearly, from its first to its last sample, to the median duration: one that was cut short too.
+
+    Of poses (``Demonstrations(rotation=...)``) position and rotation are learned as one movement in a chart around the
+    mean rotation; covariance and gains are those of deviations at the desired pose, in axes of the world, and in blocks
+    of N/m and Nm/rad. Nothing depends on signs of quaternions, on how the world and the tool are turned, or on units.
 
     Parameters
     ----------
@@ -68,9 +72,11 @@ class DMPController(BaseEstimator):
     n_steps : int, default=100
         Points of a movement at which forcing and variability are learned.
     stiffness_law : StiffnessLaw, default=None
-        None is ``StiffnessLaw()``: 50 to 1000 N/m between quantiles of the standard deviations along the movement.
-    mass : float, default=1.0
-        Virtual mass of the admittance, kg.
+        None is ``StiffnessLaw()``: 50 to 1000 N/m between quantiles of the standard deviations along the movement; of
+        poses with ``RotationLimits()``, 2.5 to 50 Nm/rad. Of angles the two are in Nm/rad.
+    mass : float or array-like of shape (d, d), default=1.0
+        Virtual mass of the admittance, kg; of angles, and the rotation of poses, kg m^2. A robot's own, which changes
+        along the movement, is what :meth:`Schedule.with_inertia` takes.
     damping_ratio : float or "paper", default=1.0
         See :func:`~torch_pbd.control.damping_from_stiffness`.
     on_unknown : {"soft", "prior", "raise"}, default="soft"
@@ -81,7 +87,8 @@ class DMPController(BaseEstimator):
     Attributes
     ----------
     covariance_ : fitted covariance regressor
-        Its input is what ``phase_input`` says, its output what ``variability`` says.
+        Its input is what ``phase_input`` says, its output what ``variability`` says; of poses in the coordinates that
+        ``outputs_.decode`` takes to outputs, see :meth:`predict_cov`.
     dmp_, law_ : DMP, StiffnessLaw
         With the duration, and the bounds, of this movement.
     duration_, start_time_, time_scale_ : float
@@ -93,8 +100,11 @@ class DMPController(BaseEstimator):
         Type I uncertainty of the recordings' times, at evenly spaced times of the movement: 0 up to 2.5 spacings from
         a sample, 1 from five (a 40th of the movement at least), in the recording that knows second most.
     cutoff_, reproduction_error_ : float
-        Hz; root mean square distance of the reproduced path from the mean of the demonstrations as recorded.
+        Hz; root mean square distance of the reproduced path from the mean of the demonstrations as recorded, of poses
+        that of the positions.
     n_outputs_, n_demos_ : int
+    outputs_ : Outputs
+        Which outputs share a unit, and the chart and the axes in which those of poses are learned.
 
     Examples
     --------
@@ -177,6 +187,7 @@ class DMPController(BaseEstimator):
         shown = smoothing.merge_bursts(parameters.as_demonstrations(X, y, groups))
         self.names_, self.frame_, self.units_, self.time_unit_ = shown.names, shown.frame, shown.units, shown.time_unit
         self.n_demos_, self.n_outputs_ = len(shown), shown.n_outputs
+        outputs = outputs_under(self, shown)
         self.duration_, self.time_scale_ = units.duration_of(shown, self.duration)
         self.start_time_ = units.common_start(shown)
         seconds = self.time_unit_ in TIMES
@@ -190,14 +201,20 @@ class DMPController(BaseEstimator):
         movements = smoothing.smooth(shown, self.cutoff_, self.n_steps, self.duration_)
         # 3. Mean movement. Eq. (16) is driven by the mean over demonstrations of the forcing of eq. (18), through which
         # goes a Gaussian process, eq. (5), over the phase of eq. (17) or another input that is a function of time.
-        self.reproduction_ = Reproduction.learn(self.dmp_, movements, self.phase_input, own_goals=self.goal == "each")
+        self.reproduction_ = Reproduction.learn(
+            self.dmp_, movements, self.phase_input, own_goals=self.goal == "each", blocks=outputs.blocks
+        )
         self.start_, self.goal_ = self.reproduction_.start, self.reproduction_.goal
-        self.reproduction_error_ = self.reproduction_.check_against(movements)
-        if seconds and units.counts_as_metres(self.units_):
-            self.reproduction_.warn_if_cut(units.in_metres(self.units_))
-        # 4. Variability. The regressor learns the covariance over the same input, of positions or of the forcing.
+        self.reproduction_error_, *_ = self.reproduction_.check_against(movements)
+        if seconds and units.counts_as_metres(outputs.units(self.units_)):
+            self.reproduction_.warn_if_cut(units.in_si(outputs.units(self.units_)))
+        # 4. Variability. The regressor learns the covariance over the same input, of positions or of the forcing; of
+        # poses along the principal axes of each block.
         varying, phase = self.varying(movements), self.reproduction_.phase
-        self.covariance_ = fit_covariance(self.covariance, phase(movements.time), varying, movements.known)
+        self.outputs_ = outputs.with_axes(varying, movements.known)
+        self.covariance_ = fit_covariance(
+            self.covariance, phase(movements.time), varying, movements.known, self.outputs_
+        )
         # White noise as large as what the smoothing took away, smoothed: its share of the variance is no variability.
         self.noise_scale_ = movements.noise_scale
         noise = smoothing.noise_like(shown, self.noise_scale_)
@@ -205,16 +222,34 @@ class DMPController(BaseEstimator):
         self.noise_share_ = smoothing.variance_share(self.varying(smoothed), varying)
         # 5. Gains. The bounds of eq. (20) are quantiles of the deviations where there are samples; eq. (19) then gives
         # each principal axis its stiffness, and the damping follows from stiffness and mass.
-        known = np.linspace(0.0, self.duration_, len(self.unsampled_))[self.unsampled_ <= smoothing.UNKNOWN]
-        self.law_ = fit_law(self.stiffness_law, self.covariance_.predict_cov(phase(known[::4])), varying)
+        self.law_ = fit_law(self, varying)
         return self
 
     def predict(self, X: ArrayLike) -> Floats:
-        """Reproduced position (n, d) at times X (n, 1), which count as those of the demonstrations do.
+        """Reproduced outputs (n, d) at times X (n, 1), which count as those of the demonstrations do.
 
-        From ``start_time_``; the movement is over ``duration_`` later, and then stays at the goal.
+        Positions, and of poses three coordinates of a rotation, see :meth:`predict_pose`. From ``start_time_``; the
+        movement is over ``duration_`` later, and then stays at the goal.
         """
         return self._path(self._movement_time(X))
+
+    def predict_pose(self, X: ArrayLike) -> tuple[Floats, Floats]:
+        """Reproduced positions (n, p) and orientations (n, 4), unit quaternions w x y z, at times X (n, 1).
+
+        Raises
+        ------
+        ValueError
+            If no rotation was demonstrated.
+        """
+        path = self.predict(X)
+        if self.outputs_.reference is None:
+            raise ValueError("The demonstrations have no rotation: predict(X) is all of the movement.")
+        return self.outputs_.poses(path)
+
+    def predict_cov(self, X: ArrayLike) -> Floats:
+        """Covariance (n, d, d) of the outputs at times X (n, 1), in their squared units: of poses in their chart."""
+        inputs = self.reproduction_.phase(self._movement_time(X))
+        return self.outputs_.covariance(self.covariance_.predict_cov(inputs))
 
     def condition(self, times: ArrayLike, positions: ArrayLike, *, noise_scale: ArrayLike = 0.0) -> Self:
         """Fitted copy of a movement that passes there: where a robot was pushed to, what was seen so far, a via point.
@@ -226,24 +261,27 @@ class DMPController(BaseEstimator):
         ----------
         times : array-like of shape (m,)
             Times, which count as those of the demonstrations do.
-        positions : array-like of shape (m, d)
-            In their units; NaN where an output is not given.
+        positions : array-like of shape (m, d), or (m, p + 4) for poses
+            In their units; NaN where an output is not given. Of poses p positions and a quaternion w x y z, or outputs;
+            each of the two is given whole or not at all.
         noise_scale : float or array-like of shape (d,), default=0.0
-            Standard deviation of the error of positions.
+            Standard deviation of the error of positions; of poses one for all positions and one for the rotation.
         """
         time = self._movement_time(checks.array(times, "times", ("m",))[:, np.newaxis])
-        position = checks.real_floats(positions, "positions")
+        position = self.outputs_.rows(positions, "positions")
         if position.shape != (len(time), self.n_outputs_):
             raise ValueError(f"positions has shape {position.shape}, must have shape ({len(time)}, {self.n_outputs_}).")
-        return conditioned(self, time, position - self._path(time), noise_scale)
+        return conditioned(self, time, position - self._path(time), self.outputs_.noise(noise_scale))
 
     def predict_stiffness(self, X: ArrayLike) -> Floats:
-        """Stiffness (n, d, d) in N/m (force per unit of position) at times X (n, 1)."""
-        return gains_at(self, self._movement_time(X)).stiffness
+        """Stiffness (n, d, d) at times X (n, 1): in N/m, of angles in Nm/rad, of poses in both and in world axes."""
+        time = self._movement_time(X)
+        return gains_at(self, time, self._path(time)).stiffness
 
     def predict_damping(self, X: ArrayLike) -> Floats:
-        """Damping (n, d, d) in N s/m at times X (n, 1)."""
-        return gains_at(self, self._movement_time(X)).damping
+        """Damping (n, d, d) at times X (n, 1), in N s/m or Nm s/rad."""
+        time = self._movement_time(X)
+        return gains_at(self, time, self._path(time)).damping
 
     def schedule(
         self,
@@ -256,7 +294,7 @@ class DMPController(BaseEstimator):
         speed: float = 1.0,
         limits: units.MotionLimits | None = _LIMITS,
     ) -> Schedule:
-        """Motion and gains at ``rate``, for a robot: in s and m, if the demonstrations tell units of length.
+        """Motion and gains at ``rate``, for a robot: in s, m and rad, if the demonstrations tell units.
 
         It begins at the speed that was shown. Where recordings were cut while moving, a robot at rest needs a ramp.
 
@@ -269,7 +307,8 @@ class DMPController(BaseEstimator):
             brakes on its own path, half before its end and half after. Of what comes after it nothing was shown, so
             that on_unknown="soft" makes the robot compliant there.
         goal, start : array-like of shape (d,), default=None
-            In the units of the recordings; None are ``goal_`` and ``start_``. A goal (n, d) is that at each row.
+            In the units of the recordings; None are ``goal_`` and ``start_``. A goal (n, d) is that at each row. Of
+            poses, here and in ``via``, p positions and a unit quaternion w x y z, p + 4 numbers; or the p + 3 outputs.
         via : sequence of (time, position), default=None
             Points that the movement passes, with the stiffness of what must be met there: movement time in s from its
             start, and position (d,) in the units of the recordings, NaN where an output is free. ``covariance`` must
@@ -288,18 +327,19 @@ class DMPController(BaseEstimator):
         """
         check_is_fitted(self)
         speed = checks.number(speed, "speed", above=0.0)
-        recorded = self.units_, self.time_unit_
+        recorded = self.outputs_.units(self.units_), self.time_unit_
         units.check_motion(limits, *recorded, duration=self.duration_ / speed)
         time = tick_times(self.duration_ / speed, rate, self.n_outputs_, settle=settle)
-        bent, goal, start = planned(self, goal, start, via)
-        position, velocity, moved = bent._motion(time, goal, start, speed)
-        metres = units.in_metres(self.units_)
-        distance = metres * float(np.linalg.norm(np.ptp(position, axis=0)))
-        fastest = metres * float(np.linalg.norm(velocity, axis=1).max())
+        bent, goal, start = planned(self, *self._ends(goal, start), via)
+        path, velocity, acceleration, moved = bent._motion(time, goal, start, speed)
+        unit = units.in_si(recorded[0])
+        rows: dict[str, Any] = self.outputs_.motion(path, velocity, acceleration, unit)
+        distance = float(np.linalg.norm(np.ptp(rows["position"], axis=0)))
+        fastest = float(np.linalg.norm(rows["velocity"][:, : self.outputs_.n_positions], axis=1).max())
         units.check_motion(limits, *recorded, distance=distance, speed=fastest)
-        gains = gains_at(bent, moved)
-        rows = (time, metres * position, metres * velocity, gains.stiffness, gains.damping)
-        return Schedule(*rows, metres**2 * gains.covariance, gains.type1, **parameters.schedule_labels(self))
+        gains, scales = gains_at(bent, moved, path), self.outputs_.scales(unit)
+        rows |= gains._asdict() | {"covariance": np.multiply.outer(scales, scales) * gains.covariance}
+        return Schedule(time=time, **rows, **parameters.schedule_labels(self))
 
     def simulate(
         self,
@@ -354,7 +394,8 @@ class DMPController(BaseEstimator):
             time = np.arange(len(paces)) / checks.number(rate, "rate", above=0.0, unit="Hz")
         else:
             time = tick_times(self.duration_, rate, self.n_outputs_, settle=settle)
-        return time, *self._motion(time, goal, start, paces)[:2]
+        position, velocity, *_ = self._motion(time, *self._ends(goal, start), paces)
+        return time, position, velocity
 
     def phase(self, time: ArrayLike) -> Floats:
         """Inputs (n, 1) of ``covariance_`` at movement times (n,), which start at 0: what ``phase_input`` says."""
@@ -383,13 +424,21 @@ class DMPController(BaseEstimator):
 
     def _motion(
         self, time: Floats, goal: ArrayLike | None, start: ArrayLike | None, speed: float | Floats
-    ) -> tuple[Floats, Floats, Floats]:
-        """Position and velocity (n, d) at times (n,), and the movement time of the gains there."""
-        position, velocity, moved = self.reproduction_.plan(time, goal, start, speed)
+    ) -> tuple[Floats, Floats, Floats, Floats]:
+        """Outputs, their velocity and acceleration (n, d) at times (n,), and the movement time of the gains there."""
+        position, velocity, acceleration, moved = self.reproduction_.plan(time, goal, start, speed)
         if self._bend is not None:
-            rate = np.gradient(moved, time)[:, np.newaxis]
+            pace = np.gradient(moved, time)
+            rate, slope = pace[:, np.newaxis], np.gradient(pace, time)[:, np.newaxis]
             position, velocity = position + self._bend(moved), velocity + rate * self._bend(moved, 1)
-        return position, velocity, moved
+            acceleration = acceleration + rate**2 * self._bend(moved, 2) + slope * self._bend(moved, 1)
+        return position, velocity, acceleration, moved
+
+    def _ends(self, goal: ArrayLike | None, start: ArrayLike | None) -> tuple[Floats | None, Floats | None]:
+        """Goal and start as outputs."""
+        given = {"goal": goal, "start": start}
+        own = [None if value is None else self.outputs_.rows(value, name) for name, value in given.items()]
+        return own[0], own[1]
 
     def __sklearn_is_fitted__(self) -> bool:
         return "law_" in vars(self)

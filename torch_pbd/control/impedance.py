@@ -1,5 +1,6 @@
 """Variability of demonstrations, learned; and stiffness and damping from what is known of it, and what is not."""
 
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -7,10 +8,14 @@ import torch
 from numpy.typing import NDArray
 from sklearn.base import clone
 
+from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control.damping import damping_from_stiffness
+from torch_pbd.control.primitive.outputs import RESOLUTION, Outputs
 from torch_pbd.control.primitive.smoothing import UNKNOWN
-from torch_pbd.control.stiffness import StiffnessLaw
+from torch_pbd.control.primitive.units import in_si
+from torch_pbd.control.stiffness import RotationLimits, StiffnessLaw
+from torch_pbd.data import Demonstrations
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.estimators.demonstrations import fit_with_groups
 from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
@@ -18,8 +23,6 @@ from torch_pbd.estimators.validation import prior_covariance
 
 OnUnknown = Literal["soft", "prior", "raise"]
 
-_RESOLUTION = 1e-5  # of the extent of a movement: smaller standard deviations count as none
-_ROUNDING = 1e-11  # of the largest position
 _FAR = 1e6  # ranges of the input: only the prior speaks there
 _AT_ONCE = 2**14  # times: a regressor may need a hundred times the memory of what it predicts
 
@@ -33,20 +36,23 @@ class Gains(NamedTuple):
     type1: Floats
 
 
-def gains_at(controller: Any, time: Floats) -> Gains:
-    """Gains of a fitted :class:`~torch_pbd.control.DMPController` at movement times (n,).
+def gains_at(controller: Any, time: Floats, path: Floats) -> Gains:
+    """Gains of a fitted :class:`~torch_pbd.control.DMPController` at movement times (n,) and desired outputs (n, d).
+
+    Of poses in world axes: the covariance of a chart is brought to the desired pose, and the law applied there.
 
     Raises
     ------
     ValueError
         With on_unknown="raise", if the Type I uncertainty is above 0.5 somewhere.
     """
-    parts = [_gains(controller, part) for part in np.split(time, range(_AT_ONCE, len(time), _AT_ONCE))]
+    cuts = range(_AT_ONCE, len(time), _AT_ONCE)
+    parts = [_gains(controller, *part) for part in zip(np.split(time, cuts), np.split(path, cuts), strict=True)]
     return Gains(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def _gains(controller: Any, time: Floats) -> Gains:
-    sampled, covariance, type1 = _covariances(controller, time)
+def _gains(controller: Any, time: Floats, path: Floats) -> Gains:
+    *learned, type1 = _covariances(controller, time)
     on_unknown, law = controller.on_unknown, controller.law_
     if on_unknown == "raise" and (type1 > UNKNOWN).any():
         index = int(np.argmax(type1 > UNKNOWN))
@@ -54,17 +60,32 @@ def _gains(controller: Any, time: Floats) -> Gains:
             f"There are no data at time {time[index]:g}: the Type I uncertainty is {type1[index]:.2f}. Ask within "
             "the demonstrations, or let on_unknown='soft' make the robot compliant there."
         )
+    sampled, covariance = (at_pose(controller.outputs_, law, each, path) for each in learned)
     if on_unknown == "soft":
         # The share u of the way to the least stiffness counts holes already; their prior would count them again.
-        stiffness = law(sampled)
-        softest = stiffness.new_tensor(law.limits(stiffness.shape[-1])[0]) * torch.eye(stiffness.shape[-1]).to(
-            stiffness
-        )
+        stiffness = law(sampled, controller.mass)
+        softest = stiffness.new_tensor(law.limits(stiffness.shape[-1])[0])
+        softest = softest * torch.eye(stiffness.shape[-1]).to(stiffness)
         stiffness = softest + torch.tensor(1.0 - type1)[:, None, None] * (stiffness - softest)
     else:
-        stiffness = law(covariance)
-    damping = damping_from_stiffness(stiffness, float(controller.mass), controller.damping_ratio)
+        stiffness = law(covariance, controller.mass)
+    damping = damping_from_stiffness(stiffness, controller.mass, controller.damping_ratio)
     return Gains(stiffness.numpy(), damping.numpy(), covariance, type1)
+
+
+def at_pose(outputs: Outputs, law: StiffnessLaw, learned: Floats, path: Floats) -> Floats:
+    """Covariances (n, d, d) of what was learned, at the poses (n, d); between blocks only where the law asks for it.
+
+    All outputs are learned at once, but what few demonstrations say of how positions and rotations vary together does
+    not hold for others: without it, those left out are as likely, or likelier.
+    """
+    covariance = outputs.covariance(learned, path)
+    if len(outputs.blocks) == 1 or law.cross_terms:
+        return covariance
+    cut = np.zeros_like(covariance)
+    for block in outputs.blocks:
+        cut[:, block, block] = covariance[:, block, block]
+    return cut
 
 
 def _covariances(controller: Any, time: Floats) -> tuple[Floats, Floats, Floats]:
@@ -89,28 +110,85 @@ def _covariances(controller: Any, time: Floats) -> tuple[Floats, Floats, Floats]
 
 
 def fit_covariance(
-    regressor: CovarianceRegressor | None, inputs: Floats, varying: Floats, known: NDArray[np.bool_]
+    regressor: CovarianceRegressor | None,
+    inputs: Floats,
+    varying: Floats,
+    known: NDArray[np.bool_],
+    outputs: Outputs,
 ) -> CovarianceRegressor:
     """Clone of the regressor, fitted to what varies (K, n, d) at inputs (n, 1), where two or more know it (K, n).
 
     From one demonstration alone nothing is known of how they vary, and the others stay aligned.
     """
     fitted: CovarianceRegressor = clone(HeteroscedasticGPRegressor() if regressor is None else regressor)
-    between, extent = varying - varying[:1], _extent(varying)
-    if float(np.abs(between).max()) <= _RESOLUTION * extent:
-        # One movement, shown again: what a smooth mean leaves of it would count as variability. It stands still
-        # instead, at a distance to which the floors of regressors are relative.
-        varying = extent + between
+    between, extents = varying - varying[:1], outputs.extents(varying)
+    for block in outputs.blocks:
+        extent = extents[block][0]
+        if float(np.abs(between[..., block]).max()) <= RESOLUTION * extent:
+            # One movement, shown again: what a smooth mean leaves of it would count as variability. It stands still
+            # instead, at a distance to which the floors of regressors are relative.
+            varying = np.concatenate(
+                [varying[..., : block.start or 0], extent + between[..., block], varying[..., block.stop :]], axis=-1
+            )
     groups, steps = np.nonzero(known & (known.sum(axis=0) > 1))
-    return fit_with_groups(fitted, inputs[steps], varying[groups, steps], groups)
+    _bring_priors(fitted, outputs)
+    return fit_with_groups(fitted, inputs[steps], outputs.encode(varying[groups, steps]), groups)
 
 
-def fit_law(law: StiffnessLaw | None, covariance: Floats, varying: Floats) -> StiffnessLaw:
-    """Law with its bounds fixed to covariances (m, d, d) along a movement, of what varies (K, n, d)."""
-    return (StiffnessLaw() if law is None else law).fitted(covariance, resolution=_RESOLUTION * _extent(varying))
+def fit_law(controller: Any, varying: Floats) -> StiffnessLaw:
+    """Law of a controller with its bounds fixed to covariances where there are samples, of what varies (K, n, d)."""
+    outputs, reproduction, unsampled = controller.outputs_, controller.reproduction_, controller.unsampled_
+    time = np.linspace(0.0, controller.duration_, len(unsampled))[unsampled <= UNKNOWN][::4]
+    law = _chosen(controller.stiffness_law, outputs)
+    if law.kind == "precision" and law.effort != "match":
+        # The effort is in kg/N^2, the covariance in units of the recordings.
+        efforts = np.ones(len(outputs.blocks)) * law.effort
+        efforts[0] *= in_si(outputs.units(controller.units_)) ** 2
+        law = replace(law, effort=tuple(efforts.tolist()))
+    learned = controller.covariance_.predict_cov(reproduction.phase(time))
+    covariance = at_pose(outputs, law, learned, reproduction.motion(time)[0])
+    resolution = (RESOLUTION * outputs.extents(varying)).tolist()
+    return law.fitted(covariance, resolution=resolution, mass=controller.mass)
 
 
-def _extent(varying: Floats) -> float:
-    """Diagonal of the box around (K, n, d); where nothing moves the largest position, which floors are relative to."""
-    extent, largest = float(np.linalg.norm(np.ptp(varying, axis=(0, 1)))), float(np.abs(varying).max())
-    return extent if extent > _ROUNDING * largest else largest or 1.0
+def outputs_under(controller: Any, demonstrations: Demonstrations) -> Outputs:
+    """Outputs of demonstrations; a law or a mass of a controller that are of others are refused."""
+    reference, d = demonstrations.rotation_reference, demonstrations.n_outputs
+    outputs = Outputs(d if reference is None else d - 3, reference)
+    _chosen(controller.stiffness_law, outputs).blocks(d)
+    if np.ndim(controller.mass) and np.shape(controller.mass) != (d, d):
+        shape = np.shape(controller.mass)
+        raise ValueError(f"mass has shape {shape}, must be a number or have shape ({d}, {d}), as many as outputs.")
+    return outputs
+
+
+def _chosen(law: StiffnessLaw | None, outputs: Outputs) -> StiffnessLaw:
+    rotates = outputs.reference is not None
+    chosen = StiffnessLaw(rotation=RotationLimits() if rotates else None) if law is None else law
+    if rotates != (chosen.rotation is not None):
+        must = "limits of stiffness in Nm/rad, as the demonstrations are poses" if rotates else "None for positions"
+        remedy = "give StiffnessLaw(..., rotation=RotationLimits())" if rotates else "or give Demonstrations a rotation"
+        raise checks.refusal(chosen.rotation, "rotation of stiffness_law", must, remedy)
+    return chosen
+
+
+@dataclass(frozen=True)
+class _PriorOfCoordinates:
+    """Prior of the coordinates that are learned, from one of the outputs that is a function of the input."""
+
+    prior: Any
+    inverse: Floats
+
+    def __call__(self, X: Floats) -> Floats:
+        covariance = prior_covariance(self.prior, X, len(self.inverse))
+        return self.inverse @ covariance @ self.inverse.T
+
+
+def _bring_priors(regressor: Any, outputs: Outputs) -> None:
+    """Let priors of a regressor, or of one within, be of the coordinates that it learns."""
+    if outputs.axes is None:
+        return
+    for name, prior in regressor.get_params(deep=True).items():
+        if name.rpartition("__")[2] == "prior" and not (prior is None or isinstance(prior, str)):
+            brought = _PriorOfCoordinates(prior, np.asarray(np.linalg.inv(outputs.axes), dtype=np.float64))
+            regressor.set_params(**{name: brought if callable(prior) else brought(np.empty((0, 1)))})

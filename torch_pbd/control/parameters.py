@@ -53,7 +53,7 @@ def check_parameters(controller: Any) -> None:
     """Refuse the parameters of a DMPController that cannot be used, before any work."""
     for name, kind in _CHOICES.items():
         checks.choice(getattr(controller, name), name, kind)
-    for name, unit in (("alpha", ""), ("gamma", ""), ("tau", "s"), ("mass", "kg")):
+    for name, unit in (("alpha", ""), ("gamma", ""), ("tau", "s")):
         checks.number(getattr(controller, name), name, above=0.0, unit=unit)
     checks.number(controller.beta, "beta", above=0.0, optional=True)
     checks.number(controller.duration, "duration", above=0.0, unit="s", optional=True)
@@ -68,7 +68,11 @@ def check_parameters(controller: Any) -> None:
             timing, "timing of covariance", "'none'", "a controller sets the time of its movement itself"
         )
     checks.instance(controller.stiffness_law, "stiffness_law", StiffnessLaw, optional=True)
-    damping_from_stiffness(np.eye(1), float(controller.mass), controller.damping_ratio)  # checks what is its own
+    mass = controller.mass
+    if np.ndim(mass) < 2:
+        checks.number(mass, "mass", above=0.0, unit="kg", remedy="or give a matrix (d, d)")
+    # Checks what is its own.
+    damping_from_stiffness(np.eye(1 if np.ndim(mass) < 2 else len(mass)), mass, controller.damping_ratio)
 
 
 def check_against_duration(controller: Any) -> None:
@@ -116,7 +120,7 @@ def as_demonstrations(X: Demonstrations | ArrayLike, y: ArrayLike | None, groups
         raise ValueError(f"A controller cannot be learned of these outputs. {' '.join(demonstrations.suspects)}")
     check_unimodal(demonstrations)
     if isinstance(X, Demonstrations):  # arrays have no units: they are in m and s
-        warn_of_units(X.units)
+        warn_of_units(X.units if X.units is None or X.rotation_reference is None else X.units[:-3])
     if demonstrations.alignment == "dtw":
         checks.warn(TIMING_REMOVED)
     return demonstrations
@@ -184,11 +188,11 @@ def schedule_labels(controller: Any) -> dict[str, Any]:
     law = controller.law_
     return {
         "names": controller.names_,
-        "units": robot_unit(controller.units_),
+        "units": robot_unit(controller.outputs_.units(controller.units_)),
         "frame": controller.frame_,
         "stiffness_limits": law.limits(controller.n_outputs_),
         "covariance_of": controller.variability,
-        "mass": float(controller.mass),
+        "mass": float(controller.mass) if np.ndim(controller.mass) == 0 else np.asarray(controller.mass),
         "provenance": {
             "controller": _plain(controller),
             "covariance": _plain(controller.covariance_),
@@ -196,6 +200,7 @@ def schedule_labels(controller: Any) -> dict[str, Any]:
             "cutoff": controller.cutoff_,
             "sigma_low": law.sigma_low,
             "sigma_high": law.sigma_high,
+            **({} if law.rotation is None else {"rotation": asdict(law.rotation)}),
             "torch_pbd": version("torch_pbd"),
         },
     }

@@ -49,12 +49,12 @@ def conditioned(
     At the movement times ``pins`` the path stays, without a part in the gains. Changes are from the path, as it is not
     the model's mean: they differ by the error of the reproduction.
     """
-    model, phase = controller.covariance_, controller.reproduction_.phase
+    model, phase, outputs = controller.covariance_, controller.reproduction_.phase, controller.outputs_
     if not can_bend(controller):
         must = "a model of whole movements, with variability='position', to be bent"
         raise checks.refusal(controller.covariance, "covariance", must, "take DMPController(TrajectoryRegressor())")
     shown, inputs, stays = getattr(controller, "_shown", model), phase(time), phase(np.array(pins))
-    bent = model.condition(inputs, model.predict(inputs) + change, noise_scale=noise_scale)
+    bent = model.condition(inputs, model.predict(inputs) + outputs.encode(change), noise_scale=noise_scale)
     moved = bent.condition(stays, model.predict(stays)) if len(pins) else bent
     # Even knots, but for those beside a time that is known, where the change is to be exact.
     own = np.append(time, pins).clip(0.0, controller.duration_)
@@ -63,7 +63,7 @@ def conditioned(
     knots = np.unique(np.append(even[far], own))
     result = copy.copy(controller)
     result.covariance_, result._shown = bent, shown
-    result._bend = Bend(knots, moved.predict(phase(knots)) - shown.predict(phase(knots)))
+    result._bend = Bend(knots, outputs.decode(moved.predict(phase(knots)) - shown.predict(phase(knots))))
     return result
 
 
@@ -101,7 +101,7 @@ def planned(
     even = np.linspace(0.0, controller.duration_, 2 * controller.n_steps)
     path = CubicSpline(even, controller._motion(even, rest["goal"], rest["start"], 1.0)[0])
     for number, point in enumerate(via or ()):
-        at, position = _checked_point(point, number, controller.duration_, controller.n_outputs_)
+        at, position = _checked_point(point, number, controller)
         change = position - path(at)
         distance, limit = _distance(controller, at, change)
         if distance > limit:
@@ -118,14 +118,15 @@ def planned(
     return bent, rest["goal"], rest["start"]
 
 
-def _checked_point(point: Any, number: int, duration: float, n_outputs: int) -> tuple[float, Floats]:
-    """Movement time and position of a via point, NaN where free."""
+def _checked_point(point: Any, number: int, controller: Any) -> tuple[float, Floats]:
+    """Movement time and outputs of a via point, NaN where free."""
     try:
         at, position = point
     except (TypeError, ValueError):
         raise checks.refusal(point, f"via[{number}]", "a time in s and a position") from None
-    at = checks.number(at, f"the time of via[{number}]", least=0.0, most=duration, unit="s")
-    position = checks.real_floats(position, f"the position of via[{number}]")
+    at = checks.number(at, f"the time of via[{number}]", least=0.0, most=controller.duration_, unit="s")
+    position = controller.outputs_.rows(position, f"the position of via[{number}]")
+    n_outputs = controller.n_outputs_
     if position.shape != (n_outputs,) or np.isinf(position).any() or np.isnan(position).all():
         raise checks.refusal(
             position.tolist(), f"the position of via[{number}]", f"{n_outputs} numbers, NaN where free"
@@ -135,6 +136,7 @@ def _checked_point(point: Any, number: int, duration: float, n_outputs: int) -> 
 
 def _distance(controller: Any, at: float, change: Floats) -> tuple[float, float]:
     """Mahalanobis distance of a change of the outputs that are given, and how far 95 % of demonstrations deviate."""
+    change = controller.outputs_.encode(change)
     given = ~np.isnan(change)
     inputs, size = controller.reproduction_.phase(np.array([at])), int(given.sum())
     covariance = controller.covariance_.predict_cov(inputs)[0][np.ix_(given, given)]

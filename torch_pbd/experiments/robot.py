@@ -12,7 +12,7 @@ from sklearn.base import clone
 
 from torch_pbd.checks import Floats
 from torch_pbd.control.controller import DMPController
-from torch_pbd.control.primitive.units import in_metres
+from torch_pbd.control.primitive.units import in_si
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.rollout import Rollout
 from torch_pbd.control.stability.report import StabilityReport
@@ -93,7 +93,8 @@ def push_row(name: str, run: Run) -> dict[str, Any]:
     for output, label in list(enumerate(names))[:2]:
         row |= {f"K {label} early": float(stiffness[early, output, output])}
         row |= {f"K {label} late": float(stiffness[late, output, output])}
-    row |= {f"path error [{unit}]": scale * in_metres(run.controller.units_) * run.controller.reproduction_error_}
+    recorded = run.controller.outputs_.units(run.controller.units_)
+    row |= {f"path error [{unit}]": scale * in_si(recorded) * run.controller.reproduction_error_}
     return row
 
 

@@ -19,6 +19,7 @@ from sklearn.utils.validation import check_is_fitted
 from torch_pbd import checks
 from torch_pbd.control.controller import DMPController
 from torch_pbd.control.parameters import check_parameters
+from torch_pbd.control.primitive.outputs import Outputs
 from torch_pbd.control.primitive.reproduction import Reproduction, primitive
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.exceptions import ModelFileError
@@ -55,6 +56,7 @@ _LARGEST_LOGARITHM = 300.0
 # Arrays of a controller: for each output one number, but for the forcing.
 _NOISE, _MOTION = ("noise_scale_", "noise_share_"), ("start", "velocity", "goal", "forcing")
 _HOLES = "unsampled_"  # where there are any: other files are as those of versions that knew of none
+_OF_POSES = "rotation_reference", "output_axes"  # of poses alone
 
 
 def save(estimator: CovarianceRegressor | DMPController, path: str | os.PathLike[str]) -> None:
@@ -241,6 +243,9 @@ def _controller_arrays(controller: DMPController) -> Arrays:
     arrays |= {name: getattr(controller.reproduction_, name) for name in _MOTION}
     if controller.unsampled_.any():
         arrays[_HOLES] = controller.unsampled_
+    outputs = controller.outputs_
+    if outputs.reference is not None:
+        arrays |= dict(zip(_OF_POSES, (outputs.reference, outputs.axes), strict=True))
     return arrays
 
 
@@ -256,11 +261,19 @@ def _restore_controller(controller: Any, own: Arrays) -> None:
             setattr(controller, name, tuple(getattr(controller, name)))
     own = {_HOLES: np.zeros(2), **own}  # none at the start, none at the end
     _check_movement(own, d)
+    reference, axes = (own.pop(name, None) for name in _OF_POSES)
+    controller.outputs_ = outputs = Outputs(d if reference is None else d - 3, reference, axes)
+    if reference is not None and not (abs(np.linalg.norm(reference) - 1.0) < 1e-9 and np.linalg.cond(axes) < 1e12):
+        raise ValueError("its rotation_reference must be a unit quaternion, and its output_axes independent")
+    controller.law_.blocks(d)
     for name in (*_NOISE, _HOLES):
         setattr(controller, name, own.pop(name))
     controller.dmp_ = dmp = primitive(controller)
     time = np.linspace(0.0, controller.duration_, len(own["forcing"]))
-    controller.reproduction_ = Reproduction(dmp, controller.phase_input, controller.goal == "each", time=time, **own)
+    own_goals = controller.goal == "each"
+    controller.reproduction_ = Reproduction(
+        dmp, controller.phase_input, own_goals, time=time, blocks=outputs.blocks, **own
+    )
     controller.start_, controller.goal_ = own["start"], own["goal"]
 
 
@@ -268,6 +281,8 @@ def _check_movement(arrays: Arrays, n_outputs: int) -> None:
     """Check the arrays of a controller's own."""
     shapes: dict[str, tuple[int | str, ...]] = dict.fromkeys((*_NOISE, *_MOTION), (n_outputs,))
     shapes |= {"forcing": ("m", n_outputs), _HOLES: ("m",)}
+    if set(_OF_POSES) & set(arrays):
+        shapes |= {"rotation_reference": (4,), "output_axes": (n_outputs, n_outputs)}
     check_entries(arrays, set(shapes), "its arrays")
     for name, array in arrays.items():
         checks.array(array, name, shapes[name])

@@ -30,8 +30,8 @@ def adapt(
     goals: Float[Tensor, "*b t d"],
     start: Float[Tensor, "*b d"],
     duration: float,
-) -> tuple[Float[Tensor, "*b t d"], Float[Tensor, "*b t d"]]:
-    """Position and velocity at times of a path (position, velocity, acceleration) from another start, to other goals.
+) -> tuple[Float[Tensor, "*b t d"], Float[Tensor, "*b t d"], Float[Tensor, "*b t d"]]:
+    """Position, velocity and acceleration at times of a path of these, from another start, to other goals.
 
     With u the path relative to its own goal, the motion is ``goal + k u + c``: c takes start and goal along, by minimum
     jerk over the duration, so that with k = 1 the acceleration is the sum of both. Where this would leave the hull of
@@ -71,7 +71,8 @@ def adapt(
         shape = keep[..., None, :, None] * relative[..., ticks, :, :]
         parts.append(_still(goal).unsqueeze(-3) + shape + carried.squeeze(-1))
     motion = torch.cat([*(part[..., :-1, :, :] for part in parts[:-1]), parts[-1]], dim=-3)
-    return motion[..., 0], motion[..., 1]
+    position, velocity, acceleration = motion.unbind(-1)
+    return position, velocity, acceleration
 
 
 def _quintics(share: Float[Tensor, "*m"], horizon: Tensor) -> Float[Tensor, "*m 3 3"]:

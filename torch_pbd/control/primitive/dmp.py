@@ -197,7 +197,7 @@ class DMP:
             spring = self.beta * (driven - position) - trace[..., 1]
             path = position, rate, (self.alpha * spring + at_ticks) / self.tau**2  # eq. (16)
             ends = {"own_goal": own_goal, "goals": goals, "start": start}
-            position, rate = adapt(path, time, (position, time), **ends, duration=self.duration or self.tau)
+            position, rate, _ = adapt(path, time, (position, time), **ends, duration=self.duration or self.tau)
         return position, rate * passing[:, None]
 
     def _solve(self, forcing: Tensor, goals: Tensor, steps: Tensor, state: Tensor) -> Tensor:

@@ -37,7 +37,8 @@ class Reproduction:
 
     From ``start`` (d,) with ``velocity`` (d,) to ``goal`` (d,), by the ``forcing`` (m, d), which is linear between its
     times (m,) from 0 to the duration, held after it, and was learned over what ``phase_input`` says. With ``own_goals``
-    the goal in eq. (18) is the end of each movement, else the common one.
+    the goal in eq. (18) is the end of each movement, else the common one. ``blocks`` of outputs share a unit; none are
+    one.
     """
 
     dmp: DMP
@@ -48,18 +49,34 @@ class Reproduction:
     goal: Floats
     time: Floats
     forcing: Floats
+    blocks: tuple[slice, ...] = (slice(None),)
 
     @classmethod
-    def learn(cls, dmp: DMP, movements: Movements, phase_input: str, *, own_goals: bool) -> "Reproduction":
+    def learn(
+        cls,
+        dmp: DMP,
+        movements: Movements,
+        phase_input: str,
+        *,
+        own_goals: bool,
+        blocks: tuple[slice, ...] = (slice(None),),
+    ) -> "Reproduction":
         """Fit the forcing of the mean movement, eq. (18), and tabulate it over the duration."""
         position = movements.position
         start, velocity = position[:, 0].mean(axis=0), movements.velocity[:, 0].mean(axis=0)
         goal = position[:, -1].mean(axis=0)
         time = np.linspace(0.0, movements.time[-1], _TICKS + 1)
-        known = cls(dmp, phase_input, own_goals, start, velocity, goal, time, np.zeros((len(time), len(goal))))
+        still = np.zeros((len(time), len(goal)))
+        known = cls(dmp, phase_input, own_goals, start, velocity, goal, time, still, blocks)
         mean = known.forcing_of(movements).mean(axis=0)
         X, at = known.phase(movements.time), known.phase(time)
-        return replace(known, forcing=_process_mean(X, mean, len(position), at))
+        if len(blocks) == 1:
+            return replace(known, forcing=_process_mean(X, mean, len(position), at))
+        # Of poses along the principal axes of each block: outputs are learned one by one, and frames must not matter.
+        axes, deviation = np.eye(len(goal)), mean - mean.mean(axis=0)
+        for own in blocks:
+            axes[own, own] = np.linalg.eigh(deviation[:, own].T @ deviation[:, own])[1]
+        return replace(known, forcing=_process_mean(X, mean @ axes, len(position), at) @ axes.T)
 
     def phase(self, time: Floats) -> Floats:
         """Inputs (n, 1) of the regressors at movement times (n,): the phase, its logarithm, or the time itself."""
@@ -76,16 +93,19 @@ class Reproduction:
         forcing: Floats = self.dmp.forcing(*map(_tensor, parts)).numpy()
         return forcing
 
-    def check_against(self, movements: Movements) -> float:
-        """Root mean square distance of the motion from the mean of the movements as they were recorded.
+    def check_against(self, movements: Movements) -> list[float]:
+        """Root mean square distance of the motion from the mean of the movements as they were recorded, of each block.
 
         Warns of more than 1 % of the extent of all movements, and refuses a motion that leaves their range.
         """
         mean, path = movements.recorded_mean, self.motion(movements.time)[0]
         check_range(path, movements.bounds, "The reproduced movement")
+        return [self._error(path[:, own], mean[:, own], movements.bounds[:, own]) for own in self.blocks]
+
+    def _error(self, path: Floats, mean: Floats, bounds: Floats) -> float:
         distance = np.linalg.norm(path - mean, axis=1)
         error = float(np.sqrt(np.mean(distance**2)))
-        extent = float(np.linalg.norm(np.ptp(movements.bounds, axis=0)))
+        extent = float(np.linalg.norm(np.ptp(bounds, axis=0)))
         rounding = _ROUNDING * float(np.abs(mean).max())
         if error > _FAR * extent + rounding:
             remedy = "phase_input='time'" if self.phase_input == "s" else "a higher cutoff, or more n_steps"
@@ -100,7 +120,7 @@ class Reproduction:
 
         A unit of position is so many ``metres``.
         """
-        speed = metres * np.linalg.norm(self._curve(self.time, 1), axis=1)
+        speed = metres * np.linalg.norm(self._curve(self.time, 1)[:, self.blocks[0]], axis=1)
         ends, largest = max(float(speed[0]), float(speed[-1])), float(speed.max())
         if ends > max(_CUT * largest, _STOPPED) and speed.min() < _STEADY * largest:
             checks.warn(
@@ -109,8 +129,8 @@ class Reproduction:
                 "needs a ramp at the start, and settle > 0 at the end."
             )
 
-    def motion(self, time: Floats) -> tuple[Floats, Floats]:
-        """Position and velocity (n, d) at any times (n,): at rest at the start before 0, and long after the end.
+    def motion(self, time: Floats) -> tuple[Floats, Floats, Floats]:
+        """Position, velocity and acceleration (n, d) at any times (n,): at rest before 0, and long after the end.
 
         The primitive is solved exactly at 4000 ticks in the duration, and interpolated by cubics between. With
         adaptation="safe" it is over with the duration.
@@ -118,7 +138,7 @@ class Reproduction:
         curve, end = self._curve, self._curve.x[-1]
         within = np.clip(time, 0.0, end)
         moving = ((time >= 0.0) & (time <= end))[:, np.newaxis]
-        return curve(within), np.where(moving, curve(within, 1), 0.0)
+        return curve(within), np.where(moving, curve(within, 1), 0.0), np.where(moving, curve(within, 2), 0.0)
 
     @cached_property
     def _curve(self) -> CubicHermiteSpline:
@@ -142,8 +162,8 @@ class Reproduction:
 
     def plan(
         self, time: Floats, goal: ArrayLike | None, start: ArrayLike | None, speed: float | Floats
-    ) -> tuple[Floats, Floats, Floats]:
-        """Position and velocity (n, d) at times (n,) from 0, and movement time (n,) of the gains there.
+    ) -> tuple[Floats, Floats, Floats, Floats]:
+        """Position, velocity and acceleration (n, d) at times (n,) from 0, and movement time (n,) of the gains there.
 
         To goals (d,) or (n, d), from a start (d,), None for those demonstrated, at one speed or those of all times.
         With adaptation="safe" it brakes to rest at the end of the movement, if the times go on after it.
@@ -158,10 +178,9 @@ class Reproduction:
         pace = np.broadcast_to(np.asarray(speed, dtype=np.float64), time.shape)
         passed = time * speed if np.ndim(speed) == 0 else cumulative_trapezoid(pace, time, initial=0.0)
         if self.dmp.adaptation == "safe":
-            position, velocity, known = self._safe(passed, goals, begin, changed=changed)
-            return position, velocity * pace[:, np.newaxis], known
-        position, velocity = self.motion(passed)
-        velocity = velocity * pace[:, np.newaxis]
+            path, known = self._safe(passed, goals, begin, changed=changed)
+            return *_at_pace(path, pace, time), known
+        position, velocity, acceleration = _at_pace(self.motion(passed), pace, time)
         if changed:
             # The primitive is linear: another start and goal add its answer to their change alone.
             still, change = torch.zeros(goals.shape, dtype=torch.float64), _tensor(goals - self.goal)
@@ -169,28 +188,40 @@ class Reproduction:
             run = self.dmp.rollout(still, float(time[1]), goal=change, position0=offset, speed=speeds)
             answer = CubicHermiteSpline(time[1] * np.arange(len(time)), *(part.numpy() for part in run), axis=0)
             position, velocity = position + answer(time), velocity + answer(time, 1)
-        return position, velocity, passed
+            acceleration = acceleration + answer(time, 2)
+        return position, velocity, acceleration, passed
 
-    def _safe(self, passed: Floats, goals: Floats, start: Floats, *, changed: bool) -> tuple[Floats, Floats, Floats]:
+    def _safe(
+        self, passed: Floats, goals: Floats, start: Floats, *, changed: bool
+    ) -> tuple[tuple[Floats, Floats, Floats], Floats]:
         """Motion (n, d) by movement time, adapted without a throw, and movement time (n,) of the gains."""
-        moved, rate, known = self._braked(passed)
-        path = [self._curve(moved, order) * rate[:, np.newaxis] ** order for order in range(3)]
+        moved, rate, slope, known = self._braked(passed)
+        velocity = self._curve(moved, 1)
+        path = (
+            self._curve(moved),
+            velocity * rate[:, np.newaxis],
+            self._curve(moved, 2) * rate[:, np.newaxis] ** 2 + velocity * slope[:, np.newaxis],
+        )
         if changed:
             whole = _tensor(self._curve(self.time)), _tensor(self.time)
             ends = {"own_goal": _tensor(self.goal), "goals": _tensor(goals), "start": _tensor(start)}
             run = adapt(tuple(map(_tensor, path)), _tensor(passed), whole, **ends, duration=float(self.time[-1]))
-            path = [part.numpy() for part in run]
-        return path[0], path[1], known
+            position, velocity, acceleration = (part.numpy() for part in run)
+            path = position, velocity, acceleration
+        return path, known
 
-    def _braked(self, passed: Floats) -> tuple[Floats, Floats, Floats]:
-        """Movement time (n,) that comes to rest at the end of the movement, its rate, and the time of the gains (n,).
+    def _braked(self, passed: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        """Movement time (n,) that comes to rest at the end of the movement, its derivatives, and that of the gains.
 
         What was cut at a speed v stops on its own path, half before the end and half after it, in 1.5 v / a, which
         takes its own largest acceleration a; or in a fifth of the duration, or in what time there is, if that is less.
         """
         end, curve = float(self.time[-1]), self._curve
-        largest = max(float(np.linalg.norm(curve(self.time, 2), axis=1).max()), np.finfo(float).tiny)
-        needed = 1.5 * float(np.linalg.norm(curve(end, 1))) / largest
+        bends, last = curve(self.time, 2), curve(end, 1)
+        largest = [max(float(np.linalg.norm(bends[:, own], axis=1).max()), np.finfo(float).tiny) for own in self.blocks]
+        needed = max(
+            1.5 * float(np.linalg.norm(last[own])) / most for own, most in zip(self.blocks, largest, strict=True)
+        )
         brake = max(0.0, min(needed, _BRAKE * end, 2.0 * (float(passed[-1]) - end)))
         # The rate of movement time falls from 1 to 0 by a smooth step of u; the time moved is its integral,
         # brake (u - u^3 + u^4 / 2), half of the brake when it stands.
@@ -198,7 +229,8 @@ class Reproduction:
         share = np.clip(late * end / brake + 0.5, 0.0, 1.0) if brake > _ROUNDING * end else 1.0 * (late > _ROUNDING)
         moved = np.minimum(passed, end - 0.5 * brake) + brake * (share - share**3 + 0.5 * share**4)
         rate = 1.0 - share**2 * (3.0 - 2.0 * share)
-        return np.minimum(moved, end), rate, np.maximum(moved, passed - 0.5 * brake)
+        slope = -6.0 * share * (1.0 - share) / brake if brake > _ROUNDING * end else np.zeros(len(passed))
+        return np.minimum(moved, end), rate, slope, np.maximum(moved, passed - 0.5 * brake)
 
 
 def primitive(controller: Any) -> DMP:
@@ -207,6 +239,13 @@ def primitive(controller: Any) -> DMP:
     tau = float(controller.tau) * (controller.duration_ / 10.0 if controller.adaptation == "safe" else 1.0)
     options = {"duration": controller.duration_, "gate": controller.gate, "adaptation": controller.adaptation}
     return DMP(float(controller.alpha), beta, float(controller.gamma), tau, **options)
+
+
+def _at_pace(path: tuple[Floats, Floats, Floats], pace: Floats, time: Floats) -> tuple[Floats, Floats, Floats]:
+    """Motion (n, d) by time (n,) of one by movement time, which passes at a pace (n,)."""
+    position, velocity, acceleration = path
+    rate, slope = pace[:, np.newaxis], np.gradient(pace, time)[:, np.newaxis]
+    return position, velocity * rate, acceleration * rate**2 + velocity * slope
 
 
 def _process_mean(X: Floats, forcing: Floats, n_demos: int, at: Floats) -> Floats:

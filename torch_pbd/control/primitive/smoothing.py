@@ -196,7 +196,8 @@ def merge_bursts(demonstrations: Demonstrations) -> Demonstrations:
         f"and were merged with it: {preview([f'{few} of {n} in demonstration {k}' for k, n, few in lost])}. Take times "
         "from a clock that resolves them, or drop repeated samples."
     )
-    labels = {name: getattr(demonstrations, name) for name in ("names", "units", "frame", "time_unit")}
+    kept = ("names", "units", "frame", "time_unit", "rotation_reference")
+    labels = {name: getattr(demonstrations, name) for name in kept}
     return Demonstrations([time for time, _ in merged], [position for _, position in merged], **labels)
 
 

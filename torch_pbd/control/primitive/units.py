@@ -1,4 +1,4 @@
-"""From the units of recordings to metres and seconds, those of a robot; and what no robot does in them."""
+"""From the units of recordings to metres, radians and seconds, those of a robot; and what no robot does in them."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -55,18 +55,18 @@ def common_unit(units: Sequence[str] | None) -> str | None:
     return units[0] if units is not None and len(set(units)) == 1 else None
 
 
-def in_metres(units: Sequence[str] | None) -> float:
-    """Metres of one unit of position; 1 where units are not known, differ, or are no lengths.
+def in_si(units: Sequence[str] | None) -> float:
+    """Metres, or radians, of one unit of position; 1 where units are not known, differ, or are neither.
 
     Those are taken as they are: stiffness is then in N per unit, and mass in N s^2 per unit.
     """
-    return LENGTHS.get(common_unit(units) or "", 1.0)
+    return (LENGTHS | ANGLES).get(common_unit(units) or "", 1.0)
 
 
 def robot_unit(units: Sequence[str] | None) -> str | None:
     """Unit of the positions of a robot that follows recordings in these units."""
     common = common_unit(units)
-    return "m" if common in LENGTHS else common
+    return "m" if common in LENGTHS else "rad" if common in ANGLES else common
 
 
 def counts_as_metres(units: Sequence[str] | None) -> bool:

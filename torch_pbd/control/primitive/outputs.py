@@ -1,0 +1,177 @@
+"""Outputs of a movement: which share a unit, which are a rotation, and the axes in which they are learned."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torch_pbd import checks
+from torch_pbd.checks import Floats
+from torch_pbd.rotations import Chart
+
+RESOLUTION = 1e-5
+"""Of the extent of a movement: smaller standard deviations count as none. Of rotations also of a radian."""
+
+_ROUNDING = 1e-11  # of the largest position
+_FURTHEST = 150.0  # degrees from the reference, as for demonstrations: at 180 a chart takes the other way round
+_NEARLY_UNIT = 1e-3  # of the norm of a quaternion: as people write them
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Outputs of a movement: ``n_positions``, and, of poses, three coordinates of a rotation in the chart around R0.
+
+    ``reference`` (4,) is R0, w x y z. What the regressor learns are z of ``y = axes z``: of poses the principal axes of
+    each block, in units of its extent. Outputs are standardized one by one, which depends on their axes; and floors
+    are relative to other outputs, which must not mix m with rad.
+    """
+
+    n_positions: int
+    reference: Floats | None = None
+    axes: Floats | None = None
+
+    @property
+    def blocks(self) -> tuple[slice, ...]:
+        """Outputs that share a unit."""
+        p = self.n_positions
+        return (slice(0, p),) if self.reference is None else (slice(0, p), slice(p, p + 3))
+
+    @cached_property
+    def _chart(self) -> Chart:
+        assert self.reference is not None
+        return Chart(self.reference)
+
+    def units(self, units: Sequence[str] | None) -> Sequence[str] | None:
+        """Units of the positions alone, of those of all outputs."""
+        return None if units is None else units[: self.n_positions]
+
+    def extents(self, varying: Floats) -> Floats:
+        """Extent (d,) of what varies (K, n, d), block by block: the diagonal of its box; of poses one that turns.
+
+        Where nothing moves it is the largest position, which floors are relative to; a rotation has a radian.
+        """
+        extents = np.empty(varying.shape[-1])
+        for block in self.blocks:
+            own = varying[..., block]
+            box = np.ptp(own, axis=(0, 1)) if self.reference is None else 4.0 * own.std(axis=(0, 1))
+            extent, largest = float(np.linalg.norm(box)), float(np.abs(own).max())
+            extents[block] = extent if extent > _ROUNDING * largest else largest or 1.0
+        if self.reference is not None:
+            extents[self.n_positions :] = np.maximum(extents[self.n_positions :], 1.0)
+        return extents
+
+    def with_axes(self, varying: Floats, known: NDArray[np.bool_]) -> "Outputs":
+        """Outputs with the axes of what varies (K, n, d) between demonstrations, where known (K, n); of poses only.
+
+        Principal axes of the covariance within times, pooled: they turn with the world and with the tool. Signs are by
+        third moments, which turn too.
+        """
+        if self.reference is None:
+            return self
+        count = known.sum(axis=0)[:, np.newaxis]
+        mean = np.where(known[..., np.newaxis], varying, 0.0).sum(axis=0) / np.maximum(count, 1)
+        deviation = (varying - mean)[known]
+        axes, extents = np.eye(varying.shape[-1]), self.extents(varying)
+        for block in self.blocks:
+            own = deviation[:, block]
+            if float(np.abs(own).max()) > RESOLUTION * extents[block][0]:
+                turned = np.linalg.eigh(own.T @ own)[1]
+                axes[block, block] = turned * np.where(((own @ turned) ** 3).sum(axis=0) < 0.0, -1.0, 1.0)
+        return replace(self, axes=axes * extents)
+
+    def encode(self, values: Floats) -> Floats:
+        """Coordinates z of outputs (..., d), of which whole blocks may be NaN."""
+        if self.axes is None:
+            return values
+        inverse = np.linalg.inv(self.axes)
+        return np.concatenate([values[..., block] @ inverse[block, block].T for block in self.blocks], axis=-1)
+
+    def noise(self, scale: Any) -> Any:
+        """Standard deviation of errors of z, from those of outputs: a number or (d,); of poses equal in each block."""
+        if self.axes is None:
+            return scale
+        given = checks.real_floats(scale, "noise_scale")
+        if not given.any():
+            return 0.0
+        if given.shape != self.axes.shape[:1] or any(np.ptp(given[block]) > 0.0 for block in self.blocks):
+            must = f"0, or {self.n_positions} equal numbers for positions and 3 in rad for the rotation"
+            raise checks.refusal(scale, "noise_scale", must, "m and rad have no scale in common")
+        return given / np.linalg.norm(self.axes, axis=0)
+
+    def decode(self, coordinates: Floats) -> Floats:
+        """Outputs (..., d) of coordinates z."""
+        return coordinates if self.axes is None else coordinates @ self.axes.T
+
+    def covariance(self, learned: Floats, path: Floats | None = None) -> Floats:
+        """Covariances (n, d, d) of outputs from those of z; at poses ``path`` (n, d) in world axes.
+
+        Those of the chart are as large as in world axes only near its reference: its axes are turned by up to the half
+        of the angle to it, and stretched. What is in world axes is what a controller of the robot compares with it.
+        """
+        if self.axes is None:
+            return learned
+        turn = self.axes if path is None else self.to_world(path) @ self.axes
+        whole = turn @ learned @ np.swapaxes(turn, -1, -2)
+        return 0.5 * (whole + np.swapaxes(whole, -1, -2))
+
+    def to_world(self, path: Floats) -> Floats:
+        """Matrices (n, d, d) from small changes of outputs, at poses (n, d), to those in world axes."""
+        p = self.n_positions
+        whole = np.tile(np.eye(p + 3), (len(path), 1, 1))
+        whole[:, p:, p:] = self._chart.to_world(path[:, p:])
+        return whole
+
+    def poses(self, path: Floats) -> tuple[Floats, Floats]:
+        """Positions (n, p) and quaternions (n, 4) of outputs (n, d)."""
+        return path[..., : self.n_positions], self._chart.exp(path[..., self.n_positions :])
+
+    def motion(self, path: Floats, velocity: Floats, acceleration: Floats, unit: float) -> dict[str, Floats]:
+        """Rows of a schedule, of a motion (n, d) in units of position of so many m: in world axes."""
+        if self.reference is None:
+            return {"position": unit * path, "velocity": unit * velocity, "acceleration": unit * acceleration}
+        p, chart = self.n_positions, self._chart
+        position, orientation = self.poses(path)
+        y, rate, second = (part[:, p:] for part in (path, velocity, acceleration))
+        return {
+            "position": unit * position,
+            "velocity": np.hstack([unit * velocity[:, :p], chart.velocity(y, rate)]),
+            "acceleration": np.hstack([unit * acceleration[:, :p], chart.acceleration(y, rate, second)]),
+            "orientation": orientation,
+        }
+
+    def scales(self, unit: float) -> Floats:
+        """Units of outputs (d,) in m and rad, where those of positions are so many m."""
+        return np.concatenate([np.full(self.n_positions, unit), np.ones(0 if self.reference is None else 3)])
+
+    def rows(self, values: Any, name: str) -> Floats:
+        """Outputs (..., d) of positions followed by a unit quaternion w x y z, or as they are; NaN where not given."""
+        given = checks.real_floats(values, name)
+        p = self.n_positions
+        if self.reference is None or not given.ndim:
+            return given
+        if given.shape[-1] == p + 4:
+            quaternion = given[..., p:]
+            norm = np.linalg.norm(quaternion, axis=-1, keepdims=True)
+            good = np.isnan(quaternion).all(axis=-1) | (np.abs(norm[..., 0] - 1.0) <= _NEARLY_UNIT)
+            remedy = "give a unit quaternion w x y z, or four NaN"
+            checks.require(good, norm[..., 0], f"the norm of the quaternion of {name}", "1", remedy)
+            y = self._chart.log(quaternion / norm)
+            angle = np.rad2deg(np.linalg.norm(y, axis=-1))
+            checks.require(
+                np.isnan(angle) | (angle <= _FURTHEST),
+                angle,
+                f"the angle of {name} to the reference of the demonstrations, in degrees,",
+                f"at most {_FURTHEST:g}",
+            )
+            given = np.concatenate([given[..., :p], y], axis=-1)
+        if given.shape[-1] != p + 3:
+            must = f"must have {p + 4} columns, position and quaternion w x y z, or the {p + 3} of the outputs."
+            raise ValueError(f"{name} has shape {given.shape}, {must}")
+        for block, what in zip(self.blocks, ("position", "rotation"), strict=True):
+            free = np.isnan(given[..., block])
+            if (free.any(axis=-1) != free.all(axis=-1)).any():
+                raise ValueError(f"the {what} of {name} is given in part, must be given whole, or be NaN whole.")
+        return given
