@@ -263,7 +263,8 @@ def _restore_controller(controller: Any, own: Arrays) -> None:
     _check_movement(own, d)
     reference, axes = (own.pop(name, None) for name in _OF_POSES)
     controller.outputs_ = outputs = Outputs(d if reference is None else d - 3, reference, axes)
-    if reference is not None and not (abs(np.linalg.norm(reference) - 1.0) < 1e-9 and np.linalg.cond(axes) < 1e12):
+    unit = reference is None or abs(float(np.linalg.norm(reference)) - 1.0) < 1e-9
+    if not unit or (axes is not None and not np.linalg.cond(axes) < 1e12):
         raise ValueError("its rotation_reference must be a unit quaternion, and its output_axes independent")
     controller.law_.blocks(d)
     for name in (*_NOISE, _HOLES):
