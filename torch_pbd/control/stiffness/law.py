@@ -54,7 +54,7 @@ class StiffnessLaw:
     kind : {"linear", "precision"}, default="linear"
         "precision" is what minimizes the expected cost ``e' Sigma^-1 e + r f' M^-1 f`` of deviations e and forces f of
         a mass M: ``K = (M # Sigma^-1) / r^1/2`` with the geometric mean # of matrices, then held within the limits.
-        Its damping is :func:`~torch_pbd.control.damping_from_stiffness` of ratio 1/sqrt(2); 1 costs 6 % more.
+        Its own damping ratio is 1/sqrt(2); where limits hold, 1 costs less (scripts/benchmarks/precision_law.py).
     rotation : RotationLimits, default=None
         Of the last three outputs, if they are a rotation in rad.
     cross_terms : bool, default=False
