@@ -191,7 +191,6 @@ def test_55_a_schedule_that_cannot_be_followed_is_refused(rows, words):
     ("option", "value"),
     [
         ("mass", 0.0),
-        ("mass", np.eye(2)),
         ("mass", True),
         ("rate", math.inf),
         ("max_step", math.nan),

@@ -2,18 +2,22 @@
 
 import math
 import threading
-from operator import add
 from typing import Literal, final
+
+from numpy.typing import ArrayLike
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.control.realtime.clock import SMOOTHING, ScheduleClock, TickTimer
-from torch_pbd.control.realtime.limits import FINE, CommandLimits, ForceChannel, TickStatus
-from torch_pbd.control.realtime.steps import Numbers, Vector, braked, vector
+from torch_pbd.control.realtime.clock import ScheduleClock
+from torch_pbd.control.realtime.limits import FINE, TickStatus, channel_of
+from torch_pbd.control.realtime.motion import Motion
+from torch_pbd.control.realtime.options import Option, of_blocks, unit_quaternion
+from torch_pbd.control.realtime.places import Vector, moved
+from torch_pbd.control.realtime.steps import Numbers, vector
 from torch_pbd.control.realtime.table import ScheduleTable, virtual_mass
+from torch_pbd.control.realtime.timer import TickTimer
 from torch_pbd.control.schedule import Schedule
 
-_DECELERATION = 5.0  # units/s^2: from 0.5 m/s to rest in 0.1 s and 25 mm
 _SHARED = "this controller is in a tick already: two threads share it. Give each its own."
 
 
@@ -22,54 +26,61 @@ class RealTimeAdmittance:
     """Robot that moves as ``M a = f + K (x_d - x) + D (v_d - v)``, eq. (15) as admittance, one tick at a time.
 
     A tick is solved exactly over the time that really passed, with force and schedule held over it: irregular and
-    late ticks add no energy where the stiffness is constant. (Where it rises, see `certify`.) The schedule is copied
+    late ticks add no energy where the gains are constant. (Where they change, see `certify`.) The schedule is copied
     to a table of rows ``1 / rate`` apart, as `Schedule.resample` makes them. A tick takes the row nearest to its
     beginning, and after the end the last one, with no velocity. Schedule time comes up to speed and slows down before
     the end, so that desired motion begins as fast as the robot moves and ends at rest, within 1.5 times the schedule's
     own acceleration, or that of a soft start if it is more: also where it does several of these at a time.
 
-    Where damping shares the axes of stiffness in every row, as ``2 zeta sqrt(m K)`` does, a tick takes microseconds,
-    else 0.1 ms, for a matrix exponential: interpolation between turned axes loses the sharing, so sample the schedule
-    at ``rate``. The table of a minute at 1 kHz takes 10 MB for d = 2; ticks keep no memory.
+    On poses the deviation ``x - x_d`` ends with the rotation vector Log(R R_d'), v with the angular velocity, and f is
+    a wrench, all in world axes. Limits are then pairs, of lengths in m, m/s or N and of rotations in rad, rad/s or Nm:
+    ``force_limit=(50.0, 5.0)``. Speeds as far apart as the two approach speeds count as equal where the motion as a
+    whole is braked or catches up; the two stop together.
+
+    Where damping shares the modes of stiffness and mass in every row, as that of `Schedule.with_inertia` does, a tick
+    takes microseconds, else 0.1 ms, for a matrix exponential: interpolation between rows loses the sharing, so sample
+    the schedule at ``rate``, and then tell it the inertia. The table of a minute at 1 kHz takes 10 MB for d = 2, 100 MB
+    for poses; ticks keep no memory. Nothing is fed forward: ``schedule.acceleration`` is not used.
 
     Parameters
     ----------
     schedule : Schedule
-    mass : float, default=None
-        Virtual mass in kg, the same in all directions; None takes the schedule's, or 1 kg. Another one is told.
+    mass : float or array_like of shape (d, d), default=None
+        Virtual mass in kg, for poses also kg m and kg m2; None takes the schedule's, row by row, or 1 kg. Another one
+        is told.
     rate, max_step : float, default=1000.0, 0.01
         Rate of the loop in 1/s and longest tick in s. Over a longer one the robot has braked, or rests at its last
         command if there was time to be back; after three on end it stops.
-    force_limit, deadband : float, default=200.0, 0.0
-        Range of the sensor in N, as the length of the vector; and force on an axis, in N, that counts as none and is
-        taken off larger ones, against drift and noise.
-    spring_limit : float, default=None
-        Largest pull of the spring ``K e``, e = x_d - x, in N; None takes ``force_limit``. Beyond it, K is scaled by
-        ``spring_limit / sqrt(k_max e'K e)``, k_max its largest eigenvalue: the force of a potential that is concave in
-        e'K e, and so adds no energy where K is constant.
-    velocity_limit, acceleration_limit : float, default=None
-        Largest speed and acceleration of the command, in units/s and units/s^2; where they act, ticks are not exact.
-        None is the most that the desired motion and ``force_limit`` can cause where the damping is least.
+    force_limit, deadband : float or (float, float), default=None
+        Range of the sensor, as the length of the vector; and force on an axis that counts as none and is taken off
+        larger ones, against drift and noise. None is 200 N and 20 Nm, and no deadband.
+    spring_limit : float or (float, float), default=None
+        Largest pull of the spring ``K e``, e = x_d - x; None takes ``force_limit``. Beyond it, K is scaled by
+        ``1 / sqrt(c e'K e)``, c the larger eigenvalue over squared limit of the blocks of K: the force of a potential
+        that is concave in e'K e, and so adds no energy where K is constant, whatever the mass.
+    velocity_limit, acceleration_limit : float or (float, float), default=None
+        Largest speed and acceleration of the command; where they act, ticks are not exact. None is the most that the
+        desired motion and ``force_limit`` can cause where the damping is least.
     hold_ticks, max_bad_ticks : int, default=10
         Ticks on end with a force that is not finite, or a time that is not or does not increase, before the robot
         stops. Until then the median of the last five good forces acts, fading to nothing, or the robot brakes.
-    stop_deceleration : float, default=None
-        Deceleration of a stop, and where time is wrong, in units/s^2, within ``acceleration_limit``. None is 5, or the
-        most that the desired motion takes if that is more.
-    soft_start, approach_speed : float, default=1.0, 0.5
-        Time in s in which the desired position moves from the robot's at ``start`` to the schedule's, by minimum jerk;
-        longer where it would be faster than this, in units/s, or beyond the limit above. At 0 s the schedule begins at
-        full speed.
+    stop_deceleration : float or (float, float), default=None
+        Deceleration of a stop, and where time is wrong, within ``acceleration_limit``. None is 5 units/s2 and
+        10 rad/s2, or the most that the desired motion takes if that is more.
+    soft_start : float, default=1.0
+        Time in s in which the desired place moves from the robot's at ``start`` to the schedule's, by minimum jerk and
+        about one axis; longer where it would be beyond a limit. At 0 s the schedule begins at full speed.
+    approach_speed : float or (float, float), default=None
+        Largest speed of that; None is 0.5 units/s and 1 rad/s.
     on_gap : {"pause", "resume"}, default="pause"
         After a tick longer than ``max_step`` the schedule goes on from where it was, or also catches up, within limits
         and not before the end of a soft start.
-    force_rate_limit : float, default=None
-        Fastest change of the force, in N/s: a spike of the sensor moves the robot less, and a contact is felt later.
+    force_rate_limit : float or (float, float), default=None
+        Fastest change of the force, in N/s and Nm/s; None is none. A spike of the sensor moves the robot less, and a
+        contact is felt later.
 
     Attributes
     ----------
-    position, velocity : tuple of d floats
-        The command, in units and units/s.
     faults : TickStatus
         All faults since ``start``.
 
@@ -90,49 +101,47 @@ class RealTimeAdmittance:
     """
 
     faults: TickStatus
-    _is_stopped: bool
 
     def __init__(
         self,
         schedule: Schedule,
         *,
-        mass: float | None = None,
+        mass: ArrayLike | None = None,
         rate: float = 1000.0,
         max_step: float = 0.01,
-        force_limit: float = 200.0,
-        deadband: float = 0.0,
-        spring_limit: float | None = None,
-        velocity_limit: float | None = None,
-        acceleration_limit: float | None = None,
+        force_limit: Option = None,
+        deadband: Option = None,
+        spring_limit: Option = None,
+        velocity_limit: Option = None,
+        acceleration_limit: Option = None,
         hold_ticks: int = 10,
-        stop_deceleration: float | None = None,
+        stop_deceleration: Option = None,
         soft_start: float = 1.0,
-        approach_speed: float = 0.5,
+        approach_speed: Option = None,
         on_gap: Literal["pause", "resume"] = "pause",
         max_bad_ticks: int = 10,
-        force_rate_limit: float | None = None,
+        force_rate_limit: Option = None,
     ) -> None:
         checks.instance(schedule, "schedule", Schedule)
-        self._mass = virtual_mass(schedule.mass, mass)
+        given = {"force_limit": force_limit, "spring_limit": spring_limit, "deadband": deadband}
+        given |= {"force_rate_limit": force_rate_limit, "velocity_limit": velocity_limit}
+        given |= {"acceleration_limit": acceleration_limit, "approach_speed": approach_speed}
+        limits = of_blocks(given | {"stop_deceleration": stop_deceleration}, len(schedule.blocks))
+        inertia = virtual_mass(schedule, mass)
+        self._unit = inertia if isinstance(inertia, float) else 1.0
         self._timer = TickTimer(rate, max_step, max_bad_ticks)
-        self._channel = ForceChannel(self._mass, force_limit, deadband, force_rate_limit, hold_ticks)
-        pull = force_limit if spring_limit is None else spring_limit
-        self._pull_limit = checks.number(pull, "spring_limit", above=0.0, unit="N") / self._mass
-        self._table = table = ScheduleTable(schedule, self._mass, float(rate))
-        self._limits = limits = CommandLimits(velocity_limit, acceleration_limit)
-        self._clock = clock = ScheduleClock(table, soft_start, approach_speed, limits.acceleration, on_gap)
-        stop = checks.number(stop_deceleration, "stop_deceleration", above=0.0, unit="units/s^2", optional=True)
-        self._deceleration = min(stop or max(_DECELERATION, clock.acceleration), limits.acceleration)
-        # Impulse responses of velocity to force integrate, in absolute values, to 2 / damping at most, for any mass.
-        damping = table.least_damping
-        answer = 2.0 * (force_limit + pull) / damping if damping > 0.0 else math.inf
-        self._speed_due = clock.speed + answer if velocity_limit is None else limits.speed
+        self._channel = channel_of(self._unit, limits, hold_ticks)
+        self._table = table = ScheduleTable(schedule, inertia, float(rate), limits["spring_limit"])
+        self._clock = ScheduleClock(table, soft_start, limits["approach_speed"], limits["acceleration_limit"], on_gap)
+        self._motion = Motion(table, self._timer, self._clock, limits, self._unit)
+        self._is_pose, self._speeds = schedule.orientation is not None, limits["velocity_limit"]
         self._turn = threading.Lock()
-        self._begin(math.nan, None, (0.0,) * table.n_axes, 0.0, ())
+        self._begin(math.nan, 0.0, None, None, (0.0,) * table.n_axes, ())
 
     def __repr__(self) -> str:
+        mass = f"{self._unit:g} kg" if self._table.mass is None else str(self._table.mass.shape[1:])
         return (
-            f"RealTimeAdmittance(n_axes={self._table.n_axes}, mass={self._mass:g} kg, rate={self._table.rate:g} Hz, "
+            f"RealTimeAdmittance(n_axes={self._table.n_axes}, mass={mass}, rate={self._table.rate:g} Hz, "
             f"schedule_time={self.schedule_time:.6g}..{self._table.end:.6g} s, faults={self.faults})"
         )
 
@@ -142,6 +151,7 @@ class RealTimeAdmittance:
         position: Numbers | None = None,
         velocity: Numbers | None = None,
         *,
+        orientation: Numbers | None = None,
         at: float = 0.0,
         force_bias: Numbers | None = None,
     ) -> None:
@@ -151,8 +161,10 @@ class RealTimeAdmittance:
         ----------
         now : float
             Time of a monotonic clock, in s, from which ticks count.
-        position, velocity : sequence of d floats, default=None
+        position, velocity : sequence of p and d floats, default=None
             State of the robot, in units and units/s; None is where the schedule is, and at rest.
+        orientation : sequence of 4 floats, default=None
+            Unit quaternion w x y z of the robot; None is that of the schedule.
         at : float, default=0.0
             Time in the schedule to begin at, in s; ``schedule_time`` goes on after a stop.
         force_bias : sequence of d floats, default=None
@@ -164,29 +176,32 @@ class RealTimeAdmittance:
         ValueError, RuntimeError
             If an argument is not as described, or the velocity beyond ``velocity_limit``; in a tick of another thread.
         """
-        d = self._table.n_axes
+        d, blocks = self._table.n_axes, self._table.blocks
         now = checks.number(now, "now", unit="s")
         at = checks.number(at, "at", least=0.0, most=self._table.end, unit="s")
-        here = None if position is None else vector(position, "position", d)
+        here = None if position is None else vector(position, "position", blocks[0].stop)
+        turned = None if orientation is None else unit_quaternion(orientation, is_pose=len(blocks) == 2)
         moving = (0.0,) * d if velocity is None else vector(velocity, "velocity", d)
         bias = () if force_bias is None else vector(force_bias, "force_bias", d)
-        checks.number(math.hypot(*moving), "the speed", most=self._limits.speed, unit="units/s", remedy="slow it down")
+        names = ("the speed", "units/s"), ("the angular speed", "rad/s")
+        for (name, unit), block, most in zip(names, blocks, self._speeds, strict=False):
+            checks.number(math.hypot(*moving[block]), name, most=most, unit=unit, remedy="slow it down")
         if not self._turn.acquire(False):
             raise RuntimeError(_SHARED)
         try:
-            self._begin(now, here, moving, at, bias)
+            self._begin(now, at, here, turned, moving, bias)
         finally:
             self._turn.release()
 
     def tick(self, now: float, force: Numbers) -> TickStatus:
-        """Move on to ``now``, and tell the faults, 0 if none; ``position`` and ``velocity`` are then the command.
+        """Move on to ``now``, and tell the faults, 0 if none; position, orientation and velocity are then the command.
 
         Parameters
         ----------
         now : float
             Time of the clock that ``start`` was given, in s.
         force : sequence of d floats
-            External force in N as measured now; it acts over the time since the last tick.
+            External force in N, and torque in Nm, as measured now; it acts over the time since the last tick.
 
         Raises
         ------
@@ -201,16 +216,17 @@ class RealTimeAdmittance:
                 now = float(now)
             except (TypeError, ValueError, OverflowError):
                 raise checks.refusal(now, "now", "a time in s") from None
-            timer = self._timer
+            timer, channel, motion = self._timer, self._channel, self._motion
             step = now - timer.last
             is_regular = timer.is_regular and 0.0 < step <= timer.max_step
-            status = self._channel.take(force, step if is_regular else timer.step)
+            status = channel.take(force, step if is_regular else timer.step)
             if status is not FINE:
-                self._is_stopped = self._is_stopped or self._channel.is_lost
-            moved = self._live(now, step) if is_regular else self._live_irregular(now)
-            if moved is not FINE:
-                status |= moved
-            if self._is_stopped:
+                motion.is_stopped = motion.is_stopped or channel.is_lost
+            push = channel.push
+            reached = motion.live(now, step, push) if is_regular else motion.live_irregular(now, push)
+            if reached is not FINE:
+                status |= reached
+            if motion.is_stopped:
                 status |= TickStatus.STOPPED
             if status is not FINE:
                 self.faults |= status
@@ -219,24 +235,46 @@ class RealTimeAdmittance:
             self._turn.release()
 
     @property
+    def position(self) -> Vector:
+        """Position to command, p floats in units."""
+        return self._motion.place[: self._table.blocks[0].stop]
+
+    @property
+    def orientation(self) -> Vector | None:
+        """Orientation to command, a unit quaternion w x y z; None where the schedule has none."""
+        return self._motion.place[-4:] if self._is_pose else None
+
+    @property
+    def velocity(self) -> Vector:
+        """Velocity to command, d floats in units/s, and of rotations in rad/s and world axes."""
+        return self._motion.velocity
+
+    @property
     def force(self) -> Vector:
         """External force f that acted in the last tick, d floats in N."""
-        return tuple(self._mass * component for component in self._channel.push)
+        return tuple(self._unit * component for component in self._channel.push)
 
     @property
     def desired_position(self) -> Vector:
-        """Desired position x_d of the last tick, d floats in units."""
-        return self._row[: self._table.n_axes]
+        """Desired position x_d of the last tick, p floats in units."""
+        return self._motion.row[: self._table.blocks[0].stop]
+
+    @property
+    def desired_orientation(self) -> Vector | None:
+        """Desired orientation R_d of the last tick, as ``orientation``."""
+        return (
+            moved(self._motion.row[: self._table.n_place], (0.0,) * self._table.n_axes)[-4:] if self._is_pose else None
+        )
 
     @property
     def desired_velocity(self) -> Vector:
         """Desired velocity v_d of the last tick, d floats in units/s."""
-        return self._row[self._table.n_axes : 2 * self._table.n_axes]
+        return self._motion.row[self._table.n_place :][: self._table.n_axes]
 
     @property
     def stiffness(self) -> Floats:
         """Stiffness K (d, d) of the last tick in N/m, as ``spring_limit`` let it be."""
-        return self._scale * self._table.stiffness[self._clock.index]
+        return self._motion.scale * self._table.stiffness[self._clock.index]
 
     @property
     def damping(self) -> Floats:
@@ -248,53 +286,15 @@ class RealTimeAdmittance:
         """Time in the schedule, in s."""
         return self._clock.time_at(self._timer.last)
 
-    def _begin(self, now: float, position: Vector | None, velocity: Vector, at: float, bias: Vector) -> None:
-        self._timer.begin(now)
+    def _begin(
+        self,
+        now: float,
+        at: float,
+        position: Vector | None,
+        orientation: Vector | None,
+        velocity: Vector,
+        bias: Vector,
+    ) -> None:
         self._channel.begin(len(velocity), bias)
-        self._scale, self._row = 1.0, self._clock.begin(now, at, position, velocity)
-        self.position, self.velocity = position or self._row[: len(velocity)], velocity
-        self._top_speed = max(self._speed_due, math.hypot(*velocity))
-        self._is_stopped, self.faults = False, FINE
-
-    def _live(self, now: float, step: float) -> TickStatus:
-        if self._is_stopped:
-            self._brake(now, step, self._deceleration)
-            return FINE
-        timer, clock, limits = self._timer, self._clock, self._limits
-        here, push = (self.position, self.velocity), self._channel.push
-        row = clock.row(timer.last, step)
-        if clock.boost:
-            boosted = tuple(map(add, push, clock.boost))
-            state, self._scale = self._table.advance(row, boosted, here, step, self._pull_limit)
-            clock.spare(push, here[1], state[1], step)
-        else:
-            state, self._scale = self._table.advance(row, push, here, step, self._pull_limit)
-        status = FINE if self._scale == 1.0 else TickStatus.SPRING_LIMITED
-        if limits.is_any or math.hypot(*state[1]) > self._top_speed:
-            state, reached = limits.applied(state, here, step, self._top_speed)
-            status |= reached
-        self._row, (self.position, self.velocity) = row, state
-        timer.last = now
-        timer.step += SMOOTHING * (step - timer.step)
-        return status
-
-    def _live_irregular(self, now: float) -> TickStatus:
-        timer = self._timer
-        status, shift = timer.read(now)
-        self._clock.shift(shift)
-        self._is_stopped |= timer.is_failed
-        if status is FINE:
-            return self._live(now, now - timer.last)
-        if status is TickStatus.CLOCK:
-            now = timer.last + timer.step
-        # In 1 + sqrt(2) times as long as it brakes the robot can be back: after a longer gap, without commands, it
-        # rests where it was told to be last, and is not thrown from there.
-        passed, speed = now - timer.last, max(math.hypot(*self.velocity), self._clock.speed_at(timer.last))
-        can_be_back = status is TickStatus.LATE and passed * self._deceleration > 3.0 * speed
-        self._brake(now, passed, math.inf if can_be_back else self._deceleration)
-        return status
-
-    def _brake(self, now: float, passed: float, deceleration: float) -> None:
-        self._clock.brake(self._timer.last, passed, deceleration, math.hypot(*self.velocity))
-        self.position, self.velocity = braked((self.position, self.velocity), deceleration, passed)
-        self._timer.last = now
+        self._motion.begin(now, at, position, orientation, velocity)
+        self.faults = FINE

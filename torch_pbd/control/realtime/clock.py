@@ -1,22 +1,16 @@
-"""The two clocks of the real-time controller: that of the loop, and where it is in its schedule."""
+"""The clock of the schedule: where the real-time controller is in it, and the motion desired then."""
 
 import math
-from operator import add, mul, sub
+from operator import add, mul
 from typing import final
 
 import numpy as np
 
 from torch_pbd import checks
-from torch_pbd.control.realtime.limits import FINE, TickStatus
-from torch_pbd.control.realtime.steps import Vector, minimum_jerk
+from torch_pbd.control.realtime.places import Vector, deviation, moved, norm_with, rotated
+from torch_pbd.control.realtime.steps import minimum_jerk
 from torch_pbd.control.realtime.table import ScheduleTable
 
-# A reading must tell ticks apart to 1 %: times since 1970 in s do, in ns they do not.
-_COARSE = 0.01
-# One late tick is a stall, two may be; three on end are a loop that is too slow.
-_LATE_ON_END = 3
-# Share of the newest tick in how long a tick lasts: neither one short tick nor one long counts for much.
-SMOOTHING = 0.1
 # The desired motion may be 1.5 times as fast as the schedule, and accelerate so much more: one half of that changes the
 # pace, the other is left for the square of the pace while it catches up.
 _SPEED, _SHARE = 1.5, 0.25
@@ -26,58 +20,6 @@ _LEAST_SPARE = 0.1
 _ON_ROW = 1e-6
 # A minimum jerk of 1 over a time of 1 has a velocity of 15/8 and an acceleration of 10 / sqrt(3).
 _STEEPEST, _SHARPEST = 1.875, 5.7735
-
-
-@final
-class TickTimer:
-    """Ticks of at most ``max_step`` s; ``last`` is until when the motion is known, ``step`` how long ticks last."""
-
-    def __init__(self, rate: float, max_step: float, max_bad_ticks: int) -> None:
-        self._rate = checks.number(rate, "rate", above=0.0, unit="1/s")
-        self.max_step = checks.number(max_step, "max_step", above=1.0 / self._rate, unit="s", remedy="give some ticks")
-        self._max_bad_ticks = checks.count(max_bad_ticks, "max_bad_ticks")
-        self.begin(math.nan)
-
-    def begin(self, now: float) -> None:
-        """Count from ``now``."""
-        if math.ulp(now) * self._rate > _COARSE:
-            must = f"small enough to tell ticks of {1.0 / self._rate:g} s apart"
-            raise checks.refusal(now, "now", must, "give seconds", unit="s")
-        self.last = self._newest = now
-        self.step = 1.0 / self._rate
-        self.is_regular, self._is_new = False, True
-        self._n_bad = self._n_late = 0
-
-    @property
-    def is_failed(self) -> bool:
-        """Whether bad or late ticks are too many on end for the robot to go on."""
-        return self._n_bad >= self._max_bad_ticks or self._n_late >= _LATE_ON_END
-
-    def read(self, now: float) -> tuple[TickStatus, float]:
-        """Fault of a tick that is not like the last one, and the time by which ``last`` was put forward.
-
-        Where the clock does not say how long a tick took, it is taken to be as long as they are.
-        """
-        if math.isnan(self.last):
-            raise RuntimeError("tick before start: call start(now) with the time of the same clock first.")
-        if self.is_regular:
-            self.is_regular, self._newest = False, self.last
-        if not self._newest < now < math.inf:
-            self._n_bad += 1
-            return TickStatus.CLOCK, 0.0
-        shift = 0.0
-        # The clock has lost what bad ticks have lived through.
-        if self._n_bad and now < self.last + 0.5 * self.step:
-            shift, self.last = now - self.step - self.last, now - self.step
-        self._newest, self._n_bad, step = now, 0, now - self.last
-        if step > self.max_step:
-            self._n_late += 1
-            if self._is_new and self._n_late >= _LATE_ON_END:
-                must = f"longer than a tick: all {self._n_late} since start were longer, the last of {step:.4g} s"
-                raise checks.refusal(self.max_step, "max_step", must, "give some ticks, and times in s", unit="s")
-            return TickStatus.LATE, shift
-        self.is_regular, self._is_new, self._n_late = True, False, 0
-        return FINE, shift
 
 
 @final
@@ -93,17 +35,39 @@ class ScheduleClock:
     takes what the schedule's own acceleration leaves, and a change of pace what both leave; nothing is caught up
     meanwhile; and the pace rises no faster than the pull of the spring leaves room for (see `spare`). The end of the
     schedule does not slow an approach, which has a pace of its own, ``_free``, and is ``_ahead`` of the schedule then.
+
+    Speeds and accelerations of poses are those of `norm_with` a lever: both blocks then keep to all of the above. An
+    approach turns the desired orientation by A, a share of the way in between: ``A R_d`` moves at w_A + A w_d, and the
+    acceleration of that has w_A x A w_d besides.
     """
 
     def __init__(
-        self, table: ScheduleTable, soft_start: float, approach_speed: float, acceleration_limit: float, on_gap: str
+        self,
+        table: ScheduleTable,
+        soft_start: float,
+        approach_speeds: Vector,
+        acceleration_limits: Vector,
+        on_gap: str,
     ) -> None:
         self._catches_up = checks.choice(on_gap, "on_gap", ("pause", "resume")) == "resume"
-        self._table, self._d, self._rate = table, table.n_axes, table.rate
+        self._table, self._d, self._n_place, self._rate = table, table.n_axes, table.n_place, table.rate
+        self._motion = slice(table.n_place, table.n_place + table.n_axes)
         self._packed, self._row_size, self._unpack = table.packed, table.layout.size, table.layout.unpack_from
         self._soft_start = checks.number(soft_start, "soft_start", least=0.0, unit="s")
-        self._approach_speed = checks.number(approach_speed, "approach_speed", above=0.0, unit="units/s")
-        own, fastest = table.acceleration, float(table.speeds.max())
+        # What a soft start does not tell apart counts as equally fast.
+        self.scales = scales = tuple([approach_speeds[0] / speed for speed in approach_speeds])
+        lever = None if len(scales) == 1 else scales[1]
+        self._approach_speed = approach_speed = approach_speeds[0]
+        self._lever, self.norm, acceleration_limit = lever, norm_with(lever), self.least(acceleration_limits)
+        speeds, accelerations = (
+            np.max(
+                [scale * np.linalg.norm(rows[:, b], axis=1) for scale, b in zip(scales, table.blocks, strict=True)],
+                axis=0,
+            )
+            for rows in (table.velocity, table.acceleration)
+        )
+        own, fastest = float(accelerations.max()), float(speeds.max())
+        self._spin = float(np.linalg.norm(table.velocity[:, table.blocks[1]], axis=1).max()) if lever else 0.0
         # Acceleration of a soft start that comes up to speed; without one, a second is as long as its default.
         soft = max(fastest, approach_speed) / (soft_start or 1.0)
         # One half of a limit is left for the schedule's own acceleration.
@@ -116,28 +80,33 @@ class ScheduleClock:
         self._fastest = min(_SPEED, math.sqrt(room)) if self._catches_up else 1.0
         # Integral of dt / |x'| from each row to the end; where the schedule rests it is long, not endless.
         times = np.append(np.arange(table.last) / table.rate, table.end)
-        speeds = np.maximum(0.5 * (table.speeds[1:] + table.speeds[:-1]), 1e-9 * self.speed)
-        left = np.append(np.cumsum((np.diff(times) / speeds)[::-1])[::-1], 0.0)
+        middle = np.maximum(0.5 * (speeds[1:] + speeds[:-1]), 1e-9 * self.speed)
+        left = np.append(np.cumsum((np.diff(times) / middle)[::-1])[::-1], 0.0)
         squared_limits = 2.0 * self.gain * left
         self._tail = int(np.count_nonzero(squared_limits >= self._fastest**2))
         # Where a schedule that ends while moving is slower if it may take one half of `gain` for that.
-        ends_moving = table.speeds[-1] * table.rate > self.gain
+        ends_moving = speeds[-1] * table.rate > self.gain
         self._slow_from = float(times[np.count_nonzero(squared_limits >= 2.0) - 1]) if ends_moving else math.inf
         # Items of a memoryview are floats, and a tick takes them faster than those of an array.
         self._squared_limits = squared_limits.data
 
-    def begin(self, now: float, at: float, position: Vector | None, velocity: Vector) -> Vector:
+    def begin(
+        self, now: float, at: float, position: Vector | None, orientation: Vector | None, velocity: Vector
+    ) -> tuple[Vector, Vector]:
         """Start at a time of the schedule, whose row it is, as fast as the velocity of the robot is the desired one.
 
-        A desired position that begins elsewhere comes to the schedule's by minimum jerk.
+        The robot's place, where the schedule is if None is given, comes back too: if the desired place begins
+        elsewhere, it comes to the schedule's by minimum jerk, and turns about one axis.
         """
         d = self._d
         self._at, self._origin, self._lag, self._is_soft = at, now - at, 0.0, False
         self.boost: Vector = ()
         self._spare, self._ahead, self._end_share = self.gain, 0.0, 1.0
         row, squared_limit = self._desired(at)
-        self._distance: Vector = (0.0,) * d if position is None else tuple(map(sub, row, position))
-        way, room = math.hypot(*self._distance), self._room
+        n_place, n_position = self._n_place, len(velocity) - 3 * (self._lever is not None)
+        place = (*(position or row[:n_position]), *(orientation or row[n_position:n_place]))
+        self._distance = deviation(row[:n_place], place, d)
+        way, room = self.norm(self._distance), self._room
         self._blend = self._time_of(way, room)
         # An approach that meets the slow end of its schedule leaves one half of `gain` to it.
         if at + self._blend > self._slow_from:
@@ -147,16 +116,21 @@ class ScheduleClock:
         self._is_soft = any(self._distance) and self._soft_start > 0.0
         if self._is_soft:
             # At a pace of 1 the approach leaves this much less than `gain` to changes of pace.
-            taken = self.gain + _SHARPEST * way / self._blend / self._blend - self._room
+            taken = self.gain + self._sharpness(way) - self._room
             self._taken = min(max(taken, 0.0), self.gain)
         # The pace at which the desired motion is nearest to that of the robot.
-        motion = row[d : 2 * d]
-        square, along = sum(map(mul, motion, motion)), sum(map(mul, motion, velocity))
+        scales = (1.0,) * d if self._lever is None else (*[1.0] * (d - 3), *[self._lever**2] * 3)
+        scaled = tuple(map(mul, scales, row[self._motion]))
+        square, along = sum(map(mul, scaled, row[self._motion])), sum(map(mul, scaled, velocity))
         pace = max(0.0, along / square) if square and self._soft_start else 1.0
         self._free = min(1.0, pace)
         self._pace = min(self._free, math.sqrt(squared_limit))
         self._is_steady = self._pace == 1.0 and not self._is_soft
-        return tuple(row)
+        return tuple(row), moved(place, (0.0,) * d)  # between two rows quaternions are shorter than 1
+
+    def least(self, options: Vector) -> float:
+        """Smaller one of the speeds or accelerations of positions and rotations, as the norm tells them."""
+        return min(map(mul, self.scales, options))
 
     def time_at(self, now: float) -> float:
         """Schedule time at the end of the last tick, in s."""
@@ -165,10 +139,10 @@ class ScheduleClock:
     def speed_at(self, now: float) -> float:
         """Desired speed at the end of the last tick."""
         row, _ = self._desired(now - self._origin)
-        motion = row[self._d : 2 * self._d]
+        motion = row[self._motion]
         if self._is_soft:
-            return math.hypot(*[self._pace * v + self._free * w for v, w in zip(motion, self._slope, strict=True)])
-        return self._pace * math.hypot(*motion)
+            return self.norm([self._pace * v + self._free * w for v, w in zip(motion, self._slope, strict=True)])
+        return self._pace * self.norm(motion)
 
     def row(self, begin: float, step: float) -> Vector:
         """Row of the table, with the desired motion, for a tick; without calls where nothing is ramped."""
@@ -202,31 +176,34 @@ class ScheduleClock:
         # tells how much it may.
         self._spare = 0.0
 
-    def spare(self, push: Vector, before: Vector, after: Vector, step: float) -> None:
-        """Let the pace rise by what a tick's change of velocity leaves, where the boost and a push do not cause it."""
+    def spare(self, pushed: Vector, before: Vector, after: Vector, step: float) -> None:
+        """Let the pace rise by what a tick's change of velocity leaves, where boost and acceleration do not cause it.
+
+        The acceleration is that of a push from outside.
+        """
         # While a push is not taken out, a robot that is shaken comes back to its schedule seconds later.
-        boosted = [v + step * part for v, part in zip(before, self.boost, strict=True)]
-        self._spare = self.acceleration + math.hypot(*push) - math.dist(after, boosted) / step
+        surplus = [w - v - step * part for v, w, part in zip(before, after, self.boost, strict=True)]
+        self._spare = self.acceleration + self.norm(pushed) - self.norm(surplus) / step
 
     def shift(self, time: float) -> None:
         """Let so much time of the loop's clock pass without schedule time."""
         self._origin += time
 
     def _ramped(self, begin: float, step: float) -> Vector:
-        d, time, last_pace = self._d, begin - self._origin, self._pace
+        time, last_pace = begin - self._origin, self._pace
         row, squared_limit = self._desired(time)
-        motion = row[d : 2 * d]
+        motion = row[self._motion]
         # Most ticks of an approach: at a pace of 1 nothing changes it, for nothing is caught up.
         if self._is_soft and last_pace == self._free == 1.0 <= squared_limit:
             self.boost, self._spare = (), 0.0
-            row[d : 2 * d] = map(add, motion, self._slope)
+            row[self._motion] = map(add, motion, self._slope)
             return tuple(row)
-        speed, last_free, gain = math.hypot(*motion), last_pace, self.gain
+        speed, last_free, gain = self.norm(motion), last_pace, self.gain
         if self._is_soft:
             slope, last_free = self._slope, self._free
             gain -= self._taken * last_free * last_free
             # Where the schedule is slower than its approach, `gain` is for the changes of both.
-            speed = speed + math.hypot(*slope) if last_pace < last_free else math.hypot(*map(add, motion, slope))
+            speed = speed + self.norm(slope) if last_pace < last_free else self.norm([*map(add, motion, slope)])
         faster, free = self._freely(last_free, gain, speed, step)
         self._pace = pace = min(last_pace + faster, free, math.sqrt(squared_limit))
         # Where the pace is even nothing says what is spare, and the first tick of a rise finds out.
@@ -234,13 +211,12 @@ class ScheduleClock:
             self.boost, self._spare = (), 0.0
         else:
             self.boost = tuple([(pace - last_pace) / step * part for part in motion])
-        row[d : 2 * d] = [pace * part for part in motion]
+        row[self._motion] = [pace * part for part in motion]
         if self._is_soft:
             if self.boost:
                 self.boost = tuple([a + (free - last_free) / step * b for a, b in zip(self.boost, slope, strict=True)])
             self._ahead += 0.5 * step * (free + last_free - pace - last_pace)
-            for i, part in enumerate(slope, start=d):
-                row[i] += free * part
+            row[self._motion] = [pace * a + free * b for a, b in zip(motion, slope, strict=True)]
         self._free = free if self._is_soft else pace
         lost = step - 0.5 * step * (pace + last_pace)
         self._origin, self._lag = self._origin + lost, max(0.0, self._lag + lost) if self._lag else 0.0
@@ -269,7 +245,7 @@ class ScheduleClock:
 
         An approach under way changes the position, and its own velocity at a pace of 1 is ``_slope``.
         """
-        table, d, limits = self._table, self._d, self._squared_limits
+        table, limits, n_place = self._table, self._squared_limits, self._n_place
         if time >= table.end:
             self.index, row, squared_limit = table.last, list(table.row(table.last)), math.inf
         else:
@@ -278,7 +254,8 @@ class ScheduleClock:
             share = (time - start) / (stop - start) if time < stop else 1.0
             row = list(self._unpack(self._packed, index * self._row_size))
             after = self._unpack(self._packed, (index + 1) * self._row_size)
-            for i in range(2 * d):
+            # Of quaternions that are so near, lengths and angles change evenly enough, and lengths do not matter.
+            for i in range(n_place + self._d):
                 row[i] += share * (after[i] - row[i])
             low, high = limits[index], limits[index + 1]
             squared_limit = low + share * (high - low)
@@ -288,12 +265,21 @@ class ScheduleClock:
         if self._is_soft:
             left, slope = minimum_jerk(phase)
             slope /= -self._blend
-            for i, part in enumerate(self._distance):
-                row[i] -= left * part
+            away = [-left * part for part in self._distance]
+            row[:n_place] = moved(row[:n_place], away)
+            if self._lever is not None:
+                turning = slice(n_place + self._d - 3, n_place + self._d)
+                row[turning] = rotated(row[turning], away[-3:])
             self._slope = [slope * part for part in self._distance]
             squared_limit *= self._end_share
         return row, squared_limit
 
     def _time_of(self, way: float, room: float) -> float:
         """Time of an approach within its largest speed and this acceleration."""
-        return max(self._soft_start, _STEEPEST * way / self._approach_speed, math.sqrt(_SHARPEST * way / room))
+        spun = _STEEPEST * way * self._spin
+        soonest = (spun + math.sqrt(spun * spun + 4.0 * _SHARPEST * way * room)) / (2.0 * room)
+        return max(self._soft_start, _STEEPEST * way / self._approach_speed, soonest)
+
+    def _sharpness(self, way: float) -> float:
+        """Largest acceleration of the approach."""
+        return (_SHARPEST * way / self._blend + _STEEPEST * way * self._spin) / self._blend

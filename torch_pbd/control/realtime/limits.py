@@ -2,11 +2,13 @@
 
 import math
 from collections import deque
+from collections.abc import Mapping
 from enum import IntFlag
 from typing import final
 
 from torch_pbd import checks
-from torch_pbd.control.realtime.steps import Numbers, State, Vector, drift
+from torch_pbd.control.realtime.places import Vector, deviation, moved
+from torch_pbd.control.realtime.steps import Numbers, State, mean_move
 
 
 class TickStatus(IntFlag):
@@ -44,21 +46,16 @@ _RECENT = 5
 
 @final
 class ForceChannel:
-    """The force that acts, per kg of virtual mass; options as `RealTimeAdmittance` takes them.
+    """The force, or torque, of d axes that acts, over ``unit`` kg: limits in N, or in Nm.
 
     A lost force is replaced by the median of the last good ones, on each axis, which fades to nothing over
     ``hold_ticks``: neither a wild reading before the loss nor an old push can carry the robot away. After more ticks
     than that, it ``is_lost``.
     """
 
-    def __init__(
-        self, mass: float, force_limit: float, deadband: float, force_rate_limit: float | None, hold_ticks: int
-    ) -> None:
-        self._mass = mass
-        self._limit = checks.number(force_limit, "force_limit", above=0.0, unit="N") / mass
-        self._deadband = checks.number(deadband, "deadband", least=0.0, unit="N") / mass
-        rate = checks.number(force_rate_limit, "force_rate_limit", above=0.0, unit="N/s", optional=True)
-        self._rate_limit = math.inf if rate is None else rate / mass
+    def __init__(self, unit: float, limit: float, deadband: float, rate_limit: float, hold_ticks: int) -> None:
+        self._unit, self._limit, self._deadband = unit, limit / unit, deadband / unit
+        self._rate_limit = rate_limit / unit
         self._hold_ticks = checks.count(hold_ticks, "hold_ticks", least=0)
         self.begin(0, ())
 
@@ -71,11 +68,11 @@ class ForceChannel:
     def take(self, force: Numbers, step: float) -> TickStatus:
         """Let a force as measured act, as far as it may, ``step`` s after the last one."""
         try:
-            mass = self._mass
+            unit = self._unit
             if self._bias:
-                push = tuple([(float(part) - bias) / mass for part, bias in zip(force, self._bias, strict=True)])
+                push = tuple([(float(part) - bias) / unit for part, bias in zip(force, self._bias, strict=True)])
             else:
-                push = tuple([float(part) / mass for part in force])
+                push = tuple([float(part) / unit for part in force])
         except (TypeError, ValueError, OverflowError):
             push = ()
         if len(push) != len(self.push):
@@ -105,30 +102,86 @@ class ForceChannel:
 
 
 @final
+class WrenchChannel:
+    """Force and torque on a pose, each as its own `ForceChannel`: one that is lost is bridged by itself."""
+
+    def __init__(self, force: ForceChannel, torque: ForceChannel) -> None:
+        self._channels = force, torque
+
+    @property
+    def push(self) -> Vector:
+        """Force and torque that act."""
+        force, torque = self._channels
+        return force.push + torque.push
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether one of them is."""
+        return self._channels[0].is_lost or self._channels[1].is_lost
+
+    def begin(self, d: int, bias: Vector) -> None:
+        """Forget all; before the first there was none."""
+        force, torque = self._channels
+        force.begin(d - 3, bias[:-3])
+        torque.begin(3, bias[-3:])
+        self._n_axes = d
+
+    def take(self, wrench: Numbers, step: float) -> TickStatus:
+        """Let a wrench as measured act, as far as it may, ``step`` s after the last one."""
+        try:
+            parts = tuple([float(part) for part in wrench])
+        except (TypeError, ValueError, OverflowError):
+            parts = ()
+        if len(parts) != self._n_axes:
+            raise checks.refusal(wrench, "force", f"{self._n_axes} numbers in N and Nm")
+        force, torque = self._channels
+        status, of_torque = force.take(parts[:-3], step), torque.take(parts[-3:], step)
+        return status if of_torque is FINE else status | of_torque
+
+
+def channel_of(unit: float, options: Mapping[str, Vector], hold_ticks: int) -> ForceChannel | WrenchChannel:
+    """Channel of a force, or of a force and a torque, by the options of `of_blocks`."""
+    names = ("force_limit", "deadband", "force_rate_limit")
+    of_each = zip(*[options[name] for name in names], strict=True)
+    channels = [ForceChannel(unit, limit, band, rate_limit, hold_ticks) for limit, band, rate_limit in of_each]
+    return channels[0] if len(channels) == 1 else WrenchChannel(*channels)
+
+
+@final
 class CommandLimits:
-    """Largest speed and acceleration of the command; infinite where they are None."""
+    """Largest speed and acceleration of the command, for each block; infinite where there is none."""
 
-    def __init__(self, velocity_limit: float | None, acceleration_limit: float | None) -> None:
-        speed = checks.number(velocity_limit, "velocity_limit", above=0.0, unit="units/s", optional=True)
-        rise = checks.number(acceleration_limit, "acceleration_limit", above=0.0, unit="units/s^2", optional=True)
-        self.speed, self.acceleration = speed or math.inf, rise or math.inf
-        self.is_any = min(self.speed, self.acceleration) < math.inf
+    def __init__(self, speeds: Vector, accelerations: Vector, blocks: tuple[slice, ...]) -> None:
+        self.speeds, self.accelerations, self._blocks = speeds, accelerations, blocks
+        self.is_any = min(*speeds, *accelerations) < math.inf
 
-    def applied(self, state: State, last: State, step: float, top_speed: float) -> tuple[State, TickStatus]:
-        """Position and velocity that a tick of ``step`` s leads to, within limits, and which of these acted."""
-        (position, velocity), (last_position, last_velocity) = state, last
-        # The change of velocity is shortened first, then the velocity: the second never undoes the first.
-        change, most, reached = math.dist(velocity, last_velocity), self.acceleration * step, FINE
-        if change > most:
-            velocity = tuple(v + most / change * (w - v) for v, w in zip(last_velocity, velocity, strict=True))
-            reached |= TickStatus.ACCELERATION_LIMITED
-        speed = math.hypot(*velocity)
-        if speed > top_speed:
-            velocity = tuple(top_speed / speed * component for component in velocity)
-            reached |= TickStatus.VELOCITY_LIMITED
-        # A swing within one tick, from rest to rest, is too fast as well.
-        elif math.dist(position, last_position) > top_speed * step:
-            reached |= TickStatus.VELOCITY_LIMITED
-        if reached:
-            position = drift(last_position, last_velocity, velocity, step)
-        return (position, velocity), reached
+    def applied(self, state: State, last: State, step: float, top_speeds: Vector) -> tuple[State, TickStatus]:
+        """Place and velocity that a tick of ``step`` s leads to, within limits, and which of these acted."""
+        (place, velocity), (last_place, last_velocity) = state, last
+        move, reached = deviation(place, last_place, len(velocity)), FINE
+        moves: Vector = ()
+        velocities: Vector = ()
+        for block, top_speed, most in zip(self._blocks, top_speeds, self.accelerations, strict=True):
+            of_block = move[block], velocity[block], last_velocity[block]
+            part, slower, acted = _limited(*of_block, step, top_speed, most * step)
+            moves, velocities, reached = moves + part, velocities + slower, reached | acted
+        return ((moved(last_place, moves), velocities) if reached else state), reached
+
+
+def _limited(
+    move: Vector, velocity: Vector, last_velocity: Vector, step: float, top_speed: float, most: float
+) -> tuple[Vector, Vector, TickStatus]:
+    """Move and velocity of a block in a tick in which the velocity changes by ``most`` at most."""
+    # The change of velocity is shortened first, then the velocity: the second never undoes the first.
+    change, reached = math.dist(velocity, last_velocity), FINE
+    if change > most:
+        velocity = tuple([v + most / change * (w - v) for v, w in zip(last_velocity, velocity, strict=True)])
+        reached |= TickStatus.ACCELERATION_LIMITED
+    speed = math.hypot(*velocity)
+    if speed > top_speed:
+        velocity = tuple([top_speed / speed * component for component in velocity])
+        reached |= TickStatus.VELOCITY_LIMITED
+    # A swing within one tick, from rest to rest, is too fast as well.
+    elif math.hypot(*move) > top_speed * step:
+        reached |= TickStatus.VELOCITY_LIMITED
+    return (mean_move(last_velocity, velocity, step) if reached else move), velocity, reached

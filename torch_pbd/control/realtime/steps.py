@@ -1,18 +1,21 @@
-"""One tick of the real-time controller, solved exactly: with floats where axes are shared, else with NumPy."""
+"""One tick of the real-time controller, solved exactly: with floats where modes are shared, else with NumPy."""
 
 import math
-from collections.abc import Sequence
-from operator import mul, sub
+from collections.abc import Callable, Sequence
+from operator import mul
 
 import numpy as np
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
+from torch_pbd.control.realtime.places import Norm, Vector, deviation, moved
 
 Numbers = Sequence[float] | Floats
-Vector = tuple[float, ...]
 State = tuple[Vector, Vector]
-"""Position and velocity."""
+"""Place and velocity."""
+Solved = tuple[Vector, Vector, float]
+Solve = Callable[[Vector, Vector, Vector, tuple[Vector, Vector], float, float], Solved]
+Advance = Callable[[Vector, Vector, State, float, float], tuple[State, float]]
 
 # Of (w h)^2, w the frequency of an axis and h the step: below, two terms of a series in it have all digits.
 _CRITICAL = 1e-7
@@ -21,7 +24,7 @@ _SHORT = 0.01
 
 
 def advance_plane(row: Vector, push: Vector, state: State, step: float, pull_limit: float) -> tuple[State, float]:
-    """`advance_modal` for d = 2, written out."""
+    """Place and velocity after ``step`` s, and the scale of the stiffness: `along_modes` for d = 2, written out."""
     goal_x, goal_y, goal_vx, goal_vy, top, stiff_1, stiff_2, decay_1, decay_2, cos, sin, _, _ = row
     ((x, y), (vx, vy)), (push_x, push_y) = state, push
     off_x, off_y = x - goal_x, y - goal_y
@@ -42,47 +45,74 @@ def advance_plane(row: Vector, push: Vector, state: State, step: float, pull_lim
     return (there, (vx + cos * dv_1 - sin * dv_2, vy + sin * dv_1 + cos * dv_2)), scale
 
 
-def advance_modal(row: Vector, push: Vector, state: State, step: float, pull_limit: float) -> tuple[State, float]:
-    """Position and velocity after ``step`` s, and the scale of the stiffness; each axis by itself.
+def along_modes(
+    row: Vector, push: Vector, off: Vector, state: tuple[Vector, Vector], step: float, pull_limit: float
+) -> Solved:
+    """Move and velocity after ``step`` s, and the scale of the stiffness; each mode by itself.
 
-    Along an axis, y = x - x_d follows y'' + 2 a y' + k y = f + 2 a v_d, all per kg. With the responses S and P of
-    `_responses` and q = f + 2 a v_d - k y, y grows by S v + P q and v by S q - (2 a S + k P) v: increments, which
-    keep their digits in short ticks.
+    Modes, the columns of P, are such that P' M P = 1, while P' K P and P' D P are diagonal: with e = P y and f of a
+    mode that of P' f, each y follows y'' + 2 a y' + k y = f + 2 a v_d. For a mass m in all directions they are its
+    axes, with all per kg. With the responses S and B of `_responses` and q = f + 2 a v_d - k y, y grows by S v + B q
+    and v by S q - (2 a S + k B) v: increments, which keep their digits in short ticks.
+
+    A row has the largest stiffness, k and a of each mode, the rows of P' M, which tell y from e, and those of P', which
+    are the same for one mass in all directions and are then left out.
     """
-    (position, velocity), d = state, len(push)
-    stiffness, decay = row[2 * d + 1 : 3 * d + 1], row[3 * d + 1 : 4 * d + 1]
-    axes = [row[start : start + d] for start in range(4 * d + 1, len(row), d)]
-    off = tuple(map(sub, position, row))
-    off_axes = [_dot(axis, off) for axis in axes]
-    pull = row[2 * d] * sum(k * y * y for k, y in zip(stiffness, off_axes, strict=True))
+    (goal_velocity, velocity), d = state, len(push)
+    stiffness, decay = row[1 : d + 1], row[d + 1 : 2 * d + 1]
+    maps = [row[start : start + d] for start in range(2 * d + 1, len(row), d)]
+    tells, shapes = maps[:d], maps[-d:]
+    y = [_dot(tell, off) for tell in tells]
+    pull = row[0] * sum([k * part * part for k, part in zip(stiffness, y, strict=True)])
     scale = pull_limit / math.sqrt(pull) if pull > pull_limit * pull_limit else 1.0
-    there, faster = list(position), list(velocity)
-    for axis, k, a, y in zip(axes, stiffness, decay, off_axes, strict=True):
-        s, p = _responses(scale * k, a, step)
-        v = _dot(axis, velocity)
-        q = _dot(axis, push) + 2.0 * a * _dot(axis, row[d : 2 * d]) - scale * k * y
-        dx, dv = s * v + p * q, s * q - (2.0 * a * s + scale * k * p) * v
-        for i, share in enumerate(axis):
-            there[i] += dx * share
+    move, faster = [0.0] * d, list(velocity)
+    for tell, shape, k, a, part in zip(tells, shapes, stiffness, decay, y, strict=True):
+        s, b = _responses(scale * k, a, step)
+        v = _dot(tell, velocity)
+        q = _dot(shape, push) + 2.0 * a * _dot(tell, goal_velocity) - scale * k * part
+        dy, dv = s * v + b * q, s * q - (2.0 * a * s + scale * k * b) * v
+        for i, share in enumerate(shape):
+            move[i] += dy * share
             faster[i] += dv * share
-    return (tuple(there), tuple(faster)), scale
+    return tuple(move), tuple(faster), scale
 
 
-def advance_coupled(row: Vector, push: Vector, state: State, step: float, pull_limit: float) -> tuple[State, float]:
-    """As `advance_modal` for matrices that share no axes: exp(X) - 1 of the whole system, time in ticks."""
-    (position, velocity), d = state, len(push)
-    goal, goal_velocity, (top,), gains = np.split(np.array(row), [d, 2 * d, 2 * d + 1])
-    stiffness, damping = gains.reshape(2, d, d)
-    off = np.subtract(position, goal)
-    pull = top * (off @ stiffness @ off)
+def coupled(
+    row: Vector, push: Vector, off: Vector, state: tuple[Vector, Vector], step: float, pull_limit: float
+) -> Solved:
+    """As `along_modes` for matrices that share no modes: exp(X) - 1 of the whole system, time in ticks.
+
+    A row has the largest stiffness, K, D, and the inverse of a mass that is not the same in all directions.
+    """
+    (goal_velocity, velocity), d = state, len(push)
+    stiffness, damping, *inverse = np.array(row[1:]).reshape(-1, d, d)
+    pull = row[0] * (off @ stiffness @ off)
     scale = pull_limit / math.sqrt(pull) if pull > pull_limit * pull_limit else 1.0
+    gains = np.concatenate([-scale * stiffness, -damping, (push + damping @ goal_velocity)[:, None]], axis=1)
+    for each in inverse:
+        gains = each @ gains
     rate = np.zeros((2 * d + 1, 2 * d + 1))
     rate[:d, d:-1] = np.eye(d)
-    rate[d:-1, :d], rate[d:-1, d:-1] = -(step**2) * scale * stiffness, -step * damping
-    rate[d:-1, -1] = step**2 * (push + damping @ goal_velocity)
+    rate[d:-1] = gains * np.repeat([step**2, step, step**2], [d, d, 1])
     change = _expm1(rate) @ np.concatenate([off, np.multiply(step, velocity), [1.0]])
-    there, faster = np.add(position, change[:d]), np.add(velocity, change[d:-1] / step)
-    return (tuple(there.tolist()), tuple(faster.tolist())), scale
+    return tuple(change[:d].tolist()), tuple(np.add(velocity, change[d:-1] / step).tolist()), scale
+
+
+def advance_with(solve: Solve, n_place: int, d: int) -> Advance:
+    """Function as `advance_plane` for places of ``n_place`` floats and d axes, by one of those above.
+
+    For poses the angular velocity is integrated over the tick as that of a fixed axis would be, and turns the robot in
+    world axes: ``R <- Exp(dr) R``. The deviation is then told anew from where both are, so that the transport of it by
+    the desired rotation, which turns e by w_d x e, comes out by itself.
+    """
+
+    def advance(row: Vector, push: Vector, state: State, step: float, pull_limit: float) -> tuple[State, float]:
+        place, velocity = state
+        motion, off = (row[n_place : n_place + d], velocity), deviation(place, row[:n_place], d)
+        move, velocity, scale = solve(row[n_place + d :], push, off, motion, step, pull_limit)
+        return (moved(place, move), velocity), scale
+
+    return advance
 
 
 def _expm1(matrix: Floats) -> Floats:
@@ -135,19 +165,19 @@ def minimum_jerk(phase: float) -> tuple[float, float]:
     return 1.0 - phase**3 * (10.0 - 15.0 * phase + 6.0 * phase**2), -30.0 * phase**2 * (1.0 - phase) ** 2
 
 
-def braked(state: State, deceleration: float, step: float) -> State:
-    """Position and velocity after braking for ``step`` s, or until standing still."""
-    position, velocity = state
-    speed = math.hypot(*velocity)
+def braked(state: State, norm: Norm, deceleration: float, step: float) -> State:
+    """Place and velocity after braking for ``step`` s, all axes alike, or until standing still."""
+    place, velocity = state
+    speed = norm(velocity)
     braking = min(step, speed / deceleration)
     left = 1.0 - deceleration * step / speed if braking == step else 0.0
-    slower = tuple(left * component for component in velocity)
-    return drift(position, velocity, slower, braking), slower
+    slower = tuple([left * component for component in velocity])
+    return moved(place, mean_move(velocity, slower, braking)), slower
 
 
-def drift(position: Vector, before: Vector, after: Vector, time: float) -> Vector:
-    """Position after a time in which the velocity changes evenly."""
-    return tuple(x + 0.5 * time * (v + w) for x, v, w in zip(position, before, after, strict=True))
+def mean_move(before: Vector, after: Vector, time: float) -> Vector:
+    """Move in a time in which the velocity changes evenly."""
+    return tuple([0.5 * time * (v + w) for v, w in zip(before, after, strict=True)])
 
 
 def _dot(left: Vector, right: Vector) -> float:

@@ -1,0 +1,103 @@
+"""The motion of the real-time controller, tick by tick: along the law, or braked where ticks are bad."""
+
+import math
+from collections.abc import Mapping
+from operator import add
+from typing import final
+
+import numpy as np
+
+from torch_pbd.control.realtime.clock import ScheduleClock
+from torch_pbd.control.realtime.limits import FINE, CommandLimits, TickStatus
+from torch_pbd.control.realtime.places import Vector
+from torch_pbd.control.realtime.steps import braked
+from torch_pbd.control.realtime.table import ScheduleTable
+from torch_pbd.control.realtime.timer import SMOOTHING, TickTimer
+
+# From an approach at 0.5 m/s and 1 rad/s a robot is at rest in 0.1 s, after 25 mm and 3 degrees.
+_DECELERATION = (5.0, 10.0)
+
+
+@final
+class Motion:
+    """Place and velocity of the command, what moves them, and whether the robot is to brake for good."""
+
+    row: Vector
+    place: Vector
+    velocity: Vector
+    scale: float
+    is_stopped: bool
+
+    def __init__(
+        self, table: ScheduleTable, timer: TickTimer, clock: ScheduleClock, options: Mapping[str, Vector], unit: float
+    ) -> None:
+        self._table, self._timer, self._clock = table, timer, clock
+        speeds, rises, stops = (options[name] for name in ("velocity_limit", "acceleration_limit", "stop_deceleration"))
+        self._limits = CommandLimits(speeds, rises, table.blocks)
+        self._pull_limit = options["spring_limit"][0] / unit
+        stop = clock.least(stops) if stops else max(clock.least(_DECELERATION[: len(table.blocks)]), clock.acceleration)
+        self._deceleration = min(stop, clock.least(rises))
+        # Impulse responses of velocity to force integrate, in absolute values, to 2 / damping at most along each mode,
+        # for any mass: twice what damping alone lets them do, where not all modes are met at their worst at once.
+        answers = 2.0 * table.mobility @ np.add(options["force_limit"], options["spring_limit"])
+        due = [clock.speed / scale + answer for scale, answer in zip(clock.scales, answers.tolist(), strict=True)]
+        self._speeds_due = tuple([d if most == math.inf else most for d, most in zip(due, speeds, strict=True)])
+
+    def begin(
+        self, now: float, at: float, position: Vector | None, orientation: Vector | None, velocity: Vector
+    ) -> None:
+        """Forget all, and be at a place, or where the schedule is at that time."""
+        self._timer.begin(now)
+        self.row, self.place = self._clock.begin(now, at, position, orientation, velocity)
+        self.velocity, self.scale = velocity, 1.0
+        speeds = [math.hypot(*velocity[block]) for block in self._table.blocks]
+        self._top_speeds = tuple(map(max, self._speeds_due, speeds))
+        self._least_top = min(self._top_speeds)
+        self.is_stopped = False
+
+    def live(self, now: float, step: float, push: Vector) -> TickStatus:
+        """Move on to ``now``, ``step`` s after the last tick, under a push."""
+        if self.is_stopped:
+            self._brake(now, step, self._deceleration)
+            return FINE
+        timer, clock, table = self._timer, self._clock, self._table
+        here = self.place, self.velocity
+        row = clock.row(timer.last, step)
+        if clock.boost:
+            boosted = tuple(map(add, push, table.forced(clock.boost, clock.index)))
+            state, self.scale = table.advance(row, boosted, here, step, self._pull_limit)
+            clock.spare(table.accelerated(push, clock.index), here[1], state[1], step)
+        else:
+            state, self.scale = table.advance(row, push, here, step, self._pull_limit)
+        status = FINE if self.scale == 1.0 else TickStatus.SPRING_LIMITED
+        # No block is beyond its own top speed where all together are within the least of them.
+        if self._limits.is_any or math.hypot(*state[1]) > self._least_top:
+            state, reached = self._limits.applied(state, here, step, self._top_speeds)
+            status |= reached
+        self.row, (self.place, self.velocity) = row, state
+        timer.last = now
+        timer.step += SMOOTHING * (step - timer.step)
+        return status
+
+    def live_irregular(self, now: float, push: Vector) -> TickStatus:
+        """The same for a tick that is not like the last one, if ``now`` can be."""
+        timer = self._timer
+        status, shift = timer.read(now)
+        self._clock.shift(shift)
+        self.is_stopped |= timer.is_failed
+        if status is FINE:
+            return self.live(now, now - timer.last, push)
+        if status is TickStatus.CLOCK:
+            now = timer.last + timer.step
+        # In 1 + sqrt(2) times as long as it brakes the robot can be back: after a longer gap, without commands, it
+        # rests where it was told to be last, and is not thrown from there.
+        passed, speed = now - timer.last, max(self._clock.norm(self.velocity), self._clock.speed_at(timer.last))
+        can_be_back = status is TickStatus.LATE and passed * self._deceleration > 3.0 * speed
+        self._brake(now, passed, math.inf if can_be_back else self._deceleration)
+        return status
+
+    def _brake(self, now: float, passed: float, deceleration: float) -> None:
+        norm = self._clock.norm
+        self._clock.brake(self._timer.last, passed, deceleration, norm(self.velocity))
+        self.place, self.velocity = braked((self.place, self.velocity), norm, deceleration, passed)
+        self._timer.last = now
