@@ -18,16 +18,16 @@ double microseconds(Clock::time_point start) {
 
 long n_allocations = 0;
 
-template <std::size_t N>
+template <std::size_t N, std::size_t M = N>
 void run(const torch_pbd::Schedule& schedule) {
-    torch_pbd::Admittance<N> controller(schedule);
+    torch_pbd::Admittance<N, M> controller(schedule);
     const int n_ticks = static_cast<int>(1000.0 * (schedule.time.back() - schedule.time.front())) + 2000;
     std::vector<double> times(static_cast<std::size_t>(n_ticks));
     const long before = n_allocations;
     controller.start(0.0);
     for (int i = 0; i < n_ticks; ++i) {
         torch_pbd::Vector<N> force;
-        force.fill(5.0 * std::sin(0.01 * i));
+        force.fill(2.0 * std::sin(0.01 * i));
         const auto start = Clock::now();
         controller.tick(1e-3 * (i + 1), force);
         times[static_cast<std::size_t>(i)] = microseconds(start);
@@ -56,11 +56,11 @@ int main(int n_arguments, char** arguments) {
         const auto start = Clock::now();
         const auto schedule = torch_pbd::Schedule::load(arguments[1]);
         std::printf("%zu rows read in %.1f ms\n", schedule.n_rows, 1e-3 * microseconds(start));
+        const bool is_pose = !schedule.orientation.empty();
         switch (schedule.n_outputs) {
             case 2: run<2>(schedule); break;
-            case 3: run<3>(schedule); break;
-            case 6: run<6>(schedule); break;
-            default: return std::fprintf(stderr, "this example has 2, 3 and 6 axes\n"), 1;
+            case 6: is_pose ? run<6, 7>(schedule) : run<6>(schedule); break;
+            default: return std::fprintf(stderr, "this example has 2 and 6 axes\n"), 1;
         }
     } catch (const std::exception& error) {
         return std::fprintf(stderr, "%s\n", error.what()), 1;

@@ -13,90 +13,110 @@
 #pragma once
 
 #include <algorithm>
+#include <cmath>
 #include <cstddef>
-#include <limits>
 #include <memory>
 #include <optional>
-#include <stdexcept>
 
 #include "clock.hpp"
 #include "limits.hpp"
 #include "linalg.hpp"
+#include "places.hpp"
 #include "schedule.hpp"
 #include "steps.hpp"
 #include "table.hpp"
+#include "timer.hpp"
 
 namespace torch_pbd {
 
 /// Options of `Admittance`, those of `RealTimeAdmittance`, where they are explained at length.
+///
+/// Those of two numbers have a second one for the rotations of poses, in Nm and rad.
 struct Options {
     /// Virtual mass in kg; none is the schedule's, or 1 kg. Refused where the schedule's damping is for another one.
     std::optional<double> mass;
     double rate = 1000.0;  ///< of the loop, in 1/s
     double max_step = 0.01;  ///< longest tick in s; over a longer one the robot has braked; after three it stops
-    double force_limit = 200.0;  ///< range of the sensor in N, as the length of the vector
-    double deadband = 0.0;  ///< force on an axis, in N, that counts as none
-    std::optional<double> spring_limit;  ///< largest pull of the spring in N; none is `force_limit`
-    std::optional<double> velocity_limit;  ///< of the command, in units/s
-    std::optional<double> acceleration_limit;  ///< of the command, in units/s^2
+    Limit force_limit{200.0, 20.0};  ///< range of the sensor in N and Nm, as the length of a vector
+    Limit deadband{0.0, 0.0};  ///< force on an axis, in N and Nm, that counts as none
+    std::optional<Limit> spring_limit;  ///< largest pull of the spring in N and Nm; none is `force_limit`
+    Limit velocity_limit{infinity, infinity};  ///< of the command, in units/s and rad/s
+    Limit acceleration_limit{infinity, infinity};  ///< of the command, in units/s^2 and rad/s^2
     int hold_ticks = 10;  ///< ticks on end with a force that is not finite before the robot stops
     int max_bad_ticks = 10;  ///< ticks on end with a time that is wrong before the robot stops
-    std::optional<double> stop_deceleration;  ///< of a stop, in units/s^2
+    std::optional<Limit> stop_deceleration;  ///< of a stop, in units/s^2 and rad/s^2
     double soft_start = 1.0;  ///< time of the approach to the schedule at `start`, in s
-    double approach_speed = 0.5;  ///< largest speed of the approach, in units/s
+    Limit approach_speed{0.5, 1.0};  ///< largest speed of the approach, in units/s and rad/s
     bool catches_up = false;  ///< after a late tick, `on_gap="resume"`
-    std::optional<double> force_rate_limit;  ///< fastest change of the force, in N/s
+    Limit force_rate_limit{infinity, infinity};  ///< fastest change of the force, in N/s and Nm/s
 };
 
 /// Robot of N axes that moves as M a = f + K (x_d - x) + D (v_d - v), one tick at a time.
 ///
+/// Places have M numbers: as many as there are axes, or one more where the last three axes are those of an orientation.
 /// A tick is solved exactly over the time that really passed, with force and schedule held over it. Constructor and
 /// `start` check what they are given, and throw std::invalid_argument. One thread at a time may use an object.
-template <std::size_t N>
+template <std::size_t N, std::size_t M = N>
 class Admittance {
 public:
+    static constexpr bool kIsPose = M != N;
+    using Position = Vector<n_positions<N, M>>;
+
     explicit Admittance(const Schedule& schedule, const Options& options = {})
-        : mass_(virtual_mass(schedule, options.mass)),
-          timer_(checked(options.rate, options.rate > 0.0, "rate", "above 0"), options.max_step, options.max_bad_ticks),
-          channel_(mass_, options.force_limit, options.deadband, options.force_rate_limit, options.hold_ticks),
+        : unit_(virtual_mass(schedule, options.mass)),
+          timer_(checked(options.rate, 0.0 < options.rate && options.rate < infinity, "rate", "above 0"),
+                 options.max_step, options.max_bad_ticks),
+          channel_(unit_, options.force_limit, options.deadband, options.force_rate_limit, options.hold_ticks),
           limits_(options.velocity_limit, options.acceleration_limit),
-          table_(std::make_shared<const ScheduleTable<N>>(schedule, mass_, options.rate)),
+          pull_limit_(checked<N, M>(options.spring_limit.value_or(options.force_limit), "spring_limit")),
+          table_(std::make_shared<const ScheduleTable<N, M>>(schedule, unit_, options.rate, pull_limit_)),
           clock_(table_, options.soft_start, options.approach_speed, limits_.acceleration, options.catches_up) {
-        const double pull =
-            options.spring_limit ? positive_or_infinite(options.spring_limit, "spring_limit") : options.force_limit;
-        pull_limit_ = pull / mass_;
-        const double stop = options.stop_deceleration
-                                ? positive_or_infinite(options.stop_deceleration, "stop_deceleration")
-                                : std::max(kDeceleration, clock_.acceleration);
-        deceleration_ = std::min(stop, limits_.acceleration);
-        // Impulse responses of velocity to force integrate, in absolute values, to 2 / damping at most, for any mass.
-        const double damping = table_->least_damping;
-        const double answer = damping > 0.0 ? 2.0 * (options.force_limit + pull) / damping : infinity;
-        speed_due_ = options.velocity_limit ? limits_.speed : clock_.speed + answer;
-        state_ = desired_ = clock_.begin(0.0, 0.0, std::nullopt, {});
-        state_.velocity = {};
+        const Limit stop = checked<N, M>(options.stop_deceleration.value_or(kDeceleration), "stop_deceleration");
+        deceleration_ =
+            std::min(options.stop_deceleration ? clock_.least(stop) : std::max(clock_.least(stop), clock_.acceleration),
+                     clock_.least(limits_.acceleration));
+        // Impulse responses of velocity to force integrate, in absolute values, to 2 / damping at most along each mode,
+        // for any mass: twice what damping alone lets them do, where not all modes are met at their worst at once.
+        const Limit force = options.force_limit;
+        const Limit answer =
+            table_->mobility({force.position + pull_limit_.position, force.rotation + pull_limit_.rotation});
+        const auto due = [&](std::size_t b) {
+            return limits_.speed[b] < infinity ? limits_.speed[b] : clock_.speed / clock_.scale(b) + 2.0 * answer[b];
+        };
+        speed_due_ = {due(0), kIsPose ? due(1) : 0.0};
+        desired_ = clock_.begin(0.0, 0.0, {}, {}, {}, state_.place);
     }
 
     /// Begins, or begins again, at `now` s of a monotonic clock: faults, forces and motion are forgotten.
     ///
-    /// No position is where the schedule is. `at` is the time in the schedule to begin at, in s; `schedule_time` goes
-    /// on after a stop. `force_bias` is the reading of the sensor while nothing touches it, in N.
-    void start(double now, const std::optional<Vector<N>>& position = {}, const Vector<N>& velocity = {},
-               double at = 0.0, const Vector<N>& force_bias = {}) {
+    /// No position or orientation, a unit quaternion w x y z, is where the schedule is. `at` is the time in the
+    /// schedule to begin at, in s; `schedule_time` goes on after a stop. `force_bias` is the reading of the sensor
+    /// while nothing touches it, in N and Nm.
+    void start(double now, const std::optional<Position>& position = {}, const Vector<N>& velocity = {},
+               double at = 0.0, const Vector<N>& force_bias = {}, const std::optional<Quaternion>& orientation = {}) {
         checked(at, 0.0 <= at && at <= table_->end, "at", "a time of the schedule, in s");
-        for (std::size_t i = 0; i < N; ++i) {
-            checked(position ? (*position)[i] : 0.0, true, "position", "finite");
-            checked(velocity[i], true, "velocity", "finite");
-            checked(force_bias[i], true, "force_bias", "finite");
+        check_finite(position.value_or(Position{}), "position");
+        check_finite(velocity, "velocity");
+        check_finite(force_bias, "force_bias");
+        std::optional<Quaternion> turned;
+        if (orientation) {
+            const double length = linalg::norm(*orientation);
+            checked(length, kIsPose && std::abs(length - 1.0) <= kOff, "the length of orientation", "1, of a pose");
+            turned = linalg::scaled(1.0 / length, *orientation);
         }
-        const double speed = linalg::norm(velocity);
-        checked(speed, speed <= limits_.speed, "the speed", "velocity_limit at most");
+        Limit speed{0.0, 0.0};
+        for (std::size_t b = 0; b < kBlocks.size(); ++b) {
+            const double along = linalg::norm(velocity, kBlocks[b]);
+            checked(along, along <= limits_.speed[b], b == 0 ? "the speed" : "the angular speed",
+                    "velocity_limit at most");
+            (b == 0 ? speed.position : speed.rotation) = along;
+        }
         timer_.begin(now);
         channel_.begin(force_bias);
         scale_ = 1.0;
-        desired_ = clock_.begin(now, at, position, velocity);
-        state_ = {position.value_or(desired_.position), velocity};
-        top_speed_ = std::max(speed_due_, speed);
+        desired_ = clock_.begin(now, at, position, turned, velocity, state_.place);
+        state_.velocity = velocity;
+        top_speed_ = {std::max(speed_due_.position, speed.position), std::max(speed_due_.rotation, speed.rotation)};
         is_started_ = true;
         is_stopped_ = false;
         faults_ = 0;
@@ -118,25 +138,59 @@ public:
         return faults;
     }
 
-    const Vector<N>& position() const { return state_.position; }  ///< command, in units
-    const Vector<N>& velocity() const { return state_.velocity; }  ///< command, in units/s
+    /// Position to command, in units.
+    Position position() const { return position_of(state_); }
+    /// Orientation to command, a unit quaternion w x y z from the tool to the world; of poses.
+    Quaternion orientation() const { return orientation_of(state_); }
+    const Vector<N>& velocity() const { return state_.velocity; }  ///< to command, in units/s and rad/s
     Faults faults() const { return faults_; }  ///< all since `start`
-    double mass() const { return mass_; }  ///< in kg
 
-    /// External force that acted in the last tick, in N.
-    Vector<N> force() const { return linalg::scaled(mass_, channel_.push); }
-    const Vector<N>& desired_position() const { return desired_.position; }  ///< of the last tick, in units
-    const Vector<N>& desired_velocity() const { return desired_.velocity; }  ///< of the last tick, in units/s
-    /// Stiffness of the last tick in N/m, as `spring_limit` let it be.
+    /// External force that acted in the last tick, in N and Nm.
+    Vector<N> force() const { return linalg::scaled(unit_, channel_.push); }
+    Position desired_position() const { return position_of(desired_); }  ///< of the last tick
+    /// Desired orientation of the last tick; of poses.
+    Quaternion desired_orientation() const {
+        const Quaternion turned = orientation_of(desired_);
+        return linalg::scaled(1.0 / linalg::norm(turned), turned);
+    }
+    const Vector<N>& desired_velocity() const { return desired_.velocity; }  ///< of the last tick
+    /// Stiffness of the last tick in N/m and Nm/rad, as `spring_limit` let it be.
     Matrix<N> stiffness() const { return linalg::scaled(scale_, table_->stiffness[clock_.index]); }
-    const Matrix<N>& damping() const { return table_->damping[clock_.index]; }  ///< of the last tick, in N s/m
+    const Matrix<N>& damping() const { return table_->damping[clock_.index]; }  ///< of the last tick
     double schedule_time() const { return clock_.time_at(timer_.last); }  ///< in s
 
 private:
+    static constexpr auto kBlocks = blocks<N, M>;
+    // From an approach at 0.5 m/s and 1 rad/s a robot is at rest in 0.1 s, after 25 mm and 3 degrees.
+    static constexpr Limit kDeceleration{5.0, 10.0};
+    // Share of the newest tick in how long a tick lasts: neither one short tick nor one long counts for much.
+    static constexpr double kSmoothing = 0.1;
+    static constexpr double kOff = 1e-3;  // of a quaternion's length: four rounded digits
+
     static double virtual_mass(const Schedule& schedule, std::optional<double> given) {
+        if (!schedule.inertia.empty()) {
+            checked(given.value_or(1.0), !given, "mass", "left out: the schedule has the inertia of its damping");
+            return 1.0;
+        }
         const double mass = given.value_or(schedule.mass.value_or(1.0));
         checked(mass, 1e-50 <= mass && mass <= 1e50, "mass", "from 1e-50 to 1e50 kg");
         return checked(mass, !schedule.mass || mass == *schedule.mass, "mass", "that of the schedule's damping");
+    }
+
+    template <std::size_t K>
+    static void check_finite(const Vector<K>& values, const char* name) {
+        for (const double value : values) checked(value, std::isfinite(value), name, "finite");
+    }
+
+    static Position position_of(const State<N, M>& state) {
+        Position position;
+        std::copy(state.place.begin(), state.place.begin() + position.size(), position.begin());
+        return position;
+    }
+
+    static Quaternion orientation_of(const State<N, M>& state) {
+        static_assert(kIsPose, "positions have no orientation");
+        return places::orientation_of(state.place);
     }
 
     Faults live(double now, double step) {
@@ -144,15 +198,22 @@ private:
             brake(now, step, deceleration_);
             return 0;
         }
-        const State<N> before = state_;
+        const State<N, M> before = state_;
         const Vector<N>& push = channel_.push;
+        const double pull_limit = pull_limit_.position / unit_;
         desired_ = clock_.row(timer_.last, step);
-        const Vector<N> boosted = clock_.is_boosted ? linalg::sum(push, clock_.boost) : push;
-        scale_ = table_->advance(clock_.index, desired_, boosted, state_, step, pull_limit_);
-        if (clock_.is_boosted) clock_.spare(push, before.velocity, state_.velocity, step);
+        if (clock_.is_boosted) {
+            const Vector<N> boosted = linalg::sum(push, table_->forced(clock_.boost, clock_.index));
+            scale_ = table_->advance(clock_.index, desired_, boosted, state_, step, pull_limit);
+            clock_.spare(table_->accelerated(push, clock_.index), before.velocity, state_.velocity, step);
+        } else {
+            scale_ = table_->advance(clock_.index, desired_, push, state_, step, pull_limit);
+        }
         Faults faults = 0;
         if (scale_ != 1.0) faults = kSpringLimited;
-        if (limits_.is_any() || linalg::norm(state_.velocity) > top_speed_)
+        // No block is beyond its own top speed where all together are within the least of them.
+        const double least = kIsPose ? std::min(top_speed_.position, top_speed_.rotation) : top_speed_.position;
+        if (limits_.is_any || linalg::norm(state_.velocity) > least)
             faults |= limits_.apply(state_, before, step, top_speed_);
         timer_.last = now;
         timer_.step += kSmoothing * (step - timer_.step);
@@ -169,32 +230,34 @@ private:
         // In 1 + sqrt(2) times as long as it brakes the robot can be back: after a longer gap, without commands, it
         // rests where it was told to be last, and is not thrown from there.
         const double passed = now - timer_.last;
-        const double speed = std::max(linalg::norm(state_.velocity), clock_.speed_at(timer_.last));
+        const double speed = std::max(clock_.norm(state_.velocity), clock_.speed_at(timer_.last));
         const bool can_be_back = fault == kLate && passed * deceleration_ > 3.0 * speed;
         brake(now, passed, can_be_back ? infinity : deceleration_);
         return fault;
     }
 
     void brake(double now, double passed, double deceleration) {
-        clock_.brake(timer_.last, passed, deceleration, linalg::norm(state_.velocity));
-        state_ = braked(state_, deceleration, passed);
+        const double speed = clock_.norm(state_.velocity);
+        clock_.brake(timer_.last, passed, deceleration, speed);
+        state_ = braked(state_, speed, deceleration, passed);
         timer_.last = now;
     }
 
-    static constexpr double kDeceleration = 5.0;  // units/s^2: from 0.5 m/s to rest in 0.1 s and 25 mm
-    // Share of the newest tick in how long a tick lasts: neither one short tick nor one long counts for much.
-    static constexpr double kSmoothing = 0.1;
-
-    double mass_;
+    double unit_;  // kg of one mass in all directions; 1 where it is a matrix
     TickTimer timer_;
-    ForceChannel<N> channel_;
-    CommandLimits<N> limits_;
-    std::shared_ptr<const ScheduleTable<N>> table_;
-    ScheduleClock<N> clock_;
-    double pull_limit_, deceleration_, speed_due_, top_speed_ = infinity, scale_ = 1.0;
-    State<N> state_, desired_;
+    ForceChannel<N, M> channel_;
+    CommandLimits<N, M> limits_;
+    Limit pull_limit_;
+    std::shared_ptr<const ScheduleTable<N, M>> table_;
+    ScheduleClock<N, M> clock_;
+    double deceleration_, scale_ = 1.0;
+    Limit speed_due_{}, top_speed_{};
+    State<N, M> state_{}, desired_{};
     bool is_started_ = false, is_stopped_ = false;
     Faults faults_ = 0;
 };
+
+/// Robot whose schedule has three positions and an orientation: twists and wrenches of six, in world axes.
+using PoseAdmittance = Admittance<6, 7>;
 
 }  // namespace torch_pbd

@@ -1,10 +1,9 @@
-/// The two clocks of the loop: its own, and where it is in its schedule; realtime/clock.py line by line.
+/// The clock of the schedule: where the loop is in it, and the motion desired then; realtime/clock.py line by line.
 #pragma once
 
 #include <algorithm>
 #include <cmath>
 #include <cstddef>
-#include <limits>
 #include <memory>
 #include <optional>
 #include <utility>
@@ -12,71 +11,11 @@
 
 #include "limits.hpp"
 #include "linalg.hpp"
+#include "places.hpp"
 #include "steps.hpp"
 #include "table.hpp"
 
 namespace torch_pbd {
-
-/// Ticks of at most `max_step` s; `last` is until when the motion is known, `step` how long ticks last.
-class TickTimer {
-public:
-    TickTimer(double rate, double longest, int max_bad_ticks)
-        : max_step(checked(longest, longest > 1.0 / rate, "max_step", "more than 1 / rate: give some ticks")),
-          rate_(rate),
-          max_bad_ticks_(static_cast<int>(checked(max_bad_ticks, max_bad_ticks >= 1, "max_bad_ticks", "at least 1"))) {}
-
-    /// Counts from `now`.
-    void begin(double now) {
-        // A reading must tell ticks apart to 1 %: times since 1970 in s do, in ns they do not.
-        const double resolution = std::nextafter(std::abs(now), infinity) - std::abs(now);
-        checked(now, resolution * rate_ <= 0.01, "now", "small enough to tell ticks apart: give seconds");
-        last = newest_ = now;
-        step = 1.0 / rate_;
-        is_regular = false;
-        n_bad_ = n_late_ = 0;
-    }
-
-    /// Whether bad or late ticks are too many on end for the robot to go on.
-    bool is_failed() const { return n_bad_ >= max_bad_ticks_ || n_late_ >= kLateOnEnd; }
-
-    /// Fault of a tick that is not like the last one; `shift` is the time by which `last` was put forward.
-    ///
-    /// Where the clock does not say how long a tick took, it is taken to be as long as they are.
-    Faults read(double now, double& shift) {
-        shift = 0.0;
-        if (is_regular) {
-            is_regular = false;
-            newest_ = last;
-        }
-        if (!(newest_ < now && now < infinity)) {
-            ++n_bad_;
-            return kClock;
-        }
-        // The clock has lost what bad ticks have lived through.
-        if (n_bad_ && now < last + 0.5 * step) {
-            shift = now - step - last;
-            last = now - step;
-        }
-        newest_ = now;
-        n_bad_ = 0;
-        if (now - last > max_step) {
-            ++n_late_;
-            return kLate;
-        }
-        is_regular = true;
-        n_late_ = 0;
-        return 0;
-    }
-
-    double last = std::numeric_limits<double>::quiet_NaN();
-    double step = 0.0, max_step;
-    bool is_regular = false;
-
-private:
-    static constexpr int kLateOnEnd = 3;  // one late tick is a stall, two may be; three are a loop that is too slow
-    double newest_ = 0.0, rate_;
-    int max_bad_ticks_, n_bad_ = 0, n_late_ = 0;
-};
 
 /// Schedule time, which runs at a pace from 0 to 1, or a little more to catch up, and the motion desired then.
 ///
@@ -89,22 +28,36 @@ private:
 /// takes what the schedule's own acceleration leaves, and a change of pace what both leave; nothing is caught up
 /// meanwhile; and the pace rises no faster than the pull of the spring leaves room for (see `spare`). The end of the
 /// schedule does not slow an approach, which has a pace of its own, `free_`, and is `ahead_` of the schedule then.
-template <std::size_t N>
+///
+/// Speeds and accelerations of poses are those of `norm`, with a lever: both blocks then keep to all of the above. An
+/// approach turns the desired orientation by A, a share of the way in between: A R_d moves at w_A + A w_d, and the
+/// acceleration of that has w_A x A w_d besides.
+template <std::size_t N, std::size_t M>
 class ScheduleClock {
 public:
-    ScheduleClock(std::shared_ptr<const ScheduleTable<N>> table, double soft_start, double approach_speed,
-                  double acceleration_limit, bool catches_up)
+    ScheduleClock(std::shared_ptr<const ScheduleTable<N, M>> table, double soft_start, Limit approach_speed,
+                  Limit acceleration_limit, bool catches_up)
         : table_(std::move(table)),
-          soft_start_(checked(soft_start, soft_start >= 0.0, "soft_start", "a finite number of at least 0")),
-          approach_speed_(checked(approach_speed, approach_speed > 0.0, "approach_speed", "a finite number above 0")),
+          soft_start_(checked(soft_start, 0.0 <= soft_start && soft_start < infinity, "soft_start", "of at least 0")),
+          approach_(checked<N, M>(approach_speed, "approach_speed")),
           catches_up_(catches_up) {
-        const std::vector<double>& speeds = table_->speeds;
-        const double own = table_->acceleration, fastest = *std::max_element(speeds.begin(), speeds.end());
+        double own = 0.0, fastest = 0.0;
+        const std::size_t last = table_->last();
+        speeds_.resize(last + 1);
+        for (std::size_t i = 0; i <= last; ++i) {
+            speeds_[i] = norm(motion(i));
+            fastest = std::max(fastest, speeds_[i]);
+            if (i > 0) {
+                const Vector<N> change = linalg::difference(motion(i), motion(i - 1));
+                own = std::max(own, norm(change) / (table_->time(i) - table_->time(i - 1)));
+            }
+            if constexpr (M != N) spin_ = std::max(spin_, linalg::norm(motion(i), blocks<N, M>[1]));
+        }
         // Acceleration of a soft start that comes up to speed; without one, a second is as long as its default.
-        const double soft = std::max(fastest, approach_speed) / (soft_start > 0.0 ? soft_start : 1.0);
+        const double soft = std::max(fastest, approach_.position) / (soft_start > 0.0 ? soft_start : 1.0);
         // One half of a limit is left for the schedule's own acceleration.
-        gain_ = std::min(std::max(kShare * own, soft), 0.5 * acceleration_limit);
-        speed = kSpeed * fastest + approach_speed;
+        gain_ = std::min(std::max(kShare * own, soft), 0.5 * least(acceleration_limit));
+        speed = kSpeed * fastest + approach_.position;
         acceleration = std::max((1.0 + kShare) * own + gain_, kSharpest / kSteepest * soft);
         // What the schedule's own acceleration leaves to an approach; a critically damped spring overshoots it by 13 %.
         room_ = std::max(gain_, acceleration - (1.0 + kShare) * own);
@@ -113,10 +66,30 @@ public:
         find_ends();
     }
 
-    /// Starts at a time of the schedule, whose motion it is, as fast as the velocity of the robot is the desired one.
+    /// Norm of velocities: their length, or of poses the larger one of that of positions and lever times rotations.
+    double norm(const Vector<N>& twist) const {
+        double most = 0.0;
+        for (std::size_t b = 0; b < blocks<N, M>.size(); ++b)
+            most = std::max(most, scale(b) * linalg::norm(twist, blocks<N, M>[b]));
+        return most;
+    }
+
+    /// What speeds of a block count in this norm: what a soft start does not tell apart counts as equally fast.
+    double scale(std::size_t block) const { return approach_.position / approach_[block]; }
+
+    /// Smaller one of the speeds or accelerations of positions and rotations, as the norm tells them.
+    double least(Limit limit) const {
+        double smallest = infinity;
+        for (std::size_t b = 0; b < blocks<N, M>.size(); ++b) smallest = std::min(smallest, scale(b) * limit[b]);
+        return smallest;
+    }
+
+    /// Starts at a time of the schedule, whose motion it tells, as fast as the robot's velocity is the desired one.
     ///
-    /// A desired position that begins elsewhere comes to the schedule's by minimum jerk.
-    State<N> begin(double now, double at, const std::optional<Vector<N>>& position, const Vector<N>& velocity) {
+    /// No position or orientation is where the schedule is; `place` is then where the robot is. If the desired place
+    /// begins elsewhere, it comes to the schedule's by minimum jerk, and turns about one axis.
+    State<N, M> begin(double now, double at, const std::optional<Vector<n_positions<N, M>>>& position,
+                      const std::optional<Quaternion>& orientation, const Vector<N>& velocity, Vector<M>& place) {
         at_ = at;
         origin_ = now - at;
         lag_ = 0.0;
@@ -126,9 +99,14 @@ public:
         ahead_ = 0.0;
         end_share_ = 1.0;
         double squared_limit;
-        const State<N> row = desired(at, squared_limit);
-        distance_ = position ? linalg::difference(row.position, *position) : Vector<N>{};
-        const double way = linalg::norm(distance_);
+        const State<N, M> row = desired(at, squared_limit);
+        place = row.place;
+        if (position) std::copy(position->begin(), position->end(), place.begin());
+        if constexpr (M != N)
+            if (orientation) places::set_tail(place, *orientation);
+        distance_ = places::deviation<N>(row.place, place);
+        place = places::moved(place, Vector<N>{});  // between two rows quaternions are shorter than 1
+        const double way = norm(distance_);
         double room = room_;
         blend_ = time_of(way, room);
         // An approach that meets the slow end of its schedule leaves one half of `gain` to it.
@@ -140,9 +118,16 @@ public:
         }
         is_soft_ = !linalg::is_zero(distance_) && soft_start_ > 0.0;
         // At a pace of 1 the approach leaves this much less than `gain` to changes of pace.
-        if (is_soft_) taken_ = std::clamp(gain_ + kSharpest * way / blend_ / blend_ - room_, 0.0, gain_);
+        if (is_soft_) taken_ = std::clamp(gain_ + sharpness(way) - room_, 0.0, gain_);
         // The pace at which the desired motion is nearest to that of the robot.
-        const double square = linalg::dot(row.velocity, row.velocity), along = linalg::dot(row.velocity, velocity);
+        double square = 0.0, along = 0.0;
+        for (std::size_t b = 0; b < blocks<N, M>.size(); ++b) {
+            for (std::size_t i = blocks<N, M>[b].begin; i < blocks<N, M>[b].end; ++i) {
+                const double scaled = scale(b) * scale(b) * row.velocity[i];
+                square += scaled * row.velocity[i];
+                along += scaled * velocity[i];
+            }
+        }
         free_ = std::min(1.0, square > 0.0 && soft_start_ > 0.0 ? std::max(0.0, along / square) : 1.0);
         pace_ = std::min(free_, std::sqrt(squared_limit));
         is_steady_ = pace_ == 1.0 && !is_soft_;
@@ -155,13 +140,13 @@ public:
     /// Desired speed at the end of the last tick.
     double speed_at(double now) {
         double squared_limit;
-        const State<N> row = desired(now - origin_, squared_limit);
-        if (!is_soft_) return pace_ * linalg::norm(row.velocity);
-        return linalg::norm(linalg::sum(linalg::scaled(pace_, row.velocity), linalg::scaled(free_, slope_)));
+        const State<N, M> row = desired(now - origin_, squared_limit);
+        if (!is_soft_) return pace_ * norm(row.velocity);
+        return norm(linalg::sum(linalg::scaled(pace_, row.velocity), linalg::scaled(free_, slope_)));
     }
 
     /// Motion that is desired in a tick, whose gains are those of the row `index`.
-    State<N> row(double begin, double step) {
+    State<N, M> row(double begin, double step) {
         if (is_steady_) {
             const double nearest = std::max(0.0, (begin - origin_) * table_->rate + 0.5);
             if (nearest < static_cast<double>(tail_)) {
@@ -201,12 +186,13 @@ public:
         spare_ = 0.0;
     }
 
-    /// Lets the pace rise by what a tick's change of velocity leaves, where the boost and a push do not cause it.
+    /// Lets the pace rise by what a tick's change of velocity leaves, where boost and an acceleration do not cause it.
     ///
-    /// While a push is not taken out, a robot that is shaken comes back to its schedule seconds later.
-    void spare(const Vector<N>& push, const Vector<N>& before, const Vector<N>& after, double step) {
+    /// The acceleration is that of a push from outside: while it is not taken out, a robot that is shaken comes back to
+    /// its schedule seconds later.
+    void spare(const Vector<N>& pushed, const Vector<N>& before, const Vector<N>& after, double step) {
         const Vector<N> boosted = linalg::sum(before, linalg::scaled(step, boost));
-        spare_ = acceleration + linalg::norm(push) - linalg::distance(after, boosted) / step;
+        spare_ = acceleration + norm(pushed) - norm(linalg::difference(after, boosted)) / step;
     }
 
     /// Lets so much time of the loop's clock pass without schedule time.
@@ -218,14 +204,18 @@ public:
     bool is_boosted = false;
 
 private:
+    /// Velocity of the schedule at a row, also at the last one.
+    const Vector<N>& motion(std::size_t row) const {
+        return row == table_->last() ? table_->velocity_at_end : table_->rows[row].velocity;
+    }
+
     /// Largest squares of the pace before the end, where it acts, and from when on.
     void find_ends() {
         const std::size_t last = table_->last();
-        const std::vector<double>& speeds = table_->speeds;
         squared_limits_.assign(last + 1, 0.0);
         double left = 0.0;  // integral of dt / |x'| to the end; where the schedule rests it is long, not endless
         for (std::size_t i = last; i-- > 0;) {
-            const double mean = std::max(0.5 * (speeds[i + 1] + speeds[i]), 1e-9 * speed);
+            const double mean = std::max(0.5 * (speeds_[i + 1] + speeds_[i]), 1e-9 * speed);
             left += (table_->time(i + 1) - table_->time(i)) / mean;
             squared_limits_[i] = 2.0 * gain_ * left;
         }
@@ -236,41 +226,40 @@ private:
         tail_ = count(fastest_ * fastest_);
         // Where a schedule that ends while moving is slower if it may take one half of `gain` for that.
         const std::size_t fast = count(2.0);
-        const bool ends_moving = speeds.back() * table_->rate > gain_;
+        const bool ends_moving = speeds_.back() * table_->rate > gain_;
         slow_from_ = ends_moving ? table_->time(fast > 0 ? fast - 1 : last) : infinity;
     }
 
-    State<N> ramped(double begin, double step) {
+    State<N, M> ramped(double begin, double step) {
         const double time = begin - origin_, last_pace = pace_;
         double squared_limit;
-        State<N> row = desired(time, squared_limit);
-        const Vector<N> motion = row.velocity;
+        State<N, M> row = desired(time, squared_limit);
+        const Vector<N> moving = row.velocity;
         // Most ticks of an approach: at a pace of 1 nothing changes it, for nothing is caught up.
         if (is_soft_ && last_pace == 1.0 && free_ == 1.0 && 1.0 <= squared_limit) {
             clear_boost();
             spare_ = 0.0;
-            row.velocity = linalg::sum(motion, slope_);
+            row.velocity = linalg::sum(moving, slope_);
             return row;
         }
-        double motion_speed = linalg::norm(motion), last_free = last_pace, gain = gain_;
+        double motion_speed = norm(moving), last_free = last_pace, gain = gain_;
         if (is_soft_) {
             last_free = free_;
             gain -= taken_ * last_free * last_free;
             // Where the schedule is slower than its approach, `gain` is for the changes of both.
-            motion_speed =
-                last_pace < last_free ? motion_speed + linalg::norm(slope_) : linalg::norm(linalg::sum(motion, slope_));
+            motion_speed = last_pace < last_free ? motion_speed + norm(slope_) : norm(linalg::sum(moving, slope_));
         }
         const auto [faster, free] = freely(last_free, gain, motion_speed, step);
         const double pace = pace_ = std::min({last_pace + faster, free, std::sqrt(squared_limit)});
         // Where the pace is even nothing says what is spare, and the first tick of a rise finds out.
         is_boosted = pace != last_pace || (free != last_free && is_soft_);
         if (is_boosted) {
-            boost = linalg::scaled((pace - last_pace) / step, motion);
+            boost = linalg::scaled((pace - last_pace) / step, moving);
         } else {
             clear_boost();
             spare_ = 0.0;
         }
-        row.velocity = linalg::scaled(pace, motion);
+        row.velocity = linalg::scaled(pace, moving);
         if (is_soft_) {
             if (is_boosted) boost = linalg::sum(boost, linalg::scaled((free - last_free) / step, slope_));
             ahead_ += 0.5 * step * (free + last_free - pace - last_pace);
@@ -313,8 +302,8 @@ private:
     /// Motion at a time and a pace of 1, between a row and the next, and the square of the largest pace.
     ///
     /// An approach under way changes the position, and its own velocity at a pace of 1 is `slope_`.
-    State<N> desired(double time, double& squared_limit) {
-        State<N> row;
+    State<N, M> desired(double time, double& squared_limit) {
+        State<N, M> row;
         if (time >= table_->end) {
             index = table_->last();
             row = table_->rows[index];
@@ -324,11 +313,10 @@ private:
             const double start = static_cast<double>(index) / table_->rate, stop = table_->time(index + 1);
             const double share = time < stop ? (time - start) / (stop - start) : 1.0;
             row = table_->rows[index];
-            const State<N>& after = table_->rows[index + 1];
-            for (std::size_t i = 0; i < N; ++i) {
-                row.position[i] += share * (after.position[i] - row.position[i]);
-                row.velocity[i] += share * (after.velocity[i] - row.velocity[i]);
-            }
+            const State<N, M>& after = table_->rows[index + 1];
+            // Of quaternions that are so near, lengths and angles change evenly enough, and lengths do not matter.
+            for (std::size_t i = 0; i < M; ++i) row.place[i] += share * (after.place[i] - row.place[i]);
+            for (std::size_t i = 0; i < N; ++i) row.velocity[i] += share * (after.velocity[i] - row.velocity[i]);
             const double low = squared_limits_[index], high = squared_limits_[index + 1];
             squared_limit = low + share * (high - low);
         }
@@ -339,7 +327,11 @@ private:
             // Rest of a way of 1 by minimum jerk, and its slope over the phase.
             const double left = 1.0 - phase * phase * phase * (10.0 - 15.0 * phase + 6.0 * (phase * phase));
             const double slope = 30.0 * (phase * phase) * ((1.0 - phase) * (1.0 - phase)) / blend_;
-            row.position = linalg::difference(row.position, linalg::scaled(left, distance_));
+            const Vector<N> away = linalg::scaled(-left, distance_);
+            row.place = places::moved(row.place, away);
+            if constexpr (M != N)
+                places::set_tail(row.velocity,
+                                 rotations::rotated(places::rotation_of(row.velocity), places::rotation_of(away)));
             slope_ = linalg::scaled(slope, distance_);
             squared_limit *= end_share_;
         }
@@ -348,8 +340,13 @@ private:
 
     /// Time of an approach within its largest speed and this acceleration.
     double time_of(double way, double room) const {
-        return std::max({soft_start_, kSteepest * way / approach_speed_, std::sqrt(kSharpest * way / room)});
+        const double spun = kSteepest * way * spin_;
+        const double soonest = (spun + std::sqrt(spun * spun + 4.0 * kSharpest * way * room)) / (2.0 * room);
+        return std::max({soft_start_, kSteepest * way / approach_.position, soonest});
     }
+
+    /// Largest acceleration of the approach.
+    double sharpness(double way) const { return (kSharpest * way / blend_ + kSteepest * way * spin_) / blend_; }
 
     void clear_boost() {
         is_boosted = false;
@@ -367,11 +364,13 @@ private:
     // A minimum jerk of 1 over a time of 1 has a velocity of 15/8 and an acceleration of 10 / sqrt(3).
     static constexpr double kSteepest = 1.875, kSharpest = 5.7735;
 
-    std::shared_ptr<const ScheduleTable<N>> table_;
-    double soft_start_, approach_speed_;
+    std::shared_ptr<const ScheduleTable<N, M>> table_;
+    double soft_start_;
+    Limit approach_;
     bool catches_up_;
+    double spin_ = 0.0;  ///< largest angular speed of the schedule
     double gain_, room_, fastest_, slow_from_;
-    std::vector<double> squared_limits_;
+    std::vector<double> speeds_, squared_limits_;
     std::size_t tail_;
     double at_ = 0.0, origin_ = 0.0, lag_ = 0.0, spare_ = 0.0, ahead_ = 0.0, end_share_ = 1.0, blend_ = 1.0;
     double taken_ = 0.0, free_ = 1.0, pace_ = 1.0;

@@ -6,12 +6,11 @@
 #include <cmath>
 #include <cstddef>
 #include <limits>
-#include <optional>
 #include <sstream>
 #include <stdexcept>
-#include <string>
 
 #include "linalg.hpp"
+#include "places.hpp"
 #include "steps.hpp"
 
 namespace torch_pbd {
@@ -32,67 +31,58 @@ enum Fault : unsigned {
 };
 using Faults = unsigned;
 
+/// Option that positions and rotations have each their own of; without an orientation the second is not used.
+struct Limit {
+    double position, rotation = 0.0;
+
+    double operator[](std::size_t block) const { return block == 0 ? position : rotation; }
+};
+
 /// Refuses a number: one sentence that says which it was, and what it must be.
 inline double checked(double value, bool is_good, const char* name, const char* must) {
-    if (is_good && std::isfinite(value)) return value;
+    if (is_good && !std::isnan(value)) return value;
     std::ostringstream message;
     message << name << " is " << value << ", must be " << must << ".";
     throw std::invalid_argument(message.str());
 }
 
-/// A finite number above 0, or infinity where none is given.
-inline double positive_or_infinite(std::optional<double> value, const char* name) {
-    return value ? checked(*value, *value > 0.0, name, "a finite number above 0") : infinity;
+/// Option of positions, and if there are rotations, of these: above 0, or from 0 on, and finite if it must be.
+template <std::size_t N, std::size_t M>
+Limit checked(Limit limit, const char* name, bool may_be_zero = false, bool may_be_infinite = false) {
+    for (std::size_t b = 0; b < blocks<N, M>.size(); ++b) {
+        const double value = limit[b];
+        checked(value, value > 0.0 || (may_be_zero && value == 0.0), name, may_be_zero ? "of at least 0" : "above 0");
+        checked(value, value < infinity || may_be_infinite, name, "finite");
+    }
+    return limit;
 }
 
-/// The force that acts, per kg of virtual mass.
+/// The force that acts, and of poses the torque, over `unit` kg.
 ///
-/// A lost force is replaced by the median of the last good ones, on each axis, which fades to nothing over
+/// One that is lost is replaced by the median of the last good ones, on each axis, which fades to nothing over
 /// `hold_ticks`: neither a wild reading before the loss nor an old push can carry the robot away.
-template <std::size_t N>
+template <std::size_t N, std::size_t M>
 class ForceChannel {
 public:
-    ForceChannel(double mass, double force_limit, double deadband, std::optional<double> rate_limit, int hold_ticks)
-        : mass_(mass),
-          limit_(positive_or_infinite(force_limit, "force_limit") / mass),
-          deadband_(checked(deadband, deadband >= 0.0, "deadband", "a finite number of at least 0") / mass),
-          rate_limit_(positive_or_infinite(rate_limit, "force_rate_limit") / mass),
+    ForceChannel(double unit, Limit limit, Limit deadband, Limit rate_limit, int hold_ticks)
+        : unit_(unit),
+          limit_(checked<N, M>(limit, "force_limit")),
+          deadband_(checked<N, M>(deadband, "deadband", true)),
+          rate_limit_(checked<N, M>(rate_limit, "force_rate_limit", false, true)),
           hold_ticks_(static_cast<int>(checked(hold_ticks, hold_ticks >= 0, "hold_ticks", "at least 0"))) {}
 
     /// Forgets all forces; before the first there was none.
     void begin(const Vector<N>& bias) {
         push = {};
         bias_ = bias;
-        n_lost_ = 0;
+        channels_ = {};
         is_lost = false;
-        recent_ = {};
     }
 
     /// Lets a force as measured act, as far as it may, `step` s after the last one.
     Faults take(const Vector<N>& force, double step) {
-        Vector<N> measured;
-        for (std::size_t i = 0; i < N; ++i) {
-            measured[i] = (force[i] - bias_[i]) / mass_;
-            measured[i] -= std::max(-deadband_, std::min(deadband_, measured[i]));
-        }
-        const double length = linalg::norm(measured);
         Faults faults = 0;
-        if (!(length < infinity)) {
-            bridge();
-            return kForceInvalid;
-        }
-        if (length > limit_) {
-            for (double& part : measured) part = part / length * limit_;
-            faults = kForceSaturated;
-        }
-        const double change = linalg::distance(measured, push), most = rate_limit_ * step;
-        if (change > most) {
-            for (std::size_t i = 0; i < N; ++i) measured[i] = push[i] + most / change * (measured[i] - push[i]);
-            faults |= kForceRateLimited;
-        }
-        push = measured;
-        n_lost_ = 0;
-        recent_[newest_ = (newest_ + 1) % recent_.size()] = push;
+        for (std::size_t b = 0; b < channels_.size(); ++b) faults |= take(force, step, b);
         return faults;
     }
 
@@ -100,58 +90,112 @@ public:
     bool is_lost = false;  ///< for more than `hold_ticks` on end
 
 private:
-    void bridge() {
-        is_lost = ++n_lost_ > hold_ticks_;
-        const double share = std::max(0.0, 1.0 - n_lost_ / (hold_ticks_ + 1.0));
-        for (std::size_t i = 0; i < N; ++i) {
+    // A median of five is a good force after one or two wild ones, and 2 ms late at 1 kHz.
+    static constexpr std::size_t kRecent = 5;
+    struct Channel {
+        int n_lost = 0;
+        std::array<Vector<N>, kRecent> recent{};
+        std::size_t newest = 0;
+    };
+
+    Faults take(const Vector<N>& force, double step, std::size_t b) {
+        const Block block = blocks<N, M>[b];
+        const double deadband = deadband_[b] / unit_, limit = limit_[b] / unit_, most = rate_limit_[b] / unit_ * step;
+        Vector<N> measured = push;
+        for (std::size_t i = block.begin; i < block.end; ++i) {
+            measured[i] = (force[i] - bias_[i]) / unit_;
+            measured[i] -= std::max(-deadband, std::min(deadband, measured[i]));
+        }
+        const double length = linalg::norm(measured, block);
+        Faults faults = 0;
+        if (!(length < infinity)) {
+            bridge(block, channels_[b]);
+            return kForceInvalid;
+        }
+        if (length > limit) {
+            for (std::size_t i = block.begin; i < block.end; ++i) measured[i] = measured[i] / length * limit;
+            faults = kForceSaturated;
+        }
+        const double change = linalg::norm(linalg::difference(measured, push), block);
+        if (change > most) {
+            for (std::size_t i = block.begin; i < block.end; ++i)
+                measured[i] = push[i] + most / change * (measured[i] - push[i]);
+            faults |= kForceRateLimited;
+        }
+        push = measured;
+        Channel& channel = channels_[b];
+        channel.n_lost = 0;
+        channel.newest = (channel.newest + 1) % kRecent;
+        channel.recent[channel.newest] = push;
+        return faults;
+    }
+
+    void bridge(Block block, Channel& channel) {
+        is_lost = ++channel.n_lost > hold_ticks_ || is_lost;
+        const double share = std::max(0.0, 1.0 - channel.n_lost / (hold_ticks_ + 1.0));
+        for (std::size_t i = block.begin; i < block.end; ++i) {
             std::array<double, kRecent> parts;
-            for (std::size_t k = 0; k < kRecent; ++k) parts[k] = recent_[k][i];
+            for (std::size_t k = 0; k < kRecent; ++k) parts[k] = channel.recent[k][i];
             std::nth_element(parts.begin(), parts.begin() + kRecent / 2, parts.end());
             push[i] = share * parts[kRecent / 2];
         }
     }
 
-    // A median of five is a good force after one or two wild ones, and 2 ms late at 1 kHz.
-    static constexpr std::size_t kRecent = 5;
-    double mass_, limit_, deadband_, rate_limit_;
-    int hold_ticks_, n_lost_ = 0;
+    double unit_;
+    Limit limit_, deadband_, rate_limit_;
+    int hold_ticks_;
     Vector<N> bias_{};
-    std::array<Vector<N>, kRecent> recent_{};
-    std::size_t newest_ = 0;
+    std::array<Channel, blocks<N, M>.size()> channels_{};
 };
 
-/// Largest speed and acceleration of the command; infinite where none is given.
-template <std::size_t N>
+/// Largest speed and acceleration of the command; infinite where there is none.
+template <std::size_t N, std::size_t M>
 class CommandLimits {
 public:
-    CommandLimits(std::optional<double> velocity_limit, std::optional<double> acceleration_limit)
-        : speed(positive_or_infinite(velocity_limit, "velocity_limit")),
-          acceleration(positive_or_infinite(acceleration_limit, "acceleration_limit")) {}
-
-    bool is_any() const { return speed < infinity || acceleration < infinity; }
+    CommandLimits(Limit velocity_limit, Limit acceleration_limit)
+        : speed(checked<N, M>(velocity_limit, "velocity_limit", false, true)),
+          acceleration(checked<N, M>(acceleration_limit, "acceleration_limit", false, true)) {
+        for (std::size_t b = 0; b < blocks<N, M>.size(); ++b)
+            is_any = is_any || speed[b] < infinity || acceleration[b] < infinity;
+    }
 
     /// Brings a state that a tick of `step` s led to within limits; returns which of them acted.
-    Faults apply(State<N>& state, const State<N>& last, double step, double top_speed) const {
-        // The change of velocity is shortened first, then the velocity: the second never undoes the first.
-        const double change = linalg::distance(state.velocity, last.velocity), most = acceleration * step;
+    Faults apply(State<N, M>& state, const State<N, M>& last, double step, Limit top_speed) const {
+        Vector<N> move = places::deviation<N>(state.place, last.place);
         Faults faults = 0;
-        if (change > most) {
-            for (std::size_t i = 0; i < N; ++i)
-                state.velocity[i] = last.velocity[i] + most / change * (state.velocity[i] - last.velocity[i]);
-            faults |= kAccelerationLimited;
-        }
-        const double reached = linalg::norm(state.velocity);
-        if (reached > top_speed) {
-            state.velocity = linalg::scaled(top_speed / reached, state.velocity);
-            faults |= kVelocityLimited;
-        } else if (linalg::distance(state.position, last.position) > top_speed * step) {
-            faults |= kVelocityLimited;  // a swing within one tick, from rest to rest, is too fast as well
-        }
-        if (faults) state.position = drift(last.position, last.velocity, state.velocity, step);
+        for (std::size_t b = 0; b < blocks<N, M>.size(); ++b)
+            faults |=
+                apply(move, state.velocity, last.velocity, step, blocks<N, M>[b], top_speed[b], acceleration[b] * step);
+        if (faults) state.place = places::moved(last.place, move);
         return faults;
     }
 
-    double speed, acceleration;
+    Limit speed, acceleration;
+    bool is_any = false;
+
+private:
+    /// The same for move and velocity of one block, whose velocity changes by `most` at most.
+    static Faults apply(Vector<N>& move, Vector<N>& velocity, const Vector<N>& last, double step, Block block,
+                        double top_speed, double most) {
+        // The change of velocity is shortened first, then the velocity: the second never undoes the first.
+        const double change = linalg::norm(linalg::difference(velocity, last), block);
+        Faults faults = 0;
+        if (change > most) {
+            for (std::size_t i = block.begin; i < block.end; ++i)
+                velocity[i] = last[i] + most / change * (velocity[i] - last[i]);
+            faults |= kAccelerationLimited;
+        }
+        const double speed = linalg::norm(velocity, block);
+        if (speed > top_speed) {
+            for (std::size_t i = block.begin; i < block.end; ++i) velocity[i] *= top_speed / speed;
+            faults |= kVelocityLimited;
+        } else if (linalg::norm(move, block) > top_speed * step) {
+            faults |= kVelocityLimited;  // a swing within one tick, from rest to rest, is too fast as well
+        }
+        if (faults)
+            for (std::size_t i = block.begin; i < block.end; ++i) move[i] = 0.5 * step * (last[i] + velocity[i]);
+        return faults;
+    }
 };
 
 }  // namespace torch_pbd

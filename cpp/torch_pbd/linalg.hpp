@@ -50,17 +50,29 @@ bool is_zero(const Vector<N>& a) {
     return std::all_of(a.begin(), a.end(), [](double part) { return part == 0.0; });
 }
 
-/// Length of a vector; infinite or NaN only where a part is.
+/// Some of the components of a vector, from `begin` to before `end`.
+struct Block {
+    std::size_t begin, end;
+};
+
+/// Length of a block of a vector; infinite or NaN only where a component is.
 template <std::size_t N>
-double norm(const Vector<N>& a) {
-    const double square = dot(a, a);
+double norm(const Vector<N>& a, Block block) {
+    double square = 0.0;
+    for (std::size_t i = block.begin; i < block.end; ++i) square += a[i] * a[i];
     if (1e-280 < square && square < 1e280) return std::sqrt(square);
     double scale = 0.0;  // squares have overflown, or lost digits
-    for (const double part : a) scale = std::abs(part) > scale || std::isnan(part) ? std::abs(part) : scale;
+    for (std::size_t i = block.begin; i < block.end; ++i)
+        if (std::abs(a[i]) > scale || std::isnan(a[i])) scale = std::abs(a[i]);
     if (scale == 0.0 || !std::isfinite(scale)) return scale;
     double sum = 0.0;
-    for (const double part : a) sum += (part / scale) * (part / scale);
+    for (std::size_t i = block.begin; i < block.end; ++i) sum += (a[i] / scale) * (a[i] / scale);
     return scale * std::sqrt(sum);
+}
+
+template <std::size_t N>
+double norm(const Vector<N>& a) {
+    return norm(a, {0, N});
 }
 
 template <std::size_t N>
@@ -72,6 +84,23 @@ template <std::size_t N>
 Vector<N> product(const Matrix<N>& a, const Vector<N>& x) {
     Vector<N> result;
     for (std::size_t i = 0; i < N; ++i) result[i] = dot(a[i], x);
+    return result;
+}
+
+/// A' x, without the transpose.
+template <std::size_t N>
+Vector<N> transposed_product(const Matrix<N>& a, const Vector<N>& x) {
+    Vector<N> result{};
+    for (std::size_t i = 0; i < N; ++i)
+        for (std::size_t j = 0; j < N; ++j) result[j] += a[i][j] * x[i];
+    return result;
+}
+
+template <std::size_t N>
+Matrix<N> transposed(const Matrix<N>& a) {
+    Matrix<N> result;
+    for (std::size_t i = 0; i < N; ++i)
+        for (std::size_t j = 0; j < N; ++j) result[j][i] = a[i][j];
     return result;
 }
 
@@ -141,6 +170,34 @@ Eigen<N> eigh(Matrix<N> a) {
     Eigen<N> result{{}, axes};
     for (std::size_t i = 0; i < N; ++i) result.values[i] = a[i][i];
     return result;
+}
+
+/// Lower factor L of a positive definite matrix A = L L'.
+template <std::size_t N>
+Matrix<N> cholesky(const Matrix<N>& a) {
+    Matrix<N> factor{};
+    for (std::size_t i = 0; i < N; ++i) {
+        for (std::size_t j = 0; j <= i; ++j) {
+            double rest = a[i][j];
+            for (std::size_t k = 0; k < j; ++k) rest -= factor[i][k] * factor[j][k];
+            factor[i][j] = i == j ? std::sqrt(rest) : rest / factor[j][j];
+        }
+    }
+    return factor;
+}
+
+/// Inverse of a lower triangle.
+template <std::size_t N>
+Matrix<N> inverse_lower(const Matrix<N>& factor) {
+    Matrix<N> inverse{};
+    for (std::size_t j = 0; j < N; ++j) {
+        for (std::size_t i = j; i < N; ++i) {
+            double rest = i == j ? 1.0 : 0.0;
+            for (std::size_t k = j; k < i; ++k) rest -= factor[i][k] * inverse[k][j];
+            inverse[i][j] = rest / factor[i][i];
+        }
+    }
+    return inverse;
 }
 
 /// exp(matrix) - 1 by Taylor series and doubling: without the 1, slow motions keep their digits beside fast ones.

@@ -1,16 +1,20 @@
 /// One tick of the admittance, solved exactly; the comments that derive it are those of realtime/steps.py.
 #pragma once
 
+#include <algorithm>
 #include <cmath>
 #include <cstddef>
 
 #include "linalg.hpp"
+#include "places.hpp"
 
 namespace torch_pbd {
 
-template <std::size_t N>
+/// Place, of M numbers, and velocity.
+template <std::size_t N, std::size_t M>
 struct State {
-    Vector<N> position, velocity;
+    Vector<M> place;
+    Vector<N> velocity;
 };
 
 /// Impulse response of y'' + 2 a y' + k y = 0 (y = 0, y' = 1 at first) after a time, and its integral.
@@ -42,88 +46,104 @@ inline Responses responses(double stiffness, double decay, double step) {
     return {impulse, step * step * series};
 }
 
-/// Stiffness of each axis per kg, half its damping per kg, and the axes, which both share.
+/// Modes that stiffness and damping share, and their gains.
+///
+/// Modes, the columns of P, are such that P' M P = 1, while P' K P and P' D P are diagonal. For a mass in all
+/// directions they are its axes, with all per kg.
 template <std::size_t N>
 struct Modes {
     double top;  ///< largest stiffness
-    Vector<N> stiffness, decay;
-    Matrix<N> axes;
+    Vector<N> stiffness, decay;  ///< of each mode, and half its damping
+    Matrix<N> tells, shapes;  ///< rows of P' M, which tell y from e = P y, and those of P'
+};
+
+/// What moves a robot in a tick: forces, and what the spring's ends are.
+template <std::size_t N>
+struct Drive {
+    Vector<N> push, off, desired_velocity;  ///< external force, e = x - x_d, v_d
+    double step, pull_limit;
 };
 
 /// Scale of the stiffness at which the spring pulls at `limit` most, from the largest pull that e'K e allows.
 inline double spring_scale(double pull, double limit) { return pull > limit * limit ? limit / std::sqrt(pull) : 1.0; }
 
-/// Moves the state on by `step` s, each axis by itself; returns the scale of the stiffness.
+/// Move in a tick, each mode by itself; changes the velocity, and tells the scale of the stiffness.
 ///
-/// Along an axis, y = x - x_d follows y'' + 2 a y' + k y = f + 2 a v_d, all per kg. With the responses S and P of
-/// `responses` and q = f + 2 a v_d - k y, y grows by S v + P q and v by S q - (2 a S + k P) v: increments, which keep
+/// With f of a mode that of P' f, each y follows y'' + 2 a y' + k y = f + 2 a v_d. With the responses S and B of
+/// `responses` and q = f + 2 a v_d - k y, y grows by S v + B q and v by S q - (2 a S + k B) v: increments, which keep
 /// their digits in short ticks.
 template <std::size_t N>
-double advance(const Modes<N>& modes, const State<N>& desired, const Vector<N>& push, State<N>& state, double step,
-               double pull_limit) {
+Vector<N> along_modes(const Modes<N>& modes, const Drive<N>& drive, Vector<N>& velocity, double& scale) {
     using linalg::dot;
-    const Vector<N> off = linalg::product(modes.axes, linalg::difference(state.position, desired.position));
+    const Vector<N> y = linalg::product(modes.tells, drive.off), before = velocity;
     double pull = 0.0;
-    for (std::size_t i = 0; i < N; ++i) pull += modes.stiffness[i] * off[i] * off[i];
-    const double scale = spring_scale(modes.top * pull, pull_limit);
-    const State<N> before = state;
+    for (std::size_t i = 0; i < N; ++i) pull += modes.stiffness[i] * y[i] * y[i];
+    scale = spring_scale(modes.top * pull, drive.pull_limit);
+    Vector<N> move{};
     for (std::size_t i = 0; i < N; ++i) {
-        const Vector<N>& axis = modes.axes[i];
-        const double k = scale * modes.stiffness[i], a = modes.decay[i], v = dot(axis, before.velocity);
-        const auto [s, p] = responses(k, a, step);
-        const double q = dot(axis, push) + 2.0 * a * dot(axis, desired.velocity) - k * off[i];
-        const double dx = s * v + p * q, dv = s * q - (2.0 * a * s + k * p) * v;
+        const Vector<N>&tell = modes.tells[i], &shape = modes.shapes[i];
+        const double k = scale * modes.stiffness[i], a = modes.decay[i], v = dot(tell, before);
+        const auto [s, b] = responses(k, a, drive.step);
+        const double q = dot(shape, drive.push) + 2.0 * a * dot(tell, drive.desired_velocity) - k * y[i];
+        const double dy = s * v + b * q, dv = s * q - (2.0 * a * s + k * b) * v;
         for (std::size_t j = 0; j < N; ++j) {
-            state.position[j] += dx * axis[j];
-            state.velocity[j] += dv * axis[j];
+            move[j] += dy * shape[j];
+            velocity[j] += dv * shape[j];
         }
     }
-    return scale;
+    return move;
 }
 
-/// As `advance` for matrices, per kg, that share no axes: exp(X) - 1 of the whole system, time in ticks.
+/// As `along_modes` for matrices that share none: exp(X) - 1 of the whole system, time in ticks.
+///
+/// Of the modes, `shapes` is the inverse of the factor L of a mass matrix; without one the gains are per kg.
 template <std::size_t N>
-double advance_coupled(const Matrix<N>& stiffness, const Matrix<N>& damping, double top, const State<N>& desired,
-                       const Vector<N>& push, State<N>& state, double step, double pull_limit) {
-    const Vector<N> off = linalg::difference(state.position, desired.position);
-    const double scale = spring_scale(top * linalg::dot(off, linalg::product(stiffness, off)), pull_limit);
-    const Vector<N> held = linalg::sum(push, linalg::product(damping, desired.velocity));
+Vector<N> coupled(const Modes<N>& modes, bool has_mass, const Matrix<N>& stiffness, const Matrix<N>& damping,
+                  const Drive<N>& drive, Vector<N>& velocity, double& scale) {
+    const double step = drive.step;
+    scale = spring_scale(modes.top * linalg::dot(drive.off, linalg::product(stiffness, drive.off)), drive.pull_limit);
+    const Vector<N> held = linalg::sum(drive.push, linalg::product(damping, drive.desired_velocity));
+    const auto per_mass = [&](const Vector<N>& force) {
+        return has_mass ? linalg::transposed_product(modes.shapes, linalg::product(modes.shapes, force)) : force;
+    };
     Matrix<2 * N + 1> rate{};
+    const auto set_column = [&rate](std::size_t column, double factor, const Vector<N>& acceleration) {
+        for (std::size_t i = 0; i < N; ++i) rate[N + i][column] = factor * acceleration[i];
+    };
     Vector<2 * N + 1> start{};
     start[2 * N] = 1.0;
     for (std::size_t i = 0; i < N; ++i) {
         rate[i][N + i] = 1.0;
-        for (std::size_t j = 0; j < N; ++j) {
-            rate[N + i][j] = -(step * step) * scale * stiffness[i][j];
-            rate[N + i][N + j] = -step * damping[i][j];
-        }
-        rate[N + i][2 * N] = step * step * held[i];
-        start[i] = off[i];
-        start[N + i] = step * state.velocity[i];
+        set_column(i, -(step * step) * scale, per_mass(stiffness[i]));  // rows are columns: both are symmetric
+        set_column(N + i, -step, per_mass(damping[i]));
+        start[i] = drive.off[i];
+        start[N + i] = step * velocity[i];
     }
+    set_column(2 * N, step * step, per_mass(held));
     const Vector<2 * N + 1> change = linalg::product(linalg::expm1(rate), start);
+    Vector<N> move;
     for (std::size_t i = 0; i < N; ++i) {
-        state.position[i] += change[i];
-        state.velocity[i] += change[N + i] / step;
+        move[i] = change[i];
+        velocity[i] += change[N + i] / step;
     }
-    return scale;
+    return move;
 }
 
-/// Position after a time in which the velocity changes evenly.
+/// Move in a time in which the velocity changes evenly.
 template <std::size_t N>
-Vector<N> drift(const Vector<N>& position, const Vector<N>& before, const Vector<N>& after, double time) {
-    Vector<N> result;
-    for (std::size_t i = 0; i < N; ++i) result[i] = position[i] + 0.5 * time * (before[i] + after[i]);
-    return result;
+Vector<N> mean_move(const Vector<N>& before, const Vector<N>& after, double time) {
+    Vector<N> move;
+    for (std::size_t i = 0; i < N; ++i) move[i] = 0.5 * time * (before[i] + after[i]);
+    return move;
 }
 
-/// State after braking for `step` s, or until standing still.
-template <std::size_t N>
-State<N> braked(const State<N>& state, double deceleration, double step) {
-    const double speed = linalg::norm(state.velocity), braking = std::min(step, speed / deceleration);
+/// State after braking for `step` s, all axes alike, from a speed, or until standing still.
+template <std::size_t N, std::size_t M>
+State<N, M> braked(const State<N, M>& state, double speed, double deceleration, double step) {
+    const double braking = std::min(step, speed / deceleration);
     const double left = braking == step ? 1.0 - deceleration * step / speed : 0.0;
     const Vector<N> slower = linalg::scaled(left, state.velocity);
-    return {drift(state.position, state.velocity, slower, braking), slower};
+    return {places::moved<N>(state.place, mean_move(state.velocity, slower, braking)), slower};
 }
 
 }  // namespace torch_pbd

@@ -4,12 +4,14 @@
 #include <algorithm>
 #include <cmath>
 #include <cstddef>
+#include <limits>
 #include <stdexcept>
 #include <string>
 #include <vector>
 
 #include "limits.hpp"
 #include "linalg.hpp"
+#include "places.hpp"
 #include "schedule.hpp"
 #include "steps.hpp"
 
@@ -17,49 +19,102 @@ namespace torch_pbd {
 
 /// A schedule in rows `1 / rate` apart, the last one at `end` s, with no velocity.
 ///
-/// Between its own rows the schedule is what `Schedule.resample` of Python says: gains on straight lines, positions on
-/// the cubic through positions and velocities, and velocities its derivative.
-template <std::size_t N>
+/// Between its own rows the schedule is what `Schedule.resample` of Python says: gains and masses on straight lines,
+/// positions on the cubic through positions and velocities, orientations on that of the rotation vector from the row
+/// before. Gains of the modes are per kg of a mass that is the same in all directions, `unit`.
+template <std::size_t N, std::size_t M>
 class ScheduleTable {
 public:
-    ScheduleTable(const Schedule& schedule, double mass, double ticks_per_second)
-        : rate(ticks_per_second), mass_(mass) {
-        if (schedule.n_outputs != N)
-            throw std::invalid_argument("the schedule has " + std::to_string(schedule.n_outputs) +
-                                        " outputs, must have " + std::to_string(N) + ".");
-        if (!schedule.orientation.empty() || !schedule.inertia.empty())
-            throw std::invalid_argument("the schedule has orientations or a mass matrix, of which this loop has none.");
+    ScheduleTable(const Schedule& schedule, double mass, double ticks_per_second, Limit pull_limit)
+        : rate(ticks_per_second), unit(mass), has_mass(!schedule.inertia.empty()) {
+        if (schedule.n_outputs != N || schedule.n_positions != n_positions<N, M>)
+            throw std::invalid_argument("the schedule has " + std::to_string(schedule.n_positions) + " positions of " +
+                                        std::to_string(schedule.n_outputs) + " outputs, must have " +
+                                        std::to_string(n_positions<N, M>) + " of " + std::to_string(N) + ".");
         end = schedule.time.back() - schedule.time.front();
-        fill(schedule, grid());
-        is_shared_ = share_axes();
-        if (!is_shared_) modes_.clear();
+        times_ = grid();
+        rows.resize(times_.size());
+        stiffness.resize(times_.size());
+        damping.resize(times_.size());
+        modes_.resize(times_.size());
+        std::size_t knot = 0;
+        for (std::size_t i = 0; i < times_.size(); ++i) {
+            const std::vector<double>& knots = schedule.time;
+            while (knot + 2 < knots.size() && knots[knot + 1] - knots[0] <= times_[i]) ++knot;
+            fill(schedule, knot, i);
+            if (!share_axes(schedule, knot, i)) is_shared_ = false;
+            modes_[i].top = largest(i, pull_limit);
+        }
+        velocity_at_end = rows.back().velocity;
+        rows.back().velocity = {};
     }
 
-    /// Moves a state on by `step` s with the gains of a row; returns the scale of its stiffness.
-    double advance(std::size_t row, const State<N>& desired, const Vector<N>& push, State<N>& state, double step,
+    /// Moves a state on by `step` s with the gains of a row; tells the scale of its stiffness.
+    ///
+    /// The angular velocity is integrated over the tick as that of a fixed axis would be, and turns the robot in world
+    /// axes. The deviation is then told anew from where both are, so that the transport of it by the desired rotation,
+    /// which turns e by w_d x e, comes out by itself.
+    double advance(std::size_t row, const State<N, M>& desired, const Vector<N>& push, State<N, M>& state, double step,
                    double pull_limit) const {
-        if (is_shared_) return torch_pbd::advance(modes_[row], desired, push, state, step, pull_limit);
-        const Matrix<N> k = linalg::scaled(1.0 / mass_, stiffness[row]), d = linalg::scaled(1.0 / mass_, damping[row]);
-        return advance_coupled(k, d, tops_[row], desired, push, state, step, pull_limit);
+        const Vector<N> off = places::deviation<N>(state.place, desired.place);
+        const Drive<N> drive{push, off, desired.velocity, step, pull_limit};
+        const Modes<N>& modes = modes_[row];
+        double scale;
+        const Vector<N> move = is_shared_
+                                   ? along_modes(modes, drive, state.velocity, scale)
+                                   : coupled(modes, has_mass, linalg::scaled(1.0 / unit, stiffness[row]),
+                                             linalg::scaled(1.0 / unit, damping[row]), drive, state.velocity, scale);
+        state.place = places::moved(state.place, move);
+        return scale;
     }
 
-    double rate, end;
-    std::vector<State<N>> rows;
-    std::vector<Matrix<N>> stiffness, damping;  ///< N/m and N s/m
-    std::vector<double> speeds;  ///< of the desired motion, those before the last row was stopped
-    double acceleration = 0.0;  ///< largest, of the same
-    double least_damping = 0.0;  ///< smallest eigenvalue, in N s/m
+    /// Push, as ticks take it, that causes an acceleration: a force, or that per kg.
+    Vector<N> forced(const Vector<N>& acceleration, std::size_t row) const {
+        if (!has_mass) return acceleration;
+        return linalg::transposed_product(modes_[row].tells, linalg::product(modes_[row].tells, acceleration));
+    }
+
+    /// Acceleration that such a push causes.
+    Vector<N> accelerated(const Vector<N>& push, std::size_t row) const {
+        if (!has_mass) return push;
+        return linalg::transposed_product(modes_[row].shapes, linalg::product(modes_[row].shapes, push));
+    }
+
+    /// Largest norm, over the rows, of each block of D^-1, times what acts on the blocks: velocities of positions and
+    /// rotations under steady forces and torques where damping alone acts. Infinite where it is singular.
+    Limit mobility(Limit force) const {
+        constexpr double singular = 1e-12;  // relative to the largest entry, units of lengths and angles apart
+        Matrix<2> most{};
+        for (const Matrix<N>& gain : damping) {
+            const auto [values, axes] = linalg::eigh(gain);
+            const double scale = linalg::largest(gain), least = *std::min_element(values.begin(), values.end());
+            if (!(least > singular * scale)) return {infinity, infinity};
+            Matrix<N> inverse{};
+            for (std::size_t i = 0; i < N; ++i)
+                for (std::size_t j = 0; j < N; ++j)
+                    for (std::size_t k = 0; k < N; ++k) inverse[j][k] += axes[i][j] * axes[i][k] / values[i];
+            for (std::size_t b = 0; b < blocks<N, M>.size(); ++b)
+                for (std::size_t c = 0; c < blocks<N, M>.size(); ++c)
+                    most[b][c] = std::max(most[b][c], spectral_norm(inverse, blocks<N, M>[b], blocks<N, M>[c]));
+        }
+        const Vector<2> reached = linalg::product(most, Vector<2>{force.position, force.rotation});
+        return {reached[0], reached[1]};
+    }
 
     std::size_t last() const { return rows.size() - 1; }
+    double time(std::size_t row) const { return times_[row]; }  ///< in s
 
-    /// Time of a row, in s.
-    double time(std::size_t row) const { return row == last() ? end : static_cast<double>(row) / rate; }
+    double rate, unit, end;
+    bool has_mass;  ///< that is a matrix
+    std::vector<State<N, M>> rows;
+    std::vector<Matrix<N>> stiffness, damping;  ///< N/m and N s/m
+    Vector<N> velocity_at_end;  ///< before the last row was stopped
 
 private:
     /// Times of the rows: every `1 / rate`, where 10 s at 1 kHz are 10001 rows, however 10 * 1000 is rounded.
     std::vector<double> grid() const {
         constexpr double rounding = 1e-3, most = 4e6;  // of a tick; rows: an hour at 1 kHz
-        const double ticks = end * rate, counted = std::max(1.0, std::ceil(ticks - rounding));
+        const double counted = std::max(1.0, std::ceil(end * rate - rounding));
         checked(rate, counted + 1.0 <= most, "rate", "low enough for a table of 4,000,000 rows");
         // A schedule shorter than a tick of the loop is begun and ended.
         std::vector<double> times(static_cast<std::size_t>(counted) + 1, end);
@@ -67,31 +122,53 @@ private:
         return times;
     }
 
-    void fill(const Schedule& schedule, const std::vector<double>& times) {
-        rows.resize(times.size());
-        stiffness.resize(times.size());
-        damping.resize(times.size());
-        speeds.resize(times.size());
-        const std::vector<double>& knots = schedule.time;
-        std::size_t knot = 0;
-        for (std::size_t i = 0; i < times.size(); ++i) {
-            while (knot + 2 < knots.size() && knots[knot + 1] - knots[0] <= times[i]) ++knot;
-            const double h = (knots[knot + 1] - knots[0]) - (knots[knot] - knots[0]);
-            const double s = (times[i] - (knots[knot] - knots[0])) / h;
-            for (std::size_t a = 0; a < N; ++a) {
-                hermite(&schedule.position[knot * N + a], &schedule.velocity[knot * N + a], s, h, rows[i], a);
-                for (std::size_t b = 0; b < N; ++b) {
-                    const std::size_t place = (knot * N + a) * N + b;
-                    stiffness[i][a][b] = blend(schedule.stiffness[place], schedule.stiffness[place + N * N], s);
-                    damping[i][a][b] = blend(schedule.damping[place], schedule.damping[place + N * N], s);
-                }
-            }
-            speeds[i] = linalg::norm(rows[i].velocity);
-            if (i > 0)
-                acceleration = std::max(
-                    acceleration, linalg::distance(rows[i].velocity, rows[i - 1].velocity) / (times[i] - times[i - 1]));
+    /// Interval of the schedule from a knot on, and where a row is in it.
+    struct Place {
+        double share, step;
+    };
+
+    Place place(const Schedule& schedule, std::size_t knot, std::size_t row) const {
+        const double first = schedule.time[0], start = schedule.time[knot] - first;
+        const double step = (schedule.time[knot + 1] - first) - start;
+        return {(times_[row] - start) / step, step};
+    }
+
+    void fill(const Schedule& schedule, std::size_t knot, std::size_t row) {
+        const Place at = place(schedule, knot, row);
+        constexpr std::size_t p = n_positions<N, M>;
+        const double *position = &schedule.position[knot * p], *velocity = &schedule.velocity[knot * N];
+        State<N, M>& state = rows[row];
+        for (std::size_t i = 0; i < p; ++i)
+            cubic(position[i], position[p + i], velocity[i], velocity[N + i], at, state.place[i], state.velocity[i]);
+        if constexpr (M != N) {
+            const double* q = &schedule.orientation[knot * 4];
+            turn({q[0], q[1], q[2], q[3]}, {q[4], q[5], q[6], q[7]}, velocity, at, state);
         }
-        rows.back().velocity = {};
+        stiffness[row] = blended(schedule.stiffness, knot, at.share);
+        damping[row] = blended(schedule.damping, knot, at.share);
+    }
+
+    /// Cubic of the rotation vector y from the first row, R = R_row Exp(y).
+    static void turn(const Quaternion& start, const Quaternion& end, const double* velocity, Place at,
+                     State<N, M>& state) {
+        using namespace rotations;
+        const Vector<3> way = log(multiply(conjugate(start), end));
+        const auto rate = [&](const double* twist) {
+            return turned(conjugate(start), {twist[N - 3], twist[N - 2], twist[N - 1]});
+        };
+        const Vector<3> begins = rate(velocity), ends = left_jacobian_inverse(way, rate(velocity + N));
+        Vector<3> vector, slope;
+        for (std::size_t i = 0; i < 3; ++i) cubic(0.0, way[i], begins[i], ends[i], at, vector[i], slope[i]);
+        places::set_tail(state.place, multiply(start, exp(vector)));
+        places::set_tail(state.velocity, turned(start, left_jacobian(vector, slope)));
+    }
+
+    /// Cubic from the first to the last value with the rates at start and end, and its derivative.
+    static void cubic(double first, double last, double start, double end, Place at, double& value, double& slope) {
+        const auto [s, h] = at;
+        const double bend = h * s * (1.0 - s) * ((1.0 - s) * start - s * end);
+        value = blend(first, last, s * s * (3.0 - 2.0 * s)) + bend;
+        slope = blend(start, end, s) + 3.0 * s * (1.0 - s) * (2.0 * (last - first) / h - start - end);
     }
 
     /// Straight line from start to end, exact at both and where they agree.
@@ -99,66 +176,78 @@ private:
         return share < 0.5 ? start + share * (end - start) : end - (1.0 - share) * (end - start);
     }
 
-    /// Cubic between two rows of one output at a share s of the h s between them, and its derivative.
-    static void hermite(const double* position, const double* velocity, double s, double h, State<N>& row,
-                        std::size_t output) {
-        const double x = position[0], next_x = position[N], v = velocity[0], next_v = velocity[N];
-        const double bend = h * s * (1.0 - s) * ((1.0 - s) * v - s * next_v);
-        row.position[output] = blend(x, next_x, s * s * (3.0 - 2.0 * s)) + bend;
-        row.velocity[output] = blend(v, next_v, s) + 3.0 * s * (1.0 - s) * (2.0 * ((next_x - x) / h) - v - next_v);
+    static Matrix<N> blended(const std::vector<double>& matrices, std::size_t knot, double share) {
+        const double *start = &matrices[knot * N * N], *end = start + N * N;
+        Matrix<N> result;
+        for (std::size_t i = 0; i < N; ++i)
+            for (std::size_t j = 0; j < N; ++j) result[i][j] = blend(start[N * i + j], end[N * i + j], share);
+        return result;
     }
 
-    /// Finds the axes that stiffness and damping share; false where they share none in some row.
+    /// Finds the modes that stiffness and damping share; false where they share none.
     ///
-    /// Axes of the sum are those of both, also where equal values of one leave its own undetermined. A weight other
-    /// than 1 tells apart two axes of which one is as stiff as the other is damped.
-    bool share_axes() {
+    /// With M = L L' they are P = L'^-1 Q, P' M = Q' L', where Q are the axes of L^-1 K L'^-1 and L^-1 D L'^-1. Axes of
+    /// the sum are those of both, also where equal values of one leave its own undetermined. A weight other than 1
+    /// tells apart two axes of which one is as stiff as the other is damped.
+    bool share_axes(const Schedule& schedule, std::size_t knot, std::size_t row) {
         constexpr double rounding = 1e-9, tiny = std::numeric_limits<double>::min();
-        modes_.resize(rows.size());
-        bool is_shared = true;
-        double least = infinity;
-        for (std::size_t i = 0; i < rows.size(); ++i) {
-            const Matrix<N> k = linalg::scaled(1.0 / mass_, stiffness[i]), d = linalg::scaled(1.0 / mass_, damping[i]);
-            const double k_most = std::max(linalg::largest(k), tiny), d_most = std::max(linalg::largest(d), tiny);
-            Matrix<N> both;
-            for (std::size_t a = 0; a < N; ++a)
-                for (std::size_t b = 0; b < N; ++b) both[a][b] = k[a][b] / k_most + 0.6 * d[a][b] / d_most;
-            Modes<N>& modes = modes_[i];
-            modes.axes = linalg::eigh(both).axes;
-            for (std::size_t a = 0; a < N; ++a) {
-                const Vector<N> force = linalg::product(k, modes.axes[a]), drag = linalg::product(d, modes.axes[a]);
-                for (std::size_t b = 0; b < N; ++b) {
-                    if (a == b) continue;
-                    is_shared = is_shared && std::abs(linalg::dot(modes.axes[b], force)) <= rounding * k_most &&
-                                std::abs(linalg::dot(modes.axes[b], drag)) <= rounding * d_most;
-                }
-                modes.stiffness[a] = std::max(linalg::dot(modes.axes[a], force), 0.0);
-                modes.decay[a] = 0.5 * std::max(linalg::dot(modes.axes[a], drag), 0.0);
-                least = std::min(least, 2.0 * modes.decay[a]);
+        Modes<N>& modes = modes_[row];
+        Matrix<N> k = linalg::scaled(1.0 / unit, stiffness[row]), d = linalg::scaled(1.0 / unit, damping[row]);
+        if (has_mass) {
+            const double share = place(schedule, knot, row).share;
+            const Matrix<N> factor = linalg::cholesky(blended(schedule.inertia, knot, share));
+            modes.tells = linalg::transposed(factor);
+            modes.shapes = linalg::inverse_lower(factor);
+            for (Matrix<N>* gain : {&k, &d})
+                *gain = linalg::product(linalg::product(modes.shapes, *gain), linalg::transposed(modes.shapes));
+        }
+        const double k_most = std::max(linalg::largest(k), tiny), d_most = std::max(linalg::largest(d), tiny);
+        Matrix<N> both;
+        for (std::size_t a = 0; a < N; ++a)
+            for (std::size_t b = 0; b < N; ++b)
+                both[a][b] = 0.5 * ((k[a][b] + k[b][a]) / k_most + 0.6 * (d[a][b] + d[b][a]) / d_most);
+        const Matrix<N> axes = linalg::eigh(both).axes;
+        for (std::size_t a = 0; a < N; ++a) {
+            const Vector<N> force = linalg::product(k, axes[a]), drag = linalg::product(d, axes[a]);
+            for (std::size_t b = 0; b < N; ++b) {
+                if (a != b && !(std::abs(linalg::dot(axes[b], force)) <= rounding * k_most &&
+                                std::abs(linalg::dot(axes[b], drag)) <= rounding * d_most))
+                    return false;
             }
-            modes.top = *std::max_element(modes.stiffness.begin(), modes.stiffness.end());
+            modes.stiffness[a] = std::max(linalg::dot(axes[a], force), 0.0);
+            modes.decay[a] = 0.5 * std::max(linalg::dot(axes[a], drag), 0.0);
         }
-        if (!is_shared) least = find_tops();
-        least_damping = mass_ * least;
-        return is_shared;
+        modes.tells = has_mass ? linalg::product(axes, modes.tells) : axes;
+        modes.shapes = has_mass ? linalg::product(axes, modes.shapes) : axes;
+        return true;
     }
 
-    /// Largest stiffness of each row, per kg; returns the smallest damping.
-    double find_tops() {
-        double least = infinity;
-        for (std::size_t i = 0; i < rows.size(); ++i) {
-            const Vector<N> k = linalg::eigh(linalg::scaled(1.0 / mass_, stiffness[i])).values;
-            const Vector<N> d = linalg::eigh(linalg::scaled(1.0 / mass_, damping[i])).values;
-            tops_.push_back(*std::max_element(k.begin(), k.end()));
-            least = std::min(least, *std::min_element(d.begin(), d.end()));
+    /// Square of the first limit over that of the largest |K e| / limit of a block at e'K e = 1: k_max of one block.
+    ///
+    /// |K e|^2 <= k_max e'K e in each block, with k_max that of the block: with the others' displacements too, as
+    /// |B'K e|^2 <= |B'K B| e'K e for any B.
+    double largest(std::size_t row, Limit pull_limit) const {
+        double most = 0.0;
+        for (std::size_t b = 0; b < blocks<N, M>.size(); ++b) {
+            const double ratio = pull_limit.position / pull_limit[b];
+            most = std::max(most, spectral_norm(stiffness[row], blocks<N, M>[b], blocks<N, M>[b]) * ratio * ratio);
         }
-        return least;
+        return most / unit;
     }
 
-    double mass_;
-    bool is_shared_;
+    /// Largest singular value of a block of a matrix.
+    static double spectral_norm(const Matrix<N>& matrix, Block rows_of, Block columns) {
+        Matrix<N> square{};
+        for (std::size_t i = columns.begin; i < columns.end; ++i)
+            for (std::size_t j = columns.begin; j < columns.end; ++j)
+                for (std::size_t k = rows_of.begin; k < rows_of.end; ++k) square[i][j] += matrix[k][i] * matrix[k][j];
+        const Vector<N> values = linalg::eigh(square).values;
+        return std::sqrt(*std::max_element(values.begin(), values.end()));
+    }
+
+    bool is_shared_ = true;
+    std::vector<double> times_;
     std::vector<Modes<N>> modes_;
-    std::vector<double> tops_;
 };
 
 }  // namespace torch_pbd

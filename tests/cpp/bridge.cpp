@@ -3,8 +3,11 @@
 #include <exception>
 #include <map>
 #include <memory>
+#include <optional>
 #include <string>
 #include <torch_pbd/admittance.hpp>
+#include <tuple>
+#include <type_traits>
 #include <vector>
 
 using torch_pbd::Admittance;
@@ -17,7 +20,7 @@ namespace {
 
 struct Loop {
     virtual ~Loop() = default;
-    virtual void start(double now, const double* position, const double* velocity, double at, const double* bias) = 0;
+    virtual void start(double now, const double* place, const double* velocity, double at, const double* bias) = 0;
     virtual unsigned tick(double now, const double* force) = 0;
     virtual void read(double* out) const = 0;
 };
@@ -29,58 +32,71 @@ Vector<N> vector(const double* values) {
     return result;
 }
 
-template <std::size_t N>
+template <std::size_t N, std::size_t M = N>
 struct LoopOf final : Loop {
     LoopOf(const Schedule& schedule, const Options& options) : controller(schedule, options) {}
 
-    void start(double now, const double* position, const double* velocity, double at, const double* bias) override {
-        std::optional<Vector<N>> here;
-        if (position) here = vector<N>(position);
-        controller.start(now, here, vector<N>(velocity), at, vector<N>(bias));
+    // A place that begins or ends with NaN has no position or orientation.
+    void start(double now, const double* place, const double* velocity, double at, const double* bias) override {
+        std::optional<typename Admittance<N, M>::Position> position;
+        std::optional<torch_pbd::Quaternion> orientation;
+        if (place[0] == place[0]) position = vector<std::tuple_size_v<typename decltype(position)::value_type>>(place);
+        if (M != N && place[M - 1] == place[M - 1]) orientation = vector<4>(place + M - 4);
+        controller.start(now, position, vector<N>(velocity), at, vector<N>(bias), orientation);
     }
 
     unsigned tick(double now, const double* force) override { return controller.tick(now, vector<N>(force)); }
 
     void read(double* out) const override {
+        const auto add = [&out](const auto& part) { out = std::copy(part.begin(), part.end(), out); };
         *out++ = controller.schedule_time();
-        for (const Vector<N>& part : {controller.position(), controller.velocity(), controller.force(),
-                                      controller.desired_position(), controller.desired_velocity()})
-            out = std::copy(part.begin(), part.end(), out);
+        add(controller.position());
+        if constexpr (M != N) add(controller.orientation());
+        add(controller.velocity());
+        add(controller.force());
+        add(controller.desired_position());
+        if constexpr (M != N) add(controller.desired_orientation());
+        add(controller.desired_velocity());
         for (const Matrix<N>& gain : {controller.stiffness(), controller.damping()})
-            for (const Vector<N>& row : gain) out = std::copy(row.begin(), row.end(), out);
+            for (const Vector<N>& row : gain) add(row);
     }
 
-    Admittance<N> controller;
+    Admittance<N, M> controller;
 };
 
-// Options in the order of their declaration; NaN is the default.
+// Options in the order of their declaration, two numbers each, of which most use one; NaN is the default.
 Options as_options(const double* values) {
     Options options;
-    const auto set = [&values](auto& option) {
-        if (const double value = *values++; value == value) option = static_cast<std::decay_t<decltype(option)>>(value);
+    const auto is_given = [&values] { return values[0] == values[0]; };
+    const auto set = [&](auto& option) {
+        if (is_given()) option = static_cast<std::decay_t<decltype(option)>>(values[0]);
+        values += 2;
     };
-    const auto set_optional = [&values](std::optional<double>& option) {
-        if (const double value = *values++; value == value) option = value;
+    const auto set_limit = [&](auto& option) {
+        if (is_given()) option = torch_pbd::Limit{values[0], values[1]};
+        values += 2;
     };
-    set_optional(options.mass);
+    if (is_given()) options.mass = values[0];
+    values += 2;
     set(options.rate);
     set(options.max_step);
-    set(options.force_limit);
-    set(options.deadband);
-    set_optional(options.spring_limit);
-    set_optional(options.velocity_limit);
-    set_optional(options.acceleration_limit);
+    set_limit(options.force_limit);
+    set_limit(options.deadband);
+    set_limit(options.spring_limit);
+    set_limit(options.velocity_limit);
+    set_limit(options.acceleration_limit);
     set(options.hold_ticks);
     set(options.max_bad_ticks);
-    set_optional(options.stop_deceleration);
+    set_limit(options.stop_deceleration);
     set(options.soft_start);
-    set(options.approach_speed);
+    set_limit(options.approach_speed);
     set(options.catches_up);
-    set_optional(options.force_rate_limit);
+    set_limit(options.force_rate_limit);
     return options;
 }
 
 std::unique_ptr<Loop> make(const Schedule& schedule, const Options& options) {
+    if (!schedule.orientation.empty()) return std::make_unique<LoopOf<6, 7>>(schedule, options);
     switch (schedule.n_outputs) {
         case 1: return std::make_unique<LoopOf<1>>(schedule, options);
         case 2: return std::make_unique<LoopOf<2>>(schedule, options);
@@ -133,10 +149,10 @@ long read_array(const char* path, const char* name, double* out, char* text) {
 
 void destroy(Loop* loop) { delete loop; }
 
-bool start(Loop* loop, double now, const double* position, const double* velocity, double at, const double* bias,
+bool start(Loop* loop, double now, const double* place, const double* velocity, double at, const double* bias,
            char* text) {
     return said(text, [&] {
-        loop->start(now, position, velocity, at, bias);
+        loop->start(now, place, velocity, at, bias);
         return true;
     });
 }

@@ -67,24 +67,29 @@ def read_array(path, name):
 class CppAdmittance:
     """`torch_pbd::Admittance` with the names of `RealTimeAdmittance`."""
 
-    def __init__(self, path, n_axes, **options):
+    def __init__(self, path, n_axes, *, is_pose=False, **options):
         assert set(options) <= set(OPTIONS)
         options = {**options, "on_gap": float(options.get("on_gap") == "resume")}
-        values = [math.nan if options.get(name) is None else options[name] for name in OPTIONS]
-        self._library, self._d = library(), n_axes
-        self._text = create_string_buffer(500)
-        self._numbers, d = c_double * n_axes, n_axes
-        self._loop = self._library.create(bytes(path), (c_double * len(values))(*values), self._text)
+        values = [np.resize(math.nan if options.get(name) is None else options[name], 2) for name in OPTIONS]
+        self._library, self._text = library(), create_string_buffer(500)
+        self._d, self._m = d, m = n_axes, n_axes + is_pose
+        self._twist, self._place = c_double * d, c_double * m
+        self._loop = self._library.create(bytes(path), (c_double * (2 * len(values)))(*np.ravel(values)), self._text)
         self._check(self._loop)
-        self._force, self._out = self._numbers(), (c_double * (1 + 5 * d + 2 * d * d))()
+        self._n_told = 1 + 3 * d + 2 * m
+        self._force, self._out = self._twist(), (c_double * (self._n_told + 2 * d * d))()
 
     def __del__(self):
         if getattr(self, "_loop", None):
             self._library.destroy(self._loop)
 
-    def start(self, now, position=None, velocity=None, *, at=0.0, force_bias=None):
-        given = [None if each is None else self._numbers(*each) for each in (position, velocity, force_bias)]
-        self._check(self._library.start(self._loop, now, given[0], given[1], at, given[2], self._text))
+    def start(self, now, position=None, velocity=None, *, orientation=None, at=0.0, force_bias=None):
+        p = self._d - 3 * (self._m > self._d)
+        place = [math.nan] * p if position is None else [*position]
+        if self._m > self._d:
+            place += [math.nan] * 4 if orientation is None else [*orientation]
+        given = [None if each is None else self._twist(*each) for each in (velocity, force_bias)]
+        self._check(self._library.start(self._loop, now, self._place(*place), given[0], at, given[1], self._text))
 
     def tick(self, now, force):
         self._force[:] = force
@@ -92,13 +97,13 @@ class CppAdmittance:
 
     @property
     def told(self):
-        """Schedule time, position, velocity, force, desired position and velocity of the last tick."""
-        return self._out[: 1 + 5 * self._d]
+        """Schedule time, place, velocity, force, desired place and velocity of the last tick."""
+        return self._out[: self._n_told]
 
     @property
     def gains(self):
         """Stiffness and damping of the last tick, (2, d, d)."""
-        return np.reshape(self._out[1 + 5 * self._d :], (2, self._d, self._d))
+        return np.reshape(self._out[self._n_told :], (2, self._d, self._d))
 
     def _check(self, succeeded):
         if not succeeded:
@@ -111,12 +116,13 @@ class Both:
     def __init__(self, schedule, folder, **options):
         path = Path(folder) / "schedule.csv"
         schedule.save(path)
+        self.is_pose, d, p = schedule.orientation is not None, schedule.n_outputs, schedule.position.shape[1]
         self.python = RealTimeAdmittance(schedule, **options)
-        self.cpp = CppAdmittance(path, schedule.n_outputs, **options)
-        d = schedule.n_outputs
-        # Lengths and speeds are compared with the largest of the motion, forces with the largest force.
+        self.cpp = CppAdmittance(path, d, is_pose=self.is_pose, **options)
+        # Lengths, angles and speeds are compared with the largest of the motion, forces with the largest force.
         reach, speed = np.abs(schedule.position).max(), np.abs(schedule.velocity).max()
-        self._scales = np.repeat([schedule.duration, reach, speed, 1.0, reach, speed], [1, d, d, d, d, d])
+        sizes = [1, p, 4 * self.is_pose, d, d, p, 4 * self.is_pose, d]
+        self._scales = np.repeat([schedule.duration, reach, 1.0, speed, 1.0, reach, 1.0, speed], sizes)
         self.worst = 0.0
 
     def __getattr__(self, name):
@@ -130,8 +136,9 @@ class Both:
         status, faults = self.python.tick(now, force), self.cpp.tick(now, force)
         assert faults == status, f"at {now}"
         loop, cpp = self.python, self.cpp.told
-        told = [loop.schedule_time, *loop.position, *loop.velocity, *loop.force]
-        told += [*loop.desired_position, *loop.desired_velocity]
+        told = [loop.schedule_time, *loop.position, *(loop.orientation if self.is_pose else ())]
+        told += [*loop.velocity, *loop.force, *loop.desired_position]
+        told += [*(loop.desired_orientation if self.is_pose else ()), *loop.desired_velocity]
         for i, (left, right) in enumerate(zip(told, cpp, strict=True)):
             scale = self._scales[i] = max(self._scales[i], abs(left))
             self.worst = max(self.worst, abs(left - right) / scale)
