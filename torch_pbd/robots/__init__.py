@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from torch_pbd.robots.franka_panda import panda, panda_mjcf
     from torch_pbd.robots.kinematics import inverse_kinematics, operational_inertia
     from torch_pbd.robots.mujoco import ArmRun
-    from torch_pbd.robots.session import RobotLimits, RobotStoppedError
+    from torch_pbd.robots.session import RobotLimits, RobotRun, RobotStoppedError
 
 # Where each name lives.
 _HOMES = {
@@ -19,6 +19,7 @@ _HOMES = {
     "ArmRun": "mujoco",
     "RobotStoppedError": "session",
     "RobotLimits": "session",
+    "RobotRun": "session",
     "inverse_kinematics": "kinematics",
     "operational_inertia": "kinematics",
     "panda": "franka_panda",
@@ -29,6 +30,7 @@ _MODULES = ("franky", "mujoco", "robosuite", "ros", "ur_rtde")
 __all__ = [
     "ArmRun",
     "RobotLimits",
+    "RobotRun",
     "RobotStoppedError",
     "inverse_kinematics",
     "operational_inertia",

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from torch_pbd import checks
-from torch_pbd.robots.extra import required
+from torch_pbd.robots.session import required
 
 HOME = (0.0, -math.pi / 4, 0.0, -3 * math.pi / 4, 0.0, math.pi / 2, math.pi / 4)
 """Joint angles in rad, far from limits and singularities: the hand points down, 0.31 m before the base."""

@@ -10,9 +10,8 @@ from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control.schedule import Schedule
 from torch_pbd.exceptions import InvalidParameterError
-from torch_pbd.robots.extra import required
 from torch_pbd.robots.kinematics import MujocoArm, ToolState, pose_error
-from torch_pbd.robots.session import RobotStoppedError, check_start, poses
+from torch_pbd.robots.session import RobotStoppedError, check_start, poses, required
 
 # A tick as a whole number of steps of the simulation, to what rounding leaves of both.
 _UNEVEN = 1e-6

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any, final
 
 import numpy as np
@@ -11,6 +12,17 @@ from torch_pbd import checks, rotations
 from torch_pbd.checks import Floats
 from torch_pbd.control.schedule import Schedule
 from torch_pbd.exceptions import InvalidParameterError
+
+
+def required(module: str, package: str = "") -> Any:
+    """A library that this package does not need as a whole; ``package`` is its name for pip, if it is another."""
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        name = package or module.partition(".")[0]
+        raise ModuleNotFoundError(
+            f"this needs {name}, which is not installed: pip install {name}, or pip install 'torch_pbd[robot]'"
+        ) from error
 
 
 class RobotStoppedError(RuntimeError):
@@ -86,19 +98,60 @@ def check_start(
         )
 
 
+@final
+@dataclass(frozen=True, eq=False)
+class RobotRun:
+    """Poses of a tool that followed a schedule, as far as it came.
+
+    Attributes
+    ----------
+    time : (m,), s
+        In the schedule.
+    position, orientation : (m, 3) in m and (m, 4), w x y z
+    deviation : (m, 6), m and rad
+        From the schedule: translation, and the rotation vector that turns the desired orientation into the true one.
+    """
+
+    time: Floats
+    position: Floats
+    orientation: Floats
+    deviation: Floats
+
+    def __repr__(self) -> str:
+        parts = np.split(self.deviation, 2, axis=1)
+        farthest, widest = (np.linalg.norm(part, axis=1).max(initial=0.0) for part in parts)
+        end = self.time.max(initial=0.0)
+        return f"RobotRun(n={len(self.time)}, to {end:.6g} s, deviation up to {farthest:.3g} m, {widest:.3g} rad)"
+
+
+def recorded(schedule: Schedule, rows: list[tuple[float, Floats, Floats]]) -> RobotRun:
+    """The run of a robot that was at these times within the schedule, positions and orientations."""
+    time = np.array([row[0] for row in rows])
+    position, orientation = np.split(np.reshape([np.concatenate(row[1:]) for row in rows], (-1, 7)), [3], axis=1)
+    ends = schedule.time[[0, -1]]
+    grid = np.union1d(np.clip(time, *ends), ends)  # two or more, however early the robot stopped
+    desired, at = poses(schedule.resample(times=grid)), np.searchsorted(grid, np.clip(time, *ends))
+    turn = rotations.log(rotations.multiply(orientation, rotations.conjugate(desired[1][at])))
+    return RobotRun(time, position, orientation, np.hstack([position - desired[0][at], turn]))
+
+
 @contextmanager
 def stopping(stop: Callable[[], Any], on_fault: Callable[[RobotStoppedError], Any] | None) -> Iterator[None]:
     """Stop a robot at the end, and at whatever goes wrong; then tell ``on_fault``, or raise where it is None."""
+    cause: BaseException | None = None
     try:
         yield
-    except Exception as error:
+    except BaseException as error:
+        cause = error
+    try:
         stop()
-        fault = error if isinstance(error, RobotStoppedError) else RobotStoppedError(f"{type(error).__name__}: {error}")
-        if on_fault is None:
-            raise fault from error
-        on_fault(fault)
-    except BaseException:  # the user's own stop, by the keyboard
-        stop()
-        raise
-    else:
-        stop()
+    except Exception as error:  # the robot's own words of why it had stopped
+        cause = error if cause is None or isinstance(cause, Exception) else cause
+    if cause is None:
+        return
+    if not isinstance(cause, Exception):  # the user's own stop, by the keyboard
+        raise cause
+    fault = cause if isinstance(cause, RobotStoppedError) else RobotStoppedError(f"{type(cause).__name__}: {cause}")
+    if on_fault is None:
+        raise fault from (None if fault is cause else cause)
+    on_fault(fault)

@@ -1,0 +1,110 @@
+"""Actions for robosuite's controller against its own law, and in its own simulation where it is installed."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from arm_tasks import made_schedule, on_arm
+
+from torch_pbd import rotations
+from torch_pbd.control import Schedule
+from torch_pbd.robots import RobotStoppedError
+from torch_pbd.robots.robosuite import CONTROLLER, run, to_actions
+
+FREQUENCY = 50.0
+
+
+def diagonal_schedule(position, orientation, duration=3.0, mass=1.0):
+    time = np.arange(round(duration * FREQUENCY) + 1) / FREQUENCY
+    s, way = time / duration, np.array([0.1, 0.1, 0.08, 0.1, -0.1, 0.6])
+    share = 10.0 * s**3 - 15.0 * s**4 + 6.0 * s**5
+    speed = (30.0 * s**2 - 60.0 * s**3 + 30.0 * s**4) / duration
+    rise = (60.0 * s - 180.0 * s**2 + 120.0 * s**3) / duration**2
+    gains = np.array([np.diag(level) for level in np.linspace([150, 200, 250, 150, 200, 300], 280.0, len(time))])
+    return Schedule(
+        time, position + np.outer(share, way[:3]), np.outer(speed, way), gains, gains, 0.0 * gains, 0.0 * time,
+        acceleration=np.outer(rise, way),
+        orientation=rotations.multiply(rotations.exp(np.outer(share, way[3:])), orientation),
+    ).with_inertia(mass)  # fmt: skip
+
+
+@pytest.mark.parametrize("mass", [1.0, 2.5])
+def test_the_controllers_law_is_that_of_the_schedule(mass, rng):
+    """kp (goal - x) - kd v, with kd = 2 ratio kp^1/2, is the acceleration of eq. (15) with the desired velocity."""
+    schedule = diagonal_schedule(np.array([0.4, 0.0, 0.5]), np.array([0.0, 1.0, 0.0, 0.0]), mass=mass)
+    ratio, kp, goal, turn = np.split(to_actions(schedule, FREQUENCY), [6, 12, 15], axis=1)
+    offset, velocity = rng.normal(size=(2, len(schedule), 6))
+    turned = rotations.multiply(rotations.exp(turn), rotations.conjugate(schedule.orientation))
+    error = np.hstack([goal - schedule.position, rotations.log(turned)]) - offset
+    found = kp * error - 2.0 * ratio * np.sqrt(kp) * velocity
+    spring = np.einsum("nij,nj->ni", schedule.stiffness, -offset)
+    damper = np.einsum("nij,nj->ni", schedule.damping, schedule.velocity - velocity)
+    np.testing.assert_allclose(found, (spring + damper) / mass + schedule.acceleration, rtol=0, atol=1e-9)
+
+
+def test_an_arms_inertia_is_refused_and_what_is_lost_is_told():
+    mujoco = pytest.importorskip("mujoco")
+    assert mujoco
+    from torch_pbd.robots import panda
+
+    schedule, _ = on_arm(made_schedule(duration=1.0, rate=50.0), panda())
+    with pytest.raises(ValueError, match=r"give schedule\.with_inertia\(1\.0\)"):
+        to_actions(schedule)
+    with pytest.warns(UserWarning, match="diagonal gains lose"):
+        to_actions(schedule.with_inertia(1.0))
+
+
+class FakeEnvironment:
+    """Of robosuite what the adapter asks for; the arm is at once where it is sent, and ends its episode at a step."""
+
+    control_freq, action_dim = FREQUENCY, 19
+
+    def __init__(self, schedule, end=1000):
+        composite = SimpleNamespace(_action_split_indexes={"right": (1, 19)})
+        self.robots = [SimpleNamespace(composite_controller=composite, eef_site_id={"right": 2})]
+        places, turns = np.zeros((3, 3)), np.zeros((3, 9))
+        places[2], turns[2] = schedule.position[0], rotations.matrix(schedule.orientation[0]).ravel()
+        self.sim = SimpleNamespace(data=SimpleNamespace(site_xpos=places, site_xmat=turns))
+        self.actions, self.end = [], end
+
+    def step(self, action):
+        if len(self.actions) == self.end:
+            raise ValueError("executing action in terminated episode")
+        self.actions.append(action)
+        self.sim.data.site_xpos[2] = action[13:16]
+        self.sim.data.site_xmat[2] = rotations.matrix(rotations.exp(action[16:19])).ravel()
+
+
+def test_actions_go_to_the_arm_and_an_ended_episode_is_a_fault():
+    schedule = diagonal_schedule(np.array([0.4, 0.0, 0.5]), np.array([0.0, 1.0, 0.0, 0.0]))
+    env = FakeEnvironment(schedule)
+    found = run(env, schedule)
+    np.testing.assert_array_equal(np.array(env.actions)[:, 1:], to_actions(schedule, FREQUENCY))
+    assert not np.array(env.actions)[:, 0].any()
+    assert len(found.time) == len(schedule)
+    with pytest.raises(RobotStoppedError, match="terminated episode"):
+        run(FakeEnvironment(schedule, end=5), schedule)
+    faults = []
+    assert len(run(FakeEnvironment(schedule, end=5), schedule, on_fault=faults.append).time) == 6
+    assert len(faults) == 1
+    away = FakeEnvironment(schedule)
+    away.sim.data.site_xpos[2] += 0.02
+    with pytest.raises(ValueError, match="from the first pose of schedule"):
+        run(away, schedule)
+    assert not away.actions
+
+
+def test_in_robosuite_the_arm_is_on_its_way():
+    """Of the real library: 2 mm at 20 Hz, at which goals stand still for 50 ms."""
+    robosuite = pytest.importorskip("robosuite")
+    parts = {"right": {**CONTROLLER, "gripper": {"type": "GRIP"}}}
+    env = robosuite.make(
+        "Lift", robots="Panda", controller_configs={"type": "BASIC", "body_parts": parts}, control_freq=20,
+        has_renderer=False, has_offscreen_renderer=False, use_camera_obs=False, initialization_noise=None,
+    )  # fmt: skip
+    env.reset()
+    site = env.robots[0].eef_site_id["right"]
+    turn = rotations.from_matrix(env.sim.data.site_xmat[site].reshape(3, 3))
+    found = run(env, diagonal_schedule(env.sim.data.site_xpos[site].copy(), turn))
+    assert np.abs(found.deviation[:, :3]).max() < 5e-3
+    assert np.abs(found.deviation[:, 3:]).max() < 0.03

@@ -1,0 +1,131 @@
+"""Schedules on a Franka arm by franky (franky-control 2.0): impedance control with all 6 x 6 gains."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from torch_pbd import checks
+from torch_pbd.control.schedule import Schedule
+from torch_pbd.robots.session import (
+    RobotLimits,
+    RobotRun,
+    RobotStoppedError,
+    check_limits,
+    check_start,
+    poses,
+    recorded,
+    required,
+    stopping,
+)
+
+
+def run(
+    robot: Any,
+    schedule: Schedule,
+    *,
+    on_fault: Callable[[RobotStoppedError], Any] | None = None,
+    limits: RobotLimits | None = None,
+    period: float = 0.005,
+    max_step: float = 0.1,
+    settle: float = 0.5,
+    gains_time_constant: float = 0.1,
+    **tracker: Any,
+) -> RobotRun:
+    """Follow a schedule of poses with ``franky.CartesianImpedanceTracker``; the arm must be at its first pose.
+
+    franky's controller adds ``Lambda a_d`` and Coriolis forces, so that the arm moves with its own inertia: make the
+    schedule `with_inertia` of it, or its damping is that of another robot (franky's default, 2 K^1/2, knows no mass).
+    Time is that of the robot; in between, targets of the last ``period`` are held. What to know of franky:
+
+    - Gains follow those sent with a lag of ``gains_time_constant``; they are sent as much ahead.
+    - Deviations count up to ``translational_error_clip`` (0.10 m) and ``rotational_error_clip`` (0.25 rad) on an axis:
+      beyond, the arm is softer than the schedule says.
+    - What it does not know is friction: 1.5 N of it hold the tool 30 mm away at 50 N/m. Learn with ``stiffness_min`` of
+      some hundred, and give ``friction``.
+
+    libfranka's own example takes vec(q), sin(theta / 2) of the rotation, for the error: to it, send twice the
+    rotational stiffness.
+
+    Parameters
+    ----------
+    robot : franky.Robot
+        In no motion, its end effector the tool of the schedule, its base the schedule's frame.
+    schedule : Schedule
+        Of poses, in m.
+    on_fault : callable, default=None
+        Told the fault, a `RobotStoppedError`, after the arm was stopped; None raises it.
+    limits : RobotLimits, default=None
+        Checked before the arm moves; None is those of the Panda.
+    period, max_step : float, default=0.005, 0.1
+        From one target to the next, and the longest time of the robot without a new one, s; longer is a fault.
+    settle : float, default=0.5
+        Time at the first row before the motion begins, s, in which gains are reached.
+    gains_time_constant : float, default=0.1
+        Of franky's filter, s.
+    **tracker
+        Of ``franky.CartesianImpedanceTracker``: ``posture_task``, ``friction``, the clips, ``max_delta_tau``.
+
+    Returns
+    -------
+    RobotRun
+        As far as it came.
+
+    Raises
+    ------
+    ValueError
+        Before anything moves: if the schedule is beyond the limits, or the arm elsewhere.
+    RobotStoppedError
+        If the arm stops by itself, the connection breaks, or a target comes late.
+    """
+    franky = required("franky", "franky-control")
+    check_limits(schedule, RobotLimits() if limits is None else limits)
+    checks.number(period, "period", above=0.0, below=max_step, unit="s")
+    # A target holds for a period: that of its middle is never further than half of it from the motion.
+    rows = schedule.resample(times=np.arange(schedule.time[0] + 0.5 * period, schedule.time[-1], period))
+    ahead = round(gains_time_constant / period)
+    gains = [_gains(franky, rows, min(row + ahead, len(rows) - 1)) for row in range(len(rows))]
+    targets = [_target(franky, rows, row) for row in range(len(rows))]
+    start = robot.current_pose.end_effector_pose
+    check_start(schedule, start.translation, np.roll(start.quaternion, 1))
+    passed: list[tuple[float, Any, Any]] = []
+    session = franky.CartesianImpedanceTracker(
+        robot, gains=_gains(franky, rows, 0), gains_time_constant=gains_time_constant, period=period, **tracker
+    )
+    with stopping(session.stop, on_fault):
+        last = robot.state.time.to_sec()
+        origin = last + settle - schedule.time[0]
+        while session.tick() is not None:
+            state = robot.state
+            now = state.time.to_sec()
+            if now - last > max_step:
+                raise RobotStoppedError(f"no target came for {now - last:.3g} s, must come within {max_step:g} s")
+            last = now
+            row = math.floor((now - origin - schedule.time[0]) / period + 1e-6)  # times are whole milliseconds
+            if row >= len(rows):
+                break
+            if row >= 0:
+                pose = state.O_T_EE
+                passed.append((now - origin, pose.translation, np.roll(pose.quaternion, 1)))
+                session.set_gains(gains=gains[row])
+                session.set_target(*targets[row])
+        else:
+            raise RobotStoppedError("the arm is no longer under control: it met a limit, or somebody stopped it")
+    return recorded(schedule, passed)
+
+
+def _gains(franky: Any, rows: Schedule, row: int) -> Any:
+    gains = franky.CartesianImpedanceGains()
+    gains.stiffness, gains.damping = rows.stiffness[row], rows.damping[row]
+    return gains
+
+
+def _target(franky: Any, rows: Schedule, row: int) -> tuple[Any, ...]:
+    """Pose, twist and, where it is known, acceleration."""
+    position, orientation = poses(rows)
+    pose = franky.Affine(position[row], np.roll(orientation[row], -1))
+    twist = franky.Twist(*np.split(rows.velocity[row], 2))
+    if rows.acceleration is None:
+        return pose, twist
+    return pose, twist, franky.TwistAcceleration(*np.split(rows.acceleration[row], 2))

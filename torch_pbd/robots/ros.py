@@ -1,0 +1,109 @@
+"""Schedules as ROS 2 messages, written with rosbags: no ROS is needed, and no robot."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from torch_pbd import checks
+from torch_pbd.checks import Floats
+from torch_pbd.control.schedule import Schedule
+from torch_pbd.robots.session import poses, required
+
+Gains = Literal["matrix", "diagonal"]
+
+_TOPICS = {
+    "target_pose": "geometry_msgs/msg/PoseStamped",
+    "target_twist": "geometry_msgs/msg/TwistStamped",
+    "target_stiffness": "std_msgs/msg/Float64MultiArray",
+    "target_damping": "std_msgs/msg/Float64MultiArray",
+}
+
+
+def to_messages(schedule: Schedule, *, gains: Gains = "matrix") -> Iterator[tuple[str, int, Any]]:
+    """Topic, time in ns and message for each row of a schedule of poses: what a node publishes.
+
+    Poses and gains go to the topics of crisp_controllers, which takes ``gains="diagonal"``: six numbers, as the
+    admittance controller of ros2_control and FZI's cartesian controllers, which read them as parameters.
+    Torque-controlled arms have friction that none of them knows: 1.5 N hold the tool 30 mm away at 50 N/m, so learn
+    with ``stiffness_min`` of some hundred.
+
+    Parameters
+    ----------
+    schedule : Schedule
+        Of poses, in m; its ``frame`` is the messages', or ``base``.
+    gains : {"matrix", "diagonal"}, default="matrix"
+        36 numbers, row by row, or the diagonals alone.
+
+    Yields
+    ------
+    topic : str
+        ``target_pose``, ``target_twist`` (world axes), ``target_stiffness`` or ``target_damping``.
+    time : int
+        Of the schedule, ns; the same in the header.
+    message
+        Of rosbags, with the fields of ROS.
+
+    Warns
+    -----
+    UserWarning
+        Of what diagonal gains lose.
+    """
+    types = _store().types
+    position, orientation = poses(schedule)
+    if checks.choice(gains, "gains", Gains) == "diagonal":
+        schedule, loss = schedule.diagonal()
+        if loss.stiffness_max > 0.0:
+            checks.warn(f"{loss}.")
+    vector, quaternion = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
+    pose, twist = types["geometry_msgs/msg/Pose"], types["geometry_msgs/msg/Twist"]
+    for row, time in enumerate(schedule.time):
+        stamp = round(1e9 * time)
+        when = types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
+        header = types["std_msgs/msg/Header"](when, schedule.frame or "base")
+        place = types["geometry_msgs/msg/Point"](*position[row].tolist())
+        turn = quaternion(*np.roll(orientation[row], -1).tolist())  # x y z w
+        parts = [vector(*part) for part in schedule.velocity[row].reshape(2, 3).tolist()]
+        yield "target_pose", stamp, types[_TOPICS["target_pose"]](header, pose(place, turn))
+        yield "target_twist", stamp, types[_TOPICS["target_twist"]](header, twist(*parts))
+        for name, matrix in (("stiffness", schedule.stiffness[row]), ("damping", schedule.damping[row])):
+            yield f"target_{name}", stamp, _array(types, matrix, gains)
+
+
+def to_bag(schedule: Schedule, path: str | os.PathLike[str], *, gains: Gains = "matrix") -> None:
+    """Write the messages of `to_messages` to a rosbag2: a new folder, which ``ros2 bag play`` publishes.
+
+    Parameters
+    ----------
+    schedule : Schedule
+    path : path
+        Of the folder, which must not exist.
+    gains : {"matrix", "diagonal"}, default="matrix"
+
+    Raises
+    ------
+    FileExistsError
+        If there is something at the path.
+    """
+    if Path(path).exists():
+        raise FileExistsError(f"{path} exists: give a new folder, or remove it.")
+    store = _store()
+    with required("rosbags.rosbag2").Writer(Path(path), version=9) as writer:
+        topics = {name: writer.add_connection(f"/{name}", kind, typestore=store) for name, kind in _TOPICS.items()}
+        for name, stamp, message in to_messages(schedule, gains=gains):
+            writer.write(topics[name], stamp, store.serialize_cdr(message, _TOPICS[name]))
+
+
+def _store() -> Any:
+    typesys = required("rosbags.typesys")
+    return typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+
+
+def _array(types: Any, matrix: Floats, gains: Gains) -> Any:
+    dimension, layout = types["std_msgs/msg/MultiArrayDimension"], types["std_msgs/msg/MultiArrayLayout"]
+    shape = (6,) if gains == "diagonal" else (6, 6)
+    values = np.diagonal(matrix).copy() if gains == "diagonal" else matrix.ravel()
+    axes = [dimension(name, 6, 6 ** (len(shape) - i)) for i, name in enumerate(("rows", "columns")[: len(shape)])]
+    return types["std_msgs/msg/Float64MultiArray"](layout(axes, 0), values)
