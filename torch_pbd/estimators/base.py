@@ -53,12 +53,7 @@ class CovarianceRegressor(TorchEstimator):
         if not (return_std or return_cov):
             mean = self._mean(inputs)
             return mean.ravel() if self._y_is_1d else mean
-        mean, covariance = self._moments(inputs)
-        shaped = mean.ravel() if self._y_is_1d else mean
-        if return_cov:
-            return shaped, covariance
-        std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-        return shaped, std.ravel() if self._y_is_1d else std
+        return shaped_as_y(*self._moments(inputs), y_is_1d=self._y_is_1d, return_cov=return_cov)
 
     def predict_cov(self, X: ArrayLike) -> Floats:
         """Covariances of the outputs at X: (n_samples, n_outputs, n_outputs), also for one output.
@@ -177,6 +172,15 @@ class CovarianceRegressor(TorchEstimator):
             return ()
         covariance = prior_covariance(prior, x.cpu().numpy(), self.n_outputs_)
         return (safe_cholesky(self._door(covariance), name="prior(X)"),)
+
+
+def shaped_as_y(mean: Floats, covariance: Floats, *, y_is_1d: bool, return_cov: bool) -> tuple[Floats, Floats]:
+    """Mean (n, d) as y was, with the covariance (n, d, d) as it is, or with the standard deviations as y was."""
+    mean = mean.ravel() if y_is_1d else mean
+    if return_cov:
+        return mean, covariance
+    std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    return mean, std.ravel() if y_is_1d else std
 
 
 def by_chunks(function: Callable[[Any], Any], x: Tensor | Floats) -> Any:

@@ -49,11 +49,7 @@ def describe(demonstrations: Demonstrations, source: str) -> str:
 def figure_of(model: CovarianceRegressor, demonstrations: Demonstrations, name: str, input: Input = "time") -> Figure:
     """Every output over the input with its band, beyond the data too; two outputs also in the plane."""
     n_outputs = demonstrations.n_outputs
-    n_panels = n_outputs + (n_outputs == 2)
-    n_columns = min(3, n_panels)
-    n_rows = -(-n_panels // n_columns)
-    figure, grid = figure_grid(n_rows, n_columns, (4.0 * n_columns, 3.3 * n_rows))
-    axes = list(grid.flat)
+    figure, axes = _panels(n_outputs + (n_outputs == 2), 3.3)
     X, y, _ = demonstrations.stack(input)
     plot_model_bands(model, X, y, axes[:n_outputs])
     for output, ax in enumerate(axes[:n_outputs]):
@@ -68,8 +64,6 @@ def figure_of(model: CovarianceRegressor, demonstrations: Demonstrations, name: 
         plot_covariance_ellipses(*model.predict(query, return_cov=True), axes[2])
         equal_scales(axes[2])
         axes[2].set_title("2 sd ellipses", fontsize=10)
-    for ax in axes[n_panels:]:
-        ax.set_visible(False)
     figure.suptitle(name)
     return figure
 
@@ -77,15 +71,21 @@ def figure_of(model: CovarianceRegressor, demonstrations: Demonstrations, name: 
 def figure_of_recordings(demonstrations: Demonstrations, name: str) -> Figure:
     """Every output over the time, at most nine of them."""
     n = min(demonstrations.n_outputs, 9)
-    n_columns = min(3, n)
-    n_rows = -(-n // n_columns)
-    figure, grid = figure_grid(n_rows, n_columns, (4.0 * n_columns, 2.6 * n_rows))
-    for output, ax in enumerate(grid.flat):
-        ax.set_visible(output < n)
-        if output < n:
-            plot_demonstrations(demonstrations, [output], ax)
+    figure, axes = _panels(n, 2.6)
+    for output, ax in enumerate(axes):
+        plot_demonstrations(demonstrations, [output], ax)
     figure.suptitle(name if n == demonstrations.n_outputs else f"{name}: 9 of {demonstrations.n_outputs} outputs")
     return figure
+
+
+def _panels(n: int, height: float) -> tuple[Figure, list[Any]]:
+    """Figure with n Axes in three columns, 4 by ``height`` inches each."""
+    n_columns = min(3, n)
+    n_rows = -(-n // n_columns)
+    figure, grid = figure_grid(n_rows, n_columns, (4.0 * n_columns, height * n_rows))
+    for ax in grid.flat[n:]:
+        ax.set_visible(False)
+    return figure, list(grid.flat[:n])
 
 
 def run_recordings(

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from torch_pbd.gp.observations import neighbourhoods, spacing
+from torch_pbd.gp.observations import neighbourhoods, spacing, sum_by
 from torch_pbd.kernels import correlation, differences, value_and_slope
 from torch_pbd.linalg import safe_cholesky
 
@@ -160,5 +160,4 @@ def inducing_inputs(inputs: Float[Tensor, "n e"], n_inducing: int) -> Float[Tens
     if len(inputs) <= n_inducing:
         return inputs
     index = neighbourhoods(inputs, n_inducing)
-    counts = torch.bincount(index).to(inputs)
-    return inputs.new_zeros(len(counts), inputs.shape[1]).index_add_(0, index, inputs) / counts[:, None]
+    return sum_by(inputs, index) / torch.bincount(index).to(inputs)[:, None]

@@ -94,13 +94,18 @@ def merge_observations(observations: Observations, max_inputs: int) -> Observati
     if len(observations.counts) <= max_inputs:
         return observations
     index = neighbourhoods(observations.inputs, max_inputs)
-    counts = observations.counts.new_zeros(int(index.max()) + 1).index_add_(0, index, observations.counts)
+    weights = observations.counts[:, None]
+    counts = sum_by(weights, index)
+    inputs, targets = (
+        sum_by(part * weights, index) / counts for part in (observations.inputs, observations.targets.mT)
+    )
+    return Observations(inputs, targets.mT.contiguous(), counts[:, 0])
 
-    def mean(values: Tensor) -> Tensor:
-        total = values.new_zeros(len(counts), values.shape[1])
-        return total.index_add_(0, index, values * observations.counts[:, None]) / counts[:, None]
 
-    return Observations(mean(observations.inputs), mean(observations.targets.mT).mT.contiguous(), counts)
+def sum_by(values: Float[Tensor, "n d"], index: Int64[Tensor, " n"], n_groups: int | None = None) -> Tensor:
+    """Sums (m, d) of the rows of each group; of as many groups as the index says, or more."""
+    n_groups = int(index.max()) + 1 if n_groups is None else n_groups
+    return values.new_zeros(n_groups, values.shape[1]).index_add_(0, index, values)
 
 
 class Resolution(NamedTuple):

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from torch_pbd.gp import neighbourhoods
+from torch_pbd.gp.observations import neighbourhoods, sum_by
 from torch_pbd.linalg import scale_tril_from_root
 
 _CHUNK = 1024  # inputs that a mean is evaluated at together: its correlations take 8 kB for each, of 1000 inputs
@@ -38,7 +38,7 @@ class TrainingSet:
 
     def sums(self, values: Float[Tensor, "rows d"]) -> Float[Tensor, "n d"]:
         """Sum at each distinct input of what rows have."""
-        return _sum_by(values, self.index, len(self.inputs))
+        return sum_by(values, self.index, len(self.inputs))
 
     def means(self) -> Float[Tensor, "n d"]:
         """Mean of y at each distinct input."""
@@ -53,9 +53,8 @@ class TrainingSet:
         if len(self.inputs) <= max_inputs:
             return self
         index = neighbourhoods(self.inputs, max_inputs)[self.index]
-        n_inputs = int(index.max()) + 1
-        counts = torch.bincount(index, minlength=n_inputs).to(self.x)
-        return replace(self, inputs=_sum_by(self.x, index, n_inputs) / counts[:, None], index=index)
+        counts = torch.bincount(index).to(self.x)
+        return replace(self, inputs=sum_by(self.x, index) / counts[:, None], index=index)
 
     def residual(self, mean: Callable[[Tensor], Tensor]) -> Float[Tensor, "rows d"]:
         """Residual of y from its mean at each row; ``mean`` maps inputs (m, e) to (m, d).
@@ -178,7 +177,3 @@ def _expected_diagonal(degrees: Tensor, n_outputs: int) -> Tensor:
     # Column i of the factor of the scatter has a mean of that of chi with K - i degrees times that of the true one.
     rest = degrees[:, None] - torch.arange(n_outputs).to(degrees)
     return (torch.lgamma((rest + 1.0) / 2.0) - torch.lgamma(rest / 2.0)).exp() * (2.0 / degrees[:, None]).sqrt()
-
-
-def _sum_by(values: Tensor, index: Tensor, n_groups: int) -> Tensor:
-    return values.new_zeros(n_groups, values.shape[1]).index_add_(0, index, values)

@@ -12,7 +12,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.estimators.base import Uncertainty
+from torch_pbd.estimators.base import Uncertainty, shaped_as_y
 from torch_pbd.estimators.validation import checked_rows
 from torch_pbd.files.memory import require_much
 from torch_pbd.movement.law import RESOLUTION, MovementLaw, student_log_density
@@ -84,13 +84,8 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         if return_std and return_cov:
             raise ValueError("At most one of return_std and return_cov can be True.")
         mean, covariance = self._marginals(self._times(X))
-        shaped = mean.ravel() if self._y_is_1d else mean
-        if return_cov:
-            return shaped, covariance
-        if not return_std:
-            return shaped
-        std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-        return shaped, std.ravel() if self._y_is_1d else std
+        both = shaped_as_y(mean, covariance, y_is_1d=self._y_is_1d, return_cov=return_cov)
+        return both if return_cov or return_std else both[0]
 
     def predict_cov(self, X: ArrayLike) -> Floats:
         """Covariance of the outputs at each row of X: (n_samples, n_outputs, n_outputs), in squared units of y."""
