@@ -50,6 +50,7 @@ def scale_tril_from_root(root: Float[Tensor, "*b d r"]) -> Float[Tensor, "*b d d
     n_outputs, rank = root.shape[-2:]
     if rank < n_outputs:
         root = torch.cat([root, root.new_zeros(*root.shape[:-1], n_outputs - rank)], dim=-1)
+    # The decomposition leaves the signs of the rows of R open.
     upper = torch.linalg.qr(root.mT).R
     sign = torch.where(upper.diagonal(dim1=-2, dim2=-1) < 0, -1.0, 1.0).to(upper)
     return (sign.unsqueeze(-1) * upper).mT
@@ -111,6 +112,8 @@ def student_log_density(
     whitened = torch.linalg.solve_triangular(scale_tril, residual.unsqueeze(-1), upper=False).squeeze(-1)
     square = whitened.square().sum(-1)
     log_det = scale_tril.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    # With the scale matrix (df - 2) / df times the covariance the density is
+    # gamma((df + d) / 2) / gamma(df / 2) |(df - 2) pi S|^-1/2 (1 + x' S^-1 x / (df - 2))^-(df + d)/2.
     # Beyond it the gamma functions lose more digits than the two densities differ by.
     capped = degrees.clamp_max(1e7)
     constant = torch.lgamma(0.5 * (capped + size)) - torch.lgamma(0.5 * capped)

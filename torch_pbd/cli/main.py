@@ -15,6 +15,7 @@ from torch_pbd.cli.words import unknown
 from torch_pbd.console import Notes, say
 from torch_pbd.exceptions import ConfigError, FolderInUseError
 
+# The last two are 128 and the number of the signal, as of shells.
 _ERROR, _USAGE, _IN_USE, _INTERRUPTED, _TERMINATED = 1, 2, 3, 130, 143
 
 

@@ -211,6 +211,7 @@ def _take(value: Any, hint: Any, place: Place, before: Any = None) -> Any:
         return _take_class(value, table, place, before)
     for part in alternatives(hint):
         if get_origin(part) is dict and isinstance(value, dict) and value:
+            # A dotted option changes one entry of a mapping; a mapping given whole replaces it.
             kept = (before or {}) if isinstance(value, _Dotted) else {}
             inner = get_args(part)[1]
             return kept | {key: _take(v, inner, place.below(key), kept.get(key)) for key, v in value.items()}
@@ -256,12 +257,14 @@ def _take_class(value: Any, table: Mapping[str, str], place: Place, before: _Spe
         name = _find_class(value["class_path"], table, place.below("class_path"))
     elif before or only:
         name = before.name if before else str(only)
+        # Where one class alone can stand its name may be left out, and so may init_args.
         if "init_args" not in value and (only or isinstance(value, _Dotted)):
             value, inside = {"init_args": value}, place
     else:
         raise place.error(f"has no class_path, must be one of {', '.join(table)}.")
     for key in set(value).difference(_CLASS_KEYS):
         raise place.below(key).error(unknown(key, _CLASS_KEYS, "a key here; parameters stand below init_args"))
+    # Parameters that were given before stay, unless the class is another.
     spec = _Spec(name, table, dict(before.init_args) if before and before.name == name else {})
     given = value.get("init_args")
     given = read_yaml(given, "init_args").content if isinstance(given, _Text) else given

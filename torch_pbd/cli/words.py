@@ -12,6 +12,7 @@ from torch_pbd.cli.yaml import Keys
 from torch_pbd.exceptions import ConfigError
 
 _LONGEST = 120  # letters of a name: one line of a wide terminal
+# Half a line: what the value must be stands beside it.
 _LONGEST_VALUE = 60
 
 _NAMES: dict[Any, str] = {

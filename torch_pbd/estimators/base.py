@@ -117,6 +117,8 @@ class CovarianceRegressor(TorchEstimator):
         )
         mean, scale_tril = (part.cpu().numpy() for part in self._tensors(self._mean_and_tril, x))
         normal = generator.standard_normal((*mean.shape, n_samples))
+        # Student's t of this covariance: normal numbers times the root of (df - 2) over a chi-squared number, which is
+        # a gamma number of shape df / 2 and scale 2.
         degrees = self._degrees(x)
         if degrees is not None:
             each = degrees.cpu().numpy()[:, np.newaxis]
@@ -148,6 +150,7 @@ class CovarianceRegressor(TorchEstimator):
 
     def _degrees(self, x: Tensor) -> Tensor | None:
         """Degrees of freedom of the predictive density at x; None where it is normal."""
+        # A core has degrees of freedom everywhere or nowhere: one row tells.
         if self.module_.degrees(x[:1]) is None:
             return None
         return self._tensors(lambda rows: (self.module_.degrees(rows),), x)[0]
@@ -187,6 +190,7 @@ def by_chunks(function: Callable[[Any], Any], x: Tensor | Floats) -> Any:
     """Tuple of arrays that a function of rows gives for x, called for a bounded number of rows at a time."""
     if len(x) <= _CHUNK:
         return function(x)
+    # What the first chunk takes tells what all will take.
     first = function(x[:_CHUNK])
     require_much(
         2.0 * len(x) / _CHUNK * sum(part.nbytes for part in first),  # in parts, and joined

@@ -169,11 +169,14 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
         log_diagonal = self.diagonal == "log" or (self.diagonal == "auto" and smoothed)
         scale_tril = empirical_tril(training, bias_correction=self.bias_correction)
         linked = _with_least_diagonal(scale_tril) if log_diagonal else scale_tril
+        # Smoothed logarithms give the geometric mean of the entries, which for chi numbers is below their mean by a
+        # factor that is known.
         if log_diagonal and smoothed:
             linked = linked.tril(-1) + torch.diag_embed(
                 linked.diagonal(dim1=-2, dim2=-1) * mean_over_geometric(training)
             )
         deviation = tril_deviation(linked, problem.prior_tril, log_diagonal=log_diagonal)
+        # An entry of the factor of K rows has an error whose variance falls with K - 1.
         degrees = training.counts - 1.0
         observations = Observations(training.inputs, deviation.mT.contiguous(), degrees / degrees.mean())
         noise_scale = self._entry_noise(problem)
@@ -213,6 +216,7 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
         start = tril_deviation(pooled, problem.prior_tril, log_diagonal=log_diagonal)
         prior = problem.prior_tril.reshape(-1, *problem.prior_tril.shape[-2:])
         row, column = torch.tril_indices(*prior.shape[-2:], device=prior.device)
+        # A priori an entry deviates by as much as its row of the prior's factor is long, the output's prior deviation.
         amplitude = prior.square().sum(-1).mean(0).sqrt()[row]
         if log_diagonal:
             amplitude = torch.where(row == column, _LOG_AMPLITUDE, amplitude)

@@ -91,6 +91,7 @@ def check_demonstrations(X: Floats, y: Floats, groups: Any) -> None:
         warn_if_few_demonstrations(groups, y.shape[1])
     if _unimodality_reported.get() or X.shape[1] > 1 or len(counts) < 2 or counts.min() < 2:
         return
+    # Each time of a demonstration once: of two rows at one time the first counts.
     times, positions = [], []
     for rows in np.split(np.argsort(groups, kind="stable"), np.cumsum(counts)[:-1]):
         time, first = np.unique(X[rows, 0], return_index=True)

@@ -232,6 +232,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
             what=f"n_samples={n_samples} at {len(x)} rows",
             remedy="Draw fewer at a time.",
         )
+        # Weights are drawn once, for all chunks of X: a draw is one function.
         normal = [[self._door(generator.standard_normal(size)) for size in core.draw_sizes()] for _ in range(n_samples)]
         drawn = [torch.stack(process) for process in zip(*normal, strict=True)]
         result = np.empty((len(x), self.n_outputs_, self.n_outputs_, n_samples))
@@ -257,6 +258,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         prior_tril = self._prior_tril(X, training, scaling)
         warn_if_few(len(y), y.shape[1])
         warn_if_identical(training)
+        # A mean that does not follow the data at the merged inputs begins again, from all rows.
         rows, training = training, training.merged(self.max_inputs)
         group = None if groups is None else self._door(groups).long()
         options = SearchOptions(self.max_iter, self.tol, self.n_restarts, self._progress())

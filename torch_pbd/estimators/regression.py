@@ -51,6 +51,7 @@ class MixtureRegression:
         arrays = [tensor.detach().numpy() for tensor in _tensors(module)]
         n_components, e = len(mean), core.n_features
         units = [part.numpy() for part in (module.x_shift, module.x_scale, module.y_shift, module.y_scale)]
+        # Component k whitens x by inv(L_xx), and says level + gain (x - centre) of y: both by one product with x.
         inverse = np.linalg.inv(scale_tril[:, :e, :e])
         gain = units[3][:, np.newaxis] * (scale_tril[:, e:, :e] @ inverse)
         centre, level = mean[:, :e, np.newaxis], units[3] * mean[:, e:]

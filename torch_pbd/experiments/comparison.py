@@ -108,6 +108,7 @@ def compare_models(
     """
     inputs, empirical = empirical_covariances(X, y)
     folds = left_out(groups, max_folds)
+    # One by one, before the folds share the cores: these are the times that are reported.
     fits = {name: fit_once(clone(model), X, y, groups, finished=finished) for name, model in models.items()}
     jobs = (
         delayed(score_fold)(clone(model), X, y, groups, fold, finished, whole=whole_movements)
@@ -118,6 +119,7 @@ def compare_models(
     scores = []
     for name, (fitted, seconds) in fits.items():
         covariance = fitted.predict_cov(inputs)
+        # Of covariances the smallest eigenvalue would tell the smallest unit: that of correlations tells singular ones.
         scale = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
         held_out = [next(results) for _ in folds]
         scores.append(

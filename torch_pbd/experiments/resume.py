@@ -51,6 +51,7 @@ def finished_fits(folder: Path, *, resume: bool) -> Iterator[FinishedFits]:
     if not resume and finished.files():
         checks.warn(f"{folder} of a run that was cut is cleared: --resume would have gone on with it.")
         finished.clear()
+    # Not where the run fails or is cut: then it keeps what is finished.
     yield finished
     finished.clear()
 
@@ -73,6 +74,7 @@ def fit_once(model: Any, *data: Any, finished: FinishedFits | None = None) -> tu
         return _timed_fit(model, *data)
     key = _key(model, *data)
     found = finished.files(key)
+    # The first fit that is asked for tells whether there is anything to resume from.
     if finished.resume and not found:
         checks.warn(f"There is nothing finished to resume from in {finished.folder}: the run begins.")
     finished.resume = False
@@ -98,6 +100,7 @@ def _key(model: Any, *data: Any) -> str:
 
     from torch_pbd.persistence.plain import encode_parameters
 
+    # What rows of demonstrations do not say, names and units, counts too: a controller keeps them.
     labels: list[Any] = []
     if len(data) == 1:
         (demos,) = data

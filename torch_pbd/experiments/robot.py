@@ -84,6 +84,7 @@ def push_row(name: str, run: Run) -> dict[str, Any]:
     unit, scale = readable_unit(run.schedule.units)
     time, stiffness = run.schedule.time, run.schedule.stiffness
     early, late = (int(np.searchsorted(time, centre * run.controller.duration_)) for centre in _PUSHES)
+    # Against the run without pushes: how far the robot lags behind by itself does not count.
     deviation = np.abs(run.rollout.position - run.unpushed.position)[:, 0]
     half = len(time) // 2
     first, second = scale * deviation[:half].max(), scale * deviation[half:].max()

@@ -127,6 +127,7 @@ def score_fold(
 ) -> dict[str, float]:
     """Fit without a demonstration, and score how well its rows are predicted, and if asked for it as a whole."""
     left = groups == demonstration
+    # Of this thread: what else runs on the machine does not count.
     start = time.thread_time()
     model, _ = fit_once(model, X[~left], y[~left], groups[~left], finished=finished)
     seconds = time.thread_time() - start
@@ -151,6 +152,7 @@ def summarize(rows: Sequence[Row]) -> list[Row]:
         for row in rows:
             if row["task"] == task:
                 folds.setdefault(row["model"], []).append(row)
+        # Folds that failed are NaN, and left out of the means.
         values = {name: np.array([row["log_likelihood"] for row in own]) for name, own in folds.items()}
         first = next(iter(folds))
         for name, own in folds.items():

@@ -14,6 +14,7 @@ from torch_pbd.gp.observations import neighbourhoods, spacing, sum_by
 from torch_pbd.kernels import correlation, differences, value_and_slope
 from torch_pbd.linalg import safe_cholesky
 
+# In ranges of the inputs: those that nearly coincide, as of two precisions, show no finer detail than this.
 _SHORTEST = 1e-3
 _EXACT_RESOLUTION = 0.75  # spacings of the inputs: shorter "needles" explain each input by itself
 _RESOLUTION = 1.0  # spacings: at this length scale features carry 0.995 of the variance between inducing inputs

@@ -81,6 +81,7 @@ class LatentGP(nn.Module):
 
     def _weighted(self, x: Tensor, *weights: Tensor) -> list[Tensor]:
         cross = correlation(x, self.inputs, self.length_scale, self.kernel)
+        # Processes that share their length scales share the correlations.
         if len(cross) == 1:
             return [cross[0] @ weight.mT for weight in weights]
         return [(cross @ weight.unsqueeze(-1)).squeeze(-1).mT for weight in weights]
@@ -110,6 +111,7 @@ class LatentGP(nn.Module):
             gram, cross = self.root @ gram @ self.root.mT, self.root @ cross
         if bool((noise_ratio > 0).any()):
             gram = gram + torch.diag_embed(noise)
+        # Eq. (6) over the squared amplitude, 1 - k' inv(K + ratio / counts) k, by the factor of the matrix.
         factor = safe_cholesky(gram, name="the kernel matrix of the training inputs")
         whitened = torch.linalg.solve_triangular(factor, cross, upper=False)
         return (1.0 - whitened.square().sum(-2)).clamp(0.0, 1.0)

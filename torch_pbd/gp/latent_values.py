@@ -24,6 +24,8 @@ def pivoted_root(inputs: Float[Tensor, "n e"], length_scale: Float[Tensor, " e"]
     columns = inputs.new_zeros(limit, len(inputs))
     rest = torch.ones_like(inputs[:, 0])
     scaled = inputs / length_scale
+    # Column r is (K e_p - L L_p') / sqrt(rest_p) of the columns L before it: Cholesky's, with the pivot p where most of
+    # the variance is left.
     for rank in range(limit):
         pivot = int(rest.argmax())
         largest = float(rest[pivot])
@@ -42,6 +44,7 @@ def _orthogonal(root: Tensor) -> Tensor:
 
     Of each column, whose sign is arbitrary, the entry at the first input is not negative.
     """
+    # With root = U S V' the matrix is U S^2 U': V is a rotation of the whitened values, which changes nothing.
     vectors, values, _ = torch.linalg.svd(root, full_matrices=False)
     basis = (vectors * values)[:, values.square() > _RANK_TOLERANCE * values[0].square()]
     return torch.where(basis[0] < 0, -basis, basis).contiguous()
@@ -109,6 +112,7 @@ class LatentValues(nn.Module):
         ``u_t`` are those processes' deviations at input t; ``k`` counts their whitened values one after the other.
         Only the blocks on the diagonal and below are computed: above there are zeros.
         """
+        # Process i has the deviations a_i B_i w_i: block (i, j) is the sum over t of a_i a_j weight_ij B_i' B_j.
         amplitude = self.log_amplitude.detach().exp()[members]
         weight = weight * (amplitude[:, None] * amplitude)
         weight = weight.permute(1, 2, 0).contiguous()
@@ -146,9 +150,11 @@ class LatentValues(nn.Module):
             if root is not None:
                 return _orthogonal(root)[None], 0.0
         gram = correlation(self.inputs, self.inputs, length_scale, self.kernel)
+        # Trained length scales need a basis that autograd can differentiate: a Cholesky factor, of full rank.
         if self.train_hyperparameters:
             return cholesky_with_jitter(gram, name="the kernel matrix of the training inputs")
         eigenvalue, eigenvector = torch.linalg.eigh(gram)
+        # Of several length scales: directions that matter to none are left out, those of some are zero for others.
         matters = eigenvalue > _RANK_TOLERANCE * eigenvalue[..., -1:]
         root = eigenvalue.where(matters, 0.0).sqrt()
         return (eigenvector * root.unsqueeze(-2))[..., matters.any(0)], 0.0
@@ -158,6 +164,7 @@ class LatentValues(nn.Module):
         deviation = deviation.unsqueeze(-1)
         if self.train_hyperparameters:
             return torch.linalg.solve_triangular(self.basis, deviation, upper=False).squeeze(-1).contiguous()
+        # Columns are orthogonal, so that least squares is one division each.
         return (self.basis.mT @ deviation / self._square()).squeeze(-1).contiguous()
 
     def _weight(self, whitened: Tensor) -> Tensor:

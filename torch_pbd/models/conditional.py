@@ -226,6 +226,7 @@ class ConditionalNormal(nn.Module):
 
         ``prior_scale_tril`` replaces the prior the model was fitted with, where that depends on x.
         """
+        # By a QR decomposition of the root, whose square is not formed: correlations near one keep their digits.
         mean, root = self.core(self._standardized(x), self._standardized_prior(prior_scale_tril))
         return self.y_shift + self.y_scale * mean, scale_tril_from_root(self._in_units(root))
 
@@ -285,4 +286,5 @@ class ConditionalNormal(nn.Module):
 
     def _in_units(self, root: Tensor) -> Tensor:
         """Root of a covariance, with the floor, in the units of the data."""
+        # The floor comes before the units: relative to all outputs, it would drown one that has a large unit.
         return self.y_scale.unsqueeze(-1) * with_floor(root)

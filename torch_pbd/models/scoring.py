@@ -123,6 +123,7 @@ def _step(z: Tensor, blocks: list[tuple[Tensor, Tensor]]) -> Tensor:
     """Step of the whitened values, in coordinates z in which the curvature of these factors is the unit matrix."""
     if not blocks:
         return z
+    # With the curvature P = F F' and step = inv(F') z the quadratic form step' P step is |z|^2.
     step = torch.zeros_like(z)
     for members, factor in blocks:
         solved = torch.linalg.solve_triangular(factor.mT, z[members].reshape(-1, 1), upper=True)

@@ -99,6 +99,7 @@ class WishartLink:
         self, root: Float[Tensor, "n d df"], scale_tril: Float[Tensor, "n d d"], inverse: Float[Tensor, "n d d"]
     ) -> Iterator[tuple[Int64[Tensor, " b"], Float[Tensor, "n b d d"]]]:
         """Derivatives of ``scale_tril`` in the deviations: C tril(D), half of D's diagonal, D as above."""
+        # For entry i of vector j it is S = C^-1 e_i (C^-1 U e_j)'.
         half = torch.einsum("nai,nbj->njiab", inverse, inverse @ root).flatten(1, 2)
         lower = torch.ones_like(inverse[0]).tril() - 0.5 * torch.eye(root.shape[1]).to(root)
         yield self._members(root), scale_tril.unsqueeze(1) @ ((half + half.mT) * lower)

@@ -182,6 +182,7 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         X, targets = checked_rows(self, X, y, reset=False)
         targets = targets.reshape(len(X), -1)
         mean, covariance = self._marginals(self._times(X))
+        # With L L' the covariance of a row, its squared distance is that of inv(L) (y - mean).
         try:
             whitened = np.linalg.solve(np.linalg.cholesky(covariance), (targets - mean)[..., np.newaxis])[..., 0]
         except np.linalg.LinAlgError as error:

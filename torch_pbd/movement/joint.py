@@ -52,6 +52,7 @@ class JointNormal:
 
     def covariance(self) -> Float[Tensor, "n d n d"]:
         """Whole covariance: n d squared numbers."""
+        # The inner part R kron I + U U' first, and then a block of A on either side.
         n, d = self.mean.shape
         inner = torch.einsum("ij,ab->iajb", self.correlation, torch.eye(d).to(self.mean))
         flat = self.loadings.reshape(n * d, -1)
@@ -87,6 +88,7 @@ class JointNormal:
 
     def square(self, x: Float[Tensor, "s n d"]) -> Float[Tensor, " s"]:
         """Squared Mahalanobis distance of movements to the mean."""
+        # With S = R kron I + U U' it is r' inv(S) r of r = inv(A) (x - mean).
         residual = torch.linalg.solve(self.factor, (x - self.mean)[..., None])[..., 0]
         solved = self._solve_inner(residual.permute(1, 2, 0))  # (n, d, s)
         square = (residual.permute(1, 2, 0) * solved).sum((0, 1))
@@ -114,11 +116,13 @@ class JointNormal:
 
     @cached_property
     def _log_det_inner(self) -> Tensor:
+        # det(R kron I + U U') = det(R)^d det(I + U' inv(R) U).
         along = self._correlation_root.diagonal().log().sum() * self.mean.shape[1]
         return 2.0 * (along + self._capacitance_root.diagonal().log().sum())
 
     def _solve_inner(self, right: Float[Tensor, "n d s"]) -> Float[Tensor, "n d s"]:
         """Solution of ``(R kron I + U U') x = right``."""
+        # Woodbury: inv(R) - inv(R) U inv(I + U' inv(R) U) U' inv(R), with R for R kron I.
         n, d, s = right.shape
         solved = torch.cholesky_solve(right.reshape(n, d * s), self._correlation_root).reshape(n, d, s)
         cross = torch.einsum("ndk,nds->ks", self._whitened_loadings, right)
@@ -142,6 +146,7 @@ class JointNormal:
     def _log_det_explained(self) -> Tensor:
         if not self.explained.shape[-1]:
             return self.mean.new_zeros(())
+        # Taking V V' off multiplies the determinant by det(I - V' inv(Sigma) V).
         return 2.0 * self._explained_root.diagonal().log().sum()
 
 

@@ -118,6 +118,7 @@ class KMPBaseline(MovementRegressor):
             what=f"the covariance between {n} rows and {d} outputs",
             remedy="Ask for fewer rows.",
         )
+        # All outputs of one time after another: the kernel of the times, for each output by itself.
         gram, cross = (np.kron(self._kernel(self._scaled(other), reference), unit) for other in (reference, time))
         noise = block_diag(*covariances)
         mean = cross @ np.linalg.solve(gram + self.lambda_mean * noise, means.ravel())

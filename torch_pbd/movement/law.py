@@ -94,11 +94,12 @@ class MovementLaw(BaseEstimator, ABC):
             )
         scale = np.broadcast_to(checks.real_floats(noise_scale, "noise_scale"), (self.n_outputs_,))
         checks.require((scale >= 0.0) & np.isfinite(scale), scale, "noise_scale", "a finite number of at least 0")
+        # Rows of which nothing is given say nothing.
         given = ~np.isnan(value).all(axis=1)
-        known = Known(time[given], value[given], np.broadcast_to(scale, value[given].shape))
-        if self._known is not None:
-            known = Known(*(np.concatenate(pair) for pair in zip(self._known, known, strict=True)))
+        new = Known(time[given], value[given], np.broadcast_to(scale, value[given].shape))
+        known = self._observations.and_also(new)
         copied = copy.copy(self)
+        # The law before conditioning is the same for all copies.
         copied._known, copied._kept = known, self.__dict__.setdefault("_kept", {})
         copied._observed(self._union(known.time[:0], known)[2])  # refuses what cannot be conditioned on
         return copied
@@ -110,19 +111,24 @@ class MovementLaw(BaseEstimator, ABC):
 
     def known_times(self) -> Floats:
         """Times (m,) at which something is known of the movement."""
-        return np.empty(0) if self._known is None else self._known.time
+        return self._observations.time
+
+    @property
+    def _observations(self) -> Known:
+        """All that is known of the movement; no rows where nothing is."""
+        nothing = np.empty((0, self.n_outputs_))
+        return Known(np.empty(0), nothing, nothing) if self._known is None else self._known
 
     def _union(self, time: Floats, known: Known | None) -> tuple[Floats, NDArray[np.intp], NDArray[np.intp]]:
         """Distinct times of queries and of what is known, and the places of both among them."""
         both = np.concatenate([time, np.empty(0) if known is None else known.time])
+        # In ranges of the fit, and rounded: 0.1 + 0.2 is the time 0.3.
         _, first, index = np.unique(np.round(self._scaled(both), RESOLUTION), return_index=True, return_inverse=True)
         return both[first], index[: len(time)], index[len(time) :]
 
     def _observed(self, places: NDArray[np.intp]) -> Observed:
         """Observations of the movement, by the places of their times in a union of times."""
-        nothing = np.empty((0, self.n_outputs_))
-        known = Known(np.empty(0), nothing, nothing) if self._known is None else self._known
-        return known.observed(places)
+        return self._observations.observed(places)
 
     def _conditioned(self, time: Floats) -> tuple[Conditioned, Tensor]:
         """Law of all times that matter, given what is known, and the places of ``time`` among them."""
@@ -136,6 +142,7 @@ class MovementLaw(BaseEstimator, ABC):
             known, law = kept["last"]
             place = np.searchsorted(known, scaled).clip(max=len(known) - 1)
             old = known[place] == scaled
+            # Of times that all are known the law is a part of that kept; where most are, only the others take work.
             if old.all():
                 return law if len(old) == len(known) else law.at(torch.from_numpy(place))
             if 2 * old.sum() > len(old):
@@ -165,9 +172,12 @@ class MovementLaw(BaseEstimator, ABC):
 
     def _score(self, recording: Recording) -> float:
         """Joint log density of one demonstration."""
+        # Of a step that is known, or is there twice, no variance is left, and so no density.
         law, rows = self._law(recording.time)
-        known = set() if self._known is None else set(rows.tolist()) & set(self._exact_places(recording.time))
-        if len(set(rows.tolist())) < len(rows) or known:
+        known = self._observations
+        exact = ((known.noise == 0.0) & ~np.isnan(known.value)).any(axis=1)
+        exact_places = self._union(recording.time, known)[2][exact].tolist()
+        if len(set(rows.tolist())) < len(rows) or not set(rows.tolist()).isdisjoint(exact_places):
             raise ValueError(
                 "X has a time twice in a demonstration, or one that is known without noise: leave it out, the movement "
                 "has no density there."
@@ -176,12 +186,6 @@ class MovementLaw(BaseEstimator, ABC):
         square = law.square(torch.from_numpy(recording.position)[None])
         size = recording.position.size
         return float(student_log_density(square.numpy(), float(law.log_det()), size, self.df_)[0])
-
-    def _exact_places(self, time: Floats) -> list[int]:
-        assert self._known is not None
-        places = self._union(time, self._known)[2]
-        exact = ((self._known.noise == 0.0) & ~np.isnan(self._known.value)).any(axis=1)
-        return [int(place) for place in places[exact]]
 
 
 def student_log_density(square: Floats, log_det: Any, size: int, df: float) -> Floats:

@@ -34,6 +34,10 @@ class Known(NamedTuple):
     value: Floats
     noise: Floats
 
+    def and_also(self, other: "Known") -> "Known":
+        """These observations and others after them."""
+        return Known(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
+
     def observed(self, places: NDArray[np.intp]) -> Observed:
         """Observations as a joint law takes them, by the places of their times among the steps of the law.
 

@@ -93,6 +93,7 @@ class TimedMovement(MovementRegressor):
             for (model, phases), count in zip(self._models(self._times(X)), counts, strict=True)
             if count
         ]
+        # They were made node by node: the first few must not be of one node.
         return np.asarray(generator.permutation(np.concatenate(parts)))
 
     def _mixed_uncertainty(self, time: Floats) -> Uncertainty:
@@ -113,10 +114,9 @@ class TimedMovement(MovementRegressor):
         """Log of the mean density over the posterior, restricted to movements that still run."""
         if self._timing is None:
             return super()._score(recording)
-        empty = Known(recording.time[:0], recording.position[:0], recording.position[:0])
-        known = empty if self._known is None else self._known
-        new = Known(*recording, np.zeros_like(recording.position))
-        before, whole = self._log_likelihood(known), Known(*map(np.concatenate, zip(known, new, strict=True)))
+        known = self._observations
+        whole = known.and_also(Known(*recording, np.zeros_like(recording.position)))
+        before = self._log_likelihood(known)
 
         def exact(duration: Tensor, pace: Tensor) -> Tensor:
             models = [self._model(*node) for node in zip(duration, pace, strict=True)]
@@ -252,13 +252,13 @@ class TimedMovement(MovementRegressor):
         model = copy.copy(self)
         model._timing = None
         if self._known is not None:
-            model._known = self._known._replace(
-                time=phase_of(torch.from_numpy(self._known.time) / duration, pace).numpy()
-            )
+            phase = phase_of(torch.from_numpy(self._known.time) / duration, pace).numpy()
+            model._known = self._known._replace(time=phase)
         return model
 
     def _matched(self, mean: Floats, covariance: Floats, outer: str) -> tuple[Floats, Floats]:
         """Mean and covariance of a mixture whose components have these."""
+        # Law of total covariance: the mean of the covariances, and the covariance of the means.
         weight = self._posterior().weight.numpy()
         whole = np.tensordot(weight, mean, 1)
         deviation = np.sqrt(weight)[:, np.newaxis, np.newaxis] * (mean - whole)

@@ -73,6 +73,7 @@ class TrajectoryLaw(nn.Module):
         time = (x - self.x_shift) / self.x_scale
         correlation = self.share * kernel.correlation(time, time)
         loadings = ((1.0 - self.share) / len(self.residual)).sqrt() * kernel.loadings(time)
+        # S_tt, whose factor A_t takes out, so that the blocks of the joint law are those of the marginals.
         own = loadings @ loadings.mT + self.share * torch.eye(mean.shape[1]).to(mean)
         root = safe_cholesky(covariance, name="the covariance at a step")
         factor = torch.linalg.solve_triangular(torch.linalg.cholesky(own), root, upper=False, left=False)
@@ -196,6 +197,7 @@ class TrajectoryRegressor(TimedMovement):
         grid = np.linspace(low, high, n_grid_steps(recordings))
         mean, covariance = self._regressor_marginals(grid)
         residual = np.stack([sampled(recording, grid) for recording in recordings]) - mean
+        # Of z = inv(L_t) (y_t - m_t), of unit covariance at each step, the correlation along time is left to be found.
         whitened = np.linalg.solve(np.linalg.cholesky(covariance), residual[..., np.newaxis])[..., 0]
         kernels = ("matern52", "squared_exponential") if self.time_kernel == "auto" else (self.time_kernel,)
         share = None if self.shrinkage == "auto" else 1.0 - float(self.shrinkage)

@@ -17,6 +17,7 @@ Check = Callable[[Any, str], Any]
 _LAW = "stiffness_law"
 # What files say nothing of that are from before there were other laws.
 _LAW_OF_POSITIONS = {"kind": "linear", "rotation": None, "cross_terms": False, "effort": "match"}
+# Types of arrays; those of objects are names of columns.
 _INTEGERS = [f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)]
 _DTYPES = ["float64", "float32", "float16", *_INTEGERS, "bool", "object"]
 

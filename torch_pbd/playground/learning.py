@@ -60,6 +60,7 @@ def adjust(learned: Learned, settings: Settings) -> Answer:
     """Schedule with other limits, mass or speed: the model stays as it is."""
     learned.settings = settings
     for name, fitted in learned.controllers.items():
+        # The fitted model is frozen: gains are made anew, nothing is learned again.
         learned.controllers[name] = _controller(FrozenEstimator(fitted.covariance_), settings).fit(learned.strokes)
     learned.bent = _bent(learned)
     return follow(learned)

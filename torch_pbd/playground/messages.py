@@ -20,6 +20,7 @@ FILES = ["demonstrations.csv", "schedule.npz", "schedule.json", "schedule.csv", 
 MOST_BYTES = 2**21
 """Longest message: forty strokes of a minute at 60 Hz take less."""
 
+# What a person draws is far less: a minute of a stroke at 60 Hz has 3600 samples.
 _MOST_STROKES, _MOST_SAMPLES, _MOST_POINTS = 40, 4000, 12
 _FARTHEST = 10.0  # m
 _LEAST_STEP = 1e-4  # s: events of a pointer that share a millisecond are one
@@ -70,6 +71,7 @@ def _as_stroke(rows: Any, name: str) -> Stroke:
         raise ValueError(f"{name} must have 5 to {_MOST_SAMPLES} samples: draw it more slowly, or shorter.")
     samples = checks.array(rows, name, ("n", 3))
     checks.require(np.abs(samples[:, 1:]) <= _FARTHEST, samples[:, 1:], name, f"within {_FARTHEST:g} m")
+    # A clock that was set back gives times that do not increase: such samples are left out too.
     later = np.append(True, np.diff(np.maximum.accumulate(samples[:, 0])) > _LEAST_STEP)
     samples = samples[later]
     if len(samples) < 5:

@@ -138,6 +138,7 @@ class Playground:
         origin = headers.get("origin", "" if scope["type"] == "websocket" else None)
         is_from_us = origin is None or origin.removeprefix("http://") in self._hosts
         token = scope["path"].lstrip("/").partition("/")[0]
+        # Compared in constant time: how long a guess takes says nothing of the secret.
         return headers.get("host") in self._hosts and is_from_us and secrets.compare_digest(
             token.encode(), self.token.encode()
         )  # fmt: skip
@@ -162,6 +163,7 @@ class Playground:
             if future is not None and not future.done():
                 future.set_result(answer)
             return
+        # Tab -1 is every one.
         for tab in [self._tabs[number]] if number in self._tabs else list(self._tabs.values()) * (number == -1):
             task = asyncio.ensure_future(tab.deliver(dict(answer)))
             self._sending.add(task)

@@ -252,6 +252,7 @@ def plot_schedule(schedule: Any) -> list[Axes]:
     figure, plane, bands = _panels(3 - (schedule.n_outputs == 2), n_space=2 if schedule.n_outputs == 2 else 0)
     names, (unit, scale) = schedule_names(schedule), readable_unit(schedule.units)
     position = [f"{name} [{short_unit(schedule.units)}]" for name in names]
+    # The path of two outputs takes the place of their positions over time.
     if plane:
         path, some = schedule.position, np.linspace(0, len(schedule) - 1, 21).round().astype(int)
         plane[0].plot(*path.T, color=MODEL, lw=1.5, label="planned: position, 2 sd")
@@ -305,6 +306,7 @@ def plot_pushes(rollout: Any, unpushed: Any = None, names: Sequence[str] | None 
 
 def _panels(n_bands: int, n_space: int) -> tuple[Figure, list[Any], list[Axes]]:
     """Figure with the Axes of a path in two or three dimensions, if any, and those of bands, in a column or 3 x 3."""
+    # The path has a column of its own, as high as all bands together.
     if n_space:
         figure = shown_figure((9.6 if n_bands else 5.6, 4.8))
         columns = figure.add_gridspec(

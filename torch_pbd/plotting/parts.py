@@ -104,6 +104,7 @@ def plot_covariance_ellipses(
     centres = checks.array(mean, "mean", ("n", 2))
     matrices = checks.array(covariance, "covariance", (len(centres), 2, 2))
     checks.semidefinite(matrices, "covariance")
+    # With covariances A diag(v) A' the curves are mean + n_std A sqrt(v) (cos, sin).
     angle = np.linspace(0.0, 2.0 * np.pi, 73)
     circle = np.stack([np.cos(angle), np.sin(angle)])
     values, axes = np.linalg.eigh(matrices)
@@ -176,6 +177,7 @@ def _empirical_bands(position: Floats, targets: Floats) -> tuple[Floats, Floats,
     distinct, index, counts = np.unique(position, return_inverse=True, return_counts=True)
     means = np.stack([np.bincount(index, column) / counts for column in targets.T], axis=1)
     squares = np.stack([np.bincount(index, column) for column in ((targets - means[index]) ** 2).T], axis=1)
+    # The divisor K - 1 is that of the empirical covariances that models are compared with.
     repeated = counts > 1
     std = np.sqrt(squares[repeated] / (counts[repeated, np.newaxis] - 1))
     return distinct[repeated], means[repeated], std

@@ -114,11 +114,9 @@ class HeteroscedasticModel(Core):
         checks.require(medians >= 0.0, medians, "medians", "at least 0")
         if len(config["exact"]) != len(_FAMILIES):
             raise ValueError(f"exact is {config['exact']!r:.80}, must be for {', '.join(_FAMILIES)}")
-        n_rows = sum(name.startswith("coefficient_weights_") for name in shapes)
-        if n_rows != n_outputs - 1:
-            raise ValueError(
-                f"it has coefficients of {n_rows} outputs, must have them of all {n_outputs} but the first"
-            )
+        n = sum(name.startswith("coefficient_weights_") for name in shapes)
+        if n != n_outputs - 1:
+            raise ValueError(f"it has coefficients of {n} outputs, must have them of all {n_outputs} but the first")
         e, d, m, a = n_features, n_outputs, size_of(shapes, "inducing"), size_of(shapes, "mean_inducing")
         # A constant is one more feature.
         in_mean, in_log_variance, in_row = (n + bool(row[2]) for n, row in zip((a, m, m), medians, strict=True))
@@ -211,6 +209,7 @@ class HeteroscedasticModel(Core):
         """
         prepared = self._prepared()
         _, log_variance_values, _, nearness = prepared.features(x)
+        # Of the prior they are infinite: with the share of the data, 1 - missing, going to zero the law becomes normal.
         variance = prepared.covariance.log_variance_at_features(log_variance_values)[1].mean(-1)
         return degrees_of_freedom(variance) / (1.0 - _missing(nearness)).clamp_min(1e-12)
 
@@ -281,6 +280,7 @@ class HeteroscedasticModel(Core):
         return {**self.__dict__, "_kept": None}
 
     def _family(self, number: int) -> ProcessFamily:
+        # The mean, number 0, rests on inducing inputs of its own, and is never stretched.
         inducing = self.inducing if number else self.mean_inducing
         stretch = getattr(self, "stretch", None) if number else None
         features = FeatureMap(inducing, self.kernel, getattr(self, "period", None), self.exact[number], stretch)
