@@ -76,12 +76,18 @@ class CovarianceRegressor(TorchEstimator):
 
     def log_likelihood(self, X: ArrayLike, y: ArrayLike) -> Floats:
         """Log density of each row of y at X, in nats: (n_samples,)."""
-        x, mean, scale_tril, targets = self._scored(X, y)
+        check_is_fitted(self)
+        inputs, targets = checked_rows(self, X, y, reset=False)
+        targets = targets.reshape(len(inputs), -1)
+        if targets.shape[1] != self.n_outputs_:
+            raise ValueError(f"y has {targets.shape[1]} outputs, but the model was fitted with {self.n_outputs_}.")
+        x = self._door(inputs)
+        mean, scale_tril = self._tensors(self._mean_and_tril, x)
         with torch.inference_mode():
-            degrees = self._degrees(x)
+            residual, degrees = self._door(targets) - mean, self._degrees(x)
             if degrees is None:
-                return gaussian_log_density(targets - mean, scale_tril).cpu().numpy()
-            return student_log_density(targets - mean, scale_tril, degrees).cpu().numpy()
+                return gaussian_log_density(residual, scale_tril).cpu().numpy()
+            return student_log_density(residual, scale_tril, degrees).cpu().numpy()
 
     def score(self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None) -> float:
         """Mean log density of the rows of y at X, in nats: higher is better.
@@ -138,15 +144,6 @@ class CovarianceRegressor(TorchEstimator):
 
     def _moments(self, X: Floats) -> tuple[Floats, ...]:
         return self._arrays(lambda x: self.module_.moments(x, *self._prior_tril_at(x)), X)
-
-    def _scored(self, X: ArrayLike, y: ArrayLike) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        check_is_fitted(self)
-        inputs, targets = checked_rows(self, X, y, reset=False)
-        targets = targets.reshape(len(inputs), -1)
-        if targets.shape[1] != self.n_outputs_:
-            raise ValueError(f"y has {targets.shape[1]} outputs, but the model was fitted with {self.n_outputs_}.")
-        x = self._door(inputs)
-        return x, *self._tensors(self._mean_and_tril, x), self._door(targets)
 
     def _degrees(self, x: Tensor) -> Tensor | None:
         """Degrees of freedom of the predictive density at x; None where it is normal."""

@@ -105,7 +105,8 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         if aligned:
             mean, covariance, report, jitter = self._fit_empirical(problem)
         else:
-            mean, mean_report = self._fit_mean(training)
+            job = self._mean_job(training)
+            mean, mean_report = mean_consistent_with_repeats(training, *job, *fit_together([job]))
             covariance, report, jitter = self._fit_likelihood(problem, training.residual(mean))
             report = report.after(mean_report, "search of the mean")
         return Fitted(self._assemble(self._core_class(mean, covariance), scaling), report, jitter)
@@ -153,11 +154,6 @@ class LatentCovarianceRegressor(CovarianceRegressor):
             return torch.diag(1.0 / self._door(scaling.y_scale))
         prior = standardized_prior(self.prior, _in_units(training, scaling), scaling.y_scale)
         return safe_cholesky(self._door(prior), name="prior")
-
-    def _fit_mean(self, training: TrainingSet) -> tuple[LatentGP, FitReport]:
-        """Gaussian processes of the mean, by themselves."""
-        job = self._mean_job(training)
-        return mean_consistent_with_repeats(training, *job, *fit_together([job]))
 
     def _mean_job(self, training: TrainingSet) -> tuple[Observations, EvidenceSearch]:
         """Means at the inputs, weighted by their counts, and the search for their hyperparameters."""

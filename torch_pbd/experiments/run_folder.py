@@ -263,7 +263,8 @@ def write_report(folder: RunFolder, command: str, text: str) -> Path:
     parts = [f"<h1>torch-pbd {html.escape(command)}</h1>", f"<pre>{html.escape(text)}</pre>"]
     for path in folder.figures:
         data = base64.b64encode(path.read_bytes()).decode()
-        caption = html.escape(f"{path.stem}: {_caption(path.stem)}")
+        shows = next(text for part, text in _CAPTIONS.items() if part in path.stem or part == "figure")
+        caption = html.escape(f"{path.stem}: {shows}")
         picture = f'<img alt="{caption}" src="data:image/png;base64,{data}">'
         parts.append(f"<figure>{picture}<figcaption>{caption}</figcaption></figure>")
     lines = html.escape("\n".join(_next_steps(folder.path, command)))
@@ -272,10 +273,6 @@ def write_report(folder: RunFolder, command: str, text: str) -> Path:
     body = "\n".join(parts)
     folder.write_text("index.html", f'<!doctype html><html lang="en"><head>{head}</head><body>{body}</body></html>\n')
     return folder.path / "index.html"
-
-
-def _caption(name: str) -> str:
-    return next(text for part, text in _CAPTIONS.items() if part in name or part == "figure")
 
 
 def _next_steps(folder: Path, command: str) -> Iterable[str]:

@@ -155,7 +155,10 @@ def empirical_tril(training: TrainingSet, *, bias_correction: bool = False) -> F
     scale_tril = scale_tril_from_root(root) / (degrees + prior_degrees * lacking).sqrt()[:, None, None]
     if not bias_correction:
         return scale_tril
-    expected = _expected_diagonal(degrees.clamp_min(n_outputs), n_outputs)
+    # Column i of the factor of the scatter has a mean of that of chi with K - i degrees times that of the true one.
+    degrees = degrees.clamp_min(n_outputs)[:, None]
+    rest = degrees - torch.arange(n_outputs).to(degrees)
+    expected = (torch.lgamma((rest + 1.0) / 2.0) - torch.lgamma(rest / 2.0)).exp() * (2.0 / degrees).sqrt()
     return scale_tril / torch.where(lacking[:, None], 1.0, expected)[:, None, :]
 
 
@@ -170,10 +173,3 @@ def mean_over_geometric(training: TrainingSet) -> Float[Tensor, "n d"]:
     half = 0.5 * (degrees[:, None] - torch.arange(n_outputs).to(degrees)).clamp_min(1.0)
     ratio = (torch.lgamma(half + 0.5) - torch.lgamma(half) - 0.5 * torch.digamma(half)).exp()
     return torch.where((degrees < n_outputs)[:, None], 1.0, ratio)
-
-
-def _expected_diagonal(degrees: Tensor, n_outputs: int) -> Tensor:
-    """Mean of each column of the factor of an empirical covariance over that of the true one."""
-    # Column i of the factor of the scatter has a mean of that of chi with K - i degrees times that of the true one.
-    rest = degrees[:, None] - torch.arange(n_outputs).to(degrees)
-    return (torch.lgamma((rest + 1.0) / 2.0) - torch.lgamma(rest / 2.0)).exp() * (2.0 / degrees[:, None]).sqrt()

@@ -84,7 +84,14 @@ class JointNormal:
 
     def log_det(self) -> Tensor:
         """Log determinant of the covariance."""
-        return self._log_det_inner + 2.0 * torch.linalg.slogdet(self.factor).logabsdet.sum() + self._log_det_explained
+        # det(R kron I + U U') = det(R)^d det(I + U' inv(R) U), and taking V V' off multiplies the determinant of the
+        # whole by det(I - V' inv(Sigma) V).
+        along = self._correlation_root.diagonal().log().sum() * self.mean.shape[1]
+        log_det = 2.0 * (along + self._capacitance_root.diagonal().log().sum())
+        log_det = log_det + 2.0 * torch.linalg.slogdet(self.factor).logabsdet.sum()
+        if self.explained.shape[-1]:
+            log_det = log_det + 2.0 * self._explained_root.diagonal().log().sum()
+        return log_det
 
     def square(self, x: Float[Tensor, "s n d"]) -> Float[Tensor, " s"]:
         """Squared Mahalanobis distance of movements to the mean."""
@@ -114,12 +121,6 @@ class JointNormal:
         gram = torch.einsum("ndk,ndl->kl", self.loadings, self._whitened_loadings)
         return torch.linalg.cholesky(symmetrize(gram) + torch.eye(len(gram)).to(gram))
 
-    @cached_property
-    def _log_det_inner(self) -> Tensor:
-        # det(R kron I + U U') = det(R)^d det(I + U' inv(R) U).
-        along = self._correlation_root.diagonal().log().sum() * self.mean.shape[1]
-        return 2.0 * (along + self._capacitance_root.diagonal().log().sum())
-
     def _solve_inner(self, right: Float[Tensor, "n d s"]) -> Float[Tensor, "n d s"]:
         """Solution of ``(R kron I + U U') x = right``."""
         # Woodbury: inv(R) - inv(R) U inv(I + U' inv(R) U) U' inv(R), with R for R kron I.
@@ -141,13 +142,6 @@ class JointNormal:
         return safe_cholesky(
             torch.eye(len(gram)).to(gram) - symmetrize(gram), name="what observations leave open of the movement"
         )
-
-    @cached_property
-    def _log_det_explained(self) -> Tensor:
-        if not self.explained.shape[-1]:
-            return self.mean.new_zeros(())
-        # Taking V V' off multiplies the determinant by det(I - V' inv(Sigma) V).
-        return 2.0 * self._explained_root.diagonal().log().sum()
 
 
 @dataclass(frozen=True)
