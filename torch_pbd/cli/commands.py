@@ -61,13 +61,16 @@ OPTIONS: dict[str, dict[str, Option]] = {
     "experiment": {
         **_FILE,
         **_MADE,
-        "common_start": Option(bool, False, "made demonstrations start at one point"),
+        "common_start": Option(bool, False, "made demonstrations of the tunnel start at one point"),
+        "task": Option(Literal["tunnel", "peg"], "tunnel", "to make demonstrations of: peg turns a tool"),
         "controllers": Option(
             dict[str, "DMPController"],
             {"recommended": "DMPController"},
             f"controllers {_CLASS_HELP} --controllers.help DMPController",
         ),
         "push": Option(Annotated[float, (-1e6, 1e6)], 5.0, "peak of the two pushes along the first output, N"),
+        "torque": Option(Annotated[float, (-1e6, 1e6)], 1.2, "peak of two pushes of poses by torque, Nm"),
+        "arm": Option(Literal["panda", "none"], "panda", "whose inertia a robot of poses has; none: 1 kg"),
         "rate": Option(Annotated[float, (1e-3, 1e6)], 1000.0, "ticks of the controller, Hz"),
     },
     "compare": {
@@ -189,22 +192,35 @@ def inspect(options: Any, folder: Any) -> str:
 
 def experiment(options: Any, folder: Any) -> str:
     """A skill, learned and reproduced on a simulated robot that is pushed."""
-    from torch_pbd.data import make_tunnel_demonstrations
+    from torch_pbd.data import make_pose_demonstrations, make_tunnel_demonstrations
     from torch_pbd.experiments.recordings import describe
     from torch_pbd.experiments.robot import framework_figure, run_robot
 
     made = options.data is None
-    if made:
+    if made and options.task == "peg":
+        demonstrations = make_pose_demonstrations(options.n_demos, random_state=options.seed)
+    elif made:
         demonstrations = make_tunnel_demonstrations(
             options.n_demos, random_state=options.seed, common_start=options.common_start
         )
     else:
         demonstrations = _loaded(options)
-    say(describe(demonstrations, "tunnel task" if made else _name(options.data)))
+    say(describe(demonstrations, f"{options.task} task" if made else _name(options.data)))
+    if demonstrations.rotation_reference is not None:
+        return _pose_experiment(options, demonstrations, folder)
     where = f"along {demonstrations.names[0]}, at 20 % and 80 % of the movement; K is the stiffness there, N/m"
     say(f"pushes of {options.push:g} N {where}\n")
     folder.write_figure(framework_figure(), "figure5_framework")
     return run_robot(options.controllers, demonstrations, folder, peak=options.push, rate=options.rate, in_tunnel=made)
+
+
+def _pose_experiment(options: Any, demonstrations: Any, folder: Any) -> str:
+    from torch_pbd.experiments.poses import run_poses
+
+    pushes = f"{options.push:g} N along and {options.torque:g} Nm about"
+    say(f"pushes of {pushes} each axis of the tool, at 20 % and 80 % of the movement; K is\nthe stiffness there\n")
+    sizes = {"peak": options.push, "torque": options.torque, "rate": options.rate}
+    return run_poses(options.controllers, demonstrations, folder, **sizes, arm=options.arm)
 
 
 def compare(options: Any, folder: Any) -> str:

@@ -27,6 +27,7 @@ CLASSES: Mapping[str, Mapping[str, str]] = {
     "Model": {**REGRESSORS, **MOVEMENTS},
     "DMPController": {"DMPController": ESTIMATORS["DMPController"]},
     "StiffnessLaw": {"StiffnessLaw": "torch_pbd.control.stiffness"},
+    "RotationLimits": {"RotationLimits": "torch_pbd.control.stiffness"},
 }
 """The closed table: the classes that a value of a type can be of, and their modules. No other is ever imported."""
 

@@ -6,11 +6,19 @@ from torch_pbd.plotting.parts import (
     plot_covariance_ellipses,
     plot_demonstrations,
     plot_model_bands,
+    plot_outputs,
     plot_rollout,
     plot_std_band,
     plot_stiffness,
 )
-from torch_pbd.plotting.poses import plot_covariance_ellipsoids, plot_frames
+from torch_pbd.plotting.poses import (
+    AXES,
+    draw_planned_poses,
+    plot_covariance_ellipsoids,
+    plot_frames,
+    pose_panels,
+    principal,
+)
 from torch_pbd.plotting.style import (
     DATA,
     EMPIRICAL,
@@ -32,6 +40,7 @@ from torch_pbd.plotting.style import (
 )
 
 __all__ = [
+    "AXES",
     "DATA",
     "EMPIRICAL",
     "FORCE",
@@ -43,6 +52,7 @@ __all__ = [
     "TRUTH",
     "MovementDisplay",
     "draw_edges",
+    "draw_planned_poses",
     "equal_scales",
     "figure_grid",
     "legend_below",
@@ -54,11 +64,14 @@ __all__ = [
     "plot_frames",
     "plot_model_bands",
     "plot_movements",
+    "plot_outputs",
     "plot_pushes",
     "plot_rollout",
     "plot_schedule",
     "plot_std_band",
     "plot_stiffness",
+    "pose_panels",
+    "principal",
     "readable_unit",
     "schedule_names",
     "short_unit",

@@ -1,0 +1,295 @@
+"""The robotic experiment with a tool that turns: learned poses on the plant of an arm, pushed by force and torque."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from matplotlib.figure import Figure
+from sklearn.base import clone
+
+from torch_pbd import rotations
+from torch_pbd.checks import Floats
+from torch_pbd.control.controller import DMPController
+from torch_pbd.control.schedule.schedule import Schedule
+from torch_pbd.control.simulation.plant import AdmittancePlant
+from torch_pbd.control.simulation.rollout import Rollout
+from torch_pbd.control.simulation.run import simulate_schedule
+from torch_pbd.control.stability.report import StabilityReport
+from torch_pbd.data import Demonstrations
+from torch_pbd.exceptions import ConfigError
+from torch_pbd.experiments.resume import fit_once
+from torch_pbd.experiments.run_folder import RunFolder, format_table, slug
+from torch_pbd.plotting import (
+    AXES,
+    DATA,
+    EMPIRICAL,
+    FORCE,
+    LINES,
+    MODEL,
+    SERIES,
+    draw_planned_poses,
+    figure_grid,
+    legend_below,
+    plot_outputs,
+    plot_stiffness,
+    pose_panels,
+    principal,
+)
+
+Arm = Literal["panda", "none"]
+
+_PUSHES = (0.2, 0.8)  # of the duration
+_PUSH_LENGTH = 0.08  # of the duration
+_TOOL = "xyz"
+_ROWS = 50.0  # Hz; along a path the inertia of an arm changes with its joints, within seconds
+_CERTIFIED = 200.0  # Hz of the rows that are certified
+_N_STEPS = 101
+_DEGREES = 180.0 / np.pi
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Pushes by force, or by torque: outputs, unit of what they do, and words."""
+
+    outputs: slice
+    name: str
+    unit: str
+    scale: float
+    push_unit: str
+    stiffness_unit: str
+    where: str
+
+
+FORCES = Kind(slice(0, 3), "force", "mm", 1e3, "N", "N/m", "along")
+TORQUES = Kind(slice(3, 6), "torque", "deg", _DEGREES, "Nm", "Nm/rad", "about")
+
+
+@dataclass(frozen=True)
+class PoseRun:
+    """One controller on one task of poses: its schedule for the arm, and what pushes in each axis of the tool do."""
+
+    controller: DMPController
+    planned: Schedule
+    schedule: Schedule
+    unpushed: Rollout
+    forces: tuple[Rollout, ...]
+    torques: tuple[Rollout, ...]
+    report: StabilityReport
+
+    def along(self, values: Floats, kind: Kind) -> Floats:
+        """Matrices (n, 6, 6), or vectors (n, 6), in each axis (n, 3) of the tool, in the outputs of a kind."""
+        axes = _axes(self.schedule)
+        if values.ndim == 3:
+            return np.einsum("nia,nij,nja->na", axes, values[:, kind.outputs, kind.outputs], axes)
+        return np.einsum("nia,ni->na", axes, values[:, kind.outputs])
+
+    def moved(self, kind: Kind) -> Floats:
+        """What a push in each axis of the tool moves there (n, 3), against the run without pushes, in units shown."""
+        rollouts = self.forces if kind is FORCES else self.torques
+        moves = [self.along(run.deviation - self.unpushed.deviation, kind)[:, i] for i, run in enumerate(rollouts)]
+        return kind.scale * np.stack(moves, axis=1)
+
+
+def run_poses(
+    controllers: Mapping[str, DMPController],
+    demonstrations: Demonstrations,
+    folder: RunFolder,
+    *,
+    peak: float = 12.0,
+    torque: float = 1.2,
+    rate: float = 1000.0,
+    arm: Arm = "panda",
+) -> str:
+    """Run each controller; writes figures, models, schedules, metrics, reports; returns tables and reports as text."""
+    if demonstrations.n_outputs != 6:
+        raise ConfigError(f"data: a pose has three positions and a rotation, not the outputs {demonstrations.names}.")
+    rows, reports = [], []
+    for name, controller in controllers.items():
+        fitted, _ = fit_once(clone(controller), demonstrations, finished=folder.finished)
+        run = pushed(fitted, rate, peak, torque, arm)
+        rows += [row for kind in (FORCES, TORQUES) for row in push_rows(name, run, kind)]
+        reports.append(f"{name}: a movement of {run.schedule.duration:.3g} s\n{_inertia(run)}\n{run.report}")
+        _write(run, name, demonstrations, folder)
+    folder.write_metrics(rows)
+    folder.write_text("stability.txt", "\n\n".join(reports) + "\n")
+    tables = [
+        format_table([_shown(row, kind) for row in rows if row["push"] == kind.name]) for kind in (FORCES, TORQUES)
+    ]
+    return "\n\n".join([*tables, *reports])
+
+
+def pushed(controller: DMPController, rate: float, peak: float, torque: float, arm: Arm) -> PoseRun:
+    """Plan for the arm, push along and about each axis of the tool, early and late, and certify."""
+    planned = controller.schedule(rate)
+    schedule = with_panda(planned) if arm == "panda" else planned
+    plant = AdmittancePlant(None)
+
+    def run(largest: float, kind: Kind, axis: int) -> Rollout:
+        wrench = _wrench(schedule, largest, kind, axis)
+        return simulate_schedule(schedule, plant, wrench, rate, random_state=0)
+
+    forces, torques = (
+        tuple(run(largest, kind, axis) for axis in range(3)) for largest, kind in ((peak, FORCES), (torque, TORQUES))
+    )
+    report = schedule.resample(min(rate, _CERTIFIED)).certify()
+    return PoseRun(controller, planned, schedule, run(0.0, FORCES, 0), forces, torques, report)
+
+
+def with_panda(schedule: Schedule) -> Schedule:
+    """Schedule with the inertia of a Panda along it, and the damping for that."""
+    from torch_pbd.robots import HOME, inverse_kinematics, operational_inertia, panda  # here: it needs the extra robot
+
+    arm, few = panda(), schedule.resample(_ROWS)
+    joints = inverse_kinematics(arm, few.position, np.asarray(few.orientation), "tool", start=HOME)
+    inertia = few.with_inertia(operational_inertia(arm, joints, "tool")).resample(times=schedule.time)
+    return schedule.with_inertia(np.asarray(inertia.mass))
+
+
+def _axes(schedule: Schedule) -> Floats:
+    """Axes of the tool, the columns of matrices (n, 3, 3)."""
+    return rotations.matrix(np.asarray(schedule.orientation))
+
+
+def damping_ratio(schedule: Schedule, damping: Floats) -> float:
+    """Smallest damping ratio of the modes of ``M e'' + D e' + K e = 0`` over the rows of a schedule."""
+    d, mass = schedule.n_outputs, np.asarray(1.0 if schedule.mass is None else schedule.mass)
+    mass = mass if mass.ndim else mass * np.eye(d)
+    system = np.zeros((len(schedule), 2 * d, 2 * d))
+    system[:, :d, d:] = np.eye(d)
+    system[:, d:] = -np.linalg.solve(mass, np.concatenate([schedule.stiffness, damping], axis=-1))
+    modes = np.linalg.eigvals(system)
+    return float((-modes.real / np.abs(modes)).min())
+
+
+def push_rows(name: str, run: PoseRun, kind: Kind) -> list[dict[str, Any]]:
+    """Rows of the table: what the early and the late push do in each axis of the tool, and stiffness there."""
+    moved, stiffness = np.abs(run.moved(kind)), run.along(run.schedule.stiffness, kind)
+    half = len(run.schedule) // 2
+    early, late = _push_rows(run.schedule)
+    rows = []
+    for axis, letter in enumerate(_TOOL):
+        first, second = float(moved[:half, axis].max()), float(moved[half:, axis].max())
+        row: dict[str, Any] = {"controller": name, "push": kind.name, "axis": f"tool {letter}", "unit": kind.unit}
+        row |= {"early": first, "late": second, "ratio": first / second}
+        rows.append(row | {"K early": float(stiffness[early, axis]), "K late": float(stiffness[late, axis])})
+    return rows
+
+
+def _shown(row: Mapping[str, Any], kind: Kind) -> dict[str, Any]:
+    """Row as it is printed."""
+    units = {"early": kind.unit, "late": kind.unit, "K early": kind.stiffness_unit, "K late": kind.stiffness_unit}
+    names = {key: f"{key} [{unit}]" for key, unit in units.items()} | {"axis": f"{kind.name} {kind.where}"}
+    return {names.get(key, key): value for key, value in row.items() if key not in ("push", "unit")}
+
+
+def _inertia(run: PoseRun) -> str:
+    mass = run.schedule.mass
+    if not isinstance(mass, np.ndarray):
+        return "Inertia: that of the plant, 1 kg and 1 kg m2, is no arm's."
+    blocks = [np.linalg.eigvalsh(mass[:, block, block]) for block in run.schedule.blocks]
+    ranges = [f"{own.min():.2g} to {own.max():.2g} {unit}" for own, unit in zip(blocks, ("kg", "kg m2"), strict=True)]
+    own, other = (damping_ratio(run.schedule, schedule.damping) for schedule in (run.schedule, run.planned))
+    return (
+        f"Inertia of the arm along it: {' and '.join(ranges)}; smallest damping ratio {own:.2f}, and "
+        f"{other:.2f} with a damping made for 1 kg."
+    )
+
+
+def _wrench(schedule: Schedule, largest: float, kind: Kind, axis: int) -> Floats:
+    """Wrenches (n, 6): pulses of a squared sine in an axis that the tool has in their middle."""
+    wrench = np.zeros((len(schedule), 6))
+    for row in _push_rows(schedule):
+        u = np.clip((schedule.time - schedule.time[row]) / (_PUSH_LENGTH * schedule.duration) + 0.5, 0.0, 1.0)
+        wrench[:, kind.outputs] += largest * np.sin(np.pi * u[:, np.newaxis]) ** 2 * _axes(schedule)[row, :, axis]
+    return wrench
+
+
+def _push_rows(schedule: Schedule) -> tuple[int, ...]:
+    """Rows in the middle of pushes."""
+    return tuple(round(centre * (len(schedule) - 1)) for centre in _PUSHES)
+
+
+def _write(run: PoseRun, name: str, demonstrations: Demonstrations, folder: RunFolder) -> None:
+    file = slug(name)
+    folder.write_figure(task_figure(run, demonstrations, name), f"{file}_figure6_task")
+    folder.write_figure(variability_figure(run, demonstrations, name), f"{file}_figure7_variability")
+    folder.write_figure(pushes_figure(run, name), f"{file}_figure8_pushes")
+    folder.write_model(run.controller, f"{file}_controller")
+    target = folder.path / "schedule"
+    target.mkdir(exist_ok=True)
+    run.schedule.save(target / f"{file}.npz")
+    run.schedule.resample(100.0).save(target / f"{file}_100hz.csv")
+
+
+def task_figure(run: PoseRun, demonstrations: Demonstrations, name: str) -> Figure:
+    """Demonstrated paths, the planned one with ellipsoids and frames, and rotations over time: Figure 6."""
+    figure, (space,), bands = pose_panels(3, lambda size: Figure(figsize=size, layout="constrained"))
+    places, _ = demonstrations.to_poses()
+    for k, path in enumerate(places):
+        space.plot(*path.T, color=DATA, lw=0.8, label=None if k else "demonstrations", zorder=1)
+    draw_planned_poses(run.schedule, space)
+    chart = rotations.Chart(np.asarray(demonstrations.rotation_reference))
+    planned = chart.log(np.asarray(run.schedule.orientation))
+    for i, (band, output) in enumerate(zip(bands, demonstrations.names[-3:], strict=True)):
+        for time, position in demonstrations:
+            phase = (time - time[0]) / (time[-1] - time[0])
+            band.plot(run.schedule.duration * phase, _DEGREES * position[:, i - 3], color=DATA, lw=0.8)
+        band.plot(run.schedule.time, _DEGREES * planned[:, i], color=MODEL, lw=1.8)
+        band.set_ylabel(f"{output} [deg]")
+        band.margins(x=0.0)
+    bands[-1].set_xlabel("time [s]")
+    bands[0].set_title(name, fontsize=10)
+    legend_below(figure, [space])
+    return figure
+
+
+def variability_figure(run: PoseRun, demonstrations: Demonstrations, name: str) -> Figure:
+    """Empirical and inferred standard deviations in principal axes, and stiffness there, of both blocks: Figure 7."""
+    figure, grid = figure_grid(2, 2, (9.6, 6.0), sharex=True)
+    phase, covariances = empirical_covariances(demonstrations)
+    for kind, block, column in zip((FORCES, TORQUES), run.schedule.blocks, grid.T, strict=True):
+        spread, gains = column
+        inferred, seen = (
+            kind.scale * np.sqrt(principal(values[:, block, block]))
+            for values in (run.schedule.covariance, covariances)
+        )
+        plot_outputs(run.schedule.time, inferred, spread, [f"inferred, {axis}" for axis in AXES], [MODEL])
+        plot_outputs(run.schedule.duration * phase, seen, spread, [f"empirical, {a}" for a in AXES], [EMPIRICAL])
+        spread.set(ylabel=f"1 sd [{kind.unit}]", ylim=(0.0, None))
+        plot_stiffness(run.schedule, gains, block)
+        gains.set_ylim(0.0, None)
+        for line, axis in zip(gains.lines, AXES, strict=False):
+            line.set_label(f"stiffness, {axis}")
+            line.set_color(SERIES[0])
+    grid[0, 0].set_title(name, fontsize=10)
+    legend_below(figure, grid[:, 0], 3)
+    return figure
+
+
+def empirical_covariances(demonstrations: Demonstrations) -> tuple[Floats, Floats]:
+    """Phases (n,) and covariances (n, 6, 6) of recorded poses there, at their mean, in world axes."""
+    aligned = demonstrations.align(n=_N_STEPS)
+    places, turns = map(np.array, aligned.to_poses())
+    means = np.stack([rotations.mean(turns[:, i]) for i in range(_N_STEPS)])
+    turned = rotations.log(rotations.multiply(turns, rotations.conjugate(means)))
+    deviations = np.concatenate([places - places.mean(axis=0), turned], axis=-1)
+    return aligned.times[0], np.einsum("kni,knj->nij", deviations, deviations) / (len(demonstrations) - 1)
+
+
+def pushes_figure(run: PoseRun, name: str) -> Figure:
+    """Deviation, push and stiffness in each axis of the tool over time, of forces and of torques: Figure 8."""
+    figure, grid = figure_grid(3, 2, (9.6, 6.6), sharex=True)
+    time, labels = run.schedule.time, [f"tool {letter}" for letter in _TOOL]
+    for kind, column in zip((FORCES, TORQUES), grid.T, strict=True):
+        above, middle, below = column
+        plot_outputs(time, run.moved(kind), above, labels)
+        above.set_ylabel(f"moved [{kind.unit}]")
+        rollout = (run.forces if kind is FORCES else run.torques)[0]
+        middle.plot(time, np.linalg.norm(rollout.force, axis=1), LINES[0], color=FORCE, lw=1.5, label="push")
+        middle.set_ylabel(f"{kind.name} [{kind.push_unit}]")
+        plot_outputs(time, run.along(run.schedule.stiffness, kind), below, labels)
+        below.set(xlabel="time [s]", ylabel=f"stiffness [{kind.stiffness_unit}]", ylim=(0.0, None))
+        above.set_title(f"{name}: pushed {kind.where} each axis", fontsize=10)
+    legend_below(figure, grid[:, 0])
+    return figure
