@@ -10,9 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.data.alignment import check_overlap, unit_phases
-from torch_pbd.data.editing import Alignment, Editing
+from torch_pbd.data.editing import Editing
 from torch_pbd.data.poses import as_outputs, frozen, same_reference, unwrapped
 from torch_pbd.data.recordings import Missing, as_recordings, as_time_unit, preview
+from torch_pbd.data.resampling import Alignment
 from torch_pbd.data.units import find_suspects
 from torch_pbd.exceptions import InvalidParameterError
 

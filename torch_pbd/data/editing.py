@@ -1,4 +1,4 @@
-"""What makes other demonstrations of some: joined, resampled, selected, in other units, cut."""
+"""What makes other demonstrations of some: joined, selected, in other units, cut."""
 
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, Self
@@ -7,38 +7,21 @@ import numpy as np
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.data.alignment import interpolate, on_common_phases, times_from_start
 from torch_pbd.data.pauses import extents, still
 from torch_pbd.data.poses import charted, mean_rotation, poses, same_reference, unwrapped, with_whole_rotation
 from torch_pbd.data.recordings import MIN_SAMPLES, as_texts, preview
-from torch_pbd.data.tables import Tables
+from torch_pbd.data.resampling import Resampling
 from torch_pbd.data.units import ANGLES, LENGTHS, TIMES, check_unit, find_suspects
 from torch_pbd.exceptions import InvalidParameterError
-from torch_pbd.files.memory import require_much
 
 if TYPE_CHECKING:
     from torch_pbd.data.description import Description
 
-Alignment = Literal["phase", "dtw"]
 
-MAX_DEFAULT_STEPS = 200
-"""Most points `Demonstrations.align` takes of its own accord: dynamic time warping takes time in their square."""
-
-
-class Editing(Tables):
+class Editing(Resampling):
     """Methods of `torch_pbd.data.Demonstrations`; abstract."""
 
-    times: tuple[Floats, ...]
-    positions: tuple[Floats, ...]
-    names: tuple[str, ...]
-    units: tuple[str, ...] | None
     frame: str | None
-    time_unit: str
-    alignment: Alignment | None
-    rotation_reference: Floats | None
-
-    def _replace(self, times: Any, positions: Any, **changes: Any) -> Self:
-        raise NotImplementedError
 
     def __getitem__(self, index: Any) -> Any:
         raise NotImplementedError
@@ -82,48 +65,6 @@ class Editing(Tables):
             Unit quaternions w x y z; signs go on along time and from one demonstration to the next.
         """
         return poses(self.positions, self.rotation_reference)
-
-    def resample(self, n: int) -> Self:
-        """Each demonstration at ``n`` points evenly spaced over its own time, by linear interpolation.
-
-        Rotations are interpolated in their chart, which between neighbouring samples is the shortest turn to second
-        order in its angle.
-
-        Demonstrations that start and end at the same times are aligned afterwards.
-        """
-        grids = [np.linspace(time[0], time[-1], _checked_n(n)) for time in self.times]
-        return self._replace(grids, list(map(interpolate, self.times, self.positions, grids)))
-
-    def align(self, method: Literal["phase", "dtw"] = "phase", n: int | None = None) -> Self:
-        """All demonstrations on one grid of phases, evenly spaced over 0..1; ``time_unit`` becomes "1".
-
-        Parameters
-        ----------
-        method : {"phase", "dtw"}, default="phase"
-            "phase" is linear time normalization. "dtw" then takes differences of timing out by dynamic time warping
-            (``torch_pbd.data.alignment.dtw_warps``), keeping the ends of each demonstration and the mean timing of all.
-            It also takes for timing what only looks like it: use it where the shape is what matters, and not to predict
-            new demonstrations, in which the timing comes back (measured: 3.7 nats a step worse). It compares positions
-            in their units; outputs whose ``units`` differ in standard deviations of all outputs of one unit.
-        n : int, default=None
-            Number of phases; None takes the median number of samples, at most 200. "dtw" takes time and memory in
-            proportion to its square.
-
-        Returns
-        -------
-        Demonstrations
-            Aligned.
-        """
-        checks.choice(method, "method", Alignment)
-        typical = round(float(np.median(list(map(len, self.times)))))
-        n = _checked_n(min(typical, MAX_DEFAULT_STEPS) if n is None else n)
-        units = self.units
-        if units is None and self.rotation_reference is not None:
-            units = (*[""] * (len(self.names) - 3), *["rad"] * 3)
-        grid, positions = on_common_phases(self.times, self.positions, method, n, units)
-        # Timing that was taken out stays out, whatever is done to the demonstrations afterwards.
-        alignment = "dtw" if "dtw" in (method, self.alignment) else "phase"
-        return self._replace(grid, positions, time_unit="1", alignment=alignment)
 
     def select(self, outputs: str | Sequence[str]) -> Self:
         """These demonstrations with some of the outputs, in the order given; a rotation, all of it, stays last."""
@@ -229,13 +170,6 @@ class Editing(Tables):
         times = [time[span] for time, span in zip(self.times, spans, strict=True)]
         return self._replace(times, [position[span] for position, span in zip(self.positions, spans, strict=True)])
 
-    def from_start(self) -> Self:
-        """These demonstrations with the times of each counted from its start.
-
-        Grids that then differ by no more than their stamps resolve become one, as in ``stack("phase")``.
-        """
-        return self._replace(times_from_start(self.times), self.positions)
-
     def split(self, k: int | Sequence[int]) -> tuple[Self, Self]:
         """Leave demonstrations out: ``(train, test)``, where ``test`` has those numbered ``k``, and ``train`` some."""
         held_out = np.zeros(len(self.times), dtype=bool)
@@ -255,12 +189,6 @@ class Editing(Tables):
         from torch_pbd.data.description import describe
 
         return describe(self)
-
-
-def _checked_n(n: int) -> int:
-    checks.count(n, "n", least=MIN_SAMPLES)
-    require_much(64.0 * n, what=f"n={n} points", remedy="Lower it.")
-    return n
 
 
 def _span(time: Floats, start_end: Any, i: int) -> tuple[int, int]:

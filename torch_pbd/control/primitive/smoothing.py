@@ -5,13 +5,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline, CubicHermiteSpline, make_interp_spline, make_smoothing_spline
+from scipy.interpolate import BSpline, CubicHermiteSpline, make_interp_spline
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.data import Demonstrations
 from torch_pbd.data.alignment import interpolate
 from torch_pbd.data.recordings import preview
+from torch_pbd.data.sampling import KNOWN, LEAST_SAMPLES, LOST, holes_of, smoothing_spline, spacing_of
 
 UNKNOWN = 0.5
 """Type I uncertainty above which nothing is known: ``on_unknown="raise"`` raises."""
@@ -19,15 +20,12 @@ UNKNOWN = 0.5
 # Of the mean spacing: clocks do not jitter by as little, drivers that number repeated stamps do. Bursts of five samples
 # 1e-9 to 1e-6 s apart, differentiated as they are, make a path of 8.7e7 m of recordings that stay within 0.41 m.
 _RESOLUTION = 1e-3
-# A movement is known up to 2.5 spacings from a sample, as in a dropout of three whose neighbours jitter, and no longer
-# at five. Of a finer sampling five count as a 40th of the movement, which is one cycle of the automatic cutoff.
-_KNOWN, _LOST, _FINEST = 2.5, 5.0, 200
 _INTERVALS = 4000  # of a table: 200 in the shortest hole, of 7.5 spacings
 CUTOFF_HZ = 4.0
 """Cutoff of slow movements: hands move below it, and tremor (8 to 12 Hz) and encoders' steps are above."""
 
 _CUTOFF_CYCLES = 40.0  # in a movement, the least cutoff of any: fast ones have detail above 4 Hz
-_LEAST_SAMPLES = {True: 5, False: 3}  # with a cutoff, as the smoothing spline needs, and without one
+_LEAST_SAMPLES = {True: LEAST_SAMPLES, False: 3}  # with a cutoff and without one
 _MOST_BEYOND = 0.1  # of the range of an output in all recordings; paths through holes keep half of it
 
 
@@ -148,19 +146,7 @@ def _through(splines: list[BSpline], times: list[Floats], number: int, edges: Fl
 def _spline(time: Floats, position: Floats, cutoff: float | None) -> BSpline:
     if cutoff is None:
         return make_interp_spline(time, position, k=5 if len(time) > 5 else min(3, len(time) - 1))
-    # Weights by the spacing make the sum an integral: lam = 1 / w^4 then halves the amplitude at w. In units of
-    # the mean spacing and of each output's spread, which keeps the spline's equations well conditioned. A sample
-    # beside a hole stands for no more time than others: it would count as free of noise.
-    between = np.diff(time)
-    between[holes_of(time)] = spacing_of(time)
-    spacing = np.gradient(np.r_[0.0, np.cumsum(between)])
-    unit = spacing.mean()
-    offset = position.mean(axis=0)
-    spread = np.ptp(position, axis=0)
-    scale = np.where(spread > 0.0, spread, 1.0)
-    weight = 1.0 / (2.0 * np.pi * cutoff * unit) ** 4
-    smoothed = make_smoothing_spline(time / unit, (position - offset) / scale, spacing / unit, weight)
-    return BSpline(smoothed.t * unit, smoothed.c * scale + offset, smoothed.k)
+    return smoothing_spline(time, position, cutoff)
 
 
 def automatic_cutoff(duration: float, *, knows_seconds: bool) -> float:
@@ -211,26 +197,11 @@ def _merge(time: Floats, position: Floats) -> tuple[Floats, Floats]:
     return time, position
 
 
-def spacing_of(time: Floats) -> float:
-    """Distance of neighbouring samples: the median of those that a 400th of the recording tells apart.
-
-    Of recordings finer than 200 samples it is a 200th: their shortest hole is then a matter of the movement.
-    """
-    lasting = time[-1] - time[0]
-    _, first = np.unique(np.floor(2 * _FINEST * ((time - time[0]) / lasting)), return_index=True)
-    return max(float(np.median(np.diff(time[first]))), lasting / _FINEST)
-
-
-def holes_of(time: Floats) -> NDArray[np.intp]:
-    """Indices (m,) of the samples before a hole: 7.5 spacings or more, whose middle is unknown."""
-    return np.flatnonzero(np.diff(time) > (_KNOWN + _LOST) * spacing_of(time))
-
-
 def unsampled(time: Floats, at: Floats) -> Floats:
     """Type I uncertainty (m,) of one recording at times (m,) within it: 0 near its samples, 1 far from them."""
     after = np.clip(np.searchsorted(time, at), 1, len(time) - 1)
     distance = np.minimum(np.abs(at - time[after - 1]), np.abs(time[after] - at))
-    share = np.clip((distance / spacing_of(time) - _KNOWN) / (_LOST - _KNOWN), 0.0, 1.0)
+    share = np.clip((distance / spacing_of(time) - KNOWN) / (LOST - KNOWN), 0.0, 1.0)
     # A smooth step, so that stiffness has no corner where knowledge ends.
     return np.asarray(share**2 * (3.0 - 2.0 * share))
 
