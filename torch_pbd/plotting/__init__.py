@@ -19,6 +19,7 @@ from torch_pbd.plotting.poses import (
     pose_panels,
     principal,
 )
+from torch_pbd.plotting.rerun import to_rerun
 from torch_pbd.plotting.style import (
     DATA,
     EMPIRICAL,
@@ -75,4 +76,5 @@ __all__ = [
     "readable_unit",
     "schedule_names",
     "short_unit",
+    "to_rerun",
 ]

@@ -1,0 +1,194 @@
+"""Recordings, what was learned of them, schedules and runs as a file for the viewer of Rerun."""
+
+import os
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from torch_pbd import checks
+from torch_pbd.checks import Floats
+from torch_pbd.exceptions import InvalidParameterError
+from torch_pbd.plotting.style import DATA, FORCE, MODEL, OTHER, ROBOT, schedule_names
+
+_N_ELLIPSOIDS = 21
+_FLAT = 1e-3  # of an ellipse's longer half axis: its third one, in a plane
+_N_STD = 2.0
+
+
+def to_rerun(
+    path: str | os.PathLike[str],
+    *,
+    demonstrations: Any = None,
+    display: Any = None,
+    schedule: Any = None,
+    rollout: Any = None,
+) -> None:
+    """Write a file that the viewer of Rerun (https://rerun.io) opens: ``rerun FILE.rrd``.
+
+    Outputs over time are curves, and of two or three outputs or a pose, paths are lines in space, covariances
+    ellipsoids of two standard deviations, tools frames that move with time. What is in m, or without units, shares one
+    space; recordings in other units have their own.
+
+    Parameters
+    ----------
+    path : path-like
+        Ends with .rrd; replaces a file that is there.
+    demonstrations : Demonstrations, default=None
+    display : MovementDisplay, default=None
+        What models learned of a movement: its mean, and bands.
+    schedule : Schedule, default=None
+        With the eigenvalues of its stiffness, block by block.
+    rollout : Rollout, default=None
+        A single run, as ``simulate`` of a controller returns it.
+
+    Raises
+    ------
+    ValueError
+        If nothing is given to write, or the path ends with something else.
+    ImportError
+        If rerun-sdk is not installed: ``pip install 'torch_pbd[rerun]'``.
+    """
+    if not os.fspath(path).endswith(".rrd"):
+        raise checks.refusal(os.fspath(path), "path", "a file that ends with .rrd")
+    if demonstrations is None and display is None and schedule is None and rollout is None:
+        raise InvalidParameterError("there is nothing to write: give demonstrations, display, schedule or rollout.")
+    try:
+        import rerun
+    except ImportError as error:
+        raise ImportError(
+            "to_rerun needs rerun-sdk, which is not installed: pip install 'torch_pbd[rerun]'."
+        ) from error
+    stream = rerun.RecordingStream("torch_pbd")
+    stream.save(os.fspath(path))
+    writer = _Writer(rerun, stream)
+    if demonstrations is not None:
+        writer.write_demonstrations(demonstrations)
+    if display is not None:
+        writer.write_laws(display)
+    if schedule is not None:
+        writer.write_schedule(schedule)
+    if rollout is not None:
+        writer.write_rollout(rollout, None if schedule is None else schedule_names(schedule))
+    stream.disconnect()  # the file is complete then
+
+
+class _Writer:
+    """Entities of a stream: ``space`` or the like for paths, ``outputs``, ``stiffness``, ``force`` for curves."""
+
+    def __init__(self, rerun: Any, stream: Any) -> None:
+        self._rerun, self._stream = rerun, stream
+
+    def write_demonstrations(self, demonstrations: Any) -> None:
+        for k, (time, position) in enumerate(_in_seconds(demonstrations)):
+            self._path(f"{_space(demonstrations)}/demonstrations/{k}", position[:, : _n_space(demonstrations)], DATA)
+            self._curves("outputs", f"demonstration {k}", time, position, demonstrations.names, DATA)
+
+    def write_laws(self, display: Any) -> None:
+        demonstrations, n_space = display.demonstrations, _n_space(display.demonstrations)
+        # Seconds of the grid's unit, by the demonstrations: both go from their first sample to their last.
+        time = display.grid
+        if display.input == "time":
+            own, seconds = demonstrations.times[0], next(iter(_in_seconds(demonstrations)))[0]
+            time = time * (np.ptp(seconds) / np.ptp(own))
+        for (name, (mean, covariance)), color in zip(display.laws.items(), (MODEL, OTHER), strict=False):
+            self._path(f"{_space(demonstrations)}/{name}", mean[:, :n_space], color)
+            self._ellipsoids(f"{_space(demonstrations)}/{name}/covariance", mean, covariance, n_space, color)
+            std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+            for label, shift in (("", 0.0), (" +2 sd", _N_STD), (" -2 sd", -_N_STD)):
+                self._curves("outputs", f"{name}{label}", time, mean + shift * std, demonstrations.names, color)
+
+    def write_schedule(self, schedule: Any) -> None:
+        p = schedule.position.shape[1]
+        n_space = p if p in (2, 3) and schedule.units in (None, "m") else 0
+        self._path("space/schedule", schedule.position[:, :n_space], MODEL)
+        if schedule.covariance_of == "position":
+            self._ellipsoids("space/schedule/covariance", schedule.position, schedule.covariance, n_space, MODEL)
+        self._curves("outputs", "schedule", schedule.time, schedule.position, schedule_names(schedule)[:p], MODEL)
+        if n_space == 3:
+            self._frames("space/schedule/tool", schedule.time, schedule.position, schedule.orientation)
+        for block, kind in zip(schedule.blocks, ("positions", "rotation"), strict=False):
+            eigenvalues = np.linalg.eigvalsh(schedule.stiffness[:, block, block])
+            axes = [f"axis {i}" for i in range(eigenvalues.shape[1])]
+            self._curves(f"stiffness/{kind}", "", schedule.time, eigenvalues, axes, MODEL)
+
+    def write_rollout(self, rollout: Any, names: Sequence[str] | None) -> None:
+        if np.ndim(rollout.position) != 2:
+            raise InvalidParameterError(f"rollout is {rollout!r}, must be a single run: take one of the batch.")
+        run, p = rollout.numpy(), rollout.position.shape[1]
+        names = names or [f"y{i}" for i in range(run.velocity.shape[1])]
+        n_space = p if p in (2, 3) else 0
+        self._path("space/run", run.position[:, :n_space], ROBOT)
+        if n_space == 3:
+            self._frames("space/run/tool", run.time, run.position, getattr(run, "orientation", None))
+        self._curves("outputs", "run", run.time, run.position, names[:p], ROBOT)
+        self._curves("force", "", run.time, run.force, names, FORCE)
+
+    def _path(self, entity: str, position: Floats, color: str) -> None:
+        if position.shape[1]:
+            line = self._rerun.LineStrips3D([_in_space(position)], colors=[_rgb(color)])
+            self._stream.log(entity, line, static=True)
+
+    def _ellipsoids(self, entity: str, mean: Floats, covariance: Floats, n_space: int, color: str) -> None:
+        if not n_space:
+            return
+        rows = np.linspace(0, len(mean) - 1, min(_N_ELLIPSOIDS, len(mean))).round().astype(int)
+        variances, axes = np.linalg.eigh(covariance[rows, :n_space, :n_space])
+        half, turned = _N_STD * np.sqrt(variances.clip(0.0)), np.tile(np.eye(3), (len(rows), 1, 1))
+        turned[:, :n_space, :n_space] = axes * np.sign(np.linalg.det(axes))[:, np.newaxis, np.newaxis] ** n_space
+        if n_space == 2:
+            turned[:, :, 0] *= np.linalg.det(turned)[:, np.newaxis]
+            half = np.column_stack([half, _FLAT * half.max(axis=1)])
+        from scipy.spatial.transform import Rotation
+
+        ellipsoids = self._rerun.Ellipsoids3D(
+            centers=_in_space(mean[rows, :n_space]),
+            half_sizes=half,
+            quaternions=Rotation.from_matrix(turned).as_quat(),  # x y z w, as Rerun has them
+            colors=[_rgb(color)],
+        )
+        self._stream.log(entity, ellipsoids, static=True)
+
+    def _frames(self, entity: str, time: Floats, position: Floats, orientation: Floats | None) -> None:
+        if orientation is None:
+            return
+        transform = self._rerun.Transform3D
+        columns = transform.columns(translation=position, quaternion=orientation[:, [1, 2, 3, 0]])
+        self._stream.send_columns(entity, indexes=[self._index(time)], columns=columns)
+        extent = float(np.linalg.norm(np.ptp(position, axis=0)))
+        self._stream.log(entity, self._rerun.TransformAxes3D(axis_length=0.1 * (extent or 1.0)), static=True)
+
+    def _curves(self, root: str, label: str, time: Floats, values: Floats, names: Sequence[str], color: str) -> None:
+        for name, column in zip(names, np.transpose(values), strict=True):
+            entity = self._rerun.new_entity_path([part for part in (*root.split("/"), name, label) if part])
+            self._stream.log(entity, self._rerun.SeriesLines(colors=[_rgb(color)], names=[label or name]), static=True)
+            columns = self._rerun.Scalars.columns(scalars=column)
+            self._stream.send_columns(entity, indexes=[self._index(time)], columns=columns)
+
+    def _index(self, time: Floats) -> Any:
+        return self._rerun.TimeColumn("time", duration=np.asarray(time))
+
+
+def _in_seconds(demonstrations: Any) -> Iterator[Any]:
+    """Demonstrations in s, or in phase where they are."""
+    return iter(demonstrations if demonstrations.time_unit == "1" else demonstrations.in_units(time_unit="s"))
+
+
+def _n_space(demonstrations: Any) -> int:
+    """Outputs that are coordinates of a point: two or three of a length, all but a rotation."""
+    n = demonstrations.n_outputs - 3 * (demonstrations.rotation_reference is not None)
+    units = set((demonstrations.units or ())[:n])
+    return n if n in (2, 3) and len(units) < 2 and not units & {"rad", "deg"} else 0
+
+
+def _space(demonstrations: Any) -> str:
+    unit = (demonstrations.units or ("m",))[0]
+    return "space" if unit == "m" else f"space in {unit}"
+
+
+def _in_space(position: Floats) -> Floats:
+    return np.pad(position, ((0, 0), (0, 3 - position.shape[1])))
+
+
+def _rgb(color: str) -> list[int]:
+    return [int(color[i : i + 2], 16) for i in (1, 3, 5)]
