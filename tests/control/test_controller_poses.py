@@ -292,14 +292,18 @@ def test_laws_and_masses_of_other_outputs_are_refused():
 def test_joints_are_followed_in_radians_whatever_they_were_recorded_in():
     made = poses()
     law = StiffnessLaw([10.0, 20.0], [100.0, 200.0])
-    found = []
-    for unit, scale in (("rad", 1.0), ("deg", np.rad2deg(1.0))):
-        joints = Demonstrations(made.times, [scale * p[:, :2] for p in made.positions], names=["j1", "j2"], units=unit)
-        found.append(fitted(joints, stiffness_law=law).schedule(20.0))
+    shown = [
+        Demonstrations(made.times, [scale * p[:, :2] for p in made.positions], names=["j1", "j2"], units=unit)
+        for unit, scale in (("rad", 1.0), ("deg", np.rad2deg(1.0)))
+    ]
+    found = [fitted(joints, stiffness_law=law).schedule(20.0) for joints in shown]
     np.testing.assert_allclose(found[0].stiffness, found[1].stiffness, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(found[0].covariance, found[1].covariance, rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(found[0].position, found[1].position, rtol=1e-9, atol=1e-9)
     assert {schedule.units for schedule in found} == {"rad"}
     assert "N/m" not in repr(found[1])
+    by_effort = StiffnessLaw([10.0, 20.0], [100.0, 200.0], kind="precision", effort=0.01)
+    efforts = [fitted(joints, stiffness_law=by_effort).law_.effort for joints in shown]
+    np.testing.assert_allclose(efforts, [[0.01, 0.01], [0.01 * np.deg2rad(1.0) ** 2] * 2], rtol=1e-12)
     assert np.abs(found[0].stiffness[:, 0, 1]).max() == 0.0
     assert found[0].stiffness_limits == ((10.0, 20.0), (100.0, 200.0))

@@ -142,9 +142,9 @@ def fit_law(controller: Any, varying: Floats) -> StiffnessLaw:
     law = _chosen(controller.stiffness_law, outputs)
     if law.kind == "precision" and law.effort != "match":
         # The effort is in kg/N^2, the covariance in units of the recordings.
-        efforts = np.ones(len(outputs.blocks)) * law.effort
-        efforts[0] *= in_si(outputs.units(controller.units_)) ** 2
-        law = replace(law, effort=tuple(efforts.tolist()))
+        units = outputs.scales(in_si(outputs.units(controller.units_)))
+        units = units[[block.outputs.start for block in law.blocks(len(units))]]
+        law = replace(law, effort=(units**2 * law.effort).tolist())
     learned = controller.covariance_.predict_cov(reproduction.phase(time))
     covariance = at_pose(outputs, law, learned, reproduction.motion(time)[0])
     resolution = (RESOLUTION * outputs.extents(varying)).tolist()
