@@ -179,7 +179,8 @@ def shaped_as_y(mean: Floats, covariance: Floats, *, y_is_1d: bool, return_cov: 
     mean = mean.ravel() if y_is_1d else mean
     if return_cov:
         return mean, covariance
-    std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    # Of an output that is known the variance is zero but for rounding, which may be below.
+    std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).clip(0.0))
     return mean, std.ravel() if y_is_1d else std
 
 
