@@ -10,8 +10,8 @@ from torch_pbd.control import RotationLimits, Schedule, StiffnessLaw
 from torch_pbd.data import make_pose_demonstrations, pose_covariance, pose_mean
 from torch_pbd.exceptions import ConfigError
 from torch_pbd.experiments.poses import (
-    FORCES,
-    TORQUES,
+    POSITION,
+    ROTATION,
     damping_ratio,
     empirical_covariances,
     push_rows,
@@ -67,8 +67,8 @@ def test_the_table_has_what_the_runs_show(run):
     turns = Rotation.from_quat(run.schedule.orientation, scalar_first=True).as_matrix()
     half, late = len(turns) // 2, round(0.8 * (len(turns) - 1))
     for kind, rollouts, block, scale in (
-        (FORCES, run.forces, slice(3), 1e3),
-        (TORQUES, run.torques, slice(3, 6), 180 / np.pi),
+        (POSITION, run.forces, slice(3), 1e3),
+        (ROTATION, run.torques, slice(3, 6), 180 / np.pi),
     ):
         for axis, row in enumerate(push_rows("mine", run, kind)):
             own = turns[:, :, axis]
@@ -79,7 +79,7 @@ def test_the_table_has_what_the_runs_show(run):
             assert row["K late"] == pytest.approx(stiffness, rel=1e-12)
             assert row["axis"] == f"tool {'xyz'[axis]}"
     # A peg in its hole may turn about its axis, and not about the others.
-    about = [row["late"] for row in push_rows("mine", run, TORQUES)]
+    about = [row["late"] for row in push_rows("mine", run, ROTATION)]
     assert about[2] > 2.0 * max(about[:2])
 
 
@@ -120,7 +120,7 @@ def test_a_run_leaves_its_tables_figures_schedules_and_models(controller, record
     assert "a b         tool z" in text
     assert "1 kg and 1 kg m2, is no arm's" in text
     assert {path.name for path in (tmp_path / "figures").iterdir()} == {
-        "a_b_figure6_task.png", "a_b_figure7_variability.png", "a_b_figure8_pushes.png",
+        "figure6_task.png", "a_b_figure7_variability.png", "a_b_figure8_pushes.png",
     }  # fmt: skip
     assert Schedule.load(tmp_path / "schedule" / "a_b.npz").orientation.shape[1] == 4
     assert (tmp_path / "model" / "a_b_controller.safetensors").is_file()

@@ -21,18 +21,17 @@ from torch_pbd.exceptions import ConfigError
 from torch_pbd.experiments.resume import fit_once
 from torch_pbd.experiments.run_folder import RunFolder, format_table, slug
 from torch_pbd.plotting import (
-    AXES,
     DATA,
     EMPIRICAL,
     FORCE,
-    LINES,
-    MODEL,
-    SERIES,
-    draw_planned_poses,
+    POSITION,
+    ROTATION,
+    Kind,
+    draw_pose_schedule,
+    draw_recorded_poses,
     figure_grid,
     legend_below,
     plot_outputs,
-    plot_stiffness,
     pose_panels,
     principal,
 )
@@ -45,24 +44,6 @@ _TOOL = "xyz"
 _ROWS = 50.0  # Hz; along a path the inertia of an arm changes with its joints, within seconds
 _CERTIFIED = 200.0  # Hz of the rows that are certified
 _N_STEPS = 101
-_DEGREES = 180.0 / np.pi
-
-
-@dataclass(frozen=True)
-class Kind:
-    """Pushes by force, or by torque: outputs, unit of what they do, and words."""
-
-    outputs: slice
-    name: str
-    unit: str
-    scale: float
-    push_unit: str
-    stiffness_unit: str
-    where: str
-
-
-FORCES = Kind(slice(0, 3), "force", "mm", 1e3, "N", "N/m", "along")
-TORQUES = Kind(slice(3, 6), "torque", "deg", _DEGREES, "Nm", "Nm/rad", "about")
 
 
 @dataclass(frozen=True)
@@ -86,7 +67,7 @@ class PoseRun:
 
     def moved(self, kind: Kind) -> Floats:
         """What a push in each axis of the tool moves there (n, 3), against the run without pushes, in units shown."""
-        rollouts = self.forces if kind is FORCES else self.torques
+        rollouts = self.forces if kind is POSITION else self.torques
         moves = [self.along(run.deviation - self.unpushed.deviation, kind)[:, i] for i, run in enumerate(rollouts)]
         return kind.scale * np.stack(moves, axis=1)
 
@@ -104,17 +85,18 @@ def run_poses(
     """Run each controller; writes figures, models, schedules, metrics, reports; returns tables and reports as text."""
     if demonstrations.n_outputs != 6:
         raise ConfigError(f"data: a pose has three positions and a rotation, not the outputs {demonstrations.names}.")
+    folder.write_figure(task_figure(demonstrations), "figure6_task")
     rows, reports = [], []
     for name, controller in controllers.items():
         fitted, _ = fit_once(clone(controller), demonstrations, finished=folder.finished)
         run = pushed(fitted, rate, peak, torque, arm)
-        rows += [row for kind in (FORCES, TORQUES) for row in push_rows(name, run, kind)]
+        rows += [row for kind in (POSITION, ROTATION) for row in push_rows(name, run, kind)]
         reports.append(f"{name}: a movement of {run.schedule.duration:.3g} s\n{_inertia(run)}\n{run.report}")
         _write(run, name, demonstrations, folder)
     folder.write_metrics(rows)
     folder.write_text("stability.txt", "\n\n".join(reports) + "\n")
     tables = [
-        format_table([_shown(row, kind) for row in rows if row["push"] == kind.name]) for kind in (FORCES, TORQUES)
+        format_table([_shown(row, kind) for row in rows if row["push"] == kind.push]) for kind in (POSITION, ROTATION)
     ]
     return "\n\n".join([*tables, *reports])
 
@@ -130,10 +112,10 @@ def pushed(controller: DMPController, rate: float, peak: float, torque: float, a
         return simulate_schedule(schedule, plant, wrench, rate, random_state=0)
 
     forces, torques = (
-        tuple(run(largest, kind, axis) for axis in range(3)) for largest, kind in ((peak, FORCES), (torque, TORQUES))
+        tuple(run(largest, kind, axis) for axis in range(3)) for largest, kind in ((peak, POSITION), (torque, ROTATION))
     )
     report = schedule.resample(min(rate, _CERTIFIED)).certify()
-    return PoseRun(controller, planned, schedule, run(0.0, FORCES, 0), forces, torques, report)
+    return PoseRun(controller, planned, schedule, run(0.0, POSITION, 0), forces, torques, report)
 
 
 def with_panda(schedule: Schedule) -> Schedule:
@@ -170,7 +152,7 @@ def push_rows(name: str, run: PoseRun, kind: Kind) -> list[dict[str, Any]]:
     rows = []
     for axis, letter in enumerate(_TOOL):
         first, second = float(moved[:half, axis].max()), float(moved[half:, axis].max())
-        row: dict[str, Any] = {"controller": name, "push": kind.name, "axis": f"tool {letter}", "unit": kind.unit}
+        row: dict[str, Any] = {"controller": name, "push": kind.push, "axis": f"tool {letter}", "unit": kind.unit}
         row |= {"early": first, "late": second, "ratio": first / second}
         rows.append(row | {"K early": float(stiffness[early, axis]), "K late": float(stiffness[late, axis])})
     return rows
@@ -179,7 +161,7 @@ def push_rows(name: str, run: PoseRun, kind: Kind) -> list[dict[str, Any]]:
 def _shown(row: Mapping[str, Any], kind: Kind) -> dict[str, Any]:
     """Row as it is printed."""
     units = {"early": kind.unit, "late": kind.unit, "K early": kind.stiffness_unit, "K late": kind.stiffness_unit}
-    names = {key: f"{key} [{unit}]" for key, unit in units.items()} | {"axis": f"{kind.name} {kind.where}"}
+    names = {key: f"{key} [{unit}]" for key, unit in units.items()} | {"axis": f"{kind.push} {kind.where}"}
     return {names.get(key, key): value for key, value in row.items() if key not in ("push", "unit")}
 
 
@@ -212,8 +194,7 @@ def _push_rows(schedule: Schedule) -> tuple[int, ...]:
 
 def _write(run: PoseRun, name: str, demonstrations: Demonstrations, folder: RunFolder) -> None:
     file = slug(name)
-    folder.write_figure(task_figure(run, demonstrations, name), f"{file}_figure6_task")
-    folder.write_figure(variability_figure(run, demonstrations, name), f"{file}_figure7_variability")
+    folder.write_figure(schedule_figure(run, demonstrations, name), f"{file}_figure7_variability")
     folder.write_figure(pushes_figure(run, name), f"{file}_figure8_pushes")
     folder.write_model(run.controller, f"{file}_controller")
     target = folder.path / "schedule"
@@ -222,48 +203,26 @@ def _write(run: PoseRun, name: str, demonstrations: Demonstrations, folder: RunF
     run.schedule.resample(100.0).save(target / f"{file}_100hz.csv")
 
 
-def task_figure(run: PoseRun, demonstrations: Demonstrations, name: str) -> Figure:
-    """Demonstrated paths, the planned one with ellipsoids and frames, and rotations over time: Figure 6."""
-    figure, (space,), bands = pose_panels(3, lambda size: Figure(figsize=size, layout="constrained"))
-    places, _ = demonstrations.to_poses()
-    for k, path in enumerate(places):
-        space.plot(*path.T, color=DATA, lw=0.8, label=None if k else "demonstrations", zorder=1)
-    draw_planned_poses(run.schedule, space)
-    chart = rotations.Chart(np.asarray(demonstrations.rotation_reference))
-    planned = chart.log(np.asarray(run.schedule.orientation))
-    for i, (band, output) in enumerate(zip(bands, demonstrations.names[-3:], strict=True)):
-        for time, position in demonstrations:
-            phase = (time - time[0]) / (time[-1] - time[0])
-            band.plot(run.schedule.duration * phase, _DEGREES * position[:, i - 3], color=DATA, lw=0.8)
-        band.plot(run.schedule.time, _DEGREES * planned[:, i], color=MODEL, lw=1.8)
-        band.set_ylabel(f"{output} [deg]")
-        band.margins(x=0.0)
-    bands[-1].set_xlabel("time [s]")
-    bands[0].set_title(name, fontsize=10)
-    legend_below(figure, [space])
+def task_figure(demonstrations: Demonstrations) -> Figure:
+    """Demonstrated paths with frames of the tool, and rotations over time: Figure 6."""
+    figure, space, bands = pose_panels(3, _figure)
+    draw_recorded_poses(demonstrations, space[0], bands)
+    legend_below(figure, space)
     return figure
 
 
-def variability_figure(run: PoseRun, demonstrations: Demonstrations, name: str) -> Figure:
-    """Empirical and inferred standard deviations in principal axes, and stiffness there, of both blocks: Figure 7."""
-    figure, grid = figure_grid(2, 2, (9.6, 6.0), sharex=True)
+def schedule_figure(run: PoseRun, demonstrations: Demonstrations, name: str) -> Figure:
+    """Planned path, deviations and empirical ones in principal axes, and stiffness there, of both blocks: Figure 7."""
+    figure, (space,), bands = pose_panels(4, _figure)
+    for path in demonstrations.to_poses()[0]:
+        space.plot(*path.T, color=DATA, lw=0.8)
+    draw_pose_schedule(run.schedule, space, bands)
     phase, covariances = empirical_covariances(demonstrations)
-    for kind, block, column in zip((FORCES, TORQUES), run.schedule.blocks, grid.T, strict=True):
-        spread, gains = column
-        inferred, seen = (
-            kind.scale * np.sqrt(principal(values[:, block, block]))
-            for values in (run.schedule.covariance, covariances)
-        )
-        plot_outputs(run.schedule.time, inferred, spread, [f"inferred, {axis}" for axis in AXES], [MODEL])
-        plot_outputs(run.schedule.duration * phase, seen, spread, [f"empirical, {a}" for a in AXES], [EMPIRICAL])
-        spread.set(ylabel=f"1 sd [{kind.unit}]", ylim=(0.0, None))
-        plot_stiffness(run.schedule, gains, block)
-        gains.set_ylim(0.0, None)
-        for line, axis in zip(gains.lines, AXES, strict=False):
-            line.set_label(f"stiffness, {axis}")
-            line.set_color(SERIES[0])
-    grid[0, 0].set_title(name, fontsize=10)
-    legend_below(figure, grid[:, 0], 3)
+    for kind, band in zip((POSITION, ROTATION), bands, strict=False):
+        deviation = kind.scale * np.sqrt(principal(covariances[:, kind.outputs, kind.outputs]))
+        plot_outputs(run.schedule.duration * phase, deviation, band, ["empirical", "_", "_"], [EMPIRICAL])
+    bands[0].set_title(name, fontsize=10)
+    legend_below(figure, [space, *bands])
     return figure
 
 
@@ -277,17 +236,21 @@ def empirical_covariances(demonstrations: Demonstrations) -> tuple[Floats, Float
     return aligned.times[0], np.einsum("kni,knj->nij", deviations, deviations) / (len(demonstrations) - 1)
 
 
+def _figure(size: tuple[float, float]) -> Figure:
+    return Figure(figsize=size, layout="constrained")
+
+
 def pushes_figure(run: PoseRun, name: str) -> Figure:
     """Deviation, push and stiffness in each axis of the tool over time, of forces and of torques: Figure 8."""
     figure, grid = figure_grid(3, 2, (9.6, 6.6), sharex=True)
     time, labels = run.schedule.time, [f"tool {letter}" for letter in _TOOL]
-    for kind, column in zip((FORCES, TORQUES), grid.T, strict=True):
+    for kind, column in zip((POSITION, ROTATION), grid.T, strict=True):
         above, middle, below = column
         plot_outputs(time, run.moved(kind), above, labels)
         above.set_ylabel(f"moved [{kind.unit}]")
-        rollout = (run.forces if kind is FORCES else run.torques)[0]
-        middle.plot(time, np.linalg.norm(rollout.force, axis=1), LINES[0], color=FORCE, lw=1.5, label="push")
-        middle.set_ylabel(f"{kind.name} [{kind.push_unit}]")
+        rollout = (run.forces if kind is POSITION else run.torques)[0]
+        middle.plot(time, np.linalg.norm(rollout.force, axis=1), color=FORCE, lw=1.5, label="push")
+        middle.set_ylabel(f"{kind.push} [{kind.push_unit}]")
         plot_outputs(time, run.along(run.schedule.stiffness, kind), below, labels)
         below.set(xlabel="time [s]", ylabel=f"stiffness [{kind.stiffness_unit}]", ylim=(0.0, None))
         above.set_title(f"{name}: pushed {kind.where} each axis", fontsize=10)

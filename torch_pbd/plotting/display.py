@@ -18,7 +18,7 @@ from torch_pbd.plotting.parts import (
     plot_std_band,
     plot_stiffness,
 )
-from torch_pbd.plotting.poses import AXES, draw_planned_poses, draw_recorded_poses, pose_panels, principal
+from torch_pbd.plotting.poses import draw_pose_schedule, draw_poses, draw_recorded_poses
 from torch_pbd.plotting.style import (
     MODEL,
     OTHER,
@@ -144,7 +144,7 @@ class MovementDisplay:
         """
         models = [model for model in (estimator, other) if model is not None]
         for model in models:
-            if not hasattr(model, "predict_cov"):
+            if not (hasattr(model, "predict_cov") and hasattr(model, "log_likelihood")):
                 remedy = "of a controller take its covariance_"
                 raise checks.refusal(model, "estimator", "a covariance regressor or model of movements", remedy)
         names = names or [type(model).__name__ for model in models]
@@ -222,11 +222,7 @@ def plot_movements(demonstrations: Any, outputs: Sequence[int | str] | None = No
     """Draw demonstrations: what `Demonstrations.plot` does."""
     shown = chosen_outputs(outputs, demonstrations.names, _MOST)
     if outputs is None and ax is None and demonstrations.rotation_reference is not None and len(shown) == 6:
-        pose_figure, space, turns = pose_panels(3)
-        draw_recorded_poses(demonstrations, space[0], turns)
-        turns[-1].set_xlabel(time_label(demonstrations.time_unit))
-        legend_below(pose_figure, space)
-        return [*space, *turns]
+        return draw_poses(demonstrations, draw_recorded_poses, 3)
     in_space = len(shown) in (2, 3)
     figure: Figure | None = None
     axes: list[Any] = [ax]
@@ -248,7 +244,7 @@ def plot_movements(demonstrations: Any, outputs: Sequence[int | str] | None = No
 def plot_schedule(schedule: Any) -> list[Axes]:
     """Draw a schedule: what `Schedule.plot` does."""
     if schedule.orientation is not None and schedule.position.shape[1] == 3:
-        return _plot_poses(schedule)
+        return draw_poses(schedule, draw_pose_schedule, 4)
     figure, plane, bands = _panels(3 - (schedule.n_outputs == 2), n_space=2 if schedule.n_outputs == 2 else 0)
     names, (unit, scale) = schedule_names(schedule), readable_unit(schedule.units)
     position = [f"{name} [{short_unit(schedule.units)}]" for name in names]
@@ -272,31 +268,11 @@ def plot_schedule(schedule: Any) -> list[Axes]:
     return [*plane, *bands]
 
 
-def _plot_poses(schedule: Any) -> list[Axes]:
-    figure, space, bands = pose_panels(4)
-    draw_planned_poses(schedule, space[0])
-    for block, spread, gains in zip(schedule.blocks, bands[:2], bands[2:], strict=True):
-        unit, scale = readable_unit(schedule.units) if block.start == 0 else ("deg", 180.0 / np.pi)
-        deviation = scale * np.sqrt(principal(schedule.covariance[:, block, block]))
-        plot_outputs(schedule.time, deviation, spread, AXES, [MODEL])
-        spread.set(ylabel=f"1 sd [{unit}]", ylim=(0.0, None))
-        plot_stiffness(schedule, gains, block)
-        gains.set_ylim(0.0, None)
-    for band in bands[:-1]:
-        band.set_xlabel("")
-    legend_below(figure, [*space, *bands])
-    return [*space, *bands]
-
-
 def plot_pushes(rollout: Any, unpushed: Any = None, names: Sequence[str] | None = None) -> list[Axes]:
     """Draw a simulated run: what `Rollout.plot` does."""
-    n_columns = 1 + (rollout.velocity.shape[-1] > rollout.position.shape[-1])
-    figure = shown_figure((6.4 if n_columns == 1 else 11.0, 6.6))
-    axes = [
-        figure.add_subplot(3, n_columns, 1 + row * n_columns + column)
-        for column in range(n_columns)
-        for row in range(3)
-    ]
+    n = 1 + (rollout.velocity.shape[-1] > rollout.position.shape[-1])
+    figure = shown_figure((6.4 if n == 1 else 11.0, 6.6))
+    axes = [figure.add_subplot(3, n, 1 + i % 3 * n + i // 3) for i in range(3 * n)]
     plot_rollout(rollout.numpy(), axes, names=names, unpushed=None if unpushed is None else unpushed.numpy())
     for i, ax in enumerate(axes):
         ax.tick_params(labelbottom=i % 3 == 2)

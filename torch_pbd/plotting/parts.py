@@ -1,7 +1,7 @@
 """Parts of figures; each function takes data and the Axes to draw into."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,19 +11,23 @@ from numpy.typing import ArrayLike
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.plotting.poses import AXES, POSE_NAMES, principal
 from torch_pbd.plotting.style import (
+    AXES,
     DATA,
     EMPIRICAL,
     FORCE,
     LINES,
     MODEL,
+    POSE_NAMES,
+    ROTATION,
     SERIES,
     TRUTH,
+    Kind,
     check_axes,
     check_kind,
     chosen_outputs,
     output_label,
+    principal,
     readable_unit,
     schedule_names,
     short_unit,
@@ -211,7 +215,7 @@ def plot_stiffness(schedule: Any, ax: Axes, block: slice | None = None) -> list[
     limits = [np.broadcast_to(limit, schedule.n_outputs)[block] for limit in schedule.stiffness_limits or ()]
     for i, limit in enumerate(np.unique(limits)):
         ax.axhline(limit, color=DATA, lw=0.8, ls=":", label=None if i else "limits of the stiffness")
-    unit = "Nm/rad" if block.start else f"N/{short_unit(schedule.units)}"
+    unit = ROTATION.stiffness_unit if block.start else f"N/{short_unit(schedule.units)}"
     ax.set(xlabel="time [s]", ylabel=f"stiffness [{unit}]")
     return lines
 
@@ -250,27 +254,16 @@ def plot_rollout(
     check_axes("axes", axes, 3 if p == d else 6)
     names = names or (POSE_NAMES if d == p + 3 == 6 else [f"y{i}" for i in range(d)])
     chosen, stiffness_unit = chosen_outputs(outputs, names, 6), f"N/{short_unit(unit)}"
-    kinds = [_Kind("along", "force", "N", *readable_unit(unit), stiffness_unit)]
-    kinds += [_Kind("about", "torque", "Nm", "deg", 180.0 / np.pi, "Nm/rad")] if d > p else []
+    kinds = [Kind(slice(p), "along", "force", "N", *readable_unit(unit), stiffness_unit)]
+    kinds += [ROTATION] if d > p else []
     for i, kind in enumerate(kinds):
         own = [output for output in chosen if (output >= p) == bool(i)]
         labels = [names[output].removeprefix("r") if i else names[output] for output in own]
         _plot_pushed(rollout, unpushed, axes[3 * i : 3 * i + 3], own, labels, kind)
 
 
-class _Kind(NamedTuple):
-    """Words and units of outputs that are positions, or rotations."""
-
-    where: str
-    push: str
-    push_unit: str
-    unit: str
-    scale: float
-    stiffness_unit: str
-
-
 def _plot_pushed(
-    rollout: Any, unpushed: Any, axes: Sequence[Axes], chosen: list[int], labels: list[str], kind: _Kind
+    rollout: Any, unpushed: Any, axes: Sequence[Axes], chosen: list[int], labels: list[str], kind: Kind
 ) -> None:
     above, middle, below = axes
     along = [f"{kind.where} {label}" for label in labels]

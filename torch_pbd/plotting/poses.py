@@ -1,6 +1,6 @@
 """Poses in space: frames of a tool along a path, and how far its position and its axes spread."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,14 +11,28 @@ from numpy.typing import ArrayLike
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.plotting.style import DATA, MODEL, SERIES, check_axes, equal_scales, mark_ends, shown_figure
+from torch_pbd.plotting.parts import plot_outputs, plot_stiffness
+from torch_pbd.plotting.style import (
+    AXES,
+    DATA,
+    MODEL,
+    POSE_NAMES,
+    POSITION,
+    ROTATION,
+    SERIES,
+    check_axes,
+    equal_scales,
+    legend_below,
+    mark_ends,
+    principal,
+    readable_unit,
+    shown_figure,
+    time_label,
+)
 from torch_pbd.rotations import matrix
 
 _LENGTH = 0.1  # of a frame's axes: share of the longest side of the path
 _CIRCLE = np.stack([np.cos(np.linspace(0.0, 2.0 * np.pi, 49)), np.sin(np.linspace(0.0, 2.0 * np.pi, 49))])
-_DEGREES = 180.0 / np.pi
-POSE_NAMES = ("x", "y", "z", "rx", "ry", "rz")
-AXES = ("most precise axis", "middle axis", "freest axis")
 
 
 def plot_frames(
@@ -104,6 +118,14 @@ def pose_panels(n_bands: int, make: Any = shown_figure) -> tuple[Figure, list[An
     return figure, [space], bands
 
 
+def draw_poses(what: Any, draw: Callable[[Any, Axes, list[Axes]], None], n_bands: int) -> list[Axes]:
+    """Axes of a new figure of demonstrations or of a schedule, the space first."""
+    figure, space, bands = pose_panels(n_bands)
+    draw(what, space[0], bands)
+    legend_below(figure, [*space, *bands])
+    return [*space, *bands]
+
+
 def draw_recorded_poses(demonstrations: Any, ax: Axes, bands: Sequence[Axes], n_frames: int = 4) -> None:
     """Draw demonstrated poses: paths in space with frames at a few phases, and rotations over time."""
     places, turns = demonstrations.to_poses()
@@ -115,9 +137,10 @@ def draw_recorded_poses(demonstrations: Any, ax: Axes, bands: Sequence[Axes], n_
         mark_ends(ax, path, label=k == 0)
     for i, (band, name) in enumerate(zip(bands, demonstrations.names[-3:], strict=True)):
         for time, position in demonstrations:
-            band.plot(time, _DEGREES * position[:, i - 3], color=DATA, lw=1.0, alpha=0.8)
+            band.plot(time, ROTATION.scale * position[:, i - 3], color=DATA, lw=1.0, alpha=0.8)
         band.set_ylabel(f"{name} [deg]")
         band.margins(x=0.0)
+    bands[-1].set_xlabel(time_label(demonstrations.time_unit))
     label_space(ax, demonstrations.names[:3], None if demonstrations.units is None else demonstrations.units[0])
 
 
@@ -135,17 +158,24 @@ def draw_planned_poses(schedule: Any, ax: Axes, n_poses: int = 7) -> None:
     label_space(ax, (schedule.names or POSE_NAMES)[:3], schedule.units)
 
 
+def draw_pose_schedule(schedule: Any, space: Axes, bands: Sequence[Axes]) -> None:
+    """Draw a schedule of poses: its path, and over time the deviations of both blocks and their stiffness."""
+    draw_planned_poses(schedule, space)
+    kinds = POSITION._replace(unit=readable_unit(schedule.units)[0], scale=readable_unit(schedule.units)[1]), ROTATION
+    for kind, block, spread, gains in zip(kinds, schedule.blocks, bands[:2], bands[2:], strict=True):
+        deviation = kind.scale * np.sqrt(principal(schedule.covariance[:, block, block]))
+        plot_outputs(schedule.time, deviation, spread, AXES, [MODEL])
+        spread.set(ylabel=f"1 sd [{kind.unit}]", ylim=(0.0, None))
+        plot_stiffness(schedule, gains, block)
+        gains.set_ylim(0.0, None)
+    bands[2].set_xlabel("")
+
+
 def label_space(ax: Any, names: Sequence[str], unit: str | None) -> None:
     """Name the axes of a space, on one scale."""
     ax.set(**{f"{axis}label": f"{name} [{unit or 'unit'}]" for axis, name in zip("xyz", names, strict=True)})
     equal_scales(ax, zoom=0.88)
     ax.view_init(elev=22.0, azim=-35.0)
-
-
-def principal(matrices: Floats, *, descending: bool = False) -> Floats:
-    """Eigenvalues (n, d) of symmetric matrices (n, d, d), in order."""
-    values = np.linalg.eigvalsh(matrices).clip(0.0)
-    return values[:, ::-1] if descending else values
 
 
 def _great_circles(covariance: Floats) -> Floats:

@@ -1,13 +1,14 @@
 """Style of all figures: one colour for one meaning, labels with units, grids and legends."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from torch_pbd import checks
+from torch_pbd.checks import Floats
 
 # Okabe and Ito's colours, which colour-blind readers tell apart; the truth is drawn dashed too.
 DATA, MODEL, EMPIRICAL, FORCE, TRUTH = "#999999", "#0072B2", "#E69F00", "#D55E00", "#000000"
@@ -19,6 +20,25 @@ LINES = ("-", "--", ":", "-.")
 
 _LONGEST_UNIT = 8  # letters; a longer one is a description
 _FLAT = 3.0  # ratio of the sides of a plane from which on equal scales would leave a sliver
+
+POSE_NAMES = ("x", "y", "z", "rx", "ry", "rz")
+
+
+class Kind(NamedTuple):
+    """Outputs that share a unit: words and units of what pushes do to them."""
+
+    outputs: slice
+    where: str
+    push: str
+    push_unit: str
+    unit: str
+    scale: float  # of the unit shown
+    stiffness_unit: str
+
+
+POSITION = Kind(slice(0, 3), "along", "force", "N", "mm", 1e3, "N/m")
+ROTATION = Kind(slice(3, 6), "about", "torque", "Nm", "deg", 180.0 / np.pi, "Nm/rad")
+AXES = ("most precise axis", "middle axis", "freest axis")
 
 
 def figure_grid(n_rows: int, n_columns: int, size: tuple[float, float], **options: Any) -> tuple[Figure, Any]:
@@ -118,3 +138,9 @@ def check_kind(value: Any, name: str, kind: str) -> None:
     """Check that an object is of a class by the name of it: those that draw themselves stand above this floor."""
     if type(value).__name__ != kind:
         raise checks.refusal(value, name, f"a {kind}")
+
+
+def principal(matrices: Floats, *, descending: bool = False) -> Floats:
+    """Eigenvalues (n, d) of symmetric matrices (n, d, d), in order."""
+    values = np.linalg.eigvalsh(matrices).clip(0.0)
+    return values[:, ::-1] if descending else values
