@@ -1,4 +1,4 @@
-"""Make the pictures of the README: `python scripts/make_pictures.py` writes docs/pictures/overview.png and push.gif."""
+"""Make the pictures of README and documentation: `python scripts/make_pictures.py` writes those in docs/pictures."""
 
 from pathlib import Path
 
@@ -11,16 +11,19 @@ from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.figure import Figure
 
 from torch_pbd import DMPController
-from torch_pbd.data import make_handwriting_demonstrations
+from torch_pbd.control import RotationLimits, StiffnessLaw
+from torch_pbd.data import make_handwriting_demonstrations, make_pose_demonstrations
 from torch_pbd.plotting import (
     DATA,
     FORCE,
     MODEL,
     ROBOT,
+    draw_pose_schedule,
     legend_below,
     mark_ends,
     plot_covariance_ellipses,
     plot_demonstrations,
+    pose_panels,
 )
 
 FOLDER = Path(__file__).parents[1] / "docs" / "pictures"
@@ -126,8 +129,23 @@ def animation(strokes, schedule, run, n_frames=75):
     return FuncAnimation(figure, draw, frames=n_frames)
 
 
+def poses():
+    """A peg that is turned and put into a hole: what was shown and learned, and the stiffness of both blocks."""
+    shown = make_pose_demonstrations(12, rate=25.0, random_state=0)
+    law = StiffnessLaw(stiffness_min=100.0, stiffness_max=1500.0, rotation=RotationLimits(2.0, 60.0))
+    schedule = DMPController(stiffness_law=law).fit(shown).schedule(100.0)
+    figure, (space,), bands = pose_panels(4, lambda size: Figure(figsize=size, layout="constrained"))
+    for path in shown.to_poses()[0]:
+        space.plot(*path.T, color=DATA, lw=0.8)
+    space.lines[0].set_label("demonstrations")
+    draw_pose_schedule(schedule, space, bands)
+    legend_below(figure, [space, *bands])
+    return figure
+
+
 if __name__ == "__main__":
     FOLDER.mkdir(exist_ok=True)
     learned = learn()
     overview(*learned).savefig(FOLDER / "overview.png", dpi=110)
+    poses().savefig(FOLDER / "pose.png", dpi=90)
     animation(*learned).save(FOLDER / "push.gif", writer=PillowWriter(fps=12), dpi=90)

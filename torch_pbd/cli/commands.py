@@ -217,8 +217,8 @@ def experiment(options: Any, folder: Any) -> str:
 def _pose_experiment(options: Any, demonstrations: Any, folder: Any) -> str:
     from torch_pbd.experiments.poses import run_poses
 
-    pushes = f"{options.push:g} N along and {options.torque:g} Nm about"
-    say(f"pushes of {pushes} each axis of the tool, at 20 % and 80 % of the movement; K is\nthe stiffness there\n")
+    pushes = f"{options.push:g} N along and {options.torque:g} Nm about each axis of the tool"
+    say(f"pushes of {pushes},\nat 20 % and 80 % of the movement; K is the stiffness there\n")
     sizes = {"peak": options.push, "torque": options.torque, "rate": options.rate}
     return run_poses(options.controllers, demonstrations, folder, **sizes, arm=options.arm)
 
