@@ -24,7 +24,7 @@ names = ["x", "y", "z", "qx", "qy", "qz", "qw"]
 recorded = Demonstrations(made.times, columns, names=names, units="m", rotation=["qw", "qx", "qy", "qz"])
 print(recorded.names, recorded.units, recorded.rotation_reference.round(3))
 
-law = StiffnessLaw(stiffness_min=100.0, stiffness_max=1500.0, rotation=RotationLimits(2.0, 60.0))
+law = StiffnessLaw(stiffness_min=300.0, stiffness_max=1500.0, rotation=RotationLimits(5.0, 60.0))
 schedule = DMPController(stiffness_law=law).fit(recorded).schedule(200.0)
 
 # The covariance is that at the planned pose; in black that of the law which the demonstrations were made by.

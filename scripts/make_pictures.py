@@ -132,7 +132,7 @@ def animation(strokes, schedule, run, n_frames=75):
 def poses():
     """A peg that is turned and put into a hole: what was shown and learned, and the stiffness of both blocks."""
     shown = make_pose_demonstrations(12, rate=25.0, random_state=0)
-    law = StiffnessLaw(stiffness_min=100.0, stiffness_max=1500.0, rotation=RotationLimits(2.0, 60.0))
+    law = StiffnessLaw(stiffness_min=300.0, stiffness_max=1500.0, rotation=RotationLimits(5.0, 60.0))
     schedule = DMPController(stiffness_law=law).fit(shown).schedule(100.0)
     figure, (space,), bands = pose_panels(4, lambda size: Figure(figsize=size, layout="constrained"))
     for path in shown.to_poses()[0]:

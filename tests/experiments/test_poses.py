@@ -118,7 +118,7 @@ def test_a_run_leaves_its_tables_figures_schedules_and_models(controller, record
     folder = RunFolder(tmp_path, {})
     text = run_poses({"a b": controller}, recorded, folder, rate=100.0, arm="none")
     assert "a b         tool z" in text
-    assert "1 kg and 1 kg m2, is no arm's" in text
+    assert "a b: a movement of" in text
     assert {path.name for path in (tmp_path / "figures").iterdir()} == {
         "figure6_task.png", "a_b_figure7_variability.png", "a_b_figure8_pushes.png",
     }  # fmt: skip

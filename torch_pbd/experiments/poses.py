@@ -42,7 +42,6 @@ _PUSHES = (0.2, 0.8)  # of the duration
 _PUSH_LENGTH = 0.08  # of the duration
 _TOOL = "xyz"
 _ROWS = 50.0  # Hz; along a path the inertia of an arm changes with its joints, within seconds
-_CERTIFIED = 200.0  # Hz of the rows that are certified
 _N_STEPS = 101
 
 
@@ -91,7 +90,9 @@ def run_poses(
         fitted, _ = fit_once(clone(controller), demonstrations, finished=folder.finished)
         run = pushed(fitted, rate, peak, torque, arm)
         rows += [row for kind in (POSITION, ROTATION) for row in push_rows(name, run, kind)]
-        reports.append(f"{name}: a movement of {run.schedule.duration:.3g} s\n{_inertia(run)}\n{run.report}")
+        plain = damping_ratio(run.schedule, run.planned.damping)
+        note = f"a damping made for 1 kg would have a ratio of {plain:.2f} here" if arm != "none" else "of 1 kg"
+        reports.append(f"{name}: a movement of {run.schedule.duration:.3g} s; {note}\n{run.report}")
         _write(run, name, demonstrations, folder)
     folder.write_metrics(rows)
     folder.write_text("stability.txt", "\n\n".join(reports) + "\n")
@@ -114,8 +115,7 @@ def pushed(controller: DMPController, rate: float, peak: float, torque: float, a
     forces, torques = (
         tuple(run(largest, kind, axis) for axis in range(3)) for largest, kind in ((peak, POSITION), (torque, ROTATION))
     )
-    report = schedule.resample(min(rate, _CERTIFIED)).certify()
-    return PoseRun(controller, planned, schedule, run(0.0, POSITION, 0), forces, torques, report)
+    return PoseRun(controller, planned, schedule, run(0.0, POSITION, 0), forces, torques, schedule.certify())
 
 
 def with_panda(schedule: Schedule) -> Schedule:
@@ -163,19 +163,6 @@ def _shown(row: Mapping[str, Any], kind: Kind) -> dict[str, Any]:
     units = {"early": kind.unit, "late": kind.unit, "K early": kind.stiffness_unit, "K late": kind.stiffness_unit}
     names = {key: f"{key} [{unit}]" for key, unit in units.items()} | {"axis": f"{kind.push} {kind.where}"}
     return {names.get(key, key): value for key, value in row.items() if key not in ("push", "unit")}
-
-
-def _inertia(run: PoseRun) -> str:
-    mass = run.schedule.mass
-    if not isinstance(mass, np.ndarray):
-        return "Inertia: that of the plant, 1 kg and 1 kg m2, is no arm's."
-    blocks = [np.linalg.eigvalsh(mass[:, block, block]) for block in run.schedule.blocks]
-    ranges = [f"{own.min():.2g} to {own.max():.2g} {unit}" for own, unit in zip(blocks, ("kg", "kg m2"), strict=True)]
-    own, other = (damping_ratio(run.schedule, schedule.damping) for schedule in (run.schedule, run.planned))
-    return (
-        f"Inertia of the arm along it: {' and '.join(ranges)}; smallest damping ratio {own:.2f}, and "
-        f"{other:.2f} with a damping made for 1 kg."
-    )
 
 
 def _wrench(schedule: Schedule, largest: float, kind: Kind, axis: int) -> Floats:
