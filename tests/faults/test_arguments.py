@@ -112,7 +112,7 @@ NO_NUMBERS = {
 PASSES = {  # what is a value there, and what it means is in the docstring
     ("tunnel", "nan"), ("sensor", "nan"), ("law", "empty"), ("damping", "empty"), ("tunnel", "empty"),
     ("paper", "empty"), ("plant force", "none"), ("plant start", "none"), ("rollout start", "none"),
-    ("positions", "generator"),
+    ("positions", "generator"), ("plant mass", "none"),
 }  # fmt: skip
 
 

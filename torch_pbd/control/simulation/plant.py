@@ -245,9 +245,9 @@ def _start(task: Task, position0: Tensor | None, orientation0: Tensor | None) ->
 
 def _poses(task: Task, record: dict[str, Tensor]) -> dict[str, Tensor]:
     """Fields of a Rollout, whose poses are positions and orientations."""
-    record |= {"desired_position": task.position, "deviation": record["position"] - task.position}
     if task.turning is None:
-        return record
+        return record | {"desired_position": task.position}
+    record["pose_deviation"] = record["position"] - task.position
     desired, p = task.turning.orientation, task.n_positions
     rotation, commanded = (record[name][..., p:] for name in ("position", "commanded_position"))
     record |= {name: record[name][..., :p] for name in ("position", "commanded_position")}
@@ -260,9 +260,11 @@ def _poses(task: Task, record: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _check_memory(batch: torch.Size, task: Task) -> None:
-    # Measured: six motions are held, and where rollouts differ in their gains, twelve matrices.
+    # Measured: five motions are held, of poses six and two orientations, and where rollouts differ in their gains,
+    # twelve matrices.
     d = task.position.shape[-1]
-    of_each = 6 * d + (12 * d * d if task.stiffness.ndim > 3 or task.stiffness_filter is not None else 0)
+    of_each = 5 * d + (12 * d * d if task.stiffness.ndim > 3 or task.stiffness_filter is not None else 0)
+    of_each += 0 if task.turning is None else d + 8
     if task.position.device.type == "cpu":  # elsewhere torch raises by itself
         require_memory(
             of_each * batch.numel() * task.n_ticks * task.position.element_size(),

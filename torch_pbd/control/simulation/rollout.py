@@ -26,8 +26,6 @@ class Rollout:
     stiffness, damping : (..., T, d, d), N/m and N s/m
         In effect during the tick, behind the filter.
     desired_position : (..., T, p), m
-    deviation : (..., T, d), m
-        Position less desired position; and the rotation vector e from the desired orientation, ``R = exp([e]) R_d``.
     commanded_position : (..., T, p), m
         By the admittance, of the robot's position loop; without such a loop, ``position``.
     filter_share : (..., T) or None
@@ -38,6 +36,9 @@ class Rollout:
         Whether the force sensor was out of its range.
     orientation, desired_orientation, commanded_orientation : (..., T, 4) or None
         Of poses, as unit quaternions w x y z.
+    pose_deviation : (..., T, d) or None, m and rad
+        Of poses, position less desired position, and rotation vector e from the desired orientation in world axes,
+        ``R = exp([e]) R_d``.
     """
 
     time: Any
@@ -47,7 +48,6 @@ class Rollout:
     stiffness: Any
     damping: Any
     desired_position: Any
-    deviation: Any
     commanded_position: Any
     filter_share: Any = None
     tank_energy: Any = None
@@ -55,6 +55,7 @@ class Rollout:
     orientation: Any = None
     desired_orientation: Any = None
     commanded_orientation: Any = None
+    pose_deviation: Any = None
 
     def __repr__(self) -> str:
         *batch, n_ticks, d = self.velocity.shape
@@ -93,6 +94,11 @@ class Rollout:
         from torch_pbd.plotting import plot_pushes  # here: it needs matplotlib, a run does not
 
         return plot_pushes(self, unpushed, names)
+
+    @property
+    def deviation(self) -> Any:
+        """Position less desired position, and of poses the rotation vector away from the desired one, (..., T, d)."""
+        return self.position - self.desired_position if self.pose_deviation is None else self.pose_deviation
 
     @property
     def interventions(self) -> Any:
