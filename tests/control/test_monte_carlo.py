@@ -343,3 +343,8 @@ def test_arguments_for_poses_are_checked(arguments, words):
         simulate_many(pose_schedule(31), **{"n_rollouts": 5, "duration": 0.1, "random_state": 0, **arguments})
     with pytest.raises(ValueError, match=re.escape("torque is 0.5 Nm, must be 0 for a schedule without orientation")):
         simulate_many(turning_schedule(), 5, torque=0.5)
+
+
+def test_pushes_that_turn_a_tool_far_away_are_told_of():
+    with pytest.warns(UserWarning, match=r"turned by up to .* rad from the desired orientation"):
+        simulate_many(pose_schedule(31), 3, torque=60.0, duration=0.15, random_state=0)

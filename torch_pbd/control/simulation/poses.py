@@ -14,6 +14,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torch_pbd import checks
+
+# rad. The path of a push is off by about a sixth of its largest angle, of that angle: a quarter here.
+_FAR = 0.5 * math.pi
+
 
 def multiply(first: Float[Tensor, "*a 4"], second: Float[Tensor, "*b 4"]) -> Float[Tensor, "*c 4"]:
     """Product of quaternions w x y z: the rotation by ``second``, then by ``first``."""
@@ -37,6 +42,15 @@ def rotation_between(start: Float[Tensor, "*a 4"], end: Float[Tensor, "*b 4"]) -
     tiny = length < torch.finfo(length.dtype).tiny
     angle = 2.0 * torch.atan2(length, 1.0 + away)
     return torch.where(tiny, 2.0, angle / torch.where(tiny, 1.0, length)) * xyz
+
+
+def warn_if_far(angle: float) -> None:
+    """Warn where the robot is so far from the desired orientation that a linear model is no longer one."""
+    if angle > _FAR:
+        checks.warn(
+            f"The robot is turned by up to {angle:.2g} rad from the desired orientation, where the linear plant "
+            "is off by a quarter of the path or more: push less, or raise the stiffness of rotations."
+        )
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from torch_pbd.checks import Floats
 from torch_pbd.control.matrices import as_mass, mass_rows
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.plant import AdmittancePlant, run_task
+from torch_pbd.control.simulation.poses import warn_if_far
 from torch_pbd.control.simulation.rollout import Rollout
 from torch_pbd.control.simulation.rollouts import Pushes, RolloutSummary, Tally, quantiles_in, simulate_blocks
 from torch_pbd.control.simulation.ticks import Task, block_length
@@ -162,7 +163,10 @@ def simulate_many(
             )
             for tally, rows in zip(tallies, deviations, strict=True)
         ]
-    return summaries[0] if len(summaries) == 1 else replace(summaries[0], rotation=summaries[1])
+    if len(summaries) == 1:
+        return summaries[0]
+    warn_if_far(float(summaries[1].peak_deviation.max()))
+    return replace(summaries[0], rotation=summaries[1])
 
 
 def _effect(tally: Tally, schedule: Schedule, dt: float, begin: Floats, lasting: Floats) -> dict[str, Any]:
