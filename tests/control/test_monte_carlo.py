@@ -335,7 +335,6 @@ def test_a_schedules_inertia_is_compared_with_that_of_the_plant():
         ({"start_scale": 0.1}, "start_scale is 0.1, must be (float, float), in m and rad, for poses, or 0.0"),
         ({"threshold": 0.1}, "threshold is 0.1, must be (float, float), in m and rad, for poses, or None"),
         ({"threshold": (0.1, 0.0)}, "threshold is 0.0 rad, must be a finite number above 0"),
-        ({"plant": AdmittancePlant(None, stiffness_filter=RateLimit())}, "but the mass varies, (31, 6, 6)"),
     ],
 )
 def test_arguments_for_poses_are_checked(arguments, words):

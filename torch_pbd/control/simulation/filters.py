@@ -4,8 +4,9 @@ Both stand between the stiffness that is asked for and the one in effect, at eve
 share of the step that their invariant allows. Damping steps by the same share. State and gains are those of
 ``M a = u - K y - D v`` held over a tick, y the deviation from the desired position.
 
-Both are of one mass M. One that varies, such as the inertia of an arm along its path, changes the kinetic energy by
-``1/2 v' dM v`` from tick to tick, which no stiffness that is held back takes out again: neither invariant would hold.
+Where a desired orientation turns, deviations of rotation turn with it, and so do the gains that are held on to: what is
+held back is their change as the tool sees it. An inertia that varies, as that of an arm, changes the kinetic energy by
+``1/2 v' dM v`` from tick to tick at the same velocity; what each filter makes of that, it says.
 """
 
 from dataclasses import dataclass
@@ -16,7 +17,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torch_pbd import checks
-from torch_pbd.control.simulation.ticks import ActiveFilter, Gains, State, StiffnessFilter, admittance_rate, transition
+from torch_pbd.control.simulation.gains import ActiveFilter, Gains, State, StiffnessFilter, mass_at
+from torch_pbd.control.simulation.ticks import admittance_rate, transition
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.linalg import symmetrize
 
@@ -34,7 +36,9 @@ class RateLimit(StiffnessFilter):
     the conditions of K. Kronander and A. Billard, "Stability considerations for variable impedance control",
     IEEE Transactions on Robotics 32, 2016. It needs no measurement. The admittance is passive with respect to
     ``v + a y`` and a force that is held over each tick; behind a position loop that lags, a robot need not be.
-    The proof is of one mass, and of a desired orientation that stands still: others are refused.
+    Where the mass varies, or a desired orientation turns, the function is that of each tick's own mass, of the
+    difference between any two motions under the same gains, and has to pay for that too: a run stops where the damping
+    cannot, since no stiffness would help.
 
     Parameters
     ----------
@@ -48,16 +52,8 @@ class RateLimit(StiffnessFilter):
     def __post_init__(self) -> None:
         checks.number(self.alpha, "alpha", above=0.0, unit="1/s", optional=True)
 
-    def start(
-        self, stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float, *, is_turning: bool = False
-    ) -> "_RateLimited":
+    def start(self, stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> "_RateLimited":
         """Begin a run over the wanted gains (..., T, d, d), which must allow alpha and be positive definite."""
-        _check_mass(mass, self)
-        if is_turning:
-            raise InvalidParameterError(
-                "stiffness_filter is a RateLimit, but the desired orientation turns, and the deviation with it: its "
-                "proof does not hold there. Take EnergyTank(), or filter positions alone."
-            )
         inverse = torch.linalg.inv(torch.linalg.cholesky(mass))
         limit = float(torch.linalg.eigvalsh(symmetrize(inverse @ damping @ inverse.mT)).min())
         alpha = 0.5 * limit if self.alpha is None else self.alpha
@@ -77,44 +73,55 @@ class RateLimit(StiffnessFilter):
 
 class _RateLimited(ActiveFilter):
     def __init__(self, alpha: float, mass: Tensor, dt: float) -> None:
-        self._alpha, self._mass, self._dt = alpha, mass, dt
-        self._gains: Gains | None = None
+        super().__init__(mass)
+        self._alpha, self._dt = alpha, dt
 
     def select(self, stiffness: Tensor, damping: Tensor, deviation: Tensor) -> Gains:
-        if self._gains is None:
+        last, held = self._begin()
+        if last is None or held is None:
             self._gains = Gains(stiffness, damping, stiffness.new_ones(stiffness.shape[:-2]))
         else:
-            share = self._largest_share(stiffness, damping, self._gains)
-            self._gains = _partway(self._gains, stiffness, damping, share)
+            share = self._largest_share(stiffness, damping, last, held)
+            self._gains = _partway(held, stiffness, damping, share)
         return self._gains
 
-    def _largest_share(self, stiffness: Tensor, damping: Tensor, last: Gains) -> Tensor:
+    def _largest_share(self, stiffness: Tensor, damping: Tensor, last: Gains, held: Gains) -> Tensor:
         """Largest s in [0, 1] for which the last tick pays for the step ``s dP`` of the function P.
 
         Whatever its state x at the start and its force f: ``E' (P + s dP) E <= P + W`` with E the map of (x, f) to
-        the state at the end, and W twice the work of f on ``v + a y``.
+        the state at the end, and W twice the work of f on ``v + a y``. On the left, P is that of the gains held on to
+        and of this tick's mass, and E turns the deviation with them.
         """
-        d = stiffness.shape[-1]
-        end = transition(admittance_rate(last.stiffness, last.damping, self._mass), self._dt)[..., : 2 * d, :]
+        d, mass = stiffness.shape[-1], mass_at(self._mass, self._tick - 1)
+        end = transition(admittance_rate(last.stiffness, last.damping, mass), self._dt)[..., : 2 * d, :]
         start = torch.eye(3 * d).to(end)
         moved = end - start[: 2 * d]
         # The equation of motion integrated over the tick, M dv = f h - K int(y) - D dy, gives int(y), of which the port
         # is dy + a int(y).
-        pull = self._dt * start[2 * d :] - self._mass @ moved[..., d:, :] - last.damping @ moved[..., :d, :]
+        pull = self._dt * start[2 * d :] - mass @ moved[..., d:, :] - last.damping @ moved[..., :d, :]
         port = moved[..., :d, :] + self._alpha * torch.linalg.solve(last.stiffness, pull)
-        function = lyapunov_matrix(last.stiffness, last.damping, self._mass, self._alpha)
+        function = lyapunov_matrix(last.stiffness, last.damping, mass, self._alpha)
         work = torch.nn.functional.pad(port, (0, 0, 2 * d, 0))
-        paid = torch.nn.functional.pad(function, (0, d, 0, d)) + work + work.mT - end.mT @ function @ end
+        if self._turn is not None:
+            position, rotation, velocity = end.split([d - 3, 3, d], dim=-2)
+            end = torch.cat([position, self._turn @ rotation, velocity], dim=-2)
+        after = lyapunov_matrix(held.stiffness, held.damping, mass_at(self._mass, self._tick), self._alpha)
+        paid = torch.nn.functional.pad(function, (0, d, 0, d)) + work + work.mT - end.mT @ after @ end
         # dP = dK + a dD, of deviations. With F F' = paid, s is one over the largest eigenvalue of F^-1 E' dP E F'^-1.
-        rise = stiffness - last.stiffness + self._alpha * (damping - last.damping)
-        factor = torch.linalg.cholesky(symmetrize(paid))
+        rise = stiffness - held.stiffness + self._alpha * (damping - held.damping)
+        factor, failed = torch.linalg.cholesky_ex(symmetrize(paid))
+        if bool(failed.any()):
+            raise InvalidParameterError(
+                f"stiffness_filter is a RateLimit, but at tick {self._tick} the mass rises, or the desired orientation "
+                "turns, faster than the damping can pay for: damp more, move more slowly, or take EnergyTank()."
+            )
         half = torch.linalg.solve_triangular(factor, end[..., :d, :].mT, upper=False)
         needed = torch.linalg.eigvalsh(symmetrize(half @ rise @ half.mT))[..., -1]
         return torch.where(needed > 1.0, (1.0 - _MARGIN) / needed.clamp_min(1.0), 1.0)
 
 
 def lyapunov_matrix(
-    stiffness: Float[Tensor, "*b d d"], damping: Float[Tensor, "*b d d"], mass: Float[Tensor, "d d"], alpha: float
+    stiffness: Float[Tensor, "*b d d"], damping: Float[Tensor, "*b d d"], mass: Float[Tensor, "*m d d"], alpha: float
 ) -> Float[Tensor, "*b n n"]:
     """Twice the matrix of Kronander and Billard's V in (deviation, velocity), n = 2 d."""
     cross = (alpha * mass).expand_as(stiffness)
@@ -132,9 +139,9 @@ class EnergyTank(StiffnessFilter):
     tank has less, only that share of the rise is made; the stiffness may always fall. With the energy H of
     spring and mass, T of the tank and the work W of external force and desired motion,
     ``H + T - W <= H_0 + T_0`` at every tick, to rounding. What a falling stiffness takes out of the spring goes into
-    the tank whole. Where a desired orientation turns, what that does to the energy of the spring is work of the desired
-    motion too. As for :class:`RateLimit`, this is of the admittance, not of a robot that lags behind it, and of one
-    mass: one that varies is refused. After
+    the tank whole, and a stiffness that turns with the desired orientation costs nothing. Where the mass varies, what
+    that does to the kinetic energy counts as work of the motion, in W: the tank answers for the stiffness alone. As for
+    :class:`RateLimit`, this is of the admittance, not of a robot that lags behind it. After
     F. Ferraguti, C. Secchi, C. Fantuzzi, "A tank-based approach to impedance control with variable stiffness",
     ICRA 2013, made exact for gains that switch at ticks.
 
@@ -158,11 +165,8 @@ class EnergyTank(StiffnessFilter):
         checks.number(self.energy, "energy", least=0.0, most=self.energy_max, unit="J")
         checks.number(self.efficiency, "efficiency", least=0.0, below=1.0)
 
-    def start(
-        self, stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float, *, is_turning: bool = False
-    ) -> "_Tank":
+    def start(self, stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> "_Tank":
         """Begin a run over the wanted gains (..., T, d, d)."""
-        _check_mass(mass, self)
         return _Tank(self, mass)
 
 
@@ -170,11 +174,11 @@ class _Tank(ActiveFilter):
     tank_energy: Tensor
 
     def __init__(self, tank: EnergyTank, mass: Tensor) -> None:
-        self._tank, self._mass = tank, mass
-        self._gains: Gains | None = None
+        super().__init__(mass)
+        self._tank = tank
 
     def select(self, stiffness: Tensor, damping: Tensor, deviation: Tensor) -> Gains:
-        last = self._gains
+        _, last = self._begin()
         share = deviation.new_ones(deviation.shape[:-1])
         if last is None:
             self.tank_energy = torch.full_like(share, self._tank.energy)
@@ -198,14 +202,8 @@ class _Tank(ActiveFilter):
 
     def _energy(self, deviation: Tensor, velocity: Tensor) -> Tensor:
         assert self._gains is not None
-        return 0.5 * (_quadratic(self._gains.stiffness, deviation) + _quadratic(self._mass, velocity))
-
-
-def _check_mass(mass: Tensor, wanted: StiffnessFilter) -> None:
-    if mass.ndim > 2:
-        raise InvalidParameterError(
-            f"stiffness_filter is {wanted}, but the mass varies, {tuple(mass.shape)}: the energy that this brings is "
-            "not the filter's to hold back. Give one mass, or no filter, and certify the schedule."
+        return 0.5 * (
+            _quadratic(self._gains.stiffness, deviation) + _quadratic(mass_at(self._mass, self._tick), velocity)
         )
 
 

@@ -9,12 +9,13 @@ from torch import Tensor
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control.matrices import as_mass, as_tensor, mass_rows
+from torch_pbd.control.simulation.gains import StiffnessFilter
 from torch_pbd.control.simulation.given import check_given
 from torch_pbd.control.simulation.poses import exp, multiply, rotation_between, turning, warn_if_far
 from torch_pbd.control.simulation.position_loop import PositionLoop
 from torch_pbd.control.simulation.rollout import Rollout
 from torch_pbd.control.simulation.sensor import ForceSensor
-from torch_pbd.control.simulation.ticks import Environment, StiffnessFilter, Task, closed_loop, open_loop
+from torch_pbd.control.simulation.ticks import Environment, Task, closed_loop, open_loop
 from torch_pbd.files.memory import require_memory
 
 _PARTS = ("sensor", "position_loop", "environment", "stiffness_filter")
@@ -225,8 +226,9 @@ def run_task(
         record |= {"force": force.expand_as(position), "stiffness": task.stiffness, "damping": task.damping}
     else:
         record = closed_loop(task, force, state, generator)
-    for name in ("stiffness", "damping"):
-        record[name] = record[name].expand(*batch, *record[name].shape[-3:])
+    for name, n_dims in {"stiffness": 3, "damping": 3, "filter_share": 1}.items():
+        if name in record:
+            record[name] = record[name].expand(*batch, *record[name].shape[-n_dims:])
     _check_finished(record["position"], record["velocity"])
     time = torch.arange(task.n_ticks, dtype=force.dtype, device=force.device) * task.dt
     return Rollout(time, **_poses(task, record))

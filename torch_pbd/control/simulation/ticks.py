@@ -5,7 +5,6 @@ matrix exponential is then exact, whatever its length; at its end the desired po
 position and the rotation from the desired orientation, and that moves on as :mod:`poses` says.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -15,15 +14,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torch_pbd.control.simulation.gains import State, StiffnessFilter, mass_at
 from torch_pbd.control.simulation.poses import Turning
 from torch_pbd.control.simulation.position_loop import PositionLoop
 from torch_pbd.control.simulation.sensor import ForceSensor
 
 # Transitions that are computed together, which bounds the memory; a power of 2, as the lengths of blocks are.
 _MATRICES_AT_ONCE = 2**13
-
-State = tuple[Tensor, Tensor]
-"""Position and velocity (..., d)."""
 
 
 def admittance_rate(
@@ -43,38 +40,6 @@ def admittance_rate(
 def transition(rate: Float[Tensor, "*b n n"], dt: float) -> Float[Tensor, "*b n n"]:
     """Map of ``[deviation, velocity, force]`` over a tick of ``dt`` s in which everything is held."""
     return torch.linalg.matrix_exp(rate * dt)
-
-
-@dataclass(frozen=True)
-class Gains:
-    """Stiffness and damping in effect, (..., d, d), and the share (...) of the step towards the wanted ones."""
-
-    stiffness: Tensor
-    damping: Tensor
-    share: Tensor
-
-
-class ActiveFilter(ABC):
-    """Filter of the gains in a run."""
-
-    tank_energy: Tensor | None = None
-
-    @abstractmethod
-    def select(self, stiffness: Tensor, damping: Tensor, deviation: Tensor) -> Gains:
-        """Gains for this tick, of the wanted ones (..., d, d) and the deviation (..., d) at its start."""
-
-    def settle(self, before: State, after: State, force: Tensor) -> None:  # noqa: B027 - most have nothing to note
-        """Take note of the tick: (deviation, velocity) at its start and end, and the force held in it."""
-
-
-class StiffnessFilter(ABC):
-    """Filter of the gains, as :class:`~torch_pbd.control.AdmittancePlant` takes it."""
-
-    @abstractmethod
-    def start(
-        self, stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float, *, is_turning: bool = False
-    ) -> ActiveFilter:
-        """Begin a run over the wanted gains (..., T, d, d), along a desired orientation that turns or not."""
 
 
 @runtime_checkable
@@ -203,8 +168,8 @@ def tick_maps(task: Task, dt: float) -> Iterator[tuple[slice, Tensor]]:
     n_together = max(1, _MATRICES_AT_ONCE // batch)
     for first in range(0, task.n_ticks, n_together):
         ticks = slice(first, min(first + n_together, task.n_ticks))
-        mass = task.mass if task.mass.ndim == 2 else task.mass[..., ticks, :, :]
-        yield ticks, _tick_map(task.stiffness[..., ticks, :, :], task.damping[..., ticks, :, :], mass, dt)
+        gains = task.stiffness[..., ticks, :, :], task.damping[..., ticks, :, :]
+        yield ticks, _tick_map(*gains, mass_at(task.mass, ticks), dt)
 
 
 def _tick_map(stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> Tensor:
@@ -237,8 +202,7 @@ class Loop:
         self._robot = None if loop is None else loop.start(*state, task.dt)
         self._read = None if sensor is None else sensor.start(state[0], task.dt, generator)
         gains = task.stiffness, task.damping, task.mass, task.dt
-        is_turning = task.turning is not None and bool(task.turning.turns.any())
-        self._filter = None if wanted is None else wanted.start(*gains, is_turning=is_turning)
+        self._filter = None if wanted is None else wanted.start(*gains)
         self._maps = (each for _, maps in tick_maps(task, task.dt / task.substeps) for each in maps.unbind(-3))
 
     def run(self, tick: int, force: Tensor) -> dict[str, Tensor]:
@@ -259,13 +223,19 @@ class Loop:
         if self._read is not None:
             measured, record["saturated"] = self._read(total)
         push = (damping @ task.velocity[..., tick, :].unsqueeze(-1)).squeeze(-1) + task.inertial_force[..., tick, :]
-        self._move(stiffness, damping, (force, measured), push, desired)
+        if self._filter is None:
+            each = next(self._maps)
+        else:
+            each = _tick_map(stiffness, damping, mass_at(task.mass, tick), task.dt)
+        self._move(each, (force, measured), push, desired)
         if self._robot is not None:
             self._robot(commanded)
         if tick + 1 < task.n_ticks:
             self._deviation = task.carry(tick, self._deviation) - (task.position[..., tick + 1, :] - desired)
             if self._robot is not None:
                 self._robot.carry(partial(task.carry, tick))
+            if self._filter is not None and task.turning is not None:
+                self._filter.carry(task.turning.transport[..., tick, :, :])
         return record | {"stiffness": stiffness, "damping": damping}
 
     def _wall(self, position: Tensor, velocity: Tensor) -> Tensor:
@@ -275,15 +245,9 @@ class Loop:
         force = walls.force(position[..., :p], velocity[..., :p])
         return torch.nn.functional.pad(force, (0, position.shape[-1] - p))  # on a point: without a torque
 
-    def _move(
-        self, stiffness: Tensor, damping: Tensor, forces: tuple[Tensor, Tensor], push: Tensor, desired: Tensor
-    ) -> None:
-        """Move over the tick, by the measured force; the walls are evaluated anew in each of its parts."""
+    def _move(self, each: Tensor, forces: tuple[Tensor, Tensor], push: Tensor, desired: Tensor) -> None:
+        """Move over the tick by its map and the measured force; the walls are evaluated anew in each of its parts."""
         outside, force = forces
-        if self._filter is None:
-            each = next(self._maps)
-        else:
-            each = _tick_map(stiffness, damping, self._task.mass, self._task.dt)
         for part in range(self._task.substeps):
             before = self._deviation, self._velocity
             if part:
