@@ -14,7 +14,7 @@ from sklearn.exceptions import ConvergenceWarning, NotFittedError
 
 from torch_pbd import CholeskyCovRegressor, WishartProcessRegressor
 from torch_pbd.exceptions import DataRankWarning, NotPositiveDefiniteError
-from torch_pbd.gp import evidence
+from torch_pbd.gp import latent
 from torch_pbd.models import costs
 
 NEAR = np.linspace(-1.5, 1.5, 31)[:, np.newaxis]
@@ -318,7 +318,7 @@ def test_29_a_loss_that_is_none_at_the_start_is_an_error(name, monkeypatch):
 @pytest.mark.parametrize("name", ["cholesky", "cholesky-likelihood", "wishart-random"])
 def test_29_evidence_that_is_no_number_counts_as_too_far(name, first, monkeypatch):
     whole = fitted(name).predict_cov(NEAR)
-    broken = NotANumberFrom(monkeypatch, evidence.Evidence, "__call__", first)
+    broken = NotANumberFrom(monkeypatch, latent.Evidence, "__call__", first)
     with pytest.warns(ConvergenceWarning, match="not finite"):
         model = new(name).fit(*demonstrations())
     covariance = model.predict_cov(NEAR)
@@ -329,7 +329,7 @@ def test_29_evidence_that_is_no_number_counts_as_too_far(name, first, monkeypatc
 
 @pytest.mark.parametrize("name", ["cholesky", "wishart"])
 def test_29_evidence_that_is_never_a_number_is_an_error(name, monkeypatch):
-    NotANumberFrom(monkeypatch, evidence.Evidence, "__call__", 1)
+    NotANumberFrom(monkeypatch, latent.Evidence, "__call__", 1)
     with pytest.raises(NotPositiveDefiniteError, match=r"wherever the hyperparameters were searched.*noise_scale=None"):
         new(name).fit(*demonstrations())
 
