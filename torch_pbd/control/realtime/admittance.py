@@ -33,9 +33,10 @@ class RealTimeAdmittance:
     own acceleration, or that of a soft start if it is more: also where it does several of these at a time.
 
     On poses the deviation ``x - x_d`` ends with the rotation vector Log(R R_d'), v with the angular velocity, and f is
-    a wrench, all in world axes. Limits are then pairs, of lengths in m, m/s or N and of rotations in rad, rad/s or Nm:
-    ``force_limit=(50.0, 5.0)``. Speeds as far apart as the two approach speeds count as equal where the motion as a
-    whole is braked or catches up; the two stop together.
+    a wrench, all in world axes; a spring that is not as stiff about all axes is a potential only to the second order of
+    that vector, and ticks are exact to its first. Limits are then pairs, of lengths and of rotations, in N and Nm or in
+    m/s and rad/s: ``force_limit=(50.0, 5.0)``. Speeds as far apart as the two approach speeds count as equal where the
+    motion is braked or catches up as a whole; the two stop together.
 
     Where damping shares the modes of stiffness and mass in every row, as that of `Schedule.with_inertia` does, a tick
     takes microseconds, else 0.1 ms, for a matrix exponential: interpolation between rows loses the sharing, so sample
@@ -56,8 +57,9 @@ class RealTimeAdmittance:
         larger ones, against drift and noise. None is 200 N and 20 Nm, and no deadband.
     spring_limit : float or (float, float), default=None
         Largest pull of the spring ``K e``, e = x_d - x; None takes ``force_limit``. Beyond it, K is scaled by
-        ``1 / sqrt(c e'K e)``, c the larger eigenvalue over squared limit of the blocks of K: the force of a potential
-        that is concave in e'K e, and so adds no energy where K is constant, whatever the mass.
+        ``spring_limit / sqrt(k_max e'K e)``, k_max its largest eigenvalue: the force of a potential that is concave in
+        e'K e, and so adds no energy where K is constant, whatever the mass. On poses each spring by itself, or both by
+        the smaller scale where K couples them.
     velocity_limit, acceleration_limit : float or (float, float), default=None
         Largest speed and acceleration of the command; where they act, ticks are not exact. None is the most that the
         desired motion and ``force_limit`` can cause where the damping is least.
@@ -134,9 +136,9 @@ class RealTimeAdmittance:
         self._table = table = ScheduleTable(schedule, inertia, float(rate), limits["spring_limit"])
         self._clock = ScheduleClock(table, soft_start, limits["approach_speed"], limits["acceleration_limit"], on_gap)
         self._motion = Motion(table, self._timer, self._clock, limits, self._unit)
-        self._is_pose, self._speeds = schedule.orientation is not None, limits["velocity_limit"]
+        self._is_pose, self._speeds = len(table.blocks) == 2, limits["velocity_limit"]
         self._turn = threading.Lock()
-        self._begin(math.nan, 0.0, None, None, (0.0,) * table.n_axes, ())
+        self._begin(math.nan, 0.0, (None, None, (0.0,) * table.n_axes), ())
 
     def __repr__(self) -> str:
         mass = f"{self._unit:g} kg" if self._table.mass is None else str(self._table.mass.shape[1:])
@@ -180,16 +182,15 @@ class RealTimeAdmittance:
         now = checks.number(now, "now", unit="s")
         at = checks.number(at, "at", least=0.0, most=self._table.end, unit="s")
         here = None if position is None else vector(position, "position", blocks[0].stop)
-        turned = None if orientation is None else unit_quaternion(orientation, is_pose=len(blocks) == 2)
+        turned = None if orientation is None else unit_quaternion(orientation, is_pose=self._is_pose)
         moving = (0.0,) * d if velocity is None else vector(velocity, "velocity", d)
         bias = () if force_bias is None else vector(force_bias, "force_bias", d)
-        names = ("the speed", "units/s"), ("the angular speed", "rad/s")
-        for (name, unit), block, most in zip(names, blocks, self._speeds, strict=False):
-            checks.number(math.hypot(*moving[block]), name, most=most, unit=unit, remedy="slow it down")
+        for name, block, most in zip(("the speed", "the angular speed"), blocks, self._speeds, strict=False):
+            checks.number(math.hypot(*moving[block]), name, most=most, unit="units/s", remedy="slow it down")
         if not self._turn.acquire(False):
             raise RuntimeError(_SHARED)
         try:
-            self._begin(now, at, here, turned, moving, bias)
+            self._begin(now, at, (here, turned, moving), bias)
         finally:
             self._turn.release()
 
@@ -274,7 +275,7 @@ class RealTimeAdmittance:
     @property
     def stiffness(self) -> Floats:
         """Stiffness K (d, d) of the last tick in N/m, as ``spring_limit`` let it be."""
-        return self._motion.scale * self._table.stiffness[self._clock.index]
+        return self._table.scaled(self._motion.scale, self._clock.index)
 
     @property
     def damping(self) -> Floats:
@@ -286,15 +287,7 @@ class RealTimeAdmittance:
         """Time in the schedule, in s."""
         return self._clock.time_at(self._timer.last)
 
-    def _begin(
-        self,
-        now: float,
-        at: float,
-        position: Vector | None,
-        orientation: Vector | None,
-        velocity: Vector,
-        bias: Vector,
-    ) -> None:
-        self._channel.begin(len(velocity), bias)
-        self._motion.begin(now, at, position, orientation, velocity)
+    def _begin(self, now: float, at: float, start: tuple[Vector | None, Vector | None, Vector], bias: Vector) -> None:
+        self._channel.begin(self._table.n_axes, bias)
+        self._motion.begin(now, at, *start)
         self.faults = FINE

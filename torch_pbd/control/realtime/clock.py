@@ -38,7 +38,7 @@ class ScheduleClock:
 
     Speeds and accelerations of poses are those of `norm_with` a lever: both blocks then keep to all of the above. An
     approach turns the desired orientation by A, a share of the way in between: ``A R_d`` moves at w_A + A w_d, and the
-    acceleration of that has w_A x A w_d besides.
+    acceleration of that has w_A x A w_d besides, which is allowed for at full speed.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class ScheduleClock:
         # What a soft start does not tell apart counts as equally fast.
         self.scales = scales = tuple([approach_speeds[0] / speed for speed in approach_speeds])
         lever = None if len(scales) == 1 else scales[1]
-        self._approach_speed = approach_speed = approach_speeds[0]
+        approach_speed = approach_speeds[0]
         self._lever, self.norm, acceleration_limit = lever, norm_with(lever), self.least(acceleration_limits)
         speeds, accelerations = (
             np.max(
@@ -67,7 +67,9 @@ class ScheduleClock:
             for rows in (table.velocity, table.acceleration)
         )
         own, fastest = float(accelerations.max()), float(speeds.max())
-        self._spin = float(np.linalg.norm(table.velocity[:, table.blocks[1]], axis=1).max()) if lever else 0.0
+        spin = float(np.linalg.norm(table.velocity[:, table.blocks[1]], axis=1).max()) if lever else 0.0
+        if spin * approach_speed > _SHARE * acceleration_limit:
+            approach_speed = _SHARE * acceleration_limit / spin
         # Acceleration of a soft start that comes up to speed; without one, a second is as long as its default.
         soft = max(fastest, approach_speed) / (soft_start or 1.0)
         # One half of a limit is left for the schedule's own acceleration.
@@ -78,6 +80,7 @@ class ScheduleClock:
         self._room = max(self.gain, self.acceleration - (1.0 + _SHARE) * own)
         room = (self.acceleration - self.gain) / own if own else math.inf
         self._fastest = min(_SPEED, math.sqrt(room)) if self._catches_up else 1.0
+        self._approach_speed, self.acceleration = approach_speed, self.acceleration + approach_speed * spin
         # Integral of dt / |x'| from each row to the end; where the schedule rests it is long, not endless.
         times = np.append(np.arange(table.last) / table.rate, table.end)
         middle = np.maximum(0.5 * (speeds[1:] + speeds[:-1]), 1e-9 * self.speed)
@@ -116,7 +119,7 @@ class ScheduleClock:
         self._is_soft = any(self._distance) and self._soft_start > 0.0
         if self._is_soft:
             # At a pace of 1 the approach leaves this much less than `gain` to changes of pace.
-            taken = self.gain + self._sharpness(way) - self._room
+            taken = self.gain + _SHARPEST * way / self._blend / self._blend - self._room
             self._taken = min(max(taken, 0.0), self.gain)
         # The pace at which the desired motion is nearest to that of the robot.
         scales = (1.0,) * d if self._lever is None else (*[1.0] * (d - 3), *[self._lever**2] * 3)
@@ -276,10 +279,4 @@ class ScheduleClock:
 
     def _time_of(self, way: float, room: float) -> float:
         """Time of an approach within its largest speed and this acceleration."""
-        spun = _STEEPEST * way * self._spin
-        soonest = (spun + math.sqrt(spun * spun + 4.0 * _SHARPEST * way * room)) / (2.0 * room)
-        return max(self._soft_start, _STEEPEST * way / self._approach_speed, soonest)
-
-    def _sharpness(self, way: float) -> float:
-        """Largest acceleration of the approach."""
-        return (_SHARPEST * way / self._blend + _STEEPEST * way * self._spin) / self._blend
+        return max(self._soft_start, _STEEPEST * way / self._approach_speed, math.sqrt(_SHARPEST * way / room))

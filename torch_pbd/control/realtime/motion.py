@@ -10,7 +10,7 @@ import numpy as np
 from torch_pbd.control.realtime.clock import ScheduleClock
 from torch_pbd.control.realtime.limits import FINE, CommandLimits, TickStatus
 from torch_pbd.control.realtime.places import Vector
-from torch_pbd.control.realtime.steps import braked
+from torch_pbd.control.realtime.steps import Scale, braked
 from torch_pbd.control.realtime.table import ScheduleTable
 from torch_pbd.control.realtime.timer import SMOOTHING, TickTimer
 
@@ -25,7 +25,7 @@ class Motion:
     row: Vector
     place: Vector
     velocity: Vector
-    scale: float
+    scale: Scale
     is_stopped: bool
 
     def __init__(

@@ -15,7 +15,9 @@ State = tuple[Vector, Vector]
 """Place and velocity."""
 Solved = tuple[Vector, Vector, float]
 Solve = Callable[[Vector, Vector, Vector, tuple[Vector, Vector], float, float], Solved]
-Advance = Callable[[Vector, Vector, State, float, float], tuple[State, float]]
+Scale = float | Vector
+"""Scale of the stiffness: that of all, or those of positions and of rotations."""
+Advance = Callable[[Vector, Vector, State, float, float], tuple[State, Scale]]
 
 # Of (w h)^2, w the frequency of an axis and h the step: below, two terms of a series in it have all digits.
 _CRITICAL = 1e-7
@@ -106,13 +108,57 @@ def advance_with(solve: Solve, n_place: int, d: int) -> Advance:
     the desired rotation, which turns e by w_d x e, comes out by itself.
     """
 
-    def advance(row: Vector, push: Vector, state: State, step: float, pull_limit: float) -> tuple[State, float]:
+    def advance(row: Vector, push: Vector, state: State, step: float, pull_limit: float) -> tuple[State, Scale]:
         place, velocity = state
         motion, off = (row[n_place : n_place + d], velocity), deviation(place, row[:n_place], d)
         move, velocity, scale = solve(row[n_place + d :], push, off, motion, step, pull_limit)
         return (moved(place, move), velocity), scale
 
     return advance
+
+
+def advance_apart(solve: Solve, p: int, d: int) -> Advance:
+    """As `advance_with` for poses whose positions and rotations have springs apart, each with a limit of its own.
+
+    Each spring has a potential of its own then, and a scale: twisted beyond its torque, a tool keeps its stiffness
+    along the way. A row has, before what the function takes, the largest stiffness over squared limit of the two, and
+    the two stiffnesses. Where a limit acts, modes are no longer shared, unless both scales are the same.
+    """
+    start, middle = p + 4 + d, p + 6 + d
+    rotation, gains = middle + p * p, middle + p * p + 9
+
+    def advance(row: Vector, push: Vector, state: State, step: float, _: float) -> tuple[State, Scale]:
+        place, velocity = state
+        motion, off = (row[p + 4 : start], velocity), deviation(place, row[: p + 4], d)
+        pull = row[start] * _quadratic(row[middle:rotation], off[:p])
+        torque = row[start + 1] * _quadratic(row[rotation:gains], off[p:])
+        if pull <= 1.0 >= torque:
+            move, velocity, _scale = solve(row[gains:], push, off, motion, step, math.inf)
+            return (moved(place, move), velocity), 1.0
+        scales = 1.0 / math.sqrt(max(pull, 1.0)), 1.0 / math.sqrt(max(torque, 1.0))
+        scaled = _scaled(row[gains:], solve is coupled, np.repeat(scales, [p, 3]))
+        move, velocity, _scale = coupled(scaled, push, off, motion, step, math.inf)
+        return (moved(place, move), velocity), scales
+
+    return advance
+
+
+def _scaled(row: Vector, is_coupled: bool, scales: Floats) -> Vector:
+    """Row for `coupled` with a stiffness scaled on each axis, from one for that or for `along_modes`."""
+    d = len(scales)
+    if is_coupled:
+        stiffness, *others = np.array(row[1:]).reshape(-1, d, d)
+    else:
+        values, decays, *maps = np.split(np.array(row[1:]), [d, 2 * d, 2 * d + d * d])
+        tells, shapes = (part.reshape(-1, d) for part in maps)
+        stiffness, others = tells.T * values @ tells, [tells.T * 2.0 * decays @ tells]
+        others += [shapes.T @ shapes] if len(shapes) else []
+    return (0.0, *np.concatenate([scales[:, None] * stiffness, *others]).ravel().tolist())
+
+
+def _quadratic(matrix: Vector, x: Vector) -> float:
+    d = len(x)
+    return sum([part * _dot(matrix[i * d : (i + 1) * d], x) for i, part in enumerate(x)])
 
 
 def _expm1(matrix: Floats) -> Floats:

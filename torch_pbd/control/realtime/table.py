@@ -9,7 +9,16 @@ import numpy as np
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control.realtime.places import Vector
-from torch_pbd.control.realtime.steps import Solve, advance_plane, advance_with, along_modes, coupled
+from torch_pbd.control.realtime.steps import (
+    Advance,
+    Scale,
+    Solve,
+    advance_apart,
+    advance_plane,
+    advance_with,
+    along_modes,
+    coupled,
+)
 from torch_pbd.control.schedule import Schedule
 from torch_pbd.control.schedule.rows import Between, count_rows, row_times
 
@@ -77,23 +86,27 @@ class ScheduleTable:
         if isinstance(mass, np.ndarray):
             self.mass = between.linear(mass) if mass.ndim == 3 else np.broadcast_to(mass, self.stiffness.shape)
         solve, gains, along = _gains(self.stiffness, self.damping, mass if np.ndim(mass) < 3 else self.mass)
-        is_plane = solve is along_modes and self.mass is None and self.n_axes == self.n_place == 2
-        self.advance = advance_plane if is_plane else advance_with(solve, self.n_place, self.n_axes)
         unit = mass if isinstance(mass, float) else 1.0
-        if len(self.blocks) == 1 and along is not None and self.mass is None:
-            largest, least = along[0].max(axis=1), unit * float(along[1].min())
+        self.advance, springs = self._springs(solve, along, unit, pull_limits)
+        if along is not None and len(self.blocks) == 1 and self.mass is None:
+            least = unit * float(along[1].min())
             self.mobility = np.full((1, 1), 1.0 / least if least > 0.0 else math.inf)
         else:
-            largest = _largest(self.stiffness, self.blocks, pull_limits) / unit
             self.mobility = _mobility(self.damping, self.blocks)
         # Rows are packed, for the garbage collector would hold up the loop to walk over a list of a million rows.
-        parts = [part.reshape(len(grid), -1) for part in (place, velocity, largest, *gains)]
+        parts = [part.reshape(len(grid), -1) for part in (place, velocity, *springs, *gains)]
         rows = np.concatenate(parts, axis=1)
         self.packed, self.layout = rows.tobytes(), struct.Struct(f"{rows.shape[1]}d")
 
     def row(self, index: int) -> Vector:
         """One row, unpacked."""
         return self.layout.unpack_from(self.packed, index * self.layout.size)
+
+    def scaled(self, scale: Scale, index: int) -> Floats:
+        """Stiffness (d, d) of a row in N/m, in a tick that scaled it."""
+        scales = scale if isinstance(scale, tuple) else (scale,) * len(self.blocks)
+        sizes = [block.stop - block.start for block in self.blocks]
+        return np.repeat(scales, sizes)[:, np.newaxis] * self.stiffness[index]
 
     def forced(self, acceleration: Vector, index: int) -> Vector:
         """Push, as ticks take it, that causes an acceleration: a force, or that per kg."""
@@ -102,6 +115,30 @@ class ScheduleTable:
     def accelerated(self, push: Vector, index: int) -> Vector:
         """Acceleration that such a push causes."""
         return push if self.mass is None else tuple(np.linalg.solve(self.mass[index], push).tolist())
+
+    def _springs(
+        self, solve: Solve, along: list[Floats] | None, unit: float, pull_limits: Vector
+    ) -> tuple[Advance, list[Floats]]:
+        """Function that advances, and what it needs of each row to limit the spring."""
+        d, n_place = self.n_axes, self.n_place
+        if along is not None and self.mass is None and d == n_place:
+            return advance_plane if d == 2 else advance_with(solve, n_place, d), [along[0].max(axis=1)]
+        # |K e|^2 <= k_max e'K e in each block, with k_max that of the block, also where others are displaced, for
+        # |B'K e|^2 <= |B'K B| e'K e for any B.
+        stiffest = [np.linalg.eigvalsh(self.stiffness[:, block, block])[:, -1] for block in self.blocks]
+        largest = [most / limit**2 for most, limit in zip(stiffest, pull_limits, strict=True)]
+        whole = np.max(largest, axis=0) * (pull_limits[0] ** 2 / unit)
+        if len(self.blocks) == 1 or not _are_apart(self.stiffness, *self.blocks):
+            return advance_with(solve, n_place, d), [whole]
+        springs = [self.stiffness[:, block, block] for block in self.blocks]
+        return advance_apart(solve, self.blocks[0].stop, d), [*largest, *springs, whole]
+
+
+def _are_apart(stiffness: Floats, first: slice, second: slice) -> bool:
+    """Whether no stiffness couples positions and rotations."""
+    along = np.sqrt(np.abs(stiffness).max(axis=0).diagonal())
+    coupling = np.abs(stiffness[:, first, second]).max(axis=0)
+    return bool((coupling <= checks.ROUNDING * np.multiply.outer(along[first], along[second])).all())
 
 
 def _gains(stiffness: Floats, damping: Floats, mass: Any) -> tuple[Solve, list[Floats], list[Floats] | None]:
@@ -126,17 +163,6 @@ def _gains(stiffness: Floats, damping: Floats, mass: Any) -> tuple[Solve, list[F
     if is_matrix:
         return coupled, [stiffness, damping, np.broadcast_to(np.linalg.inv(mass), stiffness.shape)], None
     return coupled, scaled, None
-
-
-def _largest(stiffness: Floats, blocks: Blocks, pull_limits: Vector) -> Floats:
-    """Square of the first limit over that of the largest |K e| / limit of a block at e'K e = 1: k_max of one block.
-
-    ``|K e|^2 <= k_max e'K e`` in each block, with k_max that of the block: with the others' displacements too, as
-    ``|B'K e|^2 <= |B'K B| e'K e`` for any B.
-    """
-    along = [np.linalg.eigvalsh(stiffness[:, block, block])[:, -1] for block in blocks]
-    relative = [most * (pull_limits[0] / limit) ** 2 for most, limit in zip(along, pull_limits, strict=True)]
-    return np.max(relative, axis=0)
 
 
 def _mobility(damping: Floats, blocks: Blocks) -> Floats:
