@@ -143,3 +143,21 @@ def test_the_experiment_of_poses_runs_from_its_configuration(tmp_path, capsys):
         "made for 1 kg",
     ):
         assert words in text
+
+
+@pytest.mark.slow
+def test_an_arm_in_mujoco_is_pushed_as_far_as_its_plant():
+    pytest.importorskip("mujoco")
+    from torch_pbd.robots import HOME, inverse_kinematics, mujoco, panda
+
+    law = StiffnessLaw(stiffness_min=300.0, stiffness_max=1500.0, rotation=RotationLimits(5.0, 60.0))
+    controller = DMPController(GMMBaseline(n_components=3), stiffness_law=law)
+    run = pushed(controller.fit(make_pose_demonstrations(random_state=0)), 1000.0, 12.0, 1.2, "panda")
+    schedule, model = run.schedule, panda()
+    joints = inverse_kinematics(model, schedule.position, schedule.orientation, "tool", start=HOME)
+    still = mujoco.run(model, schedule, joints).deviation
+    for kind, rollout, axis in ((POSITION, run.forces[1], 1), (ROTATION, run.torques[2], 2)):
+        moved = mujoco.run(model, schedule, joints, wrench=rollout.force).deviation - still
+        own = np.abs(kind.scale * run.along(moved, kind)[:, axis])
+        # The plant is linear in rotations, and has the inertia of the arm where it should be.
+        assert own.max() == pytest.approx(np.abs(run.moved(kind)[:, axis]).max(), rel=0.02)
