@@ -106,7 +106,8 @@ def pushed(controller: DMPController, rate: float, peak: float, torque: float, a
     """Plan for the arm, push along and about each axis of the tool, early and late, and certify."""
     planned = controller.schedule(rate)
     schedule = with_panda(planned) if arm == "panda" else planned
-    plant = AdmittancePlant(None)
+    # As torque control of an arm, which feeds its inertia times the acceleration forward.
+    plant = AdmittancePlant(None, feed_forward=True)
 
     def run(largest: float, kind: Kind, axis: int) -> Rollout:
         wrench = _wrench(schedule, largest, kind, axis)
