@@ -9,7 +9,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small: th
 import shapes
 
 TORCH_CONTROL = [
-    "damping", "matrices", "stiffness", "primitive.dmp", "stability.certify", "stability.lyapunov",
+    "damping", "matrices", "stiffness", "primitive.dmp", "stability.certify",
+    *(f"stability.{part}" for part in ("common_function", "dynamics", "environment", "gain", "lyapunov")),
     *(f"simulation.{part}" for part in (
         "walls", "filters", "plant", "sensor", "rollout", "rollouts", "position_loop", "ticks")),
 ]  # fmt: skip

@@ -15,8 +15,10 @@ from torch_pbd import CholeskyCovRegressor, DMPController, load_demonstrations
 from torch_pbd.control.damping import damping_from_stiffness, required_damping_ratio
 from torch_pbd.control.simulation.plant import AdmittancePlant
 from torch_pbd.control.simulation.ticks import admittance_rate, transition
-from torch_pbd.control.stability import certify as module
-from torch_pbd.control.stability.lyapunov import Knots, has_common_function
+from torch_pbd.control.stability import gain as module
+from torch_pbd.control.stability.common_function import isotropic_function, scaled
+from torch_pbd.control.stability.dynamics import ErrorDynamics
+from torch_pbd.control.stability.lyapunov import Knots
 from torch_pbd.data import make_tunnel_demonstrations
 
 N_KNOTS = 12
@@ -39,10 +41,11 @@ def turned(eigenvalues, angle):
     return symmetric(axes * eigenvalues.unsqueeze(-2) @ axes.mT)
 
 
-def periodic_schedules(n_schedules, d, generator):
-    """Time (n, T), stiffness and damping (n, T, d, d), mass (n, 1, d, d); the last knot is the first.
+def periodic_schedules(n_schedules, d, generator, *, is_varying=False):
+    """Time (n, T), stiffness and damping (n, T, d, d), mass (n, 1 or T, d, d); the last knot is the first.
 
-    Periods from 0.3 to 8 natural ones, damping ratios from 0.01 to 1.5, stiffness ratios up to 30, axes that turn.
+    Periods from 0.3 to 8 natural ones, damping ratios from 0.01 to 1.5, stiffness ratios up to 30, axes that turn; the
+    mass, where it varies, by a factor of up to 20, and its axes by half turns of their own.
     """
 
     def uniform(*shape):
@@ -53,6 +56,12 @@ def periodic_schedules(n_schedules, d, generator):
     waves = torch.sin(around + 6.3 * uniform(n_schedules, 1, d)) + 0.4 * torch.sin(2.0 * around + uniform(1))
     depth = 0.5 * math.log(30.0) * uniform(n_schedules, 1, 1) ** 2
     half_turns = torch.floor(3.0 * uniform(n_schedules, 1))
+    if is_varying:
+        depths = 0.5 * math.log(20.0) * uniform(n_schedules, 1, 1)
+        swings = torch.exp(depths * torch.sin(around + 6.3 * uniform(n_schedules, 1, d)))
+        turns = torch.floor(2.0 * uniform(n_schedules, 1)) * around[:, 0] / 2.0
+        mass = turned(torch.linalg.eigvalsh(mass) * swings, 3.0 * uniform(n_schedules, 1) + turns)
+        mass[:, -1] = mass[:, 0]
     stiffness = turned(300.0 * torch.exp(depth * waves), half_turns * around[:, 0] / 2.0)
     stiffness[:, -1] = stiffness[:, 0]
     ratio = 0.01 * 150.0 ** uniform(n_schedules, 1, 1, 1)
@@ -66,8 +75,8 @@ def maps_between_knots(time, stiffness, damping, mass, n_steps=80):
     """Transitions (n, T - 1, 2 d, 2 d) of gains that are linear between knots, by Runge and Kutta's method."""
 
     def rate(share):
-        gains = (torch.lerp(each[:, :-1], each[:, 1:], share) for each in (stiffness, damping))
-        return admittance_rate(*gains, mass)[..., : 2 * d, : 2 * d]
+        gains = (torch.lerp(each[:, :-1], each[:, 1:], share) for each in (stiffness, damping, mass.expand_as(damping)))
+        return admittance_rate(*gains)[..., : 2 * d, : 2 * d]
 
     d = stiffness.shape[-1]
     step = time.diff()[..., None, None] / n_steps
@@ -82,10 +91,11 @@ def maps_between_knots(time, stiffness, damping, mass, n_steps=80):
 
 
 @pytest.mark.parametrize("d", [1, 2])
-def test_none_of_a_thousand_certified_schedules_grows(d, generator):
-    """500 for each d: the growth over a period by the largest eigenvalue of its map, and V at every knot."""
-    time, stiffness, damping, mass = periodic_schedules(500, d, generator)
-    found = [Knots(*each).certificate() for each in zip(time, stiffness, damping, mass[:, 0], strict=True)]
+@pytest.mark.parametrize("is_varying", [False, True])
+def test_none_of_a_thousand_certified_schedules_grows(d, is_varying, generator):
+    """250 for each: the growth over a period by the largest eigenvalue of its map, and V at every knot."""
+    time, stiffness, damping, mass = periodic_schedules(250, d, generator, is_varying=is_varying)
+    found = [Knots(ErrorDynamics(*each)).certificate() for each in zip(time, stiffness, damping, mass, strict=True)]
     alpha, margin = torch.tensor([each[:2] for each in found], dtype=torch.float64).unbind(-1)
     maps = maps_between_knots(time, stiffness, damping, mass)
     over_period = torch.eye(2 * d).double()
@@ -94,8 +104,8 @@ def test_none_of_a_thousand_certified_schedules_grows(d, generator):
     growth = torch.linalg.eigvals(over_period).abs().amax(-1)
     certified = margin >= 0.0
     assert growth[certified].max() <= 1.0 + 1e-9
-    assert 150 < certified.sum() < 350
-    assert (growth > 1.01).sum() > 20  # the search can find growth
+    assert 30 < certified.sum() < 200
+    assert (growth > 1.01).sum() > 10  # the search can find growth
     alpha = alpha[:, None, None, None]
     rows = [[stiffness + alpha * damping, alpha * mass], [alpha * mass, mass]]
     function = torch.cat([torch.cat([each.expand_as(stiffness) for each in row], dim=-1) for row in rows], dim=-2)
@@ -126,7 +136,7 @@ def test_the_unstable_example_is_flagged():
     assert max(map(len, str(report).splitlines())) <= 80
     calm = certify(unstable(), mass=10.0, speed=0.5 * report.max_speed)
     assert calm.certified
-    assert "margin" in str(calm)
+    assert "holds: rate" in str(calm)
     assert "NOT" not in str(calm)
 
 
@@ -203,13 +213,19 @@ def rotating(n=60, d=2, turns=1.0, mass=1.0, ratio=0.7):
 UNEVEN = torch.tensor([[2.0, 0.5], [0.5, 0.7]]).double()
 
 
-def margin_at(schedule, alpha, speed=1.0):
-    """Smallest eigenvalue of ``2 a K - K' - a D'``, where it is smallest, in numpy."""
-    step = (np.diff(schedule.time) / speed)[:, None, None]
+def margin_at(schedule, mass, alpha):
+    """Smallest eigenvalue of Q relative to P at both ends of every interval, in numpy."""
+    step = np.diff(schedule.time)[:, None, None]
     stiffness, damping = schedule.stiffness.numpy(), schedule.damping.numpy()
     rise = (np.diff(stiffness, axis=0) + alpha * np.diff(damping, axis=0)) / step
-    ends = np.stack([2.0 * alpha * stiffness[:-1] - rise, 2.0 * alpha * stiffness[1:] - rise])
-    return np.linalg.eigvalsh(ends)[..., 0].min()
+    values = []
+    for end in (slice(0, -1), slice(1, None)):
+        held, cross = alpha * stiffness[end] - 0.5 * rise, np.broadcast_to(alpha * mass, rise.shape)
+        falls = np.block([[held, 0.0 * rise], [0.0 * rise, damping[end] - alpha * mass]])
+        function = np.block([[stiffness[end] + alpha * damping[end], cross], [cross, cross / alpha]])
+        inverse = np.linalg.inv(np.linalg.cholesky(function))
+        values.append(np.linalg.eigvalsh(inverse @ falls @ inverse.swapaxes(1, 2))[:, 0].min())
+    return min(values)
 
 
 @pytest.mark.parametrize(
@@ -219,11 +235,10 @@ def test_the_margin_is_the_best_over_all_alpha(schedule, mass):
     report = certify(schedule, mass=mass)
     matrix = mass * np.eye(schedule.stiffness.shape[-1]) if isinstance(mass, float) else mass.numpy()
     largest = min(scipy.linalg.eigh(each, matrix, eigvals_only=True)[0] for each in schedule.damping.numpy())
-    grid = np.linspace(1e-6, 1.0, 2001) * largest
-    margins = [margin_at(schedule, alpha) for alpha in grid]
+    margins = [margin_at(schedule, matrix, alpha) for alpha in np.linspace(2e-3, 1.0, 500) * largest]
     assert 0.0 < report.alpha <= largest * (1.0 + 1e-12)
-    assert report.margin == pytest.approx(margin_at(schedule, report.alpha), rel=1e-9, abs=1e-9)
-    assert max(margins) <= report.margin + 1e-9 * abs(report.margin)
+    assert report.margin == pytest.approx(margin_at(schedule, matrix, report.alpha), rel=1e-9, abs=1e-9)
+    assert max(margins) <= report.margin + 1e-5 * abs(report.margin)
     resolution = abs(np.diff(margins)).max()
     assert report.margin <= max(margins) + resolution
     assert any(math.isclose(report.margin_time, each) for each in schedule.time)
@@ -285,7 +300,7 @@ def test_the_gain_is_the_largest_over_all_pairs_of_knots(monkeypatch):
     expected = brute_gain(schedule, UNEVEN.numpy())
     assert certify(schedule, mass=UNEVEN).gain == pytest.approx(expected, rel=1e-9)
     assert expected > 1.1
-    monkeypatch.setattr(module, "_MAX_BEGINNINGS", 5)  # of longer schedules, some
+    monkeypatch.setattr(module, "_MAX_PARTS", 5)  # of longer schedules, some
     thinned = certify(schedule, mass=UNEVEN).gain
     assert 0.9 * expected < thinned <= expected * (1.0 + 1e-9)
 
@@ -349,13 +364,21 @@ def test_the_rule_is_the_required_damping_ratio(mass):
         assert report.stiffness_ratio == pytest.approx(spread, rel=1e-9)
         assert report.required_damping_ratio == pytest.approx(required_damping_ratio(spread), rel=1e-9)
         assert report.damping_ratio == pytest.approx(ratio * required_damping_ratio(spread), rel=1e-9)
-        assert report.stable_at_any_schedule == holds
+        assert has_isotropic_function(schedule.stiffness, schedule.damping, mass) == holds
+        assert report.stable_at_any_schedule or not holds
     schedule.damping = schedule.damping * 2.0
     assert certify(schedule, mass=mass).stable_at_any_schedule
     schedule.damping[30] *= 1.01  # not by one ratio, which the function has room for
     assert certify(schedule, mass=mass).stable_at_any_schedule
-    schedule.damping[30] /= 100.0
+    schedule.damping[30] /= 1000.0
     assert not certify(schedule, mass=mass).stable_at_any_schedule
+
+
+def has_isotropic_function(stiffness, damping, mass=1.0):
+    mass = mass * torch.eye(stiffness.shape[-1]).double() if isinstance(mass, float) else mass
+    rows, _ = scaled(ErrorDynamics(torch.arange(len(stiffness)).double(), stiffness, damping, mass[None]))
+    found = isotropic_function(rows)
+    return found is not None and found.largest(rows) < 0.0
 
 
 def searched_function(stiffness, damping):
@@ -389,7 +412,7 @@ def test_one_function_is_found_where_a_search_over_all_finds_one_and_falls_whate
         falls, a, b = searched_function(stiffness.numpy(), damping.numpy())
         if abs(falls) < 5e-3:  # the grid of 3050 is not finer
             continue
-        found.append(has_common_function(stiffness, damping))
+        found.append(has_isotropic_function(stiffness, damping))
         assert found[-1] == (falls > 0.0)
         if not found[-1]:
             continue
@@ -407,9 +430,9 @@ def test_one_function_is_found_where_a_search_over_all_finds_one_and_falls_whate
 def test_damping_that_grows_with_stiffness_serves_any_ratio():
     """D = 1 + 2 K: ``P = [[1/2, 1/2], [1/2, 1]]`` falls by ``y'Ky + |v|^2`` at least, whatever K is."""
     stiffness = torch.logspace(0.0, 8.0, 30).double()[:, None, None]
-    assert has_common_function(stiffness, 1.0 + 2.0 * stiffness)
-    assert not has_common_function(stiffness, 2.0 * stiffness.sqrt())
-    assert not has_common_function(stiffness, 0.0 * stiffness)
+    assert has_isotropic_function(stiffness, 1.0 + 2.0 * stiffness)
+    assert not has_isotropic_function(stiffness, 2.0 * stiffness.sqrt())
+    assert not has_isotropic_function(stiffness, 0.0 * stiffness)
 
 
 def assert_stays_guaranteed(schedule):

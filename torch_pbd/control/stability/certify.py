@@ -1,38 +1,30 @@
-"""Guarantees of a stiffness schedule, each by its name, and what it may touch.
-
-With the deviation y from the desired motion, ``M y'' + D y' + K y = f``: a rise of K feeds energy in.
-"""
+"""Guarantees of a stiffness schedule, each by its name, and what it may touch."""
 
 import math
 from typing import Any
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
-from torch_pbd import checks
+from torch_pbd import checks, rotations
 from torch_pbd.control.damping import required_damping_ratio
-from torch_pbd.control.matrices import as_mass, mass_matrix
+from torch_pbd.control.matrices import as_mass
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.position_loop import PositionLoop
-from torch_pbd.control.simulation.ticks import admittance_rate, transition
-from torch_pbd.control.stability.lyapunov import Knots, has_common_function, held_growth
+from torch_pbd.control.stability.common_function import common_function
+from torch_pbd.control.stability.dynamics import ErrorDynamics
+from torch_pbd.control.stability.environment import stiffest_environment
+from torch_pbd.control.stability.gain import largest_gain
+from torch_pbd.control.stability.lyapunov import Knots, held_growth
 from torch_pbd.control.stability.report import StabilityReport
+from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.linalg import spectral_map, symmetrize
-
-# Parts of the schedule that are followed at a time for their gain.
-_MAX_BEGINNINGS = 400
-# N/m; stiffer than anything there is.
-_STIFFEST = 1e9
-# Knots of a schedule that are coupled to an environment, each of which takes 60 eigenvalues of a matrix of 5 + delay.
-_MAX_KNOTS = 200
-_BISECTIONS = 60
 
 
 def certify(
     schedule: Schedule | Any,
     *,
-    mass: Any = 1.0,
+    mass: Any = None,
     speed: float = 1.0,
     position_loop: PositionLoop | Any = None,
     force_cutoff: float | None = 500.0,
@@ -43,9 +35,10 @@ def certify(
     Parameters
     ----------
     schedule : Schedule
-        Whose times and gains are checked.
-    mass : float or array_like of shape (d, d), default=1.0
-        Virtual mass of the admittance, kg.
+        Whose times, gains and, for poses, angular velocities are checked.
+    mass : float, array_like of shape (d, d) or (n, d, d), or callable, default=None
+        Virtual mass of the admittance, or inertia of the arm at each row, in kg, for poses also kg m and kg m^2; or a
+        function of time (n,), in s, that returns it. None is the schedule's own, or 1 kg.
     speed : float, default=1.0
         Replay speed: 2 is twice as fast.
     position_loop : PositionLoop, default=None
@@ -72,124 +65,86 @@ def certify(
     checks.instance(schedule, "schedule", Schedule)
     # An axis that is free never returns: nothing is to be certified of it.
     checks.semidefinite(schedule.stiffness, "stiffness", definite=True)
+    inertia = _inertia(schedule, mass)
     time, stiffness, damping = map(torch.tensor, (schedule.time, schedule.stiffness, schedule.damping))
-    checked = as_mass(mass)
-    inertia, is_number = mass_matrix(checked, stiffness).detach(), not (isinstance(checked, Tensor) and checked.ndim)
-    knots = Knots(time / speed, stiffness, damping, inertia)
+    dynamics = ErrorDynamics(time / speed, stiffness, damping, inertia, _transport(schedule, speed))
+    knots, maps = Knots(dynamics), dynamics.tick_maps()
     alpha, margin, worst = knots.certificate()
-    ratio, required, at_any_schedule, smallest = _damping_rule(stiffness, damping, inertia)
-    rate = admittance_rate(stiffness[:-1], damping[:-1], inertia)[..., : 2 * inertia.shape[0], : 2 * inertia.shape[0]]
-    maps = transition(rate * (time / speed).diff()[:, None, None], 1.0)
+    rate, fastest = common_function(dynamics)
+    smallest, ratio = _ratios(dynamics)
+    # The rule is of one function that no axis is special to: of one inertia, and of outputs of one unit.
+    ratio = ratio if len(inertia) == 1 and schedule.orientation is None else math.nan
     loop = PositionLoop() if position_loop is None else position_loop
+    pressed = [math.nan] * 2
+    if len(inertia) == 1:  # an inertia that varies is an arm's own: there is no position loop
+        for i, block in enumerate((slice(None), block, block) for block in schedule.blocks):
+            pressed[i] = stiffest_environment(
+                stiffness[block], damping[block], inertia[block][0], loop, force_cutoff, dt
+            )
     return StabilityReport(
         damping_ratio=smallest,
         stiffness_ratio=ratio,
-        required_damping_ratio=required,
-        stable_at_any_schedule=at_any_schedule,
+        required_damping_ratio=math.nan if math.isnan(ratio) else required_damping_ratio(ratio),
+        stable_at_any_schedule=not math.isnan(rate),
+        any_schedule_rate=rate,
+        any_schedule_speed=speed * fastest,
         alpha=alpha,
         margin=margin,
-        margin_time=float(time[worst]),
-        held_growth=held_growth(maps, stiffness, damping, inertia, alpha),
+        margin_time=float(schedule.time[worst]),
+        held_growth=held_growth(dynamics, maps, alpha) if margin >= 0.0 else math.nan,
         max_speed=speed * knots.max_speed(),
-        gain=_gain(maps, stiffness, inertia),
-        environment_stiffness=stiffest_environment(stiffness, damping, inertia, loop, force_cutoff, dt),
+        gain=largest_gain(dynamics, maps),
+        environment_stiffness=pressed[0],
+        environment_rotation=pressed[1],
         speed=float(speed),
-        mass=float(inertia[0, 0]) if is_number else tuple(map(tuple, inertia.tolist())),
+        mass=_as_given(inertia),
+        inertia=tuple(_range(inertia[:, block, block]) for block in schedule.blocks),
+        units=tuple("Nm/rad" if i or schedule.units == "rad" else "N/m" for i in range(len(schedule.blocks))),
     )
 
 
-def _damping_rule(stiffness: Tensor, damping: Tensor, mass: Tensor) -> tuple[float, float, bool, float]:
-    """Stiffness ratio, damping ratio it requires, whether one function falls at all knots, and the smallest ratio."""
-    inverse = spectral_map(mass, torch.rsqrt)
-    stiff, damp = (symmetrize(inverse @ gain @ inverse) for gain in (stiffness, damping))
-    eigenvalues = torch.linalg.eigvalsh(stiff)
-    ratio = float(eigenvalues.max() / eigenvalues.min())
-    root = spectral_map(stiff, lambda value: value.pow(-0.25))
-    ratios = torch.linalg.eigvalsh(symmetrize(root @ damp @ root)) / 2.0
-    return ratio, required_damping_ratio(ratio), has_common_function(stiff, damp), float(ratios.min())
+def _inertia(schedule: Schedule, mass: Any) -> Tensor:
+    """Masses (m, d, d), m = 1 where it is one for all rows."""
+    given = schedule.mass if mass is None else mass(schedule.time) if callable(mass) else mass
+    checked = as_mass(1.0 if given is None else given)
+    n, d, _ = schedule.stiffness.shape
+    if not (isinstance(checked, Tensor) and checked.ndim):
+        return float(checked) * torch.eye(d, dtype=torch.float64)[None]
+    if tuple(checked.shape) not in ((d, d), (n, d, d)):
+        raise InvalidParameterError(
+            f"mass has shape {tuple(checked.shape)}, must be a number or have shape {(d, d)} or {(n, d, d)}."
+        )
+    rows = checked.detach().double().reshape(-1, d, d)
+    return rows[:1] if bool((rows == rows[:1]).all()) else rows
 
 
-def _gain(maps: Float[Tensor, "m n n"], stiffness: Float[Tensor, "k d d"], mass: Tensor) -> float:
-    """Largest ``||P_j^1/2 Phi(j, i) P_i^-1/2||`` over i < j, with P = diag(K, M) and the exact maps Phi."""
-    energy = torch.stack([torch.block_diag(each, mass) for each in stiffness])
-    root = torch.linalg.cholesky(energy).mT
-    maps = torch.linalg.solve_triangular(root[:-1], root[1:] @ maps, upper=True, left=False)
-    begun, identity = maps[:0], torch.eye(maps.shape[-1]).to(maps)
-    largest = 1.0
-    for each in maps:
-        begun = each @ torch.cat([begun, identity[None]])
-        squared = begun.mT @ begun
-        # A part that has not grown so far gains no more than one that begins here. Whether all eigenvalues are below
-        # a limit is seen sooner than what they are.
-        grown = torch.linalg.cholesky_ex((1.0 + 1e-12) * identity - squared).info > 0
-        begun, squared = begun[grown], squared[grown]
-        record = torch.linalg.cholesky_ex(largest * (1.0 + 1e-12) * identity - squared).info > 0
-        if bool(record.any()):
-            largest = float(torch.linalg.eigvalsh(squared[record]).max())
-        if len(begun) > _MAX_BEGINNINGS:
-            begun = begun[torch.linalg.matrix_norm(begun).topk(_MAX_BEGINNINGS).indices]
-    return math.sqrt(largest)
+def _as_given(inertia: Tensor) -> float | tuple[tuple[float, ...], ...] | None:
+    """One number, one matrix, or None where the rows differ."""
+    if len(inertia) > 1:
+        return None
+    number = float(inertia[0, 0, 0])
+    is_number = torch.equal(inertia[0], number * torch.eye(inertia.shape[-1]).to(inertia))
+    return number if is_number else tuple(map(tuple, inertia[0].tolist()))
 
 
-def stiffest_environment(
-    stiffness: Float[Tensor, "n d d"],
-    damping: Float[Tensor, "n d d"],
-    mass: Float[Tensor, "d d"],
-    position_loop: PositionLoop,
-    force_cutoff: float | None = 500.0,
-    dt: float = 0.001,
-) -> float:
-    """Stiffest spring, N/m, that the robot can press on without vibrating, the least over the gains given.
-
-    The robot reads the force through a low-pass of ``force_cutoff`` Hz, and follows the admittance by its
-    position loop: the closed loop along an axis of the damping, tick by tick, is a matrix, and the spring is the
-    stiffest up to which its eigenvalues stay within the unit circle; about ``damping / (lag of loop and sensor)``.
-    Gains are held, and axes taken one by one; of more than 200 knots, 200 are looked at and those with the least
-    damping and stiffness.
-    """
-    chosen = torch.linspace(0, len(stiffness) - 1, min(len(stiffness), _MAX_KNOTS)).round().long()
-    softest = [torch.linalg.eigvalsh(gain)[:, 0].argmin() for gain in (stiffness, damping)]
-    chosen = torch.cat([chosen.to(stiffness.device), torch.stack(softest)])
-    axes = torch.linalg.eigh(symmetrize(damping[chosen])).eigenvectors
-    along = [
-        (axes * (matrix @ axes)).sum(-2).reshape(-1, 1, 1) for matrix in (stiffness[chosen], damping[chosen], mass)
-    ]
-    ticks = transition(admittance_rate(*along), dt)[:, :2]
-    low, high = torch.zeros_like(along[0][:, 0, 0]), torch.full_like(along[0][:, 0, 0], 2.0 * _STIFFEST)
-    for _ in range(_BISECTIONS):
-        # By the logarithm while that is wide: the answer may lie anywhere between a feather and a wall.
-        middle = torch.where(high > 1e3 * low.clamp_min(1.0), (low.clamp_min(1.0) * high).sqrt(), 0.5 * (low + high))
-        closed = _closed_loop(ticks, position_loop, force_cutoff, dt, middle)
-        stable = torch.linalg.eigvals(closed).abs().amax(-1) < 1.0
-        low, high = torch.where(stable, middle, low), torch.where(stable, high, middle)
-        lasting = low <= high.min()  # the others are not the least
-        low, high, ticks = low[lasting], high[lasting], ticks[lasting]
-    least = float(low.min())
-    return math.inf if least > _STIFFEST else least
+def _range(matrices: Tensor) -> tuple[float, float]:
+    eigenvalues = torch.linalg.eigvalsh(matrices)
+    return float(eigenvalues.min()), float(eigenvalues.max())
 
 
-def _closed_loop(
-    ticks: Float[Tensor, "n 2 3"],
-    position_loop: PositionLoop,
-    force_cutoff: float | None,
-    dt: float,
-    environment: Float[Tensor, " n"],
-) -> Float[Tensor, "n m m"]:
-    """Matrices of [admittance position, velocity; robot position, velocity; filtered force; commands waiting]."""
-    n_waiting = position_loop.delay_steps
-    closed = ticks.new_zeros(len(ticks), 5 + n_waiting, 5 + n_waiting)
-    robot, filtered, waiting = 2, 4, 5
-    if force_cutoff is None:
-        closed[:, :2, robot] = -environment[:, None] * ticks[:, :, 2]
-    else:
-        gain = -math.expm1(-2.0 * math.pi * force_cutoff * dt)
-        closed[:, :2, filtered] = ticks[:, :, 2]
-        closed[:, filtered, filtered] = 1.0 - gain
-        closed[:, filtered, robot] = -environment * gain
-    closed[:, :2, :2] = ticks[:, :, :2]
-    follow = position_loop.transition(dt, ticks)
-    closed[:, robot : robot + 2, robot : robot + 2] = follow[:, :2]
-    closed[:, robot : robot + 2, waiting if n_waiting else 0] = follow[:, 2]
-    for step in range(n_waiting):  # the oldest command comes first
-        closed[:, waiting + step, 0 if step == n_waiting - 1 else waiting + step + 1] = 1.0
-    return closed
+def _transport(schedule: Schedule, speed: float) -> Tensor | None:
+    """What carries the deviations of poses along, (n, d, d), if they turn."""
+    if schedule.orientation is None or not schedule.velocity[:, -3:].any():
+        return None
+    carried = torch.zeros(schedule.stiffness.shape, dtype=torch.float64)
+    carried[:, -3:, -3:] = torch.tensor(speed * rotations.cross_matrix(schedule.velocity[:, -3:]))
+    return carried
+
+
+def _ratios(dynamics: ErrorDynamics) -> tuple[float, float]:
+    """Smallest damping ratio, and largest over smallest stiffness per mass, each row in its own."""
+    stiffness, damping = map(dynamics.per_mass, (dynamics.stiffness, dynamics.damping))
+    spectrum = torch.linalg.eigh(stiffness)
+    root = spectral_map(stiffness, lambda value: value.pow(-0.25), tuple(spectrum))
+    ratios = torch.linalg.eigvalsh(symmetrize(root @ damping @ root)) / 2.0
+    return float(ratios.min()), float(spectrum.eigenvalues.max() / spectrum.eigenvalues.min())

@@ -10,58 +10,79 @@ from typing import final
 MAX_GAIN = 2.0
 # Growth over an interval that is none: rounding of an exact map.
 GROWTH_ROUNDING = 1e-9
+_WIDTH = 80
+_NOT_PROMISED = (
+    "saturated motors, delay, elastic joints, contact, errors that a driver clips, an elbow that drifts, Coriolis "
+    "forces left in, another inertia than this"
+)
 
 
 @final
 @dataclass(frozen=True)
 class StabilityReport:
-    """Stability of a schedule at one mass and speed, as :func:`certify` found it; ``print`` it.
+    """Stability of a schedule at one inertia and speed, as :func:`certify` found it; ``print`` it.
 
-    Guaranteed is the admittance of this mass, integrated exactly, without a force. A lag between it and the robot, by
-    a position loop or a filter of the force, is in ``environment_stiffness`` only.
+    Guaranteed is the motion of this inertia, integrated exactly, without a force. What a real robot adds to it, above
+    all lag, saturation and contact, is not in it; what a position loop and a filter of the force do against a spring is
+    in ``environment_stiffness`` only. All rates and ratios hold whatever the units; stiffnesses of positions and of
+    rotations are never compared.
 
     Attributes
     ----------
     damping_ratio : float
-        Smallest over the schedule and its axes.
+        Smallest over the schedule and its axes, at each row with its own inertia.
     stiffness_ratio : float
-        Largest over smallest stiffness R, of all axes and times.
+        Largest over smallest stiffness R, of all axes and times. NaN for poses and for an inertia that varies: the rule
+        below is false of these.
     required_damping_ratio : float
         Of damping ``2 zeta (M K)^1/2`` with one zeta, from here on any schedule within these limits is exponentially
-        stable: :func:`~torch_pbd.control.required_damping_ratio`.
+        stable: :func:`~torch_pbd.control.required_damping_ratio`. NaN where R is.
     stable_at_any_schedule : bool
-        Whether one function of the state, which no axis is special to, falls at every knot. Any schedule of these gains
-        and blends of them, at any speed, in any order, held over ticks or linear between knots, is then exponentially
-        stable.
+        Whether one function of the state was found that falls at every row. Any schedule of these rows and of blends of
+        their gains and inertias is then exponentially stable: in any order, held for any time or linear between rows,
+        at any speed up to ``any_schedule_speed``. What :meth:`Schedule.diagonal` makes of it is asked anew.
+    any_schedule_rate : float
+        Rate at which the root of that function falls at least, 1/s; NaN where none was found.
+    any_schedule_speed : float
+        Replay speed up to which it falls; infinite but for poses that turn, whose angular velocity must be within that
+        speed's.
     alpha : float
         Constant of the certificate, 1/s.
     margin : float
-        Of the certificate, N/m/s: smallest eigenvalue of ``2 alpha K - K' - alpha D'``. Not negative: V of
-        Kronander and Billard never grows without a force, and the admittance is passive with respect to the force
-        and ``v + alpha y``. Exact for gains that are linear between the knots of the schedule. Negative says
-        that this certificate does not hold, not that the schedule is unstable.
+        Of the certificate, 1/s: rate at which the root of Kronander and Billard's V falls at least, the smallest
+        eigenvalue of ``-dV/dt`` relative to V, halved. Not negative: V never grows without a force, and the motion is
+        passive with respect to the force and ``v + alpha e``. Exact for gains that are linear between the rows.
+        Negative says that this certificate does not hold, not that the schedule is unstable.
     held_growth : float
-        Largest growth of such a V, of this alpha, a half or a quarter of it, over an interval between knots in which
+        Largest growth of such a V, of this alpha, a half or a quarter of it, over an interval between rows in which
         the gains are held instead, as at the ticks of a controller: 1 is none. NaN without an alpha.
     margin_time : float
         Where the margin is smallest, s.
     max_speed : float
-        Largest replay speed at which the margin is not negative; 1 is the schedule's own. Where the rule holds, any
-        speed is stable.
+        Largest replay speed at which the margin is not negative; 1 is the schedule's own.
     gain : float
-        Largest growth of ``sqrt(v'Mv + y'Ky)`` over a part of the schedule from any state, gains held between
-        knots: not conservative. 1 is no growth. Of parts that all grow at a time, the 400 that have grown the most.
-    environment_stiffness : float
-        Stiffest spring, N/m, that the robot can press on in the softest phase without vibrating, behind its
-        position loop.
-    speed, mass : float, float or tuple of rows
-        Replay speed, and virtual mass in kg.
+        Largest growth of ``sqrt(v'Mv + e'Ke)`` over a part of the schedule from any state, gains held between
+        rows: not conservative. 1 is no growth. Of parts that all grow at a time, the 100 that have grown the most.
+    environment_stiffness, environment_rotation : float
+        Stiffest spring, N/m, and for poses Nm/rad, that the robot can press on in the softest phase without vibrating,
+        behind its position loop. NaN where there is none: for an inertia that varies, which is that of an arm without
+        a position loop, and the second without an orientation.
+    speed : float
+        Replay speed.
+    mass : float, tuple of rows, or None
+        Inertia in kg, for poses also kg m and kg m^2; None if it varies.
+    inertia : tuple of (float, float)
+        Smallest and largest of the positions, kg, and of the rotation, kg m^2.
+    units : tuple of str
+        Of the stiffness of these.
     """
 
     damping_ratio: float
     stiffness_ratio: float
     required_damping_ratio: float
     stable_at_any_schedule: bool
+    any_schedule_rate: float
+    any_schedule_speed: float
     alpha: float
     margin: float
     margin_time: float
@@ -69,12 +90,15 @@ class StabilityReport:
     max_speed: float
     gain: float
     environment_stiffness: float
+    environment_rotation: float
     speed: float
-    mass: float | tuple[tuple[float, ...], ...]
+    mass: float | tuple[tuple[float, ...], ...] | None
+    inertia: tuple[tuple[float, float], ...]
+    units: tuple[str, ...]
 
     @property
     def certified(self) -> bool:
-        """Whether the certificate holds for this very schedule and speed, its gains linear or held between knots."""
+        """Whether the certificate holds for this very schedule and speed, its gains linear or held between rows."""
         return self.margin >= 0.0 and self.held_growth <= 1.0 + GROWTH_ROUNDING
 
     @property
@@ -83,28 +107,70 @@ class StabilityReport:
         return self.certified or self.stable_at_any_schedule
 
     def __str__(self) -> str:
-        any_schedule = "holds" if self.stable_at_any_schedule else "does not hold"
-        certificate = "holds" if self.certified else "DOES NOT HOLD"
-        warning = "" if self.gain <= MAX_GAIN else f"  <- above {MAX_GAIN:g}: disturbances grow on the way"
-        speed = "any" if math.isinf(self.max_speed) else f"{self.max_speed:.3g} x"
-        if self.stable_at_any_schedule and math.isfinite(self.max_speed):
-            speed = f"any, by the rule; by the certificate {speed}"
-        grows = self.margin >= 0.0 and self.held_growth > 1.0 + GROWTH_ROUNDING
-        held = f"; held between knots, V grows by {self.held_growth - 1.0:.2g}" if grows else ""
-        remedy = "slow down" if self.margin < 0.0 else "resample it finer"
-        verdict = "guaranteed" if self.stable else f"NOT GUARANTEED: {remedy}, damp more, or use a filter"
-        mass = f"{self.mass:g} kg" if isinstance(self.mass, float) else "a mass matrix"
         rows = {
-            "exact and without lag": verdict,
-            "any-schedule rule": f"{any_schedule}: damping ratio {self.damping_ratio:.3g}; one of "
-            f"{self.required_damping_ratio:.3g} will do for stiffness ratio {self.stiffness_ratio:.3g}",
-            "certificate of this one": f"{certificate}: margin {self.margin:.4g} N/m/s at t = "
-            f"{self.margin_time:.3g} s, alpha {self.alpha:.3g} /s{held}",
-            "replay speed limit": speed,
-            "gain from any state": f"{self.gain:.3g}{warning}",
-            "stiffest environment": f"{self.environment_stiffness:.4g} N/m in the softest phase",
+            "exact and without lag": self._verdict(),
+            "any-schedule rule": self._any_schedule(),
+            "certificate of this one": self._certificate(),
+            "replay speed limit": self._speed_limit(),
+            "gain from any state": f"{self.gain:.3g}{self._warning()}",
+            "stiffest environment": self._environment(),
+            "promised": self._promise(),
+            "not promised": _NOT_PROMISED,
         }
-        head = f"stability of the admittance at {mass}, replay speed {self.speed:g}"
+        head = fill(f"stability of {self._robot()}, replay speed {self.speed:g}", _WIDTH)
         return "\n".join(
-            [head, *(fill(f"  {name:<25}{text}", 80, subsequent_indent=27 * " ") for name, text in rows.items())]
+            [head, *(fill(f"  {name:<25}{text}", _WIDTH, subsequent_indent=27 * " ") for name, text in rows.items())]
         )
+
+    def _robot(self) -> str:
+        kilograms = ["kg m^2" if unit == "Nm/rad" else "kg" for unit in self.units]
+        if isinstance(self.mass, float):
+            return f"the admittance at {self.mass:g} {' and '.join(kilograms)}"
+        ranges = (f"{low:.3g} to {high:.3g} {unit}" for (low, high), unit in zip(self.inertia, kilograms, strict=True))
+        return f"{'an inertia that varies' if self.mass is None else 'a mass matrix'}, {' and '.join(ranges)}"
+
+    def _verdict(self) -> str:
+        remedy = "slow down" if self.margin < 0.0 else "resample it finer"
+        return "guaranteed" if self.stable else f"NOT GUARANTEED: {remedy}, damp more, or use a filter"
+
+    def _any_schedule(self) -> str:
+        text = "does not hold"
+        if self.stable_at_any_schedule:
+            text = f"holds: in any order at a rate of {self.any_schedule_rate:.3g} /s"
+        text += f"; damping ratio {self.damping_ratio:.3g}"
+        if not math.isnan(self.stiffness_ratio):
+            required = f"{self.required_damping_ratio:.3g} will do for stiffness ratio {self.stiffness_ratio:.3g}"
+            return f"{text}; one of {required}"
+        what = "an inertia that varies" if self.mass is None else "poses"
+        return f"{text}; no ratio is enough in itself for {what}"
+
+    def _certificate(self) -> str:
+        grows = self.margin >= 0.0 and self.held_growth > 1.0 + GROWTH_ROUNDING
+        held = f"; held between rows, V grows by {self.held_growth - 1.0:.2g}" if grows else ""
+        verdict = "holds" if self.certified else "DOES NOT HOLD"
+        return f"{verdict}: rate {self.margin:.3g} /s at t = {self.margin_time:.3g} s, alpha {self.alpha:.3g} /s{held}"
+
+    def _speed_limit(self) -> str:
+        own, any_order = (_speed(each) for each in (self.max_speed, self.any_schedule_speed))
+        if not self.stable_at_any_schedule or own == any_order:
+            return own
+        return f"{any_order}, by the rule; by the certificate {own}"
+
+    def _warning(self) -> str:
+        return "" if self.gain <= MAX_GAIN else f"  <- above {MAX_GAIN:g}: disturbances grow on the way"
+
+    def _environment(self) -> str:
+        if math.isnan(self.environment_stiffness):
+            return "not asked: an arm of its own inertia has no position loop"
+        pressed = zip((self.environment_stiffness, self.environment_rotation), self.units, strict=False)
+        return " and ".join(f"{value:.4g} {unit}" for value, unit in pressed) + " in the softest phase"
+
+    def _promise(self) -> str:
+        if not self.stable:
+            return "nothing"
+        which = "these rows in any order, blended, held" if self.stable_at_any_schedule else "this schedule as it is"
+        return f"without a force deviations die out exponentially, for {which}; a force moves it by a bounded amount"
+
+
+def _speed(limit: float) -> str:
+    return "any" if math.isinf(limit) else f"{limit:.3g} x"
