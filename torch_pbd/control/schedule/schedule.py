@@ -181,8 +181,8 @@ class Schedule:
         ----------
         speed : float
             From 1e-9 to 1e9; the stiffness rises that much faster too.
-        mass : float, or array_like of shape (d, d) or (n, d, d), default=None
-            Mass of the admittance in kg, to certify the stability at the new speed. None: not checked.
+        mass : float, array_like of shape (d, d) or (n, d, d), or callable, default=None
+            As for :func:`~torch_pbd.control.certify`, to check the stability at the new speed. None: not checked.
 
         Raises
         ------
@@ -192,7 +192,7 @@ class Schedule:
         speed = checks.number(speed, "speed", least=_SLOWEST, most=1.0 / _SLOWEST)
         report = None if mass is None else self.certify(mass=mass, speed=speed)
         if report is not None and not report.stable:
-            remedy = f"the margin is {report.margin:.4g} N/m/s; the highest safe speed is {report.max_speed:.4g}"
+            remedy = f"the margin is {report.margin:.4g} /s; the highest safe speed is {report.max_speed:.4g}"
             if report.margin >= 0.0:
                 remedy = f"held between rows, its gains let V grow by {report.held_growth - 1.0:.2g}; resample it finer"
             remedy = f"{remedy}, or filter the stiffness and give no mass here"
@@ -245,11 +245,10 @@ class Schedule:
         return replace(self, **rows, frame=frame)
 
     def certify(self, *, mass: Any = None, **options: Any) -> "StabilityReport":
-        """`torch_pbd.control.certify` of this schedule, whose options it takes; no mass is its own, or 1 kg."""
+        """:func:`torch_pbd.control.certify` of this schedule, whose options it takes; no mass is its own, or 1 kg."""
         from torch_pbd.control.stability.certify import certify  # here: it needs torch, a schedule does not
 
-        own: Any = 1.0 if self.mass is None else self.mass
-        return certify(self, mass=own if mass is None else mass, **options)
+        return certify(self, mass=mass, **options)
 
     def diagonal(self) -> tuple["Schedule", DiagonalLoss]:
         """Schedule with diagonal stiffness and damping, for controllers that take no other, and what that loses."""

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torch_pbd import checks, rotations
 from torch_pbd.control.damping import required_damping_ratio
-from torch_pbd.control.matrices import as_mass
+from torch_pbd.control.matrices import as_mass, mass_rows
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.position_loop import PositionLoop
 from torch_pbd.control.stability.common_function import common_function
@@ -17,7 +17,6 @@ from torch_pbd.control.stability.environment import stiffest_environment
 from torch_pbd.control.stability.gain import largest_gain
 from torch_pbd.control.stability.lyapunov import Knots, held_growth
 from torch_pbd.control.stability.report import StabilityReport
-from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.linalg import spectral_map, symmetrize
 
 
@@ -65,8 +64,8 @@ def certify(
     checks.instance(schedule, "schedule", Schedule)
     # An axis that is free never returns: nothing is to be certified of it.
     checks.semidefinite(schedule.stiffness, "stiffness", definite=True)
-    inertia = _inertia(schedule, mass)
     time, stiffness, damping = map(torch.tensor, (schedule.time, schedule.stiffness, schedule.damping))
+    inertia = _inertia(schedule, mass, stiffness)
     dynamics = ErrorDynamics(time / speed, stiffness, damping, inertia, _transport(schedule, speed))
     knots, maps = Knots(dynamics), dynamics.tick_maps()
     alpha, margin, worst = knots.certificate()
@@ -103,19 +102,11 @@ def certify(
     )
 
 
-def _inertia(schedule: Schedule, mass: Any) -> Tensor:
+def _inertia(schedule: Schedule, mass: Any, like: Tensor) -> Tensor:
     """Masses (m, d, d), m = 1 where it is one for all rows."""
     given = schedule.mass if mass is None else mass(schedule.time) if callable(mass) else mass
-    checked = as_mass(1.0 if given is None else given)
-    n, d, _ = schedule.stiffness.shape
-    if not (isinstance(checked, Tensor) and checked.ndim):
-        return float(checked) * torch.eye(d, dtype=torch.float64)[None]
-    if tuple(checked.shape) not in ((d, d), (n, d, d)):
-        raise InvalidParameterError(
-            f"mass has shape {tuple(checked.shape)}, must be a number or have shape {(d, d)} or {(n, d, d)}."
-        )
-    rows = checked.detach().double().reshape(-1, d, d)
-    return rows[:1] if bool((rows == rows[:1]).all()) else rows
+    rows = mass_rows(as_mass(1.0 if given is None else given), like).detach()
+    return rows if rows.ndim == 3 else rows[None]
 
 
 def _as_given(inertia: Tensor) -> float | tuple[tuple[float, ...], ...] | None:
