@@ -166,6 +166,7 @@ def fit(options: Any, folder: Any) -> str:
     model, _ = fit_once(options.model, X, y, groups, finished=folder.finished)
     name = type(model).__name__
     model_path, figure_path = write_fitted(model, demonstrations, folder, name, options.input)
+    # A model of whole movements has no single optimization whose end could be told.
     if hasattr(model, "score_demonstrations"):
         learned, likelihood = {}, model.score(X, y, groups=groups)
         settled, of_what = f"learned {len(demonstrations)} movements", "joint log-likelihood"

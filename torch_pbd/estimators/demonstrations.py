@@ -38,6 +38,7 @@ def check_groups(groups: Any, n_samples: int) -> NDArray[np.intp]:
     ValueError
         If there is not one label a row, or one is missing.
     """
+    # Any labels will do that can be told apart: numbers, names, dates.
     labels = _as_labels(groups)
     if labels.shape != (n_samples,):
         raise ValueError(

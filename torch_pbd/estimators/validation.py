@@ -161,6 +161,7 @@ def check_inputs_vary(X: Floats) -> None:
             f"X is constant: {columns} of X have the same value in all {len(X)} rows, so nothing can depend on X. "
             "Give the time, phase or position of each row."
         )
+    # In their own ranges, so that the rank is the same in all units.
     centred = (X - X.mean(axis=0)) / np.where(constant, 1.0, spread)
     rank = np.linalg.matrix_rank(centred[:, ~constant], tol=1e-9 * np.sqrt(len(X)))
     if constant.any() or rank < X.shape[1] - constant.sum():
@@ -191,6 +192,7 @@ def without_rounding(X: Floats) -> Floats:
         near = gap <= np.finfo(np.float32).eps * np.ptp(value)
         near[:-1] |= (single[1:] == value[:-1]) | (single[:-1] == value[1:])
         near &= gap < _NEAR * np.quantile(gap, 0.9, method="lower")
+        # Of values that follow each other closely all take the first.
         first = np.maximum.accumulate(np.where(np.append(False, near[:-1]), 0, np.arange(len(value))))
         column[:] = value[first[index]]
         if near.mean() > _MANY:

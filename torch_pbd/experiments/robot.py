@@ -58,6 +58,7 @@ def push_profile(time: Floats, duration: float, peak: float, n_outputs: int) -> 
     """Forces (n, d) in N: pulses of a squared sine along the first output, early and late in the movement."""
     force = np.zeros((len(time), n_outputs))
     for centre in _PUSHES:
+        # From 0 to 1 through a pulse, at whose ends a squared sine has neither force nor slope.
         u = np.clip((time / duration - centre) / _PUSH_LENGTH + 0.5, 0.0, 1.0)
         force[:, 0] += peak * np.sin(np.pi * u) ** 2
     return force

@@ -215,6 +215,7 @@ def format_table(rows: Sequence[Mapping[str, Any]], width: int = _WIDTH) -> str:
     columns = [column for column in rows[0] if any(row[column] == row[column] for row in rows)]
     texts = {column for column in columns if isinstance(rows[0][column], str)}
     cells = {column: [_cell(row[column]) for row in rows] for column in columns}
+    # Headers take more lines until the table fits; what is too much then comes off the longest texts.
     for n_lines in (1, 2, 3):
         widths = {column: max(_header_width(column, n_lines), *map(len, cells[column])) for column in columns}
         spare = width - sum(widths.values()) - 2 * (len(columns) - 1)

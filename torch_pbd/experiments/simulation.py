@@ -162,8 +162,10 @@ class ScikitLearnGMR(BaseEstimator):
         log_share = np.stack(
             [np.log(w) + multivariate_normal(m[:e], c[:e, :e]).logpdf(x) for w, m, c in parts], axis=-1
         )
+        # Less the largest logarithm: far from all components every density is zero.
         share = np.exp(log_share - log_share.max(axis=-1, keepdims=True))
         share /= share.sum(axis=-1, keepdims=True)
+        # Given x a component has the mean m_y + G' (x - m_x) and the covariance C_yy - C_yx G, with G = C_xx^-1 C_xy.
         gains = [np.linalg.solve(c[:e, :e], c[:e, e:]) for _, _, c in parts]
         means = np.stack([m[e:] + (x - m[:e]) @ gain for (_, m, _), gain in zip(parts, gains, strict=True)], axis=1)
         within = np.stack([c[e:, e:] - c[e:, :e] @ gain for (_, _, c), gain in zip(parts, gains, strict=True)])

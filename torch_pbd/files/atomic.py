@@ -30,6 +30,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     if it cannot be written, or is a folder, a pipe or a device.
     """
     file_path = _target(path)
+    # In the same folder, as only within one file system a file takes another's place at once.
     draft = file_path.with_name(f".{file_path.name}.{os.getpid()}.{token_hex(4)}.draft")
     try:
         with draft.open("xb") as file:

@@ -36,6 +36,7 @@ def write_checksummed(path: Path, key: str, header: Mapping[str, Any], arrays: M
     """
     whole = {name: np.asarray(array, order="C") for name, array in arrays.items()}
     _check_types(whole)
+    # Through JSON once: the checksum is of what will be read again, lists where there were tuples.
     plain = json.loads(json.dumps(dict(header)))
     text = json.dumps({**plain, "sha256": _digest(plain, whole)})
     if len(text) > MAX_HEADER_BYTES:
@@ -65,6 +66,7 @@ def read_checksummed(path: Path, key: str, format_version: int) -> tuple[dict[st
         content = path.read_bytes()
         text, arrays = _unpacked(content, key)
         header = json.loads(text)
+        # The checksum is of the content: another spelling of it would have the same.
         if json.dumps(header) != text:
             raise ValueError("its header is not as it was written")
     except Exception as error:  # parsers of bytes that are not what they claim to be raise errors of all kinds

@@ -147,6 +147,7 @@ def _maximize(grid: EvidenceGrid, search: EvidenceSearch) -> _Ends:
         left, level = grid.unsettled(), grid.next_level
         if level is not None and bool(left.any()):
             n_nodes = level.n_nodes or level.max_inputs or grid.evidence.n_inputs
+            # So cheap is the next level then that those that have settled go on to it too.
             if len(left) * n_nodes**3 <= _FEW:
                 grid.refine()
                 continue

@@ -61,6 +61,7 @@ def judge_movement(
         draws = model.sample_demonstrations(X, n_draws, random_state)
         joint = float(model.score_demonstrations(X, y)[0])
     else:
+        # Rows of a regressor are independent of each other: a movement is one draw of each.
         draws = model.sample_y(X, n_draws, random_state).reshape(*shape, n_draws).transpose(2, 0, 1)
         joint = float(np.sum(model.log_likelihood(X, y)))
     moments = mean.reshape(shape), np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))

@@ -165,6 +165,7 @@ class _Weights:
         positions = np.concatenate(self._positions)
         deviation = positions.std(axis=0)
         least = _LEAST_NOISE * np.where(deviation > 0.0, deviation, 1.0)
+        # Samples, less the weights that were fitted to them.
         freedoms = max(1, len(positions) - n_basis * len(recordings))
         self.noise_scale: Floats = np.maximum(np.sqrt(np.sum(squares, axis=0) / freedoms), least)
 
@@ -174,6 +175,7 @@ class _Weights:
         flat = centred.reshape(len(values), -1)
         own = flat.T @ flat / (len(values) - 1)
         outputs = np.einsum("kbi,kbj->ij", centred, centred) / (len(values) - 1) / self.n_basis
+        # Weights of near bases vary alike, and the outputs of each as those of all do.
         number = np.arange(self.n_basis)
         smooth = np.exp(-0.5 * np.square((number[:, np.newaxis] - number) / reach))
         return np.asarray((1.0 - share) * own + share * np.kron(smooth, outputs))

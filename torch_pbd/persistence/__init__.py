@@ -85,6 +85,7 @@ def save(estimator: CovarianceRegressor | DMPController, path: str | os.PathLike
     if not is_ours(estimator):
         raise TypeError(f"estimator is a {name}; can save {', '.join(ESTIMATORS)}. In a pipeline, save that step.")
     check_is_fitted(estimator)
+    # What could not be loaded again is not written.
     description, arrays = _described(estimator)
     try:
         with warnings.catch_warnings():

@@ -78,6 +78,7 @@ def work(connection: Connection) -> None:
     try:
         while True:
             requests: list[tuple[int, Answer]] = []
+            # With nothing to do it waits for a request; between two steps of a fit it only looks for one.
             while connection.poll(None if not (fits or requests) else 0.0):
                 requests.append(connection.recv())
             for tab, request in _newest(requests):
@@ -94,6 +95,7 @@ def work(connection: Connection) -> None:
 
 def _newest(requests: list[tuple[int, Answer]]) -> list[tuple[int, Answer]]:
     """Requests without those that a later one of the same tab and kind replaces."""
+    # Files that are asked for are all given: none takes the place of another.
     last = {(tab, request["type"]): number for number, (tab, request) in enumerate(requests)}
     return [
         each

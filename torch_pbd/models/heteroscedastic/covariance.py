@@ -76,6 +76,7 @@ class LatentCovariance:
             features = self.coefficient_family.scaled(row_values, self.rows.amplitude)
             unexplained = self.rows.unexplained(features)
             rows, variances = [], []
+            # Coefficients of one output share their features, and each has a block of the weights.
             for i, weights in enumerate(self.coefficients, start=1):
                 pad = (0, mean.shape[1] - i)
                 own = features[i - 1]

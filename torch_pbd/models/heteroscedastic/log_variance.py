@@ -211,6 +211,7 @@ def _maximize(features: Tensor, target: Tensor, half: Tensor, pooled: Tensor, st
     for _ in range(_MAX_ITER):
         new_mean, new_location = _least_squares(features, target, half, location)
         step, change = new_mean - mean, new_location - location
+        # Newton's step, or as much of it as descends.
         share = torch.ones_like(value)
         for _ in range(_HALVINGS):
             new_value = _loss(new_location - target, half, new_mean)

@@ -58,6 +58,7 @@ def is_signal(
     value = value / (value.abs() + value.abs().median(0).values).clamp_min(_LEAST)
     value = value - value.mean(0)
     coloured = sum(_correlation(value[lag:], value[: len(value) - lag])[1] for lag in range(1, LAGS + 1)) > least
+    # Products of rows of different demonstrations: the square of their sum, less the squares of each one's.
     if group is None:
         n_demos, alike = float(training.counts.mean()), total.square().sum(0) - both.square().sum(0)
     else:
