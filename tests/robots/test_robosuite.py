@@ -1,15 +1,12 @@
 """Actions for robosuite's controller against its own law, and in its own simulation where it is installed."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from arm_tasks import made_schedule, on_arm
 
 from torch_pbd import rotations
 from torch_pbd.control import Schedule
-from torch_pbd.robots import RobotStoppedError
-from torch_pbd.robots.robosuite import CONTROLLER, run, to_actions
+from torch_pbd.robots.robosuite import CONTROLLER, to_actions
 
 FREQUENCY = 50.0
 
@@ -43,8 +40,7 @@ def test_the_controllers_law_is_that_of_the_schedule(mass, rng):
 
 
 def test_an_arms_inertia_is_refused_and_what_is_lost_is_told():
-    mujoco = pytest.importorskip("mujoco")
-    assert mujoco
+    pytest.importorskip("mujoco")
     from torch_pbd.robots import panda
 
     schedule, _ = on_arm(made_schedule(duration=1.0, rate=50.0), panda())
@@ -52,46 +48,12 @@ def test_an_arms_inertia_is_refused_and_what_is_lost_is_told():
         to_actions(schedule)
     with pytest.warns(UserWarning, match="diagonal gains lose"):
         to_actions(schedule.with_inertia(1.0))
-
-
-class FakeEnvironment:
-    """Of robosuite what the adapter asks for; the arm is at once where it is sent, and ends its episode at a step."""
-
-    control_freq, action_dim = FREQUENCY, 19
-
-    def __init__(self, schedule, end=1000):
-        composite = SimpleNamespace(_action_split_indexes={"right": (1, 19)})
-        self.robots = [SimpleNamespace(composite_controller=composite, eef_site_id={"right": 2})]
-        places, turns = np.zeros((3, 3)), np.zeros((3, 9))
-        places[2], turns[2] = schedule.position[0], rotations.matrix(schedule.orientation[0]).ravel()
-        self.sim = SimpleNamespace(data=SimpleNamespace(site_xpos=places, site_xmat=turns))
-        self.actions, self.end = [], end
-
-    def step(self, action):
-        if len(self.actions) == self.end:
-            raise ValueError("executing action in terminated episode")
-        self.actions.append(action)
-        self.sim.data.site_xpos[2] = action[13:16]
-        self.sim.data.site_xmat[2] = rotations.matrix(rotations.exp(action[16:19])).ravel()
-
-
-def test_actions_go_to_the_arm_and_an_ended_episode_is_a_fault():
-    schedule = diagonal_schedule(np.array([0.4, 0.0, 0.5]), np.array([0.0, 1.0, 0.0, 0.0]))
-    env = FakeEnvironment(schedule)
-    found = run(env, schedule)
-    np.testing.assert_array_equal(np.array(env.actions)[:, 1:], to_actions(schedule, FREQUENCY))
-    assert not np.array(env.actions)[:, 0].any()
-    assert len(found.time) == len(schedule)
-    with pytest.raises(RobotStoppedError, match="terminated episode"):
-        run(FakeEnvironment(schedule, end=5), schedule)
-    faults = []
-    assert len(run(FakeEnvironment(schedule, end=5), schedule, on_fault=faults.append).time) == 6
-    assert len(faults) == 1
-    away = FakeEnvironment(schedule)
-    away.sim.data.site_xpos[2] += 0.02
-    with pytest.raises(ValueError, match="from the first pose of schedule"):
-        run(away, schedule)
-    assert not away.actions
+    stiff = made_schedule(duration=1.0, rate=50.0, stiffness=(200.0, 4000.0))
+    with (
+        pytest.raises(ValueError, match=r"kp\[\d+, \d\] is .*, must be above zero and at most 3000"),
+        pytest.warns(UserWarning, match="diagonal gains"),
+    ):
+        to_actions(stiff.with_inertia(1.0))
 
 
 def test_in_robosuite_the_arm_is_on_its_way():
@@ -103,8 +65,17 @@ def test_in_robosuite_the_arm_is_on_its_way():
         has_renderer=False, has_offscreen_renderer=False, use_camera_obs=False, initialization_noise=None,
     )  # fmt: skip
     env.reset()
-    site = env.robots[0].eef_site_id["right"]
-    turn = rotations.from_matrix(env.sim.data.site_xmat[site].reshape(3, 3))
-    found = run(env, diagonal_schedule(env.sim.data.site_xpos[site].copy(), turn))
-    assert np.abs(found.deviation[:, :3]).max() < 5e-3
-    assert np.abs(found.deviation[:, 3:]).max() < 0.03
+    data, site = env.sim.data, env.robots[0].eef_site_id["right"]
+
+    def pose():
+        return data.site_xpos[site].copy(), rotations.from_matrix(data.site_xmat[site].reshape(3, 3))
+
+    schedule, found = diagonal_schedule(*pose()), []
+    for action in to_actions(schedule, env.control_freq):
+        found.append(pose())
+        env.step(np.append(action, 0.0))  # and the gripper
+    position, orientation = map(np.array, zip(*found, strict=True))
+    desired = schedule.resample(env.control_freq)
+    turn = rotations.log(rotations.multiply(orientation, rotations.conjugate(desired.orientation)))
+    assert np.linalg.norm(position - desired.position, axis=1).max() < 5e-3
+    assert np.linalg.norm(turn, axis=1).max() < 0.03
