@@ -1,5 +1,6 @@
 """Figures of demonstrations, of what a model learned from them, and of what a robot did with it."""
 
+from torch_pbd.plotting.arm import plot_arm
 from torch_pbd.plotting.display import MovementDisplay, plot_movements, plot_pushes, plot_schedule
 from torch_pbd.plotting.parts import (
     draw_edges,
@@ -67,6 +68,7 @@ __all__ = [
     "legend_below",
     "mark_ends",
     "output_label",
+    "plot_arm",
     "plot_covariance_ellipses",
     "plot_covariance_ellipsoids",
     "plot_demonstrations",
