@@ -29,7 +29,7 @@ _LIMITS = RobotLimits(stiffness=(0.0, np.inf), rotational_stiffness=(0.0, np.inf
 
 
 def to_actions(schedule: Schedule, control_freq: float = 20.0) -> Floats:
-    """Actions (n, 18) of the :data:`CONTROLLER`, for ``env.step``: damping ratios, kp, position, rotation vector.
+    """Actions (n, 18) of the ``CONTROLLER``, for ``env.step``: damping ratios, kp, position, rotation vector.
 
     The controller's wrench is ``Lambda (kp e - kd v)``, kp in 1/s^2: the arm moves as a unit mass, so that a schedule
     of 1 kg (and 1 kg m^2) is right as it is, and its certificate holds. Goals lead by ``(D v_d + a_d) / K``, as the
