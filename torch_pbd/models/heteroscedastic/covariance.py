@@ -9,8 +9,13 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from torch_pbd.gp.inducing import FixedFeatures
-from torch_pbd.models.heteroscedastic.log_variance import LEAST_SQUARE, Squares, fit_log_variance, search_log_variance
-from torch_pbd.models.heteroscedastic.predictive import FactorMoments
+from torch_pbd.models.heteroscedastic.log_variance import (
+    LEAST_SQUARE,
+    FactorMoments,
+    Squares,
+    fit_log_variance,
+    search_log_variance,
+)
 from torch_pbd.models.heteroscedastic.processes import Gradient, Processes, ProcessFamily, Search
 from torch_pbd.models.heteroscedastic.regression import LinearEvidence, Regression, Weights
 from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation

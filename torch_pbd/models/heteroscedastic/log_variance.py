@@ -1,4 +1,6 @@
-"""Logarithms of conditional variances as Gaussian processes, their latent values integrated out."""
+"""Logarithms of conditional variances as Gaussian processes, their latent values integrated out; and the moments of
+the factor of a covariance that has them.
+"""
 
 import math
 from collections.abc import Callable
@@ -22,6 +24,7 @@ logarithm."""
 # Newton's steps (in the logarithm of a variance) end at this one: that after it is about its square.
 _MAX_ITER, _TOL = 60, 1e-5
 _HALVINGS, _ROUNDING = 20, 1e-12  # of a step that does not descend, and what counts as none of a loss
+_LEAST_DEGREES = 3.0  # below two, Student's t has no covariance
 _LEAST_RESIDUAL = -40.0  # bounds exp(-x) where a start is far below its target
 
 
@@ -245,3 +248,43 @@ def _least_squares(features: Tensor, target: Tensor, half: Tensor, location: Ten
 def _loss(residual: Tensor, half: Tensor, mean: Tensor) -> Tensor:
     """Sum of h (x + exp(-x)) + m'm / 2."""
     return (half * (residual + torch.exp(-residual.clamp_min(_LEAST_RESIDUAL)))).sum(-1) + 0.5 * mean.square().sum(-1)
+
+
+def degrees_of_freedom(variance: Tensor) -> Tensor:
+    """Squares from which a variance is known whose logarithm has this variance.
+
+    It is trigamma(degrees / 2), and ``trigamma(z)`` is taken for ``1 / z + 1 / (2 z^2)``.
+    """
+    return ((1.0 + (1.0 + 2.0 * variance).sqrt()) / variance).clamp_min(_LEAST_DEGREES)
+
+
+@dataclass(frozen=True)
+class FactorMoments:
+    """Moments of the entries of the lower factor of a covariance at n inputs, as independent normal numbers."""
+
+    log_variance: Float[Tensor, "n d"]
+    log_variance_variance: Float[Tensor, "n d"]
+    below: Float[Tensor, "n d d"]
+    """Entries below the diagonal."""
+    below_variance: Float[Tensor, "n d d"]
+
+    @property
+    def degrees(self) -> Float[Tensor, " n"]:
+        """Squares from which the variances are known, in the mean."""
+        return degrees_of_freedom(self.log_variance_variance.mean(-1))
+
+    def tril(self) -> Float[Tensor, "n d d"]:
+        """The factor at the means of the latent processes."""
+        return self.below + torch.diag_embed(torch.exp(0.5 * self.log_variance))
+
+    def expected_root(self, most: float) -> Float[Tensor, "n d 2*d"]:
+        """Root of the expected covariance.
+
+        With a normal log variance of mean l and variance v the deviation's mean is exp(l / 2 + v / 8), and the variance
+        exceeds its square by a factor exp(v / 4). No v is above ``most`` in it, as where nothing is known an
+        expectation has little to say.
+        """
+        variance = self.log_variance_variance / (1.0 + self.log_variance_variance / most)
+        deviation = torch.exp(0.5 * self.log_variance + 0.125 * variance)
+        excess = deviation.square() * torch.expm1(0.25 * variance) + self.below_variance.sum(-1)
+        return torch.cat([self.below + torch.diag_embed(deviation), torch.diag_embed(excess.sqrt())], dim=-1)

@@ -16,16 +16,15 @@ from torch_pbd.linalg import safe_cholesky, symmetrize
 from torch_pbd.models.conditional import Core, Shapes, blank, size_of
 from torch_pbd.models.heteroscedastic.covariance import LatentCovariance
 from torch_pbd.models.heteroscedastic.fit import HeteroscedasticFit
+from torch_pbd.models.heteroscedastic.log_variance import FactorMoments, degrees_of_freedom
 from torch_pbd.models.heteroscedastic.mean import LatentMean
 from torch_pbd.models.heteroscedastic.predictive import (
-    FactorMoments,
+    Prepared,
     as_inverse_gamma,
-    degrees_of_freedom,
     log_correlation_variance,
     shrink_correlation,
     under_expected_noise,
 )
-from torch_pbd.models.heteroscedastic.prepared import Prepared
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
 from torch_pbd.models.heteroscedastic.regression import Weights
 
