@@ -20,7 +20,7 @@ from torch_pbd.cli.yaml import MAX_BYTES, read_yaml, read_yaml_file
 from torch_pbd.exceptions import ConfigError
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").rglob("*.yaml"))
-COMMAND_OF = {"robot": "experiment"}
+COMMAND_OF = {"robot": "experiment", "pose": "experiment"}
 
 
 @pytest.fixture
