@@ -25,6 +25,7 @@ _MAX_ITER = 60  # at each of them
 _MAX_SEARCHES = 6
 _NEAR = 0.03  # of the rate among some rows, by which that of all may be lower
 _AT_ONCE = 256  # rows, which bounds the memory
+_UNBOUNDED = 1e6  # rate, of natural frequencies, that stands for none
 
 
 def common_function(dynamics: ErrorDynamics) -> tuple[float, float]:
@@ -42,7 +43,7 @@ def common_function(dynamics: ErrorDynamics) -> tuple[float, float]:
         d/dt z'Pz = 2 z'P (v + W e, a) - 2 (e, v, a)'Y (K e + D v + M a),    for any Y of shape (3 d, d),
 
     because the last bracket is zero; and the right side is linear in (K, D, M, W). What one Y makes negative definite
-    in (e, v, a) for rows is so for their blends.
+    in (e, v, a) for rows is so for their blends. The a that is the worst is put in, which leaves a form in z.
     """
     rows, frequency = scaled(dynamics)
     function = isotropic_function(rows) if dynamics.is_plain else None
@@ -85,26 +86,30 @@ def scaled(dynamics: ErrorDynamics) -> tuple[ErrorDynamics, float]:
 
 @dataclass(frozen=True)
 class Function:
-    """``|T z|^2``, T upper triangular; where masses differ also w, and ``U'^-1 Y``, ``U = blkdiag(T, diag(exp w))``."""
+    """``|T z|^2`` with T upper triangular, and, where masses differ, ``blkdiag(T, 1)'^-1 Y``."""
 
     root: Float[Tensor, "s s"]
-    multiplier: Float[Tensor, "r d"] | None = None
-    log_weight: Float[Tensor, " d"] | None = None
+    multiplier: Float[Tensor, "t d"] | None = None
 
-    def change(self, rows: ErrorDynamics) -> Float[Tensor, "n r r"]:
+    def change(self, rows: ErrorDynamics) -> Float[Tensor, "n s s"]:
         """Symmetric matrices whose largest eigenvalue bounds the rate of ``|T z|``, relative to it."""
-        zero, root = torch.zeros_like(rows.stiffness), self.root
-        kinematic = [zero if rows.transport is None else rows.transport, torch.eye(zero.shape[-1]).to(zero) + zero]
-        if self.multiplier is None or self.log_weight is None:  # the mass is 1
-            pull = torch.cat([-rows.stiffness, -rows.damping], dim=-1)
-            change = root @ torch.cat([torch.cat(kinematic, dim=-1), pull], dim=-2)
-        else:
-            kinematic = [torch.cat([*kinematic, zero], dim=-1), torch.cat([zero, zero, kinematic[1]], dim=-1)]
-            balance = torch.cat([rows.stiffness, rows.damping, rows.mass], dim=-1)
-            change = torch.nn.functional.pad(root @ torch.cat(kinematic, dim=-2), (0, 0, 0, zero.shape[-1]))
-            change = change - self.multiplier @ balance
-            root = torch.block_diag(root, torch.diag(self.log_weight.exp()))
-        return symmetrize(torch.linalg.solve_triangular(root, change, upper=True, left=False))
+        zero, d = torch.zeros_like(rows.stiffness), rows.stiffness.shape[-1]
+        transport = zero if rows.transport is None else rows.transport
+        kinematic = torch.cat([transport, torch.eye(d).to(zero) + zero], dim=-1)
+        pull = torch.cat([rows.stiffness, rows.damping], dim=-1)
+        if self.multiplier is None:  # the mass is 1
+            return symmetrize(self._per_root(self.root @ torch.cat([kinematic, -pull], dim=-2)))
+        of_state, of_acceleration = self.multiplier.split([2 * d, d])
+        change = self._per_root(self.root[:, :d] @ kinematic - of_state @ pull)
+        coupling = self.root[:, d:] - of_state @ rows.mass - self._per_root(of_acceleration @ pull).mT
+        # It is a concave function of the acceleration if this is positive definite, and largest at some.
+        factor, failed = torch.linalg.cholesky_ex(2.0 * symmetrize(of_acceleration @ rows.mass))
+        half = torch.linalg.solve_triangular(factor, coupling.mT, upper=False)
+        change = symmetrize(change) + 0.5 * half.mT @ half
+        return torch.where(failed[:, None, None] > 0, _UNBOUNDED * torch.eye(2 * d).to(change), change)
+
+    def _per_root(self, matrix: Tensor) -> Tensor:
+        return torch.linalg.solve_triangular(self.root, matrix, upper=True, left=False)
 
     def eigenvalues(self, rows: ErrorDynamics) -> Float[Tensor, "n r"]:
         """Eigenvalues of these matrices."""
@@ -133,7 +138,7 @@ def searched_function(rows: ErrorDynamics) -> Function | None:
     root = torch.kron(torch.tensor([[1.0, 0.5], [0.0, math.sqrt(0.75)]]), torch.eye(d)).to(rows.time)
     free = [tril_to_vector(root.mT)]
     if len(rows.mass) > 1:  # at first ``Y M a`` is ``P (0, a)`` for the mean mass, and as much of a as will do
-        free += [torch.cat([root[:, d:], 0.3 * torch.eye(d).to(root)]).flatten(), torch.zeros(d).to(root)]
+        free += [torch.cat([root[:, d:], 0.3 * torch.eye(d).to(root)]).flatten()]
     at, inverse = torch.cat(free)[None], torch.eye(sum(map(len, free))).to(root)[None]
     chosen, temperatures = evenly(len(rows.time), _N_ROWS), _TEMPERATURES
     for _ in range(_MAX_SEARCHES):
@@ -155,9 +160,8 @@ def searched_function(rows: ErrorDynamics) -> Function | None:
 
 
 def _unpacked(free: Float[Tensor, " p"], d: int) -> Function:
-    root, others = free.split([d * (2 * d + 1), len(free) - d * (2 * d + 1)])
-    upper = vector_to_tril(root).mT
-    return Function(upper, others[:-d].unflatten(0, (3 * d, d)), others[-d:]) if len(others) else Function(upper)
+    root, multiplier = free.split([d * (2 * d + 1), len(free) - d * (2 * d + 1)])
+    return Function(vector_to_tril(root).mT, multiplier.unflatten(0, (3 * d, d)) if len(multiplier) else None)
 
 
 def _smoothed(
