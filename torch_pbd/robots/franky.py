@@ -55,7 +55,7 @@ def run(
     schedule : Schedule
         Of poses, in m.
     on_fault : callable, default=None
-        Told the fault, a `RobotStoppedError`, after the arm was stopped; None raises it.
+        Told the fault, a ``RobotStoppedError``, after the arm was stopped; None raises it.
     limits : RobotLimits, default=None
         Checked before the arm moves; None is those of the Panda.
     period, max_step : float, default=0.005, 0.1

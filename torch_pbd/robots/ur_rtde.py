@@ -37,7 +37,7 @@ def run(
     gain: float = 300.0,
     **loop: Any,
 ) -> RobotRun:
-    """Follow a schedule of poses as an admittance: `RealTimeAdmittance` here, ``servoL`` there.
+    """Follow a schedule of poses as an admittance: ``RealTimeAdmittance`` here, ``servoL`` there.
 
     The sensor is zeroed first: nothing may touch the tool. The arm lags ``lookahead_time`` behind; what the tool feels
     is the virtual mass of the schedule, of which less than some kg may shake in contact with what is stiff.
@@ -49,14 +49,14 @@ def run(
     schedule : Schedule
         Of poses, in m.
     on_fault : callable, default=None
-        Told the fault, a `RobotStoppedError`, after the arm was stopped; None raises it.
+        Told the fault, a ``RobotStoppedError``, after the arm was stopped; None raises it.
     limits : RobotLimits, default=None
         Of the motion, checked before the arm moves; None is 1 m/s and 3.1 rad/s. The robot is asked whether it can
         come there.
     lookahead_time, gain : float, default=0.05, 300.0
         Of ``servoL``: 0.03 to 0.2 s, 100 to 2000.
     **loop
-        Of `RealTimeAdmittance`: ``force_limit``, ``deadband``, ``velocity_limit``, ``soft_start``.
+        Of ``RealTimeAdmittance``: ``force_limit``, ``deadband``, ``velocity_limit``, ``soft_start``.
 
     Returns
     -------
