@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from torch_pbd.control.damping import damping_from_stiffness
-from torch_pbd.control.simulation.filters import EnergyTank, RateLimit, lyapunov_matrix
+from torch_pbd.control.filters import EnergyTank, RateLimit
+from torch_pbd.control.simulation.filters import lyapunov_matrix, started
 from torch_pbd.control.simulation.plant import AdmittancePlant
 from torch_pbd.control.simulation.ticks import admittance_rate, transition
 
@@ -170,7 +171,7 @@ def test_the_worst_force_cannot_break_the_rate_limit_nor_is_a_share_too_small(dt
     """
     stiffness, damping = schedules(200, 2, generator)
     alpha = 0.03
-    limit = RateLimit(alpha).start(stiffness, damping, MASS, dt)
+    limit = started(RateLimit(alpha), stiffness, damping, MASS, dt)
     nowhere = torch.zeros(200, 2).double()
     before, after = (limit.select(stiffness[:, k], damping[:, k], nowhere) for k in (0, 1))
     rate = torch.zeros(200, 8, 8).double()

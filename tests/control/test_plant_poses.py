@@ -10,7 +10,8 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from torch_pbd import rotations
-from torch_pbd.control.simulation.filters import EnergyTank, RateLimit, lyapunov_matrix
+from torch_pbd.control.filters import EnergyTank, RateLimit
+from torch_pbd.control.simulation.filters import lyapunov_matrix
 from torch_pbd.control.simulation.plant import AdmittancePlant
 from torch_pbd.control.simulation.poses import exp, multiply, rotation_between, turning
 from torch_pbd.control.simulation.position_loop import PositionLoop

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from torch_pbd.control.controller import DMPController
     from torch_pbd.control.damping import damping_from_stiffness, required_damping_ratio
+    from torch_pbd.control.filters import EnergyTank, RateLimit
     from torch_pbd.control.primitive.dmp import DMP
     from torch_pbd.control.primitive.units import MotionLimits
     from torch_pbd.control.realtime import RealTimeAdmittance, TickStatus
     from torch_pbd.control.schedule.schedule import Schedule
-    from torch_pbd.control.simulation.filters import EnergyTank, RateLimit
     from torch_pbd.control.simulation.plant import AdmittancePlant
     from torch_pbd.control.simulation.position_loop import PositionLoop
     from torch_pbd.control.simulation.rollout import Rollout
@@ -27,11 +27,11 @@ _HOMES = {
     "AdmittancePlant": "simulation.plant",
     "DMP": "primitive.dmp",
     "DMPController": "controller",
-    "EnergyTank": "simulation.filters",
+    "EnergyTank": "filters",
     "ForceSensor": "simulation.sensor",
     "MotionLimits": "primitive.units",
     "PositionLoop": "simulation.position_loop",
-    "RateLimit": "simulation.filters",
+    "RateLimit": "filters",
     "RealTimeAdmittance": "realtime",
     "Rollout": "simulation.rollout",
     "RolloutSummary": "simulation.rollouts",

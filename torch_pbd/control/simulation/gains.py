@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -56,11 +57,11 @@ class ActiveFilter(ABC):
         """Take note of the tick: (deviation, velocity) at its start and end, and the force held in it."""
 
 
-class StiffnessFilter(ABC):
-    """Filter of the gains, as :class:`~torch_pbd.control.AdmittancePlant` takes it."""
+@runtime_checkable
+class StartFilter(Protocol):
+    """Begin of a run of a filter."""
 
-    @abstractmethod
-    def start(self, stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> ActiveFilter:
+    def __call__(self, stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> ActiveFilter:
         """Begin a run over the wanted gains (..., T, d, d), of a mass (d, d) or (..., T, d, d)."""
 
 

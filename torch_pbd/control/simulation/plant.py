@@ -1,6 +1,7 @@
 """The simulated robot under admittance control: eq. (15) with a mass, tick by tick."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Literal, final
 
 import torch
@@ -8,8 +9,9 @@ from torch import Tensor
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
+from torch_pbd.control.filters import StiffnessFilter
 from torch_pbd.control.matrices import as_mass, as_tensor, mass_rows
-from torch_pbd.control.simulation.gains import StiffnessFilter
+from torch_pbd.control.simulation.filters import started
 from torch_pbd.control.simulation.given import check_given
 from torch_pbd.control.simulation.poses import exp, multiply, rotation_between, turning, warn_if_far
 from torch_pbd.control.simulation.position_loop import PositionLoop
@@ -200,6 +202,8 @@ class AdmittancePlant:
         turns = None if orientation_desired is None else turning(orientation_desired)
         pose = position_desired if turns is None else torch.nn.functional.pad(position_desired, (0, 3))
         acting = {name: getattr(self, name) for name in ("substeps", *_PARTS)}
+        if self.stiffness_filter is not None:
+            acting["stiffness_filter"] = partial(started, self.stiffness_filter)
         return Task(pose, velocity_desired, inertial, stiffness, damping, mass, dt, **acting, turning=turns)
 
 

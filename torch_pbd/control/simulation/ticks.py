@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torch_pbd.control.simulation.gains import State, StiffnessFilter, mass_at
+from torch_pbd.control.simulation.gains import StartFilter, State, mass_at
 from torch_pbd.control.simulation.poses import Turning
 from torch_pbd.control.simulation.position_loop import PositionLoop
 from torch_pbd.control.simulation.sensor import ForceSensor
@@ -69,7 +69,7 @@ class Task:
     position_loop: PositionLoop | None
     environment: Environment | None
     substeps: int
-    stiffness_filter: StiffnessFilter | None
+    stiffness_filter: StartFilter | None
     turning: Turning | None = None
 
     @property
@@ -202,7 +202,7 @@ class Loop:
         self._robot = None if loop is None else loop.start(*state, task.dt)
         self._read = None if sensor is None else sensor.start(state[0], task.dt, generator)
         gains = task.stiffness, task.damping, task.mass, task.dt
-        self._filter = None if wanted is None else wanted.start(*gains)
+        self._filter = None if wanted is None else wanted(*gains)
         self._maps = (each for _, maps in tick_maps(task, task.dt / task.substeps) for each in maps.unbind(-3))
 
     def run(self, tick: int, force: Tensor) -> dict[str, Tensor]:
