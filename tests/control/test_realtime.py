@@ -110,7 +110,7 @@ def test_a_tick_with_a_limited_spring_is_that_of_the_stiffness_it_tells(d, coupl
 
 
 def test_axes_that_are_shared_need_no_matrix_exponential(monkeypatch):
-    monkeypatch.delattr(steps, "_expm1")
+    monkeypatch.delattr(steps, "expm1")
     turned = np.array([[0.6, -0.8], [0.8, 0.6]])
     for stiffness, damping in [
         (100.0 * np.eye(2), turned @ np.diag([1.0, 9.0]) @ turned.T),  # whose own axes are open

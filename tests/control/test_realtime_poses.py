@@ -58,7 +58,7 @@ def test_a_tick_with_an_inertia_is_the_matrix_exponential(coupled, rng):
 
 
 def test_damping_made_for_an_inertia_needs_no_matrix_exponential(monkeypatch):
-    monkeypatch.delattr(steps, "_expm1")
+    monkeypatch.delattr(steps, "expm1")
     for inertia in (arm_inertia, arm_inertia(np.zeros(1))[0], 3.0):
         controller = RealTimeAdmittance(make_pose_schedule(0.05, inertia=inertia))
         controller.start(0.0)

@@ -8,11 +8,12 @@ from numpy.typing import ArrayLike
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
+from torch_pbd.control.filters import StiffnessFilter
 from torch_pbd.control.realtime.clock import ScheduleClock
 from torch_pbd.control.realtime.limits import FINE, TickStatus, channel_of
 from torch_pbd.control.realtime.motion import Motion
-from torch_pbd.control.realtime.options import Option, of_blocks, unit_quaternion
-from torch_pbd.control.realtime.places import Vector, moved
+from torch_pbd.control.realtime.options import Option, StartState, of_blocks, start_state
+from torch_pbd.control.realtime.places import Vector
 from torch_pbd.control.realtime.steps import Numbers, vector
 from torch_pbd.control.realtime.table import ScheduleTable, virtual_mass
 from torch_pbd.control.realtime.timer import TickTimer
@@ -78,8 +79,10 @@ class RealTimeAdmittance:
         After a tick longer than ``max_step`` the schedule goes on from where it was, or also catches up, within limits
         and not before the end of a soft start.
     force_rate_limit : float or (float, float), default=None
-        Fastest change of the force, in N/s and Nm/s; None is none. A spike of the sensor moves the robot less, and a
-        contact is felt later.
+        Fastest change of the force, per s: a spike of the sensor moves the robot less, and a contact is felt later.
+    stiffness_filter : EnergyTank or RateLimit, default=None
+        Holds back what would feed energy into the robot. The k_max of ``spring_limit`` is then that of all rows. The
+        proof of a `RateLimit` is of springs that no limit scales, of one mass, and not of poses.
 
     Attributes
     ----------
@@ -123,6 +126,7 @@ class RealTimeAdmittance:
         on_gap: Literal["pause", "resume"] = "pause",
         max_bad_ticks: int = 10,
         force_rate_limit: Option = None,
+        stiffness_filter: StiffnessFilter | None = None,
     ) -> None:
         checks.instance(schedule, "schedule", Schedule)
         given = {"force_limit": force_limit, "spring_limit": spring_limit, "deadband": deadband}
@@ -133,11 +137,11 @@ class RealTimeAdmittance:
         self._unit = inertia if isinstance(inertia, float) else 1.0
         self._timer = TickTimer(rate, max_step, max_bad_ticks)
         self._channel = channel_of(self._unit, limits, hold_ticks)
-        self._table = table = ScheduleTable(schedule, inertia, float(rate), limits["spring_limit"])
+        steady, pulls = stiffness_filter is not None, limits["spring_limit"]
+        self._table = table = ScheduleTable(schedule, inertia, float(rate), pulls, steady=steady)
         self._clock = ScheduleClock(table, soft_start, limits["approach_speed"], limits["acceleration_limit"], on_gap)
-        self._motion = Motion(table, self._timer, self._clock, limits, self._unit)
-        self._is_pose, self._speeds = len(table.blocks) == 2, limits["velocity_limit"]
-        self._turn = threading.Lock()
+        self._motion = Motion(table, self._timer, self._clock, limits, self._unit, stiffness_filter)
+        self._is_pose, self._speeds, self._turn = len(table.blocks) == 2, limits["velocity_limit"], threading.Lock()
         self._begin(math.nan, 0.0, (None, None, (0.0,) * table.n_axes), ())
 
     def __repr__(self) -> str:
@@ -178,19 +182,14 @@ class RealTimeAdmittance:
         ValueError, RuntimeError
             If an argument is not as described, or the velocity beyond ``velocity_limit``; in a tick of another thread.
         """
-        d, blocks = self._table.n_axes, self._table.blocks
         now = checks.number(now, "now", unit="s")
         at = checks.number(at, "at", least=0.0, most=self._table.end, unit="s")
-        here = None if position is None else vector(position, "position", blocks[0].stop)
-        turned = None if orientation is None else unit_quaternion(orientation, is_pose=self._is_pose)
-        moving = (0.0,) * d if velocity is None else vector(velocity, "velocity", d)
-        bias = () if force_bias is None else vector(force_bias, "force_bias", d)
-        for name, block, most in zip(("the speed", "the angular speed"), blocks, self._speeds, strict=False):
-            checks.number(math.hypot(*moving[block]), name, most=most, unit="units/s", remedy="slow it down")
+        state = start_state(position, orientation, velocity, self._table.blocks, self._speeds)
+        bias = () if force_bias is None else vector(force_bias, "force_bias", self._table.n_axes)
         if not self._turn.acquire(False):
             raise RuntimeError(_SHARED)
         try:
-            self._begin(now, at, (here, turned, moving), bias)
+            self._begin(now, at, state, bias)
         finally:
             self._turn.release()
 
@@ -258,14 +257,12 @@ class RealTimeAdmittance:
     @property
     def desired_position(self) -> Vector:
         """Desired position x_d of the last tick, p floats in units."""
-        return self._motion.row[: self._table.blocks[0].stop]
+        return self._motion.desired_place[: self._table.blocks[0].stop]
 
     @property
     def desired_orientation(self) -> Vector | None:
         """Desired orientation R_d of the last tick, as ``orientation``."""
-        return (
-            moved(self._motion.row[: self._table.n_place], (0.0,) * self._table.n_axes)[-4:] if self._is_pose else None
-        )
+        return self._motion.desired_place[-4:] if self._is_pose else None
 
     @property
     def desired_velocity(self) -> Vector:
@@ -275,19 +272,29 @@ class RealTimeAdmittance:
     @property
     def stiffness(self) -> Floats:
         """Stiffness K (d, d) of the last tick in N/m, as ``spring_limit`` let it be."""
-        return self._table.scaled(self._motion.scale, self._clock.index)
+        return self._table.scaled(self._motion.gains[0], self._motion.scale)
 
     @property
     def damping(self) -> Floats:
         """Damping D (d, d) of the last tick in N s/m."""
-        return self._table.damping[self._clock.index].copy()
+        return self._motion.gains[1].copy()
+
+    @property
+    def filter_share(self) -> float:
+        """Share of the last change of the gains that ``stiffness_filter`` granted, 0 to 1."""
+        return 1.0 if self._motion.filtered is None else self._motion.filtered.share
+
+    @property
+    def tank_energy(self) -> float | None:
+        """Energy in the tank of an `EnergyTank` in J; None without."""
+        return None if self._motion.filtered is None else self._motion.filtered.tank_energy
 
     @property
     def schedule_time(self) -> float:
         """Time in the schedule, in s."""
         return self._clock.time_at(self._timer.last)
 
-    def _begin(self, now: float, at: float, start: tuple[Vector | None, Vector | None, Vector], bias: Vector) -> None:
+    def _begin(self, now: float, at: float, start: StartState, bias: Vector) -> None:
         self._channel.begin(self._table.n_axes, bias)
         self._motion.begin(now, at, *start)
         self.faults = FINE

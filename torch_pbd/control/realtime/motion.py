@@ -7,9 +7,12 @@ from typing import final
 
 import numpy as np
 
+from torch_pbd.checks import Floats
+from torch_pbd.control.filters import StiffnessFilter
 from torch_pbd.control.realtime.clock import ScheduleClock
+from torch_pbd.control.realtime.filters import FilteredGains
 from torch_pbd.control.realtime.limits import FINE, CommandLimits, TickStatus
-from torch_pbd.control.realtime.places import Vector
+from torch_pbd.control.realtime.places import Vector, moved
 from torch_pbd.control.realtime.steps import Scale, braked
 from torch_pbd.control.realtime.table import ScheduleTable
 from torch_pbd.control.realtime.timer import SMOOTHING, TickTimer
@@ -29,12 +32,19 @@ class Motion:
     is_stopped: bool
 
     def __init__(
-        self, table: ScheduleTable, timer: TickTimer, clock: ScheduleClock, options: Mapping[str, Vector], unit: float
+        self,
+        table: ScheduleTable,
+        timer: TickTimer,
+        clock: ScheduleClock,
+        options: Mapping[str, Vector],
+        unit: float,
+        wanted: StiffnessFilter | None,
     ) -> None:
         self._table, self._timer, self._clock = table, timer, clock
         speeds, rises, stops = (options[name] for name in ("velocity_limit", "acceleration_limit", "stop_deceleration"))
         self._limits = CommandLimits(speeds, rises, table.blocks)
         self._pull_limit = options["spring_limit"][0] / unit
+        self.filtered = None if wanted is None else FilteredGains(wanted, table, unit, self._pull_limit)
         stop = clock.least(stops) if stops else max(clock.least(_DECELERATION[: len(table.blocks)]), clock.acceleration)
         self._deceleration = min(stop, clock.least(rises))
         # Impulse responses of velocity to force integrate, in absolute values, to 2 / damping at most along each mode,
@@ -54,6 +64,20 @@ class Motion:
         self._top_speeds = tuple(map(max, self._speeds_due, speeds))
         self._least_top = min(self._top_speeds)
         self.is_stopped = False
+        if self.filtered is not None:
+            self.filtered.begin(self._clock.index)
+
+    @property
+    def desired_place(self) -> Vector:
+        """Desired place of the last tick; its quaternion is a unit one."""
+        return moved(self.row[: self._table.n_place], (0.0,) * self._table.n_axes)
+
+    @property
+    def gains(self) -> tuple[Floats, Floats]:
+        """Stiffness, before a limit scaled it, and damping (d, d) of the last tick."""
+        if self.filtered is not None:
+            return self.filtered.stiffness, self.filtered.damping
+        return self._table.stiffness[self._clock.index], self._table.damping[self._clock.index]
 
     def live(self, now: float, step: float, push: Vector) -> TickStatus:
         """Move on to ``now``, ``step`` s after the last tick, under a push."""
@@ -63,17 +87,20 @@ class Motion:
         timer, clock, table = self._timer, self._clock, self._table
         here = self.place, self.velocity
         row = clock.row(timer.last, step)
-        if clock.boost:
-            boosted = tuple(map(add, push, table.forced(clock.boost, clock.index)))
-            state, self.scale = table.advance(row, boosted, here, step, self._pull_limit)
-            clock.spare(table.accelerated(push, clock.index), here[1], state[1], step)
+        acting = tuple(map(add, push, table.forced(clock.boost, clock.index))) if clock.boost else push
+        if self.filtered is None:
+            state, self.scale = table.advance(row, acting, here, step, self._pull_limit)
         else:
-            state, self.scale = table.advance(row, push, here, step, self._pull_limit)
+            state, self.scale = self.filtered.advance(row, clock.index, acting, here, step)
+        if clock.boost:
+            clock.spare(table.accelerated(push, clock.index), here[1], state[1], step)
         status = FINE if self.scale == 1.0 else TickStatus.SPRING_LIMITED
         # No block is beyond its own top speed where all together are within the least of them.
         if self._limits.is_any or math.hypot(*state[1]) > self._least_top:
             state, reached = self._limits.applied(state, here, step, self._top_speeds)
             status |= reached
+        if self.filtered is not None:
+            self.filtered.settle(row, acting, here, state)
         self.row, (self.place, self.velocity) = row, state
         timer.last = now
         timer.step += SMOOTHING * (step - timer.step)

@@ -8,11 +8,14 @@ import numpy as np
 
 from torch_pbd import checks
 from torch_pbd.control.realtime.places import Vector
-from torch_pbd.control.realtime.steps import Numbers
+from torch_pbd.control.realtime.steps import Numbers, vector
 from torch_pbd.exceptions import InvalidParameterError
 
 Option = float | tuple[float, float] | None
 """Number for positions; for poses a pair, of positions and of rotations; None is the default."""
+
+StartState = tuple[Vector | None, Vector | None, Vector]
+"""Position, orientation and velocity; places are None where they are those of the schedule."""
 
 # What rotations have for a unit of positions.
 _ANGULAR = {"N": "Nm", "N/s": "Nm/s", "units/s": "rad/s", "units/s^2": "rad/s^2"}
@@ -55,10 +58,26 @@ def _checked(value: Any, name: str, unit: str) -> float:
     return checks.number(value, name, above=0.0, unit=unit)
 
 
-def unit_quaternion(values: Numbers, *, is_pose: bool) -> Vector:
-    """Unit quaternion of an orientation, for a schedule that has some."""
-    if not is_pose:
+def start_state(
+    position: Numbers | None,
+    orientation: Numbers | None,
+    velocity: Numbers | None,
+    blocks: tuple[slice, ...],
+    speed_limits: Vector,
+) -> StartState:
+    """State of a robot that begins, checked: at rest where no velocity is given."""
+    d = blocks[-1].stop
+    here = None if position is None else vector(position, "position", blocks[0].stop)
+    if orientation is not None and len(blocks) == 1:
         raise InvalidParameterError("orientation is given, must be None for a schedule without: leave it out.")
+    turned = None if orientation is None else _unit_quaternion(orientation)
+    moving = (0.0,) * d if velocity is None else vector(velocity, "velocity", d)
+    for name, block, most in zip(("the speed", "the angular speed"), blocks, speed_limits, strict=False):
+        checks.number(math.hypot(*moving[block]), name, most=most, unit="units/s", remedy="slow it down")
+    return here, turned, moving
+
+
+def _unit_quaternion(values: Numbers) -> Vector:
     quaternion = checks.array(values, "orientation", (4,))
     length = float(np.linalg.norm(quaternion))
     remedy = "give a unit quaternion w x y z"

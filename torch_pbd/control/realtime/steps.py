@@ -96,7 +96,7 @@ def coupled(
     rate = np.zeros((2 * d + 1, 2 * d + 1))
     rate[:d, d:-1] = np.eye(d)
     rate[d:-1] = gains * np.repeat([step**2, step, step**2], [d, d, 1])
-    change = _expm1(rate) @ np.concatenate([off, np.multiply(step, velocity), [1.0]])
+    change = expm1(rate) @ np.concatenate([off, np.multiply(step, velocity), [1.0]])
     return tuple(change[:d].tolist()), tuple(np.add(velocity, change[d:-1] / step).tolist()), scale
 
 
@@ -161,7 +161,7 @@ def _quadratic(matrix: Vector, x: Vector) -> float:
     return sum([part * _dot(matrix[i * d : (i + 1) * d], x) for i, part in enumerate(x)])
 
 
-def _expm1(matrix: Floats) -> Floats:
+def expm1(matrix: Floats) -> Floats:
     """exp(matrix) - 1 by Taylor series and doubling: without the 1, slow motions keep their digits beside fast ones."""
     doublings = max(0, math.frexp(np.abs(matrix).sum(axis=1).max())[1] + 1)
     # The norm is now 1/2 at most, for which 14 terms have all digits.

@@ -62,12 +62,14 @@ class ScheduleTable:
     ``mass`` (n, d, d) is that of the rows. ``stiffness`` and ``damping`` (n, d, d) are in N/m and N s/m, ``velocity``
     (n, d) and ``acceleration`` (n - 1, d) of the desired motion those before the last row was stopped. ``mobility`` has
     the largest norm of each block of D^-1: of the velocities of positions and rotations under steady forces and
-    torques where damping alone acts.
+    torques where damping alone acts. Rows of a ``steady`` table limit their springs by the largest stiffness of all.
     """
 
     mobility: Floats
 
-    def __init__(self, schedule: Schedule, mass: float | Floats, rate: float, pull_limits: Vector) -> None:
+    def __init__(
+        self, schedule: Schedule, mass: float | Floats, rate: float, pull_limits: Vector, *, steady: bool = False
+    ) -> None:
         duration = schedule.duration
         if count_rows(duration, rate) > _MAX_ROWS:
             must = f"at most {_MAX_ROWS / duration:g} for a schedule of {duration:g} s, a table of {_MAX_ROWS} rows"
@@ -87,7 +89,10 @@ class ScheduleTable:
             self.mass = between.linear(mass) if mass.ndim == 3 else np.broadcast_to(mass, self.stiffness.shape)
         solve, gains, along = _gains(self.stiffness, self.damping, mass if np.ndim(mass) < 3 else self.mass)
         unit = mass if isinstance(mass, float) else 1.0
+        self.is_apart = len(self.blocks) == 2 and _are_apart(self.stiffness, *self.blocks)
         self.advance, springs = self._springs(solve, along, unit, pull_limits)
+        for largest in springs[: (1 + self.is_apart) * steady]:
+            largest[:] = largest.max()
         if along is not None and len(self.blocks) == 1 and self.mass is None:
             least = unit * float(along[1].min())
             self.mobility = np.full((1, 1), 1.0 / least if least > 0.0 else math.inf)
@@ -102,11 +107,11 @@ class ScheduleTable:
         """One row, unpacked."""
         return self.layout.unpack_from(self.packed, index * self.layout.size)
 
-    def scaled(self, scale: Scale, index: int) -> Floats:
-        """Stiffness (d, d) of a row in N/m, in a tick that scaled it."""
+    def scaled(self, stiffness: Floats, scale: Scale) -> Floats:
+        """Stiffness (d, d) as scaled in a tick."""
         scales = scale if isinstance(scale, tuple) else (scale,) * len(self.blocks)
         sizes = [block.stop - block.start for block in self.blocks]
-        return np.repeat(scales, sizes)[:, np.newaxis] * self.stiffness[index]
+        return np.repeat(scales, sizes)[:, np.newaxis] * stiffness
 
     def forced(self, acceleration: Vector, index: int) -> Vector:
         """Push, as ticks take it, that causes an acceleration: a force, or that per kg."""
@@ -128,7 +133,7 @@ class ScheduleTable:
         stiffest = [np.linalg.eigvalsh(self.stiffness[:, block, block])[:, -1] for block in self.blocks]
         largest = [most / limit**2 for most, limit in zip(stiffest, pull_limits, strict=True)]
         whole = np.max(largest, axis=0) * (pull_limits[0] ** 2 / unit)
-        if len(self.blocks) == 1 or not _are_apart(self.stiffness, *self.blocks):
+        if not self.is_apart:
             return advance_with(solve, n_place, d), [whole]
         springs = [self.stiffness[:, block, block] for block in self.blocks]
         return advance_apart(solve, self.blocks[0].stop, d), [*largest, *springs, whole]
