@@ -84,10 +84,14 @@ class Loop:
         if is_at_rest and not is_quiet and self.rng.random() < 0.05:
             self.n_dead, self.told = 0, self.true + self.offset
             self.starts[len(self.acting)] = self.controller.schedule_time
-            here, goal = self.controller.position, self.controller.desired_position
-            self.controller.start(self.told, here, at=self.controller.schedule_time)
             # From where a push has held it the robot approaches by minimum jerk, at 0.5 m/s at most.
-            self.n_quiet = QUIET + round(1.875 * math.dist(here, goal) / 0.5 / STEP)
+            self.n_quiet = QUIET + round(1.875 * self.restart() / STEP)
+
+    def restart(self):
+        """Begin again from where the robot is; returns the time of its way at the speed of an approach."""
+        here, goal = self.controller.position, self.controller.desired_position
+        self.controller.start(self.told, here, at=self.controller.schedule_time)
+        return math.dist(here, goal) / 0.5
 
     def force(self, *, is_quiet):
         push = self.push * (not is_quiet) * math.sin(2.0 * self.true) ** 2
