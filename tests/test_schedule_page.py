@@ -166,7 +166,7 @@ def test_the_program_of_the_page_does_what_python_does(page, tmp_path):
     program = compiled(tmp_path / "page.cpp", "-O2")
     ran = subprocess.run([program], capture_output=True, text=True, check=True, cwd=tmp_path)
     controller = RealTimeAdmittance(page["schedule"])
-    controller.start(0.0)
+    controller.start(0.0, [0.0, 0.01])
     for tick in range(1, 4001):
         controller.tick(1e-3 * tick, [0.0, 5.0])
     assert ran.stdout == "{:.4f} {:.4f}\n".format(*controller.position)

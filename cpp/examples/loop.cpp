@@ -42,13 +42,13 @@ void run(const torch_pbd::Schedule& schedule) {
 }  // namespace
 
 // Whoever allocates is counted.
-void* operator new(std::size_t size) {
+[[gnu::noinline]] void* operator new(std::size_t size) {
     ++n_allocations;
     if (void* memory = std::malloc(size)) return memory;
     throw std::bad_alloc();
 }
-void operator delete(void* memory) noexcept { std::free(memory); }
-void operator delete(void* memory, std::size_t) noexcept { std::free(memory); }
+[[gnu::noinline]] void operator delete(void* memory) noexcept { std::free(memory); }
+[[gnu::noinline]] void operator delete(void* memory, std::size_t) noexcept { std::free(memory); }
 
 int main(int n_arguments, char** arguments) {
     if (n_arguments != 2) return std::fprintf(stderr, "usage: loop SCHEDULE.csv\n"), 2;

@@ -1,7 +1,7 @@
 /// The controller inside a robot's 1 kHz loop: measured force in, commanded motion out. C++17, no other library.
 ///
 ///     torch_pbd::Admittance<2> controller(torch_pbd::Schedule::load("letter.csv"));
-///     controller.start(seconds(), robot.position());
+///     controller.start(seconds(), {robot.position()});
 ///     while (true) {
 ///         const torch_pbd::Faults faults = controller.tick(seconds(), robot.force());
 ///         robot.move(controller.position(), controller.velocity());
@@ -62,6 +62,15 @@ public:
     static constexpr bool kIsPose = M != N;
     using Position = Vector<n_positions<N, M>>;
 
+    /// Where the robot is at the start, and where in the schedule.
+    struct Start {
+        std::optional<Position> position{};  ///< none is that of the schedule
+        Vector<N> velocity{};  ///< in units/s and rad/s
+        double at = 0.0;  ///< time in the schedule, in s; `schedule_time` goes on after a stop
+        Vector<N> force_bias{};  ///< reading of the sensor while nothing touches it, in N and Nm
+        std::optional<Quaternion> orientation{};  ///< of poses: unit quaternion w x y z; none is that of the schedule
+    };
+
     explicit Admittance(const Schedule& schedule, const Options& options = {})
         : unit_(virtual_mass(schedule, options.mass)),
           timer_(checked(options.rate, 0.0 < options.rate && options.rate < infinity, "rate", "above 0"),
@@ -87,35 +96,33 @@ public:
         desired_ = clock_.begin(0.0, 0.0, {}, {}, {}, state_.place);
     }
 
-    /// Begins, or begins again, at `now` s of a monotonic clock: faults, forces and motion are forgotten.
-    ///
-    /// No position or orientation, a unit quaternion w x y z, is where the schedule is. `at` is the time in the
-    /// schedule to begin at, in s; `schedule_time` goes on after a stop. `force_bias` is the reading of the sensor
-    /// while nothing touches it, in N and Nm.
-    void start(double now, const std::optional<Position>& position = {}, const Vector<N>& velocity = {},
-               double at = 0.0, const Vector<N>& force_bias = {}, const std::optional<Quaternion>& orientation = {}) {
-        checked(at, 0.0 <= at && at <= table_->end, "at", "a time of the schedule, in s");
-        check_finite(position.value_or(Position{}), "position");
-        check_finite(velocity, "velocity");
-        check_finite(force_bias, "force_bias");
-        std::optional<Quaternion> turned;
+    /// Begins where the schedule does, at rest, at `now` s of a monotonic clock.
+    void start(double now) { start(now, Start{}); }
+
+    /// Begins, or begins again: faults, forces and motion are forgotten.
+    void start(double now, const Start& from) {
+        checked(from.at, 0.0 <= from.at && from.at <= table_->end, "at", "a time of the schedule, in s");
+        check_finite(from.position.value_or(Position{}), "position");
+        check_finite(from.velocity, "velocity");
+        check_finite(from.force_bias, "force_bias");
+        std::optional<Quaternion> orientation = from.orientation;
         if (orientation) {
             const double length = linalg::norm(*orientation);
             checked(length, kIsPose && std::abs(length - 1.0) <= kOff, "the length of orientation", "1, of a pose");
-            turned = linalg::scaled(1.0 / length, *orientation);
+            orientation = linalg::scaled(1.0 / length, *orientation);
         }
         Limit speed{0.0, 0.0};
         for (std::size_t b = 0; b < kBlocks.size(); ++b) {
-            const double along = linalg::norm(velocity, kBlocks[b]);
+            const double along = linalg::norm(from.velocity, kBlocks[b]);
             checked(along, along <= limits_.speed[b], b == 0 ? "the speed" : "the angular speed",
                     "velocity_limit at most");
             (b == 0 ? speed.position : speed.rotation) = along;
         }
         timer_.begin(now);
-        channel_.begin(force_bias);
-        scale_ = 1.0;
-        desired_ = clock_.begin(now, at, position, turned, velocity, state_.place);
-        state_.velocity = velocity;
+        channel_.begin(from.force_bias);
+        scale_ = {1.0, 1.0};
+        desired_ = clock_.begin(now, from.at, from.position, orientation, from.velocity, state_.place);
+        state_.velocity = from.velocity;
         top_speed_ = {std::max(speed_due_.position, speed.position), std::max(speed_due_.rotation, speed.rotation)};
         is_started_ = true;
         is_stopped_ = false;
@@ -155,7 +162,7 @@ public:
     }
     const Vector<N>& desired_velocity() const { return desired_.velocity; }  ///< of the last tick
     /// Stiffness of the last tick in N/m and Nm/rad, as `spring_limit` let it be.
-    Matrix<N> stiffness() const { return linalg::scaled(scale_, table_->stiffness[clock_.index]); }
+    Matrix<N> stiffness() const { return table_->scaled_stiffness(scale_, clock_.index); }
     const Matrix<N>& damping() const { return table_->damping[clock_.index]; }  ///< of the last tick
     double schedule_time() const { return clock_.time_at(timer_.last); }  ///< in s
 
@@ -210,7 +217,7 @@ private:
             scale_ = table_->advance(clock_.index, desired_, push, state_, step, pull_limit);
         }
         Faults faults = 0;
-        if (scale_ != 1.0) faults = kSpringLimited;
+        if (scale_.position != 1.0 || scale_.rotation != 1.0) faults = kSpringLimited;
         // No block is beyond its own top speed where all together are within the least of them.
         const double least = kIsPose ? std::min(top_speed_.position, top_speed_.rotation) : top_speed_.position;
         if (limits_.is_any || linalg::norm(state_.velocity) > least)
@@ -250,8 +257,8 @@ private:
     Limit pull_limit_;
     std::shared_ptr<const ScheduleTable<N, M>> table_;
     ScheduleClock<N, M> clock_;
-    double deceleration_, scale_ = 1.0;
-    Limit speed_due_{}, top_speed_{};
+    double deceleration_;
+    Limit speed_due_{}, top_speed_{}, scale_{1.0, 1.0};
     State<N, M> state_{}, desired_{};
     bool is_started_ = false, is_stopped_ = false;
     Faults faults_ = 0;

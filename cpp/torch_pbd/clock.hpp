@@ -31,7 +31,7 @@ namespace torch_pbd {
 ///
 /// Speeds and accelerations of poses are those of `norm`, with a lever: both blocks then keep to all of the above. An
 /// approach turns the desired orientation by A, a share of the way in between: A R_d moves at w_A + A w_d, and the
-/// acceleration of that has w_A x A w_d besides.
+/// acceleration of that has w_A x A w_d besides, which is allowed for at full speed.
 template <std::size_t N, std::size_t M>
 class ScheduleClock {
 public:
@@ -40,8 +40,9 @@ public:
         : table_(std::move(table)),
           soft_start_(checked(soft_start, 0.0 <= soft_start && soft_start < infinity, "soft_start", "of at least 0")),
           approach_(checked<N, M>(approach_speed, "approach_speed")),
+          approach_speed_(approach_.position),
           catches_up_(catches_up) {
-        double own = 0.0, fastest = 0.0;
+        double own = 0.0, fastest = 0.0, spin = 0.0;
         const std::size_t last = table_->last();
         speeds_.resize(last + 1);
         for (std::size_t i = 0; i <= last; ++i) {
@@ -51,18 +52,21 @@ public:
                 const Vector<N> change = linalg::difference(motion(i), motion(i - 1));
                 own = std::max(own, norm(change) / (table_->time(i) - table_->time(i - 1)));
             }
-            if constexpr (M != N) spin_ = std::max(spin_, linalg::norm(motion(i), blocks<N, M>[1]));
+            if constexpr (M != N) spin = std::max(spin, linalg::norm(motion(i), blocks<N, M>[1]));
         }
+        const double limit = least(acceleration_limit);
+        if (spin * approach_speed_ > kShare * limit) approach_speed_ = kShare * limit / spin;
         // Acceleration of a soft start that comes up to speed; without one, a second is as long as its default.
-        const double soft = std::max(fastest, approach_.position) / (soft_start > 0.0 ? soft_start : 1.0);
+        const double soft = std::max(fastest, approach_speed_) / (soft_start > 0.0 ? soft_start : 1.0);
         // One half of a limit is left for the schedule's own acceleration.
-        gain_ = std::min(std::max(kShare * own, soft), 0.5 * least(acceleration_limit));
-        speed = kSpeed * fastest + approach_.position;
+        gain_ = std::min(std::max(kShare * own, soft), 0.5 * limit);
+        speed = kSpeed * fastest + approach_speed_;
         acceleration = std::max((1.0 + kShare) * own + gain_, kSharpest / kSteepest * soft);
         // What the schedule's own acceleration leaves to an approach; a critically damped spring overshoots it by 13 %.
         room_ = std::max(gain_, acceleration - (1.0 + kShare) * own);
         const double room = own > 0.0 ? (acceleration - gain_) / own : infinity;
         fastest_ = catches_up ? std::min(kSpeed, std::sqrt(room)) : 1.0;
+        acceleration += approach_speed_ * spin;
         find_ends();
     }
 
@@ -118,7 +122,7 @@ public:
         }
         is_soft_ = !linalg::is_zero(distance_) && soft_start_ > 0.0;
         // At a pace of 1 the approach leaves this much less than `gain` to changes of pace.
-        if (is_soft_) taken_ = std::clamp(gain_ + sharpness(way) - room_, 0.0, gain_);
+        if (is_soft_) taken_ = std::clamp(gain_ + kSharpest * way / blend_ / blend_ - room_, 0.0, gain_);
         // The pace at which the desired motion is nearest to that of the robot.
         double square = 0.0, along = 0.0;
         for (std::size_t b = 0; b < blocks<N, M>.size(); ++b) {
@@ -340,13 +344,8 @@ private:
 
     /// Time of an approach within its largest speed and this acceleration.
     double time_of(double way, double room) const {
-        const double spun = kSteepest * way * spin_;
-        const double soonest = (spun + std::sqrt(spun * spun + 4.0 * kSharpest * way * room)) / (2.0 * room);
-        return std::max({soft_start_, kSteepest * way / approach_.position, soonest});
+        return std::max({soft_start_, kSteepest * way / approach_speed_, std::sqrt(kSharpest * way / room)});
     }
-
-    /// Largest acceleration of the approach.
-    double sharpness(double way) const { return (kSharpest * way / blend_ + kSteepest * way * spin_) / blend_; }
 
     void clear_boost() {
         is_boosted = false;
@@ -367,8 +366,8 @@ private:
     std::shared_ptr<const ScheduleTable<N, M>> table_;
     double soft_start_;
     Limit approach_;
+    double approach_speed_;  ///< in the norm
     bool catches_up_;
-    double spin_ = 0.0;  ///< largest angular speed of the schedule
     double gain_, room_, fastest_, slow_from_;
     std::vector<double> speeds_, squared_limits_;
     std::size_t tail_;

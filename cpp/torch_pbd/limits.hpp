@@ -33,7 +33,7 @@ using Faults = unsigned;
 
 /// Option that positions and rotations have each their own of; without an orientation the second is not used.
 struct Limit {
-    double position, rotation = 0.0;
+    double position = 0.0, rotation = 0.0;
 
     double operator[](std::size_t block) const { return block == 0 ? position : rotation; }
 };

@@ -122,8 +122,11 @@ Vector<N> deviation(const Vector<M>& place, const Vector<M>& goal) {
     Vector<N> move;
     for (std::size_t i = 0; i < n_positions<N, M>; ++i) move[i] = place[i] - goal[i];
     if constexpr (M != N) {
-        const Quaternion back = rotations::conjugate(orientation_of(goal));
-        set_tail(move, rotations::log(rotations::multiply(orientation_of(place), back)));
+        const Quaternion turned = orientation_of(place), still = orientation_of(goal);
+        // Products of equal quaternions are not zero to the last bit.
+        const bool is_equal = turned == still;
+        set_tail(move,
+                 is_equal ? Vector<3>{} : rotations::log(rotations::multiply(turned, rotations::conjugate(still))));
     }
     return move;
 }

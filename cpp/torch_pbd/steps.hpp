@@ -106,6 +106,7 @@ Vector<N> coupled(const Modes<N>& modes, bool has_mass, const Matrix<N>& stiffne
     const auto per_mass = [&](const Vector<N>& force) {
         return has_mass ? linalg::transposed_product(modes.shapes, linalg::product(modes.shapes, force)) : force;
     };
+    const Matrix<N> k = linalg::transposed(stiffness), d = linalg::transposed(damping);
     Matrix<2 * N + 1> rate{};
     const auto set_column = [&rate](std::size_t column, double factor, const Vector<N>& acceleration) {
         for (std::size_t i = 0; i < N; ++i) rate[N + i][column] = factor * acceleration[i];
@@ -114,8 +115,8 @@ Vector<N> coupled(const Modes<N>& modes, bool has_mass, const Matrix<N>& stiffne
     start[2 * N] = 1.0;
     for (std::size_t i = 0; i < N; ++i) {
         rate[i][N + i] = 1.0;
-        set_column(i, -(step * step) * scale, per_mass(stiffness[i]));  // rows are columns: both are symmetric
-        set_column(N + i, -step, per_mass(damping[i]));
+        set_column(i, -(step * step) * scale, per_mass(k[i]));
+        set_column(N + i, -step, per_mass(d[i]));
         start[i] = drive.off[i];
         start[N + i] = step * velocity[i];
     }

@@ -37,35 +37,54 @@ public:
         stiffness.resize(times_.size());
         damping.resize(times_.size());
         modes_.resize(times_.size());
+        springs_.resize(times_.size());
         std::size_t knot = 0;
         for (std::size_t i = 0; i < times_.size(); ++i) {
             const std::vector<double>& knots = schedule.time;
             while (knot + 2 < knots.size() && knots[knot + 1] - knots[0] <= times_[i]) ++knot;
             fill(schedule, knot, i);
             if (!share_axes(schedule, knot, i)) is_shared_ = false;
-            modes_[i].top = largest(i, pull_limit);
+            springs_[i] = {stiffest(i, 0, pull_limit), blocks<N, M>.size() > 1 ? stiffest(i, 1, pull_limit) : 0.0};
+            const double limit = pull_limit.position;
+            modes_[i].top = std::max(springs_[i].position, springs_[i].rotation) * (limit * limit / unit);
         }
+        is_apart_ = are_apart();
         velocity_at_end = rows.back().velocity;
         rows.back().velocity = {};
     }
 
-    /// Moves a state on by `step` s with the gains of a row; tells the scale of its stiffness.
+    /// Moves a state on by `step` s with the gains of a row; tells the scales of its springs.
     ///
     /// The angular velocity is integrated over the tick as that of a fixed axis would be, and turns the robot in world
     /// axes. The deviation is then told anew from where both are, so that the transport of it by the desired rotation,
     /// which turns e by w_d x e, comes out by itself.
-    double advance(std::size_t row, const State<N, M>& desired, const Vector<N>& push, State<N, M>& state, double step,
-                   double pull_limit) const {
+    ///
+    /// Where positions and rotations have springs apart, each has a potential, a limit and a scale of its own: twisted
+    /// beyond its torque, a tool keeps its stiffness along the way. Where a limit acts, modes are no longer shared.
+    Limit advance(std::size_t row, const State<N, M>& desired, const Vector<N>& push, State<N, M>& state, double step,
+                  double pull_limit) const {
         const Vector<N> off = places::deviation<N>(state.place, desired.place);
-        const Drive<N> drive{push, off, desired.velocity, step, pull_limit};
         const Modes<N>& modes = modes_[row];
-        double scale;
-        const Vector<N> move = is_shared_
-                                   ? along_modes(modes, drive, state.velocity, scale)
-                                   : coupled(modes, has_mass, linalg::scaled(1.0 / unit, stiffness[row]),
-                                             linalg::scaled(1.0 / unit, damping[row]), drive, state.velocity, scale);
+        Limit scale{1.0, 1.0};
+        if (is_apart_)
+            scale = {spring_scale(pull(row, off, 0), 1.0), spring_scale(pull(row, off, blocks<N, M>.size() - 1), 1.0)};
+        const Drive<N> drive{push, off, desired.velocity, step, is_apart_ ? infinity : pull_limit};
+        double whole;
+        const Vector<N> move = is_shared_ && scale.position == 1.0 && scale.rotation == 1.0
+                                   ? along_modes(modes, drive, state.velocity, whole)
+                                   : coupled(modes, has_mass, linalg::scaled(1.0 / unit, scaled_stiffness(scale, row)),
+                                             linalg::scaled(1.0 / unit, damping[row]), drive, state.velocity, whole);
         state.place = places::moved(state.place, move);
-        return scale;
+        return is_apart_ ? scale : Limit{whole, whole};
+    }
+
+    /// Stiffness of a row in N/m and Nm/rad, in a tick that scaled it.
+    Matrix<N> scaled_stiffness(Limit scale, std::size_t row) const {
+        Matrix<N> scaled = stiffness[row];
+        for (std::size_t b = 0; b < blocks<N, M>.size(); ++b)
+            for (std::size_t i = blocks<N, M>[b].begin; i < blocks<N, M>[b].end; ++i)
+                scaled[i] = linalg::scaled(scale[b], scaled[i]);
+        return scaled;
     }
 
     /// Push, as ticks take it, that causes an acceleration: a force, or that per kg.
@@ -222,17 +241,35 @@ private:
         return true;
     }
 
-    /// Square of the first limit over that of the largest |K e| / limit of a block at e'K e = 1: k_max of one block.
+    /// Largest stiffness of a block over its squared limit.
     ///
-    /// |K e|^2 <= k_max e'K e in each block, with k_max that of the block: with the others' displacements too, as
+    /// |K e|^2 <= k_max e'K e in each block, with k_max that of the block, also where others are displaced, for
     /// |B'K e|^2 <= |B'K B| e'K e for any B.
-    double largest(std::size_t row, Limit pull_limit) const {
-        double most = 0.0;
-        for (std::size_t b = 0; b < blocks<N, M>.size(); ++b) {
-            const double ratio = pull_limit.position / pull_limit[b];
-            most = std::max(most, spectral_norm(stiffness[row], blocks<N, M>[b], blocks<N, M>[b]) * ratio * ratio);
-        }
-        return most / unit;
+    double stiffest(std::size_t row, std::size_t b, Limit pull_limit) const {
+        return spectral_norm(stiffness[row], blocks<N, M>[b], blocks<N, M>[b]) / (pull_limit[b] * pull_limit[b]);
+    }
+
+    /// Square of the largest pull of the spring of a block, over that of its limit.
+    double pull(std::size_t row, const Vector<N>& off, std::size_t b) const {
+        const Block block = blocks<N, M>[b];
+        double sum = 0.0;
+        for (std::size_t i = block.begin; i < block.end; ++i)
+            for (std::size_t j = block.begin; j < block.end; ++j) sum += off[i] * stiffness[row][i][j] * off[j];
+        return springs_[row][b] * sum;
+    }
+
+    /// Whether no stiffness couples positions and rotations.
+    bool are_apart() const {
+        constexpr double rounding = 1e-9;
+        if (M == N) return false;
+        Matrix<N> most{};
+        for (const Matrix<N>& gain : stiffness)
+            for (std::size_t i = 0; i < N; ++i)
+                for (std::size_t j = 0; j < N; ++j) most[i][j] = std::max(most[i][j], std::abs(gain[i][j]));
+        for (std::size_t i = 0; i < N - 3; ++i)
+            for (std::size_t j = N - 3; j < N; ++j)
+                if (!(most[i][j] <= rounding * std::sqrt(most[i][i]) * std::sqrt(most[j][j]))) return false;
+        return true;
     }
 
     /// Largest singular value of a block of a matrix.
@@ -245,8 +282,9 @@ private:
         return std::sqrt(*std::max_element(values.begin(), values.end()));
     }
 
-    bool is_shared_ = true;
+    bool is_shared_ = true, is_apart_ = false;
     std::vector<double> times_;
+    std::vector<Limit> springs_;  ///< largest stiffness over squared limit
     std::vector<Modes<N>> modes_;
 };
 

@@ -6,7 +6,6 @@
 #include <optional>
 #include <string>
 #include <torch_pbd/admittance.hpp>
-#include <tuple>
 #include <type_traits>
 #include <vector>
 
@@ -38,11 +37,14 @@ struct LoopOf final : Loop {
 
     // A place that begins or ends with NaN has no position or orientation.
     void start(double now, const double* place, const double* velocity, double at, const double* bias) override {
-        std::optional<typename Admittance<N, M>::Position> position;
-        std::optional<torch_pbd::Quaternion> orientation;
-        if (place[0] == place[0]) position = vector<std::tuple_size_v<typename decltype(position)::value_type>>(place);
-        if (M != N && place[M - 1] == place[M - 1]) orientation = vector<4>(place + M - 4);
-        controller.start(now, position, vector<N>(velocity), at, vector<N>(bias), orientation);
+        typename Admittance<N, M>::Start from;
+        constexpr std::size_t p = torch_pbd::n_positions<N, M>;
+        if (place[0] == place[0]) from.position = vector<p>(place);
+        if (M != N && place[M - 1] == place[M - 1]) from.orientation = vector<4>(place + M - 4);
+        from.velocity = vector<N>(velocity);
+        from.force_bias = vector<N>(bias);
+        from.at = at;
+        controller.start(now, from);
     }
 
     unsigned tick(double now, const double* force) override { return controller.tick(now, vector<N>(force)); }

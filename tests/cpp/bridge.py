@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torch_pbd.control.realtime import RealTimeAdmittance
+from torch_pbd.control.realtime import RealTimeAdmittance, TickStatus
 
 ROOT = Path(__file__).parents[2]
 COMPILER = shutil.which("g++")
@@ -36,8 +36,12 @@ def compiled(source, *options):
 
 
 @functools.cache
-def library():
-    path = compiled(Path(__file__).with_name("bridge.cpp"), "-O1", "-shared", "-fPIC")
+def _library():
+    """Library of this folder, or why it is not there: it is compiled once, in any case."""
+    try:
+        path = compiled(Path(__file__).with_name("bridge.cpp"), "-O1", "-shared", "-fPIC")
+    except AssertionError as error:
+        return error
     loaded = ctypes.CDLL(str(path))
     shutil.rmtree(path.parent)
     numbers = POINTER(c_double)
@@ -50,6 +54,13 @@ def library():
     ]:
         function = getattr(loaded, name)
         function.restype, function.argtypes = result, arguments
+    return loaded
+
+
+def library():
+    """Functions of `bridge.cpp`."""
+    loaded = _library()
+    assert isinstance(loaded, ctypes.CDLL), loaded
     return loaded
 
 
@@ -123,7 +134,7 @@ class Both:
         reach, speed = np.abs(schedule.position).max(), np.abs(schedule.velocity).max()
         sizes = [1, p, 4 * self.is_pose, d, d, p, 4 * self.is_pose, d]
         self._scales = np.repeat([schedule.duration, reach, 1.0, speed, 1.0, reach, 1.0, speed], sizes)
-        self.worst = 0.0
+        self.worst, self.seen = 0.0, TickStatus(0)
 
     def __getattr__(self, name):
         return getattr(self.python, name)
@@ -135,6 +146,7 @@ class Both:
     def tick(self, now, force):
         status, faults = self.python.tick(now, force), self.cpp.tick(now, force)
         assert faults == status, f"at {now}"
+        self.seen |= status
         loop, cpp = self.python, self.cpp.told
         told = [loop.schedule_time, *loop.position, *(loop.orientation if self.is_pose else ())]
         told += [*loop.velocity, *loop.force, *loop.desired_position]
