@@ -168,8 +168,8 @@ class StabilityReport:
     def _promise(self) -> str:
         if not self.stable:
             return "nothing"
-        which = "these rows in any order, blended, held" if self.stable_at_any_schedule else "this schedule as it is"
-        return f"without a force deviations die out exponentially, for {which}; a force moves it by a bounded amount"
+        which = "these rows in any order, blended or held" if self.stable_at_any_schedule else "this schedule as it is"
+        return f"without a force deviations die out, of {which}; a bounded force moves it by a bounded amount"
 
 
 def _speed(limit: float) -> str:
