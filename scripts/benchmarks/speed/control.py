@@ -4,7 +4,7 @@ import numpy as np
 
 from speed import rollouts
 from speed.rows import Findings, Plan, Row
-from speed.ticks import BLOCK, blocks, clock_cost, memory_kept
+from speed.ticks import BLOCK, blocks, clock_cost, memory_kept, pose_ticks
 from torch_pbd import DMPController, HeteroscedasticGPRegressor
 from torch_pbd.control import RealTimeAdmittance
 from torch_pbd.data import make_tunnel_demonstrations
@@ -17,6 +17,7 @@ def measure(plan: Plan) -> Findings:
     rows = [
         *_ticks(plan),
         Row(f"kept by {n_ticks:,} ticks", [float(kept)], "bytes", bar=("<=", 0.0)),
+        *_pose_ticks(plan),
         *_stiffness_error(plan),
         *rollouts.measure(plan),
     ]
@@ -50,6 +51,17 @@ def _ticks(plan: Plan) -> list[Row]:
             other_name="a tick of eager torch",
             bar=(">=", 40.0),
         ),
+    ]
+
+
+def _pose_ticks(plan: Plan) -> list[Row]:
+    n_ticks = plan.size(100_000, 200)
+    seconds = (np.array(pose_ticks(n_ticks)) - clock_cost()) * 1e-9
+    what = f"a tick of a pose, d = 6, with an inertia, of {n_ticks:,}"
+    return [
+        Row(f"{what}: median", [float(np.median(seconds))], bar=("<=", 40e-6)),
+        Row(f"{what}: 99.9th percentile", [float(np.quantile(seconds, 0.999))]),
+        Row(f"{what}: kept", [float(memory_kept(n_ticks, is_pose=True))], "bytes", bar=("<=", 0.0)),
     ]
 
 

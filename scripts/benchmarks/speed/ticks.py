@@ -130,19 +130,54 @@ def clock_cost(n_readings: int = 20_000) -> float:
     return float(np.median(took))
 
 
-def memory_kept(n_ticks: int) -> int:
+def pose_schedule() -> Schedule:
+    """11 s of a tool that circles and turns, 300..900 N/m and 20..60 Nm/rad, with the inertia of an arm that turns."""
+    phase = np.arange(1.1 * BLOCK + 1) / RATE
+    zero, one = 0.0 * phase, 1.0 + 0.0 * phase
+    turn = np.stack([np.cos(phase), -np.sin(phase), zero, np.sin(phase), np.cos(phase), zero, zero, zero, one], axis=1)
+    whole = np.zeros((len(phase), 6, 6))
+    whole[:, :3, :3] = whole[:, 3:, 3:] = turn.reshape(-1, 3, 3)
+    values = np.array([300.0, 600.0, 900.0, 20.0, 40.0, 60.0])
+    stiffness = whole * values @ whole.mT
+    coupling = 0.3 * np.diag(np.sqrt([5.0 * 0.1, 8.0 * 0.3, 19.0 * 0.9]), 3)
+    inertia = np.diag([5.0, 8.0, 19.0, 0.1, 0.3, 0.9]) + coupling + coupling.T
+    position = np.stack([0.1 * np.cos(phase), 0.1 * np.sin(phase), 0.01 * phase], axis=1)
+    velocity = np.stack([-0.1 * np.sin(phase), 0.1 * np.cos(phase), 0.01 * one, zero, zero, one], axis=1)
+    orientation = np.stack([np.cos(0.5 * phase), zero, zero, np.sin(0.5 * phase)], axis=1)
+    gains = (0.5 * (stiffness + stiffness.mT),) * 3
+    rows = Schedule(phase, position, velocity, *gains, type1=zero, orientation=orientation)
+    return rows.with_inertia(whole @ inertia @ whole.mT)
+
+
+def pose_ticks(n_ticks: int) -> list[int]:
+    """Nanoseconds of each tick of a pose under a wrench of some newtons, with one reading of the clock."""
+    schedule, draw = pose_schedule(), random.Random(0)
+    controller, clock, took = RealTimeAdmittance(schedule), time.thread_time_ns, []
+    for block in range(0, n_ticks, BLOCK):
+        controller.start(0.0, velocity=schedule.velocity[0])
+        for i in range(1, min(BLOCK, n_ticks - block) + 1):
+            now = (i + 0.2 * draw.random()) / RATE
+            wrench = [draw.gauss(0, 5), draw.gauss(0, 5), draw.gauss(0, 5), draw.random(), draw.random(), draw.random()]
+            before = clock()
+            controller.tick(now, wrench)
+            took.append(clock() - before)
+    return took
+
+
+def memory_kept(n_ticks: int, *, is_pose: bool = False) -> int:
     """Bytes that ticks leave behind."""
-    controller = RealTimeAdmittance(turning_schedule(), mass=MASS)
+    controller = RealTimeAdmittance(pose_schedule() if is_pose else turning_schedule())
+    force = (1.0, 2.0, 3.0, 0.1, 0.2, 0.3) if is_pose else (1.0, 2.0)
     controller.start(0.0, at=10.0)  # most ticks are after the end, where a million of them begin to count
     for i in range(1, 4000):
-        controller.tick(i / RATE, (1.0, 2.0))
+        controller.tick(i / RATE, force)
     gc.collect()
     tracemalloc.start()
     for i in range(4000, 5000):
-        controller.tick(i / RATE, (1.0, 2.0))
+        controller.tick(i / RATE, force)
     before = tracemalloc.get_traced_memory()[0]
     for i in range(5000, 5000 + n_ticks):
-        controller.tick(i / RATE, (1.0, 2.0))
+        controller.tick(i / RATE, force)
     kept = tracemalloc.get_traced_memory()[0] - before
     tracemalloc.stop()
     return kept
