@@ -49,7 +49,7 @@ space.legend(loc="upper left")
 
 for row, (block, scale, unit) in enumerate(((slice(3), 1e3, "mm"), (slice(3, 6), 180.0 / np.pi, "degrees"))):
     band = figure.add_subplot(columns[row, 1])
-    for motion, style, color, label in ((pushed.deviation, "-", ROBOT, "arm"), (plant - calm, ":", MODEL, "plant")):
+    for motion, style, color, label in ((pushed.deviation, "-", ROBOT, "arm"), (plant - calm, ":", "k", "plant")):
         band.plot(schedule.time, scale * np.linalg.norm(motion[:, block], axis=1), style, color=color, label=label)
     band.set(ylabel=f"deviation [{unit}]", xlabel="time [s]")
     band.legend()

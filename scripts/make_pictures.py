@@ -1,11 +1,13 @@
 """Make the pictures of README and documentation: `python scripts/make_pictures.py` writes those in docs/pictures."""
 
+import runpy
 from pathlib import Path
 
 import matplotlib
 
 matplotlib.use("Agg")
 
+import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.figure import Figure
@@ -143,9 +145,16 @@ def poses():
     return figure
 
 
+def arm():
+    """An arm that is pushed on a learned pose task: the figure of the gallery."""
+    runpy.run_path(str(FOLDER.parents[1] / "examples" / "plot_16_arm.py"))
+    return plt.gcf()
+
+
 if __name__ == "__main__":
     FOLDER.mkdir(exist_ok=True)
     learned = learn()
     overview(*learned).savefig(FOLDER / "overview.png", dpi=110)
     poses().savefig(FOLDER / "pose.png", dpi=90)
+    arm().savefig(FOLDER / "arm.png", dpi=90)
     animation(*learned).save(FOLDER / "push.gif", writer=PillowWriter(fps=12), dpi=90)
