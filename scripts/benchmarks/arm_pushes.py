@@ -31,9 +31,9 @@ class Outcome(NamedTuple):
     ratio_pushed: float
 
 
-def peg(stiffness_min: float) -> Schedule:
-    """The made pose task, learned."""
-    law = StiffnessLaw(stiffness_min, 1000.0, rotation=RotationLimits())
+def peg(stiffness_min: float, *rotation: float) -> Schedule:
+    """The made pose task, learned; limits of rotation in Nm/rad."""
+    law = StiffnessLaw(stiffness_min, 1000.0, rotation=RotationLimits(*rotation))
     return DMPController(stiffness_law=law).fit(make_pose_demonstrations(random_state=0)).schedule(RATE)
 
 
