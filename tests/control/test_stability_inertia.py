@@ -1,5 +1,6 @@
 """What is guaranteed of poses, and where the inertia differs from row to row, against brute force."""
 
+import itertools
 import math
 import re
 from dataclasses import replace
@@ -13,14 +14,19 @@ from control.loops import as_schedule
 from control.test_stability import maps_between_knots, periodic_schedules
 from scipy.spatial.transform import Rotation
 
+from torch_pbd import rotations
 from torch_pbd.control.damping import damping_from_stiffness
 from torch_pbd.control.schedule import Schedule
+from torch_pbd.control.simulation.plant import AdmittancePlant
+from torch_pbd.control.simulation.run import simulate_schedule
 from torch_pbd.control.simulation.ticks import admittance_rate
 from torch_pbd.control.stability import gain
 from torch_pbd.control.stability.common_function import common_function, scaled, searched_function
 from torch_pbd.control.stability.dynamics import ErrorDynamics
 from torch_pbd.control.stability.gain import largest_gain
 from torch_pbd.control.stability.lyapunov import Knots, held_growth
+
+START = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 def turned(eigenvalues, angle):
@@ -175,12 +181,31 @@ def test_growth_over_ticks_that_are_held_is_that_of_scipy(rng):
     for alpha in (2.0, 1.0, 0.5):
         function = [np.block([[k + alpha * c, alpha * m], [alpha * m, m]]) for k, c, m in rows]
         for i, step in enumerate(np.diff(dynamics.time)):
-            free = scipy.linalg.expm(step * rate_matrix(*rows[i], dynamics.transport[i].numpy()))
+            free = scipy.linalg.expm(step * rate_matrix(*rows[i], np.zeros((6, 6))))
+            free[:6] = scipy.linalg.expm(step * dynamics.transport[i].numpy()) @ free[:6]
             np.testing.assert_allclose(maps[i], free, rtol=1e-9, atol=1e-11)
             grown = free.T @ function[i + 1] @ free
             growth.append(scipy.linalg.eigh(grown, function[i], eigvals_only=True)[-1])
     assert held_growth(dynamics, maps, 2.0) == pytest.approx(np.reshape(growth, (3, 6)).max(1).min(), rel=1e-9)
     assert held_growth(dynamics, maps, 2.0) > 1.1
+
+
+def test_maps_are_those_of_the_simulated_robot(rng):
+    """The difference of two runs of poses, one pushed by a millinewton in its first tick, goes by them from then on."""
+    dynamics = arm_rows(rng, 101, duration=1.0, spin=1.5)
+    schedule = as_poses(dynamics)
+    turns = rotations.exp(0.01 * schedule.velocity[:-1, 3:])
+    orientation = list(
+        itertools.accumulate(turns, lambda before, turn: rotations.multiply(turn, before), initial=START)
+    )
+    schedule, push = replace(schedule, orientation=np.array(orientation)), np.zeros((101, 6))
+    push[0] = 1e-3 * rng.normal(size=6)
+    pushed, free = (simulate_schedule(schedule, AdmittancePlant(None), force, 100.0, 0) for force in (push, None))
+    state = np.concatenate([pushed.deviation - free.deviation, pushed.velocity - free.velocity], axis=1)
+    carried = state[1]
+    for tick, each in enumerate(dynamics.tick_maps().numpy()[1:], start=1):
+        carried = each @ carried
+        np.testing.assert_allclose(carried, state[tick + 1], atol=1e-6 * abs(state[tick + 1]).max())
 
 
 def counterexample(n_cycles=6):

@@ -54,19 +54,22 @@ class ErrorDynamics:
         return symmetrize(torch.linalg.solve_triangular(factor.mT, half, upper=True, left=False))
 
     def tick_maps(self) -> Float[Tensor, "k s s"]:
-        """Maps of (e, v) over each of the n - 1 intervals with everything held, s = 2 d."""
+        """Maps of (e, v) over each of the n - 1 intervals with everything held, s = 2 d.
+
+        As in the simulated robot, the desired motion stands still in the interval, and what it carries along turns at
+        its end.
+        """
         d, n_intervals = self.stiffness.shape[-1], len(self.time) - 1
         # Of (w e, v), whose rates are of one size, the exponential takes fewer products.
-        size = torch.linalg.matrix_norm(self.per_mass(self.stiffness)).mean()
         scale = torch.ones(2 * d).to(self.stiffness)
-        scale[:d] = size.sqrt()
+        scale[:d] = torch.linalg.matrix_norm(self.per_mass(self.stiffness)).mean().sqrt()
         maps = self.stiffness.new_zeros(n_intervals, 2 * d, 2 * d)
         for rows in torch.arange(n_intervals).split(_AT_ONCE):
             pull = torch.cat([self.stiffness[rows], self.damping[rows]], dim=-1)
             maps[rows, d:] = -torch.linalg.solve(self.mass if len(self.mass) == 1 else self.mass[rows], pull)
             maps[rows, :d, d:] = torch.eye(d).to(maps)
-            if self.transport is not None:
-                maps[rows, :d, :d] = self.transport[rows]
             step = (self.time[rows + 1] - self.time[rows])[:, None, None]
             maps[rows] = transition(scale[:, None] * maps[rows] / scale * step, 1.0) / scale[:, None] * scale
+            if self.transport is not None:
+                maps[rows, :d] = transition(self.transport[rows] * step, 1.0) @ maps[rows, :d]
         return maps
