@@ -358,7 +358,7 @@ def test_the_gain_of_many_rows_is_that_of_all_of_them(monkeypatch, rng):
 def switched_maps(time, stiffness, damping, mass, generator):
     """Maps (n, m, 4, 4), and times (n, m): rows and blends of rows held, and the smooth way from row to row.
 
-    Held for 0.01 to 1 natural period; from row to row up to ten times as fast as it was, or as slowly.
+    Held for 0.01 to 1 natural period; from row to row up to ten times as fast as it was.
     """
     n, n_knots = time.shape
     uniform = torch.rand(n, n_knots, n_knots, generator=generator, dtype=torch.float64)
@@ -369,8 +369,8 @@ def switched_maps(time, stiffness, damping, mass, generator):
     length = 0.01 * 100.0**share * 2.0 * math.pi / frequency[:, None]
     rate = admittance_rate(*(each.repeat(1, 3, 1, 1) for each in rows))[..., :4, :4]
     held = torch.linalg.matrix_exp(rate * length[..., None, None])
-    speed = 10.0 ** (2.0 * torch.rand(n, 1, generator=generator, dtype=torch.float64) - 1.0)
-    smooth = maps_between_knots(time / speed, stiffness, damping, mass)
+    speed = 10.0 ** torch.rand(n, 1, generator=generator, dtype=torch.float64)
+    smooth = maps_between_knots(time / speed, stiffness, damping, mass, n_steps=400)
     return torch.cat([held, smooth], dim=1), torch.cat([length, time.diff() / speed], dim=1)
 
 
@@ -398,7 +398,7 @@ def worst_rates(maps, length, norm, generator):
     return worst
 
 
-@pytest.mark.parametrize("n_schedules", [20, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n_schedules", [12, pytest.param(1000, marks=pytest.mark.slow)])
 def test_none_that_is_certified_in_any_order_grows_in_any(n_schedules, generator):
     """Inertia that varies, two axes: no cycle falls more slowly than the rate says, chosen by whom it may be."""
     time, *gains = (each[:, :-1] for each in periodic_schedules(n_schedules, 2, generator, is_varying=True))
@@ -414,6 +414,7 @@ def test_none_that_is_certified_in_any_order_grows_in_any(n_schedules, generator
             [stiff, stiff, torch.linalg.matrix_norm(gains[2]).mean(1).sqrt()[:, None].expand(-1, 2)], dim=1
         )
         worst = torch.maximum(worst, worst_rates(maps, length, norm * scale[:, None], generator))
+    assert torch.isfinite(worst).all()
     certified = ~rate.isnan()
     assert (worst[certified] <= -rate[certified] * (1.0 - 1e-9)).all()
     assert certified.sum() > 0.1 * n_schedules
