@@ -85,3 +85,19 @@ def test_a_schedule_of_poses_is_drawn_block_by_block(planned, space):
             np.testing.assert_allclose(gains.lines[axis].get_ydata(), stiffness[:, 2 - axis], rtol=1e-9)
     assert [line.get_ydata()[0] for line in torque.lines[3:]] == [1.0, 60.0]
     assert [line.get_ydata()[0] for line in force.lines[3:]] == [10.0, 1000.0]
+
+
+@pytest.mark.parametrize("n_positions", [1, 2, 4])
+def test_poses_that_are_not_in_space_are_drawn_over_time(planned, space, n_positions):
+    """A tool in a plane; a gripper as a fourth position."""
+    some = [*[0, 1, 2, 2][:n_positions], 3, 4, 5]
+    gains = [matrices[:, some][:, :, some] for matrices in (planned.stiffness, planned.damping, planned.covariance)]
+    for gain in gains:  # positions and rotations are coupled by three positions only
+        gain[:, -3:, :-3] = gain[:, :-3, -3:] = 0.0
+        gain[:, 3:-3, :3] = gain[:, :3, 3:-3] = 0.0
+    rows = planned.time, planned.position[:, some[:-3]], planned.velocity[:, some], *gains, planned.type1
+    axes = Schedule(*rows, orientation=planned.orientation).plot()
+    assert [ax.get_ylabel() for ax in axes[-4:]] == ["1 sd [mm]", "1 sd [deg]", "stiffness [N/m]", "stiffness [Nm/rad]"]
+    for ax, values in zip(axes[-2:], (gains[0][:, :-3, :-3], gains[0][:, -3:, -3:]), strict=True):
+        drawn = np.stack([line.get_ydata() for line in ax.lines], axis=1)
+        np.testing.assert_allclose(drawn, np.linalg.eigvalsh(values)[:, ::-1])

@@ -245,8 +245,8 @@ def variability_figure(run: Run, demonstrations: Demonstrations, name: str) -> F
 def pushes_figure(run: Run, name: str) -> Figure:
     """Deviation, force and stiffness along the first output over time: Figure 8."""
     figure, axes = figure_grid(3, 1, (6.4, 6.0), sharex=True)
-    names, unit = schedule_names(run.schedule), run.schedule.units
-    plot_rollout(run.rollout, axes[:, 0], outputs=[0], names=names, unit=unit, unpushed=run.unpushed)
+    names = schedule_names(run.schedule)
+    plot_rollout(run.rollout, axes[:, 0], outputs=[0], names=names, unpushed=run.unpushed)
     axes[0, 0].set_title(name, fontsize=10)
     legend_below(figure, axes[:, 0])
     return figure

@@ -18,16 +18,16 @@ from torch_pbd.plotting.parts import (
     plot_std_band,
     plot_stiffness,
 )
-from torch_pbd.plotting.poses import draw_pose_schedule, draw_poses, draw_recorded_poses
+from torch_pbd.plotting.poses import draw_blocks, draw_pose_schedule, draw_poses, draw_recorded_poses
 from torch_pbd.plotting.style import (
     MODEL,
     OTHER,
     TRUTH,
     chosen_outputs,
     equal_scales,
+    kind_of,
     legend_below,
     mark_ends,
-    readable_unit,
     schedule_names,
     short_unit,
     shown_figure,
@@ -243,27 +243,31 @@ def plot_movements(demonstrations: Any, outputs: Sequence[int | str] | None = No
 
 def plot_schedule(schedule: Any) -> list[Axes]:
     """Draw a schedule: what `Schedule.plot` does."""
-    if schedule.orientation is not None and schedule.position.shape[1] == 3:
+    p, turns = schedule.position.shape[1], schedule.orientation is not None
+    if turns and p == 3:
         return draw_poses(schedule, draw_pose_schedule, 4)
-    figure, plane, bands = _panels(3 - (schedule.n_outputs == 2), n_space=2 if schedule.n_outputs == 2 else 0)
-    names, (unit, scale) = schedule_names(schedule), readable_unit(schedule.units)
-    position = [f"{name} [{short_unit(schedule.units)}]" for name in names]
+    figure, plane, bands = _panels(2 * len(schedule.blocks) + (p != 2), n_space=2 if p == 2 else 0)
+    names, kind = schedule_names(schedule), kind_of(schedule.units, p)
+    position = [f"{name} [{short_unit(schedule.units)}]" for name in names[:p]]
     # The path of two outputs takes the place of their positions over time.
     if plane:
         path, some = schedule.position, np.linspace(0, len(schedule) - 1, 21).round().astype(int)
         plane[0].plot(*path.T, color=MODEL, lw=1.5, label="planned: position, 2 sd")
-        plot_covariance_ellipses(path[some], schedule.covariance[some], plane[0])
+        plot_covariance_ellipses(path[some], schedule.covariance[some, :2, :2], plane[0])
         mark_ends(plane[0], path)
         plane[0].set(xlabel=position[0], ylabel=position[1])
         equal_scales(plane[0])
     else:
         plot_outputs(schedule.time, schedule.position, bands[0], position)
         bands[0].set_ylabel(f"position [{short_unit(schedule.units)}]")
-    deviation = scale * np.sqrt(np.diagonal(schedule.covariance, axis1=1, axis2=2))
-    plot_outputs(schedule.time, deviation, bands[-2], [f"along {name}" for name in names])
-    bands[-2].set(ylabel=f"1 sd [{unit}]", ylim=(0.0, None))
-    plot_stiffness(schedule, bands[-1])
-    bands[-1].set_ylim(0.0, None)
+    if turns:
+        draw_blocks(schedule, bands[-4:])
+    else:
+        deviation = kind.scale * np.sqrt(np.diagonal(schedule.covariance, axis1=1, axis2=2))
+        plot_outputs(schedule.time, deviation, bands[-2], [f"{kind.where} {name}" for name in names])
+        bands[-2].set(ylabel=f"1 sd [{kind.unit}]", ylim=(0.0, None))
+        plot_stiffness(schedule, bands[-1])
+        bands[-1].set_ylim(0.0, None)
     legend_below(figure, [*plane, *bands[1:]])
     return [*plane, *bands]
 

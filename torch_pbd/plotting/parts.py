@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.plotting.style import (
-    AXES,
     DATA,
     EMPIRICAL,
     FORCE,
@@ -23,14 +22,14 @@ from torch_pbd.plotting.style import (
     SERIES,
     TRUTH,
     Kind,
+    axis_names,
     check_axes,
     check_kind,
     chosen_outputs,
+    kind_of,
     output_label,
     principal,
-    readable_unit,
     schedule_names,
-    short_unit,
     time_label,
 )
 
@@ -206,17 +205,17 @@ def plot_stiffness(schedule: Any, ax: Axes, block: slice | None = None) -> list[
     check_kind(schedule, "schedule", "Schedule")
     check_axes("ax", [ax])
     block = schedule.blocks[0] if block is None else block
+    kind = ROTATION if block.start else kind_of(schedule.units, block.stop)
     if len(schedule.blocks) > 1:
         gains = principal(schedule.stiffness[:, block, block], descending=True)
-        lines = plot_outputs(schedule.time, gains, ax, AXES[: gains.shape[1]], [MODEL])
+        lines = plot_outputs(schedule.time, gains, ax, axis_names(gains.shape[1]), [MODEL])
     else:
         gains = np.diagonal(schedule.stiffness, axis1=1, axis2=2)
-        lines = plot_outputs(schedule.time, gains, ax, [f"along {name}" for name in schedule_names(schedule)])
+        lines = plot_outputs(schedule.time, gains, ax, [f"{kind.where} {name}" for name in schedule_names(schedule)])
     limits = [np.broadcast_to(limit, schedule.n_outputs)[block] for limit in schedule.stiffness_limits or ()]
     for i, limit in enumerate(np.unique(limits)):
         ax.axhline(limit, color=DATA, lw=0.8, ls=":", label=None if i else "limits of the stiffness")
-    unit = ROTATION.stiffness_unit if block.start else f"N/{short_unit(schedule.units)}"
-    ax.set(xlabel="time [s]", ylabel=f"stiffness [{unit}]")
+    ax.set(xlabel="time [s]", ylabel=f"stiffness [{kind.stiffness_unit}]")
     return lines
 
 
@@ -226,7 +225,7 @@ def plot_rollout(
     *,
     outputs: Sequence[int | str] | None = None,
     names: Sequence[str] | None = None,
-    unit: str | None = "m",
+    unit: str | None = None,
     unpushed: Any = None,
 ) -> None:
     """Draw what pushes did: deviation, external force and stiffness over time, the paper's Figure 8.
@@ -241,8 +240,8 @@ def plot_rollout(
         Outputs to draw, by number or by name; None is the first six.
     names : sequence of str, default=None
         Names of the outputs; None calls them y0, y1, ..., and of poses x, y, z, rx, ry, rz.
-    unit : str, default="m"
-        Unit of the schedule's positions; None where it is not known.
+    unit : str, default=None
+        Unit of the positions; None is that of the rollout.
     unpushed : Rollout, default=None
         The same run without pushes, drawn thin: how far the robot lags behind by itself.
     """
@@ -253,9 +252,8 @@ def plot_rollout(
     p, d = rollout.position.shape[-1], rollout.velocity.shape[-1]
     check_axes("axes", axes, 3 if p == d else 6)
     names = names or (POSE_NAMES if d == p + 3 == 6 else [f"y{i}" for i in range(d)])
-    chosen, stiffness_unit = chosen_outputs(outputs, names, 6), f"N/{short_unit(unit)}"
-    kinds = [Kind(slice(p), "along", "force", "N", *readable_unit(unit), stiffness_unit)]
-    kinds += [ROTATION] if d > p else []
+    chosen = chosen_outputs(outputs, names, 6)
+    kinds = [kind_of(unit or rollout.units, p)] + ([ROTATION] if d > p else [])
     for i, kind in enumerate(kinds):
         own = [output for output in chosen if (output >= p) == bool(i)]
         labels = [names[output].removeprefix("r") if i else names[output] for output in own]

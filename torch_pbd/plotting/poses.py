@@ -13,19 +13,18 @@ from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.plotting.parts import plot_outputs, plot_stiffness
 from torch_pbd.plotting.style import (
-    AXES,
     DATA,
     MODEL,
     POSE_NAMES,
-    POSITION,
     ROTATION,
     SERIES,
+    axis_names,
     check_axes,
     equal_scales,
+    kind_of,
     legend_below,
     mark_ends,
     principal,
-    readable_unit,
     shown_figure,
     time_label,
 )
@@ -161,14 +160,19 @@ def draw_planned_poses(schedule: Any, ax: Axes, n_poses: int = 7) -> None:
 def draw_pose_schedule(schedule: Any, space: Axes, bands: Sequence[Axes]) -> None:
     """Draw a schedule of poses: its path, and over time the deviations of both blocks and their stiffness."""
     draw_planned_poses(schedule, space)
-    kinds = POSITION._replace(unit=readable_unit(schedule.units)[0], scale=readable_unit(schedule.units)[1]), ROTATION
+    draw_blocks(schedule, bands)
+    bands[2].set_xlabel("")
+
+
+def draw_blocks(schedule: Any, bands: Sequence[Axes]) -> None:
+    """Draw deviations of positions and of rotations in principal axes over time, and the stiffness of both there."""
+    kinds = kind_of(schedule.units, schedule.position.shape[1]), ROTATION
     for kind, block, spread, gains in zip(kinds, schedule.blocks, bands[:2], bands[2:], strict=True):
         deviation = kind.scale * np.sqrt(principal(schedule.covariance[:, block, block]))
-        plot_outputs(schedule.time, deviation, spread, AXES, [MODEL])
+        plot_outputs(schedule.time, deviation, spread, axis_names(deviation.shape[1]), [MODEL])
         spread.set(ylabel=f"1 sd [{kind.unit}]", ylim=(0.0, None))
         plot_stiffness(schedule, gains, block)
         gains.set_ylim(0.0, None)
-    bands[2].set_xlabel("")
 
 
 def label_space(ax: Any, names: Sequence[str], unit: str | None) -> None:

@@ -100,7 +100,20 @@ def short_unit(unit: str | None) -> str:
 
 def schedule_names(schedule: Any) -> Sequence[str]:
     """Names of the outputs of a schedule."""
-    return schedule.names or [f"y{i}" for i in range(schedule.position.shape[1])]
+    return schedule.names or [f"y{i}" for i in range(schedule.n_outputs)]
+
+
+def kind_of(unit: str | None, n_outputs: int) -> Kind:
+    """Words and units of positions in this unit: joints are pushed by torques."""
+    shown, stiffness = readable_unit(unit), f"N/{short_unit(unit)}"
+    if unit == "rad":
+        return Kind(slice(n_outputs), "about", "torque", "Nm", *shown, "Nm/rad")
+    return Kind(slice(n_outputs), "along", "force", "N", *shown, stiffness)
+
+
+def axis_names(n_axes: int) -> list[str]:
+    """Names of principal axes, the most precise first."""
+    return [AXES[0], *[AXES[1]] * (n_axes - 2), AXES[2]][:n_axes]
 
 
 def output_label(demonstrations: Any, output: int) -> str:

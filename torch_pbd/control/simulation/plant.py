@@ -250,7 +250,7 @@ def _start(task: Task, position0: Tensor | None, orientation0: Tensor | None) ->
     return torch.cat([position.expand(*batch, -1), rotation.expand(*batch, -1)], dim=-1)
 
 
-def _poses(task: Task, record: dict[str, Tensor]) -> dict[str, Tensor]:
+def _poses(task: Task, record: dict[str, Tensor]) -> dict[str, Any]:
     """Fields of a Rollout, whose poses are positions and orientations."""
     if task.turning is None:
         return record | {"desired_position": task.position}

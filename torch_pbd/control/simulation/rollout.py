@@ -1,7 +1,7 @@
 """A simulated run: states, forces and gains over time."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, final
 
 from torch import Tensor
@@ -39,6 +39,8 @@ class Rollout:
     pose_deviation : (..., T, d) or None, m and rad
         Of poses, position less desired position, and rotation vector e from the desired orientation in world axes,
         ``R = exp([e]) R_d``.
+    units : str or None
+        Of the schedule's positions: "rad" of joints, which have rad for m above, and Nm for N; None where unknown.
     """
 
     time: Any
@@ -56,6 +58,7 @@ class Rollout:
     desired_orientation: Any = None
     commanded_orientation: Any = None
     pose_deviation: Any = None
+    units: str | None = "m"
 
     def __repr__(self) -> str:
         *batch, n_ticks, d = self.velocity.shape
@@ -64,13 +67,14 @@ class Rollout:
         return (
             f"Rollout({f'batch={tuple(batch)}, ' if batch else ''}n_ticks={n_ticks}, n_outputs={d}, "
             f"time={float(self.time[0]):.6g}..{float(self.time[-1]):.6g} s, "
-            f"deviation up to {float(abs(self.deviation[..., :p]).max()):.3g} m{turned})"
+            f"deviation up to {float(abs(self.deviation[..., :p]).max()):.3g} {self.units or 'units'}{turned})"
         )
 
     def numpy(self) -> "Rollout":
         """The run as NumPy arrays, on the CPU."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return Rollout(**{k: v.detach().cpu().numpy() if isinstance(v, Tensor) else v for k, v in values.items()})
+        arrays: dict[str, Any] = {k: v.detach().cpu().numpy() for k, v in values.items() if isinstance(v, Tensor)}
+        return replace(self, **arrays)
 
     def plot(self, *, unpushed: "Rollout | None" = None, names: Sequence[str] | None = None) -> Any:
         """Draw deviation, external force and stiffness over time, below each other in a new figure; rotations beside.

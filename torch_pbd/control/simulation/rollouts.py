@@ -25,7 +25,8 @@ _CHUNK = 4096
 class RolloutSummary:
     """Effect of R random pushes on a robot; NumPy arrays.
 
-    Of poses, these are of the positions; ``rotation`` is the same of the rotation vectors, with rad for m and Nm for N.
+    Of poses, these are of the positions; ``rotation`` is the same of the rotation vectors. Where ``units`` are "rad",
+    as there and of joints, read rad for m and Nm for N.
 
     Attributes
     ----------
@@ -44,6 +45,8 @@ class RolloutSummary:
     push : (R, p), N
         Force at its peak.
     rotation : RolloutSummary or None
+    units : str or None
+        Of the schedule's positions; None where it is not known.
     """
 
     time: Floats
@@ -57,6 +60,7 @@ class RolloutSummary:
     duration: Floats
     push: Floats
     rotation: "RolloutSummary | None" = None
+    units: str | None = "m"
 
     @property
     def n_rollouts(self) -> int:
@@ -64,7 +68,12 @@ class RolloutSummary:
         return len(self.onset)
 
     def __repr__(self) -> str:
-        parts = [(self, 1e3, "mm")] + ([] if self.rotation is None else [(self.rotation, 180.0 / math.pi, "degrees")])
+        scales = {"m": (1e3, "mm"), "rad": (180.0 / math.pi, "degrees")}
+        parts = [
+            (part, *scales.get(part.units or "", (1.0, part.units or "units")))
+            for part in (self, self.rotation)
+            if part is not None
+        ]
         shown = [
             f"{'/'.join(f'{scale * peak:.3g}' for peak in np.quantile(part.peak_deviation, (0.05, 0.5, 0.95)))} {unit} "
             f"at 5/50/95 %, {np.isfinite(part.return_time).mean():.0%} return"

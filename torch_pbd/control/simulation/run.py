@@ -41,7 +41,7 @@ def simulate_schedule(
     task = _task_of(schedule, plant, 1.0 / rate)
     noisy = task.sensor is not None and task.sensor.is_noisy  # else nothing is drawn: None is the caller's global state
     generator = torch.Generator().manual_seed(int(draw.randint(2**31 - 1))) if noisy else None
-    return run_task(task, torch.tensor(push), generator=generator).numpy()
+    return replace(run_task(task, torch.tensor(push), generator=generator).numpy(), units=schedule.units)
 
 
 def simulate_many(
@@ -160,8 +160,9 @@ def simulate_many(
                 onset=schedule.time[0] + begin,
                 duration=lasting,
                 push=push[:, tally.axes],
+                units=unit,
             )
-            for tally, rows in zip(tallies, deviations, strict=True)
+            for tally, rows, unit in zip(tallies, deviations, [schedule.units, "rad"], strict=False)
         ]
     if len(summaries) == 1:
         return summaries[0]
