@@ -72,6 +72,13 @@ def test_damping_made_for_one_kilogram_rings(model, task):
     assert calm[after].min() > -0.03 * calm.max()
 
 
+@pytest.mark.parametrize("mass", [None, 1.0])
+def test_damping_that_is_not_for_an_arm_is_told(model, task, mass):
+    schedule, joints = task
+    with pytest.warns(UserWarning, match="the arm moves with its own inertia"):
+        run(model, replace(schedule, mass=mass).resample(times=schedule.time[:3]), joints[:3])
+
+
 def test_a_constant_wrench_is_held_by_the_stiffness(model, task):
     """At rest: K e = f, by force and torque; and the true rotation is Exp(e) of the desired one, in world axes."""
     schedule, joints = task

@@ -18,6 +18,7 @@ from torch_pbd.robots.session import (
     recorded,
     required,
     stopping,
+    warn_of_mass,
 )
 
 
@@ -72,6 +73,11 @@ def run(
     RobotRun
         As far as it came.
 
+    Warns
+    -----
+    UserWarning
+        If the schedule was not made `with_inertia` of an arm.
+
     Raises
     ------
     ValueError
@@ -81,12 +87,11 @@ def run(
     """
     franky = required("franky", "franky-control")
     check_limits(schedule, RobotLimits() if limits is None else limits)
+    warn_of_mass(schedule)
     checks.number(period, "period", above=0.0, below=max_step, unit="s")
     # A target holds for a period: that of its middle is never further than half of it from the motion.
     rows = schedule.resample(times=np.arange(schedule.time[0] + 0.5 * period, schedule.time[-1], period))
-    ahead = round(gains_time_constant / period)
-    gains = [_gains(franky, rows, min(row + ahead, len(rows) - 1)) for row in range(len(rows))]
-    targets = [_target(franky, rows, row) for row in range(len(rows))]
+    gains, targets = _planned(franky, rows, round(gains_time_constant / period))
     start = robot.current_pose.end_effector_pose
     check_start(schedule, start.translation, np.roll(start.quaternion, 1))
     passed: list[tuple[float, Any, Any]] = []
@@ -113,6 +118,13 @@ def run(
         else:
             raise RobotStoppedError("the arm is no longer under control: it met a limit, or somebody stopped it")
     return recorded(schedule, passed)
+
+
+def _planned(franky: Any, rows: Schedule, ahead: int) -> tuple[list[Any], list[tuple[Any, ...]]]:
+    """Gains, of so many rows ahead, and targets for all rows."""
+    n = len(rows)
+    gains = [_gains(franky, rows, min(row + ahead, n - 1)) for row in range(n)]
+    return gains, [_target(franky, rows, row) for row in range(n)]
 
 
 def _gains(franky: Any, rows: Schedule, row: int) -> Any:

@@ -11,7 +11,7 @@ from torch_pbd.checks import Floats
 from torch_pbd.control.schedule import Schedule
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.robots.kinematics import MujocoArm, ToolState, pose_error
-from torch_pbd.robots.session import RobotStoppedError, check_start, poses, required
+from torch_pbd.robots.session import RobotStoppedError, check_start, poses, required, warn_of_mass
 
 # A tick as a whole number of steps of the simulation, to what rounding leaves of both.
 _UNEVEN = 1e-6
@@ -95,6 +95,11 @@ def run(
     -------
     ArmRun
 
+    Warns
+    -----
+    UserWarning
+        If the schedule was not made `with_inertia` of an arm.
+
     Raises
     ------
     ValueError
@@ -109,6 +114,7 @@ def run(
     """
     simulation = _Simulation(model, tool, posture_rate)
     position, orientation = poses(schedule)
+    warn_of_mass(schedule)
     n, n_joints = len(schedule), simulation.chain.limits.shape[1]
     n_steps = _steps_a_tick(schedule.time, model.opt.timestep)
     path = checks.array(joints, "joints", (n, n_joints))

@@ -84,6 +84,16 @@ def check_limits(schedule: Schedule, limits: Any) -> None:
         checks.require(good, eigenvalues, "the eigenvalue of stiffness", f"from {low:g} to {high:g} {unit}")
 
 
+def warn_of_mass(schedule: Schedule) -> None:
+    """Tell of a damping that is not for the inertia with which an arm moves that is controlled by torques."""
+    if not isinstance(schedule.mass, np.ndarray):
+        mass = "no known mass" if schedule.mass is None else f"{schedule.mass:g} kg and kg m^2"
+        checks.warn(
+            f"The damping of schedule is for {mass}, but the arm moves with its own inertia, and may ring: give "
+            "schedule.with_inertia(operational_inertia(model, joints, tool))."
+        )
+
+
 def check_start(
     schedule: Schedule, position: Floats, orientation: Floats, *, distance: float = 0.01, angle: float = 0.05
 ) -> None:
