@@ -44,7 +44,7 @@ def test_a_bag_holds_the_schedule(schedule, tmp_path):
 
 
 def test_six_numbers_are_told_with_their_loss(schedule):
-    with pytest.warns(UserWarning, match="displacements under a force are off by up to"):
+    with pytest.warns(UserWarning, match="displacements under a force or a torque are off by up to"):
         messages = list(to_messages(schedule, gains="diagonal"))
     topic, _, message = messages[4 * 30 + 2]
     assert topic == "target_stiffness"

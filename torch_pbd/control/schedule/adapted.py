@@ -1,5 +1,6 @@
 """Rows of a schedule made fit for a robot: for its inertia, in its frame, with the diagonal gains that it takes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, final
 
@@ -75,7 +76,8 @@ class DiagonalLoss:
     Attributes
     ----------
     stiffness_max, stiffness_median, damping_max, damping_median : float
-        Frobenius norm of the entries off the diagonal over that of the whole; largest and median over time.
+        Frobenius norm of the entries off the diagonal over that of the whole, in which positions and rotations count
+        alike, each in units of its own block's norm; largest and median over time.
     displacement, time : float
         Largest ||x - x_diagonal|| / ||x|| over all forces and times, where the force displaces the robot by x
         with the whole stiffness, and when that is, in s. 1 is an error as large as the displacement.
@@ -92,7 +94,7 @@ class DiagonalLoss:
         return (
             f"diagonal gains lose {self.stiffness_max:.1%} of the stiffness (median {self.stiffness_median:.1%}), "
             f"{self.damping_max:.1%} of the damping (median {self.damping_median:.1%}); displacements under a force "
-            f"are off by up to {self.displacement:.1%}, at {self.time:.6g} s"
+            f"or a torque are off by up to {self.displacement:.1%}, at {self.time:.6g} s"
         )
 
 
@@ -109,16 +111,21 @@ def diagonal_gains(schedule: Any) -> tuple[Floats, Floats, DiagonalLoss]:
     displacement = np.max([np.linalg.norm(coupling[:, b, b], ord=2, axis=(1, 2)) for b in schedule.blocks], axis=0)
     worst = int(displacement.argmax())
     loss = DiagonalLoss(
-        *_relative_loss(schedule.stiffness, stiffness),
-        *_relative_loss(schedule.damping, damping),
+        *_relative_loss(schedule.stiffness, stiffness, schedule.blocks),
+        *_relative_loss(schedule.damping, damping, schedule.blocks),
         displacement=float(displacement[worst]),
         time=float(schedule.time[worst]),
     )
     return stiffness, damping, loss
 
 
-def _relative_loss(matrices: Floats, diagonal: Floats) -> tuple[float, float]:
+def _relative_loss(matrices: Floats, diagonal: Floats, blocks: Sequence[slice]) -> tuple[float, float]:
     """Frobenius norm of the entries lost relative to the whole, 0 where all is zero: largest and median over time."""
-    whole = np.linalg.norm(matrices, axis=(1, 2))
-    loss = np.linalg.norm(matrices - diagonal, axis=(1, 2)) / np.where(whole > 0.0, whole, 1.0)
+    norms = np.ones(matrices.shape[:2])  # of the block of each output: N/m and Nm/rad are not added
+    for block in blocks:
+        norms[:, block] = np.linalg.norm(matrices[:, block, block], axis=(1, 2))[:, np.newaxis]
+    root = np.sqrt(np.where(norms > 0.0, norms, 1.0))
+    unit = root[:, :, np.newaxis] * root[:, np.newaxis, :]
+    whole = np.linalg.norm(matrices / unit, axis=(1, 2))
+    loss = np.linalg.norm((matrices - diagonal) / unit, axis=(1, 2)) / np.where(whole > 0.0, whole, 1.0)
     return float(loss.max()), float(np.median(loss))
