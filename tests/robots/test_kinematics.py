@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from torch_pbd import rotations
-from torch_pbd.robots import HOME, inverse_kinematics, operational_inertia, panda, panda_mjcf
+from torch_pbd.robots import HOME, inverse_kinematics, kinematics, operational_inertia, panda, panda_mjcf
 from torch_pbd.robots.kinematics import arm, pose_error
 
 mujoco = pytest.importorskip("mujoco")
@@ -132,7 +132,12 @@ def test_inertia_of_a_stretched_arm_is_refused(model):
 
 @pytest.mark.parametrize(
     ("tool", "joints", "message"),
-    [("gripper", HOME, "a site \\(tool\\) or a body"), ("tool", HOME[:6], "shape"), ("world", HOME, "hinges")],
+    [
+        ("gripper", HOME, "a site \\(tool\\) or a body"),
+        ("tool", HOME[:6], "shape"),
+        ("world", HOME, "hinges"),
+        ("tool", np.degrees(HOME), r"joints\[0, 1\] is -45.0, must be within the limits of its joint: give rad"),
+    ],
 )
 def test_what_is_no_arm_is_refused(model, tool, joints, message):
     with pytest.raises(ValueError, match=message):
@@ -163,6 +168,13 @@ def test_inverse_kinematics_meets_the_path_whichever_way_it_is_gone(model):
     for joints in there[::10]:
         free = np.linalg.svd(chain.at(joints).jacobian)[2][-1]
         assert abs(free @ (HOME - joints)) < 1e-5
+
+
+def test_a_posture_that_is_not_found_is_not_called_out_of_reach(model, monkeypatch):
+    monkeypatch.setattr(kinematics, "_SETTLED", 0.0)  # no step is that short
+    position, orientation = path(model, 2)
+    with pytest.raises(ValueError, match=r"row 0 of the path, at .* is reached, but .* give another posture"):
+        inverse_kinematics(model, position, orientation, "tool", start=HOME)
 
 
 def test_what_is_out_of_reach_is_told_with_its_row(model):

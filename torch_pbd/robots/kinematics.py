@@ -14,6 +14,8 @@ from torch_pbd.robots.session import required
 _MAX_STEPS, _REACHED, _SETTLED = 200, 1e-9, 1e-7
 # In rad a step, as linear goes so far; and the share of the easiest direction at which another counts as lost.
 _LONGEST_STEP, _SINGULAR = 0.3, 1e-4
+# In rad (or m, of a slide), beyond the limits of a joint: recorded angles overshoot, and those in degrees go further.
+_OVERSHOT = 0.1
 
 
 class ToolState(NamedTuple):
@@ -66,7 +68,8 @@ def operational_inertia(model: Any, joints: ArrayLike, tool: str) -> Floats:
     Raises
     ------
     ValueError
-        If the model has no such tool, or the arm is singular: it then cannot be moved in some direction.
+        If the model has no such tool, joints are beyond their limits by more than 0.1 rad, or the arm is singular: it
+        then cannot be moved in some direction.
 
     References
     ----------
@@ -74,9 +77,11 @@ def operational_inertia(model: Any, joints: ArrayLike, tool: str) -> Floats:
     Automation 3(1), 1987, eq. (12).
     """
     chain = arm(model, tool)
-    n = chain.limits.shape[1]
+    low, high = chain.limits
     angles = checks.real_floats(joints, "joints")
-    rows = checks.array(angles.reshape(-1, angles.shape[-1] if angles.ndim else 1), "joints", ("rows", n))
+    rows = checks.array(angles.reshape(-1, angles.shape[-1] if angles.ndim else 1), "joints", ("rows", len(low)))
+    possible = (rows >= low - _OVERSHOT) & (rows <= high + _OVERSHOT)
+    checks.require(possible, rows, "joints", "within the limits of its joint", "give rad, and the model of this arm")
     mobility = np.stack([_mobility(chain.at(row)) for row in rows])
     checks.semidefinite(mobility, "J M^-1 J'", definite=True, remedy="keep the arm away from its singularities")
     inertia = np.linalg.inv(mobility)
@@ -157,8 +162,14 @@ def _reach(chain: Arm, joints: Floats, position: Floats, orientation: Floats, ne
             return joints
         joints = joints + step * min(1.0, _LONGEST_STEP / longest)
     distance, angle = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
+    where = f"row {row} of the path, at {position.round(4).tolist()} m,"
+    if float(np.abs(error).max()) < _REACHED:
+        raise InvalidParameterError(
+            f"{where} is reached, but with no joint angles that come to rest nearest to posture: give another posture, "
+            "or start."
+        )
     raise InvalidParameterError(
-        f"row {row} of the path, at {position.round(4).tolist()} m, is {1e3 * distance:.3g} mm and {angle:.3g} rad out "
+        f"{where} is {1e3 * distance:.3g} mm and {angle:.3g} rad out "
         "of reach: move it nearer to the base with schedule.transform, or start from other joint angles."
     )
 
