@@ -52,6 +52,11 @@ def log(quaternion: Floats) -> Floats:
     return np.where(tiny, 2.0, 2.0 * np.arctan2(length, w) / np.where(tiny, 1.0, length)) * xyz
 
 
+def between(start: Floats, end: Floats) -> Floats:
+    """Rotation vector (..., 3) in world axes from one quaternion (..., 4) to another, the shorter way."""
+    return log(multiply(end, conjugate(start)))
+
+
 def matrix(quaternion: Floats) -> Floats:
     """Rotation matrix (..., 3, 3) of a quaternion (..., 4)."""
     w, v = quaternion[..., :1, np.newaxis], quaternion[..., 1:]

@@ -8,8 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torch_pbd import checks
-from torch_pbd.control.matrices import as_mass, as_semidefinite
-from torch_pbd.exceptions import InvalidParameterError
+from torch_pbd.control.matrices import as_mass, as_semidefinite, check_fits
 from torch_pbd.linalg import spectral_map, symmetrize
 
 
@@ -48,12 +47,7 @@ def damping_from_stiffness(
     mass = as_mass(mass)
     if not isinstance(mass, Tensor) or mass.ndim == 0:
         return 2.0 * ratio * mass**0.5 * spectral_map(matrix, _root, spectrum)
-    sizes = zip(reversed(mass.shape), reversed(matrix.shape), strict=False)
-    if mass.shape[-1] != matrix.shape[-1] or not all(1 in pair or pair[0] == pair[1] for pair in sizes):
-        raise InvalidParameterError(
-            f"mass has shape {tuple(mass.shape)}, but stiffness has shape {tuple(matrix.shape)}: give a number, or a "
-            "matrix (d, d) of as many axes for all of them."
-        )
+    check_fits(mass, matrix, "stiffness")
     mass = mass.to(matrix)
     along_mass = torch.linalg.eigh(symmetrize(mass.detach()))
     root, inverse = (spectral_map(mass, function, tuple(along_mass)) for function in (torch.sqrt, torch.rsqrt))

@@ -77,8 +77,7 @@ def mass_rows(mass: float | Tensor, like: Tensor) -> Tensor:
     if not isinstance(mass, Tensor) or mass.ndim < 3:
         return mass_matrix(mass, like)
     rows = mass.to(like)
-    sizes = zip(reversed(rows.shape), reversed(like.shape), strict=False)
-    if rows.shape[-3:] != like.shape[-3:] or not all(1 in pair or pair[0] == pair[1] for pair in sizes):
+    if rows.shape[-3:] != like.shape[-3:] or not _fit(rows, like):
         one, each = tuple(like.shape[-2:]), ", ".join(map(str, like.shape[-3:]))
         raise InvalidParameterError(
             f"mass has shape {tuple(rows.shape)}, must be a number or have shape {one} or (..., {each}), one for each "
@@ -87,6 +86,20 @@ def mass_rows(mass: float | Tensor, like: Tensor) -> Tensor:
     # Rows that are all the same are one mass; those that want gradients get them row by row.
     is_one = rows.ndim == 3 and not rows.requires_grad and bool((rows == rows[0]).all())
     return rows[0] if is_one else rows
+
+
+def check_fits(mass: Tensor, like: Tensor, name: str) -> None:
+    """Refuse masses (..., d, d) that do not broadcast with the matrices (..., d, d) of this name."""
+    if not _fit(mass, like):
+        raise InvalidParameterError(
+            f"mass has shape {tuple(mass.shape)}, but {name} has shape {tuple(like.shape)}: give a number, or "
+            "matrices (d, d) of as many axes."
+        )
+
+
+def _fit(mass: Tensor, like: Tensor) -> bool:
+    sizes = zip(reversed(mass.shape), reversed(like.shape), strict=False)
+    return mass.shape[-1] == like.shape[-1] and all(1 in pair or pair[0] == pair[1] for pair in sizes)
 
 
 def as_semidefinite(value: Any, name: str) -> tuple[Tensor, tuple[Tensor, Tensor]]:

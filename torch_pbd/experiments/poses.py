@@ -19,6 +19,7 @@ from torch_pbd.control.stability.report import StabilityReport
 from torch_pbd.data import Demonstrations
 from torch_pbd.exceptions import ConfigError
 from torch_pbd.experiments.resume import fit_once
+from torch_pbd.experiments.robot import PUSHES, pulse
 from torch_pbd.experiments.run_folder import RunFolder, format_table, slug
 from torch_pbd.plotting import (
     DATA,
@@ -38,8 +39,6 @@ from torch_pbd.plotting import (
 
 Arm = Literal["panda", "none"]
 
-_PUSHES = (0.2, 0.8)  # of the duration
-_PUSH_LENGTH = 0.08  # of the duration
 _TOOL = "xyz"
 _ROWS = 50.0  # Hz; along a path the inertia of an arm changes with its joints, within seconds
 _N_STEPS = 101
@@ -168,16 +167,15 @@ def _shown(row: Mapping[str, Any], kind: Kind) -> dict[str, Any]:
 
 def _wrench(schedule: Schedule, largest: float, kind: Kind, axis: int) -> Floats:
     """Wrenches (n, 6): pulses of a squared sine in an axis that the tool has in their middle."""
-    wrench = np.zeros((len(schedule), 6))
+    wrench, phase = np.zeros((len(schedule), 6)), (schedule.time - schedule.time[0]) / schedule.duration
     for row in _push_rows(schedule):
-        u = np.clip((schedule.time - schedule.time[row]) / (_PUSH_LENGTH * schedule.duration) + 0.5, 0.0, 1.0)
-        wrench[:, kind.outputs] += largest * np.sin(np.pi * u[:, np.newaxis]) ** 2 * _axes(schedule)[row, :, axis]
+        wrench[:, kind.outputs] += largest * np.outer(pulse(phase, phase[row]), _axes(schedule)[row, :, axis])
     return wrench
 
 
 def _push_rows(schedule: Schedule) -> tuple[int, ...]:
     """Rows in the middle of pushes."""
-    return tuple(round(centre * (len(schedule) - 1)) for centre in _PUSHES)
+    return tuple(round(centre * (len(schedule) - 1)) for centre in PUSHES)
 
 
 def _write(run: PoseRun, name: str, demonstrations: Demonstrations, folder: RunFolder) -> None:
@@ -219,8 +217,7 @@ def empirical_covariances(demonstrations: Demonstrations) -> tuple[Floats, Float
     aligned = demonstrations.align(n=_N_STEPS)
     places, turns = map(np.array, aligned.to_poses())
     means = np.stack([rotations.mean(turns[:, i]) for i in range(_N_STEPS)])
-    turned = rotations.log(rotations.multiply(turns, rotations.conjugate(means)))
-    deviations = np.concatenate([places - places.mean(axis=0), turned], axis=-1)
+    deviations = np.concatenate([places - places.mean(axis=0), rotations.between(means, turns)], axis=-1)
     return aligned.times[0], np.einsum("kni,knj->nij", deviations, deviations) / (len(demonstrations) - 1)
 
 

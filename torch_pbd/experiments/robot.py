@@ -36,7 +36,7 @@ from torch_pbd.plotting import (
     schedule_names,
 )
 
-_PUSHES = (0.2, 0.8)  # of the duration: 2 s and 8 s of the paper's 10 s
+PUSHES = (0.2, 0.8)  # of the duration: 2 s and 8 s of the paper's 10 s
 _PUSH_LENGTH = 0.08  # of the duration: 0.8 s
 _N_ELLIPSES = 13  # one every 0.8 s of the paper's movement: more would cover each other
 _MOST_OUTPUTS = 6  # panels of Figure 7 that a page holds
@@ -57,11 +57,13 @@ class Run:
 def push_profile(time: Floats, duration: float, peak: float, n_outputs: int) -> Floats:
     """Forces (n, d) in N: pulses of a squared sine along the first output, early and late in the movement."""
     force = np.zeros((len(time), n_outputs))
-    for centre in _PUSHES:
-        # From 0 to 1 through a pulse, at whose ends a squared sine has neither force nor slope.
-        u = np.clip((time / duration - centre) / _PUSH_LENGTH + 0.5, 0.0, 1.0)
-        force[:, 0] += peak * np.sin(np.pi * u) ** 2
+    force[:, 0] = peak * sum(pulse(time / duration, centre) for centre in PUSHES)
     return force
+
+
+def pulse(phase: Floats, centre: float) -> Floats:
+    """Squared sine (n,) of height 1 around a phase: at the ends of a push it has neither force nor slope."""
+    return np.sin(np.pi * np.clip((phase - centre) / _PUSH_LENGTH + 0.5, 0.0, 1.0)) ** 2
 
 
 def run_controller(
@@ -84,7 +86,7 @@ def push_row(name: str, run: Run) -> dict[str, Any]:
     """Row of the table: displacement by the two pushes, against the run without them, and stiffness there."""
     unit, scale = readable_unit(run.schedule.units)
     time, stiffness = run.schedule.time, run.schedule.stiffness
-    early, late = (int(np.searchsorted(time, centre * run.controller.duration_)) for centre in _PUSHES)
+    early, late = (int(np.searchsorted(time, centre * run.controller.duration_)) for centre in PUSHES)
     # Against the run without pushes: how far the robot lags behind by itself does not count.
     deviation = np.abs(run.rollout.position - run.unpushed.position)[:, 0]
     half = len(time) // 2

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from torch_pbd import checks
+from torch_pbd import checks, rotations
 from torch_pbd.checks import Floats
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.plotting.style import DATA, FORCE, MODEL, OTHER, ROBOT, schedule_names
@@ -139,12 +139,10 @@ class _Writer:
         if n_space == 2:
             turned[:, :, 0] *= np.linalg.det(turned)[:, np.newaxis]
             half = np.column_stack([half, _FLAT * half.max(axis=1)])
-        from scipy.spatial.transform import Rotation
-
         ellipsoids = self._rerun.Ellipsoids3D(
             centers=_in_space(mean[rows, :n_space]),
             half_sizes=half,
-            quaternions=Rotation.from_matrix(turned).as_quat(),  # x y z w, as Rerun has them
+            quaternions=np.roll(rotations.from_matrix(turned), -1, axis=1),  # x y z w, as Rerun has them
             colors=[_rgb(color)],
         )
         self._stream.log(entity, ellipsoids, static=True)
@@ -153,7 +151,7 @@ class _Writer:
         if orientation is None:
             return
         transform = self._rerun.Transform3D
-        columns = transform.columns(translation=position, quaternion=orientation[:, [1, 2, 3, 0]])
+        columns = transform.columns(translation=position, quaternion=np.roll(orientation, -1, axis=1))
         self._stream.send_columns(entity, indexes=[self._index(time)], columns=columns)
         extent = float(np.linalg.norm(np.ptp(position, axis=0)))
         self._stream.log(entity, self._rerun.TransformAxes3D(axis_length=0.1 * (extent or 1.0)), static=True)

@@ -146,9 +146,8 @@ def inverse_kinematics(
 
 
 def pose_error(state: ToolState, position: Floats, orientation: Floats) -> Floats:
-    """What takes the tool to a pose: translation and rotation vector (6,), in world axes."""
-    turn = rotations.multiply(orientation, rotations.conjugate(state.orientation))
-    return np.concatenate([position - state.position, rotations.log(turn)])
+    """Translation and rotation vector (6,), in world axes, that take the tool to a pose."""
+    return np.concatenate([position - state.position, rotations.between(state.orientation, orientation)])
 
 
 def _reach(chain: Arm, joints: Floats, position: Floats, orientation: Floats, near: Floats, row: int) -> Floats:

@@ -100,7 +100,7 @@ def check_start(
     """Refuse a start in m and rad away from where the robot is: it would jump."""
     first, turned = poses(schedule)
     away = float(np.linalg.norm(first[0] - position))
-    turn = float(np.linalg.norm(rotations.log(rotations.multiply(turned[0], rotations.conjugate(orientation)))))
+    turn = float(np.linalg.norm(rotations.between(orientation, turned[0])))
     if not (away <= distance and turn <= angle):
         raise InvalidParameterError(
             f"the robot is {1e3 * away:.3g} mm and {turn:.3g} rad from the first pose of schedule, must be within "
@@ -141,7 +141,7 @@ def recorded(schedule: Schedule, rows: list[tuple[float, Floats, Floats]]) -> Ro
     ends = schedule.time[[0, -1]]
     grid = np.union1d(np.clip(time, *ends), ends)  # two or more, however early the robot stopped
     desired, at = poses(schedule.resample(times=grid)), np.searchsorted(grid, np.clip(time, *ends))
-    turn = rotations.log(rotations.multiply(orientation, rotations.conjugate(desired[1][at])))
+    turn = rotations.between(desired[1][at], orientation)
     return RobotRun(time, position, orientation, np.hstack([position - desired[0][at], turn]))
 
 

@@ -185,10 +185,8 @@ class StiffnessLaw:
         blocks = self.blocks(n_outputs)
         if len(blocks) == 1:
             return blocks[0].stiffness_min, blocks[0].stiffness_max
-        sizes = [block.outputs.stop - block.outputs.start for block in blocks]
-        low = [block.stiffness_min for block, size in zip(blocks, sizes, strict=True) for _ in range(size)]
-        high = [block.stiffness_max for block, size in zip(blocks, sizes, strict=True) for _ in range(size)]
-        return tuple(low), tuple(high)
+        low, high = zip(*[(block.stiffness_min, block.stiffness_max) for block in blocks], strict=True)
+        return tuple(limits.of_outputs(blocks, low)), tuple(limits.of_outputs(blocks, high))
 
     def _linear(self, block: Block, matrix: Tensor, spectrum: tuple[Tensor, Tensor] | None) -> Tensor:
         """Stiffness of one block by eq. (19) and (20)."""
@@ -213,9 +211,8 @@ class StiffnessLaw:
         matrices: 0 <= U <= 1, so that K lies within its limits, and no length makes rotations of positions.
         """
         scales = [self._scales(block, block.of(matrix), None) for block in blocks]
-        inverse, gain = matrix.new_zeros(matrix.shape[-1]), matrix.new_zeros(matrix.shape[-1])
-        for block, (low, high) in zip(blocks, scales, strict=True):
-            inverse[block.outputs], gain[block.outputs] = 1.0 / high, math.sqrt(high / (high - low))
+        inverse = matrix.new_tensor(limits.of_outputs(blocks, [1.0 / high for _, high in scales]))
+        gain = matrix.new_tensor(limits.of_outputs(blocks, [math.sqrt(high / (high - low)) for low, high in scales]))
         tiny = torch.finfo(matrix.dtype).tiny
         root = spectral_map(torch.outer(inverse, inverse) * matrix, lambda variance: variance.clamp_min(tiny).sqrt())
         share = gain[:, None] * (torch.eye(len(gain)).to(matrix) - root) * gain
@@ -231,10 +228,8 @@ class StiffnessLaw:
         masses = as_masses(mass, matrix)
         shape = torch.broadcast_shapes(matrix.shape, masses.shape)
         matrix, masses = matrix.expand(shape), masses.expand(shape)
-        low, high, effort = (matrix.new_zeros(shape[-1]) for _ in range(3))
-        for block, each in zip(blocks, efforts, strict=True):
-            low[block.outputs], high[block.outputs] = block.stiffness_min, block.stiffness_max
-            effort[block.outputs] = each
+        given = efforts, [block.stiffness_min for block in blocks], [block.stiffness_max for block in blocks]
+        effort, low, high = (matrix.new_tensor(limits.of_outputs(blocks, values)) for values in given)
         if self.cross_terms or len(blocks) == 1:
             return precision_stiffness(matrix, masses, effort, low, high)
         stiffness = torch.zeros_like(matrix)

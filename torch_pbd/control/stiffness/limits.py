@@ -1,6 +1,6 @@
 """Blocks of outputs that share a unit: limits of their stiffness, and the standard deviations from which they hold."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from numbers import Real
 from typing import Any, NamedTuple, final
@@ -53,6 +53,12 @@ class Block(NamedTuple):
     def of(self, matrix: Tensor) -> Tensor:
         """Part (..., k, k) of matrices (..., d, d)."""
         return matrix[..., self.outputs, self.outputs]
+
+
+def of_outputs(blocks: Sequence[Block], values: Iterable[Any]) -> list[Any]:
+    """Values of blocks, each as often as its block has outputs."""
+    sizes = [block.outputs.stop - block.outputs.start for block in blocks]
+    return [value for value, size in zip(values, sizes, strict=True) for _ in range(size)]
 
 
 def plain(value: Any, name: str) -> Any:

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torch_pbd import checks
-from torch_pbd.control.matrices import as_mass
+from torch_pbd.control.matrices import as_mass, check_fits
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.linalg import spectral_map
 
@@ -28,15 +28,9 @@ def as_masses(mass: Any, like: Tensor) -> Tensor:
     """Masses (..., d, d) that fit matrices (..., d, d), of a number in kg or of matrices."""
     if mass is None:
         raise checks.refusal(None, "mass", "given", "the stiffness of kind='precision' depends on it")
-    value = as_mass(mass)
-    matrix = torch.as_tensor(value).to(like)
+    matrix = torch.as_tensor(as_mass(mass)).to(like)
     matrix = matrix if matrix.ndim else matrix * torch.eye(like.shape[-1]).to(like)
-    sizes = zip(reversed(matrix.shape), reversed(like.shape), strict=False)
-    if matrix.shape[-1] != like.shape[-1] or not all(1 in pair or pair[0] == pair[1] for pair in sizes):
-        raise InvalidParameterError(
-            f"mass has shape {tuple(matrix.shape)}, but covariance has shape {tuple(like.shape)}: give a number, or "
-            "matrices (d, d) of as many axes."
-        )
+    check_fits(matrix, like, "covariance")
     return matrix
 
 
