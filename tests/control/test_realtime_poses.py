@@ -386,11 +386,11 @@ def test_ticks_of_poses_keep_no_memory(coupled):
         for i in range(n, m):
             controller.tick(i / 1000 + (i % 100 == 0), [math.nan if i % 7 == 0 else 1.0] * 6)
 
-    ticks(1, 500)
+    ticks(1, 300)
     tracemalloc.start()
-    ticks(500, 1000)
+    ticks(300, 500)
     before = tracemalloc.get_traced_memory()[0]
-    ticks(1000, 3000)
+    ticks(500, 1000)  # a float kept in each would be 12 kB
     grown = tracemalloc.get_traced_memory()[0] - before
     tracemalloc.stop()
     assert grown < 2000

@@ -159,7 +159,7 @@ def as_times(X: ArrayLike) -> Floats:
 
 
 def as_speed(values: ArrayLike) -> Floats:
-    """How fast movement time passes: a number, or one for each tick (n,); none negative."""
+    """Rate at which movement time passes: a number, or one for each tick (n,); none negative."""
     speed = checks.real_floats(values, "speed")
     if speed.ndim and (speed.ndim > 1 or len(speed) < 2):
         raise ValueError(f"speed has shape {speed.shape}, must be a number, or have shape (n,): one for each tick.")

@@ -68,7 +68,7 @@ def conditioned(
 
 
 def can_bend(controller: Any) -> bool:
-    """Whether a controller's covariance is a model of whole movements, of positions."""
+    """True if a controller's covariance is a model of whole movements, of positions."""
     return hasattr(controller.covariance_, "condition") and controller.variability == "position"
 
 

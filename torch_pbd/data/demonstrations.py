@@ -148,7 +148,7 @@ class Demonstrations(Editing):
 
     @property
     def is_aligned(self) -> bool:
-        """Whether all demonstrations share exactly one grid of times."""
+        """True if all demonstrations share exactly one grid of times."""
         return all(np.array_equal(time, self.times[0]) for time in self.times)
 
     def __len__(self) -> int:

@@ -1,4 +1,4 @@
-"""What is in recordings, and what is likely wrong with them, each with its remedy."""
+"""Contents of recordings, and likely mistakes in them, each with its remedy."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -90,7 +90,7 @@ def _column(demonstrations: Any, i: int) -> Floats:
 
 
 def _still_ends(time: Floats, position: Floats, extent: Floats, pause: float) -> tuple[float, float]:
-    """How long nothing moves at the beginning and at the end."""
+    """Times at the beginning and at the end of a recording in which nothing moves."""
     moving = np.flatnonzero(~still(time, position, extent, pause))
     return (time[moving[0]] - time[0], time[-1] - time[moving[-1]]) if len(moving) else (time[-1] - time[0], 0.0)
 

@@ -1,4 +1,4 @@
-"""What makes other demonstrations of some: joined, selected, in other units, cut."""
+"""Demonstrations made of others: joined, selected, in other units, cut."""
 
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, Self
@@ -185,7 +185,7 @@ class Editing(Resampling):
         return self[~held_out], self[held_out]
 
     def describe(self) -> "Description":
-        """What is in the recordings, and what is likely wrong with them: tables to print, and ``mistakes``."""
+        """Contents of the recordings, and likely mistakes in them: tables to print, and ``mistakes``."""
         from torch_pbd.data.description import describe
 
         return describe(self)

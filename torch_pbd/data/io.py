@@ -157,7 +157,7 @@ def load_demonstrations(
 
 
 def inspect_demonstrations(source: Source, **options: Any) -> tuple[Demonstrations, Description]:
-    """What can be read of a source, and its description; takes the options of `load_demonstrations`.
+    """Demonstrations as far as they can be read, and their description; takes the options of `load_demonstrations`.
 
     What that function would refuse is left out or guessed, if there is a way, and told among the ``mistakes``.
     """

@@ -1,4 +1,4 @@
-"""Where nothing moves."""
+"""Pauses in recordings, in which nothing moves."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ _STILL = 0.02
 
 
 def extents(position: Floats, demonstrations: Any) -> Floats:
-    """How far each output (d,) goes in a recording; those of a rotation all as far as the furthest of them.
+    """Extent (d,) of each output in a recording; of a rotation the largest of the three for all of them.
 
     A tool that turns about one axis trembles about the others, and all axes are as good.
     """
@@ -23,7 +23,7 @@ def extents(position: Floats, demonstrations: Any) -> Floats:
 
 
 def still(time: Floats, position: Floats, extent: Floats, pause: float) -> NDArray[np.bool_]:
-    """Whether each sample is in a stretch of at least ``pause`` in which no output leaves 2 % of its extent (d,)."""
+    """Samples (T,) in a stretch of at least ``pause`` in which no output leaves 2 % of its extent (d,)."""
     result = np.zeros(len(time), dtype=bool)
     if not extent.any() or time[-1] - time[0] < pause:
         return result

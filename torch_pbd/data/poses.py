@@ -24,7 +24,7 @@ _N_PHASES = 201  # of each recording in the mean: it does not hang on how long o
 
 
 class Outputs(NamedTuple):
-    """What `torch_pbd.data.Demonstrations` holds of recordings."""
+    """Recordings and labels as `torch_pbd.data.Demonstrations` holds them."""
 
     times: tuple[Floats, ...]
     positions: tuple[Floats, ...]
@@ -114,7 +114,7 @@ def with_whole_rotation(chosen: Sequence[str], names: Sequence[str], reference: 
 
 
 def same_reference(one: Floats | None, other: Floats | None) -> bool:
-    """Whether two references, if there are any, are one to the last bit."""
+    """True of two references that are equal to the last bit, and of none and none."""
     return one is other if one is None or other is None else np.array_equal(one, other)
 
 

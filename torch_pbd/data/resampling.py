@@ -129,7 +129,7 @@ def _checked_n(n: int) -> int:
 
 
 def _between_samples(time: Floats, grid: Floats, max_gap: float) -> NDArray[np.bool_]:
-    """Whether each point of a grid lies on a sample, or between two that are not further apart than ``max_gap``."""
+    """Points of a grid, as a mask, on a sample or between two that are not further apart than ``max_gap``."""
     after = np.searchsorted(time, grid).clip(1, len(time) - 1)
     gap, distance = time[after] - time[after - 1], np.minimum(grid - time[after - 1], time[after] - grid)
     return (gap <= max_gap) | (distance <= _ROUNDING * (time[-1] - time[0]))

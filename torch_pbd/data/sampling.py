@@ -11,7 +11,7 @@ from torch_pbd.checks import Floats
 KNOWN, LOST = 2.5, 5.0
 _FINEST = 200
 LEAST_SAMPLES = 5
-"""As many as a smoothing spline needs."""
+"""Fewest samples of which there is a smoothing spline."""
 
 
 def spacing_of(time: Floats) -> float:

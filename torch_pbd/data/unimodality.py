@@ -29,7 +29,7 @@ class _Split(NamedTuple):
 
 
 def check_unimodal(demonstrations: Demonstrations) -> bool:
-    """Whether the demonstrations look like one way to do the task; warns if they do not.
+    """Check that the demonstrations look like one way to do the task; warns if they do not.
 
     The paper assumes one mode (Section II): between two ways around an obstacle, a mean goes through it. Looked at
     are the direction in which the whole demonstrations differ most, and that at each of 20 steps: their places

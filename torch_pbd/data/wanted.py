@@ -1,4 +1,4 @@
-"""What is wanted of a file, whatever its format: columns by their names, times, units; the one way out of files."""
+"""Options of reading, whatever the format: columns by their names, times, units; the one way out of files."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -52,7 +52,7 @@ class Wanted:
     missing: Missing = "raise"
     max_bytes: int = MAX_BYTES
     notes: list[str] | None = None
-    """Where a list, what would be refused and has a way around is told there."""
+    """If a list, it is told what would be refused and has a way around."""
 
     def __post_init__(self) -> None:
         checks.text(self.demo, "demo", optional=True)

@@ -64,7 +64,7 @@ class PoseRun:
         return np.einsum("nia,ni->na", axes, values[:, kind.outputs])
 
     def moved(self, kind: Kind) -> Floats:
-        """What a push in each axis of the tool moves there (n, 3), against the run without pushes, in units shown."""
+        """Displacement (n, 3) by a push in each axis of the tool, along it, against the run without; in units shown."""
         rollouts = self.forces if kind is POSITION else self.torques
         moves = [self.along(run.deviation - self.unpushed.deviation, kind)[:, i] for i, run in enumerate(rollouts)]
         return kind.scale * np.stack(moves, axis=1)

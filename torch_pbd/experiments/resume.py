@@ -30,10 +30,10 @@ class FinishedFits:
 
     folder: Path
     resume: bool = False
-    """Whether the next fit that is asked for should be there."""
+    """True if the next fit that is asked for should be there."""
 
     def files(self, key: str = "") -> list[Path]:
-        """One file a fit; those of a key."""
+        """Files of finished fits, one each: of a key, or all."""
         return [file for file in self.folder.glob(f"{key}*") if _NAME.fullmatch(file.name)]
 
     def clear(self) -> None:

@@ -80,7 +80,7 @@ LINKS = (
 )  # fmt: skip
 
 FLANGE = 0.107
-"""Of the last link's frame, along z, m."""
+"""Distance of the flange from the last link's frame, along z, in m."""
 
 # The hand, turned by -45 degrees at the flange: its mass and inertia as the manufacturer configures it, and its tip.
 _HAND = """
@@ -155,7 +155,7 @@ def panda_mjcf(*, hand: bool = True, armature: float = 0.1, timestep: float = 1e
 
 
 def panda(*, hand: bool = True, armature: float = 0.1, timestep: float = 1e-3) -> Any:
-    """The arm of `panda_mjcf`, whose parameters these are, as a ``mujoco.MjModel``; needs the extra ``robot``.
+    """Franka Emika Panda as a ``mujoco.MjModel``, with the parameters of `panda_mjcf`; needs the extra ``robot``.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Where the tool of an arm is, how it moves and what it weighs at given joint angles: by MuJoCo or Pinocchio."""
+"""Pose, Jacobian and inertia of the tool of an arm at given joint angles, by MuJoCo or Pinocchio."""
 
 from typing import Any, NamedTuple, Protocol, final
 

@@ -144,7 +144,7 @@ def _steps_a_tick(time: Floats, timestep: float) -> int:
 
 
 class _Row(NamedTuple):
-    """What is wanted at a tick, and what pushes during it."""
+    """Desired motion and gains at a tick, and the push during it."""
 
     position: Floats
     orientation: Floats
@@ -181,7 +181,7 @@ class _Simulation:
         return state
 
     def tick(self, row: _Row, n_steps: int) -> tuple[Any, ...]:
-        """All that is known at the start of a tick, which is then taken."""
+        """State and commands at the start of a tick, which is then taken."""
         data = self._data
         self._mujoco.mj_forward(self._model, data)  # of positions and velocities that the last step left
         state = self.chain.measure(data)

@@ -1,4 +1,4 @@
-"""What all robots have in common: checks before the first tick, and a stop whatever happens."""
+"""Sessions with robots: checks before the first tick, and a stop whatever happens."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -32,7 +32,7 @@ class RobotStoppedError(RuntimeError):
 @final
 @dataclass(frozen=True)
 class RobotLimits:
-    """What a robot can follow; a schedule beyond it is refused before the first tick.
+    """Limits of what a robot can follow; a schedule beyond them is refused before the first tick.
 
     Defaults are those of the Franka Panda's interface.
 

@@ -70,7 +70,7 @@ def robot_unit(units: Sequence[str] | None) -> str | None:
 
 
 def counts_as_metres(units: Sequence[str] | None) -> bool:
-    """Whether schedules of recordings in these units are in m, or in what is taken for it where there are none."""
+    """True if schedules of recordings in these units are in m, which is also assumed where there are none."""
     return units is None or robot_unit(units) == "m"
 
 

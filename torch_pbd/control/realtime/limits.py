@@ -116,7 +116,7 @@ class WrenchChannel:
 
     @property
     def is_lost(self) -> bool:
-        """Whether one of them is."""
+        """True if the force or the torque is lost."""
         return self._channels[0].is_lost or self._channels[1].is_lost
 
     def begin(self, d: int, bias: Vector) -> None:

@@ -107,7 +107,7 @@ class Motion:
         return status
 
     def live_irregular(self, now: float, push: Vector) -> TickStatus:
-        """The same for a tick that is not like the last one, if ``now`` can be."""
+        """Status of a tick that is not like the last one, if ``now`` can be."""
         timer = self._timer
         status, shift = timer.read(now)
         self._clock.shift(shift)

@@ -104,7 +104,7 @@ class ScheduleTable:
         self.packed, self.layout = rows.tobytes(), struct.Struct(f"{rows.shape[1]}d")
 
     def row(self, index: int) -> Vector:
-        """One row, unpacked."""
+        """Row of the table, unpacked."""
         return self.layout.unpack_from(self.packed, index * self.layout.size)
 
     def scaled(self, stiffness: Floats, scale: Scale) -> Floats:
@@ -140,7 +140,7 @@ class ScheduleTable:
 
 
 def _are_apart(stiffness: Floats, first: slice, second: slice) -> bool:
-    """Whether no stiffness couples positions and rotations."""
+    """True if no stiffness couples positions and rotations."""
     along = np.sqrt(np.abs(stiffness).max(axis=0).diagonal())
     coupling = np.abs(stiffness[:, first, second]).max(axis=0)
     return bool((coupling <= checks.ROUNDING * np.multiply.outer(along[first], along[second])).all())

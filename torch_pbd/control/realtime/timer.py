@@ -36,7 +36,7 @@ class TickTimer:
 
     @property
     def is_failed(self) -> bool:
-        """Whether bad or late ticks are too many on end for the robot to go on."""
+        """True if bad or late ticks are too many on end for the robot to go on."""
         return self._n_bad >= self._max_bad_ticks or self._n_late >= _LATE_ON_END
 
     def read(self, now: float) -> tuple[TickStatus, float]:

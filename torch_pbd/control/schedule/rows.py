@@ -50,7 +50,7 @@ def blend(start: Floats, end: Floats, share: Floats) -> Floats:
 
 
 class Between:
-    """Where times (m,) lie between the rows of a schedule at ``knots`` (n,), n >= 2."""
+    """Places of times (m,) between the rows of a schedule at ``knots`` (n,), n >= 2."""
 
     def __init__(self, knots: Floats, times: Floats) -> None:
         self._row = np.clip(np.searchsorted(knots, times, side="right") - 1, 0, len(knots) - 2)

@@ -105,7 +105,7 @@ class ForceSensor:
 
     @property
     def is_noisy(self) -> bool:
-        """Whether readings are drawn."""
+        """True if readings are drawn at random."""
         return any(value != 0.0 for value in _each(self.noise_scale))
 
     @classmethod

@@ -79,13 +79,13 @@ class Task:
 
     @property
     def is_open(self) -> bool:
-        """Whether nothing acts in the loop."""
+        """True if nothing acts in the loop."""
         parts = (self.sensor, self.position_loop, self.environment, self.stiffness_filter)
         return all(part is None for part in parts)
 
     @property
     def is_shared(self) -> bool:
-        """Whether all rollouts of a batch have the same gains and desired motion."""
+        """True if all rollouts of a batch have the same gains and desired motion."""
         motion = [self.position, self.velocity, self.inertial_force]
         motion += [] if self.turning is None else [self.turning.turns]
         return self.stiffness.ndim == 3 and all(part.ndim == 2 for part in motion)

@@ -71,7 +71,7 @@ class _Table:
     wanted: Wanted
 
     def recordings_at_once(self) -> tuple[list[NDArray[Any]], list[NDArray[Any]]] | None:
-        """What :meth:`recordings` gives, in a sixth of the time; None where a line needs to be looked at."""
+        """Result of :meth:`recordings`, in a sixth of the time; None where a line needs to be looked at."""
         start = self.file.tell()
         first = next(csv.reader([self.file.readline(_LONGEST_HEADER)], delimiter=self.delimiter), [])
         self.file.seek(start)

@@ -50,7 +50,7 @@ def _read_info(path: Path) -> dict[str, Any]:
 
 
 def _is_number(feature: Any) -> bool:
-    """Whether a feature is a number or a vector of some, and no image."""
+    """True of a feature that is a number or a vector of some, and no image."""
     return str(feature["dtype"]).startswith(("float", "int", "bool")) and len(feature["shape"]) == 1
 
 
