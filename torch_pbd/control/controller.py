@@ -197,7 +197,7 @@ class DMPController(Planning):
         if seconds and units.counts_as_metres(outputs.units(self.units_)):
             self.reproduction_.warn_if_cut(units.in_si(outputs.units(self.units_)))
         # 4. Variability. The regressor learns the covariance over the same input, of positions or of the forcing; of
-        # poses along the principal axes of each block.
+        # poses along axes of each block that its covariances have in common.
         varying, phase = self.varying(movements), self.reproduction_.phase
         self.outputs_ = outputs.with_axes(varying, movements.known)
         self.covariance_ = fit_covariance(

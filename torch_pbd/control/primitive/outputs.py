@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import expm
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
@@ -15,7 +16,8 @@ from torch_pbd.rotations import Chart
 RESOLUTION = 1e-5
 """Of the extent of a movement: smaller standard deviations count as none. Of rotations also of a radian."""
 
-_ROUNDING = 1e-11  # of the largest position
+_ROUNDING = 1e-11  # of the largest position; in rad
+_STEPS, _FLAT = 100, 1e-3  # at most; of curvature, where two axes are as good turned
 _FURTHEST = 150.0  # degrees from the reference, as for demonstrations: at 180 a chart takes the other way round
 _NEARLY_UNIT = 1e-3  # of the norm of a quaternion: as people write them
 
@@ -24,7 +26,7 @@ _NEARLY_UNIT = 1e-3  # of the norm of a quaternion: as people write them
 class Outputs:
     """Outputs of a movement: ``n_positions``, and, of poses, three coordinates of a rotation in the chart around R0.
 
-    ``reference`` (4,) is R0, w x y z. What the regressor learns are z of ``y = axes z``: of poses the principal axes of
+    ``reference`` (4,) is R0, w x y z. What the regressor learns are z of ``y = axes z``: of poses the common axes of
     each block, in units of its extent. Outputs are standardized one by one, which depends on their axes; and floors
     are relative to other outputs, which must not mix m with rad.
     """
@@ -66,20 +68,21 @@ class Outputs:
     def with_axes(self, varying: Floats, known: NDArray[np.bool_]) -> "Outputs":
         """Outputs with the axes of what varies (K, n, d) between demonstrations, where known (K, n); of poses only.
 
-        Principal axes of the covariance within times, pooled: they turn with the world and with the tool. Signs are by
-        third moments, which turn too.
+        They are the common axes of the covariances within times: they turn with the world and with the tool, and so do
+        their signs, by third moments. Of the pooled covariance free phases, which are large, would choose the axes of
+        the precise ones.
         """
         if self.reference is None:
             return self
         count = known.sum(axis=0)[:, np.newaxis]
         mean = np.where(known[..., np.newaxis], varying, 0.0).sum(axis=0) / np.maximum(count, 1)
-        deviation = (varying - mean)[known]
+        deviation = np.where(known[..., np.newaxis], varying - mean, 0.0)
         axes, extents = np.eye(varying.shape[-1]), self.extents(varying)
         for block in self.blocks:
-            own = deviation[:, block]
-            if float(np.abs(own).max()) > RESOLUTION * extents[block][0]:
-                turned = np.linalg.eigh(own.T @ own)[1]
-                axes[block, block] = turned * np.where(((own @ turned) ** 3).sum(axis=0) < 0.0, -1.0, 1.0)
+            own, least = deviation[..., block], RESOLUTION * extents[block][0]
+            if own.shape[-1] > 1 and float(np.abs(own).max()) > least:
+                turned = common_axes(own, count[:, 0] - 1, least)
+                axes[block, block] = turned * np.where(((own @ turned) ** 3).sum(axis=(0, 1)) < 0.0, -1.0, 1.0)
         return replace(self, axes=axes * extents)
 
     def encode(self, values: Floats) -> Floats:
@@ -175,3 +178,57 @@ class Outputs:
             if (free.any(axis=-1) != free.all(axis=-1)).any():
                 raise ValueError(f"the {what} of {name} is given in part, must be given whole, or be NaN whole.")
         return given
+
+
+def common_axes(deviation: Floats, degrees: NDArray[np.integer], least: float) -> Floats:
+    """Axes (d, d), its columns, that the covariances of deviations (K, n, d) within times have nearly in common.
+
+    Maximum likelihood of common principal components: the sum over times, ``degrees`` (n,) of freedom each, of the log
+    variances along the axes is least, so that each time counts by its shape, however large it is. Before, they are
+    shrunk towards spheres, by the oracle approximating estimate: times that are no less round than chance would have
+    it, of so few demonstrations, count little. Standard deviations below ``least`` count as none. In ascending order of
+    the mean log variance.
+
+    References
+    ----------
+    B. Flury, "Common principal components in k groups", Journal of the American Statistical Association 79, 1984.
+    Y. Chen, A. Wiesel, Y. Eldar, A. Hero, "Shrinkage algorithms for MMSE covariance estimation", IEEE Transactions on
+    Signal Processing 58, 2010.
+    """
+    scatter, free = np.einsum("kni,knj->nij", deviation, deviation), np.maximum(degrees, 0)[:, np.newaxis, np.newaxis]
+    covariances = _shrunk(scatter / np.maximum(free, 1) + least**2 * np.eye(scatter.shape[-1]), free)
+    axes = np.linalg.eigh(scatter.sum(axis=0))[1]  # of the pooled covariance, which stay where no shape tells anything
+    found = _along(covariances, axes)
+    for _ in range(_STEPS):
+        # Newton's step of the angle in each plane of two axes, with the curvature where all are diagonal.
+        variance = found[:, :, np.newaxis]
+        inverse, ratio = 1.0 / variance, variance / np.swapaxes(variance, 1, 2)
+        slope = (free * (axes.T @ covariances @ axes) * (inverse - np.swapaxes(inverse, 1, 2))).sum(axis=0)
+        angles = slope / (free * (ratio + np.swapaxes(ratio, 1, 2) - 2.0 + _FLAT)).sum(axis=0)
+        tried = axes @ expm(angles)
+        while _rise(free, found, ahead := _along(covariances, tried)) > _ROUNDING:
+            angles = 0.5 * angles
+            tried = axes @ expm(angles)
+        axes, found = tried, ahead
+        if np.abs(angles).max() < _ROUNDING:
+            break
+    return np.array(axes[:, np.argsort((free[:, 0] * np.log(found)).sum(axis=0))], dtype=np.float64)
+
+
+def _along(covariances: Floats, axes: Floats) -> Floats:
+    """Variances (n, d) along axes."""
+    return np.asarray(np.einsum("ia,nij,ja->na", axes, covariances, axes), dtype=np.float64)
+
+
+def _rise(free: Floats, before: Floats, after: Floats) -> float:
+    """Rise of the mean log variance."""
+    return float((free[:, 0] * np.log(after / before)).sum() / free.sum())
+
+
+def _shrunk(covariances: Floats, free: Floats) -> Floats:
+    """Covariances (n, d, d) nearer to spheres: the nearer, the rounder they are, and the fewer degrees they have."""
+    d, trace = covariances.shape[-1], np.trace(covariances, axis1=1, axis2=2)[:, np.newaxis, np.newaxis]
+    square = (covariances**2).sum(axis=(1, 2), keepdims=True)
+    chance = (1.0 - 2.0 / d) * square + trace**2
+    share = chance / np.maximum(chance, (free + 1.0 - 2.0 / d) * (square - trace**2 / d))
+    return (1.0 - share) * covariances + share * trace / d * np.eye(d)
