@@ -258,7 +258,7 @@ def _evenly(schedule: Schedule, rate: float | None) -> Schedule:
 
 def _task_of(schedule: Schedule, plant: AdmittancePlant | None, dt: float, device: str | None = None) -> Task:
     """Task of a plant that follows a schedule, row by row; warns where its mass is not that of the schedule."""
-    plant = AdmittancePlant(None) if plant is None else checks.instance(plant, "plant", AdmittancePlant)
+    plant = checks.instance(plant, "plant", AdmittancePlant, optional=True) or AdmittancePlant(None)
     rows = (schedule.position, schedule.velocity, schedule.stiffness, schedule.damping)
     motion = [torch.tensor(row, device=device) for row in rows]  # of copies: its own are read-only
     mass = plant.inertia(motion[2], schedule.time, schedule.mass)
