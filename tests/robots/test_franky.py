@@ -138,7 +138,7 @@ def test_what_is_beyond_limits_is_refused_before_anything_moves(schedule, change
 
 def test_without_franky_the_command_to_install_it_is_told(schedule, monkeypatch):
     monkeypatch.setitem(sys.modules, "franky", None)
-    with pytest.raises(ModuleNotFoundError, match="pip install franky-control"):
+    with pytest.raises(ModuleNotFoundError, match=r"a Franka arm needs franky, .* pip install 'torch_pbd\[robot\]'"):
         run(None, schedule)
 
 

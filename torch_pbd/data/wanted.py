@@ -3,7 +3,6 @@
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -231,17 +230,6 @@ def check_movements(names: Sequence[str], positions: Sequence[Floats]) -> dict[s
                 f"Leave it out, or {remedy}."
             )
     return found
-
-
-def optional(module: str, extra: str, what: str) -> Any:
-    """A library that only some formats need, imported when one of them is read."""
-    try:
-        return import_module(module)
-    except ModuleNotFoundError as error:
-        package = module.partition(".")[0]
-        raise ModuleNotFoundError(
-            f"{what} is read by {package}, which is not installed: pip install 'torch_pbd[{extra}]'"
-        ) from error
 
 
 def natural(name: str) -> list[tuple[int, str]]:

@@ -9,6 +9,7 @@ import numpy as np
 from torch_pbd import checks, rotations
 from torch_pbd.checks import Floats
 from torch_pbd.exceptions import InvalidParameterError
+from torch_pbd.extras import optional
 from torch_pbd.plotting.style import DATA, FORCE, MODEL, OTHER, ROBOT, schedule_names
 
 _N_ELLIPSOIDS = 21
@@ -53,12 +54,7 @@ def to_rerun(
         raise checks.refusal(os.fspath(path), "path", "a file that ends with .rrd")
     if demonstrations is None and display is None and schedule is None and rollout is None:
         raise InvalidParameterError("there is nothing to write: give demonstrations, display, schedule or rollout.")
-    try:
-        import rerun
-    except ImportError as error:
-        raise ImportError(
-            "to_rerun needs rerun-sdk, which is not installed: pip install 'torch_pbd[rerun]'."
-        ) from error
+    rerun = optional("rerun", "rerun", "to_rerun")
     stream = rerun.RecordingStream("torch_pbd")
     stream.save(os.fspath(path))
     writer = _Writer(rerun, stream)

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from torch_pbd import checks
-from torch_pbd.robots.session import required
+from torch_pbd.extras import optional
 
 HOME = (0.0, -math.pi / 4, 0.0, -3 * math.pi / 4, 0.0, math.pi / 2, math.pi / 4)
 """Joint angles in rad, far from limits and singularities: the hand points down, 0.31 m before the base."""
@@ -164,7 +164,7 @@ def panda(*, hand: bool = True, armature: float = 0.1, timestep: float = 1e-3) -
     array([12.5,  5.1,  6.5])
     """
     text = panda_mjcf(hand=hand, armature=armature, timestep=timestep)
-    return required("mujoco").MjModel.from_xml_string(text)
+    return optional("mujoco", "robot", "a model for MuJoCo").MjModel.from_xml_string(text)
 
 
 def _body(number: int, link: Link, inner: str) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 
 from torch_pbd import checks
 from torch_pbd.control.schedule import Schedule
+from torch_pbd.extras import optional
 from torch_pbd.robots.session import (
     RobotLimits,
     RobotRun,
@@ -16,7 +17,6 @@ from torch_pbd.robots.session import (
     check_start,
     poses,
     recorded,
-    required,
     stopping,
     warn_of_mass,
 )
@@ -85,7 +85,7 @@ def run(
     RobotStoppedError
         If the arm stops by itself, the connection breaks, or a target comes late.
     """
-    franky = required("franky", "franky-control")
+    franky = optional("franky", "robot", "a Franka arm")
     check_limits(schedule, RobotLimits() if limits is None else limits)
     warn_of_mass(schedule)
     checks.number(period, "period", above=0.0, below=max_step, unit="s")

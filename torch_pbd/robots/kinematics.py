@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from torch_pbd import checks, rotations
 from torch_pbd.checks import Floats
 from torch_pbd.exceptions import InvalidParameterError
-from torch_pbd.robots.session import required
+from torch_pbd.extras import optional
 
 # Of a row: by Newton's steps the error is squared, so that what remains is rounding.
 _MAX_STEPS, _REACHED, _SETTLED = 200, 1e-9, 1e-7
@@ -183,7 +183,7 @@ class MujocoArm:
     """The :class:`Arm` of a ``mujoco.MjModel``."""
 
     def __init__(self, model: Any, tool: str) -> None:
-        self._library = mujoco = required("mujoco")
+        self._library = mujoco = optional("mujoco", "robot", "an arm in MuJoCo")
         self._model, self._data = model, mujoco.MjData(model)
         kinds = mujoco.mjtObj
         site = mujoco.mj_name2id(model, kinds.mjOBJ_SITE, tool)
@@ -240,7 +240,7 @@ class _PinocchioArm:
     """The :class:`Arm` of a ``pinocchio.Model``."""
 
     def __init__(self, model: Any, tool: str) -> None:
-        self._library = pin = required("pinocchio", "pin")
+        self._library = pin = optional("pinocchio", "robot", "an arm in Pinocchio")
         self._model, self._data, self._neutral = model, model.createData(), pin.neutral(model)
         if not model.existFrame(tool):
             raise checks.refusal(

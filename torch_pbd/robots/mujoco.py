@@ -10,8 +10,9 @@ from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control.schedule import Schedule
 from torch_pbd.exceptions import InvalidParameterError
+from torch_pbd.extras import optional
 from torch_pbd.robots.kinematics import MujocoArm, ToolState, pose_error
-from torch_pbd.robots.session import RobotStoppedError, check_start, poses, required, warn_of_mass
+from torch_pbd.robots.session import RobotStoppedError, check_start, poses, warn_of_mass
 
 # A tick as a whole number of steps of the simulation, to what rounding leaves of both.
 _UNEVEN = 1e-6
@@ -163,7 +164,7 @@ class _Simulation:
     """An arm in MuJoCo, its controller, and what is measured at a tick."""
 
     def __init__(self, model: Any, tool: str, posture_rate: float) -> None:
-        self._mujoco = required("mujoco")
+        self._mujoco = optional("mujoco", "robot", "an arm in MuJoCo")
         checks.instance(model, "model", self._mujoco.MjModel)
         self.chain = chain = MujocoArm(model, checks.text(tool, "tool"))
         if model.nu != chain.limits.shape[1] or model.nv != model.nu:

@@ -10,7 +10,8 @@ import numpy as np
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control.schedule import Schedule
-from torch_pbd.robots.session import poses, required
+from torch_pbd.extras import optional
+from torch_pbd.robots.session import poses
 
 Gains = Literal["matrix", "diagonal"]
 
@@ -90,14 +91,14 @@ def to_bag(schedule: Schedule, path: str | os.PathLike[str], *, gains: Gains = "
     if Path(path).exists():
         raise FileExistsError(f"{path} exists: give a new folder, or remove it.")
     store = _store()
-    with required("rosbags.rosbag2").Writer(Path(path), version=9) as writer:
+    with optional("rosbags.rosbag2", "robot", "a bag of messages").Writer(Path(path), version=9) as writer:
         topics = {name: writer.add_connection(f"/{name}", kind, typestore=store) for name, kind in _TOPICS.items()}
         for name, stamp, message in to_messages(schedule, gains=gains):
             writer.write(topics[name], stamp, store.serialize_cdr(message, _TOPICS[name]))
 
 
 def _store() -> Any:
-    typesys = required("rosbags.typesys")
+    typesys = optional("rosbags.typesys", "robot", "a message of ROS")
     return typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
 
 

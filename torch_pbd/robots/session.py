@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib import import_module
 from typing import Any, final
 
 import numpy as np
@@ -12,17 +11,6 @@ from torch_pbd import checks, rotations
 from torch_pbd.checks import Floats
 from torch_pbd.control.schedule import Schedule
 from torch_pbd.exceptions import InvalidParameterError
-
-
-def required(module: str, package: str = "") -> Any:
-    """A library that this package does not need as a whole; ``package`` is its name for pip, if it is another."""
-    try:
-        return import_module(module)
-    except ModuleNotFoundError as error:
-        name = package or module.partition(".")[0]
-        raise ModuleNotFoundError(
-            f"this needs {name}, which is not installed: pip install {name}, or pip install 'torch_pbd[robot]'"
-        ) from error
 
 
 class RobotStoppedError(RuntimeError):

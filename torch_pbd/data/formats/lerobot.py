@@ -9,7 +9,8 @@ import numpy as np
 
 from torch_pbd.data.formats.parquet import read_columns
 from torch_pbd.data.recordings import preview
-from torch_pbd.data.wanted import Arguments, Wanted, column_names, natural, optional, rows_of
+from torch_pbd.data.wanted import Arguments, Wanted, column_names, natural, rows_of
+from torch_pbd.extras import optional
 
 _LARGEST_INFO = 2**22  # bytes
 

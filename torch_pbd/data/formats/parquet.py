@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torch_pbd.data.wanted import Arguments, Wanted, optional
+from torch_pbd.data.wanted import Arguments, Wanted
+from torch_pbd.extras import optional
 
 
 def read(path: Path, wanted: Wanted) -> Arguments:

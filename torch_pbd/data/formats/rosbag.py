@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torch_pbd import checks
-from torch_pbd.data.wanted import Arguments, Wanted, optional
+from torch_pbd.data.wanted import Arguments, Wanted
+from torch_pbd.extras import optional
 
 _XYZ, _XYZW = ("x", "y", "z"), ("x", "y", "z", "w")
 
