@@ -182,10 +182,10 @@ class MovementDisplay:
         return self
 
     def _plot_band(self, ax: Axes, output: int) -> None:
-        time_unit = "1" if self.input == "phase" else self.demonstrations.time_unit
-        plot_demonstrations(
-            self.demonstrations if self.input == "time" else _in_phase(self.demonstrations), [output], ax
-        )
+        shown = self.demonstrations
+        if self.input == "phase" and shown.time_unit != "1":
+            shown = shown.align(n=_N_STEPS)
+        plot_demonstrations(shown, [output], ax)
         for (name, (mean, covariance)), color in zip(self.laws.items(), _COLORS, strict=False):
             std = np.sqrt(covariance[:, output, output])
             plot_std_band(self.grid, mean[:, output], std, ax, n_std=self.n_std, color=color, label=self._label(name))
@@ -193,7 +193,7 @@ class MovementDisplay:
             mean, covariance = self.truth
             std = 0.5 * self.n_std * np.sqrt(covariance[:, output, output])
             draw_edges(self.grid, mean[:, output], std, ax, f"truth: {self.n_std:g} sd", TRUTH)
-        ax.set_xlabel(time_label(time_unit))
+        ax.set_xlabel(time_label(shown.time_unit))
         ax.margins(x=0.0)
 
     def _plot_path(self, ax: Any) -> None:
@@ -298,7 +298,3 @@ def _panels(n_bands: int, n_space: int) -> tuple[Figure, list[Any], list[Axes]]:
     n_rows = -(-n_bands // n_columns)
     figure = shown_figure((3.4 * n_columns if n_columns > 1 else 6.4, max(3.6, 2.0 * n_rows + 0.6)))
     return figure, [], [figure.add_subplot(n_rows, n_columns, i + 1) for i in range(n_bands)]
-
-
-def _in_phase(demonstrations: Any) -> Any:
-    return demonstrations if demonstrations.time_unit == "1" else demonstrations.align(n=_N_STEPS)
