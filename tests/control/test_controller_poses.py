@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import torch_pbd
-from torch_pbd import CholeskyCovRegressor, Demonstrations, DMPController, TrajectoryRegressor
+from torch_pbd import CholeskyCovRegressor, Demonstrations, DMPController, GMMBaseline, TrajectoryRegressor
 from torch_pbd.control import RotationLimits, StiffnessLaw
 from torch_pbd.control.primitive.outputs import Outputs
 from torch_pbd.data import make_pose_demonstrations, make_tunnel_demonstrations
@@ -184,8 +184,9 @@ def test_starts_and_goals_are_poses_or_outputs(controller):
     [
         (np.zeros(5), "goal has shape (5,), must have 7 columns, position and quaternion w x y z, or the 6"),
         (np.r_[np.zeros(3), 0.5, 0.0, 0.0, 0.0], "the norm of the quaternion of goal is 0.5, must be 1"),
-        (np.r_[np.nan, np.zeros(5)], "the position of goal is given in part"),
+        (np.r_[np.nan, np.zeros(5)], "goal has a part of the position, must have all of it"),
         ("turned over", "in degrees, is 170"),
+        ("turned over", "is the quaternion in the order w x y z?"),
     ],
 )
 def test_goals_that_are_no_poses_of_this_task_are_refused(controller, goal, words):
@@ -233,7 +234,7 @@ def test_a_rotation_that_does_not_vary_has_no_part_in_units():
     still = {"by": lambda p, q: (p, np.broadcast_to(TOOL, q.shape))}
     found = []
     for unit in ("m", "mm"):
-        with pytest.warns(UserWarning, match="The covariances do not vary"):
+        with pytest.warns(UserWarning, match="The covariances of rotations do not vary"):
             found.append(fitted(poses(unit, **still)).schedule(20.0))
     np.testing.assert_allclose(found[0].stiffness, found[1].stiffness, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(found[0].covariance, found[1].covariance, rtol=1e-9, atol=1e-15)
@@ -287,6 +288,30 @@ def test_laws_and_masses_of_other_outputs_are_refused():
     ):
         with pytest.raises(ValueError, match=re.escape(words)):
             fitted(shown, **options)
+
+
+def test_rotations_alone_are_refused_by_what_was_recorded():
+    made = poses()
+    alone = Demonstrations(made.times, made.to_poses()[1], names=NAMES[3:], units="rad", rotation=NAMES[3:])
+    with pytest.raises(ValueError, match="have a rotation alone, rx, ry, rz"):
+        fitted(alone)
+
+
+def test_recordings_that_were_cut_while_turning_are_told_of():
+    """The second half of each, at places that go nowhere."""
+    made = make_pose_demonstrations(8, rate=50.0, random_state=0)
+    turns = [turn[len(turn) // 2 :] for turn in made.to_poses()[1]]
+    rows = [np.hstack([np.outer(np.linspace(0.1 * k, 0.0, len(q)), np.ones(3)), q]) for k, q in enumerate(turns)]
+    times = [time[len(time) // 2 :] - time[len(time) // 2] for time in made.times]
+    turning = Demonstrations(times, rows, names=NAMES, units="m", rotation=NAMES[3:])
+    with pytest.warns(UserWarning, match=r"The movement starts at [0-9.]+ rad/s .* cut while moving"):
+        fitted(turning)
+
+
+def test_a_reproduction_that_is_off_says_which_part_is():
+    of_rotation = pytest.warns(UserWarning, match=r"is [0-9.]+ rad of rotation off the mean of the demonstrations")
+    with pytest.warns(UserWarning, match=r"is [0-9.]+ off the mean of the demonstrations"), of_rotation:
+        fitted(poses(), GMMBaseline(n_components=1), phase_input="s")
 
 
 def test_joints_are_followed_in_radians_whatever_they_were_recorded_in():

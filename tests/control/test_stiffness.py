@@ -162,6 +162,13 @@ def test_covariances_that_do_not_vary_are_told_of_and_stiff(covariance):
     assert torch.equal(stiffness, 1000.0 * torch.eye(d).double().expand(np.shape(covariance)))
 
 
+def test_the_output_that_does_not_vary_is_named():
+    covariance = np.diag([1e-4, 1e-3]) * np.linspace(1.0, 2.0, 5)[:, None, None]
+    covariance[:, 1, 1] = 1e-3
+    with pytest.warns(UserWarning, match="The covariances of output 1 do not vary"):
+        StiffnessLaw([50.0, 50.0], 1000.0)(covariance)
+
+
 def test_arrays_give_what_tensors_give_and_are_left_alone(generator):
     covariance = covariances(6, d=2, generator=generator)
     array = covariance.numpy().copy()

@@ -118,6 +118,11 @@ def as_demonstrations(X: Demonstrations | ArrayLike, y: ArrayLike | None, groups
         )
     if demonstrations.suspects:
         raise ValueError(f"A controller cannot be learned of these outputs. {' '.join(demonstrations.suspects)}")
+    if demonstrations.rotation_reference is not None and demonstrations.n_outputs == 3:
+        raise ValueError(
+            f"The demonstrations have a rotation alone, {', '.join(demonstrations.names)}, must have positions beside "
+            "it: record them too."
+        )
     check_unimodal(demonstrations)
     if isinstance(X, Demonstrations):  # arrays have no units: they are in m and s
         warn_of_units(X.units if X.units is None or X.rotation_reference is None else X.units[:-3])

@@ -79,7 +79,7 @@ class Planning(BaseEstimator):
             In their units; NaN where an output is not given. Of poses p positions and a quaternion w x y z, or outputs;
             each of the two is given whole or not at all.
         noise_scale : float or array-like of shape (d,), default=0.0
-            Standard deviation of the error of positions; of poses one for all positions and one for the rotation.
+            Standard deviation of the error of positions; of poses p equal numbers and three equal ones in rad.
         """
         time = self._movement_time(checks.array(times, "times", ("m",))[:, np.newaxis])
         position = self.outputs_.rows(positions, "positions")

@@ -168,6 +168,7 @@ class Outputs:
                 angle,
                 f"the angle of {name} to the reference of the demonstrations, in degrees,",
                 f"at most {_FURTHEST:g}",
+                "is the quaternion in the order w x y z?",
             )
             given = np.concatenate([given[..., :p], y], axis=-1)
         if given.shape[-1] != p + 3:
@@ -176,7 +177,7 @@ class Outputs:
         for block, what in zip(self.blocks, ("position", "rotation"), strict=True):
             free = np.isnan(given[..., block])
             if (free.any(axis=-1) != free.all(axis=-1)).any():
-                raise ValueError(f"the {what} of {name} is given in part, must be given whole, or be NaN whole.")
+                raise ValueError(f"{name} has a part of the {what}, must have all of it, or NaN for all of it.")
         return given
 
 

@@ -25,9 +25,10 @@ _FAR = 0.01  # of the extent of a movement: a worse reproduction is worth a warn
 # Time constants after the end at which an additive movement is at rest: exp(-20) is 2e-9 of what it was.
 _SETTLE = 20.0
 _BRAKE = 0.2  # of the duration: the most that the stop of a movement that was cut may take
-# Of the largest speed, the last in m/s. Who cuts more than 6 % of a minimum jerk has a tenth of its largest there.
-# Movements that keep above half of their largest are meant to pass, and 0.1 m/s a robot stops within 1 mm at 5 m/s^2.
-_CUT, _STEADY, _STOPPED = 0.1, 0.5, 0.1
+# Of the largest speed, the last in m/s and rad/s. Who cuts more than 6 % of a minimum jerk has a tenth of its largest
+# there. Movements that keep above half of their largest are meant to pass, and a robot stops 0.1 m/s within 1 mm at
+# 5 m/s^2, and 0.3 rad/s within 0.3 degrees at 10 rad/s^2.
+_CUT, _STEADY, _STOPPED = 0.1, 0.5, (0.1, 0.3)
 _ROUNDING = 1e-9  # of the duration, or of the largest position
 
 
@@ -100,9 +101,13 @@ class Reproduction:
         """
         mean, path = movements.recorded_mean, self.motion(movements.time)[0]
         check_range(path, movements.bounds, "The reproduced movement")
-        return [self._error(path[:, own], mean[:, own], movements.bounds[:, own]) for own in self.blocks]
+        units = ("", " rad of rotation")
+        return [
+            self._error(path[:, own], mean[:, own], movements.bounds[:, own], unit)
+            for own, unit in zip(self.blocks, units, strict=False)
+        ]
 
-    def _error(self, path: Floats, mean: Floats, bounds: Floats) -> float:
+    def _error(self, path: Floats, mean: Floats, bounds: Floats, unit: str) -> float:
         distance = np.linalg.norm(path - mean, axis=1)
         error = float(np.sqrt(np.mean(distance**2)))
         extent = float(np.linalg.norm(np.ptp(bounds, axis=0)))
@@ -110,8 +115,8 @@ class Reproduction:
         if error > _FAR * extent + rounding:
             remedy = "phase_input='time'" if self.phase_input == "s" else "a higher cutoff, or more n_steps"
             checks.warn(
-                f"The reproduced movement is {error:.3g} off the mean of the demonstrations, {error / extent:.1%} of "
-                f"its extent: try {remedy}."
+                f"The reproduced movement is {error:.3g}{unit} off the mean of the demonstrations, "
+                f"{error / extent:.1%} of its extent: try {remedy}."
             )
         return error
 
@@ -120,14 +125,16 @@ class Reproduction:
 
         A unit of position is so many ``metres``.
         """
-        speed = metres * np.linalg.norm(self._curve(self.time, 1)[:, self.blocks[0]], axis=1)
-        ends, largest = max(float(speed[0]), float(speed[-1])), float(speed.max())
-        if ends > max(_CUT * largest, _STOPPED) and speed.min() < _STEADY * largest:
-            checks.warn(
-                f"The movement starts at {speed[0]:.3g} m/s and ends at {speed[-1]:.3g} m/s, where its largest is "
-                f"{largest:.3g}: the recordings were cut while moving. Record from rest to rest; else a robot at rest "
-                "needs a ramp at the start, and settle > 0 at the end."
-            )
+        velocity, parts = self._curve(self.time, 1), zip(("m/s", "rad/s"), (metres, 1.0), _STOPPED, strict=True)
+        for own, (unit, scale, stopped) in zip(self.blocks, parts, strict=False):
+            speed = scale * np.linalg.norm(velocity[:, own], axis=1)
+            ends, largest = max(float(speed[0]), float(speed[-1])), float(speed.max())
+            if ends > max(_CUT * largest, stopped) and speed.min() < _STEADY * largest:
+                checks.warn(
+                    f"The movement starts at {speed[0]:.3g} {unit} and ends at {speed[-1]:.3g} {unit}, where its "
+                    f"largest is {largest:.3g}: the recordings were cut while moving. Record from rest to rest; else a "
+                    "robot at rest needs a ramp at the start, and settle > 0 at the end."
+                )
 
     def motion(self, time: Floats) -> tuple[Floats, Floats, Floats]:
         """Position, velocity and acceleration (n, d) at any times (n,): at rest before 0, and long after the end.

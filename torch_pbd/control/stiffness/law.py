@@ -171,13 +171,14 @@ class StiffnessLaw:
             raise InvalidParameterError(
                 f"covariance is of {n_outputs} outputs, must be of {wanted}{more}, as the law is."
             )
-        blocks = [Block(slice(0, n_positions), *rows)] if not sizes else []  # type: ignore[arg-type]
+        name = "positions" if rotation is not None else ""
+        blocks = [Block(slice(0, n_positions), *rows, name=name)] if not sizes else []  # type: ignore[arg-type]
         if sizes:
             each = [row if isinstance(row, tuple) else [row] * n_positions for row in rows]
-            blocks = [Block(slice(i, i + 1), *row) for i, row in enumerate(zip(*each, strict=True))]
+            blocks = [Block(slice(i, i + 1), *row, name=f"output {i}") for i, row in enumerate(zip(*each, strict=True))]
         if rotation is not None:
             own = rotation.stiffness_min, rotation.stiffness_max, rotation.sigma_low, rotation.sigma_high
-            blocks.append(Block(slice(n_positions, n_outputs), *own))
+            blocks.append(Block(slice(n_positions, n_outputs), *own, name="rotations"))
         return blocks
 
     def limits(self, n_outputs: int) -> tuple[Limit, Limit]:
@@ -262,7 +263,7 @@ class StiffnessLaw:
         """Bounds of the standard deviation of one block whose covariances are ``part``."""
         if self.bounds == "quantile":
             variances = torch.linalg.eigvalsh(part.detach()) if variances is None else variances
-            return limits.quantiles(variances, resolution)
+            return limits.quantiles(variances, resolution, block.name)
         assert block.sigma_low is not None
         assert block.sigma_high is not None
         low, high = block.sigma_low, block.sigma_high

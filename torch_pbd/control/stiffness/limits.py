@@ -49,6 +49,7 @@ class Block(NamedTuple):
     stiffness_max: float
     sigma_low: float | None
     sigma_high: float | None
+    name: str = ""
 
     def of(self, matrix: Tensor) -> Tensor:
         """Part (..., k, k) of matrices (..., d, d)."""
@@ -97,10 +98,10 @@ def _pairs(low: Any, high: Any, low_name: str, high_name: str) -> list[tuple[tup
     return list(zip(*(side * (size // len(side)) for side in sides), strict=True))
 
 
-def quantiles(variances: Tensor, resolution: float = 0.0) -> tuple[float, float]:
+def quantiles(variances: Tensor, resolution: float = 0.0, name: str = "") -> tuple[float, float]:
     """Bounds of the standard deviation as quantiles of those along all axes, of which smaller count as ``resolution``.
 
-    Warns where the standard deviations do not vary.
+    Warns where the standard deviations, of outputs of a ``name``, do not vary.
     """
     if not variances.numel():
         raise InvalidParameterError(
@@ -112,9 +113,9 @@ def quantiles(variances: Tensor, resolution: float = 0.0) -> tuple[float, float]
     if high > low * (1.0 + checks.ROUNDING):
         return low, high
     checks.warn(
-        f"The covariances do not vary: their standard deviations have quantiles {low:.3g} and {high:.3g}. "
-        "Every direction counts as precise, and gets stiffness_max; give sigma_low and sigma_high with "
-        "bounds='sigma' to say what is precise."
+        f"The covariances {f'of {name} ' if name else ''}do not vary: their standard deviations have quantiles "
+        f"{low:.3g} and {high:.3g}. Every direction counts as precise, and gets stiffness_max; give "
+        "sigma_low and sigma_high with bounds='sigma' to say what is precise."
     )
     precise = max(high * (1.0 + 1e-6), _SMALLEST) if high else 1.0
     return precise, 2.0 * precise
