@@ -235,6 +235,17 @@ def test_an_experiment_on_a_file_takes_its_covariance_from_the_config(recording,
     assert "GMMBaseline" in schedule.provenance["covariance"]
 
 
+def test_joints_are_pushed_by_torques(tmp_path, capsys, monkeypatch):
+    path = tmp_path / "joints.npz"
+    turned = np.random.default_rng(0).normal(size=(3, 9, 2))
+    torch_pbd.save_demonstrations(Demonstrations(np.arange(9.0), turned, names=["a", "b"], units="rad"), path)
+    monkeypatch.setattr("torch_pbd.experiments.robot.run_robot", lambda *args, **options: "")
+    assert main(["experiment", "--data", str(path), "--output", str(tmp_path / "out")]) == 0
+    assert "pushes of 5 Nm about a, at 20 % and 80 % of the movement; K is the stiffness there, Nm/rad" in (
+        capsys.readouterr().out
+    )
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "told"), [("kuka_cube_pick", "cut while moving"), ("letter_G", "which is no known length")]

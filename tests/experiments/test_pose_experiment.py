@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from sklearn.base import clone
 
 from torch_pbd import Demonstrations, DMPController, GMMBaseline
 from torch_pbd.cli.main import main
@@ -128,6 +129,13 @@ def test_a_run_leaves_its_tables_figures_schedules_and_models(controller, record
     flat = Demonstrations([0.0, 1.0], np.zeros((2, 2, 2)), names=("x", "y"))
     with pytest.raises(ConfigError, match=r"a pose has three positions and a rotation, not the outputs \('x', 'y'\)"):
         run_poses({"a": controller}, flat, folder)
+
+
+def test_without_pushes_there_is_no_ratio_and_the_mass_is_the_controllers(controller, recorded, tmp_path):
+    heavy = clone(controller).set_params(mass=3.0)
+    text = run_poses({"a": heavy}, recorded, RunFolder(tmp_path, {}), peak=0.0, torque=0.0, rate=100.0, arm="none")
+    assert text.split("\n")[3].split()[3:5] == ["0", "0"]
+    assert " s; of 3 kg\n" in text
 
 
 @pytest.mark.slow

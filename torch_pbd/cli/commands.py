@@ -209,8 +209,10 @@ def experiment(options: Any, folder: Any) -> str:
     say(describe(demonstrations, f"{options.task} task" if made else _name(options.data)))
     if demonstrations.rotation_reference is not None:
         return _pose_experiment(options, demonstrations, folder)
-    where = f"along {demonstrations.names[0]}, at 20 % and 80 % of the movement; K is the stiffness there, N/m"
-    say(f"pushes of {options.push:g} N {where}\n")
+    turns = set(demonstrations.units or ()) in ({"rad"}, {"deg"})
+    where, unit = ("Nm about", "Nm/rad") if turns else ("N along", "N/m")
+    where += f" {demonstrations.names[0]}, at 20 % and 80 % of the movement; K is the stiffness there, {unit}"
+    say(f"pushes of {options.push:g} {where}\n")
     folder.write_figure(framework_figure(), "figure5_framework")
     return run_robot(options.controllers, demonstrations, folder, peak=options.push, rate=options.rate, in_tunnel=made)
 

@@ -114,8 +114,9 @@ def _of_times(demonstrations: Any, second: float) -> Iterator[str]:
             )
     elif unit in TIMES and max(time[-1] - time[0] for time in times) / second > _LONGEST:
         yield "A recording is longer than ten minutes. Cut it into demonstrations: cut='pauses' or [[start, end]]."
-    if np.abs(starts).max() > _UNIX:
-        yield f"Times start at {starts[0]:.0f} s, as stamps since 1970 do. Count from the start: from_start=True."
+    latest = starts[np.abs(starts).argmax()]
+    if np.abs(latest) > _UNIX:
+        yield f"Times start at {latest:.0f} s, as stamps since 1970 do. Count from the start: from_start=True."
     if apart and len(times) > 1:
         yield "The recordings do not overlap in time. Count each from its start, from_start=True, or take a phase."
     for k, time in enumerate(times):
@@ -181,14 +182,9 @@ def _flips(demonstrations: Any) -> Iterator[str]:
         if {column[-1] for column in columns} != set("wxyz"):
             yield f"{name} has an order that nobody named: w may be first or last. Say it by rotation=, w x y z."
         each = [position[:, place : place + 4] for position in demonstrations.positions]
-        for k, q in enumerate(each):
-            turned = np.flatnonzero((q[1:] * q[:-1]).sum(axis=1) < 0.0)
-            if len(turned):
-                when = demonstrations.times[k][turned[0] + 1]
-                yield f"{name} of recording {k} flips its sign at {when:.6g}: negate it from there."
-        other = [k for k, q in enumerate(each) if q[0] @ each[0][0] < 0.0]
-        if other:
-            yield f"{name} of {_numbers(other)} has the sign of -q where recording 0 has q: negate it."
+        flips = [k for k, q in enumerate(each) if ((q[1:] * q[:-1]).sum(axis=1) < 0.0).any() or q[0] @ each[0][0] < 0.0]
+        if flips:
+            yield f"{name} is -q where it was q, in {_numbers(flips)}: rotation= takes either sign."
 
 
 def _numbers(numbers: list[int]) -> str:

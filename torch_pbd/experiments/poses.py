@@ -1,5 +1,6 @@
 """The robotic experiment with a tool that turns: learned poses on the plant of an arm, pushed by force and torque."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -90,7 +91,8 @@ def run_poses(
         run = pushed(fitted, rate, peak, torque, arm)
         rows += [row for kind in (POSITION, ROTATION) for row in push_rows(name, run, kind)]
         plain = damping_ratio(run.schedule, run.planned.damping)
-        note = f"a damping made for 1 kg would have a ratio of {plain:.2f} here" if arm != "none" else "of 1 kg"
+        mass = f"{fitted.mass:g} kg" if np.ndim(fitted.mass) == 0 else "the mass of the controller"
+        note = f"a damping made for {mass} would have a ratio of {plain:.2f} here" if arm != "none" else f"of {mass}"
         reports.append(f"{name}: a movement of {run.schedule.duration:.3g} s; {note}\n{run.report}")
         _write(run, name, demonstrations, folder)
     folder.write_metrics(rows)
@@ -153,7 +155,7 @@ def push_rows(name: str, run: PoseRun, kind: Kind) -> list[dict[str, Any]]:
     for axis, letter in enumerate(_TOOL):
         first, second = float(moved[:half, axis].max()), float(moved[half:, axis].max())
         row: dict[str, Any] = {"controller": name, "push": kind.push, "axis": f"tool {letter}", "unit": kind.unit}
-        row |= {"early": first, "late": second, "ratio": first / second}
+        row |= {"early": first, "late": second, "ratio": first / second if second else math.nan}
         rows.append(row | {"K early": float(stiffness[early, axis]), "K late": float(stiffness[late, axis])})
     return rows
 
