@@ -97,6 +97,8 @@ def test_poses_that_are_not_in_space_are_drawn_over_time(planned, space, n_posit
         gain[:, 3:-3, :3] = gain[:, :3, 3:-3] = 0.0
     rows = planned.time, planned.position[:, some[:-3]], planned.velocity[:, some], *gains, planned.type1
     axes = Schedule(*rows, orientation=planned.orientation).plot()
+    dashes = {(line.get_label(), line.get_linestyle()) for ax in axes[-4:] for line in ax.lines}
+    assert len(dashes) == max(n_positions, 3)
     assert [ax.get_ylabel() for ax in axes[-4:]] == ["1 sd [mm]", "1 sd [deg]", "stiffness [N/m]", "stiffness [Nm/rad]"]
     for ax, values in zip(axes[-2:], (gains[0][:, :-3, :-3], gains[0][:, -3:, -3:]), strict=True):
         drawn = np.stack([line.get_ydata() for line in ax.lines], axis=1)

@@ -262,13 +262,14 @@ def plot_schedule(schedule: Any) -> list[Axes]:
         bands[0].set_ylabel(f"position [{short_unit(schedule.units)}]")
     if turns:
         draw_blocks(schedule, bands[-4:])
+        bands[-2].set_xlabel("")
     else:
         deviation = kind.scale * np.sqrt(np.diagonal(schedule.covariance, axis1=1, axis2=2))
         plot_outputs(schedule.time, deviation, bands[-2], [f"{kind.where} {name}" for name in names])
         bands[-2].set(ylabel=f"1 sd [{kind.unit}]", ylim=(0.0, None))
         plot_stiffness(schedule, bands[-1])
         bands[-1].set_ylim(0.0, None)
-    legend_below(figure, [*plane, *bands[1:]])
+    legend_below(figure, [*plane, *bands[not turns :]])  # names of positions are those of other bands
     return [*plane, *bands]
 
 
@@ -288,7 +289,7 @@ def _panels(n_bands: int, n_space: int) -> tuple[Figure, list[Any], list[Axes]]:
     """Figure with the Axes of a path in two or three dimensions, if any, and those of bands, in a column or 3 x 3."""
     # The path has a column of its own, as high as all bands together.
     if n_space:
-        figure = shown_figure((9.6 if n_bands else 5.6, 4.8))
+        figure = shown_figure((9.6 if n_bands else 5.6, max(4.8, 1.7 * n_bands)))
         columns = figure.add_gridspec(
             max(n_bands, 1), 2 if n_bands else 1, width_ratios=(1.0, 1.3) if n_bands else None
         )

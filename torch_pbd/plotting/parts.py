@@ -208,7 +208,7 @@ def plot_stiffness(schedule: Any, ax: Axes, block: slice | None = None) -> list[
     kind = ROTATION if block.start else kind_of(schedule.units, block.stop)
     if len(schedule.blocks) > 1:
         gains = principal(schedule.stiffness[:, block, block], descending=True)
-        lines = plot_outputs(schedule.time, gains, ax, axis_names(gains.shape[1]), [MODEL])
+        lines = plot_outputs(schedule.time, gains, ax, axis_names(schedule, gains.shape[1]), [MODEL])
     else:
         gains = np.diagonal(schedule.stiffness, axis1=1, axis2=2)
         lines = plot_outputs(schedule.time, gains, ax, [f"{kind.where} {name}" for name in schedule_names(schedule)])

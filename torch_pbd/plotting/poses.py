@@ -169,7 +169,7 @@ def draw_blocks(schedule: Any, bands: Sequence[Axes]) -> None:
     kinds = kind_of(schedule.units, schedule.position.shape[1]), ROTATION
     for kind, block, spread, gains in zip(kinds, schedule.blocks, bands[:2], bands[2:], strict=True):
         deviation = kind.scale * np.sqrt(principal(schedule.covariance[:, block, block]))
-        plot_outputs(schedule.time, deviation, spread, axis_names(deviation.shape[1]), [MODEL])
+        plot_outputs(schedule.time, deviation, spread, axis_names(schedule, deviation.shape[1]), [MODEL])
         spread.set(ylabel=f"1 sd [{kind.unit}]", ylim=(0.0, None))
         plot_stiffness(schedule, gains, block)
         gains.set_ylim(0.0, None)

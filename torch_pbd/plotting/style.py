@@ -111,9 +111,9 @@ def kind_of(unit: str | None, n_outputs: int) -> Kind:
     return Kind(slice(n_outputs), "along", "force", "N", *shown, stiffness)
 
 
-def axis_names(n_axes: int) -> list[str]:
-    """Names of principal axes, the most precise first."""
-    return [AXES[0], *[AXES[1]] * (n_axes - 2), AXES[2]][:n_axes]
+def axis_names(schedule: Any, n_axes: int) -> Sequence[str]:
+    """Names of principal axes of a block, the most precise first: one name, one dash in both blocks."""
+    return AXES if schedule.position.shape[1] == 3 else [AXES[0], *(f"axis {i + 2}" for i in range(n_axes - 1))]
 
 
 def output_label(demonstrations: Any, output: int) -> str:
