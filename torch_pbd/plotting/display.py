@@ -16,7 +16,6 @@ from torch_pbd.plotting.parts import (
     plot_outputs,
     plot_rollout,
     plot_std_band,
-    plot_stiffness,
 )
 from torch_pbd.plotting.poses import draw_blocks, draw_pose_schedule, draw_poses, draw_recorded_poses
 from torch_pbd.plotting.style import (
@@ -25,7 +24,6 @@ from torch_pbd.plotting.style import (
     TRUTH,
     chosen_outputs,
     equal_scales,
-    kind_of,
     legend_below,
     mark_ends,
     schedule_names,
@@ -243,12 +241,11 @@ def plot_movements(demonstrations: Any, outputs: Sequence[int | str] | None = No
 
 def plot_schedule(schedule: Any) -> list[Axes]:
     """Draw a schedule: what `Schedule.plot` does."""
-    p, turns = schedule.position.shape[1], schedule.orientation is not None
+    p, turns, unit = schedule.position.shape[1], schedule.orientation is not None, short_unit(schedule.units)
     if turns and p == 3:
         return draw_poses(schedule, draw_pose_schedule, 4)
     figure, plane, bands = _panels(2 * len(schedule.blocks) + (p != 2), n_space=2 if p == 2 else 0)
-    names, kind = schedule_names(schedule), kind_of(schedule.units, p)
-    position = [f"{name} [{short_unit(schedule.units)}]" for name in names[:p]]
+    position = [f"{name} [{unit}]" for name in schedule_names(schedule)[:p]]
     # The path of two outputs takes the place of their positions over time.
     if plane:
         path, some = schedule.position, np.linspace(0, len(schedule) - 1, 21).round().astype(int)
@@ -259,16 +256,9 @@ def plot_schedule(schedule: Any) -> list[Axes]:
         equal_scales(plane[0])
     else:
         plot_outputs(schedule.time, schedule.position, bands[0], position)
-        bands[0].set_ylabel(f"position [{short_unit(schedule.units)}]")
-    if turns:
-        draw_blocks(schedule, bands[-4:])
-        bands[-2].set_xlabel("")
-    else:
-        deviation = kind.scale * np.sqrt(np.diagonal(schedule.covariance, axis1=1, axis2=2))
-        plot_outputs(schedule.time, deviation, bands[-2], [f"{kind.where} {name}" for name in names])
-        bands[-2].set(ylabel=f"1 sd [{kind.unit}]", ylim=(0.0, None))
-        plot_stiffness(schedule, bands[-1])
-        bands[-1].set_ylim(0.0, None)
+        bands[0].set_ylabel(f"position [{unit}]")
+    draw_blocks(schedule, bands[p != 2 :])
+    bands[-2].set_xlabel("")
     legend_below(figure, [*plane, *bands[not turns :]])  # names of positions are those of other bands
     return [*plane, *bands]
 

@@ -215,7 +215,7 @@ def plot_stiffness(schedule: Any, ax: Axes, block: slice | None = None) -> list[
     limits = [np.broadcast_to(limit, schedule.n_outputs)[block] for limit in schedule.stiffness_limits or ()]
     for i, limit in enumerate(np.unique(limits)):
         ax.axhline(limit, color=DATA, lw=0.8, ls=":", label=None if i else "limits of the stiffness")
-    ax.set(xlabel="time [s]", ylabel=f"stiffness [{kind.stiffness_unit}]")
+    ax.set(xlabel="time [s]", ylabel=f"stiffness [{kind.stiffness_unit}]", ylim=(0.0, None))
     return lines
 
 

@@ -25,6 +25,7 @@ from torch_pbd.plotting.style import (
     legend_below,
     mark_ends,
     principal,
+    schedule_names,
     shown_figure,
     time_label,
 )
@@ -165,14 +166,16 @@ def draw_pose_schedule(schedule: Any, space: Axes, bands: Sequence[Axes]) -> Non
 
 
 def draw_blocks(schedule: Any, bands: Sequence[Axes]) -> None:
-    """Draw deviations of positions and of rotations in principal axes over time, and the stiffness of both there."""
-    kinds = kind_of(schedule.units, schedule.position.shape[1]), ROTATION
-    for kind, block, spread, gains in zip(kinds, schedule.blocks, bands[:2], bands[2:], strict=True):
-        deviation = kind.scale * np.sqrt(principal(schedule.covariance[:, block, block]))
-        plot_outputs(schedule.time, deviation, spread, axis_names(schedule, deviation.shape[1]), [MODEL])
+    """Draw deviations, and then stiffness, over time: of the outputs, and of poses in principal axes of both blocks."""
+    kinds, n = (kind_of(schedule.units, schedule.position.shape[1]), ROTATION), len(schedule.blocks)
+    for kind, block, spread, gains in zip(kinds, schedule.blocks, bands[:n], bands[n:], strict=False):
+        covariance = schedule.covariance[:, block, block]
+        variance = np.diagonal(covariance, axis1=1, axis2=2) if n == 1 else principal(covariance)
+        names: Sequence[str] = [f"{kind.where} {name}" for name in schedule_names(schedule)]
+        names = names if n == 1 else axis_names(schedule, variance.shape[1])
+        plot_outputs(schedule.time, kind.scale * np.sqrt(variance), spread, names, SERIES if n == 1 else [MODEL])
         spread.set(ylabel=f"1 sd [{kind.unit}]", ylim=(0.0, None))
         plot_stiffness(schedule, gains, block)
-        gains.set_ylim(0.0, None)
 
 
 def label_space(ax: Any, names: Sequence[str], unit: str | None) -> None:
