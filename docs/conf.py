@@ -31,7 +31,7 @@ myst_url_schemes = ["http", "https"]
 html_theme = "pydata_sphinx_theme"
 html_title = "torch_pbd"
 html_show_sourcelink = False
-html_theme_options = {"show_prev_next": False, "navigation_with_keys": False, "header_links_before_dropdown": 4}
+html_theme_options = {"show_prev_next": False, "navigation_with_keys": False, "header_links_before_dropdown": 6}
 # Pages without pages below them have no list of those.
 html_sidebars = {page.stem: [] for page in Path(__file__).parent.glob("*.md")}
 html_static_path = ["static"]

@@ -2,7 +2,7 @@
 A tool that turns
 =================
 
-Recorded poses are positions and quaternions. `rotation=` names the four columns of a quaternion, in the order w x y z;
+Recorded poses are positions and quaternions. ``rotation=`` names the four columns of a quaternion, as w x y z;
 learned are rotation vectors around the mean rotation. Stiffness has limits of its own for rotations, in Nm/rad, and the
 schedule is in world axes: twists, 6 x 6 gains, orientations.
 
