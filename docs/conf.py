@@ -20,6 +20,7 @@ exclude_patterns = ["_build"]
 templates_path = ["templates"]
 default_role = "autolink"  # names that are public become links, others stay as they are
 nitpicky = True
+smartquotes = False  # default="m" is code
 
 autosummary_generate = True
 autodoc_typehints = "none"  # the docstrings say more

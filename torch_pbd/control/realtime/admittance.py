@@ -48,7 +48,7 @@ class RealTimeAdmittance:
     ----------
     schedule : Schedule
     mass : float or array_like of shape (d, d), default=None
-        Virtual mass in kg, for poses also kg m and kg m2; None takes the schedule's, row by row, or 1 kg. Another one
+        Virtual mass in kg, for poses also kg m and kg m^2; None takes the schedule's, row by row, or 1 kg. Another one
         is told.
     rate, max_step : float, default=1000.0, 0.01
         Rate of the loop in 1/s and longest tick in s. Over a longer one the robot has braked, or rests at its last
