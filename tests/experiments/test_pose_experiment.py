@@ -1,5 +1,7 @@
 """The experiment with a tool that turns: what it prints is what the runs show."""
 
+import sys
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -136,6 +138,17 @@ def test_without_pushes_there_is_no_ratio_and_the_mass_is_the_controllers(contro
     text = run_poses({"a": heavy}, recorded, RunFolder(tmp_path, {}), peak=0.0, torque=0.0, rate=100.0, arm="none")
     assert text.split("\n")[3].split()[3:5] == ["0", "0"]
     assert " s; of 3 kg\n" in text
+
+
+def test_without_mujoco_the_extra_is_told_before_anything_is_learned(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    assert main(["experiment", "--task", "peg", "--output", str(tmp_path)]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(
+        "torch-pbd: arm: it needs mujoco, which is not installed: pip install 'torch_pbd[robot]'. Or"
+    )
+    assert said.endswith("--arm none.\n")
+    assert not list(tmp_path.rglob("*.safetensors"))
 
 
 @pytest.mark.slow

@@ -31,6 +31,16 @@ def refused(data, output, capsys):
     return shown.err
 
 
+def test_a_missing_extra_is_one_line(tmp_path, monkeypatch, capsys):
+    (tmp_path / "a.parquet").write_bytes(b"PAR1")
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
+    assert main(["inspect", str(tmp_path / "a.parquet"), "--output", str(tmp_path / "run")]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert said.endswith("pip install 'torch_pbd[parquet]'\n")
+
+
 def test_47_a_file_in_the_place_of_the_folder_is_told_before_the_work(data, tmp_path, capsys):
     (tmp_path / "file").write_text("mine")
     assert "File exists" in refused(data, tmp_path / "file", capsys)

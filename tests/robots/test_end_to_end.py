@@ -20,7 +20,8 @@ def check(outcomes, peaks):
 
 @pytest.mark.slow
 def test_the_made_pose_task():
-    check(list(arm_pushes.pushed(arm_pushes.peg(50.0), n_directions=1)), peaks=[0.02, 0.04])
+    # At 50 N/m a push takes the tool 64 mm away, where the arm's inertia is another: its path is then 11 % off.
+    check(list(arm_pushes.pushed(arm_pushes.peg(200.0), n_directions=1)), peaks=[0.01, 0.04])
 
 
 @pytest.mark.slow

@@ -219,7 +219,13 @@ def experiment(options: Any, folder: Any) -> str:
 
 def _pose_experiment(options: Any, demonstrations: Any, folder: Any) -> str:
     from torch_pbd.experiments.poses import run_poses
+    from torch_pbd.extras import optional
 
+    if options.arm == "panda":
+        try:
+            optional("mujoco", "robot", "it")  # before anything is learned
+        except ModuleNotFoundError as error:
+            raise ConfigError(f"arm: {error} Or leave the arm out by --arm none.") from error
     pushes = f"{options.push:g} N along and {options.torque:g} Nm about each axis of the tool"
     say(f"pushes of {pushes},\nat 20 % and 80 % of the movement; K is the stiffness there\n")
     sizes = {"peak": options.push, "torque": options.torque, "rate": options.rate}

@@ -43,6 +43,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _complain(str(error) or "the memory is not enough", _ERROR)
     except (ArithmeticError, RuntimeError) as error:  # from deep inside, where the message alone says little
         return _complain(f"{type(error).__name__}: {' '.join(str(error).split())}", _ERROR)
+    except ModuleNotFoundError as error:
+        if error.name is not None:  # of Python's own, not one of ours that tells which extra to install
+            raise
+        return _complain(str(error), _USAGE)
     except KeyboardInterrupt as stop:
         return _complain("; ".join(("interrupted", *stop.args)), _INTERRUPTED)
     except _Terminated as stop:
