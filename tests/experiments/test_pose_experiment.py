@@ -145,7 +145,7 @@ def test_without_mujoco_the_extra_is_told_before_anything_is_learned(tmp_path, m
     assert main(["experiment", "--task", "peg", "--output", str(tmp_path)]) == 2
     said = capsys.readouterr().err
     assert said.startswith(
-        "torch-pbd: arm: it needs mujoco, which is not installed: pip install 'torch_pbd[robot]'. Or"
+        "torch-pbd: arm: a Panda needs mujoco, which is not installed: pip install 'torch_pbd[robot]'. "
     )
     assert said.endswith("--arm none.\n")
     assert not list(tmp_path.rglob("*.safetensors"))

@@ -38,7 +38,7 @@ def test_a_missing_extra_is_one_line(tmp_path, monkeypatch, capsys):
     assert main(["inspect", str(tmp_path / "a.parquet"), "--output", str(tmp_path / "run")]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
-    assert said.endswith("pip install 'torch_pbd[parquet]'\n")
+    assert said.endswith("pip install 'torch_pbd[parquet]'.\n")
 
 
 def test_47_a_file_in_the_place_of_the_folder_is_told_before_the_work(data, tmp_path, capsys):

@@ -223,7 +223,7 @@ def _pose_experiment(options: Any, demonstrations: Any, folder: Any) -> str:
 
     if options.arm == "panda":
         try:
-            optional("mujoco", "robot", "it")  # before anything is learned
+            optional("mujoco", "robot", "a Panda")  # before anything is learned
         except ModuleNotFoundError as error:
             raise ConfigError(f"arm: {error} Or leave the arm out by --arm none.") from error
     pushes = f"{options.push:g} N along and {options.torque:g} Nm about each axis of the tool"
