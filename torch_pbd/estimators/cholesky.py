@@ -1,5 +1,6 @@
 """The Cholesky decomposition approach ("CD") of the paper, Section IV-D."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -33,6 +34,7 @@ _LARGEST_NOISE = 1e100  # in deviations of y: its square is a number
 _LOG_AMPLITUDE = 2.0
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class CholeskyCovRegressor(LatentCovarianceRegressor):
     """Covariance by Gaussian processes on the entries of its Cholesky factor (the paper's "CD").
 
@@ -121,42 +123,22 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
 
     _core_class = MeanAndCholesky
 
-    def __init__(
-        self,
-        *,
-        objective: str = "auto",
-        noise_scale: float | None = None,
-        diagonal: str = "auto",
-        bias_correction: bool = False,
-        latent_prior: bool = True,
-        solver: Solver = "auto",
-        kernel: KernelName = "squared_exponential",
-        prior: Prior = None,
-        length_scale: float | list[float] | None = None,
-        max_inputs: int = 256,
-        max_iter: int = 1000,
-        tol: float = 1e-4,
-        n_restarts: int = 2,
-        random_state: Any = 0,
-        device: str | None = None,
-        verbose: int = 0,
-    ) -> None:
-        self.objective = objective
-        self.noise_scale = noise_scale
-        self.diagonal = diagonal
-        self.bias_correction = bias_correction
-        self.latent_prior = latent_prior
-        self.solver = solver
-        self.kernel = kernel
-        self.prior = prior
-        self.length_scale = length_scale
-        self.max_inputs = max_inputs
-        self.max_iter = max_iter
-        self.tol = tol
-        self.n_restarts = n_restarts
-        self.random_state = random_state
-        self.device = device
-        self.verbose = verbose
+    objective: str = "auto"
+    noise_scale: float | None = None
+    diagonal: str = "auto"
+    bias_correction: bool = False
+    latent_prior: bool = True
+    solver: Solver = "auto"
+    kernel: KernelName = "squared_exponential"
+    prior: Prior = None
+    length_scale: float | list[float] | None = None
+    max_inputs: int = 256
+    max_iter: int = 1000
+    tol: float = 1e-4
+    n_restarts: int = 2
+    random_state: Any = 0
+    device: str | None = None
+    verbose: int = 0
 
     def _check_parameters(self) -> None:
         super()._check_parameters()

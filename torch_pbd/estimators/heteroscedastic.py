@@ -1,5 +1,6 @@
 """The recommended regressor: covariance by latent Gaussian processes that are integrated out."""
 
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal, Self
 
@@ -28,6 +29,7 @@ from torch_pbd.models.training import TrainingSet, default_prior_tril
 _DRAWN = 65536  # matrices drawn at a time: memory stays bounded
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class HeteroscedasticGPRegressor(CovarianceRegressor):
     """Mean and covariance by Gaussian processes, honest about what few demonstrations leave open.
 
@@ -130,36 +132,19 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
 
     _core_class, _learned = HeteroscedasticModel, {"effective_share_": checks.number}
 
-    def __init__(
-        self,
-        *,
-        kernel: KernelName | Literal["periodic"] = "squared_exponential",
-        period: float | list[float] | None = None,
-        prior: Prior = None,
-        length_scale: float | list[float] | None = None,
-        shared_length_scale: bool = False,
-        n_inducing: int | None = None,
-        max_inputs: int = 512,
-        max_iter: int = 100,
-        tol: float = 1e-3,
-        n_restarts: int = 0,
-        random_state: Any = 0,
-        device: str | None = None,
-        verbose: int = 0,
-    ) -> None:
-        self.kernel = kernel
-        self.period = period
-        self.prior = prior
-        self.length_scale = length_scale
-        self.shared_length_scale = shared_length_scale
-        self.n_inducing = n_inducing
-        self.max_inputs = max_inputs
-        self.max_iter = max_iter
-        self.tol = tol
-        self.n_restarts = n_restarts
-        self.random_state = random_state
-        self.device = device
-        self.verbose = verbose
+    kernel: KernelName | Literal["periodic"] = "squared_exponential"
+    period: float | list[float] | None = None
+    prior: Prior = None
+    length_scale: float | list[float] | None = None
+    shared_length_scale: bool = False
+    n_inducing: int | None = None
+    max_inputs: int = 512
+    max_iter: int = 100
+    tol: float = 1e-3
+    n_restarts: int = 0
+    random_state: Any = 0
+    device: str | None = None
+    verbose: int = 0
 
     def fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None = None) -> Self:
         """Learn mean and covariance.

@@ -1,6 +1,6 @@
 """Gaussian mixture regression: the baseline of the paper, and what many use today."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ _SMALLEST_RESIDUAL = 1e-6
 _DECIMALS = 7
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class GMMBaseline(CovarianceRegressor):
     """Gaussian mixture over [x, y] and Gaussian mixture regression.
 
@@ -77,30 +78,17 @@ class GMMBaseline(CovarianceRegressor):
     """
 
     _core_class = GaussianMixture
-    _regression: MixtureRegression | None = None
+    _regression = None
 
-    def __init__(
-        self,
-        *,
-        n_components: int = 5,
-        solver: str = "em",
-        reg_covar: float = 1e-6,
-        max_iter: int = 1000,
-        tol: float = 1e-7,
-        n_restarts: int = 2,
-        random_state: Any = 0,
-        device: str | None = None,
-        verbose: int = 0,
-    ) -> None:
-        self.n_components = n_components
-        self.solver = solver
-        self.reg_covar = reg_covar
-        self.max_iter = max_iter
-        self.tol = tol
-        self.n_restarts = n_restarts
-        self.random_state = random_state
-        self.device = device
-        self.verbose = verbose
+    n_components: int = 5
+    solver: str = "em"
+    reg_covar: float = 1e-6
+    max_iter: int = 1000
+    tol: float = 1e-7
+    n_restarts: int = 2
+    random_state: Any = 0
+    device: str | None = None
+    verbose: int = 0
 
     def _check_parameters(self) -> None:
         super()._check_parameters()

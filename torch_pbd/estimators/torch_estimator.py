@@ -119,7 +119,11 @@ class Fitted(NamedTuple):
 
 
 class TorchEstimator(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
-    """Base of regressors that keep what they learned in a torch module, ``module_``, on ``device``."""
+    """Base of regressors that keep what they learned in a torch module, ``module_``, on ``device``.
+
+    Estimators are dataclasses, whose fields are the parameters: scikit-learn asks of ``__init__`` that it store them
+    and do no more.
+    """
 
     device: str | None
     max_iter: int

@@ -1,6 +1,6 @@
 """The Wishart process ("WP") of the paper, Section IV-A."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -42,6 +42,7 @@ _CERTAIN = 1e-8  # ratio of noise: it keeps kernel matrices positive definite, a
 _SPREAD = {"empirical": 0.01, "random": 0.5}  # of the random part of whitened values at the start
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class WishartProcessRegressor(LatentCovarianceRegressor):
     """Covariance as a Wishart process, a sum of outer products of Gaussian process vectors ("WP").
 
@@ -120,40 +121,21 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
     _core_class, _learned = MeanAndWishart, {"df_": checks.count}
     _costly = "df or max_inputs"
 
-    def __init__(
-        self,
-        *,
-        objective: str = "auto",
-        df: int | str | None = None,
-        start: str = "empirical",
-        latent_prior: bool = True,
-        solver: Solver = "auto",
-        kernel: KernelName = "squared_exponential",
-        prior: Prior = None,
-        length_scale: float | list[float] | None = None,
-        max_inputs: int = 256,
-        max_iter: int = 1000,
-        tol: float = 1e-4,
-        n_restarts: int = 2,
-        random_state: Any = 0,
-        device: str | None = None,
-        verbose: int = 0,
-    ) -> None:
-        self.objective = objective
-        self.df = df
-        self.start = start
-        self.latent_prior = latent_prior
-        self.solver = solver
-        self.kernel = kernel
-        self.prior = prior
-        self.length_scale = length_scale
-        self.max_inputs = max_inputs
-        self.max_iter = max_iter
-        self.tol = tol
-        self.n_restarts = n_restarts
-        self.random_state = random_state
-        self.device = device
-        self.verbose = verbose
+    objective: str = "auto"
+    df: int | str | None = None
+    start: str = "empirical"
+    latent_prior: bool = True
+    solver: Solver = "auto"
+    kernel: KernelName = "squared_exponential"
+    prior: Prior = None
+    length_scale: float | list[float] | None = None
+    max_inputs: int = 256
+    max_iter: int = 1000
+    tol: float = 1e-4
+    n_restarts: int = 2
+    random_state: Any = 0
+    device: str | None = None
+    verbose: int = 0
 
     def _check_parameters(self) -> None:
         super()._check_parameters()
