@@ -2,19 +2,15 @@
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from scipy.stats import multivariate_normal
-from sklearn.base import BaseEstimator
-from sklearn.mixture import GaussianMixture
 
 from torch_pbd.checks import Floats
 from torch_pbd.data import make_paper_simulation, paper_covariance, paper_mean
 from torch_pbd.data.synthetic import Reading
 from torch_pbd.estimators.base import CovarianceRegressor
-from torch_pbd.estimators.mixture import GMMBaseline
 from torch_pbd.experiments.comparison import Score, compare_models, empirical_covariances
 from torch_pbd.experiments.resume import FinishedFits
 from torch_pbd.experiments.run_folder import RunFolder, format_table, slug
@@ -47,8 +43,7 @@ def table1(
 ) -> tuple[list[dict[str, Any]], dict[str, CovarianceRegressor]]:
     """Table I for each reading of eq. (14): medians over the seeds 0 to ``n_seeds - 1``.
 
-    A model whose name is one of the paper's (CD, WP, GMM 5, GMM 8) has the paper's figure beside it. Beside each
-    mixture is scikit-learn's with as many components, from starts of its own.
+    A model whose name is one of the paper's (CD, WP, GMM 5, GMM 8) has the paper's figure beside it.
 
     Returns
     -------
@@ -56,24 +51,19 @@ def table1(
     fitted : dict
         The models by name, fitted to the data of the first reading and seed 0.
     """
-    contenders: dict[str, Any] = {}
-    for name, model in models.items():
-        contenders[name] = model
-        if isinstance(model, GMMBaseline):
-            contenders[f"{name}, scikit-learn"] = ScikitLearnGMR(model.n_components)
     rows: list[dict[str, Any]] = []
     fitted: dict[str, CovarianceRegressor] = {}
     for reading in readings:
-        scores: dict[str, list[Score]] = {name: [] for name in contenders}
+        scores: dict[str, list[Score]] = {name: [] for name in models}
         for seed in range(n_seeds):
             data = make_paper_simulation(n_inputs, n_demos, reading=reading, random_state=seed)
             options: dict[str, Any] = {"max_folds": max_folds, "n_jobs": n_jobs, "finished": finished}
             truth = partial(paper_covariance, reading=reading)
-            for score in compare_models(contenders, *data, truth=truth, **options):
+            for score in compare_models(models, *data, truth=truth, **options):
                 scores[score.model].append(score)
                 fitted.setdefault(score.model, score.fitted)
         rows += [_row(reading, name, several) for name, several in scores.items()]
-    return rows, {name: fitted[name] for name in models}
+    return rows, fitted
 
 
 def _row(reading: str, name: str, scores: Sequence[Score]) -> dict[str, Any]:
@@ -130,58 +120,3 @@ def run_simulation(
         folder.write_figure(figure_of(model, X, y, name, readings[0]), slug(name))
     return format_table(rows)
 
-
-class ScikitLearnGMR(BaseEstimator):
-    """scikit-learn's mixture over the standardized [x, y], conditioned by Schur complements.
-
-    Parameters
-    ----------
-    n_components : int, default=5
-    random_state : int, default=0
-    """
-
-    def __init__(self, n_components: int = 5, random_state: int = 0) -> None:
-        self.n_components = n_components
-        self.random_state = random_state
-
-    def fit(self, X: Floats, y: Floats) -> Self:
-        """Fit on arrays (n, e) and (n, d), the best of three starts of k-means."""
-        joint = np.hstack([X, y])
-        self._shift, self._scale = joint.mean(axis=0), joint.std(axis=0)
-        self.mixture_ = GaussianMixture(
-            self.n_components, tol=1e-7, max_iter=1000, n_init=3, random_state=self.random_state
-        ).fit((joint - self._shift) / self._scale)
-        self._n_features = X.shape[1]
-        return self
-
-    def predict(self, X: Floats, return_cov: bool = False) -> Any:
-        """Mean (n, d), and with it the covariances (n, d, d)."""
-        e, mixture = self._n_features, self.mixture_
-        x = (X - self._shift[:e]) / self._scale[:e]
-        parts = list(zip(mixture.weights_, mixture.means_, mixture.covariances_, strict=True))
-        log_share = np.stack(
-            [np.log(w) + multivariate_normal(m[:e], c[:e, :e]).logpdf(x) for w, m, c in parts], axis=-1
-        )
-        # Less the largest logarithm: far from all components every density is zero.
-        share = np.exp(log_share - log_share.max(axis=-1, keepdims=True))
-        share /= share.sum(axis=-1, keepdims=True)
-        # Given x a component has the mean m_y + G' (x - m_x) and the covariance C_yy - C_yx G, with G = C_xx^-1 C_xy.
-        gains = [np.linalg.solve(c[:e, :e], c[:e, e:]) for _, _, c in parts]
-        means = np.stack([m[e:] + (x - m[:e]) @ gain for (_, m, _), gain in zip(parts, gains, strict=True)], axis=1)
-        within = np.stack([c[e:, e:] - c[e:, :e] @ gain for (_, _, c), gain in zip(parts, gains, strict=True)])
-        mean = np.einsum("nk,nkd->nd", share, means)
-        apart = means - mean[:, np.newaxis]
-        covariance = np.einsum("nk,kij->nij", share, within) + np.einsum("nk,nki,nkj->nij", share, apart, apart)
-        scale = self._scale[e:]
-        mean = self._shift[e:] + scale * mean
-        return (mean, covariance * scale[:, np.newaxis] * scale) if return_cov else mean
-
-    def predict_cov(self, X: Floats) -> Floats:
-        """Covariances (n, d, d)."""
-        return np.asarray(self.predict(X, return_cov=True)[1])
-
-    def score(self, X: Floats, y: Floats) -> float:
-        """Mean log density of the rows of y."""
-        mean, covariance = self.predict(X, return_cov=True)
-        rows = zip(y, mean, covariance, strict=True)
-        return float(np.mean([multivariate_normal(m, c).logpdf(target) for target, m, c in rows]))
