@@ -13,8 +13,6 @@ from torch_pbd.control import RotationLimits, Schedule, StiffnessLaw
 from torch_pbd.data import make_pose_demonstrations, pose_covariance, pose_mean
 from torch_pbd.exceptions import ConfigError
 from torch_pbd.experiments.poses import (
-    POSITION,
-    ROTATION,
     damping_ratio,
     empirical_covariances,
     push_rows,
@@ -23,6 +21,7 @@ from torch_pbd.experiments.poses import (
     with_panda,
 )
 from torch_pbd.experiments.run_folder import RunFolder
+from torch_pbd.plotting import POSITION, ROTATION
 
 LAW = StiffnessLaw(stiffness_min=100.0, stiffness_max=1500.0, rotation=RotationLimits(2.0, 60.0))
 

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.figure import Figure
 
+from torch_pbd import plotting
 from torch_pbd.control.controller import DMPController
 from torch_pbd.data import Demonstrations, make_tunnel_demonstrations, save_demonstrations
 from torch_pbd.estimators.base import CovarianceRegressor
@@ -13,7 +14,6 @@ from torch_pbd.experiments.recordings import write_fitted
 from torch_pbd.experiments.robot import draw_tunnel, run_robot
 from torch_pbd.experiments.run_folder import RunFolder, format_table
 from torch_pbd.metrics import mahalanobis_coverage
-from torch_pbd.plotting import MODEL, figure_grid, legend_below, plot_covariance_ellipses, plot_demonstrations
 
 _N_FRESH = 300  # demonstrations that stand for the truth: their covariance is known to 8 %
 _RATE = 25.0  # Hz; the movement has nothing of use above a few
@@ -53,16 +53,16 @@ def run_demo(models: Mapping[str, CovarianceRegressor], folder: RunFolder, *, n_
 
 def _tunnel_figure(models: Mapping[str, CovarianceRegressor], demonstrations: Demonstrations) -> Figure:
     """Mean and covariance of each model in the tunnel: the paper's Figure 6."""
-    figure, axes = figure_grid(1, len(models), (3.2 * len(models), 5.4), sharey=True)
+    figure, axes = plotting.figure_grid(1, len(models), (3.2 * len(models), 5.4), sharey=True)
     duration = demonstrations.times[0][-1]
     query, few = np.linspace(0.0, duration, 200)[:, np.newaxis], np.linspace(0.0, duration, 13)[:, np.newaxis]
     for ax, (name, model) in zip(axes[0], models.items(), strict=True):
         draw_tunnel(ax)
-        plot_demonstrations(demonstrations, [0, 1], ax)
+        plotting.plot_demonstrations(demonstrations, [0, 1], ax)
         # The spread along y is of micrometres: the ellipses show as lines across the path.
-        plot_covariance_ellipses(*model.predict(few, return_cov=True), ax, label="model: 2 sd, every 0.8 s")
-        ax.plot(*model.predict(query).T, color=MODEL, lw=1.5, label="model: mean")
+        plotting.plot_covariance_ellipses(*model.predict(few, return_cov=True), ax, label="model: 2 sd, every 0.8 s")
+        ax.plot(*model.predict(query).T, color=plotting.MODEL, lw=1.5, label="model: mean")
         ax.set_title(name)
         ax.label_outer()
-    legend_below(figure, axes[0, 0])
+    plotting.legend_below(figure, axes[0, 0])
     return figure

@@ -1,15 +1,15 @@
 """The robotic experiment with a tool that turns: learned poses on the plant of an arm, pushed by force and torque."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
 from matplotlib.figure import Figure
 from sklearn.base import clone
 
-from torch_pbd import rotations
+from torch_pbd import plotting, rotations
 from torch_pbd.checks import Floats
 from torch_pbd.control.controller import DMPController
 from torch_pbd.control.schedule.schedule import Schedule
@@ -22,25 +22,11 @@ from torch_pbd.exceptions import ConfigError
 from torch_pbd.experiments.resume import fit_once
 from torch_pbd.experiments.robot import PUSHES, pulse
 from torch_pbd.experiments.run_folder import RunFolder, format_table, slug
-from torch_pbd.plotting import (
-    DATA,
-    EMPIRICAL,
-    FORCE,
-    POSITION,
-    ROTATION,
-    Kind,
-    draw_pose_schedule,
-    draw_recorded_poses,
-    figure_grid,
-    legend_below,
-    plot_outputs,
-    pose_panels,
-    principal,
-)
 
 Arm = Literal["panda", "none"]
 
 _TOOL = "xyz"
+_FIGURE = partial(Figure, layout="constrained")
 _ROWS = 50.0  # Hz; along a path the inertia of an arm changes with its joints, within seconds
 _N_STEPS = 101
 
@@ -57,16 +43,16 @@ class PoseRun:
     torques: tuple[Rollout, ...]
     report: StabilityReport
 
-    def along(self, values: Floats, kind: Kind) -> Floats:
+    def along(self, values: Floats, kind: plotting.Kind) -> Floats:
         """Matrices (n, 6, 6), or vectors (n, 6), in each axis (n, 3) of the tool, in the outputs of a kind."""
         axes = _axes(self.schedule)
         if values.ndim == 3:
             return np.einsum("nia,nij,nja->na", axes, values[:, kind.outputs, kind.outputs], axes)
         return np.einsum("nia,ni->na", axes, values[:, kind.outputs])
 
-    def moved(self, kind: Kind) -> Floats:
+    def moved(self, kind: plotting.Kind) -> Floats:
         """Displacement (n, 3) by a push in each axis of the tool, along it, against the run without; in units shown."""
-        rollouts = self.forces if kind is POSITION else self.torques
+        rollouts = self.forces if kind is plotting.POSITION else self.torques
         moves = [self.along(run.deviation - self.unpushed.deviation, kind)[:, i] for i, run in enumerate(rollouts)]
         return kind.scale * np.stack(moves, axis=1)
 
@@ -89,7 +75,7 @@ def run_poses(
     for name, controller in controllers.items():
         fitted, _ = fit_once(clone(controller), demonstrations, finished=folder.finished)
         run = pushed(fitted, rate, peak, torque, arm)
-        rows += [row for kind in (POSITION, ROTATION) for row in push_rows(name, run, kind)]
+        rows += [row for kind in (plotting.POSITION, plotting.ROTATION) for row in push_rows(name, run, kind)]
         plain = damping_ratio(run.schedule, run.planned.damping)
         mass = f"{fitted.mass:g} kg" if np.ndim(fitted.mass) == 0 else "the mass of the controller"
         note = f"a damping made for {mass} would have a ratio of {plain:.2f} here" if arm != "none" else f"of {mass}"
@@ -98,7 +84,8 @@ def run_poses(
     folder.write_metrics(rows)
     folder.write_text("stability.txt", "\n\n".join(reports) + "\n")
     tables = [
-        format_table([_shown(row, kind) for row in rows if row["push"] == kind.push]) for kind in (POSITION, ROTATION)
+        format_table([_shown(row, kind) for row in rows if row["push"] == kind.push])
+        for kind in (plotting.POSITION, plotting.ROTATION)
     ]
     return "\n\n".join([*tables, *reports])
 
@@ -110,14 +97,15 @@ def pushed(controller: DMPController, rate: float, peak: float, torque: float, a
     # As torque control of an arm, which feeds its inertia times the acceleration forward.
     plant = AdmittancePlant(None, feed_forward=True)
 
-    def run(largest: float, kind: Kind, axis: int) -> Rollout:
+    def run(largest: float, kind: plotting.Kind, axis: int) -> Rollout:
         wrench = _wrench(schedule, largest, kind, axis)
         return simulate_schedule(schedule, plant, wrench, rate, random_state=0)
 
     forces, torques = (
-        tuple(run(largest, kind, axis) for axis in range(3)) for largest, kind in ((peak, POSITION), (torque, ROTATION))
+        tuple(run(largest, kind, axis) for axis in range(3))
+        for largest, kind in ((peak, plotting.POSITION), (torque, plotting.ROTATION))
     )
-    return PoseRun(controller, planned, schedule, run(0.0, POSITION, 0), forces, torques, schedule.certify())
+    return PoseRun(controller, planned, schedule, run(0.0, plotting.POSITION, 0), forces, torques, schedule.certify())
 
 
 def with_panda(schedule: Schedule) -> Schedule:
@@ -146,7 +134,7 @@ def damping_ratio(schedule: Schedule, damping: Floats) -> float:
     return float((-modes.real / np.abs(modes)).min())
 
 
-def push_rows(name: str, run: PoseRun, kind: Kind) -> list[dict[str, Any]]:
+def push_rows(name: str, run: PoseRun, kind: plotting.Kind) -> list[dict[str, Any]]:
     """Rows of the table: what the early and the late push do in each axis of the tool, and stiffness there."""
     moved, stiffness = np.abs(run.moved(kind)), run.along(run.schedule.stiffness, kind)
     half = len(run.schedule) // 2
@@ -155,19 +143,19 @@ def push_rows(name: str, run: PoseRun, kind: Kind) -> list[dict[str, Any]]:
     for axis, letter in enumerate(_TOOL):
         first, second = float(moved[:half, axis].max()), float(moved[half:, axis].max())
         row: dict[str, Any] = {"controller": name, "push": kind.push, "axis": f"tool {letter}", "unit": kind.unit}
-        row |= {"early": first, "late": second, "ratio": first / second if second else math.nan}
+        row |= {"early": first, "late": second, "ratio": first / second if second else np.nan}
         rows.append(row | {"K early": float(stiffness[early, axis]), "K late": float(stiffness[late, axis])})
     return rows
 
 
-def _shown(row: Mapping[str, Any], kind: Kind) -> dict[str, Any]:
+def _shown(row: Mapping[str, Any], kind: plotting.Kind) -> dict[str, Any]:
     """Row as it is printed."""
     units = {"early": kind.unit, "late": kind.unit, "K early": kind.stiffness_unit, "K late": kind.stiffness_unit}
     names = {key: f"{key} [{unit}]" for key, unit in units.items()} | {"axis": f"{kind.push} {kind.where}"}
     return {names.get(key, key): value for key, value in row.items() if key not in ("push", "unit")}
 
 
-def _wrench(schedule: Schedule, largest: float, kind: Kind, axis: int) -> Floats:
+def _wrench(schedule: Schedule, largest: float, kind: plotting.Kind, axis: int) -> Floats:
     """Wrenches (n, 6): pulses of a squared sine in an axis that the tool has in their middle."""
     wrench, phase = np.zeros((len(schedule), 6)), (schedule.time - schedule.time[0]) / schedule.duration
     for row in _push_rows(schedule):
@@ -185,32 +173,31 @@ def _write(run: PoseRun, name: str, demonstrations: Demonstrations, folder: RunF
     folder.write_figure(schedule_figure(run, demonstrations, name), f"{file}_figure7_variability")
     folder.write_figure(pushes_figure(run, name), f"{file}_figure8_pushes")
     folder.write_model(run.controller, f"{file}_controller")
-    target = folder.path / "schedule"
-    target.mkdir(exist_ok=True)
-    run.schedule.save(target / f"{file}.npz")
-    run.schedule.resample(100.0).save(target / f"{file}_100hz.csv")
+    folder.write_schedule(run.schedule, file)
 
 
 def task_figure(demonstrations: Demonstrations) -> Figure:
     """Demonstrated paths with frames of the tool, and rotations over time: Figure 6."""
-    figure, space, bands = pose_panels(3, _figure)
-    draw_recorded_poses(demonstrations, space[0], bands)
-    legend_below(figure, space)
+    figure, space, bands = plotting.pose_panels(3, _FIGURE)
+    plotting.draw_recorded_poses(demonstrations, space[0], bands)
+    plotting.legend_below(figure, space)
     return figure
 
 
 def schedule_figure(run: PoseRun, demonstrations: Demonstrations, name: str) -> Figure:
     """Planned path, deviations and empirical ones in principal axes, and stiffness there, of both blocks: Figure 7."""
-    figure, (space,), bands = pose_panels(4, _figure)
+    figure, (space,), bands = plotting.pose_panels(4, _FIGURE)
     for path in demonstrations.to_poses()[0]:
-        space.plot(*path.T, color=DATA, lw=0.8)
-    draw_pose_schedule(run.schedule, space, bands)
+        space.plot(*path.T, color=plotting.DATA, lw=0.8)
+    plotting.draw_pose_schedule(run.schedule, space, bands)
     phase, covariances = empirical_covariances(demonstrations)
-    for kind, band in zip((POSITION, ROTATION), bands, strict=False):
-        deviation = kind.scale * np.sqrt(principal(covariances[:, kind.outputs, kind.outputs]))
-        plot_outputs(run.schedule.duration * phase, deviation, band, ["empirical", "_", "_"], [EMPIRICAL])
+    for kind, band in zip((plotting.POSITION, plotting.ROTATION), bands, strict=False):
+        deviation = kind.scale * np.sqrt(plotting.principal(covariances[:, kind.outputs, kind.outputs]))
+        plotting.plot_outputs(
+            run.schedule.duration * phase, deviation, band, ["empirical", "_", "_"], [plotting.EMPIRICAL]
+        )
     bands[0].set_title(name, fontsize=10)
-    legend_below(figure, [space, *bands])
+    plotting.legend_below(figure, [space, *bands])
     return figure
 
 
@@ -223,23 +210,19 @@ def empirical_covariances(demonstrations: Demonstrations) -> tuple[Floats, Float
     return aligned.times[0], np.einsum("kni,knj->nij", deviations, deviations) / (len(demonstrations) - 1)
 
 
-def _figure(size: tuple[float, float]) -> Figure:
-    return Figure(figsize=size, layout="constrained")
-
-
 def pushes_figure(run: PoseRun, name: str) -> Figure:
     """Deviation, push and stiffness in each axis of the tool over time, of forces and of torques: Figure 8."""
-    figure, grid = figure_grid(3, 2, (9.6, 6.6), sharex=True)
+    figure, grid = plotting.figure_grid(3, 2, (9.6, 6.6), sharex=True)
     time, labels = run.schedule.time, [f"tool {letter}" for letter in _TOOL]
-    for kind, column in zip((POSITION, ROTATION), grid.T, strict=True):
+    for kind, column in zip((plotting.POSITION, plotting.ROTATION), grid.T, strict=True):
         above, middle, below = column
-        plot_outputs(time, run.moved(kind), above, labels)
+        plotting.plot_outputs(time, run.moved(kind), above, labels)
         above.set_ylabel(f"moved [{kind.unit}]")
-        rollout = (run.forces if kind is POSITION else run.torques)[0]
-        middle.plot(time, np.linalg.norm(rollout.force, axis=1), color=FORCE, lw=1.5, label="push")
+        rollout = (run.forces if kind is plotting.POSITION else run.torques)[0]
+        middle.plot(time, np.linalg.norm(rollout.force, axis=1), color=plotting.FORCE, lw=1.5, label="push")
         middle.set_ylabel(f"{kind.push} [{kind.push_unit}]")
-        plot_outputs(time, run.along(run.schedule.stiffness, kind), below, labels)
+        plotting.plot_outputs(time, run.along(run.schedule.stiffness, kind), below, labels)
         below.set(xlabel="time [s]", ylabel=f"stiffness [{kind.stiffness_unit}]", ylim=(0.0, None))
         above.set_title(f"{name}: pushed {kind.where} each axis", fontsize=10)
-    legend_below(figure, grid[:, 0])
+    plotting.legend_below(figure, grid[:, 0])
     return figure

@@ -7,19 +7,11 @@ from typing import Any, Literal
 import numpy as np
 from matplotlib.figure import Figure
 
+from torch_pbd import plotting
 from torch_pbd.data import Demonstrations
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.experiments.comparison import compare_models
 from torch_pbd.experiments.run_folder import RunFolder, format_table, slug
-from torch_pbd.plotting import (
-    equal_scales,
-    figure_grid,
-    legend_below,
-    output_label,
-    plot_covariance_ellipses,
-    plot_demonstrations,
-    plot_model_bands,
-)
 
 Align = Literal["auto", "none", "phase", "dtw"]
 Input = Literal["time", "phase"]
@@ -51,18 +43,18 @@ def figure_of(model: CovarianceRegressor, demonstrations: Demonstrations, name: 
     n_outputs = demonstrations.n_outputs
     figure, axes = _panels(n_outputs + (n_outputs == 2), 3.3)
     X, y, _ = demonstrations.stack(input)
-    plot_model_bands(model, X, y, axes[:n_outputs])
+    plotting.plot_model_bands(model, X, y, axes[:n_outputs])
     for output, ax in enumerate(axes[:n_outputs]):
         if input == "time":
-            plot_demonstrations(demonstrations, [output], ax)
+            plotting.plot_demonstrations(demonstrations, [output], ax)
         else:
-            ax.set(xlabel="phase", ylabel=output_label(demonstrations, output))
-    legend_below(figure, axes[0])
+            ax.set(xlabel="phase", ylabel=plotting.output_label(demonstrations, output))
+    plotting.legend_below(figure, axes[0])
     if n_outputs == 2:
-        plot_demonstrations(demonstrations, [0, 1], axes[2])
+        plotting.plot_demonstrations(demonstrations, [0, 1], axes[2])
         query = np.linspace(X.min(), X.max(), 15)[:, np.newaxis]
-        plot_covariance_ellipses(*model.predict(query, return_cov=True), axes[2])
-        equal_scales(axes[2])
+        plotting.plot_covariance_ellipses(*model.predict(query, return_cov=True), axes[2])
+        plotting.equal_scales(axes[2])
         axes[2].set_title("2 sd ellipses", fontsize=10)
     figure.suptitle(name)
     return figure
@@ -73,7 +65,7 @@ def figure_of_recordings(demonstrations: Demonstrations, name: str) -> Figure:
     n = min(demonstrations.n_outputs, 9)
     figure, axes = _panels(n, 2.6)
     for output, ax in enumerate(axes):
-        plot_demonstrations(demonstrations, [output], ax)
+        plotting.plot_demonstrations(demonstrations, [output], ax)
     figure.suptitle(name if n == demonstrations.n_outputs else f"{name}: 9 of {demonstrations.n_outputs} outputs")
     return figure
 
@@ -82,7 +74,7 @@ def _panels(n: int, height: float) -> tuple[Figure, list[Any]]:
     """Figure with n Axes in three columns, 4 by ``height`` inches each."""
     n_columns = min(3, n)
     n_rows = -(-n // n_columns)
-    figure, grid = figure_grid(n_rows, n_columns, (4.0 * n_columns, height * n_rows))
+    figure, grid = plotting.figure_grid(n_rows, n_columns, (4.0 * n_columns, height * n_rows))
     for ax in grid.flat[n:]:
         ax.set_visible(False)
     return figure, list(grid.flat[:n])

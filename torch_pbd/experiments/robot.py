@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 from sklearn.base import clone
 
+from torch_pbd import plotting
 from torch_pbd.checks import Floats
 from torch_pbd.control.controller import DMPController
 from torch_pbd.control.primitive.units import in_si
@@ -19,22 +19,6 @@ from torch_pbd.control.stability.report import StabilityReport
 from torch_pbd.data import Demonstrations, tunnel_center, tunnel_half_width
 from torch_pbd.experiments.resume import FinishedFits, fit_once
 from torch_pbd.experiments.run_folder import RunFolder, format_table, slug
-from torch_pbd.plotting import (
-    DATA,
-    MODEL,
-    draw_edges,
-    equal_scales,
-    figure_grid,
-    legend_below,
-    output_label,
-    plot_covariance_ellipses,
-    plot_demonstrations,
-    plot_rollout,
-    plot_std_band,
-    plot_stiffness,
-    readable_unit,
-    schedule_names,
-)
 
 PUSHES = (0.2, 0.8)  # of the duration: 2 s and 8 s of the paper's 10 s
 _PUSH_LENGTH = 0.08  # of the duration: 0.8 s
@@ -84,14 +68,14 @@ def run_controller(
 
 def push_row(name: str, run: Run) -> dict[str, Any]:
     """Row of the table: displacement by the two pushes, against the run without them, and stiffness there."""
-    unit, scale = readable_unit(run.schedule.units)
+    unit, scale = plotting.readable_unit(run.schedule.units)
     time, stiffness = run.schedule.time, run.schedule.stiffness
     early, late = (int(np.searchsorted(time, centre * run.controller.duration_)) for centre in PUSHES)
     # Against the run without pushes: how far the robot lags behind by itself does not count.
     deviation = np.abs(run.rollout.position - run.unpushed.position)[:, 0]
     half = len(time) // 2
     first, second = scale * deviation[:half].max(), scale * deviation[half:].max()
-    names = schedule_names(run.schedule)
+    names = plotting.schedule_names(run.schedule)
     row = {"controller": name, f"early [{unit}]": float(first), f"late [{unit}]": float(second)}
     row |= {"ratio": float(first / second)}
     for output, label in list(enumerate(names))[:2]:
@@ -145,10 +129,7 @@ def _write(run: Run, name: str, demonstrations: Demonstrations, folder: RunFolde
     folder.write_figure(variability_figure(run, demonstrations, name), f"{file}_figure7_variability")
     folder.write_figure(pushes_figure(run, name), f"{file}_figure8_pushes")
     folder.write_model(run.controller, f"{file}_controller")  # the regressor may have a file of the name
-    target = folder.path / "schedule"
-    target.mkdir(exist_ok=True)
-    run.schedule.save(target / f"{file}.npz")
-    run.schedule.resample(100.0).save(target / f"{file}_100hz.csv")
+    folder.write_schedule(run.schedule, file)
 
 
 _BOXES = (
@@ -161,23 +142,18 @@ _BOXES = (
     ("admittance, eq. (15)\nrobot", (8.7, 1.5)),
 )
 _ARROWS = ((0, 1), (1, 2), (1, 3), (2, 4), (3, 5), (4, 6), (5, 6))
-_BOX = (1.6, 0.72)  # width and height
 
 
 def framework_figure() -> Figure:
     """Way from demonstrations to motion and gains: Figure 5."""
-    figure, ((ax,),) = figure_grid(1, 1, (9.6, 3.0))
+    figure, ((ax,),) = plotting.figure_grid(1, 1, (9.6, 3.0))
     ax.set_axis_off()
     ax.set(xlim=(0.0, 9.6), ylim=(0.0, 3.0))
-    for text, (x, y) in _BOXES:
-        corner, style = (x - _BOX[0] / 2.0, y - _BOX[1] / 2.0), "round,pad=0,rounding_size=0.06"
-        ax.add_patch(FancyBboxPatch(corner, *_BOX, boxstyle=style, fc="white", ec=MODEL, lw=1.4, zorder=3))
-        ax.text(x, y, text, ha="center", va="center", fontsize=8, zorder=4)
+    frame = {"boxstyle": "round,pad=0.5", "fc": "white", "ec": plotting.MODEL, "lw": 1.4}
+    boxes = [ax.text(*at, text, ha="center", va="center", fontsize=8, bbox=frame) for text, at in _BOXES]
     for start, stop in _ARROWS:
-        (x, y), (to_x, to_y) = _BOXES[start][1], _BOXES[stop][1]
-        last = stop == len(_BOXES) - 1  # reached from above and below, the others from the left
-        head = (to_x, to_y + np.sign(y - to_y) * _BOX[1] / 2.0) if last else (to_x - _BOX[0] / 2.0, to_y)
-        ax.add_patch(FancyArrowPatch((x + _BOX[0] / 2.0, y), head, arrowstyle="-|>", mutation_scale=14, color="black"))
+        ends = {"patchA": boxes[start].get_bbox_patch(), "patchB": boxes[stop].get_bbox_patch()}
+        ax.annotate("", _BOXES[stop][1], _BOXES[start][1], arrowprops={"arrowstyle": "-|>", **ends})
     return figure
 
 
@@ -185,24 +161,24 @@ def task_figure(
     controller: DMPController, demonstrations: Demonstrations, name: str, *, in_tunnel: bool = False
 ) -> Figure:
     """Demonstrations, reproduction and, of positions, the inferred variability as ellipses: Figure 6."""
-    figure, ((ax,),) = figure_grid(1, 1, (5.2, 6.0))
+    figure, ((ax,),) = plotting.figure_grid(1, 1, (5.2, 6.0))
     if in_tunnel:
         draw_tunnel(ax)
-    plot_demonstrations(demonstrations, range(min(demonstrations.n_outputs, 2)), ax)
+    plotting.plot_demonstrations(demonstrations, range(min(demonstrations.n_outputs, 2)), ax)
     time = np.linspace(0.0, controller.duration_, 400)
     path = controller.reproduction_.motion(time)[0]
     in_plane = path.shape[1] > 1
     across, up = path[:, :2].T if in_plane else (time, path[:, 0])
-    ax.plot(across, up, color=MODEL, lw=1.8, label="reproduction", zorder=4)
+    ax.plot(across, up, color=plotting.MODEL, lw=1.8, label="reproduction", zorder=4)
     if controller.variability == "position" and in_plane:
         some = np.linspace(0.0, controller.duration_, _N_ELLIPSES)
         covariance = controller.covariance_.predict_cov(controller.phase(some))[:, :2, :2]
         centres = controller.reproduction_.motion(some)[0][:, :2]
-        plot_covariance_ellipses(centres, covariance, ax, label="inferred: 2 sd")
+        plotting.plot_covariance_ellipses(centres, covariance, ax, label="inferred: 2 sd")
     ax.set_title(name, fontsize=10)
     if in_plane and not in_tunnel:
-        equal_scales(ax)
-    legend_below(figure, ax, 2)
+        plotting.equal_scales(ax)
+    plotting.legend_below(figure, ax, 2)
     return figure
 
 
@@ -221,7 +197,7 @@ def variability_figure(run: Run, demonstrations: Demonstrations, name: str) -> F
     varying = controller.varying(movements)
     in_position = controller.variability == "position"
     n_shown = min(demonstrations.n_outputs, _MOST_OUTPUTS)
-    figure, grid = figure_grid(n_shown + 1, 1, (6.4, 1.9 * (n_shown + 1)), sharex=True)
+    figure, grid = plotting.figure_grid(n_shown + 1, 1, (6.4, 1.9 * (n_shown + 1)), sharex=True)
     axes = grid[:, 0]
     covariance = controller.covariance_.predict_cov(controller.phase(movements.time))
     centre, deviation = varying.mean(axis=0), varying.std(axis=0, ddof=1)
@@ -232,23 +208,23 @@ def variability_figure(run: Run, demonstrations: Demonstrations, name: str) -> F
             duration = controller.duration_
             curves = [((t - t[0]) / (t[-1] - t[0]) * duration, position[:, output]) for t, position in demonstrations]
         for time, curve in curves:
-            ax.plot(time, curve, color=DATA, lw=0.7, alpha=0.8, zorder=1)
+            ax.plot(time, curve, color=plotting.DATA, lw=0.7, alpha=0.8, zorder=1)
         ax.lines[0].set_label("demonstrations")
-        plot_std_band(movements.time, centre[:, output], inferred[:, output], ax, label="mean, inferred 2 sd")
-        draw_edges(movements.time, centre[:, output], deviation[:, output], ax, "empirical 2 sd")
+        plotting.plot_std_band(movements.time, centre[:, output], inferred[:, output], ax, label="mean, inferred 2 sd")
+        plotting.draw_edges(movements.time, centre[:, output], deviation[:, output], ax, "empirical 2 sd")
         name_of = demonstrations.names[output]
-        ax.set_ylabel(output_label(demonstrations, output) if in_position else f"forcing {name_of}")
-    plot_stiffness(run.schedule.resample(200.0 / controller.duration_), axes[-1])
+        ax.set_ylabel(plotting.output_label(demonstrations, output) if in_position else f"forcing {name_of}")
+    plotting.plot_stiffness(run.schedule.resample(200.0 / controller.duration_), axes[-1])
     axes[0].set_title(name, fontsize=10)
-    legend_below(figure, [axes[0], axes[-1]])
+    plotting.legend_below(figure, [axes[0], axes[-1]])
     return figure
 
 
 def pushes_figure(run: Run, name: str) -> Figure:
     """Deviation, force and stiffness along the first output over time: Figure 8."""
-    figure, axes = figure_grid(3, 1, (6.4, 6.0), sharex=True)
-    names = schedule_names(run.schedule)
-    plot_rollout(run.rollout, axes[:, 0], outputs=[0], names=names, unpushed=run.unpushed)
+    figure, axes = plotting.figure_grid(3, 1, (6.4, 6.0), sharex=True)
+    names = plotting.schedule_names(run.schedule)
+    plotting.plot_rollout(run.rollout, axes[:, 0], outputs=[0], names=names, unpushed=run.unpushed)
     axes[0, 0].set_title(name, fontsize=10)
-    legend_below(figure, axes[:, 0])
+    plotting.legend_below(figure, axes[:, 0])
     return figure

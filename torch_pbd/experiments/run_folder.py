@@ -146,6 +146,13 @@ class RunFolder:
         save(model, target)
         return target
 
+    def write_schedule(self, schedule: Any, name: str) -> None:
+        """Write ``schedule/<name>.npz``, and a row each 10 ms as a table beside it, to be looked at."""
+        target = self.path / "schedule"
+        target.mkdir(exist_ok=True)
+        schedule.save(target / f"{name}.npz")
+        schedule.resample(100.0).save(target / f"{name}_100hz.csv")
+
 
 def _check_files(folder: Path) -> None:
     """Check that what is named as files of results are is none but files, which can be replaced."""

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from torch_pbd import plotting
 from torch_pbd.checks import Floats
 from torch_pbd.data import make_paper_simulation, paper_covariance, paper_mean
 from torch_pbd.data.synthetic import Reading
@@ -14,15 +15,6 @@ from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.experiments.comparison import Score, compare_models, empirical_covariances
 from torch_pbd.experiments.resume import FinishedFits
 from torch_pbd.experiments.run_folder import RunFolder, format_table, slug
-from torch_pbd.plotting import (
-    EMPIRICAL,
-    MODEL,
-    TRUTH,
-    figure_grid,
-    legend_below,
-    plot_covariance_ellipses,
-    plot_model_bands,
-)
 
 # Table I: mean squared error on Cholesky entries, and seconds on "a standard laptop in Matlab".
 PAPER_TABLE_1 = {"CD": (3.54e-13, 0.167), "WP": (0.0206, 8.64), "GMM 8": (1.05, 0.515), "GMM 5": (7.71, 0.237)}
@@ -85,24 +77,28 @@ def _row(reading: str, name: str, scores: Sequence[Score]) -> dict[str, Any]:
 
 def figure_of(model: CovarianceRegressor, X: Floats, y: Floats, name: str, reading: Reading) -> Figure:
     """One of Figures 1 to 3: the outputs over xi, and the covariances at the inputs, beyond the data too."""
-    figure, ((*bands, plane),) = figure_grid(1, 3, (12.0, 4.2))
+    figure, ((*bands, plane),) = plotting.figure_grid(1, 3, (12.0, 4.2))
 
     def truth(xi: Floats) -> tuple[Floats, Floats]:
         variance = np.diagonal(paper_covariance(xi.clip(_LEAST_XI), reading=reading), axis1=1, axis2=2)
         return paper_mean(xi), np.where(xi > _LEAST_XI, np.sqrt(variance), np.nan)
 
-    plot_model_bands(model, X, y, bands, beyond=_BEYOND, true_std=truth)
+    plotting.plot_model_bands(model, X, y, bands, beyond=_BEYOND, true_std=truth)
     for output, ax in enumerate(bands):
         ax.set(xlabel="input xi", ylabel=f"output y{output + 1}")
     inputs, empirical = empirical_covariances(X, y)
     true = paper_covariance(inputs, reading=reading)
-    plot_covariance_ellipses(paper_mean(inputs), true, plane, color=TRUTH, label="truth", linestyle="--")
+    plotting.plot_covariance_ellipses(
+        paper_mean(inputs), true, plane, color=plotting.TRUTH, label="truth", linestyle="--"
+    )
     if empirical is not None:
         centres = np.stack([y[X[:, 0] == xi].mean(axis=0) for xi in inputs[:, 0]])
-        plot_covariance_ellipses(centres, empirical, plane, color=EMPIRICAL, label="empirical")
-    plot_covariance_ellipses(*model.predict(inputs, return_cov=True), plane, color=MODEL, label="model")
+        plotting.plot_covariance_ellipses(centres, empirical, plane, color=plotting.EMPIRICAL, label="empirical")
+    plotting.plot_covariance_ellipses(
+        *model.predict(inputs, return_cov=True), plane, color=plotting.MODEL, label="model"
+    )
     plane.set(xlabel="output y1", ylabel="output y2", title="2 sd ellipses at the inputs")
-    legend_below(figure, bands[0])
+    plotting.legend_below(figure, bands[0])
     figure.suptitle(f'{name} on eq. (14), reading "{reading}"')
     return figure
 
@@ -119,4 +115,3 @@ def run_simulation(
         folder.write_model(model, slug(name))
         folder.write_figure(figure_of(model, X, y, name, readings[0]), slug(name))
     return format_table(rows)
-
