@@ -1,19 +1,20 @@
 """Compare models on one data set: how well each repeats the data, and how well it predicts a demonstration."""
 
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from joblib import Parallel, delayed
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from sklearn.base import clone
 
 from torch_pbd.checks import Floats
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.experiments.resume import FinishedFits, fit_once
-from torch_pbd.experiments.sweep import left_out, mean_and_error, score_fold
-from torch_pbd.metrics import covariance_mse, relative_frobenius_error
+from torch_pbd.metrics import covariance_mse, mahalanobis_coverage, negative_log_likelihood, relative_frobenius_error
+from torch_pbd.movement import judge_movement
 from torch_pbd.movement.judging import MOVEMENT_STATISTICS
 
 
@@ -140,6 +141,40 @@ def compare_models(
     return scores
 
 
+def left_out(groups: NDArray[np.intp], max_folds: int | None = None) -> NDArray[np.intp]:
+    """Demonstrations to leave out, one by one: all, or some of them spread evenly; none where there is one only."""
+    demos = np.unique(groups)
+    n_folds = len(demos) if max_folds is None else min(max_folds, len(demos))
+    if len(demos) < 2 or n_folds < 1:
+        return demos[:0]
+    return demos[np.unique(np.linspace(0, len(demos) - 1, n_folds).round().astype(int))]
+
+
+def score_fold(
+    model: CovarianceRegressor,
+    X: Floats,
+    y: Floats,
+    groups: NDArray[np.intp],
+    demonstration: int,
+    finished: FinishedFits | None = None,
+    *,
+    whole: bool = False,
+) -> dict[str, float]:
+    """Fit without a demonstration, and score how well its rows are predicted, and if asked for it as a whole."""
+    left = groups == demonstration
+    # Of this thread: what else runs on the machine does not count.
+    start = time.thread_time()
+    model, _ = fit_once(model, X[~left], y[~left], groups[~left], finished=finished)
+    seconds = time.thread_time() - start
+    mean, covariance = model.predict(X[left], return_cov=True)
+    coverage = mahalanobis_coverage(mean.reshape(len(mean), -1), covariance, y[left], level=0.95)
+    # The score of a model of movements is that of the whole: here its rows are compared with those of regressors.
+    is_movement = hasattr(model, "score_demonstrations")
+    likelihood = -negative_log_likelihood(model, X[left], y[left]) if is_movement else model.score(X[left], y[left])
+    row = {"log_likelihood": likelihood, "coverage": float(coverage), "fit_seconds": seconds}
+    return row | judge_movement(model, X[left], y[left]) if whole else row
+
+
 def empirical_covariances(X: Floats, y: Floats) -> tuple[Floats, Floats | None]:
     """Distinct rows of X, and the covariance of y at each (divisor K - 1), or None if a row is alone."""
     inputs, index, counts = np.unique(X, axis=0, return_inverse=True, return_counts=True)
@@ -147,3 +182,11 @@ def empirical_covariances(X: Floats, y: Floats) -> tuple[Floats, Floats | None]:
         return inputs, None
     groups = np.split(y[np.argsort(index.ravel(), kind="stable")], np.cumsum(counts)[:-1])
     return inputs, np.stack([np.atleast_2d(np.cov(rows.T)) for rows in groups])
+
+
+def mean_and_error(values: ArrayLike) -> tuple[float, float]:
+    """Mean over the folds that have a result, and its standard error; NaN where those are too few."""
+    known = np.asarray(values, dtype=float)
+    known = known[~np.isnan(known)]
+    mean = float(known.mean()) if len(known) else np.nan
+    return mean, float(known.std(ddof=1) / len(known) ** 0.5) if len(known) > 1 else np.nan
