@@ -8,10 +8,11 @@ import pytest
 from arm_tasks import made_schedule, on_arm
 
 from torch_pbd import rotations
-from torch_pbd.robots import RobotLimits, RobotStoppedError, panda
+from torch_pbd.robots import HOME, RobotLimits, RobotStoppedError, panda
 from torch_pbd.robots.franky import run
+from torch_pbd.robots.kinematics import arm
 
-franky = pytest.importorskip("franky")
+franky, mujoco = pytest.importorskip("franky"), pytest.importorskip("mujoco")
 
 
 class Session:
@@ -40,13 +41,25 @@ class Session:
             raise franky.ControlException(self.robot.words)
 
 
+class Model:
+    """Jacobian of the arm in MuJoCo, whatever frames are given."""
+
+    def __init__(self):
+        self.arm = arm(panda(), "tool")
+
+    def zero_jacobian(self, frame, joints, *frames):
+        return self.arm.at(joints).jacobian
+
+
 class Robot:
-    """Stands at the first pose; reports its own time."""
+    """Stands at the first pose, though its joints move; reports its own time."""
+
+    joints, rates = np.array(HOME), np.array([0.4, -0.3, 0.5, 0.2, -0.6, 0.7, -0.1])
 
     def __init__(self, schedule, jumps=(), end=1e9, broken=None, words=""):
         self.pose = franky.Affine(schedule.position[0], np.roll(schedule.orientation[0], -1))
         self.milliseconds, self.jumps, self.end, self.session = 7000, dict(jumps), end, None
-        self.broken, self.words = broken, words
+        self.broken, self.words, self.model = broken, words, Model()
 
     @property
     def current_pose(self):
@@ -54,7 +67,8 @@ class Robot:
 
     @property
     def state(self):
-        return SimpleNamespace(time=franky.Duration(round(self.milliseconds)), O_T_EE=self.pose)
+        time, frames = franky.Duration(round(self.milliseconds)), {"F_T_EE": None, "EE_T_K": None}
+        return SimpleNamespace(time=time, O_T_EE=self.pose, q=self.joints, dq=self.rates, **frames)
 
 
 @pytest.fixture(autouse=True)
@@ -75,13 +89,20 @@ def test_targets_are_those_of_the_robots_time_and_gains_are_ahead(schedule):
     assert session.options == {"translational_error_clip": [0.2] * 3}
     assert len(found.time) == len(session.targets) == 400
     middles = schedule.resample(times=found.time + 0.0025)  # of the time for which they hold
+    # Less J' q', by MuJoCo's derivative of the Jacobian.
+    data = mujoco.MjData(robot.model.arm._model)
+    data.qpos[:], data.qvel[:] = robot.joints, robot.rates
+    mujoco.mj_forward(robot.model.arm._model, data)
+    bias = robot.model.arm.bias(data)
+    assert np.abs(bias).max() > 0.1
     for number in (0, 57, 200, 399):
         _, pose, twist, acceleration = session.targets[number]
         np.testing.assert_allclose(pose.translation, middles.position[number], rtol=0, atol=1e-12)
         turn = rotations.multiply(np.roll(pose.quaternion, 1), rotations.conjugate(middles.orientation[number]))
         assert np.linalg.norm(rotations.log(turn)) < 1e-12
         sent = [np.hstack([part.linear, part.angular]) for part in (twist, acceleration)]
-        np.testing.assert_allclose(sent, [middles.velocity[number], middles.acceleration[number]], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(sent[0], middles.velocity[number], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(sent[1], middles.acceleration[number] - bias, rtol=0, atol=1e-6)
         gains, ahead = session.gains[number + 1], min(number + 20, 399)  # by 0.1 s, franky's time constant
         np.testing.assert_allclose(gains.stiffness, middles.stiffness[ahead], rtol=1e-12, atol=1e-9)
         np.testing.assert_allclose(gains.damping, middles.damping[ahead], rtol=1e-12, atol=1e-9)

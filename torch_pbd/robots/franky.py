@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 
 from torch_pbd import checks
+from torch_pbd.checks import Floats
 from torch_pbd.control.schedule import Schedule
 from torch_pbd.extras import optional
 from torch_pbd.robots.session import (
     RobotLimits,
     RobotRun,
     RobotStoppedError,
+    accelerations,
     check_limits,
     check_start,
     poses,
@@ -20,6 +22,8 @@ from torch_pbd.robots.session import (
     stopping,
     warn_of_mass,
 )
+
+_STEP = 1e-3  # s, along the joints' motion: squared, and so nothing beside what is differentiated
 
 
 def run(
@@ -36,8 +40,9 @@ def run(
 ) -> RobotRun:
     """Follow a schedule of poses with ``franky.CartesianImpedanceTracker``; the arm must be at its first pose.
 
-    franky's controller adds ``Lambda a_d`` and Coriolis forces, so that the arm moves with its own inertia: make the
-    schedule `with_inertia` of it, or its damping is that of another robot (franky's default, 2 K^1/2, knows no mass).
+    franky's controller adds Coriolis forces and the inertia times the acceleration that it is told, which is
+    ``a_d - J' q'`` by the robot's own model. So the arm moves with its own inertia: make the schedule ``with_inertia``
+    of it, or its damping is that of another robot (franky's default, 2 K^1/2, knows no mass).
     Time is that of the robot; in between, targets of the last ``period`` are held. What to know of franky:
 
     - Gains follow those sent with a lag of ``gains_time_constant``; they are sent as much ahead.
@@ -76,7 +81,7 @@ def run(
     Warns
     -----
     UserWarning
-        If the schedule was not made `with_inertia` of an arm.
+        If the schedule was not made ``with_inertia`` of an arm.
 
     Raises
     ------
@@ -91,19 +96,20 @@ def run(
     checks.number(period, "period", above=0.0, below=max_step, unit="s")
     # A target holds for a period: that of its middle is never further than half of it from the motion.
     rows = schedule.resample(times=np.arange(schedule.time[0] + 0.5 * period, schedule.time[-1], period))
-    gains, targets = _planned(franky, rows, round(gains_time_constant / period))
+    gains, targets = _planned(franky, rows)
+    acceleration, ahead, model = accelerations(rows), round(gains_time_constant / period), robot.model
     start = robot.current_pose.end_effector_pose
     check_start(schedule, start.translation, np.roll(start.quaternion, 1))
     passed: list[tuple[float, Any, Any]] = []
     session = franky.CartesianImpedanceTracker(
-        robot, gains=_gains(franky, rows, 0), gains_time_constant=gains_time_constant, period=period, **tracker
+        robot, gains=gains[0], gains_time_constant=gains_time_constant, period=period, **tracker
     )
     with stopping(session.stop, on_fault):
         last = robot.state.time.to_sec()
         origin = last + settle - schedule.time[0]
         while session.tick() is not None:
             state = robot.state
-            now = state.time.to_sec()
+            now, pose = state.time.to_sec(), state.O_T_EE
             if now - last > max_step:
                 raise RobotStoppedError(f"no target came for {now - last:.3g} s, must come within {max_step:g} s")
             last = now
@@ -111,33 +117,31 @@ def run(
             if row >= len(rows):
                 break
             if row >= 0:
-                pose = state.O_T_EE
                 passed.append((now - origin, pose.translation, np.roll(pose.quaternion, 1)))
-                session.set_gains(gains=gains[row])
-                session.set_target(*targets[row])
+                session.set_gains(gains=gains[min(row + ahead, len(rows) - 1)])
+                # What the controller turns into J q'' is to be without what J' q' gives by itself.
+                rise = franky.TwistAcceleration(*np.split(acceleration[row] - _bias(franky, model, state), 2))
+                session.set_target(*targets[row], rise)
         else:
             raise RobotStoppedError("the arm is no longer under control: it met a limit, or somebody stopped it")
     return recorded(schedule, passed)
 
 
-def _planned(franky: Any, rows: Schedule, ahead: int) -> tuple[list[Any], list[tuple[Any, ...]]]:
-    """Gains, of so many rows ahead, and targets for all rows."""
-    n = len(rows)
-    gains = [_gains(franky, rows, min(row + ahead, n - 1)) for row in range(n)]
-    return gains, [_target(franky, rows, row) for row in range(n)]
-
-
-def _gains(franky: Any, rows: Schedule, row: int) -> Any:
-    gains = franky.CartesianImpedanceGains()
-    gains.stiffness, gains.damping = rows.stiffness[row], rows.damping[row]
-    return gains
-
-
-def _target(franky: Any, rows: Schedule, row: int) -> tuple[Any, ...]:
-    """Pose, twist and, where it is known, acceleration."""
+def _planned(franky: Any, rows: Schedule) -> tuple[list[Any], list[tuple[Any, Any]]]:
+    """Gains, and poses with their twists, for all rows."""
+    gains = [franky.CartesianImpedanceGains() for _ in rows.time]
+    for own, stiffness, damping in zip(gains, rows.stiffness, rows.damping, strict=True):
+        own.stiffness, own.damping = stiffness, damping
     position, orientation = poses(rows)
-    pose = franky.Affine(position[row], np.roll(orientation[row], -1))
-    twist = franky.Twist(*np.split(rows.velocity[row], 2))
-    if rows.acceleration is None:
-        return pose, twist
-    return pose, twist, franky.TwistAcceleration(*np.split(rows.acceleration[row], 2))
+    moves = zip(position, np.roll(orientation, -1, axis=1), rows.velocity, strict=True)
+    return gains, [(franky.Affine(place, turn), franky.Twist(*np.split(pace, 2))) for place, turn, pace in moves]
+
+
+def _bias(franky: Any, model: Any, state: Any) -> Floats:
+    """Acceleration (6,) of the tool while its joints keep their speed, J' q': J beside the present angles, along q'."""
+    ahead, behind = (
+        model.zero_jacobian(franky.Frame.EndEffector, state.q + step * state.dq, state.F_T_EE, state.EE_T_K)
+        for step in (_STEP, -_STEP)
+    )
+    change: Floats = (ahead - behind) @ state.dq / (2.0 * _STEP)
+    return change

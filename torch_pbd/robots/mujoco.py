@@ -12,7 +12,7 @@ from torch_pbd.control.schedule import Schedule
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.extras import optional
 from torch_pbd.robots.kinematics import MujocoArm, ToolState, pose_error
-from torch_pbd.robots.session import RobotStoppedError, check_start, poses, warn_of_mass
+from torch_pbd.robots.session import RobotStoppedError, accelerations, check_start, poses, warn_of_mass
 
 # A tick as a whole number of steps of the simulation, to what rounding leaves of both.
 _UNEVEN = 1e-6
@@ -73,17 +73,17 @@ def run(
 
     The arm keeps its inertia Lambda(q) and feels gravity and Coriolis forces h compensated: pushed by f at the tool it
     moves as ``Lambda (v' - a_d) + D (v - v_d) + K e = f``, which is the plant of a schedule that was made
-    `with_inertia` of that arm. What the six axes leave free follows ``joints``, by ``N'`` without effect on the tool.
+    ``with_inertia`` of that arm. What the six axes leave free follows ``joints``, by ``N'`` without effect on the tool.
 
     Parameters
     ----------
     model : mujoco.MjModel
-        With one torque motor for each joint, in their order; `torch_pbd.robots.panda` is one.
+        With one torque motor for each joint, in their order; ``torch_pbd.robots.panda`` is one.
     schedule : Schedule
         Of poses, its rows the ticks of the controller: evenly spaced, at 1 kHz for stiff gains
         (``schedule.resample(1000.0)``), a whole number of the model's time steps apart.
     joints : array_like of shape (T, n)
-        Joint angles in rad along the schedule, from `inverse_kinematics`: the arm starts at the first, at the
+        Joint angles in rad along the schedule, from ``inverse_kinematics``: the arm starts at the first, at the
         schedule's velocity.
     tool : str, default="tool"
         Name of a site or body.
@@ -99,7 +99,7 @@ def run(
     Warns
     -----
     UserWarning
-        If the schedule was not made `with_inertia` of an arm.
+        If the schedule was not made ``with_inertia`` of an arm.
 
     Raises
     ------
@@ -122,10 +122,8 @@ def run(
     pushes = np.zeros((n, 6)) if wrench is None else checks.array(wrench, "wrench", (n, 6))
     start = simulation.begin(path[0], schedule.velocity[0])
     check_start(schedule, start.position, start.orientation)
-    acceleration, speed = schedule.acceleration, np.gradient(path, schedule.time, axis=0)
-    if acceleration is None:
-        acceleration = np.gradient(schedule.velocity, schedule.time, axis=0)
-    motion = (position, orientation, schedule.velocity, acceleration, schedule.stiffness, schedule.damping)
+    speed = np.gradient(path, schedule.time, axis=0)
+    motion = (position, orientation, schedule.velocity, accelerations(schedule), schedule.stiffness, schedule.damping)
     posture = (path, speed, np.gradient(speed, schedule.time, axis=0))
     rows = map(_Row._make, zip(*motion, *posture, pushes, strict=True))
     columns = map(np.stack, zip(*[simulation.tick(row, n_steps) for row in rows], strict=True))

@@ -8,7 +8,7 @@ from torch_pbd import checks, rotations
 from torch_pbd.checks import Floats
 from torch_pbd.control.schedule import Schedule
 from torch_pbd.exceptions import InvalidParameterError
-from torch_pbd.robots.session import RobotLimits, check_limits, poses
+from torch_pbd.robots.session import RobotLimits, accelerations, check_limits, poses
 
 CONTROLLER: dict[str, Any] = {
     "type": "OSC_POSE",
@@ -65,8 +65,6 @@ def to_actions(schedule: Schedule, control_freq: float = 20.0) -> Floats:
     stiffness, damping = (np.diagonal(gain, axis1=1, axis2=2) / mass for gain in (rows.stiffness, rows.damping))
     good = (stiffness > 0.0) & (stiffness <= CONTROLLER["kp_limits"][1])
     checks.require(good, stiffness, "kp", "above zero and at most 3000 1/s^2", "learn with a smaller stiffness_max")
-    ahead = damping * rows.velocity
-    ahead += np.gradient(rows.velocity, rows.time, axis=0) if rows.acceleration is None else rows.acceleration
-    ahead /= stiffness
+    ahead = (damping * rows.velocity + accelerations(rows)) / stiffness
     turned = rotations.log(rotations.multiply(rotations.exp(ahead[:, 3:]), orientation))
     return np.hstack([0.5 * damping / np.sqrt(stiffness), stiffness, position + ahead[:, :3], turned])

@@ -53,6 +53,13 @@ def poses(schedule: Any) -> tuple[Floats, Floats]:
     return schedule.position, schedule.orientation
 
 
+def accelerations(schedule: Schedule) -> Floats:
+    """Planned accelerations (n, d); of a schedule that has none, differences of its velocities."""
+    if schedule.acceleration is not None:
+        return schedule.acceleration
+    return np.gradient(schedule.velocity, schedule.time, axis=0)
+
+
 def check_limits(schedule: Schedule, limits: Any) -> None:
     """Refuse a schedule of poses that is beyond limits, by row."""
     poses(schedule)
