@@ -1,7 +1,7 @@
 """Schedules on arms: their inertia, a simulated one, and adapters to the interfaces of real ones.
 
-One module for each robot, none of which is imported before it is asked for: ``franky``, ``mujoco``, ``robosuite``, ``ros`` and
-``ur_rtde``. They need NumPy and the robot's own library, not torch.
+One module for each robot, none of which is imported before it is asked for: ``franky``, ``mujoco``, ``robosuite``,
+``ros`` and ``ur_rtde``. They need NumPy and the robot's own library, not torch.
 """
 
 from importlib import import_module

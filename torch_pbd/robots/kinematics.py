@@ -82,10 +82,12 @@ def operational_inertia(model: Any, joints: ArrayLike, tool: str) -> Floats:
     rows = checks.array(angles.reshape(-1, angles.shape[-1] if angles.ndim else 1), "joints", ("rows", len(low)))
     possible = (rows >= low - _OVERSHOT) & (rows <= high + _OVERSHOT)
     checks.require(possible, rows, "joints", "within the limits of its joint", "give rad, and the model of this arm")
-    mobility = np.stack([_mobility(chain.at(row)) for row in rows])
+    states = map(chain.at, rows)
+    mobility = np.stack([state.jacobian @ np.linalg.solve(state.mass_matrix, state.jacobian.T) for state in states])
+    mobility = 0.5 * (mobility + mobility.mT)
     checks.semidefinite(mobility, "J M^-1 J'", definite=True, remedy="keep the arm away from its singularities")
     inertia = np.linalg.inv(mobility)
-    return (0.5 * (inertia + inertia.swapaxes(-1, -2))).reshape(*angles.shape[:-1], 6, 6)
+    return (0.5 * (inertia + inertia.mT)).reshape(*angles.shape[:-1], 6, 6)
 
 
 def inverse_kinematics(
@@ -171,11 +173,6 @@ def _reach(chain: Arm, joints: Floats, position: Floats, orientation: Floats, ne
         f"{where} is {1e3 * distance:.3g} mm and {angle:.3g} rad out "
         "of reach: move it nearer to the base with schedule.transform, or start from other joint angles."
     )
-
-
-def _mobility(state: ToolState) -> Floats:
-    mobility: Floats = state.jacobian @ np.linalg.solve(state.mass_matrix, state.jacobian.T)
-    return 0.5 * (mobility + mobility.T)
 
 
 @final

@@ -1,7 +1,7 @@
 """A schedule on a torque-controlled arm in MuJoCo: impedance control with the arm's own inertia, and pushes."""
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,12 +11,11 @@ from torch_pbd.checks import Floats
 from torch_pbd.control.schedule import Schedule
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.extras import optional
-from torch_pbd.robots.kinematics import MujocoArm, ToolState, pose_error
+from torch_pbd.robots.kinematics import MujocoArm, pose_error
 from torch_pbd.robots.session import RobotStoppedError, accelerations, check_start, poses, warn_of_mass
 
 # A tick as a whole number of steps of the simulation, to what rounding leaves of both.
 _UNEVEN = 1e-6
-_MEASURED = ("position", "orientation", "twist", "deviation", "joints", "torque", "mass", "saturated")
 
 
 @final
@@ -113,21 +112,14 @@ def run(
     O. Khatib, IEEE Journal of Robotics and Automation 3(1), 1987, eq. (27) and (50); C. Ott, "Cartesian impedance
     control of redundant and flexible-joint robots", Springer 2008, section 3.2, for the inertia that is kept.
     """
-    simulation = _Simulation(model, tool, posture_rate)
-    position, orientation = poses(schedule)
+    path = poses(schedule)
     warn_of_mass(schedule)
-    n, n_joints = len(schedule), simulation.chain.limits.shape[1]
     n_steps = _steps_a_tick(schedule.time, model.opt.timestep)
-    path = checks.array(joints, "joints", (n, n_joints))
-    pushes = np.zeros((n, 6)) if wrench is None else checks.array(wrench, "wrench", (n, 6))
-    start = simulation.begin(path[0], schedule.velocity[0])
-    check_start(schedule, start.position, start.orientation)
-    speed = np.gradient(path, schedule.time, axis=0)
-    motion = (position, orientation, schedule.velocity, accelerations(schedule), schedule.stiffness, schedule.damping)
-    posture = (path, speed, np.gradient(speed, schedule.time, axis=0))
-    rows = map(_Row._make, zip(*motion, *posture, pushes, strict=True))
-    columns = map(np.stack, zip(*[simulation.tick(row, n_steps) for row in rows], strict=True))
-    return ArmRun(time=schedule.time, wrench=pushes, **dict(zip(_MEASURED, columns, strict=True)))
+    simulation = _Simulation(model, tool, schedule, path, joints, posture_rate)
+    pushes = np.zeros((len(schedule), 6)) if wrench is None else checks.array(wrench, "wrench", (len(schedule), 6))
+    ticks = [simulation.tick(row, push, n_steps) for row, push in enumerate(pushes)]
+    measured = {name: np.stack([tick[name] for tick in ticks]) for name in ticks[0]}
+    return ArmRun(time=schedule.time, wrench=pushes, **measured)
 
 
 def _steps_a_tick(time: Floats, timestep: float) -> int:
@@ -142,62 +134,60 @@ def _steps_a_tick(time: Floats, timestep: float) -> int:
     return count
 
 
-class _Row(NamedTuple):
-    """Desired motion and gains at a tick, and the push during it."""
-
-    position: Floats
-    orientation: Floats
-    velocity: Floats
-    acceleration: Floats
-    stiffness: Floats
-    damping: Floats
-    joints: Floats
-    speed: Floats
-    rise: Floats
-    push: Floats
-
-
 @final
 class _Simulation:
-    """An arm in MuJoCo, its controller, and what is measured at a tick."""
+    """An arm in MuJoCo that a controller has follow a schedule."""
 
-    def __init__(self, model: Any, tool: str, posture_rate: float) -> None:
-        self._mujoco = optional("mujoco", "robot", "an arm in MuJoCo")
-        checks.instance(model, "model", self._mujoco.MjModel)
-        self.chain = chain = MujocoArm(model, checks.text(tool, "tool"))
-        if model.nu != chain.limits.shape[1] or model.nv != model.nu:
+    def __init__(
+        self,
+        model: Any,
+        tool: str,
+        schedule: Schedule,
+        path: tuple[Floats, Floats],
+        joints: ArrayLike,
+        posture_rate: float,
+    ) -> None:
+        self._mujoco = mujoco = optional("mujoco", "robot", "an arm in MuJoCo")
+        checks.instance(model, "model", mujoco.MjModel)
+        self._chain = chain = MujocoArm(model, checks.text(tool, "tool"))
+        n_joints = chain.limits.shape[1]
+        if model.nu != n_joints or model.nv != model.nu:
             raise InvalidParameterError(
-                f"model has {model.nu} motors and {model.nv} degrees of freedom for the {chain.limits.shape[1]} joints "
-                f"before {tool!r}, must have one motor for each and no others: lock fingers and leave out objects."
+                f"model has {model.nu} motors and {model.nv} degrees of freedom for the {n_joints} joints before "
+                f"{tool!r}, must have one motor for each and no others: lock fingers and leave out objects."
             )
-        self._model, self._data = model, self._mujoco.MjData(model)
         self._rate = checks.number(posture_rate, "posture_rate", least=0.0, unit="1/s")
+        self._schedule, self._poses, self._acceleration = schedule, path, accelerations(schedule)
+        self._joints = checks.array(joints, "joints", (len(schedule), n_joints))
+        self._speed = np.gradient(self._joints, schedule.time, axis=0)
+        self._rise = np.gradient(self._speed, schedule.time, axis=0)
+        start = chain.at(self._joints[0])
+        check_start(schedule, start.position, start.orientation)
+        self._model, self._data = model, mujoco.MjData(model)
+        self._data.qpos[:], self._data.qvel[:] = self._joints[0], np.linalg.pinv(start.jacobian) @ schedule.velocity[0]
 
-    def begin(self, joints: Floats, twist: Floats) -> ToolState:
-        """Put the arm at joint angles, the tool moving as told."""
-        state = self.chain.at(joints)
-        self._data.qpos[:], self._data.qvel[:] = joints, np.linalg.pinv(state.jacobian) @ twist
-        return state
-
-    def tick(self, row: _Row, n_steps: int) -> tuple[Any, ...]:
+    def tick(self, row: int, push: Floats, n_steps: int) -> dict[str, Any]:
         """State and commands at the start of a tick, which is then taken."""
-        data = self._data
+        data, planned = self._data, self._schedule
         self._mujoco.mj_forward(self._model, data)  # of positions and velocities that the last step left
-        state = self.chain.measure(data)
-        if np.any(data.qpos <= self.chain.limits[0]) or np.any(data.qpos >= self.chain.limits[1]):
+        state = self._chain.measure(data)
+        if np.any(data.qpos <= self._chain.limits[0]) or np.any(data.qpos >= self._chain.limits[1]):
             raise RobotStoppedError(f"a joint reached its limit, at {data.qpos.round(3).tolist()} rad")
         twist = state.jacobian @ data.qvel
-        error = -pose_error(state, row.position, row.orientation)
+        error = -pose_error(state, *(part[row] for part in self._poses))
         inverse = np.linalg.solve(state.mass_matrix, state.jacobian.T)
         mass = np.linalg.inv(state.jacobian @ inverse)
         # Khatib (27), with the inertia kept: forces of the arm's own motion are cancelled, and its inertia is not.
-        wrench = mass @ (row.acceleration - self.chain.bias(data))
-        wrench -= row.stiffness @ error + row.damping @ (twist - row.velocity)
-        drift = self._rate**2 * (row.joints - data.qpos) + 2.0 * self._rate * (row.speed - data.qvel) + row.rise
+        wrench = mass @ (self._acceleration[row] - self._chain.bias(data))
+        wrench -= planned.stiffness[row] @ error + planned.damping[row] @ (twist - planned.velocity[row])
+        away, slower = self._joints[row] - data.qpos, self._speed[row] - data.qvel
+        drift = self._rate**2 * away + 2.0 * self._rate * slower + self._rise[row]
         # N' M drift, N = I - M^-1 J' Lambda J (50): an acceleration of the joints that the tool does not feel.
         free = state.mass_matrix @ (drift - inverse @ (mass @ (state.jacobian @ drift)))
         torque = state.jacobian.T @ wrench + data.qfrc_bias + free
-        data.ctrl[:], data.qfrc_applied[:] = torque, state.jacobian.T @ row.push
-        reached = (state.position, state.orientation, twist, error, data.qpos.copy(), torque, mass)
+        data.ctrl[:], data.qfrc_applied[:] = torque, state.jacobian.T @ push
+        measured = {"position": state.position, "orientation": state.orientation, "twist": twist, "deviation": error}
+        measured |= {"joints": data.qpos.copy(), "torque": torque, "mass": mass}
         self._mujoco.mj_step(self._model, data, nstep=n_steps)
-        return *reached, bool(np.any(np.abs(data.actuator_force - torque) > 1e-9 * np.abs(torque).max()))
+        less = np.abs(data.actuator_force - torque) > 1e-9 * np.abs(torque).max()
+        return measured | {"saturated": bool(np.any(less))}
