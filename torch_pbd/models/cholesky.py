@@ -34,17 +34,11 @@ def _linked(scale_tril: Tensor, log_diagonal: bool) -> Tensor:
 
 @dataclass(frozen=True)
 class CholeskyLink:
-    """Root of the covariance as a function of the latent deviations, eq. (13), and its derivatives.
+    """Root of the covariance as a function of the latent deviations, eq. (13), and its derivatives."""
 
-    Parameters
-    ----------
-    prior_tril : Tensor of shape (d, d) or (n, d, d)
-    log_diagonal : bool
-        Whether the deviations of the diagonal are of its logarithm.
-    """
-
-    prior_tril: Tensor
+    prior_tril: Float[Tensor, "*n d d"]
     log_diagonal: bool
+    """Whether the deviations of the diagonal are of its logarithm."""
 
     largest_block: ClassVar[int] = 2500
     """Whitened values to solve for together: a step costs the cube of it, and few are taken."""
@@ -101,16 +95,9 @@ class CholeskyLink:
 class CholeskyCovariance(nn.Module):
     """The lower factor of the covariance: prior factor plus p = d(d+1)/2 latent processes, eq. (13).
 
-    Parameters
-    ----------
-    latent : LatentGP
-        Deviations of the entries from the prior's, in the order of ``linalg.tril_to_vector``.
-    prior_tril : Tensor of shape (d, d)
-        Factor of the covariance far from data.
-    log_diagonal : bool
-        Whether the processes of the diagonal act on its logarithm.
-    bounded : bool, default=False
-        Whether the part of the prior in the entries is kept between nothing and the prior: see ``beside_prior``.
+    ``latent`` are the deviations of the entries from the prior's, in the order of ``linalg.tril_to_vector``, those of
+    the diagonal of its logarithm if ``log_diagonal``; ``bounded`` is whether the part of the prior in the entries is
+    kept between nothing and the prior, as by :func:`beside_prior`.
     """
 
     prior_tril: Tensor

@@ -92,11 +92,7 @@ def beside_prior(
 class MeanAndCovariance(Core):
     """Gaussian processes for the mean beside a covariance of latent processes, by its root (CD and WP).
 
-    Parameters
-    ----------
-    mean : LatentGP
-    covariance : CholeskyCovariance or WishartCovariance
-        Maps inputs, and another prior, to roots; has ``latent``, ``bounded`` and ``variability``.
+    ``covariance`` maps inputs, and another prior, to roots; it has ``latent``, ``bounded`` and ``variability``.
     """
 
     def __init__(self, mean: LatentGP, covariance: Any) -> None:
@@ -200,11 +196,8 @@ class ConditionalNormal(nn.Module):
     def restored(cls, core_class: type[Core], config: Any, state: Mapping[str, Tensor]) -> "ConditionalNormal":
         """Model of its core's ``config()`` and of its ``state_dict()``, whose tensors it takes over.
 
-        Raises
-        ------
-        ValueError, TypeError, LookupError, RuntimeError
-            If a value or a tensor is missing, unknown, or of another type or shape; or if the model would not fit in
-            memory. Nothing is allocated before.
+        Errors (of value, type, look-up or run time) say that a value or a tensor is missing, unknown, or of another
+        type or shape, or that the model would not fit in memory. Nothing is allocated before.
         """
         if not isinstance(config, Mapping) or config.get("covariance") != core_class.kind:
             raise ValueError("its model is of another class")

@@ -107,17 +107,10 @@ class Cost(ABC):
 
 
 class Likelihood(Cost):
-    """Negative log likelihood of all rows, eq. (11) and (12), times a weight.
+    """Negative log likelihood of all rows, eq. (11) and (12), times a weight: one over their number for nats per row.
 
-    Parameters
-    ----------
-    link : CholeskyLink or WishartLink
-    scatter_root : Tensor of shape (n, d, r)
-        Of the sums of ``w w'`` at each distinct input, w the residuals from the mean (``TrainingSet.scatter_root``).
-    counts : Tensor of shape (n,)
-        Rows at each distinct input.
-    weight : float
-        One over the number of rows gives nats per row.
+    ``scatter_root`` is a root of the sums of ``w w'`` at each distinct input, w the residuals from the mean, as
+    ``TrainingSet.scatter_root`` gives it; ``counts`` are the rows there.
     """
 
     def __init__(
@@ -153,13 +146,9 @@ class Likelihood(Cost):
 
 
 class FactorDistance(Cost):
-    """Mean squared distance J_MSE of the vectorized Cholesky factors, eq. (9); its curvature is Gauss and Newton's.
+    """Mean squared distance J_MSE of the vectorized Cholesky factors to a target, eq. (9).
 
-    Parameters
-    ----------
-    link : WishartLink
-    target : Tensor of shape (n, d, d)
-        Lower Cholesky factors of the empirical covariances.
+    Its curvature is Gauss and Newton's. The target are factors of the empirical covariances.
     """
 
     link: WishartLink

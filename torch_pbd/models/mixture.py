@@ -45,18 +45,10 @@ class Components:
 
 
 class GaussianMixture(Core):
-    """Gaussian mixture over the joint vector [x, y], inputs first; as a core, Gaussian mixture regression.
+    """Gaussian mixture over the joint vector [x, y] of p = e + d variables; as a core, Gaussian mixture regression.
 
-    Parameters
-    ----------
-    log_weight : Tensor of shape (k,)
-        Log of the components' weights; a common constant does not matter.
-    mean : Tensor of shape (k, e + d)
-        The components' means, in the units of the data.
-    scale_tril : Tensor of shape (k, e + d, e + d)
-        Lower Cholesky factors of the components' covariances.
-    n_features : int
-        Number of inputs e: the leading columns of the data.
+    Components have weights, of whose logarithms a common constant does not matter, means, and Cholesky factors of
+    covariances; the ``n_features`` inputs are the leading variables.
     """
 
     kind = "mixture"
@@ -154,21 +146,9 @@ def expectation_maximization(
     each component's present frame: an E step whitens the data and gathers weighted moments, near the identity
     there, and an M step moves the frames. Strongly correlated data keep their digits so.
 
-    Parameters
-    ----------
-    data : Tensor of shape (n, e + d)
-        Inputs, ``n_features`` of them, and outputs side by side, standardized.
-    responsibilities : Tensor of shape (n, k)
-        Share of each component in each row; rows add up to one. An M step from them is the first iterate.
-    reg_covar : float
-        Added to every variance of every component: a share of those of the standardized data.
-    tol, max_iter : float, int
-        Stop when the loss, the negative mean log-likelihood in nats per row, changes by less than ``tol``.
-
-    Raises
-    ------
-    NotPositiveDefiniteError
-        If a component collapses and ``reg_covar`` is zero.
+    The data are inputs and outputs side by side, standardized; responsibilities, the share of each component in each
+    row, add up to one, and an M step from them is the first iterate. ``reg_covar`` is added to every variance of every
+    component. It ends when the loss, the negative mean log-likelihood in nats per row, changes by less than ``tol``.
     """
     padded = nn.functional.pad(data, (0, 1), value=1.0)  # by ones: moments of order 0 to 2 in one product
     blocks = [block.mT.contiguous() for block in padded.split(_BLOCK)]
@@ -201,13 +181,8 @@ def refine(
     A A^T + reg_covar I with A free: the floor that EM keeps, but maximized with, not added afterwards. Means
     and A are measured in the components' frames at the start, where the problem is nearly isotropic.
 
-    ``mixture``, ``data`` and ``reg_covar`` are as in :func:`expectation_maximization`, whose loss this lowers, the
-    others as in :func:`~torch_pbd.optim.minimize`.
-
-    Raises
-    ------
-    ValueError
-        If ``reg_covar`` is not above zero, or the mixture has a variance below it.
+    ``mixture``, ``data`` and ``reg_covar``, which is above zero, are as in :func:`expectation_maximization`, whose loss
+    this lowers, the others as in :func:`~torch_pbd.optim.minimize`.
     """
     with torch.no_grad():
         start = mixture.components()

@@ -88,19 +88,10 @@ def train_by_scoring(
 ) -> FitReport:
     """Minimize ``cost`` plus the negative log prior density of the latent values, hyperparameters held.
 
-    Parameters
-    ----------
-    cost : Cost
-    latent : LatentValues
-        Starts where it is, and is left at the optimum.
-    prior_weight : float
-        Of the prior density, in units of the cost.
-    solver : {"auto", "fisher", "lbfgs"}, default="auto"
-        "fisher" takes Newton's steps with the curvature of the cost. "lbfgs" is ``torch.optim.LBFGS`` in coordinates
-        in which the curvature at the start is the unit matrix, unless a block of it exceeds the link's
-        ``largest_block``. "auto" takes the first unless it does.
-    max_iter, tol, callback
-        As in :func:`torch_pbd.optim.minimize`.
+    ``latent`` starts where it is, and is left at the optimum; ``prior_weight`` is in units of the cost. The solver
+    "fisher" takes Newton's steps with the curvature of the cost. "lbfgs" is ``torch.optim.LBFGS`` in coordinates in
+    which the curvature at the start is the unit matrix, unless a block of it exceeds the link's ``largest_block``.
+    "auto" takes the first unless it does.
     """
     posterior = _Posterior(cost, latent, prior_weight)
     start = latent.whitened.detach().clone()

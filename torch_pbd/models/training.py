@@ -135,13 +135,8 @@ def empirical_tril(training: TrainingSet, *, bias_correction: bool = False) -> F
     At an input with no more than d rows the scatter is singular. There it is shrunk towards the pooled
     covariance as by an inverse-Wishart prior of d + 1 degrees of freedom.
 
-    Parameters
-    ----------
-    training : TrainingSet
-        With at least two rows at each input.
-    bias_correction : bool, default=False
-        Divide column i of each factor by its expectation for normal data (Bartlett),
-        ``sqrt(2 / (K - 1)) * gamma((K - i + 1) / 2) / gamma((K - i) / 2)``, i from 1; not where it was shrunk.
+    ``bias_correction`` divides column i of each factor that was not shrunk by its expectation for normal data
+    (Bartlett), ``sqrt(2 / (K - 1)) * gamma((K - i + 1) / 2) / gamma((K - i) / 2)``, i from 1.
     """
     n_outputs = training.y.shape[1]
     root = training.scatter_root(training.y - training.means()[training.index])

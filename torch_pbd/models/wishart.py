@@ -37,14 +37,9 @@ def padded(prior_tril: Float[Tensor, "*m d d"], df: int) -> Float[Tensor, "*m d 
 
 @dataclass(frozen=True)
 class WishartLink:
-    """Root of the covariance as a function of the latent deviations, L held at I, and its derivatives.
+    """Root of the covariance as a function of the latent deviations, L held at I, and its derivatives."""
 
-    Parameters
-    ----------
-    prior_root : Tensor of shape (d, df) or (n, d, df)
-    """
-
-    prior_root: Tensor
+    prior_root: Float[Tensor, "*n d df"]
 
     largest_block: ClassVar[int] = 600
     """Whitened values to solve for together: a step costs the cube of it, and tens of them may be taken."""
@@ -116,17 +111,10 @@ def _block(equation: str, left: Tensor, right: Tensor) -> Tensor:
 class WishartCovariance(nn.Module):
     """A Wishart process at the mean of its latent processes: eq. (8).
 
-    Parameters
-    ----------
-    latent : LatentGP
-        df * d processes: deviations of the vectors u_i from their prior means.
-    prior_root : Tensor of shape (d, df)
-        L times the prior means of the vectors; its square is the covariance far from data, and stays so while
-        L is trained: L multiplies the deviations.
-    scale_matrix_tril : Tensor of shape (d, d)
-        The paper's L, lower factor of the scale matrix V.
-    bounded : bool, default=False
-        Whether the part of the prior in the vectors is kept between nothing and the prior: see ``beside_prior``.
+    ``latent`` are the deviations of the vectors u_i from their prior means, which L, the lower factor of the scale
+    matrix V, multiplies. ``prior_root`` is L times these means; its square is the covariance far from data, and stays
+    so while L is trained. ``bounded`` is whether the part of the prior in the vectors is kept between nothing and the
+    prior, as by :func:`beside_prior`.
     """
 
     prior_root: Tensor
