@@ -31,13 +31,7 @@ def unimodality_reported() -> Iterator[None]:
 
 
 def check_groups(groups: Any, n_samples: int) -> NDArray[np.intp]:
-    """Number of each row's demonstration, from labels of any kind.
-
-    Raises
-    ------
-    ValueError
-        If there is not one label a row, or one is missing.
-    """
+    """Number of each row's demonstration, from labels of any kind, none of which is missing."""
     # Any labels will do that can be told apart: numbers, names, dates.
     labels = _as_labels(groups)
     if labels.shape != (n_samples,):

@@ -233,12 +233,8 @@ def mean_consistent_with_repeats(
     """The processes that the evidence found; or ones through the means, where rows that repeat inputs contradict them.
 
     The evidence sees the mean at each input, not how far the rows there differ. With few inputs, or jumps between them,
-    it may take for noise what all demonstrations agree on.
-
-    Warns
-    -----
-    DataRankWarning
-        If the means can be followed by a process only that swings far beyond them between the inputs: it is not taken.
+    it may take for noise what all demonstrations agree on. A process that could follow the means only by swinging far
+    beyond them between the inputs is not taken, with a warning.
     """
     mean, _ = condition(observations, found.hyperparameters, search.kernel, basis=found.basis)
     if int(training.counts.min()) < 2 or not training.repeats_inputs:

@@ -31,13 +31,7 @@ _LOWEST, _HIGHEST = 1e-6, 1e6
 def as_plain_array(values: Any, name: str) -> Any:
     """``values`` with a torch tensor turned into an array, and refused where they are no numbers or would lose meaning.
 
-    Raises
-    ------
-    TypeError
-        If an entry is no number at all.
-    ValueError
-        If ``values`` is ragged, masked, complex, or holds text or dates; or is of a float type too coarse for its
-        spread: unix time in float32 has steps of 128 s.
+    They are too coarse where a float type is for its spread: unix time in float32 has steps of 128 s.
     """
     if hasattr(values, "detach"):
         values = checks.from_tensor(values, name)
@@ -120,11 +114,9 @@ def _is_plain(X: Any, fitted: Mapping[str, Any]) -> bool:
 
 def check_weights(sample_weight: Any, n_samples: int) -> Floats:
     """Weights (n,) of rows: finite, none negative, not all zero."""
-    weights = parameter_floats(sample_weight, "sample_weight")
-    if weights.shape != (n_samples,):
-        raise ValueError(f"sample_weight has shape {weights.shape}, must have shape ({n_samples},): one for each row.")
-    if not (np.isfinite(weights).all() and (weights >= 0).all() and weights.any()):
-        raise ValueError("sample_weight must be finite, not negative, and above zero somewhere.")
+    weights = checks.array(sample_weight, "sample_weight", (n_samples,))
+    checks.require(weights >= 0.0, weights, "sample_weight", "at least 0")
+    checks.number(weights.sum(), "the sum of sample_weight", above=0.0)
     return weights
 
 
@@ -141,17 +133,9 @@ def check_squares(array: Floats, name: str) -> None:
 
 
 def check_inputs_vary(X: Floats) -> None:
-    """Check that X tells rows apart.
+    """Check that X tells rows apart; warn of columns that are constant or combinations of others.
 
-    Raises
-    ------
-    ValueError
-        If all rows of X are equal.
-
-    Warns
-    -----
-    DataRankWarning
-        If a column of X is constant or a combination of others: its length scale is not determined.
+    The length scale of such a column is not determined.
     """
     spread = np.ptp(X, axis=0)
     constant = spread <= CONSTANT * np.abs(X).max(axis=0)
@@ -177,11 +161,7 @@ def without_rounding(X: Floats) -> Floats:
     """X with values of a column made equal that a rounding to float32 has told apart.
 
     They are within its resolution of the range, or one is the other rounded, and far nearer than usual in the column.
-
-    Warns
-    -----
-    UserWarning
-        If many are, as of recordings of two precisions. In many irregular inputs some come as near by chance.
+    Of many, as of recordings of two precisions, it warns; in many irregular inputs some come as near by chance.
     """
     X = X.copy()
     for number, column in enumerate(X.T):
@@ -245,10 +225,7 @@ def parameter_floats(value: Any, name: str) -> Floats:
 def standardized_prior(prior: Prior, X: Floats, y_scale: Floats) -> Floats:
     """Covariances of a prior, as :func:`prior_covariance`, over the outputs' deviations ``y_scale`` (d,).
 
-    Warns
-    -----
-    UserWarning
-        If its variances are so far from those of y, or from each other, that float64 does not hold them beside those.
+    It warns of variances so far from those of y, or from each other, that float64 does not hold them beside those.
     """
     covariance = prior_covariance(prior, X, len(y_scale)) / y_scale[:, np.newaxis] / y_scale
     eigenvalues = np.linalg.eigvalsh(covariance)
@@ -263,13 +240,7 @@ def standardized_prior(prior: Prior, X: Floats, y_scale: Floats) -> Floats:
 
 
 def prior_covariance(prior: Prior, X: Floats, n_outputs: int) -> Floats:
-    """Covariances (n, d, d) or (d, d) that a float, array or callable prior stands for.
-
-    Raises
-    ------
-    ValueError
-        If they are not of that shape, finite, symmetric and positive definite.
-    """
+    """Covariances (n, d, d) or (d, d) that a float, array or callable prior stands for, which are positive definite."""
     shape: tuple[int, ...] = (n_outputs, n_outputs)
     if callable(prior):
         try:

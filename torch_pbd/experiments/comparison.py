@@ -39,25 +39,16 @@ class Score:
     fold_movement: tuple[dict[str, float], ...] = ()
     """Judgement of each demonstration left out as a whole, as :func:`~torch_pbd.movement.judge_movement` returns it."""
 
-    @property
-    def log_likelihood(self) -> float:
-        """Mean over the demonstrations left out."""
-        return mean_and_error(self.fold_log_likelihood)[0]
-
-    @property
-    def log_likelihood_error(self) -> float:
-        """Standard error of the mean over the demonstrations left out."""
-        return mean_and_error(self.fold_log_likelihood)[1]
-
     def row(self) -> dict[str, Any]:
         """Row of a table."""
         folds = self.fold_log_likelihood
+        mean, error = mean_and_error(folds)
         return {
             "model": self.model,
             "MSE": self.cholesky_mse,
             "error to truth": self.frobenius,
-            "held-out LL": self.log_likelihood,
-            "+-": self.log_likelihood_error,
+            "held-out LL": mean,
+            "+-": error,
             "median": float(np.median(folds)) if folds else float("nan"),
             "95 % holds": mean_and_error(self.fold_coverage)[0],
             "folds": len(folds),
@@ -86,26 +77,9 @@ def compare_models(
 ) -> list[Score]:
     """Fit every model on all the data, and once more without each of some demonstrations.
 
-    Parameters
-    ----------
-    models : mapping of str to covariance regressor
-        Cloned, not changed.
-    X, y, groups : ndarray of shapes (n_samples, n_features), (n_samples, n_outputs), (n_samples,)
-        ``groups`` tells the demonstrations apart.
-    truth : callable, default=None
-        Maps X (n, e) to the true covariances (n, d, d).
-    max_folds : int, default=10
-        Largest number of demonstrations to leave out, each by itself; spread evenly over all. 0 for none.
-    n_jobs : int, default=None
-        Fits that run at the same time, as in scikit-learn. Times are measured before, one by one.
-    finished : FinishedFits, default=None
-        Where fits are kept, and not repeated if they are there.
-    whole_movements : bool, default=False
-        Judge the demonstrations left out as a whole too.
-
-    Returns
-    -------
-    list of Score, in the order of ``models``
+    Models are cloned; ``truth`` maps X (n, e) to the true covariances (n, d, d). At most ``max_folds`` demonstrations,
+    spread evenly over all, are left out, each by itself, ``n_jobs`` of these fits at the same time; and judged as a
+    whole too if ``whole_movements``. Fits are kept in ``finished``, and not repeated if they are there.
     """
     inputs, empirical = empirical_covariances(X, y)
     folds = left_out(groups, max_folds)

@@ -59,13 +59,7 @@ def finished_fits(folder: Path, *, resume: bool) -> Iterator[FinishedFits]:
 def fit_once(model: Any, *data: Any, finished: FinishedFits | None = None) -> tuple[Any, float]:
     """The fitted model, loaded or fitted and kept, and the seconds that its fit took.
 
-    Parameters
-    ----------
-    model : covariance regressor or DMPController
-        Or a peer of theirs, which is always fitted.
-    *data : X, y and groups; or Demonstrations
-    finished : FinishedFits, default=None
-        Fits that need not be repeated; this one is added.
+    The data are X, y and groups, or Demonstrations. What is no class of this package is always fitted.
     """
     from torch_pbd.persistence import load, save
     from torch_pbd.persistence.plain import is_ours

@@ -59,23 +59,9 @@ img { max-width: 100%; height: auto; background: white; }
 class RunFolder:
     """A folder that one run at a time writes; a context manager, which gives it free again.
 
-    It is locked and ``env.json`` is written at once, so that a folder that cannot be written, or that another run
-    writes, fails before the work. Every file is there whole or as it was before. What a killed run left half written
-    is removed.
-
-    Parameters
-    ----------
-    path : str or Path
-        Made if it is not there; files of an earlier run with the same names are replaced.
-    settings : mapping
-        Arguments of the run, JSON-able, for ``env.json``.
-
-    Raises
-    ------
-    FolderInUseError
-        If another run, which the message names, writes it.
-    OSError
-        If the folder cannot be made or written.
+    It is locked, and ``env.json`` with the settings is written at once, so that a folder that cannot be made or written
+    (OSError), or that another run writes (FolderInUseError), fails before the work. Every file is there whole or as it
+    was before; those of an earlier run are replaced. What a killed run left half written is removed.
     """
 
     def __init__(self, path: str | Path, settings: Mapping[str, Any]) -> None:
@@ -192,13 +178,7 @@ def slug(name: str) -> str:
 
 
 def check_names(names: Iterable[str], argument: str) -> None:
-    """Check that every name of a model gives files of its own.
-
-    Raises
-    ------
-    ConfigError
-        If a name has no letter and no digit, or is too long; if two names give the same files.
-    """
+    """Check that every name of a model gives files of its own."""
     owners: dict[str, str] = {}
     for name in names:
         file = slug(name)

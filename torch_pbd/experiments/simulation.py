@@ -35,13 +35,8 @@ def table1(
 ) -> tuple[list[dict[str, Any]], dict[str, CovarianceRegressor]]:
     """Table I for each reading of eq. (14): medians over the seeds 0 to ``n_seeds - 1``.
 
-    A model whose name is one of the paper's (CD, WP, GMM 5, GMM 8) has the paper's figure beside it.
-
-    Returns
-    -------
-    rows : list of dict
-    fitted : dict
-        The models by name, fitted to the data of the first reading and seed 0.
+    A model whose name is one of the paper's (CD, WP, GMM 5, GMM 8) has the paper's figure beside it. With the rows come
+    the models by name, fitted to the data of the first reading and seed 0.
     """
     rows: list[dict[str, Any]] = []
     fitted: dict[str, CovarianceRegressor] = {}

@@ -52,17 +52,8 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 def remove_drafts(folder: Path) -> int:
     """Remove what :func:`replacing` has left in a folder where a process was killed or the power failed.
 
-    Nothing else may write files there meanwhile: drafts of what still runs cannot be told from others.
-
-    Parameters
-    ----------
-    folder : Path
-        Folders in it are left alone.
-
-    Returns
-    -------
-    int
-        Drafts removed.
+    Nothing else may write files there meanwhile: drafts of what still runs cannot be told from others. Folders in it
+    are left alone; what comes back is the number of drafts.
     """
     drafts = [entry for entry in folder.iterdir() if _DRAFT.fullmatch(entry.name) and not entry.is_dir()]
     for draft in drafts:

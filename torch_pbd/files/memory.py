@@ -30,19 +30,10 @@ def available_bytes() -> int:
 
 
 def require_memory(needed_bytes: float, *, what: str, remedy: str) -> None:
-    """Refuse work that this machine has not the memory for, before it is begun.
+    """Refuse work that takes more than four fifths of :func:`available_bytes`, before it is begun.
 
-    Parameters
-    ----------
-    needed_bytes : float
-        Estimate of the most that is held at one time.
-    what, remedy : str
-        Beginning and end of the message: "a schedule of 3600001 ticks", "Lower rate."
-
-    Raises
-    ------
-    ValueError
-        If it is more than four fifths of :func:`available_bytes`.
+    ``needed_bytes`` is an estimate of the most that is held at one time; ``what`` and ``remedy`` are the beginning and
+    the end of the message: "a schedule of 3600001 ticks", "Lower rate."
     """
     usable = _SHARE * available_bytes()
     if needed_bytes > usable:
