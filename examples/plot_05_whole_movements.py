@@ -11,7 +11,7 @@ import numpy as np
 
 from torch_pbd import TrajectoryRegressor
 from torch_pbd.data import make_handwriting_demonstrations
-from torch_pbd.plotting import MODEL, legend_below, mark_ends, plot_demonstrations
+from torch_pbd.plotting import MODEL, legend_below, plot_demonstrations
 
 strokes = make_handwriting_demonstrations("S", n_demos=8, timing=0.0, rate=50.0, random_state=0)
 times = strokes.times[0][:, np.newaxis]
@@ -32,6 +32,5 @@ for ax, draws, title in zip(
         ax.plot(*draw.T, color=MODEL, lw=1.2, label="draws" if i == 0 else None)
     ax.set(title=title, aspect="equal")
     ax.label_outer()
-mark_ends(axes[2], whole[0])
 legend_below(figure, list(axes))
 plt.show()

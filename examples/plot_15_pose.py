@@ -15,7 +15,6 @@ import numpy as np
 from torch_pbd import Demonstrations, DMPController
 from torch_pbd.control import RotationLimits, StiffnessLaw
 from torch_pbd.data import make_pose_demonstrations, pose_covariance
-from torch_pbd.plotting import principal
 
 made = make_pose_demonstrations(12, rate=50.0, timing=0.0, random_state=0)
 # As a robot would have recorded them, here with the real part last.
@@ -33,7 +32,7 @@ for place, _ in zip(*recorded.to_poses(), strict=True):
     space.plot(*place.T, color="tab:gray", lw=0.7)
 truth = pose_covariance(np.clip(schedule.time / schedule.duration, 0.0, 1.0))
 for block, scale, ax in zip(schedule.blocks, (1e3, 180.0 / np.pi), (moved, turned), strict=True):
-    ax.plot(schedule.time, scale * np.sqrt(principal(truth[:, block, block])), color="black", lw=0.8)
+    ax.plot(schedule.time, scale * np.sqrt(np.linalg.eigvalsh(truth[:, block, block])), color="black", lw=0.8)
 
 # An arm that is controlled by torques moves with its own inertia, here a constant one. The damping is made for it, and
 # for_arm.save("peg.npz") is what a robot takes.
