@@ -15,44 +15,57 @@ class JointNormal:
     """Normal law of n steps of d outputs whose covariance is never formed unless it is asked for.
 
     A movement is ``x_t = mean_t + A_t (g_t + U_t c)``: g has the correlation R over the steps, independently in each
-    output, and c is standard normal. Its covariance is ``A (R kron I + U U') A' - V V'``, with A block diagonal; V is
-    what observations of single entries have taken off. Costs grow with n^3 + n^2 d + n d (k + p)^2.
+    output, and c is standard normal. Its covariance is ``A ((R - W W') kron I + U U') A' - V V'``, with A block
+    diagonal; W is what observations of whole steps have taken off, V what those of single entries have. Costs grow with
+    n^3 + n^2 d + n d (k + p)^2; those of what single steps are, given others, with n alone.
     """
 
     mean: Float[Tensor, "n d"]
     factor: Float[Tensor, "n d d"]
     """A, one block a step."""
-    correlation: Float[Tensor, "n n"]
+    prior_correlation: Float[Tensor, "n n"]
     """R, positive semidefinite."""
     loadings: Float[Tensor, "n d k"]
     """U."""
+    taken: Float[Tensor, "n m"]
+    """W."""
     explained: Float[Tensor, "n d p"]
     """V."""
 
+    @classmethod
+    def prior(
+        cls,
+        mean: Float[Tensor, "n d"],
+        factor: Float[Tensor, "n d d"],
+        correlation: Float[Tensor, "n n"],
+        loadings: Float[Tensor, "n d k"],
+    ) -> "JointNormal":
+        """Law before anything is observed."""
+        return cls(mean, factor, correlation, loadings, correlation[:, :0], loadings[:, :, :0])
+
+    @cached_property
+    def correlation(self) -> Float[Tensor, "n n"]:
+        """R - W W'."""
+        return symmetrize(self.prior_correlation - self.taken @ self.taken.mT)
+
     def at(self, steps: Int[Tensor, " m"]) -> "JointNormal":
         """Law of some of the steps."""
-        return JointNormal(
-            self.mean[steps],
-            self.factor[steps],
-            self.correlation[steps][:, steps],
-            self.loadings[steps],
-            self.explained[steps],
-        )
+        rows = (part[steps] for part in (self.mean, self.factor, self.prior_correlation[:, steps]))
+        return JointNormal(*rows, *(part[steps] for part in (self.loadings, self.taken, self.explained)))
 
     def joined(self, other: "JointNormal", between: Float[Tensor, "n m"]) -> "JointNormal":
-        """Law of the steps of both, which are correlated between each other."""
-        upper = torch.cat([self.correlation, between], dim=1)
-        return JointNormal(
+        """Law of the steps of both, of which nothing is observed, and which are correlated between each other."""
+        upper = torch.cat([self.prior_correlation, between], dim=1)
+        return JointNormal.prior(
             torch.cat([self.mean, other.mean]),
             torch.cat([self.factor, other.factor]),
-            torch.cat([upper, torch.cat([between.mT, other.correlation], dim=1)]),
+            torch.cat([upper, torch.cat([between.mT, other.prior_correlation], dim=1)]),
             torch.cat([self.loadings, other.loadings]),
-            torch.cat([self.explained, other.explained]),
         )
 
     def covariance(self) -> Float[Tensor, "n d n d"]:
         """Whole covariance: n d squared numbers."""
-        # The inner part R kron I + U U' first, and then a block of A on either side.
+        # The inner part (R - W W') kron I + U U' first, and then a block of A on either side.
         n, d = self.mean.shape
         inner = torch.einsum("ij,ab->iajb", self.correlation, torch.eye(d).to(self.mean))
         flat = self.loadings.reshape(n * d, -1)
@@ -63,15 +76,17 @@ class JointNormal:
 
     def marginal(self) -> Float[Tensor, "n d d"]:
         """Covariance of the outputs at each step."""
+        variance = self.prior_correlation.diagonal() - self.taken.square().sum(1)
         inner = self.loadings @ self.loadings.mT
-        inner = inner + torch.diag_embed(self.correlation.diagonal()[:, None].expand(self.mean.shape))
+        inner.diagonal(dim1=1, dim2=2).add_(variance[:, None])
         outer = self.factor @ inner @ self.factor.mT - self.explained @ self.explained.mT
         return symmetrize(outer)
 
     def columns(self, steps: Int[Tensor, " p"], outputs: Int[Tensor, " p"]) -> Float[Tensor, "n d p"]:
         """Covariance of all steps and outputs with single entries."""
         rows = self.factor[steps, outputs]  # (p, d)
-        inner = torch.einsum("np,pd->ndp", self.correlation[:, steps], rows)
+        between = self.prior_correlation[:, steps] - self.taken @ self.taken[steps].mT
+        inner = torch.einsum("np,pd->ndp", between, rows)
         inner = inner + self.loadings @ torch.einsum("pd,pdk->kp", rows, self.loadings[steps])
         return self.factor @ inner - self.explained @ self.explained[steps, outputs].mT
 
@@ -164,10 +179,11 @@ class Observed:
 class Conditioned:
     """Joint law given what was observed; normal, by the usual formulas.
 
-    Exact steps E: with ``r = A_E^-1 (x_E - mean_E)``, G = R_:E R_EE^-1 and the loadings' coefficients c, whose
-    posterior has the precision ``P = I + U_E' R_EE^-1 U_E`` and the mean ``P^-1 U_E' R_EE^-1 r``, a movement is
-    ``mean + A (G r + (U - G U_E) c + g)``, g of the correlation ``R - G R_E:``. That is a law of the same form.
-    Single entries then take ``V V'`` off, with V their covariances with all the rest over the root of their own.
+    Exact steps E, with ``L L' = R_EE``: of ``r = A_E^-1 (x_E - mean_E)``, G = R_:E R_EE^-1 and the loadings'
+    coefficients c, whose posterior has the precision ``P = I + U_E' R_EE^-1 U_E`` and the mean ``P^-1 U_E' R_EE^-1 r``,
+    a movement is ``mean + A (G r + (U - G U_E) c + g)``, g of the correlation ``R - W W'`` with ``W = R_:E L'^-1``.
+    That is a law of the same form. Single entries then take ``V V'`` off, with V their covariances with all the rest
+    over the root of their own.
     """
 
     def __init__(self, prior: JointNormal, observed: Observed) -> None:
@@ -175,13 +191,16 @@ class Conditioned:
         steps, n_loadings = observed.steps, prior.loadings.shape[-1]
         if not len(steps):
             return
-        self._root = safe_cholesky(prior.correlation[steps][:, steps], name="the correlation of the steps given")
-        self._gain = torch.cholesky_solve(prior.correlation[steps], self._root).mT
+        between = prior.prior_correlation[:, steps]
+        self._root = safe_cholesky(between[steps], name="the correlation of the steps given")
+        self._taken = torch.linalg.solve_triangular(self._root.mT, between, upper=True, left=False)
+        self._gain = torch.linalg.solve_triangular(self._root, self._taken, upper=False, left=False)
         loadings = prior.loadings[steps]
-        self._whitened = torch.cholesky_solve(loadings.flatten(1), self._root).reshape(loadings.shape)
-        precision = torch.einsum("mdk,mdl->kl", loadings, self._whitened) + torch.eye(n_loadings).to(loadings)
-        self._precision_root = torch.linalg.cholesky(symmetrize(precision))
-        self._open = prior.loadings - torch.einsum("nm,mdk->ndk", self._gain, loadings)
+        half = torch.linalg.solve_triangular(self._root, loadings.flatten(1), upper=False)
+        self._whitened = torch.linalg.solve_triangular(self._root.mT, half, upper=True).reshape(loadings.shape)
+        half = half.reshape(-1, n_loadings)
+        self._precision_root = torch.linalg.cholesky(half.mT @ half + torch.eye(n_loadings).to(loadings))
+        self._open = prior.loadings - (self._gain @ loadings.flatten(1)).reshape(prior.loadings.shape)
 
     @property
     def sizes(self) -> tuple[int, int, int, int]:
@@ -204,15 +223,13 @@ class Conditioned:
         prior, observed = self._prior, self._observed
         if not len(observed.steps):
             return prior
-        correlation = symmetrize(prior.correlation - self._gain @ prior.correlation[observed.steps])
-        loadings = torch.linalg.solve_triangular(self._precision_root.mT, self._open, upper=True, left=False)
-        # What is known has no variance, not even of rounding, which may be below zero.
-        correlation = correlation.index_fill(0, observed.steps, 0.0).index_fill(1, observed.steps, 0.0)
         return replace(
             prior,
             mean=prior.mean + self._from_steps((observed.values - prior.mean[observed.steps])[None])[0],
-            correlation=correlation,
-            loadings=loadings.index_fill(0, observed.steps, 0.0),
+            # What is known has no variance, not even of rounding, which may be below zero.
+            factor=prior.factor.index_fill(0, observed.steps, 0.0),
+            loadings=torch.linalg.solve_triangular(self._precision_root.mT, self._open, upper=True, left=False),
+            taken=self._taken,
         )
 
     def deviations(
@@ -238,9 +255,9 @@ class Conditioned:
         """Change of the mean by what steps that are known whole deviate from it."""
         factor = self._prior.factor
         inner = torch.linalg.solve(factor[self._observed.steps], residual[..., None])[..., 0]
-        projected = torch.einsum("mdk,smd->ks", self._whitened, inner)
-        common = torch.cholesky_solve(projected, self._precision_root)
-        change = torch.einsum("nm,smd->snd", self._gain, inner) + torch.einsum("ndk,ks->snd", self._open, common)
+        projected = inner.flatten(1) @ self._whitened.flatten(0, 1)  # (s, k)
+        common = torch.cholesky_solve(projected.mT, self._precision_root)
+        change = torch.einsum("nm,smd->snd", self._gain, inner) + (self._open @ common).permute(2, 0, 1)
         return torch.einsum("nab,snb->sna", factor, change)
 
     def _entries(self, law: JointNormal) -> tuple[Float[Tensor, "n d p"], Float[Tensor, "p p"]]:

@@ -4,12 +4,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, solve_triangular
 from sklearn.base import clone
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.estimators.base import CovarianceRegressor
+from torch_pbd.estimators.base import CovarianceRegressor, by_chunks
 from torch_pbd.estimators.demonstrations import fit_with_groups
 from torch_pbd.estimators.mixture import GMMBaseline
 from torch_pbd.files.memory import require_much
@@ -111,31 +111,51 @@ class KMPBaseline(MovementRegressor):
 
     def _prior(self, time: Floats) -> JointNormal:
         n, d = len(time), self.n_outputs_
-        reference, means, covariances = self._reference if self._known is None else self._with_via_points(self._known)
-        n_reference, unit = len(reference), np.eye(d)
         require_much(
-            4 * 8.0 * ((n * d) ** 2 + (n_reference * d) ** 2),
+            4 * 8.0 * (n * d) ** 2,
             what=f"the covariance between {n} rows and {d} outputs",
             remedy="Ask for fewer rows.",
         )
+        mean, whitened, level = self._through_reference(time)
+        explained = whitened.transpose(0, 2, 1).reshape(n * d, -1)
         # All outputs of one time after another: the kernel of the times, for each output by itself.
-        gram, cross = (np.kron(self._kernel(self._scaled(other), reference), unit) for other in (reference, time))
-        noise = block_diag(*covariances)
-        mean = cross @ np.linalg.solve(gram + self.lambda_mean * noise, means.ravel())
-        explained = cross @ np.linalg.solve(gram + self.lambda_cov * noise, cross.T)
-        covariance = (np.kron(self._kernel(self._scaled(time), time), unit) - explained) * n_reference / self.lambda_cov
-        values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+        gram = np.kron(self._kernel(time, time), np.eye(d))
+        values, vectors = np.linalg.eigh(level * (gram - explained @ explained.T))
         root = (vectors * np.sqrt(values.clip(0.0))).reshape(n, d, -1)
         # The nugget is relative to the outputs, which so are the units of the structured law.
-        scale = np.sqrt(self.nugget) * np.where(self._scale > 0.0, self._scale, 1.0)
+        scale = self._nugget_scale()
         loadings = torch.from_numpy(root / scale[:, np.newaxis])
         factor = torch.from_numpy(np.diag(scale)).expand(n, d, d)
-        return JointNormal(
-            torch.from_numpy(mean.reshape(n, d)), factor, torch.eye(n).double(), loadings, loadings[:, :, :0]
-        )
+        return JointNormal.prior(torch.from_numpy(mean), factor, torch.eye(n).double(), loadings)
 
-    def _kernel(self, scaled: Floats, time: Floats) -> Floats:
-        difference = scaled[:, np.newaxis] - self._scaled(time)
+    def _marginals(self, time: Floats) -> tuple[Floats, Floats]:
+        # Rows need no covariance with each other, whose factor is cubic in their number.
+        mean, covariance = by_chunks(self._rows, time)
+        return mean, covariance
+
+    def _rows(self, time: Floats) -> tuple[Floats, Floats]:
+        mean, whitened, level = self._through_reference(time)
+        explained = whitened.transpose(0, 2, 1) @ whitened
+        nugget = np.diag(np.square(self._nugget_scale()))
+        return mean, level * (np.eye(self.n_outputs_) - 0.5 * (explained + explained.transpose(0, 2, 1))) + nugget
+
+    def _through_reference(self, time: Floats) -> tuple[Floats, Floats, float]:
+        """Mean (n, d), ``V_t = L^-1 k_t'`` (n, N d, d) with ``L L' = K + lambda_cov S``, and ``N / lambda_cov``."""
+        reference, means, covariances = self._reference if self._known is None else self._with_via_points(self._known)
+        n_reference, d = means.shape
+        gram, noise = np.kron(self._kernel(reference, reference), np.eye(d)), block_diag(*covariances)
+        weights = np.linalg.solve(gram + self.lambda_mean * noise, means.ravel()).reshape(n_reference, d)
+        root = np.linalg.cholesky(gram + self.lambda_cov * noise)
+        inverse = solve_triangular(root, np.eye(len(root)), lower=True).reshape(-1, n_reference, d)
+        cross = self._kernel(time, reference)
+        return cross @ weights, np.tensordot(cross, inverse, axes=(1, 1)), n_reference / self.lambda_cov
+
+    def _nugget_scale(self) -> Floats:
+        """Standard deviation of the independent part of each output (d,)."""
+        return np.sqrt(self.nugget) * np.where(self._scale > 0.0, self._scale, 1.0)
+
+    def _kernel(self, time: Floats, other: Floats) -> Floats:
+        difference = self._scaled(time)[:, np.newaxis] - self._scaled(other)
         return np.asarray(np.exp(-0.5 * np.square(difference / self.length_scale)))
 
     def _with_via_points(self, known: Known) -> tuple[Floats, Floats, Floats]:

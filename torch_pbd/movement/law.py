@@ -10,7 +10,6 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import gammaln
 from sklearn.base import BaseEstimator
-from sklearn.utils.validation import check_is_fitted
 from torch import Tensor
 
 from torch_pbd import checks
@@ -36,7 +35,7 @@ class MovementLaw(BaseEstimator, ABC):
     _range: tuple[float, float]
     """First of the times of the fit, and their range."""
     _known: Known | None = None
-    _kept: dict[str, tuple[Floats, JointNormal]]  # law at the last times, which conditioned copies share
+    _kept: dict[str, tuple[Floats, JointNormal]]  # last times and their law, which conditioned copies share
     _y_is_1d: bool
 
     @abstractmethod
@@ -106,7 +105,6 @@ class MovementLaw(BaseEstimator, ABC):
 
     def _times(self, X: ArrayLike) -> Floats:
         """Times (n,) of rows to predict at."""
-        check_is_fitted(self)
         return np.ascontiguousarray(checked_queries(self, X)[:, 0])
 
     def known_times(self) -> Floats:
@@ -133,26 +131,32 @@ class MovementLaw(BaseEstimator, ABC):
     def _conditioned(self, time: Floats) -> tuple[Conditioned, Tensor]:
         """Law of all times that matter, given what is known, and the places of ``time`` among them."""
         union, rows, places = self._union(time, self._known)
-        return Conditioned(self._prior_of_last(union), self._observed(places)), torch.from_numpy(rows)
+        law, index = self._prior_with(union)
+        return Conditioned(law, self._observed(index[places])), torch.from_numpy(index[rows])
 
-    def _prior_of_last(self, time: Floats) -> JointNormal:
-        """Joint law at increasing times; those that were asked for last, with others or not, take no work again."""
-        kept, scaled = self.__dict__.setdefault("_kept", {}), np.round(self._scaled(time), RESOLUTION)
+    def _prior_with(self, time: Floats) -> tuple[JointNormal, NDArray[np.intp]]:
+        """Joint law at increasing times, maybe at others too, and their places in it.
+
+        Times that were asked for last take no work again.
+        """
+        kept = self.__dict__.setdefault("_kept", {})
         if kept and len(time):
-            known, law = kept["last"]
+            last, law = kept["last"]
+            known, scaled = (np.round(self._scaled(each), RESOLUTION) for each in (last, time))
             place = np.searchsorted(known, scaled).clip(max=len(known) - 1)
             old = known[place] == scaled
-            # Of times that all are known the law is a part of that kept; where most are, only the others take work.
-            if old.all():
-                return law if len(old) == len(known) else law.at(torch.from_numpy(place))
             if 2 * old.sum() > len(old):
-                law, new = law.at(torch.from_numpy(place[old])), self._prior(time[~old])
-                order = np.argsort(np.concatenate([np.flatnonzero(old), np.flatnonzero(~old)]))
-                return law.joined(new, self._between(time[old], time[~old])).at(torch.from_numpy(order))
+                if 2 * old.sum() < len(known):
+                    last, law, place[old] = time[old], law.at(torch.from_numpy(place[old])), np.arange(old.sum())
+                new = time[~old]
+                if len(new):
+                    place[~old] = len(last) + np.arange(len(new))
+                    law = law.joined(self._prior(new), self._between(last, new))
+                return law, place
         law = self._prior(time)
         if 0 < len(time) <= _AT_ONCE:
-            kept["last"] = scaled, law
-        return law
+            kept["last"] = time, law
+        return law, np.arange(len(time))
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in super().__getstate__().items() if name != "_kept"}
@@ -173,15 +177,15 @@ class MovementLaw(BaseEstimator, ABC):
     def _score(self, recording: Recording) -> float:
         """Joint log density of one demonstration."""
         # Of a step that is known, or is there twice, no variance is left, and so no density.
-        law, rows = self._law(recording.time)
         known = self._observations
         exact = ((known.noise == 0.0) & ~np.isnan(known.value)).any(axis=1)
-        exact_places = self._union(recording.time, known)[2][exact].tolist()
-        if len(set(rows.tolist())) < len(rows) or not set(rows.tolist()).isdisjoint(exact_places):
+        own, others = (np.round(self._scaled(time), RESOLUTION) for time in (recording.time, known.time[exact]))
+        if len(np.unique(own)) < len(own) or np.isin(own, others).any():
             raise ValueError(
                 "X has a time twice in a demonstration, or one that is known without noise: leave it out, the movement "
                 "has no density there."
             )
+        law, rows = self._law(recording.time)
         law = law.at(rows)
         square = law.square(torch.from_numpy(recording.position)[None])
         size = recording.position.size

@@ -144,7 +144,7 @@ class ProMPBaseline(MovementRegressor):
         loadings = np.einsum("nb,bdk->ndk", bases, root) / self.noise_scale_[:, np.newaxis]
         tensors = map(torch.from_numpy, (bases @ self.weight_mean_, np.diag(self.noise_scale_), loadings))
         mean, factor, loading = tensors
-        return JointNormal(mean, factor.expand(n, d, d), torch.eye(n).double(), loading, loading[:, :, :0])
+        return JointNormal.prior(mean, factor.expand(n, d, d), torch.eye(n).double(), loading)
 
 
 class _Weights:

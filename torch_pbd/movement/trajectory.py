@@ -77,7 +77,7 @@ class TrajectoryLaw(nn.Module):
         own = loadings @ loadings.mT + self.share * torch.eye(mean.shape[1]).to(mean)
         root = safe_cholesky(covariance, name="the covariance at a step")
         factor = torch.linalg.solve_triangular(torch.linalg.cholesky(own), root, upper=False, left=False)
-        return JointNormal(mean, factor, correlation, loadings, loadings[:, :, :0])
+        return JointNormal.prior(mean, factor, correlation, loadings)
 
     def time_kernel(self) -> TimeKernel:
         """Correlation along the movement, in ranges of the time."""
