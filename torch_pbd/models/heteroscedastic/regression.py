@@ -5,7 +5,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float
 from torch import Tensor
 
 from torch_pbd.linalg import safe_cholesky, symmetrize, triangular_inverse
@@ -145,19 +145,16 @@ class Regression:
         The inverse W'W of an exponential correlation along a line is zero but for neighbours, as that of a Markov
         process.
         """
-        every = torch.arange(len(self.scatter), device=self.scatter.device)
+        # At each input the root's rows: of the outputs before, and of the response.
+        rows = torch.cat([self.root.mT, self.response.unsqueeze(-1)], dim=-1)
         if self.whitener is None:
-            across = 0.5 * self.scatter[:, :-1, -1]
-            return Couplings(every, every, 0.5 * self.before, across, across)
+            return Couplings(torch.cat([self.before, self.scatter[:, :-1, -1:]], dim=-1), rows[:0], rows[:0])
         inverse = self.whitener.mT @ self.whitener
         if float(inverse.tril(-2).abs().max()) > _NO_NEIGHBOUR * float(inverse.diagonal().min()):
             return None
-        left, right = torch.cat([every, every[:-1]]), torch.cat([every, every[1:]])
-        weight = torch.where(left == right, 0.5, 1.0) * inverse[left, right]
-        root = weight[:, None, None] * self.root[left]
-        across = (root @ self.response[right].unsqueeze(-1)).squeeze(-1)
-        back = weight[:, None] * (self.root[right] @ self.response[left].unsqueeze(-1)).squeeze(-1)
-        return Couplings(left, right, root @ self.root[right].mT, across, back)
+        own, beside = inverse.diagonal()[:, None, None], inverse.diagonal(1)[:, None, None]
+        after, before = self.root[:-1] @ rows[1:], self.root[1:] @ rows[:-1]
+        return Couplings(own * (self.root @ rows), beside * after, beside * before)
 
     def fit(self, features: Float[Tensor, "b n p"], precision: Float[Tensor, " n"]) -> LinearEvidence:
         """Posterior of the weights of b sets of features, one coefficient after another, with its log evidence.
@@ -167,10 +164,11 @@ class Regression:
         rows an input, it would be i times the work.
         """
         if self.couplings is not None:
-            blocks = self._precision_of_weights(self.couplings, features, precision)
+            own, after, before = self.couplings.scaled(precision)
+            blocks = self._precision_of_weights(own[..., :-1], after[..., :-1], features)
             if float(blocks.detach().diagonal(dim1=-2, dim2=-1).amax()) < _LARGEST_PRECISION:
                 factor = safe_cholesky(blocks, name="the precision of the coefficients' weights")
-                cross = self.couplings.cross(precision).mT @ features
+                cross = _at_inputs(own[..., -1], after[..., -1], before[..., -1]).mT @ features
                 projected = torch.linalg.solve_triangular(factor, cross.flatten(1).unsqueeze(-1), upper=False)
                 return LinearEvidence.from_factor(factor.mT, projected.squeeze(-1))
         return LinearEvidence.fit(*self._design(features, precision))
@@ -180,8 +178,8 @@ class Regression:
     ) -> Float[Tensor, "b n p"]:
         """Gradient of the log evidence in the features.
 
-        With the mean m and the precision P = I + X + X' of the weights, and their inner products c with the response,
-        it is ``m' dc - tr((inv(P) + m m') dX)``: block (j, k) of X is the sum over coupled inputs l and r of
+        With the mean m and the precision P = I + X of the weights, and their inner products c with the response, it is
+        that of ``m' c - tr((inv(P) + m m') X) / 2``: block (j, k) of X is the sum over coupled inputs l and r of
         ``weight_jk F_l F_r'``.
         """
         size, n_features = self._shape(features)
@@ -190,13 +188,16 @@ class Regression:
             gradient = gradient.reshape(len(features), len(precision), size, size, n_features)
             gradient = torch.einsum("mn,bmajp->bnajp", self.whitener, gradient)
             return torch.einsum("n,nja,bnajp->bnp", precision.sqrt(), self.root, gradient)
-        left, right = self.couplings.left, self.couplings.right
+        own, after, before = self.couplings.scaled(precision)
+        cross = _at_inputs(own[..., -1], after[..., -1], before[..., -1])
         second = linear.covariance + linear.mean.unsqueeze(-1) * linear.mean.unsqueeze(-2)
-        onto_left, onto_right = self._spread(
-            self.couplings.weight(precision), second, features[:, left], features[:, right]
-        )
-        gradient = self.couplings.cross(precision) @ linear.mean.reshape(-1, size, n_features)
-        return gradient.index_add(1, left, -onto_left).index_add(1, right, -onto_right)
+        in_features = []
+        for mean, its_second, its_features in zip(linear.mean, second, features, strict=True):  # bounds the memory
+            spread = self._spread(its_second, its_features)
+            first, last = spread[: len(after)], spread[len(own) - len(after) :]
+            products = (_weighted(own, spread), _weighted(after, last), _weighted(before, first))
+            in_features.append(cross @ mean.reshape(size, n_features) - _at_inputs(*products))
+        return torch.stack(in_features)
 
     def squares(
         self, features: Float[Tensor, "n p"], mean: Float[Tensor, " ip"], covariance: Float[Tensor, "ip ip"]
@@ -209,43 +210,28 @@ class Regression:
         coefficients = features @ mean.reshape(self._shape(features)).mT
         direction = torch.cat([-coefficients, torch.ones_like(coefficients[:, :1])], dim=1)
         explained = (direction.unsqueeze(1) @ self.scatter @ direction.unsqueeze(2)).flatten()
-        spread, _ = self._spread(self.before, covariance[None], features[None], features[None])
-        unknown = (spread[0] * features).sum(-1)
+        spread = self.before.flatten(1).unsqueeze(1) @ self._spread(covariance, features)
+        unknown = (spread.squeeze(1) * features).sum(-1)
         return explained.clamp_min(0.0), unknown
 
     def local_squares(self) -> Float[Tensor, " n"]:
         """Sum of squared residuals from the coefficients that fit best at each input by itself."""
         return (self.scatter[:, -1, -1] - self.response.square().sum(-1)).clamp_min(0.0)
 
-    def _precision_of_weights(self, couplings: "Couplings", features: Tensor, precision: Tensor) -> Tensor:
-        """Precision (b, i * p, i * p) of the weights."""
+    def _precision_of_weights(self, own: Tensor, after: Tensor, features: Tensor) -> Tensor:
+        """Precision (b, i * p, i * p) of the weights: all pairs of coefficients by all products of two features."""
         size, n_features = self._shape(features)
-        # Pair by pair of coefficients; where there are more of these than features, by all products of two features.
-        weight = couplings.weight(precision).flatten(1).mT
-        left, right = features[:, couplings.left], features[:, couplings.right]
-        if size * size > n_features:
-            blocks = weight @ (left.unsqueeze(-1) * right.unsqueeze(-2)).flatten(2)
-        else:
-            blocks = left.mT.unsqueeze(1) @ (weight.unsqueeze(-1) * right.unsqueeze(1))
-        blocks = blocks.reshape(-1, size, size, n_features, n_features).transpose(2, 3)
-        half = blocks.reshape(len(features), size * n_features, -1)
+        first, last = features[:, : len(after)], features[:, len(own) - len(after) :]
+        half = 0.5 * own.flatten(1).mT @ _products(features, features) + after.flatten(1).mT @ _products(first, last)
+        half = half.reshape(-1, size, size, n_features, n_features).transpose(2, 3)
+        half = half.reshape(len(features), size * n_features, -1)
         return half + half.mT + torch.eye(size * n_features).to(features)
 
-    def _spread(self, weight: Tensor, covariance: Tensor, left: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
-        """Sums over j and k of ``weight_jk`` times that block of the weights' covariance: times the features on its
-        right, and its transpose times those on its left.
-        """
-        size, n_features = self._shape(left)
-        blocks = covariance.reshape(-1, size, n_features, size, n_features).transpose(2, 3)
-        blocks = blocks.reshape(-1, size * size, n_features, n_features)
-        weight = weight.flatten(1)
-        if size * size > n_features:  # as there
-            total = (weight @ blocks.flatten(2)).unflatten(-1, (n_features, n_features))
-            onto_right = (left.unsqueeze(-2) @ total).squeeze(-2)
-            return (total @ right.unsqueeze(-1)).squeeze(-1), onto_right
-        weight = weight.mT.unsqueeze(-1)
-        onto_left = (weight * (right.unsqueeze(1) @ blocks.mT)).sum(1)
-        return onto_left, (weight * (left.unsqueeze(1) @ blocks)).sum(1)
+    def _spread(self, covariance: Tensor, features: Tensor) -> Float[Tensor, "n ii p"]:
+        """Each block of a covariance of the weights times the features (n, p) of each input."""
+        size, n_features = self._shape(features)
+        blocks = covariance.reshape(size, n_features, size, n_features).permute(3, 0, 2, 1)
+        return (features @ blocks.flatten(1)).unflatten(-1, (size * size, n_features))
 
     def _shape(self, features: Tensor) -> tuple[int, int]:
         return self.scatter.shape[-1] - 1, features.shape[-1]
@@ -262,31 +248,39 @@ class Regression:
         return design.flatten(1, 2), response.flatten().expand(len(design), -1)
 
 
-@dataclass(frozen=True)
-class Couplings:
-    """Pairs of m inputs whose rows have to do with each other, the earlier ones on the left; of an input with itself
-    half, as both sides count.
-    """
+class Couplings(NamedTuple):
+    """Scatters of the i outputs at an input with these and, last, the response, of coupled inputs: weighted by W'W."""
 
-    left: Int64[Tensor, " m"]
-    right: Int64[Tensor, " m"]
-    scatter: Float[Tensor, "m i i"]
-    """Scatter of the outputs on the left with those on the right."""
-    across: Float[Tensor, "m i"]
-    """Inner products of the outputs on the left with the response on the right."""
-    back: Float[Tensor, "m i"]
-    """Inner products of the outputs on the right with the response on the left."""
+    own: Float[Tensor, "n i j"]
+    """With those at the same input."""
+    after: Float[Tensor, "m i j"]
+    """With those at the next input: m = n - 1, or none where inputs are coupled with themselves alone."""
+    before: Float[Tensor, "m i j"]
+    """Of all inputs but the first, with those at the input before."""
 
-    def weight(self, precision: Float[Tensor, " n"]) -> Float[Tensor, "m i i"]:
-        """Scatter times the root of the precisions on both sides."""
-        return self._scale(precision)[:, :, None] * self.scatter
+    def scaled(self, precision: Float[Tensor, " n"]) -> "Couplings":
+        """Scatters times the roots of the precisions on both sides."""
+        root = precision.sqrt()[:, None, None]
+        n = len(self.after)
+        beside = root[:n] * root[len(root) - n :]
+        return Couplings(precision[:, None, None] * self.own, beside * self.after, beside * self.before)
 
-    def cross(self, precision: Float[Tensor, " n"]) -> Float[Tensor, "n i"]:
-        """Inner products of the outputs with the response at each input."""
-        scale = self._scale(precision)
-        total = torch.zeros(len(precision), self.across.shape[1]).to(scale)
-        return total.index_add(0, self.left, scale * self.across).index_add(0, self.right, scale * self.back)
 
-    def _scale(self, precision: Tensor) -> Float[Tensor, "m 1"]:
-        root = precision.sqrt()
-        return (root[self.left] * root[self.right])[:, None]
+def _at_inputs(own: Float[Tensor, "n p"], after: Float[Tensor, "m p"], before: Float[Tensor, "m p"]) -> Tensor:
+    """Sum at each input of what it has with itself, with the next one and with the one before."""
+    n_single = len(own) - len(after)
+    return (
+        own
+        + torch.cat([after, own.new_zeros(n_single, own.shape[1])])
+        + torch.cat([own.new_zeros(n_single, own.shape[1]), before])
+    )
+
+
+def _weighted(part: Float[Tensor, "n i j"], spread: Float[Tensor, "n ii p"]) -> Float[Tensor, "n p"]:
+    """Sum over the pairs of outputs."""
+    return (part[..., :-1].flatten(1).unsqueeze(1) @ spread).squeeze(1)
+
+
+def _products(left: Float[Tensor, "b m p"], right: Float[Tensor, "b m p"]) -> Float[Tensor, "b m pp"]:
+    """All products of a feature on the left and one on the right."""
+    return (left.unsqueeze(-1) * right.unsqueeze(-2)).flatten(2)
