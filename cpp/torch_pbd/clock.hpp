@@ -62,9 +62,9 @@ public:
         gain_ = std::min(std::max(kShare * own, soft), 0.5 * limit);
         speed = kSpeed * fastest + approach_speed_;
         acceleration = std::max((1.0 + kShare) * own + gain_, kSharpest / kSteepest * soft);
-        // What the schedule's own acceleration leaves to an approach; a critically damped spring overshoots it by 13 %.
+        // What the schedule's own acceleration, with what the robot overshoots it by, leaves to an approach.
         room_ = std::max(gain_, acceleration - (1.0 + kShare) * own);
-        const double room = own > 0.0 ? (acceleration - gain_) / own : infinity;
+        const double room = own > 0.0 ? (acceleration - gain_) / (kOvershoot * own) : infinity;
         fastest_ = catches_up ? std::min(kSpeed, std::sqrt(room)) : 1.0;
         acceleration += approach_speed_ * spin;
         find_ends();
@@ -360,6 +360,9 @@ private:
     static constexpr double kLeastSpare = 0.1;
     // Share of a row: time that was put onto a row takes that row, to whichever side it was rounded.
     static constexpr double kOnRow = 1e-6;
+    // A critically damped spring answers a step of the desired acceleration by 1 + (w t - 1) e^(-w t) of it: at most by
+    // this, 1 + e^-2.
+    static constexpr double kOvershoot = 1.1353352832366128;
     // A minimum jerk of 1 over a time of 1 has a velocity of 15/8 and an acceleration of 10 / sqrt(3).
     static constexpr double kSteepest = 1.875, kSharpest = 5.7735;
 

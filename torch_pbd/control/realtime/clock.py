@@ -18,6 +18,8 @@ _SPEED, _SHARE = 1.5, 0.25
 _LEAST_SPARE = 0.1
 # Share of a row: time that was put onto a row takes that row, to whichever side it was rounded.
 _ON_ROW = 1e-6
+# A critically damped spring answers a step of the desired acceleration by 1 + (w t - 1) e^(-w t) of it: at most by this.
+_OVERSHOOT = 1.0 + math.exp(-2.0)
 # A minimum jerk of 1 over a time of 1 has a velocity of 15/8 and an acceleration of 10 / sqrt(3).
 _STEEPEST, _SHARPEST = 1.875, 5.7735
 
@@ -76,9 +78,9 @@ class ScheduleClock:
         self.gain = min(max(_SHARE * own, soft), 0.5 * acceleration_limit)
         self.speed = _SPEED * fastest + approach_speed
         self.acceleration = max((1.0 + _SHARE) * own + self.gain, _SHARPEST / _STEEPEST * soft)
-        # What the schedule's own acceleration leaves to an approach; a critically damped spring overshoots it by 13 %.
+        # What the schedule's own acceleration, with what the robot overshoots it by, leaves to an approach.
         self._room = max(self.gain, self.acceleration - (1.0 + _SHARE) * own)
-        room = (self.acceleration - self.gain) / own if own else math.inf
+        room = (self.acceleration - self.gain) / (_OVERSHOOT * own) if own else math.inf
         self._fastest = min(_SPEED, math.sqrt(room)) if self._catches_up else 1.0
         self._approach_speed, self.acceleration = approach_speed, self.acceleration + approach_speed * spin
         # Integral of dt / |x'| from each row to the end; where the schedule rests it is long, not endless.
