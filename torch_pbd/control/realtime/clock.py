@@ -18,7 +18,7 @@ _SPEED, _SHARE = 1.5, 0.25
 _LEAST_SPARE = 0.1
 # Share of a row: time that was put onto a row takes that row, to whichever side it was rounded.
 _ON_ROW = 1e-6
-# A critically damped spring answers a step of the desired acceleration by 1 + (w t - 1) e^(-w t) of it: at most by this.
+# A critically damped spring answers a step of the desired acceleration by 1 + (w t - 1) e^(-w t) of it: this at most.
 _OVERSHOOT = 1.0 + math.exp(-2.0)
 # A minimum jerk of 1 over a time of 1 has a velocity of 15/8 and an acceleration of 10 / sqrt(3).
 _STEEPEST, _SHARPEST = 1.875, 5.7735
