@@ -191,12 +191,14 @@ def array(values: Any, name: str, shape: Sequence[int | str]) -> Floats:
     return floats
 
 
-def require(good: NDArray[np.bool_], values: NDArray[Any], name: str, must: str, remedy: str = "") -> None:
+def require(
+    good: NDArray[np.bool_], values: NDArray[Any], name: str, must: str, remedy: str = "", unit: str = ""
+) -> None:
     """Refuse the first value of an array that is not good, by its index."""
     if not good.all():
         index = tuple(map(int, np.argwhere(~good)[0]))
         where = f"{name}[{', '.join(map(str, index))}]" if index else name
-        raise refusal(values[index], where, must, remedy)
+        raise refusal(values[index], where, must, remedy, unit)
 
 
 def symmetric(matrices: NDArray[Any], name: str) -> Floats:

@@ -141,11 +141,19 @@ def test_a_keyboards_stop_stops_the_arm_and_goes_on(schedule):
     ("change", "limits", "message"),
     [
         (lambda s: s.transform(np.eye(3), [0.0, 0.02, 0.0]), {}, r"20 mm and .* rad from the first pose"),
-        (lambda s: s, {"speed": 0.1}, r"the velocity\[\d+\] is .*, must be at most 0.1: slow down"),
-        (lambda s: s, {"angular_speed": 0.1}, r"the angular velocity\[\d+\]"),
-        (lambda s: s, {"angular_acceleration": 0.1}, r"the angular acceleration\[\d+\]"),
-        (lambda s: s, {"stiffness": (10.0, 900.0)}, r"the eigenvalue of stiffness\[\d+, 2\] .* from 10 to 900 N/m"),
-        (lambda s: s, {"rotational_stiffness": (30.0, 300.0)}, r"the eigenvalue of stiffness.* from 30 to 300 Nm/rad"),
+        (
+            lambda s: s,
+            {"speed": 0.1},
+            r"the speed\[\d+\] is .* m/s, must be at most RobotLimits.speed, 0.1 m/s: slow down",
+        ),
+        (lambda s: s, {"angular_speed": 0.1}, r"the angular speed\[\d+\] is .* rad/s, must"),
+        (lambda s: s, {"angular_acceleration": 0.1}, r"the angular acceleration\[\d+\] is .* rad/s\^2"),
+        (
+            lambda s: s,
+            {"stiffness": (10.0, 900.0)},
+            r"stiffness\[\d+, 2\] is .* N/m, .* RobotLimits.stiffness, 10 to 900",
+        ),
+        (lambda s: s, {"rotational_stiffness": (30.0, 300.0)}, r"the eigenvalue of stiffness.* 30 to 300 Nm/rad"),
     ],
 )
 def test_what_is_beyond_limits_is_refused_before_anything_moves(schedule, change, limits, message):

@@ -64,19 +64,21 @@ def check_limits(schedule: Schedule, limits: Any) -> None:
     """Refuse a schedule of poses that is beyond limits, by row."""
     poses(schedule)
     checks.instance(limits, "limits", RobotLimits)
-    parts = [("velocity", schedule.velocity, (limits.speed, limits.angular_speed))]
+    motions = [("speed", schedule.velocity, "/s")]
     if schedule.acceleration is not None:
-        parts.append(("acceleration", schedule.acceleration, (limits.acceleration, limits.angular_acceleration)))
-    for name, values, most in parts:
-        for what, part, bound in zip(("", "angular "), (values[:, :3], values[:, 3:]), most, strict=True):
-            length = np.linalg.norm(part, axis=1)
-            checks.require(length <= bound, length, f"the {what}{name}", f"at most {bound:g}", "slow down: retime it")
-    blocks = ((slice(3), limits.stiffness, "N/m"), (slice(3, 6), limits.rotational_stiffness, "Nm/rad"))
-    for block, (low, high), unit in blocks:
+        motions.append(("acceleration", schedule.acceleration, "/s^2"))
+    for name, values, per in motions:
+        for field, part, unit in ((name, values[:, :3], f"m{per}"), (f"angular_{name}", values[:, 3:], f"rad{per}")):
+            length, most = np.linalg.norm(part, axis=1), getattr(limits, field)
+            what, must = f"the {field.replace('_', ' ')}", f"at most RobotLimits.{field}, {most:g} {unit}"
+            checks.require(length <= most, length, what, must, "slow down: retime it", unit)
+    for block, field, unit in ((slice(3), "stiffness", "N/m"), (slice(3, 6), "rotational_stiffness", "Nm/rad")):
+        low, high = getattr(limits, field)
         eigenvalues = np.linalg.eigvalsh(schedule.stiffness[:, block, block])
         slack = checks.ROUNDING * high
         good = (eigenvalues >= low - slack) & (eigenvalues <= high + slack)
-        checks.require(good, eigenvalues, "the eigenvalue of stiffness", f"from {low:g} to {high:g} {unit}")
+        must = f"within RobotLimits.{field}, {low:g} to {high:g} {unit}"
+        checks.require(good, eigenvalues, "the eigenvalue of stiffness", must, unit=unit)
 
 
 def warn_of_mass(schedule: Schedule) -> None:

@@ -72,8 +72,10 @@ def start_state(
         raise InvalidParameterError("orientation is given, must be None for a schedule without: leave it out.")
     turned = None if orientation is None else _unit_quaternion(orientation)
     moving = (0.0,) * d if velocity is None else vector(velocity, "velocity", d)
-    for name, block, most in zip(("the speed", "the angular speed"), blocks, speed_limits, strict=False):
-        checks.number(math.hypot(*moving[block]), name, most=most, unit="units/s", remedy="slow it down")
+    kinds = [("the speed", "units/s"), ("the angular speed", "rad/s")]
+    for (name, unit), block, most in zip(kinds, blocks, speed_limits, strict=False):
+        remedy = "slow it down, or raise velocity_limit"
+        checks.number(math.hypot(*moving[block]), name, most=most, unit=unit, remedy=remedy)
     return here, turned, moving
 
 
