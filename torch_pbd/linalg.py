@@ -19,6 +19,11 @@ def symmetrize(matrix: Float[Tensor, "*b d d"]) -> Float[Tensor, "*b d d"]:
     return 0.5 * (matrix + matrix.mT)
 
 
+def broadcast_shapes(*shapes: torch.Size) -> torch.Size:
+    """Shape that all broadcast to, as ``torch.broadcast_shapes`` has it, which loads sympy: a third of a second."""
+    return torch.broadcast_tensors(*(torch.empty(()).expand(shape) for shape in shapes))[0].shape
+
+
 def tril_to_vector(scale_tril: Float[Tensor, "*b d d"]) -> Float[Tensor, "*b p"]:
     """Entries of the lower triangle row by row: (0, 0), (1, 0), (1, 1), (2, 0), ..."""
     row, column = torch.tril_indices(*scale_tril.shape[-2:], device=scale_tril.device)

@@ -210,12 +210,13 @@ class DMP:
         rate[:, :2, :4] = state.new_tensor(eq16) / self.tau * lengths[:, None, None]
         rate[:, 3, 4] = 1.0
         maps = torch.linalg.matrix_exp(rate)[:, :2]
+        inputs = torch.stack([goals[..., :-1, :], forcing[..., :-1, :], forcing.diff(dim=-2)], dim=-1)
+        # What goal and forcing add is known of all ticks at once; one after another go the states alone.
+        added = (inputs @ maps[index, :, 2:].mT).unbind(dim=-3)
+        passed_on = maps[:, :, :2].mT.unbind()
         states = [state]
-        for tick, kind in enumerate(index.tolist()):
-            rise = forcing[..., tick + 1, :] - forcing[..., tick, :]
-            inputs = torch.stack([goals[..., tick, :], forcing[..., tick, :], rise], dim=-1)
-            state = torch.cat([state, inputs], dim=-1) @ maps[kind].mT
-            states.append(state)
+        for kind, increment in zip(index.tolist(), added, strict=True):
+            states.append(states[-1] @ passed_on[kind] + increment)
         return torch.stack(states, dim=-3)
 
 
@@ -223,7 +224,7 @@ def _broadcast(parts: dict[str, Tensor], n_ticks: int | None = None) -> torch.Si
     """Shape (..., d), or (..., n_ticks, d), to which all parts broadcast; outputs do not."""
     shapes = {name: tuple(part.shape) for name, part in parts.items()}
     with suppress(RuntimeError):
-        common = torch.broadcast_shapes(*shapes.values())
+        common = torch.broadcast_tensors(*parts.values())[0].shape  # torch.broadcast_shapes would load sympy
         if n_ticks in (None, common[-2]) and all(shape[-1] == common[-1] for shape in shapes.values()):
             return common
     raise ValueError(f"shapes are {shapes}, must be of the same movements, ticks and outputs.")

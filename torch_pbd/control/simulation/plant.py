@@ -19,6 +19,7 @@ from torch_pbd.control.simulation.rollout import Rollout
 from torch_pbd.control.simulation.sensor import ForceSensor
 from torch_pbd.control.simulation.ticks import Environment, Task, closed_loop, open_loop
 from torch_pbd.files.memory import require_memory
+from torch_pbd.linalg import broadcast_shapes
 
 _PARTS = ("sensor", "position_loop", "environment", "stiffness_filter")
 
@@ -221,7 +222,7 @@ def run_task(
     start, speed = _start(task, position0, orientation0), task.velocity[..., 0, :] if velocity0 is None else velocity0
     parts = [task.position, task.velocity, task.inertial_force, force, task.stiffness[..., 0]]
     parts += [] if task.turning is None else [task.turning.turns]
-    batch = torch.broadcast_shapes(*(value.shape[:-2] for value in parts), start.shape[:-1], speed.shape[:-1])
+    batch = broadcast_shapes(*(value.shape[:-2] for value in parts), start.shape[:-1], speed.shape[:-1])
     _check_memory(batch, task)
     state = start.expand(*batch, -1), speed.expand(*batch, -1)
     if task.is_open and task.is_shared:
@@ -246,7 +247,7 @@ def _start(task: Task, position0: Tensor | None, orientation0: Tensor | None) ->
     desired = task.turning.orientation[..., 0, :]
     rotation = torch.zeros_like(desired[..., 1:]) if orientation0 is None else rotation_between(desired, orientation0)
     position = start[..., : task.n_positions]
-    batch = torch.broadcast_shapes(position.shape[:-1], rotation.shape[:-1])
+    batch = broadcast_shapes(position.shape[:-1], rotation.shape[:-1])
     return torch.cat([position.expand(*batch, -1), rotation.expand(*batch, -1)], dim=-1)
 
 

@@ -15,7 +15,7 @@ from torch_pbd.control.stiffness import limits
 from torch_pbd.control.stiffness.limits import Block, Limit, RotationLimits
 from torch_pbd.control.stiffness.precision import as_masses, matched_effort, precision_stiffness
 from torch_pbd.exceptions import InvalidParameterError
-from torch_pbd.linalg import spectral_map
+from torch_pbd.linalg import broadcast_shapes, spectral_map
 
 Bounds = Literal["quantile", "sigma", "variance"]
 Kind = Literal["linear", "precision"]
@@ -227,7 +227,7 @@ class StiffnessLaw:
         scales = [self._scales(block, block.of(matrix), None) for block in blocks] if self.effort == "match" else []
         efforts = self._efforts(matrix, blocks, mass, scales)
         masses = as_masses(mass, matrix)
-        shape = torch.broadcast_shapes(matrix.shape, masses.shape)
+        shape = broadcast_shapes(matrix.shape, masses.shape)
         matrix, masses = matrix.expand(shape), masses.expand(shape)
         given = efforts, [block.stiffness_min for block in blocks], [block.stiffness_max for block in blocks]
         effort, low, high = (matrix.new_tensor(limits.of_outputs(blocks, values)) for values in given)
