@@ -223,7 +223,7 @@ def serve(port: int = 0, *, browse: bool = True) -> None:
     browse : bool, default=True
         Open the page in a browser.
     """
-    with socket.socket() as listening:
+    with socket.socket(proto=socket.IPPROTO_TCP) as listening:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listening.bind((_LOOPBACK, port))
         listening.listen()  # whoever opens the address before the first request is answered waits
