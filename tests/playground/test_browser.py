@@ -3,6 +3,7 @@
 import shutil
 import time
 
+import numpy as np
 import pytest
 
 from torch_pbd.control import Schedule
@@ -74,6 +75,15 @@ def draw(page, off):
         page.mouse.move(*at(page, *place))
         page.wait_for_timeout(20)
     page.mouse.up()
+
+
+def test_ellipses_of_the_strokes_themselves_do_not_wait_for_a_model(page):
+    strokes, measured = state(page, "state.strokes.map((stroke) => stroke.rows)"), state(page, "state.measured")
+    share = np.linspace(0.0, 1.0, len(measured["path"]))
+    places = [[np.interp(share * rows[-1][0], *np.transpose(rows)[[0, k]]) for k in (1, 2)] for rows in strokes]
+    np.testing.assert_allclose(measured["path"], np.mean(places, axis=0).T, rtol=1e-9)
+    covariance = [np.cov(np.array(places)[:, :, i].T)[[0, 0, 1], [0, 1, 1]] for i in range(len(share))]
+    np.testing.assert_allclose(measured["covariance"], covariance, rtol=1e-9, atol=1e-15)
 
 
 def test_six_strokes_and_the_way_home(page, tmp_path):

@@ -12,8 +12,8 @@ from .strokes import make_strokes
 
 def learned_from(models=("CholeskyCovRegressor",), **settings):
     settings = messages.as_settings({"models": list(models), **settings})
-    steps = list(learning.learn(messages.as_strokes(make_strokes()), settings))
-    return steps[-1][0], [answer for _, answer in steps if answer]
+    learned, steps = learning.learn(messages.as_strokes(make_strokes()), settings)
+    return learned, [answer for step in steps if (answer := step())]
 
 
 @pytest.fixture

@@ -63,6 +63,18 @@ def test_strokes_are_learned_bent_followed_and_taken_home(address):
             assert get(address, name)[0] == 404
 
 
+@pytest.mark.slow
+def test_newer_strokes_do_not_wait_for_what_is_learned_of_older_ones(address):
+    with open_page(address) as (page, _):
+        fast = {"type": "learn", "strokes": make_strokes(), "settings": {"models": ["CholeskyCovRegressor"]}}
+        ask(page, fast, "schedule")  # once the modules are loaded
+        slow = {"models": ["HeteroscedasticGPRegressor", "WishartProcessRegressor"]}
+        page.send(json.dumps({**fast, "settings": slow}))
+        assert ask(page, fast, "picture")["model"] == "CholeskyCovRegressor"
+        bent = ask(page, {"type": "bend", "points": [], "follow": False}, "picture", "score")
+        assert bent["type"] == "picture"
+
+
 def test_only_our_own_page_is_answered(address):
     assert get(address)[0] == 200
     assert b"canvas" in get(address)[1]

@@ -2,8 +2,10 @@
 
 import tempfile
 import time
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ _RATE = 1000.0  # Hz of the robot's loop
 _AT_ONCE = 20  # rows of a schedule in a row of the strip chart
 
 Answer = dict[str, Any]
+Step = Callable[[], Answer | None]
 
 
 @dataclass
@@ -34,26 +37,37 @@ class Learned:
     via: list[tuple[float, float, float]] = field(default_factory=list)
     bent: DMPController | None = None
     schedule: Schedule | None = None
+    scores: dict[tuple[str, int], float] = field(default_factory=dict)
 
 
-def learn(strokes: list[Stroke], settings: Settings) -> Iterator[tuple[Learned, Answer | None]]:
-    """Models of two strokes or more, the schedule of the first, and last how likely left-out strokes are.
+def learn(strokes: list[Stroke], settings: Settings) -> tuple[Learned, deque[Step]]:
+    """Steps that learn models of two strokes or more, the schedule of the first, and how likely left-out strokes are.
 
-    It stops after each fit, with an answer or none: whoever asks goes on, or turns to newer strokes.
+    Each may be begun again if it was interrupted.
     """
     learned = Learned(_demonstrations(strokes), settings)
-    for name in settings.models:
-        begun = time.perf_counter()
-        learned.controllers[name] = _controller(_model(name), settings).fit(learned.strokes)
-        took = time.perf_counter() - begun
-        yield learned, {**picture(learned.controllers[name], name, drawn=True), "seconds": took}
-    yield learned, follow(learned)
-    for name in settings.models if len(learned.strokes) > 2 else ():
-        scores = []
-        for score in _left_out(learned, name):
-            scores.append(score)
-            yield learned, None
-        yield learned, {"type": "score", "model": name, "nats": float(np.mean(scores))}
+    left_out = range(len(strokes)) if len(strokes) > 2 else ()
+    steps: list[Step] = [partial(_fit, learned, name) for name in settings.models]
+    steps.append(partial(follow, learned))
+    steps += [partial(_leave_out, learned, name, k) for name in settings.models for k in left_out]
+    return learned, deque(steps)
+
+
+def _fit(learned: Learned, name: str) -> Answer:
+    begun = time.perf_counter()
+    learned.controllers[name] = _controller(_model(name), learned.settings).fit(learned.strokes)
+    return {**picture(learned.controllers[name], name, drawn=True), "seconds": time.perf_counter() - begun}
+
+
+def _leave_out(learned: Learned, name: str, k: int) -> Answer | None:
+    """Log-likelihood of strokes, each left out, under the joint law of the others, once it is known of all."""
+    aligned = learned.strokes.align("phase", n=_STEPS)
+    train, test = aligned.split([k])
+    learned.scores[name, k] = float(_model(name).fit(train).score_demonstrations(test)[0]) / _STEPS
+    if k + 1 < len(aligned):
+        return None
+    nats = float(np.mean([learned.scores[name, i] for i in range(len(aligned))]))
+    return {"type": "score", "model": name, "nats": nats}
 
 
 def adjust(learned: Learned, settings: Settings) -> Answer:
@@ -159,14 +173,6 @@ def _bent(learned: Learned) -> DMPController:
         return controller
     points = np.array(learned.via)
     return controller.condition(points[:, 0], points[:, 1:])
-
-
-def _left_out(learned: Learned, name: str) -> Iterator[float]:
-    """Log-likelihood of each stroke, left out, under its joint law, in nats a sample."""
-    aligned = learned.strokes.align("phase", n=_STEPS)
-    for k in range(len(aligned)):
-        train, test = aligned.split([k])
-        yield float(_model(name).fit(train).score_demonstrations(test)[0]) / _STEPS
 
 
 def _python(learned: Learned) -> str:

@@ -223,6 +223,7 @@ def serve(port: int = 0, *, browse: bool = True) -> None:
     browse : bool, default=True
         Open the page in a browser.
     """
+    # asyncio lets small messages wait for each other, up to 40 ms, unless the protocol is named.
     with socket.socket(proto=socket.IPPROTO_TCP) as listening:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listening.bind((_LOOPBACK, port))
@@ -235,4 +236,6 @@ def serve(port: int = 0, *, browse: bool = True) -> None:
         )  # fmt: skip
         if browse:
             webbrowser.open(playground.address)
-        uvicorn.Server(config).run(sockets=[listening])
+        with contextlib.suppress(KeyboardInterrupt):  # Ctrl-C, which is how it is meant to end
+            uvicorn.Server(config).run(sockets=[listening])
+        say("\nplayground: ended.")

@@ -1,4 +1,5 @@
 // The page's state, its socket, and what the controls do. The server moves the robot; this asks it for each frame.
+import { empirical } from "./empirical.js";
 import { EXAMPLES, example } from "./examples.js";
 import { View, WORLD, drawScene, drawStrip, readColours } from "./scene.js";
 import { listen } from "./input.js";
@@ -14,7 +15,7 @@ const SLIDERS = [
 
 export const state = {
   mode: "draw", strokes: [], current: null, pen: null, undone: [],
-  pictures: {}, shown: [], scores: {}, draws: true, via: [], chosen: -1, place: null,
+  measured: null, pictures: {}, shown: [], draws: true, via: [], chosen: -1, place: null,
   settings: { stiffness_min: 50, stiffness_max: 1000, damping_ratio: 1, mass: 1, speed: 1, smooth: false, models: [] },
   schedule: null, robot: null, trace: [], hand: null, push: [0, 0], isPaused: false, tab: null,
 };
@@ -55,7 +56,7 @@ function receive(answer) {
     state.tab = answer.tab;
     offer(answer);
     learn();
-  } else if (answer.type === "ready" || answer.type === "restarted") {
+  } else if (answer.type === "restarted") {
     learn();
   } else if (answer.type === "picture") {
     if (isBending) { isBending = false; answer.draws = []; }
@@ -112,14 +113,15 @@ function learn() {
   find("unbend").hidden = true;
   for (const which of [0, 1]) find(`score-${which}`).textContent = "";
   if (visible().length < 2) {
-    Object.assign(state, { pictures: {}, shown: [], schedule: null });
-    find("report").textContent = "";
+    Object.assign(state, { measured: null, pictures: {}, shown: [], schedule: null });
+    find("safety").hidden = true;
     say(visible().length ? "Draw it once more, a little differently." : "Draw a movement here.");
     return;
   }
-  say("learning ...");
+  say(state.schedule ? "learning ..." : "learning ... (at the start some seconds)");
   statistics.asked = performance.now();
   statistics.learned = 0;
+  state.measured = empirical(visible().map((stroke) => stroke.rows));
   ask({ type: "learn", strokes: visible().map((stroke) => stroke.rows), settings: state.settings });
 }
 
@@ -132,11 +134,13 @@ export function bend(isFinished) {
 }
 
 function report(answer) {
-  const [first, ...rest] = answer.report.split("\n"), box = find("report"), verdict = document.createElement("b");
-  const at = first.indexOf(answer.is_guaranteed ? "guaranteed" : "NOT GUARANTEED");
-  verdict.textContent = first.slice(at);
-  box.replaceChildren(first.slice(0, at), verdict, `\n${rest.map((each) => each.trim().replace(/  +/, ": ")).join("\n")}`);
-  box.classList.toggle("wrong", !answer.is_guaranteed);
+  // Two spaces begin an entry, more go on with it; its name ends with two.
+  const entries = answer.report.replace(/\n {3,}/g, " ").split("\n").slice(1).map((line) => line.trim().split(/ {2,}/));
+  const verdict = find("verdict"), safety = find("safety");
+  verdict.textContent = `Stability: ${entries[0][1]}`;
+  verdict.className = answer.is_guaranteed ? "" : "wrong";
+  find("report").textContent = entries.map((entry) => entry.join(": ")).join("\n");
+  safety.hidden = false;
 }
 
 function listStrokes() {

@@ -5,7 +5,7 @@ export const WORLD = { width: 0.9, height: 0.6 }; // m
 let colours = {};
 export function readColours() {
   const style = getComputedStyle(document.documentElement);
-  for (const name of ["ground", "ink", "soft", "line", "strokes", "model", "second", "force"])
+  for (const name of ["ground", "ink", "soft", "line", "strokes", "model", "second", "empirical", "robot", "force"])
     colours[name] = style.getPropertyValue(`--${name}`).trim();
 }
 
@@ -76,6 +76,25 @@ function mark(view, point, colour, text) {
   c.fillText(text, x + 9, y - 9);
 }
 
+function legend(view, entries) { // along the frame's lower edge, as many in a row as fit
+  const c = view.context, left = view.left + 10, right = view.left + view.scale * WORLD.width - 10;
+  c.font = "12px system-ui, sans-serif";
+  c.lineWidth = 3;
+  let x = left, y = view.bottom - 10;
+  for (const [text, colour] of entries) {
+    const width = c.measureText(text).width + 44;
+    if (x > left && x + width > right) { x = left; y -= 17; }
+    c.strokeStyle = colour;
+    c.beginPath();
+    c.moveTo(x, y - 4);
+    c.lineTo(x + 20, y - 4);
+    c.stroke();
+    c.fillStyle = colours.soft;
+    c.fillText(text, x + 26, y);
+    x += width;
+  }
+}
+
 export function drawScene(view, state) {
   view.begin();
   const c = view.context, [x0, y1] = view.pixel([0, WORLD.height]);
@@ -83,9 +102,21 @@ export function drawScene(view, state) {
   c.lineWidth = 1;
   c.strokeRect(x0, y1, view.scale * WORLD.width, view.scale * WORLD.height);
   for (const stroke of state.strokes)
-    if (!stroke.hidden) line(view, stroke.rows.map((row) => row.slice(1)), colours.strokes, 1.4, state.shown.length ? 0.7 : 1);
+    if (!stroke.hidden) line(view, stroke.rows.map((row) => row.slice(1)), colours.strokes, 1.4, 1);
   if (state.current) line(view, state.current.map((row) => row.slice(1)), colours.ink, 2);
-  state.shown.forEach((name, which) => drawModel(view, state, state.pictures[name], which));
+  const entries = [["your strokes", colours.strokes]];
+  if (state.shown.length)
+    state.shown.forEach((name, which) => {
+      const colour = which ? colours.second : colours.model;
+      entries.push([`${name}: mean, 2 sd`, colour]);
+      drawModel(view, state, state.pictures[name], colour, which ? [7, 6] : []);
+    });
+  else if (state.measured) {
+    entries.push(["their mean, 2 sd", colours.empirical]);
+    drawModel(view, state, state.measured, colours.empirical);
+  }
+  if (state.robot && state.robot.is_there) entries.push(["robot, its stiffness", colours.robot]);
+  legend(view, entries);
   for (const [i, via] of state.via.entries()) {
     const colour = i === state.chosen ? colours.force : colours.ink, [x, y] = view.pixel(via.point);
     c.strokeStyle = colour;
@@ -100,28 +131,27 @@ export function drawScene(view, state) {
   if (state.robot && state.robot.is_there) drawRobot(view, state);
 }
 
-function drawModel(view, state, picture, which) {
-  const colour = which ? colours.second : colours.model;
+function drawModel(view, state, picture, colour, dash = []) {
   if (state.draws) for (const made of picture.draws) line(view, made, colour, 1, 0.35);
   picture.covariance.forEach((matrix, i) => {
     if (i % 3) return;
     const [large, small, angle] = axes(matrix); // two standard deviations
     const half = [large, small].map((value) => Math.max(1, 2 * view.scale * Math.sqrt(value)));
-    ellipse(view, picture.path[i], half, angle, { stroke: colour, fill: colour, alpha: which ? 0.1 : 0.14 });
+    ellipse(view, picture.path[i], half, angle, { stroke: colour, fill: colour, alpha: 0.13 });
   });
-  line(view, picture.path, colour, 3, 1, which ? [7, 6] : []);
-  if (which) return;
+  line(view, picture.path, colour, 3, 1, dash);
+  if (dash.length) return;
   const first = picture.path[0], last = picture.path[picture.path.length - 1];
   for (const end of [first, last]) ellipse(view, end, [4, 4], 0, { fill: colour });
-  mark(view, first, colour, "start");
-  mark(view, last, colour, "goal");
+  mark(view, first, colours.ink, "start");
+  mark(view, last, colours.ink, "goal");
 }
 
 function drawRobot(view, state) {
   const { position, desired, stiffness, force } = state.robot, c = view.context;
   const [large, small, angle] = axes(stiffness), most = state.settings.stiffness_max;
   const half = [large, small].map((value) => 6 + 38 * value / most);
-  ellipse(view, position, half, angle, { stroke: colours.ink, alpha: 0.8, width: 1.5 });
+  ellipse(view, position, half, angle, { stroke: colours.robot, width: 2 });
   line(view, [position, desired], colours.soft, 1, 1, [3, 3]);
   ellipse(view, desired, [3, 3], 0, { fill: colours.soft });
   if (state.hand) {
@@ -139,7 +169,7 @@ function drawRobot(view, state) {
     for (const side of [2.6, -2.6]) { c.moveTo(...tip); c.lineTo(tip[0] + 8 * Math.cos(turn + side), tip[1] + 8 * Math.sin(turn + side)); }
     c.stroke();
   }
-  ellipse(view, position, [7, 7], 0, { fill: colours.ink, stroke: colours.ground, width: 1.5 });
+  ellipse(view, position, [7, 7], 0, { fill: colours.robot, stroke: colours.ground, width: 1.5 });
 }
 
 function spring(view, from, to) {
@@ -171,12 +201,12 @@ export function drawStrip(view, state) {
   const widest = Math.max(0.01, ...state.trace.map((row) => row[1]));
   c.fillText(`K ${most.toFixed(0)}`, 8, top + 4);
   c.fillText("N/m  0", 8, bottom + 4);
-  c.fillText("along the stiffer and the softer axis", left + 4, top - 5);
+  c.fillText("stiffness along the stiffer and the softer axis", left + 4, top - 5);
   c.fillText("0 s", left, height - 4);
   c.textAlign = "right";
   c.fillText(`${duration.toFixed(1)} s`, right, height - 4);
-  c.fillStyle = colours.force;
-  c.fillText("deviation", right - 4, top - 5);
+  c.fillStyle = colours.robot;
+  c.fillText("deviation of the robot", right - 4, top - 5);
   c.textAlign = "left";
   c.fillText(`${(1000 * widest).toFixed(0)} mm`, right + 6, top + 4);
   c.strokeStyle = colours.line;
@@ -192,7 +222,7 @@ export function drawStrip(view, state) {
     });
     c.stroke();
   }
-  c.strokeStyle = colours.force;
+  c.strokeStyle = colours.robot;
   c.lineWidth = 1.8;
   c.beginPath();
   state.trace.forEach(([time, deviation], i) => {
