@@ -1,5 +1,6 @@
 """The page in a real browser: strokes, ellipses, a via point, pushes, files; two tabs; and nothing from elsewhere."""
 
+import json
 import shutil
 import time
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 from torch_pbd.control import Schedule
+from torch_pbd.control.simulation.run import simulate_schedule
 
 api = pytest.importorskip("playwright.sync_api", reason="the extra 'test' is not installed")
 CHROMIUM = shutil.which("chromium")
@@ -130,6 +132,33 @@ def test_a_via_point_is_met_and_the_robot_gives_way_where_strokes_differ(page):
         page.keyboard.up("ArrowLeft")
         peaks.append(state(page, "Math.max(...state.trace.map((row) => row[1]))"))
     assert peaks[1] > 1.3 * peaks[0]
+
+
+def test_a_push_deviates_as_simulate_says_of_the_same_force(page, tmp_path):
+    answers = []
+    page.on("websocket", lambda socket: socket.on("framereceived", lambda text: answers.append(text)))  # noqa: PLW0108
+    page.reload()
+    wait(page, "state.robot && state.robot.time > 0.2")
+    page.keyboard.press("p")
+    wait(page, "state.robot.time < 0.2")  # from rest at the start of a movement
+    answers.clear()
+    wait(page, "state.robot.time > 0.3 * state.schedule.duration")
+    page.keyboard.down("ArrowUp")
+    wait(page, "state.robot.time > 0.7 * state.schedule.duration")
+    page.keyboard.up("ArrowUp")
+    wait(page, "state.robot.time > 0.98 * state.schedule.duration")
+    with page.expect_download() as download:
+        page.click("text=schedule.npz")
+    download.value.save_as(tmp_path / "schedule.npz")
+    schedule = Schedule.load(tmp_path / "schedule.npz")
+    states = [each for each in map(json.loads, answers) if each["type"] == "robot"]
+    steps = np.diff([each["time"] for each in states])
+    states = states[: 1 + np.argmin(steps) if steps.min() < 0.0 else None]  # until it begins again
+    # The force of an answer was held over the ticks since the one before it.
+    time, force = [each["time"] for each in states], np.array([each["force"] for each in states])
+    held = force[np.searchsorted(time, schedule.time).clip(max=len(time) - 1)]
+    simulated = np.linalg.norm(simulate_schedule(schedule, None, held, 1000.0, None).deviation, axis=1)
+    assert max(each["deviation"] for each in states) == pytest.approx(simulated.max(), rel=0.02)
 
 
 def test_keys_alone_draw_bend_and_push(page):

@@ -68,7 +68,7 @@ class Robot:
             self._rest = self._rest + _TICK if controller.schedule_time >= schedule.duration else 0.0
             if self._rest > _REST:
                 self._rest = 0.0
-                controller.start(self._now, controller.position)
+                controller.start(self._now)  # at its start: on a way back it would not be where the schedule is
         stiffness = np.asarray(controller.stiffness)
         return {
             "type": "robot",
