@@ -288,7 +288,7 @@ START = 1_700_000_000_123_456_789
 NS = [START + round(t * 1e9) for t in TIMES[0]]
 
 
-def messages(version, kind, stamps=NS, position=PATHS[0]):
+def messages(version, kind, stamps=NS, position=PATHS[0], turns=TURNS[0]):
     """Messages as drivers send them, by their topic's kind."""
     types = STORES[version].types
 
@@ -300,7 +300,7 @@ def messages(version, kind, stamps=NS, position=PATHS[0]):
         header = make("std_msgs/Header", *((i,) if version == 1 else ()), time, "base_link")
         x, y, z = map(float, position[i])
         if kind == "PoseStamped":
-            turn = make("geometry_msgs/Quaternion", *map(float, TURNS[0][i]))
+            turn = make("geometry_msgs/Quaternion", *map(float, turns[i]))
             pose = make("geometry_msgs/Pose", make("geometry_msgs/Point", x, y, z), turn)
             yield make("geometry_msgs/PoseStamped", header, pose)
         elif kind == "WrenchStamped":
@@ -328,7 +328,7 @@ def messages(version, kind, stamps=NS, position=PATHS[0]):
 PACKAGES = {"JointState": "sensor_msgs", "TFMessage": "tf2_msgs", "String": "std_msgs"}
 
 
-def write_bag(path, store, kinds, **changes):
+def write_bag(path, store, kinds, marks=(None, {}), **changes):
     version = 1 if store == "ros1" else 2
     storage = {"sqlite3": rosbag2.StoragePlugin.SQLITE3, "mcap": rosbag2.StoragePlugin.MCAP}
     writer = rosbag1.Writer(path) if version == 1 else rosbag2.Writer(path, version=9, storage_plugin=storage[store])
@@ -339,7 +339,13 @@ def write_bag(path, store, kinds, **changes):
             connection = writer.add_connection(f"/{kind.lower()}", name, typestore=STORES[version])
             serialize = STORES[version].serialize_ros1 if version == 1 else STORES[version].serialize_cdr
             for i, message in enumerate(messages(version, kind, **changes)):
-                writer.write(connection, START + 10**9 + i, bytes(serialize(message, name)))  # received a second later
+                writer.write(connection, START + 10**9 + 2 * i, bytes(serialize(message, name)))  # a second later
+        if marks[0]:
+            name = f"std_msgs/msg/{marks[0]}"
+            connection = writer.add_connection("/is", name, typestore=STORES[version])
+            for i, value in marks[1].items():
+                mark = STORES[version].types[name](value)
+                writer.write(connection, START + 10**9 + 2 * i - 1, bytes(serialize(mark, name)))
 
 
 BAGS = ["ros1", "sqlite3", "mcap"]
@@ -398,6 +404,44 @@ def test_stamps_that_repeat_or_come_late_are_put_right_and_told(tmp_path):
     with pytest.warns(UserWarning, match=r"1 of 5 messages came after later ones.*1 repeat the stamp"):
         loaded = load_demonstrations(tmp_path / "run")
     np.testing.assert_array_equal(loaded[0].position, PATHS[0][[0, 1, 4, 3]])
+
+
+def write_marked(path, store, kind, marks, n=20):
+    """A bag of ``n`` poses at 10 Hz; before pose i a second topic says marks[i]."""
+    stamps, places = [START + i * 10**8 for i in range(n)], np.column_stack([np.arange(n) ** 2, np.zeros((n, 2))])
+    write_bag(path, store, ["PoseStamped"], (kind, marks), stamps=stamps, position=places, turns=np.eye(4)[[3] * n])
+
+
+@pytest.mark.parametrize("store", BAGS)
+@pytest.mark.parametrize(
+    ("kind", "marks", "spans"),
+    [
+        ("Bool", {0: False, 3: True, 7: False, 9: False, 12: True, 15: False}, [(3, 7), (12, 15)]),
+        ("UInt8", {2: 0, 3: 1, 7: 0, 12: 1}, [(3, 7), (12, 20)]),  # a flag: it comes back to zero
+        ("Int32", {2: 0, 7: 1, 9: 1, 12: 2}, [(2, 7), (7, 12), (12, 20)]),  # a count: it does not
+        ("String", {1: "a", 5: "", 8: "a", 12: "b"}, [(1, 5), (8, 12), (12, 20)]),
+    ],
+)
+def test_a_second_topic_cuts_a_bag_into_demonstrations(tmp_path, store, kind, marks, spans):
+    path = bag_path(tmp_path, store)
+    write_marked(path, store, kind, marks)
+    cut = load_demonstrations(path, demo="/is", outputs="x")
+    assert [[*y[:, 0]] for y in cut.positions] == [[i**2 for i in range(*span)] for span in spans]
+    for time, (first, last) in zip(cut.times, spans, strict=True):
+        np.testing.assert_allclose(time, np.arange(first - spans[0][0], last - spans[0][0]) / 10, atol=1e-12)
+
+
+def test_what_a_topic_cannot_cut_is_told(tmp_path):
+    write_marked(tmp_path / "run", "mcap", "Bool", {0: False, 3: True, 4: False, 9: True})
+    with pytest.raises(DataFormatError, match=r"topic '/cut', by which demo= .* it has: /is \(std_msgs.*, /pose"):
+        load_demonstrations(tmp_path / "run", demo="/cut")
+    with pytest.raises(DataFormatError, match=r"'/posestamped'.* is of geometry_msgs/msg/PoseStamped, must be of Bool"):
+        load_demonstrations(tmp_path / "run", demo="/posestamped")
+    with pytest.warns(UserWarning, match=r"less than two messages.*: 1 of 2 demonstrations by '/is'"):
+        assert load_demonstrations(tmp_path / "run", demo="/is", outputs="x").n_steps == (11,)
+    write_marked(tmp_path / "off", "mcap", "Bool", {0: False})
+    with pytest.raises(DataFormatError, match=r"demo='/is' marks no demonstration: its values are \[False\]"):
+        load_demonstrations(tmp_path / "off", demo="/is")
 
 
 # Extras

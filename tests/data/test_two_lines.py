@@ -84,11 +84,8 @@ def robomimic(folder):
 def bag(folder):
     for k, (time, position) in enumerate(recorded()):
         stamps = [test_formats.START + round(60e9 * k + t * 1e9) for t in time]
-        turns = np.tile([0.0, 0.0, 0.0, 1.0], (len(time), 1))
-        before, test_formats.TURNS[0] = test_formats.TURNS[0], turns
-        poses = np.column_stack([position, 0 * time])
-        write_bag(folder / f"run_{k}", "mcap", ["PoseStamped"], stamps=stamps, position=poses)
-        test_formats.TURNS[0] = before
+        poses = {"position": np.column_stack([position, 0 * time]), "turns": np.eye(4)[[3] * len(time)]}
+        write_bag(folder / f"run_{k}", "mcap", ["PoseStamped"], stamps=stamps, **poses)
     return load_demonstrations(folder / "run_*", outputs=["x", "y"])
 
 

@@ -18,10 +18,14 @@ _LONGEST = 0.25 * float(np.finfo(np.float64).max)
 Arrays = list[NDArray[Any]]
 
 
+class Fresh(list[NDArray[Any]]):
+    """Arrays that nobody else has: they need not be copied."""
+
+
 def as_recordings(times: Any, positions: Any, missing: str) -> tuple[tuple[Floats, ...], tuple[Floats, ...]]:
     """Read-only float64 copies: K times (T_k,) and K positions (T_k, d), less the missing samples if these are dropped.
 
-    Messages number the samples as they were before.
+    Messages number the samples as they were before. `Fresh` positions are no copies.
     """
     drop = checks.choice(missing, "missing", Missing) == "drop"
     samples = [_samples(entry, f"positions[{k}]", drop) for k, entry in enumerate(_as_list(positions, "positions"))]
@@ -33,9 +37,10 @@ def as_recordings(times: Any, positions: Any, missing: str) -> tuple[tuple[Float
         kept = _not_missing(grids, samples)
         grids = [grid[numbers] for grid, numbers in zip(grids, kept, strict=True)]
         samples = [sample[numbers] for sample, numbers in zip(samples, kept, strict=True)]
+    fresh = drop or isinstance(positions, Fresh)
     return (
         tuple(map(_rising, _from_common_origin(grids), grids, names, kept)),
-        tuple(_finite(sample, k, kept[k]) for k, sample in enumerate(samples)),
+        tuple(_finite(_frozen(sample, fresh), k, kept[k]) for k, sample in enumerate(samples)),
     )
 
 
@@ -191,14 +196,14 @@ def _longest_run(hole: NDArray[np.bool_]) -> int:
     return int((edges[1::2] - edges[::2]).max(initial=0))
 
 
-def _frozen(array: NDArray[Any]) -> Floats:
-    copy = np.array(array, dtype=np.float64, order="C")
+def _frozen(array: NDArray[Any], fresh: bool = False) -> Floats:
+    # A view would keep alive what it is a part of.
+    copy = np.array(array, dtype=np.float64, order="C", copy=None if fresh and array.base is None else True)
     copy.setflags(write=False)
     return copy
 
 
-def _finite(samples: NDArray[Any], k: int, numbers: NDArray[np.intp]) -> Floats:
-    position = _frozen(samples)
+def _finite(position: Floats, k: int, numbers: NDArray[np.intp]) -> Floats:
     if not np.isfinite(position).all():
         i, j = np.argwhere(~np.isfinite(position))[0]
         missing = np.isnan(position[i, j])

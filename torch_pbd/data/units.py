@@ -111,10 +111,13 @@ def _wrapped(positions: Sequence[Floats], names: Sequence[str], units: Sequence[
     known: Sequence[str | None] = units or [None] * len(names)
     within = np.cumsum([len(position) for position in positions])[:-1] - 1  # steps from one demonstration to the next
     for i, (name, unit) in enumerate(zip(names, known, strict=True)):
-        values = _column(positions, i)
-        step, whole = np.delete(np.abs(np.diff(values)), within), np.ptp(values)
-        for angle in ANGLES if unit is None else {unit} & set(ANGLES):
-            turn = 2.0 * math.pi / ANGLES[angle]
+        turns = {angle: 2.0 * math.pi / ANGLES[angle] for angle in (ANGLES if unit is None else {unit} & set(ANGLES))}
+        whole = max(position[:, i].max() for position in positions) - min(
+            position[:, i].min() for position in positions
+        )
+        # Most outputs cover less than a turn, and are not looked at step by step.
+        for angle, turn in turns.items() if whole >= (1.0 - _QUARTER) * min(turns.values(), default=math.inf) else ():
+            step = np.delete(np.abs(np.diff(_column(positions, i))), within)
             jumps = np.abs(step - turn) <= _QUARTER * turn
             other = step[~jumps].max(initial=0.0)
             # What goes on behind the jump is as smooth as elsewhere.

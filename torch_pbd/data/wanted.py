@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.data.recordings import Missing, as_texts, preview
+from torch_pbd.data.recordings import Fresh, Missing, as_texts, preview
 from torch_pbd.files.memory import require_memory
 
 _FEWEST_COUNTED = 5  # rows; fewer rise by one by chance
@@ -161,13 +162,13 @@ class Wanted:
         given = {"units": self.units, "frame": self.frame, "rotation": self.rotation, "angles": self.angles}
         labels |= {name: value for name, value in given.items() if value is not None}
         labels |= {"names": names, "time_unit": unit, "missing": self.missing}
-        return {"times": times, "positions": positions, **labels}
+        return {"times": times, "positions": Fresh(positions), **labels}
 
     def read_each(self, chosen: Chosen, recordings: Iterable[Mapping[str, NDArray[Any]]], **labels: Any) -> Arguments:
         """:meth:`arguments` of the signals of each recording."""
         parts = [self._columns(chosen, signals) for signals in recordings]
-        times = [time for time, _ in parts if time is not None]
-        return self.arguments(times or None, [position for _, position in parts], chosen.names, **labels)
+        times = [time for time, _ in parts if time is not None] if chosen.time else None
+        return self.arguments(times, [position for _, position in parts], chosen.names, **labels)
 
     def read_rows(self, chosen: Chosen, signals: Mapping[str, NDArray[Any]], **labels: Any) -> Arguments:
         """:meth:`arguments` of a long table, whose rows tell theirs; in the order of their first rows."""
@@ -183,10 +184,12 @@ class Wanted:
             return values if values.ndim == 1 else values[:, place[1]]
 
         outputs = [column(place) for place in chosen.outputs]
-        for name, values in zip(chosen.names, outputs, strict=True):
+        position = np.empty((len(outputs[0]), len(outputs)))
+        for i, (name, values) in enumerate(zip(chosen.names, outputs, strict=True)):
             if values.dtype.kind not in "biuf":
                 raise ValueError(f"column {name!r} holds {values.dtype}, no numbers: leave it out by outputs=.")
-        return column(chosen.time) if chosen.time else None, np.column_stack([o.astype(np.float64) for o in outputs])
+            position[:, i] = values
+        return column(chosen.time) if chosen.time else None, position
 
 
 def _numbers_of_dates(times: Sequence[NDArray[Any]], unit: str) -> list[Floats]:
@@ -196,13 +199,18 @@ def _numbers_of_dates(times: Sequence[NDArray[Any]], unit: str) -> list[Floats]:
     return [(time - origin).astype("m8[ns]") / step for time in times]
 
 
-def rows_of(demo: NDArray[Any]) -> list[NDArray[np.intp]]:
-    """Numbers of the rows of each demonstration, in the order of their first ones."""
-    if not len(demo):
-        return []
-    # Most tables have a run of rows for each: runs are sorted, not rows.
-    heads = np.flatnonzero(np.r_[True, demo[1:] != demo[:-1]])
+def heads_of(labels: NDArray[Any]) -> NDArray[np.intp]:
+    """Numbers of the rows that begin a run of equal ones."""
+    return np.flatnonzero(np.r_[True, labels[1:] != labels[:-1]][: len(labels)])
+
+
+def rows_of(demo: NDArray[Any]) -> Sequence[slice | NDArray[np.intp]]:
+    """Rows of each demonstration, in the order of their first ones."""
+    heads = heads_of(demo)
     _, first, inverse = np.unique(demo[heads], return_index=True, return_inverse=True)
+    # Most tables have one run of rows for each, which take no copies; else runs are sorted, not rows.
+    if len(first) == len(heads):
+        return [slice(a, b) for a, b in pairwise([*heads.tolist(), len(demo)])]
     rank = np.repeat(np.argsort(np.argsort(first))[inverse], np.diff(np.r_[heads, len(demo)]))
     return np.split(np.argsort(rank, kind="stable"), np.cumsum(np.bincount(rank))[:-1])
 

@@ -19,7 +19,7 @@ from torch_pbd.data.demonstrations import Demonstrations
 from torch_pbd.data.poses import as_columns
 from torch_pbd.data.recordings import preview
 from torch_pbd.data.units import nanoseconds_hint
-from torch_pbd.data.wanted import Arguments, Chosen, Wanted, rows_of
+from torch_pbd.data.wanted import Arguments, Chosen, Wanted, heads_of, rows_of
 from torch_pbd.files.atomic import LOADERS
 
 DELIMITERS = (",", ";", "\t")
@@ -37,10 +37,10 @@ def read(path: Path, wanted: Wanted, delimiter: str | None = None, decimal: str 
     with path.open(encoding="utf-8-sig", newline="") as file:
         try:
             table = _open_table(file, delimiter, decimal, wanted)
-            times, positions = table.recordings_at_once() or table.recordings()
+            signals = table.read_at_once() or table.read_lines()
         except UnicodeDecodeError as error:
             raise ValueError(f"it is not text in UTF-8: {error}.") from error
-    return wanted.arguments(times if table.chosen.time else None, positions, table.chosen.names)
+    return wanted.read_rows(table.chosen, signals)
 
 
 def write(demonstrations: Demonstrations, handle: BinaryIO) -> None:
@@ -70,8 +70,8 @@ class _Table:
     chosen: Chosen
     wanted: Wanted
 
-    def recordings_at_once(self) -> tuple[list[NDArray[Any]], list[NDArray[Any]]] | None:
-        """Result of :meth:`recordings`, in a sixth of the time; None where a line needs to be looked at."""
+    def read_at_once(self) -> dict[str, NDArray[Any]] | None:
+        """Result of :meth:`read_lines`, in a sixth of the time; None where a line needs to be looked at."""
         start = self.file.tell()
         first = next(csv.reader([self.file.readline(_LONGEST_HEADER)], delimiter=self.delimiter), [])
         self.file.seek(start)
@@ -98,51 +98,56 @@ class _Table:
         self.file.seek(start)
         if not len(rows):
             return None
-        labels = np.char.strip(rows[str(demo)]) if demo is not None else np.zeros(len(rows), dtype=bool)
-        lengths = np.char.str_len(labels) if demo is not None else np.ones(1)
-        if not (0 < lengths.min() <= lengths.max() < 16):  # 16: cut short
+        signals: dict[str, NDArray[Any]] = {self.header[i]: rows[str(i)] for i in outputs}
+        if time is not None:  # a copy, not a view of all columns, which recordings would keep
+            signals[self.header[time]] = rows[str(time)].copy()
+        sound = all(np.isfinite(values).all() for values in signals.values())
+        own = np.zeros(len(rows), np.int32) if demo is None else _numbered(rows[str(demo)])
+        if own is None or not sound:
             return None
-        groups = rows_of(labels)
-        times = [rows[str(time)][own] if time is not None else np.arange(float(len(own))) for own in groups]
-        positions = [np.column_stack([rows[str(i)][own] for i in outputs]) for own in groups]
-        sound = all(map(np.all, map(np.isfinite, (*times, *positions))))
-        return (times, positions) if sound and all((np.diff(own) > 0).all() for own in times) else None
+        if demo is not None:
+            signals[self.header[demo]] = own
+        moments = signals[self.header[time]] if time is not None else np.arange(len(rows))
+        return signals if all((np.diff(moments[each]) > 0).all() for each in rows_of(own)) else None
 
-    def recordings(self) -> tuple[list[NDArray[Any]], list[NDArray[Any]]]:
-        """Times, as integers where all are, and the other columns of each demonstration, as they first appear."""
+    def read_lines(self) -> dict[str, NDArray[Any]]:
+        """Columns by name; times as integers, where all are."""
         demo, time, outputs = self._columns()
-        recorded: dict[str, array[float]] = {}
-        stamps: dict[str, array[int]] = {}
+        numbers: dict[str, int] = {}
         last: dict[str, float] = {}
-        n_rows = clocks = 0
+        # Arrays of numbers take 8 bytes for each, where lists take 32.
+        own, stamps, times, values = array("q"), array("q"), array("d"), array("d")
+        clocks = 0
         for line, cells in self._rows():
             label = "" if demo is None else cells[demo].strip()
             if demo is not None and not label:
                 raise ValueError(f"line {line}, column {self.header[demo]!r}: the cell is blank.")
-            row = [self._number(cells[i], line, self.header[i]) for i in outputs]
-            before = last.get(label, -inf)
-            now = n_rows if time is None else self._time(cells[time], line, self.header[time])
-            n_rows, clocks = n_rows + 1, clocks + (time is not None and _is_clock(cells[time]))
+            values.extend(self._number(cells[i], line, self.header[i]) for i in outputs)
+            own.append(numbers.setdefault(label, len(numbers)))
+            if time is None:
+                continue
+            before, now = last.get(label, -inf), self._time(cells[time], line, self.header[time])
+            clocks += _is_clock(cells[time])
             if now <= before:
                 raise ValueError(
-                    f"line {line}, column {self.header[time or 0]!r}: {now!r} comes after {before!r} in demonstration "
+                    f"line {line}, column {self.header[time]!r}: {now!r} comes after {before!r} in demonstration "
                     f"{label!r}: times must increase strictly. Sort the lines by time and drop repeated ones"
                     f"{', or name the column that tells the demonstrations apart, demo=' if demo is None else ''}."
                     f"{nanoseconds_hint(now)}"
                 )
-            # Arrays of numbers take 8 bytes for each, where lists take 32.
-            recorded.setdefault(label, array("d")).extend([float(now), *row])
-            whole = stamps.setdefault(label, array("q"))
-            if isinstance(now, int):
-                whole.append(now)
             last[label] = before if isnan(now) else now
-        rows = {label: np.array(values).reshape(-1, 1 + len(outputs)) for label, values in recorded.items()}
-        times = [np.array(stamps[k]) if len(stamps[k]) == len(values) else values[:, 0] for k, values in rows.items()]
-        if clocks:
-            if clocks < n_rows:
-                raise ValueError(f"column {self.header[time or 0]!r}: {clocks} of {n_rows} times are dates or clocks.")
-            times = [own.astype("M8[ns]") for own in times]
-        return times, [values[:, 1:] for values in rows.values()]
+            times.append(float(now))
+            if isinstance(now, int):
+                stamps.append(now)
+        rows = np.array(values).reshape(len(own), len(outputs))
+        signals = {} if demo is None else {self.header[demo]: np.array(own)}
+        signals |= {self.header[i]: column for i, column in zip(outputs, rows.T, strict=True)}
+        if time is not None:
+            if 0 < clocks < len(own):
+                raise ValueError(f"column {self.header[time]!r}: {clocks} of {len(own)} times are dates or clocks.")
+            found = np.array(stamps) if len(stamps) == len(own) else np.array(times)
+            signals[self.header[time]] = found.astype("M8[ns]") if clocks else found
+        return signals
 
     def _columns(self) -> tuple[int | None, int | None, list[int]]:
         """Numbers of the columns of demonstration, time and outputs."""
@@ -193,6 +198,16 @@ class _Table:
                 "outputs=."
             )
         return value
+
+
+def _numbered(labels: NDArray[Any]) -> NDArray[np.int32] | None:
+    """Number of each label of at most 16 letters; None where one is blank, or may be cut short."""
+    heads = heads_of(labels)
+    each = np.char.strip(labels[heads])
+    lengths = np.char.str_len(each)
+    if not 0 < lengths.min() <= lengths.max() < 16:
+        return None
+    return np.repeat(np.unique(each, return_inverse=True)[1].astype(np.int32), np.diff(np.r_[heads, len(labels)]))
 
 
 def _open_table(file: TextIO, delimiter: str | None, decimal: str, wanted: Wanted) -> _Table:

@@ -2,22 +2,22 @@
 
 import json
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from torch_pbd.data.formats.parquet import read_columns
+from torch_pbd.data.formats.parquet import open_file, read_columns
 from torch_pbd.data.recordings import preview
-from torch_pbd.data.wanted import Arguments, Wanted, column_names, natural, rows_of
-from torch_pbd.extras import optional
+from torch_pbd.data.wanted import Arguments, Wanted, column_names, natural
 
 _LARGEST_INFO = 2**22  # bytes
 
 
 def read(path: Path, wanted: Wanted) -> Arguments:
     """Read the format of `torch_pbd.data.load_demonstrations`."""
-    parquet = optional("pyarrow.parquet", "lerobot", f"{path.name}, as all of LeRobot,")
+    opened = partial(open_file, extra="lerobot", what=f"{path.name}, as all of LeRobot,")
     info = _read_info(path / "meta" / "info.json")
     signals = {name: _columns(name, feature) for name, feature in info["features"].items() if _is_number(feature)}
     chosen = wanted.choose(signals, demo="episode_index", time="timestamp", outputs="observation.state")
@@ -33,10 +33,10 @@ def read(path: Path, wanted: Wanted) -> Arguments:
         raise ValueError("it has no Parquet files in data/.")
     parts = []
     for name in files:
-        with parquet.ParquetFile(name) as file:
+        with opened(name) as file:
             parts.append(read_columns(file, list(dict.fromkeys(["episode_index", *chosen.signals])), wanted))
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    _check_lengths(path, columns["episode_index"], parquet, wanted)
+    _check_lengths(path, columns["episode_index"], opened, wanted)
     return wanted.read_rows(chosen, columns)
 
 
@@ -65,10 +65,11 @@ def _columns(name: str, feature: dict[str, Any]) -> tuple[str, ...]:
     return column_names(name, n)
 
 
-def _check_lengths(path: Path, episode: Any, parquet: Any, wanted: Wanted) -> None:
+def _check_lengths(path: Path, episode: Any, opened: Any, wanted: Wanted) -> None:
     """Check that the episodes are as long as meta/ says: a missing file would be fewer demonstrations."""
-    found = {int(episode[rows[0]]): len(rows) for rows in rows_of(episode)}
-    said = dict(_said_lengths(path, parquet, wanted))
+    numbers, counts = np.unique(episode, return_counts=True)
+    found = dict(zip(numbers.tolist(), counts.tolist(), strict=True))
+    said = dict(_said_lengths(path, opened, wanted))
     for number in sorted(said.keys() | found.keys()):
         if said.get(number) != found.get(number) and said:
             raise ValueError(
@@ -77,9 +78,9 @@ def _check_lengths(path: Path, episode: Any, parquet: Any, wanted: Wanted) -> No
             )
 
 
-def _said_lengths(path: Path, parquet: Any, wanted: Wanted) -> Iterator[tuple[int, int]]:
+def _said_lengths(path: Path, opened: Any, wanted: Wanted) -> Iterator[tuple[int, int]]:
     for name in (path / "meta" / "episodes").rglob("*.parquet"):
-        with parquet.ParquetFile(name) as file:
+        with opened(name) as file:
             columns = read_columns(file, ["episode_index", "length"], wanted)
             yield from zip(columns["episode_index"].tolist(), columns["length"].tolist(), strict=True)
     lines = path / "meta" / "episodes.jsonl"
