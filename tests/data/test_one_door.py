@@ -3,9 +3,11 @@
 import subprocess
 import sys
 import warnings
+from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pandas as pd
+import polars as pl
 import pyarrow as pa
 import pytest
 
@@ -108,11 +110,11 @@ def test_folders_lists_and_patterns_are_one_recording_a_file(tmp_path):
         load_demonstrations(tmp_path / "trial_*.csv")
 
 
-@pytest.mark.parametrize("library", [pd.DataFrame, pa.table])
+@pytest.mark.parametrize("library", [pd.DataFrame, pl.DataFrame, pa.table])
 def test_frames_of_other_libraries_are_taken(library):
     recorded = make_tunnel_demonstrations(3, rate=5.0, random_state=0, variant="unequal")
-    table = recorded.to_frame("pandas" if library is pd.DataFrame else "pyarrow")
-    assert type(table) is (pd.DataFrame if library is pd.DataFrame else pa.Table)
+    table = recorded.to_frame(library.__module__.partition(".")[0])
+    assert type(table) is (pa.Table if library is pa.table else library)
     assert Demonstrations.from_frame(table, units="m") == recorded
     mixed = {"k": list("aababb"), "t": np.array([0, 1, 0, 2, 1, 2]), "x": np.arange(6.0), "y": np.arange(6.0) ** 2}
     made = Demonstrations.from_frame(library(mixed), demo="k", time="t", outputs=["y", "x"], time_unit="ms")
@@ -135,6 +137,23 @@ def test_frames_have_the_guards_of_files():
     counted = pd.DataFrame({"time": np.arange(9.0), "x": np.arange(9.0) ** 2, "row": np.arange(9)})
     with pytest.raises(ValueError, match="column 'row': it counts rows"):
         Demonstrations.from_frame(counted)
+    with pytest.raises(TypeError, match="frames have no option 'unit'; did you mean 'units'"):
+        Demonstrations.from_frame(table, unit="m")
+
+
+def test_frames_of_polars_have_types_of_their_own():
+    stamps = [datetime(2026, 1, 1, tzinfo=UTC) + timedelta(milliseconds=20 * i) for i in range(3)]
+    table = pl.DataFrame({"demo": ["a"] * 3 + ["b"] * 3, "time": stamps * 2, "x": [1, None, 3, 4, 5, 6]})
+    table = table.cast({"demo": pl.Categorical})
+    with pytest.warns(MissingDataWarning, match="1 of 3 in demonstration 0"):
+        made = Demonstrations.from_frame(table, missing="drop", units="mm", in_units=["m", "ms"], from_start=True)
+    assert made == Demonstrations(
+        [[0, 20 * 2], [0, 20, 40]], [[0.001, 0.003], [0.004, 0.005, 0.006]], names=["x"], units="m", time_unit="ms"
+    )
+    with pytest.raises(ValueError, match=r"table is .*, must be a dataframe .*with its rows: collect\(\) lazy ones"):
+        Demonstrations.from_frame(table.lazy())
+    with pytest.raises(ValueError, match="column 'demo' is blank in row 3: it tells the demonstrations apart"):
+        Demonstrations.from_frame(table.with_columns(demo=pl.Series([*"aaa", None, *"bb"])), outputs="x")
 
 
 def test_labels_that_differ_are_not_concatenated_and_outputs_are_selected():
@@ -163,6 +182,29 @@ def test_units_are_converted_by_their_kind():
         PLAIN.in_units("m")
     with pytest.raises(ValueError, match="time_unit is 's', must be one of h, min"):
         PLAIN.align().in_units(time_unit="s")
+
+
+def test_files_are_converted_as_they_are_loaded(tmp_path, capsys):
+    load = {"units": ["mm", "deg"], "time_unit": "ms", "in_units": ["m", "rad", "s"]}
+    loaded = load_text(tmp_path, "time,x,angle\n0,1,90\n10,2,180\n30,1500,0\n", **load)
+    mocap = Demonstrations(
+        [[0, 10, 30]], [[[1, 90], [2, 180], [1500, 0]]], names=["x", "angle"], units=["mm", "deg"], time_unit="ms"
+    )
+    assert loaded == mocap.in_units("m", "s").in_units("rad")
+    # Of several files each has units of its own.
+    save_demonstrations(mocap, tmp_path / "a.npz")
+    save_demonstrations(mocap.in_units("cm", "s"), tmp_path / "b.npz")
+    both = load_demonstrations([tmp_path / "a.npz", tmp_path / "b.npz"], in_units=["m", "s"])
+    assert both[:1] == both[1:] == mocap.in_units("m", "s")
+    (tmp_path / "run.yaml").write_text(f"data: {tmp_path}/[ab].npz\nloader: {{in_units: [m, s]}}\n")
+    shown = []
+    for arguments in (["--config", f"{tmp_path}/run.yaml"], [f"{tmp_path}/[ab].npz", "--loader.in_units", "[m, s]"]):
+        assert main(["inspect", *arguments, "--output", str(tmp_path / "out")]) == 0
+        shown.append(capsys.readouterr().out)
+    assert "start [s]  lasts [s]" in shown[0]
+    assert shown[0] == shown[1]
+    with pytest.raises(ValueError, match=r"unit is 'm', must be of the kind of one of the outputs.*give units="):
+        load_demonstrations(tmp_path / "set.csv", time_unit="ms", in_units="m")
 
 
 def movements(noise=0.0):

@@ -1,4 +1,4 @@
-"""Demonstrations made of others: joined, selected, in other units, cut."""
+"""Demonstrations made of tables and of others: joined, selected, in other units, cut."""
 
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, Self
@@ -8,10 +8,19 @@ import numpy as np
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.data.pauses import extents, still
-from torch_pbd.data.poses import charted, mean_rotation, poses, same_reference, unwrapped, with_whole_rotation
+from torch_pbd.data.poses import (
+    as_columns,
+    charted,
+    mean_rotation,
+    poses,
+    same_reference,
+    unwrapped,
+    with_whole_rotation,
+)
 from torch_pbd.data.recordings import MIN_SAMPLES, as_texts, preview
 from torch_pbd.data.resampling import Resampling
 from torch_pbd.data.units import ANGLES, LENGTHS, TIMES, check_unit, find_suspects
+from torch_pbd.data.wanted import OPTIONS, Wanted, check_options
 from torch_pbd.exceptions import InvalidParameterError
 
 if TYPE_CHECKING:
@@ -25,6 +34,65 @@ class Editing(Resampling):
 
     def __getitem__(self, index: Any) -> Any:
         raise NotImplementedError
+
+    @classmethod
+    def from_frame(cls, table: Any, **options: Any) -> Self:
+        """Demonstrations of a table of pandas, polars, pyarrow or another library that narwhals knows, a row a sample.
+
+        Parameters
+        ----------
+        table : dataframe
+            An index is ignored.
+        **options
+            Those of `torch_pbd.data.load_demonstrations`, from ``outputs`` to ``from_start``.
+
+        Returns
+        -------
+        Demonstrations
+            In the order in which they first appear.
+
+        Raises
+        ------
+        TypeError
+            If an option is not one of these.
+        ValueError
+            If it is no dataframe, or does not have the columns that the options name, or no numbers in them.
+        """
+        import narwhals
+
+        check_options(options, [name for name in OPTIONS if name != "max_bytes"], "frames")
+        wanted = Wanted(**options)
+        try:
+            rows = narwhals.from_native(table, eager_only=True)
+        except TypeError as error:
+            must, remedy = "a dataframe of pandas, polars, pyarrow or alike, with its rows", "collect() lazy ones"
+            raise checks.refusal(table, "table", must, remedy) from error
+        chosen = wanted.choose({name: (name,) for name in rows.columns}, demo="demo", time="time")
+        signals = {name: rows.get_column(name).to_numpy() for name in chosen.signals}
+        return wanted.finish([cls(**wanted.read_rows(chosen, signals))])
+
+    def to_frame(self, library: Any = "pandas") -> Any:
+        """Table with columns demo, time and the outputs, a row a sample; a rotation as its quaternion, qw to qz.
+
+        Parameters
+        ----------
+        library : {"pandas", "polars", "pyarrow"} or module, default="pandas"
+            It must be installed.
+        """
+        import narwhals
+
+        names, columns = as_columns(self)
+        taken = {"demo", "time"} & set(names)
+        if taken:
+            raise InvalidParameterError(
+                f"an output named {min(taken)!r} cannot be told from the other columns: rename it."
+            )
+        table = {
+            "demo": np.repeat(np.arange(len(self.times)), [len(time) for time in self.times]),
+            "time": np.concatenate(self.times),
+            **dict(zip(names, np.concatenate(columns).T, strict=True)),
+        }
+        return narwhals.from_dict(table, backend=library).to_native()
 
     @classmethod
     def concatenate(cls, parts: Iterable[Self]) -> Self:

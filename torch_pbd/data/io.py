@@ -1,11 +1,9 @@
 """Demonstrations from files and to files: the doors; each format has its own module, named in one table."""
 
-import difflib
 import inspect
 import os
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
@@ -14,7 +12,7 @@ from torch_pbd import checks
 from torch_pbd.data.demonstrations import Demonstrations
 from torch_pbd.data.description import Description, describe
 from torch_pbd.data.recordings import Missing
-from torch_pbd.data.wanted import MAX_BYTES, Wanted, natural
+from torch_pbd.data.wanted import MAX_BYTES, OPTIONS, Wanted, check_options, natural
 from torch_pbd.exceptions import DataFormatError
 from torch_pbd.files.atomic import LOADERS, replacing
 from torch_pbd.files.memory import require_memory
@@ -64,6 +62,7 @@ def load_demonstrations(
     frame: str | None = None,
     rate: float | None = None,
     missing: Missing = "raise",
+    in_units: str | Sequence[str] | None = None,
     cut: Literal["pauses"] | Sequence[tuple[float, float]] | None = None,
     trim: Literal["still"] | None = None,
     from_start: bool = False,
@@ -97,7 +96,9 @@ def load_demonstrations(
         name, and none is a count of rows (``frame_index``) or a number of its demonstration (``task_index``).
     demo : str, default=None
         Column that tells the demonstrations apart, by any text. None takes "demo", if there is such a column; without
-        it a table is one demonstration.
+        it a table is one demonstration. Of bags a second topic, of Bool, String or whole numbers (std_msgs): each
+        stretch over which it says the same is a demonstration, but for those of False, of an empty text, and of a 0
+        that it comes back to.
     time : str, default=None
         Column of times; None takes "time", or what the format says.
     rate : float, default=None
@@ -107,6 +108,9 @@ def load_demonstrations(
         from the first of all.
     missing : {"raise", "drop"}, default="raise"
         "drop" leaves out samples with NaN (CSV: and blank cells), and warns of how many, as `Demonstrations` does.
+    in_units : str or sequence of str, default=None
+        Convert to these units, as `Demonstrations.in_units` does: "m", or ["m", "s"] with that of the times. ``units``
+        and ``time_unit`` say what the numbers in the file are, and change none of them.
     cut : "pauses" or sequence of (start, end), default=None
         Make several demonstrations of one long recording: `Demonstrations.cut`.
     trim : "still", default=None
@@ -139,7 +143,6 @@ def load_demonstrations(
         If the file is not what its suffix says; names the array, or the line and the column. Or if it is too large
         for the memory.
     """
-    checks.flag(from_start, "from_start")
     wanted = Wanted(
         outputs=outputs,
         demo=demo,
@@ -151,9 +154,13 @@ def load_demonstrations(
         frame=frame,
         rate=rate,
         missing=missing,
+        in_units=in_units,
+        cut=cut,
+        trim=trim,
+        from_start=from_start,
         max_bytes=max_bytes,
     )
-    return _load_all(source, wanted, options, cut=cut, trim=trim, from_start=from_start)
+    return wanted.finish([_load(file, wanted, options) for file in find_files(source)])
 
 
 def inspect_demonstrations(source: Source, **options: Any) -> tuple[Demonstrations, Description]:
@@ -162,28 +169,14 @@ def inspect_demonstrations(source: Source, **options: Any) -> tuple[Demonstratio
     What that function would refuse is left out or guessed, if there is a way, and told among the ``mistakes``.
     """
     notes: list[str] = []
-    shared = {field.name for field in fields(Wanted)}
-    own = {name: value for name, value in options.items() if name not in shared}
-    whole = {name: own.pop(name, None) for name in ("cut", "trim", "from_start")}
+    own = {name: value for name, value in options.items() if name not in OPTIONS}
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        wanted = Wanted(**{name: value for name, value in options.items() if name in shared}, notes=notes)
-        demonstrations = _load_all(source, wanted, own, **whole)
+        wanted = Wanted(**{name: value for name, value in options.items() if name in OPTIONS}, notes=notes)
+        demonstrations = wanted.finish([_load(file, wanted, own) for file in find_files(source)])
     told = [str(warning.message) for warning in caught]
     suspects = " ".join(demonstrations.suspects)
     return demonstrations, describe(demonstrations, [*dict.fromkeys(notes), *(t for t in told if t != suspects)])
-
-
-def _load_all(
-    source: Source, wanted: Wanted, options: dict[str, Any], *, cut: Any, trim: Any, from_start: bool | None
-) -> Demonstrations:
-    each = [_load(file, wanted, options) for file in find_files(source)]
-    demonstrations = each[0] if len(each) == 1 else Demonstrations.concatenate(each)
-    if len(each) > 1 and wanted.angles is not None:
-        demonstrations = demonstrations.unwrap(wanted.angles)
-    demonstrations = demonstrations if cut is None else demonstrations.cut(cut)
-    demonstrations = demonstrations if trim is None else demonstrations.trim(trim)
-    return demonstrations.from_start() if from_start else demonstrations
 
 
 def find_files(source: Source) -> list[Path]:
@@ -213,16 +206,9 @@ def find_files(source: Source) -> list[Path]:
 
 def _load(file: Path, wanted: Wanted, options: dict[str, Any]) -> Demonstrations:
     reader = _function(file, _FORMATS)
-    known = list(inspect.signature(reader).parameters)[2:]
-    every = [
-        *(n for n, p in inspect.signature(load_demonstrations).parameters.items() if p.kind is p.KEYWORD_ONLY),
-        *known,
-    ]
-    for option in options:
-        if option not in known:
-            close = difflib.get_close_matches(option, every, n=1)
-            meant = f"did you mean {close[0]!r}?" if close else f"they have: {', '.join(every)}."
-            raise TypeError(f"{file.suffix or file.name} files have no option {option!r}; {meant}")
+    check_options(
+        options, [*OPTIONS, *list(inspect.signature(reader).parameters)[2:]], f"{file.suffix or file.name} files"
+    )
     if not file.exists():
         raise FileNotFoundError(f"{file} does not exist, or is not a file.")
     n_bytes = file.stat().st_size

@@ -10,7 +10,6 @@ from torch_pbd.checks import Floats
 from torch_pbd.data.alignment import interpolate, on_common_phases, times_from_start
 from torch_pbd.data.recordings import MIN_SAMPLES
 from torch_pbd.data.sampling import LEAST_SAMPLES, smoothing_spline
-from torch_pbd.data.tables import Tables
 from torch_pbd.data.units import TIMES
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.files.memory import require_much
@@ -22,7 +21,7 @@ MAX_DEFAULT_STEPS = 200
 """Most points `Demonstrations.align` takes of its own accord: dynamic time warping takes time in their square."""
 
 
-class Resampling(Tables):
+class Resampling:
     """Methods of `torch_pbd.data.Demonstrations`; abstract."""
 
     times: tuple[Floats, ...]

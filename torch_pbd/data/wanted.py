@@ -1,10 +1,11 @@
 """Options of reading, whatever the format: columns by their names, times, units; the one way out of files."""
 
+import difflib
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.data.recordings import Fresh, Missing, as_texts, preview
+from torch_pbd.data.units import TIMES
 from torch_pbd.files.memory import require_memory
 
 _FEWEST_COUNTED = 5  # rows; fewer rise by one by chance
@@ -50,6 +52,10 @@ class Wanted:
     time_unit: str | None = None
     frame: str | None = None
     missing: Missing = "raise"
+    in_units: str | Sequence[str] | None = None
+    cut: Literal["pauses"] | Sequence[tuple[float, float]] | None = None
+    trim: Literal["still"] | None = None
+    from_start: bool = False
     max_bytes: int = MAX_BYTES
     notes: list[str] | None = None
     """If a list, it is told what would be refused and has a way around."""
@@ -59,10 +65,11 @@ class Wanted:
         checks.text(self.time, "time", optional=True)
         checks.number(self.rate, "rate", above=0.0, unit="Hz", optional=True)
         checks.choice(self.missing, "missing", Missing)
+        checks.flag(self.from_start, "from_start")
         checks.count(self.max_bytes, "max_bytes", remedy="the bytes of the largest file to read")
-        if self.outputs is not None:
-            object.__setattr__(self, "outputs", as_texts(self.outputs, "outputs"))
-        object.__setattr__(self, "rotation", None if self.rotation is None else as_texts(self.rotation, "rotation"))
+        for name in ("outputs", "rotation", "in_units"):
+            value = getattr(self, name)
+            object.__setattr__(self, name, None if value is None else as_texts(value, name))
 
     def choose(
         self,
@@ -173,8 +180,22 @@ class Wanted:
     def read_rows(self, chosen: Chosen, signals: Mapping[str, NDArray[Any]], **labels: Any) -> Arguments:
         """:meth:`arguments` of a long table, whose rows tell theirs; in the order of their first rows."""
         demo = np.zeros(len(signals[chosen.signals[0]]), bool) if chosen.demo is None else signals[chosen.demo]
+        blank = [row for row in heads_of(demo) if demo[row] is None or demo[row] != demo[row]]
+        if blank:
+            raise ValueError(f"column {chosen.demo!r} is blank in row {blank[0]}: it tells the demonstrations apart.")
         each = ({name: values[own] for name, values in signals.items()} for own in rows_of(demo))
         return self.read_each(chosen, each, **labels)
+
+    def finish(self, parts: Sequence[Any]) -> Any:
+        """Demonstrations of all files as one set, converted, cut and trimmed."""
+        for unit in self.in_units or ():
+            parts = [part.in_units(**{"time_unit" if unit in TIMES else "unit": unit}) for part in parts]
+        whole = parts[0] if len(parts) == 1 else type(parts[0]).concatenate(parts)
+        if len(parts) > 1 and self.angles is not None:
+            whole = whole.unwrap(self.angles)
+        whole = whole if self.cut is None else whole.cut(self.cut)
+        whole = whole if self.trim is None else whole.trim(self.trim)
+        return whole.from_start() if self.from_start else whole
 
     def _columns(self, chosen: Chosen, signals: Mapping[str, NDArray[Any]]) -> tuple[NDArray[Any] | None, NDArray[Any]]:
         """Times (T,), where there are any, and positions (T, d) of one recording."""
@@ -190,6 +211,19 @@ class Wanted:
                 raise ValueError(f"column {name!r} holds {values.dtype}, no numbers: leave it out by outputs=.")
             position[:, i] = values
         return column(chosen.time) if chosen.time else None, position
+
+
+OPTIONS = tuple(field.name for field in fields(Wanted) if field.name != "notes")
+"""Names of the options that all formats have."""
+
+
+def check_options(options: Iterable[str], known: Sequence[str], what: str) -> None:
+    """Raise TypeError for options that ``what`` does not have."""
+    for option in options:
+        if option not in known:
+            close = difflib.get_close_matches(option, known, n=1)
+            meant = f"did you mean {close[0]!r}?" if close else f"they have: {', '.join(known)}."
+            raise TypeError(f"{what} have no option {option!r}; {meant}")
 
 
 def _numbers_of_dates(times: Sequence[NDArray[Any]], unit: str) -> list[Floats]:
