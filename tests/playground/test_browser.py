@@ -136,7 +136,7 @@ def test_a_via_point_is_met_and_the_robot_gives_way_where_strokes_differ(page):
 
 def test_a_push_deviates_as_simulate_says_of_the_same_force(page, tmp_path):
     answers = []
-    page.on("websocket", lambda socket: socket.on("framereceived", lambda text: answers.append(text)))  # noqa: PLW0108
+    page.on("websocket", lambda socket: socket.on("framereceived", lambda text: answers.append(text)))
     page.reload()
     wait(page, "state.robot && state.robot.time > 0.2")
     page.keyboard.press("p")
