@@ -1,7 +1,7 @@
 """Classes, parameters and learned attributes of estimators as plain JSON, and back: only what closed tables name."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from functools import partial
 from typing import Any
 
@@ -15,8 +15,6 @@ from torch_pbd.registry import ESTIMATORS, MOVEMENTS, REGRESSORS, load_class
 Check = Callable[[Any, str], Any]
 
 _LAW = "stiffness_law"
-# What files say nothing of that are from before there were other laws.
-_LAW_OF_POSITIONS = {"kind": "linear", "rotation": None, "cross_terms": False, "effort": "match"}
 # Types of arrays; those of objects are names of columns.
 _INTEGERS = [f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)]
 _DTYPES = ["float64", "float32", "float16", *_INTEGERS, "bool", "object"]
@@ -125,11 +123,10 @@ def _law(value: Any) -> StiffnessLaw | None:
     if value is None:
         return None
     check_entries(value, {_LAW}, "its stiffness law")
-    own = {**_LAW_OF_POSITIONS, **value[_LAW]} if isinstance(value[_LAW], dict) else value[_LAW]
-    check_entries(own, {field.name for field in fields(StiffnessLaw)}, "its stiffness law")
-    if (rotation := own["rotation"]) is not None:
-        check_entries(rotation, {field.name for field in fields(RotationLimits)}, "its limits of rotation")
-        own["rotation"] = RotationLimits(**rotation)
+    # The first files say nothing of what the laws of then did not have: it is as by default.
+    own = dict(value[_LAW])
+    if own.get("rotation") is not None:
+        own["rotation"] = RotationLimits(**own["rotation"])
     return StiffnessLaw(**own)
 
 
