@@ -112,7 +112,7 @@ def test_weak_motors_are_told(task, undisturbed):
     assert not undisturbed.saturated.any()
     most = np.abs(undisturbed.torque[:, 0]).max()
     text = panda_mjcf().replace(
-        'joint="joint1" ctrlrange="-87.0 87.0"', f'joint="joint1" ctrlrange="{-most / 2} {most / 2}"'
+        'joint="joint1" ctrlrange="-87 87"', f'joint="joint1" ctrlrange="{-most / 2} {most / 2}"'
     )
     found = run(mujoco.MjModel.from_xml_string(text), *task)
     np.testing.assert_array_equal(found.saturated, np.abs(found.torque[:, 0]) > most / 2)

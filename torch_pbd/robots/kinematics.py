@@ -161,7 +161,7 @@ def _reach(chain: Arm, joints: Floats, position: Floats, orientation: Floats, ne
         longest = float(np.abs(step).max())
         if float(np.abs(error).max()) < _REACHED and longest < _SETTLED:
             return joints
-        joints = joints + step * min(1.0, _LONGEST_STEP / longest)
+        joints = joints + step * (_LONGEST_STEP / max(_LONGEST_STEP, longest))
     distance, angle = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
     where = f"row {row} of the path, at {position.round(4).tolist()} m,"
     if float(np.abs(error).max()) < _REACHED:
