@@ -21,7 +21,7 @@ from torch_pbd.data import Demonstrations
 from torch_pbd.exceptions import ConfigError
 from torch_pbd.experiments.resume import fit_once
 from torch_pbd.experiments.robot import PUSHES, pulse
-from torch_pbd.experiments.run_folder import RunFolder, format_table, slug
+from torch_pbd.experiments.run_folder import RunFolder, format_table
 
 Arm = Literal["panda", "none"]
 
@@ -35,7 +35,6 @@ _N_STEPS = 101
 class PoseRun:
     """One controller on one task of poses: its schedule for the arm, and what pushes in each axis of the tool do."""
 
-    controller: DMPController
     planned: Schedule
     schedule: Schedule
     unpushed: Rollout
@@ -45,7 +44,7 @@ class PoseRun:
 
     def along(self, values: Floats, kind: plotting.Kind) -> Floats:
         """Matrices (n, 6, 6), or vectors (n, 6), in each axis (n, 3) of the tool, in the outputs of a kind."""
-        axes = _axes(self.schedule)
+        axes = rotations.matrix(np.asarray(self.schedule.orientation))
         if values.ndim == 3:
             return np.einsum("nia,nij,nja->na", axes, values[:, kind.outputs, kind.outputs], axes)
         return np.einsum("nia,ni->na", axes, values[:, kind.outputs])
@@ -80,7 +79,13 @@ def run_poses(
         mass = f"{fitted.mass:g} kg" if np.ndim(fitted.mass) == 0 else "the mass of the controller"
         note = f"a damping made for {mass} would have a ratio of {plain:.2f} here" if arm != "none" else f"of {mass}"
         reports.append(f"{name}: a movement of {run.schedule.duration:.3g} s; {note}\n{run.report}")
-        _write(run, name, demonstrations, folder)
+        folder.write_controller(
+            name,
+            fitted,
+            run.schedule,
+            figure7_variability=schedule_figure(run, demonstrations, name),
+            figure8_pushes=pushes_figure(run, name),
+        )
     folder.write_metrics(rows)
     folder.write_text("stability.txt", "\n\n".join(reports) + "\n")
     tables = [
@@ -105,7 +110,7 @@ def pushed(controller: DMPController, rate: float, peak: float, torque: float, a
         tuple(run(largest, kind, axis) for axis in range(3))
         for largest, kind in ((peak, plotting.POSITION), (torque, plotting.ROTATION))
     )
-    return PoseRun(controller, planned, schedule, run(0.0, plotting.POSITION, 0), forces, torques, schedule.certify())
+    return PoseRun(planned, schedule, run(0.0, plotting.POSITION, 0), forces, torques, schedule.certify())
 
 
 def with_panda(schedule: Schedule) -> Schedule:
@@ -116,11 +121,6 @@ def with_panda(schedule: Schedule) -> Schedule:
     joints = inverse_kinematics(arm, few.position, np.asarray(few.orientation), "tool", start=HOME)
     inertia = few.with_inertia(operational_inertia(arm, joints, "tool")).resample(times=schedule.time)
     return schedule.with_inertia(np.asarray(inertia.mass))
-
-
-def _axes(schedule: Schedule) -> Floats:
-    """Axes of the tool, the columns of matrices (n, 3, 3)."""
-    return rotations.matrix(np.asarray(schedule.orientation))
 
 
 def damping_ratio(schedule: Schedule, damping: Floats) -> float:
@@ -159,21 +159,14 @@ def _wrench(schedule: Schedule, largest: float, kind: plotting.Kind, axis: int) 
     """Wrenches (n, 6): pulses of a squared sine in an axis that the tool has in their middle."""
     wrench, phase = np.zeros((len(schedule), 6)), (schedule.time - schedule.time[0]) / schedule.duration
     for row in _push_rows(schedule):
-        wrench[:, kind.outputs] += largest * np.outer(pulse(phase, phase[row]), _axes(schedule)[row, :, axis])
+        tool = rotations.matrix(np.asarray(schedule.orientation)[row])
+        wrench[:, kind.outputs] += largest * np.outer(pulse(phase, phase[row]), tool[:, axis])
     return wrench
 
 
 def _push_rows(schedule: Schedule) -> tuple[int, ...]:
     """Rows in the middle of pushes."""
     return tuple(round(centre * (len(schedule) - 1)) for centre in PUSHES)
-
-
-def _write(run: PoseRun, name: str, demonstrations: Demonstrations, folder: RunFolder) -> None:
-    file = slug(name)
-    folder.write_figure(schedule_figure(run, demonstrations, name), f"{file}_figure7_variability")
-    folder.write_figure(pushes_figure(run, name), f"{file}_figure8_pushes")
-    folder.write_model(run.controller, f"{file}_controller")
-    folder.write_schedule(run.schedule, file)
 
 
 def task_figure(demonstrations: Demonstrations) -> Figure:

@@ -18,7 +18,7 @@ from torch_pbd.control.simulation.rollout import Rollout
 from torch_pbd.control.stability.report import StabilityReport
 from torch_pbd.data import Demonstrations, tunnel_center, tunnel_half_width
 from torch_pbd.experiments.resume import FinishedFits, fit_once
-from torch_pbd.experiments.run_folder import RunFolder, format_table, slug
+from torch_pbd.experiments.run_folder import RunFolder, format_table
 
 PUSHES = (0.2, 0.8)  # of the duration: 2 s and 8 s of the paper's 10 s
 _PUSH_LENGTH = 0.08  # of the duration: 0.8 s
@@ -115,21 +115,18 @@ def run_robot(
         run = run_controller(controller, demonstrations, peak=peak, rate=rate, finished=folder.finished)
         rows.append(push_row(name, run) | _guarantees(run))
         reports.append(f"{name}: a movement of {run.schedule.duration:.3g} s\n{run.report}")
-        _write(run, name, demonstrations, folder, in_tunnel=in_tunnel)
+        folder.write_controller(
+            name,
+            run.controller,
+            run.schedule,
+            figure6_task=task_figure(run.controller, demonstrations, name, in_tunnel=in_tunnel),
+            figure7_variability=variability_figure(run, demonstrations, name),
+            figure8_pushes=pushes_figure(run, name),
+        )
     folder.write_metrics(rows, metrics)
     folder.write_text("stability.txt", "\n\n".join(reports) + "\n")
     shown = [{key: value for key, value in row.items() if key not in _NOT_SHOWN} for row in rows]
     return "\n\n".join([format_table(shown), *reports])
-
-
-def _write(run: Run, name: str, demonstrations: Demonstrations, folder: RunFolder, *, in_tunnel: bool) -> None:
-    file = slug(name)
-    task = task_figure(run.controller, demonstrations, name, in_tunnel=in_tunnel)
-    folder.write_figure(task, f"{file}_figure6_task")
-    folder.write_figure(variability_figure(run, demonstrations, name), f"{file}_figure7_variability")
-    folder.write_figure(pushes_figure(run, name), f"{file}_figure8_pushes")
-    folder.write_model(run.controller, f"{file}_controller")  # the regressor may have a file of the name
-    folder.write_schedule(run.schedule, file)
 
 
 _BOXES = (

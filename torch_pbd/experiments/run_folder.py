@@ -132,12 +132,15 @@ class RunFolder:
         save(model, target)
         return target
 
-    def write_schedule(self, schedule: Any, name: str) -> None:
-        """Write ``schedule/<name>.npz``, and a row each 10 ms as a table beside it, to be looked at."""
-        target = self.path / "schedule"
+    def write_controller(self, name: str, controller: Any, schedule: Any, **figures: Any) -> None:
+        """Write figures, the model, and ``schedule/<name>.npz`` with a row each 10 ms as a table, to be looked at."""
+        file, target = slug(name), self.path / "schedule"
+        for what, figure in figures.items():
+            self.write_figure(figure, f"{file}_{what}")
+        self.write_model(controller, f"{file}_controller")  # the regressor may have a file of the name
         target.mkdir(exist_ok=True)
-        schedule.save(target / f"{name}.npz")
-        schedule.resample(100.0).save(target / f"{name}_100hz.csv")
+        schedule.save(target / f"{file}.npz")
+        schedule.resample(100.0).save(target / f"{file}_100hz.csv")
 
 
 def _check_files(folder: Path) -> None:
