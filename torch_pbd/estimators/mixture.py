@@ -141,7 +141,7 @@ class GMMBaseline(CovarianceRegressor):
 
     def _prepare(self) -> None:
         if self.device is None:
-            self._regression = MixtureRegression.from_module(self.module_)
+            self._regression = MixtureRegression(self.module_)
 
     def __getstate__(self) -> dict[str, Any]:
         """State of the base class, without the regression that follows from the module."""

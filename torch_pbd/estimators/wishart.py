@@ -7,7 +7,7 @@ import torch
 from sklearn.utils import check_random_state
 from torch import Tensor
 
-from torch_pbd import checks
+from torch_pbd import checks, gp
 from torch_pbd.estimators.latent import (
     LatentCovarianceRegressor,
     Problem,
@@ -18,16 +18,6 @@ from torch_pbd.estimators.latent import (
 )
 from torch_pbd.estimators.validation import Prior
 from torch_pbd.exceptions import DataRankWarning, NotPositiveDefiniteError
-from torch_pbd.gp import (
-    Hyperparameters,
-    LatentGP,
-    LatentValues,
-    Observations,
-    condition,
-    fit_hyperparameters,
-    fit_together,
-    merge_observations,
-)
 from torch_pbd.gp.observations import FULL, Basis
 from torch_pbd.kernels import KernelName
 from torch_pbd.models.costs import Cost, FactorDistance, Likelihood
@@ -160,9 +150,9 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
             return (_PAPER_MEAN * problem.prior_tril.diagonal())[:, None].repeat(1, self.df_)
         return padded(problem.prior_tril, self.df_)
 
-    def _fit_empirical(self, problem: Problem) -> tuple[LatentGP, WishartCovariance, FitReport, float]:
+    def _fit_empirical(self, problem: Problem) -> tuple[gp.LatentGP, WishartCovariance, FitReport, float]:
         job = self._mean_job(problem.training)
-        mean, mean_report = mean_consistent_with_repeats(problem.training, *job, *fit_together([job]))
+        mean, mean_report = mean_consistent_with_repeats(problem.training, *job, *gp.fit_together([job]))
         prior_root = self._prior_root(problem)
         target = empirical_tril(problem.training)
         cost = FactorDistance(WishartLink(prior_root), target)
@@ -173,9 +163,11 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
             return mean, found, report.after(mean_report, "search of the mean"), jitter
         inputs, matrix = problem.training.inputs, torch.eye(target.shape[-1]).to(target)
 
-        def observed(root: Tensor) -> Observations:
+        def observed(root: Tensor) -> gp.Observations:
             vectors = root.mT.flatten(1).mT.contiguous()
-            return merge_observations(Observations(inputs, vectors, torch.ones_like(inputs[:, 0])), self.max_inputs)
+            return gp.merge_observations(
+                gp.Observations(inputs, vectors, torch.ones_like(inputs[:, 0])), self.max_inputs
+            )
 
         root = padded(target, self.df_)
         # The evidence of the vectors, not of their deviations: a prior far from them would allow for any swing.
@@ -183,25 +175,25 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         hyperparameters, report = self._smoothing(observations, problem)
         warn_if_stretched(hyperparameters.amplitude, observations.targets, given=problem.length_scale is not None)
         basis = Basis(observations, FULL)
-        latent, jitter = condition(observations, hyperparameters, self.kernel, basis=basis)
+        latent, jitter = gp.condition(observations, hyperparameters, self.kernel, basis=basis)
         # That the vectors are noisy is no reason for the prior to have a share in them where there are data.
         certain = replace(hyperparameters, noise_ratio=hyperparameters.noise_ratio.clamp_max(_CERTAIN))
         priors = observed(prior_root.expand_as(root))
         with torch.no_grad():
-            latent.weight -= condition(priors, certain, self.kernel, basis=basis)[0].weight
+            latent.weight -= gp.condition(priors, certain, self.kernel, basis=basis)[0].weight
             mse = float(cost.at_root(wishart_root(latent(inputs), prior_root, matrix)))
         report = replace(report, loss=mse, loss_curve=(mse,)).after(mean_report, "search of the mean")
         prior = prior_root.reshape(-1, *root.shape[1:])[0]  # a callable one is handed in at every prediction
         return mean, WishartCovariance(latent, prior, matrix, bounded=True), report, jitter
 
-    def _smoothing(self, observations: Observations, problem: Problem) -> tuple[Hyperparameters, FitReport]:
+    def _smoothing(self, observations: gp.Observations, problem: Problem) -> tuple[gp.Hyperparameters, FitReport]:
         """Hyperparameters without noise; with a learned one where "auto" has few rows, or inputs are too near."""
 
-        def found(noise_scale: Tensor | None) -> tuple[Hyperparameters, FitReport]:
+        def found(noise_scale: Tensor | None) -> tuple[gp.Hyperparameters, FitReport]:
             search = self._search(
                 observations, longest_covariance(observations.inputs), problem.length_scale, noise_scale
             )
-            hyperparameters, _, report = fit_hyperparameters(observations, search)
+            hyperparameters, _, report = gp.fit_hyperparameters(observations, search)
             return hyperparameters, report
 
         if self.objective == "auto" and int(problem.training.counts.min()) < _FEW_ROWS:
@@ -239,7 +231,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         matrix = torch.eye(n_outputs).to(inputs).requires_grad_(not self.latent_prior)
         deviation = (start - centre).mT.flatten(-2).expand(len(inputs), -1).mT.contiguous()
         amplitude = centre.reshape(-1, n_outputs, self.df_).square().sum(-1).mean(0).sqrt().repeat(self.df_)
-        latent = LatentValues(
+        latent = gp.LatentValues(
             inputs,
             deviation,
             amplitude,
@@ -263,7 +255,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         with torch.no_grad():
             root = wishart_root(latent(), centre, matrix)
         values, deviations = (part.mT.flatten(1).mT.contiguous() for part in (root, root - prior_root))
-        gp = latent.interpolate(values, deviations if self.latent_prior else None)
+        process = latent.interpolate(values, deviations if self.latent_prior else None)
         prior = prior_root.reshape(-1, *root.shape[1:])[0]
-        covariance = WishartCovariance(gp, prior, matrix.detach().tril(), bounded=self.latent_prior)
+        covariance = WishartCovariance(process, prior, matrix.detach().tril(), bounded=self.latent_prior)
         return covariance, report, latent.jitter

@@ -25,15 +25,7 @@ from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.exceptions import ModelFileError
 from torch_pbd.files.atomic import LOADERS
 from torch_pbd.files.tensors import Arrays, read_checksummed, write_checksummed
-from torch_pbd.persistence.plain import (
-    check_entries,
-    decode_learned,
-    decode_parameters,
-    encode,
-    encode_parameters,
-    is_ours,
-    learned_checks,
-)
+from torch_pbd.persistence import plain
 from torch_pbd.registry import ESTIMATORS, MOVEMENTS, REGRESSORS
 
 FORMAT_VERSION = 1
@@ -82,7 +74,7 @@ def save(estimator: CovarianceRegressor | DMPController, path: str | os.PathLike
     if _FOREIGN.fullmatch(Path(path).suffix):
         raise ValueError(f"path={str(path)!r} has the suffix of another format: take .safetensors.")
     name = type(estimator).__name__
-    if not is_ours(estimator):
+    if not plain.is_ours(estimator):
         raise TypeError(f"estimator is a {name}; can save {', '.join(ESTIMATORS)}. In a pipeline, save that step.")
     check_is_fitted(estimator)
     # What could not be loaded again is not written.
@@ -142,8 +134,8 @@ def _described(estimator: Any) -> tuple[dict[str, Any], Arrays]:
     if getattr(estimator, "_bend", None) is not None or getattr(estimator, "_known", None) is not None:
         raise TypeError("estimator was conditioned, which a file cannot hold: save it before, or pickle it.")
     own = _controller_arrays(estimator) if isinstance(estimator, DMPController) else estimator._arrays()
-    fitted = {name: encode(getattr(estimator, name), name) for name in learned_checks(estimator)}
-    description = {**encode_parameters(estimator), "fitted": fitted}
+    fitted = {name: plain.encode(getattr(estimator, name), name) for name in plain.learned_checks(estimator)}
+    description = {**plain.encode_parameters(estimator), "fitted": fitted}
     part = _PARTS[type(estimator).__name__]
     if not hasattr(estimator, part):
         return description, own
@@ -153,14 +145,14 @@ def _described(estimator: Any) -> tuple[dict[str, Any], Arrays]:
 
 def _restored(description: Any, arrays: Arrays) -> Any:
     """Estimator of a description and its arrays."""
-    estimator = decode_parameters(description)
+    estimator = plain.decode_parameters(description)
     if isinstance(estimator, CovarianceRegressor):
         _restore_regressor(estimator, description, arrays)
         return estimator
     part = _PARTS[description["class"]]
     names = {"class", "params", "fitted"} | ({part} & set(description))
-    check_entries(description, names, "its header")
-    learned, prefix = decode_learned(estimator, description["fitted"]), f"{part}."
+    plain.check_entries(description, names, "its header")
+    learned, prefix = plain.decode_learned(estimator, description["fitted"]), f"{part}."
     vars(estimator).update(learned)
     if part in description:
         inner = description[part]
@@ -187,19 +179,19 @@ def _described_regressor(estimator: CovarianceRegressor) -> tuple[dict[str, Any]
     state = estimator.__getstate__()
     arrays, config = state.pop("_module_arrays"), state.pop("_module_config")
     learned = {key: value for key, value in state.items() if key not in estimator.get_params(deep=False)}
-    unknown = set(learned) - {*learned_checks(estimator), "feature_names_in_"}
+    unknown = set(learned) - {*plain.learned_checks(estimator), "feature_names_in_"}
     if unknown:
         raise TypeError(
             f"estimator has an attribute {min(unknown)!r}, which a model file cannot hold: delete it, or pickle the "
             "estimator."
         )
-    fitted = {key: encode(value, key) for key, value in learned.items()}
-    return {**encode_parameters(estimator), "module": config, "fitted": fitted}, arrays
+    fitted = {key: plain.encode(value, key) for key, value in learned.items()}
+    return {**plain.encode_parameters(estimator), "module": config, "fitted": fitted}, arrays
 
 
 def _restore_regressor(estimator: Any, description: dict[str, Any], arrays: Arrays) -> None:
-    check_entries(description, {"class", "params", "fitted", "module"}, "its header")
-    learned = decode_learned(estimator, description["fitted"])
+    plain.check_entries(description, {"class", "params", "fitted", "module"}, "its header")
+    learned = plain.decode_learned(estimator, description["fitted"])
     for name, array in arrays.items():
         _check_numbers(name, array)
     state = {"_module_config": description["module"], "_module_arrays": arrays}
@@ -285,7 +277,7 @@ def _check_movement(arrays: Arrays, n_outputs: int) -> None:
     shapes |= {"forcing": ("m", n_outputs), _HOLES: ("m",)}
     if set(_OF_POSES) & set(arrays):
         shapes |= {"rotation_reference": (4,), "output_axes": (n_outputs, n_outputs)}
-    check_entries(arrays, set(shapes), "its arrays")
+    plain.check_entries(arrays, set(shapes), "its arrays")
     for name, array in arrays.items():
         checks.array(array, name, shapes[name])
     checks.require((arrays[_HOLES] >= 0.0) & (arrays[_HOLES] <= 1.0), arrays[_HOLES], _HOLES, "a share from 0 to 1")

@@ -10,18 +10,8 @@ from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control.schedule import Schedule
 from torch_pbd.extras import optional
-from torch_pbd.robots.session import (
-    RobotLimits,
-    RobotRun,
-    RobotStoppedError,
-    accelerations,
-    check_limits,
-    check_start,
-    poses,
-    recorded,
-    stopping,
-    warn_of_mass,
-)
+from torch_pbd.robots import session
+from torch_pbd.robots.session import RobotLimits, RobotRun, RobotStoppedError
 
 _STEP = 1e-3  # s, along the joints' motion: squared, and so nothing beside what is differentiated
 
@@ -91,23 +81,23 @@ def run(
         If the arm stops by itself, the connection breaks, or a target comes late.
     """
     franky = optional("franky", "robot", "a Franka arm")
-    check_limits(schedule, RobotLimits() if limits is None else limits)
-    warn_of_mass(schedule)
+    session.check_limits(schedule, RobotLimits() if limits is None else limits)
+    session.warn_of_mass(schedule)
     checks.number(period, "period", above=0.0, below=max_step, unit="s")
     # A target holds for a period: that of its middle is never further than half of it from the motion.
     rows = schedule.resample(times=np.arange(schedule.time[0] + 0.5 * period, schedule.time[-1], period))
     gains, targets = _planned(franky, rows)
-    acceleration, ahead, model = accelerations(rows), round(gains_time_constant / period), robot.model
+    acceleration, ahead, model = session.accelerations(rows), round(gains_time_constant / period), robot.model
     start = robot.current_pose.end_effector_pose
-    check_start(schedule, start.translation, np.roll(start.quaternion, 1))
+    session.check_start(schedule, start.translation, np.roll(start.quaternion, 1))
     passed: list[tuple[float, Any, Any]] = []
-    session = franky.CartesianImpedanceTracker(
+    tracking = franky.CartesianImpedanceTracker(
         robot, gains=gains[0], gains_time_constant=gains_time_constant, period=period, **tracker
     )
-    with stopping(session.stop, on_fault):
+    with session.stopping(tracking.stop, on_fault):
         last = robot.state.time.to_sec()
         origin = last + settle - schedule.time[0]
-        while session.tick() is not None:
+        while tracking.tick() is not None:
             state = robot.state
             now, pose = state.time.to_sec(), state.O_T_EE
             if now - last > max_step:
@@ -118,13 +108,13 @@ def run(
                 break
             if row >= 0:
                 passed.append((now - origin, pose.translation, np.roll(pose.quaternion, 1)))
-                session.set_gains(gains=gains[min(row + ahead, len(rows) - 1)])
+                tracking.set_gains(gains=gains[min(row + ahead, len(rows) - 1)])
                 # What the controller turns into J q'' is to be without what J' q' gives by itself.
                 rise = franky.TwistAcceleration(*np.split(acceleration[row] - _bias(franky, model, state), 2))
-                session.set_target(*targets[row], rise)
+                tracking.set_target(*targets[row], rise)
         else:
             raise RobotStoppedError("the arm is no longer under control: it met a limit, or somebody stopped it")
-    return recorded(schedule, passed)
+    return session.recorded(schedule, passed)
 
 
 def _planned(franky: Any, rows: Schedule) -> tuple[list[Any], list[tuple[Any, Any]]]:
@@ -132,7 +122,7 @@ def _planned(franky: Any, rows: Schedule) -> tuple[list[Any], list[tuple[Any, An
     gains = [franky.CartesianImpedanceGains() for _ in rows.time]
     for own, stiffness, damping in zip(gains, rows.stiffness, rows.damping, strict=True):
         own.stiffness, own.damping = stiffness, damping
-    position, orientation = poses(rows)
+    position, orientation = session.poses(rows)
     moves = zip(position, np.roll(orientation, -1, axis=1), rows.velocity, strict=True)
     return gains, [(franky.Affine(place, turn), franky.Twist(*np.split(pace, 2))) for place, turn, pace in moves]
 

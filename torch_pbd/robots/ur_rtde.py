@@ -10,16 +10,8 @@ from torch_pbd import checks, rotations
 from torch_pbd.checks import Floats
 from torch_pbd.control.realtime import RealTimeAdmittance, TickStatus
 from torch_pbd.control.schedule import Schedule
-from torch_pbd.robots.session import (
-    RobotLimits,
-    RobotRun,
-    RobotStoppedError,
-    check_limits,
-    check_start,
-    poses,
-    recorded,
-    stopping,
-)
+from torch_pbd.robots import session
+from torch_pbd.robots.session import RobotLimits, RobotRun, RobotStoppedError
 
 # Of the tool, as these arms are delivered; they servo to positions, so that stiffness is a matter of the loop here.
 _LIMITS = RobotLimits(speed=1.0, angular_speed=3.1, stiffness=(0.0, np.inf), rotational_stiffness=(0.0, np.inf))
@@ -70,20 +62,20 @@ def run(
     RobotStoppedError
         If the robot stops, refuses a pose, or its force or clock are lost.
     """
-    check_limits(schedule, _LIMITS if limits is None else limits)
+    session.check_limits(schedule, _LIMITS if limits is None else limits)
     checks.number(lookahead_time, "lookahead_time", least=0.03, most=0.2, unit="s")
     checks.number(gain, "gain", least=100.0, most=2000.0)
     asked = schedule.resample(min(_ASKED, len(schedule) / schedule.duration))
-    for at, position, orientation in zip(asked.time, *poses(asked), strict=True):
+    for at, position, orientation in zip(asked.time, *session.poses(asked), strict=True):
         if not control.isPoseWithinSafetyLimits(_pose(position, orientation)):
             raise checks.refusal(position.tolist(), f"the position at {at:.4g} s", "within the robot's safety limits")
     step = control.getStepTime()
     admittance = RealTimeAdmittance(schedule, rate=1.0 / step, **loop)
     here = np.array(receive.getActualTCPPose())
-    check_start(schedule, here[:3], rotations.exp(here[3:]))
+    session.check_start(schedule, here[:3], rotations.exp(here[3:]))
     control.zeroFtSensor()
     passed: list[tuple[float, Floats, Floats]] = []
-    with stopping(control.servoStop, on_fault):
+    with session.stopping(control.servoStop, on_fault):
         admittance.start(time.monotonic(), here[:3], orientation=rotations.exp(here[3:]))
         while admittance.schedule_time < schedule.duration:
             period = control.initPeriod()
@@ -97,7 +89,7 @@ def run(
             here = np.array(receive.getActualTCPPose())
             passed.append((schedule.time[0] + admittance.schedule_time, here[:3], rotations.exp(here[3:])))
             control.waitPeriod(period)
-    return recorded(schedule, passed)
+    return session.recorded(schedule, passed)
 
 
 def _pose(position: Floats, orientation: Floats) -> list[float]:
