@@ -150,13 +150,14 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
         training, smoothed = problem.training, self.noise_scale is None
         log_diagonal = self.diagonal == "log" or (self.diagonal == "auto" and smoothed)
         scale_tril = empirical_tril(training, bias_correction=self.bias_correction)
-        linked = _with_least_diagonal(scale_tril) if log_diagonal else scale_tril
-        # Smoothed logarithms give the geometric mean of the entries, which for chi numbers is below their mean by a
-        # factor that is known.
-        if log_diagonal and smoothed:
-            linked = linked.tril(-1) + torch.diag_embed(
-                linked.diagonal(dim1=-2, dim2=-1) * mean_over_geometric(training)
-            )
+        linked = scale_tril
+        if log_diagonal:
+            diagonal = scale_tril.diagonal(dim1=-2, dim2=-1)
+            diagonal = diagonal.maximum(_LEAST_DIAGONAL * diagonal.square().mean(0).sqrt())
+            # Smoothed logarithms give the geometric mean of the entries, which for chi numbers is below their mean by a
+            # factor that is known.
+            diagonal = diagonal * mean_over_geometric(training) if smoothed else diagonal
+            linked = scale_tril.tril(-1) + torch.diag_embed(diagonal)
         deviation = tril_deviation(linked, problem.prior_tril, log_diagonal=log_diagonal)
         # An entry of the factor of K rows has an error whose variance falls with K - 1.
         degrees = training.counts - 1.0
@@ -222,9 +223,3 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
         gp = latent.interpolate(tril_to_vector(scale_tril).mT.contiguous())
         covariance = CholeskyCovariance(gp, prior[0], log_diagonal=log_diagonal, bounded=self.latent_prior)
         return covariance, report, latent.jitter
-
-
-def _with_least_diagonal(scale_tril: Tensor) -> Tensor:
-    diagonal = scale_tril.diagonal(dim1=-2, dim2=-1)
-    least = _LEAST_DIAGONAL * diagonal.square().mean(0).sqrt()
-    return scale_tril.tril(-1) + torch.diag_embed(torch.maximum(diagonal, least))

@@ -239,13 +239,12 @@ def mean_consistent_with_repeats(
     mean, _ = condition(observations, found.hyperparameters, search.kernel, basis=found.basis)
     if int(training.counts.min()) < 2 or not training.repeats_inputs:
         return mean, found.report
-    spread = _Spread(training)
     with torch.no_grad():
-        wrong = spread.contradicts(observations.targets - mean(training.inputs).mT)
+        wrong, least_error = _contradicted(training, observations.targets - mean(training.inputs).mT)
     if not bool(wrong.any()):
         return mean, found.report
     learned = found.hyperparameters.amplitude * found.hyperparameters.noise_ratio.sqrt()
-    noise_scale = torch.where(wrong, _SHARE * spread.least_error(), learned).clamp_min(_LEAST_NOISE)
+    noise_scale = torch.where(wrong, _SHARE * least_error, learned).clamp_min(_LEAST_NOISE)
     (again,) = fit_together([(observations, replace(search, noise_scale=noise_scale))])
     # Over a range or more a large amplitude is a trend.
     swings = again.hyperparameters.amplitude > _STRETCHED * observations.targets.square().mean(1).sqrt()
@@ -260,29 +259,21 @@ def mean_consistent_with_repeats(
     return condition(observations, again.hyperparameters, search.kernel, basis=again.basis)[0], again.report
 
 
-class _Spread:
-    """How far rows that repeat an input differ, (n, d), and what of it the mean at that input may be off by."""
+def _contradicted(
+    training: TrainingSet, residual: Float[Tensor, "d n"]
+) -> tuple[Bool[Tensor, " d"], Float[Tensor, " d"]]:
+    """Whether the means at the inputs are too far from where a process has them; and the smallest error of a mean.
 
-    def __init__(self, training: TrainingSet) -> None:
-        counts, squares = training.counts, training.squares()
-        self._counts, self._degrees = counts, counts - 1.0
-        self._pooled = squares.sum(0) / self._degrees.sum()
-        local = squares / self._degrees[:, None]
-        self._local = torch.maximum(local, _LEAST_SPREAD**2 * self._pooled)
-
-    def least_error(self) -> Float[Tensor, " d"]:
-        """Smallest standard error of a mean, of rows that are counted as in the evidence."""
-        return (self._local.amin(0) / self._counts.mean()).sqrt()
-
-    def contradicts(self, residual: Float[Tensor, "d n"]) -> Bool[Tensor, " d"]:
-        """Whether the means at the inputs are too far from where a process has them.
-
-        Together, by the F test of lack of fit; or at one input, by Student's t.
-        """
-        squared = residual.mT.square() * self._counts[:, None]
-        n_inputs, degrees = len(squared), float(self._degrees.sum())
-        limit = min(float(fdtri(n_inputs, degrees, 1.0 - _LEVEL)), _CLEAR**2)
-        together = squared.mean(0) > limit * self._pooled + _UNRESOLVED
-        each = squared.new_tensor(stdtrit(self._degrees.cpu().numpy(), 0.5 * _LEVEL / n_inputs))
-        alone = squared > each.square()[:, None] * self._local + _UNRESOLVED
-        return together | alone.any(0)
+    Together, by the F test of lack of fit; or at one input, by Student's t.
+    """
+    counts, squares = training.counts, training.squares()
+    degrees = counts - 1.0
+    pooled = squares.sum(0) / degrees.sum()
+    local = torch.maximum(squares / degrees[:, None], _LEAST_SPREAD**2 * pooled)
+    squared, n_inputs = residual.mT.square() * counts[:, None], len(counts)
+    limit = min(float(fdtri(n_inputs, float(degrees.sum()), 1.0 - _LEVEL)), _CLEAR**2)
+    together = squared.mean(0) > limit * pooled + _UNRESOLVED
+    each = squared.new_tensor(stdtrit(degrees.cpu().numpy(), 0.5 * _LEVEL / n_inputs))
+    alone = squared > each.square()[:, None] * local + _UNRESOLVED
+    # The error is of rows that are counted as in the evidence, by their mean.
+    return together | alone.any(0), (local.amin(0) / counts.mean()).sqrt()

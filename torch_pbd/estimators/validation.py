@@ -28,16 +28,18 @@ Prior = (
 _LOWEST, _HIGHEST = 1e-6, 1e6
 
 
-def as_plain_array(values: Any, name: str) -> Any:
-    """``values`` with a torch tensor turned into an array, and refused where they are no numbers or would lose meaning.
+def checked_values(values: Any, name: str) -> Any:
+    """``values``, all of them finite numbers, a torch tensor turned into an array.
 
-    They are too coarse where a float type is for its spread: unix time in float32 has steps of 128 s.
+    They are refused where their type is too coarse for their spread: unix time in float32 has steps of 128 s.
     """
     if hasattr(values, "detach"):
         values = checks.from_tensor(values, name)
     for label, part in _parts(values, name):
         if part.dtype in (np.float16, np.float32) and part.ndim and part.size:
             _check_resolution(part, name, label)
+        floats = checks.real_floats(part, name) if part.dtype.kind == "O" and part.ndim else part
+        checks.check_finite(floats, name, label)
     return values
 
 
@@ -46,16 +48,6 @@ def _parts(values: Any, name: str) -> list[tuple[Any, NDArray[Any]]]:
     if hasattr(values, "columns"):
         return [(label, checks.real_array(values[label], f"column {label} of {name}")) for label in values.columns]
     return [] if issparse(values) else [(None, checks.real_array(values, name))]  # scikit-learn says more of the sparse
-
-
-def checked_values(values: Any, name: str) -> Any:
-    """The same, and all of it finite."""
-    values = as_plain_array(values, name)
-    for label, part in _parts(values, name):
-        checks.check_finite(
-            checks.real_floats(part, name) if part.dtype.kind == "O" and part.ndim else part, name, label
-        )
-    return values
 
 
 def _check_resolution(array: NDArray[Any], name: str, label: Any) -> None:
@@ -214,7 +206,7 @@ def check_period(value: Any, kernel: str, x_scale: Floats) -> Floats | None:
 def parameter_floats(value: Any, name: str) -> Floats:
     """A parameter of numbers as an array of floats, of any shape."""
     try:
-        array = np.array(as_plain_array(value, name))
+        array = checks.real_array(value, name)
         if array.dtype.kind == "b":
             raise TypeError("not bool")
         return array.astype(np.float64)
