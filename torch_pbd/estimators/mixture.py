@@ -4,8 +4,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
 from sklearn.cluster import KMeans
 from sklearn.neighbors import NearestNeighbors
 
@@ -18,7 +16,6 @@ from torch_pbd.estimators.validation import Floats
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.files.memory import require_much
 from torch_pbd.models.mixture import GaussianMixture, expectation_maximization, refine
-from torch_pbd.optim import FitReport
 
 # An output's residual scale is not taken below this of its whole spread.
 _SMALLEST_RESIDUAL = 1e-6
@@ -126,17 +123,15 @@ class GMMBaseline(CovarianceRegressor):
         scaling = _by_residual(X, y)
         data = self._door(np.hstack([scaling.exact_inputs(X), scaling.exact_outputs(y)]))
         generator = checks.seed(self.random_state)
-        runs = [self._expectation_maximization(data, points, X.shape[1], generator) for _ in range(1 + self.n_restarts)]
+        limits: dict[str, Any] = {"reg_covar": self.reg_covar, "tol": self.tol, "max_iter": self.max_iter}
+        runs = []
+        for _ in range(1 + self.n_restarts):
+            kmeans = KMeans(n_components, n_init=1, random_state=generator.randint(2**31 - 1)).fit(points)
+            responsibilities = self._door(np.eye(n_components)[kmeans.labels_])
+            runs.append(expectation_maximization(data, responsibilities, n_features=X.shape[1], **limits))
         mixture, report = min(runs, key=lambda run: run[1].loss)
         if self.solver == "lbfgs":
-            report = refine(
-                mixture,
-                data,
-                reg_covar=self.reg_covar,
-                max_iter=self.max_iter,
-                tol=self.tol,
-                callback=self._progress(),
-            )
+            report = refine(mixture, data, callback=self._progress(), **limits)
         return Fitted(self._assemble(mixture, scaling), report, float(self.reg_covar))
 
     def _prepare(self) -> None:
@@ -166,22 +161,6 @@ class GMMBaseline(CovarianceRegressor):
         if regression is None or not regression.matches(self.module_):
             return super()._moments(X)
         return by_chunks(regression.moments, X)
-
-    def _expectation_maximization(
-        self, data: torch.Tensor, points: Floats, n_features: int, generator: np.random.RandomState
-    ) -> tuple[GaussianMixture, FitReport]:
-        """One run from k-means on ``points``."""
-        kmeans = KMeans(self.n_components, n_init=1, random_state=generator.randint(2**31 - 1))
-        labels: NDArray[np.intp] = kmeans.fit(points).labels_
-        responsibilities = self._door(np.eye(self.n_components)[labels])
-        return expectation_maximization(
-            data,
-            responsibilities,
-            n_features=n_features,
-            reg_covar=self.reg_covar,
-            tol=self.tol,
-            max_iter=self.max_iter,
-        )
 
 
 def _points(X: Floats, y: Floats) -> Floats:

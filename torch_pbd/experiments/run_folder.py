@@ -79,7 +79,10 @@ class RunFolder:
             for folder in (self.path, *(self.path / part for part in _PARTS if (self.path / part).exists())):
                 if not folder.is_dir() or not os.access(folder, os.W_OK):
                     raise PermissionError(f"{folder} is no folder, or not writable")
-                _check_files(folder)
+                # What is named as files of results are is to be replaced.
+                for entry in folder.iterdir():
+                    if entry.suffix in _SUFFIXES and entry.exists() and not entry.is_file():
+                        raise IsADirectoryError(f"{entry} stands where a file of results may have to: move it away")
                 remove_drafts(folder)
             self.write_text("env.json", json.dumps(_environment(settings), indent=2) + "\n")
         except BaseException:
@@ -141,13 +144,6 @@ class RunFolder:
         target.mkdir(exist_ok=True)
         schedule.save(target / f"{file}.npz")
         schedule.resample(100.0).save(target / f"{file}_100hz.csv")
-
-
-def _check_files(folder: Path) -> None:
-    """Check that what is named as files of results are is none but files, which can be replaced."""
-    for entry in folder.iterdir():
-        if entry.suffix in _SUFFIXES and entry.exists() and not entry.is_file():
-            raise IsADirectoryError(f"{entry} stands where a file of results may have to: move it away")
 
 
 def _environment(settings: Mapping[str, Any]) -> dict[str, Any]:

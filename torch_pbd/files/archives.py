@@ -29,22 +29,17 @@ def read_members(content: bytes, max_bytes: int, *, remedy: str) -> dict[str, by
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             infos = archive.infolist()
-            _check_infos(infos, max_bytes, remedy)
+            n_bytes = sum(info.file_size for info in infos)
+            if len({info.filename.removesuffix(".npy") for info in infos}) < len(infos):
+                raise ValueError("two of its members have the same name.")
+            if n_bytes > max_bytes:
+                raise ValueError(f"it unpacks to more than {max_bytes} bytes, to {n_bytes}. {remedy}")
+            require_memory(2 * n_bytes, what="what it unpacks to", remedy="Read it where there is more.")
+            if any(info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for info in infos):
+                raise ValueError("it is packed in a way that NumPy does not write.")
             return {info.filename.removesuffix(".npy"): archive.read(info) for info in infos}
     except Exception as error:  # parsers of bytes that are not what they claim to be raise errors of all kinds
         raise ValueError(f"it is not a sound .npz archive: {error}") from error
-
-
-def _check_infos(infos: list[zipfile.ZipInfo], max_bytes: int, remedy: str) -> None:
-    names = {info.filename.removesuffix(".npy") for info in infos}
-    if len(names) < len(infos):
-        raise ValueError("two of its members have the same name.")
-    n_bytes = sum(info.file_size for info in infos)
-    if n_bytes > max_bytes:
-        raise ValueError(f"it unpacks to more than {max_bytes} bytes, to {n_bytes}. {remedy}")
-    require_memory(2 * n_bytes, what="what it unpacks to", remedy="Read it where there is more.")
-    if any(info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) for info in infos):
-        raise ValueError("it is packed in a way that NumPy does not write.")
 
 
 def read_array(name: str, content: bytes) -> NDArray[Any]:

@@ -1,6 +1,6 @@
 """Pose, Jacobian and inertia of the tool of an arm at given joint angles, by MuJoCo or Pinocchio."""
 
-from typing import Any, NamedTuple, Protocol, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,23 +27,106 @@ class ToolState(NamedTuple):
     mass_matrix: Floats  # (n, n), of the joints
 
 
-class Arm(Protocol):
-    """Joints that carry a tool, in the order from the base on; others of the model are locked."""
+@final
+class MujocoArm:
+    """Joints that carry a tool, in the order from the base on, of a ``mujoco.MjModel``; others are locked."""
 
-    limits: Floats  # (2, n), lowest and highest angles
+    def __init__(self, model: Any, tool: str) -> None:
+        self._library = mujoco = optional("mujoco", "robot", "an arm in MuJoCo")
+        self._model, self._data = model, mujoco.MjData(model)
+        kinds = mujoco.mjtObj
+        site = mujoco.mj_name2id(model, kinds.mjOBJ_SITE, tool)
+        body = model.site_bodyid[site] if site >= 0 else mujoco.mj_name2id(model, kinds.mjOBJ_BODY, tool)
+        if body < 0:
+            sites = [model.site(i).name for i in range(model.nsite)]
+            bodies = [model.body(i).name for i in range(model.nbody)]
+            raise checks.refusal(tool, "tool", f"a site ({', '.join(sites)}) or a body ({', '.join(bodies)})")
+        self._site, self._body = site, body
+        carrying: list[int] = []
+        while body > 0:
+            first = int(model.body_jntadr[body])
+            carrying = [*range(first, first + int(model.body_jntnum[body])), *carrying]
+            body = model.body_parentid[body]
+        turning = np.isin(model.jnt_type[carrying], [mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE])
+        if not carrying or not turning.all():
+            raise checks.refusal(tool, "tool", "carried by hinges and slides alone", "fix the base of the arm")
+        self._angles, self._rates = model.jnt_qposadr[carrying], model.jnt_dofadr[carrying]
+        bounds = np.where(model.jnt_limited[carrying][:, np.newaxis], model.jnt_range[carrying], [-np.inf, np.inf])
+        self.limits: Floats = bounds.T  # (2, n), lowest and highest angles
 
     def at(self, joints: Floats) -> ToolState:
         """State of the tool at joint angles (n,)."""
+        self._data.qpos[self._angles] = joints
+        self._library.mj_fwdPosition(self._model, self._data)
+        return self.measure(self._data)
+
+    def bias(self, data: Any) -> Floats:
+        """Acceleration (6,) of the tool in a simulation while its joints keep their speed."""
+        rate = np.empty((6, self._model.nv))
+        point = data.site_xpos[self._site] if self._site >= 0 else data.xpos[self._body]
+        self._library.mj_jacDot(self._model, data, rate[:3], rate[3:], point, self._body)
+        change: Floats = rate @ data.qvel
+        return change
+
+    def measure(self, data: Any) -> ToolState:
+        """State of the tool in a simulation whose positions are up to date."""
+        mujoco, model = self._library, self._model
+        jacobian, mass, turn = np.empty((6, model.nv)), np.empty((model.nv, model.nv)), np.empty(4)
+        if self._site >= 0:
+            mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], self._site)
+            place = data.site_xpos[self._site].copy()
+            mujoco.mju_mat2Quat(turn, data.site_xmat[self._site])
+        else:
+            mujoco.mj_jacBody(model, data, jacobian[:3], jacobian[3:], self._body)
+            place, turn = data.xpos[self._body].copy(), data.xquat[self._body].copy()
+        # The order of arguments is that of the version: until 3, inertia lay in data.qM.
+        mujoco.mj_fullM(model, *((mass, data.qM) if hasattr(data, "qM") else (data, mass)))
+        return ToolState(place, turn, jacobian[:, self._rates], mass[np.ix_(self._rates, self._rates)])
+
+
+@final
+class PinocchioArm:
+    """The same of a ``pinocchio.Model``."""
+
+    def __init__(self, model: Any, tool: str) -> None:
+        self._library = pin = optional("pinocchio", "robot", "an arm in Pinocchio")
+        self._model, self._data, self._neutral = model, model.createData(), pin.neutral(model)
+        if not model.existFrame(tool):
+            raise checks.refusal(
+                tool, "tool", f"a frame of the model, one of {', '.join(f.name for f in model.frames)}"
+            )
+        self._frame = model.getFrameId(tool)
+        joint = model.frames[self._frame].parentJoint
+        carrying = [model.joints[i] for i in list(model.supports[joint]) if i > 0]
+        if not carrying or any(part.nq != 1 for part in carrying):
+            raise checks.refusal(tool, "tool", "carried by joints with one angle each", "fix the base of the arm")
+        self._angles, self._rates = [part.idx_q for part in carrying], [part.idx_v for part in carrying]
+        self.limits: Floats = np.stack([model.lowerPositionLimit, model.upperPositionLimit])[:, self._angles]
+
+    def at(self, joints: Floats) -> ToolState:
+        """State of the tool at joint angles (n,)."""
+        pin, model, data = self._library, self._model, self._data
+        every = self._neutral.copy()
+        every[self._angles] = joints
+        axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        jacobian = pin.computeFrameJacobian(model, data, every, self._frame, axes)[:, self._rates]
+        upper = np.triu(pin.crba(model, data, every))  # the lower half is not always filled
+        mass = (upper + np.triu(upper, 1).T)[np.ix_(self._rates, self._rates)]
+        pin.forwardKinematics(model, data, every)
+        pose = pin.updateFramePlacement(model, data, self._frame)
+        return ToolState(pose.translation.copy(), rotations.from_matrix(pose.rotation), jacobian, mass)
+
+
+Arm = MujocoArm | PinocchioArm
 
 
 def arm(model: Any, tool: str) -> Arm:
     """Arm of a ``mujoco.MjModel`` or ``pinocchio.Model``; ``tool`` is the name of a site, body or frame."""
-    kinds: dict[str, Any] = {"mujoco": MujocoArm, "pinocchio": _PinocchioArm}
+    kinds: dict[str, Any] = {"mujoco": MujocoArm, "pinocchio": PinocchioArm}
     library = type(model).__module__.partition(".")[0]
     if library not in kinds:
         raise checks.refusal(model, "model", "a mujoco.MjModel or a pinocchio.Model", "load one, or take panda()")
-    chain: Arm = kinds[library](model, checks.text(tool, "tool"))
-    return chain
+    return kinds[library](model, checks.text(tool, "tool"))
 
 
 def operational_inertia(model: Any, joints: ArrayLike, tool: str) -> Floats:
@@ -173,92 +256,3 @@ def _reach(chain: Arm, joints: Floats, position: Floats, orientation: Floats, ne
         f"{where} is {1e3 * distance:.3g} mm and {angle:.3g} rad out "
         "of reach: move it nearer to the base with schedule.transform, or start from other joint angles."
     )
-
-
-@final
-class MujocoArm:
-    """The :class:`Arm` of a ``mujoco.MjModel``."""
-
-    def __init__(self, model: Any, tool: str) -> None:
-        self._library = mujoco = optional("mujoco", "robot", "an arm in MuJoCo")
-        self._model, self._data = model, mujoco.MjData(model)
-        kinds = mujoco.mjtObj
-        site = mujoco.mj_name2id(model, kinds.mjOBJ_SITE, tool)
-        body = model.site_bodyid[site] if site >= 0 else mujoco.mj_name2id(model, kinds.mjOBJ_BODY, tool)
-        if body < 0:
-            sites = [model.site(i).name for i in range(model.nsite)]
-            bodies = [model.body(i).name for i in range(model.nbody)]
-            raise checks.refusal(tool, "tool", f"a site ({', '.join(sites)}) or a body ({', '.join(bodies)})")
-        self._site, self._body = site, body
-        carrying: list[int] = []
-        while body > 0:
-            first = int(model.body_jntadr[body])
-            carrying = [*range(first, first + int(model.body_jntnum[body])), *carrying]
-            body = model.body_parentid[body]
-        turning = np.isin(model.jnt_type[carrying], [mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE])
-        if not carrying or not turning.all():
-            raise checks.refusal(tool, "tool", "carried by hinges and slides alone", "fix the base of the arm")
-        self._angles, self._rates = model.jnt_qposadr[carrying], model.jnt_dofadr[carrying]
-        bounds = np.where(model.jnt_limited[carrying][:, np.newaxis], model.jnt_range[carrying], [-np.inf, np.inf])
-        self.limits: Floats = bounds.T
-
-    def at(self, joints: Floats) -> ToolState:
-        """State of the tool at joint angles (n,)."""
-        self._data.qpos[self._angles] = joints
-        self._library.mj_fwdPosition(self._model, self._data)
-        return self.measure(self._data)
-
-    def bias(self, data: Any) -> Floats:
-        """Acceleration (6,) of the tool in a simulation while its joints keep their speed."""
-        rate = np.empty((6, self._model.nv))
-        point = data.site_xpos[self._site] if self._site >= 0 else data.xpos[self._body]
-        self._library.mj_jacDot(self._model, data, rate[:3], rate[3:], point, self._body)
-        change: Floats = rate @ data.qvel
-        return change
-
-    def measure(self, data: Any) -> ToolState:
-        """State of the tool in a simulation whose positions are up to date."""
-        mujoco, model = self._library, self._model
-        jacobian, mass, turn = np.empty((6, model.nv)), np.empty((model.nv, model.nv)), np.empty(4)
-        if self._site >= 0:
-            mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], self._site)
-            place = data.site_xpos[self._site].copy()
-            mujoco.mju_mat2Quat(turn, data.site_xmat[self._site])
-        else:
-            mujoco.mj_jacBody(model, data, jacobian[:3], jacobian[3:], self._body)
-            place, turn = data.xpos[self._body].copy(), data.xquat[self._body].copy()
-        # The order of arguments is that of the version: until 3, inertia lay in data.qM.
-        mujoco.mj_fullM(model, *((mass, data.qM) if hasattr(data, "qM") else (data, mass)))
-        return ToolState(place, turn, jacobian[:, self._rates], mass[np.ix_(self._rates, self._rates)])
-
-
-@final
-class _PinocchioArm:
-    """The :class:`Arm` of a ``pinocchio.Model``."""
-
-    def __init__(self, model: Any, tool: str) -> None:
-        self._library = pin = optional("pinocchio", "robot", "an arm in Pinocchio")
-        self._model, self._data, self._neutral = model, model.createData(), pin.neutral(model)
-        if not model.existFrame(tool):
-            raise checks.refusal(
-                tool, "tool", f"a frame of the model, one of {', '.join(f.name for f in model.frames)}"
-            )
-        self._frame = model.getFrameId(tool)
-        joint = model.frames[self._frame].parentJoint
-        carrying = [model.joints[i] for i in list(model.supports[joint]) if i > 0]
-        if not carrying or any(part.nq != 1 for part in carrying):
-            raise checks.refusal(tool, "tool", "carried by joints with one angle each", "fix the base of the arm")
-        self._angles, self._rates = [part.idx_q for part in carrying], [part.idx_v for part in carrying]
-        self.limits: Floats = np.stack([model.lowerPositionLimit, model.upperPositionLimit])[:, self._angles]
-
-    def at(self, joints: Floats) -> ToolState:
-        pin, model, data = self._library, self._model, self._data
-        every = self._neutral.copy()
-        every[self._angles] = joints
-        axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        jacobian = pin.computeFrameJacobian(model, data, every, self._frame, axes)[:, self._rates]
-        upper = np.triu(pin.crba(model, data, every))  # the lower half is not always filled
-        mass = (upper + np.triu(upper, 1).T)[np.ix_(self._rates, self._rates)]
-        pin.forwardKinematics(model, data, every)
-        pose = pin.updateFramePlacement(model, data, self._frame)
-        return ToolState(pose.translation.copy(), rotations.from_matrix(pose.rotation), jacobian, mass)
