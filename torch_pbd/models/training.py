@@ -122,13 +122,6 @@ def default_prior_tril(y: Tensor) -> Tensor:
     return 2.0 * scale_tril_from_root(torch.cat([centred, 0.001**0.5 * torch.eye(y.shape[1]).to(y)], dim=1))
 
 
-def is_constant(training: TrainingSet) -> bool:
-    """Whether outputs never vary where inputs repeat, or nowhere if none does; but for rounding."""
-    repeated = len(training.y) - len(training.inputs)
-    mean = training.means()[training.index] if repeated else training.y.mean(0)
-    return float((training.y - mean).square().sum(0).max()) < 1e-18 * max(1, repeated or len(training.y) - 1)
-
-
 def empirical_tril(training: TrainingSet, *, bias_correction: bool = False) -> Float[Tensor, "n d d"]:
     """Factor of the empirical covariance at each distinct input; its divisor is the count less one.
 

@@ -253,7 +253,16 @@ def _restore_controller(controller: Any, own: Arrays) -> None:
                 raise ValueError(f"{name} has {len(getattr(controller, name))} entries, must have {d}")
             setattr(controller, name, tuple(getattr(controller, name)))
     own = {_HOLES: np.zeros(2), **own}  # none at the start, none at the end
-    _check_movement(own, d)
+    shapes: dict[str, tuple[int | str, ...]] = dict.fromkeys((*_NOISE, *_MOTION), (d,))
+    shapes |= {"forcing": ("m", d), _HOLES: ("m",)}
+    if set(_OF_POSES) & set(own):
+        shapes |= {"rotation_reference": (4,), "output_axes": (d, d)}
+    plain.check_entries(own, set(shapes), "its arrays")
+    for name, array in own.items():
+        checks.array(array, name, shapes[name])
+    checks.require((own[_HOLES] >= 0.0) & (own[_HOLES] <= 1.0), own[_HOLES], _HOLES, "a share from 0 to 1")
+    if min(len(own["forcing"]), len(own[_HOLES])) < 2:
+        raise ValueError(f"forcing and {_HOLES} must have a row at the start and one at the end")
     reference, axes = (own.pop(name, None) for name in _OF_POSES)
     controller.outputs_ = outputs = Outputs(d if reference is None else d - 3, reference, axes)
     unit = reference is None or abs(float(np.linalg.norm(reference)) - 1.0) < 1e-9
@@ -269,17 +278,3 @@ def _restore_controller(controller: Any, own: Arrays) -> None:
         dmp, controller.phase_input, own_goals, time=time, blocks=outputs.blocks, **own
     )
     controller.start_, controller.goal_ = own["start"], own["goal"]
-
-
-def _check_movement(arrays: Arrays, n_outputs: int) -> None:
-    """Check the arrays of a controller's own."""
-    shapes: dict[str, tuple[int | str, ...]] = dict.fromkeys((*_NOISE, *_MOTION), (n_outputs,))
-    shapes |= {"forcing": ("m", n_outputs), _HOLES: ("m",)}
-    if set(_OF_POSES) & set(arrays):
-        shapes |= {"rotation_reference": (4,), "output_axes": (n_outputs, n_outputs)}
-    plain.check_entries(arrays, set(shapes), "its arrays")
-    for name, array in arrays.items():
-        checks.array(array, name, shapes[name])
-    checks.require((arrays[_HOLES] >= 0.0) & (arrays[_HOLES] <= 1.0), arrays[_HOLES], _HOLES, "a share from 0 to 1")
-    if min(len(arrays["forcing"]), len(arrays[_HOLES])) < 2:
-        raise ValueError(f"forcing and {_HOLES} must have a row at the start and one at the end")
