@@ -15,6 +15,7 @@ from torch_pbd.data import Demonstrations, check_unimodal
 from torch_pbd.estimators.validation import Floats
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.models.heteroscedastic import HeteroscedasticFit, are_copies
+from torch_pbd.models.training import TrainingSet
 
 _unimodality_reported: ContextVar[bool] = ContextVar("_unimodality_reported", default=False)
 _COVERED = 0.5  # of the range of the input, by a demonstration that is compared with others
@@ -110,6 +111,18 @@ def warn_if_few_demonstrations(groups: NDArray[np.intp] | None, n_outputs: int) 
         checks.warn(
             f"y has {n_demos} demonstrations but {n_outputs} outputs: they leave open how the outputs vary together. "
             f"Record {n_outputs + 1} or more, or learn fewer outputs at a time.",
+            DataRankWarning,
+        )
+
+
+def warn_if_identical(training: TrainingSet) -> None:
+    """Warn of outputs that never vary where inputs repeat, or nowhere if none does; but for rounding."""
+    repeated = len(training.y) - len(training.inputs)
+    squares = training.squares() if repeated else (training.y - training.y.mean(0)).square()
+    if float(squares.sum(0).max()) < 1e-18 * max(1, repeated or len(training.y) - 1):
+        checks.warn(
+            "The demonstrations are identical: their covariance is zero, and the smallest that can be told "
+            "from it is used.",
             DataRankWarning,
         )
 

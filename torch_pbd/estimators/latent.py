@@ -12,8 +12,8 @@ from torch import Tensor
 
 from torch_pbd import checks
 from torch_pbd.estimators.base import CovarianceRegressor
-from torch_pbd.estimators.demonstrations import warn_if_few
-from torch_pbd.estimators.torch_estimator import Fitted, Integers, Standardization, warn_if_identical
+from torch_pbd.estimators.demonstrations import warn_if_few, warn_if_identical
+from torch_pbd.estimators.torch_estimator import Fitted, Integers, Standardization
 from torch_pbd.estimators.validation import Floats, check_length_scale, standardized_prior
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.files.memory import require_much

@@ -19,7 +19,6 @@ from torch_pbd.checks import Floats
 from torch_pbd.console import say
 from torch_pbd.estimators.demonstrations import check_groups
 from torch_pbd.estimators.validation import CONSTANT, check_inputs_vary, check_squares, checked_rows, without_rounding
-from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.models.conditional import ConditionalNormal, Core
 from torch_pbd.models.training import TrainingSet
 from torch_pbd.optim import FitReport, Progress
@@ -287,15 +286,3 @@ class TorchEstimator(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
                 tensors = {name: self._door(array) for name, array in arrays.items()}
                 self.module_ = ConditionalNormal.restored(self._core_class, config, tensors).requires_grad_(False)
             self._prepare()
-
-
-def warn_if_identical(training: TrainingSet) -> None:
-    """Warn of outputs that never vary where inputs repeat, or nowhere if none does; but for rounding."""
-    repeated = len(training.y) - len(training.inputs)
-    squares = training.squares() if repeated else (training.y - training.y.mean(0)).square()
-    if float(squares.sum(0).max()) < 1e-18 * max(1, repeated or len(training.y) - 1):
-        checks.warn(
-            "The demonstrations are identical: their covariance is zero, and the smallest that can be told "
-            "from it is used.",
-            DataRankWarning,
-        )
