@@ -78,6 +78,7 @@ def test_the_law_is_that_of_the_dense_reference(recordings, monkeypatch):
     # It has its own smallest nugget, and chooses the shrinkage as if that left the marginals what they are.
     monkeypatch.setattr(time_kernel, "_LEAST", min(oracle.NUGGETS))
     monkeypatch.setattr(time_kernel, "_NUGGETS", oracle.NUGGETS)
+    monkeypatch.setattr(time_kernel, "_RATIOS", ())  # and one length scale
     own = TrajectoryRegressor(time_kernel="matern52", shrinkage=1.0 - found["weight"]).fit(X_fit, y, groups=groups)
     assert own.length_scale_ == pytest.approx(found["length"])
     assert own.df_ == max(3.0, 0.5 * df)
@@ -201,7 +202,7 @@ def test_nuggets_take_missing_steps_for_missing():
     holed[0, 10:15] = torch.nan
     grid = torch.from_numpy(GRID)
     whole, part = (fit_time_kernel(grid, values, ["squared_exponential"], None) for values in (residual, holed))
-    assert part.length_scale == pytest.approx(whole.length_scale, rel=0.4)
+    assert part.scales[0][0] == pytest.approx(whole.scales[0][0], rel=0.4)
     assert not part.residual.isnan().any()
     # What stands in the hole is near to what was cut out of it.
     assert (part.residual[0, 10:15] - whole.residual[0, 10:15]).abs().max() < 0.3
@@ -211,7 +212,7 @@ def test_the_length_scale_that_made_the_movements_is_found():
     residual = torch.from_numpy(movements(30, seed=5))
     residual = residual - residual.mean(0)
     found = fit_time_kernel(torch.from_numpy(GRID), residual / residual.std(0), ["squared_exponential"], None)
-    assert found.length_scale == pytest.approx(0.2, rel=0.2)
+    assert found.scales[0][0] == pytest.approx(0.2, rel=0.2)
 
 
 @pytest.mark.parametrize("kernel", ["squared_exponential", "matern52"])

@@ -3,13 +3,17 @@
 Whitened residuals ``z`` of the demonstrations, of unit covariance at each step, are taken for ``g_t + eps_t``: g has a
 stationary kernel over time, eps_t is independent with a variance e_t, the nugget. One nugget for all steps would have
 to be as large as where movements start or end in one point, which marginals mistrack, and would spoil all others.
+
+The kernel is of one length scale, or of two that are added: what people vary slowly and what little they tremble. One
+alone must be as short as the tremble, which the likelihood sees best, and then draws are rougher and longer than
+demonstrations.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any
+from functools import cached_property, partial
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -18,10 +22,14 @@ from torch import Tensor
 from torch_pbd.kernels import correlation
 from torch_pbd.linalg import safe_cholesky, symmetrize
 
+Scales = tuple[tuple[float, float], ...]
+
 # Length scales in ranges of the time, from the spacing of some fifty steps to a movement that bends once; and nuggets
 # shared by all steps.
 _LENGTHS = torch.logspace(math.log10(0.02), 0.0, 14, dtype=torch.float64)
 _NUGGETS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1)
+_FINE_WEIGHTS, _RATIOS = (0.03, 0.1, 0.3, 0.6), (2.0, 4.0)  # of the shorter of two scales; and of the longer over it
+_SINGLE = [((length, 1.0),) for length in _LENGTHS.tolist()]
 _LEAST, _MOST, _FIRST = 1e-6, 1e3, 1e-2  # nuggets: smallest, largest, and where expectation maximization starts
 _N_STEPS, _TOLERANCE = 40, 0.02  # of expectation maximization: iterations, and change of a logarithm that ends it
 _SMOOTH = 1e-3  # nugget of a step that is told apart from noise: such steps decide on the length scale
@@ -30,13 +38,22 @@ _ROUNDS = 3  # of nuggets and length scale, which depend on each other
 _SHARES = (1.0, 0.9, 0.75, 0.6, 0.45, 0.3, 0.2, 0.1, 0.05)  # of the kernel, the rest being the demonstrations' own
 
 
+class Found(NamedTuple):
+    """Likeliest scales and nugget, shared by all steps."""
+
+    log_likelihood: float
+    scales: Scales
+    nugget: float
+
+
 @dataclass(frozen=True)
 class TimeKernel:
     """Correlation along the movement as it was found on a grid of T steps, from K demonstrations."""
 
     grid: Float[Tensor, " T"]
     kernel: str
-    length_scale: float
+    scales: Scales
+    """Length scales, the longest first, and the weights of their correlations, which add up to one."""
     nugget: Float[Tensor, " T"]
     share: float
     """Weight of the kernel's correlation; the rest is that of the demonstrations' own residuals."""
@@ -69,8 +86,7 @@ class TimeKernel:
         return {name: value for name, value in vars(self).items() if name != "_parts"}
 
     def _kernel(self, time: Tensor, other: Tensor) -> Tensor:
-        length_scale = self.grid.new_tensor([self.length_scale])
-        return correlation(time[:, None], other[:, None], length_scale, self.kernel)
+        return _correlation(time, other, self.scales, self.kernel)
 
 
 def fit_time_kernel(
@@ -91,41 +107,86 @@ def fit_time_kernel(
     residual = _unit_rms(residual)
     sizes = residual.square().nanmean((0, 2)).sqrt()
     usual = (sizes > sizes.nanmedian() / _USUAL) & (sizes < sizes.nanmedian() * _USUAL)
-    first = [_search(grid, residual, usual, kernel) for kernel in kernels]
-    best = max(range(len(kernels)), key=lambda i: first[i][0])
-    kernel, (_, *found) = kernels[best], first[best]
-    unit = _unit_kernel(grid, found[0], kernel)
+    kernel = max(kernels, key=lambda name: _search(grid, residual, usual, name).log_likelihood)
+    shares = _SHARES if share is None else (share,)
+    one = _fit_scales(grid, residual, usual, partial(_search, kernel=kernel), kernel)
+    # A second scale is likelier for residuals by themselves, not always beside those of the others.
+    two = _fit_scales(grid, residual, usual, partial(_search_two, kernel=kernel), kernel)
+    found = [(*_left_out(result, shares), result) for result in ([one] if two.scales == one.scales else [one, two])]
+    _, share, result = max(found, key=lambda each: each[0])
+    return replace(result, share=share)
+
+
+def as_scales(rows: Any) -> Scales:
+    """Scales of the rows (s, 2) of an array."""
+    return tuple((length, weight) for length, weight in rows.tolist())
+
+
+def _fit_scales(
+    grid: Tensor, residual: Tensor, usual: Bool[Tensor, " T"], search: Callable[..., Found], kernel: str
+) -> TimeKernel:
+    """Scales and nuggets by turns, from the scales of the usual steps on; the share is open."""
+    found = search(grid, residual, usual)
+    unit = _correlation(grid, grid, found.scales, kernel)
     nugget = _step_nuggets(unit, residual, _LEAST)
     for _ in range(_ROUNDS):
         smooth = nugget <= _SMOOTH
         steps = smooth if 2 * smooth.sum() >= len(grid) else nugget <= nugget.median()
-        _, *again = _search(grid, residual, steps, kernel)
-        if again == found:
+        before, found = found, search(grid, residual, steps)
+        if found[1:] == before[1:]:
             break
-        found, unit = again, _unit_kernel(grid, again[0], kernel)
-        nugget = _step_nuggets(unit, residual, min(again[1], 0.1 * _SMOOTH))
-    result = TimeKernel(grid, kernel, found[0], nugget, 1.0, _filled(unit, residual, nugget))
-    return replace(result, share=_best_share(result) if share is None else share)
+        unit = _correlation(grid, grid, found.scales, kernel)
+        nugget = _step_nuggets(unit, residual, min(found.nugget, 0.1 * _SMOOTH))
+    return TimeKernel(grid, kernel, found.scales, nugget, 1.0, _filled(unit, residual, nugget))
 
 
-def _unit_kernel(grid: Float[Tensor, " T"], length_scale: float, kernel: str) -> Float[Tensor, "T T"]:
-    return correlation(grid[:, None], grid[:, None], grid.new_tensor([length_scale]), kernel)
+def _correlation(
+    time: Float[Tensor, " n"], other: Float[Tensor, " m"], scales: Scales, kernel: str
+) -> Float[Tensor, "n m"]:
+    """Correlation of the smooth part, of unit variance."""
+    rows, columns = time[:, None], other[:, None]
+    each = [w * correlation(rows, columns, time.new_tensor([length]), kernel) for length, w in scales]
+    return torch.stack(each).sum(0)
 
 
-def _search(grid: Tensor, residual: Tensor, steps: Bool[Tensor, " T"], kernel: str) -> tuple[float, float, float]:
-    """Highest log likelihood of ``(1 - eta) K + eta I``, and its length scale and shared nugget eta."""
+def _search_two(grid: Tensor, residual: Tensor, steps: Bool[Tensor, " T"], kernel: str) -> Found:
+    """As :func:`_search`, of two scales too: on either side of the best single one.
+
+    The finer takes what a nugget stood for, which so is no larger.
+    """
+    single = _search(grid, residual, steps, kernel)
+    length = single.scales[0][0]
+    pairs = [
+        ((long, 1.0 - weight), (long / ratio, weight))
+        for ratio in _RATIOS
+        for long in _LENGTHS.tolist()
+        if length <= long <= ratio * length
+        for weight in _FINE_WEIGHTS
+    ]
+    nuggets = [nugget for nugget in _NUGGETS if nugget <= single.nugget]
+    return max(single, _search(grid, residual, steps, kernel, pairs, nuggets)) if pairs else single
+
+
+def _search(
+    grid: Tensor,
+    residual: Tensor,
+    steps: Bool[Tensor, " T"],
+    kernel: str,
+    candidates: Sequence[Scales] = _SINGLE,
+    nuggets: Sequence[float] | None = None,
+) -> Found:
+    """Highest log likelihood of ``(1 - eta) K + eta I``, and its scales and shared nugget eta."""
     steps = steps if 2 * int(steps.sum()) >= len(grid) else torch.ones_like(steps)
-    chosen = _unit_rms(residual[:, steps])
-    groups, time = _by_pattern(chosen), grid[steps][:, None]
-    unit = correlation(time, time, _LENGTHS[:, None].to(grid), kernel)
-    values = []
-    for nugget in _NUGGETS:
+    groups, time = _by_pattern(_unit_rms(residual[:, steps])), grid[steps]
+    unit = torch.stack([_correlation(time, time, scales, kernel) for scales in candidates])
+    nuggets, values = nuggets or _NUGGETS, []
+    for nugget in nuggets:
         whole = (1.0 - nugget) * unit + nugget * torch.eye(len(time)).to(grid)
         each = [_log_likelihood(whole[:, seen][:, :, seen], rows) for seen, rows in groups]
         values.append(torch.stack(each).sum(0))
     table = torch.stack(values)
     best = int(table.argmax())
-    return float(table.max()), float(_LENGTHS[best % len(_LENGTHS)]), _NUGGETS[best // len(_LENGTHS)]
+    return Found(float(table.max()), candidates[best % len(candidates)], nuggets[best // len(candidates)])
 
 
 def _log_likelihood(covariance: Float[Tensor, "b n n"], rows: Float[Tensor, "n s"]) -> Float[Tensor, " b"]:
@@ -172,8 +233,8 @@ def _filled(unit: Float[Tensor, "T T"], residual: Float[Tensor, "K T d"], nugget
     return filled
 
 
-def _best_share(kernel: TimeKernel) -> float:
-    """Share of the kernel, by the likelihood of each demonstration under the law that the others' residuals give.
+def _left_out(kernel: TimeKernel, shares: Sequence[float]) -> tuple[float, float]:
+    """Highest log likelihood of each demonstration under the law that the others' residuals give, and its share.
 
     Their law is ``z = C^-1 y``, y of the covariance ``S = share R kron I + (1 - share) / (K - 1) sum z z'`` over the
     others and ``C_t = chol S_tt``, which keeps the marginals: it bends the smooth part, and costs where that has little
@@ -182,8 +243,8 @@ def _best_share(kernel: TimeKernel) -> float:
     the others, whose inverse is that of all without what one row of it adds.
     """
     n_demos, n_steps, d = kernel.residual.shape
-    if n_demos < 3:
-        return 1.0
+    if n_demos < 3:  # one other demonstration tells nothing
+        return 0.0, shares[0]
     root = safe_cholesky(kernel.correlation(kernel.grid, kernel.grid), name="the correlation along the movement")
     residual = kernel.residual
     whitened = torch.linalg.solve_triangular(root, residual, upper=False).flatten(1)
@@ -206,7 +267,9 @@ def _best_share(kernel: TimeKernel) -> float:
         log_det = n_steps * d * math.log(share) - (n_demos - 1) * math.log(ridge) + own.log() - torch.logdet(inverse)
         return float((factor.diagonal(dim1=-2, dim2=-1).log().sum((1, 2)) - 0.5 * (square + log_det)).sum())
 
-    return max(_SHARES, key=left_out)
+    unit_log_det = n_demos * d * float(root.diagonal().log().sum())  # the same for all shares, but not for all kernels
+    values = list(map(left_out, shares))
+    return max(values) - unit_log_det, shares[values.index(max(values))]
 
 
 def _by_pattern(residual: Float[Tensor, "K T d"]) -> list[tuple[Tensor, Tensor]]:

@@ -19,7 +19,7 @@ from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky
 from torch_pbd.movement.joint import Conditioned, JointNormal
 from torch_pbd.movement.recordings import Recording, as_rows, n_grid_steps, sampled
-from torch_pbd.movement.time_kernel import TimeKernel, fit_time_kernel
+from torch_pbd.movement.time_kernel import TimeKernel, as_scales, fit_time_kernel
 from torch_pbd.movement.timed import TimedMovement
 
 _FEWEST_DF, _MOST_DF = 3.0, 200.0  # of the joint law: a variance must exist, and beyond it is normal to all purposes
@@ -39,7 +39,7 @@ class TrajectoryLaw(nn.Module):
     grid: Tensor
     nugget: Tensor
     residual: Tensor
-    length_scale: Tensor
+    scales: Tensor
     share: Tensor
     x_shift: Tensor
     x_scale: Tensor
@@ -50,12 +50,8 @@ class TrajectoryLaw(nn.Module):
         self.kernel, self._time_kernel = time_kernel.kernel, time_kernel
         for name in ("grid", "nugget", "residual"):
             self.register_buffer(name, getattr(time_kernel, name))
-        for name, value in (
-            ("length_scale", time_kernel.length_scale),
-            ("share", time_kernel.share),
-            ("x_shift", x_shift),
-            ("x_scale", x_scale),
-        ):
+        scalars = {"share": time_kernel.share, "x_shift": x_shift, "x_scale": x_scale}
+        for name, value in ({"scales": time_kernel.scales} | scalars).items():
             self.register_buffer(name, torch.tensor(value, dtype=torch.float64))
 
     def forward(self, x: Float[Tensor, "n 1"]) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d n d"]]:
@@ -82,8 +78,10 @@ class TrajectoryLaw(nn.Module):
     def time_kernel(self) -> TimeKernel:
         """Correlation along the movement, in ranges of the time."""
         if self._time_kernel.grid is not self.grid:  # the module was moved, or its buffers were loaded
-            length_scale, share = float(self.length_scale), float(self.share)
-            self._time_kernel = TimeKernel(self.grid, self.kernel, length_scale, self.nugget, share, self.residual)
+            scales = as_scales(self.scales)
+            self._time_kernel = TimeKernel(
+                self.grid, self.kernel, scales, self.nugget, float(self.share), self.residual
+            )
         return self._time_kernel
 
 
@@ -121,7 +119,7 @@ class TrajectoryRegressor(TimedMovement):
         The fitted torch module: maps times (n, 1) to joint mean (n, d) and covariance (n, d, n, d), differentiably.
     time_kernel_ : str
     length_scale_ : float
-        Of the correlation along the movement, in units of X.
+        Of the correlation along the movement, in units of X; the longer one, where the sum of two is likelier.
     nugget_scale_ : ndarray of shape (n_steps,)
         Standard deviation of the independent part of each step of the fit's grid, whose smooth part has 1.
     shrinkage_ : float
@@ -207,7 +205,7 @@ class TrajectoryRegressor(TimedMovement):
         self.module_.requires_grad_(False)
         degrees = self.regressor_.predict_df(grid[:, np.newaxis])
         self.df_ = float(np.clip(np.median(degrees) / _WHOLE, _FEWEST_DF, _MOST_DF))
-        self.time_kernel_, self.length_scale_ = found.kernel, found.length_scale * (high - low)
+        self.time_kernel_, self.length_scale_ = found.kernel, found.scales[0][0] * (high - low)
         self.nugget_scale_, self.shrinkage_ = np.sqrt(found.nugget.numpy()), 1.0 - found.share
 
     def predict(self, X: ArrayLike, *, return_std: bool = False, return_cov: bool = False) -> Any:
@@ -260,16 +258,22 @@ class TrajectoryRegressor(TimedMovement):
 
     def _restore(self, arrays: dict[str, Floats]) -> None:
         arrays = self._restore_timing(arrays)
-        n_steps, scalars = len(np.atleast_1d(arrays["grid"])), ("length_scale", "share", "x_shift", "x_scale")
+        n_steps, scalars = len(np.atleast_1d(arrays["grid"])), ("share", "x_shift", "x_scale")
         shapes: dict[str, tuple[int | str, ...]] = dict.fromkeys(scalars, ())
-        shapes |= {"grid": (n_steps,), "nugget": (n_steps,), "residual": ("K", n_steps, self.n_outputs_)}
+        shapes |= {
+            "grid": (n_steps,),
+            "scales": ("S", 2),
+            "nugget": (n_steps,),
+            "residual": ("K", n_steps, self.n_outputs_),
+        }
         own = self._restored(arrays, shapes)
         checks.require(own["nugget"] > 0.0, own["nugget"], "nugget", "above 0")
         checks.require(np.diff(own["grid"]) > 0.0, own["grid"][1:], "grid", "increasing")
-        length, share, shift, scale = (float(own[name]) for name in scalars)
+        checks.require(own["scales"] > 0.0, own["scales"], "scales", "above 0")
+        share, shift, scale = (float(own[name]) for name in scalars)
         checks.number(share, "share", above=0.0, most=1.0)
         grid, nugget, residual = (torch.from_numpy(own[name].copy()) for name in ("grid", "nugget", "residual"))
-        found = TimeKernel(grid, self.time_kernel_, length, nugget, share, residual)
+        found = TimeKernel(grid, self.time_kernel_, as_scales(own["scales"]), nugget, share, residual)
         self.module_ = TrajectoryLaw(self.regressor_.module_, found, shift, scale)
         self.module_.requires_grad_(False)
         self.nugget_scale_ = np.sqrt(own["nugget"])
