@@ -138,6 +138,7 @@ def judge(joint: tuple[Floats, Floats, float], x: Floats, train: Floats, draws: 
         "rest": (half, slice(None)),
         "between": (ends, slice(n // 2, -1)),
         "replanned": (np.arange(n) == n // 2, slice(n // 2, None)),
+        "moving": (np.isin(np.arange(n), [n // 2 - 2, n // 2]), slice(n // 2 - 1, None)),
     }
     for name, (seen, steps) in cases.items():
         row |= {f"{name}_{key}": value for key, value in judge_conditioning(joint, seen, x, steps).items()}
@@ -231,25 +232,27 @@ def made(law: str, kernel: str, length: float, n_demos: int, seed: int) -> list[
 
 
 def table_of_sets(rows: list[dict[str, Any]]) -> str:
-    """Joint log likelihood of each set, paired differences to ProMPBaseline, and the error of what is planned anew."""
+    """Joint log likelihood of each set, paired differences to ProMPBaseline, and errors of what is planned anew."""
     names = list(dict.fromkeys(row["set"] for row in rows))
     values: dict[tuple[str, str], list[float]] = {}
     for row in rows:
         values.setdefault((row["set"], row["model"]), []).append(row["joint"])
-    lines = ["| set | " + " | ".join(MODELS) + " | ahead of ProMPBaseline | planned anew |"]
-    lines.append("|" + " --- |" * (len(MODELS) + 3))
+    lines = ["| set | " + " | ".join(MODELS) + " | ahead of ProMPBaseline | planned anew | moving |"]
+    lines.append("|" + " --- |" * (len(MODELS) + 4))
     ahead = []
     for name in names:
         difference = np.subtract(values[name, "TrajectoryRegressor"], values[name, "ProMPBaseline"])
         error = difference.std(ddof=1) / math.sqrt(len(difference)) if len(difference) > 1 else math.nan
         means = " | ".join(f"{np.mean(values[name, model]):.0f}" for model in MODELS)
-        own = [row["replanned_rmse"] for row in rows if (row["set"], row["model"]) == (name, "TrajectoryRegressor")]
-        ratio = np.exp(np.log(own).mean())
-        lines.append(f"| {name} | {means} | {difference.mean():.0f} +- {error:.0f} | {ratio:.2f} |")
+        own = [row for row in rows if (row["set"], row["model"]) == (name, "TrajectoryRegressor")]
+        ratios = [np.exp(np.mean([np.log(row[f"{case}_rmse"]) for row in own])) for case in ("replanned", "moving")]
+        lines.append(
+            f"| {name} | {means} | {difference.mean():.0f} +- {error:.0f} | {ratios[0]:.2f} | {ratios[1]:.2f} |"
+        )
         ahead.append(difference.mean())
     if len(ahead) > 1:
         error = np.std(ahead, ddof=1) / math.sqrt(len(ahead))
-        lines.append(f"| mean of the sets {'| ' * len(MODELS)}| {np.mean(ahead):.0f} +- {error:.0f} | |")
+        lines.append(f"| mean of the sets {'| ' * len(MODELS)}| {np.mean(ahead):.0f} +- {error:.0f} | | |")
     return "\n".join(lines)
 
 
