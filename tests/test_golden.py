@@ -19,8 +19,9 @@ pytestmark = pytest.mark.parametrize("folder", VERSIONS, ids=lambda folder: fold
 
 
 def assert_same(found, expected):
+    # Predictions of version 1 have the jitter of kernel matrices in them, 1e-13 of a process's variance.
     expected = np.array(expected)
-    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
+    np.testing.assert_allclose(found, expected, rtol=1e-11, atol=1e-12 * np.abs(expected).max())
 
 
 def expected(folder, name):

@@ -17,6 +17,8 @@ from torch_pbd.linalg import safe_cholesky
 # In ranges of the inputs: those that nearly coincide, as of two precisions, show no finer detail than this.
 _SHORTEST = 1e-3
 _EXACT_RESOLUTION = 0.75  # spacings of the inputs: shorter "needles" explain each input by itself
+# Of a process's variance: less than this that features do not carry is the jitter of kernel matrices, and rounding.
+_ROUNDING = 1e-11
 _RESOLUTION = 1.0  # spacings: at this length scale features carry 0.995 of the variance between inducing inputs
 
 
@@ -154,6 +156,15 @@ class FixedFeatures:
             return (in_gram - 2.0 * in_cross) / length_scale.square()
 
         return values, in_log_length_scale
+
+
+def unexplained(features: Float[Tensor, "*b m"]) -> Float[Tensor, "*b"]:
+    """Share of a variance of one that features do not carry: none at the inducing inputs, all far from them.
+
+    Where y deviates by a millionth, rounding would else be a hundredth of what is predicted.
+    """
+    share = (1.0 - features.square().sum(-1)).clamp(0.0, 1.0)
+    return share * -torch.expm1(-(share / _ROUNDING).square())  # smooth, and equal to the bit above a few of these
 
 
 def inducing_inputs(inputs: Float[Tensor, "n e"], n_inducing: int) -> Float[Tensor, "m e"]:

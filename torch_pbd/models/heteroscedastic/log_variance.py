@@ -184,7 +184,7 @@ def _fit_correlated(squares: Squares, features: Tensor) -> LogVariance:
     weight, response, whitener = squares.logarithms
     design = whitener @ features
     linear = LinearEvidence.fit(design, response)
-    evidence = linear.value + weight.log().sum(-1) - 0.5 * response.square().sum(-1)
+    evidence = linear.value + weight.log().sum(-1)
     location = (features @ linear.mean.unsqueeze(-1)).squeeze(-1)
     variance = ((features @ linear.covariance) * features).sum(-1)
 

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from torch_pbd import checks
-from torch_pbd.gp.inducing import FeatureMap
+from torch_pbd.gp.inducing import FeatureMap, unexplained
 from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky, symmetrize
 from torch_pbd.models.conditional import Core, Shapes, blank, size_of
@@ -173,7 +173,12 @@ class HeteroscedasticModel(Core):
         # Where the data leave nothing to err about, rounding must not make it negative.
         least = 1e-12 * torch.diag_embed(1e-30 + error.diagonal(dim1=-2, dim2=-1))
         error_root = safe_cholesky(symmetrize(error) + least, name="the covariance of the mean's error")
-        return mean, prepared.covariance.at_features(*factor_values), error_root, _missing(nearness)[:, None, None]
+        return (
+            mean,
+            prepared.covariance.at_features(*factor_values),
+            error_root,
+            unexplained(nearness[0])[:, None, None],
+        )
 
     def _root_of_demonstrations(self, factor: FactorMoments, error_root: Tensor) -> tuple[Tensor, Tensor]:
         """Root of the expected covariance of correlated samples before its correlations are shrunk, and degrees."""
@@ -210,11 +215,11 @@ class HeteroscedasticModel(Core):
         _, log_variance_values, _, nearness = prepared.features(x)
         # Of the prior they are infinite: with the share of the data, 1 - missing, going to zero the law becomes normal.
         variance = prepared.covariance.log_variance_at_features(log_variance_values)[1].mean(-1)
-        return degrees_of_freedom(variance) / (1.0 - _missing(nearness)).clamp_min(1e-12)
+        return degrees_of_freedom(variance) / (1.0 - unexplained(nearness[0])).clamp_min(1e-12)
 
     def type1(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
         """Type I uncertainty: eq. (6) without noise over the prior variance, 0 at the inducing inputs."""
-        return _missing(self._prepared().nearness(x))
+        return unexplained(self._prepared().nearness(x)[0])
 
     def draw(
         self,
@@ -285,11 +290,6 @@ class HeteroscedasticModel(Core):
         features = FeatureMap(inducing, self.kernel, getattr(self, "period", None), self.exact[number], stretch)
         length_scale = getattr(self, f"{_FAMILIES[number]}_length_scale", None)
         return ProcessFamily(features, *self.medians[number], length_scale)
-
-
-def _missing(features: Tensor) -> Tensor:
-    """Share of the variance that features of one process of unit variance (1, n, m) do not carry."""
-    return (1.0 - features[0].square().sum(-1)).clamp(0.0, 1.0)
 
 
 def _root_of_share(share: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from torch_pbd.exceptions import NotPositiveDefiniteError
-from torch_pbd.gp.inducing import FeatureMap, Features, FixedFeatures
+from torch_pbd.gp.inducing import FeatureMap, Features, FixedFeatures, unexplained
 from torch_pbd.optim import FitReport, Progress, Status, first_failure, minimize_batch
 
 CLEAR = 3.0
@@ -144,8 +144,8 @@ class Processes:
 
     def unexplained(self, design: Float[Tensor, "b n p"]) -> Float[Tensor, "b n"]:
         """Prior variance that the features at x do not carry: none at the inducing inputs, all far from them."""
-        carried = design[..., : self.features.factor.shape[-1]].square().sum(-1)
-        return (self.amplitude.square().unsqueeze(-1) - carried).clamp_min(0.0)
+        square = self.amplitude.square().unsqueeze(-1)
+        return square * unexplained(design[..., : self.features.factor.shape[-1]] / self.amplitude[:, None, None])
 
 
 @dataclass
