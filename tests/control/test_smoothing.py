@@ -3,14 +3,14 @@ import pytest
 from scipy.signal import butter, filtfilt
 
 from torch_pbd.control.primitive import smoothing
-from torch_pbd.control.primitive.smoothing import automatic_cutoff, noise_like, variance_share
+from torch_pbd.control.primitive.smoothing import automatic_cutoff, variance_share, white_noise
 from torch_pbd.data import Demonstrations, make_tunnel_demonstrations
 
 
 def smooth(demonstrations, cutoff, n_steps):
     """Stretched to their own median duration."""
     duration = float(np.median([time[-1] - time[0] for time in demonstrations.times]))
-    return smoothing.smooth(demonstrations, cutoff, n_steps, duration)
+    return smoothing.smooth(demonstrations.times, demonstrations.positions, cutoff, n_steps, duration)
 
 
 def two(time, position, **labels):
@@ -110,7 +110,10 @@ def test_the_automatic_cutoff_knows_seconds_from_phases():
 def test_a_duration_slows_movement_and_cutoff_together(rng):
     time = np.arange(0.0, 1.0, 0.002)
     recorded = two(time, rng.normal(size=len(time)).cumsum())
-    fast, slow = (smoothing.smooth(recorded, cutoff, 50, lasting) for cutoff, lasting in [(8.0, 1.0), (2.0, 4.0)])
+    fast, slow = (
+        smoothing.smooth(recorded.times, recorded.positions, cutoff, 50, lasting)
+        for cutoff, lasting in [(8.0, 1.0), (2.0, 4.0)]
+    )
     np.testing.assert_allclose(slow.time, 4.0 * fast.time / fast.time[-1])
     ratio = fast.time[-1] / 4.0
     np.testing.assert_allclose(slow.velocity, ratio * fast.velocity, rtol=1e-9, atol=1e-9)
@@ -127,6 +130,7 @@ def test_noise_is_told_from_movement():
     movements = smooth(recorded, 4.0, 100)
     # The tremor of 0.1 mm is above the cutoff; quantization and noise of y are micrometres.
     np.testing.assert_allclose(movements.noise_scale, [1e-4, 2.3e-6], rtol=0.2)
-    share = variance_share(smooth(noise_like(recorded, movements.noise_scale), 4.0, 100).position, movements.position)
+    noise = Demonstrations(recorded.times, white_noise(recorded.n_steps, movements.noise_scale))
+    share = variance_share(smooth(noise, 4.0, 100).position, movements.position)
     assert share[0] < 1e-4  # x moves by centimetres
     assert share[1] > 0.5  # y is the same for all, but for its noise

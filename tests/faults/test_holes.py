@@ -126,7 +126,9 @@ def test_62_a_path_that_leaves_the_recorded_range_is_refused(cutoff):
 def test_62_the_range_is_that_of_the_raw_samples():
     recorded = recordings([None] * 3)
     samples = np.concatenate(recorded.positions)
-    bounds = smooth(recorded, 0.5, 50, 4.0).bounds  # a cutoff that takes most of the movement away
+    bounds = smooth(
+        recorded.times, recorded.positions, 0.5, 50, 4.0
+    ).bounds  # a cutoff that takes most of the movement away
     np.testing.assert_array_equal(bounds, [samples.min(axis=0), samples.max(axis=0)])
 
 
@@ -147,7 +149,7 @@ def test_62_very_uneven_times_are_smoothed_by_the_closed_form():
     lam = 1.0 / (2.0 * np.pi * 8.0) ** 4
     curvature = np.linalg.solve(r + lam * q.T @ (q / weight[:, None]), q.T @ position)
     expected = position - lam * (q @ curvature) / weight
-    removed = smooth(recorded, 8.0, 50, 1.0).noise_scale
+    removed = smooth(recorded.times, recorded.positions, 8.0, 50, 1.0).noise_scale
     np.testing.assert_allclose(removed, np.sqrt(np.mean((position - expected) ** 2)), rtol=1e-6)
 
 

@@ -19,7 +19,8 @@ from torch_pbd import Demonstrations, DMPController, GMMBaseline
 from torch_pbd.cli.main import main
 from torch_pbd.control import Schedule
 from torch_pbd.control.parameters import as_demonstrations
-from torch_pbd.control.primitive.units import common_unit, duration_of, in_si
+from torch_pbd.control.primitive.outputs import common_unit, in_si
+from torch_pbd.control.primitive.smoothing import duration_of
 from torch_pbd.data import load_demonstrations, make_tunnel_demonstrations, save_demonstrations
 from torch_pbd.data.units import TIMES
 from torch_pbd.exceptions import DataFormatError, ModelFileError

@@ -243,7 +243,7 @@ def test_11_jittered_times_are_taken_as_they_are(degree, rng):
     polynomial = np.polynomial.Polynomial(np.arange(1.0, degree + 2.0))
     jittered = Demonstrations(times, [polynomial(time) for time in times])
     assert not jittered.is_aligned
-    moved = smooth(jittered, None, 30, even[-1])
+    moved = smooth(jittered.times, jittered.positions, None, 30, even[-1])
     for k in range(3):
         np.testing.assert_allclose(moved.position[k, :, 0], polynomial(moved.time), rtol=1e-6)
         np.testing.assert_allclose(moved.velocity[k, :, 0], polynomial.deriv()(moved.time), rtol=1e-6)

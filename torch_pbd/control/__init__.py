@@ -7,8 +7,8 @@ if TYPE_CHECKING:
     from torch_pbd.control.controller import DMPController
     from torch_pbd.control.damping import damping_from_stiffness, required_damping_ratio
     from torch_pbd.control.filters import EnergyTank, RateLimit
+    from torch_pbd.control.planning import MotionLimits
     from torch_pbd.control.primitive.dmp import DMP
-    from torch_pbd.control.primitive.units import MotionLimits
     from torch_pbd.control.realtime import RealTimeAdmittance, TickStatus
     from torch_pbd.control.schedule.schedule import Schedule
     from torch_pbd.control.simulation.plant import AdmittancePlant
@@ -29,7 +29,7 @@ _HOMES = {
     "DMPController": "controller",
     "EnergyTank": "filters",
     "ForceSensor": "simulation.sensor",
-    "MotionLimits": "primitive.units",
+    "MotionLimits": "planning",
     "PositionLoop": "simulation.position_loop",
     "RateLimit": "filters",
     "RealTimeAdmittance": "realtime",

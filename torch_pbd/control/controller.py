@@ -10,9 +10,10 @@ from torch_pbd.checks import Floats
 from torch_pbd.control import parameters
 from torch_pbd.control.impedance import OnUnknown, fit_covariance, fit_law, outputs_under
 from torch_pbd.control.planning import Planning
-from torch_pbd.control.primitive import smoothing, units
+from torch_pbd.control.primitive import smoothing
 from torch_pbd.control.primitive.adaptation import Adaptation
 from torch_pbd.control.primitive.dmp import Gate
+from torch_pbd.control.primitive.outputs import counts_as_metres, in_si
 from torch_pbd.control.primitive.reproduction import Reproduction, primitive
 from torch_pbd.control.stiffness import StiffnessLaw
 from torch_pbd.data import Demonstrations
@@ -176,8 +177,8 @@ class DMPController(Planning):
         self.names_, self.frame_, self.units_, self.time_unit_ = shown.names, shown.frame, shown.units, shown.time_unit
         self.n_demos_, self.n_outputs_ = len(shown), shown.n_outputs
         outputs = outputs_under(self, shown)
-        self.duration_, self.time_scale_ = units.duration_of(shown, self.duration)
-        self.start_time_ = units.common_start(shown)
+        self.duration_, self.time_scale_ = smoothing.duration_of(shown, self.duration)
+        self.start_time_ = smoothing.common_start(shown)
         seconds = self.time_unit_ in TIMES
         automatic = smoothing.automatic_cutoff(self.duration_, knows_seconds=seconds)
         self.cutoff_ = automatic if self.cutoff == "auto" else self.cutoff
@@ -186,7 +187,7 @@ class DMPController(Planning):
         parameters.check_steps(self.n_steps, self.n_demos_, self.n_outputs_, learned=True)
         self.unsampled_ = smoothing.tabulate_unsampled(shown, self.duration_ / self.time_scale_, self.on_unknown)
         # 2. Smoothing. Splines at the true times give positions, velocities and accelerations at common times.
-        movements = smoothing.smooth(shown, self.cutoff_, self.n_steps, self.duration_)
+        movements = smoothing.smooth(shown.times, shown.positions, self.cutoff_, self.n_steps, self.duration_)
         # 3. Mean movement. Eq. (16) is driven by the mean over demonstrations of the forcing of eq. (18), through which
         # goes a Gaussian process, eq. (5), over the phase of eq. (17) or another input that is a function of time.
         self.reproduction_ = Reproduction.learn(
@@ -194,8 +195,8 @@ class DMPController(Planning):
         )
         self.start_, self.goal_ = self.reproduction_.start, self.reproduction_.goal
         self.reproduction_error_, *_ = self.reproduction_.check_against(movements)
-        if seconds and units.counts_as_metres(outputs.units(self.units_)):
-            self.reproduction_.warn_if_cut(units.in_si(outputs.units(self.units_)))
+        if seconds and counts_as_metres(outputs.units(self.units_)):
+            self.reproduction_.warn_if_cut(in_si(outputs.units(self.units_)))
         # 4. Variability. The regressor learns the covariance over the same input, of positions or of the forcing; of
         # poses along axes of each block that its covariances have in common.
         varying, phase = self.varying(movements), self.reproduction_.phase
@@ -205,8 +206,8 @@ class DMPController(Planning):
         )
         # White noise as large as what the smoothing took away, smoothed: its share of the variance is no variability.
         self.noise_scale_ = movements.noise_scale
-        noise = smoothing.noise_like(shown, self.noise_scale_)
-        smoothed = smoothing.smooth(noise, self.cutoff_, self.n_steps, self.duration_, noise=True)
+        noise = smoothing.white_noise(shown.n_steps, self.noise_scale_)
+        smoothed = smoothing.smooth(shown.times, noise, self.cutoff_, self.n_steps, self.duration_, noise=True)
         self.noise_share_ = smoothing.variance_share(self.varying(smoothed), varying)
         # 5. Gains. The bounds of eq. (20) are quantiles of the deviations where there are samples; eq. (19) then gives
         # each principal axis its stiffness, and the damping follows from stiffness and mass.
@@ -221,7 +222,8 @@ class DMPController(Planning):
             raise ValueError(f"n_outputs of demonstrations is {demonstrations.n_outputs}, must be {self.n_outputs_}.")
         n_steps = self.n_steps if n_steps is None else checks.count(n_steps, "n_steps", least=2)
         parameters.check_steps(n_steps, len(demonstrations), self.n_outputs_, learned=False)
-        return smoothing.smooth(smoothing.merge_bursts(demonstrations), self.cutoff_, n_steps, self.duration_)
+        shown = smoothing.merge_bursts(demonstrations)
+        return smoothing.smooth(shown.times, shown.positions, self.cutoff_, n_steps, self.duration_)
 
     def varying(self, movements: smoothing.Movements) -> Floats:
         """Positions or forcings (K, n, d) of smoothed movements of the same task, by ``variability``."""

@@ -11,9 +11,8 @@ from sklearn.base import clone
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control.damping import damping_from_stiffness
-from torch_pbd.control.primitive.outputs import RESOLUTION, Outputs
+from torch_pbd.control.primitive.outputs import RESOLUTION, Outputs, in_si
 from torch_pbd.control.primitive.smoothing import UNKNOWN
-from torch_pbd.control.primitive.units import in_si
 from torch_pbd.control.stiffness import RotationLimits, StiffnessLaw
 from torch_pbd.data import Demonstrations
 from torch_pbd.estimators.base import CovarianceRegressor

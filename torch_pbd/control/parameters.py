@@ -1,6 +1,7 @@
 """Checks of a controller's parameters, demonstrations and queries, and the labels of its schedules."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, is_dataclass
 from importlib.metadata import version
 from typing import Any, Literal
@@ -17,12 +18,12 @@ from torch_pbd.control.damping import damping_from_stiffness
 from torch_pbd.control.impedance import OnUnknown
 from torch_pbd.control.primitive.adaptation import Adaptation
 from torch_pbd.control.primitive.dmp import Gate
+from torch_pbd.control.primitive.outputs import common_unit, robot_unit
 from torch_pbd.control.primitive.smoothing import CUTOFF_HZ
-from torch_pbd.control.primitive.units import robot_unit, warn_of_units
 from torch_pbd.control.stiffness import StiffnessLaw
 from torch_pbd.data import Demonstrations, check_unimodal
 from torch_pbd.data.alignment import TIMING_REMOVED
-from torch_pbd.data.units import TIMES
+from torch_pbd.data.units import ANGLES, LENGTHS, TIMES
 from torch_pbd.estimators.demonstrations import check_groups
 from torch_pbd.estimators.validation import check_squares, checked_values
 from torch_pbd.files.memory import require_much
@@ -125,10 +126,30 @@ def as_demonstrations(X: Demonstrations | ArrayLike, y: ArrayLike | None, groups
         )
     check_unimodal(demonstrations)
     if isinstance(X, Demonstrations):  # arrays have no units: they are in m and s
-        warn_of_units(X.units if X.units is None or X.rotation_reference is None else X.units[:-3])
+        _warn_of_units(X.units if X.units is None or X.rotation_reference is None else X.units[:-3])
     if demonstrations.alignment == "dtw":
         checks.warn(TIMING_REMOVED)
     return demonstrations
+
+
+def _warn_of_units(units: Sequence[str] | None) -> None:
+    """Warn of what becomes of positions whose units are not given, differ, or are no lengths and no angles."""
+    common = common_unit(units)
+    if units is None:
+        text = "The demonstrations tell no units: positions are taken to be in m. Say so, or in what else: units='m'."
+    elif common is None:
+        text = (
+            f"The outputs are in different units, {', '.join(units)}: their principal axes mix them, and nothing is "
+            "converted to m. Bring them to one unit, or control them apart."
+        )
+    elif common not in LENGTHS | ANGLES:
+        text = (
+            f"The positions are in {common!r}, which is no known length or angle ({', '.join(LENGTHS | ANGLES)}): "
+            "stiffness is in N per that unit, and no limits of motion apply."
+        )
+    else:
+        return
+    checks.warn(text)
 
 
 def _grouped(X: ArrayLike, y: ArrayLike | None, groups: ArrayLike | None) -> Demonstrations:

@@ -1,7 +1,8 @@
 """Motions and gains of a fitted controller: predicted, bent, planned for a robot, and run in simulation."""
 
 from collections.abc import Sequence
-from typing import Any, Self
+from dataclasses import asdict, dataclass
+from typing import Any, Self, final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,8 +13,7 @@ from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control import parameters
 from torch_pbd.control.impedance import gains_at
-from torch_pbd.control.primitive import units
-from torch_pbd.control.primitive.outputs import Outputs
+from torch_pbd.control.primitive.outputs import Outputs, counts_as_metres, in_si
 from torch_pbd.control.primitive.reproduction import Reproduction
 from torch_pbd.control.schedule.rows import tick_times
 from torch_pbd.control.schedule.schedule import Schedule
@@ -22,7 +22,34 @@ from torch_pbd.control.simulation.rollout import Rollout
 from torch_pbd.control.simulation.run import simulate_schedule
 from torch_pbd.control.via import Bend, conditioned, planned
 
-_LIMITS = units.MotionLimits()
+_UNITS = {"duration": "s", "distance": "m", "speed": "m/s"}
+
+
+@final
+@dataclass(frozen=True)
+class MotionLimits:
+    """What is beyond what robots do, so that a schedule is refused: its units cannot be right.
+
+    Parameters
+    ----------
+    duration : float, default=600.0
+        Of the movement, s.
+    distance : float, default=10.0
+        Diagonal of the box around the path, m; where it lies does not matter.
+    speed : float, default=10.0
+        In m/s.
+    """
+
+    duration: float = 600.0
+    distance: float = 10.0
+    speed: float = 10.0
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            checks.number(value, name, above=0.0, unit=_UNITS[name])
+
+
+_LIMITS = MotionLimits()
 
 
 class Planning(BaseEstimator):
@@ -106,7 +133,7 @@ class Planning(BaseEstimator):
         start: ArrayLike | None = None,
         via: Sequence[tuple[float, ArrayLike]] | None = None,
         speed: float = 1.0,
-        limits: units.MotionLimits | None = _LIMITS,
+        limits: MotionLimits | None = _LIMITS,
     ) -> Schedule:
         """Motion and gains at ``rate``, for a robot: in s, m and rad, if the demonstrations tell units.
 
@@ -142,15 +169,15 @@ class Planning(BaseEstimator):
         check_is_fitted(self)
         speed = checks.number(speed, "speed", above=0.0)
         recorded = self.outputs_.units(self.units_), self.time_unit_
-        units.check_motion(limits, *recorded, duration=self.duration_ / speed)
+        _check_motion(limits, *recorded, duration=self.duration_ / speed)
         time = tick_times(self.duration_ / speed, rate, self.n_outputs_, settle=settle)
         bent, goal, start = planned(self, *self._ends(goal, start), via)
         path, velocity, acceleration, moved = bent._motion(time, goal, start, speed)
-        unit = units.in_si(recorded[0])
+        unit = in_si(recorded[0])
         rows: dict[str, Any] = self.outputs_.motion(path, velocity, acceleration, unit)
         distance = float(np.linalg.norm(np.ptp(rows["position"], axis=0)))
         fastest = float(np.linalg.norm(rows["velocity"][:, : self.outputs_.n_positions], axis=1).max())
-        units.check_motion(limits, *recorded, distance=distance, speed=fastest)
+        _check_motion(limits, *recorded, distance=distance, speed=fastest)
         gains, scales = gains_at(bent, moved, path), self.outputs_.scales(unit)
         rows |= gains._asdict() | {"covariance": np.multiply.outer(scales, scales) * gains.covariance}
         return Schedule(time=time, **rows, **parameters.schedule_labels(self))
@@ -242,3 +269,16 @@ class Planning(BaseEstimator):
     def _movement_time(self, X: ArrayLike) -> Floats:
         check_is_fitted(self)
         return self.time_scale_ * (parameters.as_times(X) - self.start_time_)
+
+
+def _check_motion(limits: Any, units: Sequence[str] | None, time_unit: str, **found: float) -> None:
+    """Refuse a duration, distance or speed, by name, beyond the limits, in units of length or without units."""
+    checks.instance(limits, "limits", MotionLimits, optional=True)
+    for name, value in found.items() if limits is not None and counts_as_metres(units) else ():
+        most, unit = getattr(limits, name), _UNITS[name]
+        if value > most:
+            raise ValueError(
+                f"the {name} of the schedule is {value:.4g} {unit}, must be at most limits.{name}, {most:g} {unit}: "
+                f"correct units ({', '.join(units or ['none'])}) or time_unit ({time_unit}) of the recordings, or give "
+                f"limits=MotionLimits({name}=...) or None."
+            )

@@ -12,7 +12,7 @@ from sklearn.base import clone
 from torch_pbd import plotting
 from torch_pbd.checks import Floats
 from torch_pbd.control.controller import DMPController
-from torch_pbd.control.primitive.units import in_si
+from torch_pbd.control.primitive.outputs import in_si
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.rollout import Rollout
 from torch_pbd.control.stability.report import StabilityReport

@@ -11,6 +11,7 @@ from scipy.linalg import expm
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
+from torch_pbd.data.units import ANGLES, LENGTHS
 from torch_pbd.rotations import Chart
 
 RESOLUTION = 1e-5
@@ -179,6 +180,30 @@ class Outputs:
             if (free.any(axis=-1) != free.all(axis=-1)).any():
                 raise ValueError(f"{name} has a part of the {what}, must have all of it, or NaN for all of it.")
         return given
+
+
+def common_unit(units: Sequence[str] | None) -> str | None:
+    """The unit of all outputs; None if they have none, or several."""
+    return units[0] if units is not None and len(set(units)) == 1 else None
+
+
+def in_si(units: Sequence[str] | None) -> float:
+    """Metres, or radians, of one unit of position; 1 where units are not known, differ, or are neither.
+
+    Those are taken as they are: stiffness is then in N per unit, and mass in N s^2 per unit.
+    """
+    return (LENGTHS | ANGLES).get(common_unit(units) or "", 1.0)
+
+
+def robot_unit(units: Sequence[str] | None) -> str | None:
+    """Unit of the positions of a robot that follows recordings in these units."""
+    common = common_unit(units)
+    return "m" if common in LENGTHS else "rad" if common in ANGLES else common
+
+
+def counts_as_metres(units: Sequence[str] | None) -> bool:
+    """True if schedules of recordings in these units are in m, which is also assumed where there are none."""
+    return units is None or robot_unit(units) == "m"
 
 
 def common_axes(deviation: Floats, degrees: NDArray[np.integer], least: float) -> Floats:

@@ -1,5 +1,6 @@
 """Recordings as a controller takes them: bursts merged, holes found, derivatives at true times by smoothing splines."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,9 +11,9 @@ from scipy.interpolate import BSpline, CubicHermiteSpline, make_interp_spline
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.data import Demonstrations
-from torch_pbd.data.alignment import interpolate
 from torch_pbd.data.recordings import preview
 from torch_pbd.data.sampling import KNOWN, LEAST_SAMPLES, LOST, holes_of, smoothing_spline, spacing_of
+from torch_pbd.data.units import TIMES
 
 UNKNOWN = 0.5
 """Type I uncertainty above which nothing is known: ``on_unknown="raise"`` raises."""
@@ -49,9 +50,15 @@ class Movements:
 
 
 def smooth(
-    demonstrations: Demonstrations, cutoff: float | None, n_steps: int, duration: float, *, noise: bool = False
+    times: Sequence[Floats],
+    positions: Sequence[Floats],
+    cutoff: float | None,
+    n_steps: int,
+    duration: float,
+    *,
+    noise: bool = False,
 ) -> Movements:
-    """Smooth each demonstration, and sample all at ``n_steps`` common movement times.
+    """Smooth each demonstration, times (T_k,) and positions (T_k, d), and sample all at ``n_steps`` common times.
 
     With a cutoff each output is the cubic smoothing spline whose weight halves the amplitude at the cutoff: at
     even sampling it is a Butterworth filter of second order run forward and backward, and it takes the times
@@ -66,27 +73,27 @@ def smooth(
     samples and, unless it is ``noise``, a path that leaves the recorded range of an output by a tenth of it.
     """
     least = _LEAST_SAMPLES[cutoff is not None]
-    for number, n_samples in enumerate(demonstrations.n_steps):
+    for number, n_samples in enumerate(map(len, times)):
         if n_samples < least:
             purpose = "to be smoothed, or cutoff=None for 3" if cutoff is not None else "for an acceleration"
             raise ValueError(
                 f"demonstration {number} has {n_samples} samples, needs at least {least} {purpose}: leave it out, or "
                 "record it at a higher rate."
             )
-    durations = [time[-1] - time[0] for time in demonstrations.times]
-    own_cutoff = None if cutoff is None else cutoff * duration / float(np.median(durations))
-    samples = np.concatenate(demonstrations.positions)
+    times = [time - time[0] for time in times]
+    own_cutoff = None if cutoff is None else cutoff * duration / float(np.median([time[-1] for time in times]))
+    samples = np.concatenate(positions)
     bounds = np.stack([samples.min(axis=0), samples.max(axis=0)])
-    splines = _splines(demonstrations, own_cutoff, bounds)
+    splines = _splines(times, positions, own_cutoff, bounds)
     grid = np.linspace(0.0, duration, n_steps)
     motions, removed, recorded, known = [], [], [], []
-    for (time, position), lasting, spline in zip(demonstrations, durations, splines, strict=True):
-        stretch = lasting / duration
-        own = np.clip(grid * stretch, 0.0, lasting)
+    for time, position, spline in zip(times, positions, splines, strict=True):
+        stretch = time[-1] / duration
+        own = np.clip(grid * stretch, 0.0, time[-1])
         motions.append([spline(own, order) * stretch**order for order in range(3)])
-        removed.append(position - spline(time - time[0]))
-        known.append(unsampled(time - time[0], own) <= UNKNOWN)
-        sampled = interpolate(time - time[0], position, own)
+        removed.append(position - spline(time))
+        known.append(unsampled(time, own) <= UNKNOWN)
+        sampled = make_interp_spline(time, position, k=1)(own)
         recorded.append(np.where(known[-1][:, np.newaxis], sampled, motions[-1][0]))
     position, velocity, acceleration = (np.stack(parts) for parts in zip(*motions, strict=True))
     if not noise:
@@ -111,13 +118,15 @@ def check_range(path: Floats, bounds: Floats, name: str) -> None:
         )
 
 
-def _splines(demonstrations: Demonstrations, cutoff: float | None, bounds: Floats) -> list[BSpline]:
+def _splines(
+    times: Sequence[Floats], positions: Sequence[Floats], cutoff: float | None, bounds: Floats
+) -> list[BSpline]:
     """Spline of each demonstration over its time from its start."""
-    times, margin = [time - time[0] for time in demonstrations.times], 0.5 * _MOST_BEYOND * np.ptp(bounds, axis=0)
-    splines = [_spline(*recording, cutoff) for recording in zip(times, demonstrations.positions, strict=True)]
+    margin = 0.5 * _MOST_BEYOND * np.ptp(bounds, axis=0)
+    splines = [_spline(*recording, cutoff) for recording in zip(times, positions, strict=True)]
     bridged = list(splines)
     # Holes are filled at the recording's own spacing, by the splines before any was, so that no order matters.
-    for number, (time, filled) in enumerate(zip(times, demonstrations.positions, strict=True)):
+    for number, (time, filled) in enumerate(zip(times, positions, strict=True)):
         samples = time
         for edges in [time[i : i + 2] for i in holes_of(time)]:
             inner = np.linspace(edges[0], edges[1], round(np.ptp(edges) / spacing_of(time)) + 1)[1:-1]
@@ -129,7 +138,7 @@ def _splines(demonstrations: Demonstrations, cutoff: float | None, bounds: Float
     return bridged
 
 
-def _through(splines: list[BSpline], times: list[Floats], number: int, edges: Floats, inner: Floats) -> Floats:
+def _through(splines: list[BSpline], times: Sequence[Floats], number: int, edges: Floats, inner: Floats) -> Floats:
     """Path of one demonstration at times ``inner`` of its hole between ``edges``."""
     rates = [time[-1] / times[number][-1] for time in times]
     sampled = [k for k, time in enumerate(times) if unsampled(time, rates[k] * inner).max() <= UNKNOWN]
@@ -154,11 +163,10 @@ def automatic_cutoff(duration: float, *, knows_seconds: bool) -> float:
     return max(CUTOFF_HZ if knows_seconds else 0.0, _CUTOFF_CYCLES / duration)
 
 
-def noise_like(demonstrations: Demonstrations, noise_scale: Floats) -> Demonstrations:
-    """White noise of a scale (d,) at the sampling times of the demonstrations, which smoothing lets through in part."""
+def white_noise(n_samples: Sequence[int], scale: Floats) -> list[Floats]:
+    """White noise (T_k, d) of a scale (d,) at so many samples of each demonstration, which smoothing lets through."""
     random = np.random.default_rng(0)
-    noise = [random.normal(size=(n, demonstrations.n_outputs)) * noise_scale for n in demonstrations.n_steps]
-    return Demonstrations(demonstrations.times, noise, time_unit=demonstrations.time_unit)
+    return [random.normal(size=(n, len(scale))) * scale for n in n_samples]
 
 
 def variance_share(part: Floats, whole: Floats) -> Floats:
@@ -229,3 +237,28 @@ def tabulate_unsampled(demonstrations: Demonstrations, lasting: float, on_unknow
             "stiffness. Record what is missing."
         )
     return table
+
+
+def duration_of(demonstrations: Demonstrations, duration: float | None) -> tuple[float, float]:
+    """Duration of a movement in s, None for the median of the demonstrations; and seconds of one unit of their time.
+
+    Warns where it is None and their times are no seconds: one unit then counts as one.
+    """
+    own = float(np.median([time[-1] - time[0] for time in demonstrations.times]))
+    if duration is not None:
+        return float(duration), duration / own
+    scale = TIMES.get(demonstrations.time_unit)  # none of a phase
+    if scale is None:
+        checks.warn(
+            f"The times of the demonstrations are in {demonstrations.time_unit!r}, not in s: the movement is taken to "
+            f"last {own:.3g} s. Give duration, in s."
+        )
+        scale = 1.0
+    return own * scale, scale
+
+
+def common_start(demonstrations: Demonstrations) -> float:
+    """Time at which the demonstrations start, up to a sample; 0 where they start at different times."""
+    starts = np.array([time[0] for time in demonstrations.times])
+    step = np.median([np.median(np.diff(time)) for time in demonstrations.times])
+    return float(np.median(starts)) if np.ptp(starts) <= step else 0.0
