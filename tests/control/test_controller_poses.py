@@ -274,6 +274,25 @@ def test_an_effort_is_of_metres_whatever_was_recorded():
     np.testing.assert_allclose(one.schedule(20.0).stiffness, other.schedule(20.0).stiffness, rtol=1e-9, atol=1e-9)
 
 
+def test_a_wrist_is_light_unless_told_otherwise(controller):
+    """Of an admittance without feed-forward the lag is D v / K: with a kilogram and a square metre of it 6 degrees."""
+    inertia = np.diag([1.0] * 3 + [0.17**2] * 3)
+    np.testing.assert_allclose(controller.mass_, inertia, rtol=1e-12)
+    schedule = controller.schedule(200.0)
+    np.testing.assert_array_equal(schedule.mass[7], controller.mass_)
+    assert "mass=1 kg and 0.0289 kg m^2, " in repr(schedule)
+    modes = np.linalg.eigvals(np.linalg.solve(inertia, schedule.stiffness))
+    expected = 2.0 * np.sqrt(modes).sum(axis=1).real  # trace of M^-1 D at a damping ratio of 1
+    np.testing.assert_allclose(np.trace(np.linalg.solve(inertia, schedule.damping), axis1=1, axis2=2), expected)
+    lag = [
+        np.linalg.norm(own.simulate(rate=200.0).deviation[:, 3:], axis=1)
+        for own in (controller, fitted(poses(), mass=1.0))
+    ]
+    assert np.rad2deg(lag[0].max()) < 1.0 < 5.0 < np.rad2deg(lag[1].max())
+    positions = fitted(make_tunnel_demonstrations(4, rate=20.0, random_state=0))
+    assert (positions.mass_, positions.schedule(20.0).mass) == (1.0, 1.0)
+
+
 def test_laws_and_masses_of_other_outputs_are_refused():
     recorded = make_tunnel_demonstrations(4, rate=20.0, random_state=0)
     for options, shown, words in (

@@ -136,7 +136,7 @@ def test_without_pushes_there_is_no_ratio_and_the_mass_is_the_controllers(contro
     heavy = clone(controller).set_params(mass=3.0)
     text = run_poses({"a": heavy}, recorded, RunFolder(tmp_path, {}), peak=0.0, torque=0.0, rate=100.0, arm="none")
     assert text.split("\n")[3].split()[3:5] == ["0", "0"]
-    assert " s; of 3 kg\n" in text
+    assert " s; of 3 kg and 3 kg m^2\n" in text
 
 
 def test_without_mujoco_the_extra_is_told_before_anything_is_learned(tmp_path, monkeypatch, capsys):

@@ -246,7 +246,7 @@ BAD_VALUES = ["1e-3", np.nan, np.inf, -1.0, 0.0, True, [1.0], 1j, 10**400]
 BAD_PARAMETERS = [
     (name, value) for name in ("alpha", "beta", "gamma", "tau", "duration", "mass", "cutoff") for value in BAD_VALUES
 ]
-BAD_PARAMETERS += [(name, None) for name in ("alpha", "gamma", "tau", "mass", "n_steps", "damping_ratio")]
+BAD_PARAMETERS += [(name, None) for name in ("alpha", "gamma", "tau", "n_steps", "damping_ratio")]
 BAD_PARAMETERS += [(name, "x") for name in ("gate", "phase_input", "variability", "goal", "on_unknown")]
 BAD_PARAMETERS += [("stiffness_law", "x"), ("stiffness_law", StiffnessLaw)]
 BAD_PARAMETERS += [("n_steps", value) for value in (4, 2.5, True, "20", 10**400)]

@@ -72,7 +72,7 @@ def test_damping_made_for_one_kilogram_rings(model, task):
     assert calm[after].min() > -0.03 * calm.max()
 
 
-@pytest.mark.parametrize("mass", [None, 1.0])
+@pytest.mark.parametrize("mass", [None, 1.0, np.diag([1.0] * 3 + [0.03] * 3)])
 def test_damping_that_is_not_for_an_arm_is_told(model, task, mass):
     schedule, joints = task
     with pytest.warns(UserWarning, match="the arm moves with its own inertia"):

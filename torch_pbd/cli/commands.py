@@ -70,7 +70,7 @@ OPTIONS: dict[str, dict[str, Option]] = {
         ),
         "push": Option(Annotated[float, (-1e6, 1e6)], 5.0, "peak of the two pushes along the first output, N"),
         "torque": Option(Annotated[float, (-1e6, 1e6)], 1.2, "peak of two pushes of poses by torque, Nm"),
-        "arm": Option(Literal["panda", "none"], "panda", "whose inertia a robot of poses has; none: 1 kg"),
+        "arm": Option(Literal["panda", "none"], "panda", "whose inertia a robot of poses has; none: a virtual one"),
         "rate": Option(Annotated[float, (1e-3, 1e6)], 1000.0, "ticks of the controller, Hz"),
     },
     "compare": {

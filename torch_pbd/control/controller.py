@@ -65,9 +65,11 @@ class DMPController(Planning):
     stiffness_law : StiffnessLaw, default=None
         None is ``StiffnessLaw()``: 50 to 1000 N/m between quantiles of the standard deviations along the movement; of
         poses with ``RotationLimits()``, 2.5 to 50 Nm/rad. Of angles the two are in Nm/rad.
-    mass : float or array-like of shape (d, d), default=1.0
-        Virtual mass of the admittance, kg; of angles, and the rotation of poses, kg m^2. A robot's own, which changes
-        along the movement, is what :meth:`Schedule.with_inertia` takes.
+    mass : float or array-like of shape (d, d), default=None
+        Virtual mass of the admittance. A number counts in kg, and as many kg m^2 for angles and rotations. None is 1,
+        but for the rotation of poses 0.0289 kg m^2, that of 1 kg at 0.17 m, as the inertia at the tool of an arm has
+        it: 1 kg m^2 is a heavy wrist, which lags behind soft rotations. A robot's own, which changes along the
+        movement, is what :meth:`Schedule.with_inertia` takes.
     damping_ratio : float or "paper", default=1.0
         See :func:`~torch_pbd.control.damping_from_stiffness`.
     on_unknown : {"soft", "prior", "raise"}, default="soft"
@@ -93,6 +95,8 @@ class DMPController(Planning):
     cutoff_, reproduction_error_ : float
         Hz; root mean square distance of the reproduced path from the mean of the demonstrations as recorded, of poses
         that of the positions.
+    mass_ : float or ndarray of shape (d, d)
+        The virtual mass.
     n_outputs_, n_demos_ : int
     outputs_ : Outputs
         Which outputs share a unit, and the chart and the axes in which those of poses are learned.
@@ -122,7 +126,7 @@ class DMPController(Planning):
         duration: float | None = None,
         n_steps: int = 100,
         stiffness_law: StiffnessLaw | None = None,
-        mass: float = 1.0,
+        mass: float | Floats | None = None,
         damping_ratio: float | Literal["paper"] = 1.0,
         on_unknown: OnUnknown = "soft",
     ) -> None:

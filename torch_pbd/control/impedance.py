@@ -62,13 +62,13 @@ def _gains(controller: Any, time: Floats, path: Floats) -> Gains:
     sampled, covariance = (at_pose(controller.outputs_, law, each, path) for each in learned)
     if on_unknown == "soft":
         # The share u of the way to the least stiffness counts holes already; their prior would count them again.
-        stiffness = law(sampled, controller.mass)
+        stiffness = law(sampled, controller.mass_)
         softest = stiffness.new_tensor(law.limits(stiffness.shape[-1])[0])
         softest = softest * torch.eye(stiffness.shape[-1]).to(stiffness)
         stiffness = softest + torch.tensor(1.0 - type1)[:, None, None] * (stiffness - softest)
     else:
-        stiffness = law(covariance, controller.mass)
-    damping = damping_from_stiffness(stiffness, controller.mass, controller.damping_ratio)
+        stiffness = law(covariance, controller.mass_)
+    damping = damping_from_stiffness(stiffness, controller.mass_, controller.damping_ratio)
     return Gains(stiffness.numpy(), damping.numpy(), covariance, type1)
 
 
@@ -147,7 +147,7 @@ def fit_law(controller: Any, varying: Floats) -> StiffnessLaw:
     learned = controller.covariance_.predict_cov(reproduction.phase(time))
     covariance = at_pose(outputs, law, learned, reproduction.motion(time)[0])
     resolution = (RESOLUTION * outputs.extents(varying)).tolist()
-    return law.fitted(covariance, resolution=resolution, mass=controller.mass)
+    return law.fitted(covariance, resolution=resolution, mass=outputs.mass(controller.mass))
 
 
 def outputs_under(controller: Any, demonstrations: Demonstrations) -> Outputs:

@@ -69,7 +69,7 @@ def check_parameters(controller: Any) -> None:
             timing, "timing of covariance", "'none'", "a controller sets the time of its movement itself"
         )
     checks.instance(controller.stiffness_law, "stiffness_law", StiffnessLaw, optional=True)
-    mass = controller.mass
+    mass: Any = 1.0 if controller.mass is None else controller.mass
     if np.ndim(mass) < 2:
         checks.number(mass, "mass", above=0.0, unit="kg", remedy="or give a matrix (d, d)")
     # Checks what is its own.
@@ -218,7 +218,7 @@ def schedule_labels(controller: Any) -> dict[str, Any]:
         "frame": controller.frame_,
         "stiffness_limits": law.limits(controller.n_outputs_),
         "covariance_of": controller.variability,
-        "mass": float(controller.mass) if np.ndim(controller.mass) == 0 else np.asarray(controller.mass),
+        "mass": float(controller.mass_) if np.ndim(controller.mass_) == 0 else np.asarray(controller.mass_),
         "provenance": {
             "controller": _plain(controller),
             "covariance": _plain(controller.covariance_),

@@ -64,7 +64,15 @@ class Planning(BaseEstimator):
     duration_: float
     start_time_: float
     time_scale_: float
+    mass: Any
     _bend: Bend | None = None
+
+    @property
+    def mass_(self) -> float | Floats:
+        """Virtual mass that gains are made for: a number of kg, or of kg m^2 for angles; or a matrix (d, d)."""
+        check_is_fitted(self)
+        given: float | Floats = self.outputs_.mass(self.mass)
+        return given
 
     def predict(self, X: ArrayLike) -> Floats:
         """Reproduced outputs (n, d) at times X (n, 1), which count as those of the demonstrations do.

@@ -76,7 +76,8 @@ def run_poses(
         run = pushed(fitted, rate, peak, torque, arm)
         rows += [row for kind in (plotting.POSITION, plotting.ROTATION) for row in push_rows(name, run, kind)]
         plain = damping_ratio(run.schedule, run.planned.damping)
-        mass = f"{fitted.mass:g} kg" if np.ndim(fitted.mass) == 0 else "the mass of the controller"
+        low, high = (f"{fitted.mass_ if np.ndim(fitted.mass_) == 0 else fitted.mass_[i, i]:.3g}" for i in (0, -1))
+        mass = f"{low} kg and {high} kg m^2"
         note = f"a damping made for {mass} would have a ratio of {plain:.2f} here" if arm != "none" else f"of {mass}"
         reports.append(f"{name}: a movement of {run.schedule.duration:.3g} s; {note}\n{run.report}")
         folder.write_controller(

@@ -63,7 +63,7 @@ def run_controller(
     schedule = fitted.schedule(rate)
     force = push_profile(schedule.time, fitted.duration_, peak, fitted.n_outputs_)
     rollout = fitted.simulate(force=force, rate=rate)
-    return Run(fitted, schedule, rollout, fitted.simulate(rate=rate), schedule.certify(mass=fitted.mass))
+    return Run(fitted, schedule, rollout, fitted.simulate(rate=rate), schedule.certify())
 
 
 def push_row(name: str, run: Run) -> dict[str, Any]:

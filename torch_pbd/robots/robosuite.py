@@ -55,7 +55,8 @@ def to_actions(schedule: Schedule, control_freq: float = 20.0) -> Floats:
     check_limits(schedule, _LIMITS)
     if isinstance(schedule.mass, np.ndarray):
         raise InvalidParameterError(
-            "schedule has the inertia of an arm, which this controller takes out: give schedule.with_inertia(1.0)."
+            "schedule has an inertia of several numbers, as that of an arm, which this controller takes out: give "
+            "schedule.with_inertia(1.0)."
         )
     rows, loss = schedule.resample(checks.number(control_freq, "control_freq", above=0.0, unit="Hz")).diagonal()
     if loss.stiffness_max > 0.0:

@@ -83,10 +83,18 @@ def check_limits(schedule: Schedule, limits: Any) -> None:
 
 def warn_of_mass(schedule: Schedule) -> None:
     """Tell of a damping that is not for the inertia with which an arm moves that is controlled by torques."""
-    if not isinstance(schedule.mass, np.ndarray):
-        mass = "no known mass" if schedule.mass is None else f"{schedule.mass:g} kg and kg m^2"
+    mass, words = schedule.mass, "no known mass"
+    if isinstance(mass, np.ndarray):
+        # Alike in all directions of a block, and all along, as no arm's own inertia is: a virtual mass.
+        own = [float(mass[0, block.start, block.start]) for block in schedule.blocks]
+        alike = np.diag(np.repeat(own, [block.stop - block.start for block in schedule.blocks]))
+        virtual = np.allclose(mass, alike, rtol=checks.ROUNDING, atol=checks.ROUNDING * min(own))
+        words = f"{own[0]:.3g} kg and {own[-1]:.3g} kg m^2" if virtual else ""
+    elif mass is not None:
+        words = f"{mass:g} kg and kg m^2"
+    if words:
         checks.warn(
-            f"The damping of schedule is for {mass}, but the arm moves with its own inertia, and may ring: give "
+            f"The damping of schedule is for {words}, but the arm moves with its own inertia, and may ring: give "
             "schedule.with_inertia(operational_inertia(model, joints, tool))."
         )
 

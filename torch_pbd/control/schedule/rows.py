@@ -1,6 +1,7 @@
 """Rows of a schedule between its own: how many at a rate, and what motion and gains are there."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -97,3 +98,13 @@ class Between:
         bend = h * s * (1.0 - s) * ((1.0 - s) * start - s * end)
         slope = blend(start, end, self._share) + 3.0 * s * (1.0 - s) * (2.0 * (last - first) / h - start - end)
         return cubic + bend, slope
+
+
+def ranges_of(matrices: Floats, blocks: Sequence[slice], units: Sequence[str]) -> str:
+    """Least and largest eigenvalue of each block of matrices (..., d, d), in words."""
+    ranges = []
+    for block, unit in zip(blocks, units, strict=False):
+        eigenvalues = np.linalg.eigvalsh(matrices[..., block, block])
+        low, high = (f"{value:.4g}" for value in (eigenvalues.min(), eigenvalues.max()))
+        ranges.append(f"{low} {unit}" if low == high else f"{low}..{high} {unit}")
+    return " and ".join(ranges)

@@ -15,7 +15,7 @@ from torch_pbd.checks import Floats
 from torch_pbd.control.schedule.adapted import DiagonalLoss, damping_with, diagonal_gains, turned_rows
 from torch_pbd.control.schedule.contents import LABELS, SHAPES, Limits, checked_fields
 from torch_pbd.control.schedule.files import read_schedule, write_schedule
-from torch_pbd.control.schedule.rows import Between, tick_times
+from torch_pbd.control.schedule.rows import Between, ranges_of, tick_times
 from torch_pbd.exceptions import InvalidParameterError
 
 if TYPE_CHECKING:
@@ -127,15 +127,14 @@ class Schedule:
 
     def __repr__(self) -> str:
         outputs = f"names={self.names}" if self.names else f"n_outputs={self.n_outputs}"
-        units = ["Nm/rad" if self.units == "rad" else "N/m", "Nm/rad"]
-        ranges = []
-        for block, unit in zip(self.blocks, units, strict=False):
-            eigenvalues = np.linalg.eigvalsh(self.stiffness[:, block, block])
-            ranges.append(f"{eigenvalues.min():.4g}..{eigenvalues.max():.4g} {unit}")
-        return (
-            f"Schedule(n={len(self)}, {outputs}, time={self.time[0]:.6g}..{self.time[-1]:.6g} s, "
-            f"stiffness={' and '.join(ranges)}, frame={self.frame!r})"
-        )
+        angles = self.units == "rad"
+        stiffness = ranges_of(self.stiffness, self.blocks, ("Nm/rad" if angles else "N/m", "Nm/rad"))
+        parts = [f"stiffness={stiffness}", f"frame={self.frame!r}"]
+        if self.mass is not None:
+            mass = self.mass * np.eye(self.n_outputs) if isinstance(self.mass, float) else self.mass
+            parts.insert(1, f"mass={ranges_of(mass, self.blocks, ('kg m^2' if angles else 'kg', 'kg m^2'))}")
+        time = f"time={self.time[0]:.6g}..{self.time[-1]:.6g} s"
+        return f"Schedule(n={len(self)}, {outputs}, {time}, {', '.join(parts)})"
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Copies go through the constructor: NumPy forgets that an array is read-only when it is pickled or copied.
