@@ -8,6 +8,8 @@ from torch_pbd.exceptions import NotPositiveDefiniteError
 from torch_pbd.linalg import (
     cholesky_with_jitter,
     gaussian_log_density,
+    least_eigenvalue,
+    rows_below,
     safe_cholesky,
     scale_tril_from_root,
     spectral_map,
@@ -191,3 +193,20 @@ def test_second_derivatives_of_spectral_maps_are_an_error_and_not_silently_wrong
     matrix = torch.eye(2, dtype=torch.float64).requires_grad_()
     with pytest.raises(RuntimeError, match="no second derivatives"):
         torch.autograd.grad(spectral_map(matrix, torch.exp).sum(), matrix, create_graph=True)
+
+
+def test_the_least_of_many_eigenvalues_is_that_of_scipy(generator):
+    """At an end of two of a batch, where one row in a hundred is far below the others, and all rows above another."""
+    root = randn(2, 300, 4, 4, generator=generator)
+    matrix, relative_to = symmetrize(root), root @ root.mT + torch.eye(4).double()
+    matrix[1, 123] -= 50.0 * torch.eye(4)
+    pairs = zip(matrix.flatten(0, 1).numpy(), relative_to.flatten(0, 1).numpy(), strict=True)
+    values = np.reshape([scipy.linalg.eigh(*pair, eigvals_only=True)[0] for pair in pairs], (2, 300)).min(0)
+
+    def pencil(rows, q, p):
+        return q * matrix[:, rows] + p * relative_to[:, rows]
+
+    least, row = least_eigenvalue(pencil, 300)
+    assert (least, row) == (pytest.approx(values.min(), rel=1e-9), 123)
+    limit = np.median(values)
+    assert rows_below(pencil, limit, 300).tolist() == np.flatnonzero(values < limit).tolist()

@@ -240,9 +240,8 @@ def semidefinite(matrices: NDArray[Any], name: str, *, definite: bool = False, r
     product = deviation[..., :, np.newaxis] * deviation[..., np.newaxis, :]
     # A variance of zero or less leaves zeros, which are not definite.
     correlations = np.divide(matrices, product, out=np.zeros_like(matrices), where=product > 0.0)
-    good = np.linalg.eigvalsh(correlations)[..., 0] > _SINGULAR
-    if not good.all():
-        own = np.linalg.eigvalsh(matrices)[..., 0]
+    if not eigenvalues_above(correlations, _SINGULAR):
+        good, own = np.linalg.eigvalsh(correlations)[..., 0] > _SINGULAR, np.linalg.eigvalsh(matrices)[..., 0]
         must = "above zero, positive definite"
         require(good, own, f"the smallest eigenvalue of {name}", must, remedy or "build it as a product A A'")
 

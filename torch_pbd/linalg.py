@@ -5,13 +5,19 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from torch_pbd.exceptions import NotPositiveDefiniteError
 
 MAX_JITTER = 1e-6
 """Largest jitter that :func:`safe_cholesky` adds, relative to the mean of the diagonal."""
+
+Pencil = Callable[[Tensor, float, float], Tensor]
+"""``q Q + p P`` of some of m rows, by their indices, q and p: symmetric Q and positive definite P (..., m, s, s)."""
+
+# Rows among which the least eigenvalue is looked for at first, and that are factored together, which stay in the cache.
+_N_SOME, _AT_ONCE = 24, 64
 
 
 def symmetrize(matrix: Float[Tensor, "*b d d"]) -> Float[Tensor, "*b d d"]:
@@ -43,6 +49,37 @@ def triangular_inverse(factor: Float[Tensor, "*b d d"], *, upper: bool = False) 
     """Inverses of triangular matrices."""
     identity = torch.eye(factor.shape[-1]).to(factor).expand_as(factor)
     return torch.linalg.solve_triangular(factor, identity, upper=upper)
+
+
+def smallest_eigenvalues(pencil: Pencil, rows: Int64[Tensor, " m"]) -> Float[Tensor, "*b m"]:
+    """Smallest eigenvalues of Q relative to P."""
+    factor = torch.linalg.cholesky(pencil(rows, 0.0, 1.0))
+    half = torch.linalg.solve_triangular(factor, pencil(rows, 1.0, 0.0), upper=False)
+    whole = torch.linalg.solve_triangular(factor.mT, half, upper=True, left=False)
+    return torch.linalg.eigvalsh(symmetrize(whole))[..., 0]
+
+
+def rows_below(pencil: Pencil, value: float, n: int) -> Int64[Tensor, " k"]:
+    """Rows, of n, with an eigenvalue of Q relative to P below a value: a Cholesky factor tells sooner than they do."""
+    found = []
+    for rows in torch.arange(n).split(max(_AT_ONCE, n // _AT_ONCE)):
+        failed = torch.linalg.cholesky_ex(pencil(rows, 1.0, -value)).info > 0
+        found.append(rows[failed.reshape(-1, len(rows)).any(0)])
+    return torch.cat(found)
+
+
+def least_eigenvalue(pencil: Pencil, n: int) -> tuple[float, int]:
+    """Smallest of all eigenvalues of the n rows of a pencil, and its row: of some, and then of those below theirs."""
+    some = evenly(n, _N_SOME)
+    least = float(smallest_eigenvalues(pencil, some).min())
+    rows = torch.cat([some, rows_below(pencil, least, n)])
+    values = smallest_eigenvalues(pencil, rows).reshape(-1, len(rows)).amin(0)
+    return float(values.min()), int(rows[values.argmin()])
+
+
+def evenly(n: int, most: int) -> Int64[Tensor, " m"]:
+    """At most so many of n indices, the first and last among them."""
+    return torch.linspace(0, n - 1, min(n, most)).round().long().unique()
 
 
 def scale_tril_from_root(root: Float[Tensor, "*b d r"]) -> Float[Tensor, "*b d d"]:

@@ -16,7 +16,7 @@ from torch_pbd.control.damping import damping_from_stiffness, required_damping_r
 from torch_pbd.control.simulation.plant import AdmittancePlant
 from torch_pbd.control.simulation.ticks import admittance_rate, transition
 from torch_pbd.control.stability import gain as module
-from torch_pbd.control.stability.common_function import isotropic_function, scaled
+from torch_pbd.control.stability.common_function import isotropic_rate
 from torch_pbd.control.stability.dynamics import ErrorDynamics
 from torch_pbd.control.stability.lyapunov import Knots
 from torch_pbd.data import make_tunnel_demonstrations
@@ -376,9 +376,7 @@ def test_the_rule_is_the_required_damping_ratio(mass):
 
 def has_isotropic_function(stiffness, damping, mass=1.0):
     mass = mass * torch.eye(stiffness.shape[-1]).double() if isinstance(mass, float) else mass
-    rows, _ = scaled(ErrorDynamics(torch.arange(len(stiffness)).double(), stiffness, damping, mass[None]))
-    found = isotropic_function(rows)
-    return found is not None and found.largest(rows) < 0.0
+    return isotropic_rate(ErrorDynamics(torch.arange(len(stiffness)).double(), stiffness, damping, mass[None])) > 0.0
 
 
 def searched_function(stiffness, damping):

@@ -17,7 +17,7 @@ from torch_pbd.control.stability.environment import stiffest_environment
 from torch_pbd.control.stability.gain import largest_gain
 from torch_pbd.control.stability.lyapunov import Knots, held_growth
 from torch_pbd.control.stability.report import StabilityReport
-from torch_pbd.linalg import spectral_map, symmetrize
+from torch_pbd.linalg import least_eigenvalue
 
 
 def certify(
@@ -92,7 +92,7 @@ def certify(
         margin_time=float(schedule.time[worst]),
         held_growth=held_growth(dynamics, maps, alpha) if margin >= 0.0 else math.nan,
         max_speed=speed * knots.max_speed(),
-        gain=largest_gain(dynamics, maps),
+        gain=largest_gain(maps),
         environment_stiffness=pressed[0],
         environment_rotation=pressed[1],
         speed=float(speed),
@@ -134,8 +134,12 @@ def _transport(schedule: Schedule, speed: float) -> Tensor | None:
 
 def _ratios(dynamics: ErrorDynamics) -> tuple[float, float]:
     """Smallest damping ratio, and largest over smallest stiffness per mass, each row in its own."""
-    stiffness, damping = map(dynamics.per_mass, (dynamics.stiffness, dynamics.damping))
-    spectrum = torch.linalg.eigh(stiffness)
-    root = spectral_map(stiffness, lambda value: value.pow(-0.25), tuple(spectrum))
-    ratios = torch.linalg.eigvalsh(symmetrize(root @ damping @ root)) / 2.0
-    return float(ratios.min()), float(spectrum.eigenvalues.max() / spectrum.eigenvalues.min())
+    squared, _, damping = dynamics.modes
+    root = squared.pow(-0.25)
+    if damping.ndim == 2:
+        least = float((root * damping * root).min())
+    else:
+        identity = torch.eye(squared.shape[-1]).to(squared)
+        relative = root[:, :, None] * damping * root[:, None, :]
+        least = least_eigenvalue(lambda rows, q, p: q * relative[rows] + p * identity, len(relative))[0]
+    return least / 2.0, float(squared.max() / squared.min())

@@ -1,6 +1,7 @@
 """One function of the state that falls at every row of a schedule, in whatever order they come."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -9,8 +10,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from torch_pbd.control.stability.dynamics import ErrorDynamics
-from torch_pbd.control.stability.lyapunov import evenly, minimize_convex, smallest_eigenvalues
-from torch_pbd.linalg import symmetrize, tril_to_vector, vector_to_tril
+from torch_pbd.linalg import evenly, least_eigenvalue, rows_below, symmetrize, tril_to_vector, vector_to_tril
 from torch_pbd.optim.batch import minimize_batch
 
 # Of the summands of a matrix whose smallest eigenvalue must be positive: a margin over rounding, 1e-13 of them.
@@ -24,7 +24,7 @@ _TEMPERATURES: tuple[float, ...] = (0.1, 0.01, 0.003)
 _MAX_ITER = 60  # at each of them
 _MAX_SEARCHES = 6
 _NEAR = 0.03  # of the rate among some rows, by which that of all may be lower
-_AT_ONCE = 256  # rows, which bounds the memory
+_GOLDEN, _N_GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0, 45  # sections: 4e-10 of the interval
 _UNBOUNDED = 1e6  # rate, of natural frequencies, that stands for none
 
 
@@ -45,21 +45,26 @@ def common_function(dynamics: ErrorDynamics) -> tuple[float, float]:
     because the last bracket is zero; and the right side is linear in (K, D, M, W). What one Y makes negative definite
     in (e, v, a) for rows is so for their blends. The a that is the worst is put in, which leaves a form in z.
     """
+    rate = isotropic_rate(dynamics) if dynamics.is_plain else math.nan
+    if not math.isnan(rate):
+        return rate, math.inf
+    if dynamics.stiffness.shape[-1] > _MAX_OUTPUTS:
+        return math.nan, 0.0
     rows, frequency = scaled(dynamics)
-    function = isotropic_function(rows) if dynamics.is_plain else None
-    if function is None and rows.stiffness.shape[-1] <= _MAX_OUTPUTS:
-        function = searched_function(rows)
-    if function is None:
+    function = searched_function(rows)
+    largest = math.inf if function is None else function.largest(rows)
+    if function is None or largest >= 0.0:
         return math.nan, 0.0
-    largest = function.largest(rows)
-    if largest >= 0.0:
-        return math.nan, 0.0
-    fastest, n = math.inf, len(dynamics.time)
-    for part in torch.arange(n).split(_AT_ONCE) if dynamics.transport is not None else ():
-        moving, at_rest = (function.change(rows.restrict(some)) for some in (part, part + n))
-        carried = -float(smallest_eigenvalues(at_rest - moving, -at_rest).min())
-        fastest = min(fastest, 1.0 / carried if carried > 0.0 else math.inf)
-    return -largest * frequency, fastest
+    if dynamics.transport is None:
+        return -largest * frequency, math.inf
+    n = len(dynamics.time)
+
+    def carried(some: Tensor, q: float, p: float) -> Tensor:
+        moving, at_rest = (function.change(rows.restrict(each)) for each in (some, some + n))
+        return (q - p) * at_rest - q * moving
+
+    slowed = -least_eigenvalue(carried, n)[0]
+    return -largest * frequency, 1.0 / slowed if slowed > 0.0 else math.inf
 
 
 def scaled(dynamics: ErrorDynamics) -> tuple[ErrorDynamics, float]:
@@ -116,13 +121,11 @@ class Function:
         return torch.linalg.eigvalsh(self.change(rows))
 
     def above(self, rows: ErrorDynamics, limit: float) -> Int64[Tensor, " k"]:
-        """Rows with an eigenvalue above a limit: a Cholesky factor tells sooner than eigenvalues do."""
-        found = []
-        for part in torch.arange(len(rows.time)).split(_AT_ONCE):
-            change = self.change(rows.restrict(part))
-            shifted = limit * torch.eye(change.shape[-1]).to(change) - change
-            found.append(part[torch.linalg.cholesky_ex(shifted).info > 0])
-        return torch.cat(found)
+        """Rows with an eigenvalue above a limit."""
+        identity = torch.eye(len(self.root)).to(self.root)
+        return rows_below(
+            lambda part, q, p: p * identity - q * self.change(rows.restrict(part)), -limit, len(rows.time)
+        )
 
     def largest(self, rows: ErrorDynamics) -> float:
         """Largest eigenvalue of all rows, and what rounding may add to it."""
@@ -175,63 +178,87 @@ def _smoothed(
         return loss.detach(), torch.autograd.grad(loss.sum(), leaf)[0]
 
 
-def isotropic_function(rows: ErrorDynamics) -> Function | None:
-    """Function to which no axis is special, for a mass of 1, if there is one.
+def isotropic_rate(dynamics: ErrorDynamics) -> float:
+    """Rate, in 1/s, of a function to which no axis is special, for one mass; NaN if there is none.
 
     Notes
     -----
-    ``V = a |y|^2 + 2 b y'v + |v|^2`` does not depend on axes. ``-dV/dt`` is the quadratic form of
+    ``V = a |y|^2 + 2 b y'v + |v|^2`` does not depend on axes, so that each row may be looked at along its own: modes
+    that are not coupled are rows by themselves. ``-dV/dt`` is the quadratic form of
     ``[[2 b K, K + b D - a], [K + b D - a, 2 D - 2 b]]`` in (y, v), linear in (K, D): what holds for the pairs holds for
     their blends. It is positive for b > 0 if and only if ``T = 4 b (D - b) - (K + b D - a) K^-1 (K + b D - a)`` is, its
     Schur complement times 2 b; V itself then is, because the motion under constant gains dies out (Lyapunov). T is
     concave in (a, b), so the smallest of all eigenvalues is too, and it is maximized by cuts: ``z'T z`` of the
     eigenvectors z found so far is an upper bound. The first are those of K.
     """
-    stiff, damp = rows.stiffness, rows.damping
-    values, axes = torch.linalg.eigh(stiff)
-    compliance = (axes / values.unsqueeze(-2)) @ axes.mT
-    lag, identity = damp @ compliance, torch.eye(stiff.shape[-1]).to(stiff).expand_as(stiff)
-    terms = torch.stack(  # T by its monomials a, b, b^2, 1, a b, a^2
-        [2.0 * identity, 2.0 * damp, -4.0 * identity - lag @ damp, -stiff, lag + lag.mT, -symmetrize(compliance)]
-    )
-    least = float(torch.linalg.eigvalsh(damp)[:, 0].min())
-    if least <= 0.0 or not bool(torch.isfinite(terms).all()):
-        return None
+    squared, _, damping = dynamics.modes
+    frequency = math.sqrt(math.sqrt(float(squared.min())) * math.sqrt(float(squared.max())))
+    stiff, damp, few = squared / frequency**2, damping / frequency, evenly(len(squared), _N_CUT)
+    if damp.ndim == 2:
+        few = (few[:, None] * damp.shape[1] + torch.arange(damp.shape[1])).flatten()
+        stiff, damp = stiff.reshape(-1, 1), damp.reshape(-1, 1, 1)
+    terms = _schur_terms(stiff, damp)
+    sizes, least = terms.abs().amax((1, 2, 3)), float(torch.linalg.eigvalsh(damp).min())
+    if least <= 0.0 or not bool(torch.isfinite(sizes).all()):
+        return math.nan
     # Where T is positive b is below every D, and a about between the smallest K and the largest K + b D. They are
     # searched by their logarithms, which stiffnesses of many powers of ten need, and which moves no maximum.
-    largest = stiff.shape[-1] * float(stiff.abs().max() + least * damp.abs().max())
-    of_a = math.log(1e-3 * float(values.min())), math.log(largest)
+    largest = dynamics.stiffness.shape[-1] * float(stiff.max() + least * damp.abs().max())
+    of_a = math.log(1e-3 * float(stiff.min())), math.log(largest)
     of_b = math.log(1e-6 * least), math.log(least)
-    few = evenly(len(axes), _N_CUT)
-    cuts = _along(terms[:, few], axes[few])
+    cuts = terms[:, few].diagonal(dim1=-2, dim2=-1).flatten(1)
     for _ in range(_ROUNDS):
 
         def excess(log_a: float, log_b: float, cuts: Tensor = cuts) -> float:
             return -float((_monomials(log_a, log_b, cuts) @ cuts).min())
 
         def best(log_b: float) -> float:
-            return minimize_convex(lambda x: excess(x, log_b), *of_a, n_steps=32)
+            return _minimize_convex(lambda x: excess(x, log_b), *of_a)
 
-        log_b = minimize_convex(lambda x: excess(best(x), x), *of_b, n_steps=32)
+        log_b = _minimize_convex(lambda x: excess(best(x), x), *of_b)
         log_a = best(log_b)
         weights = _monomials(log_a, log_b, terms)
-        negligible = _ROUNDING * float(weights.abs() @ terms.abs().amax((1, 2, 3)))
+        negligible = _ROUNDING * float(weights.abs() @ sizes)
         if excess(log_a, log_b) >= -negligible:
-            return None
-        eigenvalues, vectors = torch.linalg.eigh(symmetrize(torch.tensordot(weights, terms, 1)))
-        if float(eigenvalues.min()) > negligible:
+            return math.nan
+        matrix, identity = torch.tensordot(weights, terms, 1), torch.eye(stiff.shape[-1]).to(stiff)
+        lacking = torch.linalg.cholesky_ex(matrix - negligible * identity).info > 0
+        if not bool(lacking.any()):
             a, b = math.exp(log_a), math.exp(log_b)
-            return Function(
-                torch.linalg.cholesky(torch.kron(torch.tensor([[a, b], [b, 1.0]]).to(stiff), identity[0])).mT
-            )
-        cuts = torch.cat([cuts, _along(terms, vectors[..., :1])], dim=1)
-    return None
+            root = torch.linalg.cholesky(torch.kron(stiff.new_tensor([[a, b], [b, 1.0]]), identity)).mT
+            rows = ErrorDynamics(stiff[:, 0], torch.diag_embed(stiff), damp, identity[None])
+            rate = -Function(root).largest(rows)
+            return rate * frequency if rate > 0.0 else math.nan
+        vectors = torch.linalg.eigh(matrix[lacking]).eigenvectors[..., :1]
+        cuts = torch.cat([cuts, (vectors * (terms[:, lacking] @ vectors)).sum(-2).flatten(1)], dim=1)
+    return math.nan
+
+
+def _schur_terms(stiff: Float[Tensor, "n d"], damp: Float[Tensor, "n d d"]) -> Float[Tensor, "6 n d d"]:
+    """Coefficients of T in the Notes, of its monomials a, b, b^2, 1, a b, a^2."""
+    identity, lag = torch.eye(stiff.shape[-1]).to(stiff).expand_as(damp), damp / stiff[:, None, :]
+    of_square = -4.0 * identity - symmetrize(lag @ damp)
+    one, square = -torch.diag_embed(stiff), -torch.diag_embed(1.0 / stiff)
+    return torch.stack([2.0 * identity, 2.0 * damp, of_square, one, lag + lag.mT, square])
 
 
 def _monomials(log_a: float, log_b: float, like: Tensor) -> Tensor:
     a, b = math.exp(log_a), math.exp(log_b)
-    return torch.tensor([a, b, b * b, 1.0, a * b, a * a]).to(like)
+    return like.new_tensor([a, b, b * b, 1.0, a * b, a * a])
 
 
-def _along(terms: Float[Tensor, "k n d d"], vectors: Float[Tensor, "n d m"]) -> Float[Tensor, "k nm"]:
-    return (vectors * (terms @ vectors)).sum(-2).flatten(1)
+def _minimize_convex(function: Callable[[float], float], low: float, high: float) -> float:
+    """Where a convex function of one variable is smallest, by golden section; the ends are tried too."""
+    first, last = low, high
+    left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+    at_left, at_right = function(left), function(right)
+    for _ in range(_N_GOLDEN):
+        if at_left <= at_right:
+            high, right, at_right = right, left, at_left
+            left = high - _GOLDEN * (high - low)
+            at_left = function(left)
+        else:
+            low, left, at_left = left, right, at_right
+            right = low + _GOLDEN * (high - low)
+            at_right = function(right)
+    return min((first, last, left, right), key=function)

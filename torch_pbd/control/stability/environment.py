@@ -8,11 +8,11 @@ from torch import Tensor
 
 from torch_pbd.control.simulation.position_loop import PositionLoop
 from torch_pbd.control.simulation.ticks import admittance_rate, transition
-from torch_pbd.linalg import symmetrize
+from torch_pbd.linalg import least_eigenvalue, symmetrize
 
 # N/m; stiffer than anything there is.
 _STIFFEST = 1e9
-# Knots of a schedule that are coupled to an environment, each of which takes 60 eigenvalues of a matrix of 5 + delay.
+# Knots of a schedule that are coupled to an environment.
 _MAX_KNOTS = 200
 _BISECTIONS = 60
 
@@ -34,23 +34,32 @@ def stiffest_environment(
     damping and stiffness.
     """
     chosen = torch.linspace(0, len(stiffness) - 1, min(len(stiffness), _MAX_KNOTS)).round().long()
-    softest = [torch.linalg.eigvalsh(gain)[:, 0].argmin() for gain in (stiffness, damping)]
-    chosen = torch.cat([chosen.to(stiffness.device), torch.stack(softest)])
+    identity = torch.eye(stiffness.shape[-1]).to(stiffness)
+    softest = [
+        least_eigenvalue(lambda rows, q, p, gain=gain: q * gain[rows] + p * identity, len(gain))[1]
+        for gain in (stiffness, damping)
+    ]
+    chosen = torch.cat([chosen, torch.tensor(softest)])
     axes = torch.linalg.eigh(symmetrize(damping[chosen])).eigenvectors
     along = [
         (axes * (matrix @ axes)).sum(-2).reshape(-1, 1, 1) for matrix in (stiffness[chosen], damping[chosen], mass)
     ]
     ticks = transition(admittance_rate(*along), dt)[:, :2]
-    low, high = torch.zeros_like(along[0][:, 0, 0]), torch.full_like(along[0][:, 0, 0], 2.0 * _STIFFEST)
-    for _ in range(_BISECTIONS):
-        # By the logarithm while that is wide: the answer may lie anywhere between a feather and a wall.
-        middle = torch.where(high > 1e3 * low.clamp_min(1.0), (low.clamp_min(1.0) * high).sqrt(), 0.5 * (low + high))
-        closed = _closed_loop(ticks, position_loop, force_cutoff, dt, middle)
-        stable = torch.linalg.eigvals(closed).abs().amax(-1) < 1.0
-        low, high = torch.where(stable, middle, low), torch.where(stable, high, middle)
-        lasting = low <= high.min()  # the others are not the least
-        low, high, ticks = low[lasting], high[lasting], ticks[lasting]
-    least = float(low.min())
+
+    def is_stable(each: Tensor, environment: float) -> Tensor:
+        closed = _closed_loop(each, position_loop, force_cutoff, dt, environment)
+        return torch.linalg.eigvals(closed).abs().amax(-1) < 1.0
+
+    # Most axes are never the least: after that which is damped least, those for which what it bears is too much.
+    least, ticks = 2.0 * _STIFFEST, ticks[along[1].flatten().argsort()]
+    while len(ticks):
+        low, high = 0.0, least
+        for _ in range(_BISECTIONS):
+            # By the logarithm while that is wide: the answer may lie anywhere between a feather and a wall.
+            middle = math.sqrt(max(low, 1.0) * high) if high > 1e3 * max(low, 1.0) else 0.5 * (low + high)
+            low, high = (middle, high) if is_stable(ticks[:1], middle) else (low, middle)
+        least = low
+        ticks = ticks[1:][~is_stable(ticks[1:], least)]
     return math.inf if least > _STIFFEST else least
 
 
@@ -59,14 +68,14 @@ def _closed_loop(
     position_loop: PositionLoop,
     force_cutoff: float | None,
     dt: float,
-    environment: Float[Tensor, " n"],
+    environment: float,
 ) -> Float[Tensor, "n m m"]:
     """Matrices of [admittance position, velocity; robot position, velocity; filtered force; commands waiting]."""
     n_waiting = position_loop.delay_steps
     closed = ticks.new_zeros(len(ticks), 5 + n_waiting, 5 + n_waiting)
     robot, filtered, waiting = 2, 4, 5
     if force_cutoff is None:
-        closed[:, :2, robot] = -environment[:, None] * ticks[:, :, 2]
+        closed[:, :2, robot] = -environment * ticks[:, :, 2]
     else:
         gain = -math.expm1(-2.0 * math.pi * force_cutoff * dt)
         closed[:, :2, filtered] = ticks[:, :, 2]

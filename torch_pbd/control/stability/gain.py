@@ -6,24 +6,25 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from torch_pbd.control.stability.dynamics import ErrorDynamics
-
 # Rows between which growth is looked for, and parts that are followed from row to row: enough for 27 outputs at 2,701
 # rows to find what all of them do.
-_MAX_ROWS, _MAX_PARTS = 150, 64
+_MAX_ROWS, _MAX_PARTS, _AT_ONCE = 150, 64, 64
 
 
-def largest_gain(dynamics: ErrorDynamics, maps: Float[Tensor, "k s s"]) -> float:
-    """Largest ``||P_j^1/2 Phi(j, i) P_i^-1/2||`` over i < j, with P = diag(K, M) and the exact maps Phi.
+def largest_gain(steps: Float[Tensor, "k s s"]) -> float:
+    """Largest norm of a product of successive maps, in coordinates in which the squared length is the energy.
 
+    That is ``||P_j^1/2 Phi(j, i) P_i^-1/2||`` over i < j, with P = diag(K, M) and the exact maps Phi.
     Of long schedules it is looked for between 150 rows, the closer together the more the energy changes there, and then
     among all rows around where such a part begins and ends.
     """
-    steps = _energy_maps(dynamics, maps)
     every = torch.arange(len(steps) + 1)
     if len(steps) <= _MAX_ROWS:
         return _largest_growth(steps)[0]
-    change = torch.linalg.matrix_norm(steps.mT @ steps - torch.eye(steps.shape[-1]).to(steps)).cumsum(0)
+    identity = torch.eye(steps.shape[-1]).to(steps)
+    change = torch.cat([torch.linalg.matrix_norm(each.mT @ each - identity) for each in steps.split(_AT_ONCE)]).cumsum(
+        0
+    )
     shares = torch.linspace(0.0, float(change[-1]), _MAX_ROWS + 1).to(change)[1:-1]
     rows = torch.cat([every[:1], torch.searchsorted(change, shares) + 1, every[-1:]]).unique()
     ends = _largest_growth(_products(steps, rows))[1:]
@@ -50,19 +51,6 @@ def _largest_growth(steps: Float[Tensor, "k s s"]) -> tuple[float, int, int]:
             kept = torch.linalg.matrix_norm(begun).topk(_MAX_PARTS).indices
             begun, since = begun[kept], since[kept]
     return math.sqrt(largest), *part
-
-
-def _energy_maps(dynamics: ErrorDynamics, maps: Float[Tensor, "k s s"]) -> Float[Tensor, "k s s"]:
-    """Maps of a state whose squared length is the energy."""
-    roots = [torch.linalg.cholesky(matrix).mT for matrix in (dynamics.stiffness, dynamics.mass)]
-    d = dynamics.stiffness.shape[-1]
-    of_energy, halves = torch.empty_like(maps), (slice(0, d), slice(d, 2 * d))
-    for rows, end in zip(halves, roots, strict=True):
-        for columns, start in zip(halves, roots, strict=True):
-            carried = (end if len(end) == 1 else end[1:]) @ maps[:, rows, columns]
-            before = start if len(start) == 1 else start[:-1]
-            of_energy[:, rows, columns] = torch.linalg.solve_triangular(before, carried, upper=True, left=False)
-    return of_energy
 
 
 def _products(steps: Float[Tensor, "k s s"], rows: Int64[Tensor, " c1"]) -> Float[Tensor, "c s s"]:
