@@ -11,8 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from torch_pbd import DMPController
-from torch_pbd.control import RotationLimits, StiffnessLaw
-from torch_pbd.control.simulation.run import simulate_schedule
+from torch_pbd.control import RotationLimits, StiffnessLaw, simulate
 from torch_pbd.data import make_pose_demonstrations
 from torch_pbd.plotting import FORCE, MODEL, ROBOT, plot_arm, plot_covariance_ellipsoids, plot_frames
 from torch_pbd.robots import HOME, inverse_kinematics, operational_inertia, panda
@@ -29,7 +28,7 @@ print(f"the tool weighs {weights.min():.1f} to {weights.max():.1f} kg")
 share = np.sin(np.pi * np.clip((schedule.time - 0.8) / 0.8, 0.0, 1.0)) ** 2
 wrench = np.outer(share, [5.0, -9.0, 6.0, 0.6, 0.8, -0.6])  # N and Nm
 pushed = run(arm, schedule, joints, wrench=wrench)
-calm, plant = (simulate_schedule(schedule, None, force, 1000.0, None).deviation for force in (0.0 * wrench, wrench))
+calm, plant = (simulate(schedule, force).deviation for force in (0.0 * wrench, wrench))
 
 figure = plt.figure(figsize=(11.0, 5.6), layout="constrained")
 columns = figure.add_gridspec(2, 2, width_ratios=(1.2, 1.0))

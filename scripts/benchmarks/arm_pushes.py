@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from torch_pbd import DMPController, load_demonstrations, rotations
-from torch_pbd.control import AdmittancePlant, RotationLimits, Schedule, StiffnessLaw
-from torch_pbd.control.simulation.run import simulate_schedule
+from torch_pbd.control import RotationLimits, Schedule, StiffnessLaw, simulate
 from torch_pbd.data import make_pose_demonstrations
 from torch_pbd.robots import HOME, inverse_kinematics, operational_inertia, panda
 from torch_pbd.robots.mujoco import run
@@ -75,7 +74,7 @@ def pushed(schedule: Schedule, n_directions: int, random_state: int = 0) -> Iter
 
 
 def _plant(schedule: Schedule, forces: Any) -> Any:
-    return simulate_schedule(schedule, AdmittancePlant(None), forces, RATE, None).deviation
+    return simulate(schedule, forces).deviation
 
 
 def _outcome(arm: Any, plant: Any, *ratios: float) -> Outcome:

@@ -18,8 +18,7 @@ from franky_sim import SimulationServer
 from franky_sim.mujoco_simulator import MujocoSimulator
 
 from torch_pbd import rotations
-from torch_pbd.control import Schedule
-from torch_pbd.control.simulation.run import simulate_schedule
+from torch_pbd.control import Schedule, simulate
 from torch_pbd.robots import HOME, inverse_kinematics, operational_inertia, panda
 from torch_pbd.robots.franky import run
 
@@ -180,10 +179,7 @@ def measured(case: Case) -> Measured:
     calm = followed(case, schedule, joints[0], friction, np.zeros(6))
     pushed = {name: followed(case, schedule, joints[0], friction, wrench) for name, wrench in PUSHES.items()}
     forces = {name: np.outer(share, wrench) for name, wrench in PUSHES.items()}
-    still, *plants = (
-        simulate_schedule(schedule, None, force, 1000.0, None).deviation
-        for force in (np.zeros_like(calm), *forces.values())
-    )
+    still, *plants = (simulate(schedule, force).deviation for force in (np.zeros_like(calm), *forces.values()))
     plant = {name: found - still for name, found in zip(forces, plants, strict=True)}
     return Measured(schedule.time, calm, pushed, plant)
 

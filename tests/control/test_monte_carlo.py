@@ -18,6 +18,7 @@ from torch_pbd.control import (
     RateLimit,
     Schedule,
     Tunnel,
+    simulate,
     simulate_many,
 )
 from torch_pbd.control.damping import damping_from_stiffness
@@ -218,6 +219,22 @@ def test_ticks_are_the_rows_of_the_schedule_or_at_a_rate():
     uneven = Schedule(**{name: values[rows] for name, values in schedule._arrays().items()})
     with pytest.raises(ValueError, match=re.escape("must be evenly spaced: give rate")):
         simulate_many(uneven, 2)
+    with pytest.raises(ValueError, match=re.escape("must be evenly spaced: take schedule.resample(rate)")):
+        simulate(uneven)
+
+
+def test_a_schedule_from_a_file_is_run_as_its_rows_are(tmp_path):
+    turning_schedule(start=3.0, mass=2.0).save(tmp_path / "schedule.csv")
+    schedule, plant = Schedule.load(tmp_path / "schedule.csv"), AdmittancePlant(2.0)
+    push = np.full_like(schedule.velocity, 20.0)
+    run = simulate(schedule, push)
+    rows = (schedule.position, schedule.velocity, schedule.stiffness, schedule.damping, push)
+    alone = plant.simulate(*map(torch.tensor, rows), dt=1.0 / RATE).numpy()
+    np.testing.assert_allclose(run.position, alone.position, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(run.time, schedule.time, rtol=1e-12)
+    assert abs(run.deviation).max() > 2.0 * abs(simulate(schedule, plant=plant).deviation).max()
+    with pytest.raises(ValueError, match=r"force has shape \(300, 2\), must have shape \(301, 2\)"):
+        simulate(schedule, push[1:])
 
 
 def test_a_plant_of_another_mass_is_told_of():

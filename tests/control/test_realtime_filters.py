@@ -10,9 +10,8 @@ import pytest
 from control.loops import MASS, arm_inertia, constant, make_pose_schedule, make_schedule
 from scipy.spatial.transform import Rotation
 
-from torch_pbd.control import AdmittancePlant, EnergyTank, RateLimit
+from torch_pbd.control import AdmittancePlant, EnergyTank, RateLimit, simulate
 from torch_pbd.control.realtime import RealTimeAdmittance, TickStatus
-from torch_pbd.control.simulation.run import simulate_schedule
 
 QUIET = {"soft_start": 0.0, "spring_limit": 1e6}
 
@@ -155,7 +154,7 @@ def test_on_poses_along_an_inertia_the_loop_is_the_plant_of_torch_to_first_order
     for size in (0.5, 0.25):
         push = size * np.outer(np.sin(np.arange(len(schedule)) / 40) ** 2, [10.0, -8.0, 6.0, 1.2, 0.8, -1.0])
         plant = AdmittancePlant(None, stiffness_filter=wanted)
-        told = simulate_schedule(schedule, plant, push, 1000.0, None)
+        told = simulate(schedule, push, plant=plant)
         controller = RealTimeAdmittance(schedule, stiffness_filter=wanted, soft_start=0.0)
         controller.start(0.0, velocity=schedule.velocity[0])
         off, shares = [], []

@@ -17,8 +17,7 @@ from scipy.spatial.transform import Rotation
 from torch_pbd import rotations
 from torch_pbd.control.damping import damping_from_stiffness
 from torch_pbd.control.schedule import Schedule
-from torch_pbd.control.simulation.plant import AdmittancePlant
-from torch_pbd.control.simulation.run import simulate_schedule
+from torch_pbd.control.simulation.run import simulate
 from torch_pbd.control.simulation.ticks import admittance_rate
 from torch_pbd.control.stability import gain
 from torch_pbd.control.stability.common_function import common_function, scaled, searched_function
@@ -212,7 +211,7 @@ def test_maps_are_those_of_the_simulated_robot(rng):
     )
     schedule, push = replace(schedule, orientation=np.array(orientation)), np.zeros((101, 6))
     push[0] = 1e-3 * rng.normal(size=6)
-    pushed, free = (simulate_schedule(schedule, AdmittancePlant(None), force, 100.0, 0) for force in (push, None))
+    pushed, free = (simulate(schedule, force) for force in (push, None))
     state = np.concatenate([pushed.deviation - free.deviation, pushed.velocity - free.velocity], axis=1)
     carried = state[1]
     for tick, each in enumerate(maps_of_state(dynamics).numpy()[1:], start=1):

@@ -4,8 +4,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from torch_pbd.control import AdmittancePlant, Schedule, simulate_many
-from torch_pbd.control.simulation.run import simulate_schedule
+from torch_pbd.control import AdmittancePlant, Schedule, simulate, simulate_many
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +17,7 @@ def joints():
 
 @pytest.fixture
 def run(joints):
-    return simulate_schedule(joints, AdmittancePlant(), np.tile([5.0, 0.0], (201, 1)), 100.0, None)
+    return simulate(joints, np.tile([5.0, 0.0], (201, 1)), plant=AdmittancePlant())
 
 
 def test_a_run_is_in_radians(run):

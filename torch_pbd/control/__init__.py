@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from torch_pbd.control.simulation.position_loop import PositionLoop
     from torch_pbd.control.simulation.rollout import Rollout
     from torch_pbd.control.simulation.rollouts import RolloutSummary
-    from torch_pbd.control.simulation.run import simulate_many
+    from torch_pbd.control.simulation.run import simulate, simulate_many
     from torch_pbd.control.simulation.sensor import ForceSensor
     from torch_pbd.control.simulation.walls import Tunnel
     from torch_pbd.control.stability.certify import certify
@@ -45,6 +45,7 @@ _HOMES = {
     "damping_from_stiffness": "damping",
     "lqt": "stiffness",
     "required_damping_ratio": "damping",
+    "simulate": "simulation.run",
     "simulate_many": "simulation.run",
 }
 
@@ -70,6 +71,7 @@ __all__ = [
     "damping_from_stiffness",
     "lqt",
     "required_damping_ratio",
+    "simulate",
     "simulate_many",
 ]
 

@@ -19,7 +19,7 @@ from torch_pbd.control.schedule.rows import tick_times
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.plant import AdmittancePlant
 from torch_pbd.control.simulation.rollout import Rollout
-from torch_pbd.control.simulation.run import simulate_schedule
+from torch_pbd.control.simulation.run import simulate
 from torch_pbd.control.via import Bend, conditioned, planned
 
 _UNITS = {"duration": "s", "distance": "m", "speed": "m/s"}
@@ -211,8 +211,7 @@ class Planning(BaseEstimator):
         random_state : int, RandomState or None, default=None
             Of the noise of the plant's sensor.
         """
-        schedule = self.schedule(rate)
-        return simulate_schedule(schedule, plant, force, rate, random_state)
+        return simulate(self.schedule(rate), force, plant=plant, random_state=random_state)
 
     def reproduce(
         self,

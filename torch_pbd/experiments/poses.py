@@ -15,7 +15,7 @@ from torch_pbd.control.controller import DMPController
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.plant import AdmittancePlant
 from torch_pbd.control.simulation.rollout import Rollout
-from torch_pbd.control.simulation.run import simulate_schedule
+from torch_pbd.control.simulation.run import simulate
 from torch_pbd.control.stability.report import StabilityReport
 from torch_pbd.data import Demonstrations
 from torch_pbd.exceptions import ConfigError
@@ -105,7 +105,7 @@ def pushed(controller: DMPController, rate: float, peak: float, torque: float, a
 
     def run(largest: float, kind: plotting.Kind, axis: int) -> Rollout:
         wrench = _wrench(schedule, largest, kind, axis)
-        return simulate_schedule(schedule, plant, wrench, rate, random_state=0)
+        return simulate(schedule, wrench, plant=plant, random_state=0)
 
     forces, torques = (
         tuple(run(largest, kind, axis) for axis in range(3))

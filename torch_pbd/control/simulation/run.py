@@ -31,17 +31,63 @@ _UNEVEN = 1e-6
 _SAME_MASS = 1e-3
 
 
-def simulate_schedule(
-    schedule: Schedule, plant: AdmittancePlant | None, force: ArrayLike | None, rate: float, random_state: Any
+def simulate(
+    schedule: Schedule,
+    force: ArrayLike | None = None,
+    *,
+    plant: AdmittancePlant | None = None,
+    random_state: Any = None,
 ) -> Rollout:
-    """Run a schedule whose rows are ticks of ``1 / rate`` s under an external force (T, d) in N, and of poses Nm."""
+    """Run a schedule, as learned or from a file, on a simulated robot that a given force pushes.
+
+    Each row of the schedule is a tick, which holds its gains and desired place; of a last row that is nearer, too.
+
+    Parameters
+    ----------
+    schedule : Schedule
+        Motion and gains to follow, whose rows are evenly spaced: else ``schedule.resample(rate)`` makes them so.
+    force : array-like of shape (T, d), default=None
+        External force in N, and of poses torque in Nm, in world axes, at each of the T rows; None is none.
+    plant : AdmittancePlant, default=None
+        None is ``AdmittancePlant(None)``, with the mass of the schedule, or 1 kg where it tells none.
+    random_state : int, RandomState or None, default=None
+        Of the noise of the plant's sensor.
+
+    Returns
+    -------
+    Rollout
+        Of arrays.
+
+    Warns
+    -----
+    UserWarning
+        If the plant's mass is not that which the schedule's damping was computed for.
+
+    Raises
+    ------
+    ValueError
+        If an argument is not as described, or the motion diverges.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from torch_pbd.control import Schedule, simulate
+    >>> still, stiffness, damping = np.zeros((2000, 1)), np.full((2000, 1, 1), 50.0), np.full((2000, 1, 1), 14.0)
+    >>> schedule = Schedule(np.arange(2000) / 1000, still, still, stiffness, damping, stiffness, np.zeros(2000))
+    >>> run = simulate(schedule, np.full((2000, 1), 5.0))
+    >>> round(float(run.deviation[-1, 0]), 4)  # 5 N on 50 N/m
+    0.1
+    """
+    checks.instance(schedule, "schedule", Schedule)
+    schedule = _evenly(schedule, None, "take schedule.resample(rate)")
     shape = schedule.velocity.shape
     push = checks.array(np.zeros(shape) if force is None else force, "force", shape)
     draw = checks.seed(random_state)
-    task = _task_of(schedule, plant, 1.0 / rate)
+    task = _task_of(schedule, plant, float(schedule.time[1] - schedule.time[0]))
     noisy = task.sensor is not None and task.sensor.is_noisy  # else nothing is drawn: None is the caller's global state
     generator = torch.Generator().manual_seed(int(draw.randint(2**31 - 1))) if noisy else None
-    return replace(run_task(task, torch.tensor(push), generator=generator).numpy(), units=schedule.units)
+    run = run_task(task, torch.tensor(push), generator=generator).numpy()
+    return replace(run, time=schedule.time[0] + run.time, units=schedule.units)
 
 
 def simulate_many(
@@ -131,7 +177,7 @@ def simulate_many(
     scales = _of_blocks(start_scale, "start_scale", schedule, 0.0, least=0.0)
     levels = checks.array(quantiles, "quantiles", ("n_quantiles",)).copy()
     checks.require((levels >= 0.0) & (levels <= 1.0), levels, "quantiles", "from 0 to 1")
-    schedule = _evenly(schedule, rate)
+    schedule = _evenly(schedule, rate, "give rate, that of the ticks in Hz")
     _check_memory(n_rollouts, schedule, len(levels))
     draw = checks.seed(random_state)
     begin, lasting, push = _draw_pushes(draw, n_rollouts, schedule, [peak, torque], duration, onset)
@@ -244,14 +290,13 @@ def _check_memory(n_rollouts: int, schedule: Schedule, n_levels: int) -> None:
     )
 
 
-def _evenly(schedule: Schedule, rate: float | None) -> Schedule:
+def _evenly(schedule: Schedule, rate: float | None, remedy: str) -> Schedule:
     if rate is not None:
         return schedule.resample(rate)
     steps = np.diff(schedule.time)
     if np.ptp(steps[:-1]) > _UNEVEN * steps[0] or steps[-1] > (1.0 + _UNEVEN) * steps[0]:
         raise InvalidParameterError(
-            f"schedule has steps from {steps.min():g} to {steps.max():g} s, must be evenly spaced: give rate, that of "
-            "the ticks in Hz."
+            f"schedule has steps from {steps.min():g} to {steps.max():g} s, must be evenly spaced: {remedy}."
         )
     return schedule
 
