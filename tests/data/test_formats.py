@@ -45,7 +45,7 @@ def test_parquet_is_a_long_table(tmp_path):
     table = recorded.to_frame().rename(columns={"demo": "trial"})
     table.index = RANDOM.permutation(len(table))  # as of a selection of rows; an index of all is not in the file
     table.to_parquet(tmp_path / "indexed.parquet")
-    with pytest.raises(DataFormatError, match=r"column 6 has no name.*outputs=\['trial', 'x', 'y', 'z'\]"):
+    with pytest.raises(DataFormatError, match=r"column 6 has no name.*outputs= which of \[trial, x, y, z\]"):
         load_demonstrations(tmp_path / "indexed.parquet")
     assert load_demonstrations(tmp_path / "indexed.parquet", demo="trial", outputs=["x", "y", "z"]) == recorded
     with pytest.raises(DataFormatError, match="max_bytes=1000"):

@@ -78,6 +78,11 @@ def test_a_column_that_numbers_the_demonstrations_is_found_out(tmp_path):
     back = "\n".join([again[0], *(f"{line.split(',')[0]},{i % 20},{i}" for i, line in enumerate(again[1:]))])
     with pytest.raises(DataFormatError, match="tells the demonstrations apart"):
         load_text(tmp_path, back)
+    both = text.replace("trial,time,x", "trial,time,x,seq").replace("\n", ",SEQ\n").replace("seq,SEQ", "seq")
+    for i in range(60):
+        both = both.replace("SEQ", str(i), 1)
+    with pytest.raises(DataFormatError, match=r"outputs=\['x'\], and demo='trial'"):  # neither of two is proposed
+        load_text(tmp_path, both)
 
 
 def test_reading_at_once_is_as_reading_line_by_line(tmp_path):

@@ -87,47 +87,38 @@ class Wanted:
         places = {column: (signal, i) for signal, columns in signals.items() for i, column in enumerate(columns)}
         demo = demo if self.demo is None and demo in places else self.demo
         time = self.time or time
-        if time is not None and time not in places and self.rate is None and self.notes is not None:
-            time = self._likely_time(time, places)
         if self.rate is not None:
             time = time if time in places else None
+        elif time is not None and time not in places:
+            time = self._likely_time(time, places)
         taken = [name for name in (demo, time) if name is not None]
-        names = self._output_names(signals, places, [name for name in taken if name in places], outputs)
-        absent = [name for name in (*taken, *names) if name not in places]
-        if absent or not names:
-            what = f"no column {absent[0]!r}" if absent else "no column of outputs"
-            raise ValueError(
-                f"{what} among {preview([*places])}. Name the columns by the options demo=, time= (or rate=, in Hz, "
-                "where there are no times) and outputs=."
-            )
+        _require_columns(taken, places)
+        names = self._output_names(signals, places, taken, outputs)
+        _require_columns(names, places, "no column of outputs")
         moment = None if time is None or self.rate is not None else places[time]
         return Chosen(demo, moment, [places[name] for name in names], names)
 
     def _output_names(
-        self,
-        signals: Mapping[str, Sequence[str]],
-        places: Mapping[str, Any],
-        taken: Sequence[str],
-        default: str | None,
+        self, signals: Mapping[str, Sequence[str]], places: Mapping[str, Any], taken: Sequence[str], default: str | None
     ) -> list[str]:
         wanted = self.outputs if self.outputs is not None or default not in signals else [str(default)]
         if wanted is not None:
             names = [column for name in wanted for column in ([name] if name in places else signals.get(name, [name]))]
             return [*names, *(name for name in self.rotation or () if name not in names)]
-        names = [name for name in places if name not in taken]
-        unnamed = [name for name in names if name in _UNNAMED]
-        if unnamed:
-            self.refuse(
-                f"column {list(places).index(unnamed[0]) + 1} has no name, as the index of a table that was written "
-                f"without index=False. Leave it out, or say outputs={[n for n in names if n not in _UNNAMED]}."
-            )
-        return [name for name in names if name not in _UNNAMED]
+        names = [name for name in places if name not in (*taken, *_UNNAMED)]
+        for place, name in enumerate(places):
+            if name in _UNNAMED and name not in taken:
+                self.refuse(
+                    f"column {place + 1} has no name, as the index of a table that was written without index=False. "
+                    f"Leave it out, or say by outputs= which of {preview(names)} are movements."
+                )
+        return names
 
     def _likely_time(self, time: str, places: Mapping[str, Any]) -> str:
         """The only column whose name is one of times."""
         likely = [name for name in places if re.search(r"(?i)time|stamp|^t$|^sec|^t_", name)]
         if len(likely) == 1:
-            self.refuse(f"no column {time!r}: say time={likely[0]!r}, if that is it.")
+            self.refuse(f"no column {time!r} among {preview([*places])}: say time={likely[0]!r}, if that is it.")
         return likely[0] if len(likely) == 1 else time
 
     def refuse(self, message: str) -> None:
@@ -213,6 +204,15 @@ class Wanted:
         return column(chosen.time) if chosen.time else None, position
 
 
+def _require_columns(names: Sequence[str], places: Mapping[str, Any], none: str = "") -> None:
+    absent = [f"no column {name!r}" for name in names if name not in places] or ([] if names else [none])
+    if any(absent):
+        raise ValueError(
+            f"{absent[0]} among {preview([*places])}. Name the columns by the options demo=, time= (or rate=, in Hz, "
+            "where there are no times) and outputs=."
+        )
+
+
 OPTIONS = tuple(field.name for field in fields(Wanted) if field.name != "notes")
 """Names of the options that all formats have."""
 
@@ -265,13 +265,13 @@ def check_movements(names: Sequence[str], positions: Sequence[Floats]) -> dict[s
             2 <= len(rises) <= len(step) / _FEWEST_COUNTED and (step[rises] == 1.0).all()
         )
         if counts or numbers:
-            remedy = f"say which columns are: outputs={[n for n in names if n != name]}"
-            remedy += f", and demo={name!r} if it tells the demonstrations apart" if numbers else ""
-            found[name] = (
-                f"column {name!r}: it {'counts rows' if counts else 'numbers demonstrations'}, and is no movement. "
-                f"Leave it out, or {remedy}."
-            )
-    return found
+            found[name] = "counts rows" if counts else "numbers demonstrations"
+    kept = [name for name in names if name not in found]
+    return {
+        name: f"column {name!r}: it {what}, and is no movement. Leave it out, or say which columns are: outputs={kept}"
+        + (f", and demo={name!r} if it tells the demonstrations apart." if what.startswith("numbers") else ".")
+        for name, what in found.items()
+    }
 
 
 def natural(name: str) -> list[tuple[int, str]]:
