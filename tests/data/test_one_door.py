@@ -266,11 +266,20 @@ def test_loader_options_are_on_the_command_line_and_in_yaml(tmp_path, capsys):
     assert main(["fit", "--config", str(tmp_path / "run.yaml"), *FIT, *output]) == 0
     capsys.readouterr()
     assert main(arguments) == 1
-    assert "no column 'time' among [trial, stamp, px, py, note]" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "no column 'time' among [trial, stamp, px, py, note]: say time='stamp', if that is it" in told
+    assert "Here an option= is --loader.option." in told
     assert main([*arguments, "--loader.outpust", "px"]) == 2
     assert "no option 'outpust'; did you mean 'outputs'?" in capsys.readouterr().err
     assert main(["fit", "--data", str(tmp_path / "gone_*.csv"), *FIT, *output]) == 2
     assert "matches no file" in capsys.readouterr().err
+
+
+def test_marks_are_given_on_the_command_line_as_they_are(tmp_path, capsys):
+    (tmp_path / "set.csv").write_text("time|x\n0|1,0\n1|2,5\n2|4,0\n")
+    options = ["--loader.decimal", ",", "--loader.delimiter", "|", "--output", str(tmp_path / "out")]
+    assert main(["inspect", str(tmp_path / "set.csv"), *options]) == 0
+    assert "x       none      1        4       3" in capsys.readouterr().out
 
 
 def test_nothing_is_said_of_good_files(tmp_path):

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from argparse import Namespace
 from collections.abc import Sequence
 from itertools import takewhile
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from torch_pbd.cli import options
 from torch_pbd.cli.options import MODELS, Option, made
 from torch_pbd.console import say
-from torch_pbd.exceptions import ConfigError
+from torch_pbd.exceptions import ConfigError, DataFormatError
 from torch_pbd.registry import MOVEMENTS
 
 if TYPE_CHECKING:
@@ -264,6 +265,9 @@ def _loaded(options: Any, *, inspect: bool = False) -> Any:
         return (inspect_demonstrations if inspect else load_demonstrations)(options.data, **loader)
     except TypeError as error:
         raise ConfigError(f"loader: {error}") from error
+    except DataFormatError as error:
+        here = " Here an option= is --loader.option." if re.search(r"\b[a-z_]+=", str(error)) else ""
+        raise DataFormatError(f"{error}{here}") from error
 
 
 def _name(files: Sequence[Path]) -> str:

@@ -235,6 +235,8 @@ def _read_text(text: str, hint: Any, place: Place) -> Any:
             if any(is_of(value, part) for part in parts if part is not str):
                 return value
         return str(text)
+    if hint is Any and len(text) == 1 and not text.isalnum():
+        return str(text)  # a mark, as the decimal one of a file, of which some mean something in YAML
     return read_yaml(text, ".".join(map(str, place.keys))).content
 
 
