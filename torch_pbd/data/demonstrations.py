@@ -195,6 +195,8 @@ class Demonstrations(Editing):
     def stack(self, input: Literal["time", "phase"] = "time") -> tuple[Floats, Floats, NDArray[np.intp]]:
         """All samples below each other, as scikit-learn's estimators want them.
 
+        Names, units, and that three outputs are a rotation stay behind: `DMPController.fit` takes demonstrations whole.
+
         Parameters
         ----------
         input : {"time", "phase"}, default="time"
