@@ -6,6 +6,7 @@ import re
 from array import array
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from math import inf, isfinite, isnan, nan
 from pathlib import Path
@@ -119,26 +120,22 @@ class _Table:
         own, stamps, times, values = array("q"), array("q"), array("d"), array("d")
         clocks = 0
         for line, cells in self._rows():
-            label = "" if demo is None else cells[demo].strip()
-            if demo is not None and not label:
-                raise ValueError(f"line {line}, column {self.header[demo]!r}: the cell is blank.")
-            values.extend(self._number(cells[i], line, self.header[i]) for i in outputs)
-            own.append(numbers.setdefault(label, len(numbers)))
-            if time is None:
-                continue
-            before, now = last.get(label, -inf), self._time(cells[time], line, self.header[time])
+            place = demo or 0
+            try:
+                label = "" if demo is None else _filled(cells[demo].strip())
+                own.append(numbers.setdefault(label, len(numbers)))
+                for place in outputs:
+                    values.append(self._number(cells[place]))
+                if time is None:
+                    continue
+                place, before = time, last.get(label, -inf)
+                now = self._time(cells[time], before, label)
+            except ValueError as error:
+                raise ValueError(f"line {line}, column {self.header[place]!r}: {error}") from error
             clocks += _is_clock(cells[time])
-            if now <= before:
-                raise ValueError(
-                    f"line {line}, column {self.header[time]!r}: {now!r} comes after {before!r} in demonstration "
-                    f"{label!r}: times must increase strictly. Sort the lines by time and drop repeated ones"
-                    f"{', or name the column that tells the demonstrations apart, demo=' if demo is None else ''}."
-                    f"{nanoseconds_hint(now)}"
-                )
             last[label] = before if isnan(now) else now
             times.append(float(now))
-            if isinstance(now, int):
-                stamps.append(now)
+            stamps.extend([now] if isinstance(now, int) else ())
         rows = np.array(values).reshape(len(own), len(outputs))
         signals = {} if demo is None else {self.header[demo]: np.array(own)}
         signals |= {self.header[i]: column for i, column in zip(outputs, rows.T, strict=True)}
@@ -156,48 +153,55 @@ class _Table:
         return None if chosen.demo is None else place(chosen.demo), time, [place(name) for name in chosen.names]
 
     def _rows(self) -> Iterator[tuple[int, list[str]]]:
-        reader = csv.reader(self.file, delimiter=self.delimiter)
-        while True:
-            line = reader.line_num + self.n_before + 1  # of its beginning: a quoted cell may go on for several
-            try:
-                cells = next(reader, None)
-            except csv.Error as error:
-                raise ValueError(f"line {line}: {error}.") from error
-            if cells is None:
-                return
-            if cells and len(cells) != len(self.header):
-                raise ValueError(
-                    f"line {line}: {len(cells)} cells under {len(self.header)} column names (delimiter "
-                    f"{self.delimiter!r}, decimal mark {self.decimal!r})."
-                )
-            if cells:
-                yield line, cells
+        """Cells of each line that has some, with the number of the line: a quoted cell may go on for several."""
+        reader, line = csv.reader(self.file, delimiter=self.delimiter), self.n_before + 1
+        try:
+            for cells in reader:
+                if cells and len(cells) != len(self.header):
+                    raise ValueError(
+                        f"line {line}: {len(cells)} cells under {len(self.header)} column names (delimiter "
+                        f"{self.delimiter!r}, decimal mark {self.decimal!r})."
+                    )
+                if cells:
+                    yield line, cells
+                line = self.n_before + reader.line_num + 1
+        except csv.Error as error:
+            raise ValueError(f"line {line}: {error}.") from error
 
-    def _time(self, cell: str, line: int, column: str) -> float | int:
+    def _time(self, cell: str, before: float, label: str) -> float | int:
         """Time of a cell: an integer where float64 does not hold it, as of stamps in ns, and of dates and clocks."""
-        if _is_clock(cell):
-            return _clock_ns(cell, line, column)
-        time = self._number(cell, line, column)
-        stamp = int(cell) if abs(time) >= 2**53 and re.fullmatch(r"\s*[+-]?\d{16,19}\s*", cell) else 0
-        return stamp if 2**53 <= abs(stamp) < 2**63 else time
+        now: float | int = _clock_ns(cell) if _is_clock(cell) else self._number(cell)
+        if abs(now) >= 2**53 and re.fullmatch(r"[+-]?\d{16,19}", cell.strip()) and abs(int(cell)) < 2**63:
+            now = int(cell)
+        if now <= before:
+            apart = "" if self.chosen.demo else ", or name the column that tells the demonstrations apart, demo="
+            raise ValueError(
+                f"{now!r} comes after {before!r} in demonstration {label!r}: times must increase strictly. Sort the "
+                f"lines by time and drop repeated ones{apart}.{nanoseconds_hint(now)}"
+            )
+        return now
 
-    def _number(self, cell: str, line: int, column: str) -> float:
+    def _number(self, cell: str) -> float:
         text, foreign = cell.strip(), "_" if self.decimal == "." else "_."
         if self.wanted.missing == "drop" and text.lower() in _MISSING:
             return nan
-        try:
+        value = nan
+        with suppress(ValueError):
             # Python reads 1_0 as ten.
             value = nan if any(mark in text for mark in foreign) else float(text.replace(self.decimal, "."))
-        except ValueError:
-            value = nan
         if not isfinite(value):
             what = f"{text!r} is not a finite number" if text else "the cell is blank"
             raise ValueError(
-                f"line {line}, column {column!r}: {what} (decimal mark {self.decimal!r}). Drop the line "
-                "(missing='drop' does, where the cell is blank or nan), fill the value in, or leave the column out by "
-                "outputs=."
+                f"{what} (decimal mark {self.decimal!r}). Drop the line (missing='drop' does, where the cell is blank "
+                "or nan), fill the value in, or leave the column out by outputs=."
             )
         return value
+
+
+def _filled(label: str) -> str:
+    if not label:
+        raise ValueError("the cell is blank.")
+    return label
 
 
 def _numbered(labels: NDArray[Any]) -> NDArray[np.int32] | None:
@@ -213,27 +217,24 @@ def _numbered(labels: NDArray[Any]) -> NDArray[np.int32] | None:
 def _open_table(file: TextIO, delimiter: str | None, decimal: str, wanted: Wanted) -> _Table:
     """Read the header; the delimiter is the one that finds the columns wanted, and most columns."""
     first, n_before = _header_line(file)
-    if len(first) == _LONGEST_HEADER:
-        raise ValueError(f"line {n_before}: it is longer than {_LONGEST_HEADER} characters; it must name the columns.")
     candidates = [delimiter] if delimiter else [mark for mark in DELIMITERS if mark != decimal]
     try:
+        if len(first) == _LONGEST_HEADER:
+            raise ValueError(f"it is longer than {_LONGEST_HEADER} characters; it must name the columns.")
         headers = [[name.strip() for name in next(csv.reader([first], delimiter=c), [])] for c in candidates]
-    except csv.Error as error:
-        raise ValueError(f"line {n_before}: {error}.") from error
-    # A mark that is not the delimiter finds one column, or cuts names that hold it.
-    sought = {name for name in (wanted.demo, wanted.time or "time", *(wanted.outputs or ())) if name is not None}
-    header = max(headers, key=lambda names: (len(sought & set(names)), len(names)))
-    if first.startswith("# format:"):
-        raise ValueError(f"line 1: no columns of demonstrations, but {first.strip()!r:.80}. {LOADERS}")
-    twice = [name for name, count in Counter(header).items() if name and count > 1]
-    if twice:
-        raise ValueError(f"line {n_before}: there are two columns {twice[0]!r}.")
-    try:
+        # A mark that is not the delimiter finds one column, or cuts names that hold it.
+        sought = {wanted.demo, wanted.time or "time", *(wanted.outputs or ())}
+        header = max(headers, key=lambda names: (len(sought & set(names)), len(names)))
+        if first.startswith("# format:"):
+            raise ValueError(f"no columns of demonstrations, but {first.strip()!r:.80}. {LOADERS}")
+        twice = [name for name, count in Counter(header).items() if name and count > 1]
+        if twice:
+            raise ValueError(f"there are two columns {twice[0]!r}.")
         chosen = wanted.choose({name: (name,) for name in header}, demo="demo", time="time")
-    except ValueError as error:
-        raise ValueError(f"line {n_before}: {error}") from error
-    if chosen.names and [*filter(_is_number, header)]:
-        raise ValueError(f"line {n_before}: it must name the columns, and has numbers: {preview(header)}.")
+        if any(map(_is_number, header)):
+            raise ValueError(f"it must name the columns, and has numbers: {preview(header)}.")
+    except (ValueError, csv.Error) as error:
+        raise ValueError(f"line {n_before}: {str(error).rstrip('.')}.") from error
     return _Table(file, header, n_before, candidates[headers.index(header)], decimal, chosen, wanted)
 
 
@@ -260,12 +261,9 @@ def _is_clock(cell: str) -> bool:
     return _CLOCK.fullmatch(cell.strip()) is not None
 
 
-def _clock_ns(cell: str, line: int, column: str) -> int:
+def _clock_ns(cell: str) -> int:
     """Nanoseconds of a date and time of day, since 1970, or of a time of day, since midnight."""
     day, hours, minutes, seconds, fraction = _CLOCK.fullmatch(cell.strip()).groups()  # type: ignore[union-attr]
-    try:
-        days = int(np.datetime64(day or "1970-01-01", "D").astype(int))
-    except ValueError as error:
-        raise ValueError(f"line {line}, column {column!r}: {error}.") from error
+    days = int(np.datetime64(day or "1970-01-01", "D").astype(int))
     whole = days * 86_400 + int(hours) * 3600 + int(minutes) * 60 + int(seconds or 0)
     return whole * 10**9 + int((fraction or "0").ljust(9, "0"))
