@@ -37,38 +37,35 @@ def read(path: Path, wanted: Wanted) -> Arguments:
             raise ValueError(f"x has shape {positions.shape}, must have shape (K, T, d).")
     else:
         numbers = range(_count(members))
-        times = [_read(members, f"t_{k}") for k in numbers]
-        positions = [_read(members, f"x_{k}") for k in numbers]
-    n_demos, n_outputs = len(positions), np.shape(positions[0])[-1] if len(positions) else 0
-    for key, count in {"K": n_demos, "d": n_outputs}.items():
+        times, positions = ([_read(members, f"{letter}_{k}") for k in numbers] for letter in "tx")
+    n_outputs = np.shape(positions[0])[-1] if len(positions) else 0
+    for key, count in {"K": len(positions), "d": n_outputs}.items():
         if meta.get(key, count) != count:
             raise ValueError(f"meta says {key} = {meta[key]}, but the arrays have {count}.")
     for option in ("demo", "time", "rate"):
         if getattr(wanted, option) is not None:
             raise ValueError(f"{option} is {getattr(wanted, option)!r}, but arrays t and x say it: leave it out.")
-    # Public recordings say unit and t_unit, with a remark in brackets: "s (100 Hz)".
-    found = {
+    names, units, reference = meta.get("dims"), _units(meta), meta.get("rotation_reference")
+    if wanted.outputs is not None:
+        every, units = as_names(names, n_outputs), as_units(units, n_outputs)
+        chosen = wanted.choose({name: (name,) for name in every}).names
+        names, reference = with_whole_rotation(chosen, every, reference)
+        kept = [every.index(name) for name in names]
+        positions, units = [position[:, kept] for position in positions], units and [units[i] for i in kept]
+    return {
         "times": times,
         "positions": positions,
-        "names": meta.get("dims"),
-        "units": _units(meta),
+        "names": names,
+        "units": units if wanted.units is None else wanted.units,
         "frame": wanted.frame or _text(meta, "frame"),
+        # Public recordings say unit and t_unit, with a remark in brackets: "s (100 Hz)".
         "time_unit": wanted.time_unit or _text(meta, "time_unit") or _without_remark(_text(meta, "t_unit")) or "s",
         "alignment": meta.get("alignment"),
         "missing": wanted.missing,
         "rotation": wanted.rotation,
         "angles": wanted.angles,
-        "rotation_reference": meta.get("rotation_reference"),
+        "rotation_reference": reference,
     }
-    if wanted.outputs is not None:
-        names = as_names(found["names"], n_outputs)
-        chosen = wanted.choose({name: (name,) for name in names}).names
-        outputs, found["rotation_reference"] = with_whole_rotation(chosen, names, found["rotation_reference"])
-        kept = [names.index(name) for name in outputs]
-        units = as_units(found["units"], n_outputs)
-        found |= {"positions": [position[:, kept] for position in positions], "names": outputs}
-        found |= {"units": units and [units[i] for i in kept]}
-    return found | ({} if wanted.units is None else {"units": wanted.units})
 
 
 def read_array_file(path: Path, wanted: Wanted) -> Arguments:
@@ -97,12 +94,10 @@ def _of_laboratory(arrays: Mapping[str, NDArray[Any]], wanted: Wanted) -> Argume
             raise ValueError(
                 f"its arrays fit no layout, (K, T, d), or (T, d) each of equal d, or (T,): {shapes}. {LOADERS}"
             )
-    columns = {
-        name: (name,)
-        if array.ndim == 1
-        else tuple(f"{name}{'' if name == 'y' else '_'}{i}" for i in range(array.shape[1]))
-        for name, array in recordings[0].items()
-    }
+    columns: dict[str, tuple[str, ...]] = {name: (name,) for name in recordings[0]}
+    for name, array in recordings[0].items():
+        if array.ndim == 2:
+            columns[name] = tuple(f"{name}{'' if name == 'y' else '_'}{i}" for i in range(array.shape[1]))
     time = next((name for name in ("time", "t") if columns.get(name) == (name,)), "time")
     try:
         return wanted.read_each(wanted.choose(columns, time=time), recordings)
