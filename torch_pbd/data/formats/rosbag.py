@@ -6,7 +6,7 @@ from dataclasses import replace
 from itertools import chain
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,39 +16,26 @@ from torch_pbd.data.recordings import MIN_SAMPLES, preview
 from torch_pbd.data.wanted import Arguments, Wanted, rows_of
 from torch_pbd.extras import optional
 
-_XYZ, _XYZW = ("x", "y", "z"), ("x", "y", "z", "w")
-
-
-class _Field(NamedTuple):
-    """A field that is an output: the components of a message's part, their names and unit."""
-
-    path: str
-    components: tuple[str, ...]
-    unit: str
-
-
 _POSITION, _ROTATION = "position", "orientation"
-# Fields by message type, the first the outputs by default; the units are those that ROS prescribes (REP 103).
-_FIELDS: dict[str, dict[str, _Field]] = {
-    "Point": {_POSITION: _Field("", _XYZ, "m")},
-    "Pose": {_POSITION: _Field("position", _XYZ, "m"), _ROTATION: _Field("orientation", _XYZW, "1")},
-    "Transform": {_POSITION: _Field("translation", _XYZ, "m"), _ROTATION: _Field("rotation", _XYZW, "1")},
-    "Wrench": {"force": _Field("force", _XYZ, "N"), "torque": _Field("torque", _XYZ, "N m")},
-    "Twist": {"linear": _Field("linear", _XYZ, "m/s"), "angular": _Field("angular", _XYZ, "rad/s")},
+# Fields that are outputs by message type, the first by default: where they lie in it, the names of their components,
+# and the unit that ROS prescribes (REP 103).
+_FIELDS = {
+    "Point": {_POSITION: ("", "xyz", "m")},
+    "Pose": {_POSITION: ("position.", "xyz", "m"), _ROTATION: ("orientation.", "xyzw", "1")},
+    "Transform": {_POSITION: ("translation.", "xyz", "m"), _ROTATION: ("rotation.", "xyzw", "1")},
+    "Wrench": {"force": ("force.", "xyz", "N"), "torque": ("torque.", "xyz", "N m")},
+    "Twist": {"linear": ("linear.", "xyz", "m/s"), "angular": ("angular.", "xyz", "rad/s")},
 }
 # Where the part that has the fields lies in a message.
 _PARTS = {
-    "geometry_msgs/msg/PointStamped": ("Point", "point"),
-    "geometry_msgs/msg/PoseStamped": ("Pose", "pose"),
-    "geometry_msgs/msg/PoseWithCovarianceStamped": ("Pose", "pose.pose"),
-    "nav_msgs/msg/Odometry": ("Pose", "pose.pose"),
-    "geometry_msgs/msg/TransformStamped": ("Transform", "transform"),
-    "geometry_msgs/msg/WrenchStamped": ("Wrench", "wrench"),
-    "geometry_msgs/msg/TwistStamped": ("Twist", "twist"),
-    "geometry_msgs/msg/Pose": ("Pose", ""),
-    "geometry_msgs/msg/Point": ("Point", ""),
-    "geometry_msgs/msg/Wrench": ("Wrench", ""),
-    "geometry_msgs/msg/Twist": ("Twist", ""),
+    "geometry_msgs/msg/PointStamped": ("Point", "point."),
+    "geometry_msgs/msg/PoseStamped": ("Pose", "pose."),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": ("Pose", "pose.pose."),
+    "nav_msgs/msg/Odometry": ("Pose", "pose.pose."),
+    "geometry_msgs/msg/TransformStamped": ("Transform", "transform."),
+    "geometry_msgs/msg/WrenchStamped": ("Wrench", "wrench."),
+    "geometry_msgs/msg/TwistStamped": ("Twist", "twist."),
+    **{f"geometry_msgs/msg/{kind}": (kind, "") for kind in ("Pose", "Point", "Wrench", "Twist")},
 }
 _JOINTS, _TRANSFORMS = "sensor_msgs/msg/JointState", ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _KINDS = (*_PARTS, _JOINTS, *_TRANSFORMS)
@@ -110,24 +97,20 @@ def _listed(topics: dict[str, Any]) -> str:
 
 def _topic(topics: dict[str, Any], topic: str | None) -> str:
     """Topic wanted, or the only one with a movement."""
-    if topic is not None:
-        if topic not in topics:
-            raise ValueError(f"it has no topic {topic!r}; it has: {_listed(topics)}.")
-        found = [topic]
-    else:
-        found = [n for n, info in topics.items() if info.msgtype in _KINDS and info.msgcount]
-    if len(found) != 1:
-        what = (
-            "several topics of movements: say which by" if found else "no topic of poses, joints or forces to take by"
-        )
-        raise ValueError(f"it has {what} topic=; it has: {_listed(topics)}.")
-    info = topics[found[0]]
-    if info.msgtype not in _KINDS:
+    moving = [name for name, info in topics.items() if info.msgtype in _KINDS and info.msgcount]
+    if topic is None:
+        if len(moving) != 1:
+            several = "several topics of movements: say which by"
+            what = several if moving else "no topic of poses, joints or forces to take by"
+            raise ValueError(f"it has {what} topic=; it has: {_listed(topics)}.")
+        return moving[0]
+    if topic not in topics:
+        raise ValueError(f"it has no topic {topic!r}; it has: {_listed(topics)}.")
+    if topics[topic].msgtype not in _KINDS:
         known = ", ".join(sorted(kind.split("/")[-1] for kind in _KINDS))
-        raise ValueError(
-            f"topic {found[0]!r} is of {info.msgtype}, must be of one of {known}; it has: {_listed(topics)}."
-        )
-    return found[0]
+        kind = topics[topic].msgtype
+        raise ValueError(f"topic {topic!r} is of {kind}, must be of one of {known}; it has: {_listed(topics)}.")
+    return topic
 
 
 def _read_messages(
@@ -190,14 +173,16 @@ Getter = Callable[[list[tuple[str, int]]], Callable[[Any], Any]]
 
 def _parts(kind: str, part: str) -> tuple[dict[str, tuple[str, ...]], dict[str, str], Getter]:
     fields = _FIELDS[kind]
-    signals = {name: tuple(_column(name, letter) for letter in field.components) for name, field in fields.items()}
+
+    def column(field: str, letter: str) -> str:
+        return {_POSITION: letter, _ROTATION: f"q{letter}"}.get(field, f"{field}_{letter}")
 
     def get(places: list[tuple[str, int]]) -> Callable[[Any], Any]:
-        paths = [".".join(filter(None, (part, fields[s].path, fields[s].components[i]))) for s, i in places]
-        get_all = attrgetter(*paths)
-        return get_all if len(paths) > 1 else lambda message: (get_all(message),)
+        get_all = attrgetter(*(part + fields[field][0] + fields[field][1][i] for field, i in places))
+        return get_all if len(places) > 1 else lambda message: (get_all(message),)
 
-    return signals, {name: field.unit for name, field in fields.items()}, get
+    signals = {name: tuple(column(name, letter) for letter in letters) for name, (_, letters, _) in fields.items()}
+    return signals, {name: unit for name, (_, _, unit) in fields.items()}, get
 
 
 def _joints(message: Any) -> tuple[dict[str, tuple[str, ...]], dict[str, str], Getter]:
@@ -214,11 +199,6 @@ def _joints(message: Any) -> tuple[dict[str, tuple[str, ...]], dict[str, str], G
         return row
 
     return signals or {_POSITION: ()}, _JOINT_UNITS, get
-
-
-def _column(field: str, letter: str) -> str:
-    """Name of an output: x of positions, q of rotations, else with the field."""
-    return {_POSITION: letter, _ROTATION: f"q{letter}"}.get(field, f"{field}_{letter}")
 
 
 def _in_order(recordings: list[tuple[NDArray[Any], NDArray[Any]]]) -> list[tuple[NDArray[Any], NDArray[Any]]]:
