@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from torch_pbd.checks import Floats
 from torch_pbd.data.alignment import check_overlap
-from torch_pbd.data.pauses import extents, still
+from torch_pbd.data.sampling import extents, still
 from torch_pbd.data.units import ANGLES, LENGTHS, TIMES, quaternions
 from torch_pbd.exceptions import InvalidParameterError
 
@@ -54,24 +53,24 @@ class Description:
 
 def describe(demonstrations: Any, notes: Sequence[str] = ()) -> Description:
     """Description of `torch_pbd.data.Demonstrations`; ``notes`` are mistakes that were found on the way to them."""
-    second = 1.0 / TIMES.get(demonstrations.time_unit, 1.0)
     unit = demonstrations.time_unit
+    second = 1.0 / TIMES.get(unit, 1.0)
     recordings = []
     for k, (time, position) in enumerate(demonstrations):
         steps = np.diff(time)
-        first, last = _still_ends(time, position, extents(position, demonstrations), _PAUSE * second)
+        moves = ~still(time, position, extents(position, demonstrations), _PAUSE * second)
+        moving = time[moves] if moves.any() else time[-1:]
         row = {"#": k, "samples": len(time), f"start [{unit}]": time[0], f"lasts [{unit}]": time[-1] - time[0]}
         row |= {"rate [Hz]": second / np.median(steps), f"gap [{unit}]": steps.max()}
-        recordings.append(row | {"rest before": first, "rest after": last})
-    whole = [_column(demonstrations, i) for i in range(demonstrations.n_outputs)]
+        recordings.append(row | {"rest before": moving[0] - time[0], "rest after": time[-1] - moving[-1]})
     units = demonstrations.units or ["none"] * demonstrations.n_outputs
     outputs = [
         {"output": name, "unit": own, "least": y.min(), "largest": y.max(), "extent": np.ptp(y)}
-        for name, own, y in zip(demonstrations.names, units, whole, strict=True)
+        for name, own, y in zip(demonstrations.names, units, np.concatenate(demonstrations.positions).T, strict=True)
     ]
-    mistakes = (*notes, *_of_times(demonstrations, second), *_of_ends(demonstrations, recordings, unit))
-    mistakes = (*mistakes, *_of_outputs(demonstrations, outputs))
-    return Description(recordings, outputs, mistakes, _rotation(demonstrations))
+    mistakes = [*notes, *_of_times(demonstrations, second), *_of_ends(demonstrations, recordings, unit)]
+    mistakes += [*demonstrations.suspects, *_flips(demonstrations), *_of_outputs(demonstrations.units, outputs, notes)]
+    return Description(recordings, outputs, tuple(mistakes), _rotation(demonstrations))
 
 
 def _rotation(demonstrations: Any) -> str:
@@ -83,16 +82,6 @@ def _rotation(demonstrations: Any) -> str:
         f"Rotations are {', '.join(demonstrations.names[-3:])} around the quaternion w x y z of {reference}; the "
         f"furthest is {np.degrees(furthest):.0f} degrees from it."
     )
-
-
-def _column(demonstrations: Any, i: int) -> Floats:
-    return np.concatenate([position[:, i] for position in demonstrations.positions])
-
-
-def _still_ends(time: Floats, position: Floats, extent: Floats, pause: float) -> tuple[float, float]:
-    """Times at the beginning and at the end of a recording in which nothing moves."""
-    moving = np.flatnonzero(~still(time, position, extent, pause))
-    return (time[moving[0]] - time[0], time[-1] - time[moving[-1]]) if len(moving) else (time[-1] - time[0], 0.0)
 
 
 def _of_times(demonstrations: Any, second: float) -> Iterator[str]:
@@ -152,23 +141,16 @@ def _of_ends(demonstrations: Any, recordings: list[dict[str, Any]], unit: str) -
             )
 
 
-def _of_outputs(demonstrations: Any, outputs: list[dict[str, Any]]) -> Iterator[str]:
-    yield from demonstrations.suspects
-    yield from _flips(demonstrations)
+def _of_outputs(units: Any, outputs: list[dict[str, Any]], notes: Sequence[str]) -> Iterator[str]:
     extents = {row["output"]: row["extent"] for row in outputs}
-    if demonstrations.units is None:
-        largest = max(extents, key=lambda name: extents[name])
-        far = (
-            f" Output {largest} covers {extents[largest]:.4g}: as metres that is far, 'mm'?"
-            if extents[largest] > _FURTHEST
-            else ""
-        )
+    if units is None and not any("units=" in note for note in notes):
+        name, largest = max(extents.items(), key=lambda entry: entry[1])
+        far = f" Output {name} covers {largest:.4g}: as metres that is far, 'mm'?" if largest > _FURTHEST else ""
         yield f"The outputs have no units: give units=, as 'm', 'mm', 'rad', or one for each.{far}"
-    else:
-        for row in outputs:
-            metres = LENGTHS.get(row["unit"], 0.0) * row["extent"]
-            if metres > _FURTHEST or ANGLES.get(row["unit"], 0.0) * row["extent"] > 100.0:
-                yield f"Output {row['output']} covers {row['extent']:.4g} {row['unit']}: another unit? Give units=."
+    for row in outputs:
+        metres = LENGTHS.get(row["unit"], 0.0) * row["extent"]
+        if metres > _FURTHEST or ANGLES.get(row["unit"], 0.0) * row["extent"] > 100.0:
+            yield f"Output {row['output']} covers {row['extent']:.4g} {row['unit']}: another unit? Give units=."
     constant = [name for name, extent in extents.items() if extent == 0.0]
     if constant:
         yield f"{', '.join(constant)} never changes: leave it out, outputs={[n for n in extents if n not in constant]}."
@@ -194,18 +176,8 @@ def _numbers(numbers: list[int]) -> str:
 
 def _table(rows: list[dict[str, Any]]) -> str:
     """Text of rows with the same keys, at most 80 letters wide."""
-    cells = [[*rows[0]], *([_cell(value) for value in row.values()] for row in rows)]
-    widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
-    spare = 80 - sum(widths[1:]) - 2 * (len(widths) - 1)
-    widths[0] = min(widths[0], max(spare, 8))
-    return "\n".join(
-        "  ".join(
-            cell[:width].ljust(width) if i == 0 else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in cells
-    )
-
-
-def _cell(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    cells = [[*rows[0]], *([f"{v:.4g}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    widths[0] = min(widths[0], max(80 - sum(widths[1:]) - 2 * (len(widths) - 1), 8))
+    lines = ([row[0][: widths[0]].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])] for row in cells)
+    return "\n".join("  ".join(line).rstrip() for line in lines)

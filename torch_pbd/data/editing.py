@@ -7,7 +7,6 @@ import numpy as np
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.data.pauses import extents, still
 from torch_pbd.data.poses import (
     as_columns,
     charted,
@@ -19,6 +18,7 @@ from torch_pbd.data.poses import (
 )
 from torch_pbd.data.recordings import MIN_SAMPLES, as_texts, preview
 from torch_pbd.data.resampling import Resampling
+from torch_pbd.data.sampling import extents, still
 from torch_pbd.data.units import ANGLES, LENGTHS, TIMES, check_unit, find_suspects
 from torch_pbd.data.wanted import OPTIONS, Wanted, check_options
 from torch_pbd.exceptions import InvalidParameterError
