@@ -1,5 +1,7 @@
 """Recordings by one door: files as people have them, tables, what is made of demonstrations, the command line."""
 
+import dataclasses
+import inspect
 import subprocess
 import sys
 import warnings
@@ -13,6 +15,7 @@ import pytest
 
 from torch_pbd.cli.main import main
 from torch_pbd.data import Demonstrations, load_demonstrations, make_tunnel_demonstrations, save_demonstrations
+from torch_pbd.data.wanted import Wanted
 from torch_pbd.exceptions import DataFormatError, MissingDataWarning
 
 X = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 7.0]])
@@ -108,7 +111,7 @@ def test_folders_lists_and_patterns_are_one_recording_a_file(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"several formats, \.csv, \.npy: name those to read"):
         load_demonstrations(tmp_path)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(FileNotFoundError, match="no file of a known format"):
+    with pytest.raises(FileNotFoundError, match=r"no file of \.npz"):
         load_demonstrations(tmp_path / "empty")
     load_text(tmp_path, "time,x,z\n" + lines(0, 0.5, 1), "trial_99.csv")
     with pytest.raises(ValueError, match=r"parts\[12\] has names \('x', 'z'\), must be as parts\[0\]"):
@@ -273,6 +276,13 @@ def test_loader_options_are_on_the_command_line_and_in_yaml(tmp_path, capsys):
     assert "no option 'outpust'; did you mean 'outputs'?" in capsys.readouterr().err
     assert main(["fit", "--data", str(tmp_path / "gone_*.csv"), *FIT, *output]) == 2
     assert "matches no file" in capsys.readouterr().err
+
+
+def test_the_options_of_the_door_are_those_of_all_formats():
+    door = inspect.signature(load_demonstrations).parameters.values()
+    assert {p.name: p.default for p in door if p.kind is p.KEYWORD_ONLY} == {
+        field.name: field.default for field in dataclasses.fields(Wanted) if field.name != "notes"
+    }
 
 
 def test_marks_are_given_on_the_command_line_as_they_are(tmp_path, capsys):
