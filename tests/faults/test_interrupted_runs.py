@@ -173,7 +173,9 @@ def test_36_processes_keep_and_reuse_their_fits_too(data, tmp_path, monkeypatch)
 
 
 def test_36_an_experiment_goes_on_with_the_controllers_that_are_left(recorded, tmp_path, monkeypatch):
-    monkeypatch.setattr(robot, "_write", lambda run, name, _, folder, **__: folder.write_model(run.controller, name))
+    monkeypatch.setattr(RunFolder, "write_controller", lambda self, name, own, *_, **__: self.write_model(own, name))
+    for figure in ("task_figure", "variability_figure", "pushes_figure"):
+        monkeypatch.setattr(robot, figure, lambda *_, **__: None)
     skill = DMPController(GMMBaseline(n_components=2), n_steps=20)
     controllers = {"stiff": skill, "soft": clone(skill).set_params(alpha=16.0)}
     with RunFolder(tmp_path, {}) as folder, finished_fits(tmp_path / "finished", resume=False) as folder.finished:
