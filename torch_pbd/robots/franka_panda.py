@@ -50,7 +50,7 @@ def panda_mjcf(*, hand: bool = True, armature: float = 0.1, timestep: float = 1e
 
 
 def panda(*, hand: bool = True, armature: float = 0.1, timestep: float = 1e-3) -> Any:
-    """Franka Emika Panda as a ``mujoco.MjModel``, with the parameters of ``panda_mjcf``; needs the extra ``robot``.
+    """Franka Emika Panda as a ``mujoco.MjModel``, with the parameters of `panda_mjcf`; needs the extra ``robot``.
 
     Examples
     --------

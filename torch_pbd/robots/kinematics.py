@@ -132,7 +132,8 @@ def arm(model: Any, tool: str) -> Arm:
 def operational_inertia(model: Any, joints: ArrayLike, tool: str) -> Floats:
     """Inertia that is felt at the tool of an arm, ``Lambda = (J M^-1 J')^-1``, in world axes.
 
-    What ``Schedule.with_inertia`` takes: a torque-controlled arm that is pushed moves with it, not with 1 kg.
+    What `torch_pbd.control.Schedule.with_inertia` takes: a torque-controlled arm that is pushed moves with it, and not
+    with 1 kg.
 
     Parameters
     ----------

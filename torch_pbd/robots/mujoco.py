@@ -77,13 +77,13 @@ def run(
     Parameters
     ----------
     model : mujoco.MjModel
-        With one torque motor for each joint, in their order; ``torch_pbd.robots.panda`` is one.
+        With one torque motor for each joint, in their order; `torch_pbd.robots.panda` is one.
     schedule : Schedule
         Of poses, its rows the ticks of the controller: evenly spaced, at 1 kHz for stiff gains
         (``schedule.resample(1000.0)``), a whole number of the model's time steps apart.
     joints : array_like of shape (T, n)
-        Joint angles in rad along the schedule, from ``inverse_kinematics``: the arm starts at the first, at the
-        schedule's velocity.
+        Joint angles in rad along the schedule, from `torch_pbd.robots.inverse_kinematics`: the arm starts at the first,
+        at the schedule's velocity.
     tool : str, default="tool"
         Name of a site or body.
     wrench : array_like of shape (T, 6), default=None

@@ -74,7 +74,7 @@ def to_messages(schedule: Schedule, *, gains: Gains = "matrix") -> Iterator[tupl
 
 
 def to_bag(schedule: Schedule, path: str | os.PathLike[str], *, gains: Gains = "matrix") -> None:
-    """Write the messages of ``to_messages`` to a rosbag2: a new folder, which ``ros2 bag play`` publishes.
+    """Write the messages of `to_messages` to a rosbag2: a new folder, which ``ros2 bag play`` publishes.
 
     Parameters
     ----------
