@@ -18,6 +18,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
+from string import Template
 from typing import Any, Self
 
 from filelock import FileLock, Timeout
@@ -46,14 +47,6 @@ _CAPTIONS = {
     "figure": "What the model learned, over the data.",
 }
 """Caption of a figure, by a part of its name; the last is of all others."""
-
-_STYLE = """
-:root { color-scheme: light dark; --line: #8886; }
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }
-pre { font: 13px/1.4 ui-monospace, monospace; overflow-x: auto; border-left: 3px solid var(--line); padding-left: 1em }
-figure { margin: 2rem 0; } figcaption { margin-top: .4rem; }
-img { max-width: 100%; height: auto; background: white; }
-"""
 
 
 class RunFolder:
@@ -247,18 +240,17 @@ def write_report(folder: RunFolder, command: str, text: str) -> Path:
 
     Nothing in it is read from elsewhere, so that the page can be sent by itself.
     """
-    parts = [f"<h1>torch-pbd {html.escape(command)}</h1>", f"<pre>{html.escape(text)}</pre>"]
+    figures = []
     for path in folder.figures:
         data = base64.b64encode(path.read_bytes()).decode()
         shows = next(text for part, text in _CAPTIONS.items() if part in path.stem or part == "figure")
         caption = html.escape(f"{path.stem}: {shows}")
         picture = f'<img alt="{caption}" src="data:image/png;base64,{data}">'
-        parts.append(f"<figure>{picture}<figcaption>{caption}</figcaption></figure>")
-    lines = html.escape("\n".join(_next_steps(folder.path, command)))
-    parts.append(f"<h2>To go on</h2><pre>{lines}</pre>")
-    head = f'<meta charset="utf-8"><title>torch-pbd {html.escape(command)}</title><style>{_STYLE}</style>'
-    body = "\n".join(parts)
-    folder.write_text("index.html", f'<!doctype html><html lang="en"><head>{head}</head><body>{body}</body></html>\n')
+        figures.append(f"<figure>{picture}<figcaption>{caption}</figcaption></figure>")
+    texts = {"command": command, "text": text, "steps": "\n".join(_next_steps(folder.path, command))}
+    page = Template(Path(__file__).with_name("report.html").read_text(encoding="utf-8"))
+    escaped = {name: html.escape(part) for name, part in texts.items()}
+    folder.write_text("index.html", page.substitute(escaped, figures="\n".join(figures)))
     return folder.path / "index.html"
 
 
