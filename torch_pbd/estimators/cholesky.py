@@ -16,7 +16,7 @@ from torch_pbd.estimators.latent import (
     warn_if_stretched,
 )
 from torch_pbd.estimators.validation import Prior
-from torch_pbd.gp import LatentGP, LatentValues, Observations, condition, fit_together
+from torch_pbd.gp import LatentGP, Observations, condition, fit_together
 from torch_pbd.kernels import KernelName
 from torch_pbd.linalg import tril_to_vector
 from torch_pbd.models.cholesky import CholeskyCovariance, CholeskyLink, MeanAndCholesky, tril_deviation
@@ -203,14 +203,7 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
         amplitude = prior.square().sum(-1).mean(0).sqrt()[row]
         if log_diagonal:
             amplitude = torch.where(row == column, _LOG_AMPLITUDE, amplitude)
-        latent = LatentValues(
-            training.inputs,
-            start.expand(len(training.inputs), -1).mT.contiguous(),
-            amplitude,
-            self._default_length_scale(problem),
-            kernel=self.kernel,
-            train_hyperparameters=not self.latent_prior,
-        )
+        latent = self._latent_values(problem, start, amplitude)
         link, n_rows = CholeskyLink(problem.prior_tril, log_diagonal), len(residual)
         cost = Likelihood(link, training.scatter_root(residual), training.counts, 1.0 / n_rows)
         limits: Any = {"max_iter": self.max_iter, "tol": self.tol, "callback": self._progress()}

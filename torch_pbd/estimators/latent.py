@@ -17,7 +17,16 @@ from torch_pbd.estimators.torch_estimator import Fitted, Integers, Standardizati
 from torch_pbd.estimators.validation import Floats, check_length_scale, standardized_prior
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.files.memory import require_much
-from torch_pbd.gp import EvidenceSearch, LatentGP, Observations, condition, fit_together, resolved_length_scale, spacing
+from torch_pbd.gp import (
+    EvidenceSearch,
+    LatentGP,
+    LatentValues,
+    Observations,
+    condition,
+    fit_together,
+    resolved_length_scale,
+    spacing,
+)
 from torch_pbd.gp.search import Found
 from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky, scale_tril_from_root
@@ -175,13 +184,19 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         limits = self.max_inputs, self.n_restarts, max(100, self.max_iter)
         return EvidenceSearch(self.kernel, (shortest, longest), length_scale, noise_scale, *limits)
 
-    def _default_length_scale(self, problem: Problem) -> Tensor:
-        """Length scales (1, e) where they are not learned: a fifth of the range of the inputs, less beside a hole."""
-        n_features = problem.training.inputs.shape[1]
-        if problem.length_scale is not None:
-            return problem.length_scale[None]
-        longest = longest_covariance(problem.training.inputs)
-        return problem.training.inputs.new_full((1, n_features), min(0.2, longest) * n_features**0.5)
+    def _latent_values(self, problem: Problem, start: Tensor, amplitude: Tensor) -> LatentValues:
+        """Latent values at the inputs from where a likelihood is trained, ``start`` at one or at all of them.
+
+        Length scales that are not given are a fifth of the range of the inputs, and less beside a hole.
+        """
+        inputs, length_scale = problem.training.inputs, problem.length_scale
+        n_inputs, n_features = inputs.shape
+        if length_scale is None:
+            length_scale = inputs.new_full((n_features,), min(0.2, longest_covariance(inputs)) * n_features**0.5)
+        values, trained = start.expand(n_inputs, -1).mT.contiguous(), not self.latent_prior
+        return LatentValues(
+            inputs, values, amplitude, length_scale[None], kernel=self.kernel, train_hyperparameters=trained
+        )
 
     def _check_memory(self, n_distinct: int, n_features: int, n_outputs: int) -> None:
         n_inputs = min(n_distinct, self.max_inputs)

@@ -229,16 +229,8 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         inputs, n_outputs, prior_root = problem.training.inputs, centre.shape[-2], self._prior_root(problem)
         # A free L would grow while the whitened values shrink, and so escape their prior.
         matrix = torch.eye(n_outputs).to(inputs).requires_grad_(not self.latent_prior)
-        deviation = (start - centre).mT.flatten(-2).expand(len(inputs), -1).mT.contiguous()
         amplitude = centre.reshape(-1, n_outputs, self.df_).square().sum(-1).mean(0).sqrt().repeat(self.df_)
-        latent = gp.LatentValues(
-            inputs,
-            deviation,
-            amplitude,
-            self._default_length_scale(problem),
-            kernel=self.kernel,
-            train_hyperparameters=not self.latent_prior,
-        )
+        latent = self._latent_values(problem, (start - centre).mT.flatten(-2), amplitude)
         # Vectors that start equal, or at zero, stay so by symmetry: tell them apart.
         generator = check_random_state(self.random_state)
         noise = self._door(generator.standard_normal(latent.whitened.shape))
