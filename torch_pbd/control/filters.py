@@ -15,6 +15,10 @@ from dataclasses import dataclass
 from typing import final
 
 from torch_pbd import checks
+from torch_pbd.exceptions import InvalidParameterError
+
+MARGIN = 1e-13
+"""A share is smaller by this than the largest allowed, which pays for its own rounding: 2.2e-16, some hundred times."""
 
 
 class StiffnessFilter:
@@ -46,6 +50,21 @@ class RateLimit(StiffnessFilter):
 
     def __post_init__(self) -> None:
         checks.number(self.alpha, "alpha", above=0.0, unit="1/s", optional=True)
+
+    def constant(self, limit: float, softest: float) -> float:
+        """The constant a under the smallest eigenvalues of ``M^-1/2 D M^-1/2`` and of K in a schedule: checked."""
+        alpha = 0.5 * limit if self.alpha is None else self.alpha
+        if not 0.0 < alpha < limit:
+            raise InvalidParameterError(
+                f"alpha is {alpha:g} /s, must be above 0 and below {limit:g} /s, the smallest damping over mass of the "
+                "schedule: leave it None, or damp more."
+            )
+        if softest <= 0.0:
+            raise InvalidParameterError(
+                f"the smallest eigenvalue of stiffness is {softest:g} N/m, must be above zero for a rate limit: a free "
+                "axis has no equilibrium."
+            )
+        return alpha
 
 
 @final

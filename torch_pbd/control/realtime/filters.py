@@ -7,14 +7,11 @@ import numpy as np
 
 from torch_pbd import checks, rotations
 from torch_pbd.checks import Floats
-from torch_pbd.control.filters import EnergyTank, RateLimit, StiffnessFilter
+from torch_pbd.control.filters import MARGIN, EnergyTank, RateLimit, StiffnessFilter
 from torch_pbd.control.realtime.places import Vector, deviation
 from torch_pbd.control.realtime.steps import Scale, State, advance_apart, advance_with, coupled, expm1
 from torch_pbd.control.realtime.table import ScheduleTable
 from torch_pbd.exceptions import InvalidParameterError
-
-# A share is smaller by this than the largest allowed, which pays for its own rounding: 2.2e-16, a few hundred times.
-_MARGIN = 1e-13
 
 
 @final
@@ -129,7 +126,7 @@ class _Tank:
 
     def share(self, last: tuple[Floats, Floats], wanted: tuple[Floats, Floats], off: Floats, scales: Floats) -> float:
         asked = 0.5 * _quadratic(wanted[0] - last[0], off, scales)
-        return (1.0 - _MARGIN) * self.energy / asked if asked > self.energy else 1.0
+        return (1.0 - MARGIN) * self.energy / asked if asked > self.energy else 1.0
 
     def pay(self, rise: Floats, off: Floats, scales: Floats) -> None:
         self._take(0.5 * _quadratic(rise, off, scales))
@@ -178,7 +175,7 @@ class _Rate:
         except np.linalg.LinAlgError:  # of a tick so short that rounding hides what it pays
             return 0.0
         needed = float(np.linalg.eigvalsh(half @ rise @ half.T)[-1])
-        return (1.0 - _MARGIN) / needed if needed > 1.0 else 1.0
+        return (1.0 - MARGIN) / needed if needed > 1.0 else 1.0
 
     def pay(self, rise: Floats, off: Floats, scales: Floats) -> None:
         """Pay nothing: what a tick pays is told from its gains."""
@@ -197,20 +194,10 @@ def _rate_limit(wanted: Any, table: ScheduleTable, masses: Floats) -> _Rate:
             "the loop whether the damping pays for what turns or grows. Take EnergyTank()."
         )
     inverse = np.linalg.inv(np.linalg.cholesky(mass))
-    limit = float(np.linalg.eigvalsh(inverse @ table.damping @ inverse.T).min())
-    alpha = 0.5 * limit if wanted.alpha is None else wanted.alpha
-    if not 0.0 < alpha < limit:
-        raise InvalidParameterError(
-            f"alpha is {alpha:g} /s, must be above 0 and below {limit:g} /s, the smallest damping over mass of the "
-            "schedule: leave it None, or damp more."
-        )
-    softest = float(np.linalg.eigvalsh(table.stiffness).min())
-    if softest <= 0.0:
-        raise InvalidParameterError(
-            f"the smallest eigenvalue of stiffness is {softest:g} N/m, must be above zero for a rate limit: a free "
-            "axis has no equilibrium."
-        )
-    return _Rate(alpha, mass)
+    over_mass, softest = (
+        np.linalg.eigvalsh(each).min() for each in (inverse @ table.damping @ inverse.T, table.stiffness)
+    )
+    return _Rate(wanted.constant(float(over_mass), float(softest)), mass)
 
 
 def _quadratic(matrix: Floats, vector: Floats, scales: Floats | None = None) -> float:

@@ -1,5 +1,7 @@
 """Filters of the stiffness in the simulated robot, of many rollouts at a time."""
 
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -7,39 +9,64 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torch_pbd import checks
-from torch_pbd.control.filters import EnergyTank, RateLimit, StiffnessFilter
-from torch_pbd.control.simulation.gains import ActiveFilter, Gains, State, mass_at
-from torch_pbd.control.simulation.ticks import admittance_rate, transition
+from torch_pbd.control.filters import MARGIN, EnergyTank, RateLimit, StiffnessFilter
+from torch_pbd.control.simulation.ticks import State, admittance_rate, mass_at, transition
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.linalg import symmetrize
 
-# A share is smaller by this than the largest allowed, which pays for its own rounding: 2.2e-16, a few hundred times.
-_MARGIN = 1e-13
+
+@dataclass(frozen=True)
+class Gains:
+    """Stiffness and damping in effect, (..., d, d), and the share (...) of the step towards the wanted ones."""
+
+    stiffness: Tensor
+    damping: Tensor
+    share: Tensor
+
+
+class ActiveFilter(ABC):
+    """Filter of the gains in a run, of a robot of a mass (d, d), or of one for each tick (..., T, d, d)."""
+
+    tank_energy: Tensor | None = None
+    _gains: Gains | None = None
+    _turn: Tensor | None = None
+    _tick = -1
+
+    def __init__(self, mass: Tensor) -> None:
+        self._mass = mass
+
+    @abstractmethod
+    def select(self, stiffness: Tensor, damping: Tensor, deviation: Tensor) -> Gains:
+        """Gains for this tick, of the wanted ones (..., d, d) and the deviation (..., d) at its start."""
+
+    def carry(self, turn: Tensor) -> None:
+        """Take the gains along where the desired orientation turns, by a matrix (..., 3, 3), at the end of a tick."""
+        self._turn = turn
+
+    def _begin(self) -> tuple[Gains | None, Gains | None]:
+        """Gains of the last tick, as they were and as they are held on to in this one, that now begins."""
+        self._tick += 1
+        last, turn = self._gains, self._turn
+        if last is None or turn is None:
+            return last, last
+        d = last.stiffness.shape[-1]
+        whole = torch.eye(d).to(turn).repeat(*turn.shape[:-2], 1, 1)
+        whole[..., d - 3 :, d - 3 :] = turn
+        held = [symmetrize(whole @ gain @ whole.mT) for gain in (last.stiffness, last.damping)]
+        return last, Gains(held[0], held[1], last.share)
+
+    def settle(self, before: State, after: State, force: Tensor) -> None:  # noqa: B027 - most have nothing to note
+        """Take note of the tick: (deviation, velocity) at its start and end, and the force held in it."""
 
 
 def started(wanted: StiffnessFilter, stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> ActiveFilter:
-    """Begin a run over the wanted gains (..., T, d, d), of a mass (d, d) or (..., T, d, d).
-
-    They must allow the alpha of a rate limit, and be positive definite for one.
-    """
+    """Begin a run over the wanted gains (..., T, d, d), of a mass (d, d) or (..., T, d, d)."""
     if isinstance(wanted, EnergyTank):
         return _Tank(wanted, mass)
     rate_limit: RateLimit = checks.instance(wanted, "stiffness_filter", RateLimit)
     inverse = torch.linalg.inv(torch.linalg.cholesky(mass))
-    limit = float(torch.linalg.eigvalsh(symmetrize(inverse @ damping @ inverse.mT)).min())
-    alpha = 0.5 * limit if rate_limit.alpha is None else rate_limit.alpha
-    if not 0.0 < alpha < limit:
-        raise InvalidParameterError(
-            f"alpha is {alpha:g} /s, must be above 0 and below {limit:g} /s, the smallest damping over mass of the "
-            "schedule: leave it None, or damp more."
-        )
-    softest = float(torch.linalg.eigvalsh(stiffness).min())
-    if softest <= 0.0:
-        raise InvalidParameterError(
-            f"the smallest eigenvalue of stiffness is {softest:g} N/m, must be above zero for a rate limit: a free "
-            "axis has no equilibrium."
-        )
-    return _RateLimited(alpha, mass, dt)
+    limit = torch.linalg.eigvalsh(symmetrize(inverse @ damping @ inverse.mT)).min()
+    return _RateLimited(rate_limit.constant(float(limit), float(torch.linalg.eigvalsh(stiffness).min())), mass, dt)
 
 
 class _RateLimited(ActiveFilter):
@@ -88,7 +115,7 @@ class _RateLimited(ActiveFilter):
             )
         half = torch.linalg.solve_triangular(factor, end[..., :d, :].mT, upper=False)
         needed = torch.linalg.eigvalsh(symmetrize(half @ rise @ half.mT))[..., -1]
-        return torch.where(needed > 1.0, (1.0 - _MARGIN) / needed.clamp_min(1.0), 1.0)
+        return torch.where(needed > 1.0, (1.0 - MARGIN) / needed.clamp_min(1.0), 1.0)
 
 
 def lyapunov_matrix(
@@ -118,7 +145,7 @@ class _Tank(ActiveFilter):
             return self._gains
         asked = 0.5 * _quadratic(stiffness - last.stiffness, deviation)
         lacking = asked > self.tank_energy
-        share = torch.where(lacking, (1.0 - _MARGIN) * self.tank_energy / torch.where(lacking, asked, 1.0), 1.0)
+        share = torch.where(lacking, (1.0 - MARGIN) * self.tank_energy / torch.where(lacking, asked, 1.0), 1.0)
         self._gains = _partway(last, stiffness, damping, share)
         paid = 0.5 * _quadratic(self._gains.stiffness - last.stiffness, deviation)
         self.tank_energy = (self.tank_energy - paid).clamp(0.0, self._tank.energy_max)

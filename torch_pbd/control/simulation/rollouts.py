@@ -12,8 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torch_pbd.checks import Floats
-from torch_pbd.control.simulation.gains import State
-from torch_pbd.control.simulation.ticks import Loop, Task, block_length, block_responses
+from torch_pbd.control.simulation.ticks import Loop, State, Task, block_length, block_responses
 
 # Rollouts that move on together on a CPU: at d = 2 the forces, states and deviations of a block of them are 4 MB, which
 # stay in its cache.

@@ -5,7 +5,7 @@ matrix exponential is then exact, whatever its length; at its end the desired po
 position and the rotation from the desired orientation, and that moves on as :mod:`poses` says.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol, runtime_checkable
@@ -14,10 +14,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torch_pbd.control.simulation.gains import StartFilter, State, mass_at
 from torch_pbd.control.simulation.poses import Turning
 from torch_pbd.control.simulation.position_loop import PositionLoop
 from torch_pbd.control.simulation.sensor import ForceSensor
+
+State = tuple[Tensor, Tensor]
+"""Position and velocity (..., d)."""
 
 # Transitions that are computed together, which bounds the memory; a power of 2, as the lengths of blocks are.
 _MATRICES_AT_ONCE = 2**13
@@ -40,6 +42,11 @@ def admittance_rate(
 def transition(rate: Float[Tensor, "*b n n"], dt: float) -> Float[Tensor, "*b n n"]:
     """Map of ``[deviation, velocity, force]`` over a tick of ``dt`` s in which everything is held."""
     return torch.linalg.matrix_exp(rate * dt)
+
+
+def mass_at(mass: Tensor, ticks: int | slice) -> Tensor:
+    """Mass at some ticks, of one (d, d) or of those of all ticks (..., T, d, d)."""
+    return mass if mass.ndim == 2 else mass[..., ticks, :, :]
 
 
 @runtime_checkable
@@ -69,7 +76,7 @@ class Task:
     position_loop: PositionLoop | None
     environment: Environment | None
     substeps: int
-    stiffness_filter: StartFilter | None
+    stiffness_filter: Callable[..., Any] | None  # of the wanted gains, the mass and dt, to an `ActiveFilter`
     turning: Turning | None = None
 
     @property
