@@ -67,19 +67,6 @@ def check_overlap(times: Sequence[Floats], time_unit: str) -> None:
         )
 
 
-def on_common_phases(
-    times: Sequence[Floats], positions: Sequence[Floats], method: str, n: int, units: Sequence[str] | None
-) -> tuple[Floats, list[Floats]]:
-    """Grid of phases (n,) and positions (n, d) of each demonstration on it, as `Demonstrations.align` says."""
-    grid = np.linspace(0.0, 1.0, n)
-    phases = unit_phases(times)
-    warps = np.tile(grid, (len(times), 1))
-    if method == "dtw":
-        curves = np.stack(list(map(interpolate, phases, positions, warps)))
-        warps = dtw_warps(curves / _comparable_scale(curves, units))
-    return grid, list(map(interpolate, phases, positions, warps))
-
-
 def dtw_path(a: ArrayLike, b: ArrayLike) -> NDArray[np.intp]:
     """Pairs of samples that dynamic time warping matches between two curves.
 
@@ -131,7 +118,7 @@ def dtw_warps(curves: Floats) -> Floats:
     return np.stack([np.interp(grid, common, match) for match in matches])
 
 
-def _comparable_scale(curves: Floats, units: Sequence[str] | None) -> Floats:
+def comparable_scale(curves: Floats, units: Sequence[str] | None) -> Floats:
     """Divisor (d,) of each output of curves (K, n, d), after which distances over all of them mean something.
 
     One for all outputs of a unit, among which distances mean something before: axes may be turned.

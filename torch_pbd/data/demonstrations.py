@@ -11,8 +11,8 @@ from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.data.alignment import check_overlap, unit_phases
 from torch_pbd.data.editing import Editing
-from torch_pbd.data.poses import as_outputs, frozen, same_reference, unwrapped
-from torch_pbd.data.recordings import Missing, as_recordings, as_time_unit, preview
+from torch_pbd.data.poses import as_outputs, same_reference, unwrapped
+from torch_pbd.data.recordings import Missing, as_recordings, as_time_unit, frozen, preview
 from torch_pbd.data.resampling import Alignment
 from torch_pbd.data.units import find_suspects
 from torch_pbd.exceptions import InvalidParameterError
@@ -258,6 +258,11 @@ def _rebuild(times: Any, positions: Any, attributes: dict[str, Any]) -> Demonstr
     """Demonstrations made of others, whose labels were checked and whose suspects were warned of."""
     rebuilt = object.__new__(Demonstrations)
     times, positions = as_recordings(times, positions, "raise")
-    reference = frozen(attributes["rotation_reference"])
-    vars(rebuilt).update(attributes, times=times, positions=positions, rotation_reference=reference)
+    reference = attributes["rotation_reference"]
+    own = {
+        "times": times,
+        "positions": positions,
+        "rotation_reference": reference if reference is None else frozen(reference),
+    }
+    vars(rebuilt).update(attributes | own)
     return rebuilt

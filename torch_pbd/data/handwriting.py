@@ -9,8 +9,7 @@ from scipy.interpolate import BSpline, make_interp_spline
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.data.demonstrations import Demonstrations
-from torch_pbd.data.synthetic import Random, Seed, band_noise, generator
-from torch_pbd.files.memory import require_much
+from torch_pbd.data.synthetic import Random, Seed, band_noise, check_recording, column, generator
 
 Shape = Literal["C", "G", "J", "S", "W", "Z"]
 
@@ -107,16 +106,6 @@ def make_handwriting_demonstrations(
     return Demonstrations(times, positions, names=("x", "y"), units="m")
 
 
-def check_recording(n_demos: int, duration: float, rate: float, timing: float) -> None:
-    """Check what makers of demonstrations are told of their number and times."""
-    checks.count(n_demos, "n_demos")
-    checks.number(duration, "duration", above=0.0, unit="s")
-    checks.number(rate, "rate", above=0.0, unit="Hz")
-    checks.number(timing, "timing", least=0.0, below=0.5)
-    checks.number(duration * rate, "duration * rate, the number of steps,", least=2.0)
-    require_much(400.0 * n_demos * duration * rate, what=f"n_demos={n_demos}", remedy="Make fewer samples.")
-
-
 def paced(duration: float, rate: float, timing: float, random: Random) -> tuple[Floats, Floats]:
     """Times (T,) of a demonstration, and its phases: both its duration and its pace vary by ``timing``."""
     longer, pace = timing * random.normal(size=2)
@@ -156,7 +145,6 @@ def minimum_jerk(via_points: Floats) -> BSpline:
 
 def phases(phase: ArrayLike) -> Floats:
     """Phases (n,) from 0 to 1 of what was given as (n,) or (n, 1)."""
-    at = checks.real_floats(phase, "phase")
-    at = checks.array(at.reshape(-1, 1) if at.ndim < 2 else at, "phase", ("n", 1))[:, 0]
+    at = column(phase, "phase")
     checks.require((at >= 0.0) & (at <= 1.0), at, "phase", "from 0 to 1")
     return at

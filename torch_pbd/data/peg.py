@@ -6,9 +6,9 @@ from scipy.interpolate import BSpline
 
 from torch_pbd.checks import Floats
 from torch_pbd.data.demonstrations import Demonstrations
-from torch_pbd.data.handwriting import check_recording, minimum_jerk, paced, phases
+from torch_pbd.data.handwriting import minimum_jerk, paced, phases
 from torch_pbd.data.poses import QUATERNION
-from torch_pbd.data.synthetic import Seed, band_noise, generator
+from torch_pbd.data.synthetic import Seed, band_noise, check_recording, generator
 from torch_pbd.rotations import exp, matrix, multiply
 
 _HOLE = np.array([0.55, 0.15, 0.18])  # bottom of the hole in the frame of a robot's base, in m

@@ -9,7 +9,7 @@ import numpy as np
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.data.alignment import interpolate, unit_phases
-from torch_pbd.data.recordings import as_names, as_recordings, as_texts, as_units, preview
+from torch_pbd.data.recordings import as_names, as_recordings, as_texts, as_units, frozen, preview
 from torch_pbd.data.units import ANGLES, OFF_SPHERE
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.rotations import Chart, continuous, mean
@@ -116,15 +116,6 @@ def with_whole_rotation(chosen: Sequence[str], names: Sequence[str], reference: 
 def same_reference(one: Floats | None, other: Floats | None) -> bool:
     """True of two references that are equal to the last bit, and of none and none."""
     return one is other if one is None or other is None else np.array_equal(one, other)
-
-
-def frozen(reference: Any) -> Floats | None:
-    """Read-only copy of a reference."""
-    if reference is None:
-        return None
-    copy = np.array(reference, dtype=np.float64)
-    copy.setflags(write=False)
-    return copy
 
 
 def unwrapped(times: Any, positions: Any, names: Any, units: Any, angles: Any) -> list[Floats]:

@@ -40,7 +40,7 @@ def as_recordings(times: Any, positions: Any, missing: str) -> tuple[tuple[Float
     fresh = drop or isinstance(positions, Fresh)
     return (
         tuple(map(_rising, _from_common_origin(grids), grids, names, kept)),
-        tuple(_finite(_frozen(sample, fresh), k, kept[k]) for k, sample in enumerate(samples)),
+        tuple(_finite(frozen(sample, fresh), k, kept[k]) for k, sample in enumerate(samples)),
     )
 
 
@@ -196,7 +196,8 @@ def _longest_run(hole: NDArray[np.bool_]) -> int:
     return int((edges[1::2] - edges[::2]).max(initial=0))
 
 
-def _frozen(array: NDArray[Any], fresh: bool = False) -> Floats:
+def frozen(array: NDArray[Any], fresh: bool = False) -> Floats:
+    """Read-only array, a copy of one that is not fresh."""
     # A view would keep alive what it is a part of.
     copy = np.array(array, dtype=np.float64, order="C", copy=None if fresh and array.base is None else True)
     copy.setflags(write=False)
@@ -226,7 +227,7 @@ def _from_common_origin(grids: Arrays) -> Arrays:
 
 def _rising(grid: NDArray[Any], original: NDArray[Any], name: str, numbers: NDArray[np.intp]) -> Floats:
     """Times that rise strictly; messages show them as in ``original``."""
-    time = _frozen(grid)
+    time = frozen(grid)
     if not np.isfinite(time).all():
         i = int(np.argmin(np.isfinite(time)))
         raise InvalidParameterError(f"{name} is {time[i]} at sample {numbers[i]}, must be finite.")

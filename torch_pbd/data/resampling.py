@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.data.alignment import interpolate, on_common_phases, times_from_start
+from torch_pbd.data.alignment import comparable_scale, dtw_warps, interpolate, times_from_start, unit_phases
 from torch_pbd.data.recordings import MIN_SAMPLES
 from torch_pbd.data.sampling import LEAST_SAMPLES, smoothing_spline
 from torch_pbd.data.units import TIMES
@@ -108,7 +108,11 @@ class Resampling:
         units = self.units
         if units is None and self.rotation_reference is not None:
             units = (*[""] * (len(self.names) - 3), *["rad"] * 3)
-        grid, positions = on_common_phases(self.times, self.positions, method, n, units)
+        grid, phases = np.linspace(0.0, 1.0, n), unit_phases(self.times)
+        positions = [interpolate(own, position, grid) for own, position in zip(phases, self.positions, strict=True)]
+        if method == "dtw":
+            warps = dtw_warps(np.stack(positions) / comparable_scale(np.stack(positions), units))
+            positions = list(map(interpolate, phases, self.positions, warps))
         # Timing that was taken out stays out, whatever is done to the demonstrations afterwards.
         alignment = "dtw" if "dtw" in (method, self.alignment) else "phase"
         return self._replace(grid, positions, time_unit="1", alignment=alignment)

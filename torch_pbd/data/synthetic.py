@@ -31,7 +31,7 @@ def paper_mean(xi: ArrayLike) -> Floats:
 
     The inputs have shape (n,) or (n, 1), the result (n, 2).
     """
-    x = _column(xi)
+    x = column(xi, "xi")
     return np.column_stack([30.0 * np.sin(x / 20.0), 30.0 * np.tanh(x / 20.0)])
 
 
@@ -52,7 +52,7 @@ def paper_covariance(xi: ArrayLike, reading: Reading = "bell") -> Floats:
     ndarray of shape (n, 2, 2)
     """
     checks.choice(reading, "reading", Reading)
-    x = _column(xi)
+    x = column(xi, "xi")
     checks.require(x > -150.0, x, "xi", "above -150", "eq. (14) has a variance of xi + 150")
     exponent = {"printed": -2.0 * x / 50.0, "bell": -((x / 50.0) ** 2), "bowl": (x / 50.0) ** 2}[reading]
     covariance = np.zeros((len(x), 2, 2))
@@ -168,11 +168,7 @@ def make_tunnel_demonstrations(
         Outputs x and y in m, times in s.
     """
     checks.choice(variant, "variant", Variant)
-    checks.count(n_demos, "n_demos")
-    checks.number(duration, "duration", above=0.0, unit="s")
-    checks.number(rate, "rate", above=0.0, unit="Hz")
-    checks.number(duration * rate, "duration * rate, the number of steps,", above=0.5)  # rounded, it is one
-    require_much(400.0 * n_demos * duration * rate, what=f"n_demos={n_demos}", remedy="Make fewer samples.")
+    check_recording(n_demos, duration, rate, least_steps=0.5)
     random = generator(random_state)
     lanes = _lanes(n_demos, variant, random)
     times, positions = [], []
@@ -229,6 +225,16 @@ def _blend(along: Floats, common_start: bool, common_goal: bool) -> Floats:
     return result
 
 
+def check_recording(n_demos: int, duration: float, rate: float, timing: float = 0.0, least_steps: float = 2.0) -> None:
+    """Check what makers of demonstrations are told of their number and times."""
+    checks.count(n_demos, "n_demos")
+    checks.number(duration, "duration", above=0.0, unit="s")
+    checks.number(rate, "rate", above=0.0, unit="Hz")
+    checks.number(timing, "timing", least=0.0, below=0.5)
+    checks.number(duration * rate, "duration * rate, the number of steps,", least=least_steps)
+    require_much(400.0 * n_demos * duration * rate, what=f"n_demos={n_demos}", remedy="Make fewer samples.")
+
+
 def band_noise(time: Floats, low: float, high: float, random: Random, n_waves: int = 32) -> Floats:
     """Stationary noise of unit variance with frequencies between ``low`` and ``high``, in Hz.
 
@@ -245,7 +251,7 @@ def generator(random_state: Seed) -> Random:
     return random_state if isinstance(random_state, np.random.Generator) else checks.seed(random_state)
 
 
-def _column(xi: ArrayLike) -> Floats:
-    """Inputs (n,) of eq. (14), which has one."""
-    x = checks.real_floats(xi, "xi")
-    return checks.array(x.reshape(-1, 1) if x.ndim < 2 else x, "xi", ("n", 1))[:, 0]
+def column(values: ArrayLike, name: str) -> Floats:
+    """Inputs (n,) of what was given as (n,) or (n, 1)."""
+    x = checks.real_floats(values, name)
+    return checks.array(x.reshape(-1, 1) if x.ndim < 2 else x, name, ("n", 1))[:, 0]

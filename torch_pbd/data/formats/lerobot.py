@@ -1,7 +1,6 @@
 """LeRobot's data sets, versions 2 and 3: a folder of Parquet files, and what they hold in meta/."""
 
 import json
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -69,22 +68,18 @@ def _check_lengths(path: Path, episode: Any, opened: Any, wanted: Wanted) -> Non
     """Check that the episodes are as long as meta/ says: a missing file would be fewer demonstrations."""
     numbers, counts = np.unique(episode, return_counts=True)
     found = dict(zip(numbers.tolist(), counts.tolist(), strict=True))
-    said = dict(_said_lengths(path, opened, wanted))
+    said: dict[int, int] = {}
+    for name in (path / "meta" / "episodes").rglob("*.parquet"):
+        with opened(name) as file:
+            columns = read_columns(file, ["episode_index", "length"], wanted)
+            said |= dict(zip(columns["episode_index"].tolist(), columns["length"].tolist(), strict=True))
+    lines = path / "meta" / "episodes.jsonl"
+    if lines.is_file():
+        entries = map(json.loads, lines.read_text(encoding="utf-8").splitlines())
+        said |= {int(entry["episode_index"]): int(entry["length"]) for entry in entries}
     for number in sorted(said.keys() | found.keys()):
         if said.get(number) != found.get(number) and said:
             raise ValueError(
                 f"episode {number} has {found.get(number, 0)} samples in data/, but {said.get(number, 0)} by "
                 "meta/episodes: files are missing or cut."
             )
-
-
-def _said_lengths(path: Path, opened: Any, wanted: Wanted) -> Iterator[tuple[int, int]]:
-    for name in (path / "meta" / "episodes").rglob("*.parquet"):
-        with opened(name) as file:
-            columns = read_columns(file, ["episode_index", "length"], wanted)
-            yield from zip(columns["episode_index"].tolist(), columns["length"].tolist(), strict=True)
-    lines = path / "meta" / "episodes.jsonl"
-    if lines.is_file():
-        for line in lines.read_text(encoding="utf-8").splitlines():
-            entry = json.loads(line)
-            yield int(entry["episode_index"]), int(entry["length"])
