@@ -301,7 +301,7 @@ def test_66_70_all_recorded_sets_load_and_are_derived_without_a_word(name, recor
 
 def test_69_a_column_without_a_name_is_no_output(tmp_path):
     path = csv_of(tmp_path, as_table(tunnel()), index=True)
-    with pytest.raises(DataFormatError, match=r"column 1 has no name.*index=False.*outputs=\['x', 'y'\]"):
+    with pytest.raises(DataFormatError, match=r"column 1 has no name.*index=False.*outputs= which of \[x, y\]"):
         load_demonstrations(path)
     assert load_demonstrations(path, outputs=["x", "y"]).positions[0].shape == (101, 2)
     path.write_text("demo,time,x,\na,0,1.5,\na,1,2.5,\n")

@@ -173,23 +173,18 @@ class Editing(Resampling):
             check_unit(unit, "unit", LENGTHS | ANGLES)
             kind = next((kind for kind in (LENGTHS, ANGLES) if unit in kind), {})
             n_free = len(self.names) - 3 * (self.rotation_reference is not None)  # a rotation is in rad
-            if not set((units or ())[:n_free]) & set(kind):
-                must = f"of the kind of one of the outputs, which are in {units or 'no known units (give units=)'}"
+            units = tuple(unit if i < n_free and own in kind else own for i, own in enumerate(self.units or ()))
+            if unit not in units[:n_free]:
+                must = f"of the kind of one of the outputs, which are in {self.units or 'no known units (give units=)'}"
                 raise checks.refusal(unit, "unit", must)
-            changed = [i < n_free and own in kind for i, own in enumerate(units or ())]
-            own_units = [own if change else unit for own, change in zip(units or (), changed, strict=True)]
             positions = tuple(
-                np.column_stack([_convert(y, own, unit, kind) for y, own in zip(position.T, own_units, strict=True)])
-                for position in positions
+                np.column_stack([_convert(*column, kind) for column in zip(y.T, self.units or (), units, strict=True)])
+                for y in positions
             )
-            units = tuple(unit if change else own for own, change in zip(units or (), changed, strict=True))
         if time_unit is not None:
             if time_unit not in TIMES or self.time_unit not in TIMES:
-                raise checks.refusal(
-                    time_unit,
-                    "time_unit",
-                    f"one of {', '.join(TIMES)}, as that of these demonstrations, {self.time_unit}",
-                )
+                must = f"one of {', '.join(TIMES)}, as that of these demonstrations, {self.time_unit}"
+                raise checks.refusal(time_unit, "time_unit", must)
             times = tuple(_convert(time, self.time_unit, time_unit, TIMES) for time in times)
         return self._replace(times, positions, units=units, time_unit=time_unit or self.time_unit)
 
@@ -273,6 +268,6 @@ def _span(time: Floats, start_end: Any, i: int) -> tuple[int, int]:
 
 
 def _convert(values: Floats, unit: str, other: str, known: dict[str, float]) -> Floats:
-    """Values in another unit of the kind; whole numbers are divided by, as 1000 is exact and 0.001 is not."""
-    here, there = known[unit], known[other]
+    """Values in another unit, if it is of the kind; whole numbers are divided by, as 1000 is exact and 0.001 is not."""
+    here, there = known.get(unit, 1.0), known.get(other, 1.0)
     return values * (here / there) if here >= there else values / (there / here)

@@ -29,8 +29,18 @@ def as_recordings(times: Any, positions: Any, missing: str) -> tuple[tuple[Float
     """
     drop = checks.choice(missing, "missing", Missing) == "drop"
     samples = [_samples(entry, f"positions[{k}]", drop) for k, entry in enumerate(_as_list(positions, "positions"))]
-    grids, shared = _grids(times, len(samples), drop)
-    names = ["times" if shared else f"times[{k}]" for k in range(len(grids))]
+    stamps = _as_list(times, "times")
+    # Times are one array for all if the first entry is a number, and not an array of its own.
+    if _numbers(stamps[0], "times[0]", drop).ndim == 0:
+        names, grids = ["times"] * len(samples), [_grid(times, "times", drop)] * len(samples)
+    elif len(stamps) == len(samples):
+        names = [f"times[{k}]" for k in range(len(stamps))]
+        grids = [_grid(time, name, drop) for time, name in zip(stamps, names, strict=True)]
+    else:
+        raise InvalidParameterError(
+            f"times has {len(stamps)} arrays but positions has {len(samples)} demonstrations: give one time array for "
+            "each demonstration, or one 1-D array that all of them share."
+        )
     _check_shapes(grids, samples, names)
     kept = [np.arange(len(grid)) for grid in grids]
     if drop:
@@ -127,20 +137,6 @@ def _samples(values: Any, name: str, drop: bool) -> NDArray[Any]:
             "demonstration alone is written [positions]."
         )
     return samples
-
-
-def _grids(times: Any, n_demos: int, drop: bool) -> tuple[Arrays, bool]:
-    """Times of each demonstration, and whether they are one array that all of them share."""
-    # Times are one array for all if the first entry is a number, and not an array of its own.
-    stamps = _as_list(times, "times")
-    if _numbers(stamps[0], "times[0]", drop).ndim == 0:
-        return [_grid(times, "times", drop)] * n_demos, True
-    if len(stamps) != n_demos:
-        raise InvalidParameterError(
-            f"times has {len(stamps)} arrays but positions has {n_demos} demonstrations: give one time array for each "
-            "demonstration, or one 1-D array that all of them share."
-        )
-    return [_grid(time, f"times[{k}]", drop) for k, time in enumerate(stamps)], False
 
 
 def _grid(values: Any, name: str, drop: bool) -> NDArray[Any]:

@@ -112,9 +112,8 @@ def _wrapped(positions: Sequence[Floats], names: Sequence[str], units: Sequence[
     within = np.cumsum([len(position) for position in positions])[:-1] - 1  # steps from one demonstration to the next
     for i, (name, unit) in enumerate(zip(names, known, strict=True)):
         turns = {angle: 2.0 * math.pi / ANGLES[angle] for angle in (ANGLES if unit is None else {unit} & set(ANGLES))}
-        whole = max(position[:, i].max() for position in positions) - min(
-            position[:, i].min() for position in positions
-        )
+        ends = [[float(end(position[:, i])) for position in positions] for end in (np.max, np.min)]
+        whole = max(ends[0]) - min(ends[1])
         # Most outputs cover less than a turn, and are not looked at step by step.
         for angle, turn in turns.items() if whole >= (1.0 - _QUARTER) * min(turns.values(), default=math.inf) else ():
             step = np.delete(np.abs(np.diff(_column(positions, i))), within)

@@ -57,11 +57,11 @@ def _signals(cell: Any, place: str, step: float | None) -> dict[str, NDArray[Any
         raise ValueError(f"{place} has no matrices, but {preview([*cell])}.")
     # Time runs along the axis that all share: that of t, or the longer one of the positions.
     n = arrays["t"].size if "t" in arrays else max(arrays.get("pos", next(iter(arrays.values()))).shape)
-    signals = {}
-    for key, array in arrays.items():
-        if n in array.shape:
-            along = array.reshape(-1) if array.size == n else array if array.shape[0] == n else array.T
-            signals[key] = along
+    signals = {
+        key: array.reshape(-1) if array.size == n else array if array.shape[0] == n else array.T
+        for key, array in arrays.items()
+        if n in array.shape
+    }
     if "t" not in signals and step is not None:
         signals["t"] = np.arange(n) * step
     return signals
