@@ -22,20 +22,18 @@ MAX_HEADER_BYTES = 2**22
 
 _MAX_OUTER_BYTES = 4 * MAX_HEADER_BYTES  # the header of safetensors, in which ours is a string with escapes
 _COPIES = 3.0  # the file, the arrays in it, and one array's bytes under the checksum
-_TYPES = ["float64", "float32", "int64", "int32", "int16", "int8", "uint64", "uint32", "uint16", "uint8", "bool"]
 
 
 def write_checksummed(path: Path, key: str, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays of numbers or bools, and a header of what JSON can hold, to one file that is there whole or not.
+    """Write arrays of numbers, and a header of what JSON can hold, to one file that is there whole or not.
 
     ``key`` is the kind of the file: the name of the header in the metadata of safetensors. The header has
     ``format_version``; ``sha256`` is added to it.
 
-    Raises TypeError if an array is of another type or the header not for JSON, ValueError if it is longer than 4 MiB,
-    OSError, with the path, if the file cannot be written.
+    Raises TypeError if the header is not for JSON, ValueError if it is longer than 4 MiB, and OSError, with the path,
+    if the file cannot be written. Whose arrays they are says of what types and shapes they may be.
     """
     whole = {name: np.asarray(array, order="C") for name, array in arrays.items()}
-    _check_types(whole)
     # Through JSON once: the checksum is of what will be read again, lists where there were tuples.
     plain = json.loads(json.dumps(dict(header)))
     text = json.dumps({**plain, "sha256": _digest(plain, whole)})
@@ -88,7 +86,6 @@ def _unpacked(content: bytes, key: str) -> tuple[str, Arrays]:
     if length > _MAX_OUTER_BYTES:
         raise ValueError(f"it declares a header of {length} bytes")
     arrays: Arrays = load(content)
-    _check_types(arrays)
     # Metadata, texts by their names, are read by safe_open alone. By now this is known to be a sound header.
     metadata = json.loads(content[8 : 8 + length]).get("__metadata__", {})
     if set(metadata) != {key}:
@@ -97,14 +94,6 @@ def _unpacked(content: bytes, key: str) -> tuple[str, Arrays]:
     if len(text) > MAX_HEADER_BYTES:
         raise ValueError(f"its header is longer than {MAX_HEADER_BYTES} bytes")
     return text, arrays
-
-
-def _check_types(arrays: Mapping[str, NDArray[Any]]) -> None:
-    for name, array in arrays.items():
-        if not array.dtype.isnative or array.dtype.name not in _TYPES:
-            raise TypeError(f"array {name!r} is of {array.dtype}, it must be of {', '.join(_TYPES)}.")
-        if array.dtype.kind == "b" and (array.view(np.uint8) > 1).any():
-            raise ValueError(f"array {name!r} holds a bool that is neither false nor true")
 
 
 def _digest(header: dict[str, Any], arrays: Mapping[str, NDArray[Any]]) -> str:

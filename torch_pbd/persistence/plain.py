@@ -37,7 +37,7 @@ def decode_parameters(description: Any) -> Any:
         raise ValueError("it has no class and parameters")
     name, parameters = description["class"], description["params"]
     if name not in list(ESTIMATORS) or not isinstance(parameters, dict):  # a list asks for no hash
-        raise ValueError(f"it holds a {name!r:.80}")
+        raise ValueError(f"it holds a {name!r:.80}; known are {', '.join(ESTIMATORS)}")
     if name == "DMPController":  # files from before there was a choice are of the printed equation
         parameters = {"adaptation": "additive", **parameters}
     estimator = load_class(name)(**_decoded(name, parameters))
