@@ -1,5 +1,6 @@
 """The documentation names every public name, its code runs, and its links lead somewhere."""
 
+import ast
 import re
 import runpy
 from importlib import import_module
@@ -46,8 +47,14 @@ def test_the_python_of_a_page_runs(name, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
-def test_an_example_is_short(path):
-    assert len(path.read_text(encoding="utf-8").splitlines()) <= 60
+def test_an_example_is_short_and_takes_names_of_the_api(path):
+    text, api = path.read_text(encoding="utf-8"), (DOCS / "api.rst").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 60
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.ImportFrom) and node.module.startswith("torch_pbd"):
+            module, names = import_module(node.module), {alias.name for alias in node.names}
+            constants = {name for name in names if re.search(rf"``(torch_pbd\.\w+\.)?{name}``", api)}
+            assert {name for name in names - constants if getattr(module, name) not in documented()} == set()
 
 
 @pytest.mark.slow
