@@ -7,8 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from torch_pbd.control import Schedule
-from torch_pbd.control.simulation.run import simulate_schedule
+from torch_pbd.control import Schedule, simulate
 
 api = pytest.importorskip("playwright.sync_api", reason="the extra 'test' is not installed")
 CHROMIUM = shutil.which("chromium")
@@ -157,7 +156,7 @@ def test_a_push_deviates_as_simulate_says_of_the_same_force(page, tmp_path):
     # The force of an answer was held over the ticks since the one before it.
     time, force = [each["time"] for each in states], np.array([each["force"] for each in states])
     held = force[np.searchsorted(time, schedule.time).clip(max=len(time) - 1)]
-    simulated = np.linalg.norm(simulate_schedule(schedule, None, held, 1000.0, None).deviation, axis=1)
+    simulated = np.linalg.norm(simulate(schedule, held).deviation, axis=1)
     assert max(each["deviation"] for each in states) == pytest.approx(simulated.max(), rel=0.02)
 
 
