@@ -15,7 +15,8 @@ from torch_pbd.checks import Floats
 from torch_pbd.estimators.base import Uncertainty, shaped_as_y
 from torch_pbd.estimators.validation import checked_rows
 from torch_pbd.files.memory import require_much
-from torch_pbd.movement.law import RESOLUTION, MovementLaw, student_log_density
+from torch_pbd.linalg import gaussian_log_density, student_log_density
+from torch_pbd.movement.law import RESOLUTION, MovementLaw
 from torch_pbd.movement.recordings import Recording, as_recordings
 
 
@@ -170,9 +171,9 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         values, vectors = np.linalg.eigh(covariance)  # of a row that is known the covariance is zero
         root = vectors * np.sqrt(values.clip(0.0))[:, np.newaxis]
         deviation = root @ generator.standard_normal((*mean.shape, n_samples))
-        if math.isfinite(self.df_):
-            squares = generator.chisquare(self.df_, (len(mean), 1, n_samples))
-            deviation *= np.sqrt((self.df_ - 2.0) / squares)
+        degrees = self.predict_df(X)[:, np.newaxis, np.newaxis]
+        if np.isfinite(degrees).all():
+            deviation *= np.sqrt((degrees - 2.0) / generator.chisquare(degrees, (len(mean), 1, n_samples)))
         samples = mean[:, :, np.newaxis] + deviation
         return samples[:, 0] if self._y_is_1d else samples
 
@@ -180,15 +181,14 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         """Log density of each row of y at X, by itself, in nats: (n_samples,)."""
         check_is_fitted(self)
         X, targets = checked_rows(self, X, y, reset=False)
-        targets = targets.reshape(len(X), -1)
-        mean, covariance = self._marginals(self._times(X))
-        # With L L' the covariance of a row, its squared distance is that of inv(L) (y - mean).
-        try:
-            whitened = np.linalg.solve(np.linalg.cholesky(covariance), (targets - mean)[..., np.newaxis])[..., 0]
-        except np.linalg.LinAlgError as error:
-            raise ValueError("X has a row that is known without noise: it has no density. Leave it out.") from error
-        log_det = 2.0 * np.log(np.diagonal(np.linalg.cholesky(covariance), axis1=1, axis2=2)).sum(1)
-        return student_log_density(np.square(whitened).sum(1), log_det, targets.shape[1], self.df_)
+        mean, covariance = map(torch.from_numpy, self._marginals(self._times(X)))
+        root, info = torch.linalg.cholesky_ex(covariance)
+        if info.any():
+            raise ValueError("X has a row that is known without noise: it has no density. Leave it out.")
+        residual, degrees = torch.from_numpy(targets).reshape(mean.shape) - mean, self.predict_df(X)
+        if not np.isfinite(degrees).all():
+            return gaussian_log_density(residual, root).numpy()
+        return student_log_density(residual, root, torch.from_numpy(degrees)).numpy()
 
     def score_demonstrations(self, X: Any, y: ArrayLike | None = None, *, groups: ArrayLike | None = None) -> Floats:
         """Joint log density of each demonstration, in nats, given what is known.

@@ -159,25 +159,12 @@ class JointNormal:
         )
 
 
-@dataclass(frozen=True)
-class Observed:
-    """Observations of a movement, at steps of a joint law.
-
-    Steps known whole and without noise keep the structure of the law; other entries are conditioned on one by one.
-    """
-
-    steps: Int[Tensor, " m"]
-    """Steps that are known whole."""
-    values: Float[Tensor, "m d"]
-    entry_steps: Int[Tensor, " p"]
-    entry_outputs: Int[Tensor, " p"]
-    entry_values: Float[Tensor, " p"]
-    entry_variances: Float[Tensor, " p"]
-    """Variance of the error of each single entry."""
-
-
 class Conditioned:
     """Joint law given what was observed; normal, by the usual formulas.
+
+    Of observations at some of the steps, values (m, d) are NaN where not given, noise (m, d) is the standard deviation
+    of their errors. Steps known whole and without noise keep the structure of the law; all other entries are
+    conditioned on one by one.
 
     Exact steps E, with ``L L' = R_EE``: of ``r = A_E^-1 (x_E - mean_E)``, G = R_:E R_EE^-1 and the loadings'
     coefficients c, whose posterior has the precision ``P = I + U_E' R_EE^-1 U_E`` and the mean ``P^-1 U_E' R_EE^-1 r``,
@@ -186,9 +173,20 @@ class Conditioned:
     over the root of their own.
     """
 
-    def __init__(self, prior: JointNormal, observed: Observed) -> None:
-        self._prior, self._observed = prior, observed
-        steps, n_loadings = observed.steps, prior.loadings.shape[-1]
+    def __init__(
+        self,
+        prior: JointNormal,
+        steps: Int[Tensor, " m"],
+        values: Float[Tensor, "m d"],
+        noise: Float[Tensor, "m d"],
+    ) -> None:
+        given = ~values.isnan()
+        exact = (given & (noise == 0.0)).all(1)
+        rows, self._outputs = (given & ~exact[:, None]).nonzero(as_tuple=True)
+        self._entry_steps, self._entry_values = steps[rows], values[rows, self._outputs]
+        self._entry_noise = noise[rows, self._outputs]
+        self._prior, self._steps, self._values = prior, steps[exact], values[exact]
+        steps, n_loadings = self._steps, prior.loadings.shape[-1]
         if not len(steps):
             return
         between = prior.prior_correlation[:, steps]
@@ -205,29 +203,29 @@ class Conditioned:
     @property
     def sizes(self) -> tuple[int, int, int, int]:
         """Steps, outputs, loadings and single entries."""
-        return *self._prior.loadings.shape, len(self._observed.entry_values)
+        return *self._prior.loadings.shape, len(self._entry_values)
 
     @cached_property
     def law(self) -> JointNormal:
         """Law of all steps; those that are known have no variance left."""
-        law, observed = self._from_whole_steps(), self._observed
-        if not len(observed.entry_steps):
+        law = self._from_whole_steps()
+        if not len(self._entry_steps):
             return law
         columns, root = self._entries(law)
         explained = torch.linalg.solve_triangular(root.mT, columns, upper=True, left=False)
-        error = observed.entry_values - law.mean[observed.entry_steps, observed.entry_outputs]
+        error = self._entry_values - law.mean[self._entry_steps, self._outputs]
         whitened = torch.linalg.solve_triangular(root, error[:, None], upper=False)[:, 0]
         return replace(law, mean=law.mean + explained @ whitened, explained=explained)
 
     def _from_whole_steps(self) -> JointNormal:
-        prior, observed = self._prior, self._observed
-        if not len(observed.steps):
+        prior, steps = self._prior, self._steps
+        if not len(steps):
             return prior
         return replace(
             prior,
-            mean=prior.mean + self._from_steps((observed.values - prior.mean[observed.steps])[None])[0],
+            mean=prior.mean + self._from_steps((self._values - prior.mean[steps])[None])[0],
             # What is known has no variance, not even of rounding, which may be below zero.
-            factor=prior.factor.index_fill(0, observed.steps, 0.0),
+            factor=prior.factor.index_fill(0, steps, 0.0),
             loadings=torch.linalg.solve_triangular(self._precision_root.mT, self._open, upper=True, left=False),
             taken=self._taken,
         )
@@ -240,21 +238,19 @@ class Conditioned:
         Draws of the unconditioned law, less what it would have made of their own values at what was observed: no
         root of a singular matrix is needed (Matheron's rule).
         """
-        observed = self._observed
         drawn = self._prior.deviations(correlated, common)
-        if len(observed.steps):
-            drawn = drawn - self._from_steps(drawn[:, observed.steps])
-        if not len(observed.entry_steps):
+        if len(self._steps):
+            drawn = drawn - self._from_steps(drawn[:, self._steps])
+        if not len(self._entry_steps):
             return drawn
         columns, root = self._entries(self.law)
-        errors = drawn[:, observed.entry_steps, observed.entry_outputs].mT
-        errors = errors + observed.entry_variances.sqrt()[:, None] * noise
+        errors = drawn[:, self._entry_steps, self._outputs].mT + self._entry_noise[:, None] * noise
         return drawn - torch.einsum("ndp,ps->snd", columns, torch.cholesky_solve(errors, root))
 
     def _from_steps(self, residual: Float[Tensor, "s m d"]) -> Float[Tensor, "s n d"]:
         """Change of the mean by what steps that are known whole deviate from it."""
         factor = self._prior.factor
-        inner = torch.linalg.solve(factor[self._observed.steps], residual[..., None])[..., 0]
+        inner = torch.linalg.solve(factor[self._steps], residual[..., None])[..., 0]
         projected = inner.flatten(1) @ self._whitened.flatten(0, 1)  # (s, k)
         common = torch.cholesky_solve(projected.mT, self._precision_root)
         change = torch.einsum("nm,smd->snd", self._gain, inner) + (self._open @ common).permute(2, 0, 1)
@@ -262,7 +258,7 @@ class Conditioned:
 
     def _entries(self, law: JointNormal) -> tuple[Float[Tensor, "n d p"], Float[Tensor, "p p"]]:
         """Covariances of everything with the single entries, and the root of their own, noise included."""
-        steps, outputs = self._observed.entry_steps, self._observed.entry_outputs
+        steps, outputs = self._entry_steps, self._outputs
         columns = replace(law, explained=law.explained[..., :0]).columns(steps, outputs)
-        own = columns[steps, outputs] + torch.diag(self._observed.entry_variances)
+        own = columns[steps, outputs] + torch.diag(self._entry_noise.square())
         return columns, safe_cholesky(symmetrize(own), name="the covariance of the entries given")

@@ -14,7 +14,7 @@ from torch_pbd.estimators.demonstrations import fit_with_groups
 from torch_pbd.estimators.mixture import GMMBaseline
 from torch_pbd.files.memory import require_much
 from torch_pbd.movement.base import MovementRegressor
-from torch_pbd.movement.joint import Conditioned, JointNormal, Observed
+from torch_pbd.movement.joint import Conditioned, JointNormal
 from torch_pbd.movement.recordings import Known, Recording, as_rows
 
 
@@ -173,7 +173,8 @@ class KMPBaseline(MovementRegressor):
 
     def _conditioned(self, time: Floats) -> tuple[Conditioned, torch.Tensor]:
         """Law through the reference with the via points, without conditioning on them."""
-        union, rows, _ = self._union(time, None)
-        empty = torch.empty(0, dtype=torch.int64), torch.empty(0, self.n_outputs_).double()
-        nothing = Observed(*empty, empty[0], empty[0], empty[1][:, 0], empty[1][:, 0])
-        return Conditioned(self._prior(union), nothing), torch.from_numpy(rows)
+        union, rows, places = self._union(time, None)
+        nothing = np.empty((0, self.n_outputs_))
+        return Conditioned(self._prior(union), *Known(time[:0], nothing, nothing).tensors(places)), torch.from_numpy(
+            rows
+        )

@@ -8,14 +8,13 @@ from typing import Any, Self
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import gammaln
 from sklearn.base import BaseEstimator
 from torch import Tensor
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.estimators.validation import checked_queries
-from torch_pbd.movement.joint import Conditioned, JointNormal, Observed
+from torch_pbd.movement.joint import Conditioned, JointNormal
 from torch_pbd.movement.recordings import Known, Recording
 
 _AT_ONCE = 1024  # rows whose marginals are found together, and whose law is kept
@@ -100,7 +99,7 @@ class MovementLaw(BaseEstimator, ABC):
         copied = copy.copy(self)
         # The law before conditioning is the same for all copies.
         copied._known, copied._kept = known, self.__dict__.setdefault("_kept", {})
-        copied._observed(self._union(known.time[:0], known)[2])  # refuses what cannot be conditioned on
+        known.check(self._union(known.time[:0], known)[2])
         return copied
 
     def _times(self, X: ArrayLike) -> Floats:
@@ -124,15 +123,11 @@ class MovementLaw(BaseEstimator, ABC):
         _, first, index = np.unique(np.round(self._scaled(both), RESOLUTION), return_index=True, return_inverse=True)
         return both[first], index[: len(time)], index[len(time) :]
 
-    def _observed(self, places: NDArray[np.intp]) -> Observed:
-        """Observations of the movement, by the places of their times in a union of times."""
-        return self._observations.observed(places)
-
     def _conditioned(self, time: Floats) -> tuple[Conditioned, Tensor]:
         """Law of all times that matter, given what is known, and the places of ``time`` among them."""
         union, rows, places = self._union(time, self._known)
         law, index = self._prior_with(union)
-        return Conditioned(law, self._observed(index[places])), torch.from_numpy(index[rows])
+        return Conditioned(law, *self._observations.tensors(index[places])), torch.from_numpy(index[rows])
 
     def _prior_with(self, time: Floats) -> tuple[JointNormal, NDArray[np.intp]]:
         """Joint law at increasing times, maybe at others too, and their places in it.
@@ -187,14 +182,10 @@ class MovementLaw(BaseEstimator, ABC):
             )
         law, rows = self._law(recording.time)
         law = law.at(rows)
-        square = law.square(torch.from_numpy(recording.position)[None])
-        size = recording.position.size
-        return float(student_log_density(square.numpy(), float(law.log_det()), size, self.df_)[0])
-
-
-def student_log_density(square: Floats, log_det: Any, size: int, df: float) -> Floats:
-    """Log density of a Student's t of covariance S, from x' S^-1 x and log det S; normal if df is infinite."""
-    if not math.isfinite(df):
-        return np.asarray(-0.5 * (square + log_det + size * math.log(2.0 * math.pi)))
-    constant = gammaln(0.5 * (df + size)) - gammaln(0.5 * df) - 0.5 * size * math.log((df - 2.0) * math.pi)
-    return np.asarray(constant - 0.5 * log_det - 0.5 * (df + size) * np.log1p(square / (df - 2.0)))
+        square, log_det = float(law.square(torch.from_numpy(recording.position)[None])), float(law.log_det())
+        df, size = self.df_, recording.position.size
+        if not math.isfinite(df):
+            return -0.5 * (square + log_det + size * math.log(2.0 * math.pi))
+        # As of linalg.student_log_density, whose factor of the covariance is not formed here.
+        constant = math.lgamma(0.5 * (df + size)) - math.lgamma(0.5 * df) - 0.5 * size * math.log((df - 2.0) * math.pi)
+        return constant - 0.5 * log_det - 0.5 * (df + size) * math.log1p(square / (df - 2.0))

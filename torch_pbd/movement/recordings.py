@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
@@ -12,7 +13,6 @@ from torch_pbd.data import Demonstrations
 from torch_pbd.data.alignment import TIMING_REMOVED
 from torch_pbd.estimators.demonstrations import check_groups
 from torch_pbd.estimators.validation import checked_rows
-from torch_pbd.movement.joint import Observed
 
 # Steps on which the correlation is learned: the nuggets' iterations are cubic in them, and movements are smooth.
 _MOST_STEPS = 200
@@ -38,35 +38,22 @@ class Known(NamedTuple):
         """These observations and others after them."""
         return Known(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
 
-    def observed(self, places: NDArray[np.intp]) -> Observed:
-        """Observations as a joint law takes them, by the places of their times among the steps of the law.
-
-        Raises ValueError if an entry is known twice without noise, or too many are known one by one.
-        """
-        exact = (self.noise == 0.0).all(axis=1) & ~np.isnan(self.value).any(axis=1)
-        single = ~np.isnan(self.value) & ~exact[:, np.newaxis]
-        entry_steps, entry_outputs = np.nonzero(single)
-        values, noise = self.value[single], self.noise[single]
-        noiseless = {(int(place), j) for place in places[exact] for j in range(self.value.shape[1])}
-        pairs = [
-            (int(places[i]), int(j)) for i, j, s in zip(entry_steps, entry_outputs, noise, strict=True) if s == 0.0
-        ]
-        twice = len(noiseless.union(pairs)) < len(noiseless) + len(pairs)
-        if twice or len(noiseless) < exact.sum() * self.value.shape[1]:
+    def check(self, places: NDArray[np.intp]) -> None:
+        """Refuse an entry that is known twice without noise, by the places of the times, or too many one by one."""
+        exact = ~np.isnan(self.value) & (self.noise == 0.0)
+        rows, outputs = np.nonzero(exact)
+        if len(np.unique(np.stack([places[rows], outputs]), axis=1).T) < len(rows):
             raise ValueError("X has a time that is given twice, or is known already, without noise: leave it out.")
-        if len(values) > _MOST_ENTRIES:
+        n_single = int((~np.isnan(self.value) & ~exact.all(axis=1, keepdims=True)).sum())
+        if n_single > _MOST_ENTRIES:
             raise ValueError(
-                f"y has {len(values)} entries with noise or beside NaN, must be at most {_MOST_ENTRIES} with those "
-                "known already: give fewer times, or whole rows with noise_scale=0."
+                f"y has {n_single} entries with noise or beside NaN, must be at most {_MOST_ENTRIES} with those known "
+                "already: give fewer times, or whole rows with noise_scale=0."
             )
-        return Observed(
-            torch.from_numpy(places[exact]),
-            torch.from_numpy(self.value[exact]),
-            torch.from_numpy(places[entry_steps]),
-            torch.from_numpy(entry_outputs),
-            torch.from_numpy(values),
-            torch.from_numpy(np.square(noise)),
-        )
+
+    def tensors(self, places: NDArray[np.intp]) -> tuple[Tensor, Tensor, Tensor]:
+        """Observations at steps of a law, as :class:`~torch_pbd.movement.joint.Conditioned` takes them."""
+        return torch.from_numpy(places), torch.from_numpy(self.value), torch.from_numpy(self.noise)
 
 
 def as_recordings(model: Any, X: Any, y: Any, groups: Any, *, is_fit: bool) -> list[Recording]:

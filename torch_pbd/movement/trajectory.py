@@ -233,18 +233,8 @@ class TrajectoryRegressor(TimedMovement):
             return Uncertainty(*own)
         union, rows, places = self._union(time, self._known)
         mean, type2 = self._regressor_marginals(union)[0], self.regressor_.predict_uncertainty(union[:, None]).type2
-        law = Conditioned(self._joint(union, mean, type2), self._observed(places)).law
+        law = Conditioned(self._joint(union, mean, type2), *self._known.tensors(places)).law
         return Uncertainty(own.type1, law.marginal()[torch.from_numpy(rows)].numpy())
-
-    def log_likelihood(self, X: ArrayLike, y: ArrayLike) -> Floats:
-        """Log density of each row of y at X, by itself, in nats: (n_samples,)."""
-        return self.regressor_.log_likelihood(X, y) if self._is_regressor else super().log_likelihood(X, y)
-
-    def sample_y(self, X: ArrayLike, n_samples: int = 1, random_state: Any = None) -> Floats:
-        """Draw y at X, independently for each row; whole movements are drawn by :meth:`sample_demonstrations`."""
-        if self._is_regressor:
-            return self.regressor_.sample_y(X, n_samples, random_state)
-        return super().sample_y(X, n_samples, random_state)
 
     @property
     def _is_regressor(self) -> bool:
