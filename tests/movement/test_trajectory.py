@@ -202,7 +202,7 @@ def test_nuggets_take_missing_steps_for_missing():
     holed[0, 10:15] = torch.nan
     grid = torch.from_numpy(GRID)
     whole, part = (fit_time_kernel(grid, values, ["squared_exponential"], None) for values in (residual, holed))
-    assert part.scales[0][0] == pytest.approx(whole.scales[0][0], rel=0.4)
+    assert float(part.scales[0, 0]) == pytest.approx(float(whole.scales[0, 0]), rel=0.4)
     assert not part.residual.isnan().any()
     # What stands in the hole is near to what was cut out of it.
     assert (part.residual[0, 10:15] - whole.residual[0, 10:15]).abs().max() < 0.3
@@ -212,13 +212,23 @@ def test_the_length_scale_that_made_the_movements_is_found():
     residual = torch.from_numpy(movements(30, seed=5))
     residual = residual - residual.mean(0)
     found = fit_time_kernel(torch.from_numpy(GRID), residual / residual.std(0), ["squared_exponential"], None)
-    assert found.scales[0][0] == pytest.approx(0.2, rel=0.2)
+    assert float(found.scales[0, 0]) == pytest.approx(0.2, rel=0.2)
 
 
 @pytest.mark.parametrize("kernel", ["squared_exponential", "matern52"])
 def test_the_likelier_kernel_is_that_of_the_movements(kernel):
     series = sample_series(kernel, 0.2)
     assert fit_time_kernel(torch.from_numpy(GRID), series, ["matern52", "squared_exponential"], None).kernel == kernel
+
+
+def test_two_length_scales_are_found_where_movements_have_them():
+    # Slow deviations, and a tenth of their variance that changes four times as fast.
+    slow, fast = sample_series("matern52", 0.6, n_demos=24), sample_series("matern52", 0.15, n_demos=24).flip(0)
+    found = fit_time_kernel(torch.from_numpy(GRID), 0.9**0.5 * slow + 0.1**0.5 * fast, ["matern52"], None)
+    (long, share), (short, rest) = found.scales.tolist()
+    assert (long, short) == (pytest.approx(0.6, rel=0.4), pytest.approx(0.15, rel=0.4))
+    assert share + rest == pytest.approx(1.0)
+    assert 0.03 < rest < 0.35
 
 
 @pytest.mark.parametrize("kernel", ["squared_exponential", "matern52"])

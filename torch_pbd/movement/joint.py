@@ -208,7 +208,16 @@ class Conditioned:
     @cached_property
     def law(self) -> JointNormal:
         """Law of all steps; those that are known have no variance left."""
-        law = self._from_whole_steps()
+        law, steps = self._prior, self._steps
+        if len(steps):
+            law = replace(
+                law,
+                mean=law.mean + self._from_steps((self._values - law.mean[steps])[None])[0],
+                # What is known has no variance, not even of rounding, which may be below zero.
+                factor=law.factor.index_fill(0, steps, 0.0),
+                loadings=torch.linalg.solve_triangular(self._precision_root.mT, self._open, upper=True, left=False),
+                taken=self._taken,
+            )
         if not len(self._entry_steps):
             return law
         columns, root = self._entries(law)
@@ -216,19 +225,6 @@ class Conditioned:
         error = self._entry_values - law.mean[self._entry_steps, self._outputs]
         whitened = torch.linalg.solve_triangular(root, error[:, None], upper=False)[:, 0]
         return replace(law, mean=law.mean + explained @ whitened, explained=explained)
-
-    def _from_whole_steps(self) -> JointNormal:
-        prior, steps = self._prior, self._steps
-        if not len(steps):
-            return prior
-        return replace(
-            prior,
-            mean=prior.mean + self._from_steps((self._values - prior.mean[steps])[None])[0],
-            # What is known has no variance, not even of rounding, which may be below zero.
-            factor=prior.factor.index_fill(0, steps, 0.0),
-            loadings=torch.linalg.solve_triangular(self._precision_root.mT, self._open, upper=True, left=False),
-            taken=self._taken,
-        )
 
     def deviations(
         self, correlated: Float[Tensor, "n s"], common: Float[Tensor, "k t"], noise: Float[Tensor, "p t"]

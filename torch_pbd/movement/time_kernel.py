@@ -10,9 +10,9 @@ demonstrations.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch
@@ -22,14 +22,13 @@ from torch import Tensor
 from torch_pbd.kernels import correlation
 from torch_pbd.linalg import safe_cholesky, symmetrize
 
-Scales = tuple[tuple[float, float], ...]
+Scales = Sequence[Sequence[float]]  # length scales and weights
 
 # Length scales in ranges of the time, from the spacing of some fifty steps to a movement that bends once; and nuggets
 # shared by all steps.
-_LENGTHS = torch.logspace(math.log10(0.02), 0.0, 14, dtype=torch.float64)
+_LENGTHS = torch.logspace(math.log10(0.02), 0.0, 14, dtype=torch.float64).tolist()
 _NUGGETS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1)
 _FINE_WEIGHTS, _RATIOS = (0.03, 0.1, 0.3, 0.6), (2.0, 4.0)  # of the shorter of two scales; and of the longer over it
-_SINGLE = [((length, 1.0),) for length in _LENGTHS.tolist()]
 _LEAST, _MOST, _FIRST = 1e-6, 1e3, 1e-2  # nuggets: smallest, largest, and where expectation maximization starts
 _N_STEPS, _TOLERANCE = 40, 0.02  # of expectation maximization: iterations, and change of a logarithm that ends it
 _SMOOTH = 1e-3  # nugget of a step that is told apart from noise: such steps decide on the length scale
@@ -52,7 +51,7 @@ class TimeKernel:
 
     grid: Float[Tensor, " T"]
     kernel: str
-    scales: Scales
+    scales: Float[Tensor, "s 2"]
     """Length scales, the longest first, and the weights of their correlations, which add up to one."""
     nugget: Float[Tensor, " T"]
     share: float
@@ -86,7 +85,7 @@ class TimeKernel:
         return {name: value for name, value in vars(self).items() if name != "_parts"}
 
     def _kernel(self, time: Tensor, other: Tensor) -> Tensor:
-        return _correlation(time, other, self.scales, self.kernel)
+        return _correlation(time, other, self.scales.tolist(), self.kernel)
 
 
 def fit_time_kernel(
@@ -107,37 +106,29 @@ def fit_time_kernel(
     residual = _unit_rms(residual)
     sizes = residual.square().nanmean((0, 2)).sqrt()
     usual = (sizes > sizes.nanmedian() / _USUAL) & (sizes < sizes.nanmedian() * _USUAL)
-    kernel = max(kernels, key=lambda name: _search(grid, residual, usual, name).log_likelihood)
+    kernel = max(kernels, key=lambda name: _search(grid, residual, usual, name, 1).log_likelihood)
     shares = _SHARES if share is None else (share,)
-    one = _fit_scales(grid, residual, usual, partial(_search, kernel=kernel), kernel)
     # A second scale is likelier for residuals by themselves, not always beside those of the others.
-    two = _fit_scales(grid, residual, usual, partial(_search_two, kernel=kernel), kernel)
-    found = [(*_left_out(result, shares), result) for result in ([one] if two.scales == one.scales else [one, two])]
-    _, share, result = max(found, key=lambda each: each[0])
-    return replace(result, share=share)
+    results = [_fit_scales(grid, residual, usual, kernel, n_scales) for n_scales in (1, 2)]
+    likelihood, chosen = zip(*(_left_out(result, shares) for result in results), strict=True)
+    best = int(likelihood[1] > likelihood[0])
+    return replace(results[best], share=chosen[best])
 
 
-def as_scales(rows: Any) -> Scales:
-    """Scales of the rows (s, 2) of an array."""
-    return tuple((length, weight) for length, weight in rows.tolist())
-
-
-def _fit_scales(
-    grid: Tensor, residual: Tensor, usual: Bool[Tensor, " T"], search: Callable[..., Found], kernel: str
-) -> TimeKernel:
+def _fit_scales(grid: Tensor, residual: Tensor, usual: Bool[Tensor, " T"], kernel: str, n_scales: int) -> TimeKernel:
     """Scales and nuggets by turns, from the scales of the usual steps on; the share is open."""
-    found = search(grid, residual, usual)
+    found = _search(grid, residual, usual, kernel, n_scales)
     unit = _correlation(grid, grid, found.scales, kernel)
     nugget = _step_nuggets(unit, residual, _LEAST)
     for _ in range(_ROUNDS):
         smooth = nugget <= _SMOOTH
         steps = smooth if 2 * smooth.sum() >= len(grid) else nugget <= nugget.median()
-        before, found = found, search(grid, residual, steps)
+        before, found = found, _search(grid, residual, steps, kernel, n_scales)
         if found[1:] == before[1:]:
             break
         unit = _correlation(grid, grid, found.scales, kernel)
         nugget = _step_nuggets(unit, residual, min(found.nugget, 0.1 * _SMOOTH))
-    return TimeKernel(grid, kernel, found.scales, nugget, 1.0, _filled(unit, residual, nugget))
+    return TimeKernel(grid, kernel, grid.new_tensor(found.scales), nugget, 1.0, _filled(unit, residual, nugget))
 
 
 def _correlation(
@@ -149,39 +140,35 @@ def _correlation(
     return torch.stack(each).sum(0)
 
 
-def _search_two(grid: Tensor, residual: Tensor, steps: Bool[Tensor, " T"], kernel: str) -> Found:
-    """As :func:`_search`, of two scales too: on either side of the best single one.
-
-    The finer takes what a nugget stood for, which so is no larger.
-    """
-    single = _search(grid, residual, steps, kernel)
-    length = single.scales[0][0]
+def _search(grid: Tensor, residual: Tensor, steps: Bool[Tensor, " T"], kernel: str, n_scales: int) -> Found:
+    """Likeliest of one scale, or of two on either side of it: the finer takes what a part of the nugget stood for."""
+    steps = steps if 2 * int(steps.sum()) >= len(grid) else torch.ones_like(steps)
+    groups, time = _by_pattern(_unit_rms(residual[:, steps])), grid[steps]
+    found = _likeliest(time, groups, kernel, [((length, 1.0),) for length in _LENGTHS], _NUGGETS)
+    single = found.scales[0][0]
     pairs = [
         ((long, 1.0 - weight), (long / ratio, weight))
         for ratio in _RATIOS
-        for long in _LENGTHS.tolist()
-        if length <= long <= ratio * length
+        for long in _LENGTHS
+        if n_scales == 2 and single <= long <= ratio * single
         for weight in _FINE_WEIGHTS
     ]
-    nuggets = [nugget for nugget in _NUGGETS if nugget <= single.nugget]
-    return max(single, _search(grid, residual, steps, kernel, pairs, nuggets)) if pairs else single
+    nuggets = [nugget for nugget in _NUGGETS if nugget <= found.nugget]
+    return max(found, _likeliest(time, groups, kernel, pairs, nuggets)) if pairs else found
 
 
-def _search(
-    grid: Tensor,
-    residual: Tensor,
-    steps: Bool[Tensor, " T"],
+def _likeliest(
+    time: Tensor,
+    groups: list[tuple[Tensor, Tensor]],
     kernel: str,
-    candidates: Sequence[Scales] = _SINGLE,
-    nuggets: Sequence[float] | None = None,
+    candidates: Sequence[Scales],
+    nuggets: Sequence[float],
 ) -> Found:
     """Highest log likelihood of ``(1 - eta) K + eta I``, and its scales and shared nugget eta."""
-    steps = steps if 2 * int(steps.sum()) >= len(grid) else torch.ones_like(steps)
-    groups, time = _by_pattern(_unit_rms(residual[:, steps])), grid[steps]
     unit = torch.stack([_correlation(time, time, scales, kernel) for scales in candidates])
-    nuggets, values = nuggets or _NUGGETS, []
+    values = []
     for nugget in nuggets:
-        whole = (1.0 - nugget) * unit + nugget * torch.eye(len(time)).to(grid)
+        whole = (1.0 - nugget) * unit + nugget * torch.eye(len(time)).to(time)
         each = [_log_likelihood(whole[:, seen][:, :, seen], rows) for seen, rows in groups]
         values.append(torch.stack(each).sum(0))
     table = torch.stack(values)

@@ -19,7 +19,7 @@ from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky
 from torch_pbd.movement.joint import Conditioned, JointNormal
 from torch_pbd.movement.recordings import Recording, as_rows, n_grid_steps, sampled
-from torch_pbd.movement.time_kernel import TimeKernel, as_scales, fit_time_kernel
+from torch_pbd.movement.time_kernel import TimeKernel, fit_time_kernel
 from torch_pbd.movement.timed import TimedMovement
 
 _FEWEST_DF, _MOST_DF = 3.0, 200.0  # of the joint law: a variance must exist, and beyond it is normal to all purposes
@@ -48,10 +48,9 @@ class TrajectoryLaw(nn.Module):
         super().__init__()
         self.marginals = marginals
         self.kernel, self._time_kernel = time_kernel.kernel, time_kernel
-        for name in ("grid", "nugget", "residual"):
+        for name in ("grid", "scales", "nugget", "residual"):
             self.register_buffer(name, getattr(time_kernel, name))
-        scalars = {"share": time_kernel.share, "x_shift": x_shift, "x_scale": x_scale}
-        for name, value in ({"scales": time_kernel.scales} | scalars).items():
+        for name, value in (("share", time_kernel.share), ("x_shift", x_shift), ("x_scale", x_scale)):
             self.register_buffer(name, torch.tensor(value, dtype=torch.float64))
 
     def forward(self, x: Float[Tensor, "n 1"]) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d n d"]]:
@@ -78,10 +77,8 @@ class TrajectoryLaw(nn.Module):
     def time_kernel(self) -> TimeKernel:
         """Correlation along the movement, in ranges of the time."""
         if self._time_kernel.grid is not self.grid:  # the module was moved, or its buffers were loaded
-            scales = as_scales(self.scales)
-            self._time_kernel = TimeKernel(
-                self.grid, self.kernel, scales, self.nugget, float(self.share), self.residual
-            )
+            share = float(self.share)
+            self._time_kernel = TimeKernel(self.grid, self.kernel, self.scales, self.nugget, share, self.residual)
         return self._time_kernel
 
 
@@ -205,7 +202,7 @@ class TrajectoryRegressor(TimedMovement):
         self.module_.requires_grad_(False)
         degrees = self.regressor_.predict_df(grid[:, np.newaxis])
         self.df_ = float(np.clip(np.median(degrees) / _WHOLE, _FEWEST_DF, _MOST_DF))
-        self.time_kernel_, self.length_scale_ = found.kernel, found.scales[0][0] * (high - low)
+        self.time_kernel_, self.length_scale_ = found.kernel, float(found.scales[0, 0]) * (high - low)
         self.nugget_scale_, self.shrinkage_ = np.sqrt(found.nugget.numpy()), 1.0 - found.share
 
     def predict(self, X: ArrayLike, *, return_std: bool = False, return_cov: bool = False) -> Any:
@@ -250,20 +247,16 @@ class TrajectoryRegressor(TimedMovement):
         arrays = self._restore_timing(arrays)
         n_steps, scalars = len(np.atleast_1d(arrays["grid"])), ("share", "x_shift", "x_scale")
         shapes: dict[str, tuple[int | str, ...]] = dict.fromkeys(scalars, ())
-        shapes |= {
-            "grid": (n_steps,),
-            "scales": ("S", 2),
-            "nugget": (n_steps,),
-            "residual": ("K", n_steps, self.n_outputs_),
-        }
+        shapes |= {"grid": (n_steps,), "scales": ("S", 2)}
+        shapes |= {"nugget": (n_steps,), "residual": ("K", n_steps, self.n_outputs_)}
         own = self._restored(arrays, shapes)
-        checks.require(own["nugget"] > 0.0, own["nugget"], "nugget", "above 0")
+        for name in ("nugget", "scales"):
+            checks.require(own[name] > 0.0, own[name], name, "above 0")
         checks.require(np.diff(own["grid"]) > 0.0, own["grid"][1:], "grid", "increasing")
-        checks.require(own["scales"] > 0.0, own["scales"], "scales", "above 0")
         share, shift, scale = (float(own[name]) for name in scalars)
         checks.number(share, "share", above=0.0, most=1.0)
-        grid, nugget, residual = (torch.from_numpy(own[name].copy()) for name in ("grid", "nugget", "residual"))
-        found = TimeKernel(grid, self.time_kernel_, as_scales(own["scales"]), nugget, share, residual)
+        grid, scales, nugget, residual = (torch.from_numpy(own[name].copy()) for name in list(shapes)[3:])
+        found = TimeKernel(grid, self.time_kernel_, scales, nugget, share, residual)
         self.module_ = TrajectoryLaw(self.regressor_.module_, found, shift, scale)
         self.module_.requires_grad_(False)
         self.nugget_scale_ = np.sqrt(own["nugget"])
