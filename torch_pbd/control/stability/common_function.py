@@ -93,30 +93,31 @@ def scaled(dynamics: ErrorDynamics) -> tuple[ErrorDynamics, float]:
 class Function:
     """``|T z|^2`` with T upper triangular, and, where masses differ, ``blkdiag(T, 1)'^-1 Y``."""
 
-    root: Float[Tensor, "s s"]
-    multiplier: Float[Tensor, "t d"] | None = None
+    root: Float[Tensor, "*a s s"]
+    multiplier: Float[Tensor, "*a t d"] | None = None
 
-    def change(self, rows: ErrorDynamics) -> Float[Tensor, "n s s"]:
+    def change(self, rows: ErrorDynamics) -> Float[Tensor, "*a n s s"]:
         """Symmetric matrices whose largest eigenvalue bounds the rate of ``|T z|``, relative to it."""
         zero, d = torch.zeros_like(rows.stiffness), rows.stiffness.shape[-1]
         transport = zero if rows.transport is None else rows.transport
         kinematic = torch.cat([transport, torch.eye(d).to(zero) + zero], dim=-1)
         pull = torch.cat([rows.stiffness, rows.damping], dim=-1)
+        root = self.root.unsqueeze(-3)
         if self.multiplier is None:  # the mass is 1
-            return symmetrize(self._per_root(self.root @ torch.cat([kinematic, -pull], dim=-2)))
-        of_state, of_acceleration = self.multiplier.split([2 * d, d])
-        change = self._per_root(self.root[:, :d] @ kinematic - of_state @ pull)
-        coupling = self.root[:, d:] - of_state @ rows.mass - self._per_root(of_acceleration @ pull).mT
+            return symmetrize(self._per_root(root @ torch.cat([kinematic, -pull], dim=-2)))
+        of_state, of_acceleration = self.multiplier.unsqueeze(-3).split([2 * d, d], dim=-2)
+        change = self._per_root(root[..., :d] @ kinematic - of_state @ pull)
+        coupling = root[..., d:] - of_state @ rows.mass - self._per_root(of_acceleration @ pull).mT
         # It is a concave function of the acceleration if this is positive definite, and largest at some.
         factor, failed = torch.linalg.cholesky_ex(2.0 * symmetrize(of_acceleration @ rows.mass))
         half = torch.linalg.solve_triangular(factor, coupling.mT, upper=False)
         change = symmetrize(change) + 0.5 * half.mT @ half
-        return torch.where(failed[:, None, None] > 0, _UNBOUNDED * torch.eye(2 * d).to(change), change)
+        return torch.where(failed[..., None, None] > 0, _UNBOUNDED * torch.eye(2 * d).to(change), change)
 
     def _per_root(self, matrix: Tensor) -> Tensor:
-        return torch.linalg.solve_triangular(self.root, matrix, upper=True, left=False)
+        return torch.linalg.solve_triangular(self.root.unsqueeze(-3), matrix, upper=True, left=False)
 
-    def eigenvalues(self, rows: ErrorDynamics) -> Float[Tensor, "n r"]:
+    def eigenvalues(self, rows: ErrorDynamics) -> Float[Tensor, "*a n r"]:
         """Eigenvalues of these matrices."""
         return torch.linalg.eigvalsh(self.change(rows))
 
@@ -136,21 +137,12 @@ class Function:
 
 
 def searched_function(rows: ErrorDynamics) -> Function | None:
-    """Function of the largest rate, by BFGS on a smoothed maximum of the eigenvalues of some rows, then of more."""
-    d = rows.stiffness.shape[-1]
-    root = torch.kron(torch.tensor([[1.0, 0.5], [0.0, math.sqrt(0.75)]]), torch.eye(d)).to(rows.time)
-    free = [tril_to_vector(root.mT)]
-    if len(rows.mass) > 1:  # at first ``Y M a`` is ``P (0, a)`` for the mean mass, and as much of a as will do
-        free += [torch.cat([root[:, d:], 0.3 * torch.eye(d).to(root)]).flatten()]
-    at, inverse = torch.cat(free)[None], torch.eye(sum(map(len, free))).to(root)[None]
-    chosen, temperatures = evenly(len(rows.time), _N_ROWS), _TEMPERATURES
+    """Function of the largest rate: of some rows, then of more, those above its largest eigenvalue among some."""
+    chosen, at, inverse, temperatures = evenly(len(rows.time), _N_ROWS), None, None, _TEMPERATURES
     for _ in range(_MAX_SEARCHES):
         some = rows.restrict(chosen)
-        for temperature in temperatures:
-            objective = partial(_smoothed, rows=some, temperature=temperature)
-            at, report = minimize_batch(objective, at, max_iter=_MAX_ITER, inverse_hessian=inverse)
-            inverse = report.inverse_hessian
-        found = _unpacked(at[0], d)
+        at, inverse = search(ErrorDynamics.side_by_side([some]), at, inverse, temperatures)
+        found = unpacked(at[0], rows.stiffness.shape[-1])
         largest = float(found.eigenvalues(some).max())
         if largest >= 0.0:
             return None
@@ -162,19 +154,45 @@ def searched_function(rows: ErrorDynamics) -> Function | None:
     return found
 
 
-def _unpacked(free: Float[Tensor, " p"], d: int) -> Function:
-    root, multiplier = free.split([d * (2 * d + 1), len(free) - d * (2 * d + 1)])
-    return Function(vector_to_tril(root).mT, multiplier.unflatten(0, (3 * d, d)) if len(multiplier) else None)
+def search(
+    rows: ErrorDynamics,
+    at: Float[Tensor, "a p"] | None = None,
+    inverse: Float[Tensor, "a p p"] | None = None,
+    temperatures: tuple[float, ...] = _TEMPERATURES,
+) -> tuple[Float[Tensor, "a p"], Float[Tensor, "a p p"]]:
+    """Functions of the largest rate, and BFGS's estimate there, for rows (a, n, d, d) of a schedules side by side.
+
+    By BFGS on a smoothed maximum of the eigenvalues, from a point and an estimate or from the beginning.
+    """
+    d = rows.stiffness.shape[-1]
+    if at is None or inverse is None:
+        root = torch.kron(torch.tensor([[1.0, 0.5], [0.0, math.sqrt(0.75)]]), torch.eye(d)).to(rows.time)
+        free = [tril_to_vector(root.mT)]
+        if rows.mass.shape[1] > 1:  # at first ``Y M a`` is ``P (0, a)`` for the mean mass, and as much of a as will do
+            free += [torch.cat([root[:, d:], 0.3 * torch.eye(d).to(root)]).flatten()]
+        at = torch.cat(free).repeat(len(rows.time), 1)
+        inverse = torch.eye(at.shape[1]).to(at).expand(len(at), -1, -1)
+    for temperature in temperatures:
+        objective = partial(_smoothed, rows=rows, temperature=temperature)
+        at, report = minimize_batch(objective, at, max_iter=_MAX_ITER, inverse_hessian=inverse)
+        inverse = report.inverse_hessian
+    return at, inverse
+
+
+def unpacked(free: Float[Tensor, "*a p"], d: int) -> Function:
+    """Function, or functions side by side, of the parameters that are searched."""
+    root, multiplier = free.split([d * (2 * d + 1), free.shape[-1] - d * (2 * d + 1)], dim=-1)
+    return Function(vector_to_tril(root).mT, multiplier.unflatten(-1, (3 * d, d)) if multiplier.shape[-1] else None)
 
 
 def _smoothed(
-    free: Float[Tensor, "a p"], _: Tensor, *, rows: ErrorDynamics, temperature: float
+    free: Float[Tensor, "a p"], which: Int64[Tensor, " a"], *, rows: ErrorDynamics, temperature: float
 ) -> tuple[Float[Tensor, " a"], Float[Tensor, "a p"]]:
     """Smoothed largest eigenvalue, not below it, and its gradient."""
     with torch.enable_grad():
         leaf = free.detach().requires_grad_()
-        values = [_unpacked(each, rows.stiffness.shape[-1]).eigenvalues(rows).flatten() for each in leaf]
-        loss = torch.stack([temperature * torch.logsumexp(each / temperature, 0) for each in values])
+        values = unpacked(leaf, rows.stiffness.shape[-1]).eigenvalues(rows.restrict(which)).flatten(1)
+        loss = temperature * torch.logsumexp(values / temperature, 1)
         return loss.detach(), torch.autograd.grad(loss.sum(), leaf)[0]
 
 

@@ -1,6 +1,7 @@
 """Error dynamics of a schedule, row by row."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import NamedTuple
 
@@ -45,11 +46,11 @@ class ErrorDynamics:
         W; None is none.
     """
 
-    time: Float[Tensor, " n"]
-    stiffness: Float[Tensor, "n d d"]
-    damping: Float[Tensor, "n d d"]
-    mass: Float[Tensor, "m d d"]
-    transport: Float[Tensor, "n d d"] | None = None
+    time: Float[Tensor, "*a n"]
+    stiffness: Float[Tensor, "*a n d d"]
+    damping: Float[Tensor, "*a n d d"]
+    mass: Float[Tensor, "*a m d d"]
+    transport: Float[Tensor, "*a n d d"] | None = None
 
     @property
     def is_plain(self) -> bool:
@@ -64,6 +65,12 @@ class ErrorDynamics:
         own = damping.diagonal(dim1=-2, dim2=-1)
         coupled = (damping - torch.diag_embed(own)).abs().amax((1, 2)) > _COUPLED * damping.abs().amax((1, 2))
         return Modes(squared, axes, damping if bool(coupled.any()) else own)
+
+    @staticmethod
+    def side_by_side(schedules: Sequence["ErrorDynamics"]) -> "ErrorDynamics":
+        """Rows (a, n, d, d) of a schedules of as many rows; what is restricted then are schedules."""
+        parts = ([getattr(each, field.name) for each in schedules] for field in fields(ErrorDynamics))
+        return ErrorDynamics(*(None if part[0] is None else torch.stack(part) for part in parts))  # type: ignore[arg-type]
 
     def restrict(self, rows: Tensor) -> "ErrorDynamics":
         """Some of the rows."""
