@@ -1,13 +1,16 @@
 """Laws of blocks: poses, joints, what couples them; and the law of minimal intervention against scipy's regulator."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from scipy.linalg import block_diag, solve_continuous_are
 
-from torch_pbd.control import RotationLimits, StiffnessLaw, damping_from_stiffness, lqt
+from torch_pbd import CholeskyCovRegressor, DMPController
+from torch_pbd.control import RotationLimits, Schedule, StiffnessLaw, damping_from_stiffness, lqt
+from torch_pbd.data import make_tunnel_demonstrations
 
 ROTATION = RotationLimits(2.0, 60.0, sigma_low=0.02, sigma_high=0.3)
 POSE = StiffnessLaw(50.0, 1000.0, 0.002, 0.03, "sigma", rotation=ROTATION)
@@ -171,6 +174,48 @@ def test_minimal_intervention_is_the_optimal_regulator(d, rng):
         own = damping_from_stiffness(stiffness, mass, 0.5**0.5).numpy()
         size = np.sqrt(np.diagonal(damping))[:, None] * np.sqrt(np.diagonal(damping))
         np.testing.assert_allclose(own / size, damping / size, rtol=0, atol=1e-8)
+
+
+def test_a_schedule_takes_the_law_with_the_inertia_of_each_row(rng):
+    """The regulator of scipy row by row; with one mass and its own law, the schedule of the controller itself."""
+    n, still = 7, np.zeros((7, 3))
+    mass = np.stack([arm_mass(rng) for _ in range(n)])
+    gains = {"stiffness": np.tile(np.eye(6), (n, 1, 1)), "damping": np.tile(np.eye(6), (n, 1, 1))}
+    covariance = pose_covariances(n, rng) + 1e-6 * np.eye(6)
+    rows = {"velocity": np.zeros((n, 6)), "covariance": covariance, "type1": np.zeros(n)}
+    orientation = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
+    schedule = Schedule(0.1 * np.arange(n), still, **rows, **gains, orientation=orientation)
+    law = StiffnessLaw(1e-3, 1e7, 0.0, 1.0, "sigma", kind="precision", effort=2e-3)
+    made = schedule.with_inertia(mass, 0.5**0.5, law=law)
+    assert made.stiffness_limits == (1e-3, 1e7)
+    for own, damping, sigma, each in zip(made.stiffness, made.damping, covariance, mass, strict=True):
+        for found, expected in zip((own, damping), regulator(sigma, each, 2e-3), strict=True):
+            size = np.sqrt(np.diagonal(expected))[:, None] * np.sqrt(np.diagonal(expected))
+            np.testing.assert_allclose(found / size, expected / size, rtol=0, atol=1e-8)
+
+    pose = StiffnessLaw(kind="precision", rotation=RotationLimits(), cross_terms=True)
+    held = schedule.with_inertia(mass, law=pose)
+    low, high = (np.array(limit) for limit in pose.limits(6))
+    unit = np.sqrt(high)[:, None] * np.sqrt(high)
+    for bound, sign in ((np.diag(low), 1.0), (np.diag(high), -1.0)):
+        assert np.linalg.eigvalsh(sign * (held.stiffness - bound) / unit).min() > -1e-10
+    half = replace(schedule, type1=np.full(n, 0.5)).with_inertia(mass, law=pose)
+    np.testing.assert_allclose(half.stiffness, 0.5 * (held.stiffness + np.diag(low)), rtol=1e-12)
+    with pytest.raises(ValueError, match="law is 'precision', must be a StiffnessLaw or None"):
+        schedule.with_inertia(mass, law="precision")
+
+
+def test_the_law_and_the_mass_of_a_controller_give_its_own_schedule():
+    shown = make_tunnel_demonstrations(4, rate=25.0, random_state=0)
+    law = StiffnessLaw(kind="precision")
+    controller = DMPController(CholeskyCovRegressor(), n_steps=40, mass=3.0, stiffness_law=law).fit(shown)
+    schedule = controller.schedule(20.0)
+    again = schedule.with_inertia(3.0, law=controller.law_)
+    np.testing.assert_allclose(again.stiffness, schedule.stiffness, rtol=1e-9)
+    np.testing.assert_allclose(again.damping, schedule.damping, rtol=1e-9)
+    assert again.stiffness_limits == schedule.stiffness_limits
+    lighter = schedule.with_inertia(1.0, law=law)  # matched anew: the stiffness is of no mass
+    np.testing.assert_allclose(lighter.stiffness, schedule.with_inertia(9.0, law=law).stiffness, rtol=1e-9)
 
 
 def test_of_one_mass_it_is_the_inverse_root_of_the_covariance_and_matches_at_the_upper_quantile(rng):

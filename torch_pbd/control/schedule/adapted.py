@@ -12,29 +12,41 @@ from torch_pbd.checks import Floats
 from torch_pbd.exceptions import InvalidParameterError
 
 
-def damping_with(mass: ArrayLike, stiffness: Floats, damping_ratio: float) -> tuple[Floats, float | Floats]:
-    """Damping (n, d, d) that gives all modes of mass and stiffness (n, d, d) this ratio, and the mass, checked.
+def inertial_rows(schedule: Any, mass: Any, damping_ratio: float, law: Any) -> dict[str, Any]:
+    """Mass, damping, and stiffness if there is a law, of a schedule; see :meth:`Schedule.with_inertia`."""
+    ratio = checks.number(damping_ratio, "damping_ratio", least=0.0, most=1e6, remedy="1 is critical")
+    inertia: Any = checks.real_floats(mass(schedule.time) if callable(mass) else mass, "mass")
+    if inertia.ndim:
+        inertia = checks.array(inertia, "mass", schedule.stiffness.shape[-max(inertia.ndim, 2) :])
+        checks.semidefinite(inertia, "mass", definite=True)
+    else:
+        inertia = checks.number(float(inertia), "mass", above=0.0, unit="kg")
+    rows = {"mass": inertia}
+    matrices = inertia if np.ndim(inertia) else inertia * np.eye(schedule.n_outputs)
+    stiffness = schedule.stiffness
+    if law is not None:
+        if not hasattr(law, "limits"):  # to name its class would need torch
+            raise checks.refusal(law, "law", "a StiffnessLaw or None")
+        rows["stiffness_limits"] = law.limits(schedule.n_outputs)
+        softest, known = rows["stiffness_limits"][0] * np.eye(schedule.n_outputs), 1.0 - schedule.type1[:, None, None]
+        stiffness = rows["stiffness"] = softest + known * (np.asarray(law(schedule.covariance, matrices)) - softest)
+    return rows | {"damping": damping_with(matrices, stiffness, ratio)}
+
+
+def damping_with(mass: Floats, stiffness: Floats, damping_ratio: float) -> Floats:
+    """Damping (n, d, d) that gives all modes of mass and stiffness (n, d, d) this ratio.
 
     ``2 zeta L (L^-1 K L^-T)^1/2 L'`` with M = L L'. It is twice zeta times the geometric mean of M and K, whatever the
     factor L: that of :func:`~torch_pbd.control.damping_from_stiffness`, which takes the root of M.
     """
-    ratio = checks.number(damping_ratio, "damping_ratio", least=0.0, most=1e6, remedy="1 is critical")
-    inertia = checks.real_floats(mass, "mass")
-    n, d, _ = stiffness.shape
-    if inertia.ndim:
-        inertia = checks.array(inertia, "mass", (n, d, d)[-max(inertia.ndim, 2) :])
-        checks.semidefinite(inertia, "mass", definite=True)
-        matrices = inertia
-    else:
-        matrices = checks.number(float(inertia), "mass", above=0.0, unit="kg") * np.eye(d)
-    factor = np.broadcast_to(np.linalg.cholesky(matrices), stiffness.shape)
+    factor = np.broadcast_to(np.linalg.cholesky(mass), stiffness.shape)
     half = np.linalg.solve(factor, stiffness)
     squared, axes = np.linalg.eigh(np.linalg.solve(factor, half.swapaxes(1, 2)))
     modes = factor @ axes * squared.clip(0.0)[:, np.newaxis] ** 0.25
-    return 2.0 * ratio * modes @ modes.swapaxes(1, 2), inertia if inertia.ndim else float(inertia)
+    return 2.0 * damping_ratio * modes @ modes.swapaxes(1, 2)
 
 
-def turned_rows(schedule: Any, rotation: ArrayLike, translation: ArrayLike | None) -> dict[str, Floats]:
+def turned_rows(schedule: Any, rotation: ArrayLike, translation: ArrayLike | None) -> dict[str, Any]:
     """Arrays of a schedule that a rotation and a translation change; see :meth:`Schedule.transform`."""
     p = schedule.position.shape[1]
     if schedule.units in ("rad", "deg"):

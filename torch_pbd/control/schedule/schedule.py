@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.control.schedule.adapted import DiagonalLoss, damping_with, diagonal_gains, turned_rows
+from torch_pbd.control.schedule import adapted
 from torch_pbd.control.schedule.contents import LABELS, SHAPES, Limits, checked_fields
 from torch_pbd.control.schedule.files import read_schedule, write_schedule
 from torch_pbd.control.schedule.rows import Between, ranges_of, tick_times
@@ -199,7 +199,9 @@ class Schedule:
         acceleration = None if self.acceleration is None else self.acceleration * speed**2
         return replace(self, time=self.time / speed, velocity=self.velocity * speed, acceleration=acceleration)
 
-    def with_inertia(self, mass: ArrayLike | Callable[[Floats], ArrayLike], damping_ratio: float = 1.0) -> "Schedule":
+    def with_inertia(
+        self, mass: ArrayLike | Callable[[Floats], ArrayLike], damping_ratio: float = 1.0, *, law: Any = None
+    ) -> "Schedule":
         """Schedule for a robot of this inertia: with it, and with the damping that gives all modes this ratio.
 
         ``D = 2 zeta M^1/2 (M^-1/2 K M^-1/2)^1/2 M^1/2`` at every row, as
@@ -212,14 +214,16 @@ class Schedule:
             In kg, for poses also kg m and kg m^2, in world axes; or a function of time (n,), in s, that returns it.
         damping_ratio : float, default=1.0
             Ratio zeta; 1 is critical.
+        law : StiffnessLaw, default=None
+            Makes the stiffness anew, from the covariance and the inertia of each row, softer where the model knows
+            less, as on_unknown="soft". One with effort="match" matches it to this inertia. None keeps the stiffness.
 
         Raises
         ------
         ValueError
             If a matrix is not symmetric and positive definite, or the ratio is negative.
         """
-        damping, inertia = damping_with(mass(self.time) if callable(mass) else mass, self.stiffness, damping_ratio)
-        return replace(self, damping=damping, mass=inertia)
+        return replace(self, **adapted.inertial_rows(self, mass, damping_ratio, law))
 
     def transform(
         self, rotation: ArrayLike, translation: ArrayLike | None = None, *, frame: str | None = None
@@ -240,8 +244,7 @@ class Schedule:
         ValueError
             If the matrix is no rotation, positions are joint angles, or axes have limits of their own.
         """
-        rows: dict[str, Any] = turned_rows(self, rotation, translation)
-        return replace(self, **rows, frame=frame)
+        return replace(self, **adapted.turned_rows(self, rotation, translation), frame=frame)
 
     def certify(self, *, mass: Any = None, **options: Any) -> "StabilityReport":
         """:func:`torch_pbd.control.certify` of this schedule, whose options it takes; no mass is its own, or 1 kg."""
@@ -249,9 +252,9 @@ class Schedule:
 
         return certify(self, mass=mass, **options)
 
-    def diagonal(self) -> tuple["Schedule", DiagonalLoss]:
+    def diagonal(self) -> tuple["Schedule", adapted.DiagonalLoss]:
         """Schedule with diagonal stiffness and damping, for controllers that take no other, and what that loses."""
-        stiffness, damping, loss = diagonal_gains(self)
+        stiffness, damping, loss = adapted.diagonal_gains(self)
         return replace(self, stiffness=stiffness, damping=damping), loss
 
     def plot(self) -> Any:
@@ -289,10 +292,8 @@ class Schedule:
         return read_schedule(Path(path), build=cls)
 
     def _arrays(self) -> dict[str, Any]:
-        arrays = {name: getattr(self, name) for name in SHAPES}
-        return {name: array for name, array in arrays.items() if isinstance(array, np.ndarray)}
+        return {name: array for name in SHAPES if isinstance(array := getattr(self, name), np.ndarray)}
 
     def _labels(self) -> dict[str, Any]:
-        labels = {name: getattr(self, name) for name in LABELS}
         mass = None if isinstance(self.mass, np.ndarray) else self.mass
-        return {**labels, "mass": mass, "provenance": dict(self.provenance)}
+        return {name: getattr(self, name) for name in LABELS} | {"mass": mass, "provenance": dict(self.provenance)}
