@@ -11,11 +11,12 @@ if TYPE_CHECKING:
     from torch_pbd.control.primitive.dmp import DMP
     from torch_pbd.control.realtime import RealTimeAdmittance, TickStatus
     from torch_pbd.control.schedule.schedule import Schedule
+    from torch_pbd.control.simulation.many import simulate_many
     from torch_pbd.control.simulation.plant import AdmittancePlant
     from torch_pbd.control.simulation.position_loop import PositionLoop
     from torch_pbd.control.simulation.rollout import Rollout
     from torch_pbd.control.simulation.rollouts import RolloutSummary
-    from torch_pbd.control.simulation.run import simulate, simulate_many
+    from torch_pbd.control.simulation.run import simulate
     from torch_pbd.control.simulation.sensor import ForceSensor
     from torch_pbd.control.simulation.walls import Tunnel
     from torch_pbd.control.stability.certify import certify
@@ -46,7 +47,7 @@ _HOMES = {
     "lqt": "stiffness",
     "required_damping_ratio": "damping",
     "simulate": "simulation.run",
-    "simulate_many": "simulation.run",
+    "simulate_many": "simulation.many",
 }
 
 __all__ = [
