@@ -37,7 +37,9 @@ class RateLimit(StiffnessFilter):
     ``v + a y`` and a force that is held over each tick; behind a position loop that lags, a robot need not be.
     Where the mass varies, or a desired orientation turns, the function is that of each tick's own mass, of the
     difference between any two motions under the same gains, and has to pay for that too: a run stops where the damping
-    cannot, since no stiffness would help.
+    cannot, since no stiffness would help. That needs a positive definite ``D - a M - M'/2`` of the damping that is held
+    back, not of the one asked for, and nobody knows it before the run. A robot must not stop half way: the real-time
+    loop refuses masses that vary and poses. There :class:`EnergyTank` is for both.
 
     Parameters
     ----------
