@@ -92,9 +92,10 @@ def test_reading_at_once_is_as_reading_line_by_line(tmp_path):
     recorded = make_tunnel_demonstrations(3, random_state=0)
     save_demonstrations(recorded, tmp_path / "set.csv")
     assert load_demonstrations(tmp_path / "set.csv", units="m") == recorded
-    # Labels beyond 16 letters are read line by line.
-    wide = load_text(tmp_path, (tmp_path / "set.csv").read_text().replace("\n0,", "\n" + "a" * 40 + ","), units="m")
-    assert wide == recorded
+    # Long labels, and such that are longer than the first, are read line by line.
+    text = (tmp_path / "set.csv").read_text()
+    for number, n in ((0, 40), (2, 8), (2, 7)):
+        assert load_text(tmp_path, text.replace(f"\n{number},", "\n" + "a" * n + ","), units="m") == recorded
 
 
 def test_folders_lists_and_patterns_are_one_recording_a_file(tmp_path):

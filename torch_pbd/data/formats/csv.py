@@ -78,12 +78,12 @@ class _Table:
         self.file.seek(start)
         demo, time, outputs = self._columns()
         kinds = dict.fromkeys(range(len(self.header)), "S1") | dict.fromkeys(outputs, "f8")
+        if len(first) != len(self.header) or (time is not None and _is_clock(first[time])):
+            return None
         if time is not None:
-            if len(first) != len(self.header) or _is_clock(first[time]):
-                return None
             kinds[time] = "i8" if re.fullmatch(r"[+-]?\d{16,19}", first[time].strip()) else "f8"
         if demo is not None:
-            kinds[demo] = "S16"
+            kinds[demo] = "S8" if len(first[demo]) < 5 else "S16"  # with what is longer further down cut short
         lines = self.file if self.decimal == "." else (line.translate({44: ".", 46: "!"}) for line in self.file)
         try:
             rows = np.loadtxt(
@@ -205,11 +205,11 @@ def _filled(label: str) -> str:
 
 
 def _numbered(labels: NDArray[Any]) -> NDArray[np.int32] | None:
-    """Number of each label of at most 16 letters; None where one is blank, or may be cut short."""
+    """Number of each label; None where one is blank, or may be cut short."""
     heads = heads_of(labels)
     each = np.char.strip(labels[heads])
     lengths = np.char.str_len(each)
-    if not 0 < lengths.min() <= lengths.max() < 16:
+    if not 0 < lengths.min() <= lengths.max() < labels.dtype.itemsize:
         return None
     return np.repeat(np.unique(each, return_inverse=True)[1].astype(np.int32), np.diff(np.r_[heads, len(labels)]))
 
