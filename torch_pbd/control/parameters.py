@@ -234,10 +234,10 @@ def schedule_labels(controller: Any) -> dict[str, Any]:
 
 def _plain(value: Any) -> Any:
     """Parameter as JSON can hold it."""
-    if is_dataclass(value) and not isinstance(value, type):
-        return asdict(value)
     if isinstance(value, BaseEstimator):
         return {type(value).__name__: {k: _plain(v) for k, v in value.get_params(deep=False).items()}}
+    if is_dataclass(value) and not isinstance(value, type):
+        return asdict(value)
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     return value if value is None or isinstance(value, bool | int | float | str | list) else repr(value)
