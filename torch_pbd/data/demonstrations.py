@@ -53,7 +53,7 @@ class Demonstrations(Editing):
         How `align` brought the demonstrations onto one grid; None where it did not.
     missing : {"raise", "drop"}, default="raise"
         "drop" leaves out samples of which the time or a position is NaN or masked, and warns
-        (`MissingDataWarning`) of how many; each demonstration then has its own times. Infinity is an error.
+        (``MissingDataWarning``) of how many; each demonstration then has its own times. Infinity is an error.
     rotation : sequence of 4 str, default=None
         Columns of a unit quaternion, in the order w x y z, wherever they stand: nothing in recordings tells x y z w
         from it. They become three outputs rx, ry, rz in rad, the last ones: y = Log(R0' R), around the Frechet mean R0
@@ -195,7 +195,8 @@ class Demonstrations(Editing):
     def stack(self, input: Literal["time", "phase"] = "time") -> tuple[Floats, Floats, NDArray[np.intp]]:
         """All samples below each other, as scikit-learn's estimators want them.
 
-        Names, units, and that three outputs are a rotation stay behind: `DMPController.fit` takes demonstrations whole.
+        Names, units, and that three outputs are a rotation stay behind: ``DMPController.fit`` takes demonstrations
+        whole.
 
         Parameters
         ----------

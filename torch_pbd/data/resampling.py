@@ -59,7 +59,7 @@ class Resampling:
         """These demonstrations without what is faster, at their own times.
 
         Each is the cubic smoothing spline that halves amplitudes at the cutoff: a Butterworth filter of second order
-        forward and backward, without lag, at times that need not be even. `DMPController` smooths what it is given
+        forward and backward, without lag, at times that need not be even. ``DMPController`` smooths what it is given
         itself; covariance regressors and movement models take recordings with all their noise.
 
         Parameters
