@@ -241,9 +241,22 @@ def test_joints_are_pushed_by_torques(tmp_path, capsys, monkeypatch):
     torch_pbd.save_demonstrations(Demonstrations(np.arange(9.0), turned, names=["a", "b"], units="rad"), path)
     monkeypatch.setattr("torch_pbd.experiments.robot.run_robot", lambda *args, **options: "")
     assert main(["experiment", "--data", str(path), "--output", str(tmp_path / "out")]) == 0
-    assert "pushes of 5 Nm about a, at 20 % and 80 % of the movement; K is the stiffness there, Nm/rad" in (
-        capsys.readouterr().out
-    )
+    shown = capsys.readouterr().out
+    assert "pushes of 5 Nm about a,\nat 20 % and 80 % of the movement; K is the stiffness there, Nm/rad\n" in shown
+
+
+@pytest.mark.parametrize("name", ["push", "torque"])
+def test_a_push_against_its_axis_is_refused(name, capsys):
+    assert main(["experiment", f"--{name}", "-3"]) == 2
+    assert f"--{name} is the number -3, must be a number from 0 to 1e+06" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("task", "n_demos"), [("tunnel", 6), ("peg", 8)])
+def test_made_demonstrations_are_enough_for_their_outputs(task, n_demos, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("torch_pbd.experiments.robot.run_robot", lambda *args, **options: "")
+    monkeypatch.setattr("torch_pbd.experiments.poses.run_poses", lambda *args, **options: "")
+    assert main(["experiment", "--task", task, "--arm", "none", "--output", str(tmp_path)]) == 0
+    assert f"{task} task: {n_demos} demonstrations" in capsys.readouterr().out
 
 
 @pytest.mark.slow

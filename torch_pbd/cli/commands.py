@@ -62,6 +62,7 @@ OPTIONS: dict[str, dict[str, Option]] = {
     "experiment": {
         **_FILE,
         **_MADE,
+        "n_demos": Option(_Count | None, None, "demonstrations to make; null: 6, and of poses 8"),
         "common_start": Option(bool, False, "made demonstrations of the tunnel start at one point"),
         "task": Option(Literal["tunnel", "peg"], "tunnel", "to make demonstrations of: peg turns a tool"),
         "controllers": Option(
@@ -69,8 +70,8 @@ OPTIONS: dict[str, dict[str, Option]] = {
             {"recommended": "DMPController"},
             f"controllers {_CLASS_HELP} --controllers.help DMPController",
         ),
-        "push": Option(Annotated[float, (-1e6, 1e6)], 5.0, "peak of the two pushes along the first output, N"),
-        "torque": Option(Annotated[float, (-1e6, 1e6)], 1.2, "peak of two pushes of poses by torque, Nm"),
+        "push": Option(Annotated[float, (0.0, 1e6)], 5.0, "peak of the two pushes along the first output, N"),
+        "torque": Option(Annotated[float, (0.0, 1e6)], 1.2, "peak of two pushes of poses by torque, Nm"),
         "arm": Option(Literal["panda", "none"], "panda", "whose inertia a robot of poses has; none: a virtual one"),
         "rate": Option(Annotated[float, (1e-3, 1e6)], 1000.0, "ticks of the controller, Hz"),
     },
@@ -199,11 +200,11 @@ def experiment(options: Any, folder: Any) -> str:
     from torch_pbd.experiments.robot import framework_figure, run_robot
 
     made = options.data is None
-    if made and options.task == "peg":
-        demonstrations = make_pose_demonstrations(options.n_demos, random_state=options.seed)
+    if made and options.task == "peg":  # six outputs: fewer than seven leave open how they vary together
+        demonstrations = make_pose_demonstrations(options.n_demos or 8, random_state=options.seed)
     elif made:
         demonstrations = make_tunnel_demonstrations(
-            options.n_demos, random_state=options.seed, common_start=options.common_start
+            options.n_demos or 6, random_state=options.seed, common_start=options.common_start
         )
     else:
         demonstrations = _loaded(options)
@@ -212,8 +213,8 @@ def experiment(options: Any, folder: Any) -> str:
         return _pose_experiment(options, demonstrations, folder)
     turns = set(demonstrations.units or ()) in ({"rad"}, {"deg"})
     where, unit = ("Nm about", "Nm/rad") if turns else ("N along", "N/m")
-    where += f" {demonstrations.names[0]}, at 20 % and 80 % of the movement; K is the stiffness there, {unit}"
-    say(f"pushes of {options.push:g} {where}\n")
+    say(f"pushes of {options.push:g} {where} {demonstrations.names[0]},")
+    say(f"at 20 % and 80 % of the movement; K is the stiffness there, {unit}\n")
     folder.write_figure(framework_figure(), "figure5_framework")
     return run_robot(options.controllers, demonstrations, folder, peak=options.push, rate=options.rate, in_tunnel=made)
 

@@ -12,7 +12,7 @@ from typing import Any
 import torch_pbd
 from torch_pbd.cli import commands
 from torch_pbd.cli.words import unknown
-from torch_pbd.console import Notes, say
+from torch_pbd.console import Notes, progress, say
 from torch_pbd.exceptions import ConfigError, FolderInUseError
 
 # The last two are 128 and the number of the signal, as of shells.
@@ -94,10 +94,16 @@ def _answer(arguments: Sequence[str]) -> int:
 
 
 def _run(command: str, arguments: Sequence[str]) -> int:
-    options, config = commands.parse(command, arguments)
-    if command == "playground":
+    with progress():
+        options, config = commands.parse(command, arguments)
+        if command != "playground":
+            _work(command, options, config)
+    if command == "playground":  # which goes on until it is ended, and says so itself
         commands.playground(options)
-        return 0
+    return 0
+
+
+def _work(command: str, options: Any, config: str) -> None:
     from torch_pbd.experiments.resume import finished_fits
     from torch_pbd.experiments.run_folder import check_names, write_report
 
@@ -124,7 +130,6 @@ def _run(command: str, arguments: Sequence[str]) -> int:
                 stop.args = (f"torch-pbd {command} --config {folder.path / 'config.yaml'} --resume goes on",)
             raise
     say(f"\nreport:  {report}\nresults: {folder.path}")
-    return 0
 
 
 def _files(data: Any) -> list[Path]:

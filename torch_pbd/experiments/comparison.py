@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.base import clone
 
 from torch_pbd.checks import Floats
+from torch_pbd.console import steps
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.experiments.resume import FinishedFits, fit_once
 from torch_pbd.metrics import covariance_mse, mahalanobis_coverage, negative_log_likelihood, relative_frobenius_error
@@ -84,13 +85,16 @@ def compare_models(
     inputs, empirical = empirical_covariances(X, y)
     folds = left_out(groups, max_folds)
     # One by one, before the folds share the cores: these are the times that are reported.
-    fits = {name: fit_once(clone(model), X, y, groups, finished=finished) for name, model in models.items()}
+    fits = {
+        name: fit_once(clone(model), X, y, groups, finished=finished)
+        for name, model in steps(models.items(), "fit", len(models))
+    }
     jobs = (
         delayed(score_fold)(clone(model), X, y, groups, fold, finished, whole=whole_movements)
         for model in models.values()
         for fold in folds
     )
-    results = iter(Parallel(n_jobs=n_jobs)(jobs))
+    results = steps(Parallel(n_jobs=n_jobs, return_as="generator")(jobs), "fold", len(models) * len(folds))
     scores = []
     for name, (fitted, seconds) in fits.items():
         covariance = fitted.predict_cov(inputs)

@@ -11,6 +11,7 @@ from sklearn.base import clone
 
 from torch_pbd import plotting, rotations
 from torch_pbd.checks import Floats
+from torch_pbd.console import steps
 from torch_pbd.control.controller import DMPController
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.plant import AdmittancePlant
@@ -71,7 +72,7 @@ def run_poses(
         raise ConfigError(f"data: a pose has three positions and a rotation, not the outputs {demonstrations.names}.")
     folder.write_figure(task_figure(demonstrations), "figure6_task")
     rows, reports = [], []
-    for name, controller in controllers.items():
+    for name, controller in steps(controllers.items(), "controller", len(controllers)):
         fitted, _ = fit_once(clone(controller), demonstrations, finished=folder.finished)
         run = pushed(fitted, rate, peak, torque, arm)
         rows += [row for kind in (plotting.POSITION, plotting.ROTATION) for row in push_rows(name, run, kind)]

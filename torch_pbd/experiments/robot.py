@@ -11,6 +11,7 @@ from sklearn.base import clone
 
 from torch_pbd import plotting
 from torch_pbd.checks import Floats
+from torch_pbd.console import steps
 from torch_pbd.control.controller import DMPController
 from torch_pbd.control.primitive.outputs import in_si
 from torch_pbd.control.schedule.schedule import Schedule
@@ -111,7 +112,7 @@ def run_robot(
 ) -> str:
     """Run each controller; writes figures, models, schedules, metrics, reports; returns table and reports as text."""
     rows, reports = [], []
-    for name, controller in controllers.items():
+    for name, controller in steps(controllers.items(), "controller", len(controllers)):
         run = run_controller(controller, demonstrations, peak=peak, rate=rate, finished=folder.finished)
         rows.append(push_row(name, run) | _guarantees(run))
         reports.append(f"{name}: a movement of {run.schedule.duration:.3g} s\n{run.report}")

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from torch_pbd import plotting
 from torch_pbd.checks import Floats
+from torch_pbd.console import steps
 from torch_pbd.data import make_paper_simulation, paper_covariance, paper_mean
 from torch_pbd.data.synthetic import Reading
 from torch_pbd.estimators.base import CovarianceRegressor
@@ -42,7 +43,7 @@ def table1(
     fitted: dict[str, CovarianceRegressor] = {}
     for reading in readings:
         scores: dict[str, list[Score]] = {name: [] for name in models}
-        for seed in range(n_seeds):
+        for seed in steps(range(n_seeds), f"simulation ({reading})", n_seeds):
             data = make_paper_simulation(n_inputs, n_demos, reading=reading, random_state=seed)
             options: dict[str, Any] = {"max_folds": max_folds, "n_jobs": n_jobs, "finished": finished}
             truth = partial(paper_covariance, reading=reading)
