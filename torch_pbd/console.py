@@ -20,10 +20,12 @@ def say(text: str, stream: TextIO | None = None) -> None:
     Letters that the stream's encoding has not are question marks.
     """
     stream = sys.stdout if stream is None else stream
+    encoding, errors = getattr(stream, "encoding", None) or "utf-8", getattr(stream, "errors", None) or "strict"
+    errors = "replace" if errors == "strict" else errors
     with _LINE.lock:
         _LINE.erase()
         try:
-            print(_encodable(text, stream), file=stream, flush=True)
+            print(text.encode(encoding, errors).decode(encoding, errors), file=stream, flush=True)
         except BrokenPipeError:
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
@@ -87,15 +89,6 @@ def steps(items: Iterable[_Item], what: str, n_items: int) -> Iterator[_Item]:
             yield next(remaining)
         finally:
             _LINE.steps.pop()
-
-
-def _encodable(text: str, stream: TextIO) -> str:
-    encoding = getattr(stream, "encoding", None) or "utf-8"
-    try:
-        text.encode(encoding, getattr(stream, "errors", None) or "strict")
-    except UnicodeEncodeError:
-        return text.encode(encoding, "replace").decode(encoding)
-    return text
 
 
 class Notes:

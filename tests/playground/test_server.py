@@ -1,5 +1,6 @@
 """A raw client against the server: who is refused, and that the server lives on."""
 
+import base64
 import http.client
 import json
 from contextlib import ExitStack, closing, contextmanager
@@ -24,13 +25,12 @@ def get(address, path="", **headers):
 
 @contextmanager
 def open_page(address, origin="ours"):
-    """Socket of a page, after its first message; and the number of its tab."""
+    """Socket of a page, after its first message."""
     url = urlsplit(address)
     origin = f"http://{url.netloc}" if origin == "ours" else origin
     with sync.connect(f"ws://{url.netloc}{url.path}live", origin=origin, open_timeout=60) as page:
-        hello = json.loads(page.recv(60))
-        assert hello["type"] == "hello"
-        yield page, hello["tab"]
+        assert json.loads(page.recv(60))["type"] == "hello"
+        yield page
 
 
 def ask(page, message, *kinds):
@@ -45,7 +45,7 @@ def ask(page, message, *kinds):
 
 @pytest.mark.slow
 def test_strokes_are_learned_bent_followed_and_taken_home(address):
-    with open_page(address) as (page, tab):
+    with open_page(address) as page:
         settings = {"models": ["CholeskyCovRegressor"]}
         picture = ask(page, {"type": "learn", "strokes": make_strokes(), "settings": settings}, "picture")
         assert len(picture["path"]) == 50
@@ -55,17 +55,16 @@ def test_strokes_are_learned_bent_followed_and_taken_home(address):
         assert robot["frame"] == 7
         bent = ask(page, {"type": "bend", "points": [[0.7, 0.4, 0.35]], "follow": True}, "picture", "error")
         assert bent["path"] != picture["path"]
-        status, content, _ = get(address, f"take/{tab}/demonstrations.csv")
-        assert status == 200
-        assert content.startswith(b"demo,time,x,y")
+        taken = ask(page, {"type": "take", "name": "demonstrations.csv"}, "file", "error")
+        assert base64.b64decode(taken["content"]).startswith(b"demo,time,x,y")
         for name in ("../cli/main.py", "server.py", "nothing", "..%2f..%2fpyproject.toml"):
-            assert get(address, f"take/{tab}/{name}")[0] == 404
+            assert "name" in ask(page, {"type": "take", "name": name}, "file", "error")["text"]
             assert get(address, name)[0] == 404
 
 
 @pytest.mark.slow
 def test_newer_strokes_do_not_wait_for_what_is_learned_of_older_ones(address):
-    with open_page(address) as (page, _):
+    with open_page(address) as page:
         fast = {"type": "learn", "strokes": make_strokes(), "settings": {"models": ["CholeskyCovRegressor"]}}
         ask(page, fast, "schedule")  # once the modules are loaded
         slow = {"models": ["HeteroscedasticGPRegressor", "WishartProcessRegressor"]}
@@ -98,7 +97,7 @@ def test_only_our_own_page_is_answered(address):
 
 
 def test_noise_and_too_much_of_it_end_no_more_than_the_page(address):
-    with open_page(address) as (page, _):
+    with open_page(address) as page:
         for i in range(100):
             noise = [
                 f"{{{i}",
@@ -111,7 +110,7 @@ def test_noise_and_too_much_of_it_end_no_more_than_the_page(address):
         assert "data" not in ask(page, {"type": "read", "name": "/etc/passwd", "content": ""}, "error")
         with pytest.raises(ConnectionClosed):
             ask(page, {"type": "learn", "strokes": [[[0.001 * i, 0.0, 0.0] for i in range(1_000_000)]] * 2}, "picture")
-    with open_page(address) as (page, _):
+    with open_page(address) as page:
         assert not ask(page, {"type": "frame"}, "robot")["is_there"]
 
 

@@ -1,5 +1,6 @@
 """The learning process at work: the newest strokes come first, whatever is being learned of older ones."""
 
+import base64
 import os
 import signal
 import threading
@@ -13,8 +14,6 @@ import numpy as np
 
 from torch_pbd.playground import learning
 from torch_pbd.playground.learning import Answer, Learned, Step
-
-_NOTHING = "nothing is learned yet: draw two strokes."
 
 
 class _Newer(BaseException):
@@ -80,7 +79,7 @@ class Desk:
         try:
             answer = make()
         except Exception as error:  # whatever a fit raises is said on the page
-            answer, is_sound = {"type": "error", "text": _words(error)}, False
+            answer, is_sound = {"type": "error", "text": f"{error}" or type(error).__name__}, False
         self._is_stepping = False  # an answer is sent as a whole
         if answer is not None:
             self._connection.send((tab, answer))
@@ -98,10 +97,11 @@ class Desk:
         if kind == "read":
             strokes = learning.read_file(request["name"], request["content"])
             return {"type": "strokes", "strokes": [np.column_stack(stroke).tolist() for stroke in strokes]}
-        if kind == "take":
-            return {"type": "file", "ask": request["ask"], **_file(learned, request["name"])}
         if learned is None:
-            raise ValueError(_NOTHING)
+            raise ValueError("nothing is learned yet: draw two strokes.")
+        if kind == "take":
+            content = base64.b64encode(learning.take_home(learned, request["name"])).decode()
+            return {"type": "file", "name": request["name"], "content": content}
         if kind == "adjust":
             return learning.adjust(learned, request["settings"])
         answer = learning.bend(learned, request["points"])
@@ -116,14 +116,3 @@ def _newest(requests: list[tuple[int, Answer]]) -> list[tuple[int, Answer]]:
         for number, each in enumerate(requests)
         if each[1]["type"] in ("take", "read") or last[each[0], each[1]["type"]] == number
     ]
-
-
-def _file(learned: Learned | None, name: str) -> Answer:
-    try:
-        return {"text": _NOTHING} if learned is None else {"content": learning.take_home(learned, name)}
-    except Exception as error:  # as of a fit
-        return {"text": _words(error)}
-
-
-def _words(error: Exception) -> str:
-    return f"{error}" or type(error).__name__

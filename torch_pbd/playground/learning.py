@@ -204,21 +204,17 @@ def _python(learned: Learned) -> str:
 
 def _yaml(learned: Learned) -> str:
     settings, name = learned.settings, next(iter(learned.controllers))
-    law = {
-        "class_path": "StiffnessLaw",
-        "init_args": {
-            "stiffness_min": settings.stiffness_min, "stiffness_max": settings.stiffness_max, "smooth": settings.smooth
-        },
-    }  # fmt: skip
-    model: Any = {"class_path": name}
-    if name not in MOVEMENTS:
-        model = {"class_path": "TrajectoryRegressor", "init_args": {"regressor": model}}
+
+    def spec(class_path: str, **init_args: Any) -> dict[str, Any]:
+        return {"class_path": class_path, "init_args": init_args}
+
+    limits = {key: getattr(settings, key) for key in ("stiffness_min", "stiffness_max", "smooth")}
     arguments = {
-        "covariance": model, "n_steps": _STEPS, "stiffness_law": law, "mass": settings.mass,
+        "covariance": spec(name) if name in MOVEMENTS else spec("TrajectoryRegressor", regressor=spec(name)),
+        "n_steps": _STEPS,
+        "stiffness_law": spec("StiffnessLaw", **limits),
+        "mass": settings.mass,
         "damping_ratio": settings.damping_ratio,
-    }  # fmt: skip
-    content = {
-        "data": "demonstrations.csv",
-        "controllers": {"mine": {"class_path": "DMPController", "init_args": arguments}},
     }
+    content = {"data": "demonstrations.csv", "controllers": {"mine": spec("DMPController", **arguments)}}
     return "# torch-pbd experiment --config skill.yaml\n" + str(yaml.safe_dump(content, sort_keys=False))

@@ -19,6 +19,7 @@ from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from torch_pbd import checks
 from torch_pbd.console import say
 from torch_pbd.playground import messages
 from torch_pbd.playground.robot import Robot
@@ -26,7 +27,6 @@ from torch_pbd.playground.worker import Worker
 
 _PAGE = Path(__file__).with_name("page")
 _TABS = 4  # open at a time
-_PATIENCE = 60.0  # s for a file to be made
 _LOOPBACK = "127.0.0.1"
 _HEADERS = {
     "Content-Security-Policy": "default-src 'self'; frame-ancestors 'none'",
@@ -58,6 +58,8 @@ class Tab:
         elif kind == "read":
             name, content = messages.as_file(message)
             self._ask(type="read", name=name, content=content)
+        elif kind == "take":
+            self._ask(type="take", name=checks.choice(message.get("name"), "name", messages.FILES))
         else:
             raise ValueError(f"the page asks for {kind!r:.40}, which is not known here")
 
@@ -104,14 +106,12 @@ class Playground:
         self._hosts = {f"{name}:{port}" for name in (_LOOPBACK, "localhost")}
         self.address = f"http://{_LOOPBACK}:{port}/{self.token}/"
         self._tabs: dict[int, Tab] = {}
-        self._files: dict[int, asyncio.Future[Any]] = {}
-        self._n_tabs = self._n_files = 0
+        self._n_tabs = 0
 
     def application(self) -> Any:
         """ASGI application, which refuses what other pages of the same browser send."""
         routes = [
             Route("/{token}/", self._page),
-            Route("/{token}/take/{tab:int}/{name}", self._take),
             Route("/{token}/{name}", self._page),
             WebSocketRoute("/{token}/live", self._live),
         ]
@@ -158,11 +158,6 @@ class Playground:
             self._worker.close()
 
     def _deliver(self, number: int, answer: dict[str, Any]) -> None:
-        if answer["type"] == "file":
-            future = self._files.pop(answer["ask"], None)
-            if future is not None and not future.done():
-                future.set_result(answer)
-            return
         # Tab -1 is every one.
         for tab in [self._tabs[number]] if number in self._tabs else list(self._tabs.values()) * (number == -1):
             task = asyncio.ensure_future(tab.deliver(dict(answer)))
@@ -175,19 +170,6 @@ class Playground:
             raise HTTPException(404)
         return FileResponse(_PAGE / name, headers=_HEADERS)
 
-    async def _take(self, request: Request) -> Response:
-        name, tab = request.path_params["name"], request.path_params["tab"]
-        if name not in messages.FILES or tab not in self._tabs:
-            raise HTTPException(404)
-        self._n_files += 1
-        future = self._files[self._n_files] = asyncio.get_running_loop().create_future()
-        self._worker.ask(tab, {"type": "take", "name": name, "ask": self._n_files})
-        answer = await asyncio.wait_for(future, _PATIENCE)
-        if "text" in answer:
-            return PlainTextResponse(answer["text"], 409)
-        headers = {**_HEADERS, "Content-Disposition": f'attachment; filename="{name}"'}
-        return Response(answer["content"], media_type="application/octet-stream", headers=headers)
-
     async def _live(self, page: WebSocket) -> None:
         await page.accept()
         if len(self._tabs) >= _TABS:
@@ -198,7 +180,7 @@ class Playground:
         self._n_tabs += 1
         number = self._n_tabs
         tab = self._tabs[number] = Tab(page, self._worker, number)
-        await tab.send({"type": "hello", "tab": number, "models": messages.MODELS, "files": messages.FILES})
+        await tab.send({"type": "hello", "models": messages.MODELS, "files": messages.FILES})
         try:
             while True:
                 message = await page.receive()

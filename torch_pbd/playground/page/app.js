@@ -17,7 +17,7 @@ export const state = {
   mode: "draw", strokes: [], current: null, pen: null, undone: [],
   measured: null, pictures: {}, shown: [], draws: true, via: [], chosen: -1, place: null,
   settings: { stiffness_min: 50, stiffness_max: 1000, damping_ratio: 1, mass: 1, speed: 1, smooth: false, models: [] },
-  schedule: null, robot: null, trace: [], hand: null, push: [0, 0], isPaused: false, tab: null,
+  schedule: null, robot: null, trace: [], hand: null, push: [0, 0], isPaused: false,
 };
 // For whoever measures: frames a second, and times from asking for a frame to having it, in ms.
 export const statistics = { frames: 0, rate: 0, trips: [], learned: 0, asked: 0 };
@@ -53,7 +53,6 @@ function receive(answer) {
     if (state.trace.length > 3000) state.trace.splice(0, 1000);
     state.robot = answer;
   } else if (answer.type === "hello") {
-    state.tab = answer.tab;
     offer(answer);
     learn();
   } else if (answer.type === "restarted") {
@@ -78,6 +77,9 @@ function receive(answer) {
     state.strokes = answer.strokes.map((rows) => ({ rows: rows.map(place), hidden: false }));
     changed();
     find("note").textContent = note; // what is taken home is not in the file's coordinates
+  } else if (answer.type === "file") {
+    const href = `data:application/octet-stream;base64,${answer.content}`;
+    Object.assign(document.createElement("a"), { href, download: answer.name }).click();
   } else if (answer.type === "error") {
     isBending = false;
     fail(answer.text);
@@ -199,14 +201,14 @@ function options(select, names, chosen) {
   select.replaceChildren(...names.map(([value, text]) => new Option(text, value, false, value === chosen)));
 }
 
-function offer({ tab, models, files }) {
+function offer({ models, files }) {
   const before = state.settings.models;
   options(find("model-0"), models.map((name) => [name, name]), before[0]);
   options(find("model-1"), [["", "compare with ..."], ...models.map((name) => [name, name])], before[1] || "");
   find("files").replaceChildren(...files.map((name) => {
-    const link = document.createElement("a");
-    Object.assign(link, { href: `take/${tab}/${name}`, textContent: name, download: name });
-    return link;
+    const button = Object.assign(document.createElement("button"), { textContent: name });
+    button.onclick = () => ask({ type: "take", name });
+    return button;
   }));
   choose();
 }
