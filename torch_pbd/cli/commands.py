@@ -96,11 +96,6 @@ OPTIONS: dict[str, dict[str, Option]] = {
     },
 }  # fmt: skip
 
-OPENINGS = {
-    "demo": "{n_demos} made demonstrations of the tunnel task; the truth is that of 300 fresh ones\n",
-}
-"""First lines, said before torch, which takes seconds to load."""
-
 _LEGEND = """MSE: squared distance of Cholesky factors to the empirical covariances, units of
 the data (Table I); error to truth: relative Frobenius error of the covariance;"""
 _FOLDS_LEGEND = f"""{_LEGEND}
@@ -154,6 +149,7 @@ def demo(options: Any, folder: Any) -> str:
     """The main job: made demonstrations of the tunnel task, four models, a robot that is pushed."""
     from torch_pbd.experiments.demo import run_demo
 
+    say(f"{options.n_demos} made demonstrations of the tunnel task; the truth is that of 300 fresh ones\n")
     models = made({name: MODELS[name] for name in ("HGP", "CD", "WP", "GMM 5")}, OPTIONS["compare"]["models"].type)
     return f"{run_demo(models, folder, n_demos=options.n_demos, seed=options.seed)}\n\n{_DEMO_LEGEND}"
 

@@ -117,8 +117,6 @@ def _work(command: str, options: Any, config: str) -> None:
         try:
             with finished_fits(folder.path / "finished", resume=options.resume) as folder.finished:
                 folder.write_text("config.yaml", config)
-                if command in commands.OPENINGS:
-                    say(commands.OPENINGS[command].format(**vars(options)))
                 import torch
 
                 torch.set_num_threads(1)  # the matrices are small: threads would only wait for each other

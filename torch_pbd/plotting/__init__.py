@@ -21,11 +21,9 @@ from torch_pbd.plotting.poses import (
 )
 from torch_pbd.plotting.rerun import to_rerun
 from torch_pbd.plotting.style import (
-    AXES,
     DATA,
     EMPIRICAL,
     FORCE,
-    LINES,
     MODEL,
     OTHER,
     POSITION,
@@ -42,15 +40,12 @@ from torch_pbd.plotting.style import (
     principal,
     readable_unit,
     schedule_names,
-    short_unit,
 )
 
 __all__ = [
-    "AXES",
     "DATA",
     "EMPIRICAL",
     "FORCE",
-    "LINES",
     "MODEL",
     "OTHER",
     "POSITION",
@@ -85,6 +80,5 @@ __all__ = [
     "principal",
     "readable_unit",
     "schedule_names",
-    "short_unit",
     "to_rerun",
 ]

@@ -24,6 +24,7 @@ from torch_pbd.plotting.style import (
     Kind,
     axis_names,
     check_axes,
+    check_ellipses,
     check_kind,
     chosen_outputs,
     kind_of,
@@ -103,10 +104,7 @@ def plot_covariance_ellipses(
     linestyle: str = "-",
 ) -> LineCollection:
     """Draw the ``n_std`` ellipses of covariances (n, 2, 2) around means (n, 2)."""
-    check_axes("ax", [ax])
-    centres = checks.array(mean, "mean", ("n", 2))
-    matrices = checks.array(covariance, "covariance", (len(centres), 2, 2))
-    checks.semidefinite(matrices, "covariance")
+    centres, matrices = check_ellipses(mean, covariance, ax, 2)
     # With covariances A diag(v) A' the curves are mean + n_std A sqrt(v) (cos, sin).
     angle = np.linspace(0.0, 2.0 * np.pi, 73)
     circle = np.stack([np.cos(angle), np.sin(angle)])

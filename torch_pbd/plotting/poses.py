@@ -20,6 +20,7 @@ from torch_pbd.plotting.style import (
     SERIES,
     axis_names,
     check_axes,
+    check_ellipses,
     equal_scales,
     kind_of,
     legend_below,
@@ -98,10 +99,7 @@ def plot_covariance_ellipsoids(
 
     The axes are of projection "3d".
     """
-    check_axes("ax", [ax])
-    centres = checks.array(mean, "mean", ("n", 3))
-    matrices = checks.array(covariance, "covariance", (len(centres), 3, 3))
-    checks.semidefinite(matrices, "covariance")
+    centres, matrices = check_ellipses(mean, covariance, ax, 3)
     curves = centres[:, np.newaxis, np.newaxis, :] + n_std * _great_circles(matrices)
     return _lines(ax, curves.reshape(-1, *curves.shape[2:]), color, 0.7, label)
 
@@ -144,8 +142,8 @@ def draw_recorded_poses(demonstrations: Any, ax: Axes, bands: Sequence[Axes], n_
     label_space(ax, demonstrations.names[:3], None if demonstrations.units is None else demonstrations.units[0])
 
 
-def draw_planned_poses(schedule: Any, ax: Axes, n_poses: int = 7) -> None:
-    """Draw the path of a schedule of poses, with ellipsoids, frames, and where the axes of the tool spread."""
+def draw_pose_schedule(schedule: Any, ax: Axes, bands: Sequence[Axes], n_poses: int = 7) -> None:
+    """Draw a schedule of poses: its path with ellipsoids and frames; over time, deviations and stiffness of both blocks."""
     length = _LENGTH * float(np.ptp(schedule.position, axis=0).max())
     # At equal distances: at its ends a tool is slow.
     way = np.append(0.0, np.linalg.norm(np.diff(schedule.position, axis=0), axis=1)).cumsum()
@@ -156,11 +154,6 @@ def draw_planned_poses(schedule: Any, ax: Axes, n_poses: int = 7) -> None:
     plot_frames(path, schedule.orientation[some], ax, length=length, covariance=spread[:, 3:, 3:], label="tool, 2 sd")
     mark_ends(ax, schedule.position)
     label_space(ax, (schedule.names or POSE_NAMES)[:3], schedule.units)
-
-
-def draw_pose_schedule(schedule: Any, space: Axes, bands: Sequence[Axes]) -> None:
-    """Draw a schedule of poses: its path, and over time the deviations of both blocks and their stiffness."""
-    draw_planned_poses(schedule, space)
     draw_blocks(schedule, bands)
     bands[2].set_xlabel("")
 

@@ -147,6 +147,15 @@ def check_axes(name: str, axes: Any, n_axes: int = 1) -> None:
         raise ValueError(f"{name} is {axes!r}, must be {n_axes} matplotlib Axes.")
 
 
+def check_ellipses(mean: Any, covariance: Any, ax: Any, d: int) -> tuple[Floats, Floats]:
+    """Means (n, d) and covariances (n, d, d) to draw into an Axes."""
+    check_axes("ax", [ax])
+    centres = checks.array(mean, "mean", ("n", d))
+    matrices = checks.array(covariance, "covariance", (len(centres), d, d))
+    checks.semidefinite(matrices, "covariance")
+    return centres, matrices
+
+
 def check_kind(value: Any, name: str, kind: str) -> None:
     """Check that an object is of a class by the name of it: those that draw themselves stand above this floor."""
     if type(value).__name__ != kind:
