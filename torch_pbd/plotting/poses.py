@@ -143,7 +143,7 @@ def draw_recorded_poses(demonstrations: Any, ax: Axes, bands: Sequence[Axes], n_
 
 
 def draw_pose_schedule(schedule: Any, ax: Axes, bands: Sequence[Axes], n_poses: int = 7) -> None:
-    """Draw a schedule of poses: its path with ellipsoids and frames; over time, deviations and stiffness of both blocks."""
+    """Draw a schedule of poses: its path with ellipsoids and frames; over time, deviations and stiffness."""
     length = _LENGTH * float(np.ptp(schedule.position, axis=0).max())
     # At equal distances: at its ends a tool is slow.
     way = np.append(0.0, np.linalg.norm(np.diff(schedule.position, axis=0), axis=1)).cumsum()
