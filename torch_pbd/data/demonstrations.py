@@ -96,16 +96,6 @@ class Demonstrations(Editing):
            [0., 2., 4.]])
     """
 
-    times: tuple[Floats, ...]
-    positions: tuple[Floats, ...]
-    names: tuple[str, ...]
-    units: tuple[str, ...] | None
-    frame: str | None
-    time_unit: str
-    alignment: Alignment | None
-    rotation_reference: Floats | None
-    suspects: tuple[str, ...]
-
     def __init__(
         self,
         times: ArrayLike | Sequence[ArrayLike],

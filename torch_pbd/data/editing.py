@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 class Editing(Resampling):
     """Methods of `torch_pbd.data.Demonstrations`; abstract."""
 
-    frame: str | None
-
     def __getitem__(self, index: Any) -> Any:
         raise NotImplementedError
 

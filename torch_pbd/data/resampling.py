@@ -22,15 +22,17 @@ MAX_DEFAULT_STEPS = 200
 
 
 class Resampling:
-    """Methods of `torch_pbd.data.Demonstrations`; abstract."""
+    """State and methods of `torch_pbd.data.Demonstrations`; abstract."""
 
     times: tuple[Floats, ...]
     positions: tuple[Floats, ...]
     names: tuple[str, ...]
     units: tuple[str, ...] | None
+    frame: str | None
     time_unit: str
     alignment: Alignment | None
     rotation_reference: Floats | None
+    suspects: tuple[str, ...]
 
     def _replace(self, times: Any, positions: Any, **changes: Any) -> Self:
         raise NotImplementedError
