@@ -272,7 +272,7 @@ def test_loader_options_are_on_the_command_line_and_in_yaml(tmp_path, capsys):
     assert main(arguments) == 1
     told = capsys.readouterr().err
     assert "no column 'time' among [trial, stamp, px, py, note]: say time='stamp', if that is it" in told
-    assert "Here an option= is --loader.option." in told
+    assert "Here time= is written --loader.time." in told
     assert main([*arguments, "--loader.outpust", "px"]) == 2
     assert "no option 'outpust'; did you mean 'outputs'?" in capsys.readouterr().err
     assert main(["fit", "--data", str(tmp_path / "gone_*.csv"), *FIT, *output]) == 2

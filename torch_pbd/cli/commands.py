@@ -263,7 +263,8 @@ def _loaded(options: Any, *, inspect: bool = False) -> Any:
     except TypeError as error:
         raise ConfigError(f"loader: {error}") from error
     except DataFormatError as error:
-        here = " Here an option= is --loader.option." if re.search(r"\b[a-z_]+=", str(error)) else ""
+        option = re.search(r"\b([a-z_]+)=", str(error))
+        here = f" Here {option[1]}= is written --loader.{option[1]}." if option else ""
         raise DataFormatError(f"{error}{here}") from error
 
 
