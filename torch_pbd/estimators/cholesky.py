@@ -119,7 +119,7 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
     ((3, 2), (3, 2, 2))
     """
 
-    aligned_objective = "empirical"
+    _aligned_objective = "empirical"
 
     _core_class = MeanAndCholesky
 

@@ -66,7 +66,7 @@ class Problem:
 class LatentCovarianceRegressor(CovarianceRegressor):
     """Base of CD and WP: mean by d Gaussian processes, covariance by more of them; not for direct use."""
 
-    aligned_objective: str
+    _aligned_objective: str
     """Value of ``objective`` that works on empirical covariances."""
 
     _core_class: ClassVar[type[MeanAndCovariance]]
@@ -83,7 +83,7 @@ class LatentCovarianceRegressor(CovarianceRegressor):
 
     def _check_parameters(self) -> None:
         super()._check_parameters()
-        checks.choice(self.objective, "objective", ("auto", self.aligned_objective, "likelihood"))
+        checks.choice(self.objective, "objective", ("auto", self._aligned_objective, "likelihood"))
         checks.choice(self.kernel, "kernel", tuple(KERNELS))
         checks.count(self.max_inputs, "max_inputs", least=2)
         if isinstance(self.prior, str):

@@ -106,7 +106,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
     Sections III-B and IV-A.
     """
 
-    aligned_objective = "mse"
+    _aligned_objective = "mse"
 
     _core_class, _learned = MeanAndWishart, {"df_": checks.count}
     _costly = "df or max_inputs"
