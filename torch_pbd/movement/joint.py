@@ -182,9 +182,10 @@ class Conditioned:
     ) -> None:
         given = ~values.isnan()
         exact = (given & (noise == 0.0)).all(1)
-        rows, self._outputs = (given & ~exact[:, None]).nonzero(as_tuple=True)
-        self._entry_steps, self._entry_values = steps[rows], values[rows, self._outputs]
-        self._entry_noise = noise[rows, self._outputs]
+        rows, self._outputs = (given & ~exact[:, None]).nonzero().unbind(1)
+        self._entry_steps = steps[rows]
+        if len(rows):
+            self._entry_values, self._entry_noise = values[rows, self._outputs], noise[rows, self._outputs]
         self._prior, self._steps, self._values = prior, steps[exact], values[exact]
         steps, n_loadings = self._steps, prior.loadings.shape[-1]
         if not len(steps):
@@ -203,7 +204,7 @@ class Conditioned:
     @property
     def sizes(self) -> tuple[int, int, int, int]:
         """Steps, outputs, loadings and single entries."""
-        return *self._prior.loadings.shape, len(self._entry_values)
+        return *self._prior.loadings.shape, len(self._entry_steps)
 
     @cached_property
     def law(self) -> JointNormal:

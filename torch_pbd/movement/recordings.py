@@ -42,7 +42,7 @@ class Known(NamedTuple):
         """Refuse an entry that is known twice without noise, by the places of the times, or too many one by one."""
         exact = ~np.isnan(self.value) & (self.noise == 0.0)
         rows, outputs = np.nonzero(exact)
-        if len(np.unique(np.stack([places[rows], outputs]), axis=1).T) < len(rows):
+        if len(np.unique(places[rows] * self.value.shape[1] + outputs)) < len(rows):
             raise ValueError("X has a time that is given twice, or is known already, without noise: leave it out.")
         n_single = int((~np.isnan(self.value) & ~exact.all(axis=1, keepdims=True)).sum())
         if n_single > _MOST_ENTRIES:
