@@ -2,10 +2,11 @@
 
 Expected cost ``integral of e' Sigma^-1 e + r f' M^-1 f`` of what half-sine pushes do (10 N for positions, 1 Nm for
 rotations, 0.2 s, at even times and along every axis, so the mean over all directions), with Sigma of the recommended
-regressor, a mass of 5 kg and 0.3 kg m^2, and the r whose precision law has the median stiffness of the linear law, of
-each block. Columns: the linear law; the precision law within the same limits, damping ratios 1 and 1/sqrt(2); without
-limits; and LQT, which sees what is ahead; all relative to the first. Deviations of 0.1 mm and 1 mrad count as none.
-Recordings without a unit of length are brought to 0.5 m.
+regressor, a mass of 5 kg and 0.3 kg m^2, or with ``--varying`` one that changes along the movement as that of an arm
+does, and the r whose precision law has the median stiffness of the linear law, of each block. Columns: the linear law;
+the precision law within the same limits, damping ratios 1 and 1/sqrt(2); without limits; and LQT, which sees what is
+ahead; all relative to the first. Deviations of 0.1 mm and 1 mrad count as none. Recordings without a unit of length are
+brought to 0.5 m.
 """
 
 import argparse
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.linalg import expm
 
 from torch_pbd import Demonstrations, DMPController
 from torch_pbd.control import RotationLimits, StiffnessLaw, damping_from_stiffness, lqt
@@ -60,6 +62,20 @@ def along(shown):
     return torch.tensor(schedule.covariance + np.diag(np.where(turns, LEAST[True], LEAST[False]) ** 2)), turns
 
 
+def inertia(n, turns, is_varying):
+    """Mass (d, d), or that of each row: axes of 0.4 to 2.5 times as much, coupled by half and turning on the way."""
+    mass = np.diag(np.where(turns, MASS[True], MASS[False]))
+    if not is_varying:
+        return torch.tensor(mass)
+    d, share = len(turns), np.linspace(0.0, 1.0, n)[:, None]
+    skew = np.triu(np.ones((d, d)), 1)
+    axes = expm(0.8 * np.sin(2.0 * np.pi * share)[:, None] * (skew - skew.T) / d)
+    axes[:, np.not_equal.outer(turns, turns)] *= 0.5
+    spread = 2.5 ** np.sin(2.0 * np.pi * share + np.arange(d))
+    root = np.sqrt(mass) @ (axes * np.sqrt(spread)[:, None])
+    return torch.tensor(root @ root.swapaxes(1, 2))
+
+
 def medians(stiffness, turns):
     """Median eigenvalue of the block of positions, and of that of rotations."""
     blocks = [np.flatnonzero(turns == kind) for kind in (False, True)]
@@ -104,12 +120,12 @@ def expected_cost(stiffness, damping, covariance, mass, effort, turns):
     return cost / (N_PUSHES * d)
 
 
-def row_of(name, shown):
+def row_of(name, shown, is_varying):
     """Row of the table: median stiffness, and the expected cost of each law."""
     covariance, turns = along(shown)
     rotation = RotationLimits() if turns.any() else None
     law = StiffnessLaw(rotation=rotation).fitted(covariance)
-    mass = torch.diag(torch.tensor(np.where(turns, MASS[True], MASS[False])))
+    mass = inertia(len(covariance), turns, is_varying)
     linear = law(covariance)
     wanted = medians(linear, turns)
     precise, efforts = matched(law, covariance, mass, turns, wanted)
@@ -137,12 +153,13 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--tasks", nargs="+", default=[])
+    parser.add_argument("--varying", action="store_true", help="a mass that changes along the movement")
     given = parser.parse_args()
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")  # of units, and of recordings that were cut while moving
     rows = []
     for name, shown in tasks(given.data, given.tasks):
-        rows.append(row_of(name, shown))
+        rows.append(row_of(name, shown, given.varying))
     print(format_table(rows))
     lost = [row["task"] for row in rows if float(row["precision [%]"]) >= 100.0]
     print(f"\nThe precision law's cost is lower on {'every task tried' if not lost else 'all but ' + ', '.join(lost)}.")

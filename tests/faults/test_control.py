@@ -168,7 +168,7 @@ def changed(name, row, value, **more):
     [
         (changed("stiffness", 3, np.nan), "stiffness[3, 0, 0] is nan, must be finite"),
         (changed("position", 2, np.inf), "position[2, 0] is inf, must be finite"),
-        (changed("time", 4, 0.003), "time[4] is 0.003, must be later"),
+        (changed("time", 4, 0.003), "time[4] is 0.003 s, must be later"),
         (changed("stiffness", 5, [[100.0, 9.0], [8.0, 100.0]]), "the asymmetry of stiffness[5] is 1.0"),
         (changed("damping", 6, [[1.0, 2.0], [2.0, 1.0]]), "smallest eigenvalue of damping[6] is -1.0"),
         (changed("stiffness", 7, [[1e4, 0.0], [0.0, 0.0]], damping=np.zeros((11, 2, 2))), "damping[7] is 0.0"),

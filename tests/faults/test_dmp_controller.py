@@ -196,7 +196,7 @@ def test_24_far_away_everything_is_finite(method, far):
 def test_24_where_nothing_is_known_it_is_compliant_or_the_prior_or_an_error():
     far = [[1e6]]
     np.testing.assert_allclose(controller().predict_stiffness(far)[0], 50.0 * np.eye(2), atol=1e-6)
-    with pytest.raises(ValueError, match=r"There are no data at time 1e\+06: the Type I uncertainty is 1\.00"):
+    with pytest.raises(ValueError, match=r"There are no data at time 1e\+06 s: the Type I uncertainty is 1\.00"):
         new(on_unknown="raise").fit(recorded()).predict_stiffness(far)
 
 

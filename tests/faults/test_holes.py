@@ -180,7 +180,7 @@ def test_63_in_a_hole_the_prior_is_the_prior_and_refusing_refuses():
         np.testing.assert_allclose(model.schedule(50.0).covariance[90], prior, rtol=1e-6)
     refusing, _ = fitted(recorded, on_unknown="raise")
     refusing.predict_stiffness([[1.4], [3.3]])
-    with pytest.raises(ValueError, match=r"There are no data at time 2: the Type I uncertainty is 1\.00"):
+    with pytest.raises(ValueError, match=r"There are no data at time 2 s: the Type I uncertainty is 1\.00"):
         refusing.predict_stiffness([[2.0]])
     with pytest.raises(ValueError, match="There are no data at time"):
         refusing.schedule(100.0)

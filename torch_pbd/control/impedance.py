@@ -56,7 +56,7 @@ def _gains(controller: Any, time: Floats, path: Floats) -> Gains:
     if on_unknown == "raise" and (type1 > UNKNOWN).any():
         index = int(np.argmax(type1 > UNKNOWN))
         raise ValueError(
-            f"There are no data at time {time[index]:g}: the Type I uncertainty is {type1[index]:.2f}. Ask within "
+            f"There are no data at time {time[index]:g} s: the Type I uncertainty is {type1[index]:.2f}. Ask within "
             "the demonstrations, or let on_unknown='soft' make the robot compliant there."
         )
     sampled, covariance = (at_pose(controller.outputs_, law, each, path) for each in learned)

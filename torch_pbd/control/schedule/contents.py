@@ -2,7 +2,7 @@
 
 import math
 import reprlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
@@ -62,7 +62,7 @@ def checked_fields(fields: Mapping[str, Any]) -> dict[str, Any]:
     }
     later = np.diff(arrays["time"], prepend=-np.inf) > 0.0
     remedy = "sort the rows by time and drop repeated ones"
-    checks.require(later, arrays["time"], "time", "later than the time before it", remedy)
+    checks.require(later, arrays["time"], "time", "later than the time before it", remedy, "s")
     type1 = arrays["type1"]
     checks.require((type1 >= 0.0) & (type1 <= 1.0), type1, "type1", "from 0 (on data) to 1 (the prior alone)")
     for name in [name for name in arrays if len(SHAPES[name]) == 3]:
@@ -70,9 +70,10 @@ def checked_fields(fields: Mapping[str, Any]) -> dict[str, Any]:
         arrays[name] = 0.5 * (arrays[name] + arrays[name].swapaxes(1, 2))
     if "orientation" in arrays:
         arrays["orientation"] = _checked_orientation(arrays["orientation"])
-    limits = _checked_limits(fields["stiffness_limits"], sizes["d"])
+    units = ["Nm/rad" if fields["units"] == "rad" else "N/m"] * p + ["Nm/rad"] * (sizes["d"] - p)
+    limits = _checked_limits(fields["stiffness_limits"], units)
     if limits is not None:
-        _check_limits(arrays["stiffness"], limits)
+        _check_limits(arrays["stiffness"], limits, units[0])
     _check_held(arrays["stiffness"], arrays["damping"])
     for array in arrays.values():
         array.setflags(write=False)
@@ -92,25 +93,25 @@ def _checked_orientation(orientation: Floats) -> Floats:
     return rotations.continuous(orientation)
 
 
-def _checked_limits(limits: Any, d: int) -> Limits | None:
-    """Two numbers, or two tuples of one for each of d axes; None stays None."""
+def _checked_limits(limits: Any, units: Sequence[str]) -> Limits | None:
+    """Two numbers, or two tuples of one for each axis, of these units; None stays None."""
     if limits is None:
         return None
     if not isinstance(limits, list | tuple | np.ndarray) or len(limits) != 2:
         raise checks.refusal(limits, "stiffness_limits", "the least and the largest stiffness, or None")
     of_each = any(np.ndim(limit) for limit in limits)
     low, high = (
-        np.broadcast_to(checks.real_floats(limit, "stiffness_limits"), (d,) if of_each else ()) for limit in limits
+        np.broadcast_to(checks.real_floats(limit, "stiffness_limits"), (len(units),) if of_each else ())
+        for limit in limits
     )
-    unit = "" if of_each else "N/m"
     for i, (least, most) in enumerate(zip(low.reshape(-1), high.reshape(-1), strict=True)):
         axis = f"[{i}]" if of_each else ""
-        lowest = checks.number(float(least), f"stiffness_limits[0]{axis}", least=0.0, unit=unit)
-        checks.number(float(most), f"stiffness_limits[1]{axis}", above=0.0, least=lowest, unit=unit)
+        lowest = checks.number(float(least), f"stiffness_limits[0]{axis}", least=0.0, unit=units[i])
+        checks.number(float(most), f"stiffness_limits[1]{axis}", above=0.0, least=lowest, unit=units[i])
     return (tuple(low.tolist()), tuple(high.tolist())) if of_each else (float(low), float(high))
 
 
-def _check_limits(stiffness: Floats, limits: Limits) -> None:
+def _check_limits(stiffness: Floats, limits: Limits, unit: str) -> None:
     """Refuse a stiffness beyond the limits, as matrices and to rounding.
 
     ``K_min <= K <= K_max``, diagonal both, in units of K_max: those of lengths and angles then do not matter.
@@ -131,8 +132,8 @@ def _check_limits(stiffness: Floats, limits: Limits) -> None:
         )
     eigenvalues = np.linalg.eigvalsh(stiffness)
     good = (eigenvalues >= low - checks.ROUNDING * high) & (eigenvalues <= high + checks.ROUNDING * high)
-    must = f"within stiffness_limits, {low:g} and {high:g} N/m"
-    checks.require(good, eigenvalues, "the eigenvalue of stiffness", must, remedy)
+    must = f"within stiffness_limits, {low:g} and {high:g} {unit}"
+    checks.require(good, eigenvalues, "the eigenvalue of stiffness", must, remedy, unit)
 
 
 def _check_held(stiffness: Floats, damping: Floats) -> None:

@@ -40,7 +40,7 @@ def tick_times(duration: float, rate: float, d: int, *, settle: float = 0.0) -> 
         remedy="Lower rate, and let the robot interpolate between its rows.",
     )
     if count_rows(duration, rate) < 2:
-        raise checks.refusal(rate, "rate", f"at least {1 / duration:g}, for two rows", unit="Hz")
+        raise checks.refusal(rate, "rate", f"at least {1 / duration:g} Hz, for two rows", unit="Hz")
     return row_times(duration, rate)
 
 

@@ -167,7 +167,7 @@ class Schedule:
             grid = np.append(first + tick_times(self.duration, rate, self.n_outputs)[:-1], last)
         else:
             grid = checks.array(times, "times", ("m",))
-        checks.require((grid >= first) & (grid <= last), grid, "times", f"from {first!s} to {last!s} s")
+        checks.require((grid >= first) & (grid <= last), grid, "times", f"from {first!s} to {last!s} s", unit="s")
         between = Between(self.time, grid)
         rows: dict[str, Any] = {name: between.linear(array) for name, array in self._arrays().items()}
         rows |= {"time": grid} | dict(zip(("position", "velocity", "orientation"), between.motion(self), strict=True))
