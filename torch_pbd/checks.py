@@ -69,34 +69,19 @@ def number(
     optional: bool = False,
     remedy: str = "",
 ) -> float | None:
-    """Finite real number, within bounds: above or from ``least`` on, below or up to ``most``.
+    """Finite real number within bounds, of which ``above`` and ``below`` are themselves not allowed; no bool, no text.
 
-    Parameters
-    ----------
-    value, name
-        What was passed, and the name of the argument.
-    above, least, below, most : float or None
-        Bounds, the first and the third not part of what is allowed.
-    unit : str
-        Unit that the message gives.
-    optional : bool
-        None is allowed, and comes back.
-    remedy : str
-        What to do, at the end of the message.
-
-    Raises
-    ------
-    InvalidParameterError
-        If it is anything else: a bool, a text, NaN.
+    ``unit`` and ``remedy``, what to do, are said in the message. None comes back if it is ``optional``.
     """
     if optional and value is None:
         return None
-    if isinstance(value, Real) and not isinstance(value, bool | np.bool_) and is_finite(value):
-        real = float(value)
-        too_small = (above is not None and real <= above) or (least is not None and real < least)
-        too_large = (below is not None and real >= below) or (most is not None and real > most)
-        if not (too_small or too_large):
-            return real
+    if isinstance(value, Real) and not isinstance(value, bool | np.bool_):
+        with suppress(OverflowError):  # of an integer that is no float
+            real = float(value)
+            too_small = (above is not None and real <= above) or (least is not None and real < least)
+            too_large = (below is not None and real >= below) or (most is not None and real > most)
+            if math.isfinite(real) and not (too_small or too_large):
+                return real
     bounds = [
         f"{word} {bound:g}"
         for word, bound in (("above", above), ("of at least", least), ("below", below), ("at most", most))
@@ -175,16 +160,17 @@ def seed(value: Any, name: str = "random_state") -> np.random.RandomState:
     raise refusal(value, name, "None, an integer from 0 to 2**32 - 1 or a numpy.random.RandomState")
 
 
-def array(values: Any, name: str, shape: Sequence[int | str]) -> Floats:
+def array(values: Any, name: str, shape: Sequence[int | str] | None) -> Floats:
     """Array of finite float64 whose squares are finite too, of a shape in which letters stand for any size.
 
-    ``shape`` is such as ``("n", 3)``. The result is no copy where ``values`` is such an array already.
+    ``shape`` is such as ``("n", 3)``, None is any. The result is no copy where ``values`` is such an array already.
     """
     floats = real_floats(values, name)
-    fits = len(shape) == floats.ndim and all(
-        isinstance(size, str) or size == own for size, own in zip(shape, floats.shape, strict=True)
+    fits = shape is None or (
+        len(shape) == floats.ndim
+        and all(isinstance(size, str) or size == own for size, own in zip(shape, floats.shape, strict=True))
     )
-    if not fits:
+    if shape is not None and not fits:
         expected = f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"
         raise InvalidParameterError(f"{name} has shape {floats.shape}, must have shape {expected}.")
     require(np.abs(floats) <= LARGEST, floats, name, f"finite and at most {LARGEST:g} in size")
@@ -217,32 +203,24 @@ def symmetric(matrices: NDArray[Any], name: str) -> Floats:
     return rounding
 
 
-def positive(lowest: NDArray[Any], name: str, rounding: float | Floats, *, definite: bool = False) -> None:
-    """Check the smallest eigenvalues (...) of symmetric matrices: above zero, or above minus their rounding (...)."""
-    must = "above zero, positive definite" if definite else "zero or more, positive semidefinite"
-    good = lowest > 0.0 if definite else lowest >= -rounding
-    require(good, lowest, f"the smallest eigenvalue of {name}", must, "build it as a product A A'")
-
-
 def semidefinite(matrices: NDArray[Any], name: str, *, definite: bool = False, remedy: str = "") -> None:
     """Check that matrices (..., d, d) of floats are finite, symmetric and positive semidefinite, or definite.
 
     Symmetric and semidefinite to rounding, as in :func:`symmetric`. Definite is judged by the correlations, as outputs
     may have units that are far apart.
     """
-    rounding = symmetric(matrices, name)
-    if not definite:
-        # Cholesky factors tell semidefinite ones; matrices of zeros have no scale, and pass any shift.
-        if not eigenvalues_above(matrices, -np.where(rounding > 0.0, rounding, 1.0)):
-            positive(np.linalg.eigvalsh(matrices)[..., 0], name, rounding)
-        return
-    deviation = np.sqrt(np.diagonal(matrices, axis1=-2, axis2=-1).clip(0.0))
-    product = deviation[..., :, np.newaxis] * deviation[..., np.newaxis, :]
-    # A variance of zero or less leaves zeros, which are not definite.
-    correlations = np.divide(matrices, product, out=np.zeros_like(matrices), where=product > 0.0)
-    if not eigenvalues_above(correlations, _SINGULAR):
-        good, own = np.linalg.eigvalsh(correlations)[..., 0] > _SINGULAR, np.linalg.eigvalsh(matrices)[..., 0]
-        must = "above zero, positive definite"
+    rounding, relative = symmetric(matrices, name), matrices
+    # Matrices of zeros have no scale, and pass any shift.
+    limit: Any = -np.where(rounding > 0.0, rounding, 1.0)
+    if definite:
+        deviation = np.sqrt(np.diagonal(matrices, axis1=-2, axis2=-1).clip(0.0))
+        product = deviation[..., :, np.newaxis] * deviation[..., np.newaxis, :]
+        # A variance of zero or less leaves zeros, which are not definite.
+        relative = np.divide(matrices, product, out=np.zeros_like(matrices), where=product > 0.0)
+        limit = _SINGULAR
+    if not eigenvalues_above(relative, limit):
+        good, own = np.linalg.eigvalsh(relative)[..., 0] >= limit, np.linalg.eigvalsh(matrices)[..., 0]
+        must = "above zero, positive definite" if definite else "zero or more, positive semidefinite"
         require(good, own, f"the smallest eigenvalue of {name}", must, remedy or "build it as a product A A'")
 
 
@@ -269,12 +247,8 @@ def warn(message: str, category: type[Warning] = UserWarning) -> None:
 def real_array(values: Any, name: str) -> NDArray[Any]:
     """``values`` as an array of real numbers, in their own type: lists, tensors, series; not checked for NaN.
 
-    Raises
-    ------
-    TypeError
-        If an entry is no number at all.
-    ValueError
-        If ``values`` is ragged, masked, complex, or holds text, dates or records.
+    Raises TypeError for entries that are no numbers at all, and ValueError if they are ragged, masked, complex, or hold
+    text, dates or records.
     """
     if hasattr(values, "detach"):
         values = from_tensor(values, name)
@@ -286,7 +260,7 @@ def real_array(values: Any, name: str) -> NDArray[Any]:
         raise ValueError(f"{name} is ragged, its rows have different lengths: {error}") from error
     except RuntimeError as error:  # a list of tensors that need gradients
         raise ValueError(f"{name} cannot be made an array: {error}") from error
-    check_real(array, name)
+    _check_real(array, name)
     return array
 
 
@@ -310,7 +284,7 @@ def from_tensor(values: Any, name: str) -> NDArray[Any]:
         raise ValueError(f"{name} is a tensor that holds no numbers: {error}") from error
 
 
-def check_real(array: NDArray[Any], name: str) -> None:
+def _check_real(array: NDArray[Any], name: str) -> None:
     """Check that an array holds real numbers, or objects that are."""
     kind = array.dtype.kind
     if kind in "biuf":
@@ -339,22 +313,6 @@ def check_finite(array: NDArray[Any], name: str, column: Any = None) -> None:
     within = place[0] if place else column
     where = f"row {row}" if within is None else f"row {row}, column {within}"
     raise ValueError(f"Input {name} contains {what}. The first is in {where}: leave such rows out, or fill them in.")
-
-
-def finite(values: Any, name: str) -> Floats:
-    """Floats of any shape, all of them finite."""
-    array = real_floats(values, name)
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name} has a value that is not finite.")
-    return array
-
-
-def is_finite(value: Any) -> bool:
-    """Whether a real number is one that a float can hold."""
-    try:
-        return math.isfinite(value)
-    except OverflowError:
-        return False
 
 
 def _is_missing(entry: Any) -> bool:

@@ -82,7 +82,7 @@ def plot_std_band(
 ) -> tuple[Line2D, PolyCollection]:
     """Draw a mean (n,) over x (n,) with a band of ``n_std`` standard deviations (n,) on either side."""
     check_axes("ax", [ax])
-    across, middle, half = (checks.finite(*named).ravel() for named in ((x, "x"), (mean, "mean"), (std, "std")))
+    across, middle, half = (checks.array(*named, None).ravel() for named in ((x, "x"), (mean, "mean"), (std, "std")))
     for part, name in ((middle, "mean"), (half, "std")):
         checks.array(part, name, (len(across),))
     checks.require(half >= 0.0, half, "std", "at least zero", "give standard deviations")
@@ -141,7 +141,7 @@ def plot_model_bands(
     true_std : callable, default=None
         Maps x (n, 1) to (mean, std), both (n, n_outputs), where the truth is known.
     """
-    inputs, targets = checks.array(X, "X", ("n", 1)), checks.finite(y, "y")
+    inputs, targets = checks.array(X, "X", ("n", 1)), checks.array(y, "y", None)
     targets = targets.reshape(len(inputs), -1)
     check_axes("axes", axes, targets.shape[1])
     beyond = checks.number(beyond, "beyond", remedy="how far to draw, in ranges of X")
