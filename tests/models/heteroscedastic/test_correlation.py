@@ -6,7 +6,9 @@ from torch_pbd.models.heteroscedastic.residuals import (
     DemonstrationCorrelation,
     NoiseCorrelation,
     demonstration_correlation,
+    mean_whitener,
 )
+from torch_pbd.models.training import TrainingSet
 
 
 def known(*decays):
@@ -93,11 +95,13 @@ def test_the_whiteners_take_out_the_correlation_of_means_of_rows(rng):
     x = np.sort(rng.uniform(-0.5, 0.5, size=6))
     index = np.concatenate([np.arange(6), rng.integers(6, size=20)])
     group = np.concatenate([np.arange(6) % 4, rng.integers(4, size=20)])
-    arguments = (torch.tensor(x)[:, None], torch.tensor(index), torch.tensor(group))
-    noise = NoiseCorrelation.build(known(0.2, 0.0), *arguments)
+    inputs, index_of = torch.tensor(x)[:, None], torch.tensor(index)
+    rows = TrainingSet(inputs[index_of], torch.zeros(26, 1).double(), inputs, index_of)
+    arguments = known(0.2, 0.0), rows, torch.tensor(group)
+    noise = NoiseCorrelation.build(*arguments)
     average = (np.arange(6)[:, np.newaxis] == index) / np.sqrt(np.bincount(index))[:, np.newaxis]
     distance = np.abs(np.subtract.outer(x[index], x[index]))
-    for whitener, decay in ((noise.mean_whitener, 0.4), (noise.square_whitener, 0.2)):
+    for whitener, decay in ((mean_whitener(*arguments), 0.4), (noise.square_whitener, 0.2)):
         rows = np.exp(-distance / decay) * (group[:, np.newaxis] == group)
         covariance = average @ rows @ average.T
         whitened = whitener[0].numpy() @ covariance @ whitener[0].numpy().T
@@ -111,5 +115,7 @@ def test_the_whiteners_take_out_the_correlation_of_means_of_rows(rng):
 @pytest.mark.parametrize("correlation", [None, known(0.0, 0.0), known(0.2, 0.0)])
 def test_without_correlation_or_groups_there_is_nothing_to_take_out(correlation):
     group = None if correlation is not None and correlation.matters else torch.tensor([0, 0, 1])
-    noise = NoiseCorrelation.build(correlation, torch.zeros(3, 1).double(), torch.arange(3), group)
-    assert noise == NoiseCorrelation(None, None, None)
+    inputs = torch.zeros(3, 1).double()
+    rows = TrainingSet(inputs, inputs, inputs, torch.arange(3))
+    assert NoiseCorrelation.build(correlation, rows, group) == NoiseCorrelation()
+    assert mean_whitener(correlation, rows, group) is None

@@ -83,7 +83,7 @@ def test_gradient_of_the_evidence(correlated, family, inputs, rng):
     """The mean is at its maximum: its derivative does not enter (the envelope)."""
     copies = torch.tensor(rng.uniform(1.0, 3.0, size=(2, 9)))
     whitener = torch.tensor(np.tril(rng.normal(size=(2, 9, 9)), -1) + np.eye(9))
-    squares = squares_at(9, rng, noise=NoiseCorrelation(None, whitener, copies) if correlated else INDEPENDENT)
+    squares = squares_at(9, rng, noise=NoiseCorrelation(whitener, copies) if correlated else INDEPENDENT)
     theta = torch.tensor([[-1.0, 0.3], [-0.4, -0.6]], dtype=torch.float64)
     features = family.prepared(theta)(inputs).requires_grad_()
     assert torch.autograd.gradcheck(lambda features: Evidence.apply(features, squares), features, atol=1e-4)
@@ -190,7 +190,7 @@ def test_correlated_squares_are_a_gaussian_process_regression_of_their_logarithm
     matrix = np.sqrt(copies)[:, np.newaxis] * correlation * np.sqrt(copies)
     whitener = np.linalg.inv(np.linalg.cholesky(matrix))
     squares = squares_at(
-        9, rng, noise=NoiseCorrelation(None, *(torch.tensor(np.stack([part, part])) for part in (whitener, copies)))
+        9, rng, noise=NoiseCorrelation(*(torch.tensor(np.stack([part, part])) for part in (whitener, copies)))
     )
     features = family.prepared(torch.tensor([[-1.0, 0.5], [0.3, -0.5]], dtype=torch.float64))(inputs)
     weights, evidence = fit_log_variance(squares, features)
@@ -213,7 +213,7 @@ def test_correlated_squares_are_a_gaussian_process_regression_of_their_logarithm
 @pytest.mark.parametrize("degrees", [1.0, 2.5, 9.0])
 def test_correlated_squares_have_no_bias(degrees, rng):
     """A logarithm of a chi-squared number over its degrees is below zero in the mean."""
-    noise = NoiseCorrelation(None, torch.eye(4).double()[None], torch.ones(1, 4).double())
+    noise = NoiseCorrelation(torch.eye(4).double()[None], torch.ones(1, 4).double())
     squares = squares_at(4, rng, degrees, 20_000, noise)
     truth = np.sin(np.linspace(0.0, 4.0, 4))
     weights, _ = fit_log_variance(squares, 1e3 * torch.eye(4, dtype=torch.float64).expand(20_000, 4, 4))

@@ -29,6 +29,7 @@ from torch_pbd.models.heteroscedastic.residuals import (
     NoiseCorrelation,
     demonstration_correlation,
     is_signal,
+    mean_whitener,
 )
 from torch_pbd.models.training import TrainingSet, pooled_tril
 
@@ -120,7 +121,7 @@ def fit_heteroscedastic(
         # w = inv(C) r of each row; at each input their scatter S, the sum of w w', and its degrees of freedom.
         normal = _solve(at.pooled, residual)
         scatter, degrees = _scatter(at.training, normal, share, 1.0 if turn else _first_part(at.training, group))
-        noise = NoiseCorrelation.build(at.correlation, at.training.inputs, at.training.index, group)
+        noise = NoiseCorrelation.build(at.correlation, at.training, group)
         if turn == 1:
             at.stretch_ends(normal, noise)
         # l and phi given S, whose likelihood is that of a Wishart distribution.
@@ -208,7 +209,7 @@ class _State:
 
     def _mean(self) -> LatentMean:
         rows = self.rows
-        whitener = NoiseCorrelation.build(self.correlation, rows.inputs, rows.index, self.group).mean_whitener
+        whitener = mean_whitener(self.correlation, rows, self.group)
         tril = _noise_tril(rows.inputs, self.pooled, self.covariance)
         return fit_mean(self.mean_search, rows.inputs, rows.means(), rows.counts, tril, whitener)
 

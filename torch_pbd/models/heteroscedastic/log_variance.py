@@ -152,7 +152,7 @@ def _fit_independent(squares: Squares, features: Tensor, start: Tensor) -> LogVa
     """
     half = 0.5 * squares.degrees
     # P = 1 + F' diag(h) F, and the variances of the logarithms, the diagonal of F inv(P) F'.
-    factor = weights_factor(half.sqrt().unsqueeze(-1) * features)
+    factor, _ = weights_factor(half.sqrt().unsqueeze(-1) * features, torch.zeros_like(half))
     spread = features @ torch.cholesky_inverse(factor, upper=True)
     variance = (spread * features).sum(-1)
     log_mean = squares.log_mean

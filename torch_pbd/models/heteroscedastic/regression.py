@@ -31,7 +31,8 @@ class LinearEvidence:
     """Log density of ``response = design @ weights + noise`` with the weights integrated out, in nats.
 
     But for what no design changes. The noise is independent and of variance one. With the design D the posterior of the
-    weights has the precision P = I + D'D and the mean m = inv(P) D'y, and the value is m'P m / 2 - log|P| / 2.
+    weights has the precision P = I + D'D and the mean m = inv(P) D'y, and the value is (m'P m - y'y - log|P|) / 2,
+    without y'y where the response is not known.
     """
 
     value: Float[Tensor, "*b"]
@@ -43,19 +44,18 @@ class LinearEvidence:
     @classmethod
     def fit(cls, design: Float[Tensor, "*b n p"], response: Float[Tensor, "*b n"]) -> "LinearEvidence":
         """Evidence of b designs."""
-        found = cls.from_factor(*_triangular(design, response))
+        found = cls.from_factor(*weights_factor(design, response))
         # m'P m - y'y = -|y - D m|^2 - m'm: where the noise is small the left hand side is a difference of numbers of
         # 1e13, and the right one of residuals; an error of m changes it by no more than its square.
         residual = response - (design @ found.mean.unsqueeze(-1)).squeeze(-1)
-        log_det = found.factor.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
-        return replace(found, value=-0.5 * (residual.square().sum(-1) + found.mean.square().sum(-1)) - log_det)
+        square = residual.square().sum(-1) + found.mean.square().sum(-1)
+        return replace(found, value=-0.5 * square - _log_det(found.factor))
 
     @classmethod
     def from_factor(cls, factor: Float[Tensor, "*b p p"], projected: Float[Tensor, "*b p"]) -> "LinearEvidence":
         """Evidence of b designs, where ``factor @ mean = projected``."""
         mean = torch.linalg.solve_triangular(factor, projected.unsqueeze(-1), upper=True).squeeze(-1)
-        log_det = factor.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
-        return cls(0.5 * projected.square().sum(-1) - log_det, mean, factor)
+        return cls(0.5 * projected.square().sum(-1) - _log_det(factor), mean, factor)
 
     @cached_property
     def covariance(self) -> Float[Tensor, "*b p p"]:
@@ -74,17 +74,15 @@ class LinearEvidence:
     def divergence_from_prior(self) -> Float[Tensor, "*b"]:
         """Kullback-Leibler divergence of the weights' posterior from standard normal numbers, in nats."""
         trace = self.covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
-        log_det = 2.0 * self.factor.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
-        return 0.5 * (trace + self.mean.square().sum(-1) - self.mean.shape[-1] + log_det)
+        return 0.5 * (trace + self.mean.square().sum(-1) - self.mean.shape[-1]) + _log_det(self.factor)
 
 
-def weights_factor(design: Float[Tensor, "*b n p"]) -> Float[Tensor, "*b p p"]:
-    """Upper factor of the precision of the weights, which does not depend on the response."""
-    return _triangular(design, torch.zeros_like(design[..., 0]))[0]
+def _log_det(factor: Float[Tensor, "*b p p"]) -> Float[Tensor, "*b"]:
+    return factor.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
 
 
-def _triangular(design: Tensor, response: Tensor) -> tuple[Tensor, Tensor]:
-    """Upper factor R of the precision ``R' R``, and the response projected: ``R mean = projected``.
+def weights_factor(design: Tensor, response: Tensor) -> tuple[Tensor, Tensor]:
+    """Upper factor R of the precision ``R' R`` of the weights, and the response projected: ``R mean = projected``.
 
     Where the noise is small beside what the features carry the precision, one on its diagonal beside their
     squares, cannot be formed in floating point; then by a QR decomposition, which is slower.

@@ -148,35 +148,44 @@ class DemonstrationCorrelation:
 
 @dataclass(frozen=True)
 class NoiseCorrelation:
-    """Whiteners of the means and the mean squares of each output at n inputs; None where these are independent."""
+    """Whitener of the mean squares of each output at n inputs; None where these are independent."""
 
-    mean_whitener: Float[Tensor, "d n n"] | None = None
     square_whitener: Float[Tensor, "d n n"] | None = None
     copies: Float[Tensor, "d n"] | None = None
     """Rows at each input that count for one."""
 
     @classmethod
     def build(
-        cls,
-        correlation: DemonstrationCorrelation | None,
-        inputs: Float[Tensor, "n e"],
-        index: Int64[Tensor, " rows"],
-        group: Int64[Tensor, " rows"] | None,
+        cls, correlation: DemonstrationCorrelation | None, rows: TrainingSet, group: Int64[Tensor, " rows"] | None
     ) -> "NoiseCorrelation":
-        """Whiteners for rows of demonstrations ``group``, at ``inputs[index]``."""
+        """Whitener for rows of demonstrations ``group``."""
         if group is None or correlation is None or not correlation.matters:
             return cls()
-        # Rows of each demonstration at each distinct input.
-        names, number = group.unique(return_inverse=True)
-        occurrences = torch.bincount(number * len(inputs) + index, minlength=len(names) * len(inputs))
-        occurrences = occurrences.reshape(len(names), len(inputs)).to(inputs)
-        means, squares = (correlation.matrix(inputs, occurrences, squares=squares) for squares in (False, True))
-        return cls(_whitener(means), _whitener(squares), squares.diagonal(dim1=1, dim2=2))
+        squares = correlation.matrix(rows.inputs, _occurrences(rows, group), squares=True)
+        return cls(_whitener(squares), squares.diagonal(dim1=1, dim2=2))
 
     def restrict(self, outputs: Int64[Tensor, " b"]) -> "NoiseCorrelation":
-        """Whiteners of the selected outputs."""
-        parts = self.mean_whitener, self.square_whitener, self.copies
-        return NoiseCorrelation(*(None if part is None else part[outputs] for part in parts))
+        """Whitener of the selected outputs."""
+        if self.square_whitener is None or self.copies is None:
+            return self
+        return NoiseCorrelation(self.square_whitener[outputs], self.copies[outputs])
+
+
+def mean_whitener(
+    correlation: DemonstrationCorrelation | None, rows: TrainingSet, group: Int64[Tensor, " rows"] | None
+) -> Float[Tensor, "d n n"] | None:
+    """Whitener of the means of each output at the inputs; None where these are independent."""
+    if group is None or correlation is None or not correlation.matters:
+        return None
+    return _whitener(correlation.matrix(rows.inputs, _occurrences(rows, group), squares=False))
+
+
+def _occurrences(rows: TrainingSet, group: Tensor) -> Float[Tensor, "g n"]:
+    """Rows of each demonstration at each distinct input."""
+    names, number = group.unique(return_inverse=True)
+    size = len(names) * len(rows.inputs)
+    found = torch.bincount(number * len(rows.inputs) + rows.index, minlength=size)
+    return found.reshape(len(names), -1).to(rows.inputs)
 
 
 def _whitener(matrix: Tensor) -> Tensor:
