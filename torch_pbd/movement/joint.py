@@ -82,13 +82,13 @@ class JointNormal:
         outer = self.factor @ inner @ self.factor.mT - self.explained @ self.explained.mT
         return symmetrize(outer)
 
-    def columns(self, steps: Int[Tensor, " p"], outputs: Int[Tensor, " p"]) -> Float[Tensor, "n d p"]:
-        """Covariance of all steps and outputs with single entries."""
-        rows = self.factor[steps, outputs]  # (p, d)
+    def columns(self, steps: Int[Tensor, " p"], directions: Float[Tensor, "p d"]) -> Float[Tensor, "n d p"]:
+        """Covariance of all steps and outputs with single entries, along directions among the outputs."""
+        rows = torch.einsum("pc,pcd->pd", directions, self.factor[steps])
         between = self.prior_correlation[:, steps] - self.taken @ self.taken[steps].mT
         inner = torch.einsum("np,pd->ndp", between, rows)
         inner = inner + self.loadings @ torch.einsum("pd,pdk->kp", rows, self.loadings[steps])
-        return self.factor @ inner - self.explained @ self.explained[steps, outputs].mT
+        return self.factor @ inner - self.explained @ torch.einsum("pd,pdq->qp", directions, self.explained[steps])
 
     def deviations(self, correlated: Float[Tensor, "n s_d"], common: Float[Tensor, "k s"]) -> Float[Tensor, "s n d"]:
         """Deviations from the mean that standard normal numbers stand for, before observations of single entries."""
@@ -163,8 +163,8 @@ class Conditioned:
     """Joint law given what was observed; normal, by the usual formulas.
 
     Of observations at some of the steps, values (m, d) are NaN where not given, noise (m, d) is the standard deviation
-    of their errors. Steps known whole and without noise keep the structure of the law; all other entries are
-    conditioned on one by one.
+    of their errors, of the outputs x or, with axes, of ``axes x``. Steps known whole and without noise keep the
+    structure of the law; all other entries are conditioned on one by one.
 
     Exact steps E, with ``L L' = R_EE``: of ``r = A_E^-1 (x_E - mean_E)``, G = R_:E R_EE^-1 and the loadings'
     coefficients c, whose posterior has the precision ``P = I + U_E' R_EE^-1 U_E`` and the mean ``P^-1 U_E' R_EE^-1 r``,
@@ -179,14 +179,18 @@ class Conditioned:
         steps: Int[Tensor, " m"],
         values: Float[Tensor, "m d"],
         noise: Float[Tensor, "m d"],
+        axes: Float[Tensor, "d d"] | None = None,
     ) -> None:
         given = ~values.isnan()
         exact = (given & (noise == 0.0)).all(1)
-        rows, self._outputs = (given & ~exact[:, None]).nonzero().unbind(1)
+        rows, entries = (given & ~exact[:, None]).nonzero().unbind(1)
         self._entry_steps = steps[rows]
         if len(rows):
-            self._entry_values, self._entry_noise = values[rows, self._outputs], noise[rows, self._outputs]
+            self._entry_values, self._entry_noise = values[rows, entries], noise[rows, entries]
+            self._directions = (torch.eye(values.shape[1]).to(values) if axes is None else axes)[entries]
         self._prior, self._steps, self._values = prior, steps[exact], values[exact]
+        if axes is not None:
+            self._values = torch.linalg.solve(axes, self._values.mT).mT
         steps, n_loadings = self._steps, prior.loadings.shape[-1]
         if not len(steps):
             return
@@ -223,7 +227,7 @@ class Conditioned:
             return law
         columns, root = self._entries(law)
         explained = torch.linalg.solve_triangular(root.mT, columns, upper=True, left=False)
-        error = self._entry_values - law.mean[self._entry_steps, self._outputs]
+        error = self._entry_values - (self._directions * law.mean[self._entry_steps]).sum(1)
         whitened = torch.linalg.solve_triangular(root, error[:, None], upper=False)[:, 0]
         return replace(law, mean=law.mean + explained @ whitened, explained=explained)
 
@@ -241,7 +245,7 @@ class Conditioned:
         if not len(self._entry_steps):
             return drawn
         columns, root = self._entries(self.law)
-        errors = drawn[:, self._entry_steps, self._outputs].mT + self._entry_noise[:, None] * noise
+        errors = (self._directions * drawn[:, self._entry_steps]).sum(-1).mT + self._entry_noise[:, None] * noise
         return drawn - torch.einsum("ndp,ps->snd", columns, torch.cholesky_solve(errors, root))
 
     def _from_steps(self, residual: Float[Tensor, "s m d"]) -> Float[Tensor, "s n d"]:
@@ -255,7 +259,7 @@ class Conditioned:
 
     def _entries(self, law: JointNormal) -> tuple[Float[Tensor, "n d p"], Float[Tensor, "p p"]]:
         """Covariances of everything with the single entries, and the root of their own, noise included."""
-        steps, outputs = self._entry_steps, self._outputs
-        columns = replace(law, explained=law.explained[..., :0]).columns(steps, outputs)
-        own = columns[steps, outputs] + torch.diag(self._entry_noise.square())
+        steps, directions = self._entry_steps, self._directions
+        columns = replace(law, explained=law.explained[..., :0]).columns(steps, directions)
+        own = torch.einsum("pd,pdq->pq", directions, columns[steps]) + torch.diag(self._entry_noise.square())
         return columns, safe_cholesky(symmetrize(own), name="the covariance of the entries given")

@@ -160,8 +160,11 @@ class KMPBaseline(MovementRegressor):
 
     def _with_via_points(self, known: Known) -> tuple[Floats, Floats, Floats]:
         """Reference with what is known in place of its nearest times; outputs that are not given stay."""
-        time, means, covariances = (part.copy() for part in self._reference)
-        least = np.square(1e-3 * self._scale)  # a point without noise, of whose variance the authors take 1e-6
+        axes = np.eye(self.n_outputs_) if self._axes is None else self._axes
+        time, means = self._reference[0].copy(), self._reference[1] @ axes.T
+        covariances = axes @ self._reference[2] @ axes.T
+        # A point without noise, of whose variance the authors take 1e-6.
+        least = 1e-6 * np.square(axes * self._scale).sum(axis=1)
         for at, value, noise in zip(known.time, known.value, known.noise, strict=True):
             nearest = int(np.abs(self._reference[0] - at).argmin())
             given = ~np.isnan(value)
@@ -169,12 +172,12 @@ class KMPBaseline(MovementRegressor):
             means[nearest, given] = value[given]
             covariances[nearest][given] = covariances[nearest][:, given] = 0.0
             covariances[nearest][given, given] = np.maximum(np.square(noise), least)[given]
-        return time, means, covariances
+        back = np.linalg.inv(axes)
+        return time, means @ back.T, back @ covariances @ back.T
 
     def _conditioned(self, time: Floats) -> tuple[Conditioned, torch.Tensor]:
         """Law through the reference with the via points, without conditioning on them."""
         union, rows, places = self._union(time, None)
         nothing = np.empty((0, self.n_outputs_))
-        return Conditioned(self._prior(union), *Known(time[:0], nothing, nothing).tensors(places)), torch.from_numpy(
-            rows
-        )
+        observed = Known(time[:0], nothing, nothing).tensors(places)
+        return Conditioned(self._prior(union), *observed), torch.from_numpy(rows)

@@ -34,6 +34,7 @@ class MovementLaw(BaseEstimator, ABC):
     _range: tuple[float, float]
     """First of the times of the fit, and their range."""
     _known: Known | None = None
+    _axes: Floats | None = None  # of the coordinates in which observations are told; None: the outputs
     _kept: dict[str, tuple[Floats, JointNormal]]  # last times and their law, which conditioned copies share
     _y_is_1d: bool
 
@@ -62,6 +63,12 @@ class MovementLaw(BaseEstimator, ABC):
         if set(arrays) != set(shapes):
             raise ValueError(f"its arrays are {', '.join(arrays)}, must be {', '.join(shapes)}")
         return {name: checks.array(arrays[name], name, shape) for name, shape in shapes.items()}
+
+    def told_along(self, axes: Floats | None) -> Self:
+        """Copy whose :meth:`condition` takes rows, noise and NaN of ``axes @ y``, axes (d, d); None are the outputs."""
+        copied = copy.copy(self)
+        copied._axes, copied._kept = axes, self.__dict__.setdefault("_kept", {})
+        return copied
 
     def condition(self, X: ArrayLike, y: ArrayLike, *, noise_scale: ArrayLike = 0.0) -> Self:
         """Fitted copy, of a movement that is at y at X: a start, a goal, a via point, the part seen so far.
@@ -127,7 +134,7 @@ class MovementLaw(BaseEstimator, ABC):
         """Law of all times that matter, given what is known, and the places of ``time`` among them."""
         union, rows, places = self._union(time, self._known)
         law, index = self._prior_with(union)
-        return Conditioned(law, *self._observations.tensors(index[places])), torch.from_numpy(index[rows])
+        return Conditioned(law, *self._observations.tensors(index[places], self._axes)), torch.from_numpy(index[rows])
 
     def _prior_with(self, time: Floats) -> tuple[JointNormal, NDArray[np.intp]]:
         """Joint law at increasing times, maybe at others too, and their places in it.

@@ -51,9 +51,12 @@ class Known(NamedTuple):
                 "already: give fewer times, or whole rows with noise_scale=0."
             )
 
-    def tensors(self, places: NDArray[np.intp]) -> tuple[Tensor, Tensor, Tensor]:
+    def tensors(
+        self, places: NDArray[np.intp], axes: Floats | None = None
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
         """Observations at steps of a law, as :class:`~torch_pbd.movement.joint.Conditioned` takes them."""
-        return torch.from_numpy(places), torch.from_numpy(self.value), torch.from_numpy(self.noise)
+        steps, value, noise = map(torch.from_numpy, (places, self.value, self.noise))
+        return steps, value, noise, None if axes is None else torch.from_numpy(axes)
 
 
 def as_recordings(model: Any, X: Any, y: Any, groups: Any, *, is_fit: bool) -> list[Recording]:

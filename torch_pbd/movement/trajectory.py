@@ -230,7 +230,7 @@ class TrajectoryRegressor(TimedMovement):
             return Uncertainty(*own)
         union, rows, places = self._union(time, self._known)
         mean, type2 = self._regressor_marginals(union)[0], self.regressor_.predict_uncertainty(union[:, None]).type2
-        law = Conditioned(self._joint(union, mean, type2), *self._known.tensors(places)).law
+        law = Conditioned(self._joint(union, mean, type2), *self._known.tensors(places, self._axes)).law
         return Uncertainty(own.type1, law.marginal()[torch.from_numpy(rows)].numpy())
 
     @property
