@@ -3,10 +3,19 @@
 import re
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import torch_pbd
-from torch_pbd import CholeskyCovRegressor, Demonstrations, DMPController, GMMBaseline, TrajectoryRegressor
+from torch_pbd import (
+    CholeskyCovRegressor,
+    Demonstrations,
+    DMPController,
+    GMMBaseline,
+    KMPBaseline,
+    ProMPBaseline,
+    TrajectoryRegressor,
+)
 from torch_pbd.control import RotationLimits, StiffnessLaw
 from torch_pbd.control.primitive.outputs import Outputs
 from torch_pbd.data import make_pose_demonstrations, make_tunnel_demonstrations
@@ -184,7 +193,8 @@ def test_starts_and_goals_are_poses_or_outputs(controller):
     [
         (np.zeros(5), "goal has shape (5,), must have 7 columns, position and quaternion w x y z, or the 6"),
         (np.r_[np.zeros(3), 0.5, 0.0, 0.0, 0.0], "the norm of the quaternion of goal is 0.5, must be 1"),
-        (np.r_[np.nan, np.zeros(5)], "goal has a part of the position, must have all of it"),
+        (np.r_[np.nan, np.zeros(5)], "goal[0] is nan, must be finite"),
+        (np.r_[np.zeros(5), np.nan], "goal has a part of the rotation, must have all of it, or NaN for all of it"),
         ("turned over", "in degrees, is 170"),
         ("turned over", "is the quaternion in the order w x y z?"),
     ],
@@ -218,9 +228,46 @@ def test_a_movement_of_poses_is_bent_through_poses(bendable):
     blurred = bendable.condition([at], [via], noise_scale=[0.01] * 3 + [0.05] * 3)
     assert 0.0 < angles(blurred.predict_pose([[at]])[1][0], via[3:]) < angles(orientation, via[3:])
     with pytest.raises(
-        ValueError, match=r"noise_scale is 0\.1, must be 0, or 3 equal numbers for positions and 3 in rad"
+        ValueError, match=r"noise_scale is 0\.1, must be 0, or 6 numbers, the last three in rad: m and rad have no"
     ):
         bendable.condition([at], [via], noise_scale=0.1)
+
+
+@pytest.mark.parametrize("noise", [0.0, [0.01, 0.02, 0.03, 0.1, 0.1, 0.1]])
+def test_positions_of_a_pose_may_be_free_one_by_one(bendable, noise):
+    """Against the formula of conditioning, on the joint law of three times in the outputs themselves."""
+    at, times = 0.5 * bendable.duration_, np.array([0.3, 0.45]) * bendable.duration_
+    joint = bendable.covariance_.predict_joint(np.append(times, at)[:, None])[1]
+    axes = bendable.outputs_.axes
+    joint = np.einsum("ac,icjd,bd->iajb", axes, joint, axes)
+    change, given = np.array([0.02, -0.01]), [0, 2]
+    point = np.r_[bendable.predict([[at]])[0], np.nan][:7]
+    point[1], point[3:], point[given] = np.nan, np.nan, point[given] + change
+    own = joint[2, given][:, 2, given] + np.diag(np.square(np.broadcast_to(noise, 6))[given])
+    gain = joint[:2, :, 2, given] @ np.linalg.inv(own)
+    bent = bendable.condition([at], [point], noise_scale=noise)
+    found = bent.predict(times[:, None]) - bendable.predict(times[:, None])
+    np.testing.assert_allclose(found, gain @ change, rtol=0, atol=1e-4)  # of a spline between knots
+    explained = gain @ joint[:2, :, 2, given].transpose(0, 2, 1)
+    left = np.stack([joint[i, :, i] for i in range(2)]) - explained
+    np.testing.assert_allclose(bent.predict_cov(times[:, None]), left, rtol=1e-6, atol=1e-9)
+    if noise == 0.0:
+        planned = bendable.schedule(50.0, via=[(at, point)]).resample(times=[at, at + 0.1])
+        np.testing.assert_allclose(planned.position[0, given], point[given], rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("model", [ProMPBaseline(n_basis=8), KMPBaseline(n_reference=20)], ids=["ProMP", "KMP"])
+def test_so_they_may_with_other_models_of_movements(model):
+    bendable = fitted(poses(), model)
+    at = 0.5 * bendable.duration_
+    point = np.r_[bendable.predict([[at]])[0, :1] + 0.02, np.full(6, np.nan)]
+    bent = bendable.condition([at], [point])
+    assert bent.predict([[at]])[0, 0] == pytest.approx(point[0], abs=2e-3)
+    before, after = (np.diagonal(own.predict_cov([[at]])[0]) for own in (bendable, bent))
+    assert after[0] < 0.01 * before[0]
+    assert (after[1:] > 0.1 * before[1:]).all()
+    stiffness = bent.predict_stiffness([[at]])[0]
+    assert stiffness[0, 0] > 995.0 > np.linalg.eigvalsh(stiffness[:3, :3])[0]
 
 
 def test_likely_goals_of_poses_bend_the_movement(bendable):
@@ -307,6 +354,12 @@ def test_laws_and_masses_of_other_outputs_are_refused():
     ):
         with pytest.raises(ValueError, match=re.escape(words)):
             fitted(shown, **options)
+
+
+def test_rotations_in_a_table_are_refused_by_their_names():
+    X, y, groups = poses().stack()
+    with pytest.raises(ValueError, match=r"y has columns rx, ry, rz, as rotations of .*: give Demonstrations\."):
+        DMPController(QUICK).fit(X, pd.DataFrame(y, columns=poses().names), groups=groups)
 
 
 def test_rotations_alone_are_refused_by_what_was_recorded():

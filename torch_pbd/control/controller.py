@@ -158,7 +158,8 @@ class DMPController(Planning):
         X : Demonstrations, or array-like of shape (n_samples, 1)
             Or the times of samples, in s, which increase within each demonstration; for phases, give ``duration``.
         y : array-like of shape (n_samples, n_outputs), default=None
-            Positions at these times.
+            Positions at these times, in m: arrays have no units and no rotations, which Demonstrations have. What
+            ``stack()`` gives of poses would count rad as m; a table whose columns are named so is refused.
         groups : array-like of shape (n_samples,), default=None
             Demonstration of each sample.
 

@@ -23,6 +23,7 @@ from torch_pbd.control.primitive.smoothing import CUTOFF_HZ
 from torch_pbd.control.stiffness import StiffnessLaw
 from torch_pbd.data import Demonstrations, check_unimodal
 from torch_pbd.data.alignment import TIMING_REMOVED
+from torch_pbd.data.poses import ROTATION
 from torch_pbd.data.units import ANGLES, LENGTHS, TIMES
 from torch_pbd.estimators.demonstrations import check_groups
 from torch_pbd.estimators.validation import check_squares, checked_values
@@ -171,8 +172,13 @@ def _grouped(X: ArrayLike, y: ArrayLike | None, groups: ArrayLike | None) -> Dem
             f"X does not increase at row {row}: if another demonstration starts there, give groups, the number of the "
             "demonstration of each row."
         )
-    members = [labels == label for label in dict.fromkeys(labels.tolist())]
     names = [str(name) for name in y.columns] if hasattr(y, "columns") else None
+    if set(ROTATION) <= set(names or ()):
+        raise ValueError(
+            f"y has columns {', '.join(ROTATION)}, as rotations of poses are called, which would count in m: give "
+            "Demonstrations."
+        )
+    members = [labels == label for label in dict.fromkeys(labels.tolist())]
     return Demonstrations([times[m, 0] for m in members], [positions[m] for m in members], names=names)
 
 

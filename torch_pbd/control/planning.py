@@ -112,15 +112,18 @@ class Planning(BaseEstimator):
             Times, which count as those of the demonstrations do.
         positions : array-like of shape (m, d), or (m, p + 4) for poses
             In their units; NaN where an output is not given. Of poses p positions and a quaternion w x y z, or outputs;
-            each of the two is given whole or not at all.
+            a rotation is given whole or not at all.
         noise_scale : float or array-like of shape (d,), default=0.0
-            Standard deviation of the error of positions; of poses p equal numbers and three equal ones in rad.
+            Standard deviation of the error of positions; of poses p numbers, and three in rad.
         """
         time = self._movement_time(checks.array(times, "times", ("m",))[:, np.newaxis])
         position = self.outputs_.rows(positions, "positions")
         if position.shape != (len(time), self.n_outputs_):
             raise ValueError(f"positions has shape {position.shape}, must have shape ({len(time)}, {self.n_outputs_}).")
-        return conditioned(self, time, position - self._path(time), self.outputs_.noise(noise_scale))
+        if self.outputs_.reference is not None and np.ndim(noise_scale) == 0 and noise_scale != 0.0:
+            must = f"0, or {self.n_outputs_} numbers, the last three in rad"
+            raise checks.refusal(noise_scale, "noise_scale", must, "m and rad have no scale in common")
+        return conditioned(self, time, position - self._path(time), noise_scale)
 
     def predict_stiffness(self, X: ArrayLike) -> Floats:
         """Stiffness (n, d, d) at times X (n, 1): in N/m, of angles in Nm/rad, of poses in both and in world axes."""
@@ -160,9 +163,10 @@ class Planning(BaseEstimator):
             poses, here and in ``via``, p positions and a unit quaternion w x y z, p + 4 numbers; or the p + 3 outputs.
         via : sequence of (time, position), default=None
             Points that the movement passes, with the stiffness of what must be met there: movement time in s from its
-            start, and position (d,) in the units of the recordings, NaN where an output is free. ``covariance`` must
-            be a model of whole movements: with one, goals and starts too bend the movement as far as demonstrations
-            make likely, and the primitive does the rest. A warning tells of points that they make unlikely.
+            start, and position (d,) in the units of the recordings, NaN where an output is free (a rotation as a
+            whole). ``covariance`` must be a model of whole movements: with one, goals and starts too bend the movement
+            as far as demonstrations make likely, and the primitive does the rest. A warning tells of points that they
+            make unlikely.
         speed : float, default=1.0
             How fast movement time passes: at 0.5 the movement takes twice as long. Gains are those of movement time.
         limits : MotionLimits or None

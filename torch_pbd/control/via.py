@@ -49,13 +49,15 @@ def conditioned(
     At the movement times ``pins`` the path stays, without a part in the gains. Changes are from the path, as it is not
     the model's mean: they differ by the error of the reproduction.
     """
-    model, phase, outputs = controller.covariance_, controller.reproduction_.phase, controller.outputs_
+    outputs, phase = controller.outputs_, controller.reproduction_.phase
     if not can_bend(controller):
         must = "a model of whole movements, with variability='position', to be bent"
         raise checks.refusal(controller.covariance, "covariance", must, "take DMPController(TrajectoryRegressor())")
+    # What is known is told in outputs, which may be free one by one; poses are learned along other axes.
+    model = controller.covariance_.told_along(outputs.axes)
     shown, inputs, stays = getattr(controller, "_shown", model), phase(time), phase(np.array(pins))
-    bent = model.condition(inputs, model.predict(inputs) + outputs.encode(change), noise_scale=noise_scale)
-    moved = bent.condition(stays, model.predict(stays)) if len(pins) else bent
+    bent = model.condition(inputs, outputs.decode(model.predict(inputs)) + change, noise_scale=noise_scale)
+    moved = bent.condition(stays, outputs.decode(model.predict(stays))) if len(pins) else bent
     # Even knots, but for those beside a time that is known, where the change is to be exact.
     own = np.append(time, pins).clip(0.0, controller.duration_)
     even = np.linspace(0.0, controller.duration_, _N_KNOTS)
@@ -136,10 +138,9 @@ def _checked_point(point: Any, number: int, controller: Any) -> tuple[float, Flo
 
 def _distance(controller: Any, at: float, change: Floats) -> tuple[float, float]:
     """Mahalanobis distance of a change of the outputs that are given, and how far 95 % of demonstrations deviate."""
-    change = controller.outputs_.encode(change)
     given = ~np.isnan(change)
     inputs, size = controller.reproduction_.phase(np.array([at])), int(given.sum())
-    covariance = controller.covariance_.predict_cov(inputs)[0][np.ix_(given, given)]
+    covariance = controller.outputs_.covariance(controller.covariance_.predict_cov(inputs))[0][np.ix_(given, given)]
     degrees = float(controller.covariance_.predict_df(inputs)[0])
     square = float(change[given] @ np.linalg.solve(covariance, change[given]))
     if np.isfinite(degrees):

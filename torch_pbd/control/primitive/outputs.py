@@ -94,23 +94,8 @@ class Outputs:
         return replace(self, axes=axes * extents)
 
     def encode(self, values: Floats) -> Floats:
-        """Coordinates z of outputs (..., d), of which whole blocks may be NaN."""
-        if self.axes is None:
-            return values
-        inverse = np.linalg.inv(self.axes)
-        return np.concatenate([values[..., block] @ inverse[block, block].T for block in self.blocks], axis=-1)
-
-    def noise(self, scale: Any) -> Any:
-        """Standard deviation of errors of z, from those of outputs: a number or (d,); of poses equal in each block."""
-        if self.axes is None:
-            return scale
-        given = checks.real_floats(scale, "noise_scale")
-        if not given.any():
-            return 0.0
-        if given.shape != self.axes.shape[:1] or any(np.ptp(given[block]) > 0.0 for block in self.blocks):
-            must = f"0, or {self.n_positions} equal numbers for positions and 3 in rad for the rotation"
-            raise checks.refusal(scale, "noise_scale", must, "m and rad have no scale in common")
-        return given / np.linalg.norm(self.axes, axis=0)
+        """Coordinates z of outputs (..., d)."""
+        return values if self.axes is None else values @ np.linalg.inv(self.axes).T
 
     def decode(self, coordinates: Floats) -> Floats:
         """Outputs (..., d) of coordinates z."""
@@ -188,10 +173,9 @@ class Outputs:
         if given.shape[-1] != p + 3:
             must = f"must have {p + 4} columns, position and quaternion w x y z, or the {p + 3} of the outputs."
             raise ValueError(f"{name} has shape {given.shape}, {must}")
-        for block, what in zip(self.blocks, ("position", "rotation"), strict=True):
-            free = np.isnan(given[..., block])
-            if (free.any(axis=-1) != free.all(axis=-1)).any():
-                raise ValueError(f"{name} has a part of the {what}, must have all of it, or NaN for all of it.")
+        free = np.isnan(given[..., p:])
+        if (free.any(axis=-1) != free.all(axis=-1)).any():
+            raise ValueError(f"{name} has a part of the rotation, must have all of it, or NaN for all of it.")
         return given
 
 
