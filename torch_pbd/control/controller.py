@@ -1,5 +1,6 @@
 """The controller as an estimator: demonstrations in, a stiffness schedule out (Section V)."""
 
+from dataclasses import KW_ONLY, dataclass
 from typing import Literal, Self
 
 from numpy.typing import ArrayLike
@@ -22,6 +23,7 @@ from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.movement.base import MovementRegressor
 
 
+@dataclass(eq=False, repr=False)
 class DMPController(Planning):
     """Learn a movement and its variability from demonstrations, and how stiffly to follow it.
 
@@ -109,44 +111,24 @@ class DMPController(Planning):
     (1001, 2, 2)
     """
 
-    def __init__(
-        self,
-        covariance: CovarianceRegressor | MovementRegressor | None = None,
-        *,
-        alpha: float = 25.0,
-        beta: float | None = None,
-        gamma: float = 0.7,
-        tau: float = 1.0,
-        adaptation: Adaptation = "safe",
-        gate: Gate = "time",
-        phase_input: parameters.PhaseInput = "time",
-        variability: parameters.Variability = "position",
-        goal: parameters.Goals = "common",
-        cutoff: float | Literal["auto"] | None = "auto",
-        duration: float | None = None,
-        n_steps: int = 100,
-        stiffness_law: StiffnessLaw | None = None,
-        mass: float | Floats | None = None,
-        damping_ratio: float | Literal["paper"] = 1.0,
-        on_unknown: OnUnknown = "soft",
-    ) -> None:
-        self.covariance = covariance
-        self.alpha = alpha
-        self.beta = beta
-        self.gamma = gamma
-        self.tau = tau
-        self.adaptation = adaptation
-        self.gate = gate
-        self.phase_input = phase_input
-        self.variability = variability
-        self.goal = goal
-        self.cutoff = cutoff
-        self.duration = duration
-        self.n_steps = n_steps
-        self.stiffness_law = stiffness_law
-        self.mass = mass
-        self.damping_ratio = damping_ratio
-        self.on_unknown = on_unknown
+    covariance: CovarianceRegressor | MovementRegressor | None = None
+    _: KW_ONLY
+    alpha: float = 25.0
+    beta: float | None = None
+    gamma: float = 0.7
+    tau: float = 1.0
+    adaptation: Adaptation = "safe"
+    gate: Gate = "time"
+    phase_input: parameters.PhaseInput = "time"
+    variability: parameters.Variability = "position"
+    goal: parameters.Goals = "common"
+    cutoff: float | Literal["auto"] | None = "auto"
+    duration: float | None = None
+    n_steps: int = 100
+    stiffness_law: StiffnessLaw | None = None
+    mass: float | Floats | None = None
+    damping_ratio: float | Literal["paper"] = 1.0
+    on_unknown: OnUnknown = "soft"
 
     def fit(
         self, X: Demonstrations | ArrayLike, y: ArrayLike | None = None, *, groups: ArrayLike | None = None

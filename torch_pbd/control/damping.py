@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torch_pbd import checks
-from torch_pbd.control.matrices import as_mass, as_semidefinite, check_fits
+from torch_pbd.control.matrices import as_damping_ratio, as_mass, as_semidefinite, check_fits
 from torch_pbd.linalg import spectral_map, symmetrize
 
 
@@ -38,11 +38,9 @@ def damping_from_stiffness(
     ValueError
         If a matrix is not symmetric and positive (semi)definite, or the ratio is negative.
     """
-    if isinstance(damping_ratio, str) and damping_ratio == "paper":
-        damping_ratio, mass = 0.5, 1.0  # whose damping is K^1/2
-    # Above a million the damping overflows beside gains and masses that are still numbers.
-    remedy = "1 is critical, 'paper' is the root of the stiffness"
-    ratio = checks.number(damping_ratio, "damping_ratio", least=0.0, most=1e6, remedy=remedy)
+    ratio = as_damping_ratio(damping_ratio)
+    if ratio == "paper":
+        ratio, mass = 0.5, 1.0  # whose damping is K^1/2
     matrix, spectrum = as_semidefinite(stiffness, "stiffness")
     mass = as_mass(mass)
     if not isinstance(mass, Tensor) or mass.ndim == 0:

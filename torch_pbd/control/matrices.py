@@ -1,7 +1,7 @@
 """Tensors of what control is given: motions, gains, masses."""
 
 from numbers import Real
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -59,6 +59,15 @@ def as_mass(mass: Any) -> float | Tensor:
     number = value.item() if isinstance(value, Tensor) else value
     checked = checks.number(number, "mass", least=_LIGHTEST, most=1.0 / _LIGHTEST, unit="kg")
     return value if isinstance(value, Tensor) else checked
+
+
+def as_damping_ratio(value: Any) -> float | Literal["paper"]:
+    """Damping ratio, at least 0; or "paper", the damping K^1/2 whatever the mass."""
+    if isinstance(value, str) and value == "paper":
+        return "paper"
+    # Above a million the damping overflows beside gains and masses that are still numbers.
+    remedy = "1 is critical, 'paper' is the root of the stiffness"
+    return checks.number(value, "damping_ratio", least=0.0, most=1e6, remedy=remedy)
 
 
 def mass_matrix(mass: float | Tensor, like: Tensor) -> Tensor:

@@ -14,8 +14,8 @@ from sklearn.utils.validation import check_array, check_X_y
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.control.damping import damping_from_stiffness
 from torch_pbd.control.impedance import OnUnknown
+from torch_pbd.control.matrices import as_damping_ratio, as_mass
 from torch_pbd.control.primitive.adaptation import Adaptation
 from torch_pbd.control.primitive.dmp import Gate
 from torch_pbd.control.primitive.outputs import common_unit, robot_unit
@@ -73,8 +73,8 @@ def check_parameters(controller: Any) -> None:
     mass: Any = 1.0 if controller.mass is None else controller.mass
     if np.ndim(mass) < 2:
         checks.number(mass, "mass", above=0.0, unit="kg", remedy="or give a matrix (d, d)")
-    # Checks what is its own.
-    damping_from_stiffness(np.eye(1 if np.ndim(mass) < 2 else len(mass)), mass, controller.damping_ratio)
+    as_mass(mass)
+    as_damping_ratio(controller.damping_ratio)
 
 
 def check_against_duration(controller: Any) -> None:
