@@ -86,6 +86,8 @@ def test_the_schedule_says_what_predict_says(controller):
     assert 50.0 - 1e-9 <= eigenvalues.min() <= eigenvalues.max() <= 1000.0 + 1e-9
     assert (schedule.names, schedule.units, schedule.stiffness_limits) == (("x", "y"), "m", (50.0, 1000.0))
     assert schedule.provenance["n_demos"] == 6
+    assert schedule.provenance["controller"]["DMPController"]["alpha"] == 25.0
+    assert schedule.provenance["covariance"]["HeteroscedasticGPRegressor"]["prior"] is None
 
 
 def test_a_schedule_of_a_controller_survives_its_file(controller, tmp_path):
