@@ -52,7 +52,7 @@ def test_jacobians_are_the_rates_of_rotation(vector, rng):
     world = rotations.log(rotations.multiply(after, rotations.conjugate(before))) / (2.0 * h)
     body = rotations.log(rotations.multiply(rotations.conjugate(before), after)) / (2.0 * h)
     np.testing.assert_allclose((rotations.left_jacobian(vector) @ direction[..., None])[..., 0], world, atol=1e-8)
-    np.testing.assert_allclose((rotations.right_jacobian(vector) @ direction[..., None])[..., 0], body, atol=1e-8)
+    np.testing.assert_allclose((rotations.left_jacobian(-vector) @ direction[..., None])[..., 0], body, atol=1e-8)
 
 
 def test_chart_gives_velocity_and_acceleration_of_a_rotation_over_time(rng):

@@ -94,7 +94,7 @@ def cross_matrix(vector: Floats) -> Floats:
 
 
 def left_jacobian(vector: Floats) -> Floats:
-    """Matrix (..., 3, 3) from the rate of a rotation vector to the angular velocity in world axes.
+    """Matrix (..., 3, 3) from the rate of a rotation vector to the angular velocity in world axes, of -v in body axes.
 
     ``I + b [v] + c [v]^2`` with ``b = (1 - cos t) / t^2``, ``c = (t - sin t) / t^3``; F. Bullo, R. M. Murray,
     "Proportional derivative (PD) control on the Euclidean group", ECC 1995.
@@ -102,11 +102,6 @@ def left_jacobian(vector: Floats) -> Floats:
     b, c = (value[..., np.newaxis, np.newaxis] for value in _coefficients(vector)[:2])
     cross = cross_matrix(vector)
     return np.eye(3) + b * cross + c * cross @ cross
-
-
-def right_jacobian(vector: Floats) -> Floats:
-    """Matrix (..., 3, 3) from the rate of a rotation vector to the angular velocity in body axes."""
-    return left_jacobian(-vector)
 
 
 def continuous(quaternion: Floats) -> Floats:

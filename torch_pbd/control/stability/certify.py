@@ -65,7 +65,9 @@ def certify(
     # An axis that is free never returns: nothing is to be certified of it.
     checks.semidefinite(schedule.stiffness, "stiffness", definite=True)
     time, stiffness, damping = map(torch.tensor, (schedule.time, schedule.stiffness, schedule.damping))
-    inertia = _inertia(schedule, mass, stiffness)
+    given = schedule.mass if mass is None else mass(schedule.time) if callable(mass) else mass
+    inertia = mass_rows(as_mass(1.0 if given is None else given), stiffness).detach()
+    inertia = inertia if inertia.ndim == 3 else inertia[None]  # one for all rows
     dynamics = ErrorDynamics(time / speed, stiffness, damping, inertia, _transport(schedule, speed))
     knots, maps = Knots(dynamics), dynamics.tick_maps()
     alpha, margin, worst = knots.certificate()
@@ -100,13 +102,6 @@ def certify(
         inertia=tuple(_range(inertia[:, block, block]) for block in schedule.blocks),
         units=tuple("Nm/rad" if i or schedule.units == "rad" else "N/m" for i in range(len(schedule.blocks))),
     )
-
-
-def _inertia(schedule: Schedule, mass: Any, like: Tensor) -> Tensor:
-    """Masses (m, d, d), m = 1 where it is one for all rows."""
-    given = schedule.mass if mass is None else mass(schedule.time) if callable(mass) else mass
-    rows = mass_rows(as_mass(1.0 if given is None else given), like).detach()
-    return rows if rows.ndim == 3 else rows[None]
 
 
 def _as_given(inertia: Tensor) -> float | tuple[tuple[float, ...], ...] | None:

@@ -11,7 +11,7 @@ from torch_pbd.control.damping import damping_from_stiffness
 from torch_pbd.control.matrices import as_semidefinite
 from torch_pbd.control.stiffness.precision import as_masses
 from torch_pbd.exceptions import InvalidParameterError
-from torch_pbd.linalg import spectral_map, symmetrize
+from torch_pbd.linalg import symmetrize
 
 
 def lqt(
@@ -86,9 +86,8 @@ def _before(cost: Float[Tensor, "*b k k"], back: Float[Tensor, "*b l l"]) -> Flo
 
 def _stationary(precision: Tensor, mass: Tensor, lightness: Tensor, r: float) -> Float[Tensor, "n k k"]:
     """Cost P of states for ever under one covariance: of the gains K and D of the precision law."""
-    root = spectral_map(mass, torch.sqrt)
-    inverse = spectral_map(mass, torch.rsqrt)
-    stiffness = symmetrize(root @ spectral_map(inverse @ (precision / r) @ inverse, torch.sqrt) @ root)
+    # M # (Sigma^-1 / r): the damping of a ratio of a half is the geometric mean of mass and stiffness.
+    stiffness = damping_from_stiffness(precision / r, mass, 0.5)
     damping = damping_from_stiffness(stiffness, mass, 0.5**0.5)
     whole = torch.cat([stiffness @ lightness @ damping, stiffness], dim=-1)
     return r * torch.cat([whole, torch.cat([stiffness, damping], dim=-1)], dim=-2)
