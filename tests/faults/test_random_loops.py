@@ -157,7 +157,7 @@ def _answer(schedule, forces, starts, stalls):
     return max(speeds), max(*changes, at_once)
 
 
-# A run takes a sixth of a second. All 10,000: --hypothesis-profile=thorough.
+# A run takes a tenth of a second. All 10,000: --hypothesis-profile=thorough.
 ALL = 10_000 if settings.get_current_profile_name() == "thorough" else 600
 # Approaches that were caught up in or outlasted the schedule, springs that pulled a robot after a stall, also where the
 # schedule had gone on faster than the robot meanwhile, and catching up without what the robot overshoots by (9210).
