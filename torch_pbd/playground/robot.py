@@ -1,6 +1,7 @@
 """The robot of the page: it follows a schedule at 1 kHz, and a spring to the pointer, or the keys, pull at it."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ class Robot:
         self._schedule: Schedule | None = None
         self._controller: RealTimeAdmittance | None = None
         self._now = self._rest = self._left = 0.0
+        self._desired: Sequence[float] = (0.0, 0.0)
 
     @staticmethod
     def prepare(schedule: Schedule) -> RealTimeAdmittance:
@@ -37,6 +39,7 @@ class Robot:
         self._schedule = schedule
         self._controller = controller or self.prepare(schedule)
         self._controller.start(self._now, here, at=at)
+        self._desired = self._controller.desired_position
 
     def advance(self, elapsed: float, hand: tuple[float, float] | None, push: tuple[float, float]) -> dict[str, Any]:
         """State after ``elapsed`` s in which a hand held the robot by a spring, or let go, and keys pushed it.
@@ -63,22 +66,25 @@ class Robot:
         while self._left >= _TICK:
             self._left -= _TICK
             self._now += _TICK
-            force = _pull(controller.position, hand, push)
+            force, before = _pull(controller.position, hand, push), controller.desired_position
             controller.tick(self._now, force)
+            # The loop's desired place is that of the tick's start; the robot has come to its end.
+            self._desired = [2.0 * d - b for d, b in zip(controller.desired_position, before, strict=True)]
             self._rest = self._rest + _TICK if controller.schedule_time >= schedule.duration else 0.0
             if self._rest > _REST:
                 self._rest = 0.0
                 controller.start(self._now)  # at its start: on a way back it would not be where the schedule is
+                self._desired = controller.desired_position
         stiffness = np.asarray(controller.stiffness)
         return {
             "type": "robot",
             "is_there": True,
             "time": controller.schedule_time,
             "position": controller.position,
-            "desired": controller.desired_position,
+            "desired": self._desired,
             "force": force,
             "stiffness": [stiffness[0, 0], stiffness[0, 1], stiffness[1, 1]],
-            "deviation": math.dist(controller.position, controller.desired_position),
+            "deviation": math.dist(controller.position, self._desired),
             "faults": str(controller.faults) if controller.faults else "",
         }
 
