@@ -85,10 +85,9 @@ def fit_mean(
     Hyperparameters are chosen for each output by its own evidence, as if its noise were independent of the others';
     the posterior is that of all outputs together. ``whitener`` makes the means at different inputs independent.
     """
-    # One output: its mean over the deviation of its noise is features times weights, and noise of unit variance. For
-    # the search alone no noise is less than _NONE: the rounding of kernels, 1e-16, changes the evidence of n inputs by
-    # about n 1e-16 over the variance of the noise. Of 1e-12 that is .02 nats, by which rounding of y, 1e-15 of it, led
-    # to other length scales and to variances that differed by a fifth.
+    # One output: its mean over the deviation of its noise is features times weights, and noise of unit variance. In the
+    # search alone no noise is less than _NONE. Rounding of kernels, 1e-16, changes the evidence of n inputs by about n
+    # 1e-16 over the variance of the noise: of 1e-12 by .02 nats, and rounding of y then led to other length scales.
     scale = (counts.sqrt()[:, None] / noise_tril.square().sum(-1).sqrt()).clamp_max(1.0 / _NONE).mT.unsqueeze(-1)
     noise_whitener = scale if whitener is None else whitener * scale.mT
     response = _times(whitener, scale * means.mT.unsqueeze(-1)).squeeze(-1)
