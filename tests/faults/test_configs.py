@@ -148,7 +148,7 @@ def test_45_unknown_keys_get_the_nearest_that_is_valid_there(refused, command, t
         (
             "experiment",
             "push: 1,5",
-            "push is the text '1,5', must be a number from -1e+06 to 1e+06: write 1.5.",
+            "push is the text '1,5', must be a number from 0 to 1e+06: write 1.5.",
         ),
         ("experiment", in_controller("{stiffness_law: 5}"), "stiffness_law is the number 5, must be"),
         ("experiment", in_controller("{damping_ratio: papr}"), "must be a number or paper: did you mean 'paper'?"),
