@@ -54,7 +54,7 @@ def conditioned(
         must = "a model of whole movements, with variability='position', to be bent"
         raise checks.refusal(controller.covariance, "covariance", must, "take DMPController(TrajectoryRegressor())")
     # What is known is told in outputs, which may be free one by one; poses are learned along other axes.
-    model = controller.covariance_.told_along(outputs.axes)
+    model = controller.covariance_.observed_along(outputs.axes)
     shown, inputs, stays = getattr(controller, "_shown", model), phase(time), phase(np.array(pins))
     bent = model.condition(inputs, outputs.decode(model.predict(inputs)) + change, noise_scale=noise_scale)
     moved = bent.condition(stays, outputs.decode(model.predict(stays))) if len(pins) else bent

@@ -45,8 +45,10 @@ class Description:
         rows = _table(self.recordings[:_MOST_ROWS])
         if len(self.recordings) > _MOST_ROWS:
             rows += f"\n... {len(self.recordings)} recordings in all"
-        told = [f"{i + 1}. {sentence}" for i, sentence in enumerate(self.mistakes)] or ["Nothing looks wrong."]
-        return "\n\n".join([rows, _table(self.outputs), *([self.rotation] if self.rotation else []), "\n".join(told)])
+        findings = [f"{i + 1}. {sentence}" for i, sentence in enumerate(self.mistakes)] or ["Nothing looks wrong."]
+        return "\n\n".join(
+            [rows, _table(self.outputs), *([self.rotation] if self.rotation else []), "\n".join(findings)]
+        )
 
     __repr__ = __str__
 

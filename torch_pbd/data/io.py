@@ -151,7 +151,7 @@ def load_demonstrations(
 def inspect_demonstrations(source: Source, **options: Any) -> tuple[Demonstrations, Description]:
     """Demonstrations as far as they can be read, and their description; takes the options of `load_demonstrations`.
 
-    What that function would refuse is left out or guessed, if there is a way, and told among the ``mistakes``.
+    What that function would refuse is left out or guessed, if there is a way, and said among the ``mistakes``.
     """
     notes: list[str] = []
     own = {name: value for name, value in options.items() if name not in OPTIONS}
@@ -159,9 +159,9 @@ def inspect_demonstrations(source: Source, **options: Any) -> tuple[Demonstratio
         warnings.simplefilter("always")
         wanted = Wanted(**{name: value for name, value in options.items() if name in OPTIONS}, notes=notes)
         demonstrations = wanted.finish([_load(file, wanted, own) for file in find_files(source)])
-    told = [str(warning.message) for warning in caught]
+    messages = [str(warning.message) for warning in caught]
     suspects = " ".join(demonstrations.suspects)
-    return demonstrations, describe(demonstrations, [*dict.fromkeys(notes), *(t for t in told if t != suspects)])
+    return demonstrations, describe(demonstrations, [*dict.fromkeys(notes), *(t for t in messages if t != suspects)])
 
 
 def find_files(source: Source) -> list[Path]:

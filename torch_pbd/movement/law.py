@@ -34,7 +34,7 @@ class MovementLaw(BaseEstimator, ABC):
     _range: tuple[float, float]
     """First of the times of the fit, and their range."""
     _known: Known | None = None
-    _axes: Floats | None = None  # of the coordinates in which observations are told; None: the outputs
+    _axes: Floats | None = None  # of the coordinates of observations; None: the outputs
     _kept: dict[str, tuple[Floats, JointNormal]]  # last times and their law, which conditioned copies share
     _y_is_1d: bool
 
@@ -64,7 +64,7 @@ class MovementLaw(BaseEstimator, ABC):
             raise ValueError(f"its arrays are {', '.join(arrays)}, must be {', '.join(shapes)}")
         return {name: checks.array(arrays[name], name, shape) for name, shape in shapes.items()}
 
-    def told_along(self, axes: Floats | None) -> Self:
+    def observed_along(self, axes: Floats | None) -> Self:
         """Copy whose :meth:`condition` takes rows, noise and NaN of ``axes @ y``, axes (d, d); None are the outputs."""
         copied = copy.copy(self)
         copied._axes, copied._kept = axes, self.__dict__.setdefault("_kept", {})

@@ -70,11 +70,11 @@ def _columns(key: str, shape: tuple[int, ...]) -> tuple[str, ...]:
 # Texts of variable length, as the environment's arguments with their rate, are not read: from damaged files the HDF5
 # library may not come back.
 def _check(name: str, group: Any, found: dict[str, Any], signals: list[str]) -> None:
-    said = group.attrs.get("num_samples")
+    declared = group.attrs.get("num_samples")
     for key in signals:
         if key not in found:
             raise ValueError(f"data/{name} has no {key!r}, which others have; it has {preview([*found])}.")
-        if said is not None and len(found[key]) != int(np.asarray(said).item()):
-            raise ValueError(f"data/{name} says num_samples = {said}, but {key} has {len(found[key])}.")
+        if declared is not None and len(found[key]) != int(np.asarray(declared).item()):
+            raise ValueError(f"data/{name} says num_samples = {declared}, but {key} has {len(found[key])}.")
         if found[key].id.get_storage_size() == 0:
             raise ValueError(f"data/{name}/{key} of shape {found[key].shape} was never written.")

@@ -68,18 +68,18 @@ def _check_lengths(path: Path, episode: Any, opened: Any, wanted: Wanted) -> Non
     """Check that the episodes are as long as meta/ says: a missing file would be fewer demonstrations."""
     numbers, counts = np.unique(episode, return_counts=True)
     found = dict(zip(numbers.tolist(), counts.tolist(), strict=True))
-    said: dict[int, int] = {}
+    declared: dict[int, int] = {}
     for name in (path / "meta" / "episodes").rglob("*.parquet"):
         with opened(name) as file:
             columns = read_columns(file, ["episode_index", "length"], wanted)
-            said |= dict(zip(columns["episode_index"].tolist(), columns["length"].tolist(), strict=True))
+            declared |= dict(zip(columns["episode_index"].tolist(), columns["length"].tolist(), strict=True))
     lines = path / "meta" / "episodes.jsonl"
     if lines.is_file():
         entries = map(json.loads, lines.read_text(encoding="utf-8").splitlines())
-        said |= {int(entry["episode_index"]): int(entry["length"]) for entry in entries}
-    for number in sorted(said.keys() | found.keys()):
-        if said.get(number) != found.get(number) and said:
+        declared |= {int(entry["episode_index"]): int(entry["length"]) for entry in entries}
+    for number in sorted(declared.keys() | found.keys()):
+        if declared.get(number) != found.get(number) and declared:
             raise ValueError(
-                f"episode {number} has {found.get(number, 0)} samples in data/, but {said.get(number, 0)} by "
+                f"episode {number} has {found.get(number, 0)} samples in data/, but {declared.get(number, 0)} by "
                 "meta/episodes: files are missing or cut."
             )
