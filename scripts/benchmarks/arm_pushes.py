@@ -101,7 +101,7 @@ def main(folder: Path) -> None:
         "| task | stiffness_min | peaks | peak off by | position path | rotation path | damping ratio | pushed away |"
     )
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
-    for stiffness_min in (50.0, 200.0):
+    for stiffness_min in (50.0, 200.0, 300.0):
         for name, schedule in (("made pose task", peg(stiffness_min)), ("kuka_cube_pick", cube(folder, stiffness_min))):
             found = list(pushed(schedule, n_directions=3))
             peaks = np.array([outcome.peak for outcome in found]).max(axis=0) * [1e3, 180.0 / np.pi]
