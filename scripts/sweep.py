@@ -24,13 +24,12 @@ from threadpoolctl import threadpool_limits
 
 from torch_pbd.cli.commands import OPTIONS as COMMANDS
 from torch_pbd.cli.options import Option, parse
-from torch_pbd.console import say
+from torch_pbd.console import format_table, say
 from torch_pbd.data import Demonstrations, load_demonstrations
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.exceptions import ConfigError
 from torch_pbd.experiments.comparison import left_out, mean_and_error, score_fold
 from torch_pbd.experiments.recordings import prepare
-from torch_pbd.experiments.run_folder import format_table
 
 Row = dict[str, Any]
 

@@ -1,15 +1,17 @@
-"""Output to a terminal, or to nobody."""
+"""Output to a terminal, or to nobody: sentences, tables, and what goes on meanwhile."""
 
 import os
 import sys
+import textwrap
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any, TextIO, TypeVar
 
 _PATIENCE = 2.0  # s without a word, after which a terminal is told what goes on
 _ERASE = "\r\x1b[K"
+_WIDTH = 80  # columns of the terminals that people start with
 
 _Item = TypeVar("_Item")
 
@@ -91,14 +93,51 @@ def steps(items: Iterable[_Item], what: str, n_items: int) -> Iterator[_Item]:
             _LINE.steps.pop()
 
 
-class Notes:
-    """Shows each warning once, as one line on the standard error."""
+def format_table(rows: Sequence[Mapping[str, Any]], width: int = _WIDTH) -> str:
+    """Text table of rows with the same keys; numbers to three digits, and a dash for one that is not known.
 
-    def __init__(self) -> None:
-        self._shown: set[str] = set()
+    A column of which nothing is known is left out. Where the table would be wider than ``width``, the headers take up
+    to three lines, and then the longest texts too.
+    """
+    columns = [column for column in rows[0] if any(row[column] == row[column] for row in rows)]
+    texts = {column for column in columns if isinstance(rows[0][column], str)}
+    cells = [{column: _cell(row[column]) for column in columns} for row in rows]
+    # Headers take more lines until the table fits; what is too much then comes off the longest texts.
+    for n_lines in (1, 2, 3):
+        widths = {c: max(_header_width(c, n_lines), *(len(row[c]) for row in cells)) for c in columns}
+        spare = width - sum(widths.values()) - 2 * (len(columns) - 1)
+        if spare >= 0:
+            break
+    if texts and spare < 0:
+        longest = max(texts, key=lambda column: widths[column])
+        words = (len(word) for row in cells for word in row[longest].split())
+        widths[longest] = max(widths[longest] + spare, len(longest), *words)
 
-    def __call__(self, message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
-        """Show a warning, in the place of ``warnings.showwarning``."""
-        if str(message) not in self._shown:
-            self._shown.add(str(message))
-            say(f"note ({category.__name__}): {message}", sys.stderr)
+    def lines(entries: Mapping[str, str], *, at_bottom: bool = False) -> list[str]:
+        wrapped = {c: textwrap.wrap(entries[c], widths[c], break_on_hyphens=False) or [""] for c in columns}
+        height = max(map(len, wrapped.values()))
+        padded = []
+        for column, own in wrapped.items():
+            blank, pad = [""] * (height - len(own)), str.ljust if column in texts else str.rjust
+            padded.append([pad(part, widths[column]) for part in (blank + own if at_bottom else own + blank)])
+        return ["  ".join(line).rstrip() for line in zip(*padded, strict=True)]
+
+    header = lines({c: c for c in columns}, at_bottom=True) + lines({c: "-" * widths[c] for c in columns})
+    return "\n".join(header + [line for row in cells for line in lines(row)])
+
+
+def _header_width(header: str, n_lines: int) -> int:
+    longest = max(map(len, header.split()), default=1)
+    widths = range(longest, max(longest, len(header)) + 1)
+    return next(width for width in widths if len(textwrap.wrap(header, width, break_on_hyphens=False)) <= n_lines)
+
+
+def _cell(value: Any) -> str:
+    if not isinstance(value, float):
+        return str(value)
+    size = abs(value)
+    if value != value or not value:
+        return "-" if value else "0"
+    if 0.1 <= size < 1e5:
+        return f"{value:.2f}" if size < 100.0 else f"{value:.0f}"
+    return f"{value:.2g}" if 1e-3 <= size < 0.1 else f"{value:.2e}"

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from torch_pbd import CholeskyCovRegressor
+from torch_pbd.console import format_table
 from torch_pbd.control import DMPController, StiffnessLaw
 from torch_pbd.data import make_tunnel_demonstrations
-from torch_pbd.experiments.run_folder import format_table
 
 RATE = 50.0  # Hz
 

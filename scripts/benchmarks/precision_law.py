@@ -18,6 +18,7 @@ import torch
 from scipy.linalg import expm
 
 from torch_pbd import Demonstrations, DMPController
+from torch_pbd.console import format_table
 from torch_pbd.control import RotationLimits, StiffnessLaw, damping_from_stiffness, lqt
 from torch_pbd.data import (
     load_demonstrations,
@@ -26,7 +27,6 @@ from torch_pbd.data import (
     make_tunnel_demonstrations,
 )
 from torch_pbd.data.units import LENGTHS
-from torch_pbd.experiments.run_folder import format_table
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 RECORDED = (

@@ -3,9 +3,9 @@
 import numpy as np
 from covariance_libraries import MixtureRegression
 
+from torch_pbd.console import format_table
 from torch_pbd.data import make_paper_simulation, paper_covariance
 from torch_pbd.experiments.comparison import empirical_covariances
-from torch_pbd.experiments.run_folder import format_table
 from torch_pbd.metrics import covariance_mse, relative_frobenius_error
 
 if __name__ == "__main__":

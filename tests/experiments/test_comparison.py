@@ -32,32 +32,32 @@ class Witness(BaseEstimator):
 def test_whole_demonstrations_are_left_out_and_scored():
     X, y, groups = make_paper_simulation(8, 5, random_state=0)
     Witness.fits.clear()
-    (score,) = compare_models({"witness": Witness()}, X, y, groups, max_folds=3)
+    score = compare_models({"witness": Witness()}, X, y, groups, max_folds=3)["witness"]
     assert Witness.fits == [40, 32, 32, 32]
     expected = [-0.5 * np.square(y[groups == k]).sum(axis=1).mean() for k in (0, 2, 4)]
-    np.testing.assert_allclose(score.fold_log_likelihood, expected)
-    assert score.row()["+-"] == pytest.approx(np.std(expected, ddof=1) / 3**0.5)
-    assert score.smallest_eigenvalue == 1.0
+    np.testing.assert_allclose([fold["log_likelihood"] for fold in score.folds], expected)
+    assert score.row["+-"] == pytest.approx(np.std(expected, ddof=1) / 3**0.5)
+    assert score.row["least eig."] == 1.0
 
 
 def test_errors_are_those_to_the_empirical_and_to_the_true_covariances():
     X, y, groups = make_paper_simulation(8, 5, random_state=0)
-    (score,) = compare_models({"witness": Witness()}, X, y, groups, truth=paper_covariance, max_folds=0)
+    score = compare_models({"witness": Witness()}, X, y, groups, truth=paper_covariance, max_folds=0)["witness"]
     inputs = np.unique(X)
     empirical = np.stack([np.cov(y[X[:, 0] == xi].T) for xi in inputs])
     unit = np.tile(np.eye(2), (8, 1, 1))
-    assert score.cholesky_mse == pytest.approx(covariance_mse(unit, empirical), rel=1e-9)
+    assert score.row["MSE"] == pytest.approx(covariance_mse(unit, empirical), rel=1e-9)
     true = paper_covariance(inputs)
     ratio = np.linalg.norm(unit - true, axis=(1, 2)) / np.linalg.norm(true, axis=(1, 2))
-    assert score.frobenius == pytest.approx(ratio.mean(), rel=1e-9)
-    assert np.isnan(score.row()["held-out LL"])
+    assert score.row["error to truth"] == pytest.approx(ratio.mean(), rel=1e-9)
+    assert np.isnan(score.row["held-out LL"])
 
 
 def test_data_that_do_not_repeat_have_no_empirical_covariance(rng):
     X, y = rng.normal(size=(20, 1)), rng.normal(size=(20, 2))
     assert empirical_covariances(X, y)[1] is None
-    (score,) = compare_models({"witness": Witness()}, X, y, np.arange(20) % 4, max_folds=0)
-    assert np.isnan(score.cholesky_mse)
+    score = compare_models({"witness": Witness()}, X, y, np.arange(20) % 4, max_folds=0)["witness"]
+    assert np.isnan(score.row["MSE"])
 
 
 @pytest.mark.parametrize("n_components", [1, 5])

@@ -54,8 +54,8 @@ def planned():
 def test_pushes_are_in_the_axes_that_the_tool_has_in_their_middle(run):
     n = len(run.schedule)
     for rollouts, outputs, others, peak in (
-        (run.forces, slice(3), slice(3, 6), 12.0),
-        (run.torques, slice(3, 6), slice(3), 1.2),
+        (run.pushes["force"], slice(3), slice(3, 6), 12.0),
+        (run.pushes["torque"], slice(3, 6), slice(3), 1.2),
     ):
         for axis, rollout in enumerate(rollouts):
             for middle in (round(0.2 * (n - 1)), round(0.8 * (n - 1))):
@@ -69,8 +69,8 @@ def test_the_table_has_what_the_runs_show(run):
     turns = Rotation.from_quat(run.schedule.orientation, scalar_first=True).as_matrix()
     half, late = len(turns) // 2, round(0.8 * (len(turns) - 1))
     for kind, rollouts, block, scale in (
-        (POSITION, run.forces, slice(3), 1e3),
-        (ROTATION, run.torques, slice(3, 6), 180 / np.pi),
+        (POSITION, run.pushes["force"], slice(3), 1e3),
+        (ROTATION, run.pushes["torque"], slice(3, 6), 180 / np.pi),
     ):
         for axis, row in enumerate(push_rows("mine", run, kind)):
             own = turns[:, :, axis]
@@ -176,7 +176,7 @@ def test_an_arm_in_mujoco_is_pushed_as_far_as_its_plant():
     schedule, model = run.schedule, panda()
     joints = inverse_kinematics(model, schedule.position, schedule.orientation, "tool", start=HOME)
     still = mujoco.run(model, schedule, joints).deviation
-    for kind, rollout, axis in ((POSITION, run.forces[1], 1), (ROTATION, run.torques[2], 2)):
+    for kind, rollout, axis in ((POSITION, run.pushes["force"][1], 1), (ROTATION, run.pushes["torque"][2], 2)):
         moved = mujoco.run(model, schedule, joints, wrench=rollout.force).deviation - still
         own = np.abs(kind.scale * run.along(moved, kind)[:, axis])
         # The plant is linear in rotations, and has the inertia of the arm where it should be.

@@ -3,8 +3,9 @@ import re
 
 import pytest
 
+from torch_pbd.console import format_table
 from torch_pbd.exceptions import ConfigError
-from torch_pbd.experiments.run_folder import RunFolder, check_names, format_table, slug
+from torch_pbd.experiments.run_folder import RunFolder, check_names, slug
 
 
 def test_a_table_lines_up_and_shows_what_is_not_known_as_a_dash():

@@ -30,11 +30,10 @@ from torch_pbd import (
     load_demonstrations,
 )
 from torch_pbd.cli.main import main
-from torch_pbd.experiments import resume, robot
+from torch_pbd.experiments import robot, run_folder
 from torch_pbd.experiments.demo import run_demo
-from torch_pbd.experiments.resume import FinishedFits, finished_fits, fit_once
 from torch_pbd.experiments.robot import run_robot
-from torch_pbd.experiments.run_folder import RunFolder
+from torch_pbd.experiments.run_folder import FinishedFits, RunFolder, fit_once
 
 # What these runs are of was recorded by nobody: a few samples, without units, cut anywhere.
 pytestmark = [
@@ -68,7 +67,7 @@ def finished(folder):
 
 def watched(monkeypatch, number=None, at=0):
     """List that grows with each fit that is carried out here; the process gets a signal at the end of one of them."""
-    timed_fit, fits = resume._timed_fit, []
+    timed_fit, fits = run_folder._timed_fit, []
 
     def fit_and_signal(model, *data):
         result = timed_fit(model, *data)
@@ -77,7 +76,7 @@ def watched(monkeypatch, number=None, at=0):
             signal.raise_signal(number)
         return result
 
-    monkeypatch.setattr(resume, "_timed_fit", fit_and_signal)
+    monkeypatch.setattr(run_folder, "_timed_fit", fit_and_signal)
     return fits
 
 
@@ -178,7 +177,7 @@ def test_36_an_experiment_goes_on_with_the_controllers_that_are_left(recorded, t
         monkeypatch.setattr(robot, figure, lambda *_, **__: None)
     skill = DMPController(GMMBaseline(n_components=2), n_steps=20)
     controllers = {"stiff": skill, "soft": clone(skill).set_params(alpha=16.0)}
-    with RunFolder(tmp_path, {}) as folder, finished_fits(tmp_path / "finished", resume=False) as folder.finished:
+    with RunFolder(tmp_path, {}) as folder, FinishedFits(tmp_path / "finished") as folder.finished:
         with monkeypatch.context() as patched:
             watched(patched, signal.SIGINT, at=2)
             with pytest.raises(KeyboardInterrupt):
@@ -193,7 +192,7 @@ def test_36_an_experiment_goes_on_with_the_controllers_that_are_left(recorded, t
 def test_36_a_demo_goes_on_with_the_fits_that_are_left(tmp_path, monkeypatch):
     models = {"mixture": GMMBaseline(n_components=2)}
     fits = watched(monkeypatch)
-    with RunFolder(tmp_path, {}) as folder, finished_fits(tmp_path / "finished", resume=False) as folder.finished:
+    with RunFolder(tmp_path, {}) as folder, FinishedFits(tmp_path / "finished") as folder.finished:
         text = run_demo(models, folder, n_demos=3)
         assert fits == ["GMMBaseline", "DMPController"]
         assert len(finished(tmp_path)) == 2
@@ -246,13 +245,13 @@ def test_fits_of_other_parameters_data_or_versions_are_others(recorded, monkeypa
         (DMPController(model, n_steps=20, mass=2.0), recorded),
         (DMPController(GMMBaseline(n_components=3), n_steps=20), recorded),
     ]
-    keys = [resume._key(*given) for given in others]
+    keys = [run_folder._key(*given) for given in others]
     assert len(set(keys)) == len(others)
-    assert keys == [resume._key(clone(given[0]), *given[1:]) for given in others]
+    assert keys == [run_folder._key(clone(given[0]), *given[1:]) for given in others]
     for package in (torch_pbd, torch):
         with monkeypatch.context() as patched:
             patched.setattr(package, "__version__", "0")
-            assert not {resume._key(*given) for given in others} & set(keys)
+            assert not {run_folder._key(*given) for given in others} & set(keys)
 
 
 def test_a_peer_that_has_no_file_is_always_fitted(recorded, tmp_path, monkeypatch):

@@ -157,7 +157,7 @@ def demo(options: Any, folder: Any) -> str:
 def fit(options: Any, folder: Any) -> str:
     """One model on a file of demonstrations."""
     from torch_pbd.experiments.recordings import write_fitted
-    from torch_pbd.experiments.resume import fit_once
+    from torch_pbd.experiments.run_folder import fit_once
 
     demonstrations = _demonstrations(options)
     X, y, groups = demonstrations.stack(options.input)

@@ -12,7 +12,7 @@ from typing import Any
 import torch_pbd
 from torch_pbd.cli import commands
 from torch_pbd.cli.words import unknown
-from torch_pbd.console import Notes, progress, say
+from torch_pbd.console import progress, say
 from torch_pbd.exceptions import ConfigError, FolderInUseError
 
 # The last two are 128 and the number of the signal, as of shells.
@@ -104,8 +104,7 @@ def _run(command: str, arguments: Sequence[str]) -> int:
 
 
 def _work(command: str, options: Any, config: str) -> None:
-    from torch_pbd.experiments.resume import finished_fits
-    from torch_pbd.experiments.run_folder import check_names, write_report
+    from torch_pbd.experiments.run_folder import FinishedFits, check_names, write_report
 
     if getattr(options, "data", None) is not None:
         options.data = _files(options.data)
@@ -113,9 +112,9 @@ def _work(command: str, options: Any, config: str) -> None:
         check_names(getattr(options, argument, ()), argument)
     with _run_folder(options.output, command) as folder, warnings.catch_warnings():
         warnings.simplefilter("default")
-        warnings.showwarning = Notes()
+        warnings.showwarning = _each_once()
         try:
-            with finished_fits(folder.path / "finished", resume=options.resume) as folder.finished:
+            with FinishedFits(folder.path / "finished", options.resume) as folder.finished:
                 folder.write_text("config.yaml", config)
                 import torch
 
@@ -128,6 +127,18 @@ def _work(command: str, options: Any, config: str) -> None:
                 stop.args = (f"torch-pbd {command} --config {folder.path / 'config.yaml'} --resume goes on",)
             raise
     say(f"\nreport:  {report}\nresults: {folder.path}")
+
+
+def _each_once() -> Any:
+    """What shows each warning once, as one line on the standard error, in the place of ``warnings.showwarning``."""
+    shown = set()
+
+    def show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+        if str(message) not in shown:
+            shown.add(str(message))
+            say(f"note ({category.__name__}): {message}", sys.stderr)
+
+    return show
 
 
 def _files(data: Any) -> list[Path]:

@@ -1,9 +1,8 @@
 """Compare models on one data set: how well each repeats the data, and how well it predicts a demonstration."""
 
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from joblib import Parallel, delayed
@@ -13,55 +12,20 @@ from sklearn.base import clone
 from torch_pbd.checks import Floats
 from torch_pbd.console import steps
 from torch_pbd.estimators.base import CovarianceRegressor
-from torch_pbd.experiments.resume import FinishedFits, fit_once
+from torch_pbd.experiments.run_folder import FinishedFits, fit_once
 from torch_pbd.metrics import covariance_mse, mahalanobis_coverage, negative_log_likelihood, relative_frobenius_error
 from torch_pbd.movement import judge_movement
-from torch_pbd.movement.judging import MOVEMENT_STATISTICS
 
 
-@dataclass(frozen=True)
-class Score:
+class Score(NamedTuple):
     """Result of one model on one data set."""
 
-    model: str
     fitted: CovarianceRegressor
     """The model, fitted to all the data."""
-    cholesky_mse: float
-    """Error to the empirical covariances, squared units of y: the MSE of the paper's Table I. NaN if not aligned."""
-    frobenius: float
-    """Relative error to the true covariance, NaN where it is not known."""
-    fold_log_likelihood: tuple[float, ...]
-    """Log-likelihood of each demonstration left out, in nats per sample."""
-    fold_coverage: tuple[float, ...]
-    """Share of each demonstration left out that lies within the 95 % ellipse."""
-    fit_seconds: float
-    smallest_eigenvalue: float
-    """Smallest eigenvalue of the predicted correlations, over the data."""
-    fold_movement: tuple[dict[str, float], ...] = ()
-    """Judgement of each demonstration left out as a whole, as :func:`~torch_pbd.movement.judge_movement` returns it."""
-
-    def row(self) -> dict[str, Any]:
-        """Row of a table."""
-        folds = self.fold_log_likelihood
-        mean, error = mean_and_error(folds)
-        return {
-            "model": self.model,
-            "MSE": self.cholesky_mse,
-            "error to truth": self.frobenius,
-            "held-out LL": mean,
-            "+-": error,
-            "median": float(np.median(folds)) if folds else float("nan"),
-            "95 % holds": mean_and_error(self.fold_coverage)[0],
-            "folds": len(folds),
-            "least eig.": self.smallest_eigenvalue,
-            "fit [s]": self.fit_seconds,
-        }
-
-    def movement_row(self) -> dict[str, Any]:
-        """Row of a table of whole movements."""
-        joint, error = mean_and_error([fold["joint"] for fold in self.fold_movement])
-        holds = {name: mean_and_error([fold[name] for fold in self.fold_movement])[0] for name in MOVEMENT_STATISTICS}
-        return {"model": self.model, "joint LL": joint, "+- ": error, **holds}
+    row: dict[str, Any]
+    """Row of a table; NaN is what is not known."""
+    folds: list[dict[str, float]]
+    """Scores of each demonstration left out, as :func:`score_fold` returns them."""
 
 
 def compare_models(
@@ -75,7 +39,7 @@ def compare_models(
     n_jobs: int | None = None,
     finished: FinishedFits | None = None,
     whole_movements: bool = False,
-) -> list[Score]:
+) -> dict[str, Score]:
     """Fit every model on all the data, and once more without each of some demonstrations.
 
     Models are cloned; ``truth`` maps X (n, e) to the true covariances (n, d, d). At most ``max_folds`` demonstrations,
@@ -83,6 +47,7 @@ def compare_models(
     whole too if ``whole_movements``. Fits are kept in ``finished``, and not repeated if they are there.
     """
     inputs, empirical = empirical_covariances(X, y)
+    true = None if truth is None else truth(inputs)
     folds = left_out(groups, max_folds)
     # One by one, before the folds share the cores: these are the times that are reported.
     fits = {
@@ -95,28 +60,32 @@ def compare_models(
         for fold in folds
     )
     results = steps(Parallel(n_jobs=n_jobs, return_as="generator")(jobs), "fold", len(models) * len(folds))
-    scores = []
+    scores = {}
     for name, (fitted, seconds) in fits.items():
-        covariance = fitted.predict_cov(inputs)
-        # Of covariances the smallest eigenvalue would tell the smallest unit: that of correlations tells singular ones.
-        scale = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
         held_out = [next(results) for _ in folds]
-        scores.append(
-            Score(
-                model=name,
-                fitted=fitted,
-                cholesky_mse=float("nan") if empirical is None else covariance_mse(covariance, empirical),
-                frobenius=float("nan") if truth is None else relative_frobenius_error(covariance, truth(inputs)),
-                fold_log_likelihood=tuple(row["log_likelihood"] for row in held_out),
-                fold_coverage=tuple(row["coverage"] for row in held_out),
-                fold_movement=tuple(held_out) if whole_movements else (),
-                fit_seconds=seconds,
-                smallest_eigenvalue=float(
-                    np.linalg.eigvalsh(covariance / scale[:, :, np.newaxis] / scale[:, np.newaxis]).min()
-                ),
-            )
-        )
+        errors = _errors(fitted.predict_cov(inputs), empirical, true, held_out)
+        scores[name] = Score(fitted, {"model": name, **errors, "fit [s]": seconds}, held_out)
     return scores
+
+
+def _errors(
+    covariance: Floats, empirical: Floats | None, true: Floats | None, folds: Sequence[dict[str, float]]
+) -> dict[str, Any]:
+    likelihoods = [fold["log_likelihood"] for fold in folds]
+    mean, error = mean_and_error(likelihoods)
+    # Of covariances the smallest eigenvalue would tell the smallest unit: that of correlations tells singular ones.
+    scale = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    correlation = covariance / scale[:, :, np.newaxis] / scale[:, np.newaxis]
+    return {
+        "MSE": np.nan if empirical is None else covariance_mse(covariance, empirical),  # that of Table I
+        "error to truth": np.nan if true is None else relative_frobenius_error(covariance, true),
+        "held-out LL": mean,
+        "+-": error,
+        "median": float(np.median(likelihoods)) if folds else np.nan,
+        "95 % holds": mean_and_error([fold["coverage"] for fold in folds])[0],
+        "folds": len(folds),
+        "least eig.": float(np.linalg.eigvalsh(correlation).min()),
+    }
 
 
 def left_out(groups: NDArray[np.intp], max_folds: int | None = None) -> NDArray[np.intp]:
@@ -138,7 +107,11 @@ def score_fold(
     *,
     whole: bool = False,
 ) -> dict[str, float]:
-    """Fit without a demonstration, and score how well its rows are predicted, and if asked for it as a whole."""
+    """Fit without a demonstration, and score how well its rows are predicted, and if asked for it as a whole.
+
+    "log_likelihood" is in nats per sample, "coverage" the share of samples within the 95 % ellipse; of the whole there
+    is what :func:`~torch_pbd.movement.judge_movement` returns.
+    """
     left = groups == demonstration
     # Of this thread: what else runs on the machine does not count.
     start = time.thread_time()

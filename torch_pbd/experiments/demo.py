@@ -6,13 +6,14 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from torch_pbd import plotting
+from torch_pbd.console import format_table
 from torch_pbd.control.controller import DMPController
 from torch_pbd.data import Demonstrations, make_tunnel_demonstrations, save_demonstrations
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.experiments.comparison import compare_models
 from torch_pbd.experiments.recordings import write_fitted
 from torch_pbd.experiments.robot import draw_tunnel, run_robot
-from torch_pbd.experiments.run_folder import RunFolder, format_table
+from torch_pbd.experiments.run_folder import RunFolder
 from torch_pbd.metrics import mahalanobis_coverage
 
 _N_FRESH = 300  # demonstrations that stand for the truth: their covariance is known to 8 %
@@ -34,16 +35,17 @@ def run_demo(models: Mapping[str, CovarianceRegressor], folder: RunFolder, *, n_
     times = demonstrations.times[0][::_EVERY, np.newaxis]
     positions = fresh[:, ::_EVERY].reshape(_N_FRESH * len(times), -1)
     rows = []
-    for score in scores:
-        row = score.row()
-        mean, covariance = score.fitted.predict(times, return_cov=True)
+    for name, (model, row, _) in scores.items():
+        mean, covariance = model.predict(times, return_cov=True)
         tiled = np.tile(mean, (_N_FRESH, 1)), np.tile(covariance, (_N_FRESH, 1, 1))
         row["95 % of fresh"] = mahalanobis_coverage(*tiled, positions)
-        row["fresh LL"] = score.fitted.score(np.tile(times, (_N_FRESH, 1)), positions)
+        row["fresh LL"] = model.score(np.tile(times, (_N_FRESH, 1)), positions)
         columns = ("model", "MSE", "error to truth", "fresh LL", "95 % of fresh", "least eig.", "fit [s]")
         rows.append({column: row[column] for column in columns})
-        write_fitted(score.fitted, demonstrations, folder, score.model, "time")
-    folder.write_figure(_tunnel_figure({score.model: score.fitted for score in scores}, demonstrations), "tunnel")
+        write_fitted(model, demonstrations, folder, name, "time")
+    folder.write_figure(
+        _tunnel_figure({name: score.fitted for name, score in scores.items()}, demonstrations), "tunnel"
+    )
     folder.write_metrics(rows)
     name, model = next(iter(models.items()))
     title = "A robot under its control, pushed with 5 N along x at 2 s and 8 s:\ndisplacement, and stiffness in N/m"

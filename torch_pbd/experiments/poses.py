@@ -1,6 +1,6 @@
 """The robotic experiment with a tool that turns: learned poses on the plant of an arm, pushed by force and torque."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
@@ -11,7 +11,7 @@ from sklearn.base import clone
 
 from torch_pbd import plotting, rotations
 from torch_pbd.checks import Floats
-from torch_pbd.console import steps
+from torch_pbd.console import format_table, steps
 from torch_pbd.control.controller import DMPController
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.plant import AdmittancePlant
@@ -20,13 +20,13 @@ from torch_pbd.control.simulation.run import simulate
 from torch_pbd.control.stability.report import StabilityReport
 from torch_pbd.data import Demonstrations
 from torch_pbd.exceptions import ConfigError
-from torch_pbd.experiments.resume import fit_once
 from torch_pbd.experiments.robot import PUSHES, pulse
-from torch_pbd.experiments.run_folder import RunFolder, format_table
+from torch_pbd.experiments.run_folder import RunFolder, fit_once
 
 Arm = Literal["panda", "none"]
 
 _TOOL = "xyz"
+_KINDS = (plotting.POSITION, plotting.ROTATION)
 _FIGURE = partial(Figure, layout="constrained")
 _ROWS = 50.0  # Hz; along a path the inertia of an arm changes with its joints, within seconds
 _N_STEPS = 101
@@ -39,8 +39,8 @@ class PoseRun:
     planned: Schedule
     schedule: Schedule
     unpushed: Rollout
-    forces: tuple[Rollout, ...]
-    torques: tuple[Rollout, ...]
+    pushes: Mapping[str, list[Rollout]]
+    """By "force" and "torque", in each axis."""
     report: StabilityReport
 
     def along(self, values: Floats, kind: plotting.Kind) -> Floats:
@@ -52,8 +52,8 @@ class PoseRun:
 
     def moved(self, kind: plotting.Kind) -> Floats:
         """Displacement (n, 3) by a push in each axis of the tool, along it, against the run without; in units shown."""
-        rollouts = self.forces if kind is plotting.POSITION else self.torques
-        moves = [self.along(run.deviation - self.unpushed.deviation, kind)[:, i] for i, run in enumerate(rollouts)]
+        still = self.unpushed.deviation
+        moves = [self.along(run.deviation - still, kind)[:, i] for i, run in enumerate(self.pushes[kind.push])]
         return kind.scale * np.stack(moves, axis=1)
 
 
@@ -75,7 +75,7 @@ def run_poses(
     for name, controller in steps(controllers.items(), "controller", len(controllers)):
         fitted, _ = fit_once(clone(controller), demonstrations, finished=folder.finished)
         run = pushed(fitted, rate, peak, torque, arm)
-        rows += [row for kind in (plotting.POSITION, plotting.ROTATION) for row in push_rows(name, run, kind)]
+        rows += [row for kind in _KINDS for row in push_rows(name, run, kind)]
         plain = damping_ratio(run.schedule, run.planned.damping)
         low, high = (f"{fitted.mass_ if np.ndim(fitted.mass_) == 0 else fitted.mass_[i, i]:.3g}" for i in (0, -1))
         mass = f"{low} kg and {high} kg m^2"
@@ -90,11 +90,16 @@ def run_poses(
         )
     folder.write_metrics(rows)
     folder.write_text("stability.txt", "\n\n".join(reports) + "\n")
-    tables = [
-        format_table([_shown(row, kind) for row in rows if row["push"] == kind.push])
-        for kind in (plotting.POSITION, plotting.ROTATION)
-    ]
-    return "\n\n".join([*tables, *reports])
+    return "\n\n".join([*(_table(rows, kind) for kind in _KINDS), *reports])
+
+
+def _table(rows: Sequence[Mapping[str, Any]], kind: plotting.Kind) -> str:
+    """Table of pushes of one kind."""
+    units = {"early": kind.unit, "late": kind.unit, "K early": kind.stiffness_unit, "K late": kind.stiffness_unit}
+    names = {key: f"{key} [{unit}]" for key, unit in units.items()} | {"axis": f"{kind.push} {kind.where}"}
+    own = [row for row in rows if row["push"] == kind.push]
+    hidden = ("push", "unit")  # which stand in the header
+    return format_table([{names.get(key, key): row[key] for key in row if key not in hidden} for row in own])
 
 
 def pushed(controller: DMPController, rate: float, peak: float, torque: float, arm: Arm) -> PoseRun:
@@ -102,17 +107,12 @@ def pushed(controller: DMPController, rate: float, peak: float, torque: float, a
     planned = controller.schedule(rate)
     schedule = with_panda(planned) if arm == "panda" else planned
     # As torque control of an arm, which feeds its inertia times the acceleration forward.
-    plant = AdmittancePlant(None, feed_forward=True)
-
-    def run(largest: float, kind: plotting.Kind, axis: int) -> Rollout:
-        wrench = _wrench(schedule, largest, kind, axis)
-        return simulate(schedule, wrench, plant=plant, random_state=0)
-
-    forces, torques = (
-        tuple(run(largest, kind, axis) for axis in range(3))
-        for largest, kind in ((peak, plotting.POSITION), (torque, plotting.ROTATION))
-    )
-    return PoseRun(planned, schedule, run(0.0, plotting.POSITION, 0), forces, torques, schedule.certify())
+    run = partial(simulate, schedule, plant=AdmittancePlant(None, feed_forward=True))
+    pushes = {
+        kind.push: [run(_wrench(schedule, largest, kind, axis)) for axis in range(3)]
+        for kind, largest in zip(_KINDS, (peak, torque), strict=True)
+    }
+    return PoseRun(planned, schedule, run(), pushes, schedule.certify())
 
 
 def with_panda(schedule: Schedule) -> Schedule:
@@ -139,22 +139,14 @@ def damping_ratio(schedule: Schedule, damping: Floats) -> float:
 def push_rows(name: str, run: PoseRun, kind: plotting.Kind) -> list[dict[str, Any]]:
     """Rows of the table: what the early and the late push do in each axis of the tool, and stiffness there."""
     moved, stiffness = np.abs(run.moved(kind)), run.along(run.schedule.stiffness, kind)
-    half = len(run.schedule) // 2
-    early, late = _push_rows(run.schedule)
+    half, (early, late) = len(moved) // 2, stiffness[_push_rows(run.schedule)]
     rows = []
     for axis, letter in enumerate(_TOOL):
         first, second = float(moved[:half, axis].max()), float(moved[half:, axis].max())
         row: dict[str, Any] = {"controller": name, "push": kind.push, "axis": f"tool {letter}", "unit": kind.unit}
         row |= {"early": first, "late": second, "ratio": first / second if second else np.nan}
-        rows.append(row | {"K early": float(stiffness[early, axis]), "K late": float(stiffness[late, axis])})
+        rows.append(row | {"K early": float(early[axis]), "K late": float(late[axis])})
     return rows
-
-
-def _shown(row: Mapping[str, Any], kind: plotting.Kind) -> dict[str, Any]:
-    """Row as it is printed."""
-    units = {"early": kind.unit, "late": kind.unit, "K early": kind.stiffness_unit, "K late": kind.stiffness_unit}
-    names = {key: f"{key} [{unit}]" for key, unit in units.items()} | {"axis": f"{kind.push} {kind.where}"}
-    return {names.get(key, key): value for key, value in row.items() if key not in ("push", "unit")}
 
 
 def _wrench(schedule: Schedule, largest: float, kind: plotting.Kind, axis: int) -> Floats:
@@ -166,9 +158,9 @@ def _wrench(schedule: Schedule, largest: float, kind: plotting.Kind, axis: int) 
     return wrench
 
 
-def _push_rows(schedule: Schedule) -> tuple[int, ...]:
+def _push_rows(schedule: Schedule) -> list[int]:
     """Rows in the middle of pushes."""
-    return tuple(round(centre * (len(schedule) - 1)) for centre in PUSHES)
+    return [round(centre * (len(schedule) - 1)) for centre in PUSHES]
 
 
 def task_figure(demonstrations: Demonstrations) -> Figure:
@@ -186,7 +178,7 @@ def schedule_figure(run: PoseRun, demonstrations: Demonstrations, name: str) -> 
         space.plot(*path.T, color=plotting.DATA, lw=0.8)
     plotting.draw_pose_schedule(run.schedule, space, bands)
     phase, covariances = empirical_covariances(demonstrations)
-    for kind, band in zip((plotting.POSITION, plotting.ROTATION), bands, strict=False):
+    for kind, band in zip(_KINDS, bands, strict=False):
         deviation = kind.scale * np.sqrt(plotting.principal(covariances[:, kind.outputs, kind.outputs]))
         plotting.plot_outputs(
             run.schedule.duration * phase, deviation, band, ["empirical", "_", "_"], [plotting.EMPIRICAL]
@@ -209,12 +201,11 @@ def pushes_figure(run: PoseRun, name: str) -> Figure:
     """Deviation, push and stiffness in each axis of the tool over time, of forces and of torques: Figure 8."""
     figure, grid = plotting.figure_grid(3, 2, (9.6, 6.6), sharex=True)
     time, labels = run.schedule.time, [f"tool {letter}" for letter in _TOOL]
-    for kind, column in zip((plotting.POSITION, plotting.ROTATION), grid.T, strict=True):
-        above, middle, below = column
+    for kind, (above, middle, below) in zip(_KINDS, grid.T, strict=True):
         plotting.plot_outputs(time, run.moved(kind), above, labels)
         above.set_ylabel(f"moved [{kind.unit}]")
-        rollout = (run.forces if kind is plotting.POSITION else run.torques)[0]
-        middle.plot(time, np.linalg.norm(rollout.force, axis=1), color=plotting.FORCE, lw=1.5, label="push")
+        size = np.linalg.norm(run.pushes[kind.push][0].force, axis=1)
+        middle.plot(time, size, color=plotting.FORCE, lw=1.5, label="push")
         middle.set_ylabel(f"{kind.push} [{kind.push_unit}]")
         plotting.plot_outputs(time, run.along(run.schedule.stiffness, kind), below, labels)
         below.set(xlabel="time [s]", ylabel=f"stiffness [{kind.stiffness_unit}]", ylim=(0.0, None))

@@ -8,10 +8,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from torch_pbd import plotting
+from torch_pbd.console import format_table
 from torch_pbd.data import Demonstrations
 from torch_pbd.estimators.base import CovarianceRegressor
-from torch_pbd.experiments.comparison import compare_models
-from torch_pbd.experiments.run_folder import RunFolder, format_table, slug
+from torch_pbd.experiments.comparison import compare_models, mean_and_error
+from torch_pbd.experiments.run_folder import RunFolder, slug
+from torch_pbd.movement.judging import MOVEMENT_STATISTICS
 
 Align = Literal["auto", "none", "phase", "dtw"]
 Input = Literal["time", "phase"]
@@ -93,12 +95,18 @@ def run_recordings(
     """
     data = demonstrations.stack(input)
     scores = compare_models(models, *data, finished=folder.finished, whole_movements=True, **options)
-    rows, whole = [score.row() for score in scores], [score.movement_row() for score in scores]
-    folds = [{f"LL {i + 1}": value for i, value in enumerate(score.fold_log_likelihood)} for score in scores]
-    folder.write_metrics([row | own | each for row, own, each in zip(rows, whole, folds, strict=True)])
-    for score in scores:
-        write_fitted(score.fitted, demonstrations, folder, score.model, input)
-    return "\n\n".join(map(format_table, [rows, whole] if scores[0].fold_movement else [rows]))
+    whole, metrics = [], []
+    for name, score in scores.items():
+        joint, error = mean_and_error([fold["joint"] for fold in score.folds])
+        holds = {part: mean_and_error([fold[part] for fold in score.folds])[0] for part in MOVEMENT_STATISTICS}
+        whole.append({"model": name, "joint LL": joint, "+- ": error, **holds})
+        folds = {f"LL {i + 1}": fold["log_likelihood"] for i, fold in enumerate(score.folds)}
+        metrics.append(score.row | whole[-1] | folds)
+    folder.write_metrics(metrics)
+    for name, score in scores.items():
+        write_fitted(score.fitted, demonstrations, folder, name, input)
+    rows = [score.row for score in scores.values()]
+    return "\n\n".join(map(format_table, [rows, whole] if metrics[0]["folds"] else [rows]))
 
 
 def write_fitted(

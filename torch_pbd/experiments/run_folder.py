@@ -1,10 +1,11 @@
-"""The folder a run writes: its settings and environment, models, metrics and figures; and the page that shows them.
+"""The folder a run writes: its files, the fits that it has finished, and the page that shows them.
 
 Importing this module does not load torch: a folder that cannot be written is refused before.
 """
 
 import base64
 import csv
+import hashlib
 import html
 import io
 import json
@@ -13,27 +14,30 @@ import platform
 import re
 import socket
 import sys
-import textwrap
+import time
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from string import Template
 from typing import Any, Self
 
+import numpy as np
 from filelock import FileLock, Timeout
 
 import torch_pbd
+from torch_pbd import checks
 from torch_pbd.exceptions import ConfigError, FolderInUseError
-from torch_pbd.experiments.resume import FinishedFits
 from torch_pbd.files.atomic import remove_drafts, replacing
 
 _PACKAGES = ("torch", "scikit-learn", "numpy", "matplotlib")
 _PARTS = ("figures", "model", "schedule", "finished")
 _SUFFIXES = (".csv", ".html", ".json", ".npz", ".png", ".safetensors", ".txt", ".yaml")  # of the files of results
+_FINISHED = re.compile(r"[0-9a-f]{64}-\d+\.\d{6}\.safetensors")
 _LONGEST = 180  # bytes of a name, to which titles, suffixes and marks of drafts are added: file systems take 255
 _DPI = 110  # a figure of 12 inches fills a screen
-_WIDTH = 80  # columns of the terminals that people start with
 
 _CAPTIONS = {
     "tunnel": "Demonstrations (grey), and mean and two standard deviations of each model along the path: a model is "
@@ -47,6 +51,90 @@ _CAPTIONS = {
     "figure": "What the model learned, over the data.",
 }
 """Caption of a figure, by a part of its name; the last is of all others."""
+
+
+@dataclass
+class FinishedFits:
+    """Folder of fitted models, named by the SHA-256 of all that a fit depends on, and the seconds that it took.
+
+    It is made when the first fit ends. Worker processes write and read it too, each file whole. As a context manager it
+    begins with the fits of a run that was cut, or with none, and removes them at a good end.
+    """
+
+    folder: Path
+    resume: bool = False
+    """True if the next fit that is asked for should be there."""
+
+    def __enter__(self) -> Self:
+        if not self.resume and self.files():
+            checks.warn(f"{self.folder} of a run that was cut is cleared: --resume would have gone on with it.")
+            self._clear()
+        return self
+
+    def __exit__(self, error: object, *_: object) -> None:
+        if error is None:  # a run that fails or is cut keeps what is finished
+            self._clear()
+
+    def files(self, key: str = "") -> list[Path]:
+        """Files of finished fits, one each: of a key, or all."""
+        return [file for file in self.folder.glob(f"{key}*") if _FINISHED.fullmatch(file.name)]
+
+    def _clear(self) -> None:
+        for file in self.files():
+            file.unlink()
+        with suppress(OSError):  # of a folder that is not empty
+            self.folder.rmdir()
+
+
+def fit_once(model: Any, *data: Any, finished: FinishedFits | None = None) -> tuple[Any, float]:
+    """The fitted model, loaded or fitted and kept, and the seconds that its fit took.
+
+    The data are X, y and groups, or Demonstrations. What is no class of this package is always fitted.
+    """
+    from torch_pbd.persistence import load, save
+    from torch_pbd.persistence.plain import is_ours
+
+    if finished is None or not is_ours(model):
+        return _timed_fit(model, *data)
+    key = _key(model, *data)
+    found = finished.files(key)
+    # The first fit that is asked for tells whether there is anything to resume from.
+    if finished.resume and not found:
+        checks.warn(f"There is nothing finished to resume from in {finished.folder}: the run begins.")
+    finished.resume = False
+    if found:
+        return load(found[0]), float(found[0].stem.partition("-")[2])
+    model, seconds = _timed_fit(model, *data)
+    finished.folder.mkdir(exist_ok=True)
+    save(model, finished.folder / f"{key}-{seconds:.6f}.safetensors")
+    return model, seconds
+
+
+def _timed_fit(model: Any, *data: Any) -> tuple[Any, float]:
+    from torch_pbd.estimators.demonstrations import fit_with_groups
+
+    start = time.perf_counter()
+    fitted = model.fit(*data) if len(data) == 1 else fit_with_groups(model, *data)
+    return fitted, time.perf_counter() - start
+
+
+def _key(model: Any, *data: Any) -> str:
+    """SHA-256 of class, parameters, versions and data."""
+    import torch
+
+    from torch_pbd.persistence.plain import encode_parameters
+
+    # What rows of demonstrations do not say, names and units, counts too: a controller keeps them.
+    labels: list[Any] = []
+    if len(data) == 1:
+        (demos,) = data
+        labels, data = [demos.names, demos.units, demos.frame, demos.time_unit], demos.stack()
+    described = [encode_parameters(model), torch_pbd.__version__, torch.__version__, labels]
+    digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
+    for array in map(np.asarray, data):
+        digest.update(f"{array.dtype} {array.shape}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
 
 
 class RunFolder:
@@ -67,9 +155,9 @@ class RunFolder:
         try:
             self._lock.acquire()
         except Timeout:
-            raise FolderInUseError(f"{self.path} is being written by {_owner(self.path)}.") from None
+            raise FolderInUseError(f"{self.path} is being written by {self._owner()}.") from None
         try:
-            for folder in (self.path, *(self.path / part for part in _PARTS if (self.path / part).exists())):
+            for folder in (self.path, *filter(Path.exists, (self.path / part for part in _PARTS))):
                 if not folder.is_dir() or not os.access(folder, os.W_OK):
                     raise PermissionError(f"{folder} is no folder, or not writable")
                 # What is named as files of results are is to be replaced.
@@ -92,6 +180,14 @@ class RunFolder:
         """Let another run have the folder."""
         self._lock.release()
 
+    def _owner(self) -> str:
+        """The run that writes the folder, as its env.json says."""
+        try:
+            process = json.loads((self.path / "env.json").read_text(encoding="utf-8"))["process"]
+            return f"process {process['id']} on {process['host']}, since {process['started']}"
+        except (OSError, ValueError, KeyError, TypeError):  # it has just begun
+            return "another run"
+
     def write_text(self, name: str, text: str) -> None:
         """Write a file of text."""
         with replacing(self.path / name) as file:
@@ -107,13 +203,12 @@ class RunFolder:
 
     def write_figure(self, figure: Any, name: str) -> Path:
         """Write ``figures/<name>.png``."""
-        target = self.path / "figures" / f"{name}.png"
-        target.parent.mkdir(exist_ok=True)
         from matplotlib.layout_engine import ConstrainedLayoutEngine
 
         # A figure with a layout of its own would be laid out twice and drawn twice, which takes as long again.
         if figure.axes and figure.get_layout_engine() is None:
             ConstrainedLayoutEngine().execute(figure)
+        target = self._target("figures", f"{name}.png")
         with replacing(target) as file:
             figure.savefig(file, format="png", dpi=_DPI)
         self.figures.append(target)
@@ -123,23 +218,26 @@ class RunFolder:
         """Write ``model/<name>.safetensors``."""
         from torch_pbd.persistence import save
 
-        target = self.path / "model" / f"{name}.safetensors"
-        target.parent.mkdir(exist_ok=True)
+        target = self._target("model", f"{name}.safetensors")
         save(model, target)
         return target
 
     def write_controller(self, name: str, controller: Any, schedule: Any, **figures: Any) -> None:
         """Write figures, the model, and ``schedule/<name>.npz`` with a row each 10 ms as a table, to be looked at."""
-        file, target = slug(name), self.path / "schedule"
+        file = slug(name)
         for what, figure in figures.items():
             self.write_figure(figure, f"{file}_{what}")
         self.write_model(controller, f"{file}_controller")  # the regressor may have a file of the name
-        target.mkdir(exist_ok=True)
-        schedule.save(target / f"{file}.npz")
-        schedule.resample(100.0).save(target / f"{file}_100hz.csv")
+        schedule.save(self._target("schedule", f"{file}.npz"))
+        schedule.resample(100.0).save(self._target("schedule", f"{file}_100hz.csv"))
+
+    def _target(self, part: str, name: str) -> Path:
+        (self.path / part).mkdir(exist_ok=True)
+        return self.path / part / name
 
 
 def _environment(settings: Mapping[str, Any]) -> dict[str, Any]:
+    started = datetime.now(UTC).isoformat(" ", timespec="seconds")
     return {
         "torch_pbd": torch_pbd.__version__,
         "python": platform.python_version(),
@@ -147,21 +245,8 @@ def _environment(settings: Mapping[str, Any]) -> dict[str, Any]:
         "packages": {package: version(package) for package in _PACKAGES},
         "command": sys.argv,
         "settings": dict(settings),
-        "process": {
-            "id": os.getpid(),
-            "host": socket.gethostname(),
-            "started": datetime.now(UTC).isoformat(" ", timespec="seconds"),
-        },
+        "process": {"id": os.getpid(), "host": socket.gethostname(), "started": started},
     }
-
-
-def _owner(path: Path) -> str:
-    """The run that writes a folder, as its env.json says."""
-    try:
-        process = json.loads((path / "env.json").read_text(encoding="utf-8"))["process"]
-        return f"process {process['id']} on {process['host']}, since {process['started']}"
-    except (OSError, ValueError, KeyError, TypeError):  # it has just begun
-        return "another run"
 
 
 def slug(name: str) -> str:
@@ -185,56 +270,6 @@ def check_names(names: Iterable[str], argument: str) -> None:
         owners[file] = name
 
 
-def format_table(rows: Sequence[Mapping[str, Any]], width: int = _WIDTH) -> str:
-    """Text table of rows with the same keys; numbers to three digits, and a dash for one that is not known.
-
-    A column of which nothing is known is left out. Where the table would be wider than ``width``, the headers take up
-    to three lines, and then the longest texts too.
-    """
-    columns = [column for column in rows[0] if any(row[column] == row[column] for row in rows)]
-    texts = {column for column in columns if isinstance(rows[0][column], str)}
-    cells = {column: [_cell(row[column]) for row in rows] for column in columns}
-    # Headers take more lines until the table fits; what is too much then comes off the longest texts.
-    for n_lines in (1, 2, 3):
-        widths = {column: max(_header_width(column, n_lines), *map(len, cells[column])) for column in columns}
-        spare = width - sum(widths.values()) - 2 * (len(columns) - 1)
-        if spare >= 0:
-            break
-    longest = max(texts, key=lambda column: widths[column], default=None)
-    if longest and spare < 0:
-        words = (len(word) for cell in cells[longest] for word in cell.split())
-        widths[longest] = max(widths[longest] + spare, len(longest), *words)
-
-    def lines(entries: Mapping[str, str], *, at_bottom: bool = False) -> list[str]:
-        wrapped = [textwrap.wrap(entries[c], widths[c], break_on_hyphens=False) or [""] for c in columns]
-        height = max(map(len, wrapped))
-        blanks = [[""] * (height - len(own)) for own in wrapped]
-        full = [blank + own if at_bottom else own + blank for own, blank in zip(wrapped, blanks, strict=True)]
-        pads = [str.ljust if c in texts else str.rjust for c in columns]
-        padded = [[pad(e, widths[c]) for e in own] for c, own, pad in zip(columns, full, pads, strict=True)]
-        return ["  ".join(line).rstrip() for line in zip(*padded, strict=True)]
-
-    header = lines({c: c for c in columns}, at_bottom=True) + lines({c: "-" * widths[c] for c in columns})
-    return "\n".join(header + [line for i in range(len(rows)) for line in lines({c: cells[c][i] for c in columns})])
-
-
-def _header_width(header: str, n_lines: int) -> int:
-    longest = max(map(len, header.split()), default=1)
-    widths = range(longest, max(longest, len(header)) + 1)
-    return next(width for width in widths if len(textwrap.wrap(header, width, break_on_hyphens=False)) <= n_lines)
-
-
-def _cell(value: Any) -> str:
-    if not isinstance(value, float):
-        return str(value)
-    size = abs(value)
-    if value != value or not value:
-        return "-" if value else "0"
-    if 0.1 <= size < 1e5:
-        return f"{value:.2f}" if size < 100.0 else f"{value:.0f}"
-    return f"{value:.2g}" if 1e-3 <= size < 0.1 else f"{value:.2e}"
-
-
 def write_report(folder: RunFolder, command: str, text: str) -> Path:
     """Write ``index.html``: the text of a run, its figures inside, and commands that go on from its files.
 
@@ -254,16 +289,11 @@ def write_report(folder: RunFolder, command: str, text: str) -> Path:
     return folder.path / "index.html"
 
 
-def _next_steps(folder: Path, command: str) -> Iterable[str]:
+def _next_steps(folder: Path, command: str) -> list[str]:
     """Commands and lines of Python for the files that a run has left."""
-    if (folder / "demonstrations.csv").is_file():
-        yield f"torch-pbd compare --data {folder / 'demonstrations.csv'}"
-        yield f"torch-pbd experiment --data {folder / 'demonstrations.csv'}"
-    yield f"torch-pbd {command} --config {folder / 'config.yaml'}  # the same again"
-    models, schedules = sorted((folder / "model").glob("*.safetensors")), sorted((folder / "schedule").glob("*.npz"))
-    if models or schedules:
-        yield "python"
-    for path in models:
-        yield f">>> torch_pbd.load({str(path)!r})"
-    for path in schedules:
-        yield f">>> torch_pbd.control.Schedule.load({str(path)!r})"
+    made = folder / "demonstrations.csv"
+    steps = [f"torch-pbd {each} --data {made}" for each in ("compare", "experiment") if made.is_file()]
+    steps.append(f"torch-pbd {command} --config {folder / 'config.yaml'}  # the same again")
+    loads = [f">>> torch_pbd.load({str(path)!r})" for path in sorted(folder.glob("model/*.safetensors"))]
+    loads += [f">>> torch_pbd.control.Schedule.load({str(path)!r})" for path in sorted(folder.glob("schedule/*.npz"))]
+    return [*steps, "python", *loads] if loads else steps

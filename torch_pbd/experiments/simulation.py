@@ -9,13 +9,12 @@ from matplotlib.figure import Figure
 
 from torch_pbd import plotting
 from torch_pbd.checks import Floats
-from torch_pbd.console import steps
+from torch_pbd.console import format_table, steps
 from torch_pbd.data import make_paper_simulation, paper_covariance, paper_mean
 from torch_pbd.data.synthetic import Reading
 from torch_pbd.estimators.base import CovarianceRegressor
-from torch_pbd.experiments.comparison import Score, compare_models, empirical_covariances
-from torch_pbd.experiments.resume import FinishedFits
-from torch_pbd.experiments.run_folder import RunFolder, format_table, slug
+from torch_pbd.experiments.comparison import compare_models, empirical_covariances
+from torch_pbd.experiments.run_folder import RunFolder, slug
 
 # Table I: mean squared error on Cholesky entries, and seconds on "a standard laptop in Matlab".
 PAPER_TABLE_1 = {"CD": (3.54e-13, 0.167), "WP": (0.0206, 8.64), "GMM 8": (1.05, 0.515), "GMM 5": (7.71, 0.237)}
@@ -23,50 +22,56 @@ _BEYOND = 0.5  # of the range, so that the prior is seen
 _LEAST_XI = -149.0  # eq. (14) has a covariance above xi = -150 only
 
 
-def table1(
+def run_simulation(
     models: Mapping[str, CovarianceRegressor],
+    folder: RunFolder,
+    readings: Sequence[Reading],
     *,
-    readings: Sequence[Reading] = ("bell", "printed", "bowl"),
-    n_seeds: int = 10,
-    n_inputs: int = 10,
-    n_demos: int = 50,
-    max_folds: int = 3,
-    n_jobs: int | None = None,
-    finished: FinishedFits | None = None,
-) -> tuple[list[dict[str, Any]], dict[str, CovarianceRegressor]]:
-    """Table I for each reading of eq. (14): medians over the seeds 0 to ``n_seeds - 1``.
+    n_seeds: int,
+    n_inputs: int,
+    n_demos: int,
+    max_folds: int,
+    n_jobs: int | None,
+) -> str:
+    """Table I for each reading of eq. (14): medians over the seeds 0 to ``n_seeds - 1``; returns it as text.
 
-    A model whose name is one of the paper's (CD, WP, GMM 5, GMM 8) has the paper's figure beside it. With the rows come
-    the models by name, fitted to the data of the first reading and seed 0.
+    A model whose name is one of the paper's (CD, WP, GMM 5, GMM 8) has the paper's figure beside it. Writes metrics,
+    and of each model, fitted to the data of the first reading and seed 0, the file and the figure.
     """
     rows: list[dict[str, Any]] = []
-    fitted: dict[str, CovarianceRegressor] = {}
     for reading in readings:
-        scores: dict[str, list[Score]] = {name: [] for name in models}
+        found: dict[str, list[dict[str, Any]]] = {name: [] for name in models}
         for seed in steps(range(n_seeds), f"simulation ({reading})", n_seeds):
             data = make_paper_simulation(n_inputs, n_demos, reading=reading, random_state=seed)
-            options: dict[str, Any] = {"max_folds": max_folds, "n_jobs": n_jobs, "finished": finished}
             truth = partial(paper_covariance, reading=reading)
-            for score in compare_models(models, *data, truth=truth, **options):
-                scores[score.model].append(score)
-                fitted.setdefault(score.model, score.fitted)
-        rows += [_row(reading, name, several) for name, several in scores.items()]
-    return rows, fitted
+            scores = compare_models(
+                models, *data, truth=truth, max_folds=max_folds, n_jobs=n_jobs, finished=folder.finished
+            )
+            for name, score in scores.items():
+                found[name].append(score.row)
+            if not rows and not seed:
+                first = data, scores
+        rows += [_medians(reading, name, several) for name, several in found.items()]
+    folder.write_metrics(rows)
+    (X, y, _), scores = first
+    for name, score in scores.items():
+        folder.write_model(score.fitted, slug(name))
+        folder.write_figure(figure_of(score.fitted, X, y, name, readings[0]), slug(name))
+    return format_table(rows)
 
 
-def _row(reading: str, name: str, scores: Sequence[Score]) -> dict[str, Any]:
-    paper_mse, paper_seconds = PAPER_TABLE_1.get(name, (float("nan"), float("nan")))
-    rows = [score.row() for score in scores]
+def _medians(reading: str, name: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    paper_mse, paper_seconds = PAPER_TABLE_1.get(name, (np.nan, np.nan))
     columns = ("MSE", "error to truth", "held-out LL", "fit [s]")
-    mse, error, likelihood, seconds = (float(np.median([row[column] for row in rows])) for column in columns)
+    median = {column: float(np.median([row[column] for row in rows])) for column in columns}
     return {
         "reading": reading,
         "model": name,
-        "MSE": mse,
+        "MSE": median["MSE"],
         "paper's MSE": paper_mse,
-        "error to truth": error,
-        "held-out LL": likelihood,
-        "fit [s]": seconds,
+        "error to truth": median["error to truth"],
+        "held-out LL": median["held-out LL"],
+        "fit [s]": median["fit [s]"],
         "paper's [s]": paper_seconds,
     }
 
@@ -83,31 +88,13 @@ def figure_of(model: CovarianceRegressor, X: Floats, y: Floats, name: str, readi
     for output, ax in enumerate(bands):
         ax.set(xlabel="input xi", ylabel=f"output y{output + 1}")
     inputs, empirical = empirical_covariances(X, y)
-    true = paper_covariance(inputs, reading=reading)
-    plotting.plot_covariance_ellipses(
-        paper_mean(inputs), true, plane, color=plotting.TRUTH, label="truth", linestyle="--"
-    )
+    true = paper_mean(inputs), paper_covariance(inputs, reading=reading)
+    plotting.plot_covariance_ellipses(*true, plane, color=plotting.TRUTH, label="truth", linestyle="--")
     if empirical is not None:
         centres = np.stack([y[X[:, 0] == xi].mean(axis=0) for xi in inputs[:, 0]])
         plotting.plot_covariance_ellipses(centres, empirical, plane, color=plotting.EMPIRICAL, label="empirical")
-    plotting.plot_covariance_ellipses(
-        *model.predict(inputs, return_cov=True), plane, color=plotting.MODEL, label="model"
-    )
+    plotting.plot_covariance_ellipses(*model.predict(inputs, return_cov=True), plane, label="model")
     plane.set(xlabel="output y1", ylabel="output y2", title="2 sd ellipses at the inputs")
     plotting.legend_below(figure, bands[0])
     figure.suptitle(f'{name} on eq. (14), reading "{reading}"')
     return figure
-
-
-def run_simulation(
-    models: Mapping[str, CovarianceRegressor], folder: RunFolder, readings: Sequence[Reading], **options: Any
-) -> str:
-    """Make Table I and the figures of each model (seed 0, first reading); returns the table as text."""
-    rows, fitted = table1(models, readings=readings, finished=folder.finished, **options)
-    folder.write_metrics(rows)
-    sizes = {key: options[key] for key in ("n_inputs", "n_demos") if key in options}
-    X, y, _ = make_paper_simulation(**sizes, reading=readings[0], random_state=0)
-    for name, model in fitted.items():
-        folder.write_model(model, slug(name))
-        folder.write_figure(figure_of(model, X, y, name, readings[0]), slug(name))
-    return format_table(rows)

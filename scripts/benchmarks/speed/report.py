@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 import torch_pbd
 from speed.rows import Findings, Growth, Plan, Row
 from speed.timing import median
-from torch_pbd.experiments.run_folder import RunFolder, format_table
+from torch_pbd.console import format_table
+from torch_pbd.experiments.run_folder import RunFolder
 from torch_pbd.plotting import SERIES
 
 _PACKAGES = ("torch", "scikit-learn", "numpy", "scipy", "gpytorch", "gmr")
