@@ -15,18 +15,9 @@ from matplotlib.figure import Figure
 from torch_pbd import DMPController
 from torch_pbd.control import RotationLimits, StiffnessLaw
 from torch_pbd.data import make_handwriting_demonstrations, make_pose_demonstrations
-from torch_pbd.plotting import (
-    DATA,
-    FORCE,
-    MODEL,
-    ROBOT,
-    draw_pose_schedule,
-    legend_below,
-    mark_ends,
-    plot_covariance_ellipses,
-    plot_demonstrations,
-    pose_panels,
-)
+from torch_pbd.plotting import DATA, FORCE, MODEL, ROBOT, legend_below, plot_covariance_ellipses, plot_demonstrations
+from torch_pbd.plotting.poses import draw_pose_schedule, pose_panels
+from torch_pbd.plotting.style import mark_ends
 
 FOLDER = Path(__file__).parents[1] / "docs" / "pictures"
 DURATION, RATE = 6.0, 500.0  # s, Hz

@@ -21,7 +21,7 @@ from torch_pbd.experiments.poses import (
     with_panda,
 )
 from torch_pbd.experiments.run_folder import RunFolder
-from torch_pbd.plotting import POSITION, ROTATION
+from torch_pbd.plotting.style import POSITION, ROTATION
 
 LAW = StiffnessLaw(stiffness_min=100.0, stiffness_max=1500.0, rotation=RotationLimits(2.0, 60.0))
 

@@ -237,7 +237,7 @@ class Demonstrations(Editing):
         -------
         matplotlib.axes.Axes, or a list of them
         """
-        from torch_pbd.plotting import plot_movements  # here: matplotlib takes a while to import
+        from torch_pbd.plotting.display import plot_movements  # here: matplotlib takes a while to import
 
         return plot_movements(self, outputs, ax)
 

@@ -15,6 +15,7 @@ from torch_pbd.experiments.recordings import write_fitted
 from torch_pbd.experiments.robot import draw_tunnel, run_robot
 from torch_pbd.experiments.run_folder import RunFolder
 from torch_pbd.metrics import mahalanobis_coverage
+from torch_pbd.plotting import style
 
 _N_FRESH = 300  # demonstrations that stand for the truth: their covariance is known to 8 %
 _RATE = 25.0  # Hz; the movement has nothing of use above a few
@@ -55,7 +56,7 @@ def run_demo(models: Mapping[str, CovarianceRegressor], folder: RunFolder, *, n_
 
 def _tunnel_figure(models: Mapping[str, CovarianceRegressor], demonstrations: Demonstrations) -> Figure:
     """Mean and covariance of each model in the tunnel: the paper's Figure 6."""
-    figure, axes = plotting.figure_grid(1, len(models), (3.2 * len(models), 5.4), sharey=True)
+    figure, axes = style.figure_grid(1, len(models), (3.2 * len(models), 5.4), sharey=True)
     duration = demonstrations.times[0][-1]
     query, few = np.linspace(0.0, duration, 200)[:, np.newaxis], np.linspace(0.0, duration, 13)[:, np.newaxis]
     for ax, (name, model) in zip(axes[0], models.items(), strict=True):

@@ -22,11 +22,12 @@ from torch_pbd.data import Demonstrations
 from torch_pbd.exceptions import ConfigError
 from torch_pbd.experiments.robot import PUSHES, pulse
 from torch_pbd.experiments.run_folder import RunFolder, fit_once
+from torch_pbd.plotting import parts, poses, style
 
 Arm = Literal["panda", "none"]
 
 _TOOL = "xyz"
-_KINDS = (plotting.POSITION, plotting.ROTATION)
+_KINDS = (style.POSITION, style.ROTATION)
 _FIGURE = partial(Figure, layout="constrained")
 _ROWS = 50.0  # Hz; along a path the inertia of an arm changes with its joints, within seconds
 _N_STEPS = 101
@@ -43,14 +44,14 @@ class PoseRun:
     """By "force" and "torque", in each axis."""
     report: StabilityReport
 
-    def along(self, values: Floats, kind: plotting.Kind) -> Floats:
+    def along(self, values: Floats, kind: style.Kind) -> Floats:
         """Matrices (n, 6, 6), or vectors (n, 6), in each axis (n, 3) of the tool, in the outputs of a kind."""
         axes = rotations.matrix(np.asarray(self.schedule.orientation))
         if values.ndim == 3:
             return np.einsum("nia,nij,nja->na", axes, values[:, kind.outputs, kind.outputs], axes)
         return np.einsum("nia,ni->na", axes, values[:, kind.outputs])
 
-    def moved(self, kind: plotting.Kind) -> Floats:
+    def moved(self, kind: style.Kind) -> Floats:
         """Displacement (n, 3) by a push in each axis of the tool, along it, against the run without; in units shown."""
         still = self.unpushed.deviation
         moves = [self.along(run.deviation - still, kind)[:, i] for i, run in enumerate(self.pushes[kind.push])]
@@ -93,7 +94,7 @@ def run_poses(
     return "\n\n".join([*(_table(rows, kind) for kind in _KINDS), *reports])
 
 
-def _table(rows: Sequence[Mapping[str, Any]], kind: plotting.Kind) -> str:
+def _table(rows: Sequence[Mapping[str, Any]], kind: style.Kind) -> str:
     """Table of pushes of one kind."""
     units = {"early": kind.unit, "late": kind.unit, "K early": kind.stiffness_unit, "K late": kind.stiffness_unit}
     names = {key: f"{key} [{unit}]" for key, unit in units.items()} | {"axis": f"{kind.push} {kind.where}"}
@@ -136,7 +137,7 @@ def damping_ratio(schedule: Schedule, damping: Floats) -> float:
     return float((-modes.real / np.abs(modes)).min())
 
 
-def push_rows(name: str, run: PoseRun, kind: plotting.Kind) -> list[dict[str, Any]]:
+def push_rows(name: str, run: PoseRun, kind: style.Kind) -> list[dict[str, Any]]:
     """Rows of the table: what the early and the late push do in each axis of the tool, and stiffness there."""
     moved, stiffness = np.abs(run.moved(kind)), run.along(run.schedule.stiffness, kind)
     half, (early, late) = len(moved) // 2, stiffness[_push_rows(run.schedule)]
@@ -149,7 +150,7 @@ def push_rows(name: str, run: PoseRun, kind: plotting.Kind) -> list[dict[str, An
     return rows
 
 
-def _wrench(schedule: Schedule, largest: float, kind: plotting.Kind, axis: int) -> Floats:
+def _wrench(schedule: Schedule, largest: float, kind: style.Kind, axis: int) -> Floats:
     """Wrenches (n, 6): pulses of a squared sine in an axis that the tool has in their middle."""
     wrench, phase = np.zeros((len(schedule), 6)), (schedule.time - schedule.time[0]) / schedule.duration
     for row in _push_rows(schedule):
@@ -165,22 +166,22 @@ def _push_rows(schedule: Schedule) -> list[int]:
 
 def task_figure(demonstrations: Demonstrations) -> Figure:
     """Demonstrated paths with frames of the tool, and rotations over time: Figure 6."""
-    figure, space, bands = plotting.pose_panels(3, _FIGURE)
-    plotting.draw_recorded_poses(demonstrations, space[0], bands)
+    figure, space, bands = poses.pose_panels(3, _FIGURE)
+    poses.draw_recorded_poses(demonstrations, space[0], bands)
     plotting.legend_below(figure, space)
     return figure
 
 
 def schedule_figure(run: PoseRun, demonstrations: Demonstrations, name: str) -> Figure:
     """Planned path, deviations and empirical ones in principal axes, and stiffness there, of both blocks: Figure 7."""
-    figure, (space,), bands = plotting.pose_panels(4, _FIGURE)
+    figure, (space,), bands = poses.pose_panels(4, _FIGURE)
     for path in demonstrations.to_poses()[0]:
         space.plot(*path.T, color=plotting.DATA, lw=0.8)
-    plotting.draw_pose_schedule(run.schedule, space, bands)
+    poses.draw_pose_schedule(run.schedule, space, bands)
     phase, covariances = empirical_covariances(demonstrations)
     for kind, band in zip(_KINDS, bands, strict=False):
-        deviation = kind.scale * np.sqrt(plotting.principal(covariances[:, kind.outputs, kind.outputs]))
-        plotting.plot_outputs(
+        deviation = kind.scale * np.sqrt(np.linalg.eigvalsh(covariances[:, kind.outputs, kind.outputs]).clip(0.0))
+        parts.plot_outputs(
             run.schedule.duration * phase, deviation, band, ["empirical", "_", "_"], [plotting.EMPIRICAL]
         )
     bands[0].set_title(name, fontsize=10)
@@ -199,15 +200,15 @@ def empirical_covariances(demonstrations: Demonstrations) -> tuple[Floats, Float
 
 def pushes_figure(run: PoseRun, name: str) -> Figure:
     """Deviation, push and stiffness in each axis of the tool over time, of forces and of torques: Figure 8."""
-    figure, grid = plotting.figure_grid(3, 2, (9.6, 6.6), sharex=True)
+    figure, grid = style.figure_grid(3, 2, (9.6, 6.6), sharex=True)
     time, labels = run.schedule.time, [f"tool {letter}" for letter in _TOOL]
     for kind, (above, middle, below) in zip(_KINDS, grid.T, strict=True):
-        plotting.plot_outputs(time, run.moved(kind), above, labels)
+        parts.plot_outputs(time, run.moved(kind), above, labels)
         above.set_ylabel(f"moved [{kind.unit}]")
         size = np.linalg.norm(run.pushes[kind.push][0].force, axis=1)
         middle.plot(time, size, color=plotting.FORCE, lw=1.5, label="push")
         middle.set_ylabel(f"{kind.push} [{kind.push_unit}]")
-        plotting.plot_outputs(time, run.along(run.schedule.stiffness, kind), below, labels)
+        parts.plot_outputs(time, run.along(run.schedule.stiffness, kind), below, labels)
         below.set(xlabel="time [s]", ylabel=f"stiffness [{kind.stiffness_unit}]", ylim=(0.0, None))
         above.set_title(f"{name}: pushed {kind.where} each axis", fontsize=10)
     plotting.legend_below(figure, grid[:, 0])

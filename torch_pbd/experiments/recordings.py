@@ -14,6 +14,7 @@ from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.experiments.comparison import compare_models, mean_and_error
 from torch_pbd.experiments.run_folder import RunFolder, slug
 from torch_pbd.movement.judging import MOVEMENT_STATISTICS
+from torch_pbd.plotting import style
 
 Align = Literal["auto", "none", "phase", "dtw"]
 Input = Literal["time", "phase"]
@@ -50,13 +51,13 @@ def figure_of(model: CovarianceRegressor, demonstrations: Demonstrations, name: 
         if input == "time":
             plotting.plot_demonstrations(demonstrations, [output], ax)
         else:
-            ax.set(xlabel="phase", ylabel=plotting.output_label(demonstrations, output))
+            ax.set(xlabel="phase", ylabel=style.output_label(demonstrations, output))
     plotting.legend_below(figure, axes[0])
     if n_outputs == 2:
         plotting.plot_demonstrations(demonstrations, [0, 1], axes[2])
         query = np.linspace(X.min(), X.max(), 15)[:, np.newaxis]
         plotting.plot_covariance_ellipses(*model.predict(query, return_cov=True), axes[2])
-        plotting.equal_scales(axes[2])
+        style.equal_scales(axes[2])
         axes[2].set_title("2 sd ellipses", fontsize=10)
     figure.suptitle(name)
     return figure
@@ -76,7 +77,7 @@ def _panels(n: int, height: float) -> tuple[Figure, list[Any]]:
     """Figure with n Axes in three columns, 4 by ``height`` inches each."""
     n_columns = min(3, n)
     n_rows = -(-n // n_columns)
-    figure, grid = plotting.figure_grid(n_rows, n_columns, (4.0 * n_columns, height * n_rows))
+    figure, grid = style.figure_grid(n_rows, n_columns, (4.0 * n_columns, height * n_rows))
     for ax in grid.flat[n:]:
         ax.set_visible(False)
     return figure, list(grid.flat[:n])

@@ -19,6 +19,7 @@ from torch_pbd.control.simulation.rollout import Rollout
 from torch_pbd.control.stability.report import StabilityReport
 from torch_pbd.data import Demonstrations, tunnel_center, tunnel_half_width
 from torch_pbd.experiments.run_folder import FinishedFits, RunFolder, fit_once
+from torch_pbd.plotting import parts, style
 
 PUSHES = (0.2, 0.8)  # of the duration: 2 s and 8 s of the paper's 10 s
 _PUSH_LENGTH = 0.08  # of the duration: 0.8 s
@@ -67,14 +68,15 @@ def run_controller(
 
 def push_row(name: str, run: Run) -> dict[str, Any]:
     """Row of the table: displacement by the two pushes, against the run without them, and stiffness there."""
-    unit, scale = plotting.readable_unit(run.schedule.units)
+    kind = style.kind_of(run.schedule.units, run.schedule.n_outputs)
+    unit, scale = kind.unit, kind.scale
     time, stiffness = run.schedule.time, run.schedule.stiffness
     early, late = (int(np.searchsorted(time, centre * run.controller.duration_)) for centre in PUSHES)
     # Against the run without pushes: how far the robot lags behind by itself does not count.
     deviation = np.abs(run.rollout.position - run.unpushed.position)[:, 0]
     half = len(time) // 2
     first, second = scale * deviation[:half].max(), scale * deviation[half:].max()
-    names = plotting.schedule_names(run.schedule)
+    names = style.schedule_names(run.schedule)
     row = {"controller": name, f"early [{unit}]": float(first), f"late [{unit}]": float(second)}
     row |= {"ratio": float(first / second)}
     for output, label in list(enumerate(names))[:2]:
@@ -139,7 +141,7 @@ _ARROWS = ((0, 1), (1, 2), (1, 3), (2, 4), (3, 5), (4, 6), (5, 6))
 
 def framework_figure() -> Figure:
     """Way from demonstrations to motion and gains: Figure 5."""
-    figure, ((ax,),) = plotting.figure_grid(1, 1, (9.6, 3.0))
+    figure, ((ax,),) = style.figure_grid(1, 1, (9.6, 3.0))
     ax.set_axis_off()
     ax.set(xlim=(0.0, 9.6), ylim=(0.0, 3.0))
     frame = {"boxstyle": "round,pad=0.5", "fc": "white", "ec": plotting.MODEL, "lw": 1.4}
@@ -154,7 +156,7 @@ def task_figure(
     controller: DMPController, demonstrations: Demonstrations, name: str, *, in_tunnel: bool = False
 ) -> Figure:
     """Demonstrations, reproduction and, of positions, the inferred variability as ellipses: Figure 6."""
-    figure, ((ax,),) = plotting.figure_grid(1, 1, (5.2, 6.0))
+    figure, ((ax,),) = style.figure_grid(1, 1, (5.2, 6.0))
     if in_tunnel:
         draw_tunnel(ax)
     plotting.plot_demonstrations(demonstrations, range(min(demonstrations.n_outputs, 2)), ax)
@@ -170,7 +172,7 @@ def task_figure(
         plotting.plot_covariance_ellipses(centres, covariance, ax, label="inferred: 2 sd")
     ax.set_title(name, fontsize=10)
     if in_plane and not in_tunnel:
-        plotting.equal_scales(ax)
+        style.equal_scales(ax)
     plotting.legend_below(figure, ax, 2)
     return figure
 
@@ -190,7 +192,7 @@ def variability_figure(run: Run, demonstrations: Demonstrations, name: str) -> F
     varying = controller.varying(movements)
     in_position = controller.variability == "position"
     n_shown = min(demonstrations.n_outputs, _MOST_OUTPUTS)
-    figure, grid = plotting.figure_grid(n_shown + 1, 1, (6.4, 1.9 * (n_shown + 1)), sharex=True)
+    figure, grid = style.figure_grid(n_shown + 1, 1, (6.4, 1.9 * (n_shown + 1)), sharex=True)
     axes = grid[:, 0]
     covariance = controller.covariance_.predict_cov(controller.phase(movements.time))
     centre, deviation = varying.mean(axis=0), varying.std(axis=0, ddof=1)
@@ -204,9 +206,9 @@ def variability_figure(run: Run, demonstrations: Demonstrations, name: str) -> F
             ax.plot(time, curve, color=plotting.DATA, lw=0.7, alpha=0.8, zorder=1)
         ax.lines[0].set_label("demonstrations")
         plotting.plot_std_band(movements.time, centre[:, output], inferred[:, output], ax, label="mean, inferred 2 sd")
-        plotting.draw_edges(movements.time, centre[:, output], deviation[:, output], ax, "empirical 2 sd")
+        parts.draw_edges(movements.time, centre[:, output], deviation[:, output], ax, "empirical 2 sd")
         name_of = demonstrations.names[output]
-        ax.set_ylabel(plotting.output_label(demonstrations, output) if in_position else f"forcing {name_of}")
+        ax.set_ylabel(style.output_label(demonstrations, output) if in_position else f"forcing {name_of}")
     plotting.plot_stiffness(run.schedule.resample(200.0 / controller.duration_), axes[-1])
     axes[0].set_title(name, fontsize=10)
     plotting.legend_below(figure, [axes[0], axes[-1]])
@@ -215,8 +217,8 @@ def variability_figure(run: Run, demonstrations: Demonstrations, name: str) -> F
 
 def pushes_figure(run: Run, name: str) -> Figure:
     """Deviation, force and stiffness along the first output over time: Figure 8."""
-    figure, axes = plotting.figure_grid(3, 1, (6.4, 6.0), sharex=True)
-    names = plotting.schedule_names(run.schedule)
+    figure, axes = style.figure_grid(3, 1, (6.4, 6.0), sharex=True)
+    names = style.schedule_names(run.schedule)
     plotting.plot_rollout(run.rollout, axes[:, 0], outputs=[0], names=names, unpushed=run.unpushed)
     axes[0, 0].set_title(name, fontsize=10)
     plotting.legend_below(figure, axes[:, 0])

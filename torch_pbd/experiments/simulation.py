@@ -15,6 +15,7 @@ from torch_pbd.data.synthetic import Reading
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.experiments.comparison import compare_models, empirical_covariances
 from torch_pbd.experiments.run_folder import RunFolder, slug
+from torch_pbd.plotting import style
 
 # Table I: mean squared error on Cholesky entries, and seconds on "a standard laptop in Matlab".
 PAPER_TABLE_1 = {"CD": (3.54e-13, 0.167), "WP": (0.0206, 8.64), "GMM 8": (1.05, 0.515), "GMM 5": (7.71, 0.237)}
@@ -78,7 +79,7 @@ def _medians(reading: str, name: str, rows: Sequence[Mapping[str, Any]]) -> dict
 
 def figure_of(model: CovarianceRegressor, X: Floats, y: Floats, name: str, reading: Reading) -> Figure:
     """One of Figures 1 to 3: the outputs over xi, and the covariances at the inputs, beyond the data too."""
-    figure, ((*bands, plane),) = plotting.figure_grid(1, 3, (12.0, 4.2))
+    figure, ((*bands, plane),) = style.figure_grid(1, 3, (12.0, 4.2))
 
     def truth(xi: Floats) -> tuple[Floats, Floats]:
         variance = np.diagonal(paper_covariance(xi.clip(_LEAST_XI), reading=reading), axis1=1, axis2=2)

@@ -1,46 +1,17 @@
 """Figures of demonstrations, of what a model learned from them, and of what a robot did with it."""
 
-from torch_pbd.plotting.arm import plot_arm
-from torch_pbd.plotting.display import MovementDisplay, plot_movements, plot_pushes, plot_schedule
+from torch_pbd.plotting.display import MovementDisplay
 from torch_pbd.plotting.parts import (
-    draw_edges,
     plot_covariance_ellipses,
     plot_demonstrations,
     plot_model_bands,
-    plot_outputs,
     plot_rollout,
     plot_std_band,
     plot_stiffness,
 )
-from torch_pbd.plotting.poses import (
-    draw_pose_schedule,
-    draw_recorded_poses,
-    plot_covariance_ellipsoids,
-    plot_frames,
-    pose_panels,
-)
+from torch_pbd.plotting.poses import plot_arm, plot_covariance_ellipsoids, plot_frames
 from torch_pbd.plotting.rerun import to_rerun
-from torch_pbd.plotting.style import (
-    DATA,
-    EMPIRICAL,
-    FORCE,
-    MODEL,
-    OTHER,
-    POSITION,
-    ROBOT,
-    ROTATION,
-    SERIES,
-    TRUTH,
-    Kind,
-    equal_scales,
-    figure_grid,
-    legend_below,
-    mark_ends,
-    output_label,
-    principal,
-    readable_unit,
-    schedule_names,
-)
+from torch_pbd.plotting.style import DATA, EMPIRICAL, FORCE, MODEL, OTHER, ROBOT, SERIES, TRUTH, legend_below
 
 __all__ = [
     "DATA",
@@ -48,37 +19,19 @@ __all__ = [
     "FORCE",
     "MODEL",
     "OTHER",
-    "POSITION",
     "ROBOT",
-    "ROTATION",
     "SERIES",
     "TRUTH",
-    "Kind",
     "MovementDisplay",
-    "draw_edges",
-    "draw_pose_schedule",
-    "draw_recorded_poses",
-    "equal_scales",
-    "figure_grid",
     "legend_below",
-    "mark_ends",
-    "output_label",
     "plot_arm",
     "plot_covariance_ellipses",
     "plot_covariance_ellipsoids",
     "plot_demonstrations",
     "plot_frames",
     "plot_model_bands",
-    "plot_movements",
-    "plot_outputs",
-    "plot_pushes",
     "plot_rollout",
-    "plot_schedule",
     "plot_std_band",
     "plot_stiffness",
-    "pose_panels",
-    "principal",
-    "readable_unit",
-    "schedule_names",
     "to_rerun",
 ]

@@ -185,8 +185,8 @@ class MovementDisplay:
             shown = shown.align(n=_N_STEPS)
         plot_demonstrations(shown, [output], ax)
         for (name, (mean, covariance)), color in zip(self.laws.items(), _COLORS, strict=False):
-            std = np.sqrt(covariance[:, output, output])
-            plot_std_band(self.grid, mean[:, output], std, ax, n_std=self.n_std, color=color, label=self._label(name))
+            std, label = np.sqrt(covariance[:, output, output]), self._label(name)
+            plot_std_band(self.grid, mean[:, output], std, ax, n_std=self.n_std, color=color, label=label)
         if self.truth is not None:
             mean, covariance = self.truth
             std = 0.5 * self.n_std * np.sqrt(covariance[:, output, output])
@@ -195,22 +195,17 @@ class MovementDisplay:
         ax.margins(x=0.0)
 
     def _plot_path(self, ax: Any) -> None:
-        plot_demonstrations(self.demonstrations, self.outputs, ax)
-        for (name, law), color in zip(self.laws.items(), _COLORS, strict=False):
-            ax.plot(*law[0].T[self.outputs], color=color, lw=1.5, label=self._label(name), zorder=3)
-            self._plot_ellipses(ax, law, color)
-        if self.truth is not None:
-            self._plot_ellipses(ax, self.truth, TRUTH, "--")
-        mean, _ = next(iter(self.laws.values()))
-        mark_ends(ax, mean[:, self.outputs])
+        shown, laws = self.outputs, list(zip(self.laws.values(), _COLORS, strict=False))
+        plot_demonstrations(self.demonstrations, shown, ax)
+        for name, ((mean, _), color) in zip(self.laws, laws, strict=False):
+            ax.plot(*mean.T[shown], color=color, lw=1.5, label=self._label(name), zorder=3)
+        if len(shown) == 2:
+            some = np.linspace(0, len(self.grid) - 1, self.n_ellipses).round().astype(int)
+            for (mean, covariance), color in laws if self.truth is None else [*laws, (self.truth, TRUTH)]:
+                style: Any = {"n_std": self.n_std, "color": color, "linestyle": "--" if color == TRUTH else "-"}
+                plot_covariance_ellipses(mean[some][:, shown], covariance[some][:, shown][:, :, shown], ax, **style)
+        mark_ends(ax, laws[0][0][0][:, shown])
         equal_scales(ax)
-
-    def _plot_ellipses(self, ax: Any, law: Law, color: str, linestyle: str = "-") -> None:
-        if len(self.outputs) != 2:
-            return
-        some = np.linspace(0, len(self.grid) - 1, self.n_ellipses).round().astype(int)
-        mean, covariance = law[0][some][:, self.outputs], law[1][some][:, self.outputs][:, :, self.outputs]
-        plot_covariance_ellipses(mean, covariance, ax, n_std=self.n_std, color=color, linestyle=linestyle)
 
     def _label(self, name: str) -> str:
         return f"{name}: mean, {self.n_std:g} sd"
@@ -222,19 +217,18 @@ def plot_movements(demonstrations: Any, outputs: Sequence[int | str] | None = No
     if outputs is None and ax is None and demonstrations.rotation_reference is not None and len(shown) == 6:
         return draw_poses(demonstrations, draw_recorded_poses, 3)
     in_space = len(shown) in (2, 3)
-    figure: Figure | None = None
     axes: list[Any] = [ax]
     if ax is None:
         figure, plane, bands = _panels(0 if in_space else len(shown), n_space=len(shown) if in_space else 0)
         axes = plane or bands
-    for panel, panel_outputs in zip(axes, [shown] if in_space else [[output] for output in shown], strict=True):
-        plot_demonstrations(demonstrations, panel_outputs, panel)
+    for panel, own in zip(axes, [shown] if in_space else [[output] for output in shown], strict=True):
+        plot_demonstrations(demonstrations, own, panel)
         for k, (time, position) in enumerate(demonstrations):
-            drawn = position[:, shown] if in_space else np.column_stack([time, position[:, panel_outputs]])
-            mark_ends(panel, drawn, label=k == 0)
+            path = position[:, own]
+            mark_ends(panel, path if in_space else np.column_stack([time, path]), label=k == 0)
         if in_space:
             equal_scales(panel)
-    if figure is not None:
+    if ax is None:
         legend_below(figure, axes)
     return axes[0] if len(axes) == 1 else axes
 

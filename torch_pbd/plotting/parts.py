@@ -24,12 +24,11 @@ from torch_pbd.plotting.style import (
     Kind,
     axis_names,
     check_axes,
-    check_ellipses,
     check_kind,
     chosen_outputs,
+    ellipses,
     kind_of,
     output_label,
-    principal,
     schedule_names,
     time_label,
 )
@@ -104,17 +103,11 @@ def plot_covariance_ellipses(
     linestyle: str = "-",
 ) -> LineCollection:
     """Draw the ``n_std`` ellipses of covariances (n, 2, 2) around means (n, 2)."""
-    centres, matrices = check_ellipses(mean, covariance, ax, 2)
-    # With covariances A diag(v) A' the curves are mean + n_std A sqrt(v) (cos, sin).
-    angle = np.linspace(0.0, 2.0 * np.pi, 73)
-    circle = np.stack([np.cos(angle), np.sin(angle)])
-    values, axes = np.linalg.eigh(matrices)
-    roots = axes * np.sqrt(np.clip(values, 0.0, None))[:, np.newaxis, :]
-    curves = centres[:, np.newaxis, :] + n_std * (roots @ circle).transpose(0, 2, 1)
-    ellipses = LineCollection(list(curves), colors=color, linewidths=1.1, linestyles=linestyle, label=label, zorder=3)
-    ax.add_collection(ellipses)
+    curves = ellipses(mean, covariance, ax, n_std, 2)[:, 0]
+    drawn = LineCollection(list(curves), colors=color, linewidths=1.1, linestyles=linestyle, label=label, zorder=3)
+    ax.add_collection(drawn)
     ax.autoscale_view()
-    return ellipses
+    return drawn
 
 
 def plot_model_bands(
@@ -205,7 +198,7 @@ def plot_stiffness(schedule: Any, ax: Axes, block: slice | None = None) -> list[
     block = schedule.blocks[0] if block is None else block
     kind = ROTATION if block.start else kind_of(schedule.units, block.stop)
     if len(schedule.blocks) > 1:
-        gains = principal(schedule.stiffness[:, block, block], descending=True)
+        gains = np.linalg.eigvalsh(schedule.stiffness[:, block, block])[:, ::-1]
         lines = plot_outputs(schedule.time, gains, ax, axis_names(schedule, gains.shape[1]), [MODEL])
     else:
         gains = np.diagonal(schedule.stiffness, axis1=1, axis2=2)
@@ -223,7 +216,6 @@ def plot_rollout(
     *,
     outputs: Sequence[int | str] | None = None,
     names: Sequence[str] | None = None,
-    unit: str | None = None,
     unpushed: Any = None,
 ) -> None:
     """Draw what pushes did: deviation, external force and stiffness over time, the paper's Figure 8.
@@ -238,8 +230,6 @@ def plot_rollout(
         Outputs to draw, by number or by name; None is the first six.
     names : sequence of str, default=None
         Names of the outputs; None calls them y0, y1, ..., and of poses x, y, z, rx, ry, rz.
-    unit : str, default=None
-        Unit of the positions; None is that of the rollout.
     unpushed : Rollout, default=None
         The same run without pushes, drawn thin: how far the robot lags behind by itself.
     """
@@ -251,7 +241,7 @@ def plot_rollout(
     check_axes("axes", axes, 3 if p == d else 6)
     names = names or (POSE_NAMES if d == p + 3 == 6 else [f"y{i}" for i in range(d)])
     chosen = chosen_outputs(outputs, names, 6)
-    kinds = [kind_of(unit or rollout.units, p)] + ([ROTATION] if d > p else [])
+    kinds = [kind_of(rollout.units, p)] + ([ROTATION] if d > p else [])
     for i, kind in enumerate(kinds):
         own = [output for output in chosen if (output >= p) == bool(i)]
         labels = [names[output].removeprefix("r") if i else names[output] for output in own]

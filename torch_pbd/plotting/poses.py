@@ -1,12 +1,13 @@
-"""Poses in space: frames of a tool along a path, and how far its position and its axes spread."""
+"""Poses in space: frames of a tool, how far its position and its axes spread, and the arm that holds it."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import LightSource
 from matplotlib.figure import Figure
-from mpl_toolkits.mplot3d.art3d import Line3DCollection
+from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import ArrayLike
 
 from torch_pbd import checks
@@ -20,20 +21,22 @@ from torch_pbd.plotting.style import (
     SERIES,
     axis_names,
     check_axes,
-    check_ellipses,
+    ellipses,
     equal_scales,
     kind_of,
     legend_below,
     mark_ends,
-    principal,
     schedule_names,
     shown_figure,
     time_label,
+    unit_ellipses,
 )
 from torch_pbd.rotations import matrix
 
+_TURN = np.linspace(0.0, 2.0 * np.pi, 21)
+_ARC = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 12)  # none on the equator: it has two rings
+_SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 _LENGTH = 0.1  # of a frame's axes: share of the longest side of the path
-_CIRCLE = np.stack([np.cos(np.linspace(0.0, 2.0 * np.pi, 49)), np.sin(np.linspace(0.0, 2.0 * np.pi, 49))])
 
 
 def plot_frames(
@@ -80,7 +83,7 @@ def plot_frames(
             spread = checks.array(covariance, "covariance", (len(places), 3, 3))
             # A small rotation e moves the tip a by e x a, and the tip stays on its sphere.
             arm = -np.cross(np.eye(3), tips[:, np.newaxis, :]).swapaxes(1, 2)
-            moved = tips[:, np.newaxis, :] + n_std * _great_circles(arm @ spread @ arm.swapaxes(1, 2))[:, 0]
+            moved = tips[:, np.newaxis, :] + n_std * unit_ellipses(arm @ spread @ arm.swapaxes(1, 2))[:, 0]
             on_sphere = moved / np.linalg.norm(moved, axis=-1, keepdims=True)
             _lines(ax, places[:, np.newaxis, :] + length * on_sphere, color, 0.8, None)
     return drawn
@@ -99,9 +102,8 @@ def plot_covariance_ellipsoids(
 
     The axes are of projection "3d".
     """
-    centres, matrices = check_ellipses(mean, covariance, ax, 3)
-    curves = centres[:, np.newaxis, np.newaxis, :] + n_std * _great_circles(matrices)
-    return _lines(ax, curves.reshape(-1, *curves.shape[2:]), color, 0.7, label)
+    curves = np.concatenate(ellipses(mean, covariance, ax, n_std, 3))
+    return _lines(ax, curves, color, 0.7, label)
 
 
 def pose_panels(n_bands: int, make: Any = shown_figure) -> tuple[Figure, list[Any], list[Axes]]:
@@ -163,7 +165,7 @@ def draw_blocks(schedule: Any, bands: Sequence[Axes]) -> None:
     kinds, n = (kind_of(schedule.units, schedule.position.shape[1]), ROTATION), len(schedule.blocks)
     for kind, block, spread, gains in zip(kinds, schedule.blocks, bands[:n], bands[n:], strict=False):
         covariance = schedule.covariance[:, block, block]
-        variance = np.diagonal(covariance, axis1=1, axis2=2) if n == 1 else principal(covariance)
+        variance = np.diagonal(covariance, axis1=1, axis2=2) if n == 1 else np.linalg.eigvalsh(covariance).clip(0.0)
         names: Sequence[str] = [f"{kind.where} {name}" for name in schedule_names(schedule)]
         names = names if n == 1 else axis_names(schedule, variance.shape[1])
         plot_outputs(schedule.time, kind.scale * np.sqrt(variance), spread, names, SERIES if n == 1 else [MODEL])
@@ -178,14 +180,59 @@ def label_space(ax: Any, names: Sequence[str], unit: str | None) -> None:
     ax.view_init(elev=22.0, azim=-35.0)
 
 
-def _great_circles(covariance: Floats) -> Floats:
-    """Ellipses (n, 3, m, 3) of one standard deviation in the planes of two principal axes each, the widest first."""
-    values, axes = np.linalg.eigh(covariance)
-    roots = axes * np.sqrt(values.clip(0.0))[:, np.newaxis, :]
-    return np.stack([(roots[:, :, pair] @ _CIRCLE).swapaxes(1, 2) for pair in ([2, 1], [2, 0], [1, 0])], axis=1)
-
-
 def _lines(ax: Any, curves: Floats, color: str, width: float, label: str | None) -> Line3DCollection:
     collection = Line3DCollection(list(curves), colors=color, linewidths=width, label=label, zorder=4)
     ax.add_collection3d(collection, autolim=True)
     return collection
+
+
+def plot_arm(model: Any, joints: ArrayLike, ax: Axes, *, alpha: float = 1.0) -> Poly3DCollection:
+    """Draw the capsules, cylinders and boxes of a model at joint angles; meshes are left out.
+
+    Parameters
+    ----------
+    model : mujoco.MjModel
+        Such as `torch_pbd.robots.panda`, which has no meshes.
+    joints : array_like of shape (n,)
+        Its ``qpos``, in rad.
+    ax : matplotlib.axes.Axes
+        Of projection "3d", in m.
+    alpha : float, default=1.0
+        Opacity.
+
+    Returns
+    -------
+    Poly3DCollection
+    """
+    import mujoco
+
+    check_axes("ax", [ax])
+    data = mujoco.MjData(model)
+    data.qpos[:] = checks.array(joints, "joints", (model.nq,))
+    mujoco.mj_kinematics(model, data)
+    kinds, faces, colors = mujoco.mjtGeom, [], []
+    for geom in range(model.ngeom):
+        kind, size = int(model.geom_type[geom]), model.geom_size[geom]
+        if kind == kinds.mjGEOM_BOX:
+            shape = size * np.array([np.insert(_SQUARE[::s], i, s, axis=1) for i in range(3) for s in (-1, 1)])
+        elif kind == kinds.mjGEOM_CAPSULE:
+            shape = _turned(size[0] * np.cos(_ARC), size[0] * np.sin(_ARC) + size[1] * np.sign(_ARC))
+        elif kind == kinds.mjGEOM_CYLINDER:
+            shape = _turned(size[0] * np.array([0, 1, 1, 0]), size[1] * np.array([-1, -1, 1, 1]))
+        else:
+            continue
+        faces.append(shape @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom])
+        colors.append(np.tile(model.geom_rgba[geom], (len(shape), 1)))
+    light = LightSource(azdeg=250.0, altdeg=50.0)
+    look: dict[str, Any] = {"facecolors": np.concatenate(colors), "shade": True, "lightsource": light, "alpha": alpha}
+    drawn = Poly3DCollection(np.concatenate(faces), zorder=2, **look)
+    ax.add_collection3d(drawn, autolim=True)  # type: ignore[attr-defined]
+    return drawn
+
+
+def _turned(width: Floats, height: Floats) -> Floats:
+    """Quadrilaterals (n, 4, 3) of a profile that is turned around z."""
+    width = np.maximum(width, 1e-3 * width.max())[:, np.newaxis]  # to have a normal, a face must have four corners
+    rings = np.stack(np.broadcast_arrays(width * np.cos(_TURN), width * np.sin(_TURN), height[:, np.newaxis]), axis=-1)
+    corners = rings[:-1, :-1], rings[:-1, 1:], rings[1:, 1:], rings[1:, :-1]
+    return np.stack(corners, axis=-2).reshape(-1, 4, 3)

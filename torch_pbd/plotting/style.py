@@ -1,6 +1,7 @@
 """Style of all figures: one colour for one meaning, labels with units, grids and legends."""
 
 from collections.abc import Sequence
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ SERIES = (ROBOT, "#332288", "#56B4E9", "#882255", "#999933", "#44AA99", "#661100
 """Colours of what differs by output only: none of demonstrations, models, forces and the truth."""
 LINES = ("-", "--", ":", "-.")
 
+_CIRCLE = np.stack([np.cos(np.linspace(0.0, 2.0 * np.pi, 73)), np.sin(np.linspace(0.0, 2.0 * np.pi, 73))])
 _LONGEST_UNIT = 8  # letters; a longer one is a description
 _FLAT = 3.0  # ratio of the sides of a plane from which on equal scales would leave a sliver
 
@@ -82,15 +84,9 @@ def equal_scales(ax: Any, zoom: float = 0.85) -> None:
 
 def mark_ends(ax: Axes, path: Any, *, label: bool = True) -> None:
     """Mark the start of a path (n, 2) or (n, 3) by a circle and its goal by a star."""
-    for place, marker, name in ((path[0], "o", "start"), (path[-1], "*", "goal")):
-        size = 6 if marker == "o" else 10
-        style: dict[str, Any] = {"ls": "", "marker": marker, "ms": size, "color": "black", "mfc": "white", "zorder": 6}
-        ax.plot(*np.reshape(place, (-1, 1)), label=name if label else None, **style)
-
-
-def readable_unit(unit: str | None) -> tuple[str, float]:
-    """Unit of a deviation, and what to multiply it by: metres are shown in millimetres."""
-    return ("mm", 1000.0) if unit == "m" else (short_unit(unit), 1.0)
+    for place, marker, size, name in ((path[0], "o", 6, "start"), (path[-1], "*", 10, "goal")):
+        style: dict[str, Any] = {"ms": size, "color": "black", "mfc": "white", "label": name if label else None}
+        ax.plot(*np.reshape(place, (-1, 1)), marker, zorder=6, **style)
 
 
 def short_unit(unit: str | None) -> str:
@@ -105,10 +101,10 @@ def schedule_names(schedule: Any) -> Sequence[str]:
 
 def kind_of(unit: str | None, n_outputs: int) -> Kind:
     """Words and units of positions in this unit: joints are pushed by torques."""
-    shown, stiffness = readable_unit(unit), f"N/{short_unit(unit)}"
     if unit == "rad":
-        return Kind(slice(n_outputs), "about", "torque", "Nm", *shown, "Nm/rad")
-    return Kind(slice(n_outputs), "along", "force", "N", *shown, stiffness)
+        return Kind(slice(n_outputs), "about", "torque", "Nm", "rad", 1.0, "Nm/rad")
+    shown, scale = ("mm", 1000.0) if unit == "m" else (short_unit(unit), 1.0)  # deviations of metres are millimetres
+    return Kind(slice(n_outputs), "along", "force", "N", shown, scale, f"N/{short_unit(unit)}")
 
 
 def axis_names(schedule: Any, n_axes: int) -> Sequence[str]:
@@ -147,22 +143,25 @@ def check_axes(name: str, axes: Any, n_axes: int = 1) -> None:
         raise ValueError(f"{name} is {axes!r}, must be {n_axes} matplotlib Axes.")
 
 
-def check_ellipses(mean: Any, covariance: Any, ax: Any, d: int) -> tuple[Floats, Floats]:
-    """Means (n, d) and covariances (n, d, d) to draw into an Axes."""
+def ellipses(mean: Any, covariance: Any, ax: Any, n_std: float, d: int) -> Floats:
+    """Ellipses (n, d (d - 1) / 2, m, d) around means (n, d) in the planes of two principal axes of covariances each."""
     check_axes("ax", [ax])
     centres = checks.array(mean, "mean", ("n", d))
     matrices = checks.array(covariance, "covariance", (len(centres), d, d))
     checks.semidefinite(matrices, "covariance")
-    return centres, matrices
+    return centres[:, np.newaxis, np.newaxis, :] + n_std * unit_ellipses(matrices)
+
+
+def unit_ellipses(covariance: Floats) -> Floats:
+    """Ellipses of one standard deviation around the origin, that of the two widest axes first."""
+    values, axes = np.linalg.eigh(covariance)
+    # With covariances A diag(v) A' the curves are A sqrt(v) (cos, sin).
+    roots = axes * np.sqrt(values.clip(0.0))[:, np.newaxis, :]
+    pairs = combinations(range(covariance.shape[-1])[::-1], 2)
+    return np.stack([(roots[:, :, pair] @ _CIRCLE).swapaxes(1, 2) for pair in map(list, pairs)], axis=1)
 
 
 def check_kind(value: Any, name: str, kind: str) -> None:
     """Check that an object is of a class by the name of it: those that draw themselves stand above this floor."""
     if type(value).__name__ != kind:
         raise checks.refusal(value, name, f"a {kind}")
-
-
-def principal(matrices: Floats, *, descending: bool = False) -> Floats:
-    """Eigenvalues (n, d) of symmetric matrices (n, d, d), in order."""
-    values = np.linalg.eigvalsh(matrices).clip(0.0)
-    return values[:, ::-1] if descending else values

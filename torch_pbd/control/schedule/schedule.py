@@ -259,7 +259,7 @@ class Schedule:
 
     def plot(self) -> Any:
         """Draw motion, standard deviation and stiffness; returns the list of matplotlib Axes of a new figure."""
-        from torch_pbd.plotting import plot_schedule  # here: it needs matplotlib, a schedule does not
+        from torch_pbd.plotting.display import plot_schedule  # here: it needs matplotlib, a schedule does not
 
         return plot_schedule(self)
 

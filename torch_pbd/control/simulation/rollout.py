@@ -95,7 +95,7 @@ class Rollout:
         ValueError
             If this is a batch of runs.
         """
-        from torch_pbd.plotting import plot_pushes  # here: it needs matplotlib, a run does not
+        from torch_pbd.plotting.display import plot_pushes  # here: it needs matplotlib, a run does not
 
         return plot_pushes(self, unpushed, names)
 
