@@ -29,26 +29,24 @@ class ToolState(NamedTuple):
 
 @final
 class MujocoArm:
-    """Joints that carry a tool, in the order from the base on, of a ``mujoco.MjModel``; others are locked."""
+    """Joints that carry a tool, from the base on, of a ``mujoco.MjModel``; all others are locked."""
 
     def __init__(self, model: Any, tool: str) -> None:
         self._library = mujoco = optional("mujoco", "robot", "an arm in MuJoCo")
         self._model, self._data = model, mujoco.MjData(model)
-        kinds = mujoco.mjtObj
-        site = mujoco.mj_name2id(model, kinds.mjOBJ_SITE, tool)
-        body = model.site_bodyid[site] if site >= 0 else mujoco.mj_name2id(model, kinds.mjOBJ_BODY, tool)
-        if body < 0:
-            sites = [model.site(i).name for i in range(model.nsite)]
-            bodies = [model.body(i).name for i in range(model.nbody)]
-            raise checks.refusal(tool, "tool", f"a site ({', '.join(sites)}) or a body ({', '.join(bodies)})")
-        self._site, self._body = site, body
-        carrying: list[int] = []
-        while body > 0:
-            first = int(model.body_jntadr[body])
-            carrying = [*range(first, first + int(model.body_jntnum[body])), *carrying]
-            body = model.body_parentid[body]
+        self._site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, tool)
+        named = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, tool)
+        self._body = model.site_bodyid[self._site] if self._site >= 0 else named
+        if self._body < 0:
+            sites = ", ".join(model.site(i).name for i in range(model.nsite))
+            bodies = ", ".join(model.body(i).name for i in range(model.nbody))
+            raise checks.refusal(tool, "tool", f"a site ({sites}) or a body ({bodies})")
+        chain = [self._body]
+        while chain[-1] > 0:
+            chain.append(model.body_parentid[chain[-1]])
+        carrying = np.flatnonzero(np.isin(model.jnt_bodyid, chain))  # parents have lower numbers than their children
         turning = np.isin(model.jnt_type[carrying], [mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE])
-        if not carrying or not turning.all():
+        if not carrying.size or not turning.all():
             raise checks.refusal(tool, "tool", "carried by hinges and slides alone", "fix the base of the arm")
         self._angles, self._rates = model.jnt_qposadr[carrying], model.jnt_dofadr[carrying]
         bounds = np.where(model.jnt_limited[carrying][:, np.newaxis], model.jnt_range[carrying], [-np.inf, np.inf])
@@ -63,41 +61,38 @@ class MujocoArm:
     def bias(self, data: Any) -> Floats:
         """Acceleration (6,) of the tool in a simulation while its joints keep their speed."""
         rate = np.empty((6, self._model.nv))
-        point = data.site_xpos[self._site] if self._site >= 0 else data.xpos[self._body]
-        self._library.mj_jacDot(self._model, data, rate[:3], rate[3:], point, self._body)
+        self._library.mj_jacDot(self._model, data, rate[:3], rate[3:], self._frame(data).xpos, self._body)
         change: Floats = rate @ data.qvel
         return change
 
     def measure(self, data: Any) -> ToolState:
         """State of the tool in a simulation whose positions are up to date."""
-        mujoco, model = self._library, self._model
-        jacobian, mass, turn = np.empty((6, model.nv)), np.empty((model.nv, model.nv)), np.empty(4)
-        if self._site >= 0:
-            mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], self._site)
-            place = data.site_xpos[self._site].copy()
-            mujoco.mju_mat2Quat(turn, data.site_xmat[self._site])
-        else:
-            mujoco.mj_jacBody(model, data, jacobian[:3], jacobian[3:], self._body)
-            place, turn = data.xpos[self._body].copy(), data.xquat[self._body].copy()
+        mujoco, model, frame = self._library, self._model, self._frame(data)
+        jacobian, mass = np.empty((6, model.nv)), np.empty((model.nv, model.nv))
+        mujoco.mj_jac(model, data, jacobian[:3], jacobian[3:], frame.xpos, self._body)
         # The order of arguments is that of the version: until 3, inertia lay in data.qM.
         mujoco.mj_fullM(model, *((mass, data.qM) if hasattr(data, "qM") else (data, mass)))
-        return ToolState(place, turn, jacobian[:, self._rates], mass[np.ix_(self._rates, self._rates)])
+        turn = rotations.from_matrix(frame.xmat.reshape(3, 3))
+        return ToolState(frame.xpos.copy(), turn, jacobian[:, self._rates], mass[np.ix_(self._rates, self._rates)])
+
+    def _frame(self, data: Any) -> Any:
+        """Site or body of the tool in a simulation, with ``xpos`` and ``xmat``."""
+        return data.site(self._site) if self._site >= 0 else data.body(self._body)
 
 
 @final
 class PinocchioArm:
-    """The same of a ``pinocchio.Model``."""
+    """Joints that carry a tool, from the base on, of a ``pinocchio.Model``; all others are locked."""
 
     def __init__(self, model: Any, tool: str) -> None:
         self._library = pin = optional("pinocchio", "robot", "an arm in Pinocchio")
         self._model, self._data, self._neutral = model, model.createData(), pin.neutral(model)
         if not model.existFrame(tool):
-            raise checks.refusal(
-                tool, "tool", f"a frame of the model, one of {', '.join(f.name for f in model.frames)}"
-            )
+            frames = ", ".join(frame.name for frame in model.frames)
+            raise checks.refusal(tool, "tool", f"a frame of the model, one of {frames}")
         self._frame = model.getFrameId(tool)
-        joint = model.frames[self._frame].parentJoint
-        carrying = [model.joints[i] for i in list(model.supports[joint]) if i > 0]
+        supports = model.supports[model.frames[self._frame].parentJoint]
+        carrying = [model.joints[i] for i in list(supports) if i > 0]
         if not carrying or any(part.nq != 1 for part in carrying):
             raise checks.refusal(tool, "tool", "carried by joints with one angle each", "fix the base of the arm")
         self._angles, self._rates = [part.idx_q for part in carrying], [part.idx_v for part in carrying]
@@ -246,14 +241,11 @@ def _reach(chain: Arm, joints: Floats, position: Floats, orientation: Floats, ne
         if float(np.abs(error).max()) < _REACHED and longest < _SETTLED:
             return joints
         joints = joints + step * (_LONGEST_STEP / max(_LONGEST_STEP, longest))
-    distance, angle = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
     where = f"row {row} of the path, at {position.round(4).tolist()} m,"
     if float(np.abs(error).max()) < _REACHED:
-        raise InvalidParameterError(
-            f"{where} is reached, but with no joint angles that come to rest nearest to posture: give another posture, "
-            "or start."
-        )
+        raise InvalidParameterError(f"{where} is reached, but not nearest to posture: give another posture, or start.")
+    distance, angle = np.linalg.norm(error[:3]), np.linalg.norm(error[3:])
     raise InvalidParameterError(
-        f"{where} is {1e3 * distance:.3g} mm and {angle:.3g} rad out "
-        "of reach: move it nearer to the base with schedule.transform, or start from other joint angles."
+        f"{where} is {1e3 * distance:.3g} mm and {angle:.3g} rad out of reach: move it nearer to the base with "
+        "schedule.transform, or start from other joint angles."
     )

@@ -1,7 +1,13 @@
-"""A schedule on a torque-controlled arm in MuJoCo: impedance control with the arm's own inertia, and pushes."""
+"""The Franka Panda in MuJoCo, and a schedule on an arm there: torque control with the arm's own inertia, and pushes.
 
+``panda.xml`` says where its figures are from.
+"""
+
+import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, final
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,8 +20,61 @@ from torch_pbd.extras import optional
 from torch_pbd.robots.kinematics import MujocoArm, pose_error
 from torch_pbd.robots.session import RobotStoppedError, accelerations, check_start, poses, warn_of_mass
 
-# A tick as a whole number of steps of the simulation, to what rounding leaves of both.
+HOME = (0.0, -math.pi / 4, 0.0, -3 * math.pi / 4, 0.0, math.pi / 2, math.pi / 4)
+"""Joint angles of the Panda in rad, far from limits and singularities: the hand points down, 0.31 m before the base."""
+
+# A tick is a whole number of steps of the simulation, to what rounding leaves of both.
 _UNEVEN = 1e-6
+
+
+def panda_mjcf(*, hand: bool = True, armature: float = 0.1, timestep: float = 1e-3) -> str:
+    """Text of an MJCF file of the arm: joints ``joint1`` to ``joint7`` with torque motors, and a site ``tool``.
+
+    Joints have no friction, and bodies do not collide.
+
+    Parameters
+    ----------
+    hand : bool, default=True
+        With the manufacturer's hand of 0.73 kg, closed; the tool is then its tip, 0.1034 m beyond the flange, else
+        the flange.
+    armature : float, default=0.1
+        Inertia of each motor at its joint, kg m^2; libfranka's model has none.
+    timestep : float, default=1e-3
+        Of the simulation, s.
+
+    Returns
+    -------
+    str
+
+    References
+    ----------
+    C. Gaz et al., IEEE Robotics and Automation Letters 4(4), 2019, for the inertia; Franka Control Interface,
+    "Robot and interface specifications", for all other figures.
+    """
+    checks.number(armature, "armature", least=0.0, unit="kg m^2")
+    checks.number(timestep, "timestep", above=0.0, most=0.01, unit="s")
+    model: Any = ElementTree.parse(Path(__file__).with_name("panda.xml")).getroot()
+    model.find("option").set("timestep", repr(timestep))
+    model.find("default/joint").set("armature", repr(armature))
+    if not checks.flag(hand, "hand"):
+        last = model.find(".//body[@name='link7']")
+        flange = last.find("body").get("pos")
+        last.remove(last.find("body"))
+        ElementTree.SubElement(last, "site", name="tool", pos=flange, size="0.005")
+    return ElementTree.tostring(model, encoding="unicode")
+
+
+def panda(*, hand: bool = True, armature: float = 0.1, timestep: float = 1e-3) -> Any:
+    """Franka Emika Panda as a ``mujoco.MjModel``, with the parameters of `panda_mjcf`; needs the extra ``robot``.
+
+    Examples
+    --------
+    >>> from torch_pbd.robots import HOME, operational_inertia, panda
+    >>> operational_inertia(panda(), HOME, "tool").diagonal()[:3].round(1)  # kg; a schedule without mass assumes 1
+    array([12.5,  5.1,  6.5])
+    """
+    library = optional("mujoco", "robot", "a model for MuJoCo")
+    return library.MjModel.from_xml_string(panda_mjcf(hand=hand, armature=armature, timestep=timestep))
 
 
 @final
@@ -112,12 +171,9 @@ def run(
     O. Khatib, IEEE Journal of Robotics and Automation 3(1), 1987, eq. (27) and (50); C. Ott, "Cartesian impedance
     control of redundant and flexible-joint robots", Springer 2008, section 3.2, for the inertia that is kept.
     """
-    path = poses(schedule)
-    warn_of_mass(schedule)
-    n_steps = _steps_a_tick(schedule.time, model.opt.timestep)
-    simulation = _Simulation(model, tool, schedule, path, joints, posture_rate)
+    simulation = _Simulation(model, tool, schedule, joints, posture_rate)
     pushes = np.zeros((len(schedule), 6)) if wrench is None else checks.array(wrench, "wrench", (len(schedule), 6))
-    ticks = [simulation.tick(row, push, n_steps) for row, push in enumerate(pushes)]
+    ticks = [simulation.tick(row, push) for row, push in enumerate(pushes)]
     measured = {name: np.stack([tick[name] for tick in ticks]) for name in ticks[0]}
     return ArmRun(time=schedule.time, wrench=pushes, **measured)
 
@@ -138,17 +194,12 @@ def _steps_a_tick(time: Floats, timestep: float) -> int:
 class _Simulation:
     """An arm in MuJoCo that a controller has follow a schedule."""
 
-    def __init__(
-        self,
-        model: Any,
-        tool: str,
-        schedule: Schedule,
-        path: tuple[Floats, Floats],
-        joints: ArrayLike,
-        posture_rate: float,
-    ) -> None:
+    def __init__(self, model: Any, tool: str, schedule: Schedule, joints: ArrayLike, posture_rate: float) -> None:
         self._mujoco = mujoco = optional("mujoco", "robot", "an arm in MuJoCo")
         checks.instance(model, "model", mujoco.MjModel)
+        self._schedule, self._poses, self._acceleration = schedule, poses(schedule), accelerations(schedule)
+        warn_of_mass(schedule)
+        self._n_steps = _steps_a_tick(schedule.time, model.opt.timestep)
         self._chain = chain = MujocoArm(model, checks.text(tool, "tool"))
         n_joints = chain.limits.shape[1]
         if model.nu != n_joints or model.nv != model.nu:
@@ -157,7 +208,6 @@ class _Simulation:
                 f"{tool!r}, must have one motor for each and no others: lock fingers and leave out objects."
             )
         self._rate = checks.number(posture_rate, "posture_rate", least=0.0, unit="1/s")
-        self._schedule, self._poses, self._acceleration = schedule, path, accelerations(schedule)
         self._joints = checks.array(joints, "joints", (len(schedule), n_joints))
         self._speed = np.gradient(self._joints, schedule.time, axis=0)
         self._rise = np.gradient(self._speed, schedule.time, axis=0)
@@ -166,7 +216,7 @@ class _Simulation:
         self._model, self._data = model, mujoco.MjData(model)
         self._data.qpos[:], self._data.qvel[:] = self._joints[0], np.linalg.pinv(start.jacobian) @ schedule.velocity[0]
 
-    def tick(self, row: int, push: Floats, n_steps: int) -> dict[str, Any]:
+    def tick(self, row: int, push: Floats) -> dict[str, Any]:
         """State and commands at the start of a tick, which is then taken."""
         data, planned = self._data, self._schedule
         self._mujoco.mj_forward(self._model, data)  # of positions and velocities that the last step left
@@ -188,6 +238,6 @@ class _Simulation:
         data.ctrl[:], data.qfrc_applied[:] = torque, state.jacobian.T @ push
         measured = {"position": state.position, "orientation": state.orientation, "twist": twist, "deviation": error}
         measured |= {"joints": data.qpos.copy(), "torque": torque, "mass": mass}
-        self._mujoco.mj_step(self._model, data, nstep=n_steps)
+        self._mujoco.mj_step(self._model, data, nstep=self._n_steps)
         less = np.abs(data.actuator_force - torque) > 1e-9 * np.abs(torque).max()
         return measured | {"saturated": bool(np.any(less))}

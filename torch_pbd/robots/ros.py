@@ -58,19 +58,22 @@ def to_messages(schedule: Schedule, *, gains: Gains = "matrix") -> Iterator[tupl
         schedule, loss = schedule.diagonal()
         if loss.stiffness_max > 0.0:
             checks.warn(f"{loss}.")
-    vector, quaternion = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
-    pose, twist = types["geometry_msgs/msg/Pose"], types["geometry_msgs/msg/Twist"]
+    geometry = {
+        name: types[f"geometry_msgs/msg/{name}"] for name in ("Point", "Quaternion", "Vector3", "Pose", "Twist")
+    }
     for row, time in enumerate(schedule.time):
         stamp = round(1e9 * time)
         when = types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
         header = types["std_msgs/msg/Header"](when, schedule.frame or "base")
-        place = types["geometry_msgs/msg/Point"](*position[row].tolist())
-        turn = quaternion(*np.roll(orientation[row], -1).tolist())  # x y z w
-        parts = [vector(*part) for part in schedule.velocity[row].reshape(2, 3).tolist()]
-        yield "target_pose", stamp, types[_TOPICS["target_pose"]](header, pose(place, turn))
-        yield "target_twist", stamp, types[_TOPICS["target_twist"]](header, twist(*parts))
-        for name, matrix in (("stiffness", schedule.stiffness[row]), ("damping", schedule.damping[row])):
-            yield f"target_{name}", stamp, _array(types, matrix, gains)
+        turn = geometry["Quaternion"](*np.roll(orientation[row], -1).tolist())  # x y z w
+        pose = geometry["Pose"](geometry["Point"](*position[row].tolist()), turn)
+        twist = geometry["Twist"](
+            *(geometry["Vector3"](*part) for part in schedule.velocity[row].reshape(2, 3).tolist())
+        )
+        yield "target_pose", stamp, types[_TOPICS["target_pose"]](header, pose)
+        yield "target_twist", stamp, types[_TOPICS["target_twist"]](header, twist)
+        yield "target_stiffness", stamp, _array(types, schedule.stiffness[row], gains)
+        yield "target_damping", stamp, _array(types, schedule.damping[row], gains)
 
 
 def to_bag(schedule: Schedule, path: str | os.PathLike[str], *, gains: Gains = "matrix") -> None:
@@ -103,8 +106,8 @@ def _store() -> Any:
 
 
 def _array(types: Any, matrix: Floats, gains: Gains) -> Any:
+    values = np.diagonal(matrix) if gains == "diagonal" else matrix
     dimension, layout = types["std_msgs/msg/MultiArrayDimension"], types["std_msgs/msg/MultiArrayLayout"]
-    shape = (6,) if gains == "diagonal" else (6, 6)
-    values = np.diagonal(matrix).copy() if gains == "diagonal" else matrix.ravel()
-    axes = [dimension(name, 6, 6 ** (len(shape) - i)) for i, name in enumerate(("rows", "columns")[: len(shape)])]
-    return types["std_msgs/msg/Float64MultiArray"](layout(axes, 0), values)
+    # The stride of an axis counts the numbers from it on.
+    axes = [dimension(name, 6, 6 ** (values.ndim - i)) for i, name in enumerate(("rows", "columns")[: values.ndim])]
+    return types["std_msgs/msg/Float64MultiArray"](layout(axes, 0), values.flatten())

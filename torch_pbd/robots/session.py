@@ -12,6 +12,8 @@ from torch_pbd.checks import Floats
 from torch_pbd.control.schedule import Schedule
 from torch_pbd.exceptions import InvalidParameterError
 
+_NEAR, _TURNED = 0.01, 0.05  # m and rad: the first pose is that far from the robot at most
+
 
 class RobotStoppedError(RuntimeError):
     """A robot could not go on; it was stopped."""
@@ -82,34 +84,29 @@ def check_limits(schedule: Schedule, limits: Any) -> None:
 
 
 def warn_of_mass(schedule: Schedule) -> None:
-    """Tell of a damping that is not for the inertia with which an arm moves that is controlled by torques."""
-    mass, words = schedule.mass, "no known mass"
-    if isinstance(mass, np.ndarray):
-        # Alike in all directions of a block, and all along, as no arm's own inertia is: a virtual mass.
-        own = [float(mass[0, block.start, block.start]) for block in schedule.blocks]
-        alike = np.diag(np.repeat(own, [block.stop - block.start for block in schedule.blocks]))
-        virtual = np.allclose(mass, alike, rtol=checks.ROUNDING, atol=checks.ROUNDING * min(own))
-        words = f"{own[0]:.3g} kg and {own[-1]:.3g} kg m^2" if virtual else ""
-    elif mass is not None:
-        words = f"{mass:g} kg and kg m^2"
-    if words:
-        checks.warn(
-            f"The damping of schedule is for {words}, but the arm moves with its own inertia, and may ring: give "
-            "schedule.with_inertia(operational_inertia(model, joints, tool))."
-        )
+    """Warn of a damping that is not for the inertia with which an arm moves that is controlled by torques."""
+    words = "no known mass"
+    if schedule.mass is not None:
+        mass = schedule.mass if isinstance(schedule.mass, np.ndarray) else schedule.mass * np.eye(6)[np.newaxis]
+        own = np.diagonal(mass[0])
+        # A virtual mass is diagonal and the same all along, as no arm's own inertia is.
+        if not np.allclose(mass, np.diag(own), rtol=checks.ROUNDING, atol=checks.ROUNDING * own.min()):
+            return
+        words = f"{own[0]:.3g} kg and {own[-1]:.3g} kg m^2"
+    checks.warn(
+        f"The damping of schedule is for {words}, but the arm moves with its own inertia, and may ring: give "
+        "schedule.with_inertia(operational_inertia(model, joints, tool))."
+    )
 
 
-def check_start(
-    schedule: Schedule, position: Floats, orientation: Floats, *, distance: float = 0.01, angle: float = 0.05
-) -> None:
-    """Refuse a start in m and rad away from where the robot is: it would jump."""
-    first, turned = poses(schedule)
-    away = float(np.linalg.norm(first[0] - position))
-    turn = float(np.linalg.norm(rotations.between(orientation, turned[0])))
-    if not (away <= distance and turn <= angle):
+def check_start(schedule: Schedule, position: Floats, orientation: Floats) -> None:
+    """Refuse a start away from where the robot is: it would jump."""
+    away = float(np.linalg.norm(schedule.position[0] - position))
+    turn = float(np.linalg.norm(rotations.between(orientation, poses(schedule)[1][0])))
+    if not (away <= _NEAR and turn <= _TURNED):
         raise InvalidParameterError(
             f"the robot is {1e3 * away:.3g} mm and {turn:.3g} rad from the first pose of schedule, must be within "
-            f"{1e3 * distance:g} mm and {angle:g} rad: bring it there first."
+            f"{1e3 * _NEAR:g} mm and {_TURNED:g} rad: bring it there first."
         )
 
 
@@ -141,8 +138,8 @@ class RobotRun:
 
 def recorded(schedule: Schedule, rows: list[tuple[float, Floats, Floats]]) -> RobotRun:
     """The run of a robot that was at these times within the schedule, positions and orientations."""
-    time = np.array([row[0] for row in rows])
-    position, orientation = np.split(np.reshape([np.concatenate(row[1:]) for row in rows], (-1, 7)), [3], axis=1)
+    table = np.reshape([np.hstack(row) for row in rows], (-1, 8))
+    time, position, orientation = table[:, 0], table[:, 1:4], table[:, 4:]
     ends = schedule.time[[0, -1]]
     grid = np.union1d(np.clip(time, *ends), ends)  # two or more, however early the robot stopped
     desired, at = poses(schedule.resample(times=grid)), np.searchsorted(grid, np.clip(time, *ends))
