@@ -34,7 +34,7 @@ from torch_pbd.exceptions import InvalidParameterError
         (lambda: checks.flag("no", "shared"), "shared is 'no', must be True or False."),
         (lambda: checks.choice("c", "kind", Literal["a", "b"]), "kind is 'c', must be one of 'a', 'b'."),
         (lambda: checks.instance([1] * 99, "X", Demonstrations), "X is of type list, must be a Demonstrations."),
-        (lambda: checks.text("a\nb", "unit"), "unit is 'a\\nb', with a control character"),
+        (lambda: checks.text("a\nb", "unit"), "unit is 'a\\nb', must be text without control characters"),
         (lambda: checks.seed(-1), "random_state is -1, must be None, an integer from 0 to 2**32 - 1"),
         (lambda: checks.array([1.0], "goal", (2,)), "goal has shape (1,), must have shape (2,)."),
         (lambda: checks.array([[1.0, np.inf]], "x", ("n", 2)), "x[0, 1] is inf, must be finite and at most 1e+100"),

@@ -141,12 +141,9 @@ def text(value: Any, name: str, *, optional: bool = False) -> Any:
         return None
     if not isinstance(value, str):
         raise refusal(value, name, f"text{' or None' if optional else ''}")
-    wrong = next((letter for letter in value if unicodedata.category(letter) in ("Cc", "Cs")), None)
-    if wrong is not None:
-        kind = "a control character" if unicodedata.category(wrong) == "Cc" else "half of a surrogate pair"
-        raise InvalidParameterError(
-            f"{name} is {value!a:.80}, with {kind} (U+{ord(wrong):04X}) that not every file can hold: leave it out."
-        )
+    # Cc are control characters, Cs halves of surrogate pairs.
+    if any(unicodedata.category(letter) in ("Cc", "Cs") for letter in value):
+        raise InvalidParameterError(f"{name} is {value!a:.80}, must be text without control characters and surrogates.")
     return value
 
 
@@ -260,15 +257,47 @@ def real_array(values: Any, name: str) -> NDArray[Any]:
         raise ValueError(f"{name} is ragged, its rows have different lengths: {error}") from error
     except RuntimeError as error:  # a list of tensors that need gradients
         raise ValueError(f"{name} cannot be made an array: {error}") from error
-    _check_real(array, name)
+    kind = array.dtype.kind
+    if kind in "US" or (kind == "O" and any(isinstance(entry, str | bytes) for entry in array.flat)):
+        # scikit-learn's own checks ask for the words in the middle.
+        raise ValueError(
+            f"{name} holds text, which dtype='numeric' is not compatible with: convert it to numbers first."
+        )
+    if kind == "c":
+        raise ValueError(f"Complex data not supported: {name} is {array.dtype}. Give real and imaginary parts apart.")
+    if kind in "mM":
+        nanoseconds = f".astype('{kind}8[ns]').astype('int64')"
+        raise ValueError(f"{name} holds dates or durations ({array.dtype}): give numbers, as {nanoseconds} does in ns.")
+    if kind not in "biufO":
+        raise ValueError(f"{name} has dtype {array.dtype}: give an array of plain numbers.")
+    if kind == "O":
+        for place, entry in enumerate(array.flat):
+            _check_entry(entry, name, place)
     return array
+
+
+def _check_entry(entry: Any, name: str, place: int) -> None:
+    """Check that an object is one number, or missing, of which more is said where NaN are refused."""
+    if np.ndim(entry):
+        raise TypeError(f"{name} holds a {type(entry).__name__} as entry {place}: give one number for each.")
+    try:
+        _ = is_missing(entry) or float(entry)
+    except TypeError as error:
+        raise TypeError(f"{name} holds what is no number, as entry {place}: {error}.") from error
+    except OverflowError as error:
+        raise ValueError(f"{name} holds a number too large for float64, as entry {place}.") from error
+
+
+def is_missing(entry: Any) -> bool:
+    """Whether an object stands for a missing number: None, or NA of pandas."""
+    return entry is None or type(entry).__name__ == "NAType"
 
 
 def real_floats(values: Any, name: str) -> Floats:
     """Array of real numbers in float64, with missing entries as NaN; not a copy where it is such an array already."""
     array = real_array(values, name)
     if array.dtype.kind == "O":
-        array = np.reshape([math.nan if _is_missing(entry) else float(entry) for entry in array.flat], array.shape)
+        array = np.reshape([math.nan if is_missing(entry) else float(entry) for entry in array.flat], array.shape)
     return np.asarray(array, dtype=np.float64)
 
 
@@ -282,51 +311,3 @@ def from_tensor(values: Any, name: str) -> NDArray[Any]:
         raise ValueError(f"{name} is a tensor of {values.dtype}, which is too coarse: record it in float64.") from error
     except (NotImplementedError, RuntimeError) as error:
         raise ValueError(f"{name} is a tensor that holds no numbers: {error}") from error
-
-
-def _check_real(array: NDArray[Any], name: str) -> None:
-    """Check that an array holds real numbers, or objects that are."""
-    kind = array.dtype.kind
-    if kind in "biuf":
-        return
-    if kind in "US" or (kind == "O" and any(isinstance(entry, str | bytes) for entry in array.flat)):
-        raise ValueError(
-            f"{name} holds text, which dtype='numeric' is not compatible with: convert it to numbers first."
-        )
-    if kind == "c":
-        raise ValueError(f"Complex data not supported: {name} is {array.dtype}. Give real and imaginary parts apart.")
-    if kind in "mM":
-        nanoseconds = f".astype('{kind}8[ns]').astype('int64')"
-        raise ValueError(f"{name} holds dates or durations ({array.dtype}): give numbers, as {nanoseconds} does in ns.")
-    if kind != "O":
-        raise ValueError(f"{name} has dtype {array.dtype}: give an array of plain numbers.")
-    for place, entry in enumerate(array.flat):
-        _check_entry(entry, name, place)
-
-
-def check_finite(array: NDArray[Any], name: str, column: Any = None) -> None:
-    """Check that the columns of an array of floats (n, ...) have no NaN and no infinity, in scikit-learn's words."""
-    if array.dtype.kind != "f" or bool(np.isfinite(array).all()):
-        return
-    row, *place = map(int, np.argwhere(~np.isfinite(array))[0])
-    what = "NaN" if np.isnan(array[row, *place]) else "infinity or a value too large for dtype('float64')"
-    within = place[0] if place else column
-    where = f"row {row}" if within is None else f"row {row}, column {within}"
-    raise ValueError(f"Input {name} contains {what}. The first is in {where}: leave such rows out, or fill them in.")
-
-
-def _is_missing(entry: Any) -> bool:
-    return entry is None or type(entry).__name__ == "NAType"
-
-
-def _check_entry(entry: Any, name: str, place: int) -> None:
-    if _is_missing(entry):
-        return  # a missing value, of which more is said where NaN are refused
-    if np.ndim(entry):
-        raise TypeError(f"{name} holds a {type(entry).__name__} as entry {place}: give one number for each.")
-    try:
-        float(entry)
-    except TypeError as error:
-        raise TypeError(f"{name} holds what is no number, as entry {place}: {error}.") from error
-    except OverflowError as error:
-        raise ValueError(f"{name} holds a number too large for float64, as entry {place}.") from error

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torch_pbd import checks
 from torch_pbd.estimators.torch_estimator import TorchEstimator
-from torch_pbd.estimators.validation import Floats, check_weights, checked_queries, checked_rows, prior_covariance
+from torch_pbd.estimators.validation import Floats, checked_queries, checked_rows, prior_covariance
 from torch_pbd.files.memory import require_much
 from torch_pbd.linalg import gaussian_log_density, safe_cholesky, student_log_density
 
@@ -70,9 +70,7 @@ class CovarianceRegressor(TorchEstimator):
 
     def predict_df(self, X: ArrayLike) -> Floats:
         """Degrees of freedom of the predictive density at X: (n_samples,), infinite where it is normal."""
-        x = self._query(X)
-        degrees = self._degrees(x)
-        return np.full(len(x), np.inf) if degrees is None else degrees.cpu().numpy()
+        return self._degrees(checked_queries(self, X))
 
     def log_likelihood(self, X: ArrayLike, y: ArrayLike) -> Floats:
         """Log density of each row of y at X, in nats: (n_samples,)."""
@@ -81,13 +79,16 @@ class CovarianceRegressor(TorchEstimator):
         targets = targets.reshape(len(inputs), -1)
         if targets.shape[1] != self.n_outputs_:
             raise ValueError(f"y has {targets.shape[1]} outputs, but the model was fitted with {self.n_outputs_}.")
-        x = self._door(inputs)
-        mean, scale_tril = self._tensors(self._mean_and_tril, x)
-        with torch.inference_mode():
-            residual, degrees = self._door(targets) - mean, self._degrees(x)
+
+        def log_density(rows: Tensor) -> tuple[Tensor]:
+            x, y = rows.tensor_split([self.n_features_in_], dim=1)
+            mean, scale_tril = self.module_(x, *self._prior_tril_at(x))
+            degrees = self.module_.degrees(x)
             if degrees is None:
-                return gaussian_log_density(residual, scale_tril).cpu().numpy()
-            return student_log_density(residual, scale_tril, degrees).cpu().numpy()
+                return (gaussian_log_density(y - mean, scale_tril),)
+            return (student_log_density(y - mean, scale_tril, degrees),)
+
+        return self._arrays(log_density, np.hstack([inputs, targets]))[0]
 
     def score(self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None) -> float:
         """Mean log density of the rows of y at X, in nats: higher is better.
@@ -104,7 +105,10 @@ class CovarianceRegressor(TorchEstimator):
         densities = self.log_likelihood(X, y)
         if sample_weight is None:
             return float(densities.mean())
-        return float(np.average(densities, weights=check_weights(sample_weight, len(densities))))
+        weights = checks.array(sample_weight, "sample_weight", (len(densities),))
+        checks.require(weights >= 0.0, weights, "sample_weight", "at least 0")
+        checks.number(weights.sum(), "the sum of sample_weight", above=0.0)
+        return float(np.average(densities, weights=weights))
 
     def sample_y(self, X: ArrayLike, n_samples: int = 1, random_state: Any = None) -> Floats:
         """Draw y at X, independently for each row.
@@ -115,21 +119,20 @@ class CovarianceRegressor(TorchEstimator):
         """
         checks.count(n_samples, "n_samples", least=1)
         generator = checks.seed(random_state)
-        x = self._query(X)
+        inputs = checked_queries(self, X)
         require_much(
-            4 * 8.0 * len(x) * self.n_outputs_ * n_samples,
-            what=f"n_samples={n_samples} at {len(x)} rows",
+            4 * 8.0 * len(inputs) * self.n_outputs_ * n_samples,
+            what=f"n_samples={n_samples} at {len(inputs)} rows",
             remedy="Draw fewer at a time.",
         )
-        mean, scale_tril = (part.cpu().numpy() for part in self._tensors(self._mean_and_tril, x))
+        mean, scale_tril = self._arrays(lambda x: self.module_(x, *self._prior_tril_at(x)), inputs)
         normal = generator.standard_normal((*mean.shape, n_samples))
         # Student's t of this covariance: normal numbers times the root of (df - 2) over a chi-squared number, which is
         # a gamma number of shape df / 2 and scale 2.
-        degrees = self._degrees(x)
-        if degrees is not None:
-            each = degrees.cpu().numpy()[:, np.newaxis]
-            squares = generator.gamma(0.5 * each, 2.0, size=(len(x), n_samples))
-            normal *= np.sqrt((each - 2.0) / squares)[:, np.newaxis]
+        degrees = self._degrees(inputs)[:, np.newaxis]
+        if np.isfinite(degrees).any():  # everywhere or nowhere
+            squares = generator.gamma(0.5 * degrees, 2.0, size=(len(inputs), n_samples))
+            normal *= np.sqrt((degrees - 2.0) / squares)[:, np.newaxis]
         samples = mean[:, :, np.newaxis] + scale_tril @ normal
         return samples[:, 0] if self._y_is_1d else samples
 
@@ -145,25 +148,12 @@ class CovarianceRegressor(TorchEstimator):
     def _moments(self, X: Floats) -> tuple[Floats, ...]:
         return self._arrays(lambda x: self.module_.moments(x, *self._prior_tril_at(x)), X)
 
-    def _degrees(self, x: Tensor) -> Tensor | None:
-        """Degrees of freedom of the predictive density at x; None where it is normal."""
-        # A core has degrees of freedom everywhere or nowhere: one row tells.
-        if self.module_.degrees(x[:1]) is None:
-            return None
-        return self._tensors(lambda rows: (self.module_.degrees(rows),), x)[0]
+    def _degrees(self, X: Floats) -> Floats:
+        def degrees(x: Tensor) -> tuple[Tensor]:
+            found = self.module_.degrees(x)
+            return (torch.full_like(x[:, 0], torch.inf) if found is None else found,)
 
-    def _query(self, X: ArrayLike) -> Tensor:
-        return self._door(checked_queries(self, X))
-
-    def _arrays(self, function: Callable[[Tensor], Any], X: Floats) -> tuple[Floats, ...]:
-        return tuple(part.cpu().numpy() for part in self._tensors(function, self._door(X)))
-
-    def _tensors(self, function: Callable[[Tensor], Any], x: Tensor) -> Any:
-        with torch.inference_mode():
-            return by_chunks(function, x)
-
-    def _mean_and_tril(self, x: Tensor) -> tuple[Tensor, ...]:
-        return self.module_(x, *self._prior_tril_at(x))
+        return self._arrays(degrees, X)[0]
 
     def _prior_tril_at(self, x: Tensor) -> tuple[Tensor, ...]:
         """Factor of the prior at x, where it depends on x; else nothing, as the module has it."""
@@ -172,6 +162,14 @@ class CovarianceRegressor(TorchEstimator):
             return ()
         covariance = prior_covariance(prior, x.cpu().numpy(), self.n_outputs_)
         return (safe_cholesky(self._door(covariance), name="prior(X)"),)
+
+    def _query(self, X: ArrayLike) -> Tensor:
+        return self._door(checked_queries(self, X))
+
+    def _arrays(self, function: Callable[[Tensor], Any], X: Floats) -> tuple[Floats, ...]:
+        """Arrays that a function of tensors gives for rows, a bounded number at a time."""
+        with torch.inference_mode():
+            return tuple(part.cpu().numpy() for part in by_chunks(function, self._door(X)))
 
 
 def shaped_as_y(mean: Floats, covariance: Floats, *, y_is_1d: bool, return_cov: bool) -> tuple[Floats, Floats]:

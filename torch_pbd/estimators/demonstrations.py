@@ -1,7 +1,5 @@
 """Demonstrations among rows: their labels, and warnings where something is amiss with them."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any
 
@@ -17,23 +15,13 @@ from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.models.heteroscedastic import HeteroscedasticFit, are_copies
 from torch_pbd.models.training import TrainingSet
 
+# Whether a fit is not to warn of several ways; of the context, so that other threads are warned as before.
 _unimodality_reported: ContextVar[bool] = ContextVar("_unimodality_reported", default=False)
 _COVERED = 0.5  # of the range of the input, by a demonstration that is compared with others
 
 
-@contextmanager
-def unimodality_reported() -> Iterator[None]:
-    """Let a fit in it not warn of several ways; what other threads are warned of stays as it is."""
-    token = _unimodality_reported.set(True)
-    try:
-        yield
-    finally:
-        _unimodality_reported.reset(token)
-
-
 def check_groups(groups: Any, n_samples: int) -> NDArray[np.intp]:
     """Number of each row's demonstration, from labels of any kind, none of which is missing."""
-    # Any labels will do that can be told apart: numbers, names, dates.
     if hasattr(groups, "detach"):
         groups = checks.from_tensor(groups, "groups")
     if np.ma.is_masked(groups):
@@ -50,21 +38,13 @@ def check_groups(groups: Any, n_samples: int) -> NDArray[np.intp]:
         )
     if labels.dtype.kind == "f" and not np.isfinite(labels).all():
         raise ValueError(f"groups has a label that is not finite, at index {int(np.argmin(np.isfinite(labels)))}.")
-    if labels.dtype.kind in "mM" and np.isnat(labels).any():
-        raise ValueError(f"groups has no label at index {int(np.argmax(np.isnat(labels)))}: it is NaT.")
-    if labels.dtype.kind == "O":
-        _check_labels(labels)
-    return np.unique(labels, return_inverse=True)[1].reshape(-1)
-
-
-def _check_labels(labels: NDArray[Any]) -> None:
-    for i, label in enumerate(labels):
-        if label is None or type(label).__name__ == "NAType" or label != label:
-            raise ValueError(f"groups has no label at index {i}: say of every row which demonstration it is of.")
-    kinds = {type(label) for label in labels}
-    if len(kinds) > 1:
-        names = ", ".join(sorted(kind.__name__ for kind in kinds))
-        raise ValueError(f"groups has labels of several types ({names}): use one, so that 1 and '1' are not mixed up.")
+    if labels.dtype.kind in "mMO":
+        for i, label in enumerate(labels):
+            if checks.is_missing(label) or label != label:  # NaN and NaT are not equal to themselves
+                raise ValueError(f"groups has no label at index {i}: say of every row which demonstration it is of.")
+        if len(kinds := sorted({type(label).__name__ for label in labels})) > 1:
+            raise ValueError(f"groups has labels of several types ({', '.join(kinds)}): use one, as 1 is not '1'.")
+    return np.unique(labels, return_inverse=True)[1]
 
 
 def check_demonstrations(X: Floats, y: Floats, groups: Any) -> None:
@@ -152,5 +132,8 @@ def fit_with_groups(regressor: Any, X: ArrayLike, y: ArrayLike, groups: ArrayLik
     """
     if not has_fit_parameter(regressor, "groups"):
         return regressor.fit(X, y)
-    with unimodality_reported():
+    token = _unimodality_reported.set(True)
+    try:
         return regressor.fit(X, y, groups=groups)
+    finally:
+        _unimodality_reported.reset(token)

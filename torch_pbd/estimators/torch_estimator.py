@@ -38,9 +38,9 @@ class Standardization:
     x_scale: Floats
     y_shift: Floats
     y_scale: Floats
+    # A value that the column has, and the shift less that value. A difference of values is exact, so that what is made
+    # of these two is the same numbers wherever the origin is.
     x_parts: tuple[Floats, Floats]
-    """A value that the column has, and the shift less that value. A difference of values is exact, so that what is
-    made of these two is the same numbers wherever the origin is."""
     y_parts: tuple[Floats, Floats]
 
     @classmethod
@@ -50,12 +50,10 @@ class Standardization:
         A constant output gets the largest scale of the others, so that it is precise beside them; a
         constant input its magnitude, beside which rounding is nothing, in all units.
         """
-        low, high = X.min(axis=0), X.max(axis=0)
-        span = high - low
-        x_scale = _or_magnitude(span, np.maximum(np.abs(low), np.abs(high)))
-        y_shift = y.mean(axis=0)
+        low, span = X.min(axis=0), np.ptp(X, axis=0)
+        x_scale = _or_magnitude(span, np.abs(X).max(axis=0))
+        y_shift, largest = y.mean(axis=0), np.abs(y).max(axis=0)
         y_scale = (y - y_shift).std(axis=0)
-        largest = np.abs(y).max(axis=0)
         varies = y_scale > CONSTANT * largest
         if not varies.all():
             y_scale = np.where(varies, y_scale, y_scale[varies].max() if varies.any() else largest)
@@ -64,19 +62,19 @@ class Standardization:
         return cls(low + 0.5 * span, x_scale, y_shift, y_scale, *parts)
 
     def inputs(self, X: Floats) -> Floats:
-        """Inputs standardized."""
-        return np.asarray(np.round(self.exact_inputs(X), _DECIMALS))
+        """Standardized inputs, rounded."""
+        return self.exact_inputs(X).round(_DECIMALS)
 
     def outputs(self, y: Floats) -> Floats:
-        """Outputs standardized."""
-        return np.asarray(np.round(self.exact_outputs(y), _DECIMALS))
+        """Standardized outputs, rounded."""
+        return self.exact_outputs(y).round(_DECIMALS)
 
     def exact_inputs(self, X: Floats) -> Floats:
-        """Inputs standardized with all their digits."""
+        """Standardized inputs with all their digits."""
         return (X - self.x_parts[0] - self.x_parts[1]) / self.x_scale
 
     def exact_outputs(self, y: Floats) -> Floats:
-        """Outputs standardized with all their digits."""
+        """Standardized outputs with all their digits."""
         return (y - self.y_parts[0] - self.y_parts[1]) / self.y_scale
 
 
@@ -89,7 +87,7 @@ def _or_magnitude(spread: Floats, magnitude: Floats) -> Floats:
     return np.where(spread > CONSTANT * magnitude, spread, np.where(magnitude > 0, magnitude, 1.0))
 
 
-def canonical_order(X: Floats, y: Floats) -> NDArray[np.intp]:
+def canonical_order(X: Floats, y: Floats) -> Integers:
     """Order of the rows that does not depend on the one they come in, so that no result does."""
     order = y[:, -1].argsort()
     ordered = y[order, -1]
@@ -98,7 +96,7 @@ def canonical_order(X: Floats, y: Floats) -> NDArray[np.intp]:
     return np.lexsort(np.hstack([X, y]).T)  # where values repeat the other columns decide, which takes longer
 
 
-def distinct_rows(X: Floats) -> tuple[Floats, NDArray[np.intp]]:
+def distinct_rows(X: Floats) -> tuple[Floats, Integers]:
     """Distinct rows of X in lexicographic order, and the index of each row's own among them."""
     X = X + 0.0  # minus zero is zero
     order = X[:, 0].argsort() if X.shape[1] == 1 else np.lexsort(X.T[::-1])
@@ -178,14 +176,9 @@ class TorchEstimator(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         numbers = None if groups is None else check_groups(groups, len(inputs))[order]
         with torch.inference_mode(False), torch.enable_grad():
             rows = inputs.T.take(order, axis=1).T, targets.T.take(order, axis=1).T
-            fitted = self._fit(*rows, groups=numbers, recorded=order.argsort())
-        self.module_ = fitted.module
-        report = fitted.report
+            self.module_, report, self.jitter_ = self._fit(*rows, groups=numbers, recorded=order.argsort())
         self.n_iter_ = max(1, report.n_iter)
-        self.loss_ = report.loss
-        self.loss_curve_ = list(report.loss_curve)
-        self.converged_ = report.converged
-        self.jitter_ = fitted.jitter
+        self.loss_, self.loss_curve_, self.converged_ = report.loss, list(report.loss_curve), report.converged
         self._prepare()
         if not report.converged:
             more = f"max_iter (now {self.max_iter}) or " if report.status.is_limit else ""

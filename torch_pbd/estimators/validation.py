@@ -1,6 +1,6 @@
 """Checks of what users pass to an estimator, before any work starts: rows, parameters, the prior."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -20,9 +20,7 @@ _SHORTEST_PERIOD = 1e-8  # of the range: standardized inputs have ten decimals, 
 # Of a value, so that its square, and a thousand of them added up, is a number.
 _LARGEST = 1e140
 
-Prior = (
-    float | list[list[float]] | str | Callable[[Any], Any] | None
-)  # or any array-like; the type is what YAML can say
+Prior = float | list[list[float]] | str | Callable[[Any], Any] | None  # what YAML can say; or any array-like
 
 # Of the variance of y: beyond these the floor under variances shows far from data, or the prior near them.
 _LOWEST, _HIGHEST = 1e-6, 1e6
@@ -35,35 +33,36 @@ def checked_values(values: Any, name: str) -> Any:
     """
     if hasattr(values, "detach"):
         values = checks.from_tensor(values, name)
-    for label, part in _parts(values, name):
-        if part.dtype in (np.float16, np.float32) and part.ndim and part.size:
-            _check_resolution(part, name, label)
-        floats = checks.real_floats(part, name) if part.dtype.kind == "O" and part.ndim else part
-        checks.check_finite(floats, name, label)
+    if hasattr(values, "columns"):
+        for label in values.columns:
+            _check_numbers(checks.real_array(values[label], f"column {label} of {name}"), name, label)
+    elif not issparse(values):  # of which scikit-learn says more
+        _check_numbers(checks.real_array(values, name), name)
     return values
 
 
-def _parts(values: Any, name: str) -> list[tuple[Any, NDArray[Any]]]:
-    """Arrays that ``values`` consists of: the columns of a data frame, with their names; or itself."""
-    if hasattr(values, "columns"):
-        return [(label, checks.real_array(values[label], f"column {label} of {name}")) for label in values.columns]
-    return [] if issparse(values) else [(None, checks.real_array(values, name))]  # scikit-learn says more of the sparse
-
-
-def _check_resolution(array: NDArray[Any], name: str, label: Any) -> None:
-    columns = array.reshape(len(array), -1).astype(np.float64)
-    if not np.isfinite(columns).all():
-        return  # said better by the check for finite values
-    step = np.finfo(array.dtype).eps * np.abs(columns).max(axis=0)
-    spread = np.ptp(columns, axis=0)
-    coarse = (step > 1e-3 * spread) & (spread > 0)
-    if coarse.any():
-        column = int(np.argmax(coarse))
+def _check_numbers(array: NDArray[Any], name: str, label: Any = None) -> None:
+    """Check that rows (n, ...), or a column of this label, are finite and differ by more than their type resolves."""
+    if not (array.ndim and array.size):
+        return  # of which scikit-learn says more
+    floats = checks.real_floats(array, name).reshape(len(array), -1)
+    if not (finite := np.isfinite(floats)).all():
+        row, column = map(int, np.argwhere(~finite)[0])
+        what = "NaN" if np.isnan(floats[row, column]) else "infinity or a value too large for dtype('float64')"
+        where = f"row {row}, column {column if label is None else label}"
         raise ValueError(
-            f"{name} is {array.dtype} and column {column if label is None else label} is stored in steps of "
-            f"{step[column]:.3g} where its range is {spread[column]:.3g}: subtract an offset before storing it, or "
-            "record it in float64."
+            f"Input {name} contains {what}. The first is in {where}: leave such rows out, or fill them in."
         )
+    if array.dtype in (np.float16, np.float32):
+        step, spread = np.finfo(array.dtype).eps * np.abs(floats).max(axis=0), np.ptp(floats, axis=0)
+        coarse = (step > 1e-3 * spread) & (spread > 0)
+        if coarse.any():
+            column = int(np.argmax(coarse))
+            raise ValueError(
+                f"{name} is {array.dtype} and column {column if label is None else label} is stored in steps of "
+                f"{step[column]:.3g} where its range is {spread[column]:.3g}: subtract an offset before storing it, or "
+                "record it in float64."
+            )
 
 
 def checked_rows(estimator: Any, X: ArrayLike, y: ArrayLike, **options: Any) -> tuple[Floats, Floats]:
@@ -87,7 +86,7 @@ def checked_queries(estimator: Any, X: ArrayLike) -> Floats:
     return validate_data(estimator, X, dtype=np.float64, reset=False, ensure_min_samples=least)
 
 
-def _is_plain(X: Any, fitted: Mapping[str, Any]) -> bool:
+def _is_plain(X: Any, fitted: dict[str, Any]) -> bool:
     """Whether scikit-learn's checks, which take longer than predicting a row, would give X back as it is.
 
     ``fitted`` are the attributes of the estimator. One that was fitted to a data frame compares names.
@@ -102,14 +101,6 @@ def _is_plain(X: Any, fitted: Mapping[str, Any]) -> bool:
         and "feature_names_in_" not in fitted
         and bool(np.isfinite(X).all())
     )
-
-
-def check_weights(sample_weight: Any, n_samples: int) -> Floats:
-    """Weights (n,) of rows: finite, none negative, not all zero."""
-    weights = checks.array(sample_weight, "sample_weight", (n_samples,))
-    checks.require(weights >= 0.0, weights, "sample_weight", "at least 0")
-    checks.number(weights.sum(), "the sum of sample_weight", above=0.0)
-    return weights
 
 
 def check_squares(array: Floats, name: str) -> None:
@@ -233,20 +224,18 @@ def standardized_prior(prior: Prior, X: Floats, y_scale: Floats) -> Floats:
 
 def prior_covariance(prior: Prior, X: Floats, n_outputs: int) -> Floats:
     """Covariances (n, d, d) or (d, d) that a float, array or callable prior stands for, which are positive definite."""
+    name, value = "prior", prior
     shape: tuple[int, ...] = (n_outputs, n_outputs)
     if callable(prior):
+        name, shape = "prior(X)", (len(X), n_outputs, n_outputs)
         try:
             value = prior(X.copy())
         except Exception as error:
             error.add_note(f"Raised by prior(X), which was asked for covariances at X of shape {X.shape}.")
             raise
-        covariance = parameter_floats(value, "prior(X)")
-        name, shape = "prior(X)", (len(X), *shape)
-    else:
-        covariance = parameter_floats(prior, "prior")
-        name = "prior"
-        if covariance.ndim == 0:
-            covariance = covariance * np.eye(n_outputs)
+    covariance = parameter_floats(value, name)
+    if covariance.ndim == 0 and not callable(prior):
+        covariance = covariance * np.eye(n_outputs)
     covariance = checks.array(covariance, name, shape)
     remedy = "far from data it is the covariance, so give every direction some variance"
     checks.semidefinite(covariance, name, definite=True, remedy=remedy)
