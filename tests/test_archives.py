@@ -4,7 +4,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from torch_pbd.files.archives import read_array, read_members
+from torch_pbd.files import read_array, read_members
 
 
 def npy(array, version=None):

@@ -1,11 +1,11 @@
-"""Files written whole: `torch_pbd.files.atomic`; the name `test_files` is that of the list of faults."""
+"""Files written whole: `torch_pbd.files`; the name `test_files` is that of the list of faults."""
 
 import os
 import stat
 
 import pytest
 
-from torch_pbd.files.atomic import remove_drafts, replacing
+from torch_pbd.files import remove_drafts, replacing
 
 DRAFT = ".model.safetensors.4711.0123abcd.draft"
 

@@ -1,4 +1,4 @@
-"""Estimators by name and where they live: the one table of classes that the package, its files and commands read."""
+"""What is imported once it is needed: estimators by name, the one table of classes, and libraries of extras."""
 
 from importlib import import_module
 from typing import Any
@@ -24,3 +24,14 @@ ESTIMATORS = {**REGRESSORS, **MOVEMENTS, "DMPController": "torch_pbd.control.con
 def load_class(name: str) -> Any:
     """Class of an estimator; imports its module, and with it torch and scikit-learn."""
     return getattr(import_module(ESTIMATORS[name]), name)
+
+
+def optional(module: str, extra: str, what: str) -> Any:
+    """Library of an extra, imported once it is needed; where it is not there, the error says for ``what``."""
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        library = module.partition(".")[0]
+        raise ModuleNotFoundError(
+            f"{what} needs {library}, which is not installed: pip install 'torch_pbd[{extra}]'."
+        ) from error

@@ -21,7 +21,7 @@ from covariance_tasks import TASKS, Recording, Task, load_recordings
 from joblib import Parallel, delayed
 from threadpoolctl import threadpool_limits
 
-from torch_pbd.files.atomic import replacing
+from torch_pbd.files import replacing
 from torch_pbd.metrics import gaussian_kl, mahalanobis_coverage
 
 Row = dict[str, Any]

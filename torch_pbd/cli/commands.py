@@ -217,7 +217,7 @@ def experiment(options: Any, folder: Any) -> str:
 
 def _pose_experiment(options: Any, demonstrations: Any, folder: Any) -> str:
     from torch_pbd.experiments.poses import run_poses
-    from torch_pbd.extras import optional
+    from torch_pbd.registry import optional
 
     if options.arm == "panda":
         try:

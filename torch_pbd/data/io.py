@@ -14,7 +14,7 @@ from torch_pbd.data.description import Description, describe
 from torch_pbd.data.recordings import Missing
 from torch_pbd.data.wanted import MAX_BYTES, OPTIONS, Wanted, check_options, natural
 from torch_pbd.exceptions import DataFormatError
-from torch_pbd.files.atomic import LOADERS, replacing
+from torch_pbd.files import LOADERS, replacing
 from torch_pbd.files.memory import require_memory
 
 Source = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]

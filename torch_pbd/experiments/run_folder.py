@@ -30,7 +30,7 @@ from filelock import FileLock, Timeout
 import torch_pbd
 from torch_pbd import checks
 from torch_pbd.exceptions import ConfigError, FolderInUseError
-from torch_pbd.files.atomic import remove_drafts, replacing
+from torch_pbd.files import remove_drafts, replacing
 
 _PACKAGES = ("torch", "scikit-learn", "numpy", "matplotlib")
 _PARTS = ("figures", "model", "schedule", "finished")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from safetensors.numpy import load, save
 
 from torch_pbd.exceptions import ModelFileError
-from torch_pbd.files.atomic import replacing
+from torch_pbd.files import replacing
 from torch_pbd.files.memory import require_memory
 
 Arrays = dict[str, NDArray[Any]]

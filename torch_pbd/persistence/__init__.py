@@ -23,7 +23,7 @@ from torch_pbd.control.primitive.outputs import Outputs
 from torch_pbd.control.primitive.reproduction import Reproduction, primitive
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.exceptions import ModelFileError
-from torch_pbd.files.atomic import LOADERS
+from torch_pbd.files import LOADERS
 from torch_pbd.files.tensors import Arrays, read_checksummed, write_checksummed
 from torch_pbd.persistence import plain
 from torch_pbd.registry import ESTIMATORS, MOVEMENTS, REGRESSORS

@@ -9,8 +9,8 @@ import numpy as np
 from torch_pbd import checks, rotations
 from torch_pbd.checks import Floats
 from torch_pbd.exceptions import InvalidParameterError
-from torch_pbd.extras import optional
 from torch_pbd.plotting.style import DATA, FORCE, MODEL, OTHER, ROBOT, schedule_names
+from torch_pbd.registry import optional
 
 _N_ELLIPSOIDS = 21
 _FLAT = 1e-3  # of an ellipse's longer half axis: its third one, in a plane

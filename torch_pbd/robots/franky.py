@@ -9,7 +9,7 @@ import numpy as np
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control.schedule import Schedule
-from torch_pbd.extras import optional
+from torch_pbd.registry import optional
 from torch_pbd.robots import session
 from torch_pbd.robots.session import RobotLimits, RobotRun, RobotStoppedError
 

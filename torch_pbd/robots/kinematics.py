@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from torch_pbd import checks, rotations
 from torch_pbd.checks import Floats
 from torch_pbd.exceptions import InvalidParameterError
-from torch_pbd.extras import optional
+from torch_pbd.registry import optional
 
 # Of a row: by Newton's steps the error is squared, so that what remains is rounding.
 _MAX_STEPS, _REACHED, _SETTLED = 200, 1e-9, 1e-7

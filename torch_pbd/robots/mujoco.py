@@ -16,7 +16,7 @@ from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control.schedule import Schedule
 from torch_pbd.exceptions import InvalidParameterError
-from torch_pbd.extras import optional
+from torch_pbd.registry import optional
 from torch_pbd.robots.kinematics import MujocoArm, pose_error
 from torch_pbd.robots.session import RobotStoppedError, accelerations, check_start, poses, warn_of_mass
 

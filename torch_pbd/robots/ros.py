@@ -10,7 +10,7 @@ import numpy as np
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control.schedule import Schedule
-from torch_pbd.extras import optional
+from torch_pbd.registry import optional
 from torch_pbd.robots.session import poses
 
 Gains = Literal["matrix", "diagonal"]

@@ -20,8 +20,7 @@ import numpy as np
 
 from torch_pbd.control.schedule.contents import LABELS, OPTIONAL, SHAPES, Arrays, Labels
 from torch_pbd.exceptions import InvalidParameterError, ModelFileError
-from torch_pbd.files.archives import read_array, read_members
-from torch_pbd.files.atomic import LOADERS, replacing
+from torch_pbd.files import LOADERS, read_array, read_members, replacing
 from torch_pbd.files.memory import parsed_bytes, require_memory
 
 FORMAT = "torch_pbd.schedule"

@@ -21,7 +21,7 @@ from torch_pbd.data.poses import as_columns
 from torch_pbd.data.recordings import preview
 from torch_pbd.data.units import nanoseconds_hint
 from torch_pbd.data.wanted import Arguments, Chosen, Wanted, heads_of, rows_of
-from torch_pbd.files.atomic import LOADERS
+from torch_pbd.files import LOADERS
 
 DELIMITERS = (",", ";", "\t")
 _LONGEST_HEADER = 2**17  # characters, of thousands of columns; a file without line ends would be one header

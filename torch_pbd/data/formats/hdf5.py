@@ -8,7 +8,7 @@ import numpy as np
 from torch_pbd import checks
 from torch_pbd.data.recordings import preview
 from torch_pbd.data.wanted import Arguments, Wanted, column_names, natural
-from torch_pbd.extras import optional
+from torch_pbd.registry import optional
 
 
 def read(path: Path, wanted: Wanted, mask: str | None = None) -> Arguments:

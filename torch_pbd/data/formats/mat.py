@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch_pbd import checks
 from torch_pbd.data.recordings import preview
 from torch_pbd.data.wanted import Arguments, Wanted, column_names
-from torch_pbd.extras import optional
+from torch_pbd.registry import optional
 
 _DEEPEST = 8  # cells in structs in cells
 

@@ -14,8 +14,7 @@ from torch_pbd.data.demonstrations import Demonstrations
 from torch_pbd.data.poses import with_whole_rotation
 from torch_pbd.data.recordings import as_names, as_units, preview
 from torch_pbd.data.wanted import Arguments, Wanted, natural
-from torch_pbd.files.archives import read_array, read_members
-from torch_pbd.files.atomic import LOADERS
+from torch_pbd.files import LOADERS, read_array, read_members
 from torch_pbd.files.memory import parsed_bytes, require_memory
 
 _NUMBERED = r"[tx]_(\d+)"

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torch_pbd.data.wanted import Arguments, Wanted
-from torch_pbd.extras import optional
+from torch_pbd.registry import optional
 
 # Piece by piece: what is packed and unpacked at a time would be several times the numbers. With four times as many rows
 # what the library keeps is half of the numbers more; without a buffer, in bytes, it holds all of a row group.

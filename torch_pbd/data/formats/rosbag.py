@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch_pbd import checks
 from torch_pbd.data.recordings import MIN_SAMPLES, preview
 from torch_pbd.data.wanted import Arguments, Wanted, rows_of
-from torch_pbd.extras import optional
+from torch_pbd.registry import optional
 
 _POSITION, _ROTATION = "position", "orientation"
 # Fields that are outputs by message type, the first by default: where they lie in it, the names of their components,

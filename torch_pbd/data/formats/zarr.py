@@ -8,7 +8,7 @@ import numpy as np
 
 from torch_pbd.data.recordings import preview
 from torch_pbd.data.wanted import Arguments, Wanted, column_names
-from torch_pbd.extras import optional
+from torch_pbd.registry import optional
 
 # Codecs of numbers; another one, pickle, would execute what is in the file.
 _CODECS = {"bytes", "blosc", "zstd", "lz4", "gzip", "zlib", "bz2", "lzma", "shuffle", "bitshuffle", "delta", "crc32c"}
