@@ -7,8 +7,7 @@ import torch
 
 from torch_pbd.control.damping import damping_from_stiffness
 from torch_pbd.control.simulation.plant import AdmittancePlant
-from torch_pbd.control.simulation.position_loop import PositionLoop
-from torch_pbd.control.simulation.sensor import ForceSensor
+from torch_pbd.control.simulation.sensor import ForceSensor, PositionLoop
 from torch_pbd.control.stability.environment import stiffest_environment
 
 DT = 1e-3

@@ -12,8 +12,7 @@ import torch
 from torch_pbd.control.damping import damping_from_stiffness
 from torch_pbd.control.filters import EnergyTank
 from torch_pbd.control.simulation.plant import AdmittancePlant
-from torch_pbd.control.simulation.position_loop import PositionLoop
-from torch_pbd.control.simulation.sensor import ForceSensor
+from torch_pbd.control.simulation.sensor import ForceSensor, PositionLoop
 
 
 def tensor(*values):

@@ -14,8 +14,7 @@ from torch_pbd.control.filters import EnergyTank, RateLimit
 from torch_pbd.control.simulation.filters import lyapunov_matrix
 from torch_pbd.control.simulation.plant import AdmittancePlant
 from torch_pbd.control.simulation.poses import exp, multiply, rotation_between, turning
-from torch_pbd.control.simulation.position_loop import PositionLoop
-from torch_pbd.control.simulation.sensor import ForceSensor
+from torch_pbd.control.simulation.sensor import ForceSensor, PositionLoop
 from torch_pbd.control.simulation.ticks import admittance_rate
 from torch_pbd.control.simulation.walls import Tunnel
 

@@ -62,7 +62,7 @@ def test_68_a_shorter_last_row_is_simulated_certified_and_driven(tmp_path):
     np.testing.assert_array_equal(run.desired_position, schedule.position)
     many = simulate_many(schedule, 3, peak=1e-9, random_state=0)
     np.testing.assert_allclose(many.peak_deviation, np.linalg.norm(run.deviation, axis=1).max(), rtol=1e-6)
-    assert simulate_many(schedule, 3, rate=45.1, random_state=0).deviation.shape == (92, 3)
+    assert simulate_many(schedule.resample(45.1), 3, random_state=0).deviation.shape == (92, 3)
     report, even = (each.certify() for each in (schedule, reaching().schedule(33.5)))
     assert (report.stable, report.gain) == (True, pytest.approx(even.gain, rel=1e-3))
     robot = RealTimeAdmittance(schedule, rate=33.3, max_step=0.1)

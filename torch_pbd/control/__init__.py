@@ -11,13 +11,11 @@ if TYPE_CHECKING:
     from torch_pbd.control.primitive.dmp import DMP
     from torch_pbd.control.realtime import RealTimeAdmittance, TickStatus
     from torch_pbd.control.schedule.schedule import Schedule
-    from torch_pbd.control.simulation.many import simulate_many
     from torch_pbd.control.simulation.plant import AdmittancePlant
-    from torch_pbd.control.simulation.position_loop import PositionLoop
     from torch_pbd.control.simulation.rollout import Rollout
     from torch_pbd.control.simulation.rollouts import RolloutSummary
-    from torch_pbd.control.simulation.run import simulate
-    from torch_pbd.control.simulation.sensor import ForceSensor
+    from torch_pbd.control.simulation.run import simulate, simulate_many
+    from torch_pbd.control.simulation.sensor import ForceSensor, PositionLoop
     from torch_pbd.control.simulation.walls import Tunnel
     from torch_pbd.control.stability.certify import certify
     from torch_pbd.control.stability.report import StabilityReport
@@ -31,7 +29,7 @@ _HOMES = {
     "EnergyTank": "filters",
     "ForceSensor": "simulation.sensor",
     "MotionLimits": "planning",
-    "PositionLoop": "simulation.position_loop",
+    "PositionLoop": "simulation.sensor",
     "RateLimit": "filters",
     "RealTimeAdmittance": "realtime",
     "Rollout": "simulation.rollout",
@@ -47,7 +45,7 @@ _HOMES = {
     "lqt": "stiffness",
     "required_damping_ratio": "damping",
     "simulate": "simulation.run",
-    "simulate_many": "simulation.many",
+    "simulate_many": "simulation.run",
 }
 
 __all__ = [

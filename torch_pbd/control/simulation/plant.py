@@ -1,6 +1,7 @@
 """The simulated robot under admittance control: eq. (15) with a mass, tick by tick."""
 
 from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from typing import Any, Literal, final
 
@@ -12,19 +13,34 @@ from torch_pbd.checks import Floats
 from torch_pbd.control.filters import StiffnessFilter
 from torch_pbd.control.matrices import as_mass, as_tensor, mass_rows
 from torch_pbd.control.simulation.filters import started
-from torch_pbd.control.simulation.given import check_given
-from torch_pbd.control.simulation.poses import exp, multiply, rotation_between, turning, warn_if_far
-from torch_pbd.control.simulation.position_loop import PositionLoop
-from torch_pbd.control.simulation.rollout import Rollout
-from torch_pbd.control.simulation.sensor import ForceSensor
-from torch_pbd.control.simulation.ticks import Environment, Task, closed_loop, open_loop
-from torch_pbd.files.memory import require_memory
-from torch_pbd.linalg import broadcast_shapes
+from torch_pbd.control.simulation.poses import turning
+from torch_pbd.control.simulation.rollout import Rollout, run_task
+from torch_pbd.control.simulation.sensor import ForceSensor, PositionLoop
+from torch_pbd.control.simulation.ticks import Environment, Task
+from torch_pbd.exceptions import InvalidParameterError
 
-_PARTS = ("sensor", "position_loop", "environment", "stiffness_filter")
+_PARTS = {
+    "sensor": ForceSensor,
+    "position_loop": PositionLoop,
+    "environment": Environment,
+    "stiffness_filter": StiffnessFilter,
+}
+# Sizes of arguments behind those of the batch; those that are not here are motions of all axes, (T, d).
+_SHAPES = {
+    "position_desired": "Tp",
+    "orientation_desired": "T4",
+    "stiffness": "Tdd",
+    "damping": "Tdd",
+    "position0": "p",
+    "orientation0": "4",
+    "velocity0": "d",
+}
+# Of the squared norm of quaternions, as in schedules: those of seven digits count as unit ones.
+_NEARLY_UNIT = 1e-6
 
 
 @final
+@dataclass(eq=False, repr=False)
 class AdmittancePlant:
     """A mass on a spring and a damper that a desired motion drags along, in d axes, batched over rollouts.
 
@@ -68,38 +84,34 @@ class AdmittancePlant:
     0.1
     """
 
-    def __init__(
-        self,
-        mass: float | Tensor | Callable[[Floats], Any] | Any | None = 1.0,
-        integrator: Literal["exact"] = "exact",
-        *,
-        feed_forward: bool = False,
-        sensor: ForceSensor | None = None,
-        position_loop: PositionLoop | None = None,
-        environment: Environment | None = None,
-        substeps: int = 1,
-        stiffness_filter: StiffnessFilter | None = None,
-    ) -> None:
-        self.mass = mass if mass is None or callable(mass) else as_mass(mass)
-        self.integrator = checks.choice(integrator, "integrator", ("exact",))
-        self.feed_forward = checks.flag(feed_forward, "feed_forward")
-        self.sensor = checks.instance(sensor, "sensor", ForceSensor, optional=True)
-        self.position_loop = checks.instance(position_loop, "position_loop", PositionLoop, optional=True)
-        self.environment = checks.instance(environment, "environment", Environment, optional=True)
-        self.stiffness_filter = checks.instance(stiffness_filter, "stiffness_filter", StiffnessFilter, optional=True)
-        self.substeps = checks.count(substeps, "substeps")
-        if any(part is not None for part in (sensor, position_loop, stiffness_filter)):
+    mass: float | Tensor | Callable[[Floats], Any] | Any | None = 1.0
+    integrator: Literal["exact"] = "exact"
+    _: KW_ONLY
+    feed_forward: bool = False
+    sensor: ForceSensor | None = None
+    position_loop: PositionLoop | None = None
+    environment: Environment | None = None
+    substeps: int = 1
+    stiffness_filter: StiffnessFilter | None = None
+
+    def __post_init__(self) -> None:
+        if self.mass is not None and not callable(self.mass):
+            self.mass = as_mass(self.mass)
+        checks.choice(self.integrator, "integrator", ("exact",))
+        checks.flag(self.feed_forward, "feed_forward")
+        for name, kind in _PARTS.items():
+            checks.instance(getattr(self, name), name, kind, optional=True)
+        checks.count(self.substeps, "substeps")
+        if any(part is not None for part in (self.sensor, self.position_loop, self.stiffness_filter)):
             remedy = "sensors, position loops and filters act once a tick; shorten dt instead"
-            checks.count(substeps, "substeps", most=1, remedy=remedy)
+            checks.count(self.substeps, "substeps", most=1, remedy=remedy)
 
     def __repr__(self) -> str:
         mass: Any = self.mass
-        is_matrix = isinstance(mass, Tensor) and mass.ndim
-        shown = (
-            f"{tuple(mass.shape)} kg" if is_matrix else mass if mass is None or callable(mass) else f"{float(mass)} kg"
-        )
+        if isinstance(mass, float | Tensor):
+            mass = f"{tuple(mass.shape) if isinstance(mass, Tensor) and mass.ndim else float(mass)} kg"
         acting = [f"{name}={part}" for name in _PARTS if (part := getattr(self, name)) is not None]
-        return f"AdmittancePlant({', '.join([f'mass={shown}', *acting])})"
+        return f"AdmittancePlant({', '.join([f'mass={mass}', *acting])})"
 
     def simulate(
         self,
@@ -156,13 +168,13 @@ class AdmittancePlant:
         """
         checks.number(dt, "dt", above=0.0, unit="s")
         checks.instance(generator, "generator", torch.Generator, optional=True)
-        required = {"position_desired": position_desired, "velocity_desired": velocity_desired}
-        gains = {"stiffness": stiffness, "damping": damping}
+        given = {"position_desired": position_desired, "velocity_desired": velocity_desired}
+        given |= {"stiffness": stiffness, "damping": damping}
         optional = {"acceleration_desired": acceleration_desired, "orientation_desired": orientation_desired}
         optional |= {"force": force, "position0": position0, "velocity0": velocity0, "orientation0": orientation0}
-        given = required | gains | {name: value for name, value in optional.items() if value is not None}
+        given |= {name: value for name, value in optional.items() if value is not None}
         tensors = {name: as_tensor(value, name) for name, value in given.items()}
-        check_given(tensors)
+        _check(tensors)
         acting = {name: tensors.pop(name, None) for name in ("force", "position0", "velocity0", "orientation0")}
         times = dt * torch.arange(tensors["stiffness"].shape[-3]).double()
         mass = self.inertia(tensors["stiffness"], times.numpy())
@@ -188,18 +200,14 @@ class AdmittancePlant:
         orientation_desired: Tensor | None = None,
     ) -> Task:
         """Task of arguments of :meth:`simulate` that were checked, as this plant is to follow it."""
+        stiffness, damping = torch.broadcast_tensors(stiffness, damping)
         if mass.ndim > 2:
             stiffness, damping, mass = torch.broadcast_tensors(stiffness, damping, mass)
-        else:
-            stiffness, damping = torch.broadcast_tensors(stiffness, damping)
         inertial = torch.zeros_like(velocity_desired)
         if self.feed_forward:
             if acceleration_desired is None:  # that which takes the velocity of each tick to that of the next
-                difference = velocity_desired.diff(dim=-2) / dt
-                still = torch.zeros_like(velocity_desired[..., :1, :])
-                acceleration_desired = torch.cat([difference, still], dim=-2)
-            along = acceleration_desired
-            inertial = along @ mass.mT if mass.ndim == 2 else (mass @ along.unsqueeze(-1)).squeeze(-1)
+                acceleration_desired = torch.nn.functional.pad(velocity_desired.diff(dim=-2) / dt, (0, 0, 0, 1))
+            inertial = (mass @ acceleration_desired.unsqueeze(-1)).squeeze(-1)
         turns = None if orientation_desired is None else turning(orientation_desired)
         pose = position_desired if turns is None else torch.nn.functional.pad(position_desired, (0, 3))
         acting = {name: getattr(self, name) for name in ("substeps", *_PARTS)}
@@ -208,86 +216,31 @@ class AdmittancePlant:
         return Task(pose, velocity_desired, inertial, stiffness, damping, mass, dt, **acting, turning=turns)
 
 
-def run_task(
-    task: Task,
-    force: Tensor | None = None,
-    position0: Tensor | None = None,
-    velocity0: Tensor | None = None,
-    orientation0: Tensor | None = None,
-    *,
-    generator: torch.Generator | None = None,
-) -> Rollout:
-    """Run of a task under a force (..., T, d) and from a start (..., d) that were checked."""
-    force = torch.zeros_like(task.velocity) if force is None else force
-    start, speed = _start(task, position0, orientation0), task.velocity[..., 0, :] if velocity0 is None else velocity0
-    parts = [task.position, task.velocity, task.inertial_force, force, task.stiffness[..., 0]]
-    parts += [] if task.turning is None else [task.turning.turns]
-    batch = broadcast_shapes(*(value.shape[:-2] for value in parts), start.shape[:-1], speed.shape[:-1])
-    _check_memory(batch, task)
-    state = start.expand(*batch, -1), speed.expand(*batch, -1)
-    if task.is_open and task.is_shared:
-        position, velocity = open_loop(task, force, state)
-        record: dict[str, Any] = {"position": position, "velocity": velocity, "commanded_position": position}
-        record |= {"force": force.expand_as(position), "stiffness": task.stiffness, "damping": task.damping}
-    else:
-        record = closed_loop(task, force, state, generator)
-    for name, n_dims in {"stiffness": 3, "damping": 3, "filter_share": 1}.items():
-        if name in record:
-            record[name] = record[name].expand(*batch, *record[name].shape[-n_dims:])
-    _check_finished(record["position"], record["velocity"])
-    time = torch.arange(task.n_ticks, dtype=force.dtype, device=force.device) * task.dt
-    return Rollout(time, **_poses(task, record))
-
-
-def _start(task: Task, position0: Tensor | None, orientation0: Tensor | None) -> Tensor:
-    """Pose at the start, as :class:`Task` has them."""
-    start = task.position[..., 0, :] if position0 is None else position0
-    if task.turning is None:
-        return start
-    desired = task.turning.orientation[..., 0, :]
-    rotation = torch.zeros_like(desired[..., 1:]) if orientation0 is None else rotation_between(desired, orientation0)
-    position = start[..., : task.n_positions]
-    batch = broadcast_shapes(position.shape[:-1], rotation.shape[:-1])
-    return torch.cat([position.expand(*batch, -1), rotation.expand(*batch, -1)], dim=-1)
-
-
-def _poses(task: Task, record: dict[str, Tensor]) -> dict[str, Any]:
-    """Fields of a Rollout, whose poses are positions and orientations."""
-    if task.turning is None:
-        return record | {"desired_position": task.position}
-    record["pose_deviation"] = record["position"] - task.position
-    desired, p = task.turning.orientation, task.n_positions
-    warn_if_far(float(torch.linalg.vector_norm(record["position"].detach()[..., p:], dim=-1).max()))
-    rotation, commanded = (record[name][..., p:] for name in ("position", "commanded_position"))
-    record |= {name: record[name][..., :p] for name in ("position", "commanded_position")}
-    record |= {"desired_position": task.position[..., :p], "desired_orientation": desired}
-    turned = {
-        "orientation": multiply(exp(rotation), desired),
-        "commanded_orientation": multiply(exp(commanded), desired),
-    }
-    return record | turned
-
-
-def _check_memory(batch: torch.Size, task: Task) -> None:
-    # Measured: five motions are held, of poses six and two orientations, and where rollouts differ in their gains,
-    # twelve matrices.
-    d = task.position.shape[-1]
-    of_each = 5 * d + (12 * d * d if task.stiffness.ndim > 3 or task.stiffness_filter is not None else 0)
-    of_each += 0 if task.turning is None else d + 8
-    if task.position.device.type == "cpu":  # elsewhere torch raises by itself
-        require_memory(
-            of_each * batch.numel() * task.n_ticks * task.position.element_size(),
-            what=f"a simulation of {batch.numel()} rollouts of {task.n_ticks} ticks",
-            remedy="Simulate fewer at a time, or take simulate_many, which keeps no trajectories.",
+def _check(given: dict[str, Tensor]) -> None:
+    """Refuse arguments of several dtypes, shapes that disagree, and values that cannot be followed."""
+    kinds = sorted({f"{value.dtype} on {value.device}" for value in given.values()})
+    if len(kinds) > 1:
+        raise InvalidParameterError(
+            f"the inputs are of {', '.join(kinds)}, must be of one dtype and device: convert them."
         )
-
-
-def _check_finished(position: Tensor, velocity: Tensor) -> None:
-    """Check that a motion did not outgrow its numbers."""
-    finite = (torch.isfinite(position) & torch.isfinite(velocity)).all(-1)
-    if not bool(finite.all()):
-        tick = int((~finite.reshape(-1, finite.shape[-1]).all(0)).nonzero()[0])
-        raise ValueError(
-            f"the simulation diverged, and is not finite from tick {tick} on: take a shorter dt, or smaller stiffness, "
-            "velocity and force."
-        )
+    shape, is_pose = given["position_desired"].shape, "orientation_desired" in given
+    if "orientation0" in given and not is_pose:
+        raise InvalidParameterError("orientation0 is given, must come with orientation_desired: give both, or none.")
+    n_ticks, p = shape[-2:] if len(shape) > 1 else (0, 0)
+    sizes = {"T": n_ticks, "p": p, "d": p + 3 if is_pose else p, "4": 4}
+    for name, value in given.items():
+        letters = _SHAPES.get(name, "Td")
+        if not n_ticks or not value.numel() or value.shape[-len(letters) :] != tuple(map(sizes.__getitem__, letters)):
+            raise InvalidParameterError(
+                f"{name} has shape {tuple(value.shape)}, must have shape (..., {', '.join(letters)}), none of it "
+                f"empty, with T and p those of position_desired, {tuple(shape)}, and d = {'p + 3' if is_pose else 'p'}."
+            )
+        plain = value.detach().cpu()
+        if name in ("stiffness", "damping"):
+            checks.semidefinite(plain.numpy(), name)
+            continue
+        checks.require(torch.isfinite(plain).numpy(), plain.numpy(), name, "finite")
+        if name.startswith("orientation"):
+            squared = plain.square().sum(-1).numpy()
+            good, remedy = abs(squared - 1.0) <= _NEARLY_UNIT, "give unit quaternions w x y z"
+            checks.require(good, squared, f"the squared norm of {name}", "1", remedy)

@@ -8,7 +8,7 @@ first order in e.
 """
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -53,8 +53,7 @@ def warn_if_far(angle: float) -> None:
         )
 
 
-@dataclass(frozen=True)
-class Turning:
+class Turning(NamedTuple):
     """Desired orientations (..., T, 4) of a task, with the turns (..., T, 3) that end its ticks, none the last.
 
     ``transport`` (..., T, 3, 3) is ``exp([turn])``, which takes along what turns with the desired orientation.

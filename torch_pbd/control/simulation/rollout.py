@@ -4,7 +4,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, final
 
+import torch
 from torch import Tensor
+
+from torch_pbd.control.simulation.poses import exp, multiply, rotation_between, warn_if_far
+from torch_pbd.control.simulation.ticks import Loop, Task, open_loop
+from torch_pbd.files.memory import require_memory
+from torch_pbd.linalg import broadcast_shapes
+
+# Dimensions of a run's values behind those of the batch; of what is not here it is that of ticks alone.
+_N_DIMS = {"position": 2, "velocity": 2, "force": 2, "commanded_position": 2, "stiffness": 3, "damping": 3}
 
 
 @final
@@ -115,3 +124,73 @@ class Rollout:
                 f"interventions is of a batch {batch}, must be of one run: take filter_share of the batch."
             )
         return self.time[self.filter_share < 1.0]
+
+
+def run_task(
+    task: Task,
+    force: Tensor | None = None,
+    position0: Tensor | None = None,
+    velocity0: Tensor | None = None,
+    orientation0: Tensor | None = None,
+    *,
+    generator: torch.Generator | None = None,
+) -> Rollout:
+    """Run of a task under a force (..., T, d) and from a start (..., p), (..., d), (..., 4) that were checked."""
+    force = torch.zeros_like(task.velocity) if force is None else force
+    start, speed = _start(task, position0, orientation0), task.velocity[..., 0, :] if velocity0 is None else velocity0
+    parts = [*task.motions, force, task.stiffness[..., 0]]
+    batch = broadcast_shapes(*(part.shape[:-2] for part in parts), start.shape[:-1], speed.shape[:-1])
+    _check_memory(task, batch.numel())
+    state = start.expand(*batch, -1), speed.expand(*batch, -1)
+    if task.is_linear:
+        position, velocity = open_loop(task, force, state)
+        record: dict[str, Any] = {"position": position, "velocity": velocity, "commanded_position": position}
+        record |= {"force": force, "stiffness": task.stiffness, "damping": task.damping}
+    else:
+        loop = Loop(task, state, generator)
+        ticks = [loop.run(tick, force[..., tick, :]) for tick in range(task.n_ticks)]
+        record = {name: torch.stack([each[name] for each in ticks], dim=-_N_DIMS.get(name, 1)) for name in ticks[0]}
+    record = {name: value.expand(*batch, *value.shape[-_N_DIMS.get(name, 1) :]) for name, value in record.items()}
+    finite = (torch.isfinite(record["position"]) & torch.isfinite(record["velocity"])).all(-1)
+    if not bool(finite.all()):
+        tick = int((~finite.reshape(-1, task.n_ticks).all(0)).nonzero()[0])
+        raise ValueError(
+            f"the simulation diverged, and is not finite from tick {tick} on: take a shorter dt, or smaller stiffness, "
+            "velocity and force."
+        )
+    p = task.n_positions
+    if task.turning is not None:
+        desired, deviation = task.turning.orientation, record["position"] - task.position
+        warn_if_far(float(torch.linalg.vector_norm(deviation.detach()[..., p:], dim=-1).max()))
+        record |= {"desired_orientation": desired, "pose_deviation": deviation}
+        for name, turned in {"position": "orientation", "commanded_position": "commanded_orientation"}.items():
+            record[turned] = multiply(exp(record[name][..., p:]), desired)
+            record[name] = record[name][..., :p]
+    time = torch.arange(task.n_ticks, dtype=force.dtype, device=force.device) * task.dt
+    return Rollout(time, desired_position=task.position[..., :p], **record)
+
+
+def _start(task: Task, position0: Tensor | None, orientation0: Tensor | None) -> Tensor:
+    """Pose at the start, as :class:`Task` has them."""
+    start = task.position[..., 0, :] if position0 is None else position0
+    if task.turning is None:
+        return start
+    desired = task.turning.orientation[..., 0, :]
+    rotation = torch.zeros_like(desired[..., 1:]) if orientation0 is None else rotation_between(desired, orientation0)
+    position = start[..., : task.n_positions]
+    batch = broadcast_shapes(position.shape[:-1], rotation.shape[:-1])
+    return torch.cat([position.expand(*batch, -1), rotation.expand(*batch, -1)], dim=-1)
+
+
+def _check_memory(task: Task, n_rollouts: int) -> None:
+    # Measured: five motions are held, of poses six and two orientations, and where rollouts differ in their gains,
+    # twelve matrices.
+    d = task.position.shape[-1]
+    of_each = 5 * d + (12 * d * d if task.stiffness.ndim > 3 or task.stiffness_filter is not None else 0)
+    of_each += 0 if task.turning is None else d + 8
+    if task.position.device.type == "cpu":  # elsewhere torch raises by itself
+        require_memory(
+            of_each * n_rollouts * task.n_ticks * task.position.element_size(),
+            what=f"a simulation of {n_rollouts} rollouts of {task.n_ticks} ticks",
+            remedy="Simulate fewer at a time, or take simulate_many, which keeps no trajectories.",
+        )

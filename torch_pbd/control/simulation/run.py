@@ -1,20 +1,25 @@
-"""A schedule on a simulated robot, once, under a given force."""
+"""A schedule on a simulated robot: once, under a given force, or thousands of times, under random pushes."""
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
-from torch import Tensor
 
 from torch_pbd import checks
+from torch_pbd.checks import Floats
 from torch_pbd.control.matrices import as_mass, mass_rows
 from torch_pbd.control.schedule.schedule import Schedule
-from torch_pbd.control.simulation.plant import AdmittancePlant, run_task
-from torch_pbd.control.simulation.rollout import Rollout
-from torch_pbd.control.simulation.ticks import Task
+from torch_pbd.control.simulation.plant import AdmittancePlant
+from torch_pbd.control.simulation.poses import warn_if_far
+from torch_pbd.control.simulation.rollout import Rollout, run_task
+from torch_pbd.control.simulation.rollouts import RolloutSummary, Tally, push_many
+from torch_pbd.control.simulation.ticks import Task, block_length
 from torch_pbd.exceptions import InvalidParameterError
+from torch_pbd.files.memory import require_memory
+
+Range = float | tuple[float, float]
 
 # Of a tick: rounding of times; those of an hour at 1 kHz are off by 5e-10 of it in float64.
 _UNEVEN = 1e-6
@@ -69,52 +74,199 @@ def simulate(
     >>> round(float(run.deviation[-1, 0]), 4)  # 5 N on 50 N/m
     0.1
     """
-    checks.instance(schedule, "schedule", Schedule)
-    schedule = evenly(schedule, None, "take schedule.resample(rate)")
-    shape = schedule.velocity.shape
-    push = checks.array(np.zeros(shape) if force is None else force, "force", shape)
+    task = _task_of(schedule, plant)
+    push = np.zeros(task.velocity.shape) if force is None else force
+    push = checks.array(push, "force", task.velocity.shape)
     draw = checks.seed(random_state)
-    task = task_of(schedule, plant, float(schedule.time[1] - schedule.time[0]))
     noisy = task.sensor is not None and task.sensor.is_noisy  # else nothing is drawn: None is the caller's global state
     generator = torch.Generator().manual_seed(int(draw.randint(2**31 - 1))) if noisy else None
     run = run_task(task, torch.tensor(push), generator=generator).numpy()
     return replace(run, time=schedule.time[0] + run.time, units=schedule.units)
 
 
-def evenly(schedule: Schedule, rate: float | None, remedy: str) -> Schedule:
-    """Schedule whose rows are the ticks of a run, at a rate if one is given."""
-    if rate is not None:
-        return schedule.resample(rate)
+def simulate_many(
+    schedule: Schedule,
+    n_rollouts: int = 1000,
+    *,
+    plant: AdmittancePlant | None = None,
+    peak: Range = 5.0,
+    torque: Range = 0.0,
+    duration: Range = 0.8,
+    onset: tuple[float, float] | None = None,
+    reference: Literal["desired", "undisturbed"] = "desired",
+    quantiles: tuple[float, ...] = (0.05, 0.5, 0.95),
+    every: int = 1,
+    random_state: Any = None,
+) -> RolloutSummary:
+    """Push a robot at random, many times over, while it follows a schedule.
+
+    Each rollout gets one push: a squared sine over its duration, in a direction that is uniform on the sphere of the
+    axes of position; and of poses, by a torque at the same time, in a direction of its own. Trajectories are not kept,
+    so that memory goes with ``n_rollouts`` and not with their length. The result depends on the arguments and
+    ``random_state`` only; pushes do not depend on the number of rows.
+
+    Parameters
+    ----------
+    schedule : Schedule
+        As for :func:`simulate`.
+    n_rollouts : int, default=1000
+        Number of rollouts R.
+    plant : AdmittancePlant, default=None
+        As for :func:`simulate`. With a sensor or walls, thousands of rollouts take five to ten times longer; with a
+        filter, ten to two hundred times.
+    peak : float or (float, float), default=5.0
+        Largest force of a push, N; of two numbers, uniform between them.
+    torque : float or (float, float), default=0.0
+        Largest torque of a push, Nm, of poses: ``peak=0.0`` leaves pushes by torque alone.
+    duration : float or (float, float), default=0.8
+        Of a push, s; of two numbers, uniform between them.
+    onset : (float, float), default=None
+        Time at which pushes begin, uniform between these, s; None is so that they end within the schedule.
+    reference : {"desired", "undisturbed"}, default="desired"
+        Deviation from the desired position, or from where the robot would be without push and noise: it lags behind
+        the desired position.
+    quantiles : tuple of float, default=(0.05, 0.5, 0.95)
+        Of the deviations at a tick, by linear interpolation.
+    every : int, default=1
+        Ticks from one row of quantiles to the next. To order 10^5 rollouts takes about as long as to simulate them.
+    random_state : int, RandomState or None, default=None
+        Of pushes and the sensor's noise.
+
+    Warns
+    -----
+    UserWarning
+        If the plant's mass is not that which the schedule's damping was computed for.
+
+    Raises
+    ------
+    ValueError
+        If an argument is not as described, or the rollouts do not fit in memory.
+
+    Examples
+    --------
+    >>> from torch_pbd.control import DMPController, simulate_many
+    >>> from torch_pbd.data import make_tunnel_demonstrations
+    >>> schedule = DMPController().fit(make_tunnel_demonstrations(random_state=0)).schedule()
+    >>> summary = simulate_many(schedule, 200, random_state=0)
+    >>> summary.deviation.shape, bool((summary.peak_deviation > 0.0).all())
+    ((10001, 3), True)
+    """
+    checks.count(n_rollouts, "n_rollouts")
+    checks.count(every, "every")
+    checks.choice(reference, "reference", ("desired", "undisturbed"))
+    levels = checks.array(quantiles, "quantiles", ("n_quantiles",)).copy()
+    checks.require((levels >= 0.0) & (levels <= 1.0), levels, "quantiles", "from 0 to 1")
+    task = _task_of(schedule, plant)
+    _check_memory(n_rollouts, schedule, len(levels))
+    draw = checks.seed(random_state)
+    begin, lasting, push = _draw_pushes(draw, n_rollouts, schedule, [peak, torque], duration, onset)
+    seeds = draw.randint(2**31 - 1, size=n_rollouts).tolist()  # at most so many sensors
+    generators = (torch.Generator().manual_seed(seed) for seed in seeds)
+    tallies = [Tally(n_rollouts, block) for block in schedule.blocks]
+    with torch.no_grad():
+        pushes = torch.tensor(begin), torch.tensor(lasting), torch.tensor(push).mT.contiguous()
+        away = None
+        if reference == "undisturbed":
+            silent = None if task.sensor is None else replace(task.sensor, noise_scale=0.0)
+            away = run_task(replace(task, sensor=silent)).deviation.mT
+        rows = zip(*push_many(task, pushes, generators, tallies, levels, every, away), strict=True)
+    shared = {"quantiles": levels, "onset": schedule.time[0] + begin, "duration": lasting}
+    summaries = list[RolloutSummary]()
+    for tally, deviation, units in zip(tallies, rows, [schedule.units, "rad"], strict=False):
+        last_above = tally.last_above.numpy()
+        returned = np.maximum(task.dt * (last_above + 1.0) - begin - lasting, 0.0)
+        summaries.append(
+            RolloutSummary(
+                time=schedule.time[::every],
+                deviation=np.concatenate(deviation),
+                peak_deviation=tally.squared_peak.sqrt().numpy(),
+                peak_time=schedule.time[tally.peak_tick.long().numpy()],
+                return_time=np.where(last_above < len(schedule) - 1, returned, np.inf),
+                final_deviation=tally.squared_last.sqrt().numpy(),
+                push=push[:, tally.axes],
+                units=units,
+                **shared,
+            )
+        )
+    if len(summaries) == 1:
+        return summaries[0]
+    warn_if_far(float(summaries[1].peak_deviation.max()))
+    return replace(summaries[0], rotation=summaries[1])
+
+
+def _task_of(schedule: Schedule, plant: AdmittancePlant | None) -> Task:
+    """Task of a plant that follows a schedule, row by row; warns where its mass is not that of the schedule."""
+    checks.instance(schedule, "schedule", Schedule)
+    plant = checks.instance(plant, "plant", AdmittancePlant, optional=True) or AdmittancePlant(None)
     steps = np.diff(schedule.time)
     if np.ptp(steps[:-1]) > _UNEVEN * steps[0] or steps[-1] > (1.0 + _UNEVEN) * steps[0]:
         raise InvalidParameterError(
-            f"schedule has steps from {steps.min():g} to {steps.max():g} s, must be evenly spaced: {remedy}."
+            f"schedule has steps from {steps.min():g} to {steps.max():g} s, must be evenly spaced: take "
+            "schedule.resample(rate)."
         )
-    return schedule
-
-
-def task_of(schedule: Schedule, plant: AdmittancePlant | None, dt: float, device: str | None = None) -> Task:
-    """Task of a plant that follows a schedule, row by row; warns where its mass is not that of the schedule."""
-    plant = checks.instance(plant, "plant", AdmittancePlant, optional=True) or AdmittancePlant(None)
     rows = (schedule.position, schedule.velocity, schedule.stiffness, schedule.damping)
-    motion = [torch.tensor(row, device=device) for row in rows]  # of copies: its own are read-only
-    mass = plant.inertia(motion[2], schedule.time, schedule.mass)
+    position, velocity, stiffness, damping = map(torch.tensor, rows)  # of copies: its own are read-only
+    mass = plant.inertia(stiffness, schedule.time, schedule.mass)
     if schedule.mass is not None and plant.mass is not None:
-        _compare(mass, mass_rows(as_mass(schedule.mass), motion[2]), plant, schedule)
+        own = mass_rows(as_mass(schedule.mass), stiffness)
+        # By entries, in units of their axes.
+        root = own.diagonal(dim1=-2, dim2=-1).sqrt()
+        off = float(((mass - own).abs() / (root.unsqueeze(-1) * root.unsqueeze(-2))).max())
+        if off > _SAME_MASS:
+            met = f"mass={schedule.mass:g} kg" if isinstance(schedule.mass, float) else "that of the schedule"
+            checks.warn(
+                f"{plant} has another mass than its damping_ratio was met for, {met}, off by up to {off:.0%}: give "
+                "both the same, or mass=None, which is the schedule's."
+            )
     more = {"acceleration_desired": schedule.acceleration, "orientation_desired": schedule.orientation}
-    given = {name: torch.tensor(row, device=device) for name, row in more.items() if row is not None}
-    return plant.task(*motion, mass=mass, dt=dt, **given)
+    given = {name: torch.tensor(row) for name, row in more.items() if row is not None}
+    return plant.task(position, velocity, stiffness, damping, mass=mass, dt=float(steps[0]), **given)
 
 
-def _compare(mass: Tensor, own: Tensor, plant: AdmittancePlant, schedule: Schedule) -> None:
-    """Warn where a mass is not that which the damping was computed for: by entries, in units of their axes."""
-    root = own.diagonal(dim1=-2, dim2=-1).sqrt()
-    off = float(((mass - own).abs() / (root.unsqueeze(-1) * root.unsqueeze(-2))).max())
-    if off > _SAME_MASS:
-        given: Any = plant.mass
-        shown = "a function" if callable(given) else given if not np.ndim(given) else f"of shape {tuple(given.shape)}"
-        met = f"mass={schedule.mass:g} kg" if isinstance(schedule.mass, float) else "that of the schedule"
-        checks.warn(
-            f"The plant's mass is {shown}, but damping_ratio was met for {met}, off by up to {off:.0%}: give both the "
-            "same, or mass=None, which is the schedule's."
-        )
+def _draw_pushes(
+    draw: np.random.RandomState,
+    n_rollouts: int,
+    schedule: Schedule,
+    peaks: list[Range],
+    duration: Range,
+    onset: tuple[float, float] | None,
+) -> tuple[Floats, Floats, Floats]:
+    """Onsets, from the start of the schedule on and in order, durations (R,), and forces and torques (R, d)."""
+    longest, (start, end) = schedule.duration, schedule.time[[0, -1]].tolist()
+    lasting = np.asarray(draw.uniform(*_ends(duration, "duration", "s", above=0.0, most=longest), size=n_rollouts))
+    share = draw.uniform(size=n_rollouts)
+    if onset is None:
+        begin = share * (longest - lasting)
+    else:
+        first, last = _ends(onset, "onset", "s", pair=True, least=start, most=end)
+        begin = first + share * (last - first) - start
+    names = [("peak", "N"), ("torque", "Nm")]
+    limits = [_ends(of, *named, least=0.0, most=checks.LARGEST) for of, named in zip(peaks, names, strict=True)]
+    if len(schedule.blocks) == 1 and limits[1] != (0.0, 0.0):
+        raise checks.refusal(peaks[1], "torque", "0 for a schedule without orientation", unit="Nm")
+    push = np.zeros((n_rollouts, schedule.n_outputs))
+    for block, ends in zip(schedule.blocks, limits, strict=False):
+        direction = draw.standard_normal((n_rollouts, block.stop - block.start))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        push[:, block] = np.asarray(draw.uniform(*ends, size=n_rollouts))[:, np.newaxis] * direction
+    order = np.argsort(begin, kind="stable")  # rollouts of a chunk are pushed at about the same time
+    return begin[order], lasting[order], push[order]
+
+
+def _ends(limits: Range, name: str, unit: str, *, pair: bool = False, **bounds: Any) -> tuple[float, float]:
+    """Least and largest of a range within bounds; one number is both, unless a pair is asked for."""
+    low, high = checks.array(limits, name, (2,)) if pair or np.ndim(limits) else (limits, limits)
+    low = checks.number(low, name, unit=unit, **bounds)
+    return low, checks.number(high, name, unit=unit, **(bounds | {"least": low}))
+
+
+def _check_memory(n_rollouts: int, schedule: Schedule, n_levels: int) -> None:
+    # Per rollout the block of deviations, its order, and some numbers; per tick the gains and their maps.
+    d = schedule.n_outputs
+    of_each = 3 * block_length(d) + 10 * d + 16
+    of_ticks = len(schedule) * (4 * d * d + 4 * d + n_levels)
+    require_memory(
+        8.0 * (n_rollouts * of_each + of_ticks),
+        what=f"n_rollouts={n_rollouts}",
+        remedy="Simulate fewer at a time, with several seeds.",
+    )

@@ -1,9 +1,10 @@
-"""A force-torque sensor between the simulated hand and the controller."""
+"""What stands between the simulated hand, the controller and the robot: a force-torque sensor, and a position loop."""
 
 import math
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import product
 from typing import NamedTuple, final
 
 import torch
@@ -16,10 +17,6 @@ from torch_pbd.exceptions import InvalidParameterError
 _OF_AXES = ("bias", "noise_scale", "resolution", "range", "deadband")
 
 
-def _each(value: float | Sequence[float]) -> Sequence[float]:
-    return value if isinstance(value, tuple) else (value,)
-
-
 class Reading(NamedTuple):
     """Force read (..., d) in N, and of torques in Nm, and whether any of its axes was clipped (...)."""
 
@@ -28,7 +25,7 @@ class Reading(NamedTuple):
 
 
 @final
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class ForceSensor:
     """Model of a 6-axis force-torque sensor; works for any number of axes.
 
@@ -80,33 +77,26 @@ class ForceSensor:
 
     def __post_init__(self) -> None:
         for name in _OF_AXES:
-            value = getattr(self, name)
-            if isinstance(value, Sequence) and not isinstance(value, str):
-                object.__setattr__(self, name, tuple(value))  # a list would be neither frozen nor hashable
-        for value in _each(self.bias):
-            checks.number(value, "bias", unit="N")
-        for value in _each(self.range):
-            if value != math.inf:
-                checks.number(value, "range", above=0.0, unit="N", remedy="math.inf is a sensor without limit")
-        for name in ("noise_scale", "resolution", "deadband"):
-            values, most = _each(getattr(self, name)), _each(self.range)
-            each = most if len(most) == len(values) else [min(most)] * len(values)
-            for value, top in zip(values, each if name == "resolution" else [None] * len(values), strict=True):
-                checks.number(value, name, least=0.0, most=top, unit="N", remedy="0 is none")
+            if isinstance(getattr(self, name), list):  # which would be neither frozen nor hashable
+                object.__setattr__(self, name, tuple(getattr(self, name)))
+            for value in self._values(name):
+                above, least = (0.0, None) if name == "range" else (None, None if name == "bias" else 0.0)
+                if (name, value) != ("range", math.inf):
+                    checks.number(value, name, above=above, least=least, unit="N")
+        steps, ranges = self._values("resolution"), self._values("range")
+        for step, most in zip(steps, ranges, strict=True) if len(steps) == len(ranges) else product(steps, ranges):
+            checks.number(step, "resolution", least=0.0, most=most, unit="N", remedy="0 is none")
         checks.number(self.cutoff, "cutoff", above=0.0, unit="Hz", optional=True)
         checks.count(self.delay_steps, "delay_steps", least=0)
 
-    def __repr__(self) -> str:
-        chosen = {field.name: getattr(self, field.name) for field in fields(self)}
-        changed = {name: value for name, value in chosen.items() if value != getattr(ForceSensor, name)}
-        units = dict.fromkeys(chosen, " N") | {"cutoff": " Hz", "delay_steps": ""}
-        shown = ({"range": self.range} | changed).items()
-        return f"ForceSensor({', '.join(f'{name}={value}{units[name]}' for name, value in shown)})"
+    def _values(self, name: str) -> Sequence[float]:
+        value = getattr(self, name)
+        return value if isinstance(value, tuple) else (value,)
 
     @property
     def is_noisy(self) -> bool:
         """True if readings are drawn at random."""
-        return any(value != 0.0 for value in _each(self.noise_scale))
+        return any(self._values("noise_scale"))
 
     @classmethod
     def jr3(cls, cutoff: float = 500.0, rate: float = 1000.0) -> "ForceSensor":
@@ -129,10 +119,9 @@ class ForceSensor:
         The forces to come are of the shape, dtype and device of ``like``; noise is drawn from the ``generator``.
         """
         for name in _OF_AXES:
-            value = getattr(self, name)
-            if isinstance(value, tuple) and len(value) != like.shape[-1]:
+            if (n_values := len(self._values(name))) not in (1, like.shape[-1]):
                 raise InvalidParameterError(
-                    f"{name} has {len(value)} values, but the force has {like.shape[-1]} axes: give one for each axis, "
+                    f"{name} has {n_values} values, but the force has {like.shape[-1]} axes: give one for each axis, "
                     "or one number for all."
                 )
         remedy = f"noise_scale is {self.noise_scale} N: pass torch.Generator().manual_seed(...), or set it to 0"
@@ -163,17 +152,14 @@ class ForceReader:
         if self._gain is not None:
             # The state of dx/dt = 2 pi cutoff (level - x) at the start of the tick, over which it moves on.
             level, self._filtered = self._filtered, torch.lerp(self._filtered, level, self._gain)
-        reading = self._convert(level + self._noise())
+        if self._generator is not None:
+            # Drawn where the generator lives: the same seed is the same noise on every device.
+            at, like = self._generator.device, self._bias
+            noise = torch.randn(like.shape, generator=self._generator, dtype=like.dtype, device=at)
+            level = level + self._noise_scale * noise.to(like.device)
+        reading = self._convert(level)
         self._under_way.append(Reading(reading.force.masked_fill(lost, math.nan), reading.saturated))
         return self._under_way.popleft()
-
-    def _noise(self) -> Tensor | float:
-        generator = self._generator
-        if generator is None:
-            return 0.0
-        # Drawn where the generator lives: the same seed is the same noise on every device.
-        noise = torch.randn(self._bias.shape, generator=generator, dtype=self._bias.dtype, device=generator.device)
-        return self._noise_scale * noise.to(self._bias.device)
 
     def _convert(self, level: Tensor) -> Reading:
         """Clip, round, and take the deadband off, which may come before the delay: it has no memory."""
@@ -182,3 +168,62 @@ class ForceReader:
         step = torch.where(self._resolution > 0.0, self._resolution, 1.0)
         level = torch.where(self._resolution > 0.0, step * torch.round(level / step), level)
         return Reading(level - level.clamp(-self._deadband, self._deadband), saturated)
+
+
+@final
+@dataclass(frozen=True)
+class PositionLoop:
+    """The robot's inner position loop, critically damped and of second order behind a delay of whole ticks.
+
+    ``x'' = w^2 (x_commanded - x) - 2 w x'`` with ``w = 2 pi bandwidth``: it follows a ramp ``2 / w``, the
+    delay, and half a tick of hold late.
+
+    Parameters
+    ----------
+    bandwidth : float, default=20.0
+        In Hz.
+    delay_steps : int, default=1
+        Ticks between a command and its effect, at least 0.
+    """
+
+    bandwidth: float = 20.0
+    delay_steps: int = 1
+
+    def __post_init__(self) -> None:
+        checks.number(self.bandwidth, "bandwidth", above=0.0, unit="Hz")
+        checks.count(self.delay_steps, "delay_steps", least=0)
+
+    def transition(self, dt: float, like: Tensor) -> Float[Tensor, "2 3"]:
+        """Exact map of ``[position, velocity, command]`` to the position and velocity a tick later."""
+        # For a held command c, x - c = e^-wt ((1 + w t) (x_0 - c) + t v_0): critical damping has one root, twice.
+        w = 2.0 * math.pi * self.bandwidth
+        decay = math.exp(-w * dt)
+        rows = [
+            [(1.0 + w * dt) * decay, dt * decay, 1.0 - (1.0 + w * dt) * decay],
+            [-w * w * dt * decay, (1.0 - w * dt) * decay, w * w * dt * decay],
+        ]
+        return like.new_tensor(rows)
+
+    def start(self, position: Float[Tensor, "*b d"], velocity: Float[Tensor, "*b d"], dt: float) -> "FollowingRobot":
+        """Robot at ``position``, which its commands are at until the first takes effect."""
+        return FollowingRobot(position, velocity, self.transition(dt, position), [position] * self.delay_steps)
+
+
+@dataclass
+class FollowingRobot:
+    """Robot behind its position loop, and the commands that it has yet to follow."""
+
+    position: Tensor
+    velocity: Tensor
+    transition: Tensor
+    commands: list[Tensor]
+
+    def carry(self, change: Callable[[Tensor], Tensor]) -> None:
+        """Count position and waiting commands from another origin."""
+        self.position, self.commands = change(self.position), [change(each) for each in self.commands]
+
+    def __call__(self, command: Tensor) -> None:
+        """Move on by a tick in which this command is given."""
+        self.commands.append(command)
+        state = torch.stack([self.position, self.velocity, self.commands.pop(0)], dim=-1)
+        self.position, self.velocity = (state @ self.transition.mT).unbind(-1)

@@ -15,8 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torch_pbd.control.simulation.poses import Turning
-from torch_pbd.control.simulation.position_loop import PositionLoop
-from torch_pbd.control.simulation.sensor import ForceSensor
+from torch_pbd.control.simulation.sensor import ForceSensor, PositionLoop
 
 State = tuple[Tensor, Tensor]
 """Position and velocity (..., d)."""
@@ -33,9 +32,7 @@ def admittance_rate(
     inverse = torch.linalg.inv(mass).expand_as(stiffness)
     rate = stiffness.new_zeros(*stiffness.shape[:-2], 3 * d, 3 * d)
     rate[..., :d, d : 2 * d] = torch.eye(d).to(stiffness)
-    rate[..., d : 2 * d, :d] = -inverse @ stiffness
-    rate[..., d : 2 * d, d : 2 * d] = -inverse @ damping
-    rate[..., d : 2 * d, 2 * d :] = inverse
+    rate[..., d : 2 * d, :] = torch.cat([-inverse @ stiffness, -inverse @ damping, inverse], dim=-1)
     return rate
 
 
@@ -85,22 +82,22 @@ class Task:
         return self.position.shape[-2]
 
     @property
-    def is_open(self) -> bool:
-        """True if nothing acts in the loop."""
-        parts = (self.sensor, self.position_loop, self.environment, self.stiffness_filter)
-        return all(part is None for part in parts)
-
-    @property
-    def is_shared(self) -> bool:
-        """True if all rollouts of a batch have the same gains and desired motion."""
-        motion = [self.position, self.velocity, self.inertial_force]
-        motion += [] if self.turning is None else [self.turning.turns]
-        return self.stiffness.ndim == 3 and all(part.ndim == 2 for part in motion)
-
-    @property
     def n_positions(self) -> int:
         """Number of positions p among the d axes."""
         return self.position.shape[-1] - (0 if self.turning is None else 3)
+
+    @property
+    def motions(self) -> list[Tensor]:
+        """What moves in the desired motion (..., T, d), and of poses the turns (..., T, 3)."""
+        turns = [] if self.turning is None else [self.turning.turns]
+        return [self.position, self.velocity, self.inertial_force, *turns]
+
+    @property
+    def is_linear(self) -> bool:
+        """True if nothing acts in the loop, and all rollouts of a batch have the same gains and desired motion."""
+        acting = (self.sensor, self.position_loop, self.environment, self.stiffness_filter)
+        is_shared = self.stiffness.ndim == 3 and all(motion.ndim == 2 for motion in self.motions)
+        return is_shared and all(part is None for part in acting)
 
     def carry(self, tick: int, pose: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
         """Positions, and rotations counted from the desired orientation after a tick instead of that before it."""
@@ -112,24 +109,19 @@ class Task:
 
 
 def open_loop(task: Task, force: Tensor, state: State) -> State:
-    """Poses and velocities (..., T, d) where nothing acts in the loop and all rollouts share the task.
-
-    Blocks of ticks are then matrices on the states, and on forces (..., T, d), of all rollouts.
-    """
-    d = task.position.shape[-1]
-    start = torch.cat([state[0] - task.position[0], state[1]], dim=-1)
-    length = block_length(d, n_forces=32)
-    surplus = -task.n_ticks % length
-    forces = torch.nn.functional.pad(force, (0, 0, 0, surplus)).flatten(-2)
-    forces = forces.expand(*start.shape[:-1], -1).reshape(-1, forces.shape[-1]).mT
-    now, states = start.reshape(-1, 2 * d).mT, []  # rollouts are columns
+    """Poses and velocities (..., T, d) of a linear task under forces (..., T, d), a block of ticks at a time."""
+    d, length = task.position.shape[-1], block_length(task.position.shape[-1], n_forces=32)
+    now = torch.cat([state[0] - task.position[0], state[1]], dim=-1)
+    batch = now.shape[:-1]
+    forces = torch.nn.functional.pad(force, (0, 0, 0, -task.n_ticks % length)).flatten(-2).expand(*batch, -1)
+    now, forces = now.reshape(-1, 2 * d).mT, forces.reshape(-1, forces.shape[-1]).mT  # rollouts are columns
+    states = []
     for response, held in zip(block_responses(task, length), forces.split(length * d), strict=True):
         of_start, drift, of_forces = response.flatten(0, 1).split([2 * d, 1, len(held)], dim=1)
-        within = torch.addmm(torch.addmm(drift, of_start, now), of_forces, held)
+        within = drift + of_start @ now + of_forces @ held
         states.append(within[: -2 * d])
         now = within[-2 * d :]
-    trace = torch.cat(states).unflatten(0, (-1, 2 * d))[: task.n_ticks].permute(2, 0, 1)
-    trace = trace.reshape(*start.shape[:-1], task.n_ticks, 2 * d)
+    trace = torch.cat(states).mT.reshape(*batch, -1, 2 * d)[..., : task.n_ticks, :]
     return trace[..., :d] + task.position, trace[..., d:]
 
 
@@ -183,24 +175,8 @@ def _tick_map(stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> Te
     return transition(admittance_rate(stiffness, damping, mass), dt)[..., : 2 * stiffness.shape[-1], :]
 
 
-def _moved(each: Float[Tensor, "*b m n"], deviation: Tensor, velocity: Tensor, force: Tensor) -> State:
-    """State after a tick, of its map (m = 2 d rows, n = 3 d columns), the state before it and the force held."""
-    before = torch.cat([deviation, velocity, force], dim=-1)
-    after = before @ each.mT if each.ndim == 2 else (each @ before.unsqueeze(-1)).squeeze(-1)
-    d = deviation.shape[-1]
-    return after[..., :d], after[..., d:]
-
-
-def closed_loop(task: Task, force: Tensor, state: State, generator: torch.Generator | None) -> dict[str, Any]:
-    """Fields of a Rollout, tick by tick."""
-    loop = Loop(task, state, generator)
-    ticks = [loop.run(tick, force[..., tick, :]) for tick in range(task.n_ticks)]
-    behind = {"position": 2, "velocity": 2, "force": 2, "commanded_position": 2, "stiffness": 3, "damping": 3}
-    return {name: torch.stack([each[name] for each in ticks], dim=-behind.get(name, 1)) for name in ticks[0]}
-
-
 class Loop:
-    """State (..., d) of a closed-loop run, which moves on tick by tick."""
+    """State (..., d) of a run with what acts in it, which moves on tick by tick."""
 
     def __init__(self, task: Task, state: State, generator: torch.Generator | None) -> None:
         self._task = task
@@ -208,8 +184,7 @@ class Loop:
         loop, sensor, wanted = task.position_loop, task.sensor, task.stiffness_filter
         self._robot = None if loop is None else loop.start(*state, task.dt)
         self._read = None if sensor is None else sensor.start(state[0], task.dt, generator)
-        gains = task.stiffness, task.damping, task.mass, task.dt
-        self._filter = None if wanted is None else wanted(*gains)
+        self._filter = None if wanted is None else wanted(task.stiffness, task.damping, task.mass, task.dt)
         self._maps = (each for _, maps in tick_maps(task, task.dt / task.substeps) for each in maps.unbind(-3))
 
     def run(self, tick: int, force: Tensor) -> dict[str, Tensor]:
@@ -260,6 +235,8 @@ class Loop:
             if part:
                 force = outside + self._wall(before[0] + desired, before[1])
             held = (force + push).expand_as(before[0])
-            self._deviation, self._velocity = _moved(each, *before, held)
+            state = torch.cat([*before, held], dim=-1)
+            after = state @ each.mT if each.ndim == 2 else (each @ state.unsqueeze(-1)).squeeze(-1)
+            self._deviation, self._velocity = after.chunk(2, dim=-1)
             if self._filter is not None:
                 self._filter.settle(before, (self._deviation, self._velocity), held)

@@ -1,6 +1,7 @@
 """The walls of the tunnel task, around the simulated robot."""
 
 import math
+from dataclasses import dataclass
 from typing import Any, NamedTuple, final
 
 import torch
@@ -26,7 +27,29 @@ def corridor(y: Float[Tensor, "*b"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     )
 
 
+class ContactReport(NamedTuple):
+    """Contacts of a rollout with the walls; a batch of rollouts has a value for each.
+
+    Attributes
+    ----------
+    max_penetration : (...), m
+        Greatest depth beyond a wall; 0 where it was not touched.
+    time_in_wall : (...), s
+        Number of ticks that start beyond a wall, times dt.
+    impulse : (...), N s
+        Sum of the size of the wall's force times dt; 0 for a virtual wall.
+    n_contacts : (...)
+        Number of times that a wall was entered; to start in it counts.
+    """
+
+    max_penetration: Float[Tensor, "*b"]
+    time_in_wall: Float[Tensor, "*b"]
+    impulse: Float[Tensor, "*b"]
+    n_contacts: Int[Tensor, "*b"]
+
+
 @final
+@dataclass(frozen=True)
 class Tunnel:
     """The corridor of the task in the plane, along y, between two smooth walls without friction.
 
@@ -58,14 +81,14 @@ class Tunnel:
     of Robotic Systems 14(1), 1997: with a hand on the device the damping must also come from the device.
     """
 
-    def __init__(self, stiffness: float = 1e4, damping: float | None = None, virtual: bool = False) -> None:
-        self.stiffness = checks.number(stiffness, "stiffness", above=0.0, unit="N/m", remedy="virtual=True is no wall")
-        checks.number(damping, "damping", least=0.0, unit="N s/m", optional=True)
-        self.damping = math.sqrt(stiffness) if damping is None else damping
-        self.virtual = checks.flag(virtual, "virtual")
+    stiffness: float = 1e4
+    damping: float | None = None
+    virtual: bool = False
 
-    def __repr__(self) -> str:
-        return f"Tunnel(stiffness={self.stiffness:g} N/m, damping={self.damping:g} N s/m, virtual={self.virtual})"
+    def __post_init__(self) -> None:
+        checks.number(self.stiffness, "stiffness", above=0.0, unit="N/m", remedy="virtual=True is no wall")
+        checks.number(self.damping, "damping", least=0.0, unit="N s/m", optional=True)
+        checks.flag(self.virtual, "virtual")
 
     def penetration(self, position: Float[Tensor, "*b 2"] | Any) -> Float[Tensor, "*b"]:
         """Depth beyond the nearer wall [m], along its normal: ``(|x - x_c| - w) / sqrt(1 + slope^2)``, or 0."""
@@ -87,26 +110,22 @@ class Tunnel:
             )
         if self.virtual:
             return torch.zeros_like(position)
+        damping = math.sqrt(self.stiffness) if self.damping is None else self.damping
         closing = -(velocity * normal).sum(-1)
-        press = (self.stiffness * depth + self.damping * closing).clamp_min(0.0)
+        press = (self.stiffness * depth + damping * closing).clamp_min(0.0)
         return torch.where(depth <= 0.0, 0.0, press).unsqueeze(-1) * normal
 
     def report(
         self, rollout_position: Float[Tensor, "*b t 2"] | Any, velocity: Float[Tensor, "*b t 2"] | Any, dt: float
-    ) -> "ContactReport":
+    ) -> ContactReport:
         """Contacts of a rollout: positions and velocities (..., T, 2) at the start of ticks of ``dt`` s, all finite."""
         checks.number(dt, "dt", above=0.0, unit="s")
         rollout_position, velocity = as_rows(rollout_position, "rollout_position", 2), as_rows(velocity, "velocity", 2)
         depth = self.penetration(rollout_position)
         press = torch.linalg.vector_norm(self.force(rollout_position, velocity), dim=-1)
         inside = depth > 0.0
-        before = torch.cat([torch.zeros_like(inside[..., :1]), inside[..., :-1]], dim=-1)
-        return ContactReport(
-            max_penetration=depth.amax(-1),
-            time_in_wall=dt * inside.sum(-1).to(depth),
-            impulse=dt * press.sum(-1),
-            n_contacts=(inside & ~before).sum(-1),
-        )
+        entered = inside & ~torch.nn.functional.pad(inside, (1, 0))[..., :-1]
+        return ContactReport(depth.amax(-1), dt * inside.sum(-1).to(depth), dt * press.sum(-1), entered.sum(-1))
 
     def _contact(self, position: Tensor | Any) -> tuple[Tensor, Tensor]:
         """Depth along the normal, negative in the free corridor, and the normal."""
@@ -122,24 +141,3 @@ class Tunnel:
         steepness = (1.0 + slope.square()).sqrt()
         depth = (side * offset - half_width) / steepness
         return depth, torch.stack([-side, side * slope], dim=-1) / steepness.unsqueeze(-1)
-
-
-class ContactReport(NamedTuple):
-    """Contacts of a rollout with the walls; a batch of rollouts has a value for each.
-
-    Attributes
-    ----------
-    max_penetration : (...), m
-        Greatest depth beyond a wall; 0 where it was not touched.
-    time_in_wall : (...), s
-        Number of ticks that start beyond a wall, times dt.
-    impulse : (...), N s
-        Sum of the size of the wall's force times dt; 0 for a virtual wall.
-    n_contacts : (...)
-        Number of times that a wall was entered; to start in it counts.
-    """
-
-    max_penetration: Float[Tensor, "*b"]
-    time_in_wall: Float[Tensor, "*b"]
-    impulse: Float[Tensor, "*b"]
-    n_contacts: Int[Tensor, "*b"]

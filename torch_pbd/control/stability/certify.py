@@ -10,7 +10,7 @@ from torch_pbd import checks, rotations
 from torch_pbd.control.damping import required_damping_ratio
 from torch_pbd.control.matrices import as_mass, mass_rows
 from torch_pbd.control.schedule.schedule import Schedule
-from torch_pbd.control.simulation.position_loop import PositionLoop
+from torch_pbd.control.simulation.sensor import PositionLoop
 from torch_pbd.control.stability.common_function import common_function
 from torch_pbd.control.stability.dynamics import ErrorDynamics
 from torch_pbd.control.stability.environment import stiffest_environment

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torch_pbd.control.simulation.position_loop import PositionLoop
+from torch_pbd.control.simulation.sensor import PositionLoop
 from torch_pbd.control.simulation.ticks import admittance_rate, transition
 from torch_pbd.linalg import least_eigenvalue, symmetrize
 
