@@ -1,6 +1,7 @@
 """Learn how precise people are from demonstrations: covariance that depends on the input."""
 
 from importlib import import_module
+from pkgutil import iter_modules
 from typing import TYPE_CHECKING, Any
 
 from torch_pbd.registry import ESTIMATORS
@@ -26,19 +27,6 @@ _HOMES = {
     "load": "torch_pbd.persistence",
     "save": "torch_pbd.persistence",
 }
-_MODULES = (
-    "control",
-    "data",
-    "estimators",
-    "gp",
-    "kernels",
-    "linalg",
-    "metrics",
-    "models",
-    "movement",
-    "optim",
-    "plotting",
-)
 
 __all__ = [
     "CholeskyCovRegressor",
@@ -60,10 +48,14 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name in _HOMES:
         return getattr(import_module(_HOMES[name]), name)
-    if name in _MODULES:
+    if name in _modules():
         return import_module(f"torch_pbd.{name}")
     raise AttributeError(f"module 'torch_pbd' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *_HOMES, *_MODULES])
+    return sorted([*globals(), *_HOMES, *_modules()])
+
+
+def _modules() -> list[str]:
+    return [module.name for module in iter_modules(__path__)]

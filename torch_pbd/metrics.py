@@ -38,13 +38,7 @@ _Scorer = Callable[[Any, ArrayLike, ArrayLike], float]
 _ZERO_PIVOT = 1e-14
 
 
-def covariance_mse(
-    estimated: ArrayLike,
-    reference: ArrayLike,
-    on: Literal["cholesky", "matrix"] = "cholesky",
-    *,
-    reduce: Literal["sum", "mean"] = "sum",
-) -> float:
+def covariance_mse(estimated: ArrayLike, reference: ArrayLike, on: Literal["cholesky", "matrix"] = "cholesky") -> float:
     """Mean over the rows of the squared distance between covariances, or between their Cholesky factors.
 
     ``on="cholesky"`` is the error of Table I: section IV-A takes the Euclidean norm of the difference of the
@@ -58,21 +52,13 @@ def covariance_mse(
         Positive semidefinite for ``on="cholesky"``.
     on : {"cholesky", "matrix"}, default="cholesky"
         What is compared.
-    reduce : {"sum", "mean"}, default="sum"
-        Over the entries of one row, d (d + 1) / 2 of a factor and d^2 of a matrix: their sum is the squared
-        norm; their mean is what code that averages everything reports. The paper does not say which it is.
     """
     checks.choice(on, "on", ("cholesky", "matrix"))
-    checks.choice(reduce, "reduce", ("sum", "mean"))
     first = _covariances(estimated, "estimated")
     second = _covariances(reference, "reference", first.shape)
-    d = first.shape[-1]
-    n_entries = d * d
     if on == "cholesky":
         first, second = _semidefinite_factor(first, "estimated"), _semidefinite_factor(second, "reference")
-        n_entries = d * (d + 1) // 2
-    squared = np.square(first - second).sum(axis=(-2, -1))
-    return float(squared.mean()) / (n_entries if reduce == "mean" else 1)
+    return float(np.square(first - second).sum(axis=(-2, -1)).mean())
 
 
 def relative_frobenius_error(estimated: ArrayLike, reference: ArrayLike) -> float:
@@ -124,7 +110,7 @@ def gaussian_kl(
     whitened = np.linalg.solve(estimated_tril, np.concatenate([reference_tril, shift[..., None]], axis=-1))
     log_ratio = _log_det(estimated_tril) - _log_det(reference_tril)
     divergence = 0.5 * (np.square(whitened).sum(axis=(-2, -1)) - d) + log_ratio
-    return float(np.mean(np.maximum(divergence, 0.0)))  # equal ones may round to below zero
+    return float(divergence.clip(0.0).mean())  # of equal ones it may round to below zero
 
 
 def negative_log_likelihood(mean: Any, covariance: ArrayLike, y: ArrayLike) -> float:
@@ -145,17 +131,19 @@ def negative_log_likelihood(mean: Any, covariance: ArrayLike, y: ArrayLike) -> f
     TypeError
         If the estimator has no ``log_likelihood``.
     """
-    if _is_estimator(mean):
-        return -_mean_log_likelihood(mean, covariance, y)
+    if hasattr(mean, "predict"):
+        last = mean[-1] if isinstance(mean, Pipeline) else mean
+        if not hasattr(last, "log_likelihood"):
+            raise TypeError(f"{type(last).__name__} has no log_likelihood(X, y): pass a covariance regressor.")
+        # A pipeline passes on score, its mean, and not log_likelihood itself.
+        return -float(np.mean(mean.log_likelihood(covariance, y)) if last is mean else mean.score(covariance, y))
     whitened, scale_tril = _whitened_residual(mean, covariance, y)
     nll = 0.5 * np.square(whitened).sum(-1) + _log_det(scale_tril)
     return float(nll.mean()) + 0.5 * whitened.shape[-1] * math.log(2 * math.pi)
 
 
 @overload
-def mahalanobis_coverage(mean: float = 0.95) -> _Scorer: ...
-@overload
-def mahalanobis_coverage(*, level: float) -> _Scorer: ...
+def mahalanobis_coverage(mean: float = ..., *, level: float = ...) -> _Scorer: ...
 @overload
 def mahalanobis_coverage(mean: Any, covariance: ArrayLike, y: ArrayLike, level: float = 0.95) -> float: ...
 def mahalanobis_coverage(
@@ -187,7 +175,7 @@ def mahalanobis_coverage(
     if covariance is None or y is None:
         raise TypeError("mahalanobis_coverage takes mean, covariance, y; or estimator, X, y; or a level.")
     checks.number(level, "level", above=0.0, below=1.0)
-    if _is_estimator(mean):
+    if hasattr(mean, "predict"):
         mean, covariance = mean.predict(covariance, return_cov=True)
     whitened, _ = _whitened_residual(mean, covariance, y)
     quantile = 2 * gammaincinv(0.5 * whitened.shape[-1], level)  # of chi-squared, d degrees of freedom
@@ -196,21 +184,9 @@ def mahalanobis_coverage(
 
 def log_likelihood_scorer(estimator: Any, X: ArrayLike, y: ArrayLike) -> float:
     """``estimator.score(X, y)``, the mean log-likelihood in nats: what to select covariance models by."""
-    if hasattr(estimator, "score"):
-        return float(estimator.score(X, y))
-    raise TypeError(f"estimator is {estimator!r}, must be a fitted covariance regressor.")
-
-
-def _is_estimator(candidate: Any) -> bool:
-    return hasattr(candidate, "log_likelihood") or hasattr(candidate, "predict")
-
-
-def _mean_log_likelihood(estimator: Any, X: ArrayLike, y: ArrayLike) -> float:
-    last = estimator[-1] if isinstance(estimator, Pipeline) else estimator
-    if not hasattr(last, "log_likelihood"):
-        raise TypeError(f"{type(last).__name__} has no log_likelihood(X, y): pass a covariance regressor.")
-    # A pipeline passes on score, its mean, and not log_likelihood itself.
-    return float(np.mean(last.log_likelihood(X, y)) if last is estimator else estimator.score(X, y))
+    if not hasattr(estimator, "score"):
+        raise TypeError(f"estimator is {estimator!r}, must be a fitted covariance regressor.")
+    return float(estimator.score(X, y))
 
 
 def _whitened_residual(mean: ArrayLike, covariance: ArrayLike, y: ArrayLike) -> tuple[Floats, Floats]:
