@@ -7,7 +7,7 @@ import pytest
 from safetensors.numpy import save as to_bytes
 
 from torch_pbd.exceptions import ModelFileError
-from torch_pbd.files.tensors import MAX_HEADER_BYTES, _digest, read_checksummed, write_checksummed
+from torch_pbd.files import MAX_HEADER_BYTES, _digest, read_checksummed, write_checksummed
 
 ARRAYS = {
     "weight": np.arange(12.0).reshape(3, 4),

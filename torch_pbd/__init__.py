@@ -54,7 +54,7 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *_HOMES, *_modules()])
+    return sorted({*globals(), *_HOMES, *_modules()})
 
 
 def _modules() -> list[str]:

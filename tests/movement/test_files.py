@@ -9,7 +9,7 @@ from movement.test_trajectory import GRID, movements, stacked
 from torch_pbd import DMPController, GMMBaseline, KMPBaseline, ProMPBaseline, TrajectoryRegressor
 from torch_pbd.data import make_tunnel_demonstrations
 from torch_pbd.exceptions import ModelFileError
-from torch_pbd.files.tensors import read_checksummed, write_checksummed
+from torch_pbd.files import read_checksummed, write_checksummed
 
 X = GRID[:, np.newaxis]
 MODELS = [TrajectoryRegressor(GMMBaseline(n_restarts=0)), ProMPBaseline(n_basis=8, overlap=0.85), KMPBaseline()]

@@ -8,7 +8,7 @@ from scipy.stats import f, multivariate_t
 import torch_pbd
 from torch_pbd import Demonstrations, DMPController, GMMBaseline, TrajectoryRegressor, load_demonstrations
 from torch_pbd.exceptions import ModelFileError
-from torch_pbd.files.tensors import read_checksummed, write_checksummed
+from torch_pbd.files import read_checksummed, write_checksummed
 from torch_pbd.movement.timing import Timing, phase_of, register, time_of
 
 GRID = np.linspace(0.0, 1.0, 40)

@@ -9,6 +9,7 @@ written like a controller, with a regressor of its own, if it has one, under "re
 import os
 import re
 import warnings
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -23,8 +24,7 @@ from torch_pbd.control.primitive.outputs import Outputs
 from torch_pbd.control.primitive.reproduction import Reproduction, primitive
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.exceptions import ModelFileError
-from torch_pbd.files import LOADERS
-from torch_pbd.files.tensors import Arrays, read_checksummed, write_checksummed
+from torch_pbd.files import LOADERS, Arrays, read_checksummed, write_checksummed
 from torch_pbd.persistence import plain
 from torch_pbd.registry import ESTIMATORS, MOVEMENTS, REGRESSORS
 
@@ -128,43 +128,49 @@ def _brief(error: BaseException) -> str:
 
 def _described(estimator: Any) -> tuple[dict[str, Any], Arrays]:
     """Class, parameters and what was learned, as JSON can hold it; and the arrays."""
+    description, part = plain.encode_parameters(estimator), _PARTS.get(type(estimator).__name__)
+    learned = plain.learned_checks(estimator, vars(estimator))
     if isinstance(estimator, CovarianceRegressor):
-        return _described_regressor(estimator)
-    if getattr(estimator, "_bend", None) is not None or getattr(estimator, "_known", None) is not None:
+        state = estimator.__getstate__()
+        arrays, description["module"] = state.pop("_module_arrays"), state.pop("_module_config")
+        unknown = set(state) - {*learned, *description["params"], "_sklearn_version"}
+        if unknown:
+            raise TypeError(
+                f"estimator has an attribute {min(unknown)!r}, which a model file cannot hold: delete it, or pickle "
+                "the estimator."
+            )
+    elif getattr(estimator, "_bend", None) is not None or getattr(estimator, "_known", None) is not None:
         raise TypeError("estimator was conditioned, which a file cannot hold: save it before, or pickle it.")
-    own = _controller_arrays(estimator) if isinstance(estimator, DMPController) else estimator._arrays()
-    fitted = {name: plain.encode(getattr(estimator, name), name) for name in plain.learned_checks(estimator)}
-    description = {**plain.encode_parameters(estimator), "fitted": fitted}
-    part = _PARTS[type(estimator).__name__]
-    if not hasattr(estimator, part):
-        return description, own
-    inner, arrays = _described(getattr(estimator, part))
-    return {**description, part: inner}, own | {f"{part}.{key}": value for key, value in arrays.items()}
+    else:
+        arrays = _controller_arrays(estimator) if isinstance(estimator, DMPController) else estimator._arrays()
+    if part is not None and hasattr(estimator, part):
+        description[part], parts = _described(getattr(estimator, part))
+        arrays |= {f"{part}.{key}": value for key, value in parts.items()}
+    description["fitted"] = {name: plain.encode(getattr(estimator, name), name) for name in learned}
+    return description, arrays
 
 
-def _restored(description: Any, arrays: Arrays) -> Any:
-    """Estimator of a description and its arrays."""
-    estimator = plain.decode_parameters(description)
-    if isinstance(estimator, CovarianceRegressor):
-        _restore_regressor(estimator, description, arrays)
-        return estimator
-    part = _PARTS[description["class"]]
-    names = {"class", "params", "fitted"} | ({part} & set(description))
+def _restored(description: Any, arrays: Arrays, known: Mapping[str, str] = ESTIMATORS) -> Any:
+    """Estimator of a known class, of a description and its arrays."""
+    estimator = plain.decode_parameters(description, known)
+    part = _PARTS.get(description["class"], "module")
+    # A model of movements need not have a regressor.
+    names = {"class", "params", "fitted"} | ({part} if part == "module" else {part} & set(description))
     plain.check_entries(description, names, "its header")
-    learned, prefix = plain.decode_learned(estimator, description["fitted"]), f"{part}."
-    vars(estimator).update(learned)
-    if part in description:
-        inner = description[part]
-        if not isinstance(inner, dict) or inner.get("class") not in [*REGRESSORS, *MOVEMENTS]:
-            raise ValueError("its covariance is no regressor")
-        parts = {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
-        setattr(estimator, part, _restored(inner, parts))
-        own = getattr(estimator, part)
-        if (own.n_features_in_, own.n_outputs_) != (1, estimator.n_outputs_):
-            raise ValueError(f"its regressor must have 1 input, time, and {estimator.n_outputs_} outputs")
-    rest = {key: value for key, value in arrays.items() if not key.startswith(prefix)}
-    for name, array in rest.items():
+    vars(estimator).update(plain.decode_learned(estimator, description["fitted"]))
+    for name, array in arrays.items():
         _check_numbers(name, array)
+    if part == "module":
+        _restore_module(estimator, description["module"], arrays)
+        return estimator
+    prefix = f"{part}."
+    if part in description:
+        parts = {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
+        inner = _restored(description[part], parts, {**REGRESSORS, **MOVEMENTS})
+        if (inner.n_features_in_, inner.n_outputs_) != (1, estimator.n_outputs_):
+            raise ValueError(f"its regressor must have 1 input, time, and {estimator.n_outputs_} outputs")
+        setattr(estimator, part, inner)
+    rest = {key: value for key, value in arrays.items() if not key.startswith(prefix)}
     if isinstance(estimator, DMPController):
         _restore_controller(estimator, rest)
     else:
@@ -174,36 +180,16 @@ def _restored(description: Any, arrays: Arrays) -> Any:
     return estimator
 
 
-def _described_regressor(estimator: CovarianceRegressor) -> tuple[dict[str, Any], Arrays]:
-    state = estimator.__getstate__()
-    arrays, config = state.pop("_module_arrays"), state.pop("_module_config")
-    learned = {key: value for key, value in state.items() if key not in estimator.get_params(deep=False)}
-    unknown = set(learned) - {*plain.learned_checks(estimator), "feature_names_in_"}
-    if unknown:
-        raise TypeError(
-            f"estimator has an attribute {min(unknown)!r}, which a model file cannot hold: delete it, or pickle the "
-            "estimator."
-        )
-    fitted = {key: plain.encode(value, key) for key, value in learned.items()}
-    return {**plain.encode_parameters(estimator), "module": config, "fitted": fitted}, arrays
-
-
-def _restore_regressor(estimator: Any, description: dict[str, Any], arrays: Arrays) -> None:
-    plain.check_entries(description, {"class", "params", "fitted", "module"}, "its header")
-    learned = plain.decode_learned(estimator, description["fitted"])
-    for name, array in arrays.items():
-        _check_numbers(name, array)
-    state = {"_module_config": description["module"], "_module_arrays": arrays}
-    estimator.__setstate__({**vars(estimator), **learned, **state})
-    module = estimator.module_
-    sizes = (len(module.x_shift), len(module.y_shift))
-    if sizes != (estimator.n_features_in_, estimator.n_outputs_):
-        raise ValueError(f"its arrays are for {sizes[0]} inputs and {sizes[1]} outputs, it says otherwise")
-    if estimator._y_is_1d and estimator.n_outputs_ != 1:
-        raise ValueError(f"it says that y was 1-D, and that there are {estimator.n_outputs_} outputs")
-    if len(learned.get("feature_names_in_", module.x_shift)) != sizes[0]:
-        raise ValueError(f"it has not {sizes[0]} names of inputs")
-    if "df_" in learned and module.core.covariance.prior_root.shape[1] != estimator.df_:
+def _restore_module(estimator: Any, config: Any, arrays: Arrays) -> None:
+    estimator.__setstate__({**vars(estimator), "_module_config": config, "_module_arrays": arrays})
+    module, n_inputs, n_outputs = estimator.module_, estimator.n_features_in_, estimator.n_outputs_
+    if (len(module.x_shift), len(module.y_shift)) != (n_inputs, n_outputs):
+        raise ValueError(f"its arrays are not for {n_inputs} inputs and {n_outputs} outputs, as it says")
+    if estimator._y_is_1d and n_outputs != 1:
+        raise ValueError(f"it says that y was 1-D, and that there are {n_outputs} outputs")
+    if len(getattr(estimator, "feature_names_in_", module.x_shift)) != n_inputs:
+        raise ValueError(f"it has not {n_inputs} names of inputs")
+    if hasattr(estimator, "df_") and module.core.covariance.prior_root.shape[1] != estimator.df_:
         raise ValueError(f"df_ is {estimator.df_}, its arrays are for another")
     # What can be said of numbers that are well-formed is whether they predict at the middle of their data.
     mean, scale_tril = module(module.x_shift[None])
@@ -247,15 +233,15 @@ def _restore_controller(controller: Any, own: Arrays) -> None:
     check_parameters(controller)
     d = controller.n_outputs_
     for name in ("names_", "units_"):
-        if getattr(controller, name) is not None:
-            if len(getattr(controller, name)) != d:
-                raise ValueError(f"{name} has {len(getattr(controller, name))} entries, must have {d}")
-            setattr(controller, name, tuple(getattr(controller, name)))
+        if (value := getattr(controller, name)) is not None:
+            if len(value) != d:
+                raise ValueError(f"{name} has {len(value)} entries, must have {d}")
+            setattr(controller, name, tuple(value))
     own = {_HOLES: np.zeros(2), **own}  # none at the start, none at the end
     shapes: dict[str, tuple[int | str, ...]] = dict.fromkeys((*_NOISE, *_MOTION), (d,))
     shapes |= {"forcing": ("m", d), _HOLES: ("m",)}
     if set(_OF_POSES) & set(own):
-        shapes |= {"rotation_reference": (4,), "output_axes": (d, d)}
+        shapes |= dict(zip(_OF_POSES, ((4,), (d, d)), strict=True))
     plain.check_entries(own, set(shapes), "its arrays")
     for name, array in own.items():
         checks.array(array, name, shapes[name])
@@ -263,17 +249,16 @@ def _restore_controller(controller: Any, own: Arrays) -> None:
     if min(len(own["forcing"]), len(own[_HOLES])) < 2:
         raise ValueError(f"forcing and {_HOLES} must have a row at the start and one at the end")
     reference, axes = (own.pop(name, None) for name in _OF_POSES)
-    controller.outputs_ = outputs = Outputs(d if reference is None else d - 3, reference, axes)
     unit = reference is None or abs(float(np.linalg.norm(reference)) - 1.0) < 1e-9
     if not unit or (axes is not None and not np.linalg.cond(axes) < 1e12):
         raise ValueError("its rotation_reference must be a unit quaternion, and its output_axes independent")
+    controller.outputs_ = outputs = Outputs(d if reference is None else d - 3, reference, axes)
     controller.law_.blocks(d)
     for name in (*_NOISE, _HOLES):
         setattr(controller, name, own.pop(name))
     controller.dmp_ = dmp = primitive(controller)
     time = np.linspace(0.0, controller.duration_, len(own["forcing"]))
-    own_goals = controller.goal == "each"
     controller.reproduction_ = Reproduction(
-        dmp, controller.phase_input, own_goals, time=time, blocks=outputs.blocks, **own
+        dmp, controller.phase_input, controller.goal == "each", time=time, blocks=outputs.blocks, **own
     )
     controller.start_, controller.goal_ = own["start"], own["goal"]

@@ -6,7 +6,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torch_pbd import checks
 from torch_pbd.control.stiffness import RotationLimits, StiffnessLaw
@@ -31,13 +30,13 @@ def encode_parameters(estimator: Any) -> dict[str, Any]:
     return {"class": type(estimator).__name__, "params": {name: encode(value, name) for name, value in parameters}}
 
 
-def decode_parameters(description: Any) -> Any:
-    """Unfitted estimator of what :func:`encode_parameters` gave."""
+def decode_parameters(description: Any, known: Mapping[str, str] = ESTIMATORS) -> Any:
+    """Unfitted estimator of what :func:`encode_parameters` gave, of a known class."""
     if not isinstance(description, dict) or not {"class", "params"} <= set(description):
         raise ValueError("it has no class and parameters")
     name, parameters = description["class"], description["params"]
-    if name not in list(ESTIMATORS) or not isinstance(parameters, dict):  # a list asks for no hash
-        raise ValueError(f"it holds a {name!r:.80}; known are {', '.join(ESTIMATORS)}")
+    if name not in list(known) or not isinstance(parameters, dict):  # a list asks for no hash
+        raise ValueError(f"it holds a {name!r:.80}; known are {', '.join(known)}")
     if name == "DMPController":  # files from before there was a choice are of the printed equation
         parameters = {"adaptation": "additive", **parameters}
     estimator = load_class(name)(**_decoded(name, parameters))
@@ -47,19 +46,21 @@ def decode_parameters(description: Any) -> Any:
     return estimator
 
 
-def learned_checks(estimator: Any) -> dict[str, Check]:
-    """Attributes that a fit gives an estimator beside its module and arrays, and what each of them must be."""
+def learned_checks(estimator: Any, given: Any) -> dict[str, Check]:
+    """Attributes that a fit gives an estimator beside its module and arrays, and what each of them must be.
+
+    Names of columns are among them if they are among those ``given``: fits to arrays learn none.
+    """
     name = type(estimator).__name__
-    if name in MOVEMENTS:
-        return _MOVEMENT | estimator._learned
-    return dict(_CONTROLLER if name == "DMPController" else _REGRESSOR | estimator._learned)
+    if name == "DMPController":
+        return dict(_CONTROLLER)
+    table = {**(_MOVEMENT if name in MOVEMENTS else _REGRESSOR), **estimator._learned}
+    return table | ({"feature_names_in_": _names} if isinstance(given, dict) and "feature_names_in_" in given else {})
 
 
 def decode_learned(estimator: Any, values: Any) -> dict[str, Any]:
     """Learned attributes of an estimator, from their JSON; none is missing, unknown or not what it must be."""
-    table = learned_checks(estimator)
-    if "n_features_in_" in table and isinstance(values, dict) and "feature_names_in_" in values:
-        table["feature_names_in_"] = _names
+    table = learned_checks(estimator, values)
     check_entries(values, set(table), "what it learned")
     decoded = _decoded(type(estimator).__name__, values)
     for name, check in table.items():
@@ -106,16 +107,14 @@ def _decode(value: Any) -> Any:
     """Plain value or array, tuples as lists."""
     if isinstance(value, list):
         return [_decode(entry) for entry in value]
-    return _array(value) if isinstance(value, dict) else value
-
-
-def _array(marked: dict[str, Any]) -> NDArray[Any]:
-    if set(marked) != {"array", "dtype"} or marked["dtype"] not in _DTYPES:
-        raise ValueError(f"it holds an object of {', '.join(marked)!r:.80}")
-    array = np.array(marked["array"], dtype=marked["dtype"])
+    if not isinstance(value, dict):
+        return value
+    if set(value) != {"array", "dtype"} or value["dtype"] not in _DTYPES:
+        raise ValueError(f"it holds an object of {', '.join(value)!r:.80}")
+    array = np.array(value["array"], dtype=value["dtype"])
     # NumPy would make numbers of text, and round them: only what it gives back unchanged is of this type.
-    if array.tolist() != marked["array"] or (array.dtype == object and not all(isinstance(x, str) for x in array.flat)):
-        raise ValueError(f"{marked['array']!r:.80} are no entries of an array of {marked['dtype']}")
+    if array.tolist() != value["array"] or (array.dtype == object and not all(isinstance(x, str) for x in array.flat)):
+        raise ValueError(f"{value['array']!r:.80} are no entries of an array of {value['dtype']}")
     return array
 
 
@@ -132,9 +131,7 @@ def _law(value: Any) -> StiffnessLaw | None:
 
 def _regressor(value: Any) -> Any:
     """An unfitted regressor or movement model, or None."""
-    if isinstance(value, dict) and value.get("class") not in [*REGRESSORS, *MOVEMENTS]:
-        raise ValueError("its covariance is no regressor")
-    return decode_parameters(value) if isinstance(value, dict) else value
+    return decode_parameters(value, {**REGRESSORS, **MOVEMENTS}) if isinstance(value, dict) else value
 
 
 def _fitted_law(value: Any, name: str) -> None:
