@@ -451,20 +451,9 @@ def test_a_step_without_variance_does_not_distort_its_neighbours(grouped):
 def test_a_length_scale_that_is_given_is_held():
     model = new("heteroscedastic", length_scale=0.7).fit(*demonstrations())
     process = model.module_.core.covariance_process
-    for family, theta in (
-        (process.log_variance_family, process.log_variance_theta),
-        (process.coefficient_family, process.coefficient_theta),
-    ):
-        expected = torch.full((len(theta), 1), 0.7 / 2.0, dtype=torch.float64)  # in ranges of X
-        torch.testing.assert_close(family.length_scale_of(theta), expected, rtol=1e-12, atol=0)
-
-
-def test_a_shared_length_scale_is_one():
-    shared = HeteroscedasticGPRegressor(kernel="matern52", shared_length_scale=True).fit(*demonstrations()).module_.core
-    own = fitted("heteroscedastic").module_.core
-    for name in ("mean_theta", "log_variance_theta"):
-        assert len(getattr(shared, name)[:, 0].unique()) == 1
-        assert len(getattr(own, name)[:, 0].unique()) == 2
+    for processes in (process.log_variances, process.rows):
+        expected = torch.full_like(processes.length_scale, 0.7 / 2.0)  # in ranges of X
+        torch.testing.assert_close(processes.length_scale, expected, rtol=1e-12, atol=0)
 
 
 def test_other_units_of_x_and_y_are_the_same_model():
@@ -512,7 +501,6 @@ def test_gait_is_continuous_across_the_end_of_its_period(kernel, rng):
         ({"kernel": "rbf"}, "kernel"),
         ({"n_inducing": 1}, "n_inducing"),
         ({"max_inputs": 1}, "max_inputs"),
-        ({"shared_length_scale": "yes"}, "shared_length_scale"),
         ({"length_scale": -1.0}, "length_scale"),
         ({"period": 0.0}, "period"),
     ],

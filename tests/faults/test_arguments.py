@@ -217,7 +217,6 @@ FLAGS = [
     (lambda: StiffnessLaw(sigma_low=0.1, sigma_high=0.2, bounds="sigma", smooth="no"), "smooth"),
     (lambda: AdmittancePlant(feed_forward="no"), "feed_forward"),
     (lambda: Tunnel(virtual="no"), "virtual"),
-    (lambda: new("heteroscedastic", shared_length_scale="no").fit(*demonstrations()), "shared_length_scale"),
 ]
 
 

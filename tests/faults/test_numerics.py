@@ -122,7 +122,6 @@ BAD_PARAMETERS = {
     "reg_covar": (0.0, ValueError),
     "latent_prior": ("False", ValueError),
     "bias_correction": (None, ValueError),
-    "shared_length_scale": (1, ValueError),
 }
 
 

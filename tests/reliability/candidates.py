@@ -44,7 +44,7 @@ CANDIDATES: dict[str, list[CovarianceRegressor]] = {
     ],
     "heteroscedastic": [
         HeteroscedasticGPRegressor(),
-        HeteroscedasticGPRegressor(kernel="matern32", shared_length_scale=True),
+        HeteroscedasticGPRegressor(kernel="matern32"),
         HeteroscedasticGPRegressor(kernel="matern52", n_inducing=8),
         HeteroscedasticGPRegressor(kernel="periodic", period=1.0),
     ],

@@ -17,13 +17,14 @@ from torch_pbd.files.memory import require_much
 from torch_pbd.kernels import KERNELS, KernelName
 from torch_pbd.linalg import safe_cholesky
 from torch_pbd.models.heteroscedastic import (
-    Families,
     HeteroscedasticModel,
     SearchOptions,
+    candidate_families,
+    check_memory,
     fit_heteroscedastic,
+    inducing_sizes,
     mean_start,
 )
-from torch_pbd.models.heteroscedastic.families import check_memory, inducing_sizes
 from torch_pbd.models.training import TrainingSet, default_prior_tril
 
 _DRAWN = 65536  # matrices drawn at a time: memory stays bounded
@@ -53,8 +54,6 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         callable maps X (n, e) to (n, d, d). None learns a wide one: four times the covariance of all of y.
     length_scale : float, array-like of shape (n_features,) or None, default=None
         Length scale of the covariance's processes, in units of X; None learns it.
-    shared_length_scale : bool, default=False
-        One length scale for the log variances of all outputs, and one for all means, instead of one for each.
     n_inducing : int or None, default=None
         Inputs on which the processes rest. None takes all distinct inputs up to 48 and of more the centres of as
         many neighbourhoods; if the length scales that are found come near their distances, 128; at once for
@@ -136,7 +135,6 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
     period: float | list[float] | None = None
     prior: Prior = None
     length_scale: float | list[float] | None = None
-    shared_length_scale: bool = False
     n_inducing: int | None = None
     max_inputs: int = 512
     max_iter: int = 100
@@ -233,7 +231,6 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         checks.choice(self.kernel, "kernel", (*KERNELS, "periodic"))
         checks.count(self.n_inducing, "n_inducing", least=2, optional=True)
         checks.count(self.max_inputs, "max_inputs", least=2)
-        checks.flag(self.shared_length_scale, "shared_length_scale")
 
     def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, recorded: Integers) -> Fitted:
         if groups is not None:
@@ -249,12 +246,13 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         options = SearchOptions(self.max_iter, self.tol, self.n_restarts, self._progress())
         kernel: KernelName = "squared_exponential" if self.kernel == "periodic" else self.kernel
         sizes = inducing_sizes(self.n_inducing, X.shape[1], y.shape[1])
-        of_all: dict[str, Any] = {"period": circle, "length_scale": held, "shared": self.shared_length_scale}
-        to_try = Families.candidates(training.inputs, len(rows.inputs), sizes, kernel=kernel, **of_all)
+        to_try = candidate_families(
+            training.inputs, len(rows.inputs), sizes, kernel=kernel, period=circle, length_scale=held
+        )
         begin = partial(mean_start, rows, to_try[0].mean, options) if self.n_inducing is None else None
         fit = fit_heteroscedastic(training, group, to_try, options, begin=begin)
-        features = fit.covariance.log_variance_family.features
-        least = features.shortest_length_scale
+        family = fit.covariance.log_variances.family
+        least = family.shortest_length_scale
         if held is not None and bool((held < least).any()):
             checks.warn(
                 f"length_scale is below {least:.3g} of the range of X, which is what the inputs (or n_inducing of "
@@ -263,7 +261,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         warn_of_residuals(fit, group, self._door(recorded).long())
         self.effective_share_ = 1.0 if fit.correlation is None else float(fit.correlation.share.mean())
         report = options.outcome(tuple(-value for value in fit.log_evidence))
-        return Fitted(self._assemble(HeteroscedasticModel(fit, prior_tril), scaling), report, features.jitter)
+        return Fitted(self._assemble(HeteroscedasticModel(fit, prior_tril), scaling), report, family.jitter)
 
     def _check_memory(self, n_distinct: int, n_features: int, n_outputs: int) -> None:
         check_memory(self.n_inducing, self.max_inputs, (n_distinct, n_features, n_outputs))

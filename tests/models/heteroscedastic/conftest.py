@@ -1,7 +1,6 @@
 import pytest
 import torch
 
-from torch_pbd.gp.inducing import FeatureMap
 from torch_pbd.models.heteroscedastic import ProcessFamily
 
 
@@ -14,4 +13,4 @@ def inputs():
 @pytest.fixture
 def family(inputs):
     """Processes with the inputs as inducing ones, and a constant."""
-    return ProcessFamily(FeatureMap(inputs, "matern52", exact=True), 0.5, 1.0, 2.0)
+    return ProcessFamily(inputs, 0.5, 1.0, 2.0, kernel="matern52", exact=True)

@@ -2,12 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from torch_pbd.models.heteroscedastic.residuals import (
-    DemonstrationCorrelation,
-    NoiseCorrelation,
-    demonstration_correlation,
-    mean_whitener,
-)
+from torch_pbd.models.heteroscedastic.residuals import DemonstrationCorrelation, demonstration_correlation
 from torch_pbd.models.training import TrainingSet
 
 
@@ -97,25 +92,14 @@ def test_the_whiteners_take_out_the_correlation_of_means_of_rows(rng):
     group = np.concatenate([np.arange(6) % 4, rng.integers(4, size=20)])
     inputs, index_of = torch.tensor(x)[:, None], torch.tensor(index)
     rows = TrainingSet(inputs[index_of], torch.zeros(26, 1).double(), inputs, index_of)
-    arguments = known(0.2, 0.0), rows, torch.tensor(group)
-    noise = NoiseCorrelation.build(*arguments)
+    means, squares = (known(0.2, 0.0).at_inputs(rows, torch.tensor(group), squares=each) for each in (False, True))
     average = (np.arange(6)[:, np.newaxis] == index) / np.sqrt(np.bincount(index))[:, np.newaxis]
     distance = np.abs(np.subtract.outer(x[index], x[index]))
-    for whitener, decay in ((mean_whitener(*arguments), 0.4), (noise.square_whitener, 0.2)):
+    for (whitener, copies), decay in ((means, 0.4), (squares, 0.2)):
         rows = np.exp(-distance / decay) * (group[:, np.newaxis] == group)
         covariance = average @ rows @ average.T
         whitened = whitener[0].numpy() @ covariance @ whitener[0].numpy().T
         np.testing.assert_allclose(whitened, np.eye(6), rtol=0, atol=1e-10)
-        np.testing.assert_allclose(noise.copies[0], np.diag(covariance), rtol=1e-12)
+        np.testing.assert_allclose(copies[0], np.diag(covariance), rtol=1e-12)
         np.testing.assert_array_equal(whitener[1], np.eye(6))  # of the output whose samples are independent
-    assert noise.copies[0].max() > 1.0  # some demonstration repeats an input
-    assert torch.equal(noise.restrict(torch.tensor([1])).square_whitener, noise.square_whitener[1:])
-
-
-@pytest.mark.parametrize("correlation", [None, known(0.0, 0.0), known(0.2, 0.0)])
-def test_without_correlation_or_groups_there_is_nothing_to_take_out(correlation):
-    group = None if correlation is not None and correlation.matters else torch.tensor([0, 0, 1])
-    inputs = torch.zeros(3, 1).double()
-    rows = TrainingSet(inputs, inputs, inputs, torch.arange(3))
-    assert NoiseCorrelation.build(correlation, rows, group) == NoiseCorrelation()
-    assert mean_whitener(correlation, rows, group) is None
+    assert squares.copies[0].max() > 1.0  # some demonstration repeats an input

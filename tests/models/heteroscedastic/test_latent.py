@@ -16,7 +16,8 @@ def latent(family, rng):
 
     theta = torch.tensor([[-1.0, 0.3], [0.2, -0.5], [-0.5, 0.0]], dtype=torch.float64)
     coefficients = [weights(size=10), weights(size=20)]
-    return LatentCovariance(family, family, theta, weights(3, size=10), theta[1:], coefficients)
+    processes, rows = family.prepared(theta), family.prepared(theta[1:])
+    return LatentCovariance(theta, processes, weights(3, size=10), theta[1:], rows, coefficients)
 
 
 def test_a_draw_has_the_mean_and_the_variances_of_the_moments(latent, inputs):

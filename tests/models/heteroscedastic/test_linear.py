@@ -17,7 +17,7 @@ def test_posterior_of_the_weights_is_that_of_scikit_learn(n, p, rng):
     design, response = rng.normal(size=(n, p)), rng.normal(size=n)
     peer = GaussianProcessRegressor(DotProduct(sigma_0=0.0, sigma_0_bounds="fixed"), alpha=1.0, optimizer=None)
     mean, covariance = peer.fit(design, response).predict(np.eye(p), return_cov=True)
-    found = LinearEvidence.fit(torch.tensor(design), torch.tensor(response)).weights()
+    found = LinearEvidence.fit(torch.tensor(design), torch.tensor(response)).weights
     np.testing.assert_allclose(found.mean, mean, rtol=1e-9, atol=1e-11)
     np.testing.assert_allclose(found.root @ found.root.mT, covariance, rtol=1e-9, atol=1e-11)
     assert torch.equal(found.root, found.root.triu())
@@ -47,7 +47,7 @@ def test_gradient_of_the_log_evidence_is_that_of_autograd(scale, generator):
 
 def test_divergence_from_the_prior_is_that_of_torch(rng):
     linear = LinearEvidence.fit(torch.tensor(rng.normal(size=(9, 4))), torch.tensor(rng.normal(size=9)))
-    weights = linear.weights()
+    weights = linear.weights
     prior = MultivariateNormal(torch.zeros(4, dtype=torch.float64), torch.eye(4, dtype=torch.float64))
     expected = kl_divergence(MultivariateNormal(weights.mean, weights.root @ weights.root.mT), prior)
     assert float(linear.divergence_from_prior()) == pytest.approx(float(expected), rel=1e-9)

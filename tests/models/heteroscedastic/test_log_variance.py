@@ -11,7 +11,7 @@ from torch_pbd.models.heteroscedastic.log_variance import Squares
 from torch_pbd.models.heteroscedastic.log_variance import fit_log_variance as fit
 from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation
 
-INDEPENDENT = NoiseCorrelation()
+INDEPENDENT = None
 
 
 def fit_log_variance(squares, features):

@@ -3,21 +3,20 @@ import pytest
 import torch
 from scipy.linalg import block_diag
 
-from torch_pbd.gp.inducing import FeatureMap
 from torch_pbd.kernels import correlation
 from torch_pbd.models.heteroscedastic import ProcessFamily, SearchOptions
 from torch_pbd.models.heteroscedastic.mean import fit_mean
-from torch_pbd.models.heteroscedastic.processes import Search
+from torch_pbd.models.heteroscedastic.search import Search
 
 
 def search_of(family, d):
-    return Search(family, d, 1, SearchOptions())
+    return Search(family, d, SearchOptions())
 
 
 def prior_gram(family, theta, x, other):
     """Kernel matrix of all outputs at inputs, one output after another."""
     amplitude, length_scale = family.amplitude_of(theta), family.length_scale_of(theta)
-    blocks = correlation(x, other, length_scale, family.features.kernel).numpy()
+    blocks = correlation(x, other, length_scale, family.kernel).numpy()
     return block_diag(*(float(a) ** 2 * block for a, block in zip(amplitude, blocks, strict=True)))
 
 
@@ -26,7 +25,7 @@ def prior_gram(family, theta, x, other):
 def test_the_mean_is_a_dense_regression_of_all_outputs_under_their_noise(d, whitened, inputs, rng):
     """Kernel matrix over outputs and inputs, noise of blocks that differ between inputs: generalized least squares."""
     n = len(inputs)
-    family = ProcessFamily(FeatureMap(inputs, "matern32", exact=True), 0.3, 1.2, 0.0)
+    family = ProcessFamily(inputs, 0.3, 1.2, 0.0, kernel="matern32", exact=True)
     tril = np.tril(rng.normal(size=(n, d, d)), -1) + np.eye(d) * rng.uniform(0.2, 1.5, size=(n, 1, d))
     counts = rng.integers(1, 6, size=n).astype(float)
     along = np.exp(-np.abs((inputs - inputs.T).numpy()) / 0.2) if whitened else np.eye(n)
@@ -51,7 +50,7 @@ def test_the_mean_is_a_dense_regression_of_all_outputs_under_their_noise(d, whit
 
 
 def test_away_from_the_inducing_inputs_the_error_is_the_whole_prior_variance(inputs):
-    family = ProcessFamily(FeatureMap(inputs[::3]), 0.3, 1.2, 0.0)
+    family = ProcessFamily(inputs[::3], 0.3, 1.2, 0.0)
     tril = 0.1 * torch.eye(2, dtype=torch.float64).expand(9, 2, 2)
     means = torch.cat([torch.sin(4.0 * inputs), torch.cos(9.0 * inputs)], dim=1)
     found = fit_mean(search_of(family, 2), inputs, means, torch.full((9,), 4.0).double(), tril, None)
@@ -61,7 +60,7 @@ def test_away_from_the_inducing_inputs_the_error_is_the_whole_prior_variance(inp
 
 
 def test_hyperparameters_of_an_output_do_not_depend_on_the_others(inputs, rng):
-    family = ProcessFamily(FeatureMap(inputs, exact=True), 0.3, 1.2, 0.0)
+    family = ProcessFamily(inputs, 0.3, 1.2, 0.0, exact=True)
     means = torch.tensor(np.sin(3.0 * inputs.numpy() + np.arange(2)) + 0.1 * rng.normal(size=(9, 2)))
     tril = 0.2 * torch.eye(2, dtype=torch.float64).expand(9, 2, 2)
     counts = torch.ones(9, dtype=torch.float64)

@@ -8,7 +8,6 @@ import torch
 from scipy.optimize import brentq
 from scipy.special import polygamma
 
-from torch_pbd.gp.inducing import FeatureMap
 from torch_pbd.models.conditional import ConditionalNormal
 from torch_pbd.models.heteroscedastic import (
     Families,
@@ -30,11 +29,9 @@ def fitted(d=2, *, period=None, length_scale=None, n=12, n_demos=8, seed=0):
     factor = 0.3 * np.exp(x)[:, :, np.newaxis] * (np.eye(d) + 0.4 * np.tril(np.ones((d, d)), -1))
     y = np.sin(3.0 * x + np.arange(d)) + (factor @ rng.normal(size=(n * n_demos, d, 1)))[..., 0]
     training = TrainingSet(*map(torch.tensor, (x, y, inputs, index)))
-    features = FeatureMap(torch.tensor(inputs), "matern52", period, exact=True)
     families = Families(
-        ProcessFamily(features, 0.3, 1.2, 0.0),
-        ProcessFamily(features, 0.5, 1.0, 2.0, length_scale),
-        ProcessFamily(features, 0.5, 0.3, 1.0, length_scale),
+        ProcessFamily(torch.tensor(inputs), 0.3, 1.2, 0.0, None, "matern52", period, exact=True),
+        ProcessFamily(torch.tensor(inputs), 0.5, 1.0, 2.0, length_scale, "matern52", period, exact=True),
     )
     fit = fit_heteroscedastic(training, None, [families], SearchOptions(), n_turns=2)
     return HeteroscedasticModel(fit, PRIOR * torch.eye(d, dtype=torch.float64))

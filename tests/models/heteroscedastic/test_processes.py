@@ -1,9 +1,8 @@
 import pytest
 import torch
 
-from torch_pbd.gp.inducing import FeatureMap, FixedFeatures
 from torch_pbd.kernels import correlation
-from torch_pbd.models.heteroscedastic import ProcessFamily
+from torch_pbd.models.heteroscedastic.processes import FixedFeatures, ProcessFamily
 
 
 def tensor(values):
@@ -28,9 +27,9 @@ def test_nothing_is_unexplained_at_inducing_inputs_and_all_far_away(family, inpu
 
 
 def test_hyperparameters_stay_within_what_the_inducing_inputs_resolve(inputs):
-    family = ProcessFamily(FeatureMap(inputs), 0.5, 1.0, 0.0)
+    family = ProcessFamily(inputs, 0.5, 1.0, 0.0)
     theta = tensor([[-50.0, -1e3], [0.0, 1e3]])
-    assert family.length_scale_of(theta)[0].item() == pytest.approx(family.features.shortest_length_scale, rel=1e-9)
+    assert family.length_scale_of(theta)[0].item() == pytest.approx(family.shortest_length_scale, rel=1e-9)
     torch.testing.assert_close(family.amplitude_of(theta).log(), tensor([-4.0, 4.0]), rtol=1e-9, atol=0)
 
 
@@ -41,7 +40,7 @@ def test_a_design_that_leaves_out_what_cannot_be_told_has_the_kernel_and_its_gra
     """Gradient of a function of the kernel, by autograd through all features."""
     held = None if fixed_length_scale is None else tensor(fixed_length_scale)
     many = torch.linspace(-0.5, 0.5, 30, dtype=torch.float64)[:, None]
-    family = ProcessFamily(FeatureMap(many), 0.5, 1.0, 2.0, held)
+    family = ProcessFamily(many, 0.5, 1.0, 2.0, held)
     theta = tensor([[-1.0, 0.3], [0.2, -0.5]]).requires_grad_()
     weight = torch.randn(9, 9, dtype=torch.float64, generator=generator)
 
@@ -50,7 +49,7 @@ def test_a_design_that_leaves_out_what_cannot_be_told_has_the_kernel_and_its_gra
 
     whole = family.prepared(theta)(inputs)
     (expected,) = torch.autograd.grad(of_kernel(whole).sum(), theta)
-    design, vjp = family.design_vjp(FixedFeatures(family.features, inputs), theta.detach(), tensor([1e3, 1e3]))
+    design, vjp = family.design_vjp(FixedFeatures(family, inputs), theta.detach(), tensor([1e3, 1e3]))
     assert design.shape[-1] < 20
     torch.testing.assert_close(design @ design.mT, whole @ whole.mT, rtol=0, atol=1e-7)
     values = design.clone().requires_grad_()

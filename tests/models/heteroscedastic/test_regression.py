@@ -24,7 +24,7 @@ class Rows:
 
 
 def fitted(regression, features, precision):
-    weights = regression.fit(features[None], precision).weights()
+    weights = regression.fit(features[None], precision).weights
     return type(weights)(weights.mean[0], weights.root[0])
 
 
@@ -81,16 +81,14 @@ def test_squares_are_those_of_the_rows_and_what_the_error_of_the_coefficients_ad
     rows = Rows(rng)
     features = rng.normal(size=(3, 4))
     mean, root = rng.normal(size=8), np.triu(rng.normal(size=(8, 8)))
-    explained, unknown = rows.regression.squares(
-        torch.tensor(features), torch.tensor(mean), torch.tensor(root @ root.T)
-    )
+    parameters = torch.tensor(features), torch.tensor(mean), torch.tensor(root @ root.T)
+    expected = rows.regression.expected_squares(*parameters)
     for t in range(3):
         spread = np.kron(np.eye(2), features[t])  # coefficients from weights
         residual = rows.last[t] - rows.before[t] @ (spread @ mean)
-        assert float(explained[t]) == pytest.approx(residual @ residual, rel=RTOL)
         covariance = spread @ root @ root.T @ spread.T
         trace = sum(row @ covariance @ row for row in rows.before[t])
-        assert float(unknown[t]) == pytest.approx(trace, rel=RTOL)
+        assert float(expected[t]) == pytest.approx(residual @ residual + trace, rel=RTOL)
 
 
 @pytest.mark.parametrize(("i", "k"), [(1, 5), (2, 8), (8, 20)])

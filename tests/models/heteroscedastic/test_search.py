@@ -4,10 +4,9 @@ import torch
 from scipy.optimize import minimize
 
 from torch_pbd.exceptions import NotPositiveDefiniteError
-from torch_pbd.gp.inducing import FeatureMap
 from torch_pbd.models.heteroscedastic import ProcessFamily, SearchOptions
-from torch_pbd.models.heteroscedastic.processes import Search
 from torch_pbd.models.heteroscedastic.regression import LinearEvidence
+from torch_pbd.models.heteroscedastic.search import Search
 from torch_pbd.optim import Status
 
 
@@ -37,9 +36,9 @@ def many_inputs():
 
 
 def test_the_search_ends_where_that_of_scipy_does(many_inputs, rng):
-    family = ProcessFamily(FeatureMap(many_inputs, exact=True), 0.3, 1.2, 0.0)
+    family = ProcessFamily(many_inputs, 0.3, 1.2, 0.0, exact=True)
     evidence = evidence_of(family, many_inputs, curves(many_inputs, rng))
-    theta = Search(family, 2, 1, SearchOptions(100, 1e-5)).run(evidence, many_inputs)
+    theta = Search(family, 2, SearchOptions(100, 1e-5)).run(evidence, 40)
     for i in (0, 1):
 
         def loss(point, i=i):
@@ -52,37 +51,22 @@ def test_the_search_ends_where_that_of_scipy_does(many_inputs, rng):
         np.testing.assert_allclose(theta[i], best.x, rtol=0, atol=1e-2)
 
 
-def test_a_shared_length_scale_is_that_of_the_joint_evidence(many_inputs, rng):
-    family = ProcessFamily(FeatureMap(many_inputs, exact=True), 0.3, 1.2, 0.0, shared=True)
-    evidence = evidence_of(family, many_inputs, curves(many_inputs, rng))
-    theta = Search(family, 2, 1, SearchOptions(100, 1e-5)).run(evidence, many_inputs)
-    assert theta[0, 0] == theta[1, 0]
-    assert theta[0, 1] != theta[1, 1]
-
-    def loss(point):
-        both = tensor([[point[0], point[1]], [point[0], point[2]]])
-        return -float((evidence(both, torch.arange(2))[0] + family.log_prior(both)[0]).sum())
-
-    best = minimize(loss, [-1.0, 0.0, 0.0], method="Nelder-Mead", options={"maxiter": 2000})
-    assert loss([theta[0, 0], theta[0, 1], theta[1, 1]]) < best.fun + 1e-4
-
-
 def test_the_next_run_starts_where_the_last_ended(many_inputs, rng):
     """With the same evidence it is at the end with its first evaluation; with another it goes on from there."""
-    family = ProcessFamily(FeatureMap(many_inputs, exact=True), 0.3, 1.2, 0.0)
+    family = ProcessFamily(many_inputs, 0.3, 1.2, 0.0, exact=True)
     response = curves(many_inputs, rng)
-    search = Search(family, 2, 1, SearchOptions(100, 1e-5))
-    first = search.run(evidence_of(family, many_inputs, response), many_inputs)
-    assert torch.equal(search.run(evidence_of(family, many_inputs, response), many_inputs), first)
+    search = Search(family, 2, SearchOptions(100, 1e-5))
+    first = search.run(evidence_of(family, many_inputs, response), 40)
+    assert torch.equal(search.run(evidence_of(family, many_inputs, response), 40), first)
     assert search.options.ends[-1] == (0, Status.CONVERGED)
     other = evidence_of(family, many_inputs, response + 0.05 * torch.randn(2, 40).double())
-    anew = Search(family, 2, 1, SearchOptions(100, 1e-5)).run(other, many_inputs)
+    anew = Search(family, 2, SearchOptions(100, 1e-5)).run(other, 40)
     torch.testing.assert_close(search.run(other, many_inputs), anew, rtol=0, atol=1e-3)
 
 
 @pytest.mark.parametrize("n_restarts", [0, 2])
 def test_evidence_that_cannot_be_computed_is_gone_around(n_restarts, many_inputs, rng):
-    family = ProcessFamily(FeatureMap(many_inputs, exact=True), 0.3, 1.2, 0.0)
+    family = ProcessFamily(many_inputs, 0.3, 1.2, 0.0, exact=True)
     evidence = evidence_of(family, many_inputs, curves(many_inputs, rng))
 
     def limited(theta, rows):
@@ -90,6 +74,6 @@ def test_evidence_that_cannot_be_computed_is_gone_around(n_restarts, many_inputs
             raise NotPositiveDefiniteError("too large")
         return evidence(theta, rows)
 
-    expected = Search(family, 2, 1, SearchOptions(100, 1e-5)).run(evidence, many_inputs)
-    found = Search(family, 2, 1, SearchOptions(100, 1e-5, n_restarts)).run(limited, many_inputs)
+    expected = Search(family, 2, SearchOptions(100, 1e-5)).run(evidence, 40)
+    found = Search(family, 2, SearchOptions(100, 1e-5, n_restarts)).run(limited, 40)
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-3)

@@ -18,10 +18,10 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from torch_pbd.linalg import scale_tril_from_root
-from torch_pbd.models.heteroscedastic.covariance import LatentCovariance, fit_covariance
-from torch_pbd.models.heteroscedastic.families import Families
+from torch_pbd.models.heteroscedastic.covariance import CovarianceSearch, LatentCovariance, fit_covariance
+from torch_pbd.models.heteroscedastic.log_variance import Squares, on_stretched_inputs, stretched
 from torch_pbd.models.heteroscedastic.mean import MOST_INPUTS, LatentMean, MeanStart, fit_mean
-from torch_pbd.models.heteroscedastic.processes import Search, SearchOptions
+from torch_pbd.models.heteroscedastic.processes import ProcessFamily
 from torch_pbd.models.heteroscedastic.residuals import (
     LAGS,
     NOT_WHITE,
@@ -29,9 +29,10 @@ from torch_pbd.models.heteroscedastic.residuals import (
     NoiseCorrelation,
     demonstration_correlation,
     is_signal,
-    mean_whitener,
 )
+from torch_pbd.models.heteroscedastic.search import Families, Search, SearchOptions
 from torch_pbd.models.training import TrainingSet, pooled_tril
+from torch_pbd.optim import Progress
 
 # Rows at an input whose mean is all their own still count for this share of a degree of freedom, or nothing there
 # would be known of the variance.
@@ -107,7 +108,10 @@ def fit_heteroscedastic(
         Looks for another mean, :func:`mean_start`, where the first one does not follow the data.
     """
     families, larger = to_try[0], to_try[1] if len(to_try) > 1 else None
-    at = _State(training, group, families, options, larger, training, _start_tril(training))
+    n_demos = 1 if group is None else int(group.max()) + 1
+    at = _State(training, group, n_demos, families, options, larger, training, _start_tril(training))
+    # Share of the rows that count before the correlation of a demonstration's samples is known.
+    part = 1.0 if group is None else min(1.0, _FIRST_SAMPLES * n_demos / len(group))
     evidences: list[float] = []
     started, turn = time.perf_counter(), 0
     while turn < n_turns:
@@ -120,24 +124,24 @@ def fit_heteroscedastic(
         at.pooled = at.pooled if turn else _pooled_tril(residual, share)
         # w = inv(C) r of each row; at each input their scatter S, the sum of w w', and its degrees of freedom.
         normal = _solve(at.pooled, residual)
-        scatter, degrees = _scatter(at.training, normal, share, 1.0 if turn else _first_part(at.training, group))
-        noise = NoiseCorrelation.build(at.correlation, at.training, group)
+        scatter, degrees = _scatter(at.training, normal, share, part if turn == 0 else 1.0)
+        noise = at.noise_correlation(at.training, squares=True)
         if turn == 1:
             at.stretch_ends(normal, noise)
         # l and phi given S, whose likelihood is that of a Wishart distribution.
         fitted = at.training
         at.covariance, evidence = fit_covariance(
-            at.searches, fitted.inputs, scatter, degrees, noise, at.covariance, cautious=turn == 0
+            at.search, fitted.inputs, scatter, degrees, noise, at.covariance, cautious=turn == 0
         )
         evidences.append(evidence)
-        options.report(len(evidences), -evidence, time.perf_counter() - started)
+        if options.callback is not None:
+            options.callback(Progress(len(evidences), -evidence, time.perf_counter() - started))
         if at.refine(mean):
             n_turns = max(n_turns, turn + 2)
         if turn < n_turns - 1:
             at.correlate(normal)
         turn += 1
     assert at.covariance is not None
-    n_demos = 1 if group is None else int(group.max()) + 1
     kept = mean, at.covariance, at.pooled, at.correlation
     return HeteroscedasticFit(*kept, tuple(evidences), fitted, residual, n_demos)
 
@@ -148,6 +152,7 @@ class _State:
 
     training: TrainingSet
     group: Tensor | None
+    n_demos: int
     families: Families
     options: SearchOptions
     larger: Families | None
@@ -158,8 +163,13 @@ class _State:
     correlation: DemonstrationCorrelation | None = None
 
     def __post_init__(self) -> None:
-        self.mean_search = Search(self.families.mean, *self._shape, self.options)
-        self.searches = self.families.covariance_searches(*self._shape, self.options)
+        self.mean_search = Search(self.families.mean, self.training.y.shape[1], self.options)
+        self._begin_covariance(self.families.log_variance)
+
+    def _begin_covariance(self, log_variance: ProcessFamily) -> None:
+        """Begin the searches of the covariance anew, on processes of a family."""
+        self.families = self.families._replace(log_variance=log_variance)
+        self.search = CovarianceSearch(self.families, self.training.y.shape[1], self.options)
 
     def fit_mean(self, begin: Callable[[], MeanStart] | None) -> LatentMean:
         """Mean under the noise so far; or from another beginning, where this one does not follow the data."""
@@ -170,26 +180,41 @@ class _State:
         self.mean_search, self.pooled, self.rows = start.search, start.noise_tril, start.rows
         return self._mean()
 
-    def stretch_ends(self, normal: Tensor, noise: NoiseCorrelation) -> None:
+    def _mean(self) -> LatentMean:
+        rows = self.rows
+        noise = self.noise_correlation(rows, squares=False)
+        whitener = None if noise is None else noise.whitener
+        tril = _noise_tril(rows.inputs, self.pooled, self.covariance)
+        return fit_mean(self.mean_search, rows.inputs, rows.means(), rows.counts, tril, whitener)
+
+    def noise_correlation(self, rows: TrainingSet, *, squares: bool) -> NoiseCorrelation | None:
+        """Correlation of the means, or the mean ``squares``, of rows at different inputs; None where there is none."""
+        if self.group is None or self.correlation is None or not self.correlation.matters:
+            return None
+        return self.correlation.at_inputs(rows, self.group, squares=squares)
+
+    def stretch_ends(self, normal: Tensor, noise: NoiseCorrelation | None) -> None:
         """Stretch the ends where the covariance collapses; and begin its searches anew if what the first turn took for
         independent is not, or has other features: that is no place to start from.
         """
-        before = self.families
-        self.families = before.stretched(self.training, normal, noise, self.options)
-        if self.families is not before or (self.correlation is not None and self.correlation.matters):
-            self.covariance, self.searches = None, self.families.covariance_searches(*self._shape, self.options)
+        before = self.families.log_variance
+        squares = _squares_within(self.training, normal, noise)
+        after = stretched(before, self.training.inputs, squares, self.options)
+        if after is not before or noise is not None:
+            self.covariance = None
+            self._begin_covariance(after)
 
     def refine(self, mean: LatentMean) -> bool:
         """Go on with more inducing inputs where these do not resolve what was found; whether there is need to."""
         if self.larger is None or self.covariance is None:
             return False
-        coarse_mean = not self.mean_search.held and not mean.family.resolved(mean.theta)
+        coarse_mean = not self.mean_search.held and not mean.processes.resolved
         if coarse_mean:
-            self.mean_search = Search(self.larger.mean, *self._shape, self.options)
-        coarse = not self.covariance.resolved
+            self.mean_search = Search(self.larger.mean, self.training.y.shape[1], self.options)
+        coarse = not (self.covariance.log_variances.resolved and self.covariance.rows.resolved)
         if coarse:
-            self.families = self.families.refined(self.larger, self.training.inputs)
-            self.searches = self.families.covariance_searches(*self._shape, self.options)
+            stretch = self.families.log_variance.stretch
+            self._begin_covariance(on_stretched_inputs(self.larger.log_variance, self.training.inputs, stretch))
         self.larger = None if coarse or coarse_mean else self.larger
         return coarse or coarse_mean
 
@@ -200,18 +225,11 @@ class _State:
         whitened = _whiten(self.training, normal, self.covariance)
         self.correlation = demonstration_correlation(self.training.x, whitened, self.group)
         if self.correlation.matters:
-            self.training = self.training.merged(_n_inputs(self.training, self.group))
+            # So many inputs that each holds about a row of each demonstration, and enough rows for a covariance by
+            # themselves, which takes three more than outputs.
+            n_rows = max(self.n_demos, self.training.y.shape[1] + 3)
+            self.training = self.training.merged(max(8, len(self.training.x) // n_rows))
             self.rows = self.rows.merged(MOST_INPUTS) if self.mean_search.held else self.training
-
-    @property
-    def _shape(self) -> tuple[int, int]:
-        return self.training.y.shape[1], self.training.x.shape[1]
-
-    def _mean(self) -> LatentMean:
-        rows = self.rows
-        whitener = mean_whitener(self.correlation, rows, self.group)
-        tril = _noise_tril(rows.inputs, self.pooled, self.covariance)
-        return fit_mean(self.mean_search, rows.inputs, rows.means(), rows.counts, tril, whitener)
 
 
 def _follows(training: TrainingSet, group: Tensor | None, mean: LatentMean, pooled: Tensor) -> bool:
@@ -252,7 +270,7 @@ def _residual(training: TrainingSet, mean: LatentMean, tril: Tensor) -> tuple[Te
     inv(T) V inv(T)': of output i, that of the part of it which the outputs before do not explain.
     """
     expected, error = mean.at(training.inputs)
-    expected = expected[training.index] if training.repeats_inputs else mean.expected(training.x)
+    expected = expected[training.index] if training.repeats_inputs else mean.expected_at_rows(training.x)
     half = torch.linalg.solve_triangular(tril, error, upper=False)
     leverage = torch.linalg.solve_triangular(tril, half.mT, upper=False).diagonal(dim1=-2, dim2=-1)
     return training.y - expected, (1.0 - leverage).clamp(_LEAST_SHARE, 1.0)[training.index]
@@ -281,14 +299,12 @@ def _whiten(training: TrainingSet, normal: Tensor, covariance: LatentCovariance)
     return torch.linalg.solve_triangular(tril, normal.unsqueeze(2), upper=False).squeeze(2)
 
 
-def _first_part(training: TrainingSet, group: Tensor | None) -> float:
-    """Share of the rows that count before the correlation of a demonstration's samples is known."""
-    return 1.0 if group is None else min(1.0, _FIRST_SAMPLES * len(group.unique()) / len(group))
-
-
-def _n_inputs(training: TrainingSet, group: Tensor) -> int:
-    """Distinct inputs where demonstrations are correlated: so many that each holds about a row of each demonstration,
-    and enough rows for a covariance by themselves, which takes three more than outputs.
+def _squares_within(training: TrainingSet, normal: Tensor, noise: NoiseCorrelation | None) -> Squares:
+    """Squares of each output around its mean at each input, which an error of the mean does not change; around zero at
+    inputs of one row.
     """
-    rows = max(len(group.unique()), training.y.shape[1] + 3)
-    return max(8, len(training.x) // rows)
+    counts = training.counts
+    means = torch.where(counts[:, None] > 1.0, training.sums(normal) / counts[:, None], 0.0)
+    squares = training.sums((normal - means[training.index]).square())
+    degrees = torch.where(counts > 1.0, counts - 1.0, counts).expand(normal.shape[1], -1)
+    return Squares(squares.mT, degrees, noise)

@@ -5,18 +5,17 @@ Also where it begins if a first mean does not follow the data: at what the evide
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
 from torch_pbd.gp import EvidenceSearch, Hyperparameters, Observations, fit_hyperparameters, negative_log_evidence
-from torch_pbd.gp.inducing import FixedFeatures, inducing_inputs
 from torch_pbd.gp.observations import resolved_length_scale
 from torch_pbd.linalg import triangular_inverse
-from torch_pbd.models.heteroscedastic.processes import CLEAR, Gradient, Processes, ProcessFamily, Search, SearchOptions
+from torch_pbd.models.heteroscedastic.processes import FixedFeatures, Processes, ProcessFamily, inducing_inputs
 from torch_pbd.models.heteroscedastic.regression import LinearEvidence, Weights
+from torch_pbd.models.heteroscedastic.search import Gradient, Search, SearchOptions
 from torch_pbd.models.training import TrainingSet, pooled_tril
 
 MOST_INPUTS = 1024
@@ -36,40 +35,33 @@ _CLEARLY = 5.0  # nats: 150 to one. Sound draws gain less than one, signals that
 class LatentMean:
     """Posterior of the mean: weights of one output after another."""
 
-    family: ProcessFamily
     theta: Float[Tensor, "d q"]
+    processes: Processes
     weights: Weights
-
-    @cached_property
-    def processes(self) -> Processes:
-        """Processes of all outputs."""
-        return self.family.prepared(self.theta)
 
     def at(self, x: Float[Tensor, "n e"]) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d d"]]:
         """Expected mean at x, and the covariance of its error between the outputs."""
-        return self.at_features(self.processes.features(x))
-
-    def at_features(self, values: Float[Tensor, "d n m"]) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d d"]]:
-        """Expected mean and covariance of its error, from the features of unit variance."""
-        features = self.family.scaled(values, self.processes.amplitude)
+        features = self.processes(x)
         n_outputs, _, size = features.shape
         root = (features @ self.weights.root.reshape(n_outputs, size, -1)).transpose(0, 1)
         unexplained = torch.diag_embed(self.processes.unexplained(features).mT)
-        return self.expected_at_features(values), root @ root.mT + unexplained
+        return self._expected(features), root @ root.mT + unexplained
 
-    def expected_at_features(self, values: Float[Tensor, "d n m"]) -> Float[Tensor, "n d"]:
-        """Expected mean, from the features of unit variance."""
-        features = self.family.scaled(values, self.processes.amplitude)
+    def expected_at(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d"]:
+        """Expected mean at x, equal to the bit to that of :meth:`at`."""
+        return self._expected(self.processes(x))
+
+    def _expected(self, features: Tensor) -> Float[Tensor, "n d"]:
         return (features @ self.weights.mean.reshape(len(features), -1, 1)).squeeze(-1).mT
 
-    def expected(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d"]:
-        """Expected mean at x alone, a bounded number of rows at a time."""
+    def expected_at_rows(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d"]:
+        """Expected mean at many x, a bounded number of rows at a time, to what rounding leaves of it."""
         processes = self.processes
         weights = processes.amplitude[:, None] * self.weights.mean.reshape(len(self.theta), -1)
         # Weights of the kernel with the inducing inputs, from those of the features: no equations are solved for
         # each row.
-        weights = torch.linalg.solve_triangular(processes.features.factor.mT, weights.unsqueeze(-1), upper=True)
-        return torch.cat([(processes.features.cross(part) @ weights).squeeze(-1).mT for part in x.split(_CHUNK)])
+        weights = torch.linalg.solve_triangular(processes.factor.mT, weights.unsqueeze(-1), upper=True)
+        return torch.cat([(processes.cross(part) @ weights).squeeze(-1).mT for part in x.split(_CHUNK)])
 
 
 def fit_mean(
@@ -90,37 +82,33 @@ def fit_mean(
     # 1e-16 over the variance of the noise: of 1e-12 by .02 nats, and rounding of y then led to other length scales.
     scale = (counts.sqrt()[:, None] / noise_tril.square().sum(-1).sqrt()).clamp_max(1.0 / _NONE).mT.unsqueeze(-1)
     noise_whitener = scale if whitener is None else whitener * scale.mT
-    response = _times(whitener, scale * means.mT.unsqueeze(-1)).squeeze(-1)
+    response = _times(noise_whitener, means.mT.unsqueeze(-1)).squeeze(-1)
     information = noise_whitener.square().sum((-2, -1))
-    family = search.family
-    fixed = FixedFeatures(family.features, inputs)
+    family, fixed = search.family, FixedFeatures(search.family, inputs)
 
     def evidence(theta: Tensor, rows: Int64[Tensor, " a"]) -> tuple[Tensor, Gradient]:
-        chosen = None if whitener is None else whitener[rows]
         design, vjp = family.design_vjp(fixed, theta, information[rows])
-        whitened = _times(chosen, scale[rows] * design)
-        linear = LinearEvidence.fit(whitened, response[rows])
+        chosen, its_response = noise_whitener[rows], response[rows]
+        whitened = _times(chosen, design)
+        linear = LinearEvidence.fit(whitened, its_response)
+        transposed = chosen if whitener is None else chosen.mT
+        return linear.value, lambda: vjp(_times(transposed, linear.gradient(whitened, its_response)))
 
-        def gradient() -> Tensor:
-            in_whitened = linear.gradient(whitened, response[rows])
-            return vjp(scale[rows] * _times(None if chosen is None else chosen.mT, in_whitened))
-
-        return linear.value, gradient
-
-    theta = search.run(evidence, means)
+    theta = search.run(evidence, len(means))
     # All outputs: sqrt(count) inv(T) mean, with T the factor of the noise, has independent entries at an input.
-    features = family.prepared(theta)(inputs)
+    processes = family.prepared(theta)
     whitening = counts.sqrt()[:, None, None] * triangular_inverse(noise_tril)
-    design = torch.einsum("nij,jnp->nijp", whitening, features).flatten(2)
+    design = torch.einsum("nij,jnp->nijp", whitening, processes(inputs)).flatten(2)
     response = (whitening @ means.unsqueeze(-1)).squeeze(-1)
     if whitener is not None:
         design = torch.einsum("imn,niq->miq", whitener, design)
         response = torch.einsum("imn,ni->mi", whitener, response)
-    return LatentMean(family, theta, LinearEvidence.fit(design.flatten(0, 1), response.flatten()).weights())
+    return LatentMean(theta, processes, LinearEvidence.fit(design.flatten(0, 1), response.flatten()).weights)
 
 
-def _times(matrix: Tensor | None, values: Tensor) -> Tensor:
-    return values if matrix is None else matrix @ values
+def _times(whitener: Tensor, values: Tensor) -> Tensor:
+    """Whitened values: by a matrix, or by its diagonal (..., n, 1) where it has no more."""
+    return whitener * values if whitener.shape[-1] == 1 else whitener @ values
 
 
 @dataclass(frozen=True)
@@ -143,10 +131,10 @@ class MeanStart:
         Residuals that are not white by chance, or under noise that is louder in places, are no reason to begin here:
         these hyperparameters stay, and noise that depends on the input would have led to others.
         """
-        amplitude, rows_at_input = mean.processes.amplitude, len(self.rows.x) / len(self.observations.inputs)
-        noise_ratio = noise_tril.square().sum(1) / rows_at_input / amplitude.square()
-        first = Hyperparameters(mean.family.length_scale_of(mean.theta), amplitude, noise_ratio)
-        loss = negative_log_evidence(self.observations, first, mean.family.features.kernel)
+        processes, rows_at_input = mean.processes, len(self.rows.x) / len(self.observations.inputs)
+        noise_ratio = noise_tril.square().sum(1) / rows_at_input / processes.amplitude.square()
+        first = Hyperparameters(processes.length_scale, processes.amplitude, noise_ratio)
+        loss = negative_log_evidence(self.observations, first, processes.family.kernel)
         return not bool((loss - self.loss < _CLEARLY).all())  # what is too smooth to be evaluated is no mean to keep
 
 
@@ -165,13 +153,11 @@ def mean_start(rows: TrainingSet, family: ProcessFamily, options: SearchOptions)
         noise_scale = found.amplitude * found.noise_ratio.sqrt()
         if bool((noise_scale < _NONE).all()):
             break
-    scale = found.length_scale.amin(0).expand_as(found.length_scale) if family.shared else found.length_scale
-    n_outputs, n_features = scale.shape
+    n_outputs = len(loss)
     # As many inducing inputs as resolve the shortest length scale with room to spare.
-    needed = math.ceil(min((CLEAR / float(scale.min())) ** n_features, len(training.inputs)))
-    inducing = inducing_inputs(training.inputs, max(len(family.features.inducing), min(needed, _TOGETHER // n_outputs)))
-    exact = len(inducing) == len(rows.inputs)
-    family = replace(family, features=replace(family.features, inducing=inducing, exact=exact))
-    held = Search(family, n_outputs, n_features, options, family.theta_of(scale, found.amplitude), held=True)
+    needed = math.ceil(min(family.n_needed(float(found.length_scale.min())), len(training.inputs)))
+    inducing = inducing_inputs(training.inputs, max(len(family.inducing), min(needed, _TOGETHER // n_outputs)))
+    family = replace(family, inducing=inducing, exact=len(inducing) == len(rows.inputs))
+    held = Search(family, n_outputs, options, family.theta_of(found.length_scale, found.amplitude), held=True)
     noise_tril = (noise_scale * rows_at_input.sqrt()).diag()
     return MeanStart(held, noise_tril, rows.merged(_MOST_ROWS // n_outputs), observations, loss)

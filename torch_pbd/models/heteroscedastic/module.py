@@ -1,36 +1,49 @@
 """The fitted model as a module: everything that predicts is in its buffers."""
 
 import math
+import operator
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from torch_pbd import checks
-from torch_pbd.gp.inducing import FeatureMap, unexplained
+from torch_pbd.gp.observations import spacing
 from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky, symmetrize
 from torch_pbd.models.conditional import Core, Shapes, blank, size_of
-from torch_pbd.models.heteroscedastic.covariance import LatentCovariance
+from torch_pbd.models.heteroscedastic.covariance import FactorMoments, LatentCovariance, degrees_of_freedom
 from torch_pbd.models.heteroscedastic.fit import HeteroscedasticFit
-from torch_pbd.models.heteroscedastic.log_variance import FactorMoments, degrees_of_freedom
 from torch_pbd.models.heteroscedastic.mean import LatentMean
 from torch_pbd.models.heteroscedastic.predictive import (
-    Prepared,
     as_inverse_gamma,
     log_correlation_variance,
     shrink_correlation,
     under_expected_noise,
 )
-from torch_pbd.models.heteroscedastic.processes import ProcessFamily
+from torch_pbd.models.heteroscedastic.processes import Processes, ProcessFamily
 from torch_pbd.models.heteroscedastic.regression import Weights
 
 # Far from data a log variance may be anything: of its variance no more than this enters an expectation.
 _MOST_LOG_VARIANCE = 2.0
+# Longest length scale by which distance from the data is judged, in ranges of the input times the number of inputs;
+# but two spacings of the inducing inputs at least.
+_REACH = 0.1
 _FAMILIES = ("mean", "log_variance", "coefficient")
+
+
+class _Prepared(NamedTuple):
+    """Processes of a module's buffers, with what does not depend on x computed."""
+
+    buffers: tuple[Tensor | None, ...]
+    versions: tuple[int, ...]
+    mean: LatentMean
+    covariance: LatentCovariance
+    nearness: Processes
+    """Process of unit variance that tells how far data are."""
 
 
 class HeteroscedasticModel(Core):
@@ -58,19 +71,15 @@ class HeteroscedasticModel(Core):
     pooled_tril: Tensor
     prior_tril: Tensor
     correlation_variance: Tensor
-    _kept: Prepared | None = None
+    _kept: _Prepared | None = None
 
     def __init__(self, fit: HeteroscedasticFit, prior_tril: Float[Tensor, "d d"]) -> None:
         super().__init__()
         mean, covariance = fit.mean, fit.covariance
-        families = (mean.family, covariance.log_variance_family, covariance.coefficient_family)
-        for name, family in zip(_FAMILIES, families, strict=True):
-            if family.fixed_length_scale is not None:
-                self.register_buffer(f"{name}_length_scale", family.fixed_length_scale)
-        features = mean.family.features
+        families = mean.processes.family, covariance.log_variances.family, covariance.rows.family
         tensors = {
-            "inducing": covariance.log_variance_family.features.inducing,
-            "mean_inducing": features.inducing,
+            "inducing": families[1].inducing,
+            "mean_inducing": families[0].inducing,
             "mean_theta": mean.theta,
             "mean_weights": mean.weights.mean,
             "mean_root": mean.weights.root,
@@ -80,18 +89,18 @@ class HeteroscedasticModel(Core):
             "coefficient_theta": covariance.coefficient_theta,
             "pooled_tril": fit.pooled_tril,
             "prior_tril": prior_tril,
+            "period": families[0].period,
+            "stretch": families[1].stretch,
         }
+        for name, family in zip(_FAMILIES, families, strict=True):
+            tensors[f"{name}_length_scale"] = family.fixed_length_scale
         for i, weights in enumerate(covariance.coefficients, start=1):
-            tensors[f"coefficient_weights_{i}"] = weights.mean
-            tensors[f"coefficient_root_{i}"] = weights.root
-        if features.period is not None:
-            tensors["period"] = features.period
-        if (stretch := covariance.log_variance_family.features.stretch) is not None:
-            tensors["stretch"] = stretch
+            tensors[f"coefficient_weights_{i}"], tensors[f"coefficient_root_{i}"] = weights
         for name, tensor in tensors.items():
-            self.register_buffer(name, tensor.detach().clone().contiguous())
-        self.kernel: str = features.kernel
-        self.exact = [family.features.exact for family in families]
+            if tensor is not None:
+                self.register_buffer(name, tensor.detach().clone().contiguous())
+        self.kernel: str = families[0].kernel
+        self.exact = [family.exact for family in families]
         self.medians = [(family.length_scale, family.amplitude, family.constant) for family in families]
         if fit.correlation is not None and fit.correlation.matters:
             n_places = float(fit.correlation.share.mean()) * len(fit.training.x) / fit.n_demos
@@ -156,29 +165,21 @@ class HeteroscedasticModel(Core):
         return moments(x, prior_tril)
 
     def _moments(self, x: Tensor, prior_tril: Tensor | None) -> tuple[Tensor, Tensor]:
-        prior = self.prior_tril if prior_tril is None else prior_tril
         mean, factor, error_root, missing = self._known(x)
         if hasattr(self, "correlation_variance"):
             root = self._shrunk(*self._root_of_demonstrations(factor, error_root))
         else:
             root = torch.cat([self.pooled_tril @ factor.expected_root(_MOST_LOG_VARIANCE), error_root], dim=-1)
-        known = _root_of_share(1.0 - missing) * root
-        return mean, torch.cat([known, _root_of_share(missing) * prior.expand(len(x), -1, -1)], dim=-1)
+        return mean, self._with_prior(root, missing, prior_tril)
 
     def _known(self, x: Tensor) -> tuple[Tensor, FactorMoments, Tensor, Tensor]:
-        """Mean, moments of the factor, root of the covariance of the mean's error, and share (n, 1, 1) of the prior."""
+        """Mean, moments of the factor, root of the covariance of the mean's error, and share (n,) of the prior."""
         prepared = self._prepared()
-        mean_values, *factor_values, nearness = prepared.features(x)
-        mean, error = prepared.mean.at_features(mean_values)
+        mean, error = prepared.mean.at(x)
         # Where the data leave nothing to err about, rounding must not make it negative.
         least = 1e-12 * torch.diag_embed(1e-30 + error.diagonal(dim1=-2, dim2=-1))
         error_root = safe_cholesky(symmetrize(error) + least, name="the covariance of the mean's error")
-        return (
-            mean,
-            prepared.covariance.at_features(*factor_values),
-            error_root,
-            unexplained(nearness[0])[:, None, None],
-        )
+        return mean, prepared.covariance.at(x), error_root, self.type1(x)
 
     def _root_of_demonstrations(self, factor: FactorMoments, error_root: Tensor) -> tuple[Tensor, Tensor]:
         """Root of the expected covariance of correlated samples before its correlations are shrunk, and degrees."""
@@ -193,16 +194,21 @@ class HeteroscedasticModel(Core):
             return root if draws is None else draws
         return shrink_correlation(root, degrees, self.correlation_variance, draws)
 
+    def _with_prior(self, root: Tensor, missing: Tensor, prior_tril: Tensor | None) -> Tensor:
+        """Root of a covariance and of the prior, each with its share."""
+        prior = self.prior_tril if prior_tril is None else prior_tril
+        share = (_square_root(missing)[:, None, None] * prior).expand(*root.shape[:-1], -1)
+        return torch.cat([_square_root(1.0 - missing)[:, None, None] * root, share], dim=-1)
+
     def predict_mean(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d"]:
         """Mean alone, equal to the bit."""
-        prepared = self._prepared()
-        return prepared.mean.expected_at_features(prepared.features(x)[0])
+        return self.mean_process.expected_at(x)
 
     def variability(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d d"]:
         """Root of the covariance at the means of the latent processes, without prior and without errors."""
         factor = self.covariance_process.at(x)
         root = self._shrunk(self.pooled_tril @ factor.tril(), factor.degrees)
-        return _root_of_share(1.0 - self.type1(x))[:, None, None] * root
+        return _square_root(1.0 - self.type1(x))[:, None, None] * root
 
     def degrees(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
         """Degrees of freedom of the predictive density; infinite (a normal distribution) where only the prior
@@ -211,15 +217,14 @@ class HeteroscedasticModel(Core):
         A variance known from as many squares has a logarithm whose variance is here the mean of those of the log
         variances.
         """
-        prepared = self._prepared()
-        _, log_variance_values, _, nearness = prepared.features(x)
+        variance = self.covariance_process.log_variance_at(x)[1].mean(-1)
         # Of the prior they are infinite: with the share of the data, 1 - missing, going to zero the law becomes normal.
-        variance = prepared.covariance.log_variance_at_features(log_variance_values)[1].mean(-1)
-        return degrees_of_freedom(variance) / (1.0 - unexplained(nearness[0])).clamp_min(1e-12)
+        return degrees_of_freedom(variance) / (1.0 - self.type1(x)).clamp_min(1e-12)
 
     def type1(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
         """Type I uncertainty: eq. (6) without noise over the prior variance, 0 at the inducing inputs."""
-        return unexplained(self._prepared().nearness(x)[0])
+        nearness = self._prepared().nearness
+        return nearness.unexplained(nearness(x))[0]
 
     def draw(
         self,
@@ -228,12 +233,9 @@ class HeteroscedasticModel(Core):
         prior_tril: Float[Tensor, "n d d"] | None = None,
     ) -> Float[Tensor, "*s n d r"]:
         """Roots of posterior draws of the covariance function at x, with the prior's share in them."""
-        prior = self.prior_tril if prior_tril is None else prior_tril
-        missing = self.type1(x)[:, None, None]
         factor, draws = self.covariance_process.at(x), self.pooled_tril @ self.covariance_process.draw(x, normal)
         root = self._shrunk(self.pooled_tril @ factor.tril(), factor.degrees, draws)
-        share = (_root_of_share(missing) * prior).expand_as(root)
-        return torch.cat([_root_of_share(1.0 - missing) * root, share], dim=-1)
+        return self._with_prior(root, self.type1(x), prior_tril)
 
     def draw_sizes(self) -> list[int]:
         """Sizes of the standard normal vectors that :meth:`draw` takes."""
@@ -250,49 +252,63 @@ class HeteroscedasticModel(Core):
         """The covariance's processes, of residuals multiplied by the inverse of ``pooled_tril``."""
         return self._prepared().covariance
 
-    def _prepared(self) -> Prepared:
+    def _prepared(self) -> _Prepared:
         """Processes of the buffers, with what does not depend on x computed; anew where a buffer is another."""
         buffers = tuple(self._buffers.values())
         if any(buffer is None or buffer.is_inference() or buffer.requires_grad for buffer in buffers):
-            return self._prepare(buffers)
-        kept = self._kept
-        if kept is None or not kept.is_of(buffers):
+            return self._prepare(buffers, ())
+        kept, versions = self._kept, tuple(buffer._version for buffer in buffers if buffer is not None)
+        if kept is None or kept.versions != versions or not all(map(operator.is_, buffers, kept.buffers)):
             # Else, asked for in inference mode, these would be of no use to autograd later.
             with torch.inference_mode(False), torch.no_grad():
-                kept = self._prepare(buffers)
-                self._kept = kept
+                kept = self._kept = self._prepare(buffers, versions)
         return kept
 
-    def _prepare(self, buffers: tuple[Tensor | None, ...]) -> Prepared:
-        mean = LatentMean(self._family(0), self.mean_theta, Weights(self.mean_weights, self.mean_root))
+    def _prepare(self, buffers: tuple[Tensor | None, ...], versions: tuple[int, ...]) -> _Prepared:
+        # The mean rests on inducing inputs of its own, and is never stretched.
+        inducing, stretch = self.inducing, getattr(self, "stretch", None)
+        own = ((self.mean_inducing, None), (inducing, stretch), (inducing, stretch))
+        mean_family, log_variance_family, coefficient_family = (
+            ProcessFamily(
+                own[i][0],
+                *self.medians[i],
+                getattr(self, f"{name}_length_scale", None),
+                self.kernel,
+                getattr(self, "period", None),
+                self.exact[i],
+                own[i][1],
+            )
+            for i, name in enumerate(_FAMILIES)
+        )
+        processes = mean_family.prepared(self.mean_theta)
+        mean = LatentMean(self.mean_theta, processes, Weights(self.mean_weights, self.mean_root))
         coefficients = [
             Weights(getattr(self, f"coefficient_weights_{i}"), getattr(self, f"coefficient_root_{i}"))
             for i in range(1, len(self.coefficient_theta) + 1)
         ]
         covariance = LatentCovariance(
-            self._family(1),
-            self._family(2),
             self.log_variance_theta,
+            log_variance_family.prepared(self.log_variance_theta),
             Weights(self.log_variance_weights, self.log_variance_root),
             self.coefficient_theta,
+            coefficient_family.prepared(self.coefficient_theta),
             coefficients,
         )
-        return Prepared.of(buffers, mean, covariance)
+        # What is missing is told by one process with the length scale of the log variances (their mean, weighted by
+        # squared amplitudes), as far as that does not reach too far: a smooth process without noise claims to know
+        # what is two of its length scales away, in gaps and beyond the data.
+        weight = covariance.log_variances.amplitude.square()
+        scale = ((weight / weight.sum()) @ covariance.log_variances.length_scale.log()).exp()
+        scale = scale.clamp_max(_REACH * inducing.shape[1]).clamp_min(2.0 * spacing(inducing))
+        near = replace(log_variance_family, kernel="squared_exponential", stretch=None, constant=0.0)
+        return _Prepared(buffers, versions, mean, covariance, near.processes(scale[None], torch.ones_like(scale[:1])))
 
     def __getstate__(self) -> dict[str, Any]:
         """State for copies and pickle: without what is computed from the buffers."""
         return {**self.__dict__, "_kept": None}
 
-    def _family(self, number: int) -> ProcessFamily:
-        # The mean, number 0, rests on inducing inputs of its own, and is never stretched.
-        inducing = self.inducing if number else self.mean_inducing
-        stretch = getattr(self, "stretch", None) if number else None
-        features = FeatureMap(inducing, self.kernel, getattr(self, "period", None), self.exact[number], stretch)
-        length_scale = getattr(self, f"{_FAMILIES[number]}_length_scale", None)
-        return ProcessFamily(features, *self.medians[number], length_scale)
 
-
-def _root_of_share(share: Tensor) -> Tensor:
+def _square_root(share: Tensor) -> Tensor:
     """Square root whose gradient at zero, where the share has a minimum, is zero and not infinite."""
     positive = share > 0
     return torch.where(positive, share.where(positive, 1.0).sqrt(), 0.0)

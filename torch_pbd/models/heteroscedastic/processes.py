@@ -1,72 +1,147 @@
-"""Families of latent processes, their features, and the search for their hyperparameters."""
+"""Gaussian processes of low rank: weights of standard normal numbers on features of inducing inputs.
+
+With the kernel matrix K = L L' of the inducing inputs, and their kernel c with x, the features at x are inv(L) c. With
+the inducing inputs at all training inputs the processes are the exact ones; with fewer they are the "deterministic
+training conditional" approximation, which is exact at the inducing inputs.
+"""
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from itertools import product
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from torch_pbd.exceptions import NotPositiveDefiniteError
-from torch_pbd.gp.inducing import FeatureMap, Features, FixedFeatures, unexplained
-from torch_pbd.optim import FitReport, Progress, Status, first_failure, minimize_batch
+from torch_pbd.gp.observations import neighbourhoods, spacing, sum_by
+from torch_pbd.kernels import correlation, differences, value_and_slope
+from torch_pbd.linalg import safe_cholesky
 
-CLEAR = 3.0
-"""Times the shortest length scale, above which inducing inputs resolve one with room to spare."""
-
+# In ranges of the inputs: those that nearly coincide, as of two precisions, show no finer detail than this.
+_SHORTEST = 1e-3
+_EXACT_RESOLUTION = 0.75  # spacings of the inputs: shorter "needles" explain each input by itself
+_RESOLUTION = 1.0  # spacings: at this length scale features carry 0.995 of the variance between inducing inputs
+_CLEAR = 3.0  # times the shortest length scale, above which inducing inputs resolve one with room to spare
+# Of a process's variance: less than this that features do not carry is the jitter of kernel matrices, and rounding.
+_ROUNDING = 1e-11
 _WIDEST = 4.0  # amplitudes stay within a factor of exp(4) of their prior median
 _SPREAD_LENGTH_SCALE, _SPREAD_AMPLITUDE = 1.0, 1.5  # prior deviations of the logarithms
-# Length scales, in ranges of the inputs, short to long by threes; and logarithms of amplitudes, weak and strong.
-_STARTS = tuple(product((0.04, 0.12, 0.35, 1.0), (-1.0, 0.5)))
 # Nats of the log evidence that features which are left out may be worth, of data as expected; searches end at 1e-3, and
 # one that met a step of 3e-3, of 1e-5 here, did not.
 _NEGLIGIBLE = 1e-7
 
-_SMALL = 10_000  # entries of all processes' features
-_DIFFERENCE = 1e-3  # of hyperparameters, whose gradients' differences tell the curvature at a start
-_LEAST_CURVATURE = 0.2  # about half of the prior's
-
-Gradient = Callable[[], Float[Tensor, "a q"]]
-Evidence = Callable[[Float[Tensor, "a q"], Int64[Tensor, " a"]], tuple[Float[Tensor, " a"], Gradient]]
-"""Log evidence of hyperparameters of some of the processes, given which ones; and what computes its gradients."""
-_Objective = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-
 
 @dataclass(frozen=True)
 class ProcessFamily:
-    """``constant + amplitude * process(x / length_scale)``: d of them, each with hyperparameters of its own.
+    """``constant + amplitude * process(x / length_scale)``: b of them, each with hyperparameters of its own.
 
     Hyperparameters theta are the logarithms of the length scales (e of them) and of the amplitude over its
     prior median.
-
-    Parameters
-    ----------
-    features : FeatureMap
-    length_scale, amplitude : float
-        Medians of their prior, which is log-normal: a factor of e (of 4.5 for the amplitude) either way is usual.
-    constant : float
-        Prior standard deviation of the constant; 0 for none.
-    fixed_length_scale : Tensor of shape (e,), default=None
-        Takes the place of the searched one.
-    shared : bool, default=False
-        One length scale for all processes that are searched together.
     """
 
-    features: FeatureMap
+    inducing: Float[Tensor, "m e"]
     length_scale: float
+    """Median of its prior, which is log-normal: a factor of e either way is usual."""
     amplitude: float
+    """Median of its prior: a factor of 4.5 either way is usual."""
     constant: float
+    """Prior standard deviation of the constant; 0 for none."""
     fixed_length_scale: Float[Tensor, " e"] | None = None
-    shared: bool = False
+    """Takes the place of the searched one."""
+    kernel: str = "squared_exponential"
+    period: Float[Tensor, " e"] | None = None
+    exact: bool = False
+    """Whether the inducing inputs are all the training inputs."""
+    stretch: Float[Tensor, "2 2"] | None = None
+    """Length added next to the first and the last input, and the distance from it over which most of it is."""
+    # Kernel matrices of smooth kernels have a condition number beyond float64: what this takes away from a process of
+    # unit variance cannot be told from noise.
+    jitter: ClassVar[float] = 1e-13
+    """Added to the diagonal of kernel matrices, which is one."""
 
     def prepared(self, theta: Float[Tensor, "b q"]) -> "Processes":
         """Processes with these hyperparameters."""
-        return Processes(self, self.amplitude_of(theta), self.features(self.length_scale_of(theta)))
+        return self.processes(self.length_scale_of(theta), self.amplitude_of(theta))
+
+    def processes(self, length_scale: Float[Tensor, "b e"], amplitude: Float[Tensor, " b"]) -> "Processes":
+        """Processes of these length scales and amplitudes."""
+        inducing = self.warped(self.inducing)
+        gram = correlation(inducing, inducing, length_scale, self.kernel, self.period)
+        gram = gram + self.jitter * torch.eye(len(inducing)).to(gram)
+        factor = safe_cholesky(gram, name="the kernel matrix of the inducing inputs")
+        return Processes(self, length_scale, amplitude, factor)
+
+    def warped(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n e"]:
+        """Inputs with length added next to the ends of their range, within which alone it is."""
+        if self.stretch is None:
+            return x
+        (first, first_width), (last, last_width) = self.stretch
+        from_first, from_last = (x + 0.5).clamp_min(0.0), (0.5 - x).clamp_min(0.0)
+        return x - first * torch.expm1(-from_first / first_width) + last * torch.expm1(-from_last / last_width)
+
+    def square_differences(self, x: Float[Tensor, "n e"], other: Float[Tensor, "m e"]) -> Float[Tensor, "e n m"]:
+        """Squares of the differences in each dimension; along a circle of the chords."""
+        return torch.stack(differences(self.warped(x), self.warped(other), self.period)).square()
+
+    @cached_property
+    def farthest_first(self) -> Int64[Tensor, " m"]:
+        """Order of the inducing inputs in which each is the farthest from those before it, begun at the middle."""
+        distance = self.square_differences(self.inducing, self.inducing).sum(0)
+        number = int(distance.sum(0).argmin())
+        nearest = torch.full_like(distance[0], math.inf)
+        order = []
+        for _ in range(len(distance)):
+            order.append(number)
+            nearest = torch.minimum(nearest, distance[number])
+            nearest[number] = -1.0
+            number = int(nearest.argmax())
+        return torch.tensor(order, device=distance.device)
+
+    @cached_property
+    def shortest_length_scale(self) -> float:
+        """Length scale below which the inducing inputs no longer resolve what is between them."""
+        if len(self.inducing) < 2:
+            return _SHORTEST
+        share = _EXACT_RESOLUTION if self.exact else _RESOLUTION
+        return max(_SHORTEST, min(0.5, share * spacing(self.warped(self.inducing))))
+
+    def length_scale_of(self, theta: Float[Tensor, "b q"]) -> Float[Tensor, "b e"]:
+        """Length scales, never below what the inducing inputs resolve."""
+        if self.fixed_length_scale is not None:
+            return self.fixed_length_scale.expand(len(theta), -1)
+        least = math.log(self.shortest_length_scale)
+        return torch.logaddexp(theta[:, :-1], torch.full_like(theta[:, :-1], least)).exp()
+
+    def amplitude_of(self, theta: Float[Tensor, "b q"]) -> Float[Tensor, " b"]:
+        """Amplitude, within a wide range."""
+        return self.amplitude * (_WIDEST * torch.tanh(theta[:, -1] / _WIDEST)).exp()
+
+    def theta_of(self, length_scale: Float[Tensor, "b e"], amplitude: Float[Tensor, " b"]) -> Float[Tensor, "b q"]:
+        """Hyperparameters of these length scales and amplitudes, or those nearest to them."""
+        above = (length_scale - self.shortest_length_scale).maximum(0.3 * length_scale)
+        strength = (amplitude / self.amplitude).log().clamp(-0.5 * _WIDEST, 0.5 * _WIDEST)
+        return torch.cat([above.log(), strength[:, None]], dim=1)
+
+    def n_needed(self, length_scale: float) -> float:
+        """Number of inducing inputs, over a range of one, that resolve a length scale with room to spare."""
+        return (_CLEAR / length_scale) ** self.inducing.shape[1]
+
+    def log_prior(self, theta: Float[Tensor, "b q"]) -> tuple[Float[Tensor, " b"], Float[Tensor, "b q"]]:
+        """Log density of hyperparameters, but for a constant, and its gradient."""
+        median = theta.new_tensor([math.log(self.length_scale)] * (theta.shape[1] - 1) + [0.0])
+        spread = theta.new_tensor([_SPREAD_LENGTH_SCALE] * (theta.shape[1] - 1) + [_SPREAD_AMPLITUDE])
+        deviation = (theta - median) / spread
+        return -0.5 * deviation.square().sum(-1), -deviation / spread
+
+    def scaled(self, features: Float[Tensor, "b n m"], amplitude: Float[Tensor, " b"]) -> Float[Tensor, "b n p"]:
+        """Features times the amplitudes, and the constant."""
+        features = amplitude[:, None, None] * features
+        return torch.nn.functional.pad(features, (0, 1), value=self.constant) if self.constant else features
 
     def design_vjp(
-        self, fixed: FixedFeatures, theta: Float[Tensor, "b q"], information: Float[Tensor, " b"]
+        self, fixed: "FixedFeatures", theta: Float[Tensor, "b q"], information: Float[Tensor, " b"]
     ) -> tuple[Float[Tensor, "b n p"], Callable[[Float[Tensor, "b n p"]], Float[Tensor, "b q"]]]:
         """Design at inputs that stay, and the product of a gradient in it with its derivative in the hyperparameters.
 
@@ -86,217 +161,105 @@ class ProcessFamily:
             if self.fixed_length_scale is not None:
                 return torch.nn.functional.pad(in_amplitude[:, None], (theta.shape[1] - 1, 0))
             in_scale = vjp(amplitude[:, None, None] * gradient)
-            in_scale = in_scale * torch.sigmoid(theta[:, :-1] - math.log(self.features.shortest_length_scale))
+            in_scale = in_scale * torch.sigmoid(theta[:, :-1] - math.log(self.shortest_length_scale))
             return torch.cat([in_scale, in_amplitude[:, None]], dim=1)
 
         return design, in_theta
 
-    def scaled(self, features: Float[Tensor, "b n m"], amplitude: Float[Tensor, " b"]) -> Float[Tensor, "b n p"]:
-        """Features times the amplitudes, and the constant."""
-        features = amplitude[:, None, None] * features
-        if self.constant == 0.0:
-            return features
-        return torch.nn.functional.pad(features, (0, 1), value=self.constant)
-
-    def length_scale_of(self, theta: Float[Tensor, "b q"]) -> Float[Tensor, "b e"]:
-        """Length scales, never below what the inducing inputs resolve."""
-        if self.fixed_length_scale is not None:
-            return self.fixed_length_scale.expand(len(theta), -1)
-        least = math.log(self.features.shortest_length_scale)
-        return torch.logaddexp(theta[:, :-1], torch.full_like(theta[:, :-1], least)).exp()
-
-    def theta_of(self, length_scale: Float[Tensor, "b e"], amplitude: Float[Tensor, " b"]) -> Float[Tensor, "b q"]:
-        """Hyperparameters of these length scales and amplitudes, or those nearest to them."""
-        above = (length_scale - self.features.shortest_length_scale).maximum(0.3 * length_scale)
-        strength = (amplitude / self.amplitude).log().clamp(-0.5 * _WIDEST, 0.5 * _WIDEST)
-        return torch.cat([above.log(), strength[:, None]], dim=1)
-
-    def resolved(self, theta: Float[Tensor, "b q"]) -> bool:
-        """Whether length scales stay clear of the shortest that the inducing inputs resolve."""
-        least = CLEAR * self.features.shortest_length_scale
-        return self.features.exact or bool((self.length_scale_of(theta) > least).all())
-
-    def amplitude_of(self, theta: Float[Tensor, "b q"]) -> Float[Tensor, " b"]:
-        """Amplitude, within a wide range."""
-        return self.amplitude * (_WIDEST * torch.tanh(theta[:, -1] / _WIDEST)).exp()
-
-    def log_prior(self, theta: Float[Tensor, "b q"]) -> tuple[Float[Tensor, " b"], Float[Tensor, "b q"]]:
-        """Log density of hyperparameters, but for a constant, and its gradient."""
-        median = theta.new_tensor([math.log(self.length_scale)] * (theta.shape[1] - 1) + [0.0])
-        spread = theta.new_tensor([_SPREAD_LENGTH_SCALE] * (theta.shape[1] - 1) + [_SPREAD_AMPLITUDE])
-        deviation = (theta - median) / spread
-        return -0.5 * deviation.square().sum(-1), -deviation / spread
-
-    def starts(self, like: Tensor, n_features: int) -> Float[Tensor, "s q"]:
-        """Hyperparameters where a search may begin."""
-        return like.new_tensor([[math.log(scale)] * n_features + [amplitude] for scale, amplitude in _STARTS])
-
 
 @dataclass(frozen=True)
 class Processes:
-    """Processes of a family whose hyperparameters are known, with what does not depend on the inputs computed."""
+    """Processes of a family whose hyperparameters are known, with what does not depend on x computed."""
 
     family: ProcessFamily
+    length_scale: Float[Tensor, "b e"]
     amplitude: Float[Tensor, " b"]
-    features: Features
+    factor: Float[Tensor, "b m m"]
+    """Lower Cholesky factor of the kernel matrix of the inducing inputs."""
 
     def __call__(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "b n p"]:
-        """Features at x, of which a process is the sum weighted by standard normal numbers."""
-        return self.family.scaled(self.features(x), self.amplitude)
+        """Features at x, of which a process is the sum weighted by standard normal numbers.
+
+        Their inner products are the covariance, wherever the inducing inputs resolve it.
+        """
+        features = torch.linalg.solve_triangular(self.factor, self.cross(x).mT, upper=False).mT
+        return self.family.scaled(features, self.amplitude)
+
+    @property
+    def resolved(self) -> bool:
+        """Whether length scales stay clear of the shortest that the inducing inputs resolve, or these are all."""
+        return self.family.exact or bool((self.length_scale > _CLEAR * self.family.shortest_length_scale).all())
+
+    def cross(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "b n m"]:
+        """Kernel between x and the inducing inputs."""
+        family = self.family
+        inducing = family.warped(family.inducing)
+        return correlation(family.warped(x), inducing, self.length_scale, family.kernel, family.period)
 
     def unexplained(self, design: Float[Tensor, "b n p"]) -> Float[Tensor, "b n"]:
-        """Prior variance that the features at x do not carry: none at the inducing inputs, all far from them."""
-        square = self.amplitude.square().unsqueeze(-1)
-        return square * unexplained(design[..., : self.features.factor.shape[-1]] / self.amplitude[:, None, None])
+        """Prior variance that the features at x do not carry: none at the inducing inputs, all far from them.
+
+        Where y deviates by a millionth, rounding would else be a hundredth of what is predicted.
+        """
+        features = design[..., : self.factor.shape[-1]] / self.amplitude[:, None, None]
+        share = (1.0 - features.square().sum(-1)).clamp(0.0, 1.0)
+        # Smooth, and equal to the bit above a few of these.
+        share = share * -torch.expm1(-(share / _ROUNDING).square())
+        return self.amplitude.square()[:, None] * share
 
 
-@dataclass
-class SearchOptions:
-    """How hyperparameters are searched, and how the searches ended."""
+class FixedFeatures:
+    """Features of families on the same inducing inputs at x that stay, for one length scale after another.
 
-    max_iter: int = 30
-    tol: float = 1e-3
-    """In nats."""
-    n_restarts: int = 0
-    """Starts beside the best point of the grid, where no earlier search gives one."""
-    callback: Callable[[Progress], None] | None = None
-    """Called at the end of each turn of mean and covariance."""
-    slack: float = 1.0
-    """Times the tolerance, as long as better evidence is to come."""
-    ends: list[tuple[int, Status]] = field(default_factory=list)
-    """Iterations of each search, and what ended it."""
-
-    def report(self, turn: int, loss: float, elapsed: float) -> None:
-        """Tell the callback."""
-        if self.callback is not None:
-            self.callback(Progress(turn, loss, elapsed))
-
-    def outcome(self, losses: tuple[float, ...]) -> FitReport:
-        """Report of a fit with these losses, by how its searches ended."""
-        status = first_failure(status for _, status in self.ends)
-        return FitReport(losses[-1], losses, max(n for n, _ in self.ends), status)
-
-
-@dataclass
-class Search:
-    """Hyperparameters of the highest evidence times prior, by BFGS: for each of b processes by itself.
-
-    The first run takes the best points of a small grid, and the curvature there by differences; the next ones start
-    where the last ended, with its curvature.
-
-    Parameters
-    ----------
-    family : ProcessFamily
-    n_processes, n_features : int
-        b, and the inputs' dimensions.
-    options : SearchOptions
-        Its reports are added to.
+    The inducing inputs are taken each as far as possible from those before it, and no more of them than carry what
+    can be told: for a smooth kernel and a long length scale these are few. The features are those of the processes but
+    for an orthogonal matrix, and so are the same processes.
     """
 
-    family: ProcessFamily
-    n_processes: int
-    n_features: int
-    options: SearchOptions
-    theta: Float[Tensor, "b q"] | None = None
-    held: bool = False
-    """Whether ``theta`` is given, and not searched."""
-    _end: tuple[Tensor, Tensor] | None = None
-    """Point and inverse Hessian that the last run ended with, of each problem."""
+    def __init__(self, family: ProcessFamily, x: Float[Tensor, "n e"]) -> None:
+        self._kernel = family.kernel
+        chosen = family.inducing[family.farthest_first]
+        self._gram = family.square_differences(chosen, chosen)
+        self._cross = family.square_differences(chosen, x)
+        self._jitter = family.jitter * torch.eye(len(chosen)).to(x)
 
-    def run(self, evidence: Evidence, like: Tensor) -> Float[Tensor, "b q"]:
-        """Hyperparameters for this evidence; ``like`` has the dtype and the device to work on."""
-        if self.held and self.theta is not None:
-            return self.theta
-        every = torch.arange(self.n_processes, device=like.device)
+    def vjp(
+        self, length_scale: Float[Tensor, "b e"], negligible: Float[Tensor, " b"]
+    ) -> tuple[Float[Tensor, "b n r"], Callable[[Float[Tensor, "b n r"]], Float[Tensor, "b e"]]]:
+        """Features, and the product of a gradient in them with their derivative in the logarithms of length scales.
 
-        def value(theta: Tensor, rows: Tensor) -> tuple[Tensor, Gradient]:
-            try:
-                return evidence(theta, rows)
-            except (NotPositiveDefiniteError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
-                return math.nan * theta.sum(-1), lambda: theta  # too far, for the optimizer
-
-        def loss(theta: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-            found, gradient = value(theta, rows)
-            prior, of_prior = self.family.log_prior(theta)
-            return -found - prior, -gradient() - of_prior
-
-        def joint_loss(points: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-            values, gradients = loss(self._spread_out(points), every.repeat(len(points)))
-            each = gradients.reshape(len(points), self.n_processes, -1)
-            together = torch.cat([each[..., :-1].sum(1), each[..., -1]], dim=1)
-            return values.reshape(len(points), -1).sum(1), together
-
-        objective = joint_loss if self.family.shared else loss
-        starts = self._starts(value, objective, every, like) if self._end is None else [self._end]
-        ends = [
-            minimize_batch(
-                objective,
-                start,
-                max_iter=self.options.max_iter,
-                tol=self.options.slack * self.options.tol,
-                inverse_hessian=inverse_hessian,
-            )
-            for start, inverse_hessian in starts
-        ]
-        points, reports = zip(*ends, strict=True)
-        best = torch.stack([report.loss for report in reports]).nan_to_num(nan=math.inf).argmin(0)
-        row = torch.arange(len(best), device=like.device)
-        inverse_hessians = torch.stack([report.inverse_hessian for report in reports])
-        self._end = torch.stack(points)[best, row], inverse_hessians[best, row]
-        status = first_failure(report.status for report in reports)
-        self.options.ends.append((max(report.n_iter for report in reports), status))
-        self.theta = self._spread_out(self._end[0]) if self.family.shared else self._end[0]
-        return self.theta
-
-    def _starts(
-        self, value: Evidence, objective: _Objective, every: Tensor, like: Tensor
-    ) -> list[tuple[Tensor, Tensor]]:
-        """Best points of the grid for each problem, and inverse Hessians there."""
-        points, table = self.family.starts(like, self.n_features), -self._table(value, every, like)
-        starts = [points[rank] for rank in table.argsort(0)[: 1 + self.options.n_restarts]]
-        if self.family.shared:
-            starts = [torch.cat([start[:, :-1], start[:, -1:].expand(-1, len(every))], dim=1) for start in starts]
-        return [(start, _inverse_hessian(objective, start)) for start in starts]
-
-    def best_of_grid(self, evidence: Evidence, like: Tensor) -> Float[Tensor, ""]:
-        """Highest log evidence times prior that a search would start from, of all processes together."""
-        every = torch.arange(self.n_processes, device=like.device)
-        return self._table(evidence, every, like).amax(0).sum()
-
-    def maximum(self, evidence: Evidence, like: Tensor) -> Float[Tensor, ""]:
-        """Highest log evidence times prior that a search finds, of all processes together."""
-        theta = self.run(evidence, like)
-        value, _ = evidence(theta, torch.arange(self.n_processes, device=like.device))
-        return (value + self.family.log_prior(theta)[0]).sum()
-
-    def _table(self, value: Evidence, every: Tensor, like: Tensor) -> Float[Tensor, "s b"]:
-        """Log evidence times prior at the points of the grid; of all processes together where they share one scale.
-
-        Those of one length scale are tried together, as they take as many features; all, where calls cost more.
+        The gradient is to be that of a function of the features' inner products alone. Left out are features that
+        carry less than ``negligible`` of the variance, which is one.
         """
-        points = self.family.starts(like, self.n_features)
-        small = like.numel() * len(self.family.features.inducing) < _SMALL
-        parts = [
-            value(pair.repeat_interleave(len(every), dim=0), every.repeat(len(pair)))[0].reshape(-1, len(every))
-            for pair in points.split(len(points) if small else 2)
-        ]
-        table = (torch.cat(parts) + self.family.log_prior(points)[0][:, None]).nan_to_num(nan=-math.inf)
-        return table.sum(1, keepdim=True) if self.family.shared else table
+        inverse_square = length_scale.reciprocal().square()
+        gram, gram_slope = value_and_slope(self._gram, inverse_square, self._kernel)
+        factor = safe_cholesky(gram + self._jitter, name="the kernel matrix of the inducing inputs")
+        # The square of a diagonal entry is the variance at an inducing input given those before it, and given the
+        # first r of them none is farther from these than the next. One feature is left in any case.
+        carries = (factor.diagonal(dim1=-2, dim2=-1).square() > negligible[:, None]).any(0)
+        size = int(carries.nonzero().max()) + 1 if bool(carries.any()) else 1
+        factor, gram_slope = factor[:, :size, :size], gram_slope[:, :size, :size]
+        gram_squares, cross_squares = self._gram[:, :size, :size], self._cross[:, :size]
+        cross, cross_slope = value_and_slope(cross_squares, inverse_square, self._kernel)
+        values = torch.linalg.solve_triangular(factor, cross, upper=False).mT
 
-    def _spread_out(self, together: Float[Tensor, "s r"]) -> Float[Tensor, "sb q"]:
-        """Hyperparameters of each process from the length scales of all and the amplitude of each."""
-        scales = together[:, None, : self.n_features].expand(-1, self.n_processes, -1)
-        return torch.cat([scales, together[:, self.n_features :, None]], dim=2).flatten(0, 1)
+        # With K = L L' of the inducing inputs and C their kernel with the others the features are F' = inv(L) C, and
+        # dF' = inv(L) dC - P F', where P is the lower half of S = inv(L) dK inv(L)'. P and S / 2 differ by an
+        # antisymmetric matrix, a rotation of the features, which a function of inner products does not see:
+        # dF' = inv(L) (dC - dK inv(K) C / 2). For a squared distance s in length scales dk = -2 s k'(s) d log(scale).
+        def in_log_length_scale(gradient: Tensor) -> Tensor:
+            both = torch.cat([gradient.mT, values.mT], dim=-1)
+            adjoint, solved = torch.linalg.solve_triangular(factor.mT, both, upper=True).chunk(2, dim=-1)
+            in_cross = (adjoint * cross_slope).flatten(1) @ cross_squares.flatten(1).mT
+            in_gram = (adjoint @ solved.mT * gram_slope).flatten(1) @ gram_squares.flatten(1).mT
+            return (in_gram - 2.0 * in_cross) / length_scale.square()
+
+        return values, in_log_length_scale
 
 
-def _inverse_hessian(objective: _Objective, start: Float[Tensor, "b p"]) -> Float[Tensor, "b p p"]:
-    """By differences of gradients; of directions with less or negative curvature as if they had its size."""
-    n_problems, size = start.shape
-    steps = torch.cat([start.new_zeros(1, size), _DIFFERENCE * torch.eye(size).to(start)])
-    points = (start + steps[:, None]).flatten(0, 1)
-    rows = torch.arange(n_problems, device=start.device).repeat(size + 1)
-    _, gradients = objective(points, rows)
-    gradients = gradients.reshape(size + 1, n_problems, size)
-    hessian = ((gradients[1:] - gradients[0]) / _DIFFERENCE).transpose(0, 1)
-    curvature, axes = torch.linalg.eigh(0.5 * (hessian + hessian.mT).nan_to_num())
-    return axes @ torch.diag_embed(1.0 / curvature.abs().clamp_min(_LEAST_CURVATURE)) @ axes.mT
+def inducing_inputs(inputs: Float[Tensor, "n e"], n_inducing: int) -> Float[Tensor, "m e"]:
+    """The inputs themselves, or where they are too many the centres of their neighbourhoods."""
+    if len(inputs) <= n_inducing:
+        return inputs
+    index = neighbourhoods(inputs, n_inducing)
+    return sum_by(inputs, index) / torch.bincount(index).to(inputs)[:, None]

@@ -1,6 +1,6 @@
 """Linear models whose weights are standard normal numbers a priori, and regressions of an output on those before it."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -37,39 +37,34 @@ class LinearEvidence:
 
     value: Float[Tensor, "*b"]
     mean: Float[Tensor, "*b p"]
-    """Posterior mean of the weights."""
     factor: Float[Tensor, "*b p p"]
-    """Upper triangular; ``factor.mT @ factor`` is the precision of the weights' posterior."""
+    """Upper triangular; ``factor.mT @ factor`` is P."""
 
     @classmethod
     def fit(cls, design: Float[Tensor, "*b n p"], response: Float[Tensor, "*b n"]) -> "LinearEvidence":
         """Evidence of b designs."""
-        found = cls.from_factor(*weights_factor(design, response))
+        factor, projected = weights_factor(design, response)
+        mean = torch.linalg.solve_triangular(factor, projected.unsqueeze(-1), upper=True).squeeze(-1)
         # m'P m - y'y = -|y - D m|^2 - m'm: where the noise is small the left hand side is a difference of numbers of
         # 1e13, and the right one of residuals; an error of m changes it by no more than its square.
-        residual = response - (design @ found.mean.unsqueeze(-1)).squeeze(-1)
-        square = residual.square().sum(-1) + found.mean.square().sum(-1)
-        return replace(found, value=-0.5 * square - _log_det(found.factor))
-
-    @classmethod
-    def from_factor(cls, factor: Float[Tensor, "*b p p"], projected: Float[Tensor, "*b p"]) -> "LinearEvidence":
-        """Evidence of b designs, where ``factor @ mean = projected``."""
-        mean = torch.linalg.solve_triangular(factor, projected.unsqueeze(-1), upper=True).squeeze(-1)
-        return cls(0.5 * projected.square().sum(-1) - _log_det(factor), mean, factor)
+        residual = response - (design @ mean.unsqueeze(-1)).squeeze(-1)
+        square = residual.square().sum(-1) + mean.square().sum(-1)
+        return cls(-0.5 * square - _log_det(factor), mean, factor)
 
     @cached_property
     def covariance(self) -> Float[Tensor, "*b p p"]:
         """Posterior covariance of the weights."""
         return torch.cholesky_inverse(self.factor, upper=True)
 
+    @cached_property
+    def weights(self) -> Weights:
+        """Posterior of the weights."""
+        return Weights(self.mean, triangular_inverse(self.factor, upper=True))
+
     def gradient(self, design: Float[Tensor, "*b n p"], response: Float[Tensor, "*b n"]) -> Float[Tensor, "*b n p"]:
         """Gradient of the value in the design: (y - D m) m' - D inv(P)."""
         residual = response.unsqueeze(-1) - design @ self.mean.unsqueeze(-1)
         return residual * self.mean.unsqueeze(-2) - design @ self.covariance
-
-    def weights(self) -> Weights:
-        """The posterior."""
-        return Weights(self.mean, triangular_inverse(self.factor, upper=True))
 
     def divergence_from_prior(self) -> Float[Tensor, "*b"]:
         """Kullback-Leibler divergence of the weights' posterior from standard normal numbers, in nats."""
@@ -87,14 +82,62 @@ def weights_factor(design: Tensor, response: Tensor) -> tuple[Tensor, Tensor]:
     Where the noise is small beside what the features carry the precision, one on its diagonal beside their
     squares, cannot be formed in floating point; then by a QR decomposition, which is slower.
     """
-    precision = design.mT @ design + torch.eye(design.shape[-1]).to(design)
+    eye = torch.eye(design.shape[-1]).to(design)
+    precision = design.mT @ design + eye
     if float(precision.diagonal(dim1=-2, dim2=-1).detach().amax()) < _LARGEST_PRECISION:
         lower = safe_cholesky(precision, name="the precision of the latent weights")
         projected = torch.linalg.solve_triangular(lower, design.mT @ response.unsqueeze(-1), upper=False)
         return lower.mT, projected.squeeze(-1)
-    eye = torch.eye(design.shape[-1]).to(design).expand(*design.shape[:-2], -1, -1)
-    orthogonal, upper = torch.linalg.qr(torch.cat([design, eye], dim=-2))
+    orthogonal, upper = torch.linalg.qr(torch.cat([design, eye.expand(*design.shape[:-2], -1, -1)], dim=-2))
     return upper, (orthogonal[..., : design.shape[-2], :].mT @ response.unsqueeze(-1)).squeeze(-1)
+
+
+class Couplings(NamedTuple):
+    """Scatters of the i outputs at an input with these and, last, the response, of coupled inputs: weighted by W'W."""
+
+    own: Float[Tensor, "n i j"]
+    """With those at the same input."""
+    after: Float[Tensor, "m i j"]
+    """With those at the next input: m = n - 1, or none where inputs are coupled with themselves alone."""
+    before: Float[Tensor, "m i j"]
+    """Of all inputs but the first, with those at the input before."""
+
+    def scaled(self, precision: Float[Tensor, " n"]) -> "Couplings":
+        """Scatters times the roots of the precisions on both sides."""
+        root, n = precision.sqrt()[:, None, None], len(self.after)
+        beside = root[:n] * root[len(root) - n :]
+        return Couplings(precision[:, None, None] * self.own, beside * self.after, beside * self.before)
+
+    def response(self) -> Float[Tensor, "n i"]:
+        """Sum over the coupled inputs of the scatters with the response."""
+        return _at_inputs(self.own[..., -1], self.after[..., -1], self.before[..., -1])
+
+    def precision(self, features: Float[Tensor, "b n p"]) -> Float[Tensor, "b ip ip"]:
+        """Precision of the weights: all pairs of coefficients by all products of two features."""
+        own, after = self.own[..., :-1].flatten(1), self.after[..., :-1].flatten(1)
+        first, last = features[:, : len(after)], features[:, len(own) - len(after) :]
+        half = 0.5 * own.mT @ _products(features, features) + after.mT @ _products(first, last)
+        size, n_features = self.own.shape[1], features.shape[-1]
+        half = half.reshape(-1, size, size, n_features, n_features).transpose(2, 3)
+        half = half.reshape(len(features), size * n_features, -1)
+        return half + half.mT + torch.eye(size * n_features).to(features)
+
+    def weighted(self, spread: Float[Tensor, "n ii p"]) -> Float[Tensor, "n p"]:
+        """Sum over the coupled inputs and the pairs of outputs."""
+        n = len(self.after)
+        parts = zip(self, (spread, spread[len(spread) - n :], spread[:n]), strict=True)
+        return _at_inputs(*((part[..., :-1].flatten(1).unsqueeze(1) @ each).squeeze(1) for part, each in parts))
+
+
+def _products(left: Float[Tensor, "b m p"], right: Float[Tensor, "b m p"]) -> Float[Tensor, "b m pp"]:
+    """All products of a feature on the left and one on the right."""
+    return (left.unsqueeze(-1) * right.unsqueeze(-2)).flatten(2)
+
+
+def _at_inputs(own: Float[Tensor, "n p"], after: Float[Tensor, "m p"], before: Float[Tensor, "m p"]) -> Tensor:
+    """Sum at each input of what it has with itself, with the next one and with the one before."""
+    none = own.new_zeros(len(own) - len(after), own.shape[1])
+    return own + torch.cat([after, none]) + torch.cat([none, before])
 
 
 @dataclass(frozen=True)
@@ -112,24 +155,24 @@ class Regression:
 
     @classmethod
     def standardize(
-        cls,
-        scatter: Float[Tensor, "n j j"],
-        tril: Float[Tensor, "n i i"],
-        whitener: Float[Tensor, "n n"] | None,
+        cls, scatter: Float[Tensor, "n j j"], tril: Float[Tensor, "n i i"], whitener: Float[Tensor, "n n"] | None
     ) -> "Regression":
         """Regression of the last output of a scatter; ``tril`` is the factor of the others' covariance."""
         size = tril.shape[-1]
         # diag(inv(T), 1) S diag(inv(T), 1)': the outputs before get unit covariance, the last one keeps its unit.
-        eye = torch.eye(size + 1).to(scatter)
-        standardizing = eye.repeat(len(scatter), 1, 1)
+        standardizing = torch.eye(size + 1).to(scatter).repeat(len(scatter), 1, 1)
         standardizing[:, :size, :size] = triangular_inverse(tril)
         return cls(symmetrize(standardizing @ scatter @ standardizing.mT), whitener)
+
+    @property
+    def size(self) -> int:
+        """Number i of outputs before."""
+        return self.scatter.shape[-1] - 1
 
     @cached_property
     def before(self) -> Float[Tensor, "n i i"]:
         """Scatter of the i standardized outputs."""
-        before = self.scatter[:, :-1, :-1]
-        return before + _RIDGE * torch.eye(before.shape[-1]).to(before)
+        return self.scatter[:, :-1, :-1] + _RIDGE * torch.eye(self.size).to(self.scatter)
 
     @cached_property
     def root(self) -> Float[Tensor, "n i i"]:
@@ -142,7 +185,7 @@ class Regression:
         return torch.linalg.solve_triangular(self.root, self.scatter[:, :-1, -1:], upper=False).squeeze(-1)
 
     @cached_property
-    def couplings(self) -> "Couplings | None":
+    def couplings(self) -> Couplings | None:
         """Couplings of inputs with themselves and their neighbours; None where they are coupled with others too.
 
         The inverse W'W of an exponential correlation along a line is zero but for neighbours, as that of a Markov
@@ -167,13 +210,14 @@ class Regression:
         rows an input, it would be i times the work.
         """
         if self.couplings is not None:
-            own, after, before = self.couplings.scaled(precision)
-            blocks = self._precision_of_weights(own[..., :-1], after[..., :-1], features)
+            couplings = self.couplings.scaled(precision)
+            blocks = couplings.precision(features)
             if float(blocks.detach().diagonal(dim1=-2, dim2=-1).amax()) < _LARGEST_PRECISION:
                 factor = safe_cholesky(blocks, name="the precision of the coefficients' weights")
-                cross = _at_inputs(own[..., -1], after[..., -1], before[..., -1]).mT @ features
-                projected = torch.linalg.solve_triangular(factor, cross.flatten(1).unsqueeze(-1), upper=False)
-                return LinearEvidence.from_factor(factor.mT, projected.squeeze(-1))
+                cross = (couplings.response().mT @ features).flatten(1).unsqueeze(-1)
+                projected = torch.linalg.solve_triangular(factor, cross, upper=False)
+                mean = torch.linalg.solve_triangular(factor.mT, projected, upper=True).squeeze(-1)
+                return LinearEvidence(0.5 * projected.square().sum((-2, -1)) - _log_det(factor), mean, factor.mT)
         return LinearEvidence.fit(*self._design(features, precision))
 
     def gradient(
@@ -185,59 +229,41 @@ class Regression:
         that of ``m' c - tr((inv(P) + m m') X) / 2``: block (j, k) of X is the sum over coupled inputs l and r of
         ``weight_jk F_l F_r'``.
         """
-        size, n_features = self._shape(features)
+        n_inputs, n_features = features.shape[1:]
         if self.couplings is None:
             gradient = linear.gradient(*self._design(features, precision))
-            gradient = gradient.reshape(len(features), len(precision), size, size, n_features)
+            gradient = gradient.reshape(len(features), n_inputs, self.size, self.size, n_features)
             gradient = torch.einsum("mn,bmajp->bnajp", self.whitener, gradient)
             return torch.einsum("n,nja,bnajp->bnp", precision.sqrt(), self.root, gradient)
-        own, after, before = self.couplings.scaled(precision)
-        cross = _at_inputs(own[..., -1], after[..., -1], before[..., -1])
+        couplings = self.couplings.scaled(precision)
+        response = couplings.response()
         second = linear.covariance + linear.mean.unsqueeze(-1) * linear.mean.unsqueeze(-2)
         in_features = []
         for mean, its_second, its_features in zip(linear.mean, second, features, strict=True):  # bounds the memory
             spread = self._spread(its_second, its_features)
-            first, last = spread[: len(after)], spread[len(own) - len(after) :]
-            products = (_weighted(own, spread), _weighted(after, last), _weighted(before, first))
-            in_features.append(cross @ mean.reshape(size, n_features) - _at_inputs(*products))
+            in_features.append(response @ mean.reshape(self.size, n_features) - couplings.weighted(spread))
         return torch.stack(in_features)
 
-    def squares(
+    def expected_squares(
         self, features: Float[Tensor, "n p"], mean: Float[Tensor, " ip"], covariance: Float[Tensor, "ip ip"]
-    ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
-        """Sum of squared residuals from the expected coefficients, and what their error adds to it.
-
-        ``mean`` and ``covariance`` are of the weights.
-        """
+    ) -> Float[Tensor, " n"]:
+        """Expected sum of squared residuals, with the weights' mean and covariance."""
         # With coefficients b the sum of squares is (-b, 1) S (-b, 1)', and tr(before cov(b)) what their error adds.
-        coefficients = features @ mean.reshape(self._shape(features)).mT
+        coefficients = features @ mean.reshape(self.size, -1).mT
         direction = torch.cat([-coefficients, torch.ones_like(coefficients[:, :1])], dim=1)
         explained = (direction.unsqueeze(1) @ self.scatter @ direction.unsqueeze(2)).flatten()
         spread = self.before.flatten(1).unsqueeze(1) @ self._spread(covariance, features)
-        unknown = (spread.squeeze(1) * features).sum(-1)
-        return explained.clamp_min(0.0), unknown
+        return explained.clamp_min(0.0) + (spread.squeeze(1) * features).sum(-1)
 
     def local_squares(self) -> Float[Tensor, " n"]:
         """Sum of squared residuals from the coefficients that fit best at each input by itself."""
         return (self.scatter[:, -1, -1] - self.response.square().sum(-1)).clamp_min(0.0)
 
-    def _precision_of_weights(self, own: Tensor, after: Tensor, features: Tensor) -> Tensor:
-        """Precision (b, i * p, i * p) of the weights: all pairs of coefficients by all products of two features."""
-        size, n_features = self._shape(features)
-        first, last = features[:, : len(after)], features[:, len(own) - len(after) :]
-        half = 0.5 * own.flatten(1).mT @ _products(features, features) + after.flatten(1).mT @ _products(first, last)
-        half = half.reshape(-1, size, size, n_features, n_features).transpose(2, 3)
-        half = half.reshape(len(features), size * n_features, -1)
-        return half + half.mT + torch.eye(size * n_features).to(features)
-
     def _spread(self, covariance: Tensor, features: Tensor) -> Float[Tensor, "n ii p"]:
         """Each block of a covariance of the weights times the features (n, p) of each input."""
-        size, n_features = self._shape(features)
+        size, n_features = self.size, features.shape[-1]
         blocks = covariance.reshape(size, n_features, size, n_features).permute(3, 0, 2, 1)
         return (features @ blocks.flatten(1)).unflatten(-1, (size * size, n_features))
-
-    def _shape(self, features: Tensor) -> tuple[int, int]:
-        return self.scatter.shape[-1] - 1, features.shape[-1]
 
     def _design(self, features: Tensor, precision: Tensor) -> tuple[Tensor, Tensor]:
         """Design (b, n * i, i * p) of the rows of the root at each input, whitened, and the response."""
@@ -249,41 +275,3 @@ class Regression:
             design = torch.einsum("mn,bnaq->bmaq", self.whitener, design)
             response = self.whitener @ response
         return design.flatten(1, 2), response.flatten().expand(len(design), -1)
-
-
-class Couplings(NamedTuple):
-    """Scatters of the i outputs at an input with these and, last, the response, of coupled inputs: weighted by W'W."""
-
-    own: Float[Tensor, "n i j"]
-    """With those at the same input."""
-    after: Float[Tensor, "m i j"]
-    """With those at the next input: m = n - 1, or none where inputs are coupled with themselves alone."""
-    before: Float[Tensor, "m i j"]
-    """Of all inputs but the first, with those at the input before."""
-
-    def scaled(self, precision: Float[Tensor, " n"]) -> "Couplings":
-        """Scatters times the roots of the precisions on both sides."""
-        root = precision.sqrt()[:, None, None]
-        n = len(self.after)
-        beside = root[:n] * root[len(root) - n :]
-        return Couplings(precision[:, None, None] * self.own, beside * self.after, beside * self.before)
-
-
-def _at_inputs(own: Float[Tensor, "n p"], after: Float[Tensor, "m p"], before: Float[Tensor, "m p"]) -> Tensor:
-    """Sum at each input of what it has with itself, with the next one and with the one before."""
-    n_single = len(own) - len(after)
-    return (
-        own
-        + torch.cat([after, own.new_zeros(n_single, own.shape[1])])
-        + torch.cat([own.new_zeros(n_single, own.shape[1]), before])
-    )
-
-
-def _weighted(part: Float[Tensor, "n i j"], spread: Float[Tensor, "n ii p"]) -> Float[Tensor, "n p"]:
-    """Sum over the pairs of outputs."""
-    return (part[..., :-1].flatten(1).unsqueeze(1) @ spread).squeeze(1)
-
-
-def _products(left: Float[Tensor, "b m p"], right: Float[Tensor, "b m p"]) -> Float[Tensor, "b m pp"]:
-    """All products of a feature on the left and one on the right."""
-    return (left.unsqueeze(-1) * right.unsqueeze(-2)).flatten(2)

@@ -4,6 +4,7 @@ demonstration do.
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -111,6 +112,15 @@ def _too_smooth(training: TrainingSet) -> Bool[Tensor, " d"]:
     return smooth & training.repeats_inputs & (counts.min() > 1.0)
 
 
+class NoiseCorrelation(NamedTuple):
+    """Correlation of means, or of mean squares, of each output at n inputs."""
+
+    whitener: Float[Tensor, "d n n"]
+    """Makes them independent, of the variances of independent rows' ones."""
+    copies: Float[Tensor, "d n"]
+    """Rows at each input that count for one."""
+
+
 @dataclass(frozen=True)
 class DemonstrationCorrelation:
     """Correlation of the whitened residuals of one demonstration, ``exp(-distance / (2 * decay))``.
@@ -130,67 +140,20 @@ class DemonstrationCorrelation:
         """Whether samples of any output are correlated."""
         return bool((self.decay > 0).any())
 
-    def matrix(
-        self, inputs: Float[Tensor, "n e"], occurrences: Float[Tensor, "g n"], *, squares: bool
-    ) -> Float[Tensor, "d n n"]:
-        """Covariance of the means (or mean squares) at n inputs, were they of independent rows of unit variance.
-
-        ``occurrences`` are the rows of each of g demonstrations at each input: those of one demonstration at one
-        input are copies, so a diagonal entry is the number of rows that count for one.
-        """
+    def at_inputs(self, rows: TrainingSet, group: Int64[Tensor, " rows"], *, squares: bool) -> NoiseCorrelation:
+        """Correlation of the means, or the mean ``squares``, at the inputs of rows of demonstrations ``group``."""
+        inputs, counts = rows.inputs, rows.counts
+        # Rows of one demonstration at one input are copies: a diagonal entry is the number of rows that count for one.
+        names, number = group.unique(return_inverse=True)
+        occurrences = torch.bincount(number * len(inputs) + rows.index, minlength=len(names) * len(inputs))
+        occurrences = occurrences.reshape(len(names), -1).to(inputs)
+        shared = occurrences.mT @ occurrences / (counts[:, None] * counts).sqrt()
         distance = torch.cdist(inputs, inputs, compute_mode="donot_use_mm_for_euclid_dist")
         decay = self.decay[:, None, None].clamp_min(_LEAST)
-        correlation = torch.exp(-distance / (decay if squares else 2.0 * decay))
-        counts = occurrences.sum(0)
-        shared = occurrences.mT @ occurrences / (counts[:, None] * counts).sqrt()
-        return torch.where(self.decay[:, None, None] > 0, correlation * shared, torch.eye(len(inputs)).to(inputs))
-
-
-@dataclass(frozen=True)
-class NoiseCorrelation:
-    """Whitener of the mean squares of each output at n inputs; None where these are independent."""
-
-    square_whitener: Float[Tensor, "d n n"] | None = None
-    copies: Float[Tensor, "d n"] | None = None
-    """Rows at each input that count for one."""
-
-    @classmethod
-    def build(
-        cls, correlation: DemonstrationCorrelation | None, rows: TrainingSet, group: Int64[Tensor, " rows"] | None
-    ) -> "NoiseCorrelation":
-        """Whitener for rows of demonstrations ``group``."""
-        if group is None or correlation is None or not correlation.matters:
-            return cls()
-        squares = correlation.matrix(rows.inputs, _occurrences(rows, group), squares=True)
-        return cls(_whitener(squares), squares.diagonal(dim1=1, dim2=2))
-
-    def restrict(self, outputs: Int64[Tensor, " b"]) -> "NoiseCorrelation":
-        """Whitener of the selected outputs."""
-        if self.square_whitener is None or self.copies is None:
-            return self
-        return NoiseCorrelation(self.square_whitener[outputs], self.copies[outputs])
-
-
-def mean_whitener(
-    correlation: DemonstrationCorrelation | None, rows: TrainingSet, group: Int64[Tensor, " rows"] | None
-) -> Float[Tensor, "d n n"] | None:
-    """Whitener of the means of each output at the inputs; None where these are independent."""
-    if group is None or correlation is None or not correlation.matters:
-        return None
-    return _whitener(correlation.matrix(rows.inputs, _occurrences(rows, group), squares=False))
-
-
-def _occurrences(rows: TrainingSet, group: Tensor) -> Float[Tensor, "g n"]:
-    """Rows of each demonstration at each distinct input."""
-    names, number = group.unique(return_inverse=True)
-    size = len(names) * len(rows.inputs)
-    found = torch.bincount(number * len(rows.inputs) + rows.index, minlength=size)
-    return found.reshape(len(names), -1).to(rows.inputs)
-
-
-def _whitener(matrix: Tensor) -> Tensor:
-    """Inverses of lower factors."""
-    return triangular_inverse(safe_cholesky(matrix, name="the correlation of the demonstrations"))
+        correlation = shared * torch.exp(-distance / (decay if squares else 2.0 * decay))
+        matrix = torch.where(self.decay[:, None, None] > 0, correlation, torch.eye(len(inputs)).to(inputs))
+        factor = safe_cholesky(matrix, name="the correlation of the demonstrations")
+        return NoiseCorrelation(triangular_inverse(factor), matrix.diagonal(dim1=1, dim2=2))
 
 
 def demonstration_correlation(

@@ -7,8 +7,8 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ExpSineSquared, Matern
 
 from torch_pbd.gp import spacing
-from torch_pbd.gp.inducing import FeatureMap, FixedFeatures, inducing_inputs
 from torch_pbd.kernels import KERNELS
+from torch_pbd.models.heteroscedastic.processes import FixedFeatures, ProcessFamily, inducing_inputs
 from torch_pbd.models.heteroscedastic.regression import LinearEvidence
 
 ORACLES = {
@@ -22,13 +22,24 @@ def tensor(array):
     return torch.tensor(array, dtype=torch.float64)
 
 
+def family_on(inducing, kernel="squared_exponential", period=None, **options):
+    return ProcessFamily(inducing, 0.5, 1.0, 0.0, kernel=kernel, period=period, **options)
+
+
+def features(family, length_scale, x):
+    """Features of processes of unit variance, for one or several length scales."""
+    scales = torch.atleast_2d(length_scale)
+    values = family.processes(scales, torch.ones(len(scales)).to(scales))(x)
+    return values if length_scale.ndim > 1 else values[0]
+
+
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("length_scale", [[0.3], [0.4, 2.0]])
 def test_inner_products_of_features_are_the_kernel_at_the_inducing_inputs(kernel, length_scale, rng):
     """And with any other input, whatever lies between."""
     x, other = (rng.uniform(-1.0, 1.0, size=(n, len(length_scale))) for n in (10, 7))
-    features = FeatureMap(tensor(x), kernel)
-    first, second = (features(tensor(length_scale))(tensor(z)) for z in (x, other))
+    family = family_on(tensor(x), kernel)
+    first, second = (features(family, tensor(length_scale), tensor(z)) for z in (x, other))
     expected = ORACLES[kernel](length_scale)
     # The jitter of 1e-10, times what is left of other directions of the kernel matrix.
     np.testing.assert_allclose(first @ first.mT, expected(x), rtol=0, atol=2e-10)
@@ -38,18 +49,18 @@ def test_inner_products_of_features_are_the_kernel_at_the_inducing_inputs(kernel
 def test_each_length_scale_of_a_batch_is_on_its_own(generator):
     x = torch.rand(6, 2, dtype=torch.float64, generator=generator)
     length_scale = tensor([[0.3, 2.0], [1.0, 0.2], [0.5, 0.5]])
-    features = FeatureMap(x[:4])
-    batch = features(length_scale)(x)
+    family = family_on(x[:4])
+    batch = features(family, length_scale, x)
     for i in range(3):
-        torch.testing.assert_close(batch[i], features(length_scale[i])(x), rtol=1e-9, atol=1e-11)
+        torch.testing.assert_close(batch[i], features(family, length_scale[i], x), rtol=1e-9, atol=1e-11)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_features_are_differentiable_in_inputs_and_length_scales(kernel, generator):
-    features = FeatureMap(torch.rand(5, 2, dtype=torch.float64, generator=generator), kernel)
+    family = family_on(torch.rand(5, 2, dtype=torch.float64, generator=generator), kernel)
     x = torch.rand(3, 2, dtype=torch.float64, generator=generator).requires_grad_()
     length_scale = tensor([[0.3, 0.8], [0.5, 0.4]]).requires_grad_()
-    assert torch.autograd.gradcheck(lambda x, length_scale: features(length_scale)(x), (x, length_scale))
+    assert torch.autograd.gradcheck(lambda x, length_scale: features(family, length_scale, x), (x, length_scale))
 
 
 def test_periodic_predictions_are_those_of_scikit_learn(rng):
@@ -60,14 +71,14 @@ def test_periodic_predictions_are_those_of_scikit_learn(rng):
     peer_kernel = ExpSineSquared(2.0 * np.pi * length_scale / period, period)
     x, y = rng.uniform(0.0, period, size=(9, 1)), rng.normal(size=9)
     peer = GaussianProcessRegressor(peer_kernel, alpha=0.04, optimizer=None).fit(x, y)
-    features = FeatureMap(tensor(x), period=tensor([period]), exact=True)
+    family = family_on(tensor(x), period=tensor([period]), exact=True)
 
     def predict(query):
-        design = features(tensor([length_scale]))(tensor(query))
+        design = features(family, tensor([length_scale]), tensor(query))
         root = design @ weights.root
         return (design @ weights.mean).numpy(), (1.0 - design.square().sum(1) + root.square().sum(1)).sqrt().numpy()
 
-    weights = LinearEvidence.fit(5.0 * features(tensor([length_scale]))(tensor(x)), tensor(5.0 * y)).weights()
+    weights = LinearEvidence.fit(5.0 * features(family, tensor([length_scale]), tensor(x)), tensor(5.0 * y)).weights
     query = rng.uniform(-2.0, 3.0, size=(20, 1))
     mean, std = peer.predict(query, return_std=True)
     np.testing.assert_allclose(predict(query)[0], mean, rtol=0, atol=1e-7)
@@ -78,22 +89,22 @@ def test_periodic_predictions_are_those_of_scikit_learn(rng):
 
 def test_an_input_without_a_period_does_not_repeat(generator):
     x = torch.rand(6, 2, dtype=torch.float64, generator=generator)
-    features = FeatureMap(x, "matern32", tensor([0.8, torch.inf]))
-    start = features(tensor([0.3, 0.3]))(x)
-    turned = features(tensor([0.3, 0.3]))(x + tensor([0.8, 0.0]))
+    family = family_on(x, "matern32", tensor([0.8, torch.inf]))
+    start = features(family, tensor([0.3, 0.3]), x)
+    turned = features(family, tensor([0.3, 0.3]), x + tensor([0.8, 0.0]))
     torch.testing.assert_close(turned, start, rtol=0, atol=1e-6)
-    assert (features(tensor([0.3, 0.3]))(x + tensor([0.0, 0.8])) - start).abs().max() > 0.1
+    assert (features(family, tensor([0.3, 0.3]), x + tensor([0.0, 0.8])) - start).abs().max() > 0.1
 
 
-def missing(features, x, length_scale):
-    return 1.0 - features(length_scale)(x).square().sum(-1)
+def missing(family, x, length_scale):
+    return 1.0 - features(family, length_scale, x).square().sum(-1)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_the_more_inducing_inputs_the_less_variance_is_missing(kernel):
     x = torch.linspace(-0.5, 0.5, 301, dtype=torch.float64)[:, None]
-    maps = [FeatureMap(inducing_inputs(x, n), kernel) for n in (2, 4, 8, 16, 32)]
-    worst = [float(missing(features, x, tensor([0.2])).max()) for features in maps]
+    families = [family_on(inducing_inputs(x, n), kernel) for n in (2, 4, 8, 16, 32)]
+    worst = [float(missing(family, x, tensor([0.2])).max()) for family in families]
     assert worst[0] > 0.2
     # Of a smooth kernel only the jitter's share is missing soon, 1e-10 of each feature.
     assert all(after < 0.6 * before for before, after in pairwise(worst) if after > 1e-8)
@@ -102,14 +113,14 @@ def test_the_more_inducing_inputs_the_less_variance_is_missing(kernel):
 
 def test_at_the_shortest_length_scale_features_carry_nearly_all_of_the_variance_between():
     z = torch.linspace(-0.5, 0.5, 21, dtype=torch.float64)[:, None]
-    features = FeatureMap(z)
-    shortest = features.shortest_length_scale
+    family = family_on(z)
+    shortest = family.shortest_length_scale
     assert shortest == pytest.approx(spacing(z), rel=1e-9)
     between = torch.linspace(-0.5, 0.5, 401, dtype=torch.float64)[:, None]
-    lacking = missing(features, between, tensor([shortest]))
+    lacking = missing(family, between, tensor([shortest]))
     assert float(lacking[80:-80].max()) < 5.5e-3
     assert float(lacking.max()) < 1.5e-2  # between the last two, which have neighbours on one side
-    assert FeatureMap(z, exact=True).shortest_length_scale == pytest.approx(0.75 * spacing(z), rel=1e-9)
+    assert family_on(z, exact=True).shortest_length_scale == pytest.approx(0.75 * spacing(z), rel=1e-9)
 
 
 def test_inducing_inputs_are_the_inputs_or_the_means_of_runs_of_them(rng):
@@ -122,15 +133,15 @@ def test_inducing_inputs_are_the_inputs_or_the_means_of_runs_of_them(rng):
 
 def test_stretched_features_are_those_of_inputs_with_more_length_at_the_ends():
     x = tensor(np.linspace(-0.5, 0.5, 41)[:, np.newaxis])
-    stretched = FeatureMap(x[::4], stretch=tensor([[0.4, 0.1], [1.0, 0.02]]))
+    stretched = family_on(x[::4], stretch=tensor([[0.4, 0.1], [1.0, 0.02]]))
     at = stretched.warped(x)
     assert float(at.diff(dim=0).min()) > 0.0
     # Of the length one that is added at the end exp(-1) is more than the width away from it, and of .4 at the start.
     np.testing.assert_allclose(at[[0, 4, -1], 0] - at[20, 0], [-0.9, -0.5 + 0.1 - 0.4 * np.exp(-1), 1.5], atol=0.01)
-    plain = FeatureMap(stretched.warped(x[::4]))
-    np.testing.assert_array_equal(stretched(tensor([0.3]))(x), plain(tensor([0.3]))(at))
+    plain = family_on(stretched.warped(x[::4]))
+    np.testing.assert_array_equal(features(stretched, tensor([0.3]), x), features(plain, tensor([0.3]), at))
     values, _ = FixedFeatures(stretched, x).vjp(tensor([[0.3]]), tensor([0.0]))
-    expected = stretched(tensor([0.3]))(x)
+    expected = features(stretched, tensor([0.3]), x)
     torch.testing.assert_close(values[0] @ values[0].mT, expected @ expected.mT, rtol=0, atol=1e-6)
     assert stretched.shortest_length_scale == plain.shortest_length_scale
     # Beyond the ends no length is added.

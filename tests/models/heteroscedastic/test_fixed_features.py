@@ -1,19 +1,30 @@
 import pytest
 import torch
 
-from torch_pbd.gp.inducing import FeatureMap, FixedFeatures
 from torch_pbd.kernels import KERNELS
+from torch_pbd.models.heteroscedastic.processes import FixedFeatures, ProcessFamily
 
 
 def tensor(values):
     return torch.tensor(values, dtype=torch.float64)
 
 
+def family_on(inducing, kernel="squared_exponential", period=None, **options):
+    return ProcessFamily(inducing, 0.5, 1.0, 0.0, kernel=kernel, period=period, **options)
+
+
+def features(family, length_scale, x):
+    """Features of processes of unit variance, for one or several length scales."""
+    scales = torch.atleast_2d(length_scale)
+    values = family.processes(scales, torch.ones(len(scales)).to(scales))(x)
+    return values if length_scale.ndim > 1 else values[0]
+
+
 def maps(kernel, n_features, period, generator):
     inducing = torch.rand(12, n_features, dtype=torch.float64, generator=generator)
     x = torch.rand(7, n_features, dtype=torch.float64, generator=generator)
-    features = FeatureMap(inducing, kernel, None if period is None else tensor(period))
-    return features, FixedFeatures(features, x), x
+    family = family_on(inducing, kernel, None if period is None else tensor(period))
+    return family, FixedFeatures(family, x), x
 
 
 CASES = [(1, None), (2, None), (2, [1.3, torch.inf])]
@@ -22,9 +33,9 @@ CASES = [(1, None), (2, None), (2, [1.3, torch.inf])]
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize(("n_features", "period"), CASES)
 def test_values_are_those_of_the_map_but_for_a_rotation(kernel, n_features, period, generator):
-    features, fixed, x = maps(kernel, n_features, period, generator)
+    family, fixed, x = maps(kernel, n_features, period, generator)
     length_scale = tensor([[0.1, 0.3], [0.2, 0.05]])[:, :n_features]
-    found, expected = fixed.vjp(length_scale, tensor([1e-12, 1e-12]))[0], features(length_scale)(x)
+    found, expected = fixed.vjp(length_scale, tensor([1e-12, 1e-12]))[0], features(family, length_scale, x)
     torch.testing.assert_close(found @ found.mT, expected @ expected.mT, rtol=0, atol=1e-8)
 
 
@@ -32,14 +43,14 @@ def test_values_are_those_of_the_map_but_for_a_rotation(kernel, n_features, peri
 @pytest.mark.parametrize(("n_features", "period"), CASES)
 def test_gradient_in_the_length_scales_is_that_of_autograd(kernel, n_features, period, generator):
     """Of a function of the inner products; through the map's Cholesky factor by autograd."""
-    features, fixed, x = maps(kernel, n_features, period, generator)
+    family, fixed, x = maps(kernel, n_features, period, generator)
     log_scale = tensor([[0.1, 0.3], [0.2, 0.05]])[:, :n_features].log().requires_grad_()
     weight = torch.randn(7, 7, dtype=torch.float64, generator=generator)
 
     def of_products(values):
         return (weight * (values @ values.mT).sin()).sum()
 
-    (expected,) = torch.autograd.grad(of_products(features(log_scale.exp())(x)), log_scale)
+    (expected,) = torch.autograd.grad(of_products(features(family, log_scale.exp(), x)), log_scale)
     values, vjp = fixed.vjp(log_scale.detach().exp(), tensor([1e-12, 1e-12]))
     values.requires_grad_()
     (gradient,) = torch.autograd.grad(of_products(values), values)
@@ -50,7 +61,7 @@ def test_features_that_carry_next_to_nothing_are_left_out():
     """The longer the length scale the more of them; what is left carries all but about what was allowed."""
     inducing = torch.linspace(-0.5, 0.5, 60, dtype=torch.float64)[:, None]
     x = torch.linspace(-0.5, 0.5, 200, dtype=torch.float64)[:, None]
-    fixed = FixedFeatures(FeatureMap(inducing), x)
+    fixed = FixedFeatures(family_on(inducing), x)
     sizes = []
     for scale in (0.05, 0.2, 0.8):
         values = fixed.vjp(tensor([[scale]]), tensor([1e-8]))[0][0]
@@ -61,15 +72,15 @@ def test_features_that_carry_next_to_nothing_are_left_out():
 
 
 def test_inducing_inputs_are_taken_farthest_first():
-    features = FeatureMap(tensor([[0.0], [0.1], [0.5], [0.9], [1.0]]))
-    assert features.farthest_first.tolist()[:3] in ([2, 0, 4], [2, 4, 0])
-    around = FeatureMap(tensor([[0.0], [0.5], [0.9]]), period=tensor([1.0]))  # 0.9 is next to 0.0
+    family = family_on(tensor([[0.0], [0.1], [0.5], [0.9], [1.0]]))
+    assert family.farthest_first.tolist()[:3] in ([2, 0, 4], [2, 4, 0])
+    around = family_on(tensor([[0.0], [0.5], [0.9]]), period=tensor([1.0]))  # 0.9 is next to 0.0
     assert sorted(around.farthest_first.tolist()[:2])[1] == 1 or around.farthest_first.tolist()[1] == 1
 
 
 def test_where_nothing_can_be_told_one_feature_is_left():
     """Observations without information, as of outputs that all vanish, are no error."""
-    features = FeatureMap(tensor([[0.0], [0.5], [1.0]]))
-    values, vjp = FixedFeatures(features, tensor([[0.2]])).vjp(tensor([[0.3]]), tensor([1e4]))
+    family = family_on(tensor([[0.0], [0.5], [1.0]]))
+    values, vjp = FixedFeatures(family, tensor([[0.2]])).vjp(tensor([[0.3]]), tensor([1e4]))
     assert values.shape == (1, 1, 1)
     assert torch.isfinite(vjp(torch.ones_like(values))).all()

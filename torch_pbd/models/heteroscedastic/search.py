@@ -1,0 +1,221 @@
+"""Inducing inputs that the model's processes rest on, and the search for hyperparameters by their evidence."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from itertools import product
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from torch_pbd.exceptions import NotPositiveDefiniteError
+from torch_pbd.files.memory import require_much
+from torch_pbd.models.heteroscedastic.processes import ProcessFamily, inducing_inputs
+from torch_pbd.optim import FitReport, Progress, Status, first_failure, minimize_batch
+
+# Prior medians of length scale (in ranges of the input) and amplitude, and prior deviation of the constant. Means
+# are of outputs with unit variance, log variances and coefficients of residuals with a pooled unit covariance.
+_MEAN = (0.3, 1.2, 0.0)
+_LOG_VARIANCE = (0.5, 1.0, 2.0)
+_COEFFICIENT = (0.5, 0.3, 1.0)
+
+# By default, for one column of X and for several, and where these do not resolve what is learned. At most of all
+# outputs together, for the mean and for the covariance, as a fit takes the cube of these; but a dozen for each output.
+_OF_ONE, _OF_SEVERAL, _MOST, _TOGETHER, _FEWEST = 48, 128, 128, (800, 400), 12
+
+# Length scales, in ranges of the inputs, short to long by threes; and logarithms of amplitudes, weak and strong.
+_STARTS = tuple(product((0.04, 0.12, 0.35, 1.0), (-1.0, 0.5)))
+_SMALL = 10_000  # entries of all processes' features
+_DIFFERENCE = 1e-3  # of hyperparameters, whose gradients' differences tell the curvature at a start
+_LEAST_CURVATURE = 0.2  # about half of the prior's
+
+Gradient = Callable[[], Float[Tensor, "a q"]]
+Evidence = Callable[[Float[Tensor, "a q"], Int64[Tensor, " a"]], tuple[Float[Tensor, " a"], Gradient]]
+"""Log evidence of hyperparameters of some of the processes, given which ones; and what computes its gradients."""
+
+
+class Families(NamedTuple):
+    """Families of the processes of the mean, and of the log variances."""
+
+    mean: ProcessFamily
+    log_variance: ProcessFamily
+
+    @property
+    def coefficients(self) -> ProcessFamily:
+        """Family of the coefficients of the factor, on the features of the log variances."""
+        length_scale, amplitude, constant = _COEFFICIENT
+        return replace(self.log_variance, length_scale=length_scale, amplitude=amplitude, constant=constant)
+
+
+def inducing_sizes(n_inducing: int | None, n_features: int, n_outputs: int) -> list[tuple[int, int]]:
+    """Inducing inputs of the mean's processes and of the covariance's, to be tried one after another."""
+    if n_inducing is not None:
+        return [(n_inducing, n_inducing)]
+    most_mean, most_covariance = (max(_FEWEST, most // n_outputs) for most in _TOGETHER)
+    few = _OF_ONE if n_features == 1 else _OF_SEVERAL
+    return list(dict.fromkeys((min(size, most_mean), min(size, most_covariance)) for size in (few, _MOST)))
+
+
+def candidate_families(
+    inputs: Float[Tensor, "n e"],
+    n_distinct: int,
+    sizes: list[tuple[int, int]],
+    *,
+    kernel: str,
+    period: Float[Tensor, " e"] | None,
+    length_scale: Float[Tensor, " e"] | None,
+) -> list[Families]:
+    """Families on as many inducing inputs as :func:`inducing_sizes` says; ``length_scale`` holds the covariance's.
+
+    With as many as the ``n_distinct`` inputs that there were they are exact.
+    """
+    found = []
+    for pair in sizes:
+        of_mean, of_covariance = (inducing_inputs(inputs, size) for size in pair)
+        mean = ProcessFamily(of_mean, *_MEAN, None, kernel, period, len(of_mean) == n_distinct)
+        exact = len(of_covariance) == n_distinct
+        found.append(Families(mean, ProcessFamily(of_covariance, *_LOG_VARIANCE, length_scale, kernel, period, exact)))
+    return found
+
+
+def check_memory(n_inducing: int | None, max_inputs: int, shape: tuple[int, int, int]) -> None:
+    """Raise ValueError where a fit of ``shape``, distinct inputs, their columns and outputs, lacks memory.
+
+    Measured: each output's features for the differences that start a search take the most, and then all outputs'
+    together.
+    """
+    n_distinct, n_features, n_outputs = shape
+    n_inputs = min(n_distinct, max_inputs)
+    size = min(n_inputs, max(max(pair) for pair in inducing_sizes(n_inducing, n_features, n_outputs)))
+    searched = 4 * (n_features + 1) * (n_features + 2) * n_outputs * size * (n_inputs + size)
+    require_much(
+        8.0 * (searched + 24 * (n_outputs * size) ** 2),
+        what=f"max_inputs={max_inputs} with n_inducing={n_inducing} lets {n_inputs} distinct "
+        f"inputs and {size} inducing ones into the fit, which",
+        remedy="Lower them, n_inducing first.",
+    )
+
+
+@dataclass
+class SearchOptions:
+    """How hyperparameters are searched, and how the searches ended."""
+
+    max_iter: int = 30
+    tol: float = 1e-3
+    """In nats."""
+    n_restarts: int = 0
+    """Starts beside the best point of the grid, where no earlier search gives one."""
+    callback: Callable[[Progress], None] | None = None
+    """Called at the end of each turn of mean and covariance."""
+    slack: float = 1.0
+    """Times the tolerance, as long as better evidence is to come."""
+    ends: list[tuple[int, Status]] = field(default_factory=list)
+    """Iterations of each search, and what ended it."""
+
+    def outcome(self, losses: tuple[float, ...]) -> FitReport:
+        """Report of a fit with these losses, by how its searches ended."""
+        status = first_failure(status for _, status in self.ends)
+        return FitReport(losses[-1], losses, max(n for n, _ in self.ends), status)
+
+
+@dataclass
+class Search:
+    """Hyperparameters of the highest evidence times prior, by BFGS: for each of b processes by itself.
+
+    The first run takes the best points of a small grid, and the curvature there by differences; the next ones start
+    where the last ended, with its curvature.
+    """
+
+    family: ProcessFamily
+    n_processes: int
+    """b."""
+    options: SearchOptions
+    """Its ``ends`` are added to."""
+    theta: Float[Tensor, "b q"] | None = None
+    held: bool = False
+    """Whether ``theta`` is given, and not searched."""
+    _inverse_hessian: Float[Tensor, "b q q"] | None = None
+    """Curvature that the last run ended with."""
+
+    def run(self, evidence: Evidence, n_observed: int) -> Float[Tensor, "b q"]:
+        """Hyperparameters for this evidence, of so many observations of each process."""
+        if self.held and self.theta is not None:
+            return self.theta
+
+        def value(theta: Tensor, rows: Tensor) -> tuple[Tensor, Gradient]:
+            try:
+                return evidence(theta, rows)
+            except (NotPositiveDefiniteError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
+                return math.nan * theta.sum(-1), lambda: theta  # too far, for the optimizer
+
+        def loss(theta: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+            found, gradient = value(theta, rows)
+            prior, of_prior = self.family.log_prior(theta)
+            return -found - prior, -gradient() - of_prior
+
+        if self.theta is None or self._inverse_hessian is None:
+            table = self._grid(value, n_observed)
+            best = (-table).argsort(0)[: 1 + self.options.n_restarts]
+            starts = [(start, _inverse_hessian(loss, start)) for start in self._points()[best]]
+        else:
+            starts = [(self.theta, self._inverse_hessian)]
+        tol = self.options.slack * self.options.tol
+        ends = [
+            minimize_batch(loss, start, max_iter=self.options.max_iter, tol=tol, inverse_hessian=inverse_hessian)
+            for start, inverse_hessian in starts
+        ]
+        points, reports = zip(*ends, strict=True)
+        lowest = torch.stack([report.loss for report in reports]).nan_to_num(nan=math.inf).argmin(0)
+        row = torch.arange(self.n_processes, device=lowest.device)
+        self.theta = torch.stack(points)[lowest, row]
+        self._inverse_hessian = torch.stack([report.inverse_hessian for report in reports])[lowest, row]
+        status = first_failure(report.status for report in reports)
+        self.options.ends.append((max(report.n_iter for report in reports), status))
+        return self.theta
+
+    def best_of_grid(self, evidence: Evidence, n_observed: int) -> float:
+        """Highest log evidence times prior that a search would start from, of all processes together."""
+        return float(self._grid(evidence, n_observed).amax(0).sum())
+
+    def maximum(self, evidence: Evidence, n_observed: int) -> float:
+        """Highest log evidence times prior that a search finds, of all processes together."""
+        theta = self.run(evidence, n_observed)
+        value, _ = evidence(theta, torch.arange(self.n_processes, device=theta.device))
+        return float((value + self.family.log_prior(theta)[0]).sum())
+
+    def _points(self) -> Float[Tensor, "s q"]:
+        inducing = self.family.inducing
+        return inducing.new_tensor(
+            [[math.log(scale)] * inducing.shape[1] + [amplitude] for scale, amplitude in _STARTS]
+        )
+
+    def _grid(self, evidence: Evidence, n_observed: int) -> Float[Tensor, "s b"]:
+        """Log evidence times prior at the points where a search may begin.
+
+        Those of one length scale are tried together, as they take as many features; all, where calls cost more.
+        """
+        points = self._points()
+        every = torch.arange(self.n_processes, device=points.device)
+        small = n_observed * self.n_processes * len(self.family.inducing) < _SMALL
+        parts = [
+            evidence(part.repeat_interleave(len(every), dim=0), every.repeat(len(part)))[0].reshape(-1, len(every))
+            for part in points.split(len(points) if small else 2)
+        ]
+        return (torch.cat(parts) + self.family.log_prior(points)[0][:, None]).nan_to_num(nan=-math.inf)
+
+
+def _inverse_hessian(
+    objective: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]], start: Float[Tensor, "b p"]
+) -> Float[Tensor, "b p p"]:
+    """By differences of gradients; of directions with less or negative curvature as if they had its size."""
+    n_problems, size = start.shape
+    steps = torch.cat([start.new_zeros(1, size), _DIFFERENCE * torch.eye(size).to(start)])
+    points = (start + steps[:, None]).flatten(0, 1)
+    rows = torch.arange(n_problems, device=start.device).repeat(size + 1)
+    _, gradients = objective(points, rows)
+    gradients = gradients.reshape(size + 1, n_problems, size)
+    hessian = ((gradients[1:] - gradients[0]) / _DIFFERENCE).transpose(0, 1)
+    curvature, axes = torch.linalg.eigh(0.5 * (hessian + hessian.mT).nan_to_num())
+    return axes @ torch.diag_embed(1.0 / curvature.abs().clamp_min(_LEAST_CURVATURE)) @ axes.mT
