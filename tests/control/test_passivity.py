@@ -2,13 +2,14 @@
 
 import math
 import re
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from torch_pbd.control.damping import damping_from_stiffness
-from torch_pbd.control.filters import EnergyTank, RateLimit
-from torch_pbd.control.simulation.filters import lyapunov_matrix, started
+from torch_pbd.control.filters import EnergyTank, RateLimit, lyapunov_matrix
+from torch_pbd.control.simulation import ticks
 from torch_pbd.control.simulation.plant import AdmittancePlant
 from torch_pbd.control.simulation.ticks import admittance_rate, transition
 
@@ -171,9 +172,13 @@ def test_the_worst_force_cannot_break_the_rate_limit_nor_is_a_share_too_small(dt
     """
     stiffness, damping = schedules(200, 2, generator)
     alpha = 0.03
-    limit = started(RateLimit(alpha), stiffness, damping, MASS, dt)
+    limit = RateLimit(alpha).start(stiffness, damping, MASS, ticks._tick_change)
     nowhere = torch.zeros(200, 2).double()
-    before, after = (limit.select(stiffness[:, k], damping[:, k], nowhere) for k in (0, 1))
+    gains = []
+    for k in (0, 1):
+        limit.select(stiffness[:, k], damping[:, k], MASS, dt, nowhere)
+        gains.append(SimpleNamespace(**dict(zip(("stiffness", "damping", "share"), limit.gains, strict=True))))
+    before, after = gains
     rate = torch.zeros(200, 8, 8).double()
     rate[:, :6, :6] = admittance_rate(before.stiffness, before.damping, MASS)
     rate[:, 6:, :2] = torch.eye(2)

@@ -64,7 +64,7 @@ def stored(controller, schedule, mass, limits):
     total = controller.tank_energy + 0.5 * np.array(controller.velocity) @ mass @ controller.velocity
     for block, limit in zip(schedule.blocks, limits, strict=True):
         top = np.linalg.norm(schedule.stiffness[:, block, block], 2, axis=(1, 2)).max() / limit**2
-        stretch = off[block] @ controller._motion.filtered.stiffness[block, block] @ off[block]
+        stretch = off[block] @ controller._motion.gains[0][block, block] @ off[block]
         total += 0.5 * stretch if top * stretch <= 1.0 else math.sqrt(stretch / top) - 0.5 / top
     return total
 

@@ -8,21 +8,38 @@ Where a desired orientation turns, deviations of rotation turn with it, and so d
 held back is their change as the tool sees it. An inertia that varies, as that of an arm, changes the kinetic energy by
 ``1/2 v' dM v`` from tick to tick at the same velocity; what each filter makes of that, it says.
 
-The simulation and the real-time loop, which has no torch, run them each in numbers of its own.
+The simulation runs them on tensors (..., d) of many rollouts, the real-time loop on NumPy's arrays of one robot: the
+arithmetic is the same, of functions that have the same names in both.
 """
 
+import sys
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import final
+from typing import Any, final
 
 from torch_pbd import checks
 from torch_pbd.exceptions import InvalidParameterError
 
-MARGIN = 1e-13
-"""A share is smaller by this than the largest allowed, which pays for its own rounding: 2.2e-16, some hundred times."""
+# A tensor, or an array of NumPy.
+Array = Any
+# What deviation and velocity change by over a tick, as a matrix (..., 2 d, 3 d) on deviation, velocity and the force
+# that is held; of stiffness, damping, mass (..., d, d) and the length of the tick in s.
+TickChange = Callable[[Array, Array, Array, float], Array]
+
+State = tuple[Array, Array]  # deviation and velocity (..., d)
+Energy = Callable[[Array, Array], Array]  # (...), in J, of stiffnesses (..., d, d) and deviations (..., d)
+
+# A share is smaller by this than the largest allowed, which pays for its own rounding: 2.2e-16, some hundred times.
+_MARGIN = 1e-13
 
 
-class StiffnessFilter:
+class StiffnessFilter(ABC):
     """Filter of the gains, as :class:`~torch_pbd.control.AdmittancePlant` and the real-time loop take it."""
+
+    @abstractmethod
+    def start(self, stiffness: Array, damping: Array, mass: Array, change: TickChange) -> "ActiveFilter":
+        """Filter at work on a schedule with gains (..., T, d, d) and a mass (d, d) or (..., T, d, d)."""
 
 
 @final
@@ -53,8 +70,11 @@ class RateLimit(StiffnessFilter):
     def __post_init__(self) -> None:
         checks.number(self.alpha, "alpha", above=0.0, unit="1/s", optional=True)
 
-    def constant(self, limit: float, softest: float) -> float:
-        """The constant a under the smallest eigenvalues of ``M^-1/2 D M^-1/2`` and of K in a schedule: checked."""
+    def start(self, stiffness: Array, damping: Array, mass: Array, change: TickChange) -> "ActiveFilter":  # noqa: D102
+        linalg = _library(stiffness).linalg
+        inverse = linalg.inv(linalg.cholesky(mass))
+        limit = float(linalg.eigvalsh(inverse @ damping @ inverse.mT).min())
+        softest = float(linalg.eigvalsh(stiffness).min())
         alpha = 0.5 * limit if self.alpha is None else self.alpha
         if not 0.0 < alpha < limit:
             raise InvalidParameterError(
@@ -66,7 +86,7 @@ class RateLimit(StiffnessFilter):
                 f"the smallest eigenvalue of stiffness is {softest:g} N/m, must be above zero for a rate limit: a free "
                 "axis has no equilibrium."
             )
-        return alpha
+        return _ActiveRateLimit(alpha, change)
 
 
 @final
@@ -103,3 +123,164 @@ class EnergyTank(StiffnessFilter):
         checks.number(self.energy_max, "energy_max", least=0.0, unit="J")
         checks.number(self.energy, "energy", least=0.0, most=self.energy_max, unit="J")
         checks.number(self.efficiency, "efficiency", least=0.0, below=1.0)
+
+    def start(self, stiffness: Array, damping: Array, mass: Array, change: TickChange) -> "ActiveFilter":  # noqa: D102
+        return _ActiveTank(self)
+
+
+def spring_energy(stiffness: Array, off: Array) -> Array:
+    """Energy (...) in J of springs (..., d, d) at deviations (..., d)."""
+    return 0.5 * _quadratic(stiffness, off, off)
+
+
+class ActiveFilter(ABC):
+    """Filter of the gains at work: `select` and then `settle` each tick, and `carry` where the orientation turns.
+
+    ``gains`` are the stiffness and damping (..., d, d) in effect, and the share (...) of the step towards the wanted
+    ones; ``tank_energy`` (...) is in J, None where there is no tank.
+    """
+
+    gains: Any = None
+    tank_energy: Array = None
+
+    def begin(self) -> None:
+        """Forget all: the next tick is given what it asks for."""
+        self.gains = None
+
+    def select(
+        self, stiffness: Array, damping: Array, mass: Array, step: float, off: Array, scale: Array = 1.0
+    ) -> None:
+        """Choose the gains of a tick of ``step`` s, from the wanted ones, the mass and the deviation (..., d).
+
+        ``scale`` (..., d) is that of the springs where limits scale them.
+        """
+        if self.gains is None:
+            library, shape = _library(off), (*off.shape, off.shape[-1])
+            wanted = [library.broadcast_to(gain, shape) for gain in (stiffness, damping)]
+            self.gains = wanted[0], wanted[1], library.ones_like(off[..., 0])
+        else:
+            share = self._largest_share(stiffness, damping, mass, off, scale * off)
+            kept = (1.0 - share)[..., None, None]  # zero where all is granted, which is then exactly what is wanted
+            steps = zip((stiffness, damping), self.gains, strict=False)
+            stiffness, damping = (wanted - kept * (wanted - last) for wanted, last in steps)
+            self.gains = stiffness, damping, share
+        self._turn, self._tick = None, (*self.gains[:2], mass, step)
+
+    def carry(self, turn: Array) -> None:
+        """Take the gains along where the desired orientation turns, by a matrix (..., 3, 3), at the end of a tick."""
+        stiffness, damping, share = self.gains
+        library, d = _library(turn), stiffness.shape[-1]
+        whole = library.zeros((*turn.shape[:-2], d, d), dtype=turn.dtype, device=turn.device)
+        whole[..., : d - 3, : d - 3] = library.eye(d - 3)
+        whole[..., d - 3 :, d - 3 :] = turn
+        turned = [whole @ gain @ whole.mT for gain in (stiffness, damping)]
+        self._turn, self.gains = whole, (*(0.5 * (gain + gain.mT) for gain in turned), share)
+
+    @abstractmethod
+    def settle(self, before: State, after: State, force: Array, energy: Energy = spring_energy) -> None:
+        """Take note of a tick: its start and end, the force (..., d) held in it, and the energy that springs have."""
+
+    @abstractmethod
+    def _largest_share(self, stiffness: Array, damping: Array, mass: Array, off: Array, scaled: Array) -> Array:
+        """Largest share, of at most 1, of the step to these gains that is paid for."""
+
+
+class _ActiveTank(ActiveFilter):
+    def __init__(self, tank: EnergyTank) -> None:
+        self._tank, self.tank_energy = tank, tank.energy
+
+    def begin(self) -> None:
+        super().begin()
+        self.tank_energy = self._tank.energy
+
+    def select(
+        self, stiffness: Array, damping: Array, mass: Array, step: float, off: Array, scale: Array = 1.0
+    ) -> None:
+        last = self.gains
+        super().select(stiffness, damping, mass, step, off, scale)
+        if last is None:
+            self.tank_energy = self.tank_energy * self.gains[2]
+        else:
+            self._pay(0.5 * _quadratic(self.gains[0] - last[0], off, scale * off))
+
+    def _largest_share(self, stiffness: Array, damping: Array, mass: Array, off: Array, scaled: Array) -> Array:
+        asked, where = 0.5 * _quadratic(stiffness - self.gains[0], off, scaled), _library(off).where
+        lacking = asked > self.tank_energy
+        return where(lacking, (1.0 - _MARGIN) * self.tank_energy / where(lacking, asked, 1.0), 1.0)
+
+    def settle(self, before: State, after: State, force: Array, energy: Energy = spring_energy) -> None:
+        stiffness, _, mass, _ = self._tick
+        stored = [energy(stiffness, off) + spring_energy(mass, velocity) for off, velocity in (before, after)]
+        dissipated = stored[0] + (force * (after[0] - before[0])).sum(-1) - stored[1]
+        # What looks like negative dissipation is rounding, or a limit of the command: it is charged in full.
+        self._pay(-_library(force).where(dissipated > 0.0, self._tank.efficiency * dissipated, dissipated))
+
+    def _pay(self, energy: Array) -> None:
+        self.tank_energy = _library(energy).clip(self.tank_energy - energy, 0.0, self._tank.energy_max)
+
+
+class _ActiveRateLimit(ActiveFilter):
+    def __init__(self, alpha: float, change: TickChange) -> None:
+        self._alpha, self._change = alpha, change
+
+    def settle(self, before: State, after: State, force: Array, energy: Energy = spring_energy) -> None:
+        """Note nothing: what a tick pays is known from its gains."""
+
+    def _largest_share(self, stiffness: Array, damping: Array, mass: Array, off: Array, scaled: Array) -> Array:
+        """Largest s in [0, 1] for which the last tick pays for the step ``s dP`` of the function P.
+
+        Whatever its state x at the start and its force f: ``E' (P + s dP) E <= P + W`` with E the map of (x, f) to
+        the state at the end, and W twice the work of f on ``v + a y``. On the left, P is that of the gains held on to
+        and of this tick's mass, and E turns the deviation with them.
+        """
+        held_stiffness, held_damping, _ = self.gains
+        # dP = dK + a dD, of deviations.
+        rise = stiffness - held_stiffness + self._alpha * (damping - held_damping)
+        library, ones = _library(rise), 0.0 * rise[..., 0, 0] + 1.0
+        if not rise.any():
+            return ones
+        last_stiffness, last_damping, last_mass, step = self._tick
+        d, change = rise.shape[-1], self._change(*self._tick)
+        unit = library.eye(3 * d, dtype=rise.dtype, device=rise.device)
+        start, forces = unit[: 2 * d], unit[2 * d :]
+        # The equation of motion integrated over the tick, M dv = f h - K int(y) - D dy, gives int(y), of which the port
+        # is dy + a int(y).
+        pull = step * forces - last_mass @ change[..., d:, :] - last_damping @ change[..., :d, :]
+        port = change[..., :d, :] + self._alpha * library.linalg.solve(last_stiffness, pull)
+        if self._turn is not None:
+            position, velocity = (start + change)[..., :d, :], (start + change)[..., d:, :]
+            change = library.concatenate([self._turn @ position, velocity], axis=-2) - start
+        before = lyapunov_matrix(last_stiffness, last_damping, last_mass, self._alpha)
+        after = lyapunov_matrix(held_stiffness, held_damping, mass, self._alpha)
+        # Of E' P E - P for E = 1 + change the P is left out, which has none of the digits that count in short ticks.
+        given = forces.mT @ port - start.mT @ after @ change
+        paid = start.mT @ (before - after) @ start + given + given.mT - change.mT @ after @ change
+        try:
+            factor = library.linalg.cholesky(paid)
+        except library.linalg.LinAlgError:
+            if bool((before == after).all()):  # in a tick so short that rounding hides what it pays
+                return 0.0 * ones
+            raise InvalidParameterError(
+                "stiffness_filter is a RateLimit, but the mass rises, or the desired orientation turns, faster than "
+                "the damping can pay for: damp more, move more slowly, or take EnergyTank()."
+            ) from None
+        # With F F' = paid, s is one over the largest eigenvalue of F^-1 E' dP E F'^-1.
+        half = library.linalg.solve(factor, (start + change)[..., :d, :].mT)
+        needed = library.linalg.eigvalsh(half @ rise @ half.mT)[..., -1]
+        return library.where(needed > 1.0, (1.0 - _MARGIN) / library.clip(needed, 1.0, None), ones)
+
+
+def lyapunov_matrix(stiffness: Array, damping: Array, mass: Array, alpha: float) -> Array:
+    """Twice the matrix (..., 2 d, 2 d) of Kronander and Billard's V in (deviation, velocity)."""
+    concatenate, mass = _library(stiffness).concatenate, mass + 0.0 * stiffness
+    upper = concatenate([stiffness + alpha * damping, alpha * mass], axis=-1)
+    return concatenate([upper, concatenate([alpha * mass, mass], axis=-1)], axis=-2)
+
+
+def _quadratic(matrix: Array, left: Array, right: Array) -> Array:
+    return (left[..., None, :] @ matrix @ right[..., :, None])[..., 0, 0]
+
+
+def _library(array: Array) -> Any:
+    """NumPy or torch, where the functions for an array are."""
+    return sys.modules[type(array).__module__]

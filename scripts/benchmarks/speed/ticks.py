@@ -60,7 +60,7 @@ def bare(controller: RealTimeAdmittance, block: Iterable[Tick], took: list[int])
         before = clock()
         step = now - last
         index = int(last * RATE + 0.5)
-        gx, gy, gvx, gvy, _, k1, k2, a1, a2, c, s, _, _ = unpack(packed, (index if index < end else end) * size)
+        gx, gy, gvx, gvy, _, k1, k2, a1, a2, c, s, _ = unpack(packed, (index if index < end else end) * size)
         ex, ey = x - gx, y - gy
         v1, v2 = c * vx + s * vy, c * vy - s * vx
         q1 = (c * fx + s * fy) / MASS + 2.0 * a1 * (c * gvx + s * gvy) - k1 * (c * ex + s * ey)

@@ -10,14 +10,21 @@ from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control.filters import StiffnessFilter
 from torch_pbd.control.realtime.clock import ScheduleClock
-from torch_pbd.control.realtime.limits import FINE, TickStatus, channel_of
-from torch_pbd.control.realtime.motion import Motion
-from torch_pbd.control.realtime.options import Option, StartState, of_blocks, start_state
-from torch_pbd.control.realtime.places import Vector
-from torch_pbd.control.realtime.steps import Numbers, vector
+from torch_pbd.control.realtime.limits import (
+    FINE,
+    ForceChannel,
+    Numbers,
+    Option,
+    TickStatus,
+    finite_floats,
+    options_of_blocks,
+    unit_quaternion,
+)
+from torch_pbd.control.realtime.motion import Motion, TickTimer
+from torch_pbd.control.realtime.steps import Vector
 from torch_pbd.control.realtime.table import ScheduleTable, virtual_mass
-from torch_pbd.control.realtime.timer import TickTimer
 from torch_pbd.control.schedule import Schedule
+from torch_pbd.exceptions import InvalidParameterError
 
 _SHARED = "this controller is in a tick already: two threads share it. Give each its own."
 
@@ -132,20 +139,20 @@ class RealTimeAdmittance:
         given = {"force_limit": force_limit, "spring_limit": spring_limit, "deadband": deadband}
         given |= {"force_rate_limit": force_rate_limit, "velocity_limit": velocity_limit}
         given |= {"acceleration_limit": acceleration_limit, "approach_speed": approach_speed}
-        limits = of_blocks(given | {"stop_deceleration": stop_deceleration}, len(schedule.blocks))
-        inertia = virtual_mass(schedule, mass)
-        self._unit = inertia if isinstance(inertia, float) else 1.0
+        limits = options_of_blocks(given | {"stop_deceleration": stop_deceleration}, len(schedule.blocks))
+        self._mass = virtual_mass(schedule, mass)
         self._timer = TickTimer(rate, max_step, max_bad_ticks)
-        self._channel = channel_of(self._unit, limits, hold_ticks)
+        self._channel = ForceChannel(limits, schedule.blocks, hold_ticks)
         steady, pulls = stiffness_filter is not None, limits["spring_limit"]
-        self._table = table = ScheduleTable(schedule, inertia, float(rate), pulls, steady=steady)
+        self._table = table = ScheduleTable(schedule, self._mass, float(rate), pulls, steady=steady)
         self._clock = ScheduleClock(table, soft_start, limits["approach_speed"], limits["acceleration_limit"], on_gap)
-        self._motion = Motion(table, self._timer, self._clock, limits, self._unit, stiffness_filter)
+        self._motion = Motion(table, self._timer, self._clock, limits, stiffness_filter)
         self._is_pose, self._speeds, self._turn = len(table.blocks) == 2, limits["velocity_limit"], threading.Lock()
-        self._begin(math.nan, 0.0, (None, None, (0.0,) * table.n_axes), ())
+        still = (0.0,) * table.n_axes
+        self._begin(math.nan, 0.0, None, None, still, still)
 
     def __repr__(self) -> str:
-        mass = f"{self._unit:g} kg" if self._table.mass is None else str(self._table.mass.shape[1:])
+        mass = f"{self._mass:g} kg" if isinstance(self._mass, float) else str(self._mass.shape[-2:])
         return (
             f"RealTimeAdmittance(n_axes={self._table.n_axes}, mass={mass}, rate={self._table.rate:g} Hz, "
             f"schedule_time={self.schedule_time:.6g}..{self._table.end:.6g} s, faults={self.faults})"
@@ -184,12 +191,20 @@ class RealTimeAdmittance:
         """
         now = checks.number(now, "now", unit="s")
         at = checks.number(at, "at", least=0.0, most=self._table.end, unit="s")
-        state = start_state(position, orientation, velocity, self._table.blocks, self._speeds)
-        bias = () if force_bias is None else vector(force_bias, "force_bias", self._table.n_axes)
+        blocks, d = self._table.blocks, self._table.n_axes
+        here = None if position is None else finite_floats(position, "position", blocks[0].stop)
+        if orientation is not None and not self._is_pose:
+            raise InvalidParameterError("orientation is given, must be None for a schedule without: leave it out.")
+        turned = None if orientation is None else unit_quaternion(orientation)
+        moving, bias = finite_floats(velocity, "velocity", d), finite_floats(force_bias, "force_bias", d)
+        kinds = ("the speed", "units/s"), ("the angular speed", "rad/s")
+        for (name, unit), block, most in zip(kinds, blocks, self._speeds, strict=False):
+            remedy = "slow it down, or raise velocity_limit"
+            checks.number(math.hypot(*moving[block]), name, most=most, unit=unit, remedy=remedy)
         if not self._turn.acquire(False):
             raise RuntimeError(_SHARED)
         try:
-            self._begin(now, at, state, bias)
+            self._begin(now, at, here, turned, moving, bias)
         finally:
             self._turn.release()
 
@@ -252,7 +267,7 @@ class RealTimeAdmittance:
     @property
     def force(self) -> Vector:
         """External force f that acted in the last tick, d floats in N."""
-        return tuple(self._unit * component for component in self._channel.push)
+        return self._channel.push
 
     @property
     def desired_position(self) -> Vector:
@@ -282,19 +297,23 @@ class RealTimeAdmittance:
     @property
     def filter_share(self) -> float:
         """Share of the last change of the gains that ``stiffness_filter`` granted, 0 to 1."""
-        return 1.0 if self._motion.filtered is None else self._motion.filtered.share
+        filtered = self._motion.filtered
+        return 1.0 if filtered is None or filtered.active.gains is None else float(filtered.active.gains[2])
 
     @property
     def tank_energy(self) -> float | None:
         """Energy in the tank of an `EnergyTank` in J; None without."""
-        return None if self._motion.filtered is None else self._motion.filtered.tank_energy
+        energy = None if self._motion.filtered is None else self._motion.filtered.active.tank_energy
+        return None if energy is None else float(energy)
 
     @property
     def schedule_time(self) -> float:
         """Time in the schedule, in s."""
         return self._clock.time_at(self._timer.last)
 
-    def _begin(self, now: float, at: float, start: StartState, bias: Vector) -> None:
-        self._channel.begin(self._table.n_axes, bias)
-        self._motion.begin(now, at, *start)
+    def _begin(
+        self, now: float, at: float, position: Vector | None, orientation: Vector | None, velocity: Vector, bias: Vector
+    ) -> None:
+        self._channel.begin(bias)
+        self._motion.begin(now, at, position, orientation, velocity)
         self.faults = FINE

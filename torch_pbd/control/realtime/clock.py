@@ -7,8 +7,7 @@ from typing import final
 import numpy as np
 
 from torch_pbd import checks
-from torch_pbd.control.realtime.places import Vector, deviation, moved, norm_with, rotated
-from torch_pbd.control.realtime.steps import minimum_jerk
+from torch_pbd.control.realtime.steps import Vector, deviation, moved, norm_with, rotated
 from torch_pbd.control.realtime.table import ScheduleTable
 
 # The desired motion may be 1.5 times as fast as the schedule, and accelerate so much more: one half of that changes the
@@ -268,8 +267,9 @@ class ScheduleClock:
             phase = (time + self._ahead - self._at) / self._blend
             self._is_soft = phase < 1.0
         if self._is_soft:
-            left, slope = minimum_jerk(phase)
-            slope /= -self._blend
+            # Rest of a way of 1 by minimum jerk, and its slope.
+            left = 1.0 - phase**3 * (10.0 - 15.0 * phase + 6.0 * phase**2)
+            slope = 30.0 * phase**2 * (1.0 - phase) ** 2 / self._blend
             away = [-left * part for part in self._distance]
             row[:n_place] = moved(row[:n_place], away)
             if self._lever is not None:

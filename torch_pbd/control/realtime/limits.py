@@ -1,14 +1,38 @@
-"""Limits of the force that comes in and of the command that goes out, and the status of a tick where they acted."""
+"""Limits of the force that comes in and of the command that goes out, their options, and the status of a tick."""
 
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from enum import IntFlag
-from typing import final
+from operator import sub
+from typing import Any, final
+
+import numpy as np
 
 from torch_pbd import checks
-from torch_pbd.control.realtime.places import Vector, deviation, moved
-from torch_pbd.control.realtime.steps import Numbers, State, mean_move
+from torch_pbd.checks import Floats
+from torch_pbd.control.realtime.steps import State, Vector, deviation, mean_move, moved
+
+Numbers = Sequence[float] | Floats
+Option = float | tuple[float, float] | None
+"""Number for positions; for poses a pair, of positions and of rotations; None is the default."""
+
+# What rotations have for a unit of positions.
+_ANGULAR = {"N": "Nm", "N/s": "Nm/s", "units/s": "rad/s", "units/s^2": "rad/s^2"}
+# Defaults and units; those that are empty depend on others.
+_OPTIONS: dict[str, tuple[Vector, str]] = {
+    "force_limit": ((200.0, 20.0), "N"),
+    "spring_limit": ((), "N"),
+    "deadband": ((0.0, 0.0), "N"),
+    "force_rate_limit": ((math.inf, math.inf), "N/s"),
+    "velocity_limit": ((math.inf, math.inf), "units/s"),
+    "acceleration_limit": ((math.inf, math.inf), "units/s^2"),
+    "approach_speed": ((0.5, 1.0), "units/s"),
+    "stop_deceleration": ((), "units/s^2"),
+}
+_OFF = 1e-3  # of a quaternion's length: four rounded digits
+# A median of five is a good force after one or two wild ones, and 2 ms late at 1 kHz.
+_RECENT = 5
 
 
 class TickStatus(IntFlag):
@@ -40,49 +64,122 @@ class TickStatus(IntFlag):
 # Ticks compare statuses with this one by identity, and join only faults: to join two takes a third of a tick.
 FINE = TickStatus(0)
 
-# A median of five is a good force after one or two wild ones, and 2 ms late at 1 kHz.
-_RECENT = 5
+
+def options_of_blocks(given: Mapping[str, Any], n_blocks: int) -> dict[str, Vector]:
+    """Options for positions, and for poses those for rotations too."""
+    values = {}
+    for name, (default, unit) in _OPTIONS.items():
+        value = given[name]
+        if value is None:
+            values[name] = default[:n_blocks]
+        elif n_blocks == 1:
+            values[name] = (_checked(value, name, unit),)
+        elif isinstance(value, Sequence) and len(value) == 2:
+            values[name] = _checked(value[0], f"{name}[0]", unit), _checked(value[1], f"{name}[1]", _ANGULAR[unit])
+        else:
+            raise checks.refusal(value, name, f"a pair for poses, in {unit} and {_ANGULAR[unit]}")
+    values["spring_limit"] = values["spring_limit"] or values["force_limit"]
+    return values
+
+
+def _checked(value: Any, name: str, unit: str) -> float:
+    if name.startswith("deadband"):
+        return checks.number(value, name, least=0.0, unit=unit)
+    return checks.number(value, name, above=0.0, unit=unit)
+
+
+def finite_floats(values: Numbers | None, name: str, d: int) -> Vector:
+    """Finite floats, one for each of d axes; zeros for None."""
+    return (0.0,) * d if values is None else tuple(checks.array(values, name, (d,)).tolist())
+
+
+def unit_quaternion(values: Numbers) -> Vector:
+    """Unit quaternion, exactly, of the orientation of a robot."""
+    quaternion = checks.array(values, "orientation", (4,))
+    length = float(np.linalg.norm(quaternion))
+    remedy = "give a unit quaternion w x y z"
+    checks.number(length, "the length of orientation", least=1.0 - _OFF, most=1.0 + _OFF, remedy=remedy)
+    return tuple((quaternion / length).tolist())
 
 
 @final
 class ForceChannel:
-    """The force, or torque, of d axes that acts, over ``unit`` kg: limits in N, or in Nm.
+    """The force that acts, and of poses the torque, each within limits of its own."""
 
-    A lost force is replaced by the median of the last good ones, on each axis, which fades to nothing over
-    ``hold_ticks``: neither a wild reading before the loss nor an old push can carry the robot away. After more ticks
-    than that, it ``is_lost``.
-    """
+    push: Vector
 
-    def __init__(self, unit: float, limit: float, deadband: float, rate_limit: float, hold_ticks: int) -> None:
-        self._unit, self._limit, self._deadband = unit, limit / unit, deadband / unit
-        self._rate_limit = rate_limit / unit
-        self._hold_ticks = checks.count(hold_ticks, "hold_ticks", least=0)
-        self.begin(0, ())
+    def __init__(self, options: Mapping[str, Vector], blocks: Sequence[slice], hold_ticks: int) -> None:
+        checks.count(hold_ticks, "hold_ticks", least=0)
+        limits = [options[name] for name in ("force_limit", "deadband", "force_rate_limit")]
+        self._vectors = [
+            (_ForceVector(limit, deadband, rate_limit, hold_ticks), block)
+            for limit, deadband, rate_limit, block in zip(*limits, blocks, strict=True)
+        ]
+        self._n_axes, self._only = blocks[-1].stop, self._vectors[0][0] if len(blocks) == 1 else None
 
-    def begin(self, d: int, bias: Vector) -> None:
+    def begin(self, bias: Vector) -> None:
         """Forget all forces; before the first there was none."""
-        self.push: Vector = (0.0,) * d
-        self._bias, self._n_lost, self.is_lost = bias, 0, False
-        self._recent = deque([self.push] * _RECENT, _RECENT)
+        self.push, self._bias = (0.0,) * self._n_axes, bias if any(bias) else None
+        for vector, block in self._vectors:
+            vector.begin(block.stop - block.start)
+
+    @property
+    def is_lost(self) -> bool:
+        """True if the force or the torque is lost for longer than it is replaced."""
+        return any(vector.is_lost for vector, _ in self._vectors)
 
     def take(self, force: Numbers, step: float) -> TickStatus:
         """Let a force as measured act, as far as it may, ``step`` s after the last one."""
         try:
-            unit = self._unit
-            if self._bias:
-                push = tuple([(float(part) - bias) / unit for part, bias in zip(force, self._bias, strict=True)])
-            else:
-                push = tuple([float(part) / unit for part in force])
+            push = tuple(map(float, force))
         except (TypeError, ValueError, OverflowError):
             push = ()
-        if len(push) != len(self.push):
-            raise checks.refusal(force, "force", f"{len(self.push)} numbers in N")
+        if len(push) != self._n_axes:
+            raise checks.refusal(force, "force", f"{self._n_axes} numbers in N and Nm")
+        if self._bias:
+            push = tuple(map(sub, push, self._bias))
+        if self._only:
+            status = self._only.take(push, step)
+            self.push = self._only.push
+            return status
+        status, self.push = FINE, ()
+        for vector, block in self._vectors:
+            reached = vector.take(push[block], step)
+            status = status if reached is FINE else status | reached
+            self.push += vector.push
+        return status
+
+
+@final
+class _ForceVector:
+    """A force or a torque; one that is lost is replaced by the median of the last good ones, on each axis.
+
+    That fades to nothing over ``hold_ticks``: neither a wild reading before the loss nor an old push can carry the
+    robot away. After more ticks than that, it ``is_lost``.
+    """
+
+    push: Vector
+
+    def __init__(self, limit: float, deadband: float, rate_limit: float, hold_ticks: int) -> None:
+        self._limit, self._deadband, self._rate_limit, self._hold_ticks = limit, deadband, rate_limit, hold_ticks
+
+    def begin(self, d: int) -> None:
+        self.push, self._n_lost = (0.0,) * d, 0
+        self._recent = deque([self.push] * _RECENT, _RECENT)
+
+    @property
+    def is_lost(self) -> bool:
+        return self._n_lost > self._hold_ticks
+
+    def take(self, push: Vector, step: float) -> TickStatus:
         if self._deadband:
             push = tuple([part - max(-self._deadband, min(self._deadband, part)) for part in push])
         length, status = math.hypot(*push), FINE
         if not length <= self._limit:
             if not length < math.inf:
-                self._bridge()
+                self._n_lost += 1
+                share = max(0.0, 1.0 - self._n_lost / (self._hold_ticks + 1))
+                self.push = tuple([share * sorted(parts)[_RECENT // 2] for parts in zip(*self._recent, strict=True)])
                 return TickStatus.FORCE_INVALID
             push, status = tuple([part / length * self._limit for part in push]), TickStatus.FORCE_SATURATED
         if self._rate_limit < math.inf:
@@ -94,64 +191,12 @@ class ForceChannel:
         self._recent.append(push)
         return status
 
-    def _bridge(self) -> None:
-        self._n_lost += 1
-        self.is_lost = self._n_lost > self._hold_ticks
-        share = max(0.0, 1.0 - self._n_lost / (self._hold_ticks + 1))
-        self.push = tuple([share * sorted(parts)[_RECENT // 2] for parts in zip(*self._recent, strict=True)])
-
-
-@final
-class WrenchChannel:
-    """Force and torque on a pose, each as its own `ForceChannel`: one that is lost is bridged by itself."""
-
-    def __init__(self, force: ForceChannel, torque: ForceChannel) -> None:
-        self._channels = force, torque
-
-    @property
-    def push(self) -> Vector:
-        """Force and torque that act."""
-        force, torque = self._channels
-        return force.push + torque.push
-
-    @property
-    def is_lost(self) -> bool:
-        """True if the force or the torque is lost."""
-        return self._channels[0].is_lost or self._channels[1].is_lost
-
-    def begin(self, d: int, bias: Vector) -> None:
-        """Forget all; before the first there was none."""
-        force, torque = self._channels
-        force.begin(d - 3, bias[:-3])
-        torque.begin(3, bias[-3:])
-        self._n_axes = d
-
-    def take(self, wrench: Numbers, step: float) -> TickStatus:
-        """Let a wrench as measured act, as far as it may, ``step`` s after the last one."""
-        try:
-            parts = tuple([float(part) for part in wrench])
-        except (TypeError, ValueError, OverflowError):
-            parts = ()
-        if len(parts) != self._n_axes:
-            raise checks.refusal(wrench, "force", f"{self._n_axes} numbers in N and Nm")
-        force, torque = self._channels
-        status, of_torque = force.take(parts[:-3], step), torque.take(parts[-3:], step)
-        return status if of_torque is FINE else status | of_torque
-
-
-def channel_of(unit: float, options: Mapping[str, Vector], hold_ticks: int) -> ForceChannel | WrenchChannel:
-    """Channel of a force, or of a force and a torque, by the options of `of_blocks`."""
-    names = ("force_limit", "deadband", "force_rate_limit")
-    of_each = zip(*[options[name] for name in names], strict=True)
-    channels = [ForceChannel(unit, limit, band, rate_limit, hold_ticks) for limit, band, rate_limit in of_each]
-    return channels[0] if len(channels) == 1 else WrenchChannel(*channels)
-
 
 @final
 class CommandLimits:
     """Largest speed and acceleration of the command, for each block; infinite where there is none."""
 
-    def __init__(self, speeds: Vector, accelerations: Vector, blocks: tuple[slice, ...]) -> None:
+    def __init__(self, speeds: Vector, accelerations: Vector, blocks: Sequence[slice]) -> None:
         self.speeds, self.accelerations, self._blocks = speeds, accelerations, blocks
         self.is_any = min(*speeds, *accelerations) < math.inf
 

@@ -7,18 +7,74 @@ from typing import final
 
 import numpy as np
 
+from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control.filters import StiffnessFilter
 from torch_pbd.control.realtime.clock import ScheduleClock
 from torch_pbd.control.realtime.filters import FilteredGains
 from torch_pbd.control.realtime.limits import FINE, CommandLimits, TickStatus
-from torch_pbd.control.realtime.places import Vector, moved
-from torch_pbd.control.realtime.steps import Scale, braked
-from torch_pbd.control.realtime.table import ScheduleTable
-from torch_pbd.control.realtime.timer import SMOOTHING, TickTimer
+from torch_pbd.control.realtime.steps import Vector, braked, moved
+from torch_pbd.control.realtime.table import Scale, ScheduleTable
 
 # From an approach at 0.5 m/s and 1 rad/s a robot is at rest in 0.1 s, after 25 mm and 3 degrees.
 _DECELERATION = (5.0, 10.0)
+# A reading must tell ticks apart to 1 %: times since 1970 in s do, in ns they do not.
+_COARSE = 0.01
+# One late tick is a stall, two may be; three on end are a loop that is too slow.
+_LATE_ON_END = 3
+# Share of the newest tick in how long a tick lasts: neither one short tick nor one long counts for much.
+_SMOOTHING = 0.1
+
+
+@final
+class TickTimer:
+    """Ticks of at most ``max_step`` s; ``last`` is until when the motion is known, ``step`` how long ticks last."""
+
+    def __init__(self, rate: float, max_step: float, max_bad_ticks: int) -> None:
+        self._rate = checks.number(rate, "rate", above=0.0, unit="1/s")
+        self.max_step = checks.number(max_step, "max_step", above=1.0 / self._rate, unit="s", remedy="give some ticks")
+        self._max_bad_ticks = checks.count(max_bad_ticks, "max_bad_ticks")
+
+    def begin(self, now: float) -> None:
+        """Count from ``now``."""
+        if math.ulp(now) * self._rate > _COARSE:
+            must = f"small enough to tell ticks of {1.0 / self._rate:g} s apart"
+            raise checks.refusal(now, "now", must, "give seconds", unit="s")
+        self.last = self._newest = now
+        self.step = 1.0 / self._rate
+        self.is_regular, self._is_new = False, True
+        self._n_bad = self._n_late = 0
+
+    @property
+    def is_failed(self) -> bool:
+        """True if bad or late ticks are too many on end for the robot to go on."""
+        return self._n_bad >= self._max_bad_ticks or self._n_late >= _LATE_ON_END
+
+    def read(self, now: float) -> tuple[TickStatus, float]:
+        """Fault of a tick that is not like the last one, and the time by which ``last`` was put forward.
+
+        Where the clock does not say how long a tick took, it is taken to be as long as they are.
+        """
+        if math.isnan(self.last):
+            raise RuntimeError("tick before start: call start(now) with the time of the same clock first.")
+        if self.is_regular:
+            self.is_regular, self._newest = False, self.last
+        if not self._newest < now < math.inf:
+            self._n_bad += 1
+            return TickStatus.CLOCK, 0.0
+        shift = 0.0
+        # The clock has lost what bad ticks have lived through.
+        if self._n_bad and now < self.last + 0.5 * self.step:
+            shift, self.last = now - self.step - self.last, now - self.step
+        self._newest, self._n_bad, step = now, 0, now - self.last
+        if step > self.max_step:
+            self._n_late += 1
+            if self._is_new and self._n_late >= _LATE_ON_END:
+                must = f"longer than a tick: all {self._n_late} since start were longer, the last of {step:.4g} s"
+                raise checks.refusal(self.max_step, "max_step", must, "give some ticks, and times in s", unit="s")
+            return TickStatus.LATE, shift
+        self.is_regular, self._is_new, self._n_late = True, False, 0
+        return FINE, shift
 
 
 @final
@@ -37,14 +93,13 @@ class Motion:
         timer: TickTimer,
         clock: ScheduleClock,
         options: Mapping[str, Vector],
-        unit: float,
         wanted: StiffnessFilter | None,
     ) -> None:
         self._table, self._timer, self._clock = table, timer, clock
         speeds, rises, stops = (options[name] for name in ("velocity_limit", "acceleration_limit", "stop_deceleration"))
         self._limits = CommandLimits(speeds, rises, table.blocks)
-        self._pull_limit = options["spring_limit"][0] / unit
-        self.filtered = None if wanted is None else FilteredGains(wanted, table, unit, self._pull_limit)
+        self.filtered = None if wanted is None else FilteredGains(wanted, table)
+        self._advance = (self.filtered or table).advance
         stop = clock.least(stops) if stops else max(clock.least(_DECELERATION[: len(table.blocks)]), clock.acceleration)
         self._deceleration = min(stop, clock.least(rises))
         # Impulse responses of velocity to force integrate, in absolute values, to 2 / damping at most along each mode,
@@ -62,7 +117,7 @@ class Motion:
         self.velocity, self.scale = velocity, 1.0
         speeds = [math.hypot(*velocity[block]) for block in self._table.blocks]
         self._top_speeds = tuple(map(max, self._speeds_due, speeds))
-        self._least_top = min(self._top_speeds)
+        self._least_top = -1.0 if self._limits.is_any else min(self._top_speeds)
         self.is_stopped = False
         if self.filtered is not None:
             self.filtered.begin(self._clock.index)
@@ -76,7 +131,7 @@ class Motion:
     def gains(self) -> tuple[Floats, Floats]:
         """Stiffness, before a limit scaled it, and damping (d, d) of the last tick."""
         if self.filtered is not None:
-            return self.filtered.stiffness, self.filtered.damping
+            return self.filtered.gains
         return self._table.stiffness[self._clock.index], self._table.damping[self._clock.index]
 
     def live(self, now: float, step: float, push: Vector) -> TickStatus:
@@ -88,22 +143,19 @@ class Motion:
         here = self.place, self.velocity
         row = clock.row(timer.last, step)
         acting = tuple(map(add, push, table.forced(clock.boost, clock.index))) if clock.boost else push
-        if self.filtered is None:
-            state, self.scale = table.advance(row, acting, here, step, self._pull_limit)
-        else:
-            state, self.scale = self.filtered.advance(row, clock.index, acting, here, step)
+        state, self.scale = self._advance(row, clock.index, acting, here, step)
         if clock.boost:
             clock.spare(table.accelerated(push, clock.index), here[1], state[1], step)
         status = FINE if self.scale == 1.0 else TickStatus.SPRING_LIMITED
         # No block is beyond its own top speed where all together are within the least of them.
-        if self._limits.is_any or math.hypot(*state[1]) > self._least_top:
+        if math.hypot(*state[1]) > self._least_top:
             state, reached = self._limits.applied(state, here, step, self._top_speeds)
             status |= reached
         if self.filtered is not None:
             self.filtered.settle(row, acting, here, state)
         self.row, (self.place, self.velocity) = row, state
         timer.last = now
-        timer.step += SMOOTHING * (step - timer.step)
+        timer.step += _SMOOTHING * (step - timer.step)
         return status
 
     def live_irregular(self, now: float, push: Vector) -> TickStatus:

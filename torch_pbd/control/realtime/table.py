@@ -2,27 +2,20 @@
 
 import math
 import struct
+from collections.abc import Sequence
+from operator import mul
 from typing import Any, final
 
 import numpy as np
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.control.realtime.places import Vector
-from torch_pbd.control.realtime.steps import (
-    Advance,
-    Scale,
-    Solve,
-    advance_apart,
-    advance_plane,
-    advance_with,
-    along_modes,
-    coupled,
-)
+from torch_pbd.control.realtime.steps import State, Vector, advance_plane, along_modes, coupled, deviation, moved
 from torch_pbd.control.schedule import Schedule
 from torch_pbd.control.schedule.rows import Between, count_rows, row_times
 
-Blocks = tuple[slice, ...]
+Scale = float | Vector
+"""Scale of the stiffness: that of all, or those of positions and of rotations."""
 
 _LIGHTEST = 1e-50  # kg: products of gains with masses from this one to its inverse are numbers
 _SINGULAR = 1e-12  # of damping relative to its largest entry, units of lengths and angles apart
@@ -35,34 +28,32 @@ def virtual_mass(schedule: Schedule, given: Any) -> float | Floats:
     A number in kg, or an array (d, d), or (n, d, d) where rows differ.
     """
     own, d = schedule.mass, schedule.n_outputs
-    if isinstance(own, np.ndarray) and (own == own[0]).all():
-        own = own[0]
-    mass: Any = (1.0 if own is None else own) if given is None else given
+    mass: Any = given if given is not None else 1.0 if own is None else own
     if np.ndim(mass) == 0:
-        value: float | Floats = checks.number(mass, "mass", least=_LIGHTEST, most=1.0 / _LIGHTEST, unit="kg")
-    elif given is None:
-        value = mass
-    else:
-        value = checks.array(mass, "mass", (d, d))
-        checks.semidefinite(value, "mass", definite=True)
+        mass = checks.number(mass, "mass", least=_LIGHTEST, most=1.0 / _LIGHTEST, unit="kg")
+    elif given is not None:
+        mass = checks.array(mass, "mass", (d, d))
+        checks.semidefinite(mass, "mass", definite=True)
+    elif (mass == mass[0]).all():
+        mass = mass[0]
     if own is not None:
-        given_matrix, own_matrix = (each * np.eye(d) if np.ndim(each) == 0 else each for each in (value, own))
-        if not np.all(given_matrix == own_matrix):
+        used, wanted = (each * np.eye(d) if np.ndim(each) == 0 else each for each in (mass, own))
+        if not np.all(used == wanted):
             of = f"mass={own:g} kg" if isinstance(own, float) else f"the {d} x {d} inertia of the schedule"
-            checks.warn(f"mass is {mass}, but damping_ratio was met for {of}: give both the same.")
-    return value
+            checks.warn(f"mass is {given}, but damping_ratio was met for {of}: give both the same.")
+    return mass
 
 
 @final
 class ScheduleTable:
     """A schedule in rows of equal time, the last one at ``end`` s, with no velocity.
 
-    A row has the desired place, of ``n_place`` floats, and its velocity, of ``n_axes``; then what `advance_plane`,
-    `along_modes` or `coupled` take. Its gains are per kg of a mass that is the same in all directions; of any other,
-    ``mass`` (n, d, d) is that of the rows. ``stiffness`` and ``damping`` (n, d, d) are in N/m and N s/m, ``velocity``
-    (n, d) and ``acceleration`` (n - 1, d) of the desired motion those before the last row was stopped. ``mobility`` has
-    the largest norm of each block of D^-1: of the velocities of positions and rotations under steady forces and
-    torques where damping alone acts. Rows of a ``steady`` table limit their springs by the largest stiffness of all.
+    A row has the desired place, of ``n_place`` floats, and its velocity, of ``n_axes``; the largest stiffness of each
+    of the ``springs`` over its squared limit; and what `advance` takes besides where modes are shared. ``stiffness``,
+    ``damping`` and ``mass`` (n, d, d) are those of the rows, ``velocity`` (n, d) and ``acceleration`` (n - 1, d) of the
+    desired motion those before the last row was stopped. ``mobility`` has the largest norm of each block of D^-1: of
+    the velocities of positions and rotations under steady forces and torques where damping alone acts. Rows of a
+    ``steady`` table limit their springs by the largest stiffness of all.
     """
 
     mobility: Floats
@@ -84,59 +75,106 @@ class ScheduleTable:
         self.n_place, self.n_axes, self.blocks = place.shape[1], velocity.shape[1], schedule.blocks
         self.velocity, self.acceleration = velocity.copy(), np.diff(velocity, axis=0) / np.diff(grid)[:, np.newaxis]
         velocity[-1] = 0.0
-        self.mass: Floats | None = None
-        if isinstance(mass, np.ndarray):
-            self.mass = between.linear(mass) if mass.ndim == 3 else np.broadcast_to(mass, self.stiffness.shape)
-        solve, gains, along = _gains(self.stiffness, self.damping, mass if np.ndim(mass) < 3 else self.mass)
-        unit = mass if isinstance(mass, float) else 1.0
-        self.is_apart = len(self.blocks) == 2 and _are_apart(self.stiffness, *self.blocks)
-        self.advance, springs = self._springs(solve, along, unit, pull_limits)
-        for largest in springs[: (1 + self.is_apart) * steady]:
-            largest[:] = largest.max()
-        if along is not None and len(self.blocks) == 1 and self.mass is None:
-            least = unit * float(along[1].min())
+        self._one_mass = mass if isinstance(mass, float) else None
+        one = mass * np.eye(self.n_axes) if isinstance(mass, float) else mass
+        masses = between.linear(one) if one.ndim == 3 else one[np.newaxis]
+        shape = self.stiffness.shape
+        self.mass, self._inverse = np.broadcast_to(masses, shape), np.broadcast_to(np.linalg.inv(masses), shape)
+        springs = self._springs(
+            _shared_modes(self.stiffness, self.damping, masses, self._one_mass), pull_limits, steady
+        )
+        # Rows are packed, for the garbage collector would hold up the loop to walk over a list of a million rows.
+        rows = np.concatenate([part.reshape(len(grid), -1) for part in (place, velocity, *springs)], axis=1)
+        self.packed, self.layout = rows.tobytes(), struct.Struct(f"{rows.shape[1]}d")
+
+    def _springs(self, modes: Sequence[Floats] | None, pull_limits: Vector, steady: bool) -> list[Floats]:
+        """What a tick needs of each row besides the motion."""
+        blocks, mass = self.blocks, self._one_mass
+        is_apart = len(blocks) == 2 and _are_apart(self.stiffness, *blocks)
+        self.springs, self._are_shared = blocks if is_apart else (slice(0, self.n_axes),), modes is not None
+        self._is_plane = modes is not None and mass is not None and self.n_place == self.n_axes == 2
+        self._start = self.n_place + self.n_axes
+        # |K e|^2 <= k_max e'K e in each block, with k_max that of the block, also where others are displaced, for
+        # |B'K e|^2 <= |B'K B| e'K e for any B.
+        if modes is not None and mass is not None and len(blocks) == 1:
+            stiffest, least = [mass * modes[0].max(axis=1)], 2.0 * mass * float(modes[1].min())
             self.mobility = np.full((1, 1), 1.0 / least if least > 0.0 else math.inf)
         else:
-            self.mobility = _mobility(self.damping, self.blocks)
-        # Rows are packed, for the garbage collector would hold up the loop to walk over a list of a million rows.
-        parts = [part.reshape(len(grid), -1) for part in (place, velocity, *springs, *gains)]
-        rows = np.concatenate(parts, axis=1)
-        self.packed, self.layout = rows.tobytes(), struct.Struct(f"{rows.shape[1]}d")
+            stiffest = [np.linalg.eigvalsh(self.stiffness[:, block, block])[:, -1] for block in blocks]
+            self.mobility = _mobility(self.damping, blocks)
+        tops = [most / limit**2 for most, limit in zip(stiffest, pull_limits, strict=True)]
+        tops = tops if is_apart else [np.max(tops, axis=0)]
+        tops = [np.full_like(top, top.max()) for top in tops] if steady else tops
+        if modes is None:
+            return tops
+        if self._is_plane and mass is not None:  # along axes, with all per kg
+            return [*tops, *modes[:2], modes[2][:, 0] / math.sqrt(mass), np.full(len(tops[0]), mass)]
+        if is_apart:  # no spring is limited as a whole
+            return [*tops, *[self.stiffness[:, block, block] for block in blocks], 0.0 * tops[0], *modes]
+        return [*tops, *modes]
 
     def row(self, index: int) -> Vector:
         """Row of the table, unpacked."""
         return self.layout.unpack_from(self.packed, index * self.layout.size)
 
+    def advance(
+        self, row: Vector, index: int, push: Vector, state: State, step: float, gains: Sequence[Floats] | None = None
+    ) -> tuple[State, Scale]:
+        """Place and velocity after ``step`` s, and the scale of the stiffness; by other gains than the row's, if given.
+
+        For poses the angular velocity is integrated over the tick as that of a fixed axis would be, and turns the robot
+        in world axes: ``R <- Exp(dr) R``. The deviation is then told anew from where both are, so that the transport of
+        it by the desired rotation, which turns e by w_d x e, comes out by itself.
+        """
+        if self._is_plane and gains is None:
+            return advance_plane(row, push, state, step)
+        place, velocity = state
+        motion, off = (row[self.n_place : self._start], velocity), deviation(place, row[: self.n_place], self.n_axes)
+        at = self._start
+        if gains is None and self._are_shared:
+            if len(self.springs) == 1:
+                move, velocity, scale = along_modes(row[at:], push, off, motion, step)
+                return (moved(place, move), velocity), scale
+            p = self.n_axes - 3
+            middle, end = at + 2 + p * p, at + 11 + p * p
+            pulls = (
+                row[at] * _quadratic(row[at + 2 : middle], off[:p]),
+                row[at + 1] * _quadratic(row[middle:end], off[p:]),
+            )
+            if pulls[0] <= 1.0 >= pulls[1]:
+                move, velocity, _ = along_modes(row[end:], push, off, motion, step)
+                return (moved(place, move), velocity), 1.0
+        # Where one of two springs is limited, modes are no longer shared: twisted beyond its torque, a tool keeps its
+        # stiffness along the way.
+        stiffness, damping = (self.stiffness[index], self.damping[index]) if gains is None else gains
+        scales = self.scales(row, stiffness, np.array(off))
+        scaled = self.scaled(stiffness, scales)
+        move, velocity = coupled(scaled, damping, self._inverse[index], push, off, motion, step)
+        return (moved(place, move), velocity), scales[0] if scales[0] == scales[-1] else scales
+
+    def scales(self, row: Vector, stiffness: Floats, off: Floats) -> Vector:
+        """Scale of each spring of a stiffness (d, d) at a deviation, as its limit lets it be."""
+        springs = zip(self.springs, row[self._start :], strict=False)
+        pulls = [top * float(off[b] @ stiffness[b, b] @ off[b]) for b, top in springs]
+        return tuple([1.0 / math.sqrt(max(pull, 1.0)) for pull in pulls])
+
     def scaled(self, stiffness: Floats, scale: Scale) -> Floats:
         """Stiffness (d, d) as scaled in a tick."""
-        scales = scale if isinstance(scale, tuple) else (scale,) * len(self.blocks)
-        sizes = [block.stop - block.start for block in self.blocks]
-        return np.repeat(scales, sizes)[:, np.newaxis] * stiffness
+        if isinstance(scale, float):
+            return scale * stiffness
+        return np.repeat(scale, [b.stop - b.start for b in self.springs])[:, np.newaxis] * stiffness
 
     def forced(self, acceleration: Vector, index: int) -> Vector:
-        """Push, as ticks take it, that causes an acceleration: a force, or that per kg."""
-        return acceleration if self.mass is None else tuple((self.mass[index] @ acceleration).tolist())
+        """Force that causes an acceleration."""
+        if self._one_mass is not None:
+            return tuple([self._one_mass * part for part in acceleration])
+        return tuple((self.mass[index] @ acceleration).tolist())
 
-    def accelerated(self, push: Vector, index: int) -> Vector:
-        """Acceleration that such a push causes."""
-        return push if self.mass is None else tuple(np.linalg.solve(self.mass[index], push).tolist())
-
-    def _springs(
-        self, solve: Solve, along: list[Floats] | None, unit: float, pull_limits: Vector
-    ) -> tuple[Advance, list[Floats]]:
-        """Function that advances, and what it needs of each row to limit the spring."""
-        d, n_place = self.n_axes, self.n_place
-        if along is not None and self.mass is None and d == n_place:
-            return advance_plane if d == 2 else advance_with(solve, n_place, d), [along[0].max(axis=1)]
-        # |K e|^2 <= k_max e'K e in each block, with k_max that of the block, also where others are displaced, for
-        # |B'K e|^2 <= |B'K B| e'K e for any B.
-        stiffest = [np.linalg.eigvalsh(self.stiffness[:, block, block])[:, -1] for block in self.blocks]
-        largest = [most / limit**2 for most, limit in zip(stiffest, pull_limits, strict=True)]
-        whole = np.max(largest, axis=0) * (pull_limits[0] ** 2 / unit)
-        if not self.is_apart:
-            return advance_with(solve, n_place, d), [whole]
-        springs = [self.stiffness[:, block, block] for block in self.blocks]
-        return advance_apart(solve, self.blocks[0].stop, d), [*largest, *springs, whole]
+    def accelerated(self, force: Vector, index: int) -> Vector:
+        """Acceleration that a force causes."""
+        if self._one_mass is not None:
+            return tuple([part / self._one_mass for part in force])
+        return tuple((self._inverse[index] @ force).tolist())
 
 
 def _are_apart(stiffness: Floats, first: slice, second: slice) -> bool:
@@ -146,34 +184,38 @@ def _are_apart(stiffness: Floats, first: slice, second: slice) -> bool:
     return bool((coupling <= checks.ROUNDING * np.multiply.outer(along[first], along[second])).all())
 
 
-def _gains(stiffness: Floats, damping: Floats, mass: Any) -> tuple[Solve, list[Floats], list[Floats] | None]:
-    """Function for gains of these rows, its part of each row, and stiffness and damping (n, d) of shared modes."""
-    is_matrix = isinstance(mass, np.ndarray)
-    if is_matrix:
-        # With M = L L' modes are P = L'^-1 Q, P' M = Q' L', where Q are the axes of L^-1 K L'^-1 and L^-1 D L'^-1.
-        tells, shapes = np.linalg.cholesky(mass).mT, np.linalg.inv(np.linalg.cholesky(mass))
-        scaled = [shapes @ gain @ shapes.mT for gain in (stiffness, damping)]
-    else:
-        scaled = [stiffness / mass, damping / mass]
+def _shared_modes(
+    stiffness: Floats, damping: Floats, mass: Floats, one_mass: float | None
+) -> tuple[Floats, ...] | None:
+    """Modes of `along_modes` (n, d), (n, d), (n, d, d), (n, d, d), if stiffness and damping share them in all rows.
+
+    With M = L L' they are P = L'^-1 Q, P' M = Q' L', where Q are the axes of L^-1 K L'^-1 and L^-1 D L'^-1.
+    """
+    factor = np.linalg.cholesky(mass)
+    inverse = np.linalg.inv(factor)
+    # Near critical damping a tick has fewer digits than gains over mass: one mass is not taken out by its root.
+    scaled = [inverse @ gain @ inverse.mT if one_mass is None else gain / one_mass for gain in (stiffness, damping)]
     largest = [np.maximum(np.abs(gain).max(axis=(1, 2)), np.finfo(float).tiny)[:, None, None] for gain in scaled]
     # Axes of the sum are those of both, also where equal values of one leave its own undetermined. A weight other than
     # 1 tells apart two axes of which one is as stiff as the other is damped.
     axes = np.linalg.eigh(scaled[0] / largest[0] + 0.6 * scaled[1] / largest[1]).eigenvectors
     turned = [axes.mT @ gain @ axes for gain in scaled]
     off = 1.0 - np.eye(stiffness.shape[1])
-    if all((np.abs(gain * off) <= checks.ROUNDING * scale).all() for gain, scale in zip(turned, largest, strict=True)):
-        along = [np.maximum(gain.diagonal(axis1=1, axis2=2), 0.0) for gain in turned]
-        maps = [axes.mT @ tells, axes.mT @ shapes] if is_matrix else [axes.mT]
-        return along_modes, [along[0], 0.5 * along[1], *maps], along
-    if is_matrix:
-        return coupled, [stiffness, damping, np.broadcast_to(np.linalg.inv(mass), stiffness.shape)], None
-    return coupled, scaled, None
+    if any((np.abs(gain * off) > checks.ROUNDING * scale).any() for gain, scale in zip(turned, largest, strict=True)):
+        return None
+    k, d = (np.maximum(gain.diagonal(axis1=1, axis2=2), 0.0) for gain in turned)
+    return k, 0.5 * d, axes.mT @ factor.mT, axes.mT @ inverse
 
 
-def _mobility(damping: Floats, blocks: Blocks) -> Floats:
+def _mobility(damping: Floats, blocks: Sequence[slice]) -> Floats:
     """Largest norm, over the rows, of each block of D^-1; not finite where it is singular."""
     scale = np.abs(damping).max(axis=(1, 2), keepdims=True)
-    if np.linalg.eigvalsh(damping / np.where(scale > 0.0, scale, 1.0))[:, 0].min() <= _SINGULAR:
+    if not checks.eigenvalues_above(damping / np.where(scale > 0.0, scale, 1.0), _SINGULAR):
         return np.full((len(blocks), len(blocks)), math.inf)
     inverse = np.linalg.inv(damping)
     return np.array([[np.linalg.norm(inverse[:, b, c], 2, axis=(1, 2)).max() for c in blocks] for b in blocks])
+
+
+def _quadratic(matrix: Vector, x: Vector) -> float:
+    d = len(x)
+    return sum([part * sum(map(mul, matrix[i * d : (i + 1) * d], x)) for i, part in enumerate(x)])

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
-from functools import partial
 from typing import Any, Literal, final
 
 import torch
@@ -12,7 +11,6 @@ from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control.filters import StiffnessFilter
 from torch_pbd.control.matrices import as_mass, as_tensor, mass_rows
-from torch_pbd.control.simulation.filters import started
 from torch_pbd.control.simulation.poses import turning
 from torch_pbd.control.simulation.rollout import Rollout, run_task
 from torch_pbd.control.simulation.sensor import ForceSensor, PositionLoop
@@ -211,8 +209,6 @@ class AdmittancePlant:
         turns = None if orientation_desired is None else turning(orientation_desired)
         pose = position_desired if turns is None else torch.nn.functional.pad(position_desired, (0, 3))
         acting = {name: getattr(self, name) for name in ("substeps", *_PARTS)}
-        if self.stiffness_filter is not None:
-            acting["stiffness_filter"] = partial(started, self.stiffness_filter)
         return Task(pose, velocity_desired, inertial, stiffness, damping, mass, dt, **acting, turning=turns)
 
 

@@ -5,15 +5,16 @@ matrix exponential is then exact, whatever its length; at its end the desired po
 position and the rotation from the desired orientation, and that moves on as :mod:`poses` says.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torch_pbd.control.filters import StiffnessFilter
 from torch_pbd.control.simulation.poses import Turning
 from torch_pbd.control.simulation.sensor import ForceSensor, PositionLoop
 
@@ -73,7 +74,7 @@ class Task:
     position_loop: PositionLoop | None
     environment: Environment | None
     substeps: int
-    stiffness_filter: Callable[..., Any] | None  # of the wanted gains, the mass and dt, to an `ActiveFilter`
+    stiffness_filter: StiffnessFilter | None
     turning: Turning | None = None
 
     @property
@@ -175,6 +176,11 @@ def _tick_map(stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> Te
     return transition(admittance_rate(stiffness, damping, mass), dt)[..., : 2 * stiffness.shape[-1], :]
 
 
+def _tick_change(stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> Tensor:
+    each = _tick_map(stiffness, damping, mass, dt)
+    return each - torch.eye(each.shape[-1]).to(each)[: each.shape[-2]]
+
+
 class Loop:
     """State (..., d) of a run with what acts in it, which moves on tick by tick."""
 
@@ -184,7 +190,8 @@ class Loop:
         loop, sensor, wanted = task.position_loop, task.sensor, task.stiffness_filter
         self._robot = None if loop is None else loop.start(*state, task.dt)
         self._read = None if sensor is None else sensor.start(state[0], task.dt, generator)
-        self._filter = None if wanted is None else wanted(task.stiffness, task.damping, task.mass, task.dt)
+        gains = task.stiffness, task.damping, task.mass
+        self._filter = None if wanted is None else wanted.start(*gains, _tick_change)
         self._maps = (each for _, maps in tick_maps(task, task.dt / task.substeps) for each in maps.unbind(-3))
 
     def run(self, tick: int, force: Tensor) -> dict[str, Tensor]:
@@ -197,8 +204,8 @@ class Loop:
         total = force + self._wall(*at)
         record = {"position": at[0], "velocity": at[1], "commanded_position": commanded, "force": total}
         if self._filter is not None:
-            gains = self._filter.select(stiffness, damping, self._deviation)
-            stiffness, damping, record["filter_share"] = gains.stiffness, gains.damping, gains.share
+            self._filter.select(stiffness, damping, mass_at(task.mass, tick), task.dt, self._deviation)
+            stiffness, damping, record["filter_share"] = self._filter.gains
             if self._filter.tank_energy is not None:
                 record["tank_energy"] = self._filter.tank_energy
         measured = total
