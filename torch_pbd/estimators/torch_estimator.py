@@ -21,7 +21,7 @@ from torch_pbd.estimators.demonstrations import check_groups
 from torch_pbd.estimators.validation import CONSTANT, check_inputs_vary, check_squares, checked_rows, without_rounding
 from torch_pbd.models.conditional import ConditionalNormal, Core
 from torch_pbd.models.training import TrainingSet
-from torch_pbd.optim import FitReport, Progress
+from torch_pbd.optim import FitReport, Progress, Status
 
 # Standardized numbers keep this many decimals, so that other units are the same numbers: an optimizer with flat
 # directions would turn a difference in the last bit into digits.
@@ -181,7 +181,7 @@ class TorchEstimator(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         self.loss_, self.loss_curve_, self.converged_ = report.loss, list(report.loss_curve), report.converged
         self._prepare()
         if not report.converged:
-            more = f"max_iter (now {self.max_iter}) or " if report.status.is_limit else ""
+            more = f"max_iter (now {self.max_iter}) or " if report.status is Status.MAX_ITER else ""
             checks.warn(
                 f"{type(self).__name__} stopped early: {report.message}. The best point found is kept; "
                 f"raise {more}tol (now {self.tol:g}).",

@@ -2,8 +2,9 @@
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from enum import Enum
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -28,15 +29,9 @@ class Status(Enum):
     """How an optimization ended; the value is the phrase for it."""
 
     CONVERGED = "converged"
-    MAX_ITER = "stopped at max_iter iterations"
-    MAX_EVALUATIONS = "stopped at the most evaluations for max_iter iterations"
+    MAX_ITER = "stopped at max_iter iterations"  # or at the most evaluations for these
     LINE_SEARCH_FAILED = "no step lowers the loss, though its slope says so"
     NOT_FINITE = "the loss or its gradient is not finite"
-
-    @property
-    def is_limit(self) -> bool:
-        """Whether more iterations would have gone on."""
-        return self in (Status.MAX_ITER, Status.MAX_EVALUATIONS)
 
 
 def first_failure(statuses: Iterable[Status]) -> Status:
@@ -138,15 +133,14 @@ def minimize_batch(
     parameters : Tensor of shape (b, p)
     report : BatchReport
     """
-    x = start.detach().clone()
     objective = _guarded(objective)
-    rows = torch.arange(len(x), device=x.device)
-    loss, gradient, inverse = _start(objective, rows, x, inverse_hessian)
-    size = gradient.abs().sum(-1)  # of no parameters it is zero, and there is nothing to do
-    alive = torch.isfinite(loss + size) & (size > tol)
-    every = _problems(rows, x, loss, gradient, inverse, torch.ones_like(loss))
-    active = every.restrict(alive & (every.promise > _negligible(loss, tol)))
-    n_iter, status = 0, Status.CONVERGED if bool(torch.isfinite(loss + size).all()) else Status.NOT_FINITE
+    rows = torch.arange(len(start), device=start.device)
+    every = _start(objective, rows, start.detach().clone(), inverse_hessian)
+    first = every.loss
+    size = every.gradient.abs().sum(-1)  # of no parameters it is zero, and there is nothing to do
+    finite = torch.isfinite(first + size)
+    active = every.restrict(finite & (size > tol) & (every.promise > _negligible(first, tol)))
+    n_iter, status = 0, Status.CONVERGED if bool(finite.all()) else Status.NOT_FINITE
     while n_iter < max_iter and len(active.rows):
         n_iter += 1
         active, settled, blocked = _advance(objective, active, tol, first=n_iter == 1)
@@ -157,7 +151,7 @@ def minimize_batch(
             active = active.restrict(~settled)
     if status is Status.CONVERGED and len(active.rows):
         status = Status.MAX_ITER
-    return every.x, BatchReport(every.loss, loss, n_iter, status, every.inverse)
+    return every.x, BatchReport(every.loss, first, n_iter, status, every.inverse)
 
 
 def _guarded(objective: ValueAndGradient) -> ValueAndGradient:
@@ -186,25 +180,27 @@ class _Problems:
     inverse: Float[Tensor, "a p p"]
     step: Float[Tensor, " a"]
     """Multiple of Newton's step that is tried next."""
-    downhill: Float[Tensor, "a p 1"]
-    """Newton's step, but for its sign."""
-    promise: Float[Tensor, " a"]
-    """Fall of the loss by Newton's step, were the loss the parabola that it is taken for."""
+
+    @cached_property
+    def downhill(self) -> Float[Tensor, "a p 1"]:
+        """Newton's step, but for its sign."""
+        return self.inverse @ self.gradient.unsqueeze(-1)
+
+    @cached_property
+    def promise(self) -> Float[Tensor, " a"]:
+        """Fall of the loss by Newton's step, were the loss the parabola that it is taken for."""
+        return 0.5 * (self.gradient * self.downhill.squeeze(-1)).sum(-1)
 
     def restrict(self, chosen: Bool[Tensor, " a"]) -> "_Problems":
         """Problems that are chosen."""
-        return self if bool(chosen.all()) else _Problems(*(part[chosen] for part in vars(self).values()))
+        if bool(chosen.all()):
+            return self
+        return _Problems(*(getattr(self, part.name)[chosen] for part in fields(self)))
 
     def put(self, others: "_Problems") -> None:
         """Take the present points of some of the problems."""
         for name in ("x", "loss", "inverse"):
             setattr(self, name, getattr(self, name).index_copy(0, others.rows, getattr(others, name)))
-
-
-def _problems(rows: Tensor, x: Tensor, loss: Tensor, gradient: Tensor, inverse: Tensor, step: Tensor) -> _Problems:
-    downhill = inverse @ gradient.unsqueeze(-1)
-    promise = 0.5 * (gradient * downhill.squeeze(-1)).sum(-1)
-    return _Problems(rows, x, loss, gradient, inverse, step, downhill, promise)
 
 
 def _advance(
@@ -218,7 +214,7 @@ def _advance(
     inverse = _bfgs_update(at.inverse, (x - at.x).unsqueeze(-1), change, convex)
     gain = at.loss - loss
     short = ~convex & (gain > 0) & (at.step < _LONGEST_STEP) & (not first)
-    new = _problems(at.rows, x, loss, gradient, inverse, torch.where(short, 4.0 * at.step, 1.0))
+    new = _Problems(at.rows, x, loss, gradient, inverse, torch.where(short, 4.0 * at.step, 1.0))
     settled = ((new.promise <= _negligible(loss, tol)) | (gain <= 0.0)) & ~short
     return new, settled | (gradient.abs().sum(-1) <= tol), blocked
 
@@ -228,22 +224,21 @@ def _negligible(loss: Tensor, tol: float) -> Tensor:
     return 1e-2 * tol + torch.finfo(loss.dtype).eps * loss.abs()
 
 
-def _start(
-    objective: ValueAndGradient, rows: Tensor, x: Tensor, inverse_hessian: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Losses, gradients and inverse Hessians at the start; given none, by differences of the gradient.
+def _start(objective: ValueAndGradient, rows: Tensor, x: Tensor, inverse_hessian: Tensor | None) -> _Problems:
+    """Problems at the start; inverse Hessians that are not given are by differences of the gradient.
 
     These get the absolute values of their eigenvalues; where they are not finite they are of a step of length one.
     """
+    one = x.new_ones(len(x))
     if inverse_hessian is not None:
-        return *objective(x, rows), inverse_hessian.clone()
+        return _Problems(rows, x, *objective(x, rows), inverse_hessian.clone(), one)
     size = x.shape[-1]
     eye = torch.eye(size).to(x)
     shifts = torch.cat([eye.new_zeros(1, size), _DIFFERENCE * eye])
     losses, gradients = objective((x + shifts[:, None]).flatten(0, 1), rows.repeat(len(shifts)))
     loss, (gradient, *shifted) = losses[: len(x)], gradients.reshape(len(shifts), *x.shape)
     if not size:
-        return loss, gradient, x.new_zeros(len(x), 0, 0)
+        return _Problems(rows, x, loss, gradient, x.new_zeros(len(x), 0, 0), one)
     hessian = (torch.stack(shifted, dim=1) - gradient[:, None]) / _DIFFERENCE
     sound = torch.isfinite(hessian).all(-1).all(-1)[:, None, None]
     length = gradient.norm(dim=-1).nan_to_num(nan=1.0).clamp_min(1e-300)[:, None, None]
@@ -252,7 +247,8 @@ def _start(
     curvature = curvature.maximum(_LEAST_CURVATURE * curvature.amax(-1, keepdim=True)).clamp_min(1e-300)
     inverse = (axes / curvature.unsqueeze(-2)) @ axes.mT
     reach = (inverse @ gradient.unsqueeze(-1)).abs().amax((-2, -1))
-    return loss, gradient, inverse * (_FIRST_REACH / reach.clamp_min(_FIRST_REACH))[:, None, None]
+    inverse = inverse * (_FIRST_REACH / reach.clamp_min(_FIRST_REACH))[:, None, None]
+    return _Problems(rows, x, loss, gradient, inverse, one)
 
 
 def _bfgs_update(inverse: Tensor, step: Tensor, change: Tensor, convex: Tensor) -> Tensor:

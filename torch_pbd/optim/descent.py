@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -16,56 +17,38 @@ _LINEAR = 0.8  # with a larger share the loss is a line rather than a parabola, 
 _SHORTEST, _LONGEST = 1e-10, 1e3  # multiples of Newton's step
 _SHORTFALL = 3e4  # of what is little, that a step may promise where its fall is little: it is never all of it
 
-Newton = Callable[[Tensor], tuple[Tensor, Tensor]]
-"""Gradient and step at a point."""
 
-
-class _BestSoFar:
-    """Base of searches: the falling curve of their best losses, of which a callback hears."""
+class _Curve:
+    """Falling curve of the best losses, of which a callback hears."""
 
     def __init__(self, callback: Callback) -> None:
-        self.curve: list[float] = []
-        self.n_evaluations = 0
-        self._callback, self._started = callback, time.perf_counter()
+        self.losses: list[float] = []
+        self._n_evaluations, self._callback, self._started = 0, callback, time.perf_counter()
 
-    def is_lower(self, loss: float) -> bool:
-        """Whether a loss is finite and below all before it."""
-        return math.isfinite(loss) and (not self.curve or loss < self.curve[-1])
-
-    def record(self, loss: float) -> None:
-        """Take a lower loss for the best so far."""
-        self.curve.append(loss)
+    def add(self, loss: float) -> bool:
+        """Count an evaluation; whether its loss is finite and the lowest so far."""
+        self._n_evaluations += 1
+        if not math.isfinite(loss) or (self.losses and loss >= self.losses[-1]):
+            return False
+        self.losses.append(loss)
         if self._callback is not None:
-            self._callback(Progress(self.n_evaluations, loss, time.perf_counter() - self._started))
+            self._callback(Progress(self._n_evaluations, loss, time.perf_counter() - self._started))
+        return True
 
 
 class _NotFiniteError(ArithmeticError):
     """The loss or its gradient is not a finite number, or could not be computed."""
 
 
-class _Closure(_BestSoFar):
+class _Closure:
     """Closure for ``torch.optim``: loss and gradients at the parameters, and memory of the best of them."""
 
     def __init__(self, objective: Callable[[], Tensor], parameters: Sequence[Tensor], callback: Callback) -> None:
-        super().__init__(callback)
+        self.curve = _Curve(callback)
         self._objective, self._parameters = objective, parameters
         self._best: list[Tensor] = []
-        self._gradients: Sequence[Tensor] = []
 
     def __call__(self) -> float:
-        # Each attempt begins with the loss at the best point, which is known.
-        known = bool(self._best) and all(map(torch.equal, self._parameters, self._best))
-        value, gradients = (self.curve[-1], self._gradients) if known else self._evaluate()
-        for parameter, gradient in zip(self._parameters, gradients, strict=True):
-            parameter.grad = gradient.clone()
-        if self.is_lower(value):
-            self._best = [parameter.detach().clone() for parameter in self._parameters]
-            self._gradients = gradients
-            self.record(value)
-        return value
-
-    def _evaluate(self) -> tuple[float, Sequence[Tensor]]:
-        self.n_evaluations += 1
         try:
             with torch.enable_grad():
                 loss = self._objective()
@@ -75,7 +58,11 @@ class _Closure(_BestSoFar):
         value = float(loss.detach())
         if not math.isfinite(value) or not all(bool(torch.isfinite(gradient).all()) for gradient in gradients):
             raise _NotFiniteError(f"{Status.NOT_FINITE.value} (loss {value})")
-        return value, [gradient.contiguous() for gradient in gradients]
+        for parameter, gradient in zip(self._parameters, gradients, strict=True):
+            parameter.grad = gradient.contiguous()
+        if self.curve.add(value):
+            self._best = [parameter.detach().clone() for parameter in self._parameters]
+        return value
 
     @torch.no_grad()
     def restore(self) -> None:
@@ -125,30 +112,31 @@ def minimize(
         If the loss or its gradient is not finite at the start.
     """
     closure, n_iter = _Closure(objective, parameters, callback), 0
+    losses = closure.curve.losses
     try:
         closure()
         for number in range(_ATTEMPTS):
-            max_eval = 2 * (max_iter - n_iter) + 21  # a search takes one or two; the first is known
+            max_eval = 2 * (max_iter - n_iter) + 21  # a line search takes one or two
             optimizer = torch.optim.LBFGS(
                 list(parameters),
                 lr=0.5**number,
                 max_iter=max_iter - n_iter,
                 max_eval=max_eval,
                 tolerance_grad=tol,
-                tolerance_change=tol * max(1.0, abs(closure.curve[0])) * 1e-2,
+                tolerance_change=tol * max(1.0, abs(losses[0])) * 1e-2,
                 history_size=20,  # pairs of steps and changes of the gradient
                 line_search_fn="strong_wolfe",
             )
             memory, detail = optimizer.state[parameters[0]], ""
             try:
                 optimizer.step(closure)
-                status = Status.CONVERGED if memory["func_evals"] < max_eval else Status.MAX_EVALUATIONS
+                status = Status.CONVERGED if memory["func_evals"] < max_eval else Status.MAX_ITER
             except _NotFiniteError as error:
                 status, detail = Status.NOT_FINITE, str(error)
             except FAILURES as error:  # an IndexError where torch's strong Wolfe search brackets no minimum
                 status = Status.LINE_SEARCH_FAILED
                 detail = f"the line search failed ({type(error).__name__}: {error})"
-            n_iter += memory["n_iter"]
+            n_iter += memory.get("n_iter", 0)
             closure.restore()
             if status is Status.CONVERGED or n_iter >= max_iter:
                 break
@@ -158,73 +146,13 @@ def minimize(
         closure.restore()
     if status is Status.CONVERGED and n_iter >= max_iter:
         status = Status.MAX_ITER
-    return FitReport(closure.curve[-1], tuple(closure.curve), n_iter, status, detail)
-
-
-class _Search(_BestSoFar):
-    """Point of an optimization, and the losses it has seen."""
-
-    def __init__(self, loss: Callable[[Tensor], Tensor], start: Tensor, callback: Callback) -> None:
-        super().__init__(callback)
-        self._loss, self.x, self.n_iter = loss, start, 0
-        self.value = self._evaluate(start)
-
-    def _evaluate(self, x: Tensor) -> float:
-        """Loss at x; NaN where it is not finite, or raises one of the exceptions of a bad point."""
-        self.n_evaluations += 1
-        try:
-            value = float(self._loss(x))
-        except FAILURES as error:
-            if not self.curve:
-                raise ValueError(f"The optimization cannot start: {error}.") from error
-            return math.nan
-        if self.is_lower(value):
-            self.record(value)
-        return value if math.isfinite(value) else math.nan
-
-    def _line_search(self, step: Tensor, slope: float) -> tuple[Tensor, float]:
-        """Point with a lower loss along a step, and that loss; the present point where there is none."""
-        length, found, lowest = 1.0, self.x, self.value
-        while _SHORTEST < length < _LONGEST:
-            trial = self.x + length * step
-            reached = self._evaluate(trial)
-            share = (self.value - reached) / (-length * slope)  # NaN counts as too far
-            if share >= _ARMIJO and reached < lowest:
-                found, lowest = trial, reached
-                if length < 1.0 or share <= _LINEAR:
-                    break
-                length *= 2.0
-            elif found is not self.x:
-                break
-            else:
-                # The minimum of the parabola through both values and the slope, kept within a tenth and a half.
-                parabola = 0.5 / (1.0 - share) if math.isfinite(share) else 0.1
-                length *= min(0.5, max(0.1, parabola))
-        return found, lowest
-
-    def step(self, newton: Newton, enough: float, relative_tol: float) -> Status | None:
-        """One iteration; how it ended the optimization, None if it did not."""
-        self.n_iter += 1
-        value, (gradient, step) = self.value, newton(self.x)
-        slope = float((gradient * step).sum())
-        if not math.isfinite(slope) or not bool(torch.isfinite(step).all()):
-            raise ValueError(f"the gradient is not finite (loss {value}, slope {slope} along the step)")
-        found, lowest = self._line_search(step, slope) if slope < 0 else (self.x, value)
-        # A fall below the rounding of the loss cannot be seen.
-        promise, rounding = -0.5 * slope, 1e-14 * max(1.0, abs(value))
-        if found is self.x and promise > max(enough, rounding):
-            return Status.LINE_SEARCH_FAILED
-        self.x, self.value = found, lowest
-        little = max(enough, relative_tol * abs(value), rounding)
-        # A step that falls far short of its promise is short because of a bend, not because of an end.
-        arrived = value - lowest <= 10.0 * enough and promise <= _SHORTFALL * little
-        return Status.CONVERGED if promise <= little or arrived else None
+    return FitReport(losses[-1], tuple(losses), n_iter, status, detail)
 
 
 @torch.no_grad()
 def minimize_scoring(
     loss: Callable[[Tensor], Tensor],
-    newton: Newton,
+    newton: Callable[[Tensor], tuple[Tensor, Tensor]],
     start: Tensor,
     *,
     max_iter: int = 100,
@@ -267,16 +195,75 @@ def minimize_scoring(
     ValueError
         If the loss, its gradient or the step is not finite at the start.
     """
-    search = _Search(loss, start, callback)
-    if not math.isfinite(search.value):
-        raise ValueError(f"The optimization cannot start: the loss is not finite (loss {search.value}).")
-    enough = 1e-2 * tol * max(1.0, abs(search.curve[0]))
-    status, detail = None, ""
-    while status is None and search.n_iter < max_iter:
+    curve = _Curve(callback)
+    evaluate = partial(_evaluate, loss, curve)
+    x, value = start, evaluate(start)
+    if not math.isfinite(value):
+        raise ValueError(f"The optimization cannot start: the loss is not finite (loss {value}).")
+    enough = 1e-2 * tol * max(1.0, abs(value))
+    n_iter, status, detail = 0, Status.MAX_ITER, ""
+    while n_iter < max_iter and status is Status.MAX_ITER:
+        n_iter += 1
         try:
-            status = search.step(newton, enough, relative_tol)
+            step, slope = _checked_step(newton, x, value)
         except FAILURES as error:
-            if search.n_iter == 1:
+            if n_iter == 1:
                 raise ValueError(f"The optimization cannot start: {error}.") from error
             status, detail = Status.NOT_FINITE, str(error)
-    return search.x, FitReport(search.value, tuple(search.curve), search.n_iter, status or Status.MAX_ITER, detail)
+            break
+        found, lowest = _line_search(evaluate, x, value, step, slope) if slope < 0 else (x, value)
+        # A fall below the rounding of the loss cannot be seen.
+        promise, rounding = -0.5 * slope, 1e-14 * max(1.0, abs(value))
+        little = max(enough, relative_tol * abs(value), rounding)
+        # A step that falls far short of its promise is short because of a bend, not because of an end.
+        arrived = value - lowest <= 10.0 * enough and promise <= _SHORTFALL * little
+        if found is x and promise > max(enough, rounding):
+            status = Status.LINE_SEARCH_FAILED
+        elif promise <= little or arrived:
+            status = Status.CONVERGED
+        x, value = found, lowest
+    return x, FitReport(value, tuple(curve.losses), n_iter, status, detail)
+
+
+def _evaluate(loss: Callable[[Tensor], Tensor], curve: _Curve, x: Tensor) -> float:
+    """Loss at x; NaN where it is not finite, or raises one of the exceptions of a bad point."""
+    try:
+        value = float(loss(x))
+    except FAILURES as error:
+        if not curve.losses:
+            raise ValueError(f"The optimization cannot start: {error}.") from error
+        value = math.nan
+    curve.add(value)
+    return value if math.isfinite(value) else math.nan
+
+
+def _checked_step(newton: Callable[[Tensor], tuple[Tensor, Tensor]], x: Tensor, value: float) -> tuple[Tensor, float]:
+    """Newton's step, and the slope along it."""
+    gradient, step = newton(x)
+    slope = float((gradient * step).sum())
+    if not math.isfinite(slope) or not bool(torch.isfinite(step).all()):
+        raise ValueError(f"the gradient is not finite (loss {value}, slope {slope} along the step)")
+    return step, slope
+
+
+def _line_search(
+    evaluate: Callable[[Tensor], float], x: Tensor, value: float, step: Tensor, slope: float
+) -> tuple[Tensor, float]:
+    """Point with a lower loss along a step, and that loss; the present point where there is none."""
+    length, found, lowest = 1.0, x, value
+    while _SHORTEST < length < _LONGEST:
+        trial = x + length * step
+        reached = evaluate(trial)
+        share = (value - reached) / (-length * slope)  # NaN counts as too far
+        if share >= _ARMIJO and reached < lowest:
+            found, lowest = trial, reached
+            if length < 1.0 or share <= _LINEAR:
+                break
+            length *= 2.0
+        elif found is not x:
+            break
+        else:
+            # The minimum of the parabola through both values and the slope, kept within a tenth and a half.
+            parabola = 0.5 / (1.0 - share) if math.isfinite(share) else 0.1
+            length *= min(0.5, max(0.1, parabola))
+    return found, lowest
