@@ -107,9 +107,9 @@ def warn_if_identical(training: TrainingSet) -> None:
         )
 
 
-def warn_of_residuals(fit: HeteroscedasticFit, group: Tensor | None, given: Tensor) -> None:
+def warn_of_residuals(fit: HeteroscedasticFit, given: Tensor) -> None:
     """Warn where rows, ``given`` in this order without groups, are of demonstrations; or the mean misses a signal."""
-    if group is None and are_copies(fit.whitened(), fit.training, given):
+    if fit.group is None and are_copies(fit.whitened(), fit.training, given):
         message = (
             "y has rows that nearly repeat those beside them along X, as samples of a demonstration do. Without groups "
             "they count as independent, and what is predicted is far too certain. Give groups, the demonstration of "
@@ -117,7 +117,7 @@ def warn_of_residuals(fit: HeteroscedasticFit, group: Tensor | None, given: Tens
             "metadata routing is enabled and set_fit_request(groups=True) asks for them."
         )
         checks.warn(message, DataRankWarning)
-    elif bool((missed := fit.missed(group)).any()):
+    elif bool((missed := fit.missed()).any()):
         message = (
             f"The mean does not follow y in outputs {missed.nonzero().flatten().tolist()}: what is left is no noise, "
             "but counts as such. Raise n_inducing and max_inputs; give groups if the rows are of demonstrations."

@@ -1,7 +1,6 @@
 """The recommended regressor: covariance by latent Gaussian processes that are integrated out."""
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -18,12 +17,12 @@ from torch_pbd.kernels import KERNELS, KernelName
 from torch_pbd.linalg import safe_cholesky
 from torch_pbd.models.heteroscedastic import (
     HeteroscedasticModel,
+    ProcessFamily,
     SearchOptions,
     candidate_families,
     check_memory,
     fit_heteroscedastic,
     inducing_sizes,
-    mean_start,
 )
 from torch_pbd.models.training import TrainingSet, default_prior_tril
 
@@ -249,19 +248,18 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         to_try = candidate_families(
             training.inputs, len(rows.inputs), sizes, kernel=kernel, period=circle, length_scale=held
         )
-        begin = partial(mean_start, rows, to_try[0].mean, options) if self.n_inducing is None else None
-        fit = fit_heteroscedastic(training, group, to_try, options, begin=begin)
-        family = fit.covariance.log_variances.family
-        least = family.shortest_length_scale
+        fit = fit_heteroscedastic(training, group, to_try, options, rows=rows if self.n_inducing is None else None)
+        model = HeteroscedasticModel(fit, prior_tril)
+        least = model.covariance_process.log_variances.family.shortest_length_scale
         if held is not None and bool((held < least).any()):
             checks.warn(
                 f"length_scale is below {least:.3g} of the range of X, which is what the inputs (or n_inducing of "
                 "them) resolve: between them the covariance says nothing. Give a longer one, or None to learn it."
             )
-        warn_of_residuals(fit, group, self._door(recorded).long())
+        warn_of_residuals(fit, self._door(recorded).long())
         self.effective_share_ = 1.0 if fit.correlation is None else float(fit.correlation.share.mean())
         report = options.outcome(tuple(-value for value in fit.log_evidence))
-        return Fitted(self._assemble(HeteroscedasticModel(fit, prior_tril), scaling), report, family.jitter)
+        return Fitted(self._assemble(model, scaling), report, ProcessFamily.jitter)
 
     def _check_memory(self, n_distinct: int, n_features: int, n_outputs: int) -> None:
         check_memory(self.n_inducing, self.max_inputs, (n_distinct, n_features, n_outputs))

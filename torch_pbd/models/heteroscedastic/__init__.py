@@ -1,7 +1,6 @@
 """Mean and covariance by latent Gaussian processes that are integrated out: the recommended model."""
 
 from torch_pbd.models.heteroscedastic.fit import HeteroscedasticFit, fit_heteroscedastic
-from torch_pbd.models.heteroscedastic.mean import mean_start
 from torch_pbd.models.heteroscedastic.module import HeteroscedasticModel
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
 from torch_pbd.models.heteroscedastic.residuals import are_copies
@@ -24,5 +23,4 @@ __all__ = [
     "check_memory",
     "fit_heteroscedastic",
     "inducing_sizes",
-    "mean_start",
 ]

@@ -10,8 +10,8 @@ modified Cholesky decomposition of a covariance that depends on x (Pourahmadi, 1
 
 import math
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -19,8 +19,8 @@ from torch import Tensor
 
 from torch_pbd.linalg import scale_tril_from_root
 from torch_pbd.models.heteroscedastic.covariance import CovarianceSearch, LatentCovariance, fit_covariance
-from torch_pbd.models.heteroscedastic.log_variance import Squares, on_stretched_inputs, stretched
-from torch_pbd.models.heteroscedastic.mean import MOST_INPUTS, LatentMean, MeanStart, fit_mean
+from torch_pbd.models.heteroscedastic.log_variance import on_stretched_inputs, squares_within, stretched
+from torch_pbd.models.heteroscedastic.mean import MOST_INPUTS, LatentMean, fit_mean, mean_start
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
 from torch_pbd.models.heteroscedastic.residuals import (
     LAGS,
@@ -54,32 +54,144 @@ _MUCH_LESS, _NEARLY_ALL = 0.25, 0.9
 _WORTH_A_WARNING = 0.03  # of y's variance: what a smooth mean misses of a corner is less
 
 
-@dataclass(frozen=True)
+@dataclass
 class HeteroscedasticFit:
-    """Posterior of mean and covariance of standardized outputs."""
+    """Posterior of mean and covariance of standardized outputs, with the state that one turn leaves to the next."""
 
-    mean: LatentMean
-    covariance: LatentCovariance
-    """Posterior of L, the factor of the residuals' covariance once they are multiplied by the inverse of C."""
-    pooled_tril: Float[Tensor, "d d"]
-    """C."""
-    correlation: DemonstrationCorrelation | None
-    log_evidence: tuple[float, ...]
-    """Log evidence of the covariance's processes at the end of each turn, in nats."""
     training: TrainingSet
-    residual: Float[Tensor, "rows d"]
-    n_demos: int
-    """Demonstrations, where rows are known to be of some; else 1."""
+    group: Int64[Tensor, " rows"] | None
+    families: Families
+    larger: Families | None
+    options: SearchOptions
+    mean_rows: TrainingSet
+    pooled_tril: Float[Tensor, "d d"]
+    """C, once there are residuals."""
+    covariance: LatentCovariance | None = None
+    """Posterior of L, the factor of the residuals' covariance once they are multiplied by the inverse of C."""
+    correlation: DemonstrationCorrelation | None = None
+    log_evidence: list[float] = field(default_factory=list)
+    """Log evidence of the covariance's processes at the end of each turn, in nats."""
+    mean: LatentMean = field(init=False)
+    residual: Float[Tensor, "rows d"] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._n_outputs = self.training.y.shape[1]
+        self.n_demos = 1 if self.group is None else int(self.group.max()) + 1
+        self._mean_search = Search(self.families.mean, self._n_outputs, self.options)
+        self._begin_covariance(self.families.log_variance)
+
+    def _begin_covariance(self, log_variance: ProcessFamily) -> None:
+        """Begin the searches of the covariance anew, on processes of a family."""
+        self.families = self.families._replace(log_variance=log_variance)
+        self.search = CovarianceSearch(self.families, self._n_outputs, self.options)
+
+    def fit_mean(self, rows: TrainingSet | None) -> None:
+        """Mean under the noise so far; of ``rows`` it begins anew where this one does not follow the data."""
+        self._fit_mean()
+        if rows is None or self._follows():
+            return
+        if (start := mean_start(rows, self.mean, self.pooled_tril, self.options)) is not None:
+            self._mean_search, self.pooled_tril, self.mean_rows = start
+            self._fit_mean()
+
+    def _fit_mean(self) -> None:
+        rows, noise = self.mean_rows, self.noise_correlation(self.mean_rows, squares=False)
+        whitener = None if noise is None else noise.whitener
+        tril = self.noise_tril(rows.inputs)
+        self.mean = fit_mean(self._mean_search, rows.inputs, rows.means(), rows.counts, tril, whitener)
+
+    def _follows(self) -> bool:
+        """Whether residuals of the first mean are the noise that it was fitted under: not far less, no signal, and not
+        all of y.
+        """
+        training = self.training
+        self.residual = training.y - self.mean.expected_at_all(training)
+        whitened = self.normal()
+        less = whitened.square().mean(0) < _MUCH_LESS
+        # By Schwarz's criterion: of 20 inputs once in 30 times by chance, of 500, which tell more, once in 3,000.
+        wrong = is_signal(whitened, training, self.group, LAGS * math.log(len(training.inputs))) & ~less
+        # The noise was estimated from neighbours, unless rows repeat inputs.
+        if training.counts.mean() < 2.0 or not training.repeats_inputs:
+            wrong = wrong | less | (self.residual.square().mean(0) > _NEARLY_ALL)
+        return not bool(wrong.any())
+
+    def shares(self) -> Float[Tensor, "rows d"]:
+        """Shares of a degree of freedom that fitting the mean has left of each row.
+
+        With the covariance V of the mean's error and the factor T of the noise the leverage of a row is the diagonal of
+        inv(T) V inv(T)': of output i, that of the part of it which the outputs before do not explain.
+        """
+        tril, (_, error) = self.noise_tril(self.training.inputs), self.mean.at(self.training.inputs)
+        half = torch.linalg.solve_triangular(tril, error, upper=False)
+        leverage = torch.linalg.solve_triangular(tril, half.mT, upper=False).diagonal(dim1=-2, dim2=-1)
+        return (1.0 - leverage).clamp(_LEAST_SHARE, 1.0)[self.training.index]
+
+    def noise_tril(self, inputs: Float[Tensor, "n e"]) -> Float[Tensor, "n d d"]:
+        """Factor of the noise C L of a row at each input, with a little that is each output's own."""
+        if self.covariance is None:
+            return self.pooled_tril.expand(len(inputs), -1, -1)
+        tril = self.pooled_tril @ self.covariance.at(inputs).tril()
+        own = (_LEAST_OWN * tril.norm(dim=-1)).clamp_min(_LEAST_DEVIATION)
+        return scale_tril_from_root(torch.cat([tril, torch.diag_embed(own)], dim=-1))
+
+    def noise_correlation(self, rows: TrainingSet, *, squares: bool) -> NoiseCorrelation | None:
+        """Correlation of the means, or the mean ``squares``, of rows at different inputs; None where there is none."""
+        if self.group is None or self.correlation is None or not self.correlation.matters:
+            return None
+        return self.correlation.at_inputs(rows, self.group, squares=squares)
+
+    def stretch_ends(self, noise: NoiseCorrelation | None) -> None:
+        """Stretch the ends where the covariance collapses; and begin its searches anew if what the first turn took for
+        independent is not, or has other features: that is no place to start from.
+        """
+        before = self.families.log_variance
+        squares = squares_within(self.training, self.normal(), noise)
+        after = stretched(before, self.training.inputs, squares, self.options)
+        if after is not before or noise is not None:
+            self.covariance = None
+            self._begin_covariance(after)
+
+    def refine(self) -> bool:
+        """Go on with more inducing inputs where these do not resolve what was found; whether there is need to."""
+        if self.larger is None or self.covariance is None:
+            return False
+        coarse_mean = not self._mean_search.held and not self.mean.processes.resolved
+        if coarse_mean:
+            self._mean_search = Search(self.larger.mean, self._n_outputs, self.options)
+        coarse = not (self.covariance.log_variances.resolved and self.covariance.rows.resolved)
+        if coarse:
+            stretch = self.families.log_variance.stretch
+            self._begin_covariance(on_stretched_inputs(self.larger.log_variance, self.training.inputs, stretch))
+        self.larger = None if coarse or coarse_mean else self.larger
+        return coarse or coarse_mean
+
+    def correlate(self) -> None:
+        """How far samples of a demonstration repeat each other, by e = inv(L) w."""
+        if self.group is None:
+            return
+        self.correlation = demonstration_correlation(self.training.x, self.whitened(), self.group)
+        if self.correlation.matters:
+            # So many inputs that each holds about a row of each demonstration, and enough rows for a covariance by
+            # themselves, which takes three more than outputs.
+            n_rows = max(self.n_demos, self._n_outputs + 3)
+            self.training = self.training.merged(max(8, len(self.training.x) // n_rows))
+            self.mean_rows = self.mean_rows.merged(MOST_INPUTS) if self._mean_search.held else self.training
+
+    def normal(self) -> Float[Tensor, "rows d"]:
+        """Residuals multiplied by the inverse of C."""
+        return torch.linalg.solve_triangular(self.pooled_tril, self.residual.mT, upper=False).mT
 
     def whitened(self) -> Float[Tensor, "rows d"]:
-        """Residuals of unit covariance."""
-        return _whiten(self.training, _solve(self.pooled_tril, self.residual), self.covariance)
+        """Residuals of unit covariance at each input."""
+        assert self.covariance is not None
+        tril = self.covariance.at(self.training.inputs).tril()[self.training.index]
+        return torch.linalg.solve_triangular(tril, self.normal().unsqueeze(2), upper=False).squeeze(2)
 
-    def missed(self, group: Int64[Tensor, " rows"] | None) -> Bool[Tensor, " d"]:
+    def missed(self) -> Bool[Tensor, " d"]:
         """Outputs whose residuals are a signal that the mean does not follow."""
         # What an output has beyond those before it: of outputs that vary together nothing is left but rounding.
         matters = self.pooled_tril.diagonal().square() > _WORTH_A_WARNING
-        return matters & is_signal(self.whitened(), self.training, group, NOT_WHITE)
+        return matters & is_signal(self.whitened(), self.training, self.group, NOT_WHITE)
 
 
 def fit_heteroscedastic(
@@ -89,7 +201,7 @@ def fit_heteroscedastic(
     options: SearchOptions,
     *,
     n_turns: int = 3,
-    begin: Callable[[], MeanStart] | None = None,
+    rows: TrainingSet | None = None,
 ) -> HeteroscedasticFit:
     """Mean under the noise learned so far, then covariance of the residuals from it, ``n_turns`` times.
 
@@ -104,154 +216,43 @@ def fit_heteroscedastic(
         room to spare: in the next turn, and in one more after the last.
     options : SearchOptions
     n_turns : int, default=3
-    begin : callable, default=None
-        Looks for another mean, :func:`mean_start`, where the first one does not follow the data.
+    rows : TrainingSet, default=None
+        At all their inputs: of these the mean begins anew where the first one does not follow the data.
     """
-    families, larger = to_try[0], to_try[1] if len(to_try) > 1 else None
-    n_demos = 1 if group is None else int(group.max()) + 1
-    at = _State(training, group, n_demos, families, options, larger, training, _start_tril(training))
+    larger = to_try[1] if len(to_try) > 1 else None
+    fit = HeteroscedasticFit(training, group, to_try[0], larger, options, training, _start_tril(training))
     # Share of the rows that count before the correlation of a demonstration's samples is known.
-    part = 1.0 if group is None else min(1.0, _FIRST_SAMPLES * n_demos / len(group))
-    evidences: list[float] = []
+    first_part = 1.0 if group is None else min(1.0, _FIRST_SAMPLES * fit.n_demos / len(group))
     started, turn = time.perf_counter(), 0
     while turn < n_turns:
         options.slack = _SLACK if turn < n_turns - 1 else 1.0
         # mu given C and L, by generalized least squares.
-        mean = at.fit_mean(begin if turn == 0 else None)
+        fit.fit_mean(rows if turn == 0 else None)
         # Residuals r = y - mu, and the share 1 - h of a degree of freedom that fitting mu has left of each.
-        residual, share = _residual(at.training, mean, _noise_tril(at.training.inputs, at.pooled, at.covariance))
+        training, share = fit.training, fit.shares()
+        fit.residual = training.y - fit.mean.expected_at_all(training)
         # C C' = sum of r r' / sum of (1 - h), once: what changes later is L's.
-        at.pooled = at.pooled if turn else _pooled_tril(residual, share)
+        if turn == 0:
+            fit.pooled_tril = _pooled_tril(fit.residual, share)
         # w = inv(C) r of each row; at each input their scatter S, the sum of w w', and its degrees of freedom.
-        normal = _solve(at.pooled, residual)
-        scatter, degrees = _scatter(at.training, normal, share, part if turn == 0 else 1.0)
-        noise = at.noise_correlation(at.training, squares=True)
+        root, part = training.scatter_root(fit.normal()), first_part if turn == 0 else 1.0
+        scatter, degrees = part * (root @ root.mT), part * training.sums(share).mT
+        noise = fit.noise_correlation(training, squares=True)
         if turn == 1:
-            at.stretch_ends(normal, noise)
+            fit.stretch_ends(noise)
         # l and phi given S, whose likelihood is that of a Wishart distribution.
-        fitted = at.training
-        at.covariance, evidence = fit_covariance(
-            at.search, fitted.inputs, scatter, degrees, noise, at.covariance, cautious=turn == 0
+        fit.covariance, evidence = fit_covariance(
+            fit.search, training.inputs, scatter, degrees, noise, fit.covariance, cautious=turn == 0
         )
-        evidences.append(evidence)
+        fit.log_evidence.append(evidence)
         if options.callback is not None:
-            options.callback(Progress(len(evidences), -evidence, time.perf_counter() - started))
-        if at.refine(mean):
+            options.callback(Progress(turn + 1, -evidence, time.perf_counter() - started))
+        if fit.refine():
             n_turns = max(n_turns, turn + 2)
         if turn < n_turns - 1:
-            at.correlate(normal)
+            fit.correlate()
         turn += 1
-    assert at.covariance is not None
-    kept = mean, at.covariance, at.pooled, at.correlation
-    return HeteroscedasticFit(*kept, tuple(evidences), fitted, residual, n_demos)
-
-
-@dataclass
-class _State:
-    """State that one turn leaves to the next."""
-
-    training: TrainingSet
-    group: Tensor | None
-    n_demos: int
-    families: Families
-    options: SearchOptions
-    larger: Families | None
-    rows: TrainingSet
-    """Rows of the mean."""
-    pooled: Tensor
-    covariance: LatentCovariance | None = None
-    correlation: DemonstrationCorrelation | None = None
-
-    def __post_init__(self) -> None:
-        self.mean_search = Search(self.families.mean, self.training.y.shape[1], self.options)
-        self._begin_covariance(self.families.log_variance)
-
-    def _begin_covariance(self, log_variance: ProcessFamily) -> None:
-        """Begin the searches of the covariance anew, on processes of a family."""
-        self.families = self.families._replace(log_variance=log_variance)
-        self.search = CovarianceSearch(self.families, self.training.y.shape[1], self.options)
-
-    def fit_mean(self, begin: Callable[[], MeanStart] | None) -> LatentMean:
-        """Mean under the noise so far; or from another beginning, where this one does not follow the data."""
-        mean = self._mean()
-        start = None if begin is None or _follows(self.training, self.group, mean, self.pooled) else begin()
-        if start is None or not start.improves(mean, self.pooled):
-            return mean
-        self.mean_search, self.pooled, self.rows = start.search, start.noise_tril, start.rows
-        return self._mean()
-
-    def _mean(self) -> LatentMean:
-        rows = self.rows
-        noise = self.noise_correlation(rows, squares=False)
-        whitener = None if noise is None else noise.whitener
-        tril = _noise_tril(rows.inputs, self.pooled, self.covariance)
-        return fit_mean(self.mean_search, rows.inputs, rows.means(), rows.counts, tril, whitener)
-
-    def noise_correlation(self, rows: TrainingSet, *, squares: bool) -> NoiseCorrelation | None:
-        """Correlation of the means, or the mean ``squares``, of rows at different inputs; None where there is none."""
-        if self.group is None or self.correlation is None or not self.correlation.matters:
-            return None
-        return self.correlation.at_inputs(rows, self.group, squares=squares)
-
-    def stretch_ends(self, normal: Tensor, noise: NoiseCorrelation | None) -> None:
-        """Stretch the ends where the covariance collapses; and begin its searches anew if what the first turn took for
-        independent is not, or has other features: that is no place to start from.
-        """
-        before = self.families.log_variance
-        squares = _squares_within(self.training, normal, noise)
-        after = stretched(before, self.training.inputs, squares, self.options)
-        if after is not before or noise is not None:
-            self.covariance = None
-            self._begin_covariance(after)
-
-    def refine(self, mean: LatentMean) -> bool:
-        """Go on with more inducing inputs where these do not resolve what was found; whether there is need to."""
-        if self.larger is None or self.covariance is None:
-            return False
-        coarse_mean = not self.mean_search.held and not mean.processes.resolved
-        if coarse_mean:
-            self.mean_search = Search(self.larger.mean, self.training.y.shape[1], self.options)
-        coarse = not (self.covariance.log_variances.resolved and self.covariance.rows.resolved)
-        if coarse:
-            stretch = self.families.log_variance.stretch
-            self._begin_covariance(on_stretched_inputs(self.larger.log_variance, self.training.inputs, stretch))
-        self.larger = None if coarse or coarse_mean else self.larger
-        return coarse or coarse_mean
-
-    def correlate(self, normal: Tensor) -> None:
-        """How far samples of a demonstration repeat each other, by e = inv(L) w."""
-        if self.group is None or self.covariance is None:
-            return
-        whitened = _whiten(self.training, normal, self.covariance)
-        self.correlation = demonstration_correlation(self.training.x, whitened, self.group)
-        if self.correlation.matters:
-            # So many inputs that each holds about a row of each demonstration, and enough rows for a covariance by
-            # themselves, which takes three more than outputs.
-            n_rows = max(self.n_demos, self.training.y.shape[1] + 3)
-            self.training = self.training.merged(max(8, len(self.training.x) // n_rows))
-            self.rows = self.rows.merged(MOST_INPUTS) if self.mean_search.held else self.training
-
-
-def _follows(training: TrainingSet, group: Tensor | None, mean: LatentMean, pooled: Tensor) -> bool:
-    """Whether residuals of a mean are the noise that it was fitted under: not far less, no signal, and not all of y."""
-    residual, _ = _residual(training, mean, pooled.expand(len(training.inputs), -1, -1))
-    whitened = _solve(pooled, residual)
-    less = whitened.square().mean(0) < _MUCH_LESS
-    # By Schwarz's criterion: of 20 inputs once in 30 times by chance, of 500, which tell more, once in 3,000.
-    wrong = is_signal(whitened, training, group, LAGS * math.log(len(training.inputs))) & ~less
-    # The noise was estimated from neighbours, unless rows repeat inputs.
-    if training.counts.mean() < 2.0 or not training.repeats_inputs:
-        wrong = wrong | less | (residual.square().mean(0) > _NEARLY_ALL)
-    return not bool(wrong.any())
-
-
-def _noise_tril(inputs: Tensor, pooled: Tensor, covariance: LatentCovariance | None) -> Tensor:
-    """Factor (n, d, d) of the noise C L of a row at each input, with a little that is each output's own."""
-    if covariance is None:
-        return pooled.expand(len(inputs), -1, -1)
-    tril = pooled @ covariance.at(inputs).tril()
-    own = (_LEAST_OWN * tril.norm(dim=-1)).clamp_min(_LEAST_DEVIATION)
-    return scale_tril_from_root(torch.cat([tril, torch.diag_embed(own)], dim=-1))
+    return fit
 
 
 def _start_tril(training: TrainingSet) -> Tensor:
@@ -263,48 +264,7 @@ def _start_tril(training: TrainingSet) -> Tensor:
     return scale_tril_from_root(torch.cat([pooled_tril(whole), floor], dim=1))
 
 
-def _residual(training: TrainingSet, mean: LatentMean, tril: Tensor) -> tuple[Tensor, Tensor]:
-    """Residuals of the rows, and the shares (rows, d) of a degree of freedom that fitting the mean has left.
-
-    With the covariance V of the mean's error and the factor T of the noise the leverage of a row is the diagonal of
-    inv(T) V inv(T)': of output i, that of the part of it which the outputs before do not explain.
-    """
-    expected, error = mean.at(training.inputs)
-    expected = expected[training.index] if training.repeats_inputs else mean.expected_at_rows(training.x)
-    half = torch.linalg.solve_triangular(tril, error, upper=False)
-    leverage = torch.linalg.solve_triangular(tril, half.mT, upper=False).diagonal(dim1=-2, dim2=-1)
-    return training.y - expected, (1.0 - leverage).clamp(_LEAST_SHARE, 1.0)[training.index]
-
-
-def _scatter(training: TrainingSet, normal: Tensor, share: Tensor, part: float) -> tuple[Tensor, Tensor]:
-    """Scatter (n, d, d) and degrees of freedom (d, n) at each input, of a part of the rows."""
-    root = training.scatter_root(normal)
-    return part * (root @ root.mT), part * training.sums(share).mT
-
-
 def _pooled_tril(residual: Tensor, share: Tensor) -> Tensor:
     """Factor of the residuals' covariance, of their degrees of freedom."""
     floor = _LEAST_DEVIATION * share.sum(0).sqrt() * torch.eye(residual.shape[1]).to(residual)
     return scale_tril_from_root(torch.cat([residual.mT, floor], dim=1)) / share.sum(0).sqrt()
-
-
-def _solve(tril: Tensor, residual: Tensor) -> Tensor:
-    """Residuals (rows, d) multiplied by the inverse of a factor."""
-    return torch.linalg.solve_triangular(tril, residual.mT, upper=False).mT
-
-
-def _whiten(training: TrainingSet, normal: Tensor, covariance: LatentCovariance) -> Tensor:
-    """Residuals (rows, d) of unit covariance at each input."""
-    tril = covariance.at(training.inputs).tril()[training.index]
-    return torch.linalg.solve_triangular(tril, normal.unsqueeze(2), upper=False).squeeze(2)
-
-
-def _squares_within(training: TrainingSet, normal: Tensor, noise: NoiseCorrelation | None) -> Squares:
-    """Squares of each output around its mean at each input, which an error of the mean does not change; around zero at
-    inputs of one row.
-    """
-    counts = training.counts
-    means = torch.where(counts[:, None] > 1.0, training.sums(normal) / counts[:, None], 0.0)
-    squares = training.sums((normal - means[training.index]).square())
-    degrees = torch.where(counts > 1.0, counts - 1.0, counts).expand(normal.shape[1], -1)
-    return Squares(squares.mT, degrees, noise)

@@ -20,6 +20,7 @@ from torch_pbd.models.heteroscedastic.processes import FixedFeatures, ProcessFam
 from torch_pbd.models.heteroscedastic.regression import LinearEvidence, Weights, weights_factor
 from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation
 from torch_pbd.models.heteroscedastic.search import Evidence, Gradient, Search, SearchOptions
+from torch_pbd.models.training import TrainingSet
 
 LEAST_SQUARE = 1e-6
 """Least mean square, of the pooled variance: an exact zero, as where all recordings start at the origin, has no
@@ -241,6 +242,17 @@ def _least_squares(features: Tensor, target: Tensor, half: Tensor, location: Ten
 def _loss(residual: Tensor, half: Tensor, mean: Tensor) -> Tensor:
     """Sum of h (x + exp(-x)) + m'm / 2."""
     return (half * (residual + torch.exp(-residual.clamp_min(_LEAST_RESIDUAL)))).sum(-1) + 0.5 * mean.square().sum(-1)
+
+
+def squares_within(training: TrainingSet, normal: Tensor, noise: NoiseCorrelation | None) -> Squares:
+    """Squares of each output around its mean at each input, which an error of the mean does not change; around zero at
+    inputs of one row.
+    """
+    counts = training.counts
+    means = torch.where(counts[:, None] > 1.0, training.sums(normal) / counts[:, None], 0.0)
+    squares = training.sums((normal - means[training.index]).square())
+    degrees = torch.where(counts > 1.0, counts - 1.0, counts).expand(normal.shape[1], -1)
+    return Squares(squares.mT, degrees, noise)
 
 
 def stretched(

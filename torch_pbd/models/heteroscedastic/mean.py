@@ -5,6 +5,7 @@ Also where it begins if a first mean does not follow the data: at what the evide
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int64
@@ -13,7 +14,7 @@ from torch import Tensor
 from torch_pbd.gp import EvidenceSearch, Hyperparameters, Observations, fit_hyperparameters, negative_log_evidence
 from torch_pbd.gp.observations import resolved_length_scale
 from torch_pbd.linalg import triangular_inverse
-from torch_pbd.models.heteroscedastic.processes import FixedFeatures, Processes, ProcessFamily, inducing_inputs
+from torch_pbd.models.heteroscedastic.processes import FixedFeatures, Processes, inducing_inputs
 from torch_pbd.models.heteroscedastic.regression import LinearEvidence, Weights
 from torch_pbd.models.heteroscedastic.search import Gradient, Search, SearchOptions
 from torch_pbd.models.training import TrainingSet, pooled_tril
@@ -54,14 +55,16 @@ class LatentMean:
     def _expected(self, features: Tensor) -> Float[Tensor, "n d"]:
         return (features @ self.weights.mean.reshape(len(features), -1, 1)).squeeze(-1).mT
 
-    def expected_at_rows(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d"]:
-        """Expected mean at many x, a bounded number of rows at a time, to what rounding leaves of it."""
+    def expected_at_all(self, training: TrainingSet) -> Float[Tensor, "rows d"]:
+        """Expected mean of all rows; where they do not repeat inputs a bounded number at a time."""
+        if training.repeats_inputs:
+            return self.expected_at(training.inputs)[training.index]
         processes = self.processes
         weights = processes.amplitude[:, None] * self.weights.mean.reshape(len(self.theta), -1)
         # Weights of the kernel with the inducing inputs, from those of the features: no equations are solved for
         # each row.
         weights = torch.linalg.solve_triangular(processes.factor.mT, weights.unsqueeze(-1), upper=True)
-        return torch.cat([(processes.cross(part) @ weights).squeeze(-1).mT for part in x.split(_CHUNK)])
+        return torch.cat([(processes.cross(part) @ weights).squeeze(-1).mT for part in training.x.split(_CHUNK)])
 
 
 def fit_mean(
@@ -111,35 +114,26 @@ def _times(whitener: Tensor, values: Tensor) -> Tensor:
     return whitener * values if whitener.shape[-1] == 1 else whitener @ values
 
 
-@dataclass(frozen=True)
-class MeanStart:
-    """Beginning of a mean, and the evidence for it under noise that is the same everywhere."""
+class MeanStart(NamedTuple):
+    """Beginning of a mean."""
 
     search: Search
     """Holds the hyperparameters that were found, on the inducing inputs that they need."""
     noise_tril: Float[Tensor, "d d"]
-    """Factor of the noise of a row."""
+    """Factor of the noise of a row, the same everywhere."""
     rows: TrainingSet
     """Rows at as many inputs as are needed."""
-    observations: Observations
-    loss: Float[Tensor, " d"]
-    """Negative log evidence, in nats."""
-
-    def improves(self, mean: LatentMean, noise_tril: Float[Tensor, "d d"]) -> bool:
-        """Whether the evidence is clearly higher, of any output, than that of ``mean`` under its noise.
-
-        Residuals that are not white by chance, or under noise that is louder in places, are no reason to begin here:
-        these hyperparameters stay, and noise that depends on the input would have led to others.
-        """
-        processes, rows_at_input = mean.processes, len(self.rows.x) / len(self.observations.inputs)
-        noise_ratio = noise_tril.square().sum(1) / rows_at_input / processes.amplitude.square()
-        first = Hyperparameters(processes.length_scale, processes.amplitude, noise_ratio)
-        loss = negative_log_evidence(self.observations, first, processes.family.kernel)
-        return not bool((loss - self.loss < _CLEARLY).all())  # what is too smooth to be evaluated is no mean to keep
 
 
-def mean_start(rows: TrainingSet, family: ProcessFamily, options: SearchOptions) -> MeanStart:
-    """Start where ``family`` is too coarse for the means at the inputs, or their noise was taken for too large."""
+def mean_start(
+    rows: TrainingSet, first: LatentMean, noise_tril: Float[Tensor, "d d"], options: SearchOptions
+) -> MeanStart | None:
+    """Start where inducing inputs are too few for the means at the inputs, or their noise was taken for too large.
+
+    None unless the evidence is clearly higher, of any output, than that of the ``first`` one under its noise. Residuals
+    that are not white by chance, or under noise that is louder in places, are no reason to begin here: these
+    hyperparameters stay, and noise that depends on the input would have led to others.
+    """
     training = rows.merged(MOST_INPUTS)
     rows_at_input = training.counts.mean()
     observations = Observations(training.inputs, training.means().mT.contiguous(), training.counts / rows_at_input)
@@ -153,11 +147,15 @@ def mean_start(rows: TrainingSet, family: ProcessFamily, options: SearchOptions)
         noise_scale = found.amplitude * found.noise_ratio.sqrt()
         if bool((noise_scale < _NONE).all()):
             break
-    n_outputs = len(loss)
+    processes, family, n_outputs = first.processes, first.processes.family, len(loss)
+    noise_ratio = noise_tril.square().sum(1) / rows_at_input / processes.amplitude.square()
+    before = Hyperparameters(processes.length_scale, processes.amplitude, noise_ratio)
+    # What is too smooth to be evaluated is NaN, and no mean to keep.
+    if bool((negative_log_evidence(observations, before, family.kernel) - loss < _CLEARLY).all()):
+        return None
     # As many inducing inputs as resolve the shortest length scale with room to spare.
     needed = math.ceil(min(family.n_needed(float(found.length_scale.min())), len(training.inputs)))
     inducing = inducing_inputs(training.inputs, max(len(family.inducing), min(needed, _TOGETHER // n_outputs)))
     family = replace(family, inducing=inducing, exact=len(inducing) == len(rows.inputs))
     held = Search(family, n_outputs, options, family.theta_of(found.length_scale, found.amplitude), held=True)
-    noise_tril = (noise_scale * rows_at_input.sqrt()).diag()
-    return MeanStart(held, noise_tril, rows.merged(_MOST_ROWS // n_outputs), observations, loss)
+    return MeanStart(held, (noise_scale * rows_at_input.sqrt()).diag(), rows.merged(_MOST_ROWS // n_outputs))

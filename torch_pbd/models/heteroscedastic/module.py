@@ -76,6 +76,7 @@ class HeteroscedasticModel(Core):
     def __init__(self, fit: HeteroscedasticFit, prior_tril: Float[Tensor, "d d"]) -> None:
         super().__init__()
         mean, covariance = fit.mean, fit.covariance
+        assert covariance is not None
         families = mean.processes.family, covariance.log_variances.family, covariance.rows.family
         tensors = {
             "inducing": families[1].inducing,
