@@ -123,7 +123,7 @@ def test_the_posterior_of_a_model_is_that_of_a_dense_grid(model):
             duration, pace = timing.location.numpy() + timing.root.numpy() @ [one, two]
             if np.exp(duration) < X[-1]:
                 continue
-            plain = model._model(torch.tensor(np.exp(duration)), torch.tensor(pace))
+            plain = model._over_phase(torch.tensor(np.exp(duration)), torch.tensor(pace))
             phases = paced(np.append(X, ahead) / np.exp(duration), pace)
             mean, covariance = plain.predict_joint(phases[: len(X), np.newaxis])
             own = (covariance.reshape(12, 12) + 0.02**2 * np.eye(12))[np.ix_(given, given)]

@@ -12,12 +12,11 @@ from sklearn.utils.validation import check_is_fitted
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.estimators.base import Uncertainty, shaped_as_y
+from torch_pbd.estimators.base import Uncertainty, by_chunks, shaped_as_y
 from torch_pbd.estimators.validation import checked_rows
 from torch_pbd.files.memory import require_much
 from torch_pbd.linalg import gaussian_log_density, student_log_density
-from torch_pbd.movement.law import RESOLUTION, MovementLaw
-from torch_pbd.movement.recordings import Recording, as_recordings
+from torch_pbd.movement.law import MovementLaw, Recording, as_recordings
 
 
 class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
@@ -68,6 +67,20 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
     def _fit(self, recordings: list[Recording]) -> None:
         """Fit to two or more demonstrations."""
 
+    def _components(self, time: Floats) -> tuple[Floats, list[tuple[Self, Floats]]]:
+        """Mixture that the law is: weights, and for each the law and its inputs; one, but for unknown timing."""
+        return np.ones(1), [(self, time)]
+
+    def _rows(self, time: Floats) -> tuple[Floats, Floats]:
+        """Mean (n, d) and covariance (n, d, d) of each row under one component."""
+        law, rows = self._law(time)
+        return law.mean[rows].numpy(), law.marginal()[rows].numpy()
+
+    def _marginals(self, time: Floats) -> tuple[Floats, Floats]:
+        """Mean (n, d) and covariance (n, d, d) of each row."""
+        weight, parts = self._components(time)
+        return mixed(weight, [by_chunks(law._rows, own) for law, own in parts], "kia,kib->iab")
+
     def predict(self, X: ArrayLike, *, return_std: bool = False, return_cov: bool = False) -> Any:
         """Mean of a movement at X, and with it the standard deviations or the covariances of each row.
 
@@ -97,14 +110,22 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         return np.full(len(self._times(X)), self.df_)
 
     def predict_uncertainty(self, X: ArrayLike) -> Uncertainty:
-        """Both kinds of uncertainty at X, apart (Section IV-C); type2 is that of the movement, given what is known.
+        """Both kinds of uncertainty at X, apart (Section IV-C).
 
-        Basis functions know nothing of missing data: type1 is 0 within the times of the fit, and 1 beyond them.
+        ``type1``: missing data are where they are for the regressor, whatever is known of this movement; basis
+        functions know nothing of missing data, and have 0 within the times of the fit and 1 beyond them. ``type2`` is
+        the variability that what is known leaves.
         """
-        time = self._times(X)
-        scaled = np.round(self._scaled(time), RESOLUTION)
-        beyond = (scaled < 0.0) | (scaled > 1.0)
-        return Uncertainty(beyond.astype(np.float64), self._marginals(time)[1])
+        weight, parts = self._components(self._times(X))
+        mean, type1, type2 = zip(*(law._uncertainty(own) for law, own in parts), strict=True)
+        moments = list(zip(mean, type2, strict=True))
+        return Uncertainty(weight @ np.stack(type1), mixed(weight, moments, "kia,kib->iab")[1])
+
+    def _uncertainty(self, time: Floats) -> tuple[Floats, Floats, Floats]:
+        """Mean, Type I uncertainty and variability of each row under one component."""
+        scaled = self._rounded(time)
+        mean, covariance = by_chunks(self._rows, time)
+        return mean, ((scaled < 0.0) | (scaled > 1.0)).astype(np.float64), covariance
 
     def predict_joint(self, X: ArrayLike) -> tuple[Floats, Floats]:
         """Joint mean and covariance of a new demonstration at the rows of X.
@@ -121,9 +142,12 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
             what=f"the covariance between all {len(time)} rows and {self.n_outputs_} outputs",
             remedy="Ask for fewer rows; sample_demonstrations and score_demonstrations never form it.",
         )
-        law, rows = self._law(time)
-        covariance = law.covariance()[rows][:, :, rows]
-        return law.mean[rows].numpy(), covariance.numpy()
+        weight, parts = self._components(time)
+        moments = []
+        for model, own in parts:
+            law, rows = model._law(own)
+            moments.append((law.mean[rows].numpy(), law.covariance()[rows][:, :, rows].numpy()))
+        return mixed(weight, moments, "kia,kjb->iajb")
 
     def sample_demonstrations(self, X: ArrayLike, n_samples: int = 1, random_state: Any = None) -> Floats:
         """Draw whole demonstrations at the rows of X: smooth, and passing through what is known.
@@ -146,17 +170,22 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
             what=f"n_samples={n_samples} at {len(time)} rows",
             remedy="Draw fewer at a time.",
         )
+        weight, parts = self._components(time)
+        counts = generator.multinomial(n_samples, weight).tolist()
+        own = [law._draws(x, n, generator) for (law, x), n in zip(parts, counts, strict=True) if n]
+        # They were made component by component: the first few must not be of one.
+        return own[0] if len(parts) == 1 else np.asarray(generator.permutation(np.concatenate(own)))
+
+    def _draws(self, time: Floats, n_draws: int, generator: np.random.RandomState) -> Floats:
+        """Demonstrations (s, n, d) from one component."""
         conditioned, rows = self._conditioned(time)
-        n_steps, d, n_loadings, n_entries = conditioned.sizes
-        sizes = (n_steps, n_samples * d), (n_loadings, n_samples), (n_entries, n_samples)
-        normal = [torch.from_numpy(generator.standard_normal(size)) for size in sizes]
-        deviations = conditioned.deviations(*normal)[:, rows].numpy()
+        normal = conditioned.deviations(n_draws, lambda size: torch.from_numpy(generator.standard_normal(size)))
+        deviations = normal[:, rows].numpy()
         # One chi-squared a movement: it is unusual as a whole.
         if math.isfinite(self.df_):
-            deviations *= np.sqrt((self.df_ - 2.0) / generator.chisquare(self.df_, n_samples))[
-                :, np.newaxis, np.newaxis
-            ]
-        return conditioned.law.mean[rows].numpy() + deviations
+            scale = np.sqrt((self.df_ - 2.0) / generator.chisquare(self.df_, n_draws))
+            deviations *= scale[:, np.newaxis, np.newaxis]
+        return np.asarray(conditioned.law.mean[rows].numpy() + deviations)
 
     def sample_y(self, X: ArrayLike, n_samples: int = 1, random_state: Any = None) -> Floats:
         """Draw y at X, independently for each row; whole movements are drawn by :meth:`sample_demonstrations`.
@@ -210,9 +239,32 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
             If a demonstration has a time twice, or one that is known without noise, where it has no density.
         """
         check_is_fitted(self)
-        return np.array([self._score(recording) for recording in as_recordings(self, X, y, groups, is_fit=False)])
+        return np.array([self._score(*recording) for recording in as_recordings(self, X, y, groups, is_fit=False)])
 
     def score(self, X: Any, y: ArrayLike | None = None, *, groups: ArrayLike | None = None) -> float:
         """Joint log density of the demonstrations over their number of steps: nats a step, higher is better."""
         recordings = as_recordings(self, X, y, groups, is_fit=False)
-        return float(sum(map(self._score, recordings)) / sum(len(recording.time) for recording in recordings))
+        return float(sum(self._score(*each) for each in recordings) / sum(len(each.time) for each in recordings))
+
+    def _score(self, time: Floats, position: Floats) -> float:
+        """Joint log density of one demonstration."""
+        # Of a step that is known, or is there twice, no variance is left, and so no density.
+        own, known = self._rounded(time), self._rounded(self.known_times())[self._known.exact.any(axis=1)]
+        if len(np.unique(own)) < len(own) or np.isin(own, known).any():
+            raise ValueError(
+                "X has a time twice in a demonstration, or one that is known without noise: leave it out, the movement "
+                "has no density there."
+            )
+        law, rows = self._law(time)
+        return law.at(rows).log_density(torch.from_numpy(position), self.df_)
+
+
+def mixed(weight: Floats, moments: list[tuple[Floats, Floats]], outer: str) -> tuple[Floats, Floats]:
+    """Mean and covariance of a mixture whose components have these; ``outer`` are products of deviations, summed."""
+    if len(moments) == 1:
+        return moments[0]
+    mean, covariance = map(np.stack, zip(*moments, strict=True))
+    # Law of total covariance: the mean of the covariances, and the covariance of the means.
+    whole = np.tensordot(weight, mean, 1)
+    deviation = np.sqrt(weight)[:, np.newaxis, np.newaxis] * (mean - whole)
+    return whole, np.tensordot(weight, covariance, 1) + np.einsum(outer, deviation, deviation)

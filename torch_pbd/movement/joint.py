@@ -1,5 +1,7 @@
 """Joint normal law of a whole movement, a correlation along time, times outputs, plus loadings; and conditioned."""
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -43,10 +45,23 @@ class JointNormal:
         """Law before anything is observed."""
         return cls(mean, factor, correlation, loadings, correlation[:, :0], loadings[:, :, :0])
 
+    @classmethod
+    def with_noise(
+        cls, mean: Float[Tensor, "n d"], loadings: Float[Tensor, "n d k"], scale: Float[Tensor, " d"]
+    ) -> "JointNormal":
+        """Law of ``mean_t + loadings_t c`` and of noise of this scale, independent in all steps and outputs."""
+        n, d = mean.shape
+        return cls.prior(mean, scale.diag().expand(n, d, d), torch.eye(n).to(mean), loadings / scale[:, None])
+
     @cached_property
-    def correlation(self) -> Float[Tensor, "n n"]:
+    def _correlation(self) -> Float[Tensor, "n n"]:
         """R - W W'."""
         return symmetrize(self.prior_correlation - self.taken @ self.taken.mT)
+
+    @cached_property
+    def correlation_root(self) -> Float[Tensor, "n n"]:
+        """Lower Cholesky factor of R - W W'."""
+        return safe_cholesky(self._correlation, name="the correlation along the movement")
 
     def at(self, steps: Int[Tensor, " m"]) -> "JointNormal":
         """Law of some of the steps."""
@@ -67,7 +82,7 @@ class JointNormal:
         """Whole covariance: n d squared numbers."""
         # The inner part (R - W W') kron I + U U' first, and then a block of A on either side.
         n, d = self.mean.shape
-        inner = torch.einsum("ij,ab->iajb", self.correlation, torch.eye(d).to(self.mean))
+        inner = torch.einsum("ij,ab->iajb", self._correlation, torch.eye(d).to(self.mean))
         flat = self.loadings.reshape(n * d, -1)
         inner = inner + (flat @ flat.mT).reshape(n, d, n, d)
         explained = self.explained.reshape(n * d, -1)
@@ -79,84 +94,46 @@ class JointNormal:
         variance = self.prior_correlation.diagonal() - self.taken.square().sum(1)
         inner = self.loadings @ self.loadings.mT
         inner.diagonal(dim1=1, dim2=2).add_(variance[:, None])
-        outer = self.factor @ inner @ self.factor.mT - self.explained @ self.explained.mT
-        return symmetrize(outer)
+        return symmetrize(self.factor @ inner @ self.factor.mT - self.explained @ self.explained.mT)
 
-    def columns(self, steps: Int[Tensor, " p"], directions: Float[Tensor, "p d"]) -> Float[Tensor, "n d p"]:
-        """Covariance of all steps and outputs with single entries, along directions among the outputs."""
-        rows = torch.einsum("pc,pcd->pd", directions, self.factor[steps])
-        between = self.prior_correlation[:, steps] - self.taken @ self.taken[steps].mT
-        inner = torch.einsum("np,pd->ndp", between, rows)
-        inner = inner + self.loadings @ torch.einsum("pd,pdk->kp", rows, self.loadings[steps])
-        return self.factor @ inner - self.explained @ torch.einsum("pd,pdq->qp", directions, self.explained[steps])
+    def log_density(self, x: Float[Tensor, "n d"], df: float) -> float:
+        """Log density of a movement under Student's t of this covariance, or the normal law for infinite ``df``."""
+        root, loadings = self.correlation_root, self.loadings
 
-    def deviations(self, correlated: Float[Tensor, "n s_d"], common: Float[Tensor, "k s"]) -> Float[Tensor, "s n d"]:
-        """Deviations from the mean that standard normal numbers stand for, before observations of single entries."""
-        n, d = self.mean.shape
-        along = (self._correlation_root @ correlated).reshape(n, -1, d)
-        inner = along.permute(1, 0, 2) + torch.einsum("ndk,ks->snd", self.loadings, common)
-        return torch.einsum("nab,snb->sna", self.factor, inner)
+        def solve_correlation(right: Float[Tensor, "n d s"]) -> Float[Tensor, "n d s"]:
+            return torch.cholesky_solve(right.flatten(1), root).reshape(right.shape)
 
-    def log_det(self) -> Tensor:
-        """Log determinant of the covariance."""
-        # det(R kron I + U U') = det(R)^d det(I + U' inv(R) U), and taking V V' off multiplies the determinant of the
-        # whole by det(I - V' inv(Sigma) V).
-        along = self._correlation_root.diagonal().log().sum() * self.mean.shape[1]
-        log_det = 2.0 * (along + self._capacitance_root.diagonal().log().sum())
+        # The inner matrix S = R kron I + U U' by Woodbury, with R for R kron I: inv(R) - inv(R) U inv(C) U' inv(R) of
+        # the capacitance C = I + U' inv(R) U; its determinant is det(R)^d det(C).
+        whitened = solve_correlation(loadings)
+        gram = torch.einsum("ndk,ndl->kl", loadings, whitened)
+        capacitance_root = torch.linalg.cholesky(symmetrize(gram) + torch.eye(len(gram)).to(gram))
+        log_det = 2.0 * (x.shape[1] * root.diagonal().log().sum() + capacitance_root.diagonal().log().sum())
         log_det = log_det + 2.0 * torch.linalg.slogdet(self.factor).logabsdet.sum()
+
+        def solve_inner(right: Float[Tensor, "n d s"]) -> Float[Tensor, "n d s"]:
+            cross = torch.einsum("ndk,nds->ks", whitened, right)
+            return solve_correlation(right) - whitened @ torch.cholesky_solve(cross, capacitance_root)
+
+        residual = torch.linalg.solve(self.factor, (x - self.mean)[..., None])
+        solved = solve_inner(residual)
+        square = (residual * solved).sum()
         if self.explained.shape[-1]:
-            log_det = log_det + 2.0 * self._explained_root.diagonal().log().sum()
-        return log_det
-
-    def square(self, x: Float[Tensor, "s n d"]) -> Float[Tensor, " s"]:
-        """Squared Mahalanobis distance of movements to the mean."""
-        # With S = R kron I + U U' it is r' inv(S) r of r = inv(A) (x - mean).
-        residual = torch.linalg.solve(self.factor, (x - self.mean)[..., None])[..., 0]
-        solved = self._solve_inner(residual.permute(1, 2, 0))  # (n, d, s)
-        square = (residual.permute(1, 2, 0) * solved).sum((0, 1))
-        if self.explained.shape[-1]:
-            # Woodbury, for what was taken off.
-            cross = torch.einsum("ndp,nds->ps", self._whitened_explained, solved)
-            square = square + torch.linalg.solve_triangular(self._explained_root, cross, upper=False).square().sum(0)
-        return square
-
-    @cached_property
-    def _correlation_root(self) -> Tensor:
-        return safe_cholesky(self.correlation, name="the correlation along the movement")
-
-    @cached_property
-    def _whitened_loadings(self) -> Float[Tensor, "n d k"]:
-        """R^-1 U."""
-        n, d, k = self.loadings.shape
-        return torch.cholesky_solve(self.loadings.reshape(n, d * k), self._correlation_root).reshape(n, d, k)
-
-    @cached_property
-    def _capacitance_root(self) -> Float[Tensor, "k k"]:
-        """Factor of I + U' R^-1 U."""
-        gram = torch.einsum("ndk,ndl->kl", self.loadings, self._whitened_loadings)
-        return torch.linalg.cholesky(symmetrize(gram) + torch.eye(len(gram)).to(gram))
-
-    def _solve_inner(self, right: Float[Tensor, "n d s"]) -> Float[Tensor, "n d s"]:
-        """Solution of ``(R kron I + U U') x = right``."""
-        # Woodbury: inv(R) - inv(R) U inv(I + U' inv(R) U) U' inv(R), with R for R kron I.
-        n, d, s = right.shape
-        solved = torch.cholesky_solve(right.reshape(n, d * s), self._correlation_root).reshape(n, d, s)
-        cross = torch.einsum("ndk,nds->ks", self._whitened_loadings, right)
-        return solved - self._whitened_loadings @ torch.cholesky_solve(cross, self._capacitance_root)
-
-    @cached_property
-    def _whitened_explained(self) -> Float[Tensor, "n d p"]:
-        """A^-1 V."""
-        return torch.linalg.solve(self.factor, self.explained)
-
-    @cached_property
-    def _explained_root(self) -> Float[Tensor, "p p"]:
-        """Factor of I - V' Sigma^-1 V, with Sigma the covariance before anything was taken off."""
-        whitened = self._whitened_explained
-        gram = torch.einsum("ndp,ndq->pq", whitened, self._solve_inner(whitened))
-        return safe_cholesky(
-            torch.eye(len(gram)).to(gram) - symmetrize(gram), name="what observations leave open of the movement"
-        )
+            # Woodbury once more, for V V' that was taken off: it multiplies the determinant by that of
+            # I - V' inv(Sigma) V.
+            inner = torch.linalg.solve(self.factor, self.explained)
+            gram = torch.einsum("ndp,ndq->pq", inner, solve_inner(inner))
+            rest = torch.eye(len(gram)).to(gram) - symmetrize(gram)
+            rest_root = safe_cholesky(rest, name="what observations leave open of the movement")
+            cross = torch.einsum("ndp,nds->ps", inner, solved)
+            square = square + torch.linalg.solve_triangular(rest_root, cross, upper=False).square().sum()
+            log_det = log_det + 2.0 * rest_root.diagonal().log().sum()
+        half, size = 0.5 * float(log_det), x.numel()
+        if not math.isfinite(df):
+            return -0.5 * (float(square) + size * math.log(2.0 * math.pi)) - half
+        # As linalg.student_log_density, which takes a factor of the covariance: there is none here.
+        constant = math.lgamma(0.5 * (df + size)) - math.lgamma(0.5 * df) - 0.5 * size * math.log((df - 2.0) * math.pi)
+        return constant - half - 0.5 * (df + size) * math.log1p(float(square) / (df - 2.0))
 
 
 class Conditioned:
@@ -195,20 +172,15 @@ class Conditioned:
         if not len(steps):
             return
         between = prior.prior_correlation[:, steps]
-        self._root = safe_cholesky(between[steps], name="the correlation of the steps given")
-        self._taken = torch.linalg.solve_triangular(self._root.mT, between, upper=True, left=False)
-        self._gain = torch.linalg.solve_triangular(self._root, self._taken, upper=False, left=False)
+        root = safe_cholesky(between[steps], name="the correlation of the steps given")
+        self._taken = torch.linalg.solve_triangular(root.mT, between, upper=True, left=False)
+        self._gain = torch.linalg.solve_triangular(root, self._taken, upper=False, left=False)
         loadings = prior.loadings[steps]
-        half = torch.linalg.solve_triangular(self._root, loadings.flatten(1), upper=False)
-        self._whitened = torch.linalg.solve_triangular(self._root.mT, half, upper=True).reshape(loadings.shape)
+        half = torch.linalg.solve_triangular(root, loadings.flatten(1), upper=False)
+        self._whitened = torch.linalg.solve_triangular(root.mT, half, upper=True).reshape(loadings.shape)
         half = half.reshape(-1, n_loadings)
         self._precision_root = torch.linalg.cholesky(half.mT @ half + torch.eye(n_loadings).to(loadings))
         self._open = prior.loadings - (self._gain @ loadings.flatten(1)).reshape(prior.loadings.shape)
-
-    @property
-    def sizes(self) -> tuple[int, int, int, int]:
-        """Steps, outputs, loadings and single entries."""
-        return *self._prior.loadings.shape, len(self._entry_steps)
 
     @cached_property
     def law(self) -> JointNormal:
@@ -231,21 +203,24 @@ class Conditioned:
         whitened = torch.linalg.solve_triangular(root, error[:, None], upper=False)[:, 0]
         return replace(law, mean=law.mean + explained @ whitened, explained=explained)
 
-    def deviations(
-        self, correlated: Float[Tensor, "n s"], common: Float[Tensor, "k t"], noise: Float[Tensor, "p t"]
-    ) -> Float[Tensor, "t n d"]:
-        """Draws of the deviation from the mean, from standard normal numbers.
+    def deviations(self, n_draws: int, normal: Callable[[tuple[int, int]], Tensor]) -> Float[Tensor, "s n d"]:
+        """Draws of the deviation from the mean, from standard normal numbers of the shapes that are asked for.
 
         Draws of the unconditioned law, less what it would have made of their own values at what was observed: no
         root of a singular matrix is needed (Matheron's rule).
         """
-        drawn = self._prior.deviations(correlated, common)
+        prior = self._prior
+        n, d, n_loadings = prior.loadings.shape
+        along = (prior.correlation_root @ normal((n, n_draws * d))).reshape(n, n_draws, d)
+        inner = along.permute(1, 0, 2) + torch.einsum("ndk,ks->snd", prior.loadings, normal((n_loadings, n_draws)))
+        drawn = torch.einsum("nab,snb->sna", prior.factor, inner)
         if len(self._steps):
             drawn = drawn - self._from_steps(drawn[:, self._steps])
         if not len(self._entry_steps):
             return drawn
         columns, root = self._entries(self.law)
-        errors = (self._directions * drawn[:, self._entry_steps]).sum(-1).mT + self._entry_noise[:, None] * noise
+        noise = self._entry_noise[:, None] * normal((len(self._entry_steps), n_draws))
+        errors = (self._directions * drawn[:, self._entry_steps]).sum(-1).mT + noise
         return drawn - torch.einsum("ndp,ps->snd", columns, torch.cholesky_solve(errors, root))
 
     def _from_steps(self, residual: Float[Tensor, "s m d"]) -> Float[Tensor, "s n d"]:
@@ -258,8 +233,12 @@ class Conditioned:
         return torch.einsum("nab,snb->sna", factor, change)
 
     def _entries(self, law: JointNormal) -> tuple[Float[Tensor, "n d p"], Float[Tensor, "p p"]]:
-        """Covariances of everything with the single entries, and the root of their own, noise included."""
+        """Covariances of everything with the single entries, given the exact steps, and the root of their own."""
         steps, directions = self._entry_steps, self._directions
-        columns = replace(law, explained=law.explained[..., :0]).columns(steps, directions)
+        rows = torch.einsum("pc,pcd->pd", directions, law.factor[steps])
+        between = law.prior_correlation[:, steps] - law.taken @ law.taken[steps].mT
+        inner = torch.einsum("np,pd->ndp", between, rows)
+        inner = inner + law.loadings @ torch.einsum("pd,pdk->kp", rows, law.loadings[steps])
+        columns = law.factor @ inner
         own = torch.einsum("pd,pdq->pq", directions, columns[steps]) + torch.diag(self._entry_noise.square())
         return columns, safe_cholesky(symmetrize(own), name="the covariance of the entries given")

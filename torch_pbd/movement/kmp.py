@@ -9,13 +9,15 @@ from sklearn.base import clone
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.estimators.base import CovarianceRegressor, by_chunks
+from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.estimators.demonstrations import fit_with_groups
 from torch_pbd.estimators.mixture import GMMBaseline
 from torch_pbd.files.memory import require_much
 from torch_pbd.movement.base import MovementRegressor
 from torch_pbd.movement.joint import Conditioned, JointNormal
-from torch_pbd.movement.recordings import Known, Recording, as_rows
+from torch_pbd.movement.law import NOTHING, Recording, as_rows, check_arrays
+
+_ARRAYS = ("reference.time", "reference.mean", "reference.covariance", "range", "deviation")  # of model files
 
 
 class KMPBaseline(MovementRegressor):
@@ -94,19 +96,15 @@ class KMPBaseline(MovementRegressor):
         self._reference = time, *self.regressor_.predict(time[:, np.newaxis], return_cov=True)
 
     def _arrays(self) -> dict[str, Floats]:
-        names = ("time", "mean", "covariance")
-        arrays = {f"reference.{name}": part for name, part in zip(names, self._reference, strict=True)}
-        return arrays | {"range": np.array(self._range), "deviation": self._scale}
+        arrays = *self._reference, np.array(self._range), self._scale
+        return dict(zip(_ARRAYS, arrays, strict=True))
 
     def _restore(self, arrays: dict[str, Floats]) -> None:
         n, d = len(np.atleast_1d(arrays["reference.time"])), self.n_outputs_
-        shapes: dict[str, tuple[int | str, ...]] = {
-            "reference.time": (n,), "reference.mean": (n, d), "reference.covariance": (n, d, d), "range": (2,),
-            "deviation": (d,),
-        }  # fmt: skip
-        *reference, span, self._scale = self._restored(arrays, shapes).values()
-        checks.semidefinite(reference[2], "reference.covariance", definite=True)
-        self._reference = reference[0], reference[1], reference[2]
+        check_arrays(arrays, dict(zip(_ARRAYS, [(n,), (n, d), (n, d, d), (2,), (d,)], strict=True)))
+        time, mean, covariance, span, self._scale = (arrays[name] for name in _ARRAYS)
+        checks.semidefinite(covariance, "reference.covariance", definite=True)
+        self._reference = time, mean, covariance
         self._range = float(span[0]), checks.number(float(span[1]), "the range of X", above=0.0)
 
     def _prior(self, time: Floats) -> JointNormal:
@@ -122,18 +120,10 @@ class KMPBaseline(MovementRegressor):
         gram = np.kron(self._kernel(time, time), np.eye(d))
         values, vectors = np.linalg.eigh(level * (gram - explained @ explained.T))
         root = (vectors * np.sqrt(values.clip(0.0))).reshape(n, d, -1)
-        # The nugget is relative to the outputs, which so are the units of the structured law.
-        scale = self._nugget_scale()
-        loadings = torch.from_numpy(root / scale[:, np.newaxis])
-        factor = torch.from_numpy(np.diag(scale)).expand(n, d, d)
-        return JointNormal.prior(torch.from_numpy(mean), factor, torch.eye(n).double(), loadings)
-
-    def _marginals(self, time: Floats) -> tuple[Floats, Floats]:
-        # Rows need no covariance with each other, whose factor is cubic in their number.
-        mean, covariance = by_chunks(self._rows, time)
-        return mean, covariance
+        return JointNormal.with_noise(*map(torch.from_numpy, (mean, root, self._nugget_scale())))
 
     def _rows(self, time: Floats) -> tuple[Floats, Floats]:
+        # Rows need no covariance with each other, whose factor is cubic in their number.
         mean, whitened, level = self._through_reference(time)
         explained = whitened.transpose(0, 2, 1) @ whitened
         nugget = np.diag(np.square(self._nugget_scale()))
@@ -141,7 +131,7 @@ class KMPBaseline(MovementRegressor):
 
     def _through_reference(self, time: Floats) -> tuple[Floats, Floats, float]:
         """Mean (n, d), ``V_t = L^-1 k_t'`` (n, N d, d) with ``L L' = K + lambda_cov S``, and ``N / lambda_cov``."""
-        reference, means, covariances = self._reference if self._known is None else self._with_via_points(self._known)
+        reference, means, covariances = self._with_via_points()
         n_reference, d = means.shape
         gram, noise = np.kron(self._kernel(reference, reference), np.eye(d)), block_diag(*covariances)
         weights = np.linalg.solve(gram + self.lambda_mean * noise, means.ravel()).reshape(n_reference, d)
@@ -158,14 +148,16 @@ class KMPBaseline(MovementRegressor):
         difference = self._scaled(time)[:, np.newaxis] - self._scaled(other)
         return np.asarray(np.exp(-0.5 * np.square(difference / self.length_scale)))
 
-    def _with_via_points(self, known: Known) -> tuple[Floats, Floats, Floats]:
+    def _with_via_points(self) -> tuple[Floats, Floats, Floats]:
         """Reference with what is known in place of its nearest times; outputs that are not given stay."""
+        if not len(self._known.time):
+            return self._reference
         axes = np.eye(self.n_outputs_) if self._axes is None else self._axes
         time, means = self._reference[0].copy(), self._reference[1] @ axes.T
         covariances = axes @ self._reference[2] @ axes.T
         # A point without noise, of whose variance the authors take 1e-6.
         least = 1e-6 * np.square(axes * self._scale).sum(axis=1)
-        for at, value, noise in zip(known.time, known.value, known.noise, strict=True):
+        for at, value, noise in zip(*self._known, strict=True):
             nearest = int(np.abs(self._reference[0] - at).argmin())
             given = ~np.isnan(value)
             time[nearest] = at
@@ -176,8 +168,8 @@ class KMPBaseline(MovementRegressor):
         return time, means @ back.T, back @ covariances @ back.T
 
     def _conditioned(self, time: Floats) -> tuple[Conditioned, torch.Tensor]:
-        """Law through the reference with the via points, without conditioning on them."""
-        union, rows, places = self._union(time, None)
-        nothing = np.empty((0, self.n_outputs_))
-        observed = Known(time[:0], nothing, nothing).tensors(places)
-        return Conditioned(self._prior(union), *observed), torch.from_numpy(rows)
+        # What is known is in the reference, and is not conditioned on.
+        union, rows, _ = self._union(time, NOTHING)
+        nothing = torch.empty(0, self.n_outputs_, dtype=torch.float64)
+        law = Conditioned(self._prior(union), nothing.new_empty(0, dtype=torch.long), nothing, nothing)
+        return law, torch.from_numpy(rows)

@@ -1,9 +1,8 @@
-"""Joint law of a movement, and what is known of it: the part that models of whole movements are made of."""
+"""What models of whole movements are made of: recordings, what is known of a movement, and its joint law given that."""
 
 import copy
-import math
 from abc import ABC, abstractmethod
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -13,13 +12,43 @@ from torch import Tensor
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.estimators.validation import checked_queries
+from torch_pbd.data import Demonstrations
+from torch_pbd.data.alignment import TIMING_REMOVED
+from torch_pbd.estimators.demonstrations import check_groups
+from torch_pbd.estimators.validation import checked_queries, checked_rows
 from torch_pbd.movement.joint import Conditioned, JointNormal
-from torch_pbd.movement.recordings import Known, Recording
 
-_AT_ONCE = 1024  # rows whose marginals are found together, and whose law is kept
-RESOLUTION = 10
-"""Decimals of a time, in ranges of those of the fit: nearer ones are equal."""
+_DECIMALS = 10  # of a time, in ranges of those of the fit: nearer ones are equal, as 0.1 + 0.2 and 0.3 are
+_MOST_KEPT = 1024  # times whose law is kept
+_MOST_ENTRIES = 4096  # conditioned on one by one: a matrix of their size squared is factorized
+
+
+class Recording(NamedTuple):
+    """One demonstration: increasing times (T,) and positions (T, d)."""
+
+    time: Floats
+    position: Floats
+
+
+class Known(NamedTuple):
+    """Observations of a movement: times (m,), values (m, d), NaN where not given, and noise (m, d)."""
+
+    time: Floats
+    value: Floats
+    noise: Floats
+
+    def and_also(self, *other: Floats) -> "Known":
+        """These observations and others after them."""
+        pairs = zip(self, other, strict=True)
+        return Known(*(np.concatenate([own.reshape(-1, *new.shape[1:]), new]) for own, new in pairs))
+
+    @property
+    def exact(self) -> NDArray[np.bool_]:
+        """Entries (m, d) that are given without noise."""
+        return ~np.isnan(self.value) & (self.noise == 0.0)
+
+
+NOTHING = Known(np.empty(0), np.empty((0, 1)), np.empty((0, 1)))
 
 
 class MovementLaw(BaseEstimator, ABC):
@@ -33,7 +62,7 @@ class MovementLaw(BaseEstimator, ABC):
     n_outputs_: int
     _range: tuple[float, float]
     """First of the times of the fit, and their range."""
-    _known: Known | None = None
+    _known: Known = NOTHING
     _axes: Floats | None = None  # of the coordinates of observations; None: the outputs
     _kept: dict[str, tuple[Floats, JointNormal]]  # last times and their law, which conditioned copies share
     _y_is_1d: bool
@@ -58,16 +87,14 @@ class MovementLaw(BaseEstimator, ABC):
         """Times in ranges of those of the fit."""
         return np.asarray((time - self._range[0]) / self._range[1])
 
-    def _restored(self, arrays: dict[str, Floats], shapes: dict[str, tuple[int | str, ...]]) -> dict[str, Floats]:
-        """Arrays of a model file, which have these names and shapes and no others."""
-        if set(arrays) != set(shapes):
-            raise ValueError(f"its arrays are {', '.join(arrays)}, must be {', '.join(shapes)}")
-        return {name: checks.array(arrays[name], name, shape) for name, shape in shapes.items()}
+    def _rounded(self, time: Floats) -> Floats:
+        """Times that are equal where they count as one."""
+        return np.round(self._scaled(time), _DECIMALS)
 
     def observed_along(self, axes: Floats | None) -> Self:
         """Copy whose :meth:`condition` takes rows, noise and NaN of ``axes @ y``, axes (d, d); None are the outputs."""
-        copied = copy.copy(self)
-        copied._axes, copied._kept = axes, self.__dict__.setdefault("_kept", {})
+        copied = self._copy()
+        copied._axes = axes
         return copied
 
     def condition(self, X: ArrayLike, y: ArrayLike, *, noise_scale: ArrayLike = 0.0) -> Self:
@@ -101,40 +128,48 @@ class MovementLaw(BaseEstimator, ABC):
         checks.require((scale >= 0.0) & np.isfinite(scale), scale, "noise_scale", "a finite number of at least 0")
         # Rows of which nothing is given say nothing.
         given = ~np.isnan(value).all(axis=1)
-        new = Known(time[given], value[given], np.broadcast_to(scale, value[given].shape))
-        known = self._observations.and_also(new)
-        copied = copy.copy(self)
-        # The law before conditioning is the same for all copies.
-        copied._known, copied._kept = known, self.__dict__.setdefault("_kept", {})
-        known.check(self._union(known.time[:0], known)[2])
+        copied = self._copy()
+        copied._known = known = self._known.and_also(time[given], value[given], np.tile(scale, (int(given.sum()), 1)))
+        rows, outputs = known.exact.nonzero()
+        if len(set(zip(self._rounded(known.time)[rows], outputs, strict=True))) < len(rows):
+            raise ValueError("X has a time that is given twice, or is known already, without noise: leave it out.")
+        n_single = int((~np.isnan(known.value) & ~known.exact.all(axis=1, keepdims=True)).sum())
+        if n_single > _MOST_ENTRIES:
+            raise ValueError(
+                f"y has {n_single} entries with noise or beside NaN, must be at most {_MOST_ENTRIES} with those known "
+                "already: give fewer times, or whole rows with noise_scale=0."
+            )
         return copied
+
+    def known_times(self) -> Floats:
+        """Times (m,) at which something is known of the movement."""
+        return self._known.time
 
     def _times(self, X: ArrayLike) -> Floats:
         """Times (n,) of rows to predict at."""
         return np.ascontiguousarray(checked_queries(self, X)[:, 0])
 
-    def known_times(self) -> Floats:
-        """Times (m,) at which something is known of the movement."""
-        return self._observations.time
-
-    @property
-    def _observations(self) -> Known:
-        """All that is known of the movement; no rows where nothing is."""
-        nothing = np.empty((0, self.n_outputs_))
-        return Known(np.empty(0), nothing, nothing) if self._known is None else self._known
-
-    def _union(self, time: Floats, known: Known | None) -> tuple[Floats, NDArray[np.intp], NDArray[np.intp]]:
+    def _union(self, time: Floats, known: Known) -> tuple[Floats, NDArray[np.intp], NDArray[np.intp]]:
         """Distinct times of queries and of what is known, and the places of both among them."""
-        both = np.concatenate([time, np.empty(0) if known is None else known.time])
-        # In ranges of the fit, and rounded: 0.1 + 0.2 is the time 0.3.
-        _, first, index = np.unique(np.round(self._scaled(both), RESOLUTION), return_index=True, return_inverse=True)
+        both = np.concatenate([time, known.time])
+        _, first, index = np.unique(self._rounded(both), return_index=True, return_inverse=True)
         return both[first], index[: len(time)], index[len(time) :]
 
     def _conditioned(self, time: Floats) -> tuple[Conditioned, Tensor]:
         """Law of all times that matter, given what is known, and the places of ``time`` among them."""
         union, rows, places = self._union(time, self._known)
         law, index = self._prior_with(union)
-        return Conditioned(law, *self._observations.tensors(index[places], self._axes)), torch.from_numpy(index[rows])
+        return self._given(law, index[places]), torch.from_numpy(index[rows])
+
+    def _given(self, law: JointNormal, places: NDArray[np.intp]) -> Conditioned:
+        """Law given what is known, at these places among its steps."""
+        value, noise = (torch.from_numpy(part.reshape(-1, self.n_outputs_)) for part in self._known[1:])
+        axes = None if self._axes is None else torch.from_numpy(self._axes)
+        return Conditioned(law, torch.from_numpy(places), value, noise, axes)
+
+    def _law(self, time: Floats) -> tuple[JointNormal, Tensor]:
+        conditioned, rows = self._conditioned(time)
+        return conditioned.law, rows
 
     def _prior_with(self, time: Floats) -> tuple[JointNormal, NDArray[np.intp]]:
         """Joint law at increasing times, maybe at others too, and their places in it.
@@ -144,9 +179,9 @@ class MovementLaw(BaseEstimator, ABC):
         kept = self.__dict__.setdefault("_kept", {})
         if kept and len(time):
             last, law = kept["last"]
-            known, scaled = (np.round(self._scaled(each), RESOLUTION) for each in (last, time))
-            place = np.searchsorted(known, scaled).clip(max=len(known) - 1)
-            old = known[place] == scaled
+            known, asked = self._rounded(last), self._rounded(time)
+            place = np.searchsorted(known, asked).clip(max=len(known) - 1)
+            old = known[place] == asked
             if 2 * old.sum() > len(old):
                 if 2 * old.sum() < len(known):
                     last, law, place[old] = time[old], law.at(torch.from_numpy(place[old])), np.arange(old.sum())
@@ -156,43 +191,69 @@ class MovementLaw(BaseEstimator, ABC):
                     law = law.joined(self._prior(new), self._between(last, new))
                 return law, place
         law = self._prior(time)
-        if 0 < len(time) <= _AT_ONCE:
+        if 0 < len(time) <= _MOST_KEPT:
             kept["last"] = time, law
         return law, np.arange(len(time))
+
+    def _copy(self) -> Self:
+        """Copy with the same law before anything is known, which both keep."""
+        copied = copy.copy(self)
+        copied._kept = self.__dict__.setdefault("_kept", {})
+        return copied
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in super().__getstate__().items() if name != "_kept"}
 
-    def _law(self, time: Floats) -> tuple[JointNormal, Tensor]:
-        conditioned, rows = self._conditioned(time)
-        return conditioned.law, rows
 
-    def _marginals(self, time: Floats) -> tuple[Floats, Floats]:
-        """Mean (n, d) and covariance (n, d, d) of each row."""
-        parts = []
-        for start in range(0, max(1, len(time)), _AT_ONCE):  # rows need no correlation with each other
-            law, rows = self._law(time[start : start + _AT_ONCE])
-            parts.append((law.mean[rows].numpy(), law.marginal()[rows].numpy()))
-        mean, covariance = zip(*parts, strict=True)
-        return np.concatenate(mean), np.concatenate(covariance)
+def as_recordings(model: Any, X: Any, y: Any, groups: Any, *, is_fit: bool) -> list[Recording]:
+    """Demonstrations of what was passed to a model of movements, each in the order of its times.
 
-    def _score(self, recording: Recording) -> float:
-        """Joint log density of one demonstration."""
-        # Of a step that is known, or is there twice, no variance is left, and so no density.
-        known = self._observations
-        exact = ((known.noise == 0.0) & ~np.isnan(known.value)).any(axis=1)
-        own, others = (np.round(self._scaled(time), RESOLUTION) for time in (recording.time, known.time[exact]))
-        if len(np.unique(own)) < len(own) or np.isin(own, others).any():
-            raise ValueError(
-                "X has a time twice in a demonstration, or one that is known without noise: leave it out, the movement "
-                "has no density there."
-            )
-        law, rows = self._law(recording.time)
-        law = law.at(rows)
-        square, log_det = float(law.square(torch.from_numpy(recording.position)[None])), float(law.log_det())
-        df, size = self.df_, recording.position.size
-        if not math.isfinite(df):
-            return -0.5 * (square + log_det + size * math.log(2.0 * math.pi))
-        # As of linalg.student_log_density, whose factor of the covariance is not formed here.
-        constant = math.lgamma(0.5 * (df + size)) - math.lgamma(0.5 * df) - 0.5 * size * math.log((df - 2.0) * math.pi)
-        return constant - 0.5 * log_det - 0.5 * (df + size) * math.log1p(square / (df - 2.0))
+    A fit learns from them what its input is, and how many outputs there are: ``input_``, ``n_outputs_``.
+    """
+    if isinstance(X, Demonstrations):
+        if y is not None or groups is not None:
+            raise ValueError("y and groups must be None beside Demonstrations, which have both.")
+        timed = getattr(model, "timing", "none") != "none"
+        if is_fit:
+            model.input_ = "time" if timed or X.is_aligned else "phase"
+            if X.alignment == "dtw":
+                checks.warn(TIMING_REMOVED)
+        shown, (X, y, groups) = X, X.stack(input="phase" if timed else model.input_)
+        if timed:  # of durations that have little in common, only phases stack
+            X = np.concatenate(shown.from_start().times)[:, np.newaxis]
+    elif is_fit:
+        model.input_ = "array"
+        if groups is None:
+            raise ValueError("groups is None, must be the demonstration of each row of X: whole movements are learned.")
+    if y is None:
+        raise ValueError("y is None, must be the positions (n_samples, n_outputs) at the rows of X.")
+    inputs, targets = checked_rows(model, X, y, reset=is_fit, ensure_min_samples=1)
+    if inputs.shape[1] != 1:
+        raise ValueError(
+            f"X has {inputs.shape[1]} columns, must have one, the time or phase: a movement runs along one input."
+        )
+    if is_fit:
+        model._y_is_1d = targets.ndim == 1
+        model.n_outputs_ = 1 if model._y_is_1d else targets.shape[1]
+    targets = targets.reshape(len(inputs), -1)
+    if targets.shape[1] != model.n_outputs_:
+        raise ValueError(f"y has {targets.shape[1]} outputs, but the model was fitted with {model.n_outputs_}.")
+    numbers = np.zeros(len(inputs), dtype=np.intp) if groups is None else check_groups(groups, len(inputs))
+    order = np.lexsort([inputs[:, 0], numbers])
+    parts = np.split(order, np.flatnonzero(np.diff(numbers[order])) + 1)
+    return [Recording(inputs[rows, 0], targets[rows]) for rows in parts]
+
+
+def as_rows(recordings: list[Recording]) -> tuple[Floats, Floats, NDArray[np.intp]]:
+    """Rows of recordings for a regressor: X (n, 1), y (n, d) and their numbers (n,)."""
+    times, positions = zip(*recordings, strict=True)
+    numbers = np.repeat(np.arange(len(recordings)), [len(time) for time in times])
+    return np.concatenate(times)[:, np.newaxis], np.concatenate(positions), numbers
+
+
+def check_arrays(arrays: dict[str, Floats], shapes: dict[str, tuple[int | str, ...]]) -> None:
+    """Refuse arrays of a model file that have not these names and shapes."""
+    if set(arrays) != set(shapes):
+        raise ValueError(f"its arrays are {', '.join(arrays)}, must be {', '.join(shapes)}")
+    for name, shape in shapes.items():
+        checks.array(arrays[name], name, shape)

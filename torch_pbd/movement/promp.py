@@ -10,7 +10,7 @@ from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.movement.base import MovementRegressor
 from torch_pbd.movement.joint import JointNormal
-from torch_pbd.movement.recordings import Recording
+from torch_pbd.movement.law import Recording, check_arrays
 
 _N_BASES = (8, 12, 16, 20)  # tried by "auto", as far as recordings have samples for them
 _REACHES = (1.0, 2.0, 4.0)  # of the smooth prior, in bases
@@ -123,28 +123,20 @@ class ProMPBaseline(MovementRegressor):
 
     def _restore(self, arrays: dict[str, Floats]) -> None:
         n_basis, d = self.n_basis_, self.n_outputs_
-        shapes: dict[str, tuple[int | str, ...]] = {
-            "weight_mean_": (n_basis, d),
-            "weight_covariance_": (n_basis * d, n_basis * d),
-            "noise_scale_": (d,),
-            "range": (2,),
-        }
-        own = self._restored(arrays, shapes)
-        checks.semidefinite(own["weight_covariance_"], "weight_covariance_")
-        checks.require(own["noise_scale_"] > 0.0, own["noise_scale_"], "noise_scale_", "above 0")
-        low, width = own.pop("range").tolist()
+        shapes = {"weight_mean_": (n_basis, d), "weight_covariance_": 2 * (n_basis * d,), "noise_scale_": (d,)}
+        check_arrays(arrays, {**shapes, "range": (2,)})
+        checks.semidefinite(arrays["weight_covariance_"], "weight_covariance_")
+        checks.require(arrays["noise_scale_"] > 0.0, arrays["noise_scale_"], "noise_scale_", "above 0")
+        low, width = arrays["range"].tolist()
         self._range = low, checks.number(width, "the range of X", above=0.0)
-        self.__dict__.update(own)
+        self.__dict__.update({name: arrays[name] for name in shapes})
 
     def _prior(self, time: Floats) -> JointNormal:
-        n, d = len(time), self.n_outputs_
         bases = basis_functions(self._scaled(time), self.n_basis_, self.overlap_)
         values, vectors = np.linalg.eigh(self.weight_covariance_)
-        root = (vectors * np.sqrt(values.clip(0.0))).reshape(self.n_basis_, d, -1)
-        loadings = np.einsum("nb,bdk->ndk", bases, root) / self.noise_scale_[:, np.newaxis]
-        tensors = map(torch.from_numpy, (bases @ self.weight_mean_, np.diag(self.noise_scale_), loadings))
-        mean, factor, loading = tensors
-        return JointNormal.prior(mean, factor.expand(n, d, d), torch.eye(n).double(), loading)
+        root = (vectors * np.sqrt(values.clip(0.0))).reshape(self.n_basis_, self.n_outputs_, -1)
+        loadings = np.einsum("nb,bdk->ndk", bases, root)
+        return JointNormal.with_noise(*map(torch.from_numpy, (bases @ self.weight_mean_, loadings, self.noise_scale_)))
 
 
 class _Weights:

@@ -11,13 +11,11 @@ demonstrations.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from torch_pbd.kernels import correlation
 from torch_pbd.linalg import safe_cholesky, symmetrize
@@ -45,63 +43,60 @@ class Found(NamedTuple):
     nugget: float
 
 
-@dataclass(frozen=True)
-class TimeKernel:
-    """Correlation along the movement as it was found on a grid of T steps, from K demonstrations."""
+class TimeKernel(nn.Module):
+    """Correlation along the movement as it was found on a grid of T steps, from K demonstrations.
 
-    grid: Float[Tensor, " T"]
-    kernel: str
-    scales: Float[Tensor, "s 2"]
-    """Length scales, the longest first, and the weights of their correlations, which add up to one."""
-    nugget: Float[Tensor, " T"]
-    share: float
-    """Weight of the kernel's correlation; the rest is that of the demonstrations' own residuals."""
-    residual: Float[Tensor, "K T d"]
-    """Whitened residuals, without holes."""
+    ``scales`` (s, 2) are length scales, the longest first, and the weights of their correlations, which add up to one;
+    ``nugget`` (T,) is that of each step, ``residual`` (K, T, d) are whitened residuals without holes. ``share`` is the
+    weight of the kernel's correlation; the rest is that of the demonstrations' own residuals.
+    """
+
+    grid: Tensor
+    scales: Tensor
+    nugget: Tensor
+    residual: Tensor
+    share: Tensor
+    _weights: Tensor
+    _left: Tensor
+
+    def __init__(
+        self, kernel: str, grid: Tensor, scales: Tensor, nugget: Tensor, residual: Tensor, share: Tensor
+    ) -> None:
+        super().__init__()
+        self.kernel = kernel
+        buffers = {"grid": grid, "scales": scales, "nugget": nugget, "residual": residual, "share": share}
+        for name, value in buffers.items():
+            self.register_buffer(name, value)
+        # Weights of the kernel that make up the smooth parts of all residuals, and what these leave of them: (T, d K).
+        rows = residual.permute(1, 2, 0).reshape(len(grid), -1)
+        own = self._correlation(grid, grid)
+        root = safe_cholesky(own + torch.diag(nugget), name="the time kernel")
+        self.register_buffer("_weights", torch.cholesky_solve(rows, root), persistent=False)
+        self.register_buffer("_left", rows - own @ self._weights, persistent=False)
 
     def correlation(self, time: Float[Tensor, " n"], other: Float[Tensor, " m"]) -> Float[Tensor, "n m"]:
         """Correlation between any times: nuggets are linear between steps; equal times are one."""
         own, nugget = (_interpolated(self.grid, self.nugget[:, None], part)[:, 0] for part in (time, other))
-        whole = self._kernel(time, other) + torch.where(time[:, None] == other, nugget, 0.0)
+        whole = self._correlation(time, other) + torch.where(time[:, None] == other, nugget, 0.0)
         return (1.0 + own).rsqrt()[:, None] * whole * (1.0 + nugget).rsqrt()
 
     def loadings(self, time: Float[Tensor, " n"]) -> Float[Tensor, "n d K"]:
         """Residuals of the demonstrations at any times: smooth parts by the kernel, what is left of them linear."""
         n_demos, _, d = self.residual.shape
-        weights, left = self._parts
-        whole = self._kernel(time, self.grid) @ weights + _interpolated(self.grid, left, time)
+        whole = self._correlation(time, self.grid) @ self._weights + _interpolated(self.grid, self._left, time)
         return whole.reshape(len(time), d, n_demos)
 
-    @cached_property
-    def _parts(self) -> tuple[Float[Tensor, "T c"], Float[Tensor, "T c"]]:
-        """Weights of the smooth parts of all residuals, and what these leave of them."""
-        with torch.inference_mode(mode=False):  # others may take derivatives through them later
-            rows = self.residual.permute(1, 2, 0).reshape(len(self.grid), -1)
-            own = self._kernel(self.grid, self.grid)
-            weights = torch.cholesky_solve(rows, safe_cholesky(own + torch.diag(self.nugget), name="the time kernel"))
-            return weights, rows - own @ weights
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name != "_parts"}
-
-    def _kernel(self, time: Tensor, other: Tensor) -> Tensor:
+    def _correlation(self, time: Tensor, other: Tensor) -> Tensor:
         return _correlation(time, other, self.scales.tolist(), self.kernel)
 
 
 def fit_time_kernel(
     grid: Float[Tensor, " T"], residual: Float[Tensor, "K T d"], kernels: Sequence[str], share: float | None
 ) -> TimeKernel:
-    """Time kernel of whitened residuals, NaN where a demonstration has no sample near.
+    """Time kernel of whitened residuals, NaN where a demonstration has no sample near, over times of a range of one.
 
-    Parameters
-    ----------
-    grid : Tensor of shape (T,)
-        Times, of a range of one.
-    residual : Tensor of shape (K, T, d)
-    kernels : sequence of str
-        Of which the likeliest is taken.
-    share : float or None
-        None takes that with the highest likelihood of demonstrations left out in turn.
+    The likeliest of the ``kernels`` is taken, and for ``share`` None that under which demonstrations left out in turn
+    are likeliest.
     """
     residual = _unit_rms(residual)
     sizes = residual.square().nanmean((0, 2)).sqrt()
@@ -112,7 +107,8 @@ def fit_time_kernel(
     results = [_fit_scales(grid, residual, usual, kernel, n_scales) for n_scales in (1, 2)]
     likelihood, chosen = zip(*(_left_out(result, shares) for result in results), strict=True)
     best = int(likelihood[1] > likelihood[0])
-    return replace(results[best], share=chosen[best])
+    results[best].share.fill_(chosen[best])
+    return results[best]
 
 
 def _fit_scales(grid: Tensor, residual: Tensor, usual: Bool[Tensor, " T"], kernel: str, n_scales: int) -> TimeKernel:
@@ -128,7 +124,12 @@ def _fit_scales(grid: Tensor, residual: Tensor, usual: Bool[Tensor, " T"], kerne
             break
         unit = _correlation(grid, grid, found.scales, kernel)
         nugget = _step_nuggets(unit, residual, min(found.nugget, 0.1 * _SMOOTH))
-    return TimeKernel(grid, kernel, grid.new_tensor(found.scales), nugget, 1.0, _filled(unit, residual, nugget))
+    filled = residual.clone()
+    for k, own in enumerate(residual):  # the kernel's expectation where there were no samples
+        seen = ~own.isnan().any(1)
+        root = safe_cholesky(unit[seen][:, seen] + torch.diag(nugget[seen]), name="the time kernel")
+        filled[k, ~seen] = unit[~seen][:, seen] @ torch.cholesky_solve(own[seen], root)
+    return TimeKernel(kernel, grid, grid.new_tensor(found.scales), nugget, filled, grid.new_ones(()))
 
 
 def _correlation(
@@ -208,16 +209,6 @@ def _step_nuggets(unit: Float[Tensor, "T T"], residual: Float[Tensor, "K T d"], 
         if float(change) < _TOLERANCE:
             break
     return nugget
-
-
-def _filled(unit: Float[Tensor, "T T"], residual: Float[Tensor, "K T d"], nugget: Tensor) -> Float[Tensor, "K T d"]:
-    """Residuals with the kernel's expectation where there were none."""
-    filled = residual.clone()
-    for k, own in enumerate(residual):
-        seen = ~own.isnan().any(1)
-        root = safe_cholesky(unit[seen][:, seen] + torch.diag(nugget[seen]), name="the time kernel")
-        filled[k, ~seen] = unit[~seen][:, seen] @ torch.cholesky_solve(own[seen], root)
-    return filled
 
 
 def _left_out(kernel: TimeKernel, shares: Sequence[float]) -> tuple[float, float]:

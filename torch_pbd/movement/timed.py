@@ -5,16 +5,15 @@ from typing import Any, Self
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.console import say
-from torch_pbd.estimators.base import Uncertainty
 from torch_pbd.linalg import safe_cholesky, student_log_density
 from torch_pbd.movement.base import MovementRegressor
-from torch_pbd.movement.recordings import Known, Recording, n_grid_steps, sampled
+from torch_pbd.movement.law import Known, Recording
 from torch_pbd.movement.timing import Likelihood, Nodes, Timing, phase_of, register, time_of
 
 _FEWEST = 4  # demonstrations that say how two numbers vary together
@@ -24,6 +23,9 @@ _N_STEPS = 100  # of a curve whose pace is found
 _SEEN = 12.0
 _MOST_FOLDS = 5
 _SLACK = 1e-3  # of a duration: where all last equally long, the last sample may be later by rounding
+# Steps on which the correlation is learned: the nuggets' iterations are cubic in them, and movements are smooth.
+_MOST_STEPS = 200
+_GAP = 2.0  # sample spacings of a recording: a step farther than that from its samples was not seen in it
 
 
 class TimedMovement(MovementRegressor):
@@ -34,7 +36,7 @@ class TimedMovement(MovementRegressor):
     timing_: str
     timing_gain_: float
     _timing: Timing | None = None
-    _nodes: Nodes | None = None
+    _nodes: Nodes  # posterior of duration and pace
 
     def predict_phase(self, X: ArrayLike) -> tuple[Floats, Floats]:
         """Phase estimation: how far the movement is at times X, given what is known of it.
@@ -57,7 +59,7 @@ class TimedMovement(MovementRegressor):
         time = self._times(X)
         if self._timing is None:
             raise checks.refusal(self.timing, "timing", "'warp' or 'auto' where phases are to be estimated")
-        weight, phases = self._posterior().weight.numpy(), self._phases(time)
+        weight, phases = self._nodes.weight.numpy(), self._nodes.phases(torch.from_numpy(time)).numpy()
         mean = weight @ phases
         return mean, np.sqrt(weight @ np.square(phases - mean))
 
@@ -68,60 +70,38 @@ class TimedMovement(MovementRegressor):
         """
         copied = super().condition(X, y, noise_scale=noise_scale)
         if copied._timing is not None:
-            assert copied._known is not None
-            last = copied._last(copied._known.time)
-            copied._nodes = copied._timing.posterior(copied._log_likelihood(copied._known), last)
+            known = copied._known
+            copied._nodes = copied._timing.posterior(copied._log_likelihood(known), copied._last(known.time))
         return copied
 
-    def predict_joint(self, X: ArrayLike) -> tuple[Floats, Floats]:
-        """Joint mean and covariance at the rows of X; with timing, those of the mixture over durations and paces."""
+    def _components(self, time: Floats) -> tuple[Floats, list[tuple[Self, Floats]]]:
+        """Weights of durations and paces, and for each the law over phase and the phases of these times."""
         if self._timing is None:
-            return super().predict_joint(X)
-        laws = [model.predict_joint(phases[:, np.newaxis]) for model, phases in self._models(self._times(X))]
-        mean, covariance = zip(*laws, strict=True)
-        return self._matched(np.stack(mean), np.stack(covariance), "kia,kjb->iajb")
+            return super()._components(time)
+        nodes = self._nodes
+        laws = [self._over_phase(*node) for node in zip(nodes.duration, nodes.pace, strict=True)]
+        phases = nodes.phases(torch.from_numpy(time)).numpy()
+        return nodes.weight.numpy(), list(zip(laws, phases, strict=True))
 
-    def sample_demonstrations(self, X: ArrayLike, n_samples: int = 1, random_state: Any = None) -> Floats:
-        """Draw whole demonstrations at the rows of X; with timing, each has a duration and pace of its own."""
-        if self._timing is None:
-            return super().sample_demonstrations(X, n_samples, random_state)
-        checks.count(n_samples, "n_samples")
-        generator = checks.seed(random_state)
-        counts = generator.multinomial(n_samples, self._posterior().weight.numpy())
-        parts = [
-            model.sample_demonstrations(phases[:, np.newaxis], count, generator)
-            for (model, phases), count in zip(self._models(self._times(X)), counts, strict=True)
-            if count
-        ]
-        # They were made node by node: the first few must not be of one node.
-        return np.asarray(generator.permutation(np.concatenate(parts)))
+    def _over_phase(self, duration: Tensor, pace: Tensor) -> Self:
+        """Law over phase, of a movement of this duration and pace."""
+        law = copy.copy(self)
+        law._timing = None
+        phase = phase_of(torch.from_numpy(self._known.time) / duration, pace).numpy()
+        law._known = self._known._replace(time=phase)
+        return law
 
-    def _mixed_uncertainty(self, time: Floats) -> Uncertainty:
-        parts = [
-            (model._marginals(phases)[0], *model.predict_uncertainty(phases[:, np.newaxis]))
-            for model, phases in self._models(time)
-        ]
-        mean, type1, type2 = map(np.stack, zip(*parts, strict=True))
-        return Uncertainty(self._posterior().weight.numpy() @ type1, self._matched(mean, type2, "kia,kib->iab")[1])
-
-    def _marginals(self, time: Floats) -> tuple[Floats, Floats]:
-        if self._timing is None:
-            return super()._marginals(time)
-        mean, covariance = zip(*(model._marginals(phases) for model, phases in self._models(time)), strict=True)
-        return self._matched(np.stack(mean), np.stack(covariance), "kia,kib->iab")
-
-    def _score(self, recording: Recording) -> float:
+    def _score(self, time: Floats, position: Floats) -> float:
         """Log of the mean density over the posterior, restricted to movements that still run."""
         if self._timing is None:
-            return super()._score(recording)
-        known = self._observations
-        whole = known.and_also(Known(*recording, np.zeros_like(recording.position)))
-        before = self._log_likelihood(known)
+            return super()._score(time, position)
+        whole = self._known.and_also(time, position, np.zeros_like(position))
+        before = self._log_likelihood(self._known)
 
         def exact(duration: Tensor, pace: Tensor) -> Tensor:
-            models = [self._model(*node) for node in zip(duration, pace, strict=True)]
-            phases = phase_of(torch.from_numpy(recording.time) / duration[:, None], pace[:, None]).numpy()
-            scores = [m._score(Recording(s, recording.position)) for m, s in zip(models, phases, strict=True)]
+            laws = [self._over_phase(*node) for node in zip(duration, pace, strict=True)]
+            phases = phase_of(torch.from_numpy(time) / duration[:, None], pace[:, None]).numpy()
+            scores = [law._score(own, position) for law, own in zip(laws, phases, strict=True)]
             return before(duration, pace) + torch.tensor(scores, dtype=torch.float64)
 
         return self._log_ratio(self._log_likelihood(whole), before, self._last(whole.time), exact)
@@ -132,10 +112,42 @@ class TimedMovement(MovementRegressor):
         over = self._timing.posterior(above, last, exact=exact).log_integral
         return over - self._timing.posterior(below, last).log_integral
 
+    def _last(self, time: Floats) -> float:
+        assert self._timing is not None
+        last, longest = float(time.max(initial=0.0)), self._timing.longest()
+        if last > (1.0 + _SLACK) * longest:
+            raise ValueError(
+                f"X reaches {last:.6g}, must be at most {longest:.6g}: no movement like those shown lasts longer. "
+                "Leave out what comes after its end."
+            )
+        return min(last, longest)
+
+    def _log_likelihood(self, known: Known) -> Likelihood:
+        """Log density of what is known, at samples a twelfth of a movement apart, given durations and paces."""
+        assert self._timing is not None
+        rows = _spread(known.time, float(self._timing.location[0].exp()))
+        time, value, noise = (torch.from_numpy(each[rows]) for each in known)
+        given = ~value.flatten().isnan()
+        if not bool(given.any()):
+            return _flat
+
+        def log_likelihood(duration: Tensor, pace: Tensor) -> Tensor:
+            phases = phase_of(time / duration[:, None], pace[:, None])
+            law = self._prior(phases.flatten().numpy())
+            steps = torch.arange(phases.numel()).reshape(phases.shape)
+            mean = law.mean[steps].flatten(1)[:, given]
+            size = steps.shape[1] * law.mean.shape[1]
+            whole = torch.stack([law.at(own).covariance().reshape(size, size) for own in steps])
+            whole = whole[:, given][:, :, given] + torch.diag(noise.square().flatten()[given])
+            root = safe_cholesky(whole, name="the covariance of what is known")
+            degrees = torch.full_like(duration, self.df_)
+            return student_log_density(value.flatten()[given] - mean, root, degrees)
+
+        return log_likelihood
+
     def _timed(self, recordings: list[Recording]) -> list[Recording]:
         """Recordings over the input of the law, after it was decided whether their timing varies."""
-        self._timing = self._nodes = None
-        self.timing_ = self.timing
+        self._timing, self.timing_ = None, self.timing
         if self.timing == "none":
             return recordings
         fewest = _FEWEST + (self.timing == "auto")
@@ -156,15 +168,16 @@ class TimedMovement(MovementRegressor):
         first, duration = (np.array([recording.time[i] for recording in recordings]) for i in (0, -1))
         good = (first >= 0.0) & (first < 0.5 * duration)
         checks.require(good, first, "the first time of a demonstration", "0 or a little later", "count from its start")
-        grid = np.linspace(0.0, 1.0, _N_STEPS)
-        curves = np.stack([
-            np.stack([np.interp(grid * time[-1], time, column) for column in position.T], axis=1)
-            for time, position in recordings
-        ])  # fmt: skip
-        size = curves.std((0, 1))
-        units, durations = torch.from_numpy(curves / np.where(size > 0.0, size, 1.0)), torch.from_numpy(duration)
-        pace = register(units) if timing == "warp" else torch.zeros_like(durations)
-        self._timing = Timing.learn(durations, pace) if timing == "warp" else Timing.even(durations)
+        durations, pace = torch.from_numpy(duration), torch.zeros(len(duration), dtype=torch.float64)
+        if timing == "warp":
+            grid = np.linspace(0.0, 1.0, _N_STEPS)
+            curves = np.stack([
+                np.stack([np.interp(grid * time[-1], time, column) for column in position.T], axis=1)
+                for time, position in recordings
+            ])  # fmt: skip
+            size = curves.std((0, 1))
+            pace = register(torch.from_numpy(curves / np.where(size > 0.0, size, 1.0)))
+        self._set_timing(Timing.learn(durations, pace) if timing == "warp" else Timing.even(durations))
         # On phases that all share, as of aligned demonstrations.
         shared = np.linspace(0.0, 1.0, n_grid_steps(recordings))
         phased = []
@@ -173,6 +186,9 @@ class TimedMovement(MovementRegressor):
             seen = ~np.isnan(values).any(axis=1)
             phased.append(Recording(shared[seen], values[seen]))
         return phased
+
+    def _set_timing(self, timing: Timing) -> None:
+        self._timing, self._nodes = timing, timing.posterior(_flat)
 
     def _gain(self, recordings: list[Recording]) -> float:
         """Nats a step by which a warp makes left-out demonstrations likelier than the mean duration at an even pace.
@@ -183,118 +199,66 @@ class TimedMovement(MovementRegressor):
         gain, n_steps = 0.0, 0
         for fold in range(n_folds):
             train = [recording for number, recording in enumerate(recordings) if number % n_folds != fold]
-            warp, none = (self._fitted(train, timing) for timing in ("warp", "none"))
+            models: list[Any] = [copy.copy(self), copy.copy(self)]
+            warp, none = models
+            for model, timing in zip(models, ("warp", "none"), strict=True):
+                model._fit_law(model._phased(train, timing))
             for time, position in recordings[fold::n_folds]:
                 seen = time <= min(mean, warp._timing.longest(), none._timing.longest())
                 known = Known(time[seen], position[seen], np.zeros_like(position[seen]))
-                own, other = (m._log_ratio(m._log_likelihood(known), _flat, time[seen][-1]) for m in (warp, none))
+                own, other = (m._log_ratio(m._log_likelihood(known), _flat, time[seen][-1]) for m in models)
                 gain += own - other
-                n_steps += len(self._spread(known.time, float(mean)))
+                n_steps += len(_spread(known.time, float(mean)))
         return gain / n_steps
 
     def _timing_arrays(self) -> dict[str, Floats]:
         """Arrays of model files; none where timing is "none"."""
         if self._timing is None:
             return {}
-        arrays = {"timing_location": self._timing.location, "timing_root": self._timing.root}
-        own = {name: array.numpy() for name, array in arrays.items()} | {"timing_df": np.array(self._timing.df)}
-        return own | ({"timing_gain": np.array(self.timing_gain_)} if self.timing == "auto" else {})
+        arrays = {name: np.asarray(getattr(self._timing, name)) for name in ("location", "root", "df")}
+        arrays |= {"gain": np.array(self.timing_gain_)} if self.timing == "auto" else {}
+        return {f"timing_{name}": array for name, array in arrays.items()}
 
     def _restore_timing(self, arrays: dict[str, Floats]) -> dict[str, Floats]:
         """Take up such arrays; the others are returned."""
         self.timing_ = self.timing
         if self.timing == "none":
             return arrays
-        location, root, df = (
-            checks.array(arrays.get(f"timing_{name}"), f"timing_{name}", shape)
-            for name, shape in (("location", (2,)), ("root", (2, 2)), ("df", ()))
-        )
+        shapes: dict[str, tuple[int, ...]] = {"location": (2,), "root": (2, 2), "df": ()}
+        shapes |= {"gain": ()} if self.timing == "auto" else {}
+        own = {n: checks.array(arrays.get(f"timing_{n}"), f"timing_{n}", shape).copy() for n, shape in shapes.items()}
+        root = own["root"]
         checks.require((root >= 0.0) | ~np.eye(2, dtype=bool), root, "timing_root", "at least 0 on its diagonal")
-        checks.number(float(df), "timing_df", above=0.0)
-        self._timing = Timing(torch.from_numpy(location.copy()), torch.from_numpy(root.copy()), float(df))
-        if self.timing == "auto":
-            self.timing_gain_ = float(checks.array(arrays.get("timing_gain"), "timing_gain", ()))
+        df = checks.number(float(own["df"]), "timing_df", above=0.0)
+        self._set_timing(Timing(torch.from_numpy(own["location"]), torch.from_numpy(root), df))
+        if "gain" in own:
+            self.timing_gain_ = float(own["gain"])
             self.timing_ = "warp" if self.timing_gain_ > 0.0 else "none"
         return {name: array for name, array in arrays.items() if not name.startswith("timing_")}
-
-    def _fitted(self, recordings: list[Recording], timing: str) -> Any:
-        """Copy that has learned from some of the recordings only."""
-        model: Any = copy.copy(self)
-        model._fit_law(model._phased(recordings, timing))
-        return model
-
-    def _last(self, time: Floats) -> float:
-        assert self._timing is not None
-        last, longest = float(time.max(initial=0.0)), self._timing.longest()
-        if last > (1.0 + _SLACK) * longest:
-            raise ValueError(
-                f"X reaches {last:.6g}, must be at most {longest:.6g}: no movement like those shown lasts longer. "
-                "Leave out what comes after its end."
-            )
-        return min(last, longest)
-
-    def _posterior(self) -> Nodes:
-        assert self._timing is not None
-        return self._timing.posterior(_flat) if self._nodes is None else self._nodes
-
-    def _phases(self, time: Floats) -> Floats:
-        nodes = self._posterior()
-        return phase_of(torch.from_numpy(time) / nodes.duration[:, None], nodes.pace[:, None]).numpy()
-
-    def _models(self, time: Floats) -> list[tuple[Self, Floats]]:
-        """Models of phase of each node, and the phases (n,) of times."""
-        nodes = self._posterior()
-        models = [self._model(*node) for node in zip(nodes.duration, nodes.pace, strict=True)]
-        return list(zip(models, self._phases(time), strict=True))
-
-    def _model(self, duration: Tensor, pace: Tensor) -> Self:
-        """Model of phase, of a movement of this duration and pace."""
-        model = copy.copy(self)
-        model._timing = None
-        if self._known is not None:
-            phase = phase_of(torch.from_numpy(self._known.time) / duration, pace).numpy()
-            model._known = self._known._replace(time=phase)
-        return model
-
-    def _matched(self, mean: Floats, covariance: Floats, outer: str) -> tuple[Floats, Floats]:
-        """Mean and covariance of a mixture whose components have these."""
-        # Law of total covariance: the mean of the covariances, and the covariance of the means.
-        weight = self._posterior().weight.numpy()
-        whole = np.tensordot(weight, mean, 1)
-        deviation = np.sqrt(weight)[:, np.newaxis, np.newaxis] * (mean - whole)
-        spread = np.tensordot(weight, covariance, 1) + np.einsum(outer, deviation, deviation)
-        return whole, spread
-
-    def _log_likelihood(self, known: Known) -> Likelihood:
-        """Log density of what is known, at samples a twelfth of a movement apart, given durations and paces."""
-        assert self._timing is not None
-        rows = self._spread(known.time, float(self._timing.location[0].exp()))
-        time, value, noise = (torch.from_numpy(each[rows]) for each in known)
-        given = ~value.flatten().isnan()
-        if not bool(given.any()):
-            return _flat
-
-        def log_likelihood(duration: Tensor, pace: Tensor) -> Tensor:
-            phases = phase_of(time / duration[:, None], pace[:, None])
-            law = self._prior(phases.flatten().numpy())
-            steps = torch.arange(phases.numel()).reshape(phases.shape)
-            mean = law.mean[steps].flatten(1)[:, given]
-            size = steps.shape[1] * law.mean.shape[1]
-            whole = torch.stack([law.at(own).covariance().reshape(size, size) for own in steps])
-            whole = whole[:, given][:, :, given] + torch.diag(noise.square().flatten()[given])
-            root = safe_cholesky(whole, name="the covariance of what is known")
-            degrees = torch.full_like(duration, self.df_)
-            return student_log_density(value.flatten()[given] - mean, root, degrees)
-
-        return log_likelihood
-
-    def _spread(self, time: Floats, duration: float) -> Any:
-        """Rows whose times are nearest to even ones, back from the last."""
-        if not len(time):
-            return np.empty(0, dtype=np.intp)
-        even = np.arange(time.max(), time.min() - 0.5 * duration / _SEEN, -duration / _SEEN)
-        return np.unique(np.abs(time[:, np.newaxis] - even).argmin(axis=0))
 
 
 def _flat(duration: Tensor, pace: Tensor) -> Tensor:
     return torch.zeros_like(duration)
+
+
+def _spread(time: Floats, duration: float) -> NDArray[np.intp]:
+    """Rows whose times are nearest to even ones, back from the last."""
+    if not len(time):
+        return np.empty(0, dtype=np.intp)
+    even = np.arange(time.max(), time.min() - 0.5 * duration / _SEEN, -duration / _SEEN)
+    return np.unique(np.abs(time[:, np.newaxis] - even).argmin(axis=0))
+
+
+def n_grid_steps(recordings: list[Recording]) -> int:
+    """Steps of the grid on which recordings are compared: their median number of samples, at most 200."""
+    return max(2, min(_MOST_STEPS, round(float(np.median([len(recording.time) for recording in recordings])))))
+
+
+def sampled(recording: Recording, grid: Floats) -> Floats:
+    """Positions of a recording at the steps of a grid, linear between samples; NaN where it has no sample near."""
+    time, position = recording
+    columns = [np.interp(grid, time, column) for column in position.T]
+    right = np.clip(np.searchsorted(time, grid), 1, len(time) - 1)
+    nearest = np.minimum(np.abs(grid - time[right - 1]), np.abs(time[right] - grid))
+    seen = nearest <= _GAP * np.median(np.diff(time))
+    return np.where(seen[:, np.newaxis], np.stack(columns, axis=1), np.nan)

@@ -39,6 +39,10 @@ class Nodes(NamedTuple):
     weight: Float[Tensor, " b"]
     log_integral: float
 
+    def phases(self, time: Float[Tensor, " n"]) -> Float[Tensor, "b n"]:
+        """Phases at these times under each node."""
+        return phase_of(time / self.duration[:, None], self.pace[:, None])
+
 
 def phase_of(time: Tensor, pace: Tensor) -> Tensor:
     """Phase at times over the duration; after the end it is 1."""

@@ -12,15 +12,15 @@ from torch import Tensor, nn
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.estimators.base import CovarianceRegressor, Uncertainty
+from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.estimators.demonstrations import fit_with_groups
 from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
 from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky
-from torch_pbd.movement.joint import Conditioned, JointNormal
-from torch_pbd.movement.recordings import Recording, as_rows, n_grid_steps, sampled
+from torch_pbd.movement.joint import JointNormal
+from torch_pbd.movement.law import Recording, as_rows, check_arrays
 from torch_pbd.movement.time_kernel import TimeKernel, fit_time_kernel
-from torch_pbd.movement.timed import TimedMovement
+from torch_pbd.movement.timed import TimedMovement, n_grid_steps, sampled
 
 _FEWEST_DF, _MOST_DF = 3.0, 200.0  # of the joint law: a variance must exist, and beyond it is normal to all purposes
 # Degrees of freedom of a row over those of a movement: how unusual a whole demonstration can be is seen in the few that
@@ -36,22 +36,15 @@ class TrajectoryLaw(nn.Module):
     ``A_t = L_t chol(S_tt)^-1``: its blocks ``Sigma_tt`` are the marginals' C_t.
     """
 
-    grid: Tensor
-    nugget: Tensor
-    residual: Tensor
-    scales: Tensor
-    share: Tensor
     x_shift: Tensor
     x_scale: Tensor
 
     def __init__(self, marginals: nn.Module | None, time_kernel: TimeKernel, x_shift: float, x_scale: float) -> None:
         super().__init__()
-        self.marginals = marginals
-        self.kernel, self._time_kernel = time_kernel.kernel, time_kernel
-        for name in ("grid", "scales", "nugget", "residual"):
-            self.register_buffer(name, getattr(time_kernel, name))
-        for name, value in (("share", time_kernel.share), ("x_shift", x_shift), ("x_scale", x_scale)):
+        self.marginals, self.time_kernel = marginals, time_kernel
+        for name, value in (("x_shift", x_shift), ("x_scale", x_scale)):
             self.register_buffer(name, torch.tensor(value, dtype=torch.float64))
+        self.requires_grad_(False)
 
     def forward(self, x: Float[Tensor, "n 1"]) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d n d"]]:
         """Joint mean and covariance at times that are all different."""
@@ -64,22 +57,13 @@ class TrajectoryLaw(nn.Module):
         self, x: Float[Tensor, " n"], mean: Float[Tensor, "n d"], covariance: Float[Tensor, "n d d"]
     ) -> JointNormal:
         """Joint law at times that are all different, of these marginals."""
-        kernel = self.time_kernel()
-        time = (x - self.x_shift) / self.x_scale
-        correlation = self.share * kernel.correlation(time, time)
-        loadings = ((1.0 - self.share) / len(self.residual)).sqrt() * kernel.loadings(time)
+        kernel, time = self.time_kernel, (x - self.x_shift) / self.x_scale
+        loadings = ((1.0 - kernel.share) / len(kernel.residual)).sqrt() * kernel.loadings(time)
         # S_tt, whose factor A_t takes out, so that the blocks of the joint law are those of the marginals.
-        own = loadings @ loadings.mT + self.share * torch.eye(mean.shape[1]).to(mean)
+        own = loadings @ loadings.mT + kernel.share * torch.eye(mean.shape[1]).to(mean)
         root = safe_cholesky(covariance, name="the covariance at a step")
         factor = torch.linalg.solve_triangular(torch.linalg.cholesky(own), root, upper=False, left=False)
-        return JointNormal.prior(mean, factor, correlation, loadings)
-
-    def time_kernel(self) -> TimeKernel:
-        """Correlation along the movement, in ranges of the time."""
-        if self._time_kernel.grid is not self.grid:  # the module was moved, or its buffers were loaded
-            share = float(self.share)
-            self._time_kernel = TimeKernel(self.grid, self.kernel, self.scales, self.nugget, share, self.residual)
-        return self._time_kernel
+        return JointNormal.prior(mean, factor, kernel.share * kernel.correlation(time, time), loadings)
 
 
 class TrajectoryRegressor(TimedMovement):
@@ -190,7 +174,7 @@ class TrajectoryRegressor(TimedMovement):
 
         low, high = float(X.min()), float(X.max())
         grid = np.linspace(low, high, n_grid_steps(recordings))
-        mean, covariance = self._regressor_marginals(grid)
+        mean, covariance = self._regressor_rows(grid)
         residual = np.stack([sampled(recording, grid) for recording in recordings]) - mean
         # Of z = inv(L_t) (y_t - m_t), of unit covariance at each step, the correlation along time is left to be found.
         whitened = np.linalg.solve(np.linalg.cholesky(covariance), residual[..., np.newaxis])[..., 0]
@@ -198,89 +182,75 @@ class TrajectoryRegressor(TimedMovement):
         share = None if self.shrinkage == "auto" else 1.0 - float(self.shrinkage)
         scaled = torch.from_numpy((grid - low) / (high - low))
         found = fit_time_kernel(scaled, torch.from_numpy(whitened), kernels, share)
-        self.module_ = TrajectoryLaw(getattr(self.regressor_, "module_", None), found, low, high - low)
-        self.module_.requires_grad_(False)
+        self._set_law(found, low, high - low)
         degrees = self.regressor_.predict_df(grid[:, np.newaxis])
         self.df_ = float(np.clip(np.median(degrees) / _WHOLE, _FEWEST_DF, _MOST_DF))
         self.time_kernel_, self.length_scale_ = found.kernel, float(found.scales[0, 0]) * (high - low)
-        self.nugget_scale_, self.shrinkage_ = np.sqrt(found.nugget.numpy()), 1.0 - found.share
+        self.shrinkage_ = 1.0 - float(found.share)
+
+    def _set_law(self, time_kernel: TimeKernel, low: float, width: float) -> None:
+        self.module_ = TrajectoryLaw(getattr(self.regressor_, "module_", None), time_kernel, low, width)
+        self.nugget_scale_, self._range = np.sqrt(time_kernel.nugget.numpy()), (low, width)
 
     def predict(self, X: ArrayLike, *, return_std: bool = False, return_cov: bool = False) -> Any:
         """Prediction of the regressor; given what is known, mean and covariance of the rest of the movement."""
-        if self._is_regressor:
-            self._times(X)
-            return self.regressor_.predict(X, return_std=return_std, return_cov=return_cov)
-        return super().predict(X, return_std=return_std, return_cov=return_cov)
+        if not self._is_regressor:
+            return super().predict(X, return_std=return_std, return_cov=return_cov)
+        self._times(X)
+        return self.regressor_.predict(X, return_std=return_std, return_cov=return_cov)
 
     def predict_df(self, X: ArrayLike) -> Floats:
         """Degrees of freedom of the marginals; given what is known, of the joint law."""
         return self.regressor_.predict_df(X) if self._is_regressor else super().predict_df(X)
 
-    def predict_uncertainty(self, X: ArrayLike) -> Uncertainty:
-        """Both kinds of uncertainty at X, apart (Section IV-C).
-
-        Missing data are where they are for the regressor, whatever is known of this movement; ``type2`` is the
-        variability that what is known leaves.
-        """
-        time = self._times(X)
-        if self._timing is not None:
-            return self._mixed_uncertainty(time)
-        own = self.regressor_.predict_uncertainty(time[:, np.newaxis])
-        if self._known is None:
-            return Uncertainty(*own)
-        union, rows, places = self._union(time, self._known)
-        mean, type2 = self._regressor_marginals(union)[0], self.regressor_.predict_uncertainty(union[:, None]).type2
-        law = Conditioned(self._joint(union, mean, type2), *self._known.tensors(places, self._axes)).law
-        return Uncertainty(own.type1, law.marginal()[torch.from_numpy(rows)].numpy())
-
     @property
     def _is_regressor(self) -> bool:
         """Whether marginals are the regressor's, at X."""
-        return self._known is None and self._timing is None
+        return self._timing is None and not len(self._known.time)
+
+    def _uncertainty(self, time: Floats) -> tuple[Floats, Floats, Floats]:
+        mean, (type1, type2) = self._rows(time)[0], self.regressor_.predict_uncertainty(time[:, np.newaxis])
+        if not self._is_regressor:
+            union, rows, places = self._union(time, self._known)
+            own = self.regressor_.predict_uncertainty(union[:, np.newaxis]).type2
+            law = self._given(self._joint(union, self._regressor_rows(union)[0], own), places).law
+            type2 = law.marginal()[torch.from_numpy(rows)].numpy()
+        return mean, type1, type2
 
     def _arrays(self) -> dict[str, Floats]:
-        state = self.module_.state_dict()
-        own = {name: array.numpy() for name, array in state.items() if not name.startswith("marginals.")}
-        return own | self._timing_arrays()
+        names = {key.rpartition(".")[2]: key for key in self.module_.state_dict() if not key.startswith("marginals.")}
+        return {name: self.module_.state_dict()[key].numpy() for name, key in names.items()} | self._timing_arrays()
 
     def _restore(self, arrays: dict[str, Floats]) -> None:
         arrays = self._restore_timing(arrays)
-        n_steps, scalars = len(np.atleast_1d(arrays["grid"])), ("share", "x_shift", "x_scale")
-        shapes: dict[str, tuple[int | str, ...]] = dict.fromkeys(scalars, ())
-        shapes |= {"grid": (n_steps,), "scales": ("S", 2)}
-        shapes |= {"nugget": (n_steps,), "residual": ("K", n_steps, self.n_outputs_)}
-        own = self._restored(arrays, shapes)
+        n_steps = len(np.atleast_1d(arrays["grid"]))
+        shapes: dict[str, tuple[int | str, ...]] = {
+            "grid": (n_steps,), "scales": ("S", 2), "nugget": (n_steps,), "residual": ("K", n_steps, self.n_outputs_),
+            "share": (), "x_shift": (), "x_scale": (),
+        }  # fmt: skip
+        check_arrays(arrays, shapes)
         for name in ("nugget", "scales"):
-            checks.require(own[name] > 0.0, own[name], name, "above 0")
-        checks.require(np.diff(own["grid"]) > 0.0, own["grid"][1:], "grid", "increasing")
-        share, shift, scale = (float(own[name]) for name in scalars)
-        checks.number(share, "share", above=0.0, most=1.0)
-        grid, scales, nugget, residual = (torch.from_numpy(own[name].copy()) for name in list(shapes)[3:])
-        found = TimeKernel(grid, self.time_kernel_, scales, nugget, share, residual)
-        self.module_ = TrajectoryLaw(self.regressor_.module_, found, shift, scale)
-        self.module_.requires_grad_(False)
-        self.nugget_scale_ = np.sqrt(own["nugget"])
-
-    def _scaled(self, time: Floats) -> Floats:
-        return np.asarray((time - float(self.module_.x_shift)) / float(self.module_.x_scale))
+            checks.require(arrays[name] > 0.0, arrays[name], name, "above 0")
+        checks.require(np.diff(arrays["grid"]) > 0.0, arrays["grid"][1:], "grid", "increasing")
+        checks.number(float(arrays["share"]), "share", above=0.0, most=1.0)
+        *own, shift, scale = (torch.tensor(arrays[name]) for name in shapes)
+        self._set_law(TimeKernel(self.time_kernel_, *own), float(shift), float(scale))
 
     def _prior(self, time: Floats) -> JointNormal:
-        mean, covariance = self._regressor_marginals(time)
-        return self._joint(time, mean, covariance)
-
-    def _between(self, time: Floats, other: Floats) -> Tensor:
-        with torch.inference_mode():
-            return self.module_.share * self.module_.time_kernel().correlation(
-                *(torch.from_numpy(self._scaled(part)) for part in (time, other))
-            )
+        return self._joint(time, *self._regressor_rows(time))
 
     def _joint(self, time: Floats, mean: Floats, covariance: Floats) -> JointNormal:
         with torch.inference_mode():
             return self.module_.joint(*map(torch.from_numpy, (time, mean, covariance)))
 
-    def _marginals(self, time: Floats) -> tuple[Floats, Floats]:
-        return self._regressor_marginals(time) if self._is_regressor else super()._marginals(time)
+    def _between(self, time: Floats, other: Floats) -> Tensor:
+        kernel, scaled = self.module_.time_kernel, (torch.from_numpy(self._scaled(part)) for part in (time, other))
+        with torch.inference_mode():
+            return kernel.share * kernel.correlation(*scaled)
 
-    def _regressor_marginals(self, time: Floats) -> tuple[Floats, Floats]:
+    def _rows(self, time: Floats) -> tuple[Floats, Floats]:
+        return self._regressor_rows(time) if self._is_regressor else super()._rows(time)
+
+    def _regressor_rows(self, time: Floats) -> tuple[Floats, Floats]:
         mean, covariance = self.regressor_.predict(time[:, np.newaxis], return_cov=True)
         return np.ascontiguousarray(mean.reshape(len(time), -1)), np.ascontiguousarray(covariance)

@@ -139,7 +139,7 @@ def _described(estimator: Any) -> tuple[dict[str, Any], Arrays]:
                 f"estimator has an attribute {min(unknown)!r}, which a model file cannot hold: delete it, or pickle "
                 "the estimator."
             )
-    elif getattr(estimator, "_bend", None) is not None or getattr(estimator, "_known", None) is not None:
+    elif {"_bend", "_known"} & set(vars(estimator)):
         raise TypeError("estimator was conditioned, which a file cannot hold: save it before, or pickle it.")
     else:
         arrays = _controller_arrays(estimator) if isinstance(estimator, DMPController) else estimator._arrays()
