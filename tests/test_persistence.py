@@ -159,6 +159,5 @@ def test_a_controller_plans_the_same_from_its_file(regressor, tmp_path):
     assert again.get_params(deep=False).keys() == controller.get_params(deep=False).keys()
     assert again.stiffness_law == law
     np.testing.assert_array_equal(again.noise_share_, controller.noise_share_)
-    np.testing.assert_array_equal(again.reproduce(50.0)[1], controller.reproduce(50.0)[1])
     again.fit(recorded)  # parameters, too, are as they were
     assert again.schedule(20.0) == controller.schedule(20.0)

@@ -46,6 +46,12 @@ def learned(shape, duration=2.0, *, units="m", offset=0.0, **parameters):
     return DMPController(model, cutoff=None, **parameters).fit(Demonstrations([time] * 4, positions, units=units))
 
 
+def motion(controller, rate, **options):
+    """Time, position and velocity of a schedule."""
+    plan = controller.schedule(rate, limits=None, **options)
+    return plan.time, plan.position, plan.velocity
+
+
 def peak(time, velocity):
     return np.linalg.norm(np.gradient(velocity, time, axis=0), axis=1).max()
 
@@ -61,11 +67,11 @@ def judge(motion, recorded, blended, ends):
 
 def worst(controller, away, rate):
     """Largest of `judge` over goals and starts; the goal is reached, and the velocity is that of the position."""
-    time, *plain = controller.reproduce(rate)
+    time, *plain = motion(controller, rate)
     way, share, found = controller.goal_ - controller.start_, (time / time[-1])[:, None], []
     for along, off in itertools.product(SHARES, away):
         goal, start = controller.start_ + along * way, controller.start_ + off
-        _, position, velocity = controller.reproduce(rate, goal=goal, start=start)
+        _, position, velocity = motion(controller, rate, goal=goal, start=start)
         blended = plain[1] + (goal - controller.goal_ - off) * 30.0 * (share * (1.0 - share)) ** 2 / time[-1]
         found.append(judge((time, position, velocity), plain, blended, (start, goal)))
         np.testing.assert_allclose(position[[0, -1]], [start, goal], atol=1e-6)
@@ -104,7 +110,7 @@ def test_72_on_recordings(name, recordings):
     told = "cut while moving" if name.startswith("kuka") else "which is no known length"
     with pytest.warns(UserWarning, match=told):
         controller.fit(recorded)
-    path = controller.reproduce(100.0)[1]
+    path = motion(controller, 100.0)[1]
     extent, axes = np.ptp(path, axis=0).max(), np.eye(path.shape[1])
     away = extent * np.concatenate([0.0 * axes[:1], 0.1 * axes, axes, -axes])
     acceleration, out = worst(controller, away, 200.0 / controller.duration_)
@@ -116,11 +122,11 @@ def test_72_on_recordings(name, recordings):
 @pytest.mark.parametrize("name", ["reaching", "fast at first", "late"])
 def test_72_a_goal_that_changes_on_the_way_is_filtered(name, at):
     controller = learned(SHAPES[name])
-    time, *recorded = controller.reproduce(200.0, settle=2.0)
+    time, *recorded = motion(controller, 200.0, settle=2.0)
     ticks = time >= 2.0 * at
     for change in ([0.5, 0.0], [-1.0, 0.3]):
         goals = controller.goal_ + np.outer(ticks, change)
-        moved = controller.reproduce(200.0, settle=2.0, goal=goals)
+        moved = motion(controller, 200.0, settle=2.0, goal=goals)
         lasting = max(2.0 - 2.0 * at, 1.0)
         share = np.clip((time - time[ticks][0]) / lasting, 0.0, 1.0)[:, None]
         blended = recorded[1] + np.array(change) * 30.0 * (share * (1.0 - share)) ** 2 / lasting
@@ -134,12 +140,12 @@ def test_72_a_goal_that_changes_on_the_way_is_filtered(name, at):
 
 def test_a_goal_that_moves_at_every_tick_is_followed_smoothly():
     controller = learned(SHAPES["reaching"])
-    time = controller.reproduce(100.0, settle=4.0)[0]
+    time = motion(controller, 100.0, settle=4.0)[0]
     moving = np.minimum(0.1 * time, 0.3)[:, None]
     goals = controller.goal_ + moving
-    _, position, velocity = controller.reproduce(100.0, settle=4.0, goal=goals)
+    _, position, velocity = motion(controller, 100.0, settle=4.0, goal=goals)
     np.testing.assert_allclose(np.gradient(position, time, axis=0)[1:-1], velocity[1:-1], atol=5e-3)
-    assert peak(time, velocity) < 2.0 * peak(time, controller.reproduce(100.0, settle=4.0)[2])
+    assert peak(time, velocity) < 2.0 * peak(time, motion(controller, 100.0, settle=4.0)[2])
     np.testing.assert_allclose(position[-1], goals[-1], atol=1e-9)
 
 

@@ -235,18 +235,16 @@ def test_a_constant_output_is_precise():
     np.testing.assert_allclose(fitted.predict_stiffness(X)[:, 1, 1], 1000.0, rtol=1e-6)
 
 
-def test_goal_and_speed_change_at_run_time_without_overshoot(controller):
-    time, plain, _ = controller.reproduce(200.0, settle=4.0)
+def test_a_goal_changes_at_run_time_without_overshoot(controller):
+    plan = controller.schedule(200.0, settle=4.0)
+    time, plain = plan.time, plan.position
     goal = np.tile(controller.goal_, (len(time), 1))
     goal[time > 6.0] += [0.0, 0.1]
-    moved = controller.reproduce(200.0, settle=4.0, goal=goal)[1]
+    moved = controller.schedule(200.0, settle=4.0, goal=goal).position
     step = (moved - plain)[:, 1]
     assert (np.diff(step) >= -1e-12).all()
     assert step[time <= 6.0].max() < 1e-12
     assert 0.0999 < step[-1] <= 0.1 + 1e-9
-    slow = np.full(len(time), 0.5)
-    path = controller.reproduce(200.0, speed=slow)[1]
-    np.testing.assert_allclose(path[::2], plain[: len(path[::2])], atol=1e-6)  # forcing is linear between ticks
 
 
 def test_a_plant_of_another_mass_is_told_of_and_a_noisy_sensor_is_seeded(controller):
@@ -284,12 +282,7 @@ def test_a_cutoff_that_takes_the_movement_away_is_told_of(tunnel):
 )
 def test_what_cannot_be_reproduced_is_refused(controller, options, message):
     with pytest.raises(ValueError, match=message):
-        controller.reproduce(50.0, **options)
-
-
-def test_one_speed_is_that_of_all_ticks(controller):
-    slow = controller.reproduce(50.0, speed=0.5)[1]
-    np.testing.assert_array_equal(slow, controller.reproduce(50.0, speed=np.full(501, 0.5))[1])
+        controller.schedule(50.0, **options)
 
 
 def test_demonstrations_that_stand_still_are_precise():

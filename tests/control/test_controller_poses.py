@@ -186,7 +186,6 @@ def test_starts_and_goals_are_poses_or_outputs(controller):
         assert angles(moved.orientation[row], pose[3:]) < 1e-9
     outputs = controller.outputs_.rows(goal, "goal")
     assert moved == controller.schedule(100.0, start=start, goal=outputs)
-    np.testing.assert_array_equal(controller.reproduce(50.0, goal=goal)[1], controller.reproduce(50.0, goal=outputs)[1])
 
 
 @pytest.mark.parametrize(

@@ -145,38 +145,15 @@ def test_the_papers_parameters_overshoot():
     assert position.max().item() - 1.0 == pytest.approx(math.exp(-math.pi / math.sqrt(3.0)), rel=1e-5)
 
 
-def test_the_path_is_the_same_at_every_speed():
-    """Slowed down, held and speeded up on the way: the same points, at other times."""
-    dmp = DMP(duration=2.0)
-    time = ticks(4001, 1e-3)
-    speed = 0.6 + 0.6 * torch.cos(2.0 * torch.pi * time / 1.3)
-    speed[1500:2000] = 0.0
-    moved = torch.cat([torch.zeros(1).double(), (0.5 * (speed[1:] + speed[:-1]) * 1e-3).cumsum(0)])
-    position, velocity, _ = movement(moved)
-    goal = position[-1]
-
-    forcing = dmp.forcing(*movement(moved), goal)
-    started = {"goal": goal, "position0": position[0], "velocity0": speed[0] * velocity[0]}
-    along, how_fast = dmp.rollout(forcing, 1e-3, speed=speed, **started)
-    inside = moved <= 2.0
-    torch.testing.assert_close(along[inside], position[inside], rtol=0, atol=1e-6)
-    torch.testing.assert_close(how_fast[inside], (speed[:, None] * velocity)[inside], rtol=0, atol=1e-5)
-    assert inside.sum() > 2000
-    assert (how_fast[1500:2000] == 0.0).all()
-    torch.testing.assert_close(along[1501], along[1999], rtol=1e-12, atol=0)
-
-
-def test_half_the_speed_and_twice_the_tau_are_the_same_path(rng):
+def test_twice_the_tau_is_the_same_path_at_half_the_speed(rng):
     forcing = torch.tensor(rng.normal(size=(51, 2)))
     between = torch.cat([torch.stack([forcing[:-1], 0.5 * (forcing[:-1] + forcing[1:])], dim=1).reshape(-1, 2),
                          forcing[-1:]])  # fmt: skip
-    start = {"goal": tensor(1.0, 2.0), "velocity0": tensor(1.0, -1.0)}
-    position, velocity = DMP().rollout(forcing, 0.02, **start)
-    start["velocity0"] = 0.5 * start["velocity0"]
-    for dmp, speed in ((DMP(), torch.full((101,), 0.5).double()), (DMP(tau=2.0), None)):
-        slow, half = dmp.rollout(between, 0.02, speed=speed, **start)
-        torch.testing.assert_close(slow[::2], position, rtol=1e-10, atol=1e-12)
-        torch.testing.assert_close(half[::2], 0.5 * velocity, rtol=1e-10, atol=1e-12)
+    goal, velocity0 = tensor(1.0, 2.0), tensor(1.0, -1.0)
+    position, velocity = DMP().rollout(forcing, 0.02, goal=goal, velocity0=velocity0)
+    slow, half = DMP(tau=2.0).rollout(between, 0.02, goal=goal, velocity0=0.5 * velocity0)
+    torch.testing.assert_close(slow[::2], position, rtol=1e-10, atol=1e-12)
+    torch.testing.assert_close(half[::2], 0.5 * velocity, rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize(("gate", "beyond"), [("none", 0.06 * 2.0 / 6.25), ("time", 0.0), ("phase", 0.0)])
@@ -219,16 +196,15 @@ def test_a_batch_is_its_members(rng):
     forcing = torch.tensor(rng.normal(size=(4, 30, 2)))
     goal = torch.tensor(rng.normal(size=(4, 30, 2)))
     starts = {name: torch.tensor(rng.normal(size=(4, 2))) for name in ("position0", "velocity0")}
-    options = {"speed": torch.linspace(0.5, 1.5, 30).double()}
-    position, velocity = DMP().rollout(forcing, 0.05, goal=goal, **starts, **options)
+    position, velocity = DMP().rollout(forcing, 0.05, goal=goal, **starts)
     for k in range(4):
         one = {name: value[k] for name, value in starts.items()}
-        alone = DMP().rollout(forcing[k], 0.05, goal=goal[k], **one, **options)
+        alone = DMP().rollout(forcing[k], 0.05, goal=goal[k], **one)
         torch.testing.assert_close((position[k], velocity[k]), alone, rtol=1e-12, atol=1e-14)
-    shared = DMP().rollout(forcing[0], 0.05, goal=goal[0], **starts, **options)[0]
+    shared = DMP().rollout(forcing[0], 0.05, goal=goal[0], **starts)[0]
     one = {name: value[2] for name, value in starts.items()}
     torch.testing.assert_close(
-        shared[2], DMP().rollout(forcing[0], 0.05, goal=goal[0], **one, **options)[0], rtol=1e-12, atol=1e-14
+        shared[2], DMP().rollout(forcing[0], 0.05, goal=goal[0], **one)[0], rtol=1e-12, atol=1e-14
     )
 
 
@@ -260,9 +236,6 @@ STILL = torch.zeros(5, 2).double()
     [
         ({"dt": 0.0}, "dt is 0.0 s"),
         ({"dt": math.nan}, "dt is nan"),
-        ({"speed": tensor(1.0, 1.0, -0.1, 1.0, 1.0)}, "speed"),
-        ({"speed": tensor(1.0, 1.0, math.nan, 1.0, 1.0)}, "speed"),
-        ({"speed": torch.zeros(5), "velocity0": torch.ones(2).double()}, "velocity0"),
         ({"goal": torch.zeros(3).double()}, "'goal': (1, 3)"),
         ({"goal": torch.zeros(4, 2).double()}, "'goal': (4, 2)"),
     ],

@@ -170,9 +170,8 @@ def test_16_float32_is_fitted_without_a_word_of_overflow():
 
 def test_20_a_movement_of_many_ticks_is_refused_with_its_memory(monkeypatch):
     monkeypatch.setattr(torch_pbd.files.memory, "available_bytes", lambda: 2**27)
-    for ask in (lambda: controller().schedule(1e6), lambda: controller().reproduce(1e6)):
-        with pytest.raises(ValueError, match=r"a schedule of 2000001 ticks of 2 axes needs about .* GiB.*Lower rate"):
-            ask()
+    with pytest.raises(ValueError, match=r"a schedule of 2000001 ticks of 2 axes needs about .* GiB.*Lower rate"):
+        controller().schedule(1e6)
     with pytest.raises(ValueError, match=r"a schedule of 2e\+300 ticks .* needs about .* GiB.*Lower rate"):
         controller().schedule(1e300)
 
@@ -222,7 +221,7 @@ def test_25_misuse_of_queries_is_told(method):
             getattr(controller(), method)(query)
 
 
-@pytest.mark.parametrize("method", ["schedule", "simulate", "reproduce", "smooth"])
+@pytest.mark.parametrize("method", ["schedule", "simulate", "smooth"])
 def test_25_a_controller_that_is_not_fitted_says_so(method):
     with pytest.raises(NotFittedError, match="not fitted yet"):
         getattr(new(), method)(*([recorded()] if method == "smooth" else []))
@@ -286,14 +285,11 @@ BAD_CALLS = [
     ("simulate", {"plant": "x"}, "plant is 'x', must be an AdmittancePlant"),
     ("simulate", {"plant": AdmittancePlant}, "must be an AdmittancePlant or None"),
     ("simulate", {"random_state": -1}, "random_state is -1, must be None"),
-    ("reproduce", {"goal": 1.0}, r"goal has shape \(\), must have shape \(2,\)"),
-    ("reproduce", {"goal": np.zeros((3, 2))}, r"goal has shape \(3, 2\)"),
-    ("reproduce", {"goal": ["1", "2"]}, "goal holds text"),
-    ("reproduce", {"start": np.zeros((201, 2))}, r"start has shape \(201, 2\), must have shape \(2,\)"),
-    ("reproduce", {"start": [np.inf, 0.0]}, r"start\[0\] is inf, must be finite"),
-    ("reproduce", {"speed": []}, r"speed has shape \(0,\)"),
-    ("reproduce", {"speed": -1.0}, "speed is -1.0, must be finite and at least 0"),
-    ("reproduce", {"speed": np.ones((2, 2))}, r"speed has shape \(2, 2\)"),
+    ("schedule", {"goal": 1.0}, r"goal has shape \(\), must have shape \(2,\)"),
+    ("schedule", {"goal": np.zeros((3, 2))}, r"goal has shape \(3, 2\)"),
+    ("schedule", {"goal": ["1", "2"]}, "goal holds text"),
+    ("schedule", {"start": np.zeros((201, 2))}, r"start has shape \(201, 2\), must have shape \(2,\)"),
+    ("schedule", {"start": [np.inf, 0.0]}, r"start\[0\] is inf, must be finite"),
     ("schedule", {"settle": -1.0}, "settle is -1.0 s, must be a finite number of at least 0"),
     ("schedule", {"settle": np.nan}, "settle is nan s, must be a finite number"),
     ("phase", {"time": 1.0}, r"time has shape \(\), must have shape \(n,\)"),
@@ -310,13 +306,13 @@ BAD_CALLS = [
 
 @pytest.mark.parametrize(("method", "given", "message"), BAD_CALLS, ids=[message for _, _, message in BAD_CALLS])
 def test_arguments_that_cannot_be_used_are_refused_by_name(method, given, message):
-    rate = {"rate": 100.0} if method in ("simulate", "reproduce", "schedule") else {}
+    rate = {"rate": 100.0} if method in ("simulate", "schedule") else {}
     with pytest.raises(ValueError, match=message):
         getattr(controller(), method)(**rate, **given)
 
 
 @pytest.mark.parametrize("rate", ["100", None, 0.0, -1.0, np.nan, np.inf, True, 1e-3, 10**400])
 def test_rates_that_are_none_are_refused(rate):
-    for method in ("schedule", "simulate", "reproduce"):
+    for method in ("schedule", "simulate"):
         with pytest.raises(ValueError, match="rate is "):
             getattr(controller(), method)(rate=rate)

@@ -181,7 +181,7 @@ class DMPController(Planning):
             self.dmp_, movements, self.phase_input, own_goals=self.goal == "each", blocks=outputs.blocks
         )
         self.start_, self.goal_ = self.reproduction_.start, self.reproduction_.goal
-        self.reproduction_error_, *_ = self.reproduction_.check_against(movements)
+        self.reproduction_error_ = self.reproduction_.check_against(movements)
         if seconds and counts_as_metres(outputs.units(self.units_)):
             self.reproduction_.warn_if_cut(in_si(outputs.units(self.units_)))
         # 4. Variability. The regressor learns the covariance over the same input, of positions or of the forcing; of

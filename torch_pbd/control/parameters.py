@@ -1,24 +1,20 @@
-"""Checks of a controller's parameters, demonstrations and queries, and the labels of its schedules."""
+"""Checks of a controller's parameters and demonstrations."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, is_dataclass
-from importlib.metadata import version
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.sparse import issparse
-from sklearn.base import BaseEstimator
-from sklearn.utils.validation import check_array, check_X_y
+from sklearn.utils.validation import check_X_y
 
 from torch_pbd import checks
-from torch_pbd.checks import Floats
 from torch_pbd.control.impedance import OnUnknown
 from torch_pbd.control.matrices import as_damping_ratio, as_mass
 from torch_pbd.control.primitive.adaptation import Adaptation
 from torch_pbd.control.primitive.dmp import Gate
-from torch_pbd.control.primitive.outputs import common_unit, robot_unit
+from torch_pbd.control.primitive.outputs import common_unit
 from torch_pbd.control.primitive.smoothing import CUTOFF_HZ
 from torch_pbd.control.stiffness import StiffnessLaw
 from torch_pbd.data import Demonstrations, check_unimodal
@@ -182,23 +178,6 @@ def _grouped(X: ArrayLike, y: ArrayLike | None, groups: ArrayLike | None) -> Dem
     return Demonstrations([times[m, 0] for m in members], [positions[m] for m in members], names=names)
 
 
-def as_times(X: ArrayLike) -> Floats:
-    """Times (n,) of a column X (n, 1), which may be empty."""
-    times = check_array(checked_values(X, "X"), dtype=np.float64, ensure_min_samples=0)
-    if times.shape[1] != 1:
-        raise ValueError(f"X has {times.shape[1]} features, but DMPController is expecting 1 feature: the time.")
-    return np.asarray(times[:, 0])
-
-
-def as_speed(values: ArrayLike) -> Floats:
-    """Rate at which movement time passes: a number, or one for each tick (n,); none negative."""
-    speed = checks.real_floats(values, "speed")
-    if speed.ndim and (speed.ndim > 1 or len(speed) < 2):
-        raise ValueError(f"speed has shape {speed.shape}, must be a number, or have shape (n,): one for each tick.")
-    checks.require(np.isfinite(speed) & (speed >= 0.0), speed, "speed", "finite and at least 0: time runs forwards")
-    return speed
-
-
 def check_steps(n_steps: int, n_demos: int, d: int, *, learned: bool) -> None:
     """Refuse more points of a movement than fit in memory: smoothed ones, and what learning the forcing of them takes.
 
@@ -213,37 +192,3 @@ def check_steps(n_steps: int, n_demos: int, d: int, *, learned: bool) -> None:
         what=f"n_steps={n_steps} of {n_demos} demonstrations of {d} axes",
         remedy="Lower n_steps: 100 to 500 follow most movements.",
     )
-
-
-def schedule_labels(controller: Any) -> dict[str, Any]:
-    """Names, units and limits of the schedules of a fitted controller, and what they come from, as JSON can hold it."""
-    law = controller.law_
-    return {
-        "names": controller.names_,
-        "units": robot_unit(controller.outputs_.units(controller.units_)),
-        "frame": controller.frame_,
-        "stiffness_limits": law.limits(controller.n_outputs_),
-        "covariance_of": controller.variability,
-        "mass": float(controller.mass_) if np.ndim(controller.mass_) == 0 else np.asarray(controller.mass_),
-        "provenance": {
-            "controller": _plain(controller),
-            "covariance": _plain(controller.covariance_),
-            "n_demos": controller.n_demos_,
-            "cutoff": controller.cutoff_,
-            "sigma_low": law.sigma_low,
-            "sigma_high": law.sigma_high,
-            **({} if law.rotation is None else {"rotation": asdict(law.rotation)}),
-            "torch_pbd": version("torch_pbd"),
-        },
-    }
-
-
-def _plain(value: Any) -> Any:
-    """Parameter as JSON can hold it."""
-    if isinstance(value, BaseEstimator):
-        return {type(value).__name__: {k: _plain(v) for k, v in value.get_params(deep=False).items()}}
-    if is_dataclass(value) and not isinstance(value, type):
-        return asdict(value)
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    return value if value is None or isinstance(value, bool | int | float | str | list) else repr(value)

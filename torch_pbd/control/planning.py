@@ -2,25 +2,27 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from importlib.metadata import version
 from typing import Any, Self, final
 
 import numpy as np
 from numpy.typing import ArrayLike
 from sklearn.base import BaseEstimator
-from sklearn.utils.validation import check_is_fitted
+from sklearn.utils.validation import check_array, check_is_fitted
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.control import parameters
 from torch_pbd.control.impedance import gains_at
-from torch_pbd.control.primitive.outputs import Outputs, counts_as_metres, in_si
+from torch_pbd.control.primitive.outputs import Outputs, counts_as_metres, in_si, robot_unit
 from torch_pbd.control.primitive.reproduction import Reproduction
 from torch_pbd.control.schedule.rows import tick_times
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.plant import AdmittancePlant
 from torch_pbd.control.simulation.rollout import Rollout
 from torch_pbd.control.simulation.run import simulate
+from torch_pbd.control.stiffness import StiffnessLaw
 from torch_pbd.control.via import Bend, conditioned, planned
+from torch_pbd.estimators.validation import checked_values
 
 _UNITS = {"duration": "s", "distance": "m", "speed": "m/s"}
 
@@ -45,8 +47,8 @@ class MotionLimits:
     speed: float = 10.0
 
     def __post_init__(self) -> None:
-        for name, value in asdict(self).items():
-            checks.number(value, name, above=0.0, unit=_UNITS[name])
+        for name, unit in _UNITS.items():
+            checks.number(getattr(self, name), name, above=0.0, unit=unit)
 
 
 _LIMITS = MotionLimits()
@@ -180,19 +182,24 @@ class Planning(BaseEstimator):
         """
         check_is_fitted(self)
         speed = checks.number(speed, "speed", above=0.0)
-        recorded = self.outputs_.units(self.units_), self.time_unit_
-        _check_motion(limits, *recorded, duration=self.duration_ / speed)
+        checks.instance(limits, "limits", MotionLimits, optional=True)
+        units, outputs = self.outputs_.units(self.units_), self.outputs_
+        bounds = limits if counts_as_metres(units) else None
+        self._refuse_beyond(bounds, "duration", self.duration_ / speed)
         time = tick_times(self.duration_ / speed, rate, self.n_outputs_, settle=settle)
-        bent, goal, start = planned(self, *self._ends(goal, start), via)
+        goal, start = (
+            None if value is None else outputs.rows(value, name) for name, value in (("goal", goal), ("start", start))
+        )
+        bent, goal, start = planned(self, goal, start, via)
         path, velocity, acceleration, moved = bent._motion(time, goal, start, speed)
-        unit = in_si(recorded[0])
-        rows: dict[str, Any] = self.outputs_.motion(path, velocity, acceleration, unit)
-        distance = float(np.linalg.norm(np.ptp(rows["position"], axis=0)))
-        fastest = float(np.linalg.norm(rows["velocity"][:, : self.outputs_.n_positions], axis=1).max())
-        _check_motion(limits, *recorded, distance=distance, speed=fastest)
-        gains, scales = gains_at(bent, moved, path), self.outputs_.scales(unit)
+        unit = in_si(units)
+        rows: dict[str, Any] = outputs.motion(path, velocity, acceleration, unit)
+        self._refuse_beyond(bounds, "distance", float(np.linalg.norm(np.ptp(rows["position"], axis=0))))
+        speeds = np.linalg.norm(rows["velocity"][:, : outputs.n_positions], axis=1)
+        self._refuse_beyond(bounds, "speed", float(speeds.max()))
+        gains, scales = gains_at(bent, moved, path), outputs.scales(unit)
         rows |= gains._asdict() | {"covariance": np.multiply.outer(scales, scales) * gains.covariance}
-        return Schedule(time=time, **rows, **parameters.schedule_labels(self))
+        return Schedule(time=time, **rows, **_labels(self))
 
     def simulate(
         self,
@@ -217,38 +224,6 @@ class Planning(BaseEstimator):
         """
         return simulate(self.schedule(rate), force, plant=plant, random_state=random_state)
 
-    def reproduce(
-        self,
-        rate: float = 1000.0,
-        *,
-        settle: float = 0.0,
-        goal: ArrayLike | None = None,
-        start: ArrayLike | None = None,
-        speed: ArrayLike | None = None,
-    ) -> tuple[Floats, Floats, Floats]:
-        """Time (n,), position and velocity (n, d) of the movement to other goals, from other starts, at other speeds.
-
-        Parameters
-        ----------
-        rate, settle : float
-            As for :meth:`schedule`; the ticks are those of the movement at speed 1, or as many as ``speed`` has.
-        goal : array-like of shape (d,) or (n, d), default=None
-            Goal, at each tick if it changes at run time; None is ``goal_``. A change is followed over the rest of the
-            movement, or half its duration if that is longer: the movement then ends later.
-        start : array-like of shape (d,), default=None
-            None is ``start_``.
-        speed : float or array-like of shape (n,), default=None
-            How fast movement time passes, at each tick if it changes; it should change smoothly.
-        """
-        check_is_fitted(self)
-        paces = parameters.as_speed(1.0 if speed is None else speed)
-        if paces.ndim:
-            time = np.arange(len(paces)) / checks.number(rate, "rate", above=0.0, unit="Hz")
-        else:
-            time = tick_times(self.duration_, rate, self.n_outputs_, settle=settle)
-        position, velocity, *_ = self._motion(time, *self._ends(goal, start), paces)
-        return time, position, velocity
-
     def phase(self, time: ArrayLike) -> Floats:
         """Inputs (n, 1) of ``covariance_`` at movement times (n,), which start at 0: what ``phase_input`` says."""
         check_is_fitted(self)
@@ -260,7 +235,7 @@ class Planning(BaseEstimator):
         return position if self._bend is None else position + self._bend(time)
 
     def _motion(
-        self, time: Floats, goal: ArrayLike | None, start: ArrayLike | None, speed: float | Floats
+        self, time: Floats, goal: Floats | None, start: Floats | None, speed: float
     ) -> tuple[Floats, Floats, Floats, Floats]:
         """Outputs, their velocity and acceleration (n, d) at times (n,), and the movement time of the gains there."""
         position, velocity, acceleration, moved = self.reproduction_.plan(time, goal, start, speed)
@@ -271,25 +246,54 @@ class Planning(BaseEstimator):
             acceleration = acceleration + rate**2 * self._bend(moved, 2) + slope * self._bend(moved, 1)
         return position, velocity, acceleration, moved
 
-    def _ends(self, goal: ArrayLike | None, start: ArrayLike | None) -> tuple[Floats | None, Floats | None]:
-        """Goal and start as outputs."""
-        given = {"goal": goal, "start": start}
-        own = [None if value is None else self.outputs_.rows(value, name) for name, value in given.items()]
-        return own[0], own[1]
-
     def _movement_time(self, X: ArrayLike) -> Floats:
+        """Movement times (n,) of a column X (n, 1), which may be empty."""
         check_is_fitted(self)
-        return self.time_scale_ * (parameters.as_times(X) - self.start_time_)
+        times = check_array(checked_values(X, "X"), dtype=np.float64, ensure_min_samples=0)
+        if times.shape[1] != 1:
+            raise ValueError(f"X has {times.shape[1]} features, but DMPController is expecting 1 feature: the time.")
+        return np.asarray(self.time_scale_ * (times[:, 0] - self.start_time_))
 
-
-def _check_motion(limits: Any, units: Sequence[str] | None, time_unit: str, **found: float) -> None:
-    """Refuse a duration, distance or speed, by name, beyond the limits, in units of length or without units."""
-    checks.instance(limits, "limits", MotionLimits, optional=True)
-    for name, value in found.items() if limits is not None and counts_as_metres(units) else ():
-        most, unit = getattr(limits, name), _UNITS[name]
-        if value > most:
+    def _refuse_beyond(self, limits: MotionLimits | None, name: str, value: float) -> None:
+        """Refuse a duration, distance or speed, by name, beyond the limits."""
+        if limits is not None and value > (most := getattr(limits, name)):
+            units = ", ".join(self.outputs_.units(self.units_) or ["none"])
             raise ValueError(
-                f"the {name} of the schedule is {value:.4g} {unit}, must be at most limits.{name}, {most:g} {unit}: "
-                f"correct units ({', '.join(units or ['none'])}) or time_unit ({time_unit}) of the recordings, or give "
+                f"the {name} of the schedule is {value:.4g} {_UNITS[name]}, must be at most limits.{name}, {most:g} "
+                f"{_UNITS[name]}: correct units ({units}) or time_unit ({self.time_unit_}) of the recordings, or give "
                 f"limits=MotionLimits({name}=...) or None."
             )
+
+
+def _labels(controller: Any) -> dict[str, Any]:
+    """Names, units and limits of the schedules of a fitted controller, and what they come from, as JSON can hold it."""
+    law, mass = controller.law_, controller.mass_
+    return {
+        "names": controller.names_,
+        "units": robot_unit(controller.outputs_.units(controller.units_)),
+        "frame": controller.frame_,
+        "stiffness_limits": law.limits(controller.n_outputs_),
+        "covariance_of": controller.variability,
+        "mass": float(mass) if np.ndim(mass) == 0 else np.asarray(mass),
+        "provenance": {
+            "controller": _plain(controller),
+            "covariance": _plain(controller.covariance_),
+            "n_demos": controller.n_demos_,
+            "cutoff": controller.cutoff_,
+            "sigma_low": law.sigma_low,
+            "sigma_high": law.sigma_high,
+            **({} if law.rotation is None else {"rotation": asdict(law.rotation)}),
+            "torch_pbd": version("torch_pbd"),
+        },
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Parameter as JSON can hold it."""
+    if isinstance(value, BaseEstimator):
+        return {type(value).__name__: {k: _plain(v) for k, v in value.get_params(deep=False).items()}}
+    if isinstance(value, StiffnessLaw):
+        return asdict(value)
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    return value if value is None or isinstance(value, bool | int | float | str | list) else repr(value)

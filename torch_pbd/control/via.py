@@ -41,6 +41,11 @@ class Bend:
         return values if order == 0 else values * (inside == time)[:, np.newaxis]
 
 
+def can_bend(controller: Any) -> bool:
+    """True if a controller's covariance is a model of whole movements, of positions."""
+    return hasattr(controller.covariance_, "condition") and controller.variability == "position"
+
+
 def conditioned(
     controller: Any, time: Floats, change: Floats, noise_scale: Any = 0.0, pins: Sequence[float] = ()
 ) -> Any:
@@ -69,14 +74,9 @@ def conditioned(
     return result
 
 
-def can_bend(controller: Any) -> bool:
-    """True if a controller's covariance is a model of whole movements, of positions."""
-    return hasattr(controller.covariance_, "condition") and controller.variability == "position"
-
-
 def planned(
-    controller: Any, goal: ArrayLike | None, start: ArrayLike | None, via: Sequence[tuple[float, ArrayLike]] | None
-) -> tuple[Any, Any, Any]:
+    controller: Any, goal: Floats | None, start: Floats | None, via: Sequence[tuple[float, ArrayLike]] | None
+) -> tuple[Any, Floats | None, Floats | None]:
     """Controller of a movement to a goal, from a start, through points; and the goal and start left to its primitive.
 
     Warns
@@ -86,7 +86,7 @@ def planned(
     """
     if via is None and (not can_bend(controller) or (goal is None and start is None)):
         return controller, goal, start
-    rest, times, changes, pins = {"goal": goal, "start": start}, [], [], []
+    rest, known, pins = {"goal": goal, "start": start}, [], []
     for name, at, own in (("start", 0.0, controller.start_), ("goal", controller.duration_, controller.goal_)):
         target = rest[name]
         if target is not None and np.ndim(target) != 1:
@@ -98,12 +98,11 @@ def planned(
         distance, limit = _distance(controller, at, change)
         share = min(1.0, limit / distance)
         rest[name] = None if share == 1.0 else own + (1.0 - share) * change
-        times.append(at)
-        changes.append(share * change)
+        known.append((at, share * change))
     even = np.linspace(0.0, controller.duration_, 2 * controller.n_steps)
-    path = CubicSpline(even, controller._motion(even, rest["goal"], rest["start"], 1.0)[0])
+    path = CubicSpline(even, controller._motion(even, rest["goal"], rest["start"], 1.0)[0]) if via else None
     for number, point in enumerate(via or ()):
-        at, position = _checked_point(point, number, controller)
+        at, position = _checked_point(point, f"via[{number}]", controller)
         change = position - path(at)
         distance, limit = _distance(controller, at, change)
         if distance > limit:
@@ -111,28 +110,26 @@ def planned(
                 f"via[{number}], at {at:g} s, is {distance:.3g} standard deviations from the movement, where "
                 f"{limit:.3g} hold {_LIKELY:.0%} of demonstrations: how people would pass there was not shown."
             )
-        times.append(at)
-        changes.append(change)
+        known.append((at, change))
+    times, changes = np.array([at for at, _ in known]), [change for _, change in known]
     # A controller that was conditioned may know its start or its end already.
-    known, phase = controller.covariance_.known_times() if can_bend(controller) else [], controller.reproduction_.phase
-    pins = [at for at in pins if at not in times and not np.isclose(phase(np.array([at]))[0, 0], known).any()]
-    bent = conditioned(controller, np.array(times), np.reshape(changes, (-1, controller.n_outputs_)), pins=pins)
+    phase, before = controller.reproduction_.phase, controller.covariance_.known_times() if can_bend(controller) else []
+    pins = [at for at in pins if at not in times and not np.isclose(phase(np.array([at]))[0, 0], before).any()]
+    bent = conditioned(controller, times, np.reshape(changes, (-1, controller.n_outputs_)), pins=pins)
     return bent, rest["goal"], rest["start"]
 
 
-def _checked_point(point: Any, number: int, controller: Any) -> tuple[float, Floats]:
+def _checked_point(point: Any, name: str, controller: Any) -> tuple[float, Floats]:
     """Movement time and outputs of a via point, NaN where free."""
     try:
         at, position = point
     except (TypeError, ValueError):
-        raise checks.refusal(point, f"via[{number}]", "a time in s and a position") from None
-    at = checks.number(at, f"the time of via[{number}]", least=0.0, most=controller.duration_, unit="s")
-    position = controller.outputs_.rows(position, f"the position of via[{number}]")
-    n_outputs = controller.n_outputs_
+        raise checks.refusal(point, name, "a time in s and a position") from None
+    at = checks.number(at, f"the time of {name}", least=0.0, most=controller.duration_, unit="s")
+    name, n_outputs = f"the position of {name}", controller.n_outputs_
+    position = controller.outputs_.rows(position, name)
     if position.shape != (n_outputs,) or np.isinf(position).any() or np.isnan(position).all():
-        raise checks.refusal(
-            position.tolist(), f"the position of via[{number}]", f"{n_outputs} numbers, NaN where free"
-        )
+        raise checks.refusal(position.tolist(), name, f"{n_outputs} numbers, NaN where free")
     return at, position
 
 

@@ -144,7 +144,6 @@ class DMP:
         velocity0: Float[Tensor, "*s d"] | Any = None,
         demonstrated_start: Float[Tensor, "*s d"] | Any = None,
         demonstrated_goal: Float[Tensor, "*s d"] | Any = None,
-        speed: Float[Tensor, " t"] | Any = None,
     ) -> tuple[Float[Tensor, "*o t d"], Float[Tensor, "*o t d"]]:
         """Position and velocity at ticks of ``dt`` seconds, exact for forcing that is linear between them.
 
@@ -160,63 +159,53 @@ class DMP:
             State at the start; None is the origin, at rest.
         demonstrated_start, demonstrated_goal : Tensor of shape (..., d), default=None
             Of the movement that forcing and ``velocity0`` are of, for "safe"; None: ``position0`` and the first goal.
-        speed : Tensor of shape (T,), default=None
-            How fast movement time passes at each tick, linear between: 0.5 takes twice as long. The path is the
-            same at every speed, so the duration changes at run time without overshoot; a speed that jumps makes
-            the velocity jump. ``velocity0`` is that at speed[0].
 
         Raises
         ------
         ValueError
-            If a shape is wrong, a value is not finite, or a speed is negative.
+            If a shape is wrong, or a value is not finite.
         """
         forcing, goal = as_rows(forcing, "forcing", 2), as_rows(goal, "goal", 1)
-        n_ticks = forcing.shape[-2]
         goals = goal if goal.ndim > 1 else goal[None]
         starts = {"position0": position0, "velocity0": velocity0}
         places = {**starts, "demonstrated_start": demonstrated_start, "demonstrated_goal": demonstrated_goal}
         given = {name: as_rows(place, name, 1) for name, place in places.items() if place is not None}
-        time, steps, passing = _movement_time(n_ticks, checks.number(dt, "dt", above=0.0, unit="s"), speed, goal)
+        dt = checks.number(dt, "dt", above=0.0, unit="s")
+        time = torch.arange(forcing.shape[-2]).to(goal) * dt
         at_ticks = forcing * self.gate_at(time)[:, None]
         rows = {"forcing": at_ticks, "goal": goals, **{name: place[..., None, :] for name, place in given.items()}}
-        shape = _broadcast(rows, n_ticks)
+        shape = _broadcast(rows, len(time))
         at_ticks, goals = at_ticks.expand(shape), goals.expand(shape)
         start, velocity = (given.get(name, goal.new_zeros(shape[-1])) for name in starts)
-        if passing[0] == 0.0 and bool((velocity != 0.0).any()):
-            raise ValueError("velocity0 must be 0 where speed[0] is 0: no movement time passes there.")
         own_start, own_goal = given.get("demonstrated_start", start), given.get("demonstrated_goal", goals[..., 0, :])
         # A safe adaptation drives the movement as it was demonstrated, and takes its path to the other start and goals.
         same = bool((own_start == start).all() and (goals == own_goal[..., None, :]).all())
         safe = self.adaptation == "safe" and not same
         driven = own_goal[..., None, :].expand(shape) if safe else goals
-        scaled = self.tau * velocity / passing[0].clamp_min(1e-12)
-        begin = torch.stack([each.expand(*shape[:-2], -1) for each in (own_start if safe else start, scaled)], dim=-1)
-        trace = self._solve(at_ticks, driven, steps, begin)
+        begin = (own_start if safe else start, self.tau * velocity)
+        trace = self._solve(at_ticks, driven, dt, torch.stack([each.expand(*shape[:-2], -1) for each in begin], dim=-1))
         position, rate = trace[..., 0], trace[..., 1] / self.tau
         if safe:
             spring = self.beta * (driven - position) - trace[..., 1]
             path = position, rate, (self.alpha * spring + at_ticks) / self.tau**2  # eq. (16)
             ends = {"own_goal": own_goal, "goals": goals, "start": start}
             position, rate, _ = adapt(path, time, (position, time), **ends, duration=self.duration or self.tau)
-        return position, rate * passing[:, None]
+        return position, rate
 
-    def _solve(self, forcing: Tensor, goals: Tensor, steps: Tensor, state: Tensor) -> Tensor:
+    def _solve(self, forcing: Tensor, goals: Tensor, dt: float, state: Tensor) -> Tensor:
         """States at the ticks, exact for forcing that is linear between them and goals held over them."""
         # Over a tick [x, z, goal, forcing, rise] has constant coefficients: the forcing grows by the rise, which like
-        # the goal stays. The matrix exponential of a tick is its map; most runs have ticks of one length.
-        lengths, index = steps.unique(return_inverse=True)
-        rate = state.new_zeros(len(lengths), 5, 5)
+        # the goal stays. The matrix exponential of a tick is its map.
+        rate = state.new_zeros(5, 5)
         eq16 = [[0.0, 1.0, 0.0, 0.0], [-self.alpha * self.beta, -self.alpha, self.alpha * self.beta, 1.0]]
-        rate[:, :2, :4] = state.new_tensor(eq16) / self.tau * lengths[:, None, None]
-        rate[:, 3, 4] = 1.0
-        maps = torch.linalg.matrix_exp(rate)[:, :2]
+        rate[:2, :4] = state.new_tensor(eq16) / self.tau * dt
+        rate[3, 4] = 1.0
+        passed_on, added = torch.linalg.matrix_exp(rate)[:2].mT.split([2, 3])
         inputs = torch.stack([goals[..., :-1, :], forcing[..., :-1, :], forcing.diff(dim=-2)], dim=-1)
         # What goal and forcing add is known of all ticks at once; one after another go the states alone.
-        added = (inputs @ maps[index, :, 2:].mT).unbind(dim=-3)
-        passed_on = maps[:, :, :2].mT.unbind()
         states = [state]
-        for kind, increment in zip(index.tolist(), added, strict=True):
-            states.append(states[-1] @ passed_on[kind] + increment)
+        for increment in (inputs @ added).unbind(dim=-3):
+            states.append(states[-1] @ passed_on + increment)
         return torch.stack(states, dim=-3)
 
 
@@ -228,15 +217,3 @@ def _broadcast(parts: dict[str, Tensor], n_ticks: int | None = None) -> torch.Si
         if n_ticks in (None, common[-2]) and all(shape[-1] == common[-1] for shape in shapes.values()):
             return common
     raise ValueError(f"shapes are {shapes}, must be of the same movements, ticks and outputs.")
-
-
-def _movement_time(n_ticks: int, dt: float, speed: Any, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Movement time at the ticks, its steps from each to the next, and how fast it passes at them."""
-    if speed is None:
-        return torch.arange(n_ticks).to(like) * dt, like.new_full((n_ticks - 1,), dt), like.new_ones(n_ticks)
-    speed = as_tensor(speed, "speed")
-    if speed.shape != (n_ticks,) or not bool((torch.isfinite(speed) & (speed >= 0.0)).all()):
-        raise ValueError(f"speed has shape {tuple(speed.shape)}, must be {n_ticks} finite numbers, none negative.")
-    passing = speed.to(like)
-    steps = 0.5 * (passing[1:] + passing[:-1]) * dt
-    return torch.cat([steps.new_zeros(1), steps.cumsum(0)]), steps, passing

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
-from scipy.integrate import cumulative_trapezoid
 from scipy.interpolate import CubicHermiteSpline
 from torch import Tensor
 
@@ -31,6 +30,8 @@ _BRAKE = 0.2  # of the duration: the most that the stop of a movement that was c
 _CUT, _STEADY, _STOPPED = 0.1, 0.5, (0.1, 0.3)
 _ROUNDING = 1e-9  # of the duration, or of the largest position
 
+_Path = tuple[Floats, Floats, Floats]  # position, velocity and acceleration (n, d)
+
 
 @dataclass(frozen=True)
 class Reproduction:
@@ -38,8 +39,7 @@ class Reproduction:
 
     From ``start`` (d,) with ``velocity`` (d,) to ``goal`` (d,), by the ``forcing`` (m, d), which is linear between its
     times (m,) from 0 to the duration, held after it, and was learned over what ``phase_input`` says. With ``own_goals``
-    the goal in eq. (18) is the end of each movement, else the common one. ``blocks`` of outputs share a unit; none are
-    one.
+    the goal in eq. (18) is the end of each movement, else the common one. ``blocks`` of outputs share a unit.
     """
 
     dmp: DMP
@@ -50,17 +50,11 @@ class Reproduction:
     goal: Floats
     time: Floats
     forcing: Floats
-    blocks: tuple[slice, ...] = (slice(None),)
+    blocks: tuple[slice, ...]
 
     @classmethod
     def learn(
-        cls,
-        dmp: DMP,
-        movements: Movements,
-        phase_input: str,
-        *,
-        own_goals: bool,
-        blocks: tuple[slice, ...] = (slice(None),),
+        cls, dmp: DMP, movements: Movements, phase_input: str, *, own_goals: bool, blocks: tuple[slice, ...]
     ) -> "Reproduction":
         """Fit the forcing of the mean movement, eq. (18), and tabulate it over the duration."""
         position = movements.position
@@ -70,14 +64,12 @@ class Reproduction:
         still = np.zeros((len(time), len(goal)))
         known = cls(dmp, phase_input, own_goals, start, velocity, goal, time, still, blocks)
         mean = known.forcing_of(movements).mean(axis=0)
-        X, at = known.phase(movements.time), known.phase(time)
-        if len(blocks) == 1:
-            return replace(known, forcing=_process_mean(X, mean, len(position), at))
         # Of poses along the principal axes of each block: outputs are learned one by one, and frames must not matter.
         axes, deviation = np.eye(len(goal)), mean - mean.mean(axis=0)
-        for own in blocks:
+        for own in blocks if len(blocks) > 1 else ():
             axes[own, own] = np.linalg.eigh(deviation[:, own].T @ deviation[:, own])[1]
-        return replace(known, forcing=_process_mean(X, mean @ axes, len(position), at) @ axes.T)
+        learned = _process_mean(known.phase(movements.time), mean @ axes, len(position), known.phase(time))
+        return replace(known, forcing=learned @ axes.T)
 
     def phase(self, time: Floats) -> Floats:
         """Inputs (n, 1) of the regressors at movement times (n,): the phase, its logarithm, or the time itself."""
@@ -94,31 +86,24 @@ class Reproduction:
         forcing: Floats = self.dmp.forcing(*map(_tensor, parts)).numpy()
         return forcing
 
-    def check_against(self, movements: Movements) -> list[float]:
-        """Root mean square distance of the motion from the mean of the movements as they were recorded, of each block.
+    def check_against(self, movements: Movements) -> float:
+        """Root mean square distance of the motion from the mean of the movements as recorded; of poses, of positions.
 
         Warns of more than 1 % of the extent of all movements, and refuses a motion that leaves their range.
         """
-        mean, path = movements.recorded_mean, self.motion(movements.time)[0]
-        check_range(path, movements.bounds, "The reproduced movement")
-        units = ("", " rad of rotation")
-        return [
-            self._error(path[:, own], mean[:, own], movements.bounds[:, own], unit)
-            for own, unit in zip(self.blocks, units, strict=False)
-        ]
-
-    def _error(self, path: Floats, mean: Floats, bounds: Floats, unit: str) -> float:
-        distance = np.linalg.norm(path - mean, axis=1)
-        error = float(np.sqrt(np.mean(distance**2)))
-        extent = float(np.linalg.norm(np.ptp(bounds, axis=0)))
-        rounding = _ROUNDING * float(np.abs(mean).max())
-        if error > _FAR * extent + rounding:
-            remedy = "phase_input='time'" if self.phase_input == "s" else "a higher cutoff, or more n_steps"
-            checks.warn(
-                f"The reproduced movement is {error:.3g}{unit} off the mean of the demonstrations, "
-                f"{error / extent:.1%} of its extent: try {remedy}."
-            )
-        return error
+        path, bounds, errors = self.motion(movements.time)[0], movements.bounds, []
+        check_range(path, bounds, "The reproduced movement")
+        for own, unit in zip(self.blocks, ("", " rad of rotation"), strict=False):
+            mean = movements.recorded_mean[:, own]
+            errors.append(error := float(np.sqrt(np.square(path[:, own] - mean).sum(axis=1).mean())))
+            extent = float(np.linalg.norm(np.ptp(bounds[:, own], axis=0)))
+            if error > _FAR * extent + _ROUNDING * float(np.abs(mean).max()):
+                remedy = "phase_input='time'" if self.phase_input == "s" else "a higher cutoff, or more n_steps"
+                checks.warn(
+                    f"The reproduced movement is {error:.3g}{unit} off the mean of the demonstrations, "
+                    f"{error / extent:.1%} of its extent: try {remedy}."
+                )
+        return errors[0]
 
     def warn_if_cut(self, metres: float) -> None:
         """Warn of a movement that was cut while moving, which a robot at rest cannot follow at once.
@@ -168,40 +153,38 @@ class Reproduction:
         return CubicHermiteSpline(time, positions, velocities, axis=0)
 
     def plan(
-        self, time: Floats, goal: ArrayLike | None, start: ArrayLike | None, speed: float | Floats
+        self, time: Floats, goal: ArrayLike | None, start: ArrayLike | None, speed: float
     ) -> tuple[Floats, Floats, Floats, Floats]:
         """Position, velocity and acceleration (n, d) at times (n,) from 0, and movement time (n,) of the gains there.
 
-        To goals (d,) or (n, d), from a start (d,), None for those demonstrated, at one speed or those of all times.
-        With adaptation="safe" it brakes to rest at the end of the movement, if the times go on after it.
+        To goals (d,) or (n, d), from a start (d,), None for those demonstrated. With adaptation="safe" it brakes to
+        rest at the end of the movement, if the times go on after it.
         """
-        changed = goal is not None or start is not None
         begin = self.start if start is None else checks.array(start, "start", self.start.shape)
         goals, shape = self.goal, (len(time), *self.goal.shape)
         if goal is not None:
             goals = checks.real_floats(goal, "goal")
             goals = checks.array(goals, "goal", shape if goals.ndim > 1 else shape[1:])
-        goals = np.broadcast_to(goals, shape)
-        pace = np.broadcast_to(np.asarray(speed, dtype=np.float64), time.shape)
-        passed = time * speed if np.ndim(speed) == 0 else cumulative_trapezoid(pace, time, initial=0.0)
-        if self.dmp.adaptation == "safe":
-            path, known = self._safe(passed, goals, begin, changed=changed)
-            return *_at_pace(path, pace, time), known
-        position, velocity, acceleration = _at_pace(self.motion(passed), pace, time)
+        goals, passed = np.broadcast_to(goals, shape), speed * time
+        plan = self._safe if self.dmp.adaptation == "safe" else self._additive
+        (position, velocity, acceleration), known = plan(passed, goals, begin, goal is not None or start is not None)
+        return position, speed * velocity, speed**2 * acceleration, known
+
+    def _additive(self, passed: Floats, goals: Floats, start: Floats, changed: bool) -> tuple[_Path, Floats]:
+        """Motion by movement time, and that of the gains; the primitive is solved with the other start and goals."""
+        path = self.motion(passed)
         if changed:
             # The primitive is linear: another start and goal add its answer to their change alone.
             still, change = torch.zeros(goals.shape, dtype=torch.float64), _tensor(goals - self.goal)
-            offset, speeds = _tensor(begin - self.start), _tensor(pace)
-            run = self.dmp.rollout(still, float(time[1]), goal=change, position0=offset, speed=speeds)
-            answer = CubicHermiteSpline(time[1] * np.arange(len(time)), *(part.numpy() for part in run), axis=0)
-            position, velocity = position + answer(time), velocity + answer(time, 1)
-            acceleration = acceleration + answer(time, 2)
-        return position, velocity, acceleration, passed
+            step = float(passed[1])
+            run = self.dmp.rollout(still, step, goal=change, position0=_tensor(start - self.start))
+            answer = CubicHermiteSpline(step * np.arange(len(passed)), *(part.numpy() for part in run), axis=0)
+            position, velocity, acceleration = path
+            path = position + answer(passed), velocity + answer(passed, 1), acceleration + answer(passed, 2)
+        return path, passed
 
-    def _safe(
-        self, passed: Floats, goals: Floats, start: Floats, *, changed: bool
-    ) -> tuple[tuple[Floats, Floats, Floats], Floats]:
-        """Motion (n, d) by movement time, adapted without a throw, and movement time (n,) of the gains."""
+    def _safe(self, passed: Floats, goals: Floats, start: Floats, changed: bool) -> tuple[_Path, Floats]:
+        """Motion by movement time, adapted without a throw, and that of the gains."""
         moved, rate, slope, known = self._braked(passed)
         velocity = self._curve(moved, 1)
         path = (
@@ -246,13 +229,6 @@ def primitive(controller: Any) -> DMP:
     tau = float(controller.tau) * (controller.duration_ / 10.0 if controller.adaptation == "safe" else 1.0)
     options = {"duration": controller.duration_, "gate": controller.gate, "adaptation": controller.adaptation}
     return DMP(float(controller.alpha), beta, float(controller.gamma), tau, **options)
-
-
-def _at_pace(path: tuple[Floats, Floats, Floats], pace: Floats, time: Floats) -> tuple[Floats, Floats, Floats]:
-    """Motion (n, d) by time (n,) of one by movement time, which passes at a pace (n,)."""
-    position, velocity, acceleration = path
-    rate, slope = pace[:, np.newaxis], np.gradient(pace, time)[:, np.newaxis]
-    return position, velocity * rate, acceleration * rate**2 + velocity * slope
 
 
 def _process_mean(X: Floats, forcing: Floats, n_demos: int, at: Floats) -> Floats:
