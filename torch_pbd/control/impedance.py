@@ -52,27 +52,27 @@ def gains_at(controller: Any, time: Floats, path: Floats) -> Gains:
 
 def _gains(controller: Any, time: Floats, path: Floats) -> Gains:
     *learned, type1 = _covariances(controller, time)
-    on_unknown, law = controller.on_unknown, controller.law_
-    if on_unknown == "raise" and (type1 > UNKNOWN).any():
+    law, mass = controller.law_, controller.mass_
+    if controller.on_unknown == "raise" and (type1 > UNKNOWN).any():
         index = int(np.argmax(type1 > UNKNOWN))
         raise ValueError(
             f"There are no data at time {time[index]:g} s: the Type I uncertainty is {type1[index]:.2f}. Ask within "
             "the demonstrations, or let on_unknown='soft' make the robot compliant there."
         )
-    sampled, covariance = (at_pose(controller.outputs_, law, each, path) for each in learned)
-    if on_unknown == "soft":
+    sampled, covariance = (_at_pose(controller.outputs_, law, each, path) for each in learned)
+    if controller.on_unknown == "soft":
         # The share u of the way to the least stiffness counts holes already; their prior would count them again.
-        stiffness = law(sampled, controller.mass_)
+        stiffness = law(sampled, mass)
         softest = stiffness.new_tensor(law.limits(stiffness.shape[-1])[0])
         softest = softest * torch.eye(stiffness.shape[-1]).to(stiffness)
         stiffness = softest + torch.tensor(1.0 - type1)[:, None, None] * (stiffness - softest)
     else:
-        stiffness = law(covariance, controller.mass_)
-    damping = damping_from_stiffness(stiffness, controller.mass_, controller.damping_ratio)
+        stiffness = law(covariance, mass)
+    damping = damping_from_stiffness(stiffness, mass, controller.damping_ratio)
     return Gains(stiffness.numpy(), damping.numpy(), covariance, type1)
 
 
-def at_pose(outputs: Outputs, law: StiffnessLaw, learned: Floats, path: Floats) -> Floats:
+def _at_pose(outputs: Outputs, law: StiffnessLaw, learned: Floats, path: Floats) -> Floats:
     """Covariances (n, d, d) of what was learned, at the poses (n, d); between blocks only where the law asks for it.
 
     All outputs are learned at once, but what few demonstrations say of how positions and rotations vary together does
@@ -119,19 +119,34 @@ def fit_covariance(
 
     From one demonstration alone nothing is known of how they vary, and the others stay aligned.
     """
-    fitted: CovarianceRegressor = clone(HeteroscedasticGPRegressor() if regressor is None else regressor)
+    fitted: Any = clone(HeteroscedasticGPRegressor() if regressor is None else regressor)
     between, extents = varying - varying[:1], outputs.extents(varying)
+    varying = varying.copy()
     for block in outputs.blocks:
-        extent = extents[block][0]
-        if float(np.abs(between[..., block]).max()) <= RESOLUTION * extent:
+        if float(np.abs(between[..., block]).max()) <= RESOLUTION * extents[block][0]:
             # One movement, shown again: what a smooth mean leaves of it would count as variability. It stands still
             # instead, at a distance to which the floors of regressors are relative.
-            varying = np.concatenate(
-                [varying[..., : block.start or 0], extent + between[..., block], varying[..., block.stop :]], axis=-1
-            )
+            varying[..., block] = extents[block] + between[..., block]
+    if outputs.axes is not None:
+        # Priors are of outputs, and the regressor, or one within, learns the coordinates along these axes.
+        inverse: Floats = np.linalg.inv(outputs.axes).astype(np.float64)
+        for name, prior in fitted.get_params(deep=True).items():
+            if name.rpartition("__")[2] == "prior" and not (prior is None or isinstance(prior, str)):
+                own = _PriorOfCoordinates(prior, inverse)
+                fitted.set_params(**{name: own if callable(prior) else own(np.empty((0, 1)))})
     groups, steps = np.nonzero(known & (known.sum(axis=0) > 1))
-    _bring_priors(fitted, outputs)
     return fit_with_groups(fitted, inputs[steps], outputs.encode(varying[groups, steps]), groups)
+
+
+@dataclass(frozen=True)
+class _PriorOfCoordinates:
+    """Prior of the coordinates that are learned, from one of the outputs that is a function of the input."""
+
+    prior: Any
+    inverse: Floats
+
+    def __call__(self, X: Floats) -> Floats:
+        return self.inverse @ prior_covariance(self.prior, X, len(self.inverse)) @ self.inverse.T
 
 
 def fit_law(controller: Any, varying: Floats) -> StiffnessLaw:
@@ -145,7 +160,7 @@ def fit_law(controller: Any, varying: Floats) -> StiffnessLaw:
         units = units[[block.outputs.start for block in law.blocks(len(units))]]
         law = replace(law, effort=(units**2 * law.effort).tolist())
     learned = controller.covariance_.predict_cov(reproduction.phase(time))
-    covariance = at_pose(outputs, law, learned, reproduction.motion(time)[0])
+    covariance = _at_pose(outputs, law, learned, reproduction.motion(time)[0])
     resolution = (RESOLUTION * outputs.extents(varying)).tolist()
     return law.fitted(covariance, resolution=resolution, mass=outputs.mass(controller.mass))
 
@@ -155,8 +170,8 @@ def outputs_under(controller: Any, demonstrations: Demonstrations) -> Outputs:
     reference, d = demonstrations.rotation_reference, demonstrations.n_outputs
     outputs = Outputs(d if reference is None else d - 3, reference)
     _chosen(controller.stiffness_law, outputs).blocks(d)
-    if np.ndim(controller.mass) and np.shape(controller.mass) != (d, d):
-        shape = np.shape(controller.mass)
+    shape = np.shape(controller.mass)
+    if shape not in ((), (d, d)):
         raise ValueError(f"mass has shape {shape}, must be a number or have shape ({d}, {d}), as many as outputs.")
     return outputs
 
@@ -169,25 +184,3 @@ def _chosen(law: StiffnessLaw | None, outputs: Outputs) -> StiffnessLaw:
         remedy = "give StiffnessLaw(..., rotation=RotationLimits())" if rotates else "or give Demonstrations a rotation"
         raise checks.refusal(chosen.rotation, "rotation of stiffness_law", must, remedy)
     return chosen
-
-
-@dataclass(frozen=True)
-class _PriorOfCoordinates:
-    """Prior of the coordinates that are learned, from one of the outputs that is a function of the input."""
-
-    prior: Any
-    inverse: Floats
-
-    def __call__(self, X: Floats) -> Floats:
-        covariance = prior_covariance(self.prior, X, len(self.inverse))
-        return self.inverse @ covariance @ self.inverse.T
-
-
-def _bring_priors(regressor: Any, outputs: Outputs) -> None:
-    """Let priors of a regressor, or of one within, be of the coordinates that it learns."""
-    if outputs.axes is None:
-        return
-    for name, prior in regressor.get_params(deep=True).items():
-        if name.rpartition("__")[2] == "prior" and not (prior is None or isinstance(prior, str)):
-            brought = _PriorOfCoordinates(prior, np.asarray(np.linalg.inv(outputs.axes), dtype=np.float64))
-            regressor.set_params(**{name: brought if callable(prior) else brought(np.empty((0, 1)))})
