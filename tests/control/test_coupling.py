@@ -5,10 +5,10 @@ import math
 import pytest
 import torch
 
-from torch_pbd.control.damping import damping_from_stiffness
+from torch_pbd.control.matrices import damping_from_stiffness
 from torch_pbd.control.simulation.plant import AdmittancePlant
 from torch_pbd.control.simulation.sensor import ForceSensor, PositionLoop
-from torch_pbd.control.stability.environment import stiffest_environment
+from torch_pbd.control.stability.certify import stiffest_environment
 
 DT = 1e-3
 
@@ -72,11 +72,11 @@ def test_the_limits_are_about_damping_over_lag(bandwidth, ratio, expected):
 def test_the_softest_axis_of_a_schedule_decides(generator):
     """Turned by any angle, and whatever the order: the limit is that of the axis with the least damping."""
     stiffness, damping = gains([1000.0, 800.0], [50.0, 400.0], [200.0, 300.0])
-    alone = stiffest_environment(*gains([50.0]), torch.eye(1).double(), PositionLoop())
+    alone = stiffest_environment(*gains([50.0]), torch.eye(1).double(), PositionLoop(), 500.0, DT)
     axes = torch.linalg.qr(torch.randn(3, 2, 2, dtype=torch.float64, generator=generator)).Q
     turned = [axes @ each @ axes.mT for each in (stiffness, damping)]
     for each in ((stiffness, damping), turned):
-        limit = stiffest_environment(*each, torch.eye(2).double(), PositionLoop())
+        limit = stiffest_environment(*each, torch.eye(2).double(), PositionLoop(), 500.0, DT)
         assert limit == pytest.approx(alone, rel=1e-6)
 
 

@@ -9,7 +9,7 @@ import scipy.linalg
 import scipy.stats
 import torch
 
-from torch_pbd.control.damping import damping_from_stiffness, required_damping_ratio
+from torch_pbd.control.matrices import damping_from_stiffness, required_damping_ratio
 
 
 def definite(*batch, d, generator, low=50.0, high=1000.0):

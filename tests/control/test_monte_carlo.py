@@ -21,7 +21,7 @@ from torch_pbd.control import (
     simulate,
     simulate_many,
 )
-from torch_pbd.control.damping import damping_from_stiffness
+from torch_pbd.control.matrices import damping_from_stiffness
 from torch_pbd.control.simulation.ticks import admittance_rate, transition
 
 RATE = 200.0

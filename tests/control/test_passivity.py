@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from torch_pbd.control.damping import damping_from_stiffness
 from torch_pbd.control.filters import EnergyTank, RateLimit, lyapunov_matrix
+from torch_pbd.control.matrices import damping_from_stiffness
 from torch_pbd.control.simulation import ticks
 from torch_pbd.control.simulation.plant import AdmittancePlant
 from torch_pbd.control.simulation.ticks import admittance_rate, transition

@@ -9,8 +9,8 @@ import scipy.linalg
 import scipy.signal
 import torch
 
-from torch_pbd.control.damping import damping_from_stiffness
 from torch_pbd.control.filters import EnergyTank
+from torch_pbd.control.matrices import damping_from_stiffness
 from torch_pbd.control.simulation.plant import AdmittancePlant
 from torch_pbd.control.simulation.sensor import ForceSensor, PositionLoop
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from torch_pbd.control.damping import damping_from_stiffness
+from torch_pbd.control.matrices import damping_from_stiffness
 from torch_pbd.control.simulation.plant import AdmittancePlant
 
 mujoco = pytest.importorskip("mujoco")

@@ -439,7 +439,7 @@ def test_the_rate_limits_function_never_grows_between_two_motions(is_pose):
         (
             {"mass": np.tile(np.eye(6), (59, 1, 1))},
             {},
-            "mass has shape (59, 6, 6), must be a number or have shape (6, 6)",
+            "mass has shape (59, 6, 6), but stiffness has shape (60, 6, 6): give a number",
         ),
         ({"mass": lambda time: np.tile(np.eye(3), (len(time), 1, 1))}, {}, "mass has shape (60, 3, 3)"),
         ({"mass": lambda time: -1.0}, {}, "mass is -1.0 kg"),

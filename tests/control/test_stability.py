@@ -12,10 +12,10 @@ import torch
 from control.loops import as_schedule
 
 from torch_pbd import CholeskyCovRegressor, DMPController, load_demonstrations
-from torch_pbd.control.damping import damping_from_stiffness, required_damping_ratio
+from torch_pbd.control.matrices import damping_from_stiffness, required_damping_ratio
 from torch_pbd.control.simulation.plant import AdmittancePlant
 from torch_pbd.control.simulation.ticks import admittance_rate, transition
-from torch_pbd.control.stability import gain as module
+from torch_pbd.control.stability import dynamics as module
 from torch_pbd.control.stability.common_function import isotropic_rate
 from torch_pbd.control.stability.dynamics import ErrorDynamics
 from torch_pbd.control.stability.lyapunov import Knots

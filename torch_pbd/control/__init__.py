@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from torch_pbd.control.controller import DMPController
-    from torch_pbd.control.damping import damping_from_stiffness, required_damping_ratio
     from torch_pbd.control.filters import EnergyTank, RateLimit
+    from torch_pbd.control.matrices import damping_from_stiffness, required_damping_ratio
     from torch_pbd.control.planning import MotionLimits
     from torch_pbd.control.primitive.dmp import DMP
     from torch_pbd.control.realtime import RealTimeAdmittance, TickStatus
@@ -41,9 +41,9 @@ _HOMES = {
     "TickStatus": "realtime",
     "Tunnel": "simulation.walls",
     "certify": "stability.certify",
-    "damping_from_stiffness": "damping",
+    "damping_from_stiffness": "matrices",
     "lqt": "stiffness",
-    "required_damping_ratio": "damping",
+    "required_damping_ratio": "matrices",
     "simulate": "simulation.run",
     "simulate_many": "simulation.run",
 }

@@ -10,7 +10,7 @@ from sklearn.base import clone
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.control.damping import damping_from_stiffness
+from torch_pbd.control.matrices import damping_from_stiffness
 from torch_pbd.control.primitive.outputs import RESOLUTION, Outputs, in_si
 from torch_pbd.control.primitive.smoothing import UNKNOWN
 from torch_pbd.control.stiffness import RotationLimits, StiffnessLaw

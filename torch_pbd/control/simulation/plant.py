@@ -183,7 +183,7 @@ class AdmittancePlant:
         mass = self.mass(times) if callable(self.mass) else self.mass
         if mass is None:
             mass = 1.0 if own is None else own
-        return mass_rows(as_mass(mass), like)
+        return mass_rows(mass, like)
 
     def task(
         self,

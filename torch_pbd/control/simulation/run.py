@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.control.matrices import as_mass, mass_rows
+from torch_pbd.control.matrices import mass_rows
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.plant import AdmittancePlant
 from torch_pbd.control.simulation.poses import warn_if_far
@@ -208,7 +208,7 @@ def _task_of(schedule: Schedule, plant: AdmittancePlant | None) -> Task:
     position, velocity, stiffness, damping = map(torch.tensor, rows)  # of copies: its own are read-only
     mass = plant.inertia(stiffness, schedule.time, schedule.mass)
     if schedule.mass is not None and plant.mass is not None:
-        own = mass_rows(as_mass(schedule.mass), stiffness)
+        own = mass_rows(schedule.mass, stiffness)
         # By entries, in units of their axes.
         root = own.diagonal(dim1=-2, dim2=-1).sqrt()
         off = float(((mass - own).abs() / (root.unsqueeze(-1) * root.unsqueeze(-2))).max())

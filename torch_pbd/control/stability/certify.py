@@ -4,20 +4,25 @@ import math
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torch_pbd import checks, rotations
-from torch_pbd.control.damping import required_damping_ratio
-from torch_pbd.control.matrices import as_mass, mass_rows
+from torch_pbd.control.matrices import mass_rows, required_damping_ratio
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.sensor import PositionLoop
+from torch_pbd.control.simulation.ticks import admittance_rate, transition
 from torch_pbd.control.stability.common_function import common_function
-from torch_pbd.control.stability.dynamics import ErrorDynamics
-from torch_pbd.control.stability.environment import stiffest_environment
-from torch_pbd.control.stability.gain import largest_gain
+from torch_pbd.control.stability.dynamics import ErrorDynamics, largest_gain
 from torch_pbd.control.stability.lyapunov import Knots, held_growth
 from torch_pbd.control.stability.report import StabilityReport
-from torch_pbd.linalg import least_eigenvalue
+from torch_pbd.linalg import evenly, least_eigenvalue, symmetrize
+
+# N/m; stiffer than anything there is.
+_STIFFEST = 1e9
+# Knots of a schedule that are coupled to an environment.
+_MAX_KNOTS = 200
+_BISECTIONS = 60
 
 
 def certify(
@@ -60,30 +65,32 @@ def certify(
     checks.number(speed, "speed", above=0.0)
     checks.number(dt, "dt", above=0.0, unit="s")
     checks.number(force_cutoff, "force_cutoff", above=0.0, unit="Hz", optional=True)
-    checks.instance(position_loop, "position_loop", PositionLoop, optional=True)
+    loop = checks.instance(position_loop, "position_loop", PositionLoop, optional=True) or PositionLoop()
     checks.instance(schedule, "schedule", Schedule)
     # An axis that is free never returns: nothing is to be certified of it.
     checks.semidefinite(schedule.stiffness, "stiffness", definite=True)
     time, stiffness, damping = map(torch.tensor, (schedule.time, schedule.stiffness, schedule.damping))
     given = schedule.mass if mass is None else mass(schedule.time) if callable(mass) else mass
-    inertia = mass_rows(as_mass(1.0 if given is None else given), stiffness).detach()
+    inertia = mass_rows(1.0 if given is None else given, stiffness).detach()
     inertia = inertia if inertia.ndim == 3 else inertia[None]  # one for all rows
-    dynamics = ErrorDynamics(time / speed, stiffness, damping, inertia, _transport(schedule, speed))
+    transport = None
+    if schedule.orientation is not None and schedule.velocity[:, -3:].any():
+        transport = torch.zeros_like(stiffness)
+        transport[:, -3:, -3:] = torch.tensor(speed * rotations.cross_matrix(schedule.velocity[:, -3:]))
+    dynamics = ErrorDynamics(time / speed, stiffness, damping, inertia, transport)
     knots, maps = Knots(dynamics), dynamics.tick_maps()
     alpha, margin, worst = knots.certificate()
     rate, fastest = common_function(dynamics)
-    smallest, ratio = _ratios(dynamics)
     # The rule is of one function that no axis is special to: of one inertia, and of outputs of one unit.
-    ratio = ratio if len(inertia) == 1 and schedule.orientation is None else math.nan
-    loop = PositionLoop() if position_loop is None else position_loop
+    squared = dynamics.modes.squared
+    ratio = float(squared.max() / squared.min()) if len(inertia) == 1 and schedule.orientation is None else math.nan
     pressed = [math.nan] * 2
     if len(inertia) == 1:  # an inertia that varies is an arm's own: there is no position loop
         for i, block in enumerate((slice(None), block, block) for block in schedule.blocks):
-            pressed[i] = stiffest_environment(
-                stiffness[block], damping[block], inertia[block][0], loop, force_cutoff, dt
-            )
+            gains = stiffness[block], damping[block], inertia[block][0]
+            pressed[i] = stiffest_environment(*gains, loop, force_cutoff, dt)
     return StabilityReport(
-        damping_ratio=smallest,
+        damping_ratio=_damping_ratio(dynamics),
         stiffness_ratio=ratio,
         required_damping_ratio=math.nan if math.isnan(ratio) else required_damping_ratio(ratio),
         stable_at_any_schedule=not math.isnan(rate),
@@ -118,23 +125,78 @@ def _range(matrices: Tensor) -> tuple[float, float]:
     return float(eigenvalues.min()), float(eigenvalues.max())
 
 
-def _transport(schedule: Schedule, speed: float) -> Tensor | None:
-    """What carries the deviations of poses along, (n, d, d), if they turn."""
-    if schedule.orientation is None or not schedule.velocity[:, -3:].any():
-        return None
-    carried = torch.zeros(schedule.stiffness.shape, dtype=torch.float64)
-    carried[:, -3:, -3:] = torch.tensor(speed * rotations.cross_matrix(schedule.velocity[:, -3:]))
-    return carried
-
-
-def _ratios(dynamics: ErrorDynamics) -> tuple[float, float]:
-    """Smallest damping ratio, and largest over smallest stiffness per mass, each row in its own."""
+def _damping_ratio(dynamics: ErrorDynamics) -> float:
+    """Smallest damping ratio of all rows, each in its own mass."""
     squared, _, damping = dynamics.modes
-    root = squared.pow(-0.25)
+    root, identity = squared.pow(-0.25), torch.eye(squared.shape[-1]).to(squared)
     if damping.ndim == 2:
-        least = float((root * damping * root).min())
+        return 0.5 * float((root * damping * root).min())
+    relative = root[:, :, None] * damping * root[:, None, :]
+    return 0.5 * least_eigenvalue(lambda rows, q, p: q * relative[rows] + p * identity, len(relative))[0]
+
+
+def stiffest_environment(
+    stiffness: Float[Tensor, "n d d"],
+    damping: Float[Tensor, "n d d"],
+    mass: Float[Tensor, "d d"],
+    position_loop: PositionLoop,
+    force_cutoff: float | None,
+    dt: float,
+) -> float:
+    """Stiffest spring, N/m, that the robot can press on without vibrating, the least over the gains given.
+
+    The robot reads the force through a low-pass of ``force_cutoff`` Hz, and follows the admittance by its
+    position loop: the closed loop along an axis of the damping, tick by tick, is a matrix, and the spring is the
+    stiffest up to which its eigenvalues stay within the unit circle; about ``damping / (lag of loop and sensor)``.
+    Gains are held, and axes taken one by one; of more than 200 knots, 200 are looked at and those with the least
+    damping and stiffness.
+    """
+    identity = torch.eye(stiffness.shape[-1]).to(stiffness)
+    softest = [
+        least_eigenvalue(lambda rows, q, p, gain=gain: q * gain[rows] + p * identity, len(gain))[1]
+        for gain in (stiffness, damping)
+    ]
+    chosen = torch.cat([evenly(len(stiffness), _MAX_KNOTS), torch.tensor(softest)])
+    axes = torch.linalg.eigh(symmetrize(damping[chosen])).eigenvectors
+    along = [
+        (axes * (matrix @ axes)).sum(-2).reshape(-1, 1, 1) for matrix in (stiffness[chosen], damping[chosen], mass)
+    ]
+    ticks = transition(admittance_rate(*along), dt)[:, :2]
+
+    def is_stable(each: Tensor, environment: float) -> Tensor:
+        closed = _closed_loop(each, position_loop, force_cutoff, dt, environment)
+        return torch.linalg.eigvals(closed).abs().amax(-1) < 1.0
+
+    # Most axes are never the least: after that which is damped least, those for which what it bears is too much.
+    least, ticks = 2.0 * _STIFFEST, ticks[along[1].flatten().argsort()]
+    while len(ticks):
+        low, high = 0.0, least
+        for _ in range(_BISECTIONS):
+            # By the logarithm while that is wide: the answer may lie anywhere between a feather and a wall.
+            middle = math.sqrt(max(low, 1.0) * high) if high > 1e3 * max(low, 1.0) else 0.5 * (low + high)
+            low, high = (middle, high) if is_stable(ticks[:1], middle) else (low, middle)
+        least = low
+        ticks = ticks[1:][~is_stable(ticks[1:], least)]
+    return math.inf if least > _STIFFEST else least
+
+
+def _closed_loop(
+    ticks: Float[Tensor, "n 2 3"], loop: PositionLoop, force_cutoff: float | None, dt: float, environment: float
+) -> Float[Tensor, "n m m"]:
+    """Matrices of [admittance position, velocity; robot position, velocity; filtered force; commands waiting]."""
+    robot, filtered, waiting, n_waiting = 2, 4, 5, loop.delay_steps
+    closed = ticks.new_zeros(len(ticks), waiting + n_waiting, waiting + n_waiting)
+    closed[:, :2, :2] = ticks[:, :, :2]
+    if force_cutoff is None:
+        closed[:, :2, robot] = -environment * ticks[:, :, 2]
     else:
-        identity = torch.eye(squared.shape[-1]).to(squared)
-        relative = root[:, :, None] * damping * root[:, None, :]
-        least = least_eigenvalue(lambda rows, q, p: q * relative[rows] + p * identity, len(relative))[0]
-    return least / 2.0, float(squared.max() / squared.min())
+        gain = -math.expm1(-2.0 * math.pi * force_cutoff * dt)
+        closed[:, :2, filtered] = ticks[:, :, 2]
+        closed[:, filtered, filtered] = 1.0 - gain
+        closed[:, filtered, robot] = -environment * gain
+    follow = loop.transition(dt, ticks)
+    closed[:, robot : robot + 2, robot : robot + 2] = follow[:, :2]
+    closed[:, robot : robot + 2, waiting if n_waiting else 0] = follow[:, 2]
+    for step in range(n_waiting):  # the oldest command comes first, and the last is the admittance's position
+        closed[:, waiting + step, waiting + step + 1 if step < n_waiting - 1 else 0] = 1.0
+    return closed

@@ -107,14 +107,27 @@ class StabilityReport:
         return self.certified or self.stable_at_any_schedule
 
     def __str__(self) -> str:
+        grows = self.margin >= 0.0 and self.held_growth > 1.0 + GROWTH_ROUNDING
+        held = f"; held between rows, V grows by {self.held_growth - 1.0:.2g}" if grows else ""
+        remedy = "slow down" if self.margin < 0.0 else "resample it finer"
+        verdict = "guaranteed" if self.stable else f"NOT GUARANTEED: {remedy}, damp more, or use a filter"
+        own, any_order = (
+            "any" if math.isinf(limit) else f"{limit:.3g} x" for limit in (self.max_speed, self.any_schedule_speed)
+        )
+        if self.stable_at_any_schedule and own != any_order:
+            own = f"{any_order}, by the rule; by the certificate {own}"
+        which = "these rows in any order, blended or held" if self.stable_at_any_schedule else "this schedule as it is"
+        what = f"of {which}; a bounded force moves it by a bounded amount"
+        warning = "" if self.gain <= MAX_GAIN else f"  <- above {MAX_GAIN:g}: disturbances grow on the way"
         rows = {
-            "exact and without lag": self._verdict(),
+            "exact and without lag": verdict,
             "any-schedule rule": self._any_schedule(),
-            "certificate of this one": self._certificate(),
-            "replay speed limit": self._speed_limit(),
-            "gain from any state": f"{self.gain:.3g}{self._warning()}",
+            "certificate of this one": f"{'holds' if self.certified else 'DOES NOT HOLD'}: rate {self.margin:.3g} /s "
+            f"at t = {self.margin_time:.3g} s, alpha {self.alpha:.3g} /s{held}",
+            "replay speed limit": own,
+            "gain from any state": f"{self.gain:.3g}{warning}",
             "stiffest environment": self._environment(),
-            "promised": self._promise(),
+            "promised": f"without a force deviations die out, {what}" if self.stable else "nothing",
             "not promised": _NOT_PROMISED,
         }
         head = fill(f"stability of {self._robot()}, replay speed {self.speed:g}", _WIDTH)
@@ -129,10 +142,6 @@ class StabilityReport:
         ranges = (f"{low:.3g} to {high:.3g} {unit}" for (low, high), unit in zip(self.inertia, kilograms, strict=True))
         return f"{'an inertia that varies' if self.mass is None else 'a mass matrix'}, {' and '.join(ranges)}"
 
-    def _verdict(self) -> str:
-        remedy = "slow down" if self.margin < 0.0 else "resample it finer"
-        return "guaranteed" if self.stable else f"NOT GUARANTEED: {remedy}, damp more, or use a filter"
-
     def _any_schedule(self) -> str:
         text = "does not hold"
         if self.stable_at_any_schedule:
@@ -144,33 +153,8 @@ class StabilityReport:
         what = "an inertia that varies" if self.mass is None else "poses"
         return f"{text}; no ratio is enough in itself for {what}"
 
-    def _certificate(self) -> str:
-        grows = self.margin >= 0.0 and self.held_growth > 1.0 + GROWTH_ROUNDING
-        held = f"; held between rows, V grows by {self.held_growth - 1.0:.2g}" if grows else ""
-        verdict = "holds" if self.certified else "DOES NOT HOLD"
-        return f"{verdict}: rate {self.margin:.3g} /s at t = {self.margin_time:.3g} s, alpha {self.alpha:.3g} /s{held}"
-
-    def _speed_limit(self) -> str:
-        own, any_order = (_speed(each) for each in (self.max_speed, self.any_schedule_speed))
-        if not self.stable_at_any_schedule or own == any_order:
-            return own
-        return f"{any_order}, by the rule; by the certificate {own}"
-
-    def _warning(self) -> str:
-        return "" if self.gain <= MAX_GAIN else f"  <- above {MAX_GAIN:g}: disturbances grow on the way"
-
     def _environment(self) -> str:
         if math.isnan(self.environment_stiffness):
             return "not asked: an arm of its own inertia has no position loop"
         pressed = zip((self.environment_stiffness, self.environment_rotation), self.units, strict=False)
         return " and ".join(f"{value:.4g} {unit}" for value, unit in pressed) + " in the softest phase"
-
-    def _promise(self) -> str:
-        if not self.stable:
-            return "nothing"
-        which = "these rows in any order, blended or held" if self.stable_at_any_schedule else "this schedule as it is"
-        return f"without a force deviations die out, of {which}; a bounded force moves it by a bounded amount"
-
-
-def _speed(limit: float) -> str:
-    return "any" if math.isinf(limit) else f"{limit:.3g} x"

@@ -2,6 +2,6 @@
 
 from torch_pbd.control.stiffness.law import StiffnessLaw
 from torch_pbd.control.stiffness.limits import RotationLimits
-from torch_pbd.control.stiffness.tracking import lqt
+from torch_pbd.control.stiffness.precision import lqt
 
 __all__ = ["RotationLimits", "StiffnessLaw", "lqt"]

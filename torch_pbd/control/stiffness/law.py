@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
+from numbers import Real
 from typing import Any, Literal, final
 
 import torch
@@ -10,16 +11,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torch_pbd import checks
-from torch_pbd.control.matrices import as_semidefinite
-from torch_pbd.control.stiffness import limits
-from torch_pbd.control.stiffness.limits import Block, Limit, RotationLimits
-from torch_pbd.control.stiffness.precision import as_masses, matched_effort, precision_stiffness
+from torch_pbd.control.matrices import as_mass, as_semidefinite, masses_like
+from torch_pbd.control.stiffness.limits import Block, Limit, RotationLimits, check_scales, check_stiffness, of_outputs
+from torch_pbd.control.stiffness.precision import matched_effort, precision_stiffness
 from torch_pbd.exceptions import InvalidParameterError
-from torch_pbd.linalg import broadcast_shapes, spectral_map
+from torch_pbd.linalg import spectral_map
 
 Bounds = Literal["quantile", "sigma", "variance"]
 Kind = Literal["linear", "precision"]
-Scales = tuple[float, float]
+
+# On the tunnel task these spread K_xx over 50 to 1000 N/m, and it rises at 214 N/m/s: at 1155 with the paper's bounds.
+_QUANTILES = (0.1, 0.9)
+# Smallest deviation that counts: squares of smaller ones are no numbers.
+_SMALLEST = 1e-150
 
 
 @final
@@ -88,27 +92,26 @@ class StiffnessLaw:
 
     def __post_init__(self) -> None:
         for name in ("stiffness_min", "stiffness_max", "sigma_low", "sigma_high", "effort"):
-            object.__setattr__(self, name, limits.plain(getattr(self, name), name))
+            if not isinstance(getattr(self, name), Real | str | None):
+                object.__setattr__(self, name, tuple(checks.array(getattr(self, name), name, ("d",)).tolist()))
         checks.flag(self.smooth, "smooth")
         checks.flag(self.cross_terms, "cross_terms")
         checks.choice(self.bounds, "bounds", Bounds)
         checks.choice(self.kind, "kind", Kind)
         checks.instance(self.rotation, "rotation", RotationLimits, optional=True)
-        each = isinstance(self.stiffness_min, tuple) or isinstance(self.stiffness_max, tuple)
-        limits.check_stiffness(self.stiffness_min, self.stiffness_max, unit="" if each else "N/m")
+        of_each = isinstance(self.stiffness_min, tuple) or isinstance(self.stiffness_max, tuple)
+        check_stiffness(self, "" if of_each else "N/m")
         if self.kind == "precision" and self.smooth:
             raise checks.refusal(True, "smooth", "False with kind='precision'", "it smooths the straight line")
         for entry in self.effort if isinstance(self.effort, tuple) else () if self.effort == "match" else [self.effort]:
             checks.number(entry, "effort", above=0.0, unit="kg/N^2", remedy="or 'match'")
-        given: dict[str, StiffnessLaw | RotationLimits | None] = {"": self, "rotation.": self.rotation}
-        for prefix, own in given.items():
-            low, high = (None, None) if own is None else (own.sigma_low, own.sigma_high)
+        for own, prefix in ((self, ""), (self.rotation, "rotation.")):
             if own is not None and self.bounds != "quantile":
-                limits.check_scales(low, high, prefix)
-            elif (low, high) != (None, None):
+                check_scales(own, prefix)
+            elif own is not None and (own.sigma_low, own.sigma_high) != (None, None):
                 raise InvalidParameterError(
-                    f"{prefix}sigma_low={low} and {prefix}sigma_high={high} are standard deviations: give "
-                    "bounds='sigma' with them (or 'variance'). bounds='quantile' takes its own from the covariances."
+                    f"{prefix}sigma_low={own.sigma_low} and {prefix}sigma_high={own.sigma_high} are standard "
+                    "deviations: give bounds='sigma' with them, or 'variance'; 'quantile' takes its own."
                 )
 
     def __call__(self, covariance: Float[Tensor, "*b d d"] | Any, mass: Any = None) -> Float[Tensor, "*b d d"]:
@@ -118,16 +121,23 @@ class StiffnessLaw:
         """
         matrix, spectrum = as_semidefinite(covariance, "covariance")
         blocks = self.blocks(matrix.shape[-1])
+        known = spectrum if len(blocks) == 1 else None
+        if self.kind == "linear" or self.effort == "match":
+            blocks = [self._with_bounds(block, matrix, known) for block in blocks]
+        masses = matrix
         if self.kind == "precision":
-            return self._precise(matrix, blocks, mass)
-        if len(blocks) == 1:
-            return self._linear(blocks[0], matrix, spectrum)
-        if self.cross_terms:
-            return self._coupled(matrix, blocks)
+            blocks, masses = self._with_efforts(blocks, mass, matrix)
+            matrix, masses = torch.broadcast_tensors(matrix, masses)
         stiffness = torch.zeros_like(matrix)
-        for block in blocks:
-            part = block.of(matrix)
-            stiffness[..., block.outputs, block.outputs] = self._linear(block, part, None)
+        for group in [blocks] if self.cross_terms else [[block] for block in blocks]:
+            outputs = slice(group[0].outputs.start, group[-1].outputs.stop)
+            part = matrix[..., outputs, outputs]
+            if self.kind == "precision":
+                given = (_vector(group, name, part) for name in ("effort", "stiffness_min", "stiffness_max"))
+                own = precision_stiffness(part, masses[..., outputs, outputs], *given)
+            else:
+                own = self._linear(group[0], part, known) if len(group) == 1 else self._coupled(group, part)
+            stiffness[..., outputs, outputs] = own
         return stiffness
 
     def fitted(
@@ -144,26 +154,25 @@ class StiffnessLaw:
         """
         matrix = as_semidefinite(covariance, "covariance")[0].detach()
         blocks = self.blocks(matrix.shape[-1])
-        each = [resolution] * matrix.shape[-1] if isinstance(resolution, float | int) else list(resolution)
-        finest = [checks.number(each[block.outputs.start], "resolution", least=0.0) for block in blocks]
-        scales = [
-            self._scales(block, block.of(matrix), None, *least) for block, *least in zip(blocks, finest, strict=True)
-        ]
-        effort = self.effort
+        finest = [resolution] * matrix.shape[-1] if isinstance(resolution, float | int) else list(resolution)
+        for i, block in enumerate(blocks):
+            least = checks.number(finest[block.outputs.start], "resolution", least=0.0)
+            blocks[i] = self._with_bounds(block, matrix, resolution=least)
+        changes: dict[str, Any] = {}
         if self.kind == "precision":
-            efforts = self._efforts(matrix, blocks, mass, scales)
-            effort = efforts[0] if len(blocks) == 1 else efforts
-        rotation, own = self.rotation, scales
-        if rotation is not None:
-            rotation, own = replace(rotation, sigma_low=scales[-1][0], sigma_high=scales[-1][1]), scales[:-1]
-        low, high = own[0] if len(own) == 1 else zip(*own, strict=True)
-        changes: dict[str, Any] = {"sigma_low": low, "sigma_high": high, "rotation": rotation, "effort": effort}
+            blocks = self._with_efforts(blocks, mass, matrix)[0]
+            changes["effort"] = _one_or_each([block.effort for block in blocks])
+        if self.rotation is not None:
+            *blocks, last = blocks
+            changes["rotation"] = replace(self.rotation, sigma_low=last.sigma_low, sigma_high=last.sigma_high)
+        changes["sigma_low"] = _one_or_each([block.sigma_low for block in blocks])
+        changes["sigma_high"] = _one_or_each([block.sigma_high for block in blocks])
         return replace(self, bounds="sigma", **changes)
 
     def blocks(self, n_outputs: int) -> list[Block]:
         """Blocks of so many outputs, in order."""
         rotation, n_positions = self.rotation, n_outputs - (0 if self.rotation is None else 3)
-        rows = (self.stiffness_min, self.stiffness_max, self.sigma_low, self.sigma_high)
+        rows: list[Any] = [self.stiffness_min, self.stiffness_max, self.sigma_low, self.sigma_high]
         sizes = {len(row) for row in rows if isinstance(row, tuple)}
         if n_positions < 1 or not sizes <= {n_positions}:
             wanted = " or ".join(map(str, sorted(sizes))) or "one or more"
@@ -171,11 +180,11 @@ class StiffnessLaw:
             raise InvalidParameterError(
                 f"covariance is of {n_outputs} outputs, must be of {wanted}{more}, as the law is."
             )
-        name = "positions" if rotation is not None else ""
-        blocks = [Block(slice(0, n_positions), *rows, name=name)] if not sizes else []  # type: ignore[arg-type]
         if sizes:
-            each = [row if isinstance(row, tuple) else [row] * n_positions for row in rows]
-            blocks = [Block(slice(i, i + 1), *row, name=f"output {i}") for i, row in enumerate(zip(*each, strict=True))]
+            each = zip(*(row if isinstance(row, tuple) else [row] * n_positions for row in rows), strict=True)
+            blocks = [Block(slice(i, i + 1), *row, name=f"output {i}") for i, row in enumerate(each)]
+        else:
+            blocks = [Block(slice(0, n_positions), *rows, name="positions" if rotation is not None else "")]
         if rotation is not None:
             own = rotation.stiffness_min, rotation.stiffness_max, rotation.sigma_low, rotation.sigma_high
             blocks.append(Block(slice(n_positions, n_outputs), *own, name="rotations"))
@@ -186,13 +195,11 @@ class StiffnessLaw:
         blocks = self.blocks(n_outputs)
         if len(blocks) == 1:
             return blocks[0].stiffness_min, blocks[0].stiffness_max
-        low, high = zip(*[(block.stiffness_min, block.stiffness_max) for block in blocks], strict=True)
-        return tuple(limits.of_outputs(blocks, low)), tuple(limits.of_outputs(blocks, high))
+        return tuple(of_outputs(blocks, "stiffness_min")), tuple(of_outputs(blocks, "stiffness_max"))
 
     def _linear(self, block: Block, matrix: Tensor, spectrum: tuple[Tensor, Tensor] | None) -> Tensor:
         """Stiffness of one block by eq. (19) and (20)."""
-        spectrum = tuple(torch.linalg.eigh(matrix.detach())) if spectrum is None else spectrum
-        low, high = self._scales(block, matrix, spectrum[0])
+        low, high = block.sigma_low, block.sigma_high
         least, most = block.stiffness_min, block.stiffness_max
 
         def stiffness(variance: Tensor) -> Tensor:
@@ -203,7 +210,7 @@ class StiffnessLaw:
 
         return spectral_map(matrix, stiffness, spectrum)
 
-    def _coupled(self, matrix: Tensor, blocks: list[Block]) -> Tensor:
+    def _coupled(self, blocks: list[Block], matrix: Tensor) -> Tensor:
         """Stiffness of all blocks with what couples them, equal to :meth:`_linear` of each where nothing does.
 
         Eq. (20) is, with the share u = clip(g (1 - s / s_high)), g = s_high / (s_high - s_low), of the way from the
@@ -211,60 +218,64 @@ class StiffnessLaw:
         1 / s_high, G and E, and U = clip(G^1/2 (1 - (H Sigma H)^1/2) G^1/2), which has no unit, all of it is a law of
         matrices: 0 <= U <= 1, so that K lies within its limits, and no length makes rotations of positions.
         """
-        scales = [self._scales(block, block.of(matrix), None) for block in blocks]
-        inverse = matrix.new_tensor(limits.of_outputs(blocks, [1.0 / high for _, high in scales]))
-        gain = matrix.new_tensor(limits.of_outputs(blocks, [math.sqrt(high / (high - low)) for low, high in scales]))
+        names = ("sigma_low", "sigma_high", "stiffness_min", "stiffness_max")
+        low, high, least, most = (_vector(blocks, name, matrix) for name in names)
+        gain, extent = (high / (high - low)).sqrt(), (most - least).sqrt()
         tiny = torch.finfo(matrix.dtype).tiny
-        root = spectral_map(torch.outer(inverse, inverse) * matrix, lambda variance: variance.clamp_min(tiny).sqrt())
+        root = spectral_map(matrix / torch.outer(high, high), lambda variance: variance.clamp_min(tiny).sqrt())
         share = gain[:, None] * (torch.eye(len(gain)).to(matrix) - root) * gain
-        least, most = (matrix.new_tensor(limit) for limit in self.limits(len(gain)))
-        extent = (most - least).sqrt()
         eased = spectral_map(share, lambda u: self._eased(u.clamp(0.0, 1.0)))
         return torch.diag(least) + torch.outer(extent, extent) * eased
-
-    def _precise(self, matrix: Tensor, blocks: list[Block], mass: Any) -> Tensor:
-        """Stiffness of minimal intervention, of each block or of all with what couples them."""
-        scales = [self._scales(block, block.of(matrix), None) for block in blocks] if self.effort == "match" else []
-        efforts = self._efforts(matrix, blocks, mass, scales)
-        masses = as_masses(mass, matrix)
-        shape = broadcast_shapes(matrix.shape, masses.shape)
-        matrix, masses = matrix.expand(shape), masses.expand(shape)
-        given = efforts, [block.stiffness_min for block in blocks], [block.stiffness_max for block in blocks]
-        effort, low, high = (matrix.new_tensor(limits.of_outputs(blocks, values)) for values in given)
-        if self.cross_terms or len(blocks) == 1:
-            return precision_stiffness(matrix, masses, effort, low, high)
-        stiffness = torch.zeros_like(matrix)
-        for block in blocks:
-            rows = [part[block.outputs] for part in (effort, low, high)]
-            own = precision_stiffness(block.of(matrix), block.of(masses), *rows)
-            stiffness[..., block.outputs, block.outputs] = own
-        return stiffness
-
-    def _efforts(self, matrix: Tensor, blocks: list[Block], mass: Any, scales: list[Scales]) -> tuple[float, ...]:
-        """Effort r of each block."""
-        if self.effort == "match":
-            masses = as_masses(mass, matrix)
-            ends = [
-                (block.of(masses), high, block.stiffness_min) for block, (_, high) in zip(blocks, scales, strict=True)
-            ]
-            return tuple(matched_effort(*end) for end in ends)
-        given: Any = self.effort
-        efforts = tuple(map(float, given)) if isinstance(given, tuple) else (float(given),) * len(blocks)
-        if len(efforts) != len(blocks):
-            raise InvalidParameterError(
-                f"effort has {len(efforts)} numbers, must be one, or {len(blocks)}: one a block."
-            )
-        return efforts
 
     def _eased(self, share: Tensor) -> Tensor:
         return share * share * (3.0 - 2.0 * share) if self.smooth else share
 
-    def _scales(self, block: Block, part: Tensor, variances: Tensor | None, resolution: float = 0.0) -> Scales:
-        """Bounds of the standard deviation of one block whose covariances are ``part``."""
-        if self.bounds == "quantile":
-            variances = torch.linalg.eigvalsh(part.detach()) if variances is None else variances
-            return limits.quantiles(variances, resolution, block.name)
-        assert block.sigma_low is not None
-        assert block.sigma_high is not None
-        low, high = block.sigma_low, block.sigma_high
-        return (math.sqrt(low), math.sqrt(high)) if self.bounds == "variance" else (low, high)
+    def _with_efforts(self, blocks: list[Block], mass: Any, like: Tensor) -> tuple[list[Block], Tensor]:
+        """Blocks with their effort r, as given, or matched to their bounds; and the mass, as matrices."""
+        if mass is None:
+            raise checks.refusal(None, "mass", "given", "the stiffness of kind='precision' depends on it")
+        masses = masses_like(as_mass(mass), like, "covariance")
+        efforts: Any = self.effort if isinstance(self.effort, tuple) else [self.effort] * len(blocks)
+        if len(efforts) != len(blocks):
+            raise InvalidParameterError(
+                f"effort has {len(efforts)} numbers, must be one, or {len(blocks)}: one a block."
+            )
+        if self.effort == "match":
+            efforts = [matched_effort(block.of(masses), block.sigma_high, block.stiffness_min) for block in blocks]
+        return [block._replace(effort=effort) for block, effort in zip(blocks, efforts, strict=True)], masses
+
+    def _with_bounds(
+        self, block: Block, matrix: Tensor, spectrum: tuple[Tensor, Tensor] | None = None, resolution: float = 0.0
+    ) -> Block:
+        """Block with bounds of its standard deviation: as given, or quantiles of those along all axes of its part.
+
+        Smaller ones count as ``resolution``. Warns where they do not vary.
+        """
+        if self.bounds != "quantile":
+            root = math.sqrt if self.bounds == "variance" else float
+            return block._replace(sigma_low=root(block.sigma_low), sigma_high=root(block.sigma_high))
+        variances = torch.linalg.eigvalsh(block.of(matrix).detach()) if spectrum is None else spectrum[0]
+        if not variances.numel():
+            raise InvalidParameterError(
+                "covariance is empty, must have at least one matrix: bounds='quantile' takes quantiles of them."
+            )
+        scales = variances.clamp_min(0.0).sqrt().clamp_min(resolution).flatten()
+        low, high = torch.quantile(scales, scales.new_tensor(_QUANTILES)).tolist()
+        # Quantiles that differ by rounding only would make a step of the line between them.
+        if high <= low * (1.0 + checks.ROUNDING):
+            checks.warn(
+                f"The covariances {f'of {block.name} ' if block.name else ''}do not vary: their standard deviations "
+                f"have quantiles {low:.3g} and {high:.3g}. Every direction counts as precise, and gets stiffness_max; "
+                "give sigma_low and sigma_high with bounds='sigma' to say what is precise."
+            )
+            low = max(high * (1.0 + 1e-6), _SMALLEST) if high else 1.0
+            high = 2.0 * low
+        return block._replace(sigma_low=low, sigma_high=high)
+
+
+def _vector(blocks: list[Block], name: str, like: Tensor) -> Tensor:
+    return like.new_tensor(of_outputs(blocks, name))
+
+
+def _one_or_each(values: list[Any]) -> Any:
+    return values[0] if len(values) == 1 else tuple(values)

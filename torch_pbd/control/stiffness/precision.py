@@ -15,23 +15,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torch_pbd import checks
-from torch_pbd.control.matrices import as_mass, check_fits
+from torch_pbd.control.matrices import as_mass, as_semidefinite, damping_from_stiffness, masses_like
 from torch_pbd.exceptions import InvalidParameterError
-from torch_pbd.linalg import spectral_map
+from torch_pbd.linalg import spectral_map, symmetrize
 
 # Of the lightest mass over the heaviest stiffness: deviations of no variance would be infinitely stiff. What is stiffer
 # than a million times the limit is held at the limit all the same, and leaves ten digits to what is not.
 _STIFFEST = 1e6
-
-
-def as_masses(mass: Any, like: Tensor) -> Tensor:
-    """Masses (..., d, d) that fit matrices (..., d, d), of a number in kg or of matrices."""
-    if mass is None:
-        raise checks.refusal(None, "mass", "given", "the stiffness of kind='precision' depends on it")
-    matrix = torch.as_tensor(as_mass(mass)).to(like)
-    matrix = matrix if matrix.ndim else matrix * torch.eye(like.shape[-1]).to(like)
-    check_fits(matrix, like, "covariance")
-    return matrix
 
 
 def matched_effort(mass: Float[Tensor, "*b d d"], scale: float, stiffness: float) -> float:
@@ -69,3 +59,78 @@ def precision_stiffness(
     share = root @ inverse @ root - torch.diag(low / metric**2)
     held = spectral_map(share, lambda u: u.clamp(0.0, 1.0))
     return torch.diag(low) + torch.outer(extent, extent) * held
+
+
+def lqt(
+    covariance: Float[Tensor, "n d d"] | Any,
+    mass: Any,
+    dt: float,
+    *,
+    effort: float = 1e-6,
+    horizon: float | None = None,
+) -> tuple[Float[Tensor, "n d d"], Float[Tensor, "n d d"]]:
+    """Stiffness and damping (n, d, d) that minimize the expected cost of what is ahead, not of what is now.
+
+    The cost is that of ``StiffnessLaw(kind="precision")``, ``e' Sigma^-1 e + r f' M^-1 f``, from each row to the end of
+    its horizon, whose end cost is that of the row there, held for ever. A free end would leave nothing to do but in
+    time, and stiffness grows without bound for it. Where the covariance does not change this is the precision law with
+    a damping ratio of 1/sqrt(2), without limits.
+
+    Parameters
+    ----------
+    covariance : Tensor of shape (n, d, d)
+        Positive definite, at ticks of ``dt``, each held over its tick.
+    mass : float or Tensor of shape (d, d) or (n, d, d)
+        In kg.
+    dt : float
+        In s.
+    effort : float, default=1e-6
+        The r, in kg/N^2.
+    horizon : float, default=None
+        How far ahead each row sees, in s; None is to the last row.
+
+    Returns
+    -------
+    stiffness, damping : Tensor of shape (n, d, d)
+        The symmetric part of the optimal stiffness, which is not symmetric where axes turn; of no limits.
+    """
+    matrix = as_semidefinite(covariance, "covariance")[0]
+    if matrix.ndim != 3 or not bool((torch.linalg.eigvalsh(matrix)[:, 0] > 0.0).all()):
+        raise InvalidParameterError("covariance must have shape (n, d, d) and be positive definite: lqt has no limits.")
+    dt, r = checks.number(dt, "dt", above=0.0, unit="s"), checks.number(effort, "effort", above=0.0, unit="kg/N^2")
+    n, d = matrix.shape[:2]
+    ahead = n - 1 if horizon is None else round(checks.number(horizon, "horizon", least=0.0, unit="s") / dt)
+    masses = masses_like(as_mass(mass), matrix, "covariance").expand(matrix.shape)
+    precision, lightness = torch.linalg.inv(matrix), torch.linalg.inv(masses)
+    still, moving = slice(0, d), slice(d, 2 * d)
+    # Over a tick the costate P z of the state z = (e, e') and the state are moved by one matrix exponential.
+    flow = matrix.new_zeros(n, 4 * d, 4 * d)
+    flow[:, still, moving] = torch.eye(d).to(matrix)
+    flow[:, moving, 3 * d :] = -lightness / r
+    flow[:, 2 * d : 3 * d, still] = -precision
+    flow[:, 3 * d :, 2 * d : 3 * d] = -torch.eye(d).to(matrix)
+    back = torch.linalg.matrix_exp(-dt * flow)
+    # The cost for ever under one covariance is that of the precision law: its stiffness M # (Sigma^-1 / r) is the
+    # geometric mean of mass and stiffness, which is the damping of a ratio of a half.
+    stiffness = damping_from_stiffness(precision / r, masses, 0.5)
+    damping = damping_from_stiffness(stiffness, masses, 0.5**0.5)
+    whole = torch.cat([stiffness @ lightness @ damping, stiffness], dim=-1)
+    cost = r * torch.cat([whole, torch.cat([stiffness, damping], dim=-1)], dim=-2)
+    if horizon is None:
+        for row in range(n - 2, -1, -1):
+            cost[row] = _before(cost[row + 1], back[row])
+    else:
+        rows = torch.arange(n)
+        cost = cost[(rows + ahead).clamp(max=n - 1)]
+        for step in range(ahead - 1, -1, -1):
+            inside = rows + step < n - 1
+            cost = torch.where(inside[:, None, None], _before(cost, back[(rows + step).clamp(max=n - 1)]), cost)
+    return symmetrize(cost[:, moving, still]) / r, symmetrize(cost[:, moving, moving]) / r
+
+
+def _before(cost: Tensor, back: Tensor) -> Tensor:
+    """Cost P of states at the start of a tick, of that at its end: the costate is P z at both."""
+    k = cost.shape[-1]
+    state = back[..., :k, :k] + back[..., :k, k:] @ cost
+    costate = back[..., k:, :k] + back[..., k:, k:] @ cost
+    return symmetrize(torch.linalg.solve(state.mT, costate.mT).mT)
