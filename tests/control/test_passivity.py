@@ -172,7 +172,7 @@ def test_the_worst_force_cannot_break_the_rate_limit_nor_is_a_share_too_small(dt
     """
     stiffness, damping = schedules(200, 2, generator)
     alpha = 0.03
-    limit = RateLimit(alpha).start(stiffness, damping, MASS, ticks._tick_change)
+    limit = RateLimit(alpha).start(stiffness, damping, MASS, ticks.tick_change)
     nowhere = torch.zeros(200, 2).double()
     gains = []
     for k in (0, 1):

@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation
 from torch_pbd import rotations
 from torch_pbd.control.filters import EnergyTank, RateLimit, lyapunov_matrix
 from torch_pbd.control.simulation.plant import AdmittancePlant
-from torch_pbd.control.simulation.poses import exp, multiply, rotation_between, turning
 from torch_pbd.control.simulation.sensor import ForceSensor, PositionLoop
-from torch_pbd.control.simulation.ticks import admittance_rate
+from torch_pbd.control.simulation.ticks import admittance_rate, exp, multiply, rotation_between, turning
 from torch_pbd.control.simulation.walls import Tunnel
 
 # Inertia of an arm's tool, as those of a Panda: kg, kg m and kg m2.

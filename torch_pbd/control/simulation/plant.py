@@ -11,10 +11,9 @@ from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control.filters import StiffnessFilter
 from torch_pbd.control.matrices import as_mass, as_tensor, mass_rows
-from torch_pbd.control.simulation.poses import turning
 from torch_pbd.control.simulation.rollout import Rollout, run_task
 from torch_pbd.control.simulation.sensor import ForceSensor, PositionLoop
-from torch_pbd.control.simulation.ticks import Environment, Task
+from torch_pbd.control.simulation.ticks import Environment, Task, turning
 from torch_pbd.exceptions import InvalidParameterError
 
 _PARTS = {

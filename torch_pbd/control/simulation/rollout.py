@@ -1,17 +1,32 @@
 """A simulated run: states, forces and gains over time."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any, final
 
 import torch
 from torch import Tensor
 
-from torch_pbd.control.simulation.poses import exp, multiply, rotation_between, warn_if_far
-from torch_pbd.control.simulation.ticks import Loop, Task, open_loop
+from torch_pbd import checks
+from torch_pbd.control.simulation.ticks import (
+    State,
+    Task,
+    exp,
+    mass_at,
+    multiply,
+    open_loop,
+    rotation_between,
+    tick_change,
+    tick_map,
+    tick_maps,
+)
 from torch_pbd.files.memory import require_memory
 from torch_pbd.linalg import broadcast_shapes
 
+# rad. The path of a push is off by about a sixth of its largest angle, of that angle: a quarter here.
+_FAR = 0.5 * math.pi
 # Dimensions of a run's values behind those of the batch; of what is not here it is that of ticks alone.
 _N_DIMS = {"position": 2, "velocity": 2, "force": 2, "commanded_position": 2, "stiffness": 3, "damping": 3}
 
@@ -126,6 +141,74 @@ class Rollout:
         return self.time[self.filter_share < 1.0]
 
 
+class Loop:
+    """State (..., d) of a run with what acts in it, which moves on tick by tick."""
+
+    def __init__(self, task: Task, state: State, generator: torch.Generator | None) -> None:
+        self._task = task
+        self._deviation, self._velocity = state[0] - task.position[..., 0, :], state[1]
+        loop, sensor, wanted = task.position_loop, task.sensor, task.stiffness_filter
+        self._robot = None if loop is None else loop.start(*state, task.dt)
+        self._read = None if sensor is None else sensor.start(state[0], task.dt, generator)
+        gains = task.stiffness, task.damping, task.mass
+        self._filter = None if wanted is None else wanted.start(*gains, tick_change)
+        self._maps = (each for _, maps in tick_maps(task, task.dt / task.substeps) for each in maps.unbind(-3))
+
+    def run(self, tick: int, force: Tensor) -> dict[str, Tensor]:
+        """One tick under a force (..., d): measure, choose the gains, move; fields of a Rollout at its start."""
+        task = self._task
+        desired = task.position[..., tick, :]
+        stiffness, damping = task.stiffness[..., tick, :, :], task.damping[..., tick, :, :]
+        commanded = self._deviation + desired
+        at = (commanded, self._velocity) if self._robot is None else (self._robot.position, self._robot.velocity)
+        total = force + self._wall(*at)
+        record = {"position": at[0], "velocity": at[1], "commanded_position": commanded, "force": total}
+        if self._filter is not None:
+            self._filter.select(stiffness, damping, mass_at(task.mass, tick), task.dt, self._deviation)
+            stiffness, damping, record["filter_share"] = self._filter.gains
+            if self._filter.tank_energy is not None:
+                record["tank_energy"] = self._filter.tank_energy
+        measured = total
+        if self._read is not None:
+            measured, record["saturated"] = self._read(total)
+        push = (damping @ task.velocity[..., tick, :].unsqueeze(-1)).squeeze(-1) + task.inertial_force[..., tick, :]
+        if self._filter is None:
+            each = next(self._maps)
+        else:
+            each = tick_map(stiffness, damping, mass_at(task.mass, tick), task.dt)
+        self._move(each, (force, measured), push, desired)
+        if self._robot is not None:
+            self._robot(commanded)
+        if tick + 1 < task.n_ticks:
+            self._deviation = task.carry(tick, self._deviation) - (task.position[..., tick + 1, :] - desired)
+            if self._robot is not None:
+                self._robot.carry(partial(task.carry, tick))
+            if self._filter is not None and task.turning is not None:
+                self._filter.carry(task.turning.transport[..., tick, :, :])
+        return record | {"stiffness": stiffness, "damping": damping}
+
+    def _wall(self, position: Tensor, velocity: Tensor) -> Tensor:
+        walls, p = self._task.environment, self._task.n_positions
+        if walls is None:
+            return torch.zeros_like(position)
+        force = walls.force(position[..., :p], velocity[..., :p])
+        return torch.nn.functional.pad(force, (0, position.shape[-1] - p))  # on a point: without a torque
+
+    def _move(self, each: Tensor, forces: tuple[Tensor, Tensor], push: Tensor, desired: Tensor) -> None:
+        """Move over the tick by its map and the measured force; the walls are evaluated anew in each of its parts."""
+        outside, force = forces
+        for part in range(self._task.substeps):
+            before = self._deviation, self._velocity
+            if part:
+                force = outside + self._wall(before[0] + desired, before[1])
+            held = (force + push).expand_as(before[0])
+            state = torch.cat([*before, held], dim=-1)
+            after = state @ each.mT if each.ndim == 2 else (each @ state.unsqueeze(-1)).squeeze(-1)
+            self._deviation, self._velocity = after.chunk(2, dim=-1)
+            if self._filter is not None:
+                self._filter.settle(before, (self._deviation, self._velocity), held)
+
+
 def run_task(
     task: Task,
     force: Tensor | None = None,
@@ -193,4 +276,13 @@ def _check_memory(task: Task, n_rollouts: int) -> None:
             of_each * n_rollouts * task.n_ticks * task.position.element_size(),
             what=f"a simulation of {n_rollouts} rollouts of {task.n_ticks} ticks",
             remedy="Simulate fewer at a time, or take simulate_many, which keeps no trajectories.",
+        )
+
+
+def warn_if_far(angle: float) -> None:
+    """Warn where the robot is so far from the desired orientation that a linear model is no longer one."""
+    if angle > _FAR:
+        checks.warn(
+            f"The robot is turned by up to {angle:.2g} rad from the desired orientation, where the linear plant "
+            "is off by a quarter of the path or more: push less, or raise the stiffness of rotations."
         )

@@ -12,7 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torch_pbd.checks import Floats
-from torch_pbd.control.simulation.ticks import Loop, Task, block_length, block_responses
+from torch_pbd.control.simulation.rollout import Loop
+from torch_pbd.control.simulation.ticks import Task, block_length, block_responses
 
 # Rollouts that move on together: at d = 2 the forces, states and deviations of a block of them are 4 MB, which stay in
 # a processor's cache.

@@ -12,8 +12,7 @@ from torch_pbd.checks import Floats
 from torch_pbd.control.matrices import mass_rows
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.plant import AdmittancePlant
-from torch_pbd.control.simulation.poses import warn_if_far
-from torch_pbd.control.simulation.rollout import Rollout, run_task
+from torch_pbd.control.simulation.rollout import Rollout, run_task, warn_if_far
 from torch_pbd.control.simulation.rollouts import RolloutSummary, Tally, push_many
 from torch_pbd.control.simulation.ticks import Task, block_length
 from torch_pbd.exceptions import InvalidParameterError

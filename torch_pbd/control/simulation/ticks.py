@@ -1,21 +1,25 @@
 """The ticks behind :class:`~torch_pbd.control.AdmittancePlant`, with and without what acts in the loop.
 
 With the deviation y from the desired position, ``M a = u - K y - D v``. Everything is held over a tick, in which the
-matrix exponential is then exact, whatever its length; at its end the desired position moves on. Of poses, y is the
-position and the rotation from the desired orientation, and that moves on as :mod:`poses` says.
+matrix exponential is then exact, whatever its length; at its end the desired position moves on.
+
+Of poses, y is the position, and the rotation of the robot R from the desired R_d as the vector ``e = Log(R R_d')``, in
+world axes. In a tick, R_d stands still and e moves with the angular velocity w; at its end R_d turns by ``delta``, and
+e becomes ``exp([delta]) (e - delta)``. Of a robot that turned by delta itself, so that e had become ``e + delta``, this
+is exact: R and R_d are then both turned in the world, and e with them. It is the discrete form of
+``e' = w - w_d + w_d x e``, to first order in e.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torch_pbd.control.filters import StiffnessFilter
-from torch_pbd.control.simulation.poses import Turning
 from torch_pbd.control.simulation.sensor import ForceSensor, PositionLoop
 
 State = tuple[Tensor, Tensor]
@@ -53,6 +57,49 @@ class Environment(Protocol):
 
     def force(self, position: Tensor, velocity: Tensor) -> Tensor:
         """Force in N on a robot at these positions, in m, and velocities (..., p); of a pose its position alone."""
+
+
+def multiply(first: Float[Tensor, "*a 4"], second: Float[Tensor, "*b 4"]) -> Float[Tensor, "*c 4"]:
+    """Product of quaternions w x y z: the rotation by ``second``, then by ``first``."""
+    (a, v), (b, w) = (each.split([1, 3], dim=-1) for each in torch.broadcast_tensors(first, second))
+    return torch.cat([a * b - (v * w).sum(-1, keepdim=True), a * w + b * v + torch.linalg.cross(v, w)], dim=-1)
+
+
+def exp(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4"]:
+    """Quaternion of a rotation vector."""
+    half = 0.5 * torch.linalg.vector_norm(vector, dim=-1, keepdim=True)
+    return torch.cat([torch.cos(half), 0.5 * torch.sinc(half / math.pi) * vector], dim=-1)
+
+
+def rotation_between(start: Float[Tensor, "*a 4"], end: Float[Tensor, "*b 4"]) -> Float[Tensor, "*c 3"]:
+    """Rotation vector in world axes from one orientation to another, the shorter way: at most pi long."""
+    nearer = torch.where((end * start).sum(-1, keepdim=True) < 0.0, -end, end)
+    conjugate = torch.cat([start[..., :1], -start[..., 1:]], dim=-1)
+    # Of the difference, so that small rotations keep their digits: q2 q1' = 1 + (q2 - q1) q1'.
+    away, xyz = multiply(nearer - start, conjugate).split([1, 3], dim=-1)
+    length = torch.linalg.vector_norm(xyz, dim=-1, keepdim=True)
+    tiny = length < torch.finfo(length.dtype).tiny
+    angle = 2.0 * torch.atan2(length, 1.0 + away)
+    return torch.where(tiny, 2.0, angle / torch.where(tiny, 1.0, length)) * xyz
+
+
+class Turning(NamedTuple):
+    """Desired orientations (..., T, 4) of a task, with the turns (..., T, 3) that end its ticks, none the last.
+
+    ``transport`` (..., T, 3, 3) is ``exp([turn])``, which takes along what turns with the desired orientation.
+    """
+
+    orientation: Tensor
+    turns: Tensor
+    transport: Tensor
+
+
+def turning(orientation: Float[Tensor, "*b t 4"]) -> Turning:
+    """Turns of unit quaternions from tick to tick."""
+    turns = rotation_between(orientation[..., :-1, :], orientation[..., 1:, :])
+    turns = torch.nn.functional.pad(turns, (0, 0, 0, 1))
+    rows = torch.linalg.cross(turns.unsqueeze(-2), torch.eye(3).to(turns).expand(*turns.shape, 3))
+    return Turning(orientation, turns, torch.linalg.matrix_exp(rows.mT))
 
 
 @dataclass(frozen=True)
@@ -169,81 +216,15 @@ def tick_maps(task: Task, dt: float) -> Iterator[tuple[slice, Tensor]]:
     for first in range(0, task.n_ticks, n_together):
         ticks = slice(first, min(first + n_together, task.n_ticks))
         gains = task.stiffness[..., ticks, :, :], task.damping[..., ticks, :, :]
-        yield ticks, _tick_map(*gains, mass_at(task.mass, ticks), dt)
+        yield ticks, tick_map(*gains, mass_at(task.mass, ticks), dt)
 
 
-def _tick_map(stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> Tensor:
+def tick_map(stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> Tensor:
+    """Map of ``[deviation, velocity, force]`` to the deviation and velocity after a tick of ``dt`` s."""
     return transition(admittance_rate(stiffness, damping, mass), dt)[..., : 2 * stiffness.shape[-1], :]
 
 
-def _tick_change(stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> Tensor:
-    each = _tick_map(stiffness, damping, mass, dt)
+def tick_change(stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> Tensor:
+    """Map of ``[deviation, velocity, force]`` to what changes in deviation and velocity over a tick of ``dt`` s."""
+    each = tick_map(stiffness, damping, mass, dt)
     return each - torch.eye(each.shape[-1]).to(each)[: each.shape[-2]]
-
-
-class Loop:
-    """State (..., d) of a run with what acts in it, which moves on tick by tick."""
-
-    def __init__(self, task: Task, state: State, generator: torch.Generator | None) -> None:
-        self._task = task
-        self._deviation, self._velocity = state[0] - task.position[..., 0, :], state[1]
-        loop, sensor, wanted = task.position_loop, task.sensor, task.stiffness_filter
-        self._robot = None if loop is None else loop.start(*state, task.dt)
-        self._read = None if sensor is None else sensor.start(state[0], task.dt, generator)
-        gains = task.stiffness, task.damping, task.mass
-        self._filter = None if wanted is None else wanted.start(*gains, _tick_change)
-        self._maps = (each for _, maps in tick_maps(task, task.dt / task.substeps) for each in maps.unbind(-3))
-
-    def run(self, tick: int, force: Tensor) -> dict[str, Tensor]:
-        """One tick under a force (..., d): measure, choose the gains, move; fields of a Rollout at its start."""
-        task = self._task
-        desired = task.position[..., tick, :]
-        stiffness, damping = task.stiffness[..., tick, :, :], task.damping[..., tick, :, :]
-        commanded = self._deviation + desired
-        at = (commanded, self._velocity) if self._robot is None else (self._robot.position, self._robot.velocity)
-        total = force + self._wall(*at)
-        record = {"position": at[0], "velocity": at[1], "commanded_position": commanded, "force": total}
-        if self._filter is not None:
-            self._filter.select(stiffness, damping, mass_at(task.mass, tick), task.dt, self._deviation)
-            stiffness, damping, record["filter_share"] = self._filter.gains
-            if self._filter.tank_energy is not None:
-                record["tank_energy"] = self._filter.tank_energy
-        measured = total
-        if self._read is not None:
-            measured, record["saturated"] = self._read(total)
-        push = (damping @ task.velocity[..., tick, :].unsqueeze(-1)).squeeze(-1) + task.inertial_force[..., tick, :]
-        if self._filter is None:
-            each = next(self._maps)
-        else:
-            each = _tick_map(stiffness, damping, mass_at(task.mass, tick), task.dt)
-        self._move(each, (force, measured), push, desired)
-        if self._robot is not None:
-            self._robot(commanded)
-        if tick + 1 < task.n_ticks:
-            self._deviation = task.carry(tick, self._deviation) - (task.position[..., tick + 1, :] - desired)
-            if self._robot is not None:
-                self._robot.carry(partial(task.carry, tick))
-            if self._filter is not None and task.turning is not None:
-                self._filter.carry(task.turning.transport[..., tick, :, :])
-        return record | {"stiffness": stiffness, "damping": damping}
-
-    def _wall(self, position: Tensor, velocity: Tensor) -> Tensor:
-        walls, p = self._task.environment, self._task.n_positions
-        if walls is None:
-            return torch.zeros_like(position)
-        force = walls.force(position[..., :p], velocity[..., :p])
-        return torch.nn.functional.pad(force, (0, position.shape[-1] - p))  # on a point: without a torque
-
-    def _move(self, each: Tensor, forces: tuple[Tensor, Tensor], push: Tensor, desired: Tensor) -> None:
-        """Move over the tick by its map and the measured force; the walls are evaluated anew in each of its parts."""
-        outside, force = forces
-        for part in range(self._task.substeps):
-            before = self._deviation, self._velocity
-            if part:
-                force = outside + self._wall(before[0] + desired, before[1])
-            held = (force + push).expand_as(before[0])
-            state = torch.cat([*before, held], dim=-1)
-            after = state @ each.mT if each.ndim == 2 else (each @ state.unsqueeze(-1)).squeeze(-1)
-            self._deviation, self._velocity = after.chunk(2, dim=-1)
-            if self._filter is not None:
-                self._filter.settle(before, (self._deviation, self._velocity), held)
