@@ -91,7 +91,7 @@ def test_split_is_a_partition(ragged):
     assert ragged.split([-1, 0]) == (ragged[[1]], ragged[[0, 2]])
     for k, words in [
         (3, "numbered 0 to 2"),
-        ([0, 1, 2], "leaves out 3 of 3"),
+        ([0, 1, 2], "leaves out all 3"),
         ([], r"k is \[\], must be"),
         (0.5, r"k is 0\.5, must be"),
     ]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from torch_pbd.data import handwriting_covariance, handwriting_mean, make_handwriting_demonstrations
-from torch_pbd.data.handwriting import Shape
+from torch_pbd.data.via_points import Shape
 
 N_DEMOS = 2000
 SHAPES = get_args(Shape)

@@ -125,12 +125,12 @@ def test_units_may_be_one_a_list_or_by_name(tmp_path, units):
     ("arrays", "words"),
     [
         ({"a": X}, "no column 'time' among [a_0]"),
-        ({"t": T}, "has no array 'x'; it has: t"),
+        ({"t": T}, "has no array 'x'; it has: [t]"),
         ({"t": T, "x": X[0]}, "x has shape (3, 1), must have shape (K, T, d)"),
         ({"t_0": T, "x_0": X[0], "t_2": T, "x_2": X[0]}, "has demonstration 2 but no t_1, x_1"),
         ({"t_0": T, "x_0": X[0], "t_1": T}, "has no array 'x_1'"),
         ({"t": T, "x": X.astype(object)}, "array 'x' cannot be read"),
-        ({"t": T[::-1], "x": X}, "times must increase strictly"),
+        ({"t": T[::-1], "x": X}, "times[0] must increase strictly"),
         ({"t": T, "x": X * np.nan}, "positions[0] is nan at sample 0"),
         ({"t": T, "x": X, "meta": np.array("{")}, "meta must be a 0-d string with a JSON object"),
         (
@@ -223,7 +223,7 @@ def test_columns_of_csv_are_chosen_and_ordered(tmp_path):
         ),
         (CSV.replace(",", ";"), {"decimal": ","}, "line 2, column 'time': '0.0' is not a finite number"),
         (CSV.replace("3,4", "3,4,5"), {}, "line 3: 5 cells under 4 column names"),
-        (CSV.replace("0.7", "0.0"), {}, "line 5, column 'time': 0.0 comes after 0.0 in demonstration 'b'"),
+        (CSV.replace("0.7", "0.0"), {}, "times[1] must increase strictly, but sample 1 is at 0.0 after 0.0"),
         (CSV + "c,0,1,1\n", {}, "times[2] has 1 samples"),
         (CSV.encode("utf-16"), {}, "is not text in UTF-8"),
         (CSV + "c,0,1," + "1" * 200_000, {}, "line 6: field larger than field limit"),

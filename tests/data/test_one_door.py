@@ -88,11 +88,10 @@ def test_a_column_that_numbers_the_demonstrations_is_found_out(tmp_path):
         load_text(tmp_path, both)
 
 
-def test_reading_at_once_is_as_reading_line_by_line(tmp_path):
+def test_labels_of_demonstrations_may_be_of_any_length(tmp_path):
     recorded = make_tunnel_demonstrations(3, random_state=0)
     save_demonstrations(recorded, tmp_path / "set.csv")
     assert load_demonstrations(tmp_path / "set.csv", units="m") == recorded
-    # Long labels, and such that are longer than the first, are read line by line.
     text = (tmp_path / "set.csv").read_text()
     for number, n in ((0, 40), (2, 8), (2, 7)):
         assert load_text(tmp_path, text.replace(f"\n{number},", "\n" + "a" * n + ","), units="m") == recorded

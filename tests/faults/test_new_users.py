@@ -208,7 +208,7 @@ def test_65_stamps_in_errors_have_all_their_digits(tmp_path):
         Demonstrations([np.array([0, 1, 2, 3]) + float(NS)], np.zeros((1, 4, 1)))
     lines = "".join(f"a,{t},0.5\n" for t in falling)
     (tmp_path / "set.csv").write_text("demo,time,x\n" + lines)
-    with pytest.raises(DataFormatError, match=f"line 4, column 'time': {NS + 600} comes after {NS + 700} .*ns"):
+    with pytest.raises(DataFormatError, match=text):
         load_demonstrations(tmp_path / "set.csv")
     with pytest.raises(ValueError, match=r"at 1\.5 after 1\.5\. Sort the samples by time and drop repeated ones\.$"):
         Demonstrations([[0.0, 1.5, 1.5]], np.zeros((1, 3, 1)))

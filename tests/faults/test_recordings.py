@@ -140,20 +140,19 @@ def test_9_places_are_those_before_the_drop(door, tmp_path):
     backwards = [with_entry(TIME, 4, 2.5), TIME, TIME]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MissingDataWarning)
-        with pytest.raises(
-            ValueError, match=r"sample 4 is at 2\.5 after 3\.0|line 6, column 'time': 2\.5 comes after 3\.0"
-        ):
+        with pytest.raises(ValueError, match=r"sample 4 is at 2\.5 after 3\.0"):
             door(backwards, holed, tmp_path, missing="drop")
 
 
 def test_9_a_time_after_a_missing_one_is_held_to_the_last_known(tmp_path):
-    with pytest.raises(DataFormatError, match=r"line 4, column 'time': 0\.5 comes after 1\.0"):
-        from_text("demo,time,x\na,1,1\na,nan,2\na,0.5,3\n", tmp_path, missing="drop")
+    message = r"times\[0\] must increase strictly, but sample 2 is at 0\.5 after 1\.0"
+    with pytest.warns(MissingDataWarning), pytest.raises(DataFormatError, match=message):
+        from_text("demo,time,x\na,1,1\na,nan,2\na,0.5,3\na,2,4\n", tmp_path, missing="drop")
 
 
 def test_9_masked_samples_are_missing_ones():
     masked = np.ma.masked_where(np.arange(36).reshape(3, 6, 2) == 20, POSITIONS)
-    with pytest.raises(ValueError, match=r"positions\[1\] has masked entries: drop these samples \(missing='drop'\)"):
+    with pytest.raises(ValueError, match=r"positions\[1\] has masked entries: leave them out"):
         Demonstrations(TIME, masked)
     with pytest.warns(MissingDataWarning, match="1 of 6 in demonstration 1"):
         kept = Demonstrations(TIME, masked, missing="drop")
@@ -170,9 +169,7 @@ def test_9_samples_of_objects_that_are_none_are_missing_ones():
 
 def test_9_one_line_a_demonstration_gets_no_longer_with_many():
     holed = with_entry(np.zeros((40, 6, 1)), (slice(None), 3), np.nan)
-    with pytest.warns(
-        MissingDataWarning, match=r"Dropped 40 of 240 .* demonstration 11, \.\.\. \(40 demonstrations in all"
-    ):
+    with pytest.warns(MissingDataWarning, match=r"Dropped 40 of 240 .* demonstration 11, \.\.\. 40 in all"):
         Demonstrations(TIME, holed, missing="drop")
 
 
@@ -225,12 +222,7 @@ def test_10_times_that_do_not_increase_are_told_at_the_first(door, times, index,
     times = np.array(times, dtype=float)
     with pytest.raises(ValueError) as caught:
         door([TIME, times, TIME], POSITIONS, tmp_path)
-    if door is as_csv:
-        assert f"line {2 + 6 + index}, column 'time': {words.replace('after', 'comes after')}" in str(caught.value)
-    else:
-        assert f"times[1] must increase strictly, but sample {index} is at {words}. Sort the samples" in str(
-            caught.value
-        )
+    assert f"times[1] must increase strictly, but sample {index} is at {words}. Sort the samples" in str(caught.value)
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3])

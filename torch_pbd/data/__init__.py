@@ -1,9 +1,8 @@
 """Demonstrations: the container, files, alignment, and made ones."""
 
 from torch_pbd.data.demonstrations import Demonstrations
-from torch_pbd.data.handwriting import handwriting_covariance, handwriting_mean, make_handwriting_demonstrations
+from torch_pbd.data.description import check_unimodal
 from torch_pbd.data.io import inspect_demonstrations, load_demonstrations, save_demonstrations
-from torch_pbd.data.peg import make_pose_demonstrations, pose_covariance, pose_mean
 from torch_pbd.data.synthetic import (
     make_paper_simulation,
     make_tunnel_demonstrations,
@@ -13,7 +12,14 @@ from torch_pbd.data.synthetic import (
     tunnel_deviation,
     tunnel_half_width,
 )
-from torch_pbd.data.unimodality import check_unimodal
+from torch_pbd.data.via_points import (
+    handwriting_covariance,
+    handwriting_mean,
+    make_handwriting_demonstrations,
+    make_pose_demonstrations,
+    pose_covariance,
+    pose_mean,
+)
 
 __all__ = [
     "Demonstrations",

@@ -24,24 +24,19 @@ def interpolate(times: Floats, positions: Floats, query: Floats) -> Floats:
 
 
 def unit_phases(times: Sequence[Floats]) -> list[Floats]:
-    """Time of each demonstration mapped affinely onto 0..1, exactly 0 and 1 at its ends.
+    """Time of each demonstration mapped affinely onto 0..1, exactly 0 and 1 at its ends."""
+    return times_from_start(times, [time[-1] - time[0] for time in times])
 
-    Grids that differ only by offset and duration get the same phases to the last bit: rounding would otherwise hide
-    from an estimator that the demonstrations are aligned.
+
+def times_from_start(times: Sequence[Floats], units: Sequence[float] | None = None) -> list[Floats]:
+    """Times of each demonstration since its start, in a unit of its own if there are some.
+
+    Grids that differ only by rounding become one to the last bit: an estimator would otherwise not see that the
+    demonstrations are aligned.
     """
-    return _shared_grids(times, [time[-1] - time[0] for time in times])
-
-
-def times_from_start(times: Sequence[Floats]) -> list[Floats]:
-    """Times counted from the start of each demonstration; grids that differ only by rounding become one."""
-    return _shared_grids(times, [1.0] * len(times))
-
-
-def _shared_grids(times: Sequence[Floats], units: Sequence[float]) -> list[Floats]:
-    """Times of each demonstration since its start, in its unit; the first of several equal grids is that of all."""
     grids: dict[int, Floats] = {}
     shared = []
-    for time, unit in zip(times, units, strict=True):
+    for time, unit in zip(times, units or [1.0] * len(times), strict=True):
         own = (time - time[0]) / unit
         grid = grids.setdefault(len(time), own)
         # Rounding is a billionth of the duration, or what large stamps resolve: each difference has two, and two grids
@@ -97,7 +92,14 @@ def dtw_path(a: ArrayLike, b: ArrayLike) -> NDArray[np.intp]:
     second = checks.array(b, "b", ("m", first.shape[1]))
     if not first.size or not second.size:
         raise InvalidParameterError(f"a has shape {first.shape} and b {second.shape}, must have samples and outputs.")
-    return _backtrack(_accumulated_cost(first, second))
+    total = _accumulated_cost(first, second)
+    i, j = len(first), len(second)
+    path = [(i, j)]
+    while (i, j) != (1, 1):
+        steps = [(i - 1, j - 1), (i - 1, j), (i, j - 1)]
+        i, j = min(steps, key=lambda step: total[step])  # the border is infinite but for its corner
+        path.append((i, j))
+    return np.array(path[::-1], dtype=np.intp) - 1
 
 
 def dtw_warps(curves: Floats) -> Floats:
@@ -111,10 +113,13 @@ def dtw_warps(curves: Floats) -> Floats:
     flat = curves.reshape(len(curves), -1)
     medoid = int(np.argmin([np.linalg.norm(flat - curve, axis=1).sum() for curve in flat]))
     grid = np.linspace(0.0, 1.0, curves.shape[1])
-    matches = [
-        grid if k == medoid else _monotone_match(dtw_path(curves[medoid], curve)) for k, curve in enumerate(curves)
-    ]
-    common = np.mean(matches, axis=0)  # increases strictly, since the medoid's own match does
+    matches = np.tile(grid, (len(curves), 1))
+    for k, curve in enumerate(curves):
+        if k != medoid:
+            path = dtw_path(curves[medoid], curve)
+            matches[k] = np.bincount(path[:, 0], weights=path[:, 1]) / np.bincount(path[:, 0]) / path[-1, 1]
+            matches[k, [0, -1]] = 0.0, 1.0
+    common = matches.mean(axis=0)  # increases strictly, since the medoid's own match does
     return np.stack([np.interp(grid, common, match) for match in matches])
 
 
@@ -131,14 +136,6 @@ def comparable_scale(curves: Floats, units: Sequence[str] | None) -> Floats:
     # leave of float64's 1e-16.
     rounding = 1e-12 * np.abs(curves).max(axis=(0, 1))
     return np.where(scale > rounding, scale, np.inf)
-
-
-def _monotone_match(path: NDArray[np.intp]) -> Floats:
-    """Phase of the second curve at each sample of the first, ends kept."""
-    n_matched = np.bincount(path[:, 0])
-    match = np.bincount(path[:, 0], weights=path[:, 1]) / n_matched / path[-1, 1]
-    match[[0, -1]] = 0.0, 1.0
-    return match
 
 
 def _accumulated_cost(a: Floats, b: Floats) -> Floats:
@@ -158,13 +155,3 @@ def _accumulated_cost(a: Floats, b: Floats) -> Floats:
         before = np.minimum(total[i, j], np.minimum(total[i, j + 1], total[i + 1, j]))
         total[i + 1, j + 1] = cost[i, j] + before
     return total
-
-
-def _backtrack(total: Floats) -> NDArray[np.intp]:
-    i, j = total.shape[0] - 1, total.shape[1] - 1
-    path = [(i, j)]
-    while (i, j) != (1, 1):
-        steps = [(i - 1, j - 1), (i - 1, j), (i, j - 1)]
-        i, j = min(steps, key=lambda step: total[step])  # the border is infinite but for its corner
-        path.append((i, j))
-    return np.array(path[::-1], dtype=np.intp) - 1

@@ -11,10 +11,10 @@ from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.data.alignment import check_overlap, unit_phases
 from torch_pbd.data.editing import Editing
-from torch_pbd.data.poses import as_outputs, same_reference, unwrapped
-from torch_pbd.data.recordings import Missing, as_recordings, as_time_unit, frozen, preview
-from torch_pbd.data.resampling import Alignment
-from torch_pbd.data.units import find_suspects
+from torch_pbd.data.poses import as_outputs, unwrapped
+from torch_pbd.data.recordings import Missing, as_recordings, frozen, preview
+from torch_pbd.data.sampling import Alignment
+from torch_pbd.data.units import TIMES, check_unit, find_suspects
 from torch_pbd.exceptions import InvalidParameterError
 
 
@@ -73,16 +73,15 @@ class Demonstrations(Editing):
     Raises
     ------
     ValueError
-        If there is no demonstration, lengths or numbers of outputs disagree, a demonstration has (left) fewer than two
-        samples, a value is not a finite real number, times do not increase strictly or are stored too coarsely to tell
-        samples apart, a name has control characters, or a unit is a known one in another spelling ("MM", "sec"). If a
-        quaternion is not of norm 1 to the rounding of files, or further than 150 degrees from the mean.
+        If there is no demonstration, lengths or numbers of outputs disagree, one has (left) fewer than two samples, a
+        value is no finite real number, times do not increase strictly or are too coarse to tell samples apart, or a
+        unit is a known one in another spelling ("MM", "sec"). If a quaternion is not of norm 1 to the rounding of
+        files, or further than 150 degrees from the mean.
 
     Warns
     -----
     UserWarning
-        If four outputs are unit quaternions, or one is an angle that jumps by a turn: these have no mean as they are.
-        If a rotation is further than 120 degrees from the mean.
+        On suspects, and rotations further than 120 degrees from the mean.
 
     Examples
     --------
@@ -115,11 +114,14 @@ class Demonstrations(Editing):
         if angles is not None:
             turned = unwrapped(*outputs[:4], angles)
             outputs = outputs._replace(positions=as_recordings(outputs.times, turned, "raise")[1])
+        if not isinstance(time_unit, str) or not time_unit:
+            raise checks.refusal(time_unit, "time_unit", "the unit of the times", "'s', or '1' for phase")
+        check_unit(time_unit, "time_unit", TIMES)
         # A frozen class sets its attributes by its dictionary.
         vars(self).update(
             outputs._asdict(),
             frame=checks.text(frame, "frame", optional=True),
-            time_unit=as_time_unit(time_unit),
+            time_unit=time_unit,
             alignment=alignment if alignment is None else checks.choice(alignment, "alignment", Alignment),
             suspects=find_suspects(outputs.positions, outputs.names, outputs.units),
         )
@@ -129,7 +131,7 @@ class Demonstrations(Editing):
     @property
     def n_outputs(self) -> int:
         """Number of outputs d."""
-        return self.positions[0].shape[1]
+        return len(self.names)
 
     @property
     def n_steps(self) -> tuple[int, ...]:
@@ -163,15 +165,15 @@ class Demonstrations(Editing):
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Demonstrations):
             return NotImplemented
-        labels = ("n_steps", "names", "units", "frame", "time_unit")
+        if any(getattr(self, name) != getattr(other, name) for name in ("names", "units", "frame", "time_unit")):
+            return False
+        if len(self) != len(other) or not np.array_equal(self.rotation_reference, other.rotation_reference):  # type: ignore[arg-type]
+            return False
         arrays = zip((*self.times, *self.positions), (*other.times, *other.positions), strict=True)
-        same = all(getattr(self, name) == getattr(other, name) for name in labels)
-        same = same and same_reference(self.rotation_reference, other.rotation_reference)
-        return same and all(np.array_equal(mine, theirs) for mine, theirs in arrays)
+        return all(np.array_equal(mine, theirs) for mine, theirs in arrays)
 
     def __repr__(self) -> str:
-        shortest, longest = min(self.n_steps), max(self.n_steps)
-        n_steps = f"{longest}" if shortest == longest else f"{shortest}..{longest}"
+        n_steps = "..".join(map(str, sorted({min(self.n_steps), max(self.n_steps)})))
         outputs = f"outputs={self.names}" if self.n_outputs <= 6 else f"n_outputs={self.n_outputs}"
         return (
             f"Demonstrations(n_demos={len(self)}, n_steps={n_steps}, {outputs}, "
@@ -214,13 +216,23 @@ class Demonstrations(Editing):
         groups = np.repeat(np.arange(len(self)), self.n_steps)
         return np.concatenate(inputs)[:, np.newaxis], np.concatenate(self.positions), groups
 
+    def split(self, k: int | Sequence[int]) -> tuple["Demonstrations", "Demonstrations"]:
+        """Leave demonstrations out: ``(train, test)``, where ``test`` has those numbered ``k``, and ``train`` some."""
+        held_out = np.zeros(len(self), dtype=bool)
+        try:
+            held_out[np.asarray(k)] = True
+        except IndexError as error:
+            must = f"the number of a demonstration, or a list of them, numbered 0 to {len(self) - 1}"
+            raise checks.refusal(k, "k", must) from error
+        if held_out.all():
+            raise InvalidParameterError(f"k leaves out all {len(self)} demonstrations: both parts need some.")
+        return self[~held_out], self[held_out]
+
     def to_array(self) -> Floats:
         """Positions (K, T, d) of aligned demonstrations; ValueError if they do not share one grid of times."""
         if not self.is_aligned:
-            raise InvalidParameterError(
-                f"the demonstrations are not aligned (lengths {preview(self.n_steps)}, or times that differ): use "
-                ".align() for a common phase, or .resample(n) where all cover the same time."
-            )
+            are = f"not aligned (lengths {preview(self.n_steps)}, or times that differ)"
+            raise InvalidParameterError(f"the demonstrations are {are}: use .align(), or .resample(n) for equal times.")
         return np.stack(self.positions)
 
     def plot(self, outputs: Sequence[int | str] | None = None, *, ax: Any = None) -> Any:
@@ -249,11 +261,8 @@ def _rebuild(times: Any, positions: Any, attributes: dict[str, Any]) -> Demonstr
     """Demonstrations made of others, whose labels were checked and whose suspects were warned of."""
     rebuilt = object.__new__(Demonstrations)
     times, positions = as_recordings(times, positions, "raise")
+    vars(rebuilt).update(attributes, times=times, positions=positions)
     reference = attributes["rotation_reference"]
-    own = {
-        "times": times,
-        "positions": positions,
-        "rotation_reference": reference if reference is None else frozen(reference),
-    }
-    vars(rebuilt).update(attributes | own)
+    if reference is not None:
+        vars(rebuilt)["rotation_reference"] = frozen(reference)
     return rebuilt

@@ -1,4 +1,4 @@
-"""Contents of recordings, and likely mistakes in them, each with its remedy."""
+"""Contents of recordings, likely mistakes in them, each with its remedy, and whether they follow one way."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -6,10 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from torch_pbd import checks
+from torch_pbd.checks import Floats
 from torch_pbd.data.alignment import check_overlap
+from torch_pbd.data.demonstrations import Demonstrations
 from torch_pbd.data.sampling import extents, still
 from torch_pbd.data.units import ANGLES, LENGTHS, TIMES, quaternions
-from torch_pbd.exceptions import InvalidParameterError
+from torch_pbd.exceptions import InvalidParameterError, UnimodalityWarning
 
 _MOST_ROWS = 20
 _PAUSE = 0.5  # s; shorter stillness is part of a movement
@@ -17,7 +20,16 @@ _GAP = 5.0  # median steps: two lost samples are no gap, a second of a sensor's 
 _ENDS = 0.2  # of the largest speed: a recording that is cut while moving
 _UNIX = 1e8  # s: no recording is three years long
 _RATES = 4.0, 5000.0  # Hz, in which hands and robots are recorded
-_LONGEST, _FURTHEST = 600.0, 10.0  # s and m of one movement
+_LONGEST, _FURTHEST, _MOST_TURNED = 600.0, 10.0, 100.0  # s, m and rad of one movement
+
+_N_STEPS, _LEAST_DEMOS = 20, 6  # at which ways may part, and with which they can be told
+# Gain of the criterion in nats, and distance of the two means in standard deviations within the groups. The best of all
+# splits of a sample from one normal distribution gains something too, and two halves of a uniform one lie 3.5 apart:
+# both bounds are above that, the second more so for whole demonstrations, in which there are more directions to choose.
+_GAIN_WHOLE, _SEPARATION_WHOLE = 8.0, 6.0
+_GAIN_STEP, _SEPARATION_STEP = 10.0, 4.5
+# Two ways around an obstacle part for a while, and each is taken by some.
+_SHARE_OF_STEPS, _SHARE_OF_DEMOS = 0.25, 0.2
 
 
 @dataclass(frozen=True, repr=False)
@@ -45,87 +57,66 @@ class Description:
         rows = _table(self.recordings[:_MOST_ROWS])
         if len(self.recordings) > _MOST_ROWS:
             rows += f"\n... {len(self.recordings)} recordings in all"
-        findings = [f"{i + 1}. {sentence}" for i, sentence in enumerate(self.mistakes)] or ["Nothing looks wrong."]
-        return "\n\n".join(
-            [rows, _table(self.outputs), *([self.rotation] if self.rotation else []), "\n".join(findings)]
-        )
+        findings = [f"{i}. {sentence}" for i, sentence in enumerate(self.mistakes, 1)] or ["Nothing looks wrong."]
+        return "\n\n".join(filter(None, [rows, _table(self.outputs), self.rotation, "\n".join(findings)]))
 
     __repr__ = __str__
 
 
 def describe(demonstrations: Any, notes: Sequence[str] = ()) -> Description:
     """Description of `torch_pbd.data.Demonstrations`; ``notes`` are mistakes that were found on the way to them."""
-    unit = demonstrations.time_unit
+    unit, names, reference = demonstrations.time_unit, demonstrations.names, demonstrations.rotation_reference
     second = 1.0 / TIMES.get(unit, 1.0)
     recordings = []
     for k, (time, position) in enumerate(demonstrations):
-        steps = np.diff(time)
-        moves = ~still(time, position, extents(position, demonstrations), _PAUSE * second)
+        steps, moves = np.diff(time), ~still(time, position, demonstrations, _PAUSE * second)
         moving = time[moves] if moves.any() else time[-1:]
         row = {"#": k, "samples": len(time), f"start [{unit}]": time[0], f"lasts [{unit}]": time[-1] - time[0]}
         row |= {"rate [Hz]": second / np.median(steps), f"gap [{unit}]": steps.max()}
         recordings.append(row | {"rest before": moving[0] - time[0], "rest after": time[-1] - moving[-1]})
-    units = demonstrations.units or ["none"] * demonstrations.n_outputs
+    together, units = np.concatenate(demonstrations.positions), demonstrations.units or ["none"] * len(names)
     outputs = [
         {"output": name, "unit": own, "least": y.min(), "largest": y.max(), "extent": np.ptp(y)}
-        for name, own, y in zip(demonstrations.names, units, np.concatenate(demonstrations.positions).T, strict=True)
+        for name, own, y in zip(names, units, together.T, strict=True)
     ]
-    mistakes = [*notes, *_of_times(demonstrations, second), *_of_ends(demonstrations, recordings, unit)]
+    rotation = ""
+    if reference is not None:
+        shown, furthest = ", ".join(f"{q:.4f}" for q in reference), np.linalg.norm(together[:, -3:], axis=1).max()
+        rotation = (
+            f"Rotations are {', '.join(names[-3:])} around the quaternion w x y z of {shown}; the furthest is "
+            f"{np.degrees(furthest):.0f} degrees from it."
+        )
+    mistakes = [*notes, *_of_times(demonstrations, second), *_of_ends(demonstrations, recordings)]
     mistakes += [*demonstrations.suspects, *_flips(demonstrations), *_of_outputs(demonstrations.units, outputs, notes)]
-    return Description(recordings, outputs, tuple(mistakes), _rotation(demonstrations))
+    return Description(recordings, outputs, tuple(mistakes), rotation)
 
 
-def _rotation(demonstrations: Any) -> str:
-    if demonstrations.rotation_reference is None:
-        return ""
-    furthest = max(np.linalg.norm(position[:, -3:], axis=1).max() for position in demonstrations.positions)
-    reference = ", ".join(f"{number:.4f}" for number in demonstrations.rotation_reference)
-    return (
-        f"Rotations are {', '.join(demonstrations.names[-3:])} around the quaternion w x y z of {reference}; the "
-        f"furthest is {np.degrees(furthest):.0f} degrees from it."
-    )
-
-
-def _of_times(demonstrations: Any, second: float) -> Iterator[str]:
+def _of_times(demonstrations: Demonstrations, second: float) -> Iterator[str]:
     times, unit = demonstrations.times, demonstrations.time_unit
-    starts = np.array([time[0] for time in times]) / second
-    steps = np.concatenate([np.diff(time) for time in times])
-    rate = 1.0 / np.median(steps)
-    apart = False
+    step = float(np.median(np.concatenate(list(map(np.diff, times)))))
+    if unit in TIMES and not _RATES[0] <= second / step <= _RATES[1]:
+        meant = [other for other, size in TIMES.items() if _RATES[0] <= 1.0 / (step * size) <= _RATES[1]]
+        if meant and meant[-1] != unit:
+            rate = f"A sample every {step:.4g} {unit} is {second / step:.3g} Hz"
+            yield f"{rate}: the times look like {meant[-1]}. Say time_unit={meant[-1]!r}."
+    elif unit in TIMES and max(time[-1] - time[0] for time in times) / second > _LONGEST:
+        yield "A recording is longer than ten minutes. Cut it into demonstrations: cut='pauses' or [[start, end]]."
+    latest = max((time[0] / second for time in times), key=abs)
+    if abs(latest) > _UNIX:
+        yield f"Times start at {latest:.0f} s, as stamps since 1970 do. Count from the start: from_start=True."
     try:
         check_overlap(times, unit)
     except InvalidParameterError:
-        apart = True
-    if unit in TIMES and not _RATES[0] <= rate * second <= _RATES[1]:
-        meant = [other for other, size in TIMES.items() if _RATES[0] <= rate / size <= _RATES[1]]
-        if meant and meant[-1] != unit:
-            yield (
-                f"A sample every {1 / rate:.4g} {unit} is {rate * second:.3g} Hz: the times look like {meant[-1]}. Say "
-                f"time_unit={meant[-1]!r}."
-            )
-    elif unit in TIMES and max(time[-1] - time[0] for time in times) / second > _LONGEST:
-        yield "A recording is longer than ten minutes. Cut it into demonstrations: cut='pauses' or [[start, end]]."
-    latest = starts[np.abs(starts).argmax()]
-    if np.abs(latest) > _UNIX:
-        yield f"Times start at {latest:.0f} s, as stamps since 1970 do. Count from the start: from_start=True."
-    if apart and len(times) > 1:
         yield "The recordings do not overlap in time. Count each from its start, from_start=True, or take a phase."
     for k, time in enumerate(times):
-        step = np.diff(time)
-        i = int(step.argmax())
-        if step[i] > _GAP * np.median(step):
-            yield (
-                f"Recording {k} has a gap of {step[i]:.3g} {unit} at {time[i]:.6g}, {step[i] / np.median(step):.0f} "
-                "times the usual step. Where others have samples they are used; else leave it out, or cut= there."
-            )
+        own = np.diff(time) / np.median(np.diff(time))
+        i = int(own.argmax())
+        if own[i] > _GAP:
+            gap = f"Recording {k} has a gap of {time[i + 1] - time[i]:.3g} {unit} at {time[i]:.6g}"
+            yield f"{gap}, {own[i]:.0f} times the usual step. Where no other has samples, leave it out, or cut= there."
 
 
-def _of_ends(demonstrations: Any, recordings: list[dict[str, Any]], unit: str) -> Iterator[str]:
-    for end, rest in (("start", "rest before"), ("end", "rest after")):
-        held = [row["#"] for row in recordings if row[rest] > 0.0]
-        if held:
-            longest = max(row[rest] for row in recordings)
-            yield f"Nothing moves at the {end} of {_numbers(held)}, for up to {longest:.3g} {unit}: say trim='still'."
+def _of_ends(demonstrations: Demonstrations, recordings: list[dict[str, Any]]) -> Iterator[str]:
     cut: dict[str, list[int]] = {"start": [], "end": []}
     for k, (time, position) in enumerate(demonstrations):
         extent = extents(position, demonstrations)
@@ -135,30 +126,35 @@ def _of_ends(demonstrations: Any, recordings: list[dict[str, Any]], unit: str) -
         for end, own in (("start", speed[:few]), ("end", speed[-few:])):
             if len(speed) >= 10 and np.median(own) > _ENDS * np.quantile(speed, 0.95):
                 cut[end].append(k)
-    for end, numbers in cut.items():
-        if numbers:
-            yield (
-                f"At the {end}, {_numbers(numbers)} {'is' if len(numbers) == 1 else 'are'} moving: it was cut there. "
-                "Record from rest to rest, or give settle= to schedule()."
-            )
+    for end, rest in (("start", "rest before"), ("end", "rest after")):
+        held, longest = [row["#"] for row in recordings if row[rest] > 0.0], max(row[rest] for row in recordings)
+        if held:
+            lasting = f"{longest:.3g} {demonstrations.time_unit}"
+            yield f"Nothing moves at the {end} of {_numbers(held)}, for up to {lasting}: say trim='still'."
+        if cut[end]:
+            are = f"{_numbers(cut[end])} {'is' if len(cut[end]) == 1 else 'are'}"
+            yield f"At the {end}, {are} moving. Record from rest to rest, or give settle= to schedule()."
 
 
 def _of_outputs(units: Any, outputs: list[dict[str, Any]], notes: Sequence[str]) -> Iterator[str]:
-    extents = {row["output"]: row["extent"] for row in outputs}
+    covers = {row["output"]: row["extent"] for row in outputs}
     if units is None and not any("units=" in note for note in notes):
-        name, largest = max(extents.items(), key=lambda entry: entry[1])
-        far = f" Output {name} covers {largest:.4g}: as metres that is far, 'mm'?" if largest > _FURTHEST else ""
-        yield f"The outputs have no units: give units=, as 'm', 'mm', 'rad', or one for each.{far}"
+        name = max(covers, key=lambda output: covers[output])
+        far = f" Output {name} covers {covers[name]:.4g}: as metres that is far, 'mm'?"
+        yield (
+            "The outputs have no units: give units=, as 'm', 'mm', 'rad', or one for each."
+            f"{far if covers[name] > _FURTHEST else ''}"
+        )
     for row in outputs:
-        metres = LENGTHS.get(row["unit"], 0.0) * row["extent"]
-        if metres > _FURTHEST or ANGLES.get(row["unit"], 0.0) * row["extent"] > 100.0:
-            yield f"Output {row['output']} covers {row['extent']:.4g} {row['unit']}: another unit? Give units=."
-    constant = [name for name, extent in extents.items() if extent == 0.0]
+        unit, extent = row["unit"], row["extent"]
+        if LENGTHS.get(unit, 0.0) * extent > _FURTHEST or ANGLES.get(unit, 0.0) * extent > _MOST_TURNED:
+            yield f"Output {row['output']} covers {extent:.4g} {unit}: another unit? Give units=."
+    constant = [name for name, extent in covers.items() if extent == 0.0]
     if constant:
-        yield f"{', '.join(constant)} never changes: leave it out, outputs={[n for n in extents if n not in constant]}."
+        yield f"{', '.join(constant)} never changes: leave it out, outputs={[n for n in covers if n not in constant]}."
 
 
-def _flips(demonstrations: Any) -> Iterator[str]:
+def _flips(demonstrations: Demonstrations) -> Iterator[str]:
     """Unit quaternions, of which nobody named the order, or of which some are -q where others are q."""
     for place in quaternions(demonstrations.positions, demonstrations.n_outputs):
         columns = demonstrations.names[place : place + 4]
@@ -183,3 +179,78 @@ def _table(rows: list[dict[str, Any]]) -> str:
     widths[0] = min(widths[0], max(80 - sum(widths[1:]) - 2 * (len(widths) - 1), 8))
     lines = ([row[0][: widths[0]].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])] for row in cells)
     return "\n".join("  ".join(line).rstrip() for line in lines)
+
+
+def check_unimodal(demonstrations: Demonstrations) -> bool:
+    """Check that the demonstrations look like one way to do the task; warns if they do not.
+
+    The paper assumes one mode (Section II): between two ways around an obstacle, a mean goes through it. Looked at
+    are the direction in which the whole demonstrations differ most, and that at each of 20 steps: their places
+    along it are split into two groups with a common variance, and the split must be worth it by the Bayesian
+    information criterion and lie wide apart. Subtle cases are missed, and fewer than six demonstrations pass.
+
+    Parameters
+    ----------
+    demonstrations : Demonstrations
+        Aligned by phase here, if they are not.
+
+    Returns
+    -------
+    bool
+
+    Warns
+    -----
+    UnimodalityWarning
+        If there are two groups, or one demonstration far from all others.
+    """
+    checks.instance(demonstrations, "demonstrations", Demonstrations)
+    n_demos = len(demonstrations)
+    if n_demos < _LEAST_DEMOS:
+        return True
+    curves = (demonstrations if demonstrations.is_aligned else demonstrations.align()).to_array()
+    residual = curves - curves.mean(axis=0)
+    deviation = residual.std(axis=(0, 1))
+    residual = residual / np.where(deviation > 0, deviation, 1.0)
+    gain, separation, few = _best_split(residual.reshape(n_demos, -1))
+    if gain <= _GAIN_WHOLE or separation <= _SEPARATION_WHOLE:
+        splits = [_best_split(residual[:, t]) for t in np.linspace(0, residual.shape[1] - 1, _N_STEPS).astype(int)]
+        clear = [s for s in splits if s[0] > _GAIN_STEP and s[1] > _SEPARATION_STEP]
+        clear = [split for split in clear if len(split[2]) >= _SHARE_OF_DEMOS * n_demos]
+        if len(clear) < _SHARE_OF_STEPS * _N_STEPS:
+            return True
+        few = max(clear)[2]
+    message = f"Demonstration {few[0]} is far from the other {n_demos - 1}: look at it, and leave it out if it failed."
+    if len(few) > 1:
+        message = (
+            f"The demonstrations seem to follow two ways: {', '.join(map(str, sorted(few)))} differ from the others. "
+            "A normal distribution puts its mean between them; learn each way by itself."
+        )
+    checks.warn(message, UnimodalityWarning)
+    return False
+
+
+def _best_split(residual: Floats) -> tuple[float, float, list[int]]:
+    """Best split of the rows in two along the direction in which they differ most.
+
+    Gain of the criterion, distance of the two means in deviations, and numbers of the rows in the smaller group.
+    """
+    left, singular, _ = np.linalg.svd(residual, full_matrices=False)
+    place = left[:, 0] * singular[0]
+    order = np.argsort(place, kind="stable")
+    x, n = place[order], len(place)
+    total = np.square(x - x.mean()).sum()
+    if total <= 1e-18 * n:
+        return 0.0, 0.0, []
+    # For each number of rows in the lower group: squares within both groups, of which a common variance is estimated.
+    count = np.arange(1, n)
+    before, squares = np.cumsum(x)[:-1], np.cumsum(x * x)[:-1]
+    within = squares - before**2 / count + (x @ x - squares) - (x.sum() - before) ** 2 / (n - count)
+    within = np.maximum(within, 1e-9 * total)
+    # Twice the log-likelihood of two groups above that of one, less log n for each of two further parameters.
+    share = count / n
+    entropy = share * np.log(share) + (1 - share) * np.log(1 - share)
+    gain = -n * np.log(within / total) + 2 * n * entropy - 2 * np.log(n)
+    best = int(gain.argmax())
+    apart = (x[best + 1 :].mean() - x[: best + 1].mean()) / np.sqrt(within[best] / n)
+    few = min(order[: best + 1], order[best + 1 :], key=len)
+    return float(gain[best]), float(apart), few.tolist()

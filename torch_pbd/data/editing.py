@@ -7,21 +7,13 @@ import numpy as np
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.data.poses import (
-    as_columns,
-    charted,
-    mean_rotation,
-    poses,
-    same_reference,
-    unwrapped,
-    with_whole_rotation,
-)
+from torch_pbd.data.poses import as_columns, charted, mean_rotation, unwrapped, with_whole_rotation
 from torch_pbd.data.recordings import MIN_SAMPLES, as_texts, preview
-from torch_pbd.data.resampling import Resampling
-from torch_pbd.data.sampling import extents, still
+from torch_pbd.data.sampling import Resampling, still
 from torch_pbd.data.units import ANGLES, LENGTHS, TIMES, check_unit, find_suspects
 from torch_pbd.data.wanted import OPTIONS, Wanted, check_options
 from torch_pbd.exceptions import InvalidParameterError
+from torch_pbd.rotations import Chart
 
 if TYPE_CHECKING:
     from torch_pbd.data.description import Description
@@ -30,12 +22,11 @@ if TYPE_CHECKING:
 class Editing(Resampling):
     """Methods of `torch_pbd.data.Demonstrations`; abstract."""
 
-    def __getitem__(self, index: Any) -> Any:
-        raise NotImplementedError
-
     @classmethod
     def from_frame(cls, table: Any, **options: Any) -> Self:
         """Demonstrations of a table of pandas, polars, pyarrow or another library that narwhals knows, a row a sample.
+
+        Demonstrations are in the order in which they first appear.
 
         Parameters
         ----------
@@ -43,11 +34,6 @@ class Editing(Resampling):
             An index is ignored.
         **options
             Those of `torch_pbd.data.load_demonstrations`, from ``outputs`` to ``from_start``.
-
-        Returns
-        -------
-        Demonstrations
-            In the order in which they first appear.
 
         Raises
         ------
@@ -60,11 +46,10 @@ class Editing(Resampling):
 
         check_options(options, [name for name in OPTIONS if name != "max_bytes"], "frames")
         wanted = Wanted(**options)
-        try:
-            rows = narwhals.from_native(table, eager_only=True)
-        except TypeError as error:
-            must, remedy = "a dataframe of pandas, polars, pyarrow or alike, with its rows", "collect() lazy ones"
-            raise checks.refusal(table, "table", must, remedy) from error
+        rows = narwhals.from_native(table, eager_only=True, pass_through=True)
+        if not isinstance(rows, narwhals.DataFrame):
+            must = "a dataframe of pandas, polars, pyarrow or alike, with its rows"
+            raise checks.refusal(table, "table", must, "collect() lazy ones")
         chosen = wanted.choose({name: (name,) for name in rows.columns}, demo="demo", time="time")
         signals = {name: rows.get_column(name).to_numpy() for name in chosen.signals}
         return wanted.finish([cls(**wanted.read_rows(chosen, signals))])
@@ -80,13 +65,8 @@ class Editing(Resampling):
         import narwhals
 
         names, columns = as_columns(self)
-        taken = {"demo", "time"} & set(names)
-        if taken:
-            raise InvalidParameterError(
-                f"an output named {min(taken)!r} cannot be told from the other columns: rename it."
-            )
         table = {
-            "demo": np.repeat(np.arange(len(self.times)), [len(time) for time in self.times]),
+            "demo": np.repeat(np.arange(len(self.times)), list(map(len, self.times))),
             "time": np.concatenate(self.times),
             **dict(zip(names, np.concatenate(columns).T, strict=True)),
         }
@@ -105,14 +85,13 @@ class Editing(Resampling):
             for label in ("names", "units", "frame", "time_unit"):
                 mine, first = getattr(part, label), getattr(sets[0], label)
                 if mine != first:
-                    raise InvalidParameterError(
-                        f"parts[{i}] has {label} {mine}, must be as parts[0], {first}: use .select() or .in_units()."
-                    )
+                    must = f"must be as parts[0], {first}: use .select() or .in_units()"
+                    raise InvalidParameterError(f"parts[{i}] has {label} {mine}, {must}.")
         times, positions = ([a for part in sets for a in getattr(part, name)] for name in ("times", "positions"))
         alignment = sets[0].alignment if len({part.alignment for part in sets}) == 1 else None
         suspects = find_suspects(positions, sets[0].names, sets[0].units)
         reference = sets[0].rotation_reference
-        if not all(same_reference(part.rotation_reference, reference) for part in sets):
+        if not all(np.array_equal(part.rotation_reference, reference) for part in sets):
             pairs = [pair for part in sets for pair in zip(*part.to_poses(), strict=True)]
             places, turns = [place for place, _ in pairs], [turn for _, turn in pairs]
             reference = mean_rotation(times, turns)
@@ -130,21 +109,23 @@ class Editing(Resampling):
         quaternions : list of K ndarray of shape (T_k, 4)
             Unit quaternions w x y z; signs go on along time and from one demonstration to the next.
         """
-        return poses(self.positions, self.rotation_reference)
+        if self.rotation_reference is None:
+            raise InvalidParameterError("the demonstrations have no rotation: name its columns by rotation=, w x y z.")
+        # w >= 0 against the reference: signs go on.
+        turns = [Chart(self.rotation_reference).exp(position[:, -3:]) for position in self.positions]
+        return [position[:, :-3] for position in self.positions], turns
 
     def select(self, outputs: str | Sequence[str]) -> Self:
         """These demonstrations with some of the outputs, in the order given; a rotation, all of it, stays last."""
         chosen = as_texts(outputs, "outputs")
-        absent = [name for name in chosen if name not in self.names]
-        if absent or not chosen or len(set(chosen)) < len(chosen):
+        if not 0 < len(chosen) == len(set(chosen) & set(self.names)):
             raise checks.refusal([*chosen], "outputs", f"different ones of {preview(self.names)}")
         chosen, reference = with_whole_rotation(chosen, self.names, self.rotation_reference)
         kept = [self.names.index(name) for name in chosen]
         positions = [position[:, kept] for position in self.positions]
         units = self.units and tuple(self.units[i] for i in kept)
-        suspects = find_suspects(positions, chosen, units)
-        labels = {"names": chosen, "units": units, "suspects": suspects, "rotation_reference": reference}
-        return self._replace(self.times, positions, **labels)
+        labels = {"names": chosen, "units": units, "rotation_reference": reference}
+        return self._replace(self.times, positions, suspects=find_suspects(positions, chosen, units), **labels)
 
     def unwrap(self, angles: str | Sequence[str]) -> Self:
         """These demonstrations with named angles that go on over a turn, along time and between demonstrations."""
@@ -169,21 +150,19 @@ class Editing(Resampling):
         times, positions, units = self.times, self.positions, self.units
         if unit is not None:
             check_unit(unit, "unit", LENGTHS | ANGLES)
-            kind = next((kind for kind in (LENGTHS, ANGLES) if unit in kind), {})
+            before, kind = self.units or (), LENGTHS if unit in LENGTHS else ANGLES
             n_free = len(self.names) - 3 * (self.rotation_reference is not None)  # a rotation is in rad
-            units = tuple(unit if i < n_free and own in kind else own for i, own in enumerate(self.units or ()))
+            units = tuple(unit if i < n_free and own in kind else own for i, own in enumerate(before))
             if unit not in units[:n_free]:
-                must = f"of the kind of one of the outputs, which are in {self.units or 'no known units (give units=)'}"
+                must = f"of the kind of one of the outputs, which are in {before or 'no known units (give units=)'}"
                 raise checks.refusal(unit, "unit", must)
-            positions = tuple(
-                np.column_stack([_convert(*column, kind) for column in zip(y.T, self.units or (), units, strict=True)])
-                for y in positions
-            )
+            here, there = (np.array([kind.get(own, 1.0) for own in each]) for each in (before, units))
+            positions = tuple(_convert(position, here, there) for position in positions)
         if time_unit is not None:
             if time_unit not in TIMES or self.time_unit not in TIMES:
                 must = f"one of {', '.join(TIMES)}, as that of these demonstrations, {self.time_unit}"
                 raise checks.refusal(time_unit, "time_unit", must)
-            times = tuple(_convert(time, self.time_unit, time_unit, TIMES) for time in times)
+            times = tuple(_convert(time, TIMES[self.time_unit], TIMES[time_unit]) for time in times)
         return self._replace(times, positions, units=units, time_unit=time_unit or self.time_unit)
 
     def cut(self, at: Literal["pauses"] | Sequence[tuple[float, float]] = "pauses", *, pause: float = 0.5) -> Self:
@@ -199,19 +178,15 @@ class Editing(Resampling):
             Shortest pause, in ``time_unit``: for so long, all outputs stay within 2 % of their extent.
         """
         if len(self.times) != 1:
-            raise InvalidParameterError(
-                f"there are {len(self.times)} recordings, must be one to be cut: take one, as [:1]."
-            )
+            raise InvalidParameterError(f"there are {len(self.times)} recordings, must be one to be cut, as [:1].")
         time, position = self.times[0], self.positions[0]
         if isinstance(at, str):
             checks.choice(at, "at", ("pauses",))
-            moving = ~still(time, position, extents(position, self), checks.number(pause, "pause", above=0.0))
+            moving = ~still(time, position, self, pause)
             edges = np.flatnonzero(np.diff(np.r_[False, moving, False]))
             spans = [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= MIN_SAMPLES]
             if not spans:
-                raise InvalidParameterError(
-                    f"at is 'pauses', but nothing moves between pauses of {pause} {self.time_unit}."
-                )
+                raise InvalidParameterError(f"nothing moves between pauses of {pause} {self.time_unit}: lower pause.")
         else:
             spans = [_span(time, start_end, i) for i, start_end in enumerate(at)]
         return self._replace([time[a:b] for a, b in spans], [position[a:b] for a, b in spans], suspects=())
@@ -222,28 +197,14 @@ class Editing(Resampling):
         ``pause`` is the shortest stretch of stillness that counts, in ``time_unit``, as in :meth:`cut`.
         """
         checks.choice(method, "method", ("still",))
-        checks.number(pause, "pause", above=0.0)
-        spans = []
+        times, positions = [], []
         for time, position in zip(self.times, self.positions, strict=True):
-            moving = np.flatnonzero(~still(time, position, extents(position, self), pause))
+            moving = np.flatnonzero(~still(time, position, self, pause))
             # One sample of stillness is kept at each end: it is where the movement starts and stops.
-            spans.append(slice(max(moving[0] - 1, 0), moving[-1] + 2) if len(moving) else slice(None))
-        times = [time[span] for time, span in zip(self.times, spans, strict=True)]
-        return self._replace(times, [position[span] for position, span in zip(self.positions, spans, strict=True)])
-
-    def split(self, k: int | Sequence[int]) -> tuple[Self, Self]:
-        """Leave demonstrations out: ``(train, test)``, where ``test`` has those numbered ``k``, and ``train`` some."""
-        held_out = np.zeros(len(self.times), dtype=bool)
-        try:
-            held_out[np.asarray(k)] = True
-        except IndexError as error:
-            must = f"the number of a demonstration, or a list of them, numbered 0 to {len(self.times) - 1}"
-            raise checks.refusal(k, "k", must) from error
-        if held_out.all():
-            raise InvalidParameterError(
-                f"k leaves out {len(self.times)} of {len(self.times)} demonstrations: both parts need some."
-            )
-        return self[~held_out], self[held_out]
+            span = slice(max(moving[0] - 1, 0), moving[-1] + 2) if len(moving) else slice(None)
+            times.append(time[span])
+            positions.append(position[span])
+        return self._replace(times, positions)
 
     def describe(self) -> "Description":
         """Contents of the recordings, and likely mistakes in them: tables to print, and ``mistakes``."""
@@ -258,14 +219,11 @@ def _span(time: Floats, start_end: Any, i: int) -> tuple[int, int]:
         raise checks.refusal(start_end, f"at[{i}]", "a start and an end after it, in the unit of the times")
     a, b = np.searchsorted(time, ends[0]), np.searchsorted(time, ends[1], side="right")
     if b - a < MIN_SAMPLES:
-        raise InvalidParameterError(
-            f"at[{i}] holds {b - a} samples between {ends[0]:g} and {ends[1]:g}, must hold {MIN_SAMPLES}: the "
-            f"recording goes from {time[0]:g} to {time[-1]:g}."
-        )
+        holds = f"at[{i}] holds {b - a} samples between {ends[0]:g} and {ends[1]:g}, must hold {MIN_SAMPLES}"
+        raise InvalidParameterError(f"{holds}: the recording goes from {time[0]:g} to {time[-1]:g}.")
     return int(a), int(b)
 
 
-def _convert(values: Floats, unit: str, other: str, known: dict[str, float]) -> Floats:
-    """Values in another unit, if it is of the kind; whole numbers are divided by, as 1000 is exact and 0.001 is not."""
-    here, there = known.get(unit, 1.0), known.get(other, 1.0)
-    return values * (here / there) if here >= there else values / (there / here)
+def _convert(values: Floats, here: Any, there: Any) -> Floats:
+    """Values in another unit; whole numbers are divided by, as 1000 is exact and 0.001 is not."""
+    return np.where(here >= there, values * (here / there), values / (there / here))

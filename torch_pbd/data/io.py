@@ -22,8 +22,8 @@ Source = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 # Bytes in memory for each of a file that is read; of CSV 1.5 are measured, more with shorter numbers, of Parquet 4.
 _COPIES = 10
 
-# Each module has read(path, wanted, **options), of which what it raises gets the path here; two have
-# write(demonstrations, handle). It is imported when a file of its kind is met, and what it needs from extras with it.
+# Readers take (path, wanted, **options) and hand over arguments of Demonstrations; what they raise gets the path here.
+# Their modules are imported when a file of their kind is met, and what they need from extras with them.
 _FORMATS = {
     ".npz": "npz.read",
     ".npy": "npz.read_array_file",
@@ -31,22 +31,22 @@ _FORMATS = {
     ".txt": "csv.read",
     ".tsv": "csv.read",
     ".parquet": "parquet.read",
-    ".hdf5": "hdf5.read",
-    ".h5": "hdf5.read",
+    ".hdf5": "datasets.read_hdf5",
+    ".h5": "datasets.read_hdf5",
     ".mat": "mat.read",
-    ".zip": "zarr.read",
+    ".zip": "datasets.read_zarr",
     ".bag": "rosbag.read",
     ".mcap": "rosbag.read",
     ".db3": "rosbag.read",
 }
 _WRITTEN = {".npz": "npz.write", ".csv": "csv.write"}
+# Formats that are folders, by a file that only they have.
 _FOLDERS = {
-    "meta/info.json": "lerobot.read",
-    ".zgroup": "zarr.read",
-    "zarr.json": "zarr.read",
+    "meta/info.json": "datasets.read_lerobot",
+    ".zgroup": "datasets.read_zarr",
+    "zarr.json": "datasets.read_zarr",
     "metadata.yaml": "rosbag.read",
 }
-"""Formats that are folders, by a file that is in them."""
 
 
 def load_demonstrations(
@@ -71,20 +71,11 @@ def load_demonstrations(
 ) -> Demonstrations:
     """Demonstrations from a file, a folder, or several files, in the format that the suffix says.
 
-    ``.npz``: either ``t`` (T,) and ``x`` (K, T, d), where all demonstrations share one grid of
-    times, or ``t_0`` (T_0,), ``x_0`` (T_0, d), ``t_1``, ``x_1``, ...; and, if it is there, ``meta``, a 0-d
-    string with a JSON object, of which ``dims`` (names of the outputs), ``units`` or ``unit``, ``time_unit``
-    or ``t_unit`` and ``frame`` are read, and ``K`` and ``d`` checked. Other arrays are ignored. Arrays of other names
-    are (K, T, d), or (T, d) for each recording; their columns are y0, y1, ... or the array's name, _0, _1, ...
-    Pickled objects are never loaded.
-
-    ``.csv``, ``.txt``, ``.tsv``, ``.parquet``: a header, then a row a sample. Rows of different demonstrations may be
-    mixed; each demonstration's own must be in order of time. Comments (#) may stand above the header of a text.
-
-    Folders of LeRobot (v2, v3): ``observation.state``, or other features by name. ``.hdf5``: robomimic's
-    ``data/demo_k/obs/...``. Folders of rosbag2, ``.mcap``, ``.db3``, ``.bag``: messages of one topic, at their headers'
-    stamps, counted from the first. ``.mat``: cells ``demos{k}`` with ``pos`` (d, T), or ``data{k}`` (2 d, T). Folders
-    ``.zarr``, and ``.zip`` of one: ``data/<key>`` and ``meta/episode_ends``.
+    Tables: ``.csv``, ``.txt``, ``.tsv``, ``.parquet``, a header and a row a sample, each demonstration's in order of
+    time. Arrays: ``.npz`` as `save_demonstrations` writes it (``t`` and ``x``, or ``t_0``, ``x_0``, ``t_1``, ...) or
+    with other names, ``.npy``, ``.mat``, ``.zarr`` and ``.zip`` of one. Data sets: folders of LeRobot (v2, v3),
+    ``.hdf5`` of robomimic. ROS: folders of rosbag2, ``.mcap``, ``.db3``, ``.bag``. The page "Recordings of every kind"
+    has their layouts. Pickled objects are never loaded.
 
     Parameters
     ----------
@@ -103,11 +94,9 @@ def load_demonstrations(
         Column of times; None takes "time", or what the format says.
     rate : float, default=None
         Samples a second, where the samples are evenly spaced: times are counted from it, and those of the file ignored.
-    units, time_unit, frame
+    rotation, angles, units, time_unit, frame, missing
         As in `Demonstrations`; None takes those in the file, if it holds them. Dates and times of day become seconds
-        from the first of all.
-    missing : {"raise", "drop"}, default="raise"
-        "drop" leaves out samples with NaN (CSV: and blank cells), and warns of how many, as `Demonstrations` does.
+        from the first of all. Quaternions of ROS and robosuite stand as x y z w; ``rotation`` names them w x y z.
     in_units : str or sequence of str, default=None
         Convert to these units, as `Demonstrations.in_units` does: "m", or ["m", "s"] with that of the times. ``units``
         and ``time_unit`` say what the numbers in the file are, and change none of them.
@@ -117,11 +106,6 @@ def load_demonstrations(
         Leave out what is still at both ends: `Demonstrations.trim`.
     from_start : bool, default=False
         Count the times of each demonstration from its start: `Demonstrations.from_start`.
-    rotation : sequence of 4 str, default=None
-        Columns of a unit quaternion in the order w x y z, wherever they stand, outputs beside those of ``outputs``. As
-        in `Demonstrations`: nothing in a file tells w x y z from x y z w, so look it up (ROS and robosuite: x y z w).
-    angles : str or sequence of str, default=None
-        Outputs that may jump by a turn, as in `Demonstrations`.
     max_bytes : int, default=512 MiB
         Larger files (.npz: unpacked) are refused before they are read.
     **options
@@ -140,12 +124,10 @@ def load_demonstrations(
     TypeError
         If an option is not one of the format's.
     DataFormatError
-        If the file is not what its suffix says; names the array, or the line and the column. Or if it is too large
-        for the memory.
+        If the file is not what its suffix says, with the array, or the line and the column; or too large.
     """
     given = locals()
-    wanted = Wanted(**{name: given[name] for name in OPTIONS})
-    return wanted.finish([_load(file, wanted, options) for file in find_files(source)])
+    return _read(source, Wanted(**{name: given[name] for name in OPTIONS}), options)
 
 
 def inspect_demonstrations(source: Source, **options: Any) -> tuple[Demonstrations, Description]:
@@ -154,21 +136,17 @@ def inspect_demonstrations(source: Source, **options: Any) -> tuple[Demonstratio
     What that function would refuse is left out or guessed, if there is a way, and said among the ``mistakes``.
     """
     notes: list[str] = []
-    own = {name: value for name, value in options.items() if name not in OPTIONS}
+    common = {name: options.pop(name) for name in OPTIONS if name in options}
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        wanted = Wanted(**{name: value for name, value in options.items() if name in OPTIONS}, notes=notes)
-        demonstrations = wanted.finish([_load(file, wanted, own) for file in find_files(source)])
-    messages = [str(warning.message) for warning in caught]
+        demonstrations = _read(source, Wanted(**common, notes=notes), options)
     suspects = " ".join(demonstrations.suspects)
-    return demonstrations, describe(demonstrations, [*dict.fromkeys(notes), *(t for t in messages if t != suspects)])
+    told = [message for message in (str(warning.message) for warning in caught) if message != suspects]
+    return demonstrations, describe(demonstrations, [*dict.fromkeys(notes), *told])
 
 
 def find_files(source: Source) -> list[Path]:
-    """Files, or folders that are one recording, of a source as `load_demonstrations` takes it.
-
-    Raises FileNotFoundError if there is none of them.
-    """
+    """Files, or folders that are one recording, of a source; FileNotFoundError if there is none."""
     if isinstance(source, Sequence) and not isinstance(source, str):
         if not source:
             raise checks.refusal(source, "source", "a path, or a list of some")
@@ -179,9 +157,9 @@ def find_files(source: Source) -> list[Path]:
         if not found:
             raise FileNotFoundError(f"{path} matches no file.")
         return found
-    if not path.is_dir() or _folder_format(path):
+    if not path.is_dir() or _reader_of(path):
         return [path]
-    within = [file for file in path.iterdir() if file.suffix.lower() in _FORMATS or _folder_format(file)]
+    within = [file for file in path.iterdir() if _reader_of(file)]
     kinds = sorted({file.suffix.lower() for file in within})
     if len(kinds) != 1:
         what = f"files of several formats, {', '.join(kinds)}" if kinds else f"no file of {', '.join(_FORMATS)}"
@@ -189,8 +167,12 @@ def find_files(source: Source) -> list[Path]:
     return sorted(within, key=lambda file: natural(file.name))
 
 
+def _read(source: Source, wanted: Wanted, options: dict[str, Any]) -> Demonstrations:
+    return wanted.finish([_load(file, wanted, options) for file in find_files(source)])
+
+
 def _load(file: Path, wanted: Wanted, options: dict[str, Any]) -> Demonstrations:
-    reader = _function(file, _FORMATS)
+    reader = _function(file, _reader_of(file), _FORMATS)
     own = list(inspect.signature(reader).parameters)[2:]
     check_options(options, [*OPTIONS, *own], f"{file.suffix or file.name} files")
     if not file.exists():
@@ -211,10 +193,9 @@ def _load(file: Path, wanted: Wanted, options: dict[str, Any]) -> Demonstrations
 def save_demonstrations(demonstrations: Demonstrations, path: str | os.PathLike[str]) -> None:
     """Write demonstrations to ``path``, in the format that its suffix says (.npz or .csv).
 
-    All numbers come back to the last bit. A CSV file does not hold units and frame, nor a checksum: one that somebody
-    cuts or changes may be read as what it is not. An .npz file holds one of each array. The file appears complete or
-    not at all, and replaces one that is there. Rotations stand in CSV files as quaternions, columns qw, qx, qy, qz,
-    which are named by ``rotation`` to be read; in .npz files as they are, with their reference.
+    All numbers come back to the last bit. The file appears complete or not at all, and replaces one that is there.
+    CSV files hold no units, no frame and no checksum, and rotations as quaternions, columns qw, qx, qy, qz, which are
+    named by ``rotation`` to be read; .npz files hold them as they are, with their reference.
 
     Parameters
     ----------
@@ -226,26 +207,22 @@ def save_demonstrations(demonstrations: Demonstrations, path: str | os.PathLike[
     ------
     ValueError
         If the suffix is not known, or a name of an output cannot be a column of a CSV file.
-    FileNotFoundError
-        If the folder does not exist.
     """
     file = Path(path)
-    write = _function(file, _WRITTEN)
+    write = _function(file, _WRITTEN.get(file.suffix.lower()), _WRITTEN)
     with replacing(file) as handle:
         write(demonstrations, handle)
 
 
-def _folder_format(path: Path) -> str | None:
-    """Module of the format that a folder is in, by a file that only such folders have; None for others."""
-    return next((module for mark, module in _FOLDERS.items() if (path / mark).is_file()), None)
+def _reader_of(path: Path) -> str | None:
+    """Place of the reader of a file, or of a folder that is one recording; a .zip is a file."""
+    own = None if path.is_dir() else _FORMATS.get(path.suffix.lower())
+    return next((place for mark, place in _FOLDERS.items() if (path / mark).is_file()), own)
 
 
-def _function(file: Path, table: dict[str, str]) -> Callable[..., Any]:
-    suffix = file.suffix.lower()
-    place = _folder_format(file) if table is _FORMATS else None
-    if place is None and suffix not in table:
-        raise ValueError(
-            f"{file} has the suffix {file.suffix!r}; known formats of demonstrations: {', '.join(table)}. {LOADERS}"
-        )
-    module, name = (place or table[suffix]).split(".")
+def _function(file: Path, place: str | None, table: dict[str, str]) -> Callable[..., Any]:
+    if place is None:
+        known = f"known formats of demonstrations: {', '.join(table)}"
+        raise ValueError(f"{file} has the suffix {file.suffix!r}; {known}. {LOADERS}")
+    module, name = place.split(".")
     return getattr(import_module(f"torch_pbd.data.formats.{module}"), name)

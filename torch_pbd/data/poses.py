@@ -43,19 +43,19 @@ def as_outputs(
         outputs = Outputs(times_, positions_, names_, as_units(units, len(names_)), None)
         return outputs if rotation_reference is None else _in_chart(outputs, rotation_reference)
     if rotation_reference is not None:
-        must = "None where rotation= names quaternions, whose mean it is"
-        raise checks.refusal(rotation_reference, "rotation_reference", must)
+        raise checks.refusal(rotation_reference, "rotation_reference", "None where rotation= names quaternions")
     chosen = as_texts(rotation, "rotation")
-    if len(chosen) != 4 or len(set(chosen)) < 4 or not set(chosen) <= set(names_):
+    if not len(chosen) == len(set(chosen)) == len(set(chosen) & set(names_)) == 4:
         must = f"four different ones of {preview(names_)}, in the order w x y z, wherever these stand"
         raise checks.refusal(rotation, "rotation", must)
     columns = [names_.index(name) for name in chosen]
-    if missing == "drop":
-        times_, positions_ = _without_zeros(times_, positions_, columns)
+    lost = [~position[:, columns].any(axis=1, keepdims=True) for position in positions_]
+    if missing == "drop" and any(map(np.any, lost)):  # a tracker that saw nothing wrote zeros
+        holes = [np.where(gone, np.nan, position) for gone, position in zip(lost, positions_, strict=True)]
+        times_, positions_ = as_recordings(times_, holes, "drop")
     turns = [_unit(position[:, columns], k, chosen) for k, position in enumerate(positions_)]
     kept = [i for i in range(len(names_)) if i not in columns]
-    one_each = units is not None and not isinstance(units, str)
-    if one_each and len(units) == len(names_):
+    if units is not None and not isinstance(units, str) and len(units) == len(names_):
         units = [units[i] for i in kept]
     own = () if units is not None and not kept else as_units(units, len(kept))
     labels = (*(names_[i] for i in kept), *ROTATION)
@@ -70,9 +70,9 @@ def as_outputs(
 
 def mean_rotation(times: Sequence[Floats], quaternions: Sequence[Floats]) -> Floats:
     """Frechet mean (4,) of recorded rotations (T_k, 4), each at evenly spaced phases."""
-    phases, turns = np.linspace(0.0, 1.0, _N_PHASES), map(continuous, quaternions)
-    even = [interpolate(own, turn, phases) for own, turn in zip(unit_phases(times), turns, strict=True)]
-    together = np.concatenate(even)
+    phases = np.linspace(0.0, 1.0, _N_PHASES)
+    pairs = zip(unit_phases(times), quaternions, strict=True)
+    together = np.concatenate([interpolate(own, continuous(turn), phases) for own, turn in pairs])
     return mean(together / np.linalg.norm(together, axis=1, keepdims=True))
 
 
@@ -85,20 +85,16 @@ def charted(
     return [np.column_stack([place, turn]) for place, turn in zip(places, turns, strict=True)]
 
 
-def poses(positions: Sequence[Floats], reference: Floats | None) -> tuple[list[Floats], list[Floats]]:
-    """Positions (T_k, p) and quaternions (T_k, 4) of outputs; w >= 0 against the reference, so that signs go on."""
-    if reference is None:
-        raise InvalidParameterError("the demonstrations have no rotation: name its columns by rotation=, w x y z.")
-    chart = Chart(reference)
-    return [position[:, :-3] for position in positions], [chart.exp(position[:, -3:]) for position in positions]
-
-
 def as_columns(demonstrations: Any) -> tuple[tuple[str, ...], Sequence[Floats]]:
     """Names and columns (T_k, ...) for tables: what other programs read, a rotation as its quaternion."""
-    if demonstrations.rotation_reference is None:
-        return demonstrations.names, demonstrations.positions
-    names = (*demonstrations.names[:-3], *QUATERNION)
-    return as_names(names, len(names)), list(map(np.hstack, zip(*demonstrations.to_poses(), strict=True)))
+    names, columns = demonstrations.names, demonstrations.positions
+    if demonstrations.rotation_reference is not None:
+        names = as_names((*names[:-3], *QUATERNION), len(names) + 1)
+        columns = list(map(np.hstack, zip(*demonstrations.to_poses(), strict=True)))
+    taken = {"demo", "time"} & set(names)
+    if taken:
+        raise InvalidParameterError(f"an output named {min(taken)!r} cannot be told from other columns: rename it.")
+    return names, columns
 
 
 def with_whole_rotation(chosen: Sequence[str], names: Sequence[str], reference: Any) -> tuple[tuple[str, ...], Any]:
@@ -106,16 +102,9 @@ def with_whole_rotation(chosen: Sequence[str], names: Sequence[str], reference: 
     own = names[-3:] if reference is not None else ()
     if not set(own) & set(chosen):
         return tuple(chosen), None
-    absent = [name for name in own if name not in chosen]
-    if absent:
-        must = f"with all of {', '.join(own)} or none of them, which are one rotation"
-        raise checks.refusal([*chosen], "outputs", must, f"{absent[0]!r} is lacking")
+    if not set(own) <= set(chosen):
+        raise checks.refusal([*chosen], "outputs", f"with all of {', '.join(own)} or none, which are one rotation")
     return (*(name for name in chosen if name not in own), *own), reference
-
-
-def same_reference(one: Floats | None, other: Floats | None) -> bool:
-    """True of two references that are equal to the last bit, and of none and none."""
-    return one is other if one is None or other is None else np.array_equal(one, other)
 
 
 def unwrapped(times: Any, positions: Any, names: Any, units: Any, angles: Any) -> list[Floats]:
@@ -149,17 +138,10 @@ def _in_chart(outputs: Outputs, rotation_reference: Any) -> Outputs:
     if abs(float(reference @ reference) - 1.0) > checks.ROUNDING:
         raise checks.refusal(rotation_reference, "rotation_reference", "a unit quaternion w x y z")
     if len(outputs.names) < 3 or (outputs.units is not None and set(outputs.units[-3:]) != {"rad"}):
-        must = f"given for outputs that end with three of a rotation in rad, and not for {preview(outputs.names)}"
+        must = f"given for outputs that end with three of a rotation in rad, not for {preview(outputs.names)}"
         raise checks.refusal(rotation_reference, "rotation_reference", must)
     _check_reach(outputs.times, [position[:, -3:] for position in outputs.positions])
     return outputs._replace(rotation_reference=frozen(reference))
-
-
-def _without_zeros(times: Any, positions: Any, columns: list[int]) -> tuple[tuple[Floats, ...], tuple[Floats, ...]]:
-    """Recordings without the samples in which a tracker that saw nothing wrote a quaternion of zeros."""
-    lost = [~position[:, columns].any(axis=1, keepdims=True) for position in positions]
-    holes = [np.where(gone, np.nan, position) for gone, position in zip(lost, positions, strict=True)]
-    return as_recordings(times, holes, "drop") if any(map(np.any, lost)) else (times, positions)
 
 
 def _unit(quaternion: Floats, k: int, names: Sequence[str]) -> Floats:
@@ -168,11 +150,9 @@ def _unit(quaternion: Floats, k: int, names: Sequence[str]) -> Floats:
     wrong = np.flatnonzero(np.abs(square - 1.0) > OFF_SPHERE)
     if len(wrong):
         i = int(wrong[0])
-        lost = "missing='drop' leaves such samples out" if square[i] == 0.0 else "divide quaternions by their norm"
-        raise InvalidParameterError(
-            f"the quaternion {', '.join(names)} has norm {math.sqrt(square[i]):.4g} at sample {i} of recording {k}, "
-            f"must have 1: name the columns of a rotation, in the order w x y z, or {lost}."
-        )
+        what = f"the quaternion {', '.join(names)} has norm {math.sqrt(square[i]):.4g} at sample {i} of recording {k}"
+        remedy = "missing='drop' leaves such samples out" if square[i] == 0.0 else "name the columns of a rotation"
+        raise InvalidParameterError(f"{what}, must have 1: {remedy}.")
     return quaternion / np.sqrt(square)[:, np.newaxis]
 
 
@@ -181,11 +161,8 @@ def _check_reach(times: Sequence[Floats], turns: Sequence[Floats]) -> None:
     k = int(np.argmax([angle.max() for angle in angles]))
     i = int(np.argmax(angles[k]))
     what = f"ecording {k} is {angles[k][i]:.1f} degrees from the mean rotation at {times[k][i]:.6g}"
-    remedy = (
-        "Three numbers for a rotation end at 180. Leave a wrong sample out; where the task turns so far, as screws do, "
-        "learn deviations from the mean rotation of each time: multiply its inverse with that of each recording."
-    )
+    remedy = "leave a wrong sample out, or, as of screws, learn deviations from the mean rotation of each time"
     if angles[k][i] > _FURTHEST:
-        raise InvalidParameterError(f"r{what}, must be at most {_FURTHEST:.0f}. {remedy}")
+        raise InvalidParameterError(f"r{what}, must be at most {_FURTHEST:.0f}: {remedy}.")
     if angles[k][i] > _FAR:
-        checks.warn(f"R{what}, and {_FURTHEST:.0f} are refused. {remedy}")
+        checks.warn(f"R{what}, and {_FURTHEST:.0f} are refused: {remedy}.")

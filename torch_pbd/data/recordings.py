@@ -8,13 +8,14 @@ from numpy.typing import NDArray
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.data.units import ANGLES, LENGTHS, TIMES, check_unit, exact, nanoseconds_hint
+from torch_pbd.data.units import ANGLES, LENGTHS, check_unit, exact, nanoseconds_hint
 from torch_pbd.exceptions import InvalidParameterError, MissingDataWarning
 
 Missing = Literal["raise", "drop"]
 MIN_SAMPLES = 2
 # Times further apart would have infinite durations, and phases of NaN. Quarters have finite differences.
 _LONGEST = 0.25 * float(np.finfo(np.float64).max)
+_ALONE = "One demonstration alone is written [positions]."
 Arrays = list[NDArray[Any]]
 
 
@@ -33,15 +34,23 @@ def as_recordings(times: Any, positions: Any, missing: str) -> tuple[tuple[Float
     # Times are one array for all if the first entry is a number, and not an array of its own.
     if _numbers(stamps[0], "times[0]", drop).ndim == 0:
         names, grids = ["times"] * len(samples), [_grid(times, "times", drop)] * len(samples)
-    elif len(stamps) == len(samples):
+    else:
         names = [f"times[{k}]" for k in range(len(stamps))]
         grids = [_grid(time, name, drop) for time, name in zip(stamps, names, strict=True)]
-    else:
-        raise InvalidParameterError(
-            f"times has {len(stamps)} arrays but positions has {len(samples)} demonstrations: give one time array for "
-            "each demonstration, or one 1-D array that all of them share."
-        )
-    _check_shapes(grids, samples, names)
+    if len(grids) != len(samples):
+        must = f"{len(grids)} arrays but positions has {len(samples)} demonstrations"
+        raise InvalidParameterError(f"times has {must}: give one for each, or a 1-D one for all.")
+    for k, (grid, sample) in enumerate(zip(grids, samples, strict=True)):
+        if len(grid) != len(sample):
+            raise InvalidParameterError(
+                f"{names[k]} has {len(grid)} samples but positions[{k}] has {len(sample)}, of lengths "
+                f"{preview(list(map(len, samples)))}: give each demonstration its own times. {_ALONE}"
+            )
+        if sample.shape[1] != samples[0].shape[1]:
+            n, first = sample.shape[1], samples[0].shape[1]
+            raise InvalidParameterError(
+                f"positions[{k}] has {n} outputs but positions[0] has {first}: select the same."
+            )
     kept = [np.arange(len(grid)) for grid in grids]
     if drop:
         kept = _not_missing(grids, samples)
@@ -62,20 +71,9 @@ def as_texts(values: Any, name: str) -> tuple[str, ...]:
     return tuple(checks.text(entry, f"{name}[{i}]") for i, entry in enumerate(entries))
 
 
-def as_labels(values: Any, n_outputs: int, name: str) -> tuple[str, ...]:
-    """Text for each output."""
-    labels = as_texts(values, name)
-    if len(labels) != n_outputs:
-        raise InvalidParameterError(
-            f"{name} has {len(labels)} entries {preview(labels)} but the demonstrations have {n_outputs} outputs: "
-            "give one for each output."
-        )
-    return labels
-
-
 def as_names(names: Any, n_outputs: int) -> tuple[str, ...]:
     """Name for each output, all different; y0, y1, ... where none are given."""
-    values = as_labels([f"y{i}" for i in range(n_outputs)] if names is None else names, n_outputs, "names")
+    values = _one_each([f"y{i}" for i in range(n_outputs)] if names is None else names, n_outputs, "names")
     if len(set(values)) < n_outputs:
         raise InvalidParameterError(f"names must differ from each other; got {preview(values)}.")
     return values
@@ -86,24 +84,32 @@ def as_units(units: Any, n_outputs: int) -> tuple[str, ...] | None:
     if units is None:
         return None
     one = isinstance(units, str)
-    values = (units,) * n_outputs if one else as_labels(units, n_outputs, "units")
+    values = (units,) * n_outputs if one else _one_each(units, n_outputs, "units")
     for i, unit in enumerate(values):
         check_unit(unit, "units" if one else f"units[{i}]", LENGTHS | ANGLES)
     return values
-
-
-def as_time_unit(time_unit: Any) -> str:
-    """Unit of the times."""
-    if not isinstance(time_unit, str) or not time_unit:
-        raise checks.refusal(time_unit, "time_unit", "the unit of the times", "'s', or '1' for phase")
-    check_unit(time_unit, "time_unit", TIMES)
-    return time_unit
 
 
 def preview(values: Sequence[object], limit: int = 12) -> str:
     """Values as a list, cut where it gets long."""
     shown = ", ".join(str(value) for value in values[:limit])
     return f"[{shown}, ... {len(values)} in all]" if len(values) > limit else f"[{shown}]"
+
+
+def frozen(array: NDArray[Any], fresh: bool = False) -> Floats:
+    """Read-only array, a copy of one that is not fresh."""
+    # A view would keep alive what it is a part of.
+    copy = np.array(array, dtype=np.float64, order="C", copy=None if fresh and array.base is None else True)
+    copy.setflags(write=False)
+    return copy
+
+
+def _one_each(values: Any, n_outputs: int, name: str) -> tuple[str, ...]:
+    labels = as_texts(values, name)
+    if len(labels) != n_outputs:
+        has = f"{name} has {len(labels)} entries {preview(labels)}"
+        raise InvalidParameterError(f"{has} but the demonstrations have {n_outputs} outputs: give one for each.")
+    return labels
 
 
 def _as_list(values: Any, name: str) -> list[Any]:
@@ -118,11 +124,7 @@ def _as_list(values: Any, name: str) -> list[Any]:
 
 def _numbers(values: Any, name: str, drop: bool) -> NDArray[Any]:
     """Real numbers in their own type, as whole numbers beyond 2**53 are exact in none else."""
-    if np.ma.is_masked(values):
-        if not drop:
-            raise InvalidParameterError(
-                f"{name} has masked entries: drop these samples (missing='drop') or fill them in first."
-            )
+    if drop and np.ma.is_masked(values):
         values = np.ma.filled(np.ma.asarray(values, dtype=np.float64), np.nan)
     array = checks.real_array(values, name)
     return array if array.dtype.kind in "fiu" else checks.real_floats(array, name)
@@ -132,10 +134,8 @@ def _samples(values: Any, name: str, drop: bool) -> NDArray[Any]:
     array = _numbers(values, name, drop)
     samples = array[:, np.newaxis] if array.ndim == 1 else array
     if samples.ndim != 2 or samples.shape[1] == 0:
-        raise InvalidParameterError(
-            f"{name} has shape {array.shape}, must be (n_samples, n_outputs), or (n_samples,) for one output: one "
-            "demonstration alone is written [positions]."
-        )
+        must = "(n_samples, n_outputs), or (n_samples,) for one output"
+        raise InvalidParameterError(f"{name} has shape {array.shape}, must be {must}. {_ALONE}")
     return samples
 
 
@@ -148,66 +148,34 @@ def _grid(values: Any, name: str, drop: bool) -> NDArray[Any]:
     return grid
 
 
-def _check_shapes(grids: Arrays, samples: Arrays, names: list[str]) -> None:
-    lengths, n_outputs = [len(sample) for sample in samples], samples[0].shape[1]
-    for k, (grid, sample) in enumerate(zip(grids, samples, strict=True)):
-        if len(grid) != len(sample):
-            raise InvalidParameterError(
-                f"{names[k]} has {len(grid)} samples but positions[{k}] has {len(sample)}, of lengths "
-                f"{preview(lengths)}: give each demonstration its own times, one for each sample, then use .resample() "
-                "or .align(). One demonstration alone is written [positions]."
-            )
-        if sample.shape[1] != n_outputs:
-            raise InvalidParameterError(
-                f"positions[{k}] has {sample.shape[1]} outputs but positions[0] has {n_outputs}: all demonstrations "
-                "must have the same outputs."
-            )
-
-
 def _not_missing(grids: Arrays, samples: Arrays) -> list[NDArray[np.intp]]:
     """Numbers of the samples of which neither the time nor a position is NaN; warns of how many are."""
     holes = [np.isnan(grid) | np.isnan(sample).any(1) for grid, sample in zip(grids, samples, strict=True)]
     lost = {k: (int(hole.sum()), len(hole)) for k, hole in enumerate(holes) if hole.any()}
     for k, (n_lost, n) in lost.items():
         if n - n_lost < MIN_SAMPLES:
-            raise InvalidParameterError(
-                f"positions[{k}] has {n - n_lost} of {n} samples left without missing values, must be at least "
-                f"{MIN_SAMPLES}: leave this demonstration out, or fill the missing values in."
-            )
+            left = f"positions[{k}] has {n - n_lost} of {n} samples left without missing values"
+            raise InvalidParameterError(f"{left}, must be at least {MIN_SAMPLES}: leave it out, or fill them in.")
     if lost:
-        counts = [f"{n_lost} of {n} in demonstration {k}" for k, (n_lost, n) in lost.items()]
-        shown = ", ".join(counts[:12]) + (f", ... ({len(counts)} demonstrations in all)" if len(counts) > 12 else "")
+        counts = preview([f"{n_lost} of {n} in demonstration {k}" for k, (n_lost, n) in lost.items()])
+        # A run begins where the padded mask turns true and ends where it turns false: edges alternate.
+        edges = [np.flatnonzero(np.diff(np.r_[False, hole, False])) for hole in holes]
+        longest = max(int((edge[1::2] - edge[::2]).max(initial=0)) for edge in edges)
         checks.warn(
-            f"Dropped {sum(map(np.sum, holes))} of {sum(map(len, holes))} samples that have missing values: {shown}. "
-            f"At most {max(map(_longest_run, holes))} of them follow each other; what interpolates later draws "
-            "straight lines there.",
+            f"Dropped {sum(map(np.sum, holes))} of {sum(map(len, holes))} samples that have missing values: "
+            f"{counts[1:-1]}. At most {longest} of them follow each other; what interpolates later draws straight "
+            "lines there.",
             MissingDataWarning,
         )
     return [np.flatnonzero(~hole) for hole in holes]
 
 
-def _longest_run(hole: NDArray[np.bool_]) -> int:
-    # A run begins where the padded mask turns true and ends where it turns false: edges alternate.
-    edges = np.flatnonzero(np.diff(np.r_[False, hole, False]))
-    return int((edges[1::2] - edges[::2]).max(initial=0))
-
-
-def frozen(array: NDArray[Any], fresh: bool = False) -> Floats:
-    """Read-only array, a copy of one that is not fresh."""
-    # A view would keep alive what it is a part of.
-    copy = np.array(array, dtype=np.float64, order="C", copy=None if fresh and array.base is None else True)
-    copy.setflags(write=False)
-    return copy
-
-
 def _finite(position: Floats, k: int, numbers: NDArray[np.intp]) -> Floats:
     if not np.isfinite(position).all():
         i, j = np.argwhere(~np.isfinite(position))[0]
-        missing = np.isnan(position[i, j])
-        remedy = "drop the missing samples (missing='drop') or fill them in" if missing else "correct the value"
-        raise InvalidParameterError(
-            f"positions[{k}] is {position[i, j]} at sample {numbers[i]}, output {j}, must be finite: {remedy} first."
-        )
+        where = f"positions[{k}] is {position[i, j]} at sample {numbers[i]}, output {j}, must be finite"
+        remedy = "drop the sample (missing='drop') or fill it in" if np.isnan(position[i, j]) else "correct it"
+        raise InvalidParameterError(f"{where}: {remedy}.")
     return position
 
 
@@ -228,11 +196,16 @@ def _rising(grid: NDArray[Any], original: NDArray[Any], name: str, numbers: NDAr
         i = int(np.argmin(np.isfinite(time)))
         raise InvalidParameterError(f"{name} is {time[i]} at sample {numbers[i]}, must be finite.")
     if np.ptp(0.25 * time) > _LONGEST:
-        raise InvalidParameterError(
-            f"{name} goes from {time.min():.3g} to {time.max():.3g}, further than float64 can tell: take another "
-            "unit of time."
-        )
-    coarse, falls = _coarseness(original), np.flatnonzero(np.diff(time) <= 0)
+        far = f"{name} goes from {time.min():.3g} to {time.max():.3g}"
+        raise InvalidParameterError(f"{far}, further than float64 can tell: take another unit of time.")
+    coarse = ""
+    if original.dtype.kind == "f" and original.dtype.itemsize < 8:  # such as Unix time in float32
+        resolution, step = float(np.spacing(np.abs(original).max())), (time[-1] - time[0]) / (len(time) - 1)
+        # A quarter of a step moves a derivative by as much: what is finer is left to smoothing.
+        if resolution > 0.25 * step:
+            coarse = f" It is {original.dtype}, which resolves {resolution:.3g} at {time[-1]:.6g}, where the mean step "
+            coarse += f"is {step:.3g}: record times as float64, or count them from the start."
+    falls = np.flatnonzero(np.diff(time) <= 0)
     if len(falls):
         i = int(falls[0]) + 1
         before, here = (exact(stamp) for stamp in original[i - 1 : i + 1].tolist())
@@ -243,18 +216,3 @@ def _rising(grid: NDArray[Any], original: NDArray[Any], name: str, numbers: NDAr
     if coarse:
         raise InvalidParameterError(f"{name} is too coarse for its own steps.{coarse}")
     return time
-
-
-def _coarseness(time: NDArray[Any]) -> str:
-    """Reason why times of low precision, as Unix time in float32, are unusable; empty where they are not."""
-    if time.dtype.kind != "f" or time.dtype.itemsize >= 8:
-        return ""
-    resolution = float(np.spacing(np.abs(time).max()))
-    step = float(time[-1] - time[0]) / (len(time) - 1)
-    # A quarter of a step moves a derivative by as much: what is finer is left to smoothing.
-    if resolution <= 0.25 * step:
-        return ""
-    return (
-        f" It is {time.dtype}, which resolves {resolution:.3g} at {float(time[-1]):.6g}, where the mean "
-        f"step is {step:.3g}: record times as float64, or count them from the start of the demonstration."
-    )

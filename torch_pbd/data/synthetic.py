@@ -170,37 +170,26 @@ def make_tunnel_demonstrations(
     checks.choice(variant, "variant", Variant)
     check_recording(n_demos, duration, rate, least_steps=0.5)
     random = generator(random_state)
-    lanes = _lanes(n_demos, variant, random)
+    lanes = random.uniform(-0.6, 0.6, size=n_demos)
+    if variant == "two_path":
+        # As many on either side; the lanes, 0 to 0.6 from the middle, go to 0.4 to 0.6.
+        lanes = random.permutation(np.where(np.arange(n_demos) % 2, 1.0, -1.0)) * (0.4 + np.abs(lanes) / 3.0)
     times, positions = [], []
     for lane in lanes:
         lasting = duration * random.uniform(0.8, 1.25) if variant == "unequal" else duration
-        time = _sample_times(lasting, rate, variant, random)
+        time = np.arange(max(1, round(lasting * rate)) + 1) / rate
+        if variant == "dropped":
+            kept = random.uniform(size=len(time)) >= 0.1
+            kept[[0, -1]] = True
+            time = time[kept]
+        if variant == "jitter":
+            time[1:-1] += random.uniform(-0.2, 0.2, size=len(time) - 2) / rate
         times.append(time)
         positions.append(_tunnel_path(time, lasting, lane, (common_start, common_goal), random))
     if variant == "outlier":
         positions[-1][:, 0] += 0.1 * np.exp(-(((positions[-1][:, 1] - 0.5) / 0.05) ** 2))
     quantized = [np.round(position / _QUANTUM) * _QUANTUM for position in positions]
     return Demonstrations(times, quantized, names=("x", "y"), units="m")
-
-
-def _lanes(n_demos: int, variant: Variant, random: Random) -> NDArray[np.float64]:
-    lanes = random.uniform(-0.6, 0.6, size=n_demos)
-    if variant != "two_path":
-        return lanes
-    # As many on either side; the lanes, 0 to 0.6 from the middle, go to 0.4 to 0.6.
-    side = random.permutation(np.where(np.arange(n_demos) % 2, 1.0, -1.0))
-    return side * (0.4 + np.abs(lanes) / 3.0)
-
-
-def _sample_times(duration: float, rate: float, variant: Variant, random: Random) -> Floats:
-    time = np.arange(max(1, round(duration * rate)) + 1) / rate
-    if variant == "dropped":
-        kept = random.uniform(size=len(time)) >= 0.1
-        kept[[0, -1]] = True
-        return time[kept]
-    if variant == "jitter":
-        time[1:-1] += random.uniform(-0.2, 0.2, size=len(time) - 2) / rate
-    return time
 
 
 def _tunnel_path(time: Floats, duration: float, lane: float, common: tuple[bool, bool], random: Random) -> Floats:

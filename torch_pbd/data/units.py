@@ -2,7 +2,7 @@
 
 import difflib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -47,10 +47,7 @@ def check_unit(unit: str, name: str, known: dict[str, float]) -> None:
     close = forms & {*known, *_SPELLED} or difflib.get_close_matches(folded, _LONG, n=1, cutoff=_CLOSE)
     if unit not in LENGTHS | ANGLES | TIMES and close:
         listed = "; ".join(", ".join(kind) for kind in (LENGTHS, ANGLES, TIMES))
-        remedy = (
-            "convert what is in others, such as inches. A word like none of them, such as 'pixels', is taken for a "
-            "unit of its own"
-        )
+        remedy = "convert what is in others; words like none of them, such as 'pixels', are units of their own"
         raise refusal(unit, name, f"written as one of the known units, {listed}", remedy)
 
 
@@ -65,20 +62,32 @@ def nanoseconds_hint(times: Any) -> str:
     largest = float(np.abs(stamps.astype(np.float64)).max())
     if not _LIKE_NS <= largest < math.inf or (stamps != np.round(stamps)).any():
         return ""
-    coarse = (
-        f", of which float64 tells {np.spacing(largest):.0f} apart: give integers" if stamps.dtype.kind == "f" else ""
+    coarse = f", of which float64 tells {np.spacing(largest):.0f} apart: give integers"
+    return (
+        f" Whole numbers above {_LIKE_NS:g} look like ns (time_unit='ns'){coarse if stamps.dtype.kind == 'f' else ''}."
     )
-    return f" Whole numbers above {_LIKE_NS:g} look like ns (time_unit='ns'){coarse}."
 
 
 def find_suspects(positions: Sequence[Floats], names: Sequence[str], units: Sequence[str] | None) -> tuple[str, ...]:
     """Sentences on outputs that are no coordinates, with the remedy; without units, an angle may be in rad or deg."""
-    return (*_quaternions(positions, names), *_wrapped(positions, names, units))
-
-
-def _column(positions: Sequence[Floats], i: int) -> Floats:
-    """One output of all demonstrations, within what differences can be taken of."""
-    return np.concatenate([position[:, i] for position in positions]).clip(-_LARGEST_ANGLE, _LARGEST_ANGLE)
+    found = []
+    for first in quaternions(positions, len(names)):
+        four = names[first : first + 4]
+        order = tuple(sorted(four, key=lambda name: name[-1:]))
+        known = [name[-1:] for name in order] == [*"wxyz"]
+        found.append(
+            f"Outputs {', '.join(four)} have the squared sum 1, as unit quaternions do, of which q and -q are one "
+            "rotation and no mean is one: say which they are, in the order w x y z, "
+            f"rotation={order if known else '(w, x, y, z), of which only you know the names'}, or leave them out."
+        )
+    for i, name in enumerate(names):
+        angle = _wrapped(positions, i, None if units is None else units[i])
+        if angle:
+            found.append(
+                f"Output {name} jumps by a turn, {2.0 * math.pi / ANGLES[angle]:.4g} {angle}, between two samples, and "
+                f"a robot would turn back the long way. Say angles=[{name!r}], and that its unit is {angle!r}."
+            )
+    return tuple(found)
 
 
 def quaternions(positions: Sequence[Floats], n_outputs: int) -> list[int]:
@@ -94,37 +103,25 @@ def quaternions(positions: Sequence[Floats], n_outputs: int) -> list[int]:
     return found
 
 
-def _quaternions(positions: Sequence[Floats], names: Sequence[str]) -> Iterator[str]:
-    for first in quaternions(positions, len(names)):
-        four = names[first : first + 4]
-        order = sorted(four, key=lambda name: name[-1:])
-        known = [name[-1:] for name in order] == [*"wxyz"]
-        columns = tuple(order) if known else "(w, x, y, z), of which only you know the names"
-        yield (
-            f"Outputs {', '.join(four)} have the squared sum 1, as unit quaternions do: q and -q are one rotation, so "
-            "their mean and their covariance are not those of rotations. Say which they are, in the order w x y z, "
-            f"rotation={columns}, or leave them out, as by outputs=[...] of load_demonstrations."
-        )
+def _column(positions: Sequence[Floats], i: int) -> Floats:
+    """One output of all demonstrations, within what differences can be taken of."""
+    return np.concatenate([position[:, i] for position in positions]).clip(-_LARGEST_ANGLE, _LARGEST_ANGLE)
 
 
-def _wrapped(positions: Sequence[Floats], names: Sequence[str], units: Sequence[str] | None) -> Iterator[str]:
-    known: Sequence[str | None] = units or [None] * len(names)
-    within = np.cumsum([len(position) for position in positions])[:-1] - 1  # steps from one demonstration to the next
-    for i, (name, unit) in enumerate(zip(names, known, strict=True)):
-        turns = {angle: 2.0 * math.pi / ANGLES[angle] for angle in (ANGLES if unit is None else {unit} & set(ANGLES))}
-        ends = [[float(end(position[:, i])) for position in positions] for end in (np.max, np.min)]
-        whole = max(ends[0]) - min(ends[1])
+def _wrapped(positions: Sequence[Floats], i: int, unit: str | None) -> str | None:
+    """Unit in which an output jumps by a turn; None where it does not."""
+    whole = max(float(y[:, i].max()) for y in positions) - min(float(y[:, i].min()) for y in positions)
+    for angle in ANGLES if unit is None else {unit} & set(ANGLES):
+        turn = 2.0 * math.pi / ANGLES[angle]
         # Most outputs cover less than a turn, and are not looked at step by step.
-        for angle, turn in turns.items() if whole >= (1.0 - _QUARTER) * min(turns.values(), default=math.inf) else ():
-            step = np.delete(np.abs(np.diff(_column(positions, i))), within)
-            jumps = np.abs(step - turn) <= _QUARTER * turn
-            other = step[~jumps].max(initial=0.0)
-            # What goes on behind the jump is as smooth as elsewhere.
-            smooth = np.abs(step[jumps] - turn) <= max(3.0 * other, 1e-3 * turn)
-            dense = other < _QUARTER * turn and 0 < jumps.sum() <= _MOST_JUMPS * len(step)
-            if dense and smooth.all() and (unit is not None or whole <= 1.01 * turn):
-                yield (
-                    f"Output {name} jumps by a turn, {turn:.4g} {angle}, between two samples: means of such recordings "
-                    f"are no angles, and a robot would turn back the long way. Say angles=[{name!r}], and "
-                    f"that its unit is {angle!r}."
-                )
+        if whole < (1.0 - _QUARTER) * turn or (unit is None and whole > 1.01 * turn):
+            continue
+        ends = np.cumsum([len(position) for position in positions])[:-1] - 1  # between two demonstrations
+        step = np.delete(np.abs(np.diff(_column(positions, i))), ends)
+        jumps = np.abs(step - turn) <= _QUARTER * turn
+        other = step[~jumps].max(initial=0.0)
+        # What goes on behind the jump is as smooth as elsewhere.
+        smooth = np.abs(step[jumps] - turn) <= max(3.0 * other, 1e-3 * turn)
+        if other < _QUARTER * turn and 0 < jumps.sum() <= _MOST_JUMPS * len(step) and smooth.all():
+            return angle
+    return None

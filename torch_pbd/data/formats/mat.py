@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from torch_pbd import checks
 from torch_pbd.data.recordings import preview
-from torch_pbd.data.wanted import Arguments, Wanted, column_names
+from torch_pbd.data.wanted import Arguments, Wanted, column_names, numeric
 from torch_pbd.registry import optional
 
 _DEEPEST = 8  # cells in structs in cells
@@ -27,13 +27,12 @@ def read(path: Path, wanted: Wanted, variable: str | None = None) -> Arguments:
         raise ValueError(
             f"it has no {what}, but {preview([*content])}: say by variable= which one holds the recordings."
         )
-    cells = content[name]
-    cells = cells if isinstance(cells, list) else [cells]
+    cells = content[name] if isinstance(content[name], list) else [content[name]]
     step = _number(content.get("dt"))
     recordings = [_signals(cell, f"{name}{{{k + 1}}}", step) for k, cell in enumerate(cells)]
     if not recordings:
         raise ValueError(f"{name} is empty.")
-    columns = {key: column_names(key, (*value.shape, 1)[1]) for key, value in recordings[0].items()}
+    columns = {key: column_names(key, value.shape) for key, value in recordings[0].items()}
     absent = [(k, key) for k, own in enumerate(recordings) for key in columns if key not in own]
     if absent:
         raise ValueError(f"{name}{{{absent[0][0] + 1}}} has no {absent[0][1]!r}, which {name}{{1}} has.")
@@ -44,15 +43,15 @@ def _signals(cell: Any, place: str, step: float | None) -> dict[str, NDArray[Any
     """Signals (T,) or (T, d) of one recording: of a struct of matrices (d, T), or of a matrix of them."""
     if not isinstance(cell, Mapping):
         matrix = np.asarray(cell)
-        if matrix.ndim != 2 or matrix.dtype.kind not in "biuf":
+        if matrix.ndim != 2:
             raise ValueError(f"{place} is a {type(cell).__name__}, must be a struct with pos, or a matrix.")
         matrix = matrix if matrix.shape[0] < matrix.shape[1] else matrix.T
         # ds-opt stacks positions on velocities.
         half = len(matrix) // 2 if len(matrix) in (4, 6) else len(matrix)
         cell = {"pos": matrix[:half], **({"vel": matrix[half:]} if half < len(matrix) else {})}
     step = _number(cell.get("dt"), step)
-    arrays = {key: np.asarray(value) for key, value in cell.items() if not isinstance(value, Mapping | list | str)}
-    arrays = {key: a for key, a in arrays.items() if a.dtype.kind in "biuf" and a.size > 1 and a.ndim <= 2}
+    arrays = numeric({key: np.asarray(value) for key, value in cell.items() if not isinstance(value, Mapping | list)})
+    arrays = {key: array for key, array in arrays.items() if array.size > 1}
     if not arrays:
         raise ValueError(f"{place} has no matrices, but {preview([*cell])}.")
     # Time runs along the axis that all share: that of t, or the longer one of the positions.
@@ -69,7 +68,7 @@ def _signals(cell: Any, place: str, step: float | None) -> dict[str, NDArray[Any
 
 def _number(value: Any, default: float | None = None) -> float | None:
     array = np.asarray(default if value is None else value)
-    return float(array.reshape(-1)[0]) if array.dtype.kind in "iuf" and array.size == 1 else default
+    return float(array.item()) if array.dtype.kind in "iuf" and array.size == 1 else default
 
 
 def _read_mat5(path: Path, wanted: Wanted) -> dict[str, Any]:
@@ -84,34 +83,29 @@ def _plain(value: Any) -> Any:
     """Lists for arrays of objects, as scipy makes of cells."""
     if isinstance(value, np.ndarray) and value.dtype == object:
         return [_plain(entry) for entry in value.reshape(-1)]
-    if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items()}
-    return value
+    return {key: _plain(entry) for key, entry in value.items()} if isinstance(value, dict) else value
 
 
 def _read_hdf5(path: Path, wanted: Wanted) -> dict[str, Any]:
     h5py = optional("h5py", "hdf5", f"{path.name}, as all of MATLAB's version 7.3,")
+    total = 0.0
     with h5py.File(path, "r") as file:
-        total = [0.0]
 
         def plain(value: Any, depth: int = 0) -> Any:
+            nonlocal total
             if depth > _DEEPEST:
                 raise ValueError(f"its structs and cells lie in each other more than {_DEEPEST} deep.")
             if isinstance(value, h5py.Group):
                 fields = {key: plain(value[key], depth + 1) for key in value}
-                return _struct_array(fields)
-            total[0] += value.nbytes
-            wanted.require(total[0], "it")
+                # An array of structs is stored as lists, one for each field.
+                lists = [entry for entry in fields.values() if isinstance(entry, list)]
+                if lists and len(lists) == len(fields) and len(set(map(len, lists))) == 1:
+                    return [dict(zip(fields, entries, strict=True)) for entries in zip(*lists, strict=True)]
+                return fields
+            total += value.nbytes
+            wanted.require(total, "it")
             if value.dtype == h5py.ref_dtype:
                 return [plain(file[reference], depth + 1) for reference in value[()].reshape(-1)]
             return value[()].T  # MATLAB's order is that of columns
 
         return {key: plain(file[key]) for key in file if not key.startswith("#")}
-
-
-def _struct_array(fields: dict[str, Any]) -> Any:
-    """One struct, or the list of them, whose fields are stored as lists."""
-    lengths = {len(value) for value in fields.values() if isinstance(value, list)}
-    if len(lengths) == 1 and all(isinstance(value, list) for value in fields.values()):
-        return [dict(zip(fields, values, strict=True)) for values in zip(*fields.values(), strict=True)]
-    return fields

@@ -2,7 +2,8 @@
 
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -25,54 +26,49 @@ def read(path: Path, wanted: Wanted) -> Arguments:
     members = read_members(
         path.read_bytes(), wanted.max_bytes, remedy=f"Raise max_bytes={wanted.max_bytes} to read it."
     )
-    if not ({"meta", "x"} & set(members) or [*members] == ["t"] or any(re.fullmatch(_NUMBERED, m) for m in members)):
-        return _of_laboratory({name: _read(members, name) for name in members}, wanted)
+    numbers = {int(match[1]) for name in members if (match := re.fullmatch(_NUMBERED, name))}
+    if not ({"meta", "x"} & set(members) or [*members] == ["t"] or numbers):
+        return _read_other({name: _read(members, name) for name in members}, wanted)
     meta = _read_meta(members)
-    # One grid of times for all demonstrations, or a grid for each.
-    if "t" in members:
-        times: Any = _read(members, "t")
-        positions: Any = _read(members, "x")
+    if "t" in members:  # one grid of times for all demonstrations
+        positions = _read(members, "x")
         if positions.ndim != 3:
             raise ValueError(f"x has shape {positions.shape}, must have shape (K, T, d).")
+        recordings = [{"t": _read(members, "t"), "x": position} for position in positions]
     else:
-        numbers = range(_count(members))
-        times, positions = ([_read(members, f"{letter}_{k}") for k in numbers] for letter in "tx")
-    n_outputs = np.shape(positions[0])[-1] if len(positions) else 0
-    for key, count in {"K": len(positions), "d": n_outputs}.items():
+        absent = set(range(len(numbers))) - numbers
+        if absent or not numbers:
+            has = f"demonstration {max(numbers)} but no t_{min(absent)}, x_{min(absent)}" if numbers else "no t and x"
+            raise ValueError(f"it has {has}; it has: {preview([*members])}. {LOADERS}")
+        recordings = [{letter: _read(members, f"{letter}_{k}") for letter in "tx"} for k in sorted(numbers)]
+    n_outputs = (*recordings[0]["x"].shape, 1)[1] if recordings else 0
+    for key, count in {"K": len(recordings), "d": n_outputs}.items():
         if meta.get(key, count) != count:
             raise ValueError(f"meta says {key} = {meta[key]}, but the arrays have {count}.")
-    for option in ("demo", "time", "rate"):
-        if getattr(wanted, option) is not None:
-            raise ValueError(f"{option} is {getattr(wanted, option)!r}, but arrays t and x say it: leave it out.")
-    names, units, reference = meta.get("dims"), _units(meta), meta.get("rotation_reference")
-    if wanted.outputs is not None:
-        every, units = as_names(names, n_outputs), as_units(units, n_outputs)
-        chosen = wanted.choose({name: (name,) for name in every}).names
-        names, reference = with_whole_rotation(chosen, every, reference)
-        kept = [every.index(name) for name in names]
-        positions, units = [position[:, kept] for position in positions], units and [units[i] for i in kept]
-    return {
-        "times": times,
-        "positions": positions,
-        "names": names,
-        "units": units if wanted.units is None else wanted.units,
-        "frame": wanted.frame or _text(meta, "frame"),
+    names = as_names(meta.get("dims"), n_outputs)
+    outputs, reference = with_whole_rotation(wanted.outputs or names, names, meta.get("rotation_reference"))
+    chosen = replace(wanted, outputs=outputs).choose({"x": names})
+    # Times are known by the name of their array, which an output may have too.
+    chosen = chosen if wanted.rate else chosen._replace(time=("t", 0))
+    units = None if wanted.units is not None else as_units(_units(meta), n_outputs)
+    return replace(wanted, outputs=outputs).read_each(
+        chosen,
+        recordings,
+        units=units and [units[i] for _, i in chosen.outputs],
+        frame=_text(meta, "frame"),
         # Public recordings say unit and t_unit, with a remark in brackets: "s (100 Hz)".
-        "time_unit": wanted.time_unit or _text(meta, "time_unit") or _without_remark(_text(meta, "t_unit")) or "s",
-        "alignment": meta.get("alignment"),
-        "missing": wanted.missing,
-        "rotation": wanted.rotation,
-        "angles": wanted.angles,
-        "rotation_reference": reference,
-    }
+        time_unit=_text(meta, "time_unit") or _without_remark(_text(meta, "t_unit")),
+        alignment=meta.get("alignment"),
+        rotation_reference=reference,
+    )
 
 
 def read_array_file(path: Path, wanted: Wanted) -> Arguments:
     """Read .npy: one array (T, d), or (K, T, d)."""
-    return _of_laboratory({"y": read_array("it", path.read_bytes())}, wanted)
+    return _read_other({"y": read_array("it", path.read_bytes())}, wanted)
 
 
-def _of_laboratory(arrays: Mapping[str, NDArray[Any]], wanted: Wanted) -> Arguments:
+def _read_other(arrays: Mapping[str, NDArray[Any]], wanted: Wanted) -> Arguments:
     """Arrays by names that mean nothing to us: (K, T, d), or a recording (T, d) each, or columns of one recording."""
     arrays = {name: array for name, array in arrays.items() if array.dtype.kind in "biuf" and 1 <= array.ndim <= 3}
     names = sorted(arrays, key=natural)
@@ -86,13 +82,13 @@ def _of_laboratory(arrays: Mapping[str, NDArray[Any]], wanted: Wanted) -> Argume
         recordings = [{name: array[k] for name, array in signals.items()} for k in range(shape[0])]
     elif flat == names and len({arrays[name].shape[1] for name in names}) == 1:
         recordings = [{"y": arrays[name]} for name in names]
-    else:
+    elif len({len(array) for array in arrays.values()}) == 1:
         recordings = [arrays]
-        if len({len(array) for array in arrays.values()}) != 1:
-            shapes = preview([f"{name} {arrays[name].shape}" for name in names])
-            raise ValueError(
-                f"its arrays fit no layout, (K, T, d), or (T, d) each of equal d, or (T,): {shapes}. {LOADERS}"
-            )
+    else:
+        shapes = preview([f"{name} {arrays[name].shape}" for name in names])
+        raise ValueError(
+            f"its arrays fit no layout, (K, T, d), or (T, d) each of equal d, or (T,): {shapes}. {LOADERS}"
+        )
     columns: dict[str, tuple[str, ...]] = {name: (name,) for name in recordings[0]}
     for name, array in recordings[0].items():
         if array.ndim == 2:
@@ -107,6 +103,7 @@ def _of_laboratory(arrays: Mapping[str, NDArray[Any]], wanted: Wanted) -> Argume
 def write(demonstrations: Demonstrations, handle: BinaryIO) -> None:
     """Write the format of `torch_pbd.data.load_demonstrations`."""
     aligned, lengths = demonstrations.is_aligned, demonstrations.n_steps
+    reference = demonstrations.rotation_reference
     meta = {
         "K": len(demonstrations),
         "T": lengths[0] if aligned else [min(lengths), max(lengths)],
@@ -118,8 +115,7 @@ def write(demonstrations: Demonstrations, handle: BinaryIO) -> None:
         "frame": demonstrations.frame,
         "alignment": demonstrations.alignment,
     }
-    if demonstrations.rotation_reference is not None:
-        meta["rotation_reference"] = demonstrations.rotation_reference.tolist()
+    meta |= {} if reference is None else {"rotation_reference": reference.tolist()}
     arrays: dict[str, Any] = {"meta": np.array(json.dumps(meta))}
     if aligned:
         arrays |= {"t": demonstrations.times[0], "x": demonstrations.to_array()}
@@ -131,7 +127,7 @@ def write(demonstrations: Demonstrations, handle: BinaryIO) -> None:
 
 def _read(members: Mapping[str, bytes], name: str) -> NDArray[Any]:
     if name not in members:
-        raise ValueError(f"it has no array {name!r}; it has: {_listed(members)}.")
+        raise ValueError(f"it has no array {name!r}; it has: {preview([*members])}.")
     try:
         return read_array(name, members[name])
     except ValueError as error:
@@ -142,30 +138,16 @@ def _read_meta(members: Mapping[str, bytes]) -> dict[str, Any]:
     if "meta" not in members:
         return {}
     text = _read(members, "meta")
+    require_memory(parsed_bytes([members["meta"]]), what="meta", remedy="Leave out what is not read.")
     try:
         if text.ndim:
             raise ValueError(f"it has shape {text.shape}")
-        require_memory(parsed_bytes([members["meta"]]), what="it", remedy="Leave out what is not read.")
         meta = json.loads(text.item())
         if not isinstance(meta, dict):
             raise TypeError(f"it is a {type(meta).__name__}")
     except (ValueError, TypeError, RecursionError) as error:
         raise ValueError(f"meta must be a 0-d string with a JSON object: {error}") from error
     return meta
-
-
-def _count(names: Iterable[str]) -> int:
-    numbers = {int(match[1]) for name in names if (match := re.fullmatch(_NUMBERED, name))}
-    if not numbers:
-        raise ValueError(f"it has neither arrays t and x nor t_0, x_0, ...; it has: {_listed(names)}. {LOADERS}")
-    missing = set(range(len(numbers))) - numbers
-    if missing:
-        raise ValueError(f"it has demonstration {max(numbers)} but no t_{min(missing)}, x_{min(missing)}.")
-    return len(numbers)
-
-
-def _listed(names: Iterable[str]) -> str:
-    return f"{', '.join(names):.200}" or "none"
 
 
 def _text(meta: dict[str, Any], name: str) -> Any:
@@ -184,5 +166,4 @@ def _units(meta: dict[str, Any]) -> Any:
 
 
 def _without_remark(unit: Any) -> Any:
-    """Unit before the remark in brackets that some recordings add to it."""
     return unit.partition(" (")[0] if isinstance(unit, str) else unit

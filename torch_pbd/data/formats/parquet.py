@@ -23,16 +23,15 @@ def read(path: Path, wanted: Wanted) -> Arguments:
 
 
 def open_file(path: Path, extra: str, what: str) -> Any:
-    """Open a file; ``extra`` and ``what`` are for the error where the library is not installed."""
+    """Open Parquet file; ``extra`` and ``what`` are for the error where the library is not installed."""
     return optional("pyarrow.parquet", extra, what).ParquetFile(path, buffer_size=_BUFFER, pre_buffer=False)
 
 
 def read_columns(file: Any, names: Sequence[str], wanted: Wanted) -> dict[str, NDArray[Any]]:
     """Columns of an open Parquet file by name; lists of one length are rows of a matrix."""
     metadata = file.metadata
-    groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
-    wanted.require(sum(group.total_byte_size for group in groups), "it")
-    wanted.require(8.0 * metadata.num_rows * len(names), "it")
+    packed = sum(metadata.row_group(i).total_byte_size for i in range(metadata.num_row_groups))
+    wanted.require(max(packed, 8.0 * metadata.num_rows * len(names)), "it")
     columns: dict[str, NDArray[Any]] = {}
     n = 0
     for batch in file.iter_batches(_ROWS, columns=list(names), use_threads=False):

@@ -1,30 +1,29 @@
 """Recordings of ROS: rosbag2 (SQLite or MCAP) and ROS 1 bags; one topic, a sample a message."""
 
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from itertools import chain
+from itertools import chain, pairwise
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torch_pbd import checks
 from torch_pbd.data.recordings import MIN_SAMPLES, preview
-from torch_pbd.data.wanted import Arguments, Wanted, rows_of
+from torch_pbd.data.wanted import Arguments, Wanted
 from torch_pbd.registry import optional
 
-_POSITION, _ROTATION = "position", "orientation"
 # Fields that are outputs by message type, the first by default: where they lie in it, the names of their components,
-# and the unit that ROS prescribes (REP 103).
+# the prefix of their columns, and the unit that ROS prescribes (REP 103).
 _FIELDS = {
-    "Point": {_POSITION: ("", "xyz", "m")},
-    "Pose": {_POSITION: ("position.", "xyz", "m"), _ROTATION: ("orientation.", "xyzw", "1")},
-    "Transform": {_POSITION: ("translation.", "xyz", "m"), _ROTATION: ("rotation.", "xyzw", "1")},
-    "Wrench": {"force": ("force.", "xyz", "N"), "torque": ("torque.", "xyz", "N m")},
-    "Twist": {"linear": ("linear.", "xyz", "m/s"), "angular": ("angular.", "xyz", "rad/s")},
+    "Point": {"position": ("", "xyz", "", "m")},
+    "Pose": {"position": ("position.", "xyz", "", "m"), "orientation": ("orientation.", "xyzw", "q", "1")},
+    "Transform": {"position": ("translation.", "xyz", "", "m"), "orientation": ("rotation.", "xyzw", "q", "1")},
+    "Wrench": {"force": ("force.", "xyz", "force_", "N"), "torque": ("torque.", "xyz", "torque_", "N m")},
+    "Twist": {"linear": ("linear.", "xyz", "linear_", "m/s"), "angular": ("angular.", "xyz", "angular_", "rad/s")},
 }
 # Where the part that has the fields lies in a message.
 _PARTS = {
@@ -54,102 +53,115 @@ def read(path: Path, wanted: Wanted, topic: str | None = None, child: str | None
     # SQLite bags of older versions do not hold the definitions of their messages: standard ones did not change.
     types = stores.get_typestore(stores.Stores.ROS2_HUMBLE)
     with highlevel.AnyReader([path], default_typestore=types) as reader:
-        name = _topic(reader.topics, topic)
+        _check_topics(reader.topics, topic, wanted.demo)
+        name = topic or next(name for name, info in reader.topics.items() if info.msgtype in _KINDS and info.msgcount)
         info = reader.topics[name]
         # A sample is 8 bytes for each of its stamp and, with room for joints, 31 outputs.
         wanted.require(256.0 * info.msgcount, f"topic {name!r}")
-        values: list[Any] = []
-        return _read_messages(info.msgtype, _stretches(reader, name, wanted.demo, values), values, wanted, child)
+        marks: list[Any] = []
+        messages = _messages(reader, name, wanted.demo, marks)
+        return _read_messages(info.msgtype, messages, marks, wanted, child)
 
 
-def _stretches(reader: Any, topic: str, demo: str | None, values: list[Any]) -> Iterator[tuple[int, int, Any]]:
-    """Messages, each with its stamp and the number of the stretch over which topic ``demo`` has one of ``values``.
+def _check_topics(topics: dict[str, Any], topic: str | None, demo: str | None) -> None:
+    """Check that a topic, or the only one, is a movement, and that the other one tells the demonstrations apart."""
+    moving = [name for name, info in topics.items() if info.msgtype in _KINDS and info.msgcount]
+    known, wrong = ", ".join(sorted(kind.split("/")[-1] for kind in _KINDS)), ""
+    if topic is None and len(moving) != 1:
+        several = "several topics of movements: say which by"
+        wrong = f"it has {several if moving else 'no topic of poses, joints or forces to take by'} topic="
+    elif topic is not None and topic not in topics:
+        wrong = f"it has no topic {topic!r}"
+    elif topic is not None and topics[topic].msgtype not in _KINDS:
+        wrong = f"topic {topic!r} is of {topics[topic].msgtype}, must be of one of {known}"
+    elif demo is not None and (demo not in topics or topics[demo].msgtype not in _MARKS):
+        what = f"is of {topics[demo].msgtype}" if demo in topics else "is not there"
+        must = "must be of Bool, String or a whole number of std_msgs"
+        wrong = f"topic {demo!r}, by which demo= tells the demonstrations apart, {what}, {must}"
+    if wrong:
+        listed = ", ".join(f"{name} ({info.msgtype}, {info.msgcount} messages)" for name, info in topics.items())
+        raise ValueError(f"{wrong}; it has: {listed or 'none'}.")
+
+
+def _messages(reader: Any, topic: str, demo: str | None, marks: list[Any]) -> Iterator[tuple[int, int, Any]]:
+    """Messages, each with its stamp and the number of the stretch over which topic ``demo`` has one of ``marks``.
 
     All in the order in which they were recorded: stamps in headers may be of another clock.
     """
-    connections = reader.topics[topic].connections
-    if demo is not None:
-        if demo not in reader.topics or reader.topics[demo].msgtype not in _MARKS:
-            what = f"is of {reader.topics[demo].msgtype}" if demo in reader.topics else "is not there"
-            raise ValueError(
-                f"topic {demo!r}, by which demo= tells the demonstrations apart, {what}, must be of Bool, String or a "
-                f"whole number of std_msgs; it has: {_listed(reader.topics)}."
-            )
-        connections = [*connections, *reader.topics[demo].connections]
+    connections = [c for name in dict.fromkeys((topic, demo)) if name for c in reader.topics[name].connections]
     deserialize = reader.typestore.deserialize_cdr if reader.is2 else reader.typestore.deserialize_ros1
     for connection, stamp, raw in reader.messages(connections):
         message = deserialize(raw, connection.msgtype)
         if connection.topic == topic:
-            yield len(values) - 1, stamp, message
-        elif not values or message.data != values[-1]:
-            values.append(message.data)
-
-
-def _is_between(value: Any, values: list[Any]) -> bool:
-    """Whether a value of the topic that tells demonstrations apart stands for none; a count from 0 does not go back."""
-    return not value.strip() if isinstance(value, str) else value is False or (value == 0 and 0 in values[1:])
-
-
-def _listed(topics: dict[str, Any]) -> str:
-    listed = ", ".join(f"{name} ({info.msgtype}, {info.msgcount} messages)" for name, info in topics.items())
-    return listed or "none"
-
-
-def _topic(topics: dict[str, Any], topic: str | None) -> str:
-    """Topic wanted, or the only one with a movement."""
-    moving = [name for name, info in topics.items() if info.msgtype in _KINDS and info.msgcount]
-    if topic is None:
-        if len(moving) != 1:
-            several = "several topics of movements: say which by"
-            what = several if moving else "no topic of poses, joints or forces to take by"
-            raise ValueError(f"it has {what} topic=; it has: {_listed(topics)}.")
-        return moving[0]
-    if topic not in topics:
-        raise ValueError(f"it has no topic {topic!r}; it has: {_listed(topics)}.")
-    if topics[topic].msgtype not in _KINDS:
-        known = ", ".join(sorted(kind.split("/")[-1] for kind in _KINDS))
-        kind = topics[topic].msgtype
-        raise ValueError(f"topic {topic!r} is of {kind}, must be of one of {known}; it has: {_listed(topics)}.")
-    return topic
+            yield len(marks) - 1, stamp, message
+        elif not marks or message.data != marks[-1]:
+            marks.append(message.data)
 
 
 def _read_messages(
-    kind: str, messages: Iterator[tuple[int, int, Any]], values: list[Any], wanted: Wanted, child: str | None
+    kind: str, messages: Iterator[tuple[int, int, Any]], marks: list[Any], wanted: Wanted, child: str | None
 ) -> Arguments:
     if kind in _TRANSFORMS:
-        messages = _of_child(messages, child)
-        kind = "geometry_msgs/msg/TransformStamped"
+        messages, kind = _of_child(messages, child), "geometry_msgs/msg/TransformStamped"
     first = next(messages, None)
     if first is None:
         raise ValueError("the topic has no messages.")
-    signals, units, get = _joints(first[2]) if kind == _JOINTS else _parts(*_PARTS[kind])
+    fields = _joints(first[2]) if kind == _JOINTS else _parts(*_PARTS[kind])
+    signals = {name: field.columns for name, field in fields.items()}
     chosen = replace(wanted, demo=None).choose({**signals, "time": ("time",)}, time="time", outputs=next(iter(signals)))
-    row, has_header = get(chosen.outputs), hasattr(first[2], "header")
+    getters = [fields[name].get(i) for name, i in chosen.outputs]
     # Arrays of numbers take 8 bytes for each, where lists of tuples take 60.
-    numbers, stamps, coordinates = array("q"), array("q"), array("d")
+    numbers, stamps, coordinates = array("i"), array("q"), array("d")
+    has_header = hasattr(first[2], "header")
     for number, stamp, message in chain([first], messages):
         if has_header:
             time = message.header.stamp
             stamp = time.sec * 10**9 + time.nanosec
         numbers.append(number)
         stamps.append(stamp)
-        coordinates.extend(row(message))
-    positions, times = np.frombuffer(coordinates).reshape(len(stamps), -1), np.frombuffer(stamps, "M8[ns]")
-    own = np.frombuffer(numbers, np.int64)
-    found = dict(zip(np.unique(own), rows_of(own), strict=True))
-    if wanted.demo is not None:
-        marked = {k: rows for k, rows in found.items() if k >= 0 and not _is_between(values[k], values)}
-        found = {k: rows for k, rows in marked.items() if len(times[rows]) >= MIN_SAMPLES}
+        coordinates.extend([get(message) for get in getters])
+    arrays = {"time": np.frombuffer(stamps, "M8[ns]"), "y": np.frombuffer(coordinates).reshape(len(stamps), -1)}
+    return wanted.read_each(
+        chosen._replace(outputs=[("y", i) for i in range(len(getters))]),
+        _recordings(arrays, numbers, marks, wanted.demo),
+        units=[fields[name].unit for name, _ in chosen.outputs],
+        frame=getattr(getattr(first[2], "header", None), "frame_id", "") or None,
+    )
+
+
+def _recordings(
+    signals: dict[str, NDArray[Any]], numbers: Sequence[int], marks: list[Any], demo: str | None
+) -> list[dict[str, NDArray[Any]]]:
+    """Signals of each stretch that is a demonstration, in order of their stamps: drivers send some twice or late."""
+    heads = np.flatnonzero(np.diff(numbers, prepend=-2))
+    found = {numbers[a]: slice(a, b) for a, b in pairwise([*heads.tolist(), len(numbers)])}
+    if demo is not None:
+        marked = {k: rows for k, rows in found.items() if k >= 0 and not _is_between(marks[k], marks)}
+        found = {k: rows for k, rows in marked.items() if rows.stop - rows.start >= MIN_SAMPLES}
         if not found:
-            raise ValueError(f"demo={wanted.demo!r} marks no demonstration: its values are {preview(values)}.")
+            raise ValueError(f"demo={demo!r} marks no demonstration: its values are {preview(marks)}.")
         if lost := len(marked) - len(found):
-            checks.warn(
-                f"Left out, with less than two messages: {lost} of {len(marked)} demonstrations by {wanted.demo!r}."
-            )
-    recordings = _in_order([(times[rows], positions[rows]) for rows in found.values()])
-    frame = getattr(getattr(first[2], "header", None), "frame_id", "") or None
-    labels = {"units": [units[signal] for signal, _ in chosen.outputs], "frame": frame}
-    return wanted.arguments([t for t, _ in recordings], [y for _, y in recordings], chosen.names, **labels)
+            checks.warn(f"Left out, with less than two messages: {lost} of {len(marked)} demonstrations by {demo!r}.")
+    recordings, n_late, n_repeated = [], 0, 0
+    for rows in found.values():
+        own = {name: values[rows] for name, values in signals.items()}
+        if not (np.diff(own["time"]) > np.timedelta64(0)).all():
+            order = np.argsort(own["time"], kind="stable")
+            repeated = np.r_[False, np.diff(own["time"][order]) == np.timedelta64(0)]
+            n_late, n_repeated = n_late + int((np.diff(order) < 0).sum()), n_repeated + int(repeated.sum())
+            own = {name: values[order[~repeated]] for name, values in own.items()}
+        recordings.append(own)
+    if n_late or n_repeated:
+        checks.warn(
+            f"{n_late} of {len(numbers)} messages came after later ones, and are put in order; {n_repeated} repeat the "
+            "stamp of another one, of which the first is kept."
+        )
+    return recordings
+
+
+def _is_between(value: Any, values: list[Any]) -> bool:
+    """Whether a value of the topic that tells demonstrations apart stands for none; a count from 0 does not go back."""
+    return not value.strip() if isinstance(value, str) else value is False or (value == 0 and 0 in values[1:])
 
 
 def _of_child(messages: Iterator[tuple[int, int, Any]], child: str | None) -> Iterator[tuple[int, int, Any]]:
@@ -168,53 +180,33 @@ def _of_child(messages: Iterator[tuple[int, int, Any]], child: str | None) -> It
         raise ValueError(f"it has no transforms of {child!r}, but of {', '.join(sorted(seen))}.")
 
 
-Getter = Callable[[list[tuple[str, int]]], Callable[[Any], Any]]
+class _Field(NamedTuple):
+    """Part of a message that is outputs: its columns, its unit, and what gets the i-th of them from a message."""
+
+    columns: tuple[str, ...]
+    unit: str
+    get: Callable[[int], Callable[[Any], float]]
 
 
-def _parts(kind: str, part: str) -> tuple[dict[str, tuple[str, ...]], dict[str, str], Getter]:
-    fields = _FIELDS[kind]
+def _parts(kind: str, part: str) -> dict[str, _Field]:
+    def field(place: str, letters: str, prefix: str, unit: str) -> _Field:
+        columns = tuple(prefix + letter for letter in letters)
+        return _Field(columns, unit, lambda i: attrgetter(part + place + letters[i]))
 
-    def column(field: str, letter: str) -> str:
-        return {_POSITION: letter, _ROTATION: f"q{letter}"}.get(field, f"{field}_{letter}")
-
-    def get(places: list[tuple[str, int]]) -> Callable[[Any], Any]:
-        get_all = attrgetter(*(part + fields[field][0] + fields[field][1][i] for field, i in places))
-        return get_all if len(places) > 1 else lambda message: (get_all(message),)
-
-    signals = {name: tuple(column(name, letter) for letter in letters) for name, (_, letters, _) in fields.items()}
-    return signals, {name: unit for name, (_, _, unit) in fields.items()}, get
+    return {name: field(*entry) for name, entry in _FIELDS[kind].items()}
 
 
-def _joints(message: Any) -> tuple[dict[str, tuple[str, ...]], dict[str, str], Getter]:
+def _joints(message: Any) -> dict[str, _Field]:
     names = [str(name) for name in message.name]
-    given = [field for field in _JOINT_UNITS if len(getattr(message, field)) == len(names) > 0]
-    signals = {field: tuple(n if field == _POSITION else f"{field}.{n}" for n in names) for field in given}
 
-    def get(places: list[tuple[str, int]]) -> Callable[[Any], Any]:
-        def row(message: Any) -> list[float]:
-            if [*message.name] != names:  # the order of joints may change
-                raise ValueError(f"a message has joints {', '.join(message.name)}, others {', '.join(names)}.")
-            return [getattr(message, field)[i] for field, i in places]
+    def get(field: str, i: int, message: Any) -> float:
+        if message.name[i] != names[i]:  # the order of joints may change
+            raise ValueError(f"a message has joints {', '.join(message.name)}, others {', '.join(names)}.")
+        return float(getattr(message, field)[i])
 
-        return row
+    def field(name: str) -> _Field:
+        columns = tuple(names if name == "position" else (f"{name}.{joint}" for joint in names))
+        return _Field(columns, _JOINT_UNITS[name], lambda i: lambda message: get(name, i, message))
 
-    return signals or {_POSITION: ()}, _JOINT_UNITS, get
-
-
-def _in_order(recordings: list[tuple[NDArray[Any], NDArray[Any]]]) -> list[tuple[NDArray[Any], NDArray[Any]]]:
-    """Samples by their stamps: drivers send some twice, and late ones; what is left out is told."""
-    n_late = n_repeated = 0
-    sorted_ = []
-    for times, positions in recordings:
-        if not (np.diff(times) > np.timedelta64(0)).all():
-            order = np.argsort(times, kind="stable")
-            repeated = np.r_[False, np.diff(times[order]) == np.timedelta64(0)]
-            n_late, n_repeated = n_late + int((np.diff(order) < 0).sum()), n_repeated + int(repeated.sum())
-            times, positions = times[order[~repeated]], positions[order[~repeated]]
-        sorted_.append((times, positions))
-    if n_late or n_repeated:
-        checks.warn(
-            f"{n_late} of {sum(len(times) for times, _ in recordings)} messages came after later ones, and are put in "
-            f"order; {n_repeated} repeat the stamp of another one, of which the first is kept."
-        )
-    return sorted_
+    given = [name for name in _JOINT_UNITS if len(getattr(message, name)) == len(names) > 0]
+    return {name: field(name) for name in given or ["position"]}

@@ -1,0 +1,179 @@
+"""Data sets of robot learning: LeRobot's folders, HDF5 of robomimic and robosuite, replay buffers in Zarr."""
+
+import json
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from torch_pbd import checks
+from torch_pbd.data.formats.parquet import open_file, read_columns
+from torch_pbd.data.recordings import preview
+from torch_pbd.data.wanted import Arguments, Wanted, column_names, natural, numeric
+from torch_pbd.registry import optional
+
+_LARGEST_INFO = 2**22  # bytes
+# Zarr's codecs of numbers; another one, pickle, would execute what is in the file.
+_CODECS = {"bytes", "blosc", "zstd", "lz4", "gzip", "zlib", "bz2", "lzma", "shuffle", "bitshuffle", "delta", "crc32c"}
+_CODECS |= {"transpose", "sharding_indexed", "numcodecs.shuffle", "numcodecs.delta", "numcodecs.zlib", "numcodecs.lz4"}
+
+
+def read_lerobot(path: Path, wanted: Wanted) -> Arguments:
+    """Read a folder of LeRobot, version 2 or 3: Parquet files, and what they hold in meta/."""
+    opened = partial(open_file, extra="lerobot", what=f"{path.name}, as all of LeRobot,")
+    info_file = path / "meta" / "info.json"
+    if info_file.stat().st_size > _LARGEST_INFO:
+        raise ValueError(f"meta/info.json has more than {_LARGEST_INFO} bytes.")
+    info = json.loads(info_file.read_text(encoding="utf-8"))
+    version = info.get("codebase_version") if isinstance(info, dict) else None
+    if not str(version).startswith(("v2", "v3")) or not isinstance(info.get("features"), dict):
+        raise ValueError(f"meta/info.json is of version {version!s:.20}, must be v2 or v3, with features.")
+    signals = {
+        name: _feature_columns(name, feature)
+        for name, feature in info["features"].items()
+        if str(feature["dtype"]).startswith(("float", "int", "bool")) and len(feature["shape"]) == 1
+    }
+    chosen = wanted.choose(signals, demo="episode_index", time="timestamp", outputs="observation.state")
+    if wanted.units is None:
+        wanted.refuse(
+            f"it does not tell the units of {preview(chosen.names, 6)}: give units=, 'deg' or 'rad' of joints, "
+            "'percent' where they go from -100 to 100, or one for each."
+        )
+    # Several episodes a file in version 3, one in version 2; the numbers in the names are in order.
+    files = sorted((path / "data").rglob("*.parquet"), key=lambda file: natural(file.relative_to(path).as_posix()))
+    if not files:
+        raise ValueError("it has no Parquet files in data/.")
+    parts = []
+    for name in files:
+        with opened(name) as file:
+            parts.append(read_columns(file, list(dict.fromkeys(["episode_index", *chosen.signals])), wanted))
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    # A missing file would be fewer demonstrations.
+    numbers, counts = np.unique(columns["episode_index"], return_counts=True)
+    found = dict(zip(numbers.tolist(), counts.tolist(), strict=True))
+    declared = _declared_lengths(path, opened, wanted) or found
+    for number in sorted(declared.keys() | found.keys()):
+        if declared.get(number) != found.get(number):
+            raise ValueError(
+                f"episode {number} has {found.get(number, 0)} samples in data/, but {declared.get(number, 0)} by "
+                "meta/episodes: files are missing or cut."
+            )
+    return wanted.read_rows(chosen, columns)
+
+
+def _feature_columns(name: str, feature: dict[str, Any]) -> tuple[str, ...]:
+    names = feature.get("names")
+    if isinstance(names, dict):  # {"motors": [...]}
+        names = [entry for entries in names.values() for entry in (entries if isinstance(entries, list) else [entries])]
+    # "x" of the state and "x" of the action are two columns.
+    if isinstance(names, list) and len(names) == feature["shape"][0] > 1:
+        return tuple(f"{name}.{entry}" for entry in names)
+    return column_names(name, (0, *feature["shape"]))
+
+
+def _declared_lengths(path: Path, opened: Any, wanted: Wanted) -> dict[int, int]:
+    """Samples of each episode by meta/; empty where that has none."""
+    declared: dict[int, int] = {}
+    for name in (path / "meta" / "episodes").rglob("*.parquet"):
+        with opened(name) as file:
+            columns = read_columns(file, ["episode_index", "length"], wanted)
+            declared |= dict(zip(columns["episode_index"].tolist(), columns["length"].tolist(), strict=True))
+    lines = path / "meta" / "episodes.jsonl"
+    if lines.is_file():
+        entries = map(json.loads, lines.read_text(encoding="utf-8").splitlines())
+        declared |= {int(entry["episode_index"]): int(entry["length"]) for entry in entries}
+    return declared
+
+
+def read_hdf5(path: Path, wanted: Wanted, mask: str | None = None) -> Arguments:
+    """Read HDF5 of robomimic, with a group data/demo_k for each demonstration; ``mask`` is a list of them in /mask."""
+    checks.text(mask, "mask", optional=True)
+    h5py = optional("h5py", "hdf5", f"{path.name}, as all of HDF5,")
+    with h5py.File(path, "r") as file:
+        data = file.get("data")
+        if not isinstance(data, h5py.Group) or not len(data):
+            raise ValueError(f"it has no group data with demonstrations, as robomimic's, but {preview([*file])}.")
+        names = sorted(data, key=natural)
+        if mask is not None:
+            if mask not in (known := [*file.get("mask", ())]):
+                raise checks.refusal(mask, "mask", f"one of {preview(known)}")
+            listed = file["mask"][mask][()]
+            names = sorted((n.decode() if isinstance(n, bytes) else str(n) for n in listed), key=natural)
+            absent = [name for name in names if name not in data]
+            if absent or not names:
+                raise ValueError(f"mask {mask!r} names {preview(absent)}, must name demonstrations in data/.")
+        each = {name: _hdf5_datasets(data[name], h5py) for name in names}
+        signals = {key: column_names(key, found.shape) for key, found in each[names[0]].items()}
+        # robosuite's quaternions have their real part last.
+        turns = [key for key, columns in signals.items() if key.endswith("quat") and len(columns) == 4]
+        signals |= {key: tuple(f"{key}_{letter}" for letter in "xyzw") for key in turns}
+        chosen = wanted.choose(signals, outputs="robot0_eef_pos" if "robot0_eef_pos" in signals else None)
+        for name in names:
+            _check_hdf5(name, data[name].attrs.get("num_samples"), each[name], chosen.signals)
+        wanted.require(sum(found[key].nbytes for found in each.values() for key in chosen.signals), "it")
+        recordings = [{key: found[key][()] for key in chosen.signals} for found in each.values()]
+    # Positions of robosuite's end effectors are in m.
+    units = "m" if all(signal.endswith(("eef_pos", "eef_quat")) for signal, _ in chosen.outputs) else None
+    return wanted.read_each(chosen, recordings, units=units)
+
+
+def _hdf5_datasets(group: Any, h5py: Any) -> dict[str, Any]:
+    """Numbers (T,) or (T, d) of a demonstration: what its obs/ holds by name, and what stands beside it."""
+    found = {}
+    for place in (group, group.get("obs")):
+        for key in place or ():
+            # Links to other files, and arrays that lie in some, are not followed.
+            value: Any = place[key] if isinstance(place.get(key, getlink=True), h5py.HardLink) else None
+            if isinstance(value, h5py.Dataset) and not value.is_virtual and not value.external:
+                found[key] = value
+    return numeric(found)
+
+
+# Texts of variable length, as the environment's arguments with their rate, are not read: from damaged files the HDF5
+# library may not come back.
+def _check_hdf5(name: str, declared: Any, found: dict[str, Any], signals: list[str]) -> None:
+    for key in signals:
+        if key not in found:
+            raise ValueError(f"data/{name} has no {key!r}, which others have; it has {preview([*found])}.")
+        if declared is not None and len(found[key]) != int(np.asarray(declared).item()):
+            raise ValueError(f"data/{name} says num_samples = {declared}, but {key} has {len(found[key])}.")
+        if found[key].id.get_storage_size() == 0:
+            raise ValueError(f"data/{name}/{key} of shape {found[key].shape} was never written.")
+
+
+def read_zarr(path: Path, wanted: Wanted) -> Arguments:
+    """Read a replay buffer of UMI or diffusion policy: data/<key> and meta/episode_ends, a folder or a zip."""
+    zarr = optional("zarr", "zarr", f"{path.name}, as all of Zarr,")
+    store = zarr.storage.ZipStore(path, mode="r") if path.is_file() else zarr.storage.LocalStore(path, read_only=True)
+    group = zarr.open_group(store, mode="r")
+    try:
+        keys = [*group["data"].array_keys()] if "data" in group else []
+        if not keys or "meta/episode_ends" not in group:
+            raise ValueError(
+                f"it has no data and meta/episode_ends, as replay buffers have, but {preview([*group.keys()])}."
+            )
+        arrays = numeric({key: group[f"data/{key}"] for key in keys})
+        ends = _read_zarr_array(group["meta/episode_ends"], wanted, "meta/episode_ends").astype(np.int64)
+        signals = {key: column_names(key, array.shape) for key, array in arrays.items()}
+        chosen = wanted.choose(signals, time="timestamp" if "timestamp" in signals else None)
+        columns = {key: _read_zarr_array(arrays[key], wanted, f"data/{key}") for key in chosen.signals}
+    finally:
+        store.close()
+    n = len(next(iter(columns.values())))
+    if not len(ends) or (np.diff(ends, prepend=0) <= 0).any() or ends[-1] != n:
+        raise ValueError(f"meta/episode_ends is {preview(ends.tolist())}, must rise to {n}, the samples of data/.")
+    spans = zip(np.r_[0, ends[:-1]], ends, strict=True)
+    return wanted.read_each(chosen, [{key: values[a:b] for key, values in columns.items()} for a, b in spans])
+
+
+def _read_zarr_array(array: Any, wanted: Wanted, name: str) -> Any:
+    """Array whose codecs, by its metadata in version 2 or 3, are those of numbers."""
+    metadata = array.metadata.to_dict()
+    stages = [*(metadata.get("codecs") or ()), *(metadata.get("filters") or ()), metadata.get("compressor")]
+    plain = json.loads(json.dumps(stages, default=lambda codec: getattr(codec, "get_config", lambda: str(codec))()))
+    strange = {stage.get("name") or stage.get("id") or "?" for stage in plain if stage} - _CODECS
+    if strange or array.dtype.kind not in "biuf":
+        raise ValueError(f"{name} is {array.dtype} packed by {', '.join(sorted(strange))}, must be plain numbers.")
+    wanted.require(array.nbytes, name)
+    return array[...]
