@@ -9,8 +9,7 @@ import numpy as np
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.data.alignment import check_overlap
-from torch_pbd.data.demonstrations import Demonstrations
-from torch_pbd.data.sampling import extents, still
+from torch_pbd.data.sampling import Resampling, extents, still
 from torch_pbd.data.units import ANGLES, LENGTHS, TIMES, quaternions
 from torch_pbd.exceptions import InvalidParameterError, UnimodalityWarning
 
@@ -91,7 +90,7 @@ def describe(demonstrations: Any, notes: Sequence[str] = ()) -> Description:
     return Description(recordings, outputs, tuple(mistakes), rotation)
 
 
-def _of_times(demonstrations: Demonstrations, second: float) -> Iterator[str]:
+def _of_times(demonstrations: Any, second: float) -> Iterator[str]:
     times, unit = demonstrations.times, demonstrations.time_unit
     step = float(np.median(np.concatenate(list(map(np.diff, times)))))
     if unit in TIMES and not _RATES[0] <= second / step <= _RATES[1]:
@@ -116,7 +115,7 @@ def _of_times(demonstrations: Demonstrations, second: float) -> Iterator[str]:
             yield f"{gap}, {own[i]:.0f} times the usual step. Where no other has samples, leave it out, or cut= there."
 
 
-def _of_ends(demonstrations: Demonstrations, recordings: list[dict[str, Any]]) -> Iterator[str]:
+def _of_ends(demonstrations: Any, recordings: list[dict[str, Any]]) -> Iterator[str]:
     cut: dict[str, list[int]] = {"start": [], "end": []}
     for k, (time, position) in enumerate(demonstrations):
         extent = extents(position, demonstrations)
@@ -154,7 +153,7 @@ def _of_outputs(units: Any, outputs: list[dict[str, Any]], notes: Sequence[str])
         yield f"{', '.join(constant)} never changes: leave it out, outputs={[n for n in covers if n not in constant]}."
 
 
-def _flips(demonstrations: Demonstrations) -> Iterator[str]:
+def _flips(demonstrations: Any) -> Iterator[str]:
     """Unit quaternions, of which nobody named the order, or of which some are -q where others are q."""
     for place in quaternions(demonstrations.positions, demonstrations.n_outputs):
         columns = demonstrations.names[place : place + 4]
@@ -181,7 +180,7 @@ def _table(rows: list[dict[str, Any]]) -> str:
     return "\n".join("  ".join(line).rstrip() for line in lines)
 
 
-def check_unimodal(demonstrations: Demonstrations) -> bool:
+def check_unimodal(demonstrations: Any) -> bool:
     """Check that the demonstrations look like one way to do the task; warns if they do not.
 
     The paper assumes one mode (Section II): between two ways around an obstacle, a mean goes through it. Looked at
@@ -203,7 +202,8 @@ def check_unimodal(demonstrations: Demonstrations) -> bool:
     UnimodalityWarning
         If there are two groups, or one demonstration far from all others.
     """
-    checks.instance(demonstrations, "demonstrations", Demonstrations)
+    if not isinstance(demonstrations, Resampling):
+        raise checks.refusal(demonstrations, "demonstrations", "a Demonstrations")
     n_demos = len(demonstrations)
     if n_demos < _LEAST_DEMOS:
         return True
