@@ -202,7 +202,8 @@ def check_unimodal(demonstrations: Any) -> bool:
     UnimodalityWarning
         If there are two groups, or one demonstration far from all others.
     """
-    if not isinstance(demonstrations, Resampling):
+    is_recorded = isinstance(demonstrations, Resampling)
+    if not is_recorded:
         raise checks.refusal(demonstrations, "demonstrations", "a Demonstrations")
     n_demos = len(demonstrations)
     if n_demos < _LEAST_DEMOS:
