@@ -128,8 +128,8 @@ def free(given):
         (lambda given: given["time"].put(6, given["time"][5]), ", must be later than the time before it"),
         (with_entry("type1", 7, 1.1), "type1[7] is 1.1, must be from 0"),
         (with_entry("type1", 7, -0.1), "type1[7] is -0.1, must be from 0"),
-        (with_entry("stiffness", 8, 2000 * np.eye(2)), "the eigenvalue of stiffness[8, 0] is 2000.0 N/m"),
-        (with_entry("stiffness", 8, 49.9 * np.eye(2)), "within stiffness_limits, 50 and 1000 N/m: limit the stiffness"),
+        (with_entry("stiffness", 8, 2000 * np.eye(2)), "the share of stiffness beyond stiffness_limits[8] is "),
+        (with_entry("stiffness", 8, 49.9 * np.eye(2)), "must be none: limit the stiffness to them"),
         (with_entry("stiffness", 8, -np.eye(2)), "the smallest eigenvalue of stiffness[8] is -1.0"),
         (with_entry("damping", 8, -np.eye(2)), "the smallest eigenvalue of damping[8] is -1.0"),
         (skewed, "the asymmetry of stiffness[3] is "),
@@ -162,9 +162,9 @@ def test_what_cannot_be_run_is_refused_with_its_place(rng, spoil, message):
         ({"names": ["x", "a\rb"]}, r"names[1] is 'a\rb', must be text without control characters"),
         ({"names": ["\ud800", "y"]}, r"names[0] is '\ud800', must be text without control characters"),
         ({"covariance_of": "velocity"}, "covariance_of is 'velocity', must be one of 'position', 'forcing'"),
-        ({"stiffness_limits": (1000, 50)}, "stiffness_limits[1] is 50.0 N/m, must be a finite number above 0"),
+        ({"stiffness_limits": (1000, 50)}, "stiffness_limits[1] is 50.0, must be a finite number above 0"),
         ({"stiffness_limits": (50,)}, "stiffness_limits is"),
-        ({"stiffness_limits": (-1, 1000)}, "stiffness_limits[0] is -1.0 N/m"),
+        ({"stiffness_limits": (-1, 1000)}, "stiffness_limits[0] is -1.0,"),
         ({"provenance": ["seed"]}, "provenance is ['seed'], must be a Mapping"),
         ({"provenance": {"a": [1, np.ones(2)]}}, "provenance['a'][1] is array([1., 1.]), must be what JSON can"),
         ({"provenance": {"a": float("nan")}}, "provenance['a'] is nan"),
@@ -209,7 +209,7 @@ def test_tolerances_are_relative(rng, scale):
     low, high = spectrum.min(), spectrum.max()
     Schedule(**given, stiffness_limits=(low * (1.0 + 1e-12), high * (1.0 - 1e-12)))
     for limits in [(low * (1.0 + 1e-6), high), (low, high * (1.0 - 1e-6))]:
-        with pytest.raises(ValueError, match="eigenvalue of stiffness"):
+        with pytest.raises(ValueError, match="share of stiffness beyond stiffness_limits"):
             Schedule(**given, stiffness_limits=limits)
     with pytest.raises(ValueError, match=r"smallest eigenvalue of covariance\[3\] is -"):
         Schedule(**{**given, "covariance": -1e-6 * given["covariance"] * (np.arange(12) == 3)[:, None, None]})
@@ -324,23 +324,20 @@ def test_retime_with_a_mass_refuses_what_no_guarantee_covers():
 def test_what_diagonal_gains_lose_is_what_forces_in_all_directions_show(rng, d):
     schedule = Schedule(**values(rng, 6, d), stiffness_limits=(50.0, 1000.0))
     diagonal, loss = schedule.diagonal()
-    for name in ("stiffness", "damping"):
+    forces = rng.normal(size=(d, 20_000))
+    for name, told in (("damping", loss.velocity), ("stiffness", loss.displacement)):
         whole, kept = getattr(schedule, name), getattr(diagonal, name)
         np.testing.assert_array_equal(kept, np.stack([np.diag(np.diag(matrix)) for matrix in whole]))
-        relative = np.array([np.linalg.norm(a - b) / np.linalg.norm(a) for a, b in zip(whole, kept, strict=True)])
-        np.testing.assert_allclose(getattr(loss, f"{name}_max"), relative.max(), rtol=1e-12, atol=0)
-        np.testing.assert_allclose(getattr(loss, f"{name}_median"), np.median(relative), rtol=1e-12, atol=0)
+        if d == 1:
+            assert told == 0.0
+            continue
+        moved, moved_otherwise = np.linalg.inv(whole) @ forces, np.linalg.inv(kept) @ forces
+        errors = np.linalg.norm(moved_otherwise - moved, axis=1) / np.linalg.norm(moved, axis=1)
+        assert (errors <= told * (1.0 + 1e-12)).all()
+        worst = errors.max(axis=1)
+        np.testing.assert_allclose(worst.max(), told, rtol=2e-3)  # 20000 forces nearly hit the worst
     assert replace(diagonal, stiffness=schedule.stiffness, damping=schedule.damping) == schedule
-    if d == 1:
-        assert loss.displacement == 0.0
-        return
-    forces = rng.normal(size=(d, 20_000))
-    moved, moved_otherwise = np.linalg.inv(schedule.stiffness) @ forces, np.linalg.inv(diagonal.stiffness) @ forces
-    errors = np.linalg.norm(moved_otherwise - moved, axis=1) / np.linalg.norm(moved, axis=1)
-    assert (errors <= loss.displacement * (1.0 + 1e-12)).all()
-    worst = errors.max(axis=1)
-    np.testing.assert_allclose(worst.max(), loss.displacement, rtol=2e-3)  # 20000 forces nearly hit the worst
-    assert loss.time == schedule.time[worst.argmax()]
+    assert d == 1 or loss.time == schedule.time[worst.argmax()]
 
 
 def test_loss_of_a_single_coupling_has_a_closed_form(rng):
@@ -348,11 +345,8 @@ def test_loss_of_a_single_coupling_has_a_closed_form(rng):
     given["stiffness"] = np.array([[[400.0, 60.0], [60.0, 100.0]], 50 * np.eye(2), np.zeros((2, 2))])
     given["damping"] = np.tile(np.eye(2), (3, 1, 1))
     _, loss = Schedule(**given).diagonal()
-    frobenius = 60 * np.sqrt(2.0) / np.sqrt(400.0**2 + 100.0**2 + 2 * 60.0**2)
-    np.testing.assert_allclose(loss.stiffness_max, frobenius, rtol=1e-12)
     np.testing.assert_allclose(loss.displacement, 60.0 / 100.0, rtol=1e-12)  # |k_xy| / min(k_xx, k_yy)
-    assert (loss.stiffness_median, loss.damping_max, loss.time) == (0.0, 0.0, given["time"][0])
-    assert "stiffness (median 0.0%)" in str(loss)
+    assert (loss.velocity, loss.time) == (0.0, given["time"][0])
     assert f"60.0%, at {given['time'][0]:.6g} s" in str(loss)
 
 
@@ -444,13 +438,13 @@ def test_a_flipped_bit_is_refused_or_changes_nothing(saved, rng):
 
 def rewritten(path, change):
     """The file after ``change(header, arrays)``, with a checksum that is right."""
-    suffix = path.suffix
-    parts = schedule_files._DECODERS[suffix](path.read_bytes())
+    encode, decode = schedule_files._FORMATS[path.suffix]
+    parts = decode(path.read_bytes())
     header, arrays = next(parts), dict(next(parts))
     header.pop("sha256")
     change(header, arrays)
     header["sha256"] = schedule_files._digest(header, arrays)
-    path.write_bytes(schedule_files._ENCODERS[suffix](header, arrays))
+    path.write_bytes(encode(header, arrays))
 
 
 @pytest.mark.parametrize(
@@ -462,7 +456,7 @@ def rewritten(path, change):
         (lambda header, _: header.update(colour=1.0), "its header has an unknown 'colour'"),
         (lambda header, _: header.update(names=["x", "x"]), "names is ['x', 'x'], must be 2 different strings"),
         (lambda header, _: header.update(provenance=None), "provenance is None, must be a Mapping"),
-        (lambda header, _: header.update(stiffness_limits=[1, 2]), "the eigenvalue of stiffness["),
+        (lambda header, _: header.update(stiffness_limits=[1, 2]), "the share of stiffness beyond stiffness_limits["),
         (lambda _, arrays: arrays.update(time=np.flip(arrays["time"])), "must be later than"),
         (lambda _, arrays: arrays.update(type1=arrays["type1"] * np.nan), "nan"),
         (lambda _, arrays: arrays.update(damping=-arrays["damping"]), "the smallest eigenvalue of damping"),

@@ -58,8 +58,9 @@ def to_actions(schedule: Schedule, control_freq: float = 20.0) -> Floats:
             "schedule has an inertia of several numbers, as that of an arm, which this controller takes out: give "
             "schedule.with_inertia(1.0)."
         )
-    rows, loss = schedule.resample(checks.number(control_freq, "control_freq", above=0.0, unit="Hz")).diagonal()
-    if loss.stiffness_max > 0.0:
+    whole = schedule.resample(checks.number(control_freq, "control_freq", above=0.0, unit="Hz"))
+    rows, loss = whole.diagonal()
+    if (rows.stiffness != whole.stiffness).any():
         checks.warn(f"{loss}.")
     position, orientation = poses(rows)
     mass = 1.0 if rows.mass is None else rows.mass

@@ -55,8 +55,8 @@ def to_messages(schedule: Schedule, *, gains: Gains = "matrix") -> Iterator[tupl
     types = _store().types
     position, orientation = poses(schedule)
     if checks.choice(gains, "gains", Gains) == "diagonal":
-        schedule, loss = schedule.diagonal()
-        if loss.stiffness_max > 0.0:
+        whole, (schedule, loss) = schedule, schedule.diagonal()
+        if (schedule.stiffness != whole.stiffness).any():
             checks.warn(f"{loss}.")
     geometry = {
         name: types[f"geometry_msgs/msg/{name}"] for name in ("Point", "Quaternion", "Vector3", "Pose", "Twist")

@@ -2,7 +2,7 @@
 
 import math
 import reprlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -51,14 +51,13 @@ def checked_fields(fields: Mapping[str, Any]) -> dict[str, Any]:
     if n < 2 or not p:
         raise InvalidParameterError(f"position has shape {position.shape}, must have at least 2 rows, 1 column.")
     sizes = {"n": n, "p": p, "d": p if fields["orientation"] is None else p + 3}
-    given = [
-        name for name in SHAPES if name not in OPTIONAL or not (fields[name] is None or np.ndim(fields[name]) == 0)
-    ]
-    if np.ndim(fields["mass"]) == 2:  # one for all rows
-        fields = {**fields, "mass": np.broadcast_to(fields["mass"], (n, *np.shape(fields["mass"])))}
+    mass: Any = fields["mass"]
+    of_rows = np.broadcast_to(mass, (n, *np.shape(mass))) if np.ndim(mass) == 2 else mass if np.ndim(mass) else None
+    given = {**fields, "mass": of_rows}
     arrays = {
-        name: checks.array(fields[name], name, [sizes.get(str(size), size) for size in SHAPES[name]]).copy()
-        for name in given
+        name: checks.array(given[name], name, [sizes.get(str(size), size) for size in shape]).copy()
+        for name, shape in SHAPES.items()
+        if given[name] is not None or name not in OPTIONAL
     }
     later = np.diff(arrays["time"], prepend=-np.inf) > 0.0
     remedy = "sort the rows by time and drop repeated ones"
@@ -70,17 +69,11 @@ def checked_fields(fields: Mapping[str, Any]) -> dict[str, Any]:
         arrays[name] = 0.5 * (arrays[name] + arrays[name].swapaxes(1, 2))
     if "orientation" in arrays:
         arrays["orientation"] = _checked_orientation(arrays["orientation"])
-    units = ["Nm/rad" if fields["units"] == "rad" else "N/m"] * p + ["Nm/rad"] * (sizes["d"] - p)
-    limits = _checked_limits(fields["stiffness_limits"], units)
-    if limits is not None:
-        _check_limits(arrays["stiffness"], limits, units[0])
+    limits = _checked_limits(fields["stiffness_limits"], arrays["stiffness"])
     _check_held(arrays["stiffness"], arrays["damping"])
     for array in arrays.values():
         array.setflags(write=False)
-    mass = fields["mass"]
-    labels = _checked_labels(
-        {name: fields[name] for name in LABELS} | {"mass": mass if "mass" not in arrays else None}, sizes["d"]
-    )
+    labels = _checked_labels({**fields, "mass": mass if of_rows is None else None}, sizes["d"])
     return {**labels, **arrays, "stiffness_limits": limits}
 
 
@@ -93,47 +86,31 @@ def _checked_orientation(orientation: Floats) -> Floats:
     return rotations.continuous(orientation)
 
 
-def _checked_limits(limits: Any, units: Sequence[str]) -> Limits | None:
-    """Two numbers, or two tuples of one for each axis, of these units; None stays None."""
+def _checked_limits(limits: Any, stiffness: Floats) -> Limits | None:
+    """Two numbers, or two tuples of one for each axis, between which the stiffness lies, to rounding; or None."""
     if limits is None:
         return None
     if not isinstance(limits, list | tuple | np.ndarray) or len(limits) != 2:
         raise checks.refusal(limits, "stiffness_limits", "the least and the largest stiffness, or None")
-    of_each = any(np.ndim(limit) for limit in limits)
-    low, high = (
-        np.broadcast_to(checks.real_floats(limit, "stiffness_limits"), (len(units),) if of_each else ())
-        for limit in limits
-    )
-    for i, (least, most) in enumerate(zip(low.reshape(-1), high.reshape(-1), strict=True)):
-        axis = f"[{i}]" if of_each else ""
-        lowest = checks.number(float(least), f"stiffness_limits[0]{axis}", least=0.0, unit=units[i])
-        checks.number(float(most), f"stiffness_limits[1]{axis}", above=0.0, least=lowest, unit=units[i])
-    return (tuple(low.tolist()), tuple(high.tolist())) if of_each else (float(low), float(high))
-
-
-def _check_limits(stiffness: Floats, limits: Limits, unit: str) -> None:
-    """Refuse a stiffness beyond the limits, as matrices and to rounding.
-
-    ``K_min <= K <= K_max``, diagonal both, in units of K_max: those of lengths and angles then do not matter.
-    """
-    low, high = map(np.asarray, limits)
-    scale = 1.0 / np.sqrt(high * np.ones(stiffness.shape[1]))
-    relative = scale[:, np.newaxis] * stiffness * scale
-    least = low / high * np.eye(stiffness.shape[1])
-    if checks.eigenvalues_above(relative - least, -checks.ROUNDING) and checks.eigenvalues_above(
-        -relative, -1.0 - checks.ROUNDING
+    d = stiffness.shape[1]
+    shape = (d,) if any(np.ndim(limit) for limit in limits) else ()
+    low, high = (np.broadcast_to(checks.real_floats(limit, "stiffness_limits"), shape) for limit in limits)
+    for axis in np.ndindex(shape):
+        where = f"[{axis[0]}]" if axis else ""
+        least = checks.number(float(low[axis]), f"stiffness_limits[0]{where}", least=0.0)
+        checks.number(float(high[axis]), f"stiffness_limits[1]{where}", above=0.0, least=least)
+    # K_min <= K <= K_max as matrices, diagonal both, in units of K_max: those of lengths and angles then do not matter.
+    scale = 1.0 / np.sqrt(high * np.ones(d))
+    relative, softest = scale[:, np.newaxis] * stiffness * scale, low / high * np.eye(d)
+    bound = -checks.ROUNDING
+    if not (
+        checks.eigenvalues_above(relative - softest, bound) and checks.eigenvalues_above(np.eye(d) - relative, bound)
     ):
-        return
-    remedy = "limit the stiffness to them, or widen them"
-    if low.ndim:
-        beyond = np.maximum(np.linalg.eigvalsh(least - relative)[:, -1], np.linalg.eigvalsh(relative)[:, -1] - 1.0)
-        checks.require(
-            beyond <= checks.ROUNDING, beyond, "the share of stiffness beyond stiffness_limits", "none", remedy
-        )
-    eigenvalues = np.linalg.eigvalsh(stiffness)
-    good = (eigenvalues >= low - checks.ROUNDING * high) & (eigenvalues <= high + checks.ROUNDING * high)
-    must = f"within stiffness_limits, {low:g} and {high:g} {unit}"
-    checks.require(good, eigenvalues, "the eigenvalue of stiffness", must, remedy, unit)
+        beyond = np.maximum(np.linalg.eigvalsh(softest - relative)[:, -1], np.linalg.eigvalsh(relative)[:, -1] - 1.0)
+        remedy = "limit the stiffness to them, or widen them"
+        name = "the share of stiffness beyond stiffness_limits"
+        checks.require(beyond <= checks.ROUNDING, beyond, name, "none", remedy)
+    return (tuple(low.tolist()), tuple(high.tolist())) if shape else (float(low), float(high))
 
 
 def _check_held(stiffness: Floats, damping: Floats) -> None:
@@ -156,13 +133,12 @@ def _checked_labels(labels: Labels, n_outputs: int) -> dict[str, Any]:
             raise checks.refusal(names, "names", f"{n_outputs} different strings, one for each output")
         # Names are titles of columns; other texts stand in JSON, which can hold line ends and controls too.
         names = tuple(checks.text(name, f"names[{i}]") for i, name in enumerate(listed))
-    for name in ("units", "frame"):
-        checks.instance(labels[name], name, str, optional=True)
-    checks.choice(labels["covariance_of"], "covariance_of", ("position", "forcing"))
     checks.instance(labels["provenance"], "provenance", Mapping)
     return {
-        **labels,
         "names": names,
+        "units": checks.instance(labels["units"], "units", str, optional=True),
+        "frame": checks.instance(labels["frame"], "frame", str, optional=True),
+        "covariance_of": checks.choice(labels["covariance_of"], "covariance_of", ("position", "forcing")),
         "mass": checks.number(labels["mass"], "mass", above=0.0, unit="kg", optional=True),
         "provenance": MappingProxyType(_json_copy(labels["provenance"], "provenance")),
     }
@@ -172,8 +148,7 @@ def _json_copy(value: Any, where: str, depth: int = 0) -> Any:
     """Copy of what comes back from JSON as it was; tuples come back as lists."""
     if depth > _DEEPEST:
         raise InvalidParameterError(
-            f"provenance is nested more than {_DEEPEST} levels deep, or holds itself, down by {where:.80}..., must be "
-            "what JSON can hold, in fewer levels."
+            f"provenance is more than {_DEEPEST} levels deep, or holds itself, at {where:.80}...: take fewer levels."
         )
     if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
         return {key: _json_copy(entry, f"{where}[{key!r}]", depth + 1) for key, entry in value.items()}
@@ -184,6 +159,6 @@ def _json_copy(value: Any, where: str, depth: int = 0) -> Any:
     if value is None or isinstance(value, bool | int | str) or (isinstance(value, float) and math.isfinite(value)):
         return value
     raise InvalidParameterError(
-        f"{where} is {reprlib.repr(value)}, must be what JSON can hold, such as text, finite numbers, lists and dicts "
-        "with text for keys: convert arrays with .tolist()."
+        f"{where} is {reprlib.repr(value)}, must be what JSON can hold: text, finite numbers, lists (take .tolist()), "
+        "or dicts with text for keys."
     )

@@ -9,8 +9,8 @@ import io
 import json
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from functools import partial
 from itertools import chain, combinations_with_replacement
 from pathlib import Path
@@ -31,8 +31,6 @@ MAX_BYTES = 2**30
 
 Built = TypeVar("Built")
 Column = tuple[str, str, tuple[int, ...]]
-# A decoder gives the header, and then, once that is known to be of a version that can be read, the arrays.
-Decoder = Callable[[bytes], Iterator[Any]]
 
 # Parsers raise these about bytes that are not what they claim to be (RecursionError is a RuntimeError).
 _DAMAGE = (ArithmeticError, LookupError, MemoryError, RuntimeError, TypeError, ValueError, csv.Error)
@@ -40,7 +38,7 @@ _DAMAGE = (ArithmeticError, LookupError, MemoryError, RuntimeError, TypeError, V
 
 def write_schedule(path: Path, arrays: Arrays, labels: Labels) -> None:
     """Write one file in the format of its suffix, as :meth:`Schedule.save` says."""
-    encode = _ENCODERS[_known_suffix(path)]
+    encode, _ = _FORMATS[_known_suffix(path)]
     header = {"format": FORMAT, "version": VERSION, **labels}
     content = encode({**header, "sha256": _digest(header, arrays)}, arrays)
     if len(content) > MAX_BYTES:
@@ -63,18 +61,15 @@ def read_schedule(path: Path, build: Callable[..., Built]) -> Built:
     try:
         if suffix != ".npz":
             require_memory(parsed_bytes([content]), what="what it says", remedy="Save it as .npz.")
-        parts = _DECODERS[suffix](content)
+        # The arrays are read once the header is known to be of a version that can be.
+        parts = _FORMATS[suffix][1](content)
         header = next(parts)
         _check_header(header, optional={"sha256"} if suffix == ".csv" else set())
         arrays = next(parts)
-        required = [name for name in SHAPES if name not in OPTIONAL]
-        if not set(required) <= set(arrays) <= set(SHAPES):
-            raise ValueError(
-                f"its arrays are {', '.join(arrays) or 'none'}, must be {', '.join(required)}, and may be "
-                f"{', '.join(sorted(OPTIONAL))}."
-            )
-        rest = {key: value for key, value in header.items() if key != "sha256"}
-        if "sha256" in header and header["sha256"] != _digest(rest, arrays):
+        if not set(SHAPES) - OPTIONAL <= set(arrays) <= set(SHAPES):
+            raise ValueError(f"its arrays are {', '.join(arrays) or 'none'}, must be {', '.join(SHAPES)}.")
+        expected = header.pop("sha256", None)
+        if expected is not None and expected != _digest(header, arrays):
             line = "delete the line that starts with '# sha256:' to accept it"
             remedy = line if suffix == ".csv" else "save it again"
             raise ValueError(f"it does not match its checksum: it is damaged, or, if edited on purpose, {remedy}.")
@@ -84,7 +79,7 @@ def read_schedule(path: Path, build: Callable[..., Built]) -> Built:
 
 
 def _known_suffix(path: Path) -> str:
-    if path.suffix.lower() not in _ENCODERS:
+    if path.suffix.lower() not in _FORMATS:
         raise InvalidParameterError(f"{path} has the suffix {path.suffix!r}, must have .npz, .json or .csv. {LOADERS}")
     return path.suffix.lower()
 
@@ -187,25 +182,20 @@ def _decode_csv(content: bytes) -> Iterator[Any]:
         if match is None or match[1] in header:
             raise ValueError(f"line {len(header) + 1} must be '# key: value' with a new key, but is {first[:80]!r}.")
         header[match[1]] = _parse_json(match[2])
-    yield header
-    yield _read_table(header["names"], chain([first], stream), n_lines_before=len(header))
+    yield dict(header)
+    yield _read_table(header["names"], csv.reader(chain([first], stream)), n_lines_before=len(header))
 
 
-def _read_table(names: Any, lines: Iterator[str], n_lines_before: int) -> Arrays:
-    reader = csv.reader(lines)
-    titles = next(reader, [])
-    p, d = (sum(title.startswith(f"{name}[") for title in titles) for name in ("position", "velocity"))
+def _read_table(names: Any, reader: Any, n_lines_before: int) -> Arrays:
+    titles: list[str] = next(reader, [])
+    counts = Counter(title.partition("[")[0] for title in titles)
+    p, d, line = counts["position"], counts["velocity"], n_lines_before + 1
     if names is not None and (not isinstance(names, list) or len(names) != d):
         raise ValueError(f"names is {names}, but there are {d} columns of velocities.")
-    there = {name for name in OPTIONAL if any(title.startswith(f"{name}[") for title in titles)}
-    sizes = {
-        name: {"n": 1, "p": p, "d": d, 4: 4}[shape[-1]]
-        for name, shape in SHAPES.items()
-        if name not in OPTIONAL or name in there
-    }
+    there = {name: shape for name, shape in SHAPES.items() if counts[name] or name not in OPTIONAL}
+    sizes = {name: {"n": 1, "p": p, "d": d, 4: 4}[shape[-1]] for name, shape in there.items()}
     # Counted before they are named, for titles of thousands of outputs would take gigabytes.
-    n_columns = sum((1, size, size * (size + 1) // 2)[len(SHAPES[name]) - 1] for name, size in sizes.items())
-    line = n_lines_before + 1
+    n_columns = sum(math.comb(size + len(there[name]) - 2, len(there[name]) - 1) for name, size in sizes.items())
     if len(titles) != n_columns:
         raise ValueError(
             f"line {line} names {len(titles)} columns, of which {d} are velocities, must name {n_columns}."
@@ -226,16 +216,20 @@ def _read_table(names: Any, lines: Iterator[str], n_lines_before: int) -> Arrays
 def _numbers(cells: Sequence[str], titles: Sequence[str], line: int) -> list[float]:
     if len(cells) != len(titles):
         raise ValueError(f"line {line} has {len(cells)} cells, but there are {len(titles)} columns.")
-    return [_number(cell, f"line {line}, column {title!r}") for cell, title in zip(cells, titles, strict=True)]
+    numbers = []
+    for cell, title in zip(cells, titles, strict=True):
+        try:
+            number = math.nan if "_" in cell else float(cell)  # Python alone reads 1_0 as ten
+        except ValueError:
+            number = math.nan
+        if not math.isfinite(number):
+            raise ValueError(f"line {line}, column {title!r}: {cell!r} is not a finite number.")
+        numbers.append(number)
+    return numbers
 
 
-def _number(cell: str, where: str) -> float:
-    # Python alone reads 1_0 as ten.
-    with suppress(ValueError):
-        if "_" not in cell and math.isfinite(value := float(cell)):
-            return value
-    raise ValueError(f"{where}: {cell!r} is not a finite number.")
-
-
-_ENCODERS = {".npz": _encode_npz, ".json": _encode_json, ".csv": _encode_csv}
-_DECODERS: dict[str, Decoder] = {".npz": _decode_npz, ".json": _decode_json, ".csv": _decode_csv}
+_FORMATS: dict[str, tuple[Callable[[Labels, Arrays], bytes], Callable[[bytes], Iterator[Any]]]] = {
+    ".npz": (_encode_npz, _decode_npz),
+    ".json": (_encode_json, _decode_json),
+    ".csv": (_encode_csv, _decode_csv),
+}

@@ -1,13 +1,16 @@
-"""Rows of a schedule between its own: how many at a rate, and what motion and gains are there."""
+"""Rows made of a schedule's own: between them, damped for an inertia, in another frame, with diagonal gains."""
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from torch_pbd import checks, rotations
 from torch_pbd.checks import Floats
+from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.files.memory import require_memory
 
 # Of a tick: 10 s at 1 kHz are 10001 rows, however 10 * 1000 is rounded; and stamps tell a duration to the thousandth of
@@ -44,12 +47,6 @@ def tick_times(duration: float, rate: float, d: int, *, settle: float = 0.0) -> 
     return row_times(duration, rate)
 
 
-def blend(start: Floats, end: Floats, share: Floats) -> Floats:
-    """Straight line from start to end, exact at both and where they agree, which (1 - s) a + s b is not."""
-    share = share.reshape(-1, *[1] * (start.ndim - 1))
-    return np.where(share < 0.5, start + share * (end - start), end - (1.0 - share) * (end - start))
-
-
 class Between:
     """Places of times (m,) between the rows of a schedule at ``knots`` (n,), n >= 2."""
 
@@ -60,51 +57,139 @@ class Between:
 
     def linear(self, values: Floats) -> Floats:
         """Values (n, ...) on straight lines, (m, ...)."""
-        return blend(values[self._row], values[self._row + 1], self._share)
+        return _blend(values[self._row], values[self._row + 1], self._share)
 
     def motion(self, schedule: Any) -> tuple[Floats, Floats, Floats | None]:
         """Position (m, p), velocity (m, d) and orientation (m, 4), or None, of a schedule whose rows these are."""
-        p = schedule.position.shape[1]
-        position, velocity = self.hermite(schedule.position, schedule.velocity[:, :p])
+        p, row = schedule.position.shape[1], self._row
+        first, second = (schedule.velocity[rows] for rows in (row, row + 1))
+        places = schedule.position[row], schedule.position[row + 1]
+        position, velocity = self._cubic(*places, first[:, :p], second[:, :p])
         if schedule.orientation is None:
             return position, velocity, None
-        orientation, turning = self.hermite_rotation(schedule.orientation, schedule.velocity[:, p:])
-        return position, np.concatenate([velocity, turning], axis=1), orientation
-
-    def hermite(self, position: Floats, velocity: Floats) -> tuple[Floats, Floats]:
-        """Cubic through positions (n, d) with these velocities (n, d), and its derivative."""
-        row = self._row
-        return self._cubic(position[row], position[row + 1], velocity[row], velocity[row + 1])
-
-    def hermite_rotation(self, orientation: Floats, velocity: Floats) -> tuple[Floats, Floats]:
-        """Quaternions (m, 4) between those of the rows (n, 4), and angular velocities, in world axes (n, 3) as given.
-
-        The cubic of each interval is that of the rotation vector y from its first row, ``R = R_row Exp(y)``.
-        """
-        row = self._row
-        start = orientation[row]
-        turn = rotations.log(rotations.multiply(rotations.conjugate(start), orientation[row + 1]))
+        # The cubic of each interval is that of the rotation vector y from its first row, R = R_row Exp(y).
+        start = schedule.orientation[row]
+        turn = rotations.log(rotations.multiply(rotations.conjugate(start), schedule.orientation[row + 1]))
         to_body = rotations.matrix(start).swapaxes(1, 2)
-        begins = (to_body @ velocity[row, :, np.newaxis])[..., 0]
-        ends = np.linalg.solve(rotations.left_jacobian(turn), to_body @ velocity[row + 1, :, np.newaxis])[..., 0]
-        vector, rate = self._cubic(np.zeros_like(turn), turn, begins, ends.astype(float))
+        begins, ends = ((to_body @ twist[:, p:, np.newaxis])[..., 0] for twist in (first, second))
+        ends = np.linalg.solve(rotations.left_jacobian(turn), ends[..., np.newaxis])[..., 0]
+        vector, rate = self._cubic(np.zeros_like(turn), turn, begins, ends)
         turning = to_body.swapaxes(1, 2) @ rotations.left_jacobian(vector) @ rate[..., np.newaxis]
-        return rotations.multiply(start, rotations.exp(vector)), turning[..., 0]
+        orientation = rotations.multiply(start, rotations.exp(vector))
+        return position, np.concatenate([velocity, turning[..., 0]], axis=1), orientation
 
     def _cubic(self, first: Floats, last: Floats, start: Floats, end: Floats) -> tuple[Floats, Floats]:
         """Cubic from the first to the last values (m, d) with the rates at start and end, and its derivative."""
         s, h = self._share[:, np.newaxis], self._step[:, np.newaxis]
-        cubic = blend(first, last, self._share**2 * (3.0 - 2.0 * self._share))
+        cubic = _blend(first, last, self._share**2 * (3.0 - 2.0 * self._share))
         bend = h * s * (1.0 - s) * ((1.0 - s) * start - s * end)
-        slope = blend(start, end, self._share) + 3.0 * s * (1.0 - s) * (2.0 * (last - first) / h - start - end)
+        slope = _blend(start, end, self._share) + 3.0 * s * (1.0 - s) * (2.0 * (last - first) / h - start - end)
         return cubic + bend, slope
 
 
-def ranges_of(matrices: Floats, blocks: Sequence[slice], units: Sequence[str]) -> str:
-    """Least and largest eigenvalue of each block of matrices (..., d, d), in words."""
-    ranges = []
-    for block, unit in zip(blocks, units, strict=False):
-        eigenvalues = np.linalg.eigvalsh(matrices[..., block, block])
-        low, high = (f"{value:.4g}" for value in (eigenvalues.min(), eigenvalues.max()))
-        ranges.append(f"{low} {unit}" if low == high else f"{low}..{high} {unit}")
-    return " and ".join(ranges)
+def _blend(start: Floats, end: Floats, share: Floats) -> Floats:
+    """Straight line from start to end, exact at both and where they agree, which (1 - s) a + s b is not."""
+    share = share.reshape(-1, *[1] * (start.ndim - 1))
+    return np.where(share < 0.5, start + share * (end - start), end - (1.0 - share) * (end - start))
+
+
+def damped_rows(schedule: Any, damping_ratio: float, law: Any) -> dict[str, Any]:
+    """Damping, and stiffness if there is a law, for the mass of a schedule; see :meth:`Schedule.with_inertia`.
+
+    The damping is ``2 zeta L (L^-1 K L^-T)^1/2 L'`` with M = L L'. It is twice zeta times the geometric mean of M and
+    K, whatever the factor L: that of :func:`~torch_pbd.control.damping_from_stiffness`, which takes the root of M.
+    """
+    ratio = checks.number(damping_ratio, "damping_ratio", least=0.0, most=1e6, remedy="1 is critical")
+    rows, unit = {"stiffness": schedule.stiffness}, np.eye(schedule.n_outputs)
+    mass = schedule.mass * unit if isinstance(schedule.mass, float) else schedule.mass
+    if law is not None:
+        if not hasattr(law, "limits"):  # to name its class would need torch
+            raise checks.refusal(law, "law", "a StiffnessLaw or None")
+        rows["stiffness_limits"] = law.limits(schedule.n_outputs)
+        softest, known = rows["stiffness_limits"][0] * unit, 1.0 - schedule.type1[:, np.newaxis, np.newaxis]
+        rows["stiffness"] = softest + known * (np.asarray(law(schedule.covariance, mass)) - softest)
+    factor = np.broadcast_to(np.linalg.cholesky(mass), schedule.stiffness.shape)
+    half = np.linalg.solve(factor, rows["stiffness"])
+    squared, axes = np.linalg.eigh(np.linalg.solve(factor, half.swapaxes(1, 2)))
+    modes = factor @ axes * squared.clip(0.0)[:, np.newaxis] ** 0.25
+    return rows | {"damping": 2.0 * ratio * modes @ modes.swapaxes(1, 2)}
+
+
+def turned_rows(schedule: Any, rotation: ArrayLike, translation: ArrayLike | None) -> dict[str, Any]:
+    """Arrays of a schedule that a rotation and a translation change; see :meth:`Schedule.transform`."""
+    p = schedule.position.shape[1]
+    if schedule.units in ("rad", "deg"):
+        raise InvalidParameterError(
+            f"the positions are in {schedule.units}, must be coordinates of a point: joint angles have no frame."
+        )
+    turn = checks.real_floats(rotation, "rotation")
+    if turn.shape == (4,) and p == 3:
+        turn = rotations.matrix(turn / np.linalg.norm(turn))
+    turn = checks.array(turn, "rotation", (p, p))
+    if not np.allclose(turn @ turn.T, np.eye(p), atol=1e-6) or np.linalg.det(turn) < 0.0:
+        raise checks.refusal(turn.tolist(), "rotation", "a rotation matrix, of which R R' = I and det R = 1")
+    for limit in schedule.stiffness_limits or ():
+        if np.ndim(limit) and any(np.ptp(np.asarray(limit)[block]) > 0.0 for block in schedule.blocks):
+            must = "the same for all axes that turn into each other"
+            remedy = "give schedules limits for each block, or none"
+            raise checks.refusal(schedule.stiffness_limits, "stiffness_limits", must, remedy)
+    whole = np.zeros((schedule.n_outputs, schedule.n_outputs))
+    for block in schedule.blocks:
+        whole[block, block] = turn
+    moved = 0.0 if translation is None else checks.array(translation, "translation", (p,))
+    rows = {"position": schedule.position @ turn.T + moved, "velocity": schedule.velocity @ whole.T}
+    if schedule.acceleration is not None:
+        rows["acceleration"] = schedule.acceleration @ whole.T
+    if schedule.orientation is not None:
+        rows["orientation"] = rotations.multiply(rotations.from_matrix(turn), schedule.orientation)
+    matrices = {name: getattr(schedule, name) for name in ("stiffness", "damping", "covariance", "mass")}
+    return rows | {name: whole @ array @ whole.T for name, array in matrices.items() if isinstance(array, np.ndarray)}
+
+
+@final
+@dataclass(frozen=True)
+class DiagonalLoss:
+    """Error of a controller that takes the diagonals of stiffness and damping only, 0 if they are all there is.
+
+    Attributes
+    ----------
+    displacement : float
+        Largest ||x - x_diagonal|| / ||x|| over all times and forces, or torques, which displace the robot by x with the
+        whole stiffness. 1 is an error as large as the displacement.
+    velocity : float
+        The same of the velocity under a force where damping alone acts.
+    time : float
+        When the displacement is off most, in s.
+    """
+
+    displacement: float
+    velocity: float
+    time: float
+
+    def __str__(self) -> str:
+        return (
+            "diagonal gains lose what couples axes: displacements under a force or a torque are off by up to "
+            f"{self.displacement:.1%}, at {self.time:.6g} s, velocities where damping alone acts by {self.velocity:.1%}"
+        )
+
+
+def diagonal_gains(schedule: Any) -> tuple[Floats, Floats, DiagonalLoss]:
+    """Diagonal stiffness and damping (n, d, d) of a schedule, and what they lose."""
+    # The nearest diagonal matrix, in the Frobenius norm, is the diagonal itself. It lies between the least and the
+    # largest eigenvalue, so within the limits too; rounding may leave it below zero.
+    gains = schedule.stiffness, schedule.damping
+    stiffness, damping = (np.eye(schedule.n_outputs) * np.maximum(gain, 0.0) for gain in gains)
+    displacement, velocity = (_diagonal_error(gain, schedule.blocks) for gain in gains)
+    worst = int(displacement.argmax())
+    loss = DiagonalLoss(float(displacement[worst]), float(velocity.max()), float(schedule.time[worst]))
+    return stiffness, damping, loss
+
+
+def _diagonal_error(gain: Floats, blocks: Sequence[slice]) -> Floats:
+    """Largest error (n,) of what a force, or a torque, causes, if of gains (n, d, d) the diagonals D are taken.
+
+    x = K^-1 f and D^-1 f differ by (I - D^-1 K) x: by its spectral norm, for the worst x.
+    """
+    along = np.maximum(np.diagonal(gain, axis1=1, axis2=2), 0.0)[..., np.newaxis]
+    coupling = (along * np.eye(gain.shape[1]) - gain) / np.where(along > 0.0, along, 1.0)
+    return np.max([np.linalg.norm(coupling[:, b, b], ord=2, axis=(1, 2)) for b in blocks], axis=0)

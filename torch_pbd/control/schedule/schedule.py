@@ -1,7 +1,7 @@
 """The schedule of a controller: position, velocity, stiffness and damping over time, and how sure the model was."""
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -12,17 +12,13 @@ from numpy.typing import ArrayLike
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.control.schedule import adapted
+from torch_pbd.control.schedule import rows
 from torch_pbd.control.schedule.contents import LABELS, SHAPES, Limits, checked_fields
 from torch_pbd.control.schedule.files import read_schedule, write_schedule
-from torch_pbd.control.schedule.rows import Between, ranges_of, tick_times
 from torch_pbd.exceptions import InvalidParameterError
 
 if TYPE_CHECKING:
     from torch_pbd.control.stability.report import StabilityReport
-
-# Times and velocities keep their digits at any speed that is not a mistake: a year for a second, and the reverse.
-_SLOWEST = 1e-9
 
 
 @final
@@ -119,22 +115,26 @@ class Schedule:
         if not isinstance(other, Schedule):
             return NotImplemented
         mine, theirs = self._arrays(), other._arrays()
-        return (
-            self._labels() == other._labels()
-            and set(mine) == set(theirs)
-            and all(np.array_equal(array, theirs[name]) for name, array in mine.items())
-        )
+        same = self._labels() == other._labels() and mine.keys() == theirs.keys()
+        return same and all(np.array_equal(array, theirs[name]) for name, array in mine.items())
 
     def __repr__(self) -> str:
         outputs = f"names={self.names}" if self.names else f"n_outputs={self.n_outputs}"
+        parts = [f"n={len(self)}", outputs, f"time={self.time[0]:.6g}..{self.time[-1]:.6g} s"]
         angles = self.units == "rad"
-        stiffness = ranges_of(self.stiffness, self.blocks, ("Nm/rad" if angles else "N/m", "Nm/rad"))
-        parts = [f"stiffness={stiffness}", f"frame={self.frame!r}"]
-        if self.mass is not None:
-            mass = self.mass * np.eye(self.n_outputs) if isinstance(self.mass, float) else self.mass
-            parts.insert(1, f"mass={ranges_of(mass, self.blocks, ('kg m^2' if angles else 'kg', 'kg m^2'))}")
-        time = f"time={self.time[0]:.6g}..{self.time[-1]:.6g} s"
-        return f"Schedule(n={len(self)}, {outputs}, {time}, {', '.join(parts)})"
+        units = {
+            "stiffness": ("Nm/rad" if angles else "N/m", "Nm/rad"),
+            "mass": ("kg m^2" if angles else "kg", "kg m^2"),
+        }
+        for name, of_blocks in units.items():
+            value, ranges = getattr(self, name), []
+            for block, unit in zip(self.blocks if value is not None else (), of_blocks, strict=False):
+                matrices = value * np.eye(self.n_outputs) if isinstance(value, float) else value
+                eigenvalues = np.linalg.eigvalsh(matrices[..., block, block])
+                low, high = (f"{value:.4g}" for value in (eigenvalues.min(), eigenvalues.max()))
+                ranges.append(f"{low} {unit}" if low == high else f"{low}..{high} {unit}")
+            parts += [f"{name}={' and '.join(ranges)}"] if ranges else []
+        return f"Schedule({', '.join(parts)}, frame={self.frame!r})"
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Copies go through the constructor: NumPy forgets that an array is read-only when it is pickled or copied.
@@ -164,14 +164,14 @@ class Schedule:
             raise InvalidParameterError(f"give either rate or times; got rate={rate!r} and times={times!r}.")
         first, last = self.time[0], self.time[-1]
         if rate is not None:
-            grid = np.append(first + tick_times(self.duration, rate, self.n_outputs)[:-1], last)
+            grid = np.append(first + rows.tick_times(self.duration, rate, self.n_outputs)[:-1], last)
         else:
             grid = checks.array(times, "times", ("m",))
         checks.require((grid >= first) & (grid <= last), grid, "times", f"from {first!s} to {last!s} s", unit="s")
-        between = Between(self.time, grid)
-        rows: dict[str, Any] = {name: between.linear(array) for name, array in self._arrays().items()}
-        rows |= {"time": grid} | dict(zip(("position", "velocity", "orientation"), between.motion(self), strict=True))
-        return replace(self, **rows)
+        between = rows.Between(self.time, grid)
+        made: dict[str, Any] = {name: between.linear(array) for name, array in self._arrays().items()}
+        motion = dict(zip(("position", "velocity", "orientation"), between.motion(self), strict=True))
+        return replace(self, **made | motion | {"time": grid})
 
     def retime(self, speed: float, *, mass: Any = None) -> "Schedule":
         """Schedule that is ``speed`` times as fast: time / speed, velocity * speed, gains and masses as they are.
@@ -188,20 +188,19 @@ class Schedule:
         ValueError
             If ``speed`` is not within these, or none of the guarantees of the report holds at it with ``mass``.
         """
-        speed = checks.number(speed, "speed", least=_SLOWEST, most=1.0 / _SLOWEST)
+        # Beyond these, a year for a second, speeds are mistakes; within, times and velocities keep their digits.
+        speed = checks.number(speed, "speed", least=1e-9, most=1e9)
         report = None if mass is None else self.certify(mass=mass, speed=speed)
         if report is not None and not report.stable:
-            remedy = f"the margin is {report.margin:.4g} /s; the highest safe speed is {report.max_speed:.4g}"
+            why = f"the margin is {report.margin:.4g} /s; the highest safe speed is {report.max_speed:.4g}"
             if report.margin >= 0.0:
-                remedy = f"held between rows, its gains let V grow by {report.held_growth - 1.0:.2g}; resample it finer"
-            remedy = f"{remedy}, or filter the stiffness and give no mass here"
+                why = f"held between rows, its gains let V grow by {report.held_growth - 1.0:.2g}; resample it finer"
+            remedy = f"{why}, or filter the stiffness and give no mass here"
             raise checks.refusal(speed, "speed", "certified to be stable", remedy)
         acceleration = None if self.acceleration is None else self.acceleration * speed**2
         return replace(self, time=self.time / speed, velocity=self.velocity * speed, acceleration=acceleration)
 
-    def with_inertia(
-        self, mass: ArrayLike | Callable[[Floats], ArrayLike], damping_ratio: float = 1.0, *, law: Any = None
-    ) -> "Schedule":
+    def with_inertia(self, mass: Any, damping_ratio: float = 1.0, *, law: Any = None) -> "Schedule":
         """Schedule for a robot of this inertia: with it, and with the damping that gives all modes this ratio.
 
         ``D = 2 zeta M^1/2 (M^-1/2 K M^-1/2)^1/2 M^1/2`` at every row, as
@@ -223,7 +222,8 @@ class Schedule:
         ValueError
             If a matrix is not symmetric and positive definite, or the ratio is negative.
         """
-        return replace(self, **adapted.inertial_rows(self, mass, damping_ratio, law))
+        heavy = replace(self, mass=mass(self.time) if callable(mass) else mass)
+        return replace(heavy, **rows.damped_rows(heavy, damping_ratio, law))
 
     def transform(
         self, rotation: ArrayLike, translation: ArrayLike | None = None, *, frame: str | None = None
@@ -244,7 +244,7 @@ class Schedule:
         ValueError
             If the matrix is no rotation, positions are joint angles, or axes have limits of their own.
         """
-        return replace(self, **adapted.turned_rows(self, rotation, translation), frame=frame)
+        return replace(self, **rows.turned_rows(self, rotation, translation), frame=frame)
 
     def certify(self, *, mass: Any = None, **options: Any) -> "StabilityReport":
         """:func:`torch_pbd.control.certify` of this schedule, whose options it takes; no mass is its own, or 1 kg."""
@@ -252,9 +252,9 @@ class Schedule:
 
         return certify(self, mass=mass, **options)
 
-    def diagonal(self) -> tuple["Schedule", adapted.DiagonalLoss]:
+    def diagonal(self) -> tuple["Schedule", rows.DiagonalLoss]:
         """Schedule with diagonal stiffness and damping, for controllers that take no other, and what that loses."""
-        stiffness, damping, loss = adapted.diagonal_gains(self)
+        stiffness, damping, loss = rows.diagonal_gains(self)
         return replace(self, stiffness=stiffness, damping=damping), loss
 
     def plot(self) -> Any:
