@@ -91,25 +91,13 @@ def number(
     raise refusal(value, name, must, remedy, unit)
 
 
-@overload
-def count(
-    value: Any, name: str, *, least: int = ..., most: int = ..., optional: Literal[False] = ..., remedy: str = ...
-) -> int: ...
-@overload
-def count(
-    value: Any, name: str, *, least: int = ..., most: int = ..., optional: Literal[True], remedy: str = ...
-) -> int | None: ...
-def count(
-    value: Any, name: str, *, least: int = 1, most: int = _MOST, optional: bool = False, remedy: str = ""
-) -> int | None:
-    """Whole number from ``least`` to ``most``; None too, if ``optional``."""
-    if optional and value is None:
-        return None
+def count(value: Any, name: str, *, least: int = 1, most: int = _MOST, remedy: str = "") -> int:
+    """Whole number from ``least`` to ``most``."""
     is_whole = isinstance(value, Integral) and not isinstance(value, bool | np.bool_)
     if is_whole and least <= int(value) <= most:
         return int(value)
     upper = f" and at most {most}" if most < _MOST or (is_whole and int(value) > most) else ""
-    raise refusal(value, name, f"an integer of at least {least}{upper}{' or None' if optional else ''}", remedy)
+    raise refusal(value, name, f"an integer of at least {least}{upper}", remedy)
 
 
 def flag(value: Any, name: str) -> bool:
@@ -163,11 +151,10 @@ def array(values: Any, name: str, shape: Sequence[int | str] | None) -> Floats:
     ``shape`` is such as ``("n", 3)``, None is any. The result is no copy where ``values`` is such an array already.
     """
     floats = real_floats(values, name)
-    fits = shape is None or (
-        len(shape) == floats.ndim
-        and all(isinstance(size, str) or size == own for size, own in zip(shape, floats.shape, strict=True))
-    )
-    if shape is not None and not fits:
+    if shape is not None and (
+        len(shape) != floats.ndim
+        or any(size != own for size, own in zip(shape, floats.shape, strict=True) if not isinstance(size, str))
+    ):
         expected = f"({', '.join(map(str, shape))}{',' if len(shape) == 1 else ''})"
         raise InvalidParameterError(f"{name} has shape {floats.shape}, must have shape {expected}.")
     require(np.abs(floats) <= LARGEST, floats, name, f"finite and at most {LARGEST:g} in size")
@@ -253,10 +240,8 @@ def real_array(values: Any, name: str) -> NDArray[Any]:
         raise ValueError(f"{name} has masked entries: leave them out, or fill them in first.")
     try:
         array = np.asarray(values)
-    except ValueError as error:
-        raise ValueError(f"{name} is ragged, its rows have different lengths: {error}") from error
-    except RuntimeError as error:  # a list of tensors that need gradients
-        raise ValueError(f"{name} cannot be made an array: {error}") from error
+    except (RuntimeError, ValueError) as error:  # RuntimeError of a list of tensors that need gradients
+        raise ValueError(f"{name} is ragged, or no array: {error}") from error
     kind = array.dtype.kind
     if kind in "US" or (kind == "O" and any(isinstance(entry, str | bytes) for entry in array.flat)):
         # scikit-learn's own checks ask for the words in the middle.

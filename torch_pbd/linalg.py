@@ -138,9 +138,8 @@ def safe_cholesky(matrix: Float[Tensor, "*b n n"], *, name: str) -> Float[Tensor
 
 def gaussian_log_density(residual: Float[Tensor, "*b d"], scale_tril: Float[Tensor, "*b d d"]) -> Float[Tensor, "*b"]:
     """Log density of N(0, scale_tril @ scale_tril.mT) at each residual."""
-    whitened = torch.linalg.solve_triangular(scale_tril, residual.unsqueeze(-1), upper=False).squeeze(-1)
-    log_det = scale_tril.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    return -0.5 * whitened.square().sum(-1) - log_det - 0.5 * residual.shape[-1] * math.log(2 * math.pi)
+    square, log_det = _square_and_log_det(residual, scale_tril)
+    return -0.5 * square - log_det - 0.5 * residual.shape[-1] * math.log(2 * math.pi)
 
 
 def student_log_density(
@@ -151,16 +150,19 @@ def student_log_density(
     ``degrees`` are above two; where they are many it is the normal density.
     """
     size = residual.shape[-1]
-    whitened = torch.linalg.solve_triangular(scale_tril, residual.unsqueeze(-1), upper=False).squeeze(-1)
-    square = whitened.square().sum(-1)
-    log_det = scale_tril.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+    square, log_det = _square_and_log_det(residual, scale_tril)
     # With the scale matrix (df - 2) / df times the covariance the density is
     # gamma((df + d) / 2) / gamma(df / 2) |(df - 2) pi S|^-1/2 (1 + x' S^-1 x / (df - 2))^-(df + d)/2.
-    # Beyond it the gamma functions lose more digits than the two densities differ by.
-    capped = degrees.clamp_max(1e7)
+    capped = degrees.clamp_max(1e7)  # beyond, the gamma functions lose more digits than the two densities differ by
     constant = torch.lgamma(0.5 * (capped + size)) - torch.lgamma(0.5 * capped)
     constant = constant - 0.5 * size * (math.pi * (capped - 2.0)).log()
     return constant - log_det - 0.5 * (capped + size) * torch.log1p(square / (capped - 2.0))
+
+
+def _square_and_log_det(residual: Tensor, scale_tril: Tensor) -> tuple[Tensor, Tensor]:
+    """Squared Mahalanobis distances of residuals (..., d), and log determinants of the factors."""
+    whitened = torch.linalg.solve_triangular(scale_tril, residual.unsqueeze(-1), upper=False)
+    return whitened.square().sum((-2, -1)), scale_tril.diagonal(dim1=-2, dim2=-1).log().sum(-1)
 
 
 class _SpectralMap(torch.autograd.Function):

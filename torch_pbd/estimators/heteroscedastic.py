@@ -228,7 +228,8 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
     def _check_parameters(self) -> None:
         super()._check_parameters()
         checks.choice(self.kernel, "kernel", (*KERNELS, "periodic"))
-        checks.count(self.n_inducing, "n_inducing", least=2, optional=True)
+        if self.n_inducing is not None:
+            checks.count(self.n_inducing, "n_inducing", least=2)
         checks.count(self.max_inputs, "max_inputs", least=2)
 
     def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, recorded: Integers) -> Fitted:

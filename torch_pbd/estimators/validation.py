@@ -35,34 +35,24 @@ def checked_values(values: Any, name: str) -> Any:
         values = checks.from_tensor(values, name)
     if hasattr(values, "columns"):
         for label in values.columns:
-            _check_numbers(checks.real_array(values[label], f"column {label} of {name}"), name, label)
+            _check_numbers(checks.real_array(values[label], f"column {label} of {name}"), f"{name}[{label!r}]")
     elif not issparse(values):  # of which scikit-learn says more
         _check_numbers(checks.real_array(values, name), name)
     return values
 
 
-def _check_numbers(array: NDArray[Any], name: str, label: Any = None) -> None:
-    """Check that rows (n, ...), or a column of this label, are finite and differ by more than their type resolves."""
+def _check_numbers(array: NDArray[Any], name: str) -> None:
+    """Check that rows (n, ...) are finite, and differ by more than their type resolves."""
     if not (array.ndim and array.size):
         return  # of which scikit-learn says more
-    floats = checks.real_floats(array, name).reshape(len(array), -1)
-    if not (finite := np.isfinite(floats)).all():
-        row, column = map(int, np.argwhere(~finite)[0])
-        what = "NaN" if np.isnan(floats[row, column]) else "infinity or a value too large for dtype('float64')"
-        where = f"row {row}, column {column if label is None else label}"
-        raise ValueError(
-            f"Input {name} contains {what}. The first is in {where}: leave such rows out, or fill them in."
-        )
+    floats = checks.real_floats(array, name)
+    remedy = "leave such rows out, or fill them in"
+    checks.require(np.isfinite(floats), floats, name, "finite, no NaN and no infinity", remedy)
     if array.dtype in (np.float16, np.float32):
         step, spread = np.finfo(array.dtype).eps * np.abs(floats).max(axis=0), np.ptp(floats, axis=0)
-        coarse = (step > 1e-3 * spread) & (spread > 0)
-        if coarse.any():
-            column = int(np.argmax(coarse))
-            raise ValueError(
-                f"{name} is {array.dtype} and column {column if label is None else label} is stored in steps of "
-                f"{step[column]:.3g} where its range is {spread[column]:.3g}: subtract an offset before storing it, or "
-                "record it in float64."
-            )
+        fine = np.asarray((step <= 1e-3 * spread) | (spread == 0))
+        must, remedy = "a thousandth of its range", "subtract an offset before storing it, or record it in float64"
+        checks.require(fine, np.asarray(step), f"the resolution of {array.dtype} in {name}", must, remedy)
 
 
 def checked_rows(estimator: Any, X: ArrayLike, y: ArrayLike, **options: Any) -> tuple[Floats, Floats]:
@@ -105,14 +95,10 @@ def _is_plain(X: Any, fitted: dict[str, Any]) -> bool:
 
 def check_squares(array: Floats, name: str) -> None:
     """Check that variances of the columns of ``array`` are numbers that float64 holds."""
-    largest = np.abs(array.reshape(len(array), -1)).max(axis=0).astype(np.float64)  # which holds the bounds
-    beyond = (largest > _LARGEST) | ((largest > 0) & (largest < 1.0 / _LARGEST))
-    if beyond.any():
-        column = int(np.argmax(beyond))
-        raise ValueError(
-            f"{name} has values of {largest[column]:.3g} in column {column}, whose squares are beyond what float64 "
-            f"holds: use units in which they are between {1.0 / _LARGEST:g} and {_LARGEST:g}."
-        )
+    largest = np.asarray(np.abs(array).max(axis=0), dtype=np.float64)  # which holds the bounds
+    fine = (largest == 0) | ((largest >= 1.0 / _LARGEST) & (largest <= _LARGEST))
+    must = f"zero, or between {1.0 / _LARGEST:g} and {_LARGEST:g} as its square is"
+    checks.require(fine, largest, f"the largest value of {name}", must, "use other units")
 
 
 def check_inputs_vary(X: Floats) -> None:
@@ -123,10 +109,9 @@ def check_inputs_vary(X: Floats) -> None:
     spread = np.ptp(X, axis=0)
     constant = spread <= CONSTANT * np.abs(X).max(axis=0)
     if constant.all():
-        columns = "column 0" if X.shape[1] == 1 else f"columns 0 to {X.shape[1] - 1}"
         raise ValueError(
-            f"X is constant: {columns} of X have the same value in all {len(X)} rows, so nothing can depend on X. "
-            "Give the time, phase or position of each row."
+            f"X is constant: its columns have the same value in all {len(X)} rows, so nothing can depend on X. Give "
+            "the time, phase or position of each row."
         )
     # In their own ranges, so that the rank is the same in all units.
     centred = (X - X.mean(axis=0)) / np.where(constant, 1.0, spread)
@@ -170,13 +155,8 @@ def check_length_scale(value: Any, n_features: int) -> Floats | None:
     """Length scales as an array (n_features,), or None where they are to be learned."""
     if value is None:
         return None
-    scales = parameter_floats(value, "length_scale")
-    if scales.shape not in [(), (n_features,)] or not (np.isfinite(scales).all() and (scales > 0).all()):
-        raise ValueError(
-            f"length_scale is {value!r}, must be None, a positive number, or {n_features} positive numbers: one "
-            "for each column of X, in its units."
-        )
-    return np.broadcast_to(scales, (n_features,)).copy()
+    must = "positive and in the units of its column of X"
+    return _of_columns(value, "length_scale", n_features, lambda scales: np.isfinite(scales) & (scales > 0), must)
 
 
 def check_period(value: Any, kernel: str, x_scale: Floats) -> Floats | None:
@@ -185,13 +165,16 @@ def check_period(value: Any, kernel: str, x_scale: Floats) -> Floats | None:
         if kernel == "periodic":
             raise ValueError("kernel == 'periodic' needs a period, in units of X, such as period=1.0 for a phase.")
         return None
-    periods = parameter_floats(value, "period")
-    if periods.shape not in [(), x_scale.shape] or not (periods >= _SHORTEST_PERIOD * x_scale).all():
-        raise ValueError(
-            f"period is {value!r}, must be None, a positive number, or {len(x_scale)} positive numbers (or inf): one "
-            f"for each column of X, in its units, and no shorter than {_SHORTEST_PERIOD:g} of its range."
-        )
-    return np.broadcast_to(periods, x_scale.shape).copy()
+    must = f"in the units of its column of X (or inf), no shorter than {_SHORTEST_PERIOD:g} of its range"
+    return _of_columns(value, "period", len(x_scale), lambda periods: periods >= _SHORTEST_PERIOD * x_scale, must)
+
+
+def _of_columns(value: Any, name: str, n_columns: int, good: Callable[[Floats], Any], must: str) -> Floats:
+    """Numbers (n_columns,), one for each column of X, of one or as many that are good."""
+    numbers = parameter_floats(value, name)
+    if numbers.shape not in [(), (n_columns,)] or not good(numbers).all():
+        raise checks.refusal(value, name, f"None, a number or {n_columns} of them, each {must}")
+    return np.broadcast_to(numbers, (n_columns,)).copy()
 
 
 def parameter_floats(value: Any, name: str) -> Floats:

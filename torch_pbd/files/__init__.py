@@ -94,25 +94,23 @@ def _target(path: Path) -> Path:
         raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
     if not target.parent.is_dir():
         raise FileNotFoundError(f"the folder {target.parent} does not exist: make it before saving {path.name}.")
-    if target.is_dir():
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if target.exists() and not target.is_file():
-        raise OSError(errno.EINVAL, "a pipe or a device, in whose place no file can be put", str(path))
+        number = errno.EISDIR if target.is_dir() else errno.EINVAL
+        raise OSError(number, "a folder, a pipe or a device, in whose place no file can be put", str(path))
     return target
 
 
 def _sync_folder(folder: Path) -> None:
     """Have the new name reach the disk too, on systems that can be asked for it."""
-    descriptor = None
     try:
         descriptor = os.open(folder, os.O_RDONLY)
-        os.fsync(descriptor)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
     except OSError as error:
         if error.errno not in _NO_SYNC:
             raise
-    finally:
-        if descriptor is not None:
-            os.close(descriptor)
 
 
 def read_members(content: bytes, max_bytes: int, *, remedy: str) -> dict[str, bytes]:

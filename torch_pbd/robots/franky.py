@@ -32,41 +32,34 @@ def run(
 
     franky's controller adds Coriolis forces and the inertia times the acceleration that it is told, which is
     ``a_d - J' q'`` by the robot's own model. So the arm moves with its own inertia: make the schedule ``with_inertia``
-    of it, or its damping is that of another robot (franky's default, 2 K^1/2, knows no mass).
-    Time is that of the robot; in between, targets of the last ``period`` are held. What to know of franky:
-
-    - Gains follow those sent with a lag of ``gains_time_constant``; they are sent as much ahead.
-    - Deviations count up to ``translational_error_clip`` (0.10 m) and ``rotational_error_clip`` (0.25 rad) on an axis:
-      beyond, the arm is softer than the schedule says.
-    - What it does not know is friction: 1.5 N of it hold the tool 30 mm away at 50 N/m. Learn with ``stiffness_min`` of
-      some hundred, and give ``friction``.
-
-    libfranka's own example takes vec(q), sin(theta / 2) of the rotation, for the error: to it, send twice the
-    rotational stiffness.
+    of it (franky's default damping, 2 K^1/2, knows no mass). Gains lag by franky's filter, and are sent as much ahead.
+    Deviations count up to ``translational_error_clip`` (0.10 m) and ``rotational_error_clip`` (0.25 rad) on an axis:
+    beyond, the arm is softer than the schedule says. Friction of 1.5 N holds the tool 30 mm away at 50 N/m: learn with
+    ``stiffness_min`` of some hundred, and give ``friction``.
 
     Parameters
     ----------
     robot : franky.Robot
-        In no motion, its end effector the tool of the schedule, its base the schedule's frame.
+        In no motion, its end effector the tool of the schedule, its base the schedule's frame. Time is the robot's.
     schedule : Schedule
-        Of poses, in m.
+        Poses, in m.
     on_fault : callable, default=None
-        Told the fault, a ``RobotStoppedError``, after the arm was stopped; None raises it.
+        Called with the fault, a ``RobotStoppedError``, once the arm was stopped; None raises it.
     limits : RobotLimits, default=None
-        Checked before the arm moves; None is those of the Panda.
+        Limits that are checked before the arm moves; None is those of the Panda.
     period, max_step : float, default=0.005, 0.1
-        From one target to the next, and the longest time of the robot without a new one, s; longer is a fault.
+        Time from one target to the next, and the longest without a new one, s; longer is a fault.
     settle : float, default=0.5
         Time at the first row before the motion begins, s, in which gains are reached.
     gains_time_constant : float, default=0.1
-        Of franky's filter, s.
+        Time constant of franky's filter of gains, s.
     **tracker
-        Of ``franky.CartesianImpedanceTracker``: ``posture_task``, ``friction``, the clips, ``max_delta_tau``.
+        Options of ``franky.CartesianImpedanceTracker``: ``posture_task``, ``friction``, clips, ``max_delta_tau``.
 
     Returns
     -------
     RobotRun
-        As far as it came.
+        The motion as far as it came.
 
     Warns
     -----

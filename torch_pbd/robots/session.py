@@ -66,12 +66,14 @@ def check_limits(schedule: Schedule, limits: Any) -> None:
     """Refuse a schedule of poses that is beyond limits, by row."""
     poses(schedule)
     checks.instance(limits, "limits", RobotLimits)
-    motions = [("speed", schedule.velocity, "/s")]
-    if schedule.acceleration is not None:
-        motions.append(("acceleration", schedule.acceleration, "/s^2"))
-    for name, values, per in motions:
-        for field, part, unit in ((name, values[:, :3], f"m{per}"), (f"angular_{name}", values[:, 3:], f"rad{per}")):
-            length, most = np.linalg.norm(part, axis=1), getattr(limits, field)
+    for field, values, block, unit in (
+        ("speed", schedule.velocity, slice(3), "m/s"),
+        ("angular_speed", schedule.velocity, slice(3, 6), "rad/s"),
+        ("acceleration", schedule.acceleration, slice(3), "m/s^2"),
+        ("angular_acceleration", schedule.acceleration, slice(3, 6), "rad/s^2"),
+    ):
+        if values is not None:
+            length, most = np.linalg.norm(values[:, block], axis=1), getattr(limits, field)
             what, must = f"the {field.replace('_', ' ')}", f"at most RobotLimits.{field}, {most:g} {unit}"
             checks.require(length <= most, length, what, must, "slow down: retime it", unit)
     for block, field, unit in ((slice(3), "stiffness", "N/m"), (slice(3, 6), "rotational_stiffness", "Nm/rad")):

@@ -39,21 +39,21 @@ def run(
     control, receive : rtde_control.RTDEControlInterface, rtde_receive.RTDEReceiveInterface
         Connected, the tool centre point that of the schedule, the robot's base its frame, the arm at its first pose.
     schedule : Schedule
-        Of poses, in m.
+        Poses, in m.
     on_fault : callable, default=None
-        Told the fault, a ``RobotStoppedError``, after the arm was stopped; None raises it.
+        Called with the fault, a ``RobotStoppedError``, once the arm was stopped; None raises it.
     limits : RobotLimits, default=None
-        Of the motion, checked before the arm moves; None is 1 m/s and 3.1 rad/s. The robot is asked whether it can
+        Limits that are checked before the arm moves; None is 1 m/s and 3.1 rad/s. The robot is asked whether it can
         come there.
     lookahead_time, gain : float, default=0.05, 300.0
-        Of ``servoL``: 0.03 to 0.2 s, 100 to 2000.
+        Arguments of ``servoL``: 0.03 to 0.2 s, 100 to 2000.
     **loop
-        Of ``RealTimeAdmittance``: ``force_limit``, ``deadband``, ``velocity_limit``, ``soft_start``.
+        Options of ``RealTimeAdmittance``: ``force_limit``, ``deadband``, ``velocity_limit``, ``soft_start``.
 
     Returns
     -------
     RobotRun
-        As far as it came.
+        The motion as far as it came.
 
     Raises
     ------
