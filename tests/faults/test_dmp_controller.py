@@ -126,7 +126,7 @@ BAD_DATA = [
     (
         lambda X, y, g: (X, (y + 2000.0).astype(np.float16), g),
         ValueError,
-        "y is float16 and column 1 is stored",
+        r"the resolution of float16 in y\[1\]",
     ),
     (lambda X, y, g: ((X + 1.7e9).astype(np.float32), y, g), ValueError, "must increase strictly"),
     (lambda X, y, g: (recorded(), y, None), ValueError, "X is Demonstrations.*give neither y nor groups"),

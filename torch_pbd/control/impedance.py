@@ -15,10 +15,9 @@ from torch_pbd.control.primitive.outputs import RESOLUTION, Outputs, in_si
 from torch_pbd.control.primitive.smoothing import UNKNOWN
 from torch_pbd.control.stiffness import RotationLimits, StiffnessLaw
 from torch_pbd.data import Demonstrations
-from torch_pbd.estimators.base import CovarianceRegressor
-from torch_pbd.estimators.demonstrations import fit_with_groups
+from torch_pbd.estimators.base import CovarianceRegressor, prior_covariance
 from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
-from torch_pbd.estimators.validation import prior_covariance
+from torch_pbd.estimators.validation import fit_with_groups
 
 OnUnknown = Literal["soft", "prior", "raise"]
 

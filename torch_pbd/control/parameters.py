@@ -21,8 +21,7 @@ from torch_pbd.data import Demonstrations, check_unimodal
 from torch_pbd.data.alignment import TIMING_REMOVED
 from torch_pbd.data.poses import ROTATION
 from torch_pbd.data.units import ANGLES, LENGTHS, TIMES
-from torch_pbd.estimators.demonstrations import check_groups
-from torch_pbd.estimators.validation import check_squares, checked_values
+from torch_pbd.estimators.validation import check_groups, check_squares, checked_values
 from torch_pbd.files.memory import require_much
 
 PhaseInput = Literal["time", "log_s", "s"]

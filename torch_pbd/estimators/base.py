@@ -1,4 +1,4 @@
-"""Predictions of the covariance regressors, as scikit-learn's interface has them and beyond it."""
+"""Predictions of the covariance regressors; and priors and other parameters in the units of the data."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -10,11 +10,17 @@ from sklearn.utils.validation import check_is_fitted
 from torch import Tensor
 
 from torch_pbd import checks
+from torch_pbd.checks import Floats
 from torch_pbd.estimators.torch_estimator import TorchEstimator
-from torch_pbd.estimators.validation import Floats, checked_queries, checked_rows, prior_covariance
+from torch_pbd.estimators.validation import checked_queries, checked_rows
 from torch_pbd.files.memory import require_much
 from torch_pbd.linalg import gaussian_log_density, safe_cholesky, student_log_density
 
+Prior = float | list[list[float]] | str | Callable[[Any], Any] | None  # what YAML can say; or any array-like
+
+_SHORTEST_PERIOD = 1e-8  # of the range: standardized inputs have ten decimals, and so this phase two
+# Of the variance of y: beyond these the floor under variances shows far from data, or the prior near them.
+_LOWEST, _HIGHEST = 1e-6, 1e6
 _CHUNK = 1024  # rows: what a prediction needs on the way is then some tens of MB for ten outputs
 
 
@@ -196,3 +202,77 @@ def by_chunks(function: Callable[[Any], Any], x: Tensor | Floats) -> Any:
     others = (function(x[start : start + _CHUNK]) for start in range(_CHUNK, len(x), _CHUNK))
     joined: Any = torch.cat if isinstance(x, Tensor) else np.concatenate
     return tuple(joined(part) for part in zip(first, *others, strict=True))
+
+
+def check_length_scale(value: Any, n_features: int) -> Floats | None:
+    """Length scales as an array (n_features,), or None where they are to be learned."""
+    if value is None:
+        return None
+    must = "positive and in the units of its column of X"
+    return _of_columns(value, "length_scale", n_features, lambda scales: np.isfinite(scales) & (scales > 0), must)
+
+
+def check_period(value: Any, kernel: str, x_scale: Floats) -> Floats | None:
+    """Periods as an array (n_features,), infinite where an input of the range ``x_scale`` does not repeat, or None."""
+    if value is None:
+        if kernel == "periodic":
+            raise ValueError("kernel == 'periodic' needs a period, in units of X, such as period=1.0 for a phase.")
+        return None
+    must = f"in the units of its column of X (or inf), no shorter than {_SHORTEST_PERIOD:g} of its range"
+    return _of_columns(value, "period", len(x_scale), lambda periods: periods >= _SHORTEST_PERIOD * x_scale, must)
+
+
+def _of_columns(value: Any, name: str, n_columns: int, good: Callable[[Floats], Any], must: str) -> Floats:
+    """Numbers (n_columns,), one for each column of X, of one or as many that are good."""
+    numbers = parameter_floats(value, name)
+    if numbers.shape not in [(), (n_columns,)] or not good(numbers).all():
+        raise checks.refusal(value, name, f"None, a number or {n_columns} of them, each {must}")
+    return np.broadcast_to(numbers, (n_columns,)).copy()
+
+
+def parameter_floats(value: Any, name: str) -> Floats:
+    """A parameter of numbers as an array of floats, of any shape."""
+    try:
+        array = checks.real_array(value, name)
+        if array.dtype.kind == "b":
+            raise TypeError("not bool")
+        return array.astype(np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} is {value!r}, must be numbers ({error}).") from error
+
+
+def standardized_prior(prior: Prior, X: Floats, y_scale: Floats) -> Floats:
+    """Covariances of a prior, as :func:`prior_covariance`, over the outputs' deviations ``y_scale`` (d,).
+
+    It warns of variances so far from those of y, or from each other, that float64 does not hold them beside those.
+    """
+    covariance = prior_covariance(prior, X, len(y_scale)) / y_scale[:, np.newaxis] / y_scale
+    eigenvalues = np.linalg.eigvalsh(covariance)
+    lowest, highest = float(eigenvalues.min()), float(eigenvalues.max())
+    if lowest < _LOWEST * max(1.0, highest) or highest > _HIGHEST:
+        checks.warn(
+            f"prior has variances of {lowest:.3g} to {highest:.3g} times those of y. Below {_LOWEST:g} of these, or of "
+            f"the largest, they come out larger; above {_HIGHEST:g} they show where there are data. Give the prior in "
+            "squared units of y."
+        )
+    return np.asarray(covariance)
+
+
+def prior_covariance(prior: Prior, X: Floats, n_outputs: int) -> Floats:
+    """Covariances (n, d, d) or (d, d) that a float, array or callable prior stands for, which are positive definite."""
+    name, value = "prior", prior
+    shape: tuple[int, ...] = (n_outputs, n_outputs)
+    if callable(prior):
+        name, shape = "prior(X)", (len(X), n_outputs, n_outputs)
+        try:
+            value = prior(X.copy())
+        except Exception as error:
+            error.add_note(f"Raised by prior(X), which was asked for covariances at X of shape {X.shape}.")
+            raise
+    covariance = parameter_floats(value, name)
+    if covariance.ndim == 0 and not callable(prior):
+        covariance = covariance * np.eye(n_outputs)
+    covariance = checks.array(covariance, name, shape)
+    remedy = "far from data it is the covariance, so give every direction some variance"
+    checks.semidefinite(covariance, name, definite=True, remedy=remedy)
+    return covariance

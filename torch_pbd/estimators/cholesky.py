@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from torch_pbd import checks
+from torch_pbd.estimators.base import Prior
 from torch_pbd.estimators.latent import (
     LatentCovarianceRegressor,
     Problem,
@@ -15,7 +16,6 @@ from torch_pbd.estimators.latent import (
     residual_tril,
     warn_if_stretched,
 )
-from torch_pbd.estimators.validation import Prior
 from torch_pbd.gp import LatentGP, Observations, condition, fit_together
 from torch_pbd.kernels import KernelName
 from torch_pbd.linalg import tril_to_vector

@@ -8,10 +8,10 @@ import torch
 from numpy.typing import ArrayLike
 
 from torch_pbd import checks
-from torch_pbd.estimators.base import CovarianceRegressor
-from torch_pbd.estimators.demonstrations import check_demonstrations, warn_if_few, warn_if_identical, warn_of_residuals
+from torch_pbd.checks import Floats
+from torch_pbd.estimators.base import CovarianceRegressor, Prior, check_length_scale, check_period, standardized_prior
 from torch_pbd.estimators.torch_estimator import Fitted, Integers, Standardization
-from torch_pbd.estimators.validation import Floats, Prior, check_length_scale, check_period, standardized_prior
+from torch_pbd.estimators.validation import check_demonstrations, warn_if_few, warn_if_identical, warn_of_residuals
 from torch_pbd.files.memory import require_much
 from torch_pbd.kernels import KERNELS, KernelName
 from torch_pbd.linalg import safe_cholesky

@@ -11,10 +11,10 @@ from scipy.special import fdtri, stdtrit
 from torch import Tensor
 
 from torch_pbd import checks
-from torch_pbd.estimators.base import CovarianceRegressor
-from torch_pbd.estimators.demonstrations import warn_if_few, warn_if_identical
+from torch_pbd.checks import Floats
+from torch_pbd.estimators.base import CovarianceRegressor, check_length_scale, standardized_prior
 from torch_pbd.estimators.torch_estimator import Fitted, Integers, Standardization
-from torch_pbd.estimators.validation import Floats, check_length_scale, standardized_prior
+from torch_pbd.estimators.validation import warn_if_few, warn_if_identical
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.files.memory import require_much
 from torch_pbd.gp import (

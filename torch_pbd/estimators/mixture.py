@@ -8,11 +8,11 @@ from sklearn.cluster import KMeans
 from sklearn.neighbors import NearestNeighbors
 
 from torch_pbd import checks
+from torch_pbd.checks import Floats
 from torch_pbd.estimators.base import CovarianceRegressor, by_chunks
-from torch_pbd.estimators.demonstrations import warn_if_few_demonstrations
 from torch_pbd.estimators.regression import MixtureRegression
 from torch_pbd.estimators.torch_estimator import Fitted, Integers, Standardization, distinct_rows, spread_of
-from torch_pbd.estimators.validation import Floats
+from torch_pbd.estimators.validation import warn_if_few_demonstrations
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.files.memory import require_much
 from torch_pbd.models.mixture import GaussianMixture, expectation_maximization, refine

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from torch_pbd.estimators.validation import Floats
+from torch_pbd.checks import Floats
 from torch_pbd.models.conditional import VARIANCE_FLOOR, ConditionalNormal
 
 # Of standardized inputs: squares of what follows stay finite.

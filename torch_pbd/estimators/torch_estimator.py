@@ -17,8 +17,14 @@ from torch import Tensor
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.console import say
-from torch_pbd.estimators.demonstrations import check_groups
-from torch_pbd.estimators.validation import CONSTANT, check_inputs_vary, check_squares, checked_rows, without_rounding
+from torch_pbd.estimators.validation import (
+    CONSTANT,
+    check_groups,
+    check_inputs_vary,
+    check_squares,
+    checked_rows,
+    without_rounding,
+)
 from torch_pbd.models.conditional import ConditionalNormal, Core
 from torch_pbd.models.training import TrainingSet
 from torch_pbd.optim import FitReport, Progress, Status

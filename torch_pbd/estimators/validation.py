@@ -1,29 +1,30 @@
-"""Checks of what users pass to an estimator, before any work starts: rows, parameters, the prior."""
+"""Checks of rows and of demonstrations among them before any work starts, and warnings where something is amiss."""
 
-from collections.abc import Callable
+from contextvars import ContextVar
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import issparse
-from sklearn.utils.validation import check_is_fitted, validate_data
+from sklearn.utils.validation import check_is_fitted, has_fit_parameter, validate_data
+from torch import Tensor
 
 from torch_pbd import checks
+from torch_pbd.checks import Floats
+from torch_pbd.data import Demonstrations, check_unimodal
 from torch_pbd.exceptions import DataRankWarning
+from torch_pbd.models.heteroscedastic import HeteroscedasticFit, are_copies
+from torch_pbd.models.training import TrainingSet
 
-Floats = NDArray[np.float64]
-# A column whose spread is below this of its largest value differs only by rounding.
 CONSTANT = 1e-11
+"""A column whose spread is below this share of its largest value differs only by rounding."""
+
 # Distance of values that are made equal, in usual distances; and of all, how many are worth saying.
 _NEAR, _MANY = 1e-3, 0.1
-_SHORTEST_PERIOD = 1e-8  # of the range: standardized inputs have ten decimals, and so this phase two
-# Of a value, so that its square, and a thousand of them added up, is a number.
-_LARGEST = 1e140
-
-Prior = float | list[list[float]] | str | Callable[[Any], Any] | None  # what YAML can say; or any array-like
-
-# Of the variance of y: beyond these the floor under variances shows far from data, or the prior near them.
-_LOWEST, _HIGHEST = 1e-6, 1e6
+_LARGEST = 1e140  # of a value, so that its square, and a thousand of them added up, is a number
+_COVERED = 0.5  # of the range of the input, by a demonstration that is compared with others
+# Whether a fit is not to warn of several ways; of the context, so that other threads are warned as before.
+_unimodality_reported: ContextVar[bool] = ContextVar("_unimodality_reported", default=False)
 
 
 def checked_values(values: Any, name: str) -> Any:
@@ -51,7 +52,10 @@ def _check_numbers(array: NDArray[Any], name: str) -> None:
     if array.dtype in (np.float16, np.float32):
         step, spread = np.finfo(array.dtype).eps * np.abs(floats).max(axis=0), np.ptp(floats, axis=0)
         fine = np.asarray((step <= 1e-3 * spread) | (spread == 0))
-        must, remedy = "a thousandth of its range", "subtract an offset before storing it, or record it in float64"
+        must, remedy = (
+            "at most a thousandth of its range",
+            "subtract an offset before storing it, or record it in float64",
+        )
         checks.require(fine, np.asarray(step), f"the resolution of {array.dtype} in {name}", must, remedy)
 
 
@@ -151,75 +155,120 @@ def without_rounding(X: Floats) -> Floats:
     return X
 
 
-def check_length_scale(value: Any, n_features: int) -> Floats | None:
-    """Length scales as an array (n_features,), or None where they are to be learned."""
-    if value is None:
-        return None
-    must = "positive and in the units of its column of X"
-    return _of_columns(value, "length_scale", n_features, lambda scales: np.isfinite(scales) & (scales > 0), must)
-
-
-def check_period(value: Any, kernel: str, x_scale: Floats) -> Floats | None:
-    """Periods as an array (n_features,), infinite where an input of the range ``x_scale`` does not repeat, or None."""
-    if value is None:
-        if kernel == "periodic":
-            raise ValueError("kernel == 'periodic' needs a period, in units of X, such as period=1.0 for a phase.")
-        return None
-    must = f"in the units of its column of X (or inf), no shorter than {_SHORTEST_PERIOD:g} of its range"
-    return _of_columns(value, "period", len(x_scale), lambda periods: periods >= _SHORTEST_PERIOD * x_scale, must)
-
-
-def _of_columns(value: Any, name: str, n_columns: int, good: Callable[[Floats], Any], must: str) -> Floats:
-    """Numbers (n_columns,), one for each column of X, of one or as many that are good."""
-    numbers = parameter_floats(value, name)
-    if numbers.shape not in [(), (n_columns,)] or not good(numbers).all():
-        raise checks.refusal(value, name, f"None, a number or {n_columns} of them, each {must}")
-    return np.broadcast_to(numbers, (n_columns,)).copy()
-
-
-def parameter_floats(value: Any, name: str) -> Floats:
-    """A parameter of numbers as an array of floats, of any shape."""
+def check_groups(groups: Any, n_samples: int) -> NDArray[np.intp]:
+    """Number of each row's demonstration, from labels of any kind, none of which is missing."""
+    if hasattr(groups, "detach"):
+        groups = checks.from_tensor(groups, "groups")
+    if np.ma.is_masked(groups):
+        raise ValueError("groups has masked entries: say of every row which demonstration it is of.")
+    if isinstance(groups, list | tuple) and len({isinstance(label, str) for label in groups}) > 1:
+        groups = np.fromiter(groups, dtype=object, count=len(groups))  # NumPy would make text of the numbers
     try:
-        array = checks.real_array(value, name)
-        if array.dtype.kind == "b":
-            raise TypeError("not bool")
-        return array.astype(np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} is {value!r}, must be numbers ({error}).") from error
-
-
-def standardized_prior(prior: Prior, X: Floats, y_scale: Floats) -> Floats:
-    """Covariances of a prior, as :func:`prior_covariance`, over the outputs' deviations ``y_scale`` (d,).
-
-    It warns of variances so far from those of y, or from each other, that float64 does not hold them beside those.
-    """
-    covariance = prior_covariance(prior, X, len(y_scale)) / y_scale[:, np.newaxis] / y_scale
-    eigenvalues = np.linalg.eigvalsh(covariance)
-    lowest, highest = float(eigenvalues.min()), float(eigenvalues.max())
-    if lowest < _LOWEST * max(1.0, highest) or highest > _HIGHEST:
-        checks.warn(
-            f"prior has variances of {lowest:.3g} to {highest:.3g} times those of y. Below {_LOWEST:g} of these, or of "
-            f"the largest, they come out larger; above {_HIGHEST:g} they show where there are data. Give the prior in "
-            "squared units of y."
+        labels = np.asarray(groups)
+    except ValueError as error:
+        raise ValueError(f"groups is ragged: give one label for each row of X ({error}).") from error
+    if labels.shape != (n_samples,):
+        raise ValueError(
+            f"groups has shape {labels.shape}, must have shape ({n_samples},): the demonstration of each row of X."
         )
-    return np.asarray(covariance)
+    if labels.dtype.kind == "f" and not np.isfinite(labels).all():
+        raise ValueError(f"groups has a label that is not finite, at index {int(np.argmin(np.isfinite(labels)))}.")
+    if labels.dtype.kind in "mMO":
+        for i, label in enumerate(labels):
+            if checks.is_missing(label) or label != label:  # NaN and NaT are not equal to themselves
+                raise ValueError(f"groups has no label at index {i}: say of every row which demonstration it is of.")
+        if len(kinds := sorted({type(label).__name__ for label in labels})) > 1:
+            raise ValueError(f"groups has labels of several types ({', '.join(kinds)}): use one, as 1 is not '1'.")
+    return np.unique(labels, return_inverse=True)[1]
 
 
-def prior_covariance(prior: Prior, X: Floats, n_outputs: int) -> Floats:
-    """Covariances (n, d, d) or (d, d) that a float, array or callable prior stands for, which are positive definite."""
-    name, value = "prior", prior
-    shape: tuple[int, ...] = (n_outputs, n_outputs)
-    if callable(prior):
-        name, shape = "prior(X)", (len(X), n_outputs, n_outputs)
-        try:
-            value = prior(X.copy())
-        except Exception as error:
-            error.add_note(f"Raised by prior(X), which was asked for covariances at X of shape {X.shape}.")
-            raise
-    covariance = parameter_floats(value, name)
-    if covariance.ndim == 0 and not callable(prior):
-        covariance = covariance * np.eye(n_outputs)
-    covariance = checks.array(covariance, name, shape)
-    remedy = "far from data it is the covariance, so give every direction some variance"
-    checks.semidefinite(covariance, name, definite=True, remedy=remedy)
-    return covariance
+def check_demonstrations(X: Floats, y: Floats, groups: Any) -> None:
+    """Warn where demonstrations are too few to tell their correlation or covariance, or seem to follow several ways.
+
+    The ways are looked for along one input, among demonstrations that cover most of it.
+    """
+    counts = np.bincount(groups)
+    if len(counts) < 2:
+        checks.warn(
+            "groups has one demonstration: how far its samples repeat each other cannot be told from it, and they "
+            "count as independent. What is predicted is its noise, not how demonstrations differ.",
+            DataRankWarning,
+        )
+    elif len(y) > y.shape[1]:
+        warn_if_few_demonstrations(groups, y.shape[1])
+    if _unimodality_reported.get() or X.shape[1] > 1 or len(counts) < 2 or counts.min() < 2:
+        return
+    # Each time of a demonstration once: of two rows at one time the first counts.
+    times, positions = [], []
+    for rows in np.split(np.argsort(groups, kind="stable"), np.cumsum(counts)[:-1]):
+        time, first = np.unique(X[rows, 0], return_index=True)
+        times.append(time)
+        positions.append(y[rows][first])
+    if min(len(time) for time in times) > 1 and min(np.ptp(time) for time in times) > _COVERED * np.ptp(X):
+        check_unimodal(Demonstrations(times, positions))
+
+
+def warn_if_few(n_rows: int, n_outputs: int, groups: NDArray[np.intp] | None = None) -> None:
+    """Warn of no more rows than outputs, whose covariance is singular; or of no more demonstrations."""
+    if n_rows <= n_outputs:
+        checks.warn(
+            f"y has {n_rows} rows but {n_outputs} outputs: they leave directions of the covariance undetermined, "
+            "which the prior decides. Record more.",
+            DataRankWarning,
+        )
+    else:
+        warn_if_few_demonstrations(groups, n_outputs)
+
+
+def warn_if_few_demonstrations(groups: NDArray[np.intp] | None, n_outputs: int) -> None:
+    """Warn of no more demonstrations than outputs: samples of one repeat each other, however many there are."""
+    if groups is not None and (n_demos := int(groups.max()) + 1) <= n_outputs:
+        checks.warn(
+            f"y has {n_demos} demonstrations but {n_outputs} outputs: they leave open how the outputs vary together. "
+            f"Record {n_outputs + 1} or more, or learn fewer outputs at a time.",
+            DataRankWarning,
+        )
+
+
+def warn_if_identical(training: TrainingSet) -> None:
+    """Warn of outputs that never vary where inputs repeat, or nowhere if none does; but for rounding."""
+    repeated = len(training.y) - len(training.inputs)
+    squares = training.squares() if repeated else (training.y - training.y.mean(0)).square()
+    if float(squares.sum(0).max()) < 1e-18 * max(1, repeated or len(training.y) - 1):
+        checks.warn(
+            "The demonstrations are identical: their covariance is zero, and the smallest that can be told "
+            "from it is used.",
+            DataRankWarning,
+        )
+
+
+def warn_of_residuals(fit: HeteroscedasticFit, given: Tensor) -> None:
+    """Warn where rows, ``given`` in this order without groups, are of demonstrations; or the mean misses a signal."""
+    if fit.group is None and are_copies(fit.whitened(), fit.training, given):
+        message = (
+            "y has rows that nearly repeat those beside them along X, as samples of a demonstration do. Without groups "
+            "they count as independent, and what is predicted is far too certain. Give groups, the demonstration of "
+            "each row, to fit; cross_val_score takes params={'groups': groups}, and a search passes them on where "
+            "metadata routing is enabled and set_fit_request(groups=True) asks for them."
+        )
+        checks.warn(message, DataRankWarning)
+    elif bool((missed := fit.missed()).any()):
+        message = (
+            f"The mean does not follow y in outputs {missed.nonzero().flatten().tolist()}: what is left is no noise, "
+            "but counts as such. Raise n_inducing and max_inputs; give groups if the rows are of demonstrations."
+        )
+        checks.warn(message)
+
+
+def fit_with_groups(regressor: Any, X: ArrayLike, y: ArrayLike, groups: ArrayLike) -> Any:
+    """Regressor fitted with the demonstrations' numbers, if its ``fit`` takes them: what users bring along need not.
+
+    That the demonstrations follow several ways is not said here: whoever has them as demonstrations says it once.
+    """
+    if not has_fit_parameter(regressor, "groups"):
+        return regressor.fit(X, y)
+    token = _unimodality_reported.set(True)
+    try:
+        return regressor.fit(X, y, groups=groups)
+    finally:
+        _unimodality_reported.reset(token)

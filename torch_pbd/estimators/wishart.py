@@ -8,6 +8,7 @@ from sklearn.utils import check_random_state
 from torch import Tensor
 
 from torch_pbd import checks, gp
+from torch_pbd.estimators.base import Prior
 from torch_pbd.estimators.latent import (
     LatentCovarianceRegressor,
     Problem,
@@ -16,7 +17,6 @@ from torch_pbd.estimators.latent import (
     residual_tril,
     warn_if_stretched,
 )
-from torch_pbd.estimators.validation import Prior
 from torch_pbd.exceptions import DataRankWarning, NotPositiveDefiniteError
 from torch_pbd.gp.observations import FULL, Basis
 from torch_pbd.kernels import KernelName

@@ -111,7 +111,7 @@ def fit_once(model: Any, *data: Any, finished: FinishedFits | None = None) -> tu
 
 
 def _timed_fit(model: Any, *data: Any) -> tuple[Any, float]:
-    from torch_pbd.estimators.demonstrations import fit_with_groups
+    from torch_pbd.estimators.validation import fit_with_groups
 
     start = time.perf_counter()
     fitted = model.fit(*data) if len(data) == 1 else fit_with_groups(model, *data)

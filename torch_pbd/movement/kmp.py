@@ -10,8 +10,8 @@ from sklearn.base import clone
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.estimators.base import CovarianceRegressor
-from torch_pbd.estimators.demonstrations import fit_with_groups
 from torch_pbd.estimators.mixture import GMMBaseline
+from torch_pbd.estimators.validation import fit_with_groups
 from torch_pbd.files.memory import require_much
 from torch_pbd.movement.base import MovementRegressor
 from torch_pbd.movement.joint import Conditioned, JointNormal

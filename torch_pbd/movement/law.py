@@ -14,8 +14,7 @@ from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.data import Demonstrations
 from torch_pbd.data.alignment import TIMING_REMOVED
-from torch_pbd.estimators.demonstrations import check_groups
-from torch_pbd.estimators.validation import checked_queries, checked_rows
+from torch_pbd.estimators.validation import check_groups, checked_queries, checked_rows
 from torch_pbd.movement.joint import Conditioned, JointNormal
 
 _DECIMALS = 10  # of a time, in ranges of those of the fit: nearer ones are equal, as 0.1 + 0.2 and 0.3 are

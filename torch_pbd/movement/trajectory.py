@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.estimators.base import CovarianceRegressor
-from torch_pbd.estimators.demonstrations import fit_with_groups
 from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
+from torch_pbd.estimators.validation import fit_with_groups
 from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky
 from torch_pbd.movement.joint import JointNormal
