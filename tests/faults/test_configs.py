@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from torch_pbd import CholeskyCovRegressor, GMMBaseline, HeteroscedasticGPRegressor, WishartProcessRegressor
 from torch_pbd.cli.commands import COMMANDS, parse
 from torch_pbd.cli.main import main
-from torch_pbd.cli.yaml import MAX_BYTES, read_yaml, read_yaml_file
+from torch_pbd.cli.values import MAX_BYTES, read_yaml, read_yaml_file
 from torch_pbd.exceptions import ConfigError
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").rglob("*.yaml"))

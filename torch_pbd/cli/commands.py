@@ -4,23 +4,16 @@ import json
 import math
 import re
 from argparse import Namespace
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import takewhile
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from torch_pbd.cli import options
 from torch_pbd.cli.options import MODELS, Option, made
 from torch_pbd.console import say
 from torch_pbd.exceptions import ConfigError, DataFormatError
 from torch_pbd.registry import MOVEMENTS
-
-if TYPE_CHECKING:
-    from torch_pbd.control.controller import DMPController
-    from torch_pbd.estimators.base import CovarianceRegressor
-    from torch_pbd.movement.base import MovementRegressor
-
-    Model = CovarianceRegressor | MovementRegressor
 
 COMMANDS = {
     "demo": "learn from six made demonstrations of the tunnel task; the main job, no data needed",
@@ -66,7 +59,7 @@ OPTIONS: dict[str, dict[str, Option]] = {
         "common_start": Option(bool, False, "made demonstrations of the tunnel start at one point"),
         "task": Option(Literal["tunnel", "peg"], "tunnel", "to make demonstrations of: peg turns a tool"),
         "controllers": Option(
-            dict[str, "DMPController"],
+            dict[str, "DMPController"],  # type: ignore[name-defined]  # a key of CLASSES, as "Model" below
             {"recommended": "DMPController"},
             f"controllers {_CLASS_HELP} --controllers.help DMPController",
         ),
@@ -77,7 +70,11 @@ OPTIONS: dict[str, dict[str, Option]] = {
     },
     "compare": {
         **_FILE,
-        "models": Option(dict[str, "Model"], MODELS, f"estimators {_CLASS_HELP} --models.help NAME"),
+        "models": Option(
+            dict[str, "Model"],  # type: ignore[name-defined]
+            MODELS,
+            f"estimators {_CLASS_HELP} --models.help NAME",
+        ),
         "max_folds": Option(Annotated[int, (0, math.inf)], 10, "demonstrations to leave out, one by one"),
         "n_jobs": Option(
             Annotated[int, (-math.inf, -1)] | _Count | None, None, "fits at the same time; -1: all cores"
@@ -116,15 +113,15 @@ eigenvalue of the predicted correlations"""
 
 def parse(command: str, arguments: Sequence[str]) -> tuple[Namespace, str]:
     """Options of a command, and the YAML that gives them again."""
-    if command == "playground":  # which has no results
-        return options.parse(f"torch-pbd {command}", COMMANDS[command], OPTIONS[command], arguments)
-    run = {
-        "output": Option(str, f"runs/{command}", "folder of the results"),
-        "resume": Option(bool, False, "go on with the finished fits in the folder of results"),
-    }
-    if command == "inspect":
-        arguments = _named_files(arguments)
-    return options.parse(f"torch-pbd {command}", COMMANDS[command], run | OPTIONS[command], arguments)
+    own = OPTIONS[command]
+    if command != "playground":  # which has no results
+        output = Option(str, f"runs/{command}", "folder of the results")
+        own = {"output": output, "resume": Option(bool, False, "go on with the finished fits in that folder")} | own
+    if command == "inspect":  # whose files may stand first, as a shell writes trial_*.csv
+        files = list(takewhile(lambda argument: not argument.startswith("-"), arguments))
+        data = ["--data", files[0] if len(files) == 1 else json.dumps(files)] if files else []
+        arguments = [*data, *arguments[len(files) :]]
+    return options.parse(f"torch-pbd {command}", COMMANDS[command], own, arguments)
 
 
 def playground(options: Any) -> None:
@@ -136,13 +133,6 @@ def playground(options: Any) -> None:
             f"playground needs {error.name}, which is not installed: pip install 'torch_pbd[playground]'."
         ) from error
     serve(options.port, browse=options.browse)
-
-
-def _named_files(arguments: Sequence[str]) -> list[str]:
-    """Arguments in which the files that stand first are an option, as ``inspect trial_*.csv`` of a shell needs it."""
-    files = list(takewhile(lambda argument: not argument.startswith("-"), arguments))
-    rest = list(arguments[len(files) :])
-    return ["--data", files[0] if len(files) == 1 else json.dumps(files), *rest] if files else rest
 
 
 def demo(options: Any, folder: Any) -> str:
@@ -181,9 +171,10 @@ def fit(options: Any, folder: Any) -> str:
 
 def inspect(options: Any, folder: Any) -> str:
     """Description of recordings, before anything is fitted."""
+    from torch_pbd.data import inspect_demonstrations
     from torch_pbd.experiments.recordings import figure_of_recordings
 
-    demonstrations, description = _loaded(options, inspect=True)
+    demonstrations, description = _loaded(options, inspect_demonstrations)
     say(f"{_name(options.data)}: {demonstrations}\n")
     figure = folder.write_figure(figure_of_recordings(demonstrations, _name(options.data)), "recordings")
     return f"{description}\n\nfigure:  {figure}"
@@ -191,43 +182,38 @@ def inspect(options: Any, folder: Any) -> str:
 
 def experiment(options: Any, folder: Any) -> str:
     """A skill, learned and reproduced on a simulated robot that is pushed."""
-    from torch_pbd.data import make_pose_demonstrations, make_tunnel_demonstrations
+    from torch_pbd.data import load_demonstrations, make_pose_demonstrations, make_tunnel_demonstrations
+    from torch_pbd.experiments.poses import run_poses
     from torch_pbd.experiments.recordings import describe
     from torch_pbd.experiments.robot import framework_figure, run_robot
+    from torch_pbd.registry import optional
 
-    made = options.data is None
-    if made and options.task == "peg":  # six outputs: fewer than seven leave open how they vary together
+    made, source = options.data is None, f"{options.task} task"
+    if not made:
+        demonstrations, source = _loaded(options, load_demonstrations), _name(options.data)
+    elif options.task == "peg":  # six outputs: fewer than seven leave open how they vary together
         demonstrations = make_pose_demonstrations(options.n_demos or 8, random_state=options.seed)
-    elif made:
+    else:
         demonstrations = make_tunnel_demonstrations(
             options.n_demos or 6, random_state=options.seed, common_start=options.common_start
         )
-    else:
-        demonstrations = _loaded(options)
-    say(describe(demonstrations, f"{options.task} task" if made else _name(options.data)))
+    say(describe(demonstrations, source))
+    where = "at 20 % and 80 % of the movement; K is the stiffness there"
+    sizes = {"peak": options.push, "rate": options.rate}
     if demonstrations.rotation_reference is not None:
-        return _pose_experiment(options, demonstrations, folder)
+        if options.arm == "panda":
+            try:
+                optional("mujoco", "robot", "a Panda")  # before anything is learned
+            except ModuleNotFoundError as error:
+                raise ConfigError(f"arm: {error} Or leave the arm out by --arm none.") from error
+        say(f"pushes of {options.push:g} N along and {options.torque:g} Nm about each axis of the tool,\n{where}\n")
+        sizes |= {"torque": options.torque}
+        return run_poses(options.controllers, demonstrations, folder, arm=options.arm, **sizes)
     turns = set(demonstrations.units or ()) in ({"rad"}, {"deg"})
-    where, unit = ("Nm about", "Nm/rad") if turns else ("N along", "N/m")
-    say(f"pushes of {options.push:g} {where} {demonstrations.names[0]},")
-    say(f"at 20 % and 80 % of the movement; K is the stiffness there, {unit}\n")
+    along, unit = ("Nm about", "Nm/rad") if turns else ("N along", "N/m")
+    say(f"pushes of {options.push:g} {along} {demonstrations.names[0]},\n{where}, {unit}\n")
     folder.write_figure(framework_figure(), "figure5_framework")
-    return run_robot(options.controllers, demonstrations, folder, peak=options.push, rate=options.rate, in_tunnel=made)
-
-
-def _pose_experiment(options: Any, demonstrations: Any, folder: Any) -> str:
-    from torch_pbd.experiments.poses import run_poses
-    from torch_pbd.registry import optional
-
-    if options.arm == "panda":
-        try:
-            optional("mujoco", "robot", "a Panda")  # before anything is learned
-        except ModuleNotFoundError as error:
-            raise ConfigError(f"arm: {error} Or leave the arm out by --arm none.") from error
-    pushes = f"{options.push:g} N along and {options.torque:g} Nm about each axis of the tool"
-    say(f"pushes of {pushes},\nat 20 % and 80 % of the movement; K is the stiffness there\n")
-    sizes = {"peak": options.push, "torque": options.torque, "rate": options.rate}
-    return run_poses(options.controllers, demonstrations, folder, **sizes, arm=options.arm)
+    return run_robot(options.controllers, demonstrations, folder, in_tunnel=made, **sizes)
 
 
 def compare(options: Any, folder: Any) -> str:
@@ -254,12 +240,11 @@ def compare(options: Any, folder: Any) -> str:
 WORK = {"demo": demo, "fit": fit, "inspect": inspect, "experiment": experiment, "compare": compare}
 
 
-def _loaded(options: Any, *, inspect: bool = False) -> Any:
-    from torch_pbd.data import inspect_demonstrations, load_demonstrations
-
+def _loaded(options: Any, load: Callable[..., Any]) -> Any:
+    """What a loader makes of the files, with the options of the command line."""
     loader = {"missing": options.missing, "from_start": options.from_start, **(options.loader or {})}
     try:
-        return (inspect_demonstrations if inspect else load_demonstrations)(options.data, **loader)
+        return load(options.data, **loader)
     except TypeError as error:
         raise ConfigError(f"loader: {error}") from error
     except DataFormatError as error:
@@ -282,12 +267,13 @@ def _of_rows(models: dict[str, Any], why: str) -> dict[str, Any]:
 
 
 def _demonstrations(options: Any) -> Any:
+    """Demonstrations of the files, described, checked and on one grid."""
     from torch_pbd import checks
-    from torch_pbd.data import check_unimodal
+    from torch_pbd.data import check_unimodal, load_demonstrations
     from torch_pbd.data.alignment import TIMING_REMOVED
     from torch_pbd.experiments.recordings import describe, prepare
 
-    recorded = _loaded(options)
+    recorded = _loaded(options, load_demonstrations)
     say(describe(recorded, _name(options.data)))
     if len(recorded) == 1:
         checks.warn("There is one demonstration: what varies between demonstrations cannot be told from how one moves.")

@@ -4,14 +4,14 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch_pbd
 from torch_pbd.cli import commands
-from torch_pbd.cli.words import unknown
+from torch_pbd.cli.values import unknown
 from torch_pbd.console import progress, say
 from torch_pbd.exceptions import ConfigError, FolderInUseError
 
@@ -34,7 +34,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     try:
         with _signals():
-            return _answer(list(sys.argv[1:] if arguments is None else arguments))
+            _run(list(sys.argv[1:] if arguments is None else arguments))
+        return 0
     except ConfigError as error:
         return _complain(str(error), _USAGE)
     except FolderInUseError as error:
@@ -74,33 +75,29 @@ def _signals() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _answer(arguments: Sequence[str]) -> int:
+def _run(arguments: Sequence[str]) -> None:
+    """Answer, or do the work of a command."""
     if not arguments or arguments[0] in ("-h", "--help") or arguments == ["help"]:
         say("torch-pbd: learn how precise people are from demonstrations\n")
         say("usage: torch-pbd COMMAND [--config FILE] [--option VALUE ...]\n")
         for name, about in commands.COMMANDS.items():
             say(f"  {name:<10}  {about}")
         say("\nOptions of a command: torch-pbd COMMAND --help. As YAML: torch-pbd COMMAND --print_config.")
-        return 0
+        return
     command, *rest = arguments
     if command == "--version":
         say(torch_pbd.__version__)
-        return 0
-    if command == "help" and rest:
+        return
+    if command == "help":
         command, rest = rest[0], ["--help"]
     if command not in commands.COMMANDS:
         raise ConfigError(f"{command!r} {unknown(command, commands.COMMANDS, 'a command')}")
-    return _run(command, rest)
-
-
-def _run(command: str, arguments: Sequence[str]) -> int:
     with progress():
-        options, config = commands.parse(command, arguments)
+        options, config = commands.parse(command, rest)
         if command != "playground":
             _work(command, options, config)
     if command == "playground":  # which goes on until it is ended, and says so itself
         commands.playground(options)
-    return 0
 
 
 def _work(command: str, options: Any, config: str) -> None:
@@ -112,7 +109,7 @@ def _work(command: str, options: Any, config: str) -> None:
         check_names(getattr(options, argument, ()), argument)
     with _run_folder(options.output, command) as folder, warnings.catch_warnings():
         warnings.simplefilter("default")
-        warnings.showwarning = _each_once()
+        warnings.showwarning = _show_once()
         try:
             with FinishedFits(folder.path / "finished", options.resume) as folder.finished:
                 folder.write_text("config.yaml", config)
@@ -127,18 +124,6 @@ def _work(command: str, options: Any, config: str) -> None:
                 stop.args = (f"torch-pbd {command} --config {folder.path / 'config.yaml'} --resume goes on",)
             raise
     say(f"\nreport:  {report}\nresults: {folder.path}")
-
-
-def _each_once() -> Any:
-    """What shows each warning once, as one line on the standard error, in the place of ``warnings.showwarning``."""
-    shown = set()
-
-    def show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
-        if str(message) not in shown:
-            shown.add(str(message))
-            say(f"note ({category.__name__}): {message}", sys.stderr)
-
-    return show
 
 
 def _files(data: Any) -> list[Path]:
@@ -163,11 +148,20 @@ def _run_folder(path: str, command: str) -> Any:
     try:
         return RunFolder(path, {"command": command})
     except OSError as error:
-        reason = error.strerror or str(error)
-        where = f" ({error.filename})" if error.filename else ""
-        raise ConfigError(
-            f"output: {path!r} cannot be a folder of results: {reason}{where}. Give another with --output FOLDER."
-        ) from error
+        what = f"{path!r} cannot be a folder of results: {error.strerror or error}"
+        raise ConfigError(f"output: {what}. Give another with --output FOLDER.") from error
+
+
+def _show_once() -> Callable[..., None]:
+    """What takes the place of ``warnings.showwarning``: each warning once, as one line on the standard error."""
+    shown = set()
+
+    def show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+        if str(message) not in shown:
+            shown.add(str(message))
+            say(f"note ({category.__name__}): {message}", sys.stderr)
+
+    return show
 
 
 def _complain(message: str, code: int) -> int:

@@ -7,7 +7,7 @@ where a class is given parameters, or built.
 import inspect
 import textwrap
 from argparse import Namespace
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
@@ -15,8 +15,18 @@ from typing import Any, NamedTuple, NoReturn, get_args, get_origin, get_type_hin
 
 import yaml
 
-from torch_pbd.cli.words import Place, alternatives, described, is_of, remedy, shown, unknown, visible
-from torch_pbd.cli.yaml import next_value, read_yaml, read_yaml_file
+from torch_pbd.cli.values import (
+    Place,
+    alternatives,
+    described,
+    is_of,
+    read_yaml,
+    read_yaml_file,
+    remedy,
+    shown,
+    unknown,
+    visible,
+)
 from torch_pbd.console import say
 from torch_pbd.exceptions import ConfigError
 from torch_pbd.registry import ESTIMATORS, MOVEMENTS, REGRESSORS
@@ -71,19 +81,28 @@ def parse(usage: str, about: str, options: Mapping[str, Option], arguments: Sequ
     """
     if {"-h", "--help"} & set(arguments):
         _answer(_help(usage, about, options))
-    given = _Values(options)
-    given.read(arguments)
-    if given.print_config == "skip_default":
-        values = {name: value for name, value in given.values.items() if value != given.defaults[name]}
-        _answer(_as_yaml(_plain(values)))
-    complete = _plain(given.values, complete=True)
-    if given.print_config is not None:
+    asked = [argument for argument in arguments if argument.partition("=")[0] == "--print_config"]
+    for flag in asked:
+        if flag not in ("--print_config", "--print_config=skip_default"):
+            raise ConfigError(f"{flag} {unknown(flag.partition('=')[2], ['skip_default'], 'a flag of it')}")
+    defaults = {
+        name: option.default and _take(option.default, option.type, Place()) for name, option in options.items()
+    }
+    values = dict(defaults)
+    for place, name, value in _given([argument for argument in arguments if argument not in asked], options):
+        if name not in options:
+            raise place.error(unknown(name, options, "an option of this command"))
+        values[name] = _take(value, options[name].type, place, values[name])
+    if asked[-1:] == ["--print_config=skip_default"]:
+        _answer(_as_yaml(_plain({name: value for name, value in values.items() if value != defaults[name]})))
+    complete = _plain(values, complete=True)
+    if asked:
         _answer(_as_yaml(complete))
     for name, option in options.items():
-        if option.required and given.values[name] is None:
+        if option.required and values[name] is None:
             raise ConfigError(f"{name} is missing: give --{name}, or {name}: in a file named by --config.")
     complete.pop("resume", None)  # the same options begin a run and resume it
-    return Namespace(**{name: _build(value, name) for name, value in given.values.items()}), _as_yaml(complete)
+    return Namespace(**{name: _build(value, name) for name, value in values.items()}), _as_yaml(complete)
 
 
 def made(value: Any, hint: Any) -> Any:
@@ -147,59 +166,41 @@ class _Dotted(dict[str, Any]):
     """Entry named by a dotted option: it is changed, and the others beside it stay."""
 
 
-class _Values:
-    """Values of the options of a command, from the defaults to the last argument."""
-
-    def __init__(self, options: Mapping[str, Option]) -> None:
-        self._options = options
-        self.print_config: str | None = None
-        self.defaults = {
-            n: None if o.default is None else _take(o.default, o.type, Place()) for n, o in options.items()
-        }
-        self.values: dict[str, Any] = dict(self.defaults)
-
-    def read(self, arguments: Sequence[str]) -> None:
-        """Take ``--name value``, ``--name=value``, ``--name.key value`` and ``--config FILE``, one after another."""
-        rest = list(arguments)
-        while rest:
-            argument = rest.pop(0)
-            if not argument.startswith("--") or argument == "--":
-                raise ConfigError(f"there is {argument!r} where an option should stand: options begin with --.")
-            name, equals, text = argument[2:].partition("=")
-            if name == "print_config":
-                if text not in ("", "skip_default"):
-                    raise ConfigError(f"--print_config={text} {unknown(text, ['skip_default'], 'a flag of it')}")
-                self.print_config = text
-            elif name == "config" and (equals or rest):
-                self._read_file(text if equals else rest.pop(0))
-            elif equals or (rest and not rest[0].startswith("--")):
-                self._set(name, text if equals else next_value(rest))
-            elif name != "config" and self._option(name.split(".")[0], Place(keys=(f"--{name}",))).type is bool:
-                self.values[name] = True
-            else:
-                raise ConfigError(f"--{name} has no value: write --{name} VALUE.")
-
-    def _option(self, name: str, place: Place) -> Option:
-        if name not in self._options:
-            raise place.error(unknown(name, self._options, "an option of this command"))
-        return self._options[name]
-
-    def _read_file(self, path: str) -> None:
-        document = read_yaml_file(path)
-        for name, value in document.content.items():
-            place = Place(visible(path), (name,), document.lines)
-            self.values[name] = _take(value, self._option(name, place).type, place, self.values[name])
-
-    def _set(self, dotted: str, text: str) -> None:
+def _given(arguments: Sequence[str], options: Mapping[str, Option]) -> Iterator[tuple[Place, str, Any]]:
+    """Place, option and value of ``--name value``, ``--name=value``, ``--name.key value``, and of entries of files."""
+    rest = list(arguments)
+    while rest:
+        argument = rest.pop(0)
+        if not argument.startswith("--") or argument == "--":
+            raise ConfigError(f"there is {argument!r} where an option should stand: options begin with --.")
+        dotted, has_value, text = argument[2:].partition("=")
         name, *keys = dotted.split(".")
         place = Place(keys=(f"--{name}",))
-        option = self._option(name, place)
-        if keys and keys[-1] == "help":
+        if not has_value and rest and not rest[0].startswith("--"):
+            has_value, text = "=", _next_value(rest)
+        if has_value and dotted == "config":
+            document = read_yaml_file(text)
+            for key, value in document.content.items():
+                yield Place(visible(text), (key,), document.lines), key, value
+        elif has_value and keys[-1:] == ["help"] and name in options:
             _answer(_class_help(text, Place(keys=(f"--{dotted}",))))
-        value: Any = _Text(text)
-        for key in reversed(keys):
-            value = _Dotted({key: value})
-        self.values[name] = _take(value, option.type, place, self.values[name])
+        elif has_value:
+            value = _Text(text)
+            for key in reversed(keys):
+                value = _Dotted({key: value})
+            yield place, name, value
+        elif dotted == "config" or (name in options and options[name].type is not bool):
+            raise ConfigError(f"--{dotted} has no value: write --{dotted} VALUE.")
+        else:
+            yield place, name, True
+
+
+def _next_value(rest: list[str]) -> str:
+    """Next argument; a list that the shell took apart, as [x, y] without quotes, is one."""
+    text = rest.pop(0)
+    while text.startswith("[") and not text.endswith("]") and any(argument.endswith("]") for argument in rest):
+        text = f"{text} {rest.pop(0)}"
+    return text
 
 
 def _take(value: Any, hint: Any, place: Place, before: Any = None) -> Any:
