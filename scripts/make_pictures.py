@@ -16,8 +16,8 @@ from torch_pbd import DMPController
 from torch_pbd.control import RotationLimits, StiffnessLaw
 from torch_pbd.data import make_handwriting_demonstrations, make_pose_demonstrations
 from torch_pbd.plotting import DATA, FORCE, MODEL, ROBOT, legend_below, plot_covariance_ellipses, plot_demonstrations
-from torch_pbd.plotting.poses import draw_pose_schedule, pose_panels
-from torch_pbd.plotting.style import mark_ends
+from torch_pbd.plotting.poses import draw_pose_schedule
+from torch_pbd.plotting.style import mark_ends, panels
 
 FOLDER = Path(__file__).parents[1] / "docs" / "pictures"
 DURATION, RATE = 6.0, 500.0  # s, Hz
@@ -127,7 +127,7 @@ def poses():
     shown = make_pose_demonstrations(12, rate=25.0, random_state=0)
     law = StiffnessLaw(stiffness_min=300.0, stiffness_max=1500.0, rotation=RotationLimits(5.0, 60.0))
     schedule = DMPController(stiffness_law=law).fit(shown).schedule(100.0)
-    figure, (space,), bands = pose_panels(4, lambda size: Figure(figsize=size, layout="constrained"))
+    figure, (space,), bands = panels(4, 3, lambda size: Figure(figsize=size, layout="constrained"))
     for path in shown.to_poses()[0]:
         space.plot(*path.T, color=DATA, lw=0.8)
     space.lines[0].set_label("demonstrations")

@@ -28,8 +28,7 @@ from torch_pbd.console import format_table, say
 from torch_pbd.data import Demonstrations, load_demonstrations
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.exceptions import ConfigError
-from torch_pbd.experiments.comparison import left_out, mean_and_error, score_fold
-from torch_pbd.experiments.recordings import prepare
+from torch_pbd.experiments.comparison import left_out, mean_and_error, prepare, score_fold
 
 Row = dict[str, Any]
 

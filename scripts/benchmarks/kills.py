@@ -23,7 +23,7 @@ import numpy as np
 
 import torch_pbd
 from torch_pbd.cli.main import main
-from torch_pbd.experiments import recordings  # noqa: F401 - loaded before the forks
+from torch_pbd.experiments import comparison  # noqa: F401 - loaded before the forks
 
 _CHANGES = ("fsync", "replace", "rename", "unlink", "link", "mkdir", "rmdir")  # of os
 FIT = {

@@ -31,9 +31,9 @@ from torch_pbd import (
 )
 from torch_pbd.cli.main import main
 from torch_pbd.experiments import robot, run_folder
-from torch_pbd.experiments.demo import run_demo
 from torch_pbd.experiments.robot import run_robot
 from torch_pbd.experiments.run_folder import FinishedFits, RunFolder, fit_once
+from torch_pbd.experiments.simulation import run_demo
 
 # What these runs are of was recorded by nobody: a few samples, without units, cut anywhere.
 pytestmark = [
@@ -83,7 +83,7 @@ def watched(monkeypatch, number=None, at=0):
 @pytest.fixture(autouse=True)
 def empty_figures(monkeypatch):
     """Figures take most of the time of a short run."""
-    monkeypatch.setattr("torch_pbd.experiments.recordings.figure_of", lambda *_: plt.figure())
+    monkeypatch.setattr("torch_pbd.experiments.comparison.figure_of", lambda *_: plt.figure())
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +120,7 @@ def test_36_38_a_finished_fit_is_reused(number, data, whole, tmp_path, monkeypat
     """The signal comes while the figure is drawn."""
     code, word = SIGNALS[number]
     with monkeypatch.context() as patched:
-        patched.setattr("torch_pbd.experiments.recordings.figure_of", lambda *_: signal.raise_signal(number))
+        patched.setattr("torch_pbd.experiments.comparison.figure_of", lambda *_: signal.raise_signal(number))
         assert fit(data, tmp_path) == code
     config = tmp_path / "config.yaml"
     assert capsys.readouterr().err == f"torch-pbd: {word}; torch-pbd fit --config {config} --resume goes on\n"
@@ -159,7 +159,7 @@ def test_36_a_comparison_goes_on_with_the_fits_that_are_left(data, tmp_path, mon
 def test_36_processes_keep_and_reuse_their_fits_too(data, tmp_path, monkeypatch):
     """One of the folds' fits is gone, and another one exchanged, which shows that it is taken."""
     with monkeypatch.context() as patched:
-        patched.setattr("torch_pbd.experiments.recordings.figure_of", lambda *_: signal.raise_signal(signal.SIGTERM))
+        patched.setattr("torch_pbd.experiments.comparison.figure_of", lambda *_: signal.raise_signal(signal.SIGTERM))
         assert compare(data, tmp_path, "--n_jobs", "2") == 143
     whole, _, gone, exchanged, *others = sorted(finished(tmp_path), key=lambda file: file.stat().st_mtime_ns)
     assert len(others) == 2
@@ -265,7 +265,7 @@ def test_a_peer_that_has_no_file_is_always_fitted(recorded, tmp_path, monkeypatc
 def test_finished_fits_of_another_run_are_told_of_where_they_are_not_used(data, tmp_path, monkeypatch, capsys):
     def cut():
         with monkeypatch.context() as patched:
-            patched.setattr("torch_pbd.experiments.recordings.figure_of", lambda *_: signal.raise_signal(signal.SIGINT))
+            patched.setattr("torch_pbd.experiments.comparison.figure_of", lambda *_: signal.raise_signal(signal.SIGINT))
             assert fit(data, tmp_path) == 130
         capsys.readouterr()
 
@@ -284,7 +284,7 @@ def test_finished_fits_of_another_run_are_told_of_where_they_are_not_used(data, 
 
 def test_a_finished_fit_that_is_damaged_is_an_error(data, tmp_path, monkeypatch, capsys):
     with monkeypatch.context() as patched:
-        patched.setattr("torch_pbd.experiments.recordings.figure_of", lambda *_: signal.raise_signal(signal.SIGTERM))
+        patched.setattr("torch_pbd.experiments.comparison.figure_of", lambda *_: signal.raise_signal(signal.SIGTERM))
         assert fit(data, tmp_path) == 143
     (file,) = finished(tmp_path)
     file.write_bytes(file.read_bytes()[:-1])

@@ -137,7 +137,7 @@ def playground(options: Any) -> None:
 
 def demo(options: Any, folder: Any) -> str:
     """The main job: made demonstrations of the tunnel task, four models, a robot that is pushed."""
-    from torch_pbd.experiments.demo import run_demo
+    from torch_pbd.experiments.simulation import run_demo
 
     say(f"{options.n_demos} made demonstrations of the tunnel task; the truth is that of 300 fresh ones\n")
     models = made({name: MODELS[name] for name in ("HGP", "CD", "WP", "GMM 5")}, OPTIONS["compare"]["models"].type)
@@ -146,7 +146,7 @@ def demo(options: Any, folder: Any) -> str:
 
 def fit(options: Any, folder: Any) -> str:
     """One model on a file of demonstrations."""
-    from torch_pbd.experiments.recordings import write_fitted
+    from torch_pbd.experiments.comparison import write_fitted
     from torch_pbd.experiments.run_folder import fit_once
 
     demonstrations = _demonstrations(options)
@@ -172,7 +172,7 @@ def fit(options: Any, folder: Any) -> str:
 def inspect(options: Any, folder: Any) -> str:
     """Description of recordings, before anything is fitted."""
     from torch_pbd.data import inspect_demonstrations
-    from torch_pbd.experiments.recordings import figure_of_recordings
+    from torch_pbd.experiments.comparison import figure_of_recordings
 
     demonstrations, description = _loaded(options, inspect_demonstrations)
     say(f"{_name(options.data)}: {demonstrations}\n")
@@ -183,8 +183,8 @@ def inspect(options: Any, folder: Any) -> str:
 def experiment(options: Any, folder: Any) -> str:
     """A skill, learned and reproduced on a simulated robot that is pushed."""
     from torch_pbd.data import load_demonstrations, make_pose_demonstrations, make_tunnel_demonstrations
+    from torch_pbd.experiments.comparison import describe
     from torch_pbd.experiments.poses import run_poses
-    from torch_pbd.experiments.recordings import describe
     from torch_pbd.experiments.robot import framework_figure, run_robot
     from torch_pbd.registry import optional
 
@@ -220,7 +220,7 @@ def compare(options: Any, folder: Any) -> str:
     """Models on a file, demonstration by demonstration, or on the paper's simulation."""
     how = {"max_folds": options.max_folds, "n_jobs": options.n_jobs}
     if options.data is not None:
-        from torch_pbd.experiments.recordings import run_recordings
+        from torch_pbd.experiments.comparison import run_recordings
 
         demonstrations = _demonstrations(options)
         if len(demonstrations) < 2:
@@ -271,7 +271,7 @@ def _demonstrations(options: Any) -> Any:
     from torch_pbd import checks
     from torch_pbd.data import check_unimodal, load_demonstrations
     from torch_pbd.data.alignment import TIMING_REMOVED
-    from torch_pbd.experiments.recordings import describe, prepare
+    from torch_pbd.experiments.comparison import describe, prepare
 
     recorded = _loaded(options, load_demonstrations)
     say(describe(recorded, _name(options.data)))

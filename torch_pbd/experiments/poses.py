@@ -27,8 +27,8 @@ from torch_pbd.plotting import parts, poses, style
 Arm = Literal["panda", "none"]
 
 _TOOL = "xyz"
+_figure = partial(Figure, layout="constrained")
 _KINDS = (style.POSITION, style.ROTATION)
-_FIGURE = partial(Figure, layout="constrained")
 _ROWS = 50.0  # Hz; along a path the inertia of an arm changes with its joints, within seconds
 _N_STEPS = 101
 
@@ -166,7 +166,7 @@ def _push_rows(schedule: Schedule) -> list[int]:
 
 def task_figure(demonstrations: Demonstrations) -> Figure:
     """Demonstrated paths with frames of the tool, and rotations over time: Figure 6."""
-    figure, space, bands = poses.pose_panels(3, _FIGURE)
+    figure, space, bands = style.panels(3, 3, _figure)
     poses.draw_recorded_poses(demonstrations, space[0], bands)
     plotting.legend_below(figure, space)
     return figure
@@ -174,7 +174,7 @@ def task_figure(demonstrations: Demonstrations) -> Figure:
 
 def schedule_figure(run: PoseRun, demonstrations: Demonstrations, name: str) -> Figure:
     """Planned path, deviations and empirical ones in principal axes, and stiffness there, of both blocks: Figure 7."""
-    figure, (space,), bands = poses.pose_panels(4, _FIGURE)
+    figure, (space,), bands = style.panels(4, 3, _figure)
     for path in demonstrations.to_poses()[0]:
         space.plot(*path.T, color=plotting.DATA, lw=0.8)
     poses.draw_pose_schedule(run.schedule, space, bands)

@@ -45,7 +45,8 @@ def learn(strokes: list[Stroke], settings: Settings) -> tuple[Learned, deque[Ste
 
     Each may be begun again if it was interrupted.
     """
-    learned = Learned(_demonstrations(strokes), settings)
+    times, positions = zip(*strokes, strict=True)
+    learned = Learned(Demonstrations(times, positions, names=["x", "y"], units="m"), settings)
     left_out = range(len(strokes)) if len(strokes) > 2 else ()
     steps: list[Step] = [partial(_fit, learned, name) for name in settings.models]
     steps.append(partial(follow, learned))
@@ -149,12 +150,6 @@ def read_file(name: str, content: bytes) -> list[Stroke]:
     return [Stroke(each.time - each.time[0], each.position) for each in demonstrations]
 
 
-def _demonstrations(strokes: list[Stroke]) -> Demonstrations:
-    return Demonstrations(
-        [stroke.time for stroke in strokes], [stroke.position for stroke in strokes], names=["x", "y"], units="m"
-    )
-
-
 def _model(name: str) -> Any:
     """Model of whole movements: by itself, or of a regressor."""
     return load_class(name)() if name in MOVEMENTS else load_class("TrajectoryRegressor")(load_class(name)())
@@ -177,29 +172,25 @@ def _bent(learned: Learned) -> DMPController:
 
 def _python(learned: Learned) -> str:
     settings, name = learned.settings, next(iter(learned.controllers))
-    model = f"{name}()" if name in MOVEMENTS else f"TrajectoryRegressor({name}())"
     around = [] if name in MOVEMENTS else ["TrajectoryRegressor"]
-    names = ", ".join(sorted(["DMPController", "load_demonstrations", name, *around]))
-    lines = [
-        f"from torch_pbd import {names}",
-        "from torch_pbd.control import StiffnessLaw",
-        "",
-        'strokes = load_demonstrations("demonstrations.csv", units="m")',
-        f"law = StiffnessLaw({settings.stiffness_min!r}, {settings.stiffness_max!r}, smooth={settings.smooth})",
-        "controller = DMPController(",
-        f"    {model}, n_steps={_STEPS}, stiffness_law=law, mass={settings.mass!r},",
-        f"    damping_ratio={settings.damping_ratio!r},",
-        ").fit(strokes)",
-    ]
+    model, bent = f"TrajectoryRegressor({name}())" if around else f"{name}()", ""
     if learned.via:
-        times = [at for at, *_ in learned.via]
-        lines.append(f"controller = controller.condition({times}, {[list(point) for _, *point in learned.via]})")
-    lines += [
-        f"schedule = controller.schedule(rate={_RATE:g}, speed={settings.speed!r})",
-        f"print(schedule.certify(mass={settings.mass!r}))",
-        'schedule.save("schedule.npz")',
-    ]
-    return "\n".join(lines) + "\n"
+        times, points = [at for at, *_ in learned.via], [list(point) for _, *point in learned.via]
+        bent = f"controller = controller.condition({times}, {points})\n"
+    return f"""\
+from torch_pbd import {", ".join(sorted(["DMPController", "load_demonstrations", name, *around]))}
+from torch_pbd.control import StiffnessLaw
+
+strokes = load_demonstrations("demonstrations.csv", units="m")
+law = StiffnessLaw({settings.stiffness_min!r}, {settings.stiffness_max!r}, smooth={settings.smooth})
+controller = DMPController(
+    {model}, n_steps={_STEPS}, stiffness_law=law, mass={settings.mass!r},
+    damping_ratio={settings.damping_ratio!r},
+).fit(strokes)
+{bent}schedule = controller.schedule(rate={_RATE:g}, speed={settings.speed!r})
+print(schedule.certify(mass={settings.mass!r}))
+schedule.save("schedule.npz")
+"""
 
 
 def _yaml(learned: Learned) -> str:
@@ -209,12 +200,13 @@ def _yaml(learned: Learned) -> str:
         return {"class_path": class_path, "init_args": init_args}
 
     limits = {key: getattr(settings, key) for key in ("stiffness_min", "stiffness_max", "smooth")}
-    arguments = {
-        "covariance": spec(name) if name in MOVEMENTS else spec("TrajectoryRegressor", regressor=spec(name)),
-        "n_steps": _STEPS,
-        "stiffness_law": spec("StiffnessLaw", **limits),
-        "mass": settings.mass,
-        "damping_ratio": settings.damping_ratio,
-    }
-    content = {"data": "demonstrations.csv", "controllers": {"mine": spec("DMPController", **arguments)}}
+    controller = spec(
+        "DMPController",
+        covariance=spec(name) if name in MOVEMENTS else spec("TrajectoryRegressor", regressor=spec(name)),
+        n_steps=_STEPS,
+        stiffness_law=spec("StiffnessLaw", **limits),
+        mass=settings.mass,
+        damping_ratio=settings.damping_ratio,
+    )
+    content = {"data": "demonstrations.csv", "controllers": {"mine": controller}}
     return "# torch-pbd experiment --config skill.yaml\n" + str(yaml.safe_dump(content, sort_keys=False))

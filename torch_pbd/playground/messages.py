@@ -60,44 +60,40 @@ def parse(text: Any) -> dict[str, Any]:
 def as_strokes(values: Any) -> list[Stroke]:
     """Strokes, each a list of rows (time in s, x in m, y in m); at least two, of at least five samples."""
     if not isinstance(values, list) or not 2 <= len(values) <= _MOST_STROKES:
-        raise ValueError(
-            f"strokes must be a list of 2 to {_MOST_STROKES}: draw the movement again, a little differently."
-        )
-    return [_as_stroke(rows, f"strokes[{k}]") for k, rows in enumerate(values)]
-
-
-def _as_stroke(rows: Any, name: str) -> Stroke:
-    if not isinstance(rows, list) or not 5 <= len(rows) <= _MOST_SAMPLES:
-        raise ValueError(f"{name} must have 5 to {_MOST_SAMPLES} samples: draw it more slowly, or shorter.")
-    samples = checks.array(rows, name, ("n", 3))
-    checks.require(np.abs(samples[:, 1:]) <= _FARTHEST, samples[:, 1:], name, f"within {_FARTHEST:g} m")
-    # A clock that was set back gives times that do not increase: such samples are left out too.
-    later = np.append(True, np.diff(np.maximum.accumulate(samples[:, 0])) > _LEAST_STEP)
-    samples = samples[later]
-    if len(samples) < 5:
-        raise ValueError(f"{name} has fewer than 5 different times: draw it more slowly.")
-    return Stroke(samples[:, 0] - samples[0, 0], samples[:, 1:])
+        raise ValueError(f"strokes must be a list of 2 to {_MOST_STROKES}: draw the movement again, a bit differently.")
+    strokes = []
+    for k, rows in enumerate(values):
+        name = f"strokes[{k}]"
+        if not isinstance(rows, list) or not 5 <= len(rows) <= _MOST_SAMPLES:
+            raise ValueError(f"{name} must have 5 to {_MOST_SAMPLES} samples: draw it more slowly, or shorter.")
+        samples = checks.array(rows, name, ("n", 3))
+        checks.require(np.abs(samples[:, 1:]) <= _FARTHEST, samples[:, 1:], name, f"within {_FARTHEST:g} m")
+        # A clock that was set back gives times that do not increase: such samples are left out too.
+        samples = samples[np.append(True, np.diff(np.maximum.accumulate(samples[:, 0])) > _LEAST_STEP)]
+        if len(samples) < 5:
+            raise ValueError(f"{name} has fewer than 5 different times: draw it more slowly.")
+        strokes.append(Stroke(samples[:, 0] - samples[0, 0], samples[:, 1:]))
+    return strokes
 
 
 def as_settings(values: Any) -> Settings:
     """Settings within the ranges of the page's sliders."""
     if not isinstance(values, dict) or set(values) - set(Settings.__dataclass_fields__):
         raise ValueError(f"settings must be a mapping of {', '.join(Settings.__dataclass_fields__)}.")
-    models = values.get("models", list(Settings.models))
-    if not isinstance(models, list) or not 1 <= len(models) <= 2:
+    given = Settings(**values)
+    if not isinstance(given.models, list | tuple) or not 1 <= len(given.models) <= 2:
         raise ValueError("models must be a list of one name, or two.")
-    for name in models:
+    for name in given.models:
         checks.choice(name, "models", MODELS)
-    least = checks.number(values.get("stiffness_min", 50.0), "stiffness_min", least=1.0, most=5000.0, unit="N/m")
-    most = checks.number(values.get("stiffness_max", 1000.0), "stiffness_max", least=least, most=5000.0, unit="N/m")
+    least = checks.number(given.stiffness_min, "stiffness_min", least=1.0, most=5000.0, unit="N/m")
     return Settings(
-        models=tuple(dict.fromkeys(models)),
+        models=tuple(dict.fromkeys(given.models)),
         stiffness_min=least,
-        stiffness_max=most,
-        smooth=checks.flag(values.get("smooth", False), "smooth"),
-        damping_ratio=checks.number(values.get("damping_ratio", 1.0), "damping_ratio", least=0.05, most=3.0),
-        mass=checks.number(values.get("mass", 1.0), "mass", least=0.1, most=50.0, unit="kg"),
-        speed=checks.number(values.get("speed", 1.0), "speed", least=0.1, most=4.0),
+        stiffness_max=checks.number(given.stiffness_max, "stiffness_max", least=least, most=5000.0, unit="N/m"),
+        smooth=checks.flag(given.smooth, "smooth"),
+        damping_ratio=checks.number(given.damping_ratio, "damping_ratio", least=0.05, most=3.0),
+        mass=checks.number(given.mass, "mass", least=0.1, most=50.0, unit="kg"),
+        speed=checks.number(given.speed, "speed", least=0.1, most=4.0),
     )
 
 

@@ -32,31 +32,17 @@ class Robot:
 
     def follow(self, schedule: Schedule, controller: RealTimeAdmittance | None = None) -> None:
         """Take up a schedule, and its loop, from where the robot is, at the same share of the movement."""
-        here, at = None, 0.0
-        if self._controller is not None and self._schedule is not None:
-            here = self._controller.position
-            at = min(1.0, self._controller.schedule_time / self._schedule.duration) * schedule.duration
-        self._schedule = schedule
-        self._controller = controller or self.prepare(schedule)
+        here, at, before = None, 0.0, self._controller
+        if before is not None and self._schedule is not None:
+            here, at = before.position, min(1.0, before.schedule_time / self._schedule.duration) * schedule.duration
+        self._schedule, self._controller = schedule, controller or self.prepare(schedule)
         self._controller.start(self._now, here, at=at)
         self._desired = self._controller.desired_position
 
     def advance(self, elapsed: float, hand: tuple[float, float] | None, push: tuple[float, float]) -> dict[str, Any]:
-        """State after ``elapsed`` s in which a hand held the robot by a spring, or let go, and keys pushed it.
+        """State after ``elapsed`` s in which a hand at a place in m pulled by a spring, or None, and keys pushed in N.
 
-        Parameters
-        ----------
-        elapsed : float
-            In s, at most 0.1 of which count.
-        hand : (float, float) or None
-            Where the hand is, in m.
-        push : (float, float)
-            Force of the keys, in N.
-
-        Returns
-        -------
-        dict
-            As the page draws it: times in s, positions in m, forces in N, stiffness in N/m as (xx, xy, yy).
+        The state is what the page draws: time in s, positions in m, force in N, stiffness in N/m as (xx, xy, yy).
         """
         controller, schedule = self._controller, self._schedule
         if controller is None or schedule is None:

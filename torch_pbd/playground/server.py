@@ -45,23 +45,23 @@ class Tab:
 
     async def answer(self, message: dict[str, Any]) -> None:
         """Do what a message asks for; a ValueError says what is wrong with it."""
-        kind = message["type"]
+        kind, request = message["type"], {"type": message["type"]}
         if kind == "frame":
             await self._frame(message)
-        elif kind == "learn":
-            settings = messages.as_settings(message.get("settings", {}))
-            self._ask(type="learn", strokes=messages.as_strokes(message.get("strokes")), settings=settings)
-        elif kind == "adjust":
-            self._ask(type="adjust", settings=messages.as_settings(message.get("settings", {})))
+            return
+        if kind in ("learn", "adjust"):
+            request["settings"] = messages.as_settings(message.get("settings", {}))
+        if kind == "learn":
+            request["strokes"] = messages.as_strokes(message.get("strokes"))
         elif kind == "bend":
-            self._ask(type="bend", points=messages.as_points(message.get("points")), follow=bool(message.get("follow")))
+            request |= {"points": messages.as_points(message.get("points")), "follow": bool(message.get("follow"))}
         elif kind == "read":
-            name, content = messages.as_file(message)
-            self._ask(type="read", name=name, content=content)
+            request["name"], request["content"] = messages.as_file(message)
         elif kind == "take":
-            self._ask(type="take", name=checks.choice(message.get("name"), "name", messages.FILES))
-        else:
+            request["name"] = checks.choice(message.get("name"), "name", messages.FILES)
+        elif kind != "adjust":
             raise ValueError(f"the page asks for {kind!r:.40}, which is not known here")
+        self._worker.ask(self._number, request)
 
     async def deliver(self, answer: dict[str, Any]) -> None:
         """Hand an answer of the worker on to the page, and its schedule to the robot."""
@@ -78,28 +78,17 @@ class Tab:
         with contextlib.suppress(RuntimeError, WebSocketDisconnect):
             await self._page.send_text(json.dumps(answer))
 
-    def _ask(self, **request: Any) -> None:
-        self._worker.ask(self._number, request)
-
     async def _frame(self, message: dict[str, Any]) -> None:
         hand = messages.as_pair(message.get("hand"), "hand", 10.0)
-        push = messages.as_pair(message.get("push"), "push", 100.0)
+        push = messages.as_pair(message.get("push"), "push", 100.0) or (0.0, 0.0)
         now = time.perf_counter()
         elapsed, self._last = now - self._last, now
-        if message.get("is_paused"):
-            elapsed = 0.0
-        state = self._robot.advance(elapsed, hand, push or (0.0, 0.0))
+        state = self._robot.advance(0.0 if message.get("is_paused") else elapsed, hand, push)
         await self.send({**state, "frame": message.get("frame")})
 
 
 class Playground:
-    """All pages of one server, its worker, and its secret.
-
-    Parameters
-    ----------
-    port : int
-        That the server listens at, on the loopback interface.
-    """
+    """All pages of the server at a port of the loopback interface, its worker, and its secret."""
 
     def __init__(self, port: int) -> None:
         self.token = secrets.token_urlsafe(16)
@@ -139,18 +128,13 @@ class Playground:
         is_from_us = origin is None or origin.removeprefix("http://") in self._hosts
         token = scope["path"].lstrip("/").partition("/")[0]
         # Compared in constant time: how long a guess takes says nothing of the secret.
-        return headers.get("host") in self._hosts and is_from_us and secrets.compare_digest(
-            token.encode(), self.token.encode()
-        )  # fmt: skip
+        is_secret = secrets.compare_digest(token.encode(), self.token.encode())
+        return is_secret and is_from_us and headers.get("host") in self._hosts
 
     @contextlib.asynccontextmanager
     async def _lifespan(self, _: Starlette) -> AsyncIterator[None]:
         loop = asyncio.get_running_loop()
-
-        def deliver(tab: int, answer: dict[str, Any]) -> None:
-            loop.call_soon_threadsafe(self._deliver, tab, answer)
-
-        self._worker = Worker(deliver)
+        self._worker = Worker(lambda tab, answer: loop.call_soon_threadsafe(self._deliver, tab, answer))
         self._sending: set[asyncio.Task[None]] = set()
         try:
             yield
@@ -196,15 +180,7 @@ class Playground:
 
 
 def serve(port: int = 0, *, browse: bool = True) -> None:
-    """Serve the page until Ctrl-C.
-
-    Parameters
-    ----------
-    port : int, default=0
-        Of the loopback interface; 0 takes a free one.
-    browse : bool, default=True
-        Open the page in a browser.
-    """
+    """Serve the page until Ctrl-C, at a port of the loopback interface (0: a free one); open it in a browser."""
     # asyncio lets small messages wait for each other, up to 40 ms, unless the protocol is named.
     with socket.socket(proto=socket.IPPROTO_TCP) as listening:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -5,7 +5,6 @@ from typing import Any, Literal, Self, final
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
@@ -26,6 +25,7 @@ from torch_pbd.plotting.style import (
     equal_scales,
     legend_below,
     mark_ends,
+    panels,
     schedule_names,
     short_unit,
     shown_figure,
@@ -167,7 +167,7 @@ class MovementDisplay:
             if not in_space:
                 self._plot_band(ax, shown[0])
         else:
-            figure, plane, bands = _panels(len(shown), n_space=len(shown) if in_space else 0)
+            figure, plane, bands = panels(len(shown), len(shown) if in_space else 0)
             for band, output in zip(bands, shown, strict=True):
                 self._plot_band(band, output)
             self.axes_ = plane + bands
@@ -219,7 +219,7 @@ def plot_movements(demonstrations: Any, outputs: Sequence[int | str] | None = No
     in_space = len(shown) in (2, 3)
     axes: list[Any] = [ax]
     if ax is None:
-        figure, plane, bands = _panels(0 if in_space else len(shown), n_space=len(shown) if in_space else 0)
+        figure, plane, bands = panels(0, len(shown)) if in_space else panels(len(shown))
         axes = plane or bands
     for panel, own in zip(axes, [shown] if in_space else [[output] for output in shown], strict=True):
         plot_demonstrations(demonstrations, own, panel)
@@ -238,7 +238,7 @@ def plot_schedule(schedule: Any) -> list[Axes]:
     p, turns, unit = schedule.position.shape[1], schedule.orientation is not None, short_unit(schedule.units)
     if turns and p == 3:
         return draw_poses(schedule, draw_pose_schedule, 4)
-    figure, plane, bands = _panels(2 * len(schedule.blocks) + (p != 2), n_space=2 if p == 2 else 0)
+    figure, plane, bands = panels(2 * len(schedule.blocks) + (p != 2), 2 if p == 2 else 0)
     position = [f"{name} [{unit}]" for name in schedule_names(schedule)[:p]]
     # The path of two outputs takes the place of their positions over time.
     if plane:
@@ -267,19 +267,3 @@ def plot_pushes(rollout: Any, unpushed: Any = None, names: Sequence[str] | None 
         ax.tick_params(labelbottom=i % 3 == 2)
     legend_below(figure, axes)
     return axes
-
-
-def _panels(n_bands: int, n_space: int) -> tuple[Figure, list[Any], list[Axes]]:
-    """Figure with the Axes of a path in two or three dimensions, if any, and those of bands, in a column or 3 x 3."""
-    # The path has a column of its own, as high as all bands together.
-    if n_space:
-        figure = shown_figure((9.6 if n_bands else 5.6, max(4.8, 1.7 * n_bands)))
-        columns = figure.add_gridspec(
-            max(n_bands, 1), 2 if n_bands else 1, width_ratios=(1.0, 1.3) if n_bands else None
-        )
-        plane = [figure.add_subplot(columns[:, 0], projection="3d" if n_space == 3 else None)]
-        return figure, plane, [figure.add_subplot(columns[i, 1]) for i in range(n_bands)]
-    n_columns = 3 if n_bands > 3 else 1
-    n_rows = -(-n_bands // n_columns)
-    figure = shown_figure((3.4 * n_columns if n_columns > 1 else 6.4, max(3.6, 2.0 * n_rows + 0.6)))
-    return figure, [], [figure.add_subplot(n_rows, n_columns, i + 1) for i in range(n_bands)]

@@ -21,7 +21,6 @@ from torch_pbd.plotting.style import (
     ROTATION,
     SERIES,
     TRUTH,
-    Kind,
     axis_names,
     check_axes,
     check_kind,
@@ -143,18 +142,23 @@ def plot_model_bands(
     mean, covariance = model.predict(query, return_cov=True)
     mean = mean.reshape(len(query), -1)
     std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    position, empirical_mean, empirical_std = _empirical_bands(inputs[:, 0], targets)
+    # The divisor K - 1 is that of the empirical covariances that models are compared with.
+    distinct, index, counts = np.unique(inputs[:, 0], return_inverse=True, return_counts=True)
+    repeated = counts > 1
+    position, divisor = distinct[repeated], counts[repeated] - 1
     for output, ax in enumerate(axes):
         plot_std_band(query, mean[:, output], std[:, output], ax, label="model: mean, 2 sd")
         if true_std is not None:
             centre, deviation = true_std(query)
             draw_edges(query[:, 0], centre[:, output], deviation[:, output], ax, "truth: 2 sd", TRUTH)
+        average = np.bincount(index, targets[:, output]) / counts
+        squares = np.bincount(index, (targets[:, output] - average[index]) ** 2)[repeated]
+        middle, half = average[repeated], np.sqrt(squares / divisor)
         if 0 < len(position) <= _N_BARS:
             style: dict[str, Any] = {"fmt": ".", "ms": 4, "capsize": 2, "lw": 1.2, "label": "empirical: mean, 2 sd"}
-            middle, half = empirical_mean[:, output], 2.0 * empirical_std[:, output]
-            ax.errorbar(position, middle, half, color=EMPIRICAL, zorder=4, **style)
+            ax.errorbar(position, middle, 2.0 * half, color=EMPIRICAL, zorder=4, **style)
         elif len(position):
-            draw_edges(position, empirical_mean[:, output], empirical_std[:, output], ax, "empirical: 2 sd")
+            draw_edges(position, middle, half, ax, "empirical: 2 sd")
         for edge in (low, high):
             ax.axvline(edge, color=DATA, lw=0.8, ls=":", label="end of the data" if edge == low else None)
 
@@ -164,17 +168,6 @@ def draw_edges(x: Floats, mean: Floats, std: Floats, ax: Axes, label: str, color
     style = "--" if color == TRUTH else "-"
     lines = ax.plot(x, np.stack([mean + 2.0 * std, mean - 2.0 * std], axis=1), style, color=color, lw=1.0, zorder=2.5)
     lines[0].set_label(label)
-
-
-def _empirical_bands(position: Floats, targets: Floats) -> tuple[Floats, Floats, Floats]:
-    """Mean and standard deviation at the inputs that repeat."""
-    distinct, index, counts = np.unique(position, return_inverse=True, return_counts=True)
-    means = np.stack([np.bincount(index, column) / counts for column in targets.T], axis=1)
-    squares = np.stack([np.bincount(index, column) for column in ((targets - means[index]) ** 2).T], axis=1)
-    # The divisor K - 1 is that of the empirical covariances that models are compared with.
-    repeated = counts > 1
-    std = np.sqrt(squares[repeated] / (counts[repeated, np.newaxis] - 1))
-    return distinct[repeated], means[repeated], std
 
 
 def plot_stiffness(schedule: Any, ax: Axes, block: slice | None = None) -> list[Line2D]:
@@ -243,29 +236,21 @@ def plot_rollout(
     chosen = chosen_outputs(outputs, names, 6)
     kinds = [kind_of(rollout.units, p)] + ([ROTATION] if d > p else [])
     for i, kind in enumerate(kinds):
+        above, middle, below = axes[3 * i : 3 * i + 3]
         own = [output for output in chosen if (output >= p) == bool(i)]
         labels = [names[output].removeprefix("r") if i else names[output] for output in own]
-        _plot_pushed(rollout, unpushed, axes[3 * i : 3 * i + 3], own, labels, kind)
-
-
-def _plot_pushed(
-    rollout: Any, unpushed: Any, axes: Sequence[Axes], chosen: list[int], labels: list[str], kind: Kind
-) -> None:
-    above, middle, below = axes
-    along = [f"{kind.where} {label}" for label in labels]
-    plot_outputs(rollout.time, kind.scale * rollout.deviation[:, chosen], above, along)
-    if unpushed is not None:
-        own = kind.scale * unpushed.deviation[:, chosen]
-        for line in above.plot(unpushed.time, own, color=DATA, lw=1.0)[:1]:
-            line.set_label("without pushes")
-    above.set_ylabel(f"deviation [{kind.unit}]")
-    plot_outputs(rollout.time, rollout.force[:, chosen], middle, [f"{kind.push} {label}" for label in labels], [FORCE])
-    middle.set_ylabel(f"external {kind.push} [{kind.push_unit}]")
-    gains = np.diagonal(rollout.stiffness, axis1=1, axis2=2)[:, chosen]
-    plot_outputs(rollout.time, gains, below, along)
-    below.set(xlabel="time [s]", ylabel=f"stiffness [{kind.stiffness_unit}]", ylim=(0.0, None))
-    for ax in (above, middle):
-        ax.axhline(0.0, color=DATA, lw=0.6, zorder=0)
+        along = [f"{kind.where} {label}" for label in labels]
+        plot_outputs(rollout.time, kind.scale * rollout.deviation[:, own], above, along)
+        if unpushed is not None:
+            lines = above.plot(unpushed.time, kind.scale * unpushed.deviation[:, own], color=DATA, lw=1.0)
+            lines[0].set_label("without pushes")
+        above.set_ylabel(f"deviation [{kind.unit}]")
+        plot_outputs(rollout.time, rollout.force[:, own], middle, [f"{kind.push} {each}" for each in labels], [FORCE])
+        middle.set_ylabel(f"external {kind.push} [{kind.push_unit}]")
+        plot_outputs(rollout.time, np.diagonal(rollout.stiffness, axis1=1, axis2=2)[:, own], below, along)
+        below.set(xlabel="time [s]", ylabel=f"stiffness [{kind.stiffness_unit}]", ylim=(0.0, None))
+        for ax in (above, middle):
+            ax.axhline(0.0, color=DATA, lw=0.6, zorder=0)
 
 
 def plot_outputs(

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LightSource
-from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from numpy.typing import ArrayLike
 
@@ -26,8 +25,8 @@ from torch_pbd.plotting.style import (
     kind_of,
     legend_below,
     mark_ends,
+    panels,
     schedule_names,
-    shown_figure,
     time_label,
     unit_ellipses,
 )
@@ -106,21 +105,9 @@ def plot_covariance_ellipsoids(
     return _lines(ax, curves, color, 0.7, label)
 
 
-def pose_panels(n_bands: int, make: Any = shown_figure) -> tuple[Figure, list[Any], list[Axes]]:
-    """Figure that ``make(size)`` makes, with the Axes of a space, and bands beside it that share their times."""
-    figure = make((11.0, max(5.2, 1.7 * n_bands)))
-    columns = figure.add_gridspec(n_bands, 2, width_ratios=(1.25, 1.0))
-    space = figure.add_subplot(columns[:, 0], projection="3d")
-    bands = [figure.add_subplot(columns[i, 1]) for i in range(n_bands)]
-    for band in bands[:-1]:
-        band.sharex(bands[-1])
-        band.tick_params(labelbottom=False)
-    return figure, [space], bands
-
-
 def draw_poses(what: Any, draw: Callable[[Any, Axes, list[Axes]], None], n_bands: int) -> list[Axes]:
     """Axes of a new figure of demonstrations or of a schedule, the space first."""
-    figure, space, bands = pose_panels(n_bands)
+    figure, space, bands = panels(n_bands, 3)
     draw(what, space[0], bands)
     legend_below(figure, [*space, *bands])
     return [*space, *bands]
@@ -141,7 +128,7 @@ def draw_recorded_poses(demonstrations: Any, ax: Axes, bands: Sequence[Axes], n_
         band.set_ylabel(f"{name} [deg]")
         band.margins(x=0.0)
     bands[-1].set_xlabel(time_label(demonstrations.time_unit))
-    label_space(ax, demonstrations.names[:3], None if demonstrations.units is None else demonstrations.units[0])
+    _label(ax, bands, demonstrations.names[:3], None if demonstrations.units is None else demonstrations.units[0])
 
 
 def draw_pose_schedule(schedule: Any, ax: Axes, bands: Sequence[Axes], n_poses: int = 7) -> None:
@@ -155,7 +142,7 @@ def draw_pose_schedule(schedule: Any, ax: Axes, bands: Sequence[Axes], n_poses: 
     plot_covariance_ellipsoids(path, spread[:, :3, :3], ax, label="position: 2 sd")
     plot_frames(path, schedule.orientation[some], ax, length=length, covariance=spread[:, 3:, 3:], label="tool, 2 sd")
     mark_ends(ax, schedule.position)
-    label_space(ax, (schedule.names or POSE_NAMES)[:3], schedule.units)
+    _label(ax, bands, (schedule.names or POSE_NAMES)[:3], schedule.units)
     draw_blocks(schedule, bands)
     bands[2].set_xlabel("")
 
@@ -173,11 +160,14 @@ def draw_blocks(schedule: Any, bands: Sequence[Axes]) -> None:
         plot_stiffness(schedule, gains, block)
 
 
-def label_space(ax: Any, names: Sequence[str], unit: str | None) -> None:
-    """Name the axes of a space, on one scale."""
+def _label(ax: Any, bands: Sequence[Axes], names: Sequence[str], unit: str | None) -> None:
+    """Name the axes of a space, on one scale, and let bands beside it have one axis of time."""
     ax.set(**{f"{axis}label": f"{name} [{unit or 'unit'}]" for axis, name in zip("xyz", names, strict=True)})
     equal_scales(ax, zoom=0.88)
     ax.view_init(elev=22.0, azim=-35.0)
+    for band in bands[:-1]:
+        band.sharex(bands[-1])
+        band.tick_params(labelbottom=False)
 
 
 def _lines(ax: Any, curves: Floats, color: str, width: float, label: str | None) -> Line3DCollection:

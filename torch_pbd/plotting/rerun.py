@@ -1,7 +1,7 @@
 """Recordings, what was learned of them, schedules and runs as a file for the viewer of Rerun."""
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -76,20 +76,20 @@ class _Writer:
         self._rerun, self._stream = rerun, stream
 
     def write_demonstrations(self, demonstrations: Any) -> None:
+        space, n_space = _space(demonstrations)
         for k, (time, position) in enumerate(_in_seconds(demonstrations)):
-            self._path(f"{_space(demonstrations)}/demonstrations/{k}", position[:, : _n_space(demonstrations)], DATA)
+            self._path(f"{space}/demonstrations/{k}", position[:, :n_space], DATA)
             self._curves("outputs", f"demonstration {k}", time, position, demonstrations.names, DATA)
 
     def write_laws(self, display: Any) -> None:
-        demonstrations, n_space = display.demonstrations, _n_space(display.demonstrations)
+        demonstrations, time = display.demonstrations, display.grid
+        space, n_space = _space(demonstrations)
         # Seconds of the grid's unit, by the demonstrations: both go from their first sample to their last.
-        time = display.grid
         if display.input == "time":
-            own, seconds = demonstrations.times[0], next(iter(_in_seconds(demonstrations)))[0]
-            time = time * (np.ptp(seconds) / np.ptp(own))
+            time = time * (np.ptp(_in_seconds(demonstrations)[0].time) / np.ptp(demonstrations.times[0]))
         for (name, (mean, covariance)), color in zip(display.laws.items(), (MODEL, OTHER), strict=False):
-            self._path(f"{_space(demonstrations)}/{name}", mean[:, :n_space], color)
-            self._ellipsoids(f"{_space(demonstrations)}/{name}/covariance", mean, covariance, n_space, color)
+            self._path(f"{space}/{name}", mean[:, :n_space], color)
+            self._ellipsoids(f"{space}/{name}/covariance", mean, covariance, n_space, color)
             std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
             for label, shift in (("", 0.0), (" +2 sd", _N_STD), (" -2 sd", -_N_STD)):
                 self._curves("outputs", f"{name}{label}", time, mean + shift * std, demonstrations.names, color)
@@ -102,7 +102,7 @@ class _Writer:
             self._ellipsoids("space/schedule/covariance", schedule.position, schedule.covariance, n_space, MODEL)
         self._curves("outputs", "schedule", schedule.time, schedule.position, schedule_names(schedule)[:p], MODEL)
         if n_space == 3:
-            self._frames("space/schedule/tool", schedule.time, schedule.position, schedule.orientation)
+            self._frames("space/schedule/tool", schedule)
         for block, kind in zip(schedule.blocks, ("positions", "rotation"), strict=False):
             eigenvalues = np.linalg.eigvalsh(schedule.stiffness[:, block, block])
             axes = [f"axis {i}" for i in range(eigenvalues.shape[1])]
@@ -113,17 +113,15 @@ class _Writer:
             raise InvalidParameterError(f"rollout is {rollout!r}, must be a single run: take one of the batch.")
         run, p = rollout.numpy(), rollout.position.shape[1]
         names = names or [f"y{i}" for i in range(run.velocity.shape[1])]
-        n_space = p if p in (2, 3) else 0
-        self._path("space/run", run.position[:, :n_space], ROBOT)
-        if n_space == 3:
-            self._frames("space/run/tool", run.time, run.position, getattr(run, "orientation", None))
+        self._path("space/run", run.position[:, : p if p in (2, 3) else 0], ROBOT)
+        if p == 3:
+            self._frames("space/run/tool", run)
         self._curves("outputs", "run", run.time, run.position, names[:p], ROBOT)
         self._curves("force", "", run.time, run.force, names, FORCE)
 
     def _path(self, entity: str, position: Floats, color: str) -> None:
         if position.shape[1]:
-            line = self._rerun.LineStrips3D([_in_space(position)], colors=[_rgb(color)])
-            self._stream.log(entity, line, static=True)
+            self._stream.log(entity, self._rerun.LineStrips3D([_in_space(position)], colors=[_rgb(color)]), static=True)
 
     def _ellipsoids(self, entity: str, mean: Floats, covariance: Floats, n_space: int, color: str) -> None:
         if not n_space:
@@ -131,9 +129,9 @@ class _Writer:
         rows = np.linspace(0, len(mean) - 1, min(_N_ELLIPSOIDS, len(mean))).round().astype(int)
         variances, axes = np.linalg.eigh(covariance[rows, :n_space, :n_space])
         half, turned = _N_STD * np.sqrt(variances.clip(0.0)), np.tile(np.eye(3), (len(rows), 1, 1))
-        turned[:, :n_space, :n_space] = axes * np.sign(np.linalg.det(axes))[:, np.newaxis, np.newaxis] ** n_space
+        turned[:, :n_space, :n_space] = axes
+        turned[:, :, 0] *= np.linalg.det(turned)[:, np.newaxis]  # a reflection is no rotation
         if n_space == 2:
-            turned[:, :, 0] *= np.linalg.det(turned)[:, np.newaxis]
             half = np.column_stack([half, _FLAT * half.max(axis=1)])
         ellipsoids = self._rerun.Ellipsoids3D(
             centers=_in_space(mean[rows, :n_space]),
@@ -143,13 +141,15 @@ class _Writer:
         )
         self._stream.log(entity, ellipsoids, static=True)
 
-    def _frames(self, entity: str, time: Floats, position: Floats, orientation: Floats | None) -> None:
+    def _frames(self, entity: str, moving: Any) -> None:
+        """Tool of a schedule or a run, if it turns."""
+        orientation = getattr(moving, "orientation", None)
         if orientation is None:
             return
-        transform = self._rerun.Transform3D
-        columns = transform.columns(translation=position, quaternion=np.roll(orientation, -1, axis=1))
-        self._stream.send_columns(entity, indexes=[self._index(time)], columns=columns)
-        extent = float(np.linalg.norm(np.ptp(position, axis=0)))
+        quaternion = np.roll(orientation, -1, axis=1)
+        columns = self._rerun.Transform3D.columns(translation=moving.position, quaternion=quaternion)
+        self._stream.send_columns(entity, indexes=[self._index(moving.time)], columns=columns)
+        extent = float(np.linalg.norm(np.ptp(moving.position, axis=0)))
         self._stream.log(entity, self._rerun.TransformAxes3D(axis_length=0.1 * (extent or 1.0)), static=True)
 
     def _curves(self, root: str, label: str, time: Floats, values: Floats, names: Sequence[str], color: str) -> None:
@@ -163,21 +163,18 @@ class _Writer:
         return self._rerun.TimeColumn("time", duration=np.asarray(time))
 
 
-def _in_seconds(demonstrations: Any) -> Iterator[Any]:
+def _in_seconds(demonstrations: Any) -> Any:
     """Demonstrations in s, or in phase where they are."""
-    return iter(demonstrations if demonstrations.time_unit == "1" else demonstrations.in_units(time_unit="s"))
+    return demonstrations if demonstrations.time_unit == "1" else demonstrations.in_units(time_unit="s")
 
 
-def _n_space(demonstrations: Any) -> int:
-    """Outputs that are coordinates of a point: two or three of a length, all but a rotation."""
+def _space(demonstrations: Any) -> tuple[str, int]:
+    """Name of the space in their unit, and outputs that are a point there: two or three of a length, no rotation."""
     n = demonstrations.n_outputs - 3 * (demonstrations.rotation_reference is not None)
-    units = set((demonstrations.units or ())[:n])
-    return n if n in (2, 3) and len(units) < 2 and not units & {"rad", "deg"} else 0
-
-
-def _space(demonstrations: Any) -> str:
-    unit = (demonstrations.units or ("m",))[0]
-    return "space" if unit == "m" else f"space in {unit}"
+    units = set((demonstrations.units or ("m",))[:n])
+    n_space = n if n in (2, 3) and len(units) < 2 and not units & {"rad", "deg"} else 0
+    first = (demonstrations.units or ("m",))[0]
+    return "space" if first == "m" else f"space in {first}", n_space
 
 
 def _in_space(position: Floats) -> Floats:

@@ -59,6 +59,24 @@ def shown_figure(size: tuple[float, float]) -> Figure:
     return pyplot.figure(figsize=size, layout="constrained")
 
 
+def panels(n_bands: int, n_space: int = 0, make: Any = shown_figure) -> tuple[Figure, list[Any], list[Axes]]:
+    """Figure that ``make(size)`` makes, Axes of a path in two or three dimensions, if any, and those of bands.
+
+    Bands stand in a column beside the path, which is as high as all of them, or in a grid of at most three columns.
+    """
+    if not n_space:
+        n_columns = 3 if n_bands > 3 else 1
+        n_rows = -(-n_bands // n_columns)
+        figure = make((3.4 * n_columns if n_columns > 1 else 6.4, max(3.6, 2.0 * n_rows + 0.6)))
+        return figure, [], [figure.add_subplot(n_rows, n_columns, i + 1) for i in range(n_bands)]
+    width, ratios = (11.0, (1.25, 1.0)) if n_space == 3 else (9.6, (1.0, 1.3))
+    n_columns = 2 if n_bands else 1
+    figure = make((width if n_bands else 5.6, max(5.0, 1.7 * n_bands)))
+    columns = figure.add_gridspec(max(n_bands, 1), n_columns, width_ratios=ratios[:n_columns])
+    path = figure.add_subplot(columns[:, 0], projection="3d" if n_space == 3 else None)
+    return figure, [path], [figure.add_subplot(columns[i, 1]) for i in range(n_bands)]
+
+
 def legend_below(figure: Figure, axes: Axes | Sequence[Axes], n_columns: int = 4) -> None:
     """Draw one legend below the figure: each label of the Axes once."""
     entries: dict[str, Any] = {}
