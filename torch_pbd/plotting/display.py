@@ -8,36 +8,14 @@ from matplotlib.axes import Axes
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.plotting.parts import (
-    draw_edges,
-    plot_covariance_ellipses,
-    plot_demonstrations,
-    plot_outputs,
-    plot_rollout,
-    plot_std_band,
-)
-from torch_pbd.plotting.poses import draw_blocks, draw_pose_schedule, draw_poses, draw_recorded_poses
-from torch_pbd.plotting.style import (
-    MODEL,
-    OTHER,
-    TRUTH,
-    chosen_outputs,
-    equal_scales,
-    legend_below,
-    mark_ends,
-    panels,
-    schedule_names,
-    short_unit,
-    shown_figure,
-    time_label,
-)
+from torch_pbd.plotting import parts, poses, style
 
 Law = tuple[Floats, Floats]
 """Means (n, d) and covariances (n, d, d) over a grid of n times."""
 
 _N_STEPS = 201  # of the grid: bands and paths look smooth
 _MOST = 9  # outputs, in a grid of 3 x 3
-_COLORS = (MODEL, OTHER)
+_COLORS = (style.MODEL, style.OTHER)
 
 
 @final
@@ -98,7 +76,7 @@ class MovementDisplay:
         self.grid = grid
         self.laws = laws
         self.truth = truth
-        self.outputs = chosen_outputs(outputs, demonstrations.names, _MOST)
+        self.outputs = style.chosen_outputs(outputs, demonstrations.names, _MOST)
         self.input = input
         self.n_std = checks.number(n_std, "n_std", above=0.0)
         self.n_ellipses = checks.count(n_ellipses, "n_ellipses", most=_N_STEPS)
@@ -167,7 +145,7 @@ class MovementDisplay:
             if not in_space:
                 self._plot_band(ax, shown[0])
         else:
-            figure, plane, bands = panels(len(shown), len(shown) if in_space else 0)
+            figure, plane, bands = style.panels(len(shown), len(shown) if in_space else 0)
             for band, output in zip(bands, shown, strict=True):
                 self._plot_band(band, output)
             self.axes_ = plane + bands
@@ -176,36 +154,37 @@ class MovementDisplay:
         if in_space:
             self._plot_path(self.ax_)
         if ax is None:
-            legend_below(figure, self.axes_)
+            style.legend_below(figure, self.axes_)
         return self
 
     def _plot_band(self, ax: Axes, output: int) -> None:
         shown = self.demonstrations
         if self.input == "phase" and shown.time_unit != "1":
             shown = shown.align(n=_N_STEPS)
-        plot_demonstrations(shown, [output], ax)
+        parts.plot_demonstrations(shown, [output], ax)
         for (name, (mean, covariance)), color in zip(self.laws.items(), _COLORS, strict=False):
             std, label = np.sqrt(covariance[:, output, output]), self._label(name)
-            plot_std_band(self.grid, mean[:, output], std, ax, n_std=self.n_std, color=color, label=label)
+            parts.plot_std_band(self.grid, mean[:, output], std, ax, n_std=self.n_std, color=color, label=label)
         if self.truth is not None:
             mean, covariance = self.truth
             std = 0.5 * self.n_std * np.sqrt(covariance[:, output, output])
-            draw_edges(self.grid, mean[:, output], std, ax, f"truth: {self.n_std:g} sd", TRUTH)
-        ax.set_xlabel(time_label(shown.time_unit))
+            parts.draw_edges(self.grid, mean[:, output], std, ax, f"truth: {self.n_std:g} sd", style.TRUTH)
+        ax.set_xlabel(style.time_label(shown.time_unit))
         ax.margins(x=0.0)
 
     def _plot_path(self, ax: Any) -> None:
         shown, laws = self.outputs, list(zip(self.laws.values(), _COLORS, strict=False))
-        plot_demonstrations(self.demonstrations, shown, ax)
+        parts.plot_demonstrations(self.demonstrations, shown, ax)
         for name, ((mean, _), color) in zip(self.laws, laws, strict=False):
             ax.plot(*mean.T[shown], color=color, lw=1.5, label=self._label(name), zorder=3)
         if len(shown) == 2:
             some = np.linspace(0, len(self.grid) - 1, self.n_ellipses).round().astype(int)
-            for (mean, covariance), color in laws if self.truth is None else [*laws, (self.truth, TRUTH)]:
-                style: Any = {"n_std": self.n_std, "color": color, "linestyle": "--" if color == TRUTH else "-"}
-                plot_covariance_ellipses(mean[some][:, shown], covariance[some][:, shown][:, :, shown], ax, **style)
-        mark_ends(ax, laws[0][0][0][:, shown])
-        equal_scales(ax)
+            for (mean, covariance), color in laws if self.truth is None else [*laws, (self.truth, style.TRUTH)]:
+                look: Any = {"n_std": self.n_std, "color": color, "linestyle": "--" if color == style.TRUTH else "-"}
+                in_plane = covariance[some][:, shown][:, :, shown]
+                parts.plot_covariance_ellipses(mean[some][:, shown], in_plane, ax, **look)
+        style.mark_ends(ax, laws[0][0][0][:, shown])
+        style.equal_scales(ax)
 
     def _label(self, name: str) -> str:
         return f"{name}: mean, {self.n_std:g} sd"
@@ -213,57 +192,57 @@ class MovementDisplay:
 
 def plot_movements(demonstrations: Any, outputs: Sequence[int | str] | None = None, ax: Axes | None = None) -> Any:
     """Draw demonstrations: what `Demonstrations.plot` does."""
-    shown = chosen_outputs(outputs, demonstrations.names, _MOST)
+    shown = style.chosen_outputs(outputs, demonstrations.names, _MOST)
     if outputs is None and ax is None and demonstrations.rotation_reference is not None and len(shown) == 6:
-        return draw_poses(demonstrations, draw_recorded_poses, 3)
+        return poses.draw_poses(demonstrations, poses.draw_recorded_poses, 3)
     in_space = len(shown) in (2, 3)
     axes: list[Any] = [ax]
     if ax is None:
-        figure, plane, bands = panels(0, len(shown)) if in_space else panels(len(shown))
+        figure, plane, bands = style.panels(0, len(shown)) if in_space else style.panels(len(shown))
         axes = plane or bands
     for panel, own in zip(axes, [shown] if in_space else [[output] for output in shown], strict=True):
-        plot_demonstrations(demonstrations, own, panel)
+        parts.plot_demonstrations(demonstrations, own, panel)
         for k, (time, position) in enumerate(demonstrations):
             path = position[:, own]
-            mark_ends(panel, path if in_space else np.column_stack([time, path]), label=k == 0)
+            style.mark_ends(panel, path if in_space else np.column_stack([time, path]), label=k == 0)
         if in_space:
-            equal_scales(panel)
+            style.equal_scales(panel)
     if ax is None:
-        legend_below(figure, axes)
+        style.legend_below(figure, axes)
     return axes[0] if len(axes) == 1 else axes
 
 
 def plot_schedule(schedule: Any) -> list[Axes]:
     """Draw a schedule: what `Schedule.plot` does."""
-    p, turns, unit = schedule.position.shape[1], schedule.orientation is not None, short_unit(schedule.units)
+    p, turns, unit = schedule.position.shape[1], schedule.orientation is not None, style.short_unit(schedule.units)
     if turns and p == 3:
-        return draw_poses(schedule, draw_pose_schedule, 4)
-    figure, plane, bands = panels(2 * len(schedule.blocks) + (p != 2), 2 if p == 2 else 0)
-    position = [f"{name} [{unit}]" for name in schedule_names(schedule)[:p]]
+        return poses.draw_poses(schedule, poses.draw_pose_schedule, 4)
+    figure, plane, bands = style.panels(2 * len(schedule.blocks) + (p != 2), 2 if p == 2 else 0)
+    position = [f"{name} [{unit}]" for name in style.schedule_names(schedule)[:p]]
     # The path of two outputs takes the place of their positions over time.
     if plane:
         path, some = schedule.position, np.linspace(0, len(schedule) - 1, 21).round().astype(int)
-        plane[0].plot(*path.T, color=MODEL, lw=1.5, label="planned: position, 2 sd")
-        plot_covariance_ellipses(path[some], schedule.covariance[some, :2, :2], plane[0])
-        mark_ends(plane[0], path)
+        plane[0].plot(*path.T, color=style.MODEL, lw=1.5, label="planned: position, 2 sd")
+        parts.plot_covariance_ellipses(path[some], schedule.covariance[some, :2, :2], plane[0])
+        style.mark_ends(plane[0], path)
         plane[0].set(xlabel=position[0], ylabel=position[1])
-        equal_scales(plane[0])
+        style.equal_scales(plane[0])
     else:
-        plot_outputs(schedule.time, schedule.position, bands[0], position)
+        parts.plot_outputs(schedule.time, schedule.position, bands[0], position)
         bands[0].set_ylabel(f"position [{unit}]")
-    draw_blocks(schedule, bands[p != 2 :])
+    poses.draw_blocks(schedule, bands[p != 2 :])
     bands[-2].set_xlabel("")
-    legend_below(figure, [*plane, *bands[not turns :]])  # names of positions are those of other bands
+    style.legend_below(figure, [*plane, *bands[not turns :]])  # names of positions are those of other bands
     return [*plane, *bands]
 
 
 def plot_pushes(rollout: Any, unpushed: Any = None, names: Sequence[str] | None = None) -> list[Axes]:
     """Draw a simulated run: what `Rollout.plot` does."""
     n = 1 + (rollout.velocity.shape[-1] > rollout.position.shape[-1])
-    figure = shown_figure((6.4 if n == 1 else 11.0, 6.6))
+    figure = style.shown_figure((6.4 if n == 1 else 11.0, 6.6))
     axes = [figure.add_subplot(3, n, 1 + i % 3 * n + i // 3) for i in range(3 * n)]
-    plot_rollout(rollout.numpy(), axes, names=names, unpushed=None if unpushed is None else unpushed.numpy())
+    parts.plot_rollout(rollout.numpy(), axes, names=names, unpushed=None if unpushed is None else unpushed.numpy())
     for i, ax in enumerate(axes):
         ax.tick_params(labelbottom=i % 3 == 2)
-    legend_below(figure, axes)
+    style.legend_below(figure, axes)
     return axes

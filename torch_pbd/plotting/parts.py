@@ -1,6 +1,7 @@
 """Parts of figures; each function takes data and the Axes to draw into."""
 
 from collections.abc import Sequence
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -11,26 +12,7 @@ from numpy.typing import ArrayLike
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.plotting.style import (
-    DATA,
-    EMPIRICAL,
-    FORCE,
-    LINES,
-    MODEL,
-    POSE_NAMES,
-    ROTATION,
-    SERIES,
-    TRUTH,
-    axis_names,
-    check_axes,
-    check_kind,
-    chosen_outputs,
-    ellipses,
-    kind_of,
-    output_label,
-    schedule_names,
-    time_label,
-)
+from torch_pbd.plotting import style
 
 _N_BARS = 30  # inputs up to which error bars are drawn; of more they would touch, and lines are
 
@@ -54,15 +36,15 @@ def plot_demonstrations(
     -------
     list of Line2D, one a demonstration
     """
-    check_kind(demonstrations, "demonstrations", "Demonstrations")
-    chosen = chosen_outputs(outputs, demonstrations.names, 3)
-    check_axes("ax", [ax])
+    style.check_kind(demonstrations, "demonstrations", "Demonstrations")
+    chosen = style.chosen_outputs(outputs, demonstrations.names, 3)
+    style.check_axes("ax", [ax])
     lines: list[Line2D] = []
     for time, position in demonstrations:
         columns = position[:, chosen].T
         drawn = (time, *columns) if len(chosen) == 1 else columns
-        lines += ax.plot(*drawn, color=DATA, lw=1.0, alpha=0.8, label=None if lines else label, zorder=1)
-    labels = [time_label(demonstrations.time_unit), *(output_label(demonstrations, one) for one in chosen)]
+        lines += ax.plot(*drawn, color=style.DATA, lw=1.0, alpha=0.8, label=None if lines else label, zorder=1)
+    labels = [style.time_label(demonstrations.time_unit), *(style.output_label(demonstrations, one) for one in chosen)]
     labels = labels if len(chosen) == 1 else labels[1:]
     ax.set(**dict(zip(("xlabel", "ylabel", "zlabel"), labels, strict=False)))
     return lines
@@ -75,11 +57,11 @@ def plot_std_band(
     ax: Axes,
     *,
     n_std: float = 2.0,
-    color: str = MODEL,
+    color: str = style.MODEL,
     label: str | None = None,
 ) -> tuple[Line2D, PolyCollection]:
     """Draw a mean (n,) over x (n,) with a band of ``n_std`` standard deviations (n,) on either side."""
-    check_axes("ax", [ax])
+    style.check_axes("ax", [ax])
     across, middle, half = (checks.array(*named, None).ravel() for named in ((x, "x"), (mean, "mean"), (std, "std")))
     for part, name in ((middle, "mean"), (half, "std")):
         checks.array(part, name, (len(across),))
@@ -97,12 +79,12 @@ def plot_covariance_ellipses(
     ax: Axes,
     *,
     n_std: float = 2.0,
-    color: str = MODEL,
+    color: str = style.MODEL,
     label: str | None = None,
     linestyle: str = "-",
 ) -> LineCollection:
     """Draw the ``n_std`` ellipses of covariances (n, 2, 2) around means (n, 2)."""
-    curves = ellipses(mean, covariance, ax, n_std, 2)[:, 0]
+    curves = style.ellipses(mean, covariance, ax, n_std, 2)[:, 0]
     drawn = LineCollection(list(curves), colors=color, linewidths=1.1, linestyles=linestyle, label=label, zorder=3)
     ax.add_collection(drawn)
     ax.autoscale_view()
@@ -135,7 +117,7 @@ def plot_model_bands(
     """
     inputs, targets = checks.array(X, "X", ("n", 1)), checks.array(y, "y", None)
     targets = targets.reshape(len(inputs), -1)
-    check_axes("axes", axes, targets.shape[1])
+    style.check_axes("axes", axes, targets.shape[1])
     beyond = checks.number(beyond, "beyond", remedy="how far to draw, in ranges of X")
     low, high = inputs.min(), inputs.max()
     query = np.linspace(low - beyond * (high - low), high + beyond * (high - low), 401)[:, np.newaxis]
@@ -150,24 +132,23 @@ def plot_model_bands(
         plot_std_band(query, mean[:, output], std[:, output], ax, label="model: mean, 2 sd")
         if true_std is not None:
             centre, deviation = true_std(query)
-            draw_edges(query[:, 0], centre[:, output], deviation[:, output], ax, "truth: 2 sd", TRUTH)
+            draw_edges(query[:, 0], centre[:, output], deviation[:, output], ax, "truth: 2 sd", style.TRUTH)
         average = np.bincount(index, targets[:, output]) / counts
         squares = np.bincount(index, (targets[:, output] - average[index]) ** 2)[repeated]
         middle, half = average[repeated], np.sqrt(squares / divisor)
         if 0 < len(position) <= _N_BARS:
-            style: dict[str, Any] = {"fmt": ".", "ms": 4, "capsize": 2, "lw": 1.2, "label": "empirical: mean, 2 sd"}
-            ax.errorbar(position, middle, 2.0 * half, color=EMPIRICAL, zorder=4, **style)
+            look: dict[str, Any] = {"fmt": ".", "ms": 4, "capsize": 2, "lw": 1.2, "label": "empirical: mean, 2 sd"}
+            ax.errorbar(position, middle, 2.0 * half, color=style.EMPIRICAL, zorder=4, **look)
         elif len(position):
             draw_edges(position, middle, half, ax, "empirical: 2 sd")
         for edge in (low, high):
-            ax.axvline(edge, color=DATA, lw=0.8, ls=":", label="end of the data" if edge == low else None)
+            ax.axvline(edge, color=style.DATA, lw=0.8, ls=":", label="end of the data" if edge == low else None)
 
 
-def draw_edges(x: Floats, mean: Floats, std: Floats, ax: Axes, label: str, color: str = EMPIRICAL) -> None:
+def draw_edges(x: Floats, mean: Floats, std: Floats, ax: Axes, label: str, color: str = style.EMPIRICAL) -> None:
     """Draw lines two standard deviations above and below a mean."""
-    style = "--" if color == TRUTH else "-"
-    lines = ax.plot(x, np.stack([mean + 2.0 * std, mean - 2.0 * std], axis=1), style, color=color, lw=1.0, zorder=2.5)
-    lines[0].set_label(label)
+    edges, dash = np.stack([mean + 2.0 * std, mean - 2.0 * std], axis=1), "--" if color == style.TRUTH else "-"
+    ax.plot(x, edges, dash, color=color, lw=1.0, zorder=2.5)[0].set_label(label)
 
 
 def plot_stiffness(schedule: Any, ax: Axes, block: slice | None = None) -> list[Line2D]:
@@ -186,19 +167,19 @@ def plot_stiffness(schedule: Any, ax: Axes, block: slice | None = None) -> list[
     -------
     list of Line2D, one an output
     """
-    check_kind(schedule, "schedule", "Schedule")
-    check_axes("ax", [ax])
+    style.check_kind(schedule, "schedule", "Schedule")
+    style.check_axes("ax", [ax])
     block = schedule.blocks[0] if block is None else block
-    kind = ROTATION if block.start else kind_of(schedule.units, block.stop)
+    kind = style.ROTATION if block.start else style.kind_of(schedule.units, block.stop)
     if len(schedule.blocks) > 1:
         gains = np.linalg.eigvalsh(schedule.stiffness[:, block, block])[:, ::-1]
-        lines = plot_outputs(schedule.time, gains, ax, axis_names(schedule, gains.shape[1]), [MODEL])
+        lines = plot_outputs(schedule.time, gains, ax, style.axis_names(schedule, gains.shape[1]), [style.MODEL])
     else:
-        gains = np.diagonal(schedule.stiffness, axis1=1, axis2=2)
-        lines = plot_outputs(schedule.time, gains, ax, [f"{kind.where} {name}" for name in schedule_names(schedule)])
+        labels = [f"{kind.where} {name}" for name in style.schedule_names(schedule)]
+        lines = plot_outputs(schedule.time, np.diagonal(schedule.stiffness, axis1=1, axis2=2), ax, labels)
     limits = [np.broadcast_to(limit, schedule.n_outputs)[block] for limit in schedule.stiffness_limits or ()]
     for i, limit in enumerate(np.unique(limits)):
-        ax.axhline(limit, color=DATA, lw=0.8, ls=":", label=None if i else "limits of the stiffness")
+        ax.axhline(limit, color=style.DATA, lw=0.8, ls=":", label=None if i else "limits of the stiffness")
     ax.set(xlabel="time [s]", ylabel=f"stiffness [{kind.stiffness_unit}]", ylim=(0.0, None))
     return lines
 
@@ -226,15 +207,15 @@ def plot_rollout(
     unpushed : Rollout, default=None
         The same run without pushes, drawn thin: how far the robot lags behind by itself.
     """
-    check_kind(rollout, "rollout", "Rollout")
+    style.check_kind(rollout, "rollout", "Rollout")
     if np.ndim(rollout.position) != 2:
         must = "of one run, (n_ticks, n_outputs): take one of the batch"
         raise checks.refusal(tuple(np.shape(rollout.position)), "the shape of the rollout's position", must)
     p, d = rollout.position.shape[-1], rollout.velocity.shape[-1]
-    check_axes("axes", axes, 3 if p == d else 6)
-    names = names or (POSE_NAMES if d == p + 3 == 6 else [f"y{i}" for i in range(d)])
-    chosen = chosen_outputs(outputs, names, 6)
-    kinds = [kind_of(rollout.units, p)] + ([ROTATION] if d > p else [])
+    style.check_axes("axes", axes, 3 if p == d else 6)
+    names = names or (style.POSE_NAMES if d == p + 3 == 6 else [f"y{i}" for i in range(d)])
+    chosen = style.chosen_outputs(outputs, names, 6)
+    kinds = [style.kind_of(rollout.units, p)] + ([style.ROTATION] if d > p else [])
     for i, kind in enumerate(kinds):
         above, middle, below = axes[3 * i : 3 * i + 3]
         own = [output for output in chosen if (output >= p) == bool(i)]
@@ -242,23 +223,25 @@ def plot_rollout(
         along = [f"{kind.where} {label}" for label in labels]
         plot_outputs(rollout.time, kind.scale * rollout.deviation[:, own], above, along)
         if unpushed is not None:
-            lines = above.plot(unpushed.time, kind.scale * unpushed.deviation[:, own], color=DATA, lw=1.0)
+            lines = above.plot(unpushed.time, kind.scale * unpushed.deviation[:, own], color=style.DATA, lw=1.0)
             lines[0].set_label("without pushes")
         above.set_ylabel(f"deviation [{kind.unit}]")
-        plot_outputs(rollout.time, rollout.force[:, own], middle, [f"{kind.push} {each}" for each in labels], [FORCE])
+        pushes = [f"{kind.push} {label}" for label in labels]
+        plot_outputs(rollout.time, rollout.force[:, own], middle, pushes, [style.FORCE])
         middle.set_ylabel(f"external {kind.push} [{kind.push_unit}]")
         plot_outputs(rollout.time, np.diagonal(rollout.stiffness, axis1=1, axis2=2)[:, own], below, along)
         below.set(xlabel="time [s]", ylabel=f"stiffness [{kind.stiffness_unit}]", ylim=(0.0, None))
         for ax in (above, middle):
-            ax.axhline(0.0, color=DATA, lw=0.6, zorder=0)
+            ax.axhline(0.0, color=style.DATA, lw=0.6, zorder=0)
 
 
 def plot_outputs(
-    time: Floats, columns: Floats, ax: Axes, labels: Sequence[str], colors: Sequence[str] = SERIES
+    time: Floats, columns: Floats, ax: Axes, labels: Sequence[str], colors: Sequence[str] = style.SERIES
 ) -> list[Line2D]:
     """Draw a line for each column (n, d) over time (n,), which differ by their dashes too."""
     lines: list[Line2D] = []
-    for i, (column, label) in enumerate(zip(columns.T, labels, strict=True)):
-        lines += ax.plot(time, column, LINES[i % len(LINES)], color=colors[i % len(colors)], lw=1.5, label=label)
+    looks = zip(cycle(style.LINES), cycle(colors), strict=False)
+    for column, label, (dash, color) in zip(columns.T, labels, looks, strict=False):
+        lines += ax.plot(time, column, dash, color=color, lw=1.5, label=label)
     ax.margins(x=0.0)
     return lines

@@ -11,25 +11,8 @@ from numpy.typing import ArrayLike
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
+from torch_pbd.plotting import style
 from torch_pbd.plotting.parts import plot_outputs, plot_stiffness
-from torch_pbd.plotting.style import (
-    DATA,
-    MODEL,
-    POSE_NAMES,
-    ROTATION,
-    SERIES,
-    axis_names,
-    check_axes,
-    ellipses,
-    equal_scales,
-    kind_of,
-    legend_below,
-    mark_ends,
-    panels,
-    schedule_names,
-    time_label,
-    unit_ellipses,
-)
 from torch_pbd.rotations import matrix
 
 _TURN = np.linspace(0.0, 2.0 * np.pi, 21)
@@ -69,11 +52,11 @@ def plot_frames(
     -------
     list of three Line3DCollection, of the axes x, y and z
     """
-    check_axes("ax", [ax])
+    style.check_axes("ax", [ax])
     places = checks.array(position, "position", ("n", 3))
     turns = matrix(checks.array(orientation, "orientation", (len(places), 4)))
     drawn = []
-    for axis, color in enumerate(SERIES[:3]):
+    for axis, color in enumerate(style.SERIES[:3]):
         tips = turns[:, :, axis]
         lines = np.stack([places, places + length * tips], axis=1)
         name = None if label is None else f"{label}: {'xyz'[axis]}"
@@ -82,7 +65,7 @@ def plot_frames(
             spread = checks.array(covariance, "covariance", (len(places), 3, 3))
             # A small rotation e moves the tip a by e x a, and the tip stays on its sphere.
             arm = -np.cross(np.eye(3), tips[:, np.newaxis, :]).swapaxes(1, 2)
-            moved = tips[:, np.newaxis, :] + n_std * unit_ellipses(arm @ spread @ arm.swapaxes(1, 2))[:, 0]
+            moved = tips[:, np.newaxis, :] + n_std * style.unit_ellipses(arm @ spread @ arm.swapaxes(1, 2))[:, 0]
             on_sphere = moved / np.linalg.norm(moved, axis=-1, keepdims=True)
             _lines(ax, places[:, np.newaxis, :] + length * on_sphere, color, 0.8, None)
     return drawn
@@ -94,22 +77,22 @@ def plot_covariance_ellipsoids(
     ax: Axes,
     *,
     n_std: float = 2.0,
-    color: str = MODEL,
+    color: str = style.MODEL,
     label: str | None = None,
 ) -> Line3DCollection:
     """Draw the ``n_std`` ellipsoids of covariances (n, 3, 3) around means (n, 3), by an ellipse in each main plane.
 
     The axes are of projection "3d".
     """
-    curves = np.concatenate(ellipses(mean, covariance, ax, n_std, 3))
+    curves = np.concatenate(style.ellipses(mean, covariance, ax, n_std, 3))
     return _lines(ax, curves, color, 0.7, label)
 
 
 def draw_poses(what: Any, draw: Callable[[Any, Axes, list[Axes]], None], n_bands: int) -> list[Axes]:
     """Axes of a new figure of demonstrations or of a schedule, the space first."""
-    figure, space, bands = panels(n_bands, 3)
+    figure, space, bands = style.panels(n_bands, 3)
     draw(what, space[0], bands)
-    legend_below(figure, [*space, *bands])
+    style.legend_below(figure, [*space, *bands])
     return [*space, *bands]
 
 
@@ -118,16 +101,16 @@ def draw_recorded_poses(demonstrations: Any, ax: Axes, bands: Sequence[Axes], n_
     places, turns = demonstrations.to_poses()
     length = _LENGTH * float(np.ptp(np.concatenate(places), axis=0).max())
     for k, (path, turn) in enumerate(zip(places, turns, strict=True)):
-        ax.plot(*path.T, color=DATA, lw=1.0, alpha=0.8, label=None if k else "demonstrations", zorder=1)
+        ax.plot(*path.T, color=style.DATA, lw=1.0, alpha=0.8, label=None if k else "demonstrations", zorder=1)
         some = np.linspace(0, len(path) - 1, n_frames).round().astype(int)
         plot_frames(path[some], turn[some], ax, length=length, label=None if k else "tool")
-        mark_ends(ax, path, label=k == 0)
+        style.mark_ends(ax, path, label=k == 0)
     for i, (band, name) in enumerate(zip(bands, demonstrations.names[-3:], strict=True)):
         for time, position in demonstrations:
-            band.plot(time, ROTATION.scale * position[:, i - 3], color=DATA, lw=1.0, alpha=0.8)
+            band.plot(time, style.ROTATION.scale * position[:, i - 3], color=style.DATA, lw=1.0, alpha=0.8)
         band.set_ylabel(f"{name} [deg]")
         band.margins(x=0.0)
-    bands[-1].set_xlabel(time_label(demonstrations.time_unit))
+    bands[-1].set_xlabel(style.time_label(demonstrations.time_unit))
     _label(ax, bands, demonstrations.names[:3], None if demonstrations.units is None else demonstrations.units[0])
 
 
@@ -138,24 +121,27 @@ def draw_pose_schedule(schedule: Any, ax: Axes, bands: Sequence[Axes], n_poses: 
     way = np.append(0.0, np.linalg.norm(np.diff(schedule.position, axis=0), axis=1)).cumsum()
     some = np.searchsorted(way, np.linspace(0.0, way[-1], n_poses)).clip(max=len(schedule) - 1)
     path, spread = schedule.position[some], schedule.covariance[some]
-    ax.plot(*schedule.position.T, color=MODEL, lw=1.8, label="planned path", zorder=3)
+    ax.plot(*schedule.position.T, color=style.MODEL, lw=1.8, label="planned path", zorder=3)
     plot_covariance_ellipsoids(path, spread[:, :3, :3], ax, label="position: 2 sd")
     plot_frames(path, schedule.orientation[some], ax, length=length, covariance=spread[:, 3:, 3:], label="tool, 2 sd")
-    mark_ends(ax, schedule.position)
-    _label(ax, bands, (schedule.names or POSE_NAMES)[:3], schedule.units)
+    style.mark_ends(ax, schedule.position)
+    _label(ax, bands, (schedule.names or style.POSE_NAMES)[:3], schedule.units)
     draw_blocks(schedule, bands)
     bands[2].set_xlabel("")
 
 
 def draw_blocks(schedule: Any, bands: Sequence[Axes]) -> None:
     """Draw deviations, and then stiffness, over time: of the outputs, and of poses in principal axes of both blocks."""
-    kinds, n = (kind_of(schedule.units, schedule.position.shape[1]), ROTATION), len(schedule.blocks)
+    kinds, n = (style.kind_of(schedule.units, schedule.position.shape[1]), style.ROTATION), len(schedule.blocks)
     for kind, block, spread, gains in zip(kinds, schedule.blocks, bands[:n], bands[n:], strict=False):
         covariance = schedule.covariance[:, block, block]
-        variance = np.diagonal(covariance, axis1=1, axis2=2) if n == 1 else np.linalg.eigvalsh(covariance).clip(0.0)
-        names: Sequence[str] = [f"{kind.where} {name}" for name in schedule_names(schedule)]
-        names = names if n == 1 else axis_names(schedule, variance.shape[1])
-        plot_outputs(schedule.time, kind.scale * np.sqrt(variance), spread, names, SERIES if n == 1 else [MODEL])
+        if n == 1:
+            variance, colors = np.diagonal(covariance, axis1=1, axis2=2), list(style.SERIES)
+            names: Sequence[str] = [f"{kind.where} {name}" for name in style.schedule_names(schedule)]
+        else:
+            variance, colors = np.linalg.eigvalsh(covariance).clip(0.0), [style.MODEL]
+            names = style.axis_names(schedule, variance.shape[1])
+        plot_outputs(schedule.time, kind.scale * np.sqrt(variance), spread, names, colors)
         spread.set(ylabel=f"1 sd [{kind.unit}]", ylim=(0.0, None))
         plot_stiffness(schedule, gains, block)
 
@@ -163,7 +149,7 @@ def draw_blocks(schedule: Any, bands: Sequence[Axes]) -> None:
 def _label(ax: Any, bands: Sequence[Axes], names: Sequence[str], unit: str | None) -> None:
     """Name the axes of a space, on one scale, and let bands beside it have one axis of time."""
     ax.set(**{f"{axis}label": f"{name} [{unit or 'unit'}]" for axis, name in zip("xyz", names, strict=True)})
-    equal_scales(ax, zoom=0.88)
+    style.equal_scales(ax)
     ax.view_init(elev=22.0, azim=-35.0)
     for band in bands[:-1]:
         band.sharex(bands[-1])
@@ -196,7 +182,7 @@ def plot_arm(model: Any, joints: ArrayLike, ax: Axes, *, alpha: float = 1.0) -> 
     """
     import mujoco
 
-    check_axes("ax", [ax])
+    style.check_axes("ax", [ax])
     data = mujoco.MjData(model)
     data.qpos[:] = checks.array(joints, "joints", (model.nq,))
     mujoco.mj_kinematics(model, data)

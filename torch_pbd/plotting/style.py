@@ -86,13 +86,10 @@ def legend_below(figure: Figure, axes: Axes | Sequence[Axes], n_columns: int = 4
     figure.legend(entries.values(), entries, loc="outside lower center", ncols=n_columns, fontsize=9)
 
 
-def equal_scales(ax: Any, zoom: float = 0.85) -> None:
-    """Give the axes of a plane or a space one scale, unless a plane is so long that nothing would be seen across it.
-
-    ``zoom`` is how much of its place a space takes.
-    """
+def equal_scales(ax: Any) -> None:
+    """Give the axes of a plane or a space one scale, unless a plane is so long that nothing would be seen across it."""
     if ax.name == "3d":
-        ax.set_box_aspect([abs(high - low) for low, high in (ax.get_xlim(), ax.get_ylim(), ax.get_zlim())], zoom=zoom)
+        ax.set_box_aspect([abs(high - low) for low, high in (ax.get_xlim(), ax.get_ylim(), ax.get_zlim())], zoom=0.85)
         ax.locator_params(nbins=4)  # more would touch
         return
     width, height = (abs(high - low) for low, high in (ax.get_xlim(), ax.get_ylim()))
