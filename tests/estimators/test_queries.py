@@ -1,12 +1,8 @@
 """What is checked of the inputs that are predicted at, and what is not worked out in vain."""
 
-import copy
-import pickle
-
 import numpy as np
 import pandas as pd
 import pytest
-import torch
 from scipy.sparse import csr_array
 
 from estimators.zoo import DEFAULTS, VARIANTS, demonstrations, fitted, new, queries
@@ -85,54 +81,3 @@ def test_the_covariance_alone_takes_no_mean(name, monkeypatch):
     monkeypatch.setattr(type(model.module_), "mean", None)
     monkeypatch.setattr(type(model.module_.core), "forward", None)
     np.testing.assert_array_equal(model.predict_cov(X), expected)
-
-
-def assert_those_of_the_module(model, X):
-    """Equal but for rounding, in units of the standard deviations."""
-    mean, covariance = model.predict(X, return_cov=True)
-    module = copy.deepcopy(model.module_)
-    expected = module.moments(torch.tensor(X))
-    scale = np.sqrt(np.diagonal(expected[1], axis1=1, axis2=2))
-    np.testing.assert_allclose((mean - expected[0].numpy()) / scale, 0.0, atol=1e-11)
-    correlations = (covariance - expected[1].numpy()) / scale[:, :, np.newaxis] / scale[:, np.newaxis]
-    np.testing.assert_allclose(correlations, 0.0, atol=1e-11)
-    np.testing.assert_array_equal(model.predict(X), mean)
-    np.testing.assert_array_equal(model.predict_cov(X), covariance)
-
-
-@pytest.mark.parametrize(("d", "e"), [(1, 1), (2, 1), (2, 2), (9, 1)])
-def test_a_mixture_predicts_what_its_module_does(d, e):
-    X = queries(e)
-    assert_those_of_the_module(fitted("mixture", d, e), X[np.abs(X).max(axis=1) < 100.0])
-
-
-def in_place(core):
-    core.mean += 0.1
-
-
-def behind_autograd(core):
-    core.log_diagonal.data.mul_(1.1)
-
-
-def replaced(core):
-    core.mean = torch.nn.Parameter(core.mean + 0.1, requires_grad=False)
-
-
-def loaded(core):
-    core.load_state_dict({key: 0.9 * value for key, value in core.state_dict().items()}, assign=True)
-
-
-@pytest.mark.parametrize("change", [in_place, behind_autograd, replaced, loaded])
-def test_a_mixture_follows_its_module(change):
-    model, X = copy.deepcopy(fitted("mixture")), queries(1)[:40]
-    before = model.predict_cov(X)
-    change(model.module_.core)
-    assert np.abs(model.predict_cov(X) - before).max() > 1e-3
-    assert_those_of_the_module(model, X)
-
-
-def test_a_mixture_from_a_pickle_predicts_the_same():
-    model, X = fitted("mixture"), queries(1)
-    twin = pickle.loads(pickle.dumps(model))
-    assert twin._regression is not None
-    np.testing.assert_array_equal(twin.predict_cov(X), model.predict_cov(X))

@@ -19,7 +19,6 @@ VARIANTS = {
     "cholesky-likelihood-raw": CholeskyCovRegressor(objective="likelihood", diagonal="raw"),
     "cholesky-eq12": CholeskyCovRegressor(**PAPER, max_iter=50),
     "wishart": WishartProcessRegressor(),
-    "wishart-random": WishartProcessRegressor(start="random", max_iter=300),
     "wishart-likelihood": WishartProcessRegressor(objective="likelihood"),
     "wishart-eq11": WishartProcessRegressor(**PAPER, max_iter=50),
     "heteroscedastic": HeteroscedasticGPRegressor(),
@@ -34,7 +33,7 @@ UNALIGNED = [
 # Name, outputs d, inputs e, whether the inputs repeat.
 CASES = [(name, d, e, True) for name in VARIANTS for d, e in [(1, 1), (2, 1), (2, 2)]]
 CASES += [(name, d, e, False) for name in UNALIGNED for d, e in [(1, 1), (2, 1), (1, 2)]]
-CASES += [(name, 9, 1, True) for name in (*DEFAULTS, "cholesky-interpolating", "cholesky-likelihood", "wishart-random")]
+CASES += [(name, 9, 1, True) for name in (*DEFAULTS, "cholesky-interpolating", "cholesky-likelihood")]
 CASES += [(name, 9, 1, False) for name in ("cholesky-likelihood", "wishart-likelihood", "heteroscedastic", "mixture")]
 PLAIN = [(name, 2, 1, True) for name in VARIANTS] + [(name, 2, 1, False) for name in UNALIGNED]
 

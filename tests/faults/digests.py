@@ -18,7 +18,7 @@ from torch_pbd.data import make_tunnel_demonstrations
 MODELS = {
     "cholesky": CholeskyCovRegressor(),
     "cholesky-likelihood": CholeskyCovRegressor(objective="likelihood"),
-    "wishart-random": WishartProcessRegressor(start="random", max_iter=500, random_state=3),
+    "wishart-likelihood": WishartProcessRegressor(objective="likelihood", max_iter=500, random_state=3),
     "heteroscedastic": HeteroscedasticGPRegressor(),
     "mixture": GMMBaseline(n_components=3, random_state=3),
     "controller": DMPController(HeteroscedasticGPRegressor(), n_steps=40),

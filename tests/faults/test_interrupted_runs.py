@@ -205,7 +205,7 @@ def test_36_a_demo_goes_on_with_the_fits_that_are_left(tmp_path, monkeypatch):
     "model",
     [
         CholeskyCovRegressor(objective="likelihood"),
-        WishartProcessRegressor(start="random", max_iter=20),
+        WishartProcessRegressor(objective="likelihood", max_iter=20),
         HeteroscedasticGPRegressor(),
         GMMBaseline(n_components=2),
         DMPController(GMMBaseline(n_components=2), n_steps=20),

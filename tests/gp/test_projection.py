@@ -7,8 +7,8 @@ from gp.oracle import negative_log_evidence
 from sklearn.gaussian_process.kernels import RBF
 
 from torch_pbd.gp import Hyperparameters, Observations, condition
-from torch_pbd.gp.latent import Evidence
-from torch_pbd.gp.observations import FULL, Basis, Resolution, neighbourhoods, resolutions
+from torch_pbd.gp.evidence import Evidence
+from torch_pbd.gp.observations import Basis, levels_on_nodes, neighbourhoods
 from torch_pbd.kernels import correlation
 
 
@@ -23,15 +23,15 @@ def observations(generator):
 
 
 def levels(observations):
-    return resolutions(observations, "squared_exponential", noisy=True)
+    return levels_on_nodes(observations.inputs, "squared_exponential", 300)
 
 
 @pytest.mark.parametrize("number", [0, 1, 2, 3])
 def test_nodes_carry_the_kernel_down_to_their_shortest_length_scale(number, observations):
-    level = levels(observations)[number]
-    basis = Basis(observations, level)
+    shortest, n_nodes = levels(observations)[number]
+    basis = Basis(observations, n_nodes)
     for factor, bound in [(1.0, 1e-12), (3.0, 1e-13), (0.3, None)]:
-        scale = torch.full((1, 1), factor * level.shortest_length_scale, dtype=torch.float64)
+        scale = torch.full((1, 1), factor * shortest, dtype=torch.float64)
         projected = basis.covariance(correlation(basis.nodes, basis.nodes, scale)[0])
         found = basis.orthogonal @ projected @ basis.orthogonal.mT / observations.counts.sqrt()
         found = (found / observations.counts.sqrt()[:, None]).numpy()
@@ -47,10 +47,10 @@ def at(evidence, length_scale, noise_ratio):
 @pytest.mark.parametrize("noise_scale", [None, 0.3])
 def test_evidence_on_nodes_is_that_of_all_inputs(noise_scale, observations):
     held = None if noise_scale is None else torch.tensor([0.3, 0.2], dtype=torch.float64)
-    full = Evidence(Basis(observations, FULL), observations.targets, "squared_exponential", held)
-    for level in levels(observations)[:-1]:
-        fewer = Evidence(Basis(observations, level), observations.targets, "squared_exponential", held)
-        where = ([[1.1 * level.shortest_length_scale], [2.0]], [1e-4, 3.0])
+    full = Evidence(Basis(observations), observations.targets, "squared_exponential", held)
+    for shortest, n_nodes in levels(observations):
+        fewer = Evidence(Basis(observations, n_nodes), observations.targets, "squared_exponential", held)
+        where = ([[1.1 * shortest], [2.0]], [1e-4, 3.0])
         (loss, gradient), (expected, expected_gradient) = at(fewer, *where), at(full, *where)
         torch.testing.assert_close(loss, expected, rtol=1e-10, atol=1e-8)
         torch.testing.assert_close(gradient, expected_gradient, rtol=1e-7, atol=1e-6)
@@ -66,7 +66,7 @@ def test_gradient_is_that_of_autograd(kernel, n_features, generator):
     observations = Observations(x, torch.randn(3, 12, generator=generator, dtype=torch.float64), counts)
     log_scale = (-torch.rand(3, n_features, generator=generator, dtype=torch.float64)).requires_grad_()
     log_ratio = torch.tensor([-6.0, -1.0, 2.0], dtype=torch.float64, requires_grad=True)
-    evidence = Evidence(Basis(observations, FULL), observations.targets, kernel, None)
+    evidence = Evidence(Basis(observations), observations.targets, kernel, None)
     rows = torch.arange(3)
     loss, gradient = evidence(log_scale.exp().detach(), log_ratio.exp().detach(), rows)
     variance = evidence.best_variance(log_scale.exp().detach(), log_ratio.exp().detach(), rows)
@@ -81,8 +81,8 @@ def test_gradient_is_that_of_autograd(kernel, n_features, generator):
 
 
 def test_gradient_under_a_held_noise_is_that_of_differences(observations):
-    level, held = levels(observations)[0], torch.tensor([0.3, 0.2], dtype=torch.float64)
-    evidence = Evidence(Basis(observations, level), observations.targets, "squared_exponential", held)
+    held = torch.tensor([0.3, 0.2], dtype=torch.float64)
+    evidence = Evidence(Basis(observations, 32), observations.targets, "squared_exponential", held)
     scale, ratio, step = [[0.3], [0.9]], np.array([1e-2, 3.0]), 1e-5
     above, below = (at(evidence, scale, list(ratio * math.exp(sign * step)))[0] for sign in (1.0, -1.0))
     expected = (above - below) / (2.0 * step)
@@ -92,7 +92,7 @@ def test_gradient_under_a_held_noise_is_that_of_differences(observations):
 def test_neighbours_taken_together_are_observations_of_their_mean_and_noise_beside(observations):
     """A process that is constant within neighbourhoods has exactly the merged evidence."""
     index = neighbourhoods(observations.inputs, 20)
-    basis = Basis(observations, Resolution(None, 20, 0.0))
+    basis = Basis(observations, max_inputs=20)
     scale, ratio = torch.tensor([[0.2]] * 2).double(), torch.tensor([0.1, 0.1]).double()
     found = Evidence(basis, observations.targets, "squared_exponential", None)(scale, ratio, torch.arange(2))[0]
     gram = correlation(basis.nodes, basis.nodes, scale)[:, index][:, :, index]
@@ -106,9 +106,9 @@ def test_processes_on_nodes_predict_what_those_on_all_inputs_do(observations):
     scale, amplitude = torch.tensor([[0.2], [0.5]]).double(), torch.tensor([1.3, 0.7]).double()
     hyperparameters = Hyperparameters(scale, amplitude, torch.tensor([1e-2, 0.3]).double())
     values = observations.targets + 2.0
-    basis = Basis(observations, levels(observations)[0])
+    basis = Basis(observations, 32)
     fewer, _ = condition(observations, hyperparameters, values=values, basis=basis)
-    every, _ = condition(observations, hyperparameters, values=values, basis=Basis(observations, FULL))
+    every, _ = condition(observations, hyperparameters, values=values, basis=Basis(observations))
     x = torch.linspace(-1.0, 2.0, 200, dtype=torch.float64)[:, None]
     torch.testing.assert_close(fewer(x), every(x), rtol=1e-9, atol=1e-10)
     torch.testing.assert_close(fewer.values(x), every.values(x), rtol=1e-9, atol=1e-10)

@@ -3,7 +3,8 @@ import pytest
 import torch
 
 from torch_pbd.gp import Hyperparameters, Observations, condition
-from torch_pbd.models.cholesky import CholeskyCovariance, CholeskyLink, tril_deviation
+from torch_pbd.models.conditional import MeanAndCholesky
+from torch_pbd.models.links import CholeskyLink
 
 INPUTS = torch.linspace(0, 1, 5, dtype=torch.float64)[:, None]
 FAR = torch.tensor([[100.0], [-1e300]], dtype=torch.float64)
@@ -21,14 +22,13 @@ def factors(n, d, rng):
 
 def interpolating(scale_tril, prior_tril, *, log_diagonal):
     """A model whose factor at the inputs is ``scale_tril``."""
-    deviation = tril_deviation(scale_tril, prior_tril, log_diagonal=log_diagonal)
-    zero = torch.zeros_like(scale_tril[0])
-    values = tril_deviation(scale_tril, zero, log_diagonal=False)
+    link = CholeskyLink(prior_tril, log_diagonal)
+    deviation, values = link.deviation(scale_tril), link.flatten(scale_tril)
     count = deviation.shape[1]
     shared = Hyperparameters(tensor([[0.15]]), torch.ones(count).double(), torch.zeros(count).double())
     observations = Observations(INPUTS, deviation.mT.contiguous(), torch.ones(5).double())
     latent, _ = condition(observations, shared, values=values.mT.contiguous())
-    return CholeskyCovariance(latent, prior_tril, log_diagonal=log_diagonal)
+    return MeanAndCholesky(latent, latent, link)
 
 
 @pytest.mark.parametrize("log_diagonal", [False, True])
@@ -37,7 +37,7 @@ def interpolating(scale_tril, prior_tril, *, log_diagonal):
 def test_a_factor_and_its_deviation_are_inverse(log_diagonal, d, one_prior, rng):
     scale_tril, prior_tril = factors(5, d, rng), factors(5, d, rng)
     prior_tril = prior_tril[0] if one_prior else prior_tril
-    deviation = tril_deviation(scale_tril, prior_tril, log_diagonal=log_diagonal)
+    deviation = CholeskyLink(prior_tril, log_diagonal).deviation(scale_tril)
     assert deviation.shape == (5, d * (d + 1) // 2)
     found = CholeskyLink(prior_tril, log_diagonal).root(deviation)
     torch.testing.assert_close(found, scale_tril, rtol=1e-9, atol=1e-12)
@@ -45,8 +45,8 @@ def test_a_factor_and_its_deviation_are_inverse(log_diagonal, d, one_prior, rng)
 
 def test_deviations_are_differences_of_entries_or_of_their_logarithms():
     scale_tril, prior_tril = tensor([[[3.0, 0.0], [5.0, 8.0]]]), tensor([[1.0, 0.0], [2.0, 4.0]])
-    assert tril_deviation(scale_tril, prior_tril, log_diagonal=False).tolist() == [[2.0, 3.0, 4.0]]
-    found = tril_deviation(scale_tril, prior_tril, log_diagonal=True)
+    assert CholeskyLink(prior_tril, False).deviation(scale_tril).tolist() == [[2.0, 3.0, 4.0]]
+    found = CholeskyLink(prior_tril, True).deviation(scale_tril)
     np.testing.assert_allclose(found, [[np.log(3.0), 3.0, np.log(2.0)]], rtol=1e-12)
 
 
@@ -61,7 +61,7 @@ def test_a_logarithm_of_any_size_gives_a_finite_positive_diagonal_and_gradient(s
 
 def test_a_variance_of_zero_has_a_finite_logarithm():
     zero = torch.zeros(1, 2, 2, dtype=torch.float64)
-    deviation = tril_deviation(zero, torch.eye(2).double(), log_diagonal=True)
+    deviation = CholeskyLink(torch.eye(2).double(), True).deviation(zero)
     assert deviation.isfinite().all()
     assert CholeskyLink(torch.eye(2).double(), True).root(deviation).abs().max() < 1e-5
 
@@ -71,18 +71,18 @@ def test_a_variance_of_zero_has_a_finite_logarithm():
 def test_the_model_goes_through_its_factors_and_returns_to_the_prior(log_diagonal, d, rng):
     scale_tril, prior_tril = factors(5, d, rng), factors(1, d, rng)[0]
     model = interpolating(scale_tril, prior_tril, log_diagonal=log_diagonal)
-    torch.testing.assert_close(model(INPUTS), scale_tril, rtol=1e-9, atol=1e-11)
+    torch.testing.assert_close(model.predict_root(INPUTS), scale_tril, rtol=1e-9, atol=1e-11)
     # The logarithm and its exponential round.
-    torch.testing.assert_close(model(FAR), prior_tril.expand(2, d, d), rtol=1e-14, atol=0)
+    torch.testing.assert_close(model.predict_root(FAR), prior_tril.expand(2, d, d), rtol=1e-14, atol=0)
 
 
 @pytest.mark.parametrize("log_diagonal", [False, True])
 def test_a_prior_handed_in_replaces_that_of_the_fit(log_diagonal, rng):
     scale_tril, prior_tril, other = factors(5, 2, rng), factors(1, 2, rng)[0], factors(2, 2, rng)
     model = interpolating(scale_tril, prior_tril, log_diagonal=log_diagonal)
-    torch.testing.assert_close(model(FAR, other), other, rtol=1e-14, atol=0)
-    same = model(INPUTS, prior_tril.expand(5, 2, 2).contiguous())
-    torch.testing.assert_close(same, model(INPUTS), rtol=1e-14, atol=0)
+    torch.testing.assert_close(model.predict_root(FAR, other), other, rtol=1e-14, atol=0)
+    same = model.predict_root(INPUTS, prior_tril.expand(5, 2, 2).contiguous())
+    torch.testing.assert_close(same, model.predict_root(INPUTS), rtol=1e-14, atol=0)
 
 
 @pytest.mark.parametrize("log_diagonal", [False, True])
@@ -97,7 +97,7 @@ def test_without_its_prior_the_model_goes_through_its_factors_and_returns_to_zer
 def test_the_factor_is_lower_triangular_and_positive_between_inputs(rng):
     prior_tril = factors(1, 2, rng)[0]
     model = interpolating(factors(5, 2, rng), prior_tril, log_diagonal=True)
-    factor = model(torch.linspace(-1, 2, 200, dtype=torch.float64)[:, None])
+    factor = model.predict_root(torch.linspace(-1, 2, 200, dtype=torch.float64)[:, None])
     assert torch.equal(factor, factor.tril())
     assert (factor.diagonal(dim1=-2, dim2=-1) > 0).all()
 
@@ -106,4 +106,4 @@ def test_the_factor_is_lower_triangular_and_positive_between_inputs(rng):
 def test_the_model_is_differentiable(log_diagonal, rng):
     model = interpolating(factors(5, 2, rng), factors(1, 2, rng)[0], log_diagonal=log_diagonal)
     x = tensor(rng.uniform(size=(3, 1))).requires_grad_()
-    assert torch.autograd.gradcheck(model, x)
+    assert torch.autograd.gradcheck(model.predict_root, x)

@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from torch_pbd.gp import Hyperparameters, Observations, condition
-from torch_pbd.models.cholesky import CholeskyCovariance, MeanAndCholesky
-from torch_pbd.models.conditional import VARIANCE_FLOOR, ConditionalNormal
+from torch_pbd.models import VARIANCE_FLOOR
+from torch_pbd.models.conditional import ConditionalNormal, MeanAndCholesky, MeanAndWishart
+from torch_pbd.models.links import CholeskyLink, WishartLink, padded
 from torch_pbd.models.mixture import GaussianMixture
-from torch_pbd.models.wishart import MeanAndWishart, WishartCovariance, padded
 
 MODELS = ["cholesky", "cholesky, logarithmic", "wishart", "mixture"]
 WITH_PRIOR = MODELS[:3]
@@ -38,13 +38,15 @@ def processes(count, rng, n=6, noise=0.1):
 def core(kind, d, rng):
     if kind == "mixture":
         factor = torch.stack([lower(d + 2, rng) for _ in range(3)])
-        return GaussianMixture(tensor([0.2, 0.3, 0.5]).log(), tensor(rng.normal(size=(3, d + 2))), factor, 2)
+        parts = factor.diagonal(dim1=-2, dim2=-1).log(), factor.tril(-1)
+        return GaussianMixture(tensor([0.2, 0.3, 0.5]).log(), tensor(rng.normal(size=(3, d + 2))), *parts, 2)
     if kind == "wishart":
-        covariance = WishartCovariance(processes(d * (d + 1), rng), padded(lower(d, rng), d + 1), lower(d, rng))
-        return MeanAndWishart(processes(d, rng), covariance)
+        latent = processes(d * (d + 1), rng)
+        link = WishartLink(padded(lower(d, rng), d + 1), scale_matrix_tril=lower(d, rng))
+        return MeanAndWishart(processes(d, rng), latent, link)
     latent = processes(d * (d + 1) // 2, rng)
-    covariance = CholeskyCovariance(latent, lower(d, rng), log_diagonal="logarithmic" in kind)
-    return MeanAndCholesky(processes(d, rng), covariance)
+    link = CholeskyLink(lower(d, rng), "logarithmic" in kind)
+    return MeanAndCholesky(processes(d, rng), latent, link)
 
 
 def model_of(kind, d, rng):

@@ -67,8 +67,8 @@ def random_mixture(k, e, d, generator):
     def randn(*shape):
         return torch.randn(*shape, dtype=torch.float64, generator=generator)
 
-    scale_tril = 0.3 * randn(k, e + d, e + d).tril(-1) + torch.diag_embed(0.5 + randn(k, e + d).abs())
-    return GaussianMixture(randn(k), randn(k, e + d), scale_tril, e)
+    lower, log_diagonal = 0.3 * randn(k, e + d, e + d).tril(-1), (0.5 + randn(k, e + d).abs()).log()
+    return GaussianMixture(randn(k), randn(k, e + d), log_diagonal, lower, e)
 
 
 def numpy_parts(mixture):
@@ -341,20 +341,13 @@ def test_refining_keeps_the_floor_under_a_collapsed_component(rng):
     np.testing.assert_allclose(numpy_parts(mixture)[2][1], 1e-3 * np.eye(2), rtol=1e-3, atol=1e-6)
 
 
-@pytest.mark.parametrize("reg_covar", [0.0, -1.0, 10.0])
-def test_refining_needs_a_floor_below_the_mixture(reg_covar, rng):
-    data = tensor(curve(rng))
-    mixture, _ = fit(data.numpy(), 3, max_iter=1)
-    with pytest.raises(ValueError, match="reg_covar is"):
-        refine(mixture, data, reg_covar=reg_covar, tol=1e-8, max_iter=10)
-
-
 def test_the_state_is_the_model(rng):
     mixture, _ = fit(curve(rng), 3)
     file = io.BytesIO()
     torch.save(mixture.state_dict(), file)
     file.seek(0)
-    copy = GaussianMixture(tensor([0.0] * 3), torch.zeros_like(mixture.mean), tensor(np.stack([np.eye(3)] * 3)), 1)
+    zeros = [torch.zeros_like(parameter) for parameter in mixture.parameters()]
+    copy = GaussianMixture(*zeros, 1)
     copy.load_state_dict(torch.load(file, weights_only=True))
     x = tensor([[0.3], [9.0]])
     assert all(torch.equal(a, b) for a, b in zip(copy(x), mixture(x), strict=True))
@@ -370,12 +363,3 @@ def test_single_precision_stays_single(rng):
     assert torch.isfinite(mixture(torch.tensor([[1e38]]))[1]).all()
     _, double = fit(data.double().numpy(), 3, reg_covar=1e-4, tol=1e-5, max_iter=100)
     assert report.loss == pytest.approx(double.loss, abs=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("n_features", "diagonal", "message"),
-    [(0, 1.0, "at least 1 and at most 1"), (2, 1.0, "n_features is 2"), (1, 0.0, "diagonal")],
-)
-def test_what_is_no_mixture_is_an_error(n_features, diagonal, message):
-    with pytest.raises(ValueError, match=message):
-        GaussianMixture(tensor([0.0]), tensor([[0.0, 0.0]]), diagonal * tensor(np.eye(2)[None]), n_features)

@@ -6,10 +6,9 @@ import pytest
 import torch
 
 from torch_pbd.gp import Hyperparameters, Observations, condition
-from torch_pbd.models.cholesky import CholeskyCovariance, MeanAndCholesky
-from torch_pbd.models.conditional import ConditionalNormal
+from torch_pbd.models.conditional import ConditionalNormal, MeanAndCholesky, MeanAndWishart
+from torch_pbd.models.links import CholeskyLink, WishartLink, padded
 from torch_pbd.models.mixture import GaussianMixture
-from torch_pbd.models.wishart import MeanAndWishart, WishartCovariance, padded
 
 MODELS = ["cholesky", "cholesky, logarithmic", "wishart", "mixture"]
 
@@ -35,14 +34,15 @@ def processes(count, kernel, rng, *, shared=False):
 def model_of(kind, rng):
     factor = tensor([[1.3, 0.0], [0.4, 0.7]])
     if kind == "mixture":
-        scale_tril = torch.stack([torch.eye(4).double(), 2.3 * torch.eye(4).double()])
-        core = GaussianMixture(tensor([0.3, 0.7]).log(), tensor(rng.normal(size=(2, 4))), scale_tril, 2)
+        log_diagonal, lower = tensor([[1.0] * 4, [2.3] * 4]).log(), torch.zeros(2, 4, 4).double()
+        core = GaussianMixture(tensor([0.3, 0.7]).log(), tensor(rng.normal(size=(2, 4))), log_diagonal, lower, 2)
     elif kind == "wishart":
         latent = processes(6, "matern32", rng, shared=True)
-        core = MeanAndWishart(processes(2, "matern52", rng), WishartCovariance(latent, padded(factor, 3), factor))
+        link = WishartLink(padded(factor, 3), scale_matrix_tril=factor)
+        core = MeanAndWishart(processes(2, "matern52", rng), latent, link)
     else:
-        covariance = CholeskyCovariance(processes(3, "matern32", rng), factor, log_diagonal="logarithmic" in kind)
-        core = MeanAndCholesky(processes(2, "squared_exponential", rng), covariance)
+        latent, link = processes(3, "matern32", rng), CholeskyLink(factor, "logarithmic" in kind)
+        core = MeanAndCholesky(processes(2, "squared_exponential", rng), latent, link)
     return ConditionalNormal(core, *(tensor(rng.uniform(1, 2, size=2)) for _ in range(4)))
 
 

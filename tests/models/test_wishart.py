@@ -3,7 +3,8 @@ import pytest
 import torch
 
 from torch_pbd.gp import Hyperparameters, Observations, condition
-from torch_pbd.models.wishart import WishartCovariance, padded, wishart_root
+from torch_pbd.models.conditional import MeanAndWishart
+from torch_pbd.models.links import WishartLink, padded
 
 INPUTS = torch.linspace(0, 1, 5, dtype=torch.float64)[:, None]
 FAR = torch.tensor([[100.0], [-1e300]], dtype=torch.float64)
@@ -16,6 +17,15 @@ def tensor(array):
 
 def lower(d, rng):
     return tensor(np.tril(rng.normal(size=(d, d))) + 2 * np.eye(d))
+
+
+def wishart_root(deviation, prior_root, matrix=None):
+    return WishartLink(prior_root, scale_matrix_tril=matrix).root(deviation)
+
+
+def model_of(latent, prior_root, matrix):
+    link = WishartLink(prior_root, scale_matrix_tril=matrix)
+    return MeanAndWishart(processes(len(matrix), 1, np.random.default_rng(0)), latent, link)
 
 
 def processes(d, df, rng):
@@ -67,36 +77,36 @@ def test_a_padded_root_has_the_covariance_of_its_factor(d, df, rng):
 @pytest.mark.parametrize(("d", "df"), SIZES)
 def test_far_from_data_the_covariance_is_exactly_the_prior(d, df, rng):
     prior_tril = lower(d, rng)
-    model = WishartCovariance(processes(d, df, rng), padded(prior_tril, df), lower(d, rng))
-    root = model(FAR)
+    model = model_of(processes(d, df, rng), padded(prior_tril, df), lower(d, rng))
+    root = model.predict_root(FAR)
     assert torch.equal(root, padded(prior_tril, df).expand(2, d, df))
     other = torch.stack([lower(d, rng), lower(d, rng)])
-    assert torch.equal(model(FAR, other), padded(other, df))
+    assert torch.equal(model.predict_root(FAR, other), padded(other, df))
 
 
 @pytest.mark.parametrize(("d", "df"), SIZES)
 def test_at_the_inputs_the_root_is_that_of_the_vectors(d, df, rng):
     latent, prior_root, matrix = processes(d, df, rng), tensor(rng.normal(size=(d, df))), lower(d, rng)
-    model = WishartCovariance(latent, prior_root, matrix)
+    model = model_of(latent, prior_root, matrix)
     vectors = latent(INPUTS).detach().numpy().reshape(5, df, d)
     expected = prior_root.numpy() + np.einsum("ab,nib->nai", matrix.numpy(), vectors)
-    np.testing.assert_allclose(model(INPUTS).detach(), expected, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(model.predict_root(INPUTS).detach(), expected, rtol=1e-9, atol=1e-12)
 
 
 def test_without_its_prior_the_root_is_that_of_the_values_and_zero_far_away(rng):
     latent = processes(2, 3, rng)
-    model = WishartCovariance(latent, torch.ones(2, 3).double(), lower(2, rng))
+    model = model_of(latent, torch.ones(2, 3).double(), lower(2, rng))
     expected = latent.values(INPUTS).numpy().reshape(5, 3, 2).swapaxes(1, 2)
     np.testing.assert_array_equal(model.variability(INPUTS), expected)
     assert (model.variability(FAR) == 0).all()
 
 
 def test_the_root_is_differentiable_in_x_and_in_the_factor(rng):
-    model = WishartCovariance(processes(2, 3, rng), padded(lower(2, rng), 3), lower(2, rng))
+    model = model_of(processes(2, 3, rng), padded(lower(2, rng), 3), lower(2, rng))
     x = tensor(rng.uniform(size=(3, 1))).requires_grad_()
     matrix = lower(2, rng).requires_grad_()
 
     def root(x, matrix):
-        return torch.func.functional_call(model, {"scale_matrix_tril": matrix}, (x,))
+        return torch.func.functional_call(model, {"covariance.scale_matrix_tril": matrix}, (x,))[1]
 
     assert torch.autograd.gradcheck(root, (x, matrix))

@@ -30,10 +30,9 @@ CANDIDATES: dict[str, list[CovarianceRegressor]] = {
     "wishart": [
         WishartProcessRegressor(**_SHORT),
         WishartProcessRegressor(**_SHORT, kernel="matern52"),
-        WishartProcessRegressor(**_SHORT, start="random"),
         WishartProcessRegressor(**_LIKELIHOOD),
         WishartProcessRegressor(**_LIKELIHOOD, solver="lbfgs", kernel="matern32"),
-        WishartProcessRegressor(**_LIKELIHOOD, start="random", df=8),
+        WishartProcessRegressor(**_LIKELIHOOD, df=8),
         WishartProcessRegressor(**_PRINTED),
     ],
     "mixture": [

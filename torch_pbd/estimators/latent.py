@@ -1,5 +1,6 @@
 """Base of the two regressors on latent Gaussian processes (CD and WP), and the mean that both have."""
 
+import inspect
 from abc import abstractmethod
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -12,43 +13,85 @@ from torch import Tensor
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.estimators.base import CovarianceRegressor, check_length_scale, standardized_prior
+from torch_pbd.estimators.base import CovarianceRegressor, Prior, check_length_scale, standardized_prior
 from torch_pbd.estimators.torch_estimator import Fitted, Integers, Standardization
 from torch_pbd.estimators.validation import warn_if_few, warn_if_identical
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.files.memory import require_much
 from torch_pbd.gp import (
     EvidenceSearch,
+    Hyperparameters,
     LatentGP,
     LatentValues,
     Observations,
     condition,
     fit_together,
+    longest_within,
     resolved_length_scale,
     spacing,
 )
-from torch_pbd.gp.search import Found
-from torch_pbd.kernels import KERNELS
-from torch_pbd.linalg import safe_cholesky, scale_tril_from_root
+from torch_pbd.gp.search import Found, Job
+from torch_pbd.kernels import KERNELS, KernelName
+from torch_pbd.linalg import safe_cholesky
 from torch_pbd.models.conditional import MeanAndCovariance
-from torch_pbd.models.scoring import Solver
+from torch_pbd.models.costs import Likelihood, Solver, train
+from torch_pbd.models.links import Link
 from torch_pbd.models.training import TrainingSet, default_prior_tril
 from torch_pbd.optim import FitReport
 
 # An amplitude of so many times the values: where a process can follow them it is up to 2.
 _STRETCHED = 10.0
-# Spacings of the inputs that an interpolating process may be as short as, and ranges that others may be as long as:
-# with longer ones the prior of a covariance would never take over.
-_SHORTEST, _LONGEST_MEAN, _LONGEST_COVARIANCE = 0.75, 10.0, 0.35
-# A hole among inputs on a line, of the range and in spacings of the others. It is to hold so many length scales: a
-# smooth process without noise claims to know what is two to three of them from many inputs.
-_HOLE, _SPACINGS, _IN_HOLE = 0.25, 5.0, 6.0
+# Spacings of the inputs that an interpolating process may be as short as, and ranges that a mean may be as long as.
+_SHORTEST, _LONGEST_MEAN = 0.75, 10.0
 
 _LEVEL = 1e-4  # of the tests: how often a mean that is right is taken for wrong
 _CLEAR = 5.0  # standard errors of the means, however few rows tell them: of twice two the test would allow for 100
 _LEAST_SPREAD = 0.03  # of the pooled one: how small that at an input is believed to be
 _UNRESOLVED = 1e-10  # squared, of standardized outputs: what a smooth process may be off by in any case
 _SHARE, _LEAST_NOISE = 0.1, 1e-6  # of the smallest error of a mean, and of the outputs' deviation
+
+_SHARED = """latent_prior : bool, default=True
+    Only for "likelihood". True maximizes the posterior density of the processes at the inputs, with hyperparameters
+    held. False is the likelihood as printed in the paper, which trains them too and overfits: without bound where
+    inputs do not repeat.
+solver : {"auto", "fisher", "lbfgs"}, default="auto"
+    Only for "likelihood". "fisher" is Newton's method with the Fisher information, "lbfgs" is torch's L-BFGS,
+    preconditioned with that information at the start: both end at the same optimum. "auto" takes "fisher", and "lbfgs"
+    where too many numbers would have to be solved for together: 2500 for CD, the rank of the kernel matrix times d, and
+    600 for WP, that times ``df`` too. Without ``latent_prior`` it is L-BFGS always.
+kernel : {"squared_exponential", "matern32", "matern52"}, default="squared_exponential"
+prior : None, float, array-like of shape (d, d), callable or "paper", default=None
+    Covariance far from data, in squared units of y. A float stands for that times the unit matrix; a callable maps
+    X (n, e) to (n, d, d). None learns a wide one: four times the covariance of all of y. "paper" is for CD a unit
+    factor in the units of y, and for WP vectors whose means are all 8, which give a covariance of rank one.
+length_scale : float, array-like of shape (n_features,) or None, default=None
+    Of the covariance's processes, in units of X. None learns it from empirical covariances, and else takes a fifth of
+    the range.
+max_inputs : int, default=256
+    Where X has more distinct rows, neighbours are merged into this many: the cost of a fit is cubic in it and linear in
+    the rows. CD merges aligned data on a line only for length scales below a fortieth of the range; longer ones of the
+    squared exponential are carried by 32 to 168 nodes, whatever the number of rows.
+max_iter : int, default=1000
+tol : float, default=1e-4
+    Stop when no gradient entry, or the fall of the loss, is above it; in nats per row.
+n_restarts : int, default=2
+    Starting points of each hyperparameter search beside the first.
+random_state : int, RandomState instance or None, default=0
+    Seed of the start of a Wishart process by its likelihood; other fits are deterministic.
+device : str or None, default=None
+    Where the torch module lives.
+verbose : int, default=0
+
+Attributes
+----------
+module_ : ConditionalNormal
+    The fitted torch module: maps x (n, e) to mean (n, d) and Cholesky factor (n, d, d), differentiably.
+n_features_in_, n_outputs_ : int
+loss_curve_ : list of float
+n_iter_ : int
+converged_ : bool
+jitter_ : float
+    Largest jitter that a kernel matrix needed, relative to its diagonal."""
 
 
 @dataclass(frozen=True)
@@ -63,23 +106,33 @@ class Problem:
     """(e,), where the user gave it."""
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class LatentCovarianceRegressor(CovarianceRegressor):
     """Base of CD and WP: mean by d Gaussian processes, covariance by more of them; not for direct use."""
 
-    _aligned_objective: str
+    _aligned_objective: ClassVar[str]
     """Value of ``objective`` that works on empirical covariances."""
-
     _core_class: ClassVar[type[MeanAndCovariance]]
-    _costly = "max_inputs"
+    _costly: ClassVar = "max_inputs"
     """Parameters that decide on the memory."""
 
-    objective: str
-    prior: Any
-    kernel: Any
-    length_scale: Any
-    max_inputs: int
-    latent_prior: bool
-    solver: Solver
+    objective: str = "auto"
+    latent_prior: bool = True
+    solver: Solver = "auto"
+    kernel: KernelName = "squared_exponential"
+    prior: Prior = None
+    length_scale: float | list[float] | None = None
+    max_inputs: int = 256
+    max_iter: int = 1000
+    tol: float = 1e-4
+    n_restarts: int = 2
+    random_state: Any = 0
+    device: str | None = None
+    verbose: int = 0
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        cls.__doc__ = inspect.cleandoc(cls.__doc__ or "").replace("{shared}", _SHARED)
 
     def _check_parameters(self) -> None:
         super()._check_parameters()
@@ -88,11 +141,10 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         checks.count(self.max_inputs, "max_inputs", least=2)
         if isinstance(self.prior, str):
             checks.choice(self.prior, "prior", ("paper",))
-        checks.choice(self.solver, "solver", ("auto", "fisher", "lbfgs"))
+        checks.choice(self.solver, "solver", Solver)
         if not checks.flag(self.latent_prior, "latent_prior") and self.solver == "fisher":
             raise ValueError(
-                "solver='fisher' holds the hyperparameters, which latent_prior=False trains: use solver='auto' or "
-                "'lbfgs', or latent_prior=True."
+                "solver='fisher' holds the hyperparameters, which latent_prior=False trains: use solver='auto'."
             )
 
     def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, recorded: Integers) -> Fitted:
@@ -104,57 +156,47 @@ class LatentCovarianceRegressor(CovarianceRegressor):
             # Those that repeat inputs have been counted.
             warn_if_few(len(y), y.shape[1], groups if counts.min() < 2 else None)
             training = training.merged(self.max_inputs)
-        problem = Problem(
-            training,
-            scaling,
-            self._prior_tril(training, scaling),
-            None if length_scale is None else self._door(length_scale / scaling.x_scale),
-        )
+        held = None if length_scale is None else self._door(length_scale / scaling.x_scale)
+        problem = Problem(training, scaling, self._prior_tril(training, scaling), held)
         warn_if_identical(training)
         if aligned:
-            mean, covariance, report, jitter = self._fit_empirical(problem)
+            core, report, jitter = self._fit_empirical(problem)
         else:
-            job = self._mean_job(training)
-            mean, mean_report = mean_consistent_with_repeats(training, *job, *fit_together([job]))
-            covariance, report, jitter = self._fit_likelihood(problem, training.residual(mean))
+            mean, mean_report = self._fit_mean(training)
+            core, report, jitter = self._fit_likelihood(problem, mean)
             report = report.after(mean_report, "search of the mean")
-        return Fitted(self._assemble(self._core_class(mean, covariance), scaling), report, jitter)
+        return Fitted(self._assemble(core, scaling), report, jitter)
 
     @abstractmethod
-    def _fit_empirical(self, problem: Problem) -> tuple[LatentGP, Any, FitReport, float]:
-        """Mean, and covariance module from the empirical covariances of aligned data."""
+    def _fit_empirical(self, problem: Problem) -> tuple[MeanAndCovariance, FitReport, float]:
+        """Core by the empirical covariances of aligned data, and its jitter."""
 
     @abstractmethod
-    def _fit_likelihood(self, problem: Problem, residual: Tensor) -> tuple[Any, FitReport, float]:
-        """Covariance module by maximum likelihood of the residuals (rows, d) from the mean."""
+    def _fit_likelihood(self, problem: Problem, mean: LatentGP) -> tuple[MeanAndCovariance, FitReport, float]:
+        """Core by maximum likelihood of the residuals from the mean, and its jitter."""
 
     def _works_on_empirical(self, inputs: Floats, counts: Any, n_outputs: int) -> bool:
         """Decide the objective; ``inputs`` are the distinct ones, with their counts."""
         fewest = int(counts.min())
-        if self.objective == "likelihood" and 2 <= fewest <= n_outputs:
-            checks.warn(
-                f"y has {fewest} demonstrations at an input but {n_outputs} outputs: the likelihood then takes for "
-                f"certain what was only not seen to vary. {n_outputs + 1} or more demonstrations determine the "
-                "covariance; objective='auto' shrinks it.",
-                DataRankWarning,
-            )
-        if self.objective == "likelihood" or (self.objective == "auto" and fewest < 2):
-            return False
-        if fewest < 2:
-            i = int(np.argmin(counts))
+        aligned = self.objective != "likelihood" and fewest >= 2
+        if self.objective == self._aligned_objective and not aligned:
             raise ValueError(
                 f"objective={self.objective!r} needs >= 2 demonstrations at each input, got 1 at X = "
-                f"{inputs[i].tolist()} ({int((counts < 2).sum())} of {len(inputs)} inputs have one row). "
-                "Align the demonstrations, record more, or use objective='likelihood'."
+                f"{inputs[np.argmin(counts)].tolist()} ({int((counts < 2).sum())} of {len(inputs)} inputs have one "
+                "row). Align the demonstrations, record more, or use objective='likelihood'."
             )
-        if fewest <= n_outputs:
+        if 2 <= fewest <= n_outputs:
+            what = (
+                "that empirical covariance is singular, and is shrunk towards the pooled covariance"
+                if aligned
+                else "the likelihood takes for certain what was only not seen to vary; objective='auto' shrinks it"
+            )
             checks.warn(
-                f"y has {fewest} demonstrations at an input but {n_outputs} outputs: that empirical covariance "
-                f"is singular, and is shrunk towards the pooled covariance. {n_outputs + 1} or more "
-                "demonstrations determine it.",
+                f"y has {fewest} demonstrations at an input but {n_outputs} outputs: {what}. {n_outputs + 1} or more "
+                "demonstrations determine the covariance.",
                 DataRankWarning,
             )
-        return True
+        return aligned
 
     def _prior_tril(self, training: TrainingSet, scaling: Standardization) -> Tensor:
         if self.prior is None:
@@ -164,39 +206,77 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         prior = standardized_prior(self.prior, _in_units(training, scaling), scaling.y_scale)
         return safe_cholesky(self._door(prior), name="prior")
 
-    def _mean_job(self, training: TrainingSet) -> tuple[Observations, EvidenceSearch]:
-        """Means at the inputs, weighted by their counts, and the search for their hyperparameters."""
-        weights = training.counts / training.counts.mean()
-        observations = Observations(training.inputs, training.means().mT.contiguous(), weights)
-        return observations, self._search(observations, _LONGEST_MEAN)
-
     def _search(
-        self,
-        observations: Observations,
-        longest: float,
-        length_scale: Tensor | None = None,
-        noise_scale: Tensor | None = None,
+        self, inputs: Tensor, longest: float, length_scale: Tensor | None = None, noise_scale: Tensor | None = None
     ) -> EvidenceSearch:
-        shortest = resolved_length_scale(observations.inputs)
+        shortest = resolved_length_scale(inputs)
         if noise_scale is not None and not bool((noise_scale > 0).any()):
             # Interpolated: longer than where inputs come closest, and the process swings between the others.
-            shortest = min(0.5, max(1e-6, _SHORTEST * spacing(observations.inputs, 0.1)))
+            shortest = min(0.5, max(1e-6, _SHORTEST * spacing(inputs, 0.1)))
         limits = self.max_inputs, self.n_restarts, max(100, self.max_iter)
         return EvidenceSearch(self.kernel, (shortest, longest), length_scale, noise_scale, *limits)
 
-    def _latent_values(self, problem: Problem, start: Tensor, amplitude: Tensor) -> LatentValues:
-        """Latent values at the inputs from where a likelihood is trained, ``start`` at one or at all of them.
+    def _mean_job(self, training: TrainingSet) -> Job:
+        """Means at the inputs, weighted by their counts, and the search for their hyperparameters."""
+        weights = training.counts / training.counts.mean()
+        observations = Observations(training.inputs, training.means().mT.contiguous(), weights)
+        return observations, self._search(training.inputs, _LONGEST_MEAN)
+
+    def _fit_mean(self, training: TrainingSet, found: Found | None = None) -> tuple[LatentGP, FitReport]:
+        """Processes that the evidence finds; or ones through the means, where rows that repeat inputs contradict them.
+
+        The evidence sees the mean at each input, not how far the rows there differ. With few inputs, or jumps between
+        them, it may take for noise what all demonstrations agree on. A process that could follow the means only by
+        swinging far beyond them between the inputs is not taken, with a warning.
+        """
+        observations, search = job = self._mean_job(training)
+        found = fit_together([job])[0] if found is None else found
+        mean, _ = condition(observations, found.hyperparameters, self.kernel, basis=found.basis)
+        if int(training.counts.min()) < 2 or not training.repeats_inputs:
+            return mean, found.report
+        with torch.no_grad():
+            wrong, least_error = _contradicted(training, observations.targets - mean(training.inputs).mT)
+        if not bool(wrong.any()):
+            return mean, found.report
+        learned = found.hyperparameters.amplitude * found.hyperparameters.noise_ratio.sqrt()
+        noise_scale = torch.where(wrong, _SHARE * least_error, learned).clamp_min(_LEAST_NOISE)
+        (again,) = fit_together([(observations, replace(search, noise_scale=noise_scale))])
+        # Over a range or more a large amplitude is a trend.
+        swings = _is_stretched(again.hyperparameters, observations)
+        swings &= again.hyperparameters.length_scale.amin(1) < 1.0
+        if bool(swings[wrong].any()):
+            checks.warn(
+                "y has means at the inputs that differ by more than its scatter there, between inputs too near to each "
+                "other for a smooth mean to follow: it does not. Make such rows of X equal, which pools them.",
+                DataRankWarning,
+            )
+            return mean, found.report
+        return condition(observations, again.hyperparameters, self.kernel, basis=again.basis)[0], again.report
+
+    def _likelihood_and_values(
+        self, problem: Problem, link: Link, residual: Tensor, start: Tensor
+    ) -> tuple[Likelihood, LatentValues]:
+        """Likelihood in nats per row, and the latent values at the inputs from where it is trained: those of a root.
 
         Length scales that are not given are a fifth of the range of the inputs, and less beside a hole.
         """
-        inputs, length_scale = problem.training.inputs, problem.length_scale
-        n_inputs, n_features = inputs.shape
+        training, length_scale = problem.training, problem.length_scale
+        n_inputs, n_features = training.inputs.shape
         if length_scale is None:
-            length_scale = inputs.new_full((n_features,), min(0.2, longest_covariance(inputs)) * n_features**0.5)
-        values, trained = start.expand(n_inputs, -1).mT.contiguous(), not self.latent_prior
-        return LatentValues(
-            inputs, values, amplitude, length_scale[None], kernel=self.kernel, train_hyperparameters=trained
-        )
+            shortest = min(0.2, longest_within(training.inputs))
+            length_scale = training.inputs.new_full((n_features,), shortest * n_features**0.5)
+        deviation = link.deviation(start).expand(n_inputs, -1).mT.contiguous()
+        options: Any = {"kernel": self.kernel, "train_hyperparameters": not self.latent_prior}
+        latent = LatentValues(training.inputs, deviation, link.amplitude(), length_scale[None], **options)
+        likelihood = Likelihood(link, training.scatter_root(residual), training.counts, 1.0 / len(residual))
+        return likelihood, latent
+
+    def _train(self, likelihood: Likelihood, latent: LatentValues) -> tuple[Tensor, FitReport]:
+        """Roots at the inputs where the likelihood has its maximum; the latent values are left there."""
+        limits: Any = {"max_iter": self.max_iter, "tol": self.tol, "callback": self._progress()}
+        report = train(likelihood, latent, solver=self.solver, **limits)
+        with torch.no_grad():
+            return likelihood.link.root(latent()), report
 
     def _check_memory(self, n_distinct: int, n_features: int, n_outputs: int) -> None:
         n_inputs = min(n_distinct, self.max_inputs)
@@ -218,60 +298,18 @@ def _in_units(training: TrainingSet, scaling: Standardization) -> Floats:
     return scaling.x_shift + scaling.x_scale * training.inputs.cpu().numpy()
 
 
-def longest_covariance(inputs: Tensor) -> float:
-    """Longest length scale of a covariance, in ranges of the inputs (n, e); a hole among them is longer."""
-    if inputs.shape[1] == 1:
-        hole = float(inputs[:, 0].sort().values.diff().max())
-        if hole > max(_HOLE, _SPACINGS * spacing(inputs)):
-            return min(_LONGEST_COVARIANCE, hole / _IN_HOLE)
-    return _LONGEST_COVARIANCE
+def _is_stretched(hyperparameters: Hyperparameters, observations: Observations) -> Bool[Tensor, " b"]:
+    """Whether each process follows its targets only as the difference of large numbers."""
+    return hyperparameters.amplitude > _STRETCHED * observations.targets.square().mean(1).sqrt().clamp_min(1e-12)
 
 
-def residual_tril(residual: Tensor) -> Tensor:
-    """Factor of the covariance of all residuals, where the training of a likelihood starts."""
-    floor = 1e-6 * torch.eye(residual.shape[1]).to(residual)
-    return scale_tril_from_root(torch.cat([residual.mT / len(residual) ** 0.5, floor], dim=1))
-
-
-def warn_if_stretched(amplitude: Tensor, targets: Tensor, *, given: bool) -> None:
+def warn_if_stretched(problem: Problem, hyperparameters: Hyperparameters, observations: Observations) -> None:
     """Warn where a length scale that the user gave is too long for what changes over the inputs."""
-    if given and bool((amplitude > _STRETCHED * targets.square().mean(1).sqrt().clamp_min(1e-12)).any()):
+    if problem.length_scale is not None and bool(_is_stretched(hyperparameters, observations).any()):
         checks.warn(
             "length_scale is so long that the covariance follows the data only as the difference of large numbers: "
             "beside the data it will overshoot the prior. Give a shorter one, or None to learn it."
         )
-
-
-def mean_consistent_with_repeats(
-    training: TrainingSet, observations: Observations, search: EvidenceSearch, found: Found
-) -> tuple[LatentGP, FitReport]:
-    """The processes that the evidence found; or ones through the means, where rows that repeat inputs contradict them.
-
-    The evidence sees the mean at each input, not how far the rows there differ. With few inputs, or jumps between them,
-    it may take for noise what all demonstrations agree on. A process that could follow the means only by swinging far
-    beyond them between the inputs is not taken, with a warning.
-    """
-    mean, _ = condition(observations, found.hyperparameters, search.kernel, basis=found.basis)
-    if int(training.counts.min()) < 2 or not training.repeats_inputs:
-        return mean, found.report
-    with torch.no_grad():
-        wrong, least_error = _contradicted(training, observations.targets - mean(training.inputs).mT)
-    if not bool(wrong.any()):
-        return mean, found.report
-    learned = found.hyperparameters.amplitude * found.hyperparameters.noise_ratio.sqrt()
-    noise_scale = torch.where(wrong, _SHARE * least_error, learned).clamp_min(_LEAST_NOISE)
-    (again,) = fit_together([(observations, replace(search, noise_scale=noise_scale))])
-    # Over a range or more a large amplitude is a trend.
-    swings = again.hyperparameters.amplitude > _STRETCHED * observations.targets.square().mean(1).sqrt()
-    swings &= again.hyperparameters.length_scale.amin(1) < 1.0
-    if bool(swings[wrong].any()):
-        checks.warn(
-            "y has means at the inputs that differ by more than its scatter there, between inputs too near to each "
-            "other for a smooth mean to follow: it does not. Make such rows of X equal, which pools them.",
-            DataRankWarning,
-        )
-        return mean, found.report
-    return condition(observations, again.hyperparameters, search.kernel, basis=again.basis)[0], again.report
 
 
 def _contradicted(

@@ -9,8 +9,7 @@ from sklearn.neighbors import NearestNeighbors
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.estimators.base import CovarianceRegressor, by_chunks
-from torch_pbd.estimators.regression import MixtureRegression
+from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.estimators.torch_estimator import Fitted, Integers, Standardization, distinct_rows, spread_of
 from torch_pbd.estimators.validation import warn_if_few_demonstrations
 from torch_pbd.exceptions import DataRankWarning
@@ -75,7 +74,6 @@ class GMMBaseline(CovarianceRegressor):
     """
 
     _core_class = GaussianMixture
-    _regression = None
 
     n_components: int = 5
     solver: str = "em"
@@ -133,34 +131,6 @@ class GMMBaseline(CovarianceRegressor):
         if self.solver == "lbfgs":
             report = refine(mixture, data, callback=self._progress(), **limits)
         return Fitted(self._assemble(mixture, scaling), report, float(self.reg_covar))
-
-    def _prepare(self) -> None:
-        if self.device is None:
-            self._regression = MixtureRegression(self.module_)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """State of the base class, without the regression that follows from the module."""
-        state = super().__getstate__()
-        state.pop("_regression", None)
-        return state
-
-    def _mean(self, X: Floats) -> Floats:
-        regression = self._regression
-        if regression is None or not regression.matches(self.module_):
-            return super()._mean(X)
-        return by_chunks(lambda rows: (regression.mean(rows),), X)[0]
-
-    def _covariance(self, X: Floats) -> Floats:
-        return self._moments(X)[1]
-
-    def _variability(self, X: Floats) -> Floats:
-        return self._covariance(X)  # there is no prior in it
-
-    def _moments(self, X: Floats) -> tuple[Floats, ...]:
-        regression = self._regression
-        if regression is None or not regression.matches(self.module_):
-            return super()._moments(X)
-        return by_chunks(regression.moments, X)
 
 
 def _points(X: Floats, y: Floats) -> Floats:

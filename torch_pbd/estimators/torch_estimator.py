@@ -25,7 +25,8 @@ from torch_pbd.estimators.validation import (
     checked_rows,
     without_rounding,
 )
-from torch_pbd.models.conditional import ConditionalNormal, Core
+from torch_pbd.models import Core
+from torch_pbd.models.conditional import ConditionalNormal
 from torch_pbd.models.training import TrainingSet
 from torch_pbd.optim import FitReport, Progress, Status
 
@@ -185,7 +186,6 @@ class TorchEstimator(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
             self.module_, report, self.jitter_ = self._fit(*rows, groups=numbers, recorded=order.argsort())
         self.n_iter_ = max(1, report.n_iter)
         self.loss_, self.loss_curve_, self.converged_ = report.loss, list(report.loss_curve), report.converged
-        self._prepare()
         if not report.converged:
             more = f"max_iter (now {self.max_iter}) or " if report.status is Status.MAX_ITER else ""
             checks.warn(
@@ -246,9 +246,6 @@ class TorchEstimator(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         parts = (scaling.x_shift, scaling.x_scale, scaling.y_shift, scaling.y_scale)
         return ConditionalNormal(core, *map(self._door, parts)).requires_grad_(False)
 
-    def _prepare(self) -> None:
-        """Work out what predictions need of the module alone."""
-
     def _door(self, array: Any) -> Tensor:
         """Copy of an array; contiguous, since torch takes no negative strides."""
         return torch.tensor(np.asarray(array, order="C"), dtype=torch.float64, device=self.device)
@@ -284,4 +281,3 @@ class TorchEstimator(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
             with torch.inference_mode(False):  # else autograd would refuse the module
                 tensors = {name: self._door(array) for name, array in arrays.items()}
                 self.module_ = ConditionalNormal.restored(self._core_class, config, tensors).requires_grad_(False)
-            self._prepare()

@@ -1,11 +1,11 @@
 """Batches of independent Gaussian processes over the same inputs: eq. (3) to (6), and their evidence."""
 
-from torch_pbd.gp.grid import EvidenceSearch
-from torch_pbd.gp.latent import LatentGP, condition, negative_log_evidence
-from torch_pbd.gp.latent_values import LatentValues
+from torch_pbd.gp.evidence import EvidenceSearch, negative_log_evidence
+from torch_pbd.gp.latent import LatentGP, LatentValues, condition
 from torch_pbd.gp.observations import (
     Hyperparameters,
     Observations,
+    longest_within,
     merge_observations,
     neighbourhoods,
     resolved_length_scale,
@@ -22,6 +22,7 @@ __all__ = [
     "condition",
     "fit_hyperparameters",
     "fit_together",
+    "longest_within",
     "merge_observations",
     "negative_log_evidence",
     "neighbourhoods",

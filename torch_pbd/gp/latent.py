@@ -1,20 +1,19 @@
-"""Latent Gaussian processes: prediction from observed values, eq. (5) and (6), and their evidence in closed form.
+"""Latent Gaussian processes: prediction from observed values, eq. (5) and (6), and values that are to be trained.
 
 Several observations of one input enter as their mean and their count: the noise of a mean is the noise over the
 root of the count. Targets are those from which the prior mean is subtracted.
 """
 
-import math
-
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
-from torch_pbd.gp.observations import FULL, Basis, Hyperparameters, Observations
-from torch_pbd.kernels import correlation, value_and_slope
+from torch_pbd.gp.observations import Basis, Hyperparameters, Observations, levels_on_nodes
+from torch_pbd.kernels import correlation
 from torch_pbd.linalg import cholesky_with_jitter, safe_cholesky
 
-_LEAST_VARIANCE = 1e-200  # squared amplitude of targets that are all zero
+# Directions of a kernel matrix with less than this of its largest eigenvalue carry no trained values.
+_RANK_TOLERANCE = 1e-11
 
 
 class LatentGP(nn.Module):
@@ -93,25 +92,24 @@ class LatentGP(nn.Module):
     def type1(self, x: Float[Tensor, "m e"]) -> Float[Tensor, " m"]:
         """Type I uncertainty: 0 at the training inputs, 1 where only the prior speaks.
 
-        The variance of eq. (6) without noise, over the squared amplitude; the average over the processes
-        has their squared amplitudes for weights.
+        It is the variance of eq. (6) without noise, over the squared amplitude: the average over the processes with
+        their squared amplitudes for weights.
         """
         reduced = self._reduced(x, torch.zeros_like(self.noise_ratio))
-        share = self.amplitude.square().clamp_min(torch.finfo(self.amplitude.dtype).tiny)
         if len(reduced) == 1:
             return reduced[0]
+        share = self.amplitude.square().clamp_min(torch.finfo(self.amplitude.dtype).tiny)
         return ((share / share.sum()) @ reduced).clamp(max=1.0)
 
     def _reduced(self, x: Tensor, noise_ratio: Tensor) -> Tensor:
         """Eq. (6) over the squared amplitude: (b, m), or (1, m) where no noise tells the processes apart."""
         gram = correlation(self.inputs, self.inputs, self.length_scale, self.kernel)
         cross = correlation(self.inputs, x, self.length_scale, self.kernel)
-        noise = noise_ratio[:, None].expand(-1, len(self.inputs)) / self.counts
         if self.root is not None:
             gram, cross = self.root @ gram @ self.root.mT, self.root @ cross
         if bool((noise_ratio > 0).any()):
-            gram = gram + torch.diag_embed(noise)
-        # Eq. (6) over the squared amplitude, 1 - k' inv(K + ratio / counts) k, by the factor of the matrix.
+            gram = gram + torch.diag_embed(noise_ratio[:, None] / self.counts)
+        # 1 - k' inv(K + ratio / counts) k, by the factor of the matrix.
         factor = safe_cholesky(gram, name="the kernel matrix of the training inputs")
         whitened = torch.linalg.solve_triangular(factor, cross, upper=False)
         return (1.0 - whitened.square().sum(-2)).clamp(0.0, 1.0)
@@ -128,10 +126,10 @@ def condition(
     """Gaussian processes conditioned on noisy observations, and the relative jitter that needed.
 
     ``values`` are those whose prior mean is zero, if they are others than the targets. The nodes of a ``basis`` that
-    carries the processes, by default all inputs, are the inputs of what is returned.
+    carries the processes, by default all inputs, become the inputs of the processes.
     """
     values = observations.targets if values is None else values
-    basis = Basis(observations, FULL) if basis is None else basis
+    basis = Basis(observations) if basis is None else basis
     targets, _ = basis.project(torch.cat([observations.targets, values]))
     gram = basis.covariance(correlation(basis.nodes, basis.nodes, hyperparameters.length_scale, kernel))
     gram = gram + hyperparameters.noise_ratio[:, None, None] * torch.eye(gram.shape[-1]).to(gram)
@@ -139,148 +137,136 @@ def condition(
     solved = torch.cholesky_solve(targets.reshape(2, -1, gram.shape[-1]).permute(1, 2, 0), factor)
     weight, value_weight = basis.node_weights(solved).unbind(-1)
     root = None if basis.root is None else basis.root.clone(memory_format=torch.contiguous_format)
-    parts = (weight.contiguous(), value_weight.contiguous(), hyperparameters, basis.counts.clone(), kernel, root)
-    return LatentGP(basis.nodes.clone(), *parts), jitter
+    weights = weight.contiguous(), value_weight.contiguous()
+    return LatentGP(basis.nodes.clone(), *weights, hyperparameters, basis.counts.clone(), kernel, root), jitter
 
 
-class Evidence:
-    """Negative log evidence (nats) of b processes as a function of length scales and noise ratio alone.
+class LatentValues(nn.Module):
+    """Values of b latent processes at n inputs, to be trained: the paper's U, whitened.
 
-    For n observations y with the covariance ``v A``, A the correlation plus the noise ratio r on the diagonal, it is
-    ``(y' inv(A) y / v + log |A| + n log(2 pi v)) / 2`` (Rasmussen and Williams, eq. (2.30)), less half the sum of
-    the logarithms of the counts, as the observations are weighted by their roots. Its minimum in v is at
-    ``v = y' inv(A) y / n``. What is outside of the basis has a covariance of v r alone.
+    The deviations from the prior mean are ``amplitude * basis @ whitened`` with ``basis @ basis.mT`` the
+    kernel matrix; a priori the whitened values are independent standard normal numbers, which is what
+    makes them easy to train. While the hyperparameters are held, the basis is that of the eigenvectors
+    which matter: far fewer than inputs for a smooth kernel.
 
     Parameters
     ----------
-    basis : Basis
-    targets : Tensor of shape (b, n)
+    inputs : Tensor of shape (n, e)
+    deviation : Tensor of shape (b, n)
+        Where training starts.
+    amplitude : Tensor of shape (b,)
+    length_scale : Tensor of shape (1, e) or (b, e)
     kernel : str
-    noise_scale : Tensor of shape (b,) or None
-        Where it is given the squared amplitude v is that which the noise ratio leaves, ``noise_scale^2 / r``. Zeros
-        are no noise, and leave the amplitude free.
+    train_hyperparameters : bool
+        Whether amplitude and length scale, then one for each process, are trained with the values.
     """
 
+    inputs: Tensor
+    basis: Tensor
+
     def __init__(
-        self, basis: Basis, targets: Float[Tensor, "b n"], kernel: str, noise_scale: Float[Tensor, " b"] | None
+        self,
+        inputs: Float[Tensor, "n e"],
+        deviation: Float[Tensor, "b n"],
+        amplitude: Float[Tensor, " b"],
+        length_scale: Float[Tensor, "g e"],
+        *,
+        kernel: str = "squared_exponential",
+        train_hyperparameters: bool = False,
     ) -> None:
-        self.basis, self.kernel = basis, kernel
-        self.targets, self.remainder = basis.project(targets)
-        self.weighted = targets * basis.observations.counts.sqrt()
-        self.noise_scale = noise_scale if noise_scale is not None and bool((noise_scale > 0).all()) else None
-        nodes = basis.nodes.mT
-        self.square_difference = (nodes[:, :, None] - nodes[:, None, :]).square()
-        self.n_inputs = targets.shape[1]
-        self.n_outside = self.n_inputs - self.targets.shape[1]
-        self._constant = self.n_inputs * math.log(2.0 * math.pi) - float(basis.observations.counts.log().sum())
+        super().__init__()
+        self.kernel, self.train_hyperparameters = kernel, train_hyperparameters
+        if train_hyperparameters:
+            length_scale = length_scale.expand(len(amplitude), -1)
+        self.register_buffer("inputs", inputs)
+        self.log_amplitude = nn.Parameter(amplitude.log(), requires_grad=train_hyperparameters)
+        self.log_length_scale = nn.Parameter(length_scale.log(), requires_grad=train_hyperparameters)
+        basis, self.jitter = self._basis()
+        self.register_buffer("basis", basis.detach())
+        self.whitened = nn.Parameter(self._whiten(deviation / amplitude[:, None]))
 
-    def __call__(
-        self, length_scale: Float[Tensor, "a e"], noise_ratio: Float[Tensor, " a"], rows: Int64[Tensor, " a"]
-    ) -> tuple[Float[Tensor, " a"], Float[Tensor, "a e+1"]]:
-        """Value for a of the processes, and gradient by the logarithms of length scales and, last, noise ratio.
+    def forward(self, whitened: Float[Tensor, "b r"] | None = None) -> Float[Tensor, "n b"]:
+        """Deviations from the prior mean at the training inputs; of other whitened values, if given."""
+        whitened = self.whitened if whitened is None else whitened
+        basis = self._basis()[0] if self.train_hyperparameters else self.basis
+        return (self.log_amplitude.exp()[:, None] * _product(basis, whitened)).mT
 
-        Both NaN where the covariance is not positive definite.
+    def vjp(self, gradient: Float[Tensor, "n b"]) -> Float[Tensor, "b r"]:
+        """Gradient in the whitened values, from that in the deviations."""
+        return _product(self.basis.mT, self.log_amplitude.exp()[:, None] * gradient.mT)
+
+    def normal_matrix(self, members: Int64[Tensor, " m"], weight: Float[Tensor, "n m m"]) -> Float[Tensor, "k k"]:
+        """Second derivatives in the whitened values of some processes, of ``1/2 sum_t u_t' weight_t u_t``.
+
+        ``u_t`` are those processes' deviations at input t; ``k`` counts their whitened values one after the other.
+        Only the blocks on the diagonal and below are computed: above there are zeros.
         """
-        inverse_square = length_scale.square().reciprocal()
-        correlated, slope = value_and_slope(self.square_difference, inverse_square, self.kernel)
-        covariance = self.basis.covariance(correlated)
-        covariance.diagonal(dim1=-2, dim2=-1).add_(noise_ratio[:, None])
-        inverse, log_det = _inverse_and_log_det(covariance)
-        targets = self.targets[rows].unsqueeze(-1)
-        alpha = inverse @ targets
-        quadratic = (targets * alpha).sum((-2, -1))
-        if self.n_outside:
-            outside = self.remainder[rows] / noise_ratio
-            quadratic = quadratic + outside
-            log_det = log_det + self.n_outside * noise_ratio.log()
-        variance = self._variance(quadratic, noise_ratio, rows)
-        loss = self._density(quadratic, log_det, variance)
-        # With M = inv(A) - alpha alpha' / v and alpha = inv(A) y, a change of A changes the value by tr(M dA) / 2: the
-        # best amplitude changes nothing to first order. The squared distance s is inversely proportional to the square
-        # of the length scale, ds = -2 s d log(scale).
-        matrix = inverse - (alpha / variance[:, None, None]) @ alpha.mT
-        by_distance = (self.basis.covariance_vjp(matrix) * slope).flatten(1)
-        by_length = (by_distance @ self.square_difference.flatten(1).mT) * -inverse_square
-        by_ratio = noise_ratio * matrix.diagonal(dim1=-2, dim2=-1).sum(-1)
-        if self.n_outside:
-            by_ratio = by_ratio + (self.n_outside - outside / variance)
-        if self.noise_scale is not None:  # the variance is inversely proportional to the ratio
-            by_ratio = by_ratio + (quadratic / variance - self.n_inputs)
-        return loss, torch.cat([by_length, 0.5 * by_ratio[:, None]], dim=1)
+        # Process i has the deviations a_i B_i w_i: block (i, j) is the sum over t of a_i a_j weight_ij B_i' B_j.
+        amplitude = self.log_amplitude.detach().exp()[members]
+        weight = weight * (amplitude[:, None] * amplitude)
+        weight = weight.permute(1, 2, 0).contiguous()
+        basis = self.basis.expand(len(self.whitened), -1, -1)
+        rank, transposed = basis.shape[-1], self.basis.mT.contiguous()
+        matrix = weight.new_zeros(len(members), rank, len(members), rank)
+        for row in range(len(members)):
+            right = transposed if len(transposed) == 1 else transposed[members[: row + 1]]
+            left = weight[row, : row + 1].unsqueeze(1) * right
+            block = left.flatten(0, 1) @ basis[members[row]]
+            matrix[row, :, : row + 1] = block.reshape(row + 1, rank, rank).permute(2, 0, 1)
+        return matrix.reshape(len(members) * rank, -1)
 
-    def table(self, length_scales: Float[Tensor, "s e"], noise_ratios: Float[Tensor, " q"]) -> Float[Tensor, "b s q"]:
-        """Values of all processes at all pairs; infinite where the covariance is near singular.
+    def trained(self) -> list[Tensor]:
+        """The parameters an optimizer may change."""
+        return [parameter for parameter in self.parameters() if parameter.requires_grad]
 
-        With the eigenvectors E and eigenvalues w of the correlation A has the same E, and w + r: one decomposition
-        of a length scale serves all processes and all noise ratios.
-        """
-        correlated, _ = value_and_slope(self.square_difference, length_scales.square().reciprocal(), self.kernel)
-        eigenvalue, eigenvector = torch.linalg.eigh(self.basis.covariance(correlated))
-        square = (self.targets @ eigenvector).square()  # (s, b, r)
-        spectrum = eigenvalue.clamp_min(0.0).unsqueeze(1) + noise_ratios[:, None]  # (s, q, r)
-        rounding = 10 * len(self.basis.nodes) * torch.finfo(spectrum.dtype).eps
-        sound = eigenvalue[:, :1] + noise_ratios > rounding * spectrum[..., -1]
-        quadratic = square @ (1.0 / spectrum.clamp_min(1e-300)).mT  # (s, b, q)
-        log_det = spectrum.clamp_min(1e-300).log().sum(-1).unsqueeze(1)
-        if self.n_outside:
-            quadratic = quadratic + self.remainder[:, None] / noise_ratios
-            log_det = log_det + self.n_outside * noise_ratios.log()
-        variance = self._variance(quadratic, noise_ratios, (slice(None), None))
-        loss = self._density(quadratic, log_det, variance)
-        return loss.where(sound.unsqueeze(1), math.inf).transpose(0, 1)
+    @torch.no_grad()
+    def interpolate(self, values: Float[Tensor, "b n"], deviation: Float[Tensor, "b n"] | None = None) -> LatentGP:
+        """Gaussian processes through ``deviation``, by None the present one, and without a prior through ``values``."""
+        if self.train_hyperparameters:
+            self.basis, self.jitter = self._basis()
+        amplitude = self.log_amplitude.exp()
+        hyperparameters = Hyperparameters(self.log_length_scale.exp(), amplitude.clone(), torch.zeros_like(amplitude))
+        whitened = self.whitened if deviation is None else self._whiten(deviation / amplitude[:, None])
+        weights = amplitude[:, None] * self._weight(whitened), self._weight(self._whiten(values))
+        return LatentGP(self.inputs, *weights, hyperparameters, torch.ones_like(self.inputs[:, 0]), self.kernel)
 
-    def residual(self, length_scale: Float[Tensor, "b e"], noise_ratio: Float[Tensor, " b"]) -> Float[Tensor, "b n"]:
-        """Weighted observations less what each process explains; of a basis of nodes."""
-        orthogonal = self.basis.orthogonal
-        assert orthogonal is not None
-        left = noise_ratio[:, None] * self._solved(length_scale, noise_ratio, slice(None))
-        return self.weighted - (self.targets - left) @ orthogonal.mT
+    def _basis(self) -> tuple[Tensor, float]:
+        """Root of the kernel matrix, and its jitter: a Cholesky factor, or eigenvectors that matter."""
+        length_scale, inputs = self.log_length_scale.exp(), self.inputs
+        # Trained length scales need a basis that autograd can differentiate.
+        if self.train_hyperparameters:
+            gram = correlation(inputs, inputs, length_scale, self.kernel)
+            return cholesky_with_jitter(gram, name="the kernel matrix of the training inputs")
+        levels = levels_on_nodes(inputs, self.kernel, len(inputs))
+        n_nodes = next((size for shortest, size in levels if shortest <= float(length_scale.min())), None)
+        once = Observations(inputs, inputs.new_zeros(0, len(inputs)), torch.ones_like(inputs[:, 0]))
+        few = Basis(once, n_nodes)
+        gram = few.covariance(correlation(few.nodes, few.nodes, length_scale, self.kernel))
+        eigenvalue, eigenvector = torch.linalg.eigh(gram)
+        # Of several length scales: directions that matter to none are left out, those of some are zero for others.
+        matters = eigenvalue > _RANK_TOLERANCE * eigenvalue[..., -1:]
+        root = eigenvalue.where(matters, 0.0).sqrt()
+        basis = (eigenvector * root.unsqueeze(-2))[..., matters.any(0)]
+        return (basis if few.orthogonal is None else few.orthogonal @ basis).contiguous(), 0.0
 
-    def best_variance(
-        self, length_scale: Float[Tensor, "a e"], noise_ratio: Float[Tensor, " a"], rows: Int64[Tensor, " a"]
-    ) -> Float[Tensor, " a"]:
-        """Squared amplitude; that of the targets themselves where the covariance is singular."""
-        targets = self.targets[rows]
-        quadratic = (targets * self._solved(length_scale, noise_ratio, rows)).sum(-1)
-        if self.n_outside:
-            quadratic = quadratic + self.remainder[rows] / noise_ratio
-        variance = self._variance(quadratic, noise_ratio, rows)
-        return torch.where(variance.isnan(), targets.square().mean(1).clamp_min(_LEAST_VARIANCE), variance)
+    def _whiten(self, deviation: Tensor) -> Tensor:
+        """Whitened values whose deviations, over the amplitude, come nearest to these."""
+        if self.train_hyperparameters:
+            return torch.linalg.solve_triangular(self.basis, deviation.unsqueeze(-1), upper=False)[..., 0].contiguous()
+        # Columns are orthogonal, so that least squares is one division each.
+        return _product(self.basis.mT, deviation) / self._square()
 
-    def _variance(self, quadratic: Tensor, noise_ratio: Tensor, rows: Tensor | tuple[slice, None]) -> Tensor:
-        if self.noise_scale is None:
-            return (quadratic / self.n_inputs).clamp_min(_LEAST_VARIANCE)
-        return (self.noise_scale[rows].square() / noise_ratio).expand_as(quadratic)
+    def _weight(self, whitened: Tensor) -> Tensor:
+        """Inverse of the kernel matrix times the deviations, over the amplitude, of whitened values."""
+        if self.train_hyperparameters:
+            return torch.linalg.solve_triangular(self.basis.mT, whitened.unsqueeze(-1), upper=True)[..., 0].contiguous()
+        return _product(self.basis, whitened / self._square())
 
-    def _density(self, quadratic: Tensor, log_det: Tensor, variance: Tensor) -> Tensor:
-        return 0.5 * (quadratic / variance + log_det + self.n_inputs * variance.log() + self._constant)
-
-    def _solved(self, length_scale: Tensor, noise_ratio: Tensor, rows: Tensor | slice) -> Float[Tensor, "a r"]:
-        """``inv(A) y``; NaN where A is singular."""
-        nodes = self.basis.nodes
-        covariance = self.basis.covariance(correlation(nodes, nodes, length_scale, self.kernel))
-        covariance.diagonal(dim1=-2, dim2=-1).add_(noise_ratio[:, None])
-        factor, info = torch.linalg.cholesky_ex(covariance)
-        solved = torch.cholesky_solve(self.targets[rows].unsqueeze(-1), factor).squeeze(-1)
-        return torch.where(info[:, None] == 0, solved, math.nan)
+    def _square(self) -> Float[Tensor, "g r"]:
+        """Squared norm of each column of the basis; one for those that are zero."""
+        square = self.basis.square().sum(-2)
+        return square.where(square > 0, 1.0)
 
 
-def negative_log_evidence(
-    observations: Observations, hyperparameters: Hyperparameters, kernel: str = "squared_exponential"
-) -> Float[Tensor, " b"]:
-    """Negative log evidence of processes with noise, in nats; NaN where the covariance is not positive definite."""
-    noise_scale = hyperparameters.amplitude * hyperparameters.noise_ratio.sqrt()
-    evidence = Evidence(Basis(observations, FULL), observations.targets, kernel, noise_scale)
-    length_scale = hyperparameters.length_scale.expand(len(noise_scale), -1)
-    rows = torch.arange(len(noise_scale), device=noise_scale.device)
-    return evidence(length_scale, hyperparameters.noise_ratio, rows)[0]
-
-
-def _inverse_and_log_det(matrix: Float[Tensor, "a r r"]) -> tuple[Tensor, Tensor]:
-    """Inverses and log determinants of positive definite matrices; the latter NaN for others."""
-    factor, info = torch.linalg.cholesky_ex(matrix)
-    log_det = 2.0 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    if bool(info.any()):
-        log_det = torch.where(info == 0, log_det, math.nan)
-        factor = torch.where((info > 0)[:, None, None], torch.eye(factor.shape[-1]).to(factor), factor)
-    return torch.cholesky_inverse(factor), log_det
+def _product(matrix: Float[Tensor, "g m n"], vectors: Float[Tensor, "b n"]) -> Float[Tensor, "b m"]:
+    return (matrix @ vectors.unsqueeze(-1)).squeeze(-1).contiguous()

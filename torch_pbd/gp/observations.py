@@ -1,10 +1,8 @@
-"""Observations of processes, and what a smooth kernel can tell of them: neighbours merged, or nodes for them."""
+"""Observations of processes, and coordinates in which they are few: merged neighbours, or nodes for the inputs."""
 
 import heapq
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int64
@@ -12,10 +10,15 @@ from torch import Tensor
 
 from torch_pbd.kernels import KERNELS
 
-_SHORTEST = 0.75  # spacings of the inputs: shorter "needles" explain each point by itself
+# Numbers of nodes to try: a decomposition costs two to six times more from one to the next. Below so many inputs for
+# each node nothing is gained by them.
+_N_NODES, _WORTH = (32, 48, 88, 168), 1.5
 
-_N_NODES = (32, 48, 88, 168)  # twice the cost of a decomposition, or six times, from one to the next
-_WORTH = 1.5  # inputs for each node, below which nothing is gained
+_SHORTEST = 0.75  # spacings of the inputs: shorter "needles" explain each point by itself
+_LONGEST = 0.35  # of the range: with longer ones the prior of a covariance would never take over
+# A hole is so much of the range, and so many spacings of the other inputs. It is to hold so many length scales: a
+# smooth process without noise claims to know what is two to three of them from many inputs.
+_HOLE, _SPACINGS, _IN_HOLE = 0.25, 5.0, 6.0
 
 
 @dataclass(frozen=True)
@@ -45,17 +48,26 @@ def resolved_length_scale(inputs: Float[Tensor, "n e"]) -> float:
 
 
 def spacing(inputs: Float[Tensor, "n e"], quantile: float = 0.9) -> float:
-    """Distance to the nearest other input, a quantile over the inputs; the finest detail they show."""
-    if inputs.shape[1] == 1 and len(inputs) > 1:
-        gap = torch.nn.functional.pad(inputs[:, 0].sort().values.diff(), (1, 1), value=float("inf"))
-        nearest = torch.minimum(gap[1:], gap[:-1]).sort().values.tolist()
+    """Quantile over the inputs of the distance to the nearest other input: the finest detail they show."""
+    if inputs.shape[1] == 1:
+        gap = torch.nn.functional.pad(inputs[:, 0].sort().values.diff(), (1, 1), value=math.inf)
+        nearest = torch.minimum(gap[1:], gap[:-1]).sort().values  # torch's quantile takes at most 16 million
         place = quantile * (len(nearest) - 1)
-        low, high = nearest[int(place)], nearest[min(int(place) + 1, len(nearest) - 1)]
-        return float(low + (place - int(place)) * (high - low))
+        pair = nearest[int(place) : int(place) + 2]
+        return float(torch.lerp(pair[0], pair[-1], place % 1.0))
     chosen = torch.arange(0, len(inputs), max(1, len(inputs) // 1000), device=inputs.device)
     distance = torch.cdist(inputs[chosen], inputs, compute_mode="donot_use_mm_for_euclid_dist")
-    distance[torch.arange(len(chosen)), chosen] = float("inf")
+    distance[torch.arange(len(chosen)), chosen] = math.inf
     return float(distance.amin(1).quantile(quantile))
+
+
+def longest_within(inputs: Float[Tensor, "n e"]) -> float:
+    """Longest length scale, in ranges of the inputs, with which a process is back at its prior beyond them.
+
+    In a hole among inputs on a line it is to be so too.
+    """
+    hole = float(inputs[:, 0].sort().values.diff().max()) if inputs.shape[1] == 1 else 0.0
+    return min(_LONGEST, hole / _IN_HOLE) if hole > max(_HOLE, _SPACINGS * spacing(inputs)) else _LONGEST
 
 
 def neighbourhoods(inputs: Float[Tensor, "n e"], max_inputs: int) -> Int64[Tensor, " n"]:
@@ -108,53 +120,15 @@ def sum_by(values: Float[Tensor, "n d"], index: Int64[Tensor, " n"], n_groups: i
     return values.new_zeros(n_groups, values.shape[1]).index_add_(0, index, values)
 
 
-class Resolution(NamedTuple):
-    """How finely observations are looked at."""
-
-    n_nodes: int | None
-    """Chebyshev nodes; by None the inputs, or the centres of their neighbourhoods."""
-    max_inputs: int | None
-    """Largest number of neighbourhoods; by None each input is for itself."""
-    shortest_length_scale: float
-    """Shortest length scale that it carries."""
-
-
-FULL = Resolution(None, None, 0.0)
-"""All inputs."""
-
-
-def resolutions(
-    observations: Observations, kernel: str, *, noisy: bool, max_inputs: int | None = None
-) -> list[Resolution]:
-    """Resolutions to try, the coarsest first; what nodes do not carry is treated as noise, so there must be some."""
-    n_inputs, n_features = observations.inputs.shape
-    finest = FULL
-    if noisy and max_inputs is not None and n_inputs > max_inputs:
-        centres = merge_observations(replace(observations, targets=observations.targets[:0]), max_inputs).inputs
-        finest = Resolution(None, max_inputs, resolved_length_scale(centres))
-    if not noisy or n_features > 1 or not KERNELS[kernel].on_nodes:
-        return [finest]
-    extent = float(observations.inputs.max() - observations.inputs.min())
-    sizes = [size for size in _N_NODES if min(n_inputs, max_inputs or n_inputs) >= _WORTH * size]
-    # Interpolation is exact to 1e-13 down to this length scale (fitted; within 10 %).
-    return [*(Resolution(size, None, extent * 4.0 / (size - 8)) for size in sizes), finest]
-
-
 class Basis:
     """Coordinates r of weighted observations at n inputs, in which a process is that of m nodes.
 
     With W the counts, the observations ``W^1/2 y`` have the covariance ``W^1/2 C W^1/2 + ratio * I`` over the squared
     amplitude. On a line the squared exponential C is ``B C_nodes B'`` to rounding, B the polynomial interpolation
-    from Chebyshev nodes, which does not depend on the length scale. With ``W^1/2 B = Q root`` the coordinates
-    ``Q' W^1/2 y`` have the covariance ``root C_nodes root' + ratio * I``, and the remainder is noise alone.
-    Where the nodes are the inputs the root is ``W^1/2``; where they are centres of neighbourhoods B is the
-    membership, and the remainder what the members differ by.
-
-    Parameters
-    ----------
-    observations : Observations
-        Whose inputs and counts count; the targets do not.
-    resolution : Resolution
+    from ``n_nodes`` Chebyshev nodes, which does not depend on the length scale. With ``W^1/2 B = Q root`` the
+    coordinates ``Q' W^1/2 y`` have the covariance ``root C_nodes root' + ratio * I``, and the remainder is noise alone.
+    Without ``n_nodes`` the nodes are the inputs, and the root is ``W^1/2``; or if there are more than ``max_inputs``
+    the centres of their neighbourhoods: B is the membership, and the remainder what the members differ by.
     """
 
     root: Float[Tensor, "r m"] | None = None
@@ -162,16 +136,18 @@ class Basis:
     orthogonal: Float[Tensor, "n r"] | None = None
     """Q; None where it is the membership."""
 
-    def __init__(self, observations: Observations, resolution: Resolution) -> None:
+    def __init__(self, observations: Observations, n_nodes: int | None = None, max_inputs: int | None = None) -> None:
         self.observations = replace(observations, targets=observations.targets[:0])
-        self.resolution = resolution
-        if resolution.n_nodes is not None:
-            nodes, interpolation = _interpolation(observations.inputs[:, 0], resolution.n_nodes)
+        self.max_inputs = max_inputs or len(observations.counts)
+        if n_nodes is not None:
+            nodes, interpolation = _interpolation(observations.inputs[:, 0], n_nodes)
             self.orthogonal, self.root = torch.linalg.qr(observations.counts.sqrt()[:, None] * interpolation)
             self.nodes, self.counts = nodes[:, None], torch.ones_like(nodes)
         else:
-            merged = merge_observations(self.observations, resolution.max_inputs or len(observations.counts))
+            merged = merge_observations(self.observations, self.max_inputs)
             self.nodes, self.counts = merged.inputs, merged.counts
+        weight = self.counts.sqrt()
+        self._weights = weight[:, None] * weight
 
     def project(self, targets: Float[Tensor, "b n"]) -> tuple[Float[Tensor, "b r"], Float[Tensor, " b"]]:
         """Coordinates of targets, and the squared norm of what is outside the basis."""
@@ -179,32 +155,29 @@ class Basis:
         if self.orthogonal is not None:
             inside = weighted @ self.orthogonal
             return inside, (weighted - inside @ self.orthogonal.mT).square().sum(1)
-        if self.resolution.max_inputs is None:
-            return weighted, torch.zeros_like(weighted[:, 0])
-        merged = merge_observations(replace(self.observations, targets=targets), self.resolution.max_inputs)
+        merged = merge_observations(replace(self.observations, targets=targets), self.max_inputs)
         inside = merged.targets * self.counts.sqrt()
         return inside, (weighted.square().sum(1) - inside.square().sum(1)).clamp_min(0.0)
 
     def covariance(self, correlation: Float[Tensor, "*b m m"]) -> Float[Tensor, "*b r r"]:
         """Covariance of the coordinates over the squared amplitude, without noise, from the nodes' correlation."""
-        if self.root is not None:
-            return self.root @ correlation @ self.root.mT
-        return correlation * self._weights
+        return correlation * self._weights if self.root is None else self.root @ correlation @ self.root.mT
 
     def covariance_vjp(self, gradient: Float[Tensor, "*b r r"]) -> Float[Tensor, "*b m m"]:
-        """``root' gradient root``: gradient by the correlation of the nodes, from that by the covariance."""
-        if self.root is not None:
-            return self.root.mT @ gradient @ self.root
-        return gradient * self._weights
+        """Gradient by the correlation of the nodes, from that by the covariance."""
+        return gradient * self._weights if self.root is None else self.root.mT @ gradient @ self.root
 
     def node_weights(self, values: Float[Tensor, "*b r q"]) -> Float[Tensor, "*b m q"]:
-        """``root' values``: weights of the correlations with the nodes."""
-        return self.root.mT @ values if self.root is not None else self.counts.sqrt()[:, None] * values
+        """Weights ``root' values`` of the correlations with the nodes."""
+        return self.counts.sqrt()[:, None] * values if self.root is None else self.root.mT @ values
 
-    @cached_property
-    def _weights(self) -> Float[Tensor, "m m"]:
-        weight = self.counts.sqrt()
-        return weight[:, None] * weight
+
+def levels_on_nodes(inputs: Float[Tensor, "n e"], kernel: str, max_inputs: int) -> list[tuple[float, int]]:
+    """Shortest length scales that numbers of nodes carry to 1e-13 (fitted; within 10 %), the longest first."""
+    if inputs.shape[1] > 1 or not KERNELS[kernel].on_nodes:
+        return []
+    extent, most = float(inputs.max() - inputs.min()), min(len(inputs), max_inputs)
+    return [(extent * 4.0 / (size - 8), size) for size in _N_NODES if most >= _WORTH * size]
 
 
 def _interpolation(x: Float[Tensor, " n"], n_nodes: int) -> tuple[Tensor, Tensor]:

@@ -1,28 +1,46 @@
 """Hyperparameters of Gaussian processes by their evidence: a grid, then BFGS from its deepest valleys.
 
 What is maximized is the evidence in length scales and noise ratio; the best amplitude is known in closed form
-(:mod:`~torch_pbd.gp.latent`). The steps, in :func:`_maximize`:
+(:class:`~torch_pbd.gp.evidence.Evidence`). The steps, in :meth:`_Search.run`:
 
 1. the evidence on a grid of length scales that a few nodes carry, at a cost that does not grow with the inputs
-   (:mod:`~torch_pbd.gp.observations`);
-2. which processes may be better with shorter length scales than these (:meth:`EvidenceGrid.unsettled`);
+   (:class:`~torch_pbd.gp.observations.Basis`);
+2. which processes may be better with shorter length scales than these;
 3. for the others, BFGS from the deepest valleys of the grid;
 4. for the rest, and those that BFGS led to the shortest length scale, the next grid, with more nodes.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from torch_pbd.exceptions import NotPositiveDefiniteError
-from torch_pbd.gp.grid import EvidenceGrid, EvidenceSearch, together
-from torch_pbd.gp.observations import Basis, Hyperparameters, Observations
+from torch_pbd.gp.evidence import MIN_NOISE_RATIO, Coordinates, Evidence, EvidenceSearch
+from torch_pbd.gp.observations import Basis, Hyperparameters, Observations, levels_on_nodes, resolved_length_scale
 from torch_pbd.optim import FitReport, Status, first_failure, minimize_batch
+
+# Entries of the matrices that are treated together: they stay near the cache, and memory is bounded.
+_ENTRIES = 1 << 20
+
+# Largest ratio of neighbouring length scales of the grid; a finer one where nodes are so few that a decomposition
+# costs nearly nothing. With the coarse one alone 3 of 1200 made-up processes lost up to 0.4 nats.
+_GRID_STEP, _FINE_STEP, _SMALL = 1.4, 1.25, 24
+
+# Where the evidence is nearly flat in the ratio no optimum is lost between coarser steps.
+_LOG10_RATIOS = (-10.0, -8.0, -6.0, -5.0, -4.0, *(0.25 * step for step in range(-14, 7)), 2.0, 3.0, 4.0)
+
+# Points that a local minimum of the grid is the lowest of: of fewer, points along one valley would be several.
+_AROUND = (5, 7)
+
+# Residuals whose first autocorrelations, squared and summed, are above the 0.9999 quantile of the chi-squared
+# distribution of as many degrees of freedom are no white noise.
+_LAGS, _NOT_WHITE = 3, 21.1
 
 # Nats for each input that polishing may be worth: an optimum deeper than that below its start on the grid would, on
 # a line, have to be a spike. Without the bound searches take a sixth longer, and 1200 processes gained nothing.
@@ -35,19 +53,25 @@ _FEW = 2e7
 # Times the shortest length scale of a level, below which BFGS has ended at that bound.
 _AT_BOUND = 1.02
 
+Job = tuple[Observations, EvidenceSearch]
+
+
+class Found(NamedTuple):
+    """Hyperparameters that maximize the evidence of each process."""
+
+    hyperparameters: Hyperparameters
+    loss: Float[Tensor, " b"]
+    """Negative log evidence, in nats."""
+    report: FitReport
+    """Report of the sum of the losses; its curve has two points, the grid's best and the end."""
+    basis: Basis
+    """The smallest of the search that carries the processes."""
+
 
 def fit_hyperparameters(
     observations: Observations, search: EvidenceSearch
 ) -> tuple[Hyperparameters, Float[Tensor, " b"], FitReport]:
-    """Hyperparameters that maximize each process's evidence: a grid, then BFGS from its deepest valleys.
-
-    Returns
-    -------
-    Hyperparameters
-    loss : Tensor of shape (b,)
-        Negative log evidence of each process, in nats.
-    report : FitReport
-        Of their sum; its curve has two points, the grid's best and the end.
+    """Hyperparameters, loss and report of one job: see :class:`Found`.
 
     Raises
     ------
@@ -60,140 +84,212 @@ def fit_hyperparameters(
     return fit_together([(observations, search)])[0][:3]
 
 
-class Found(NamedTuple):
-    """Result of a search."""
-
-    hyperparameters: Hyperparameters
-    loss: Float[Tensor, " b"]
-    """Negative log evidence, in nats."""
-    report: FitReport
-    basis: Basis
-    """The smallest of the search that carries the processes."""
-
-
-def fit_together(jobs: Sequence[tuple[Observations, EvidenceSearch]]) -> list[Found]:
+def fit_together(jobs: Sequence[Job]) -> list[Found]:
     """Results of :func:`fit_hyperparameters` for each job, in one search where inputs and counts are the same.
 
     A search of few processes costs little more than one of many: what is common is done once, and evaluations are
     batched. Jobs that hold a length scale or a noise are searched by themselves.
     """
-    alike = all(_searchable_together(jobs[0], job) for job in jobs)
-    groups = [list(jobs)] if alike else [[job] for job in jobs]
-    return [result for group in groups for result in _fit_group(group)]
-
-
-def _searchable_together(job: tuple[Observations, EvidenceSearch], other: tuple[Observations, EvidenceSearch]) -> bool:
-    (data, search), (its_data, its_search) = job, other
-    bounds = (search.length_scale_bounds[0], its_search.length_scale_bounds[1])
-    return (
-        search.length_scale is None
-        and search.noise_scale is None
-        and its_search == replace(search, length_scale_bounds=bounds)
-        and torch.equal(data.inputs, its_data.inputs)
-        and torch.equal(data.counts, its_data.counts)
+    first, search = jobs[0]
+    held = search.length_scale is not None or search.noise_scale is not None
+    alike = not held and all(
+        other == replace(search, length_scale_bounds=(search.length_scale_bounds[0], other.length_scale_bounds[1]))
+        and torch.equal(first.inputs, data.inputs)
+        and torch.equal(first.counts, data.counts)
+        for data, other in jobs
     )
-
-
-def _fit_group(jobs: list[tuple[Observations, EvidenceSearch]]) -> list[Found]:
-    search = jobs[0][1]
-    if search.noise_scale is not None and len((search.noise_scale > 0).unique()) > 1:
-        raise ValueError("noise_scale is zero for some processes and not for others: fit these in two searches.")
+    if not alike and len(jobs) > 1:
+        return [fit_together([job])[0] for job in jobs]
     with torch.inference_mode():
-        targets = torch.cat([data.targets for data, _ in jobs])
-        longest = torch.cat([its.length_scale_bounds[1] * torch.ones_like(data.targets[:, 0]) for data, its in jobs])
-        grid = EvidenceGrid(replace(jobs[0][0], targets=targets), search, longest)
-        ends = _maximize(grid, search)
+        found = _Search(jobs)
+        ends = found.run()
     # Copies, made outside of the inference mode: autograd would refuse its tensors.
-    sizes = [len(data.targets) for data, _ in jobs]
-    parts = (part.clone().split(sizes) for part in (ends.length_scale, ends.amplitude, ends.noise_ratio))
-    results = []
-    for *each, first, loss in zip(*parts, ends.start_loss.split(sizes), ends.loss.clone().split(sizes), strict=True):
-        curve = (float(first.sum()), float(loss.sum()))
-        report = FitReport(curve[-1], curve, ends.n_iter, ends.status)
-        shortest = 1.0001 * float(each[0].min())  # a search ends at the bound but for rounding
-        basis = next((basis for least, basis in grid.bases if shortest >= least), grid.bases[-1][1])
-        results.append(Found(Hyperparameters(*each), loss, report, basis))
+    results, n_features = [], first.inputs.shape[1]
+    for part in ends.clone().split([len(data.targets) for data, _ in jobs]):
+        length_scale, (noise_ratio, amplitude, start_loss, loss) = part[:, :n_features], part[:, n_features:].unbind(1)
+        curve = float(start_loss.sum()), float(loss.sum())
+        report = FitReport(curve[-1], curve, found.n_iter, first_failure(found.statuses))
+        shortest = 1.0001 * float(length_scale.min())  # a search ends at the bound but for rounding
+        basis = next((basis for least, basis in found.bases if shortest >= least), found.bases[-1][1])
+        hyperparameters = (tensor.clone() for tensor in (length_scale, amplitude, noise_ratio))
+        results.append(Found(Hyperparameters(*hyperparameters), loss.clone(), report, basis))
     return results
 
 
-@dataclass
-class _Ends:
-    """Ends of the descents of processes."""
+class _Search:
+    """Search of the processes of all jobs: the grid, of those still searched, and the ends of the others."""
 
-    length_scale: Float[Tensor, "b e"]
-    noise_ratio: Float[Tensor, " b"]
-    amplitude: Float[Tensor, " b"]
-    start_loss: Float[Tensor, " b"]
-    loss: Float[Tensor, " b"]
-    n_iter: int = 0
-    status: Status = Status.CONVERGED
+    evidence: Evidence
+    """Evidence in the basis of the present level."""
 
-    def put(self, rows: Tensor, other: "_Ends") -> None:
-        """Take the ends of some processes."""
-        for name in ("length_scale", "noise_ratio", "amplitude", "start_loss", "loss"):
-            getattr(self, name)[rows] = getattr(other, name)
-        self.n_iter = max(self.n_iter, other.n_iter)
-        self.status = first_failure((self.status, other.status))
+    def __init__(self, jobs: Sequence[Job]) -> None:
+        observations, self._options = jobs[0]
+        self._noise, self._fixed = self._options.noise_scale, self._options.length_scale
+        noise = self._noise
+        if noise is not None and len((noise > 0).unique()) > 1:
+            raise ValueError("noise_scale is zero for some processes and not for others: fit these in two searches.")
+        targets = torch.cat([data.targets for data, _ in jobs])
+        longest = [targets.new_full(data.targets.shape[:1], its.length_scale_bounds[1]) for data, its in jobs]
+        self._observations, self._longest = replace(observations, targets=targets), torch.cat(longest)
+        self._noisy = noise is None or bool((noise > 0).all())
+        self._ratios = _noise_ratios(targets, noise) if self._noisy else targets.new_zeros(1)
+        self._shortest = self._options.length_scale_bounds[0] if self._fixed is None else float(self._fixed.min())
+        self._levels = self._resolutions()
+        self._scales, self._table = targets.new_zeros(0), targets.new_zeros(len(targets), 0, len(self._ratios))
+        self._processes = torch.arange(len(targets), device=targets.device)  # those that are still searched
+        self.bases: list[tuple[float, Basis]] = []  # shortest length scale of each level so far, and its basis
+        self.n_iter, self.statuses = 0, [Status.CONVERGED]  # of the descents
+
+    def _resolutions(self) -> list[tuple[float, int | None]]:
+        """Shortest length scales of the levels, the coarsest first, and their nodes; None are the inputs themselves.
+
+        What nodes do not carry is treated as noise, so there must be some.
+        """
+        inputs, most = self._observations.inputs, self._options.max_inputs or len(self._observations.counts)
+        levels: list[tuple[float, int | None]] = [(0.0, None)]
+        if self._noisy:
+            merged = len(inputs) > most
+            least = resolved_length_scale(Basis(self._observations, max_inputs=most).nodes) if merged else 0.0
+            levels = [*levels_on_nodes(inputs, self._options.kernel, most), (least, None)]
+        # Of those that carry all length scales there are, only the coarsest.
+        last = next((i for i, (least, _) in enumerate(levels) if least <= self._shortest), len(levels) - 1)
+        return levels[: last + 1] if self._fixed is None else [levels[last]]
+
+    def run(self) -> Float[Tensor, "b c"]:
+        """Ends of all processes: length scales, noise ratio, amplitude, loss at the start and at the end."""
+        self._refine()
+        n_inputs, n_features = self._observations.inputs.shape
+        ends = self._table.new_zeros(len(self._processes), n_features + 4)
+        while True:
+            left = self._unsettled()
+            if self._levels and bool(left.any()):
+                n_nodes = self._levels[0][1] or min(n_inputs, self._options.max_inputs or n_inputs)
+                # So cheap is the next level then that those that have settled go on to it too.
+                if len(left) * n_nodes**3 <= _FEW:
+                    self._refine()
+                    continue
+            rows = (~left).nonzero().squeeze(1)
+            if len(rows):
+                ends[self._processes[rows]] = found = self._descend(rows)
+                if self._levels:  # the next one may take these further
+                    left[rows[found[:, :n_features].amin(1) < _AT_BOUND * self.bases[-1][0]]] = True
+            if not bool(left.any()):
+                return ends
+            self._keep(left)
+            self._refine()
+
+    def _keep(self, chosen: Bool[Tensor, " b"]) -> None:
+        """Leave the other processes behind."""
+        self._observations = replace(self._observations, targets=self._observations.targets[chosen])
+        self._noise = None if self._noise is None else self._noise[chosen]
+        self._longest, self._table = self._longest[chosen], self._table[chosen]
+        self._processes = self._processes[chosen]
+
+    def _refine(self) -> None:
+        """Add the length scales that the next level carries to the grid."""
+        carried, n_nodes = self._levels.pop(0)
+        least = max(self._shortest, carried)
+        longest = self.bases[-1][0] if self.bases else max(self._shortest, float(self._longest.max()))
+        basis = Basis(self._observations, n_nodes, self._options.max_inputs if self._noisy else None)
+        self.bases.append((least, basis))
+        self.evidence = Evidence(basis, self._observations.targets, self._options.kernel, self._noise)
+        if self._fixed is None:
+            step = _FINE_STEP if len(basis.nodes) <= _SMALL else _GRID_STEP
+            n_steps = max(0, math.ceil(math.log(longest / least) / math.log(step) - 1e-9))
+            new = torch.logspace(math.log10(least), math.log10(longest), n_steps + 1, dtype=self._scales.dtype)
+            new = (new[:-1] if len(self._scales) else new).to(self._scales.device)
+            each = new[:, None].expand(-1, basis.nodes.shape[1])
+        else:
+            new, each = self._fixed[:1], self._fixed[None]
+        parts = each.split(_together(basis))
+        table = torch.cat([self.evidence.table(part, self._ratios) for part in parts], dim=1)
+        if self._fixed is None:
+            # A process whose bound lies between two length scales of the grid keeps the nearer one above it.
+            beyond = new > _GRID_STEP**0.5 * self._longest[:, None]
+            table = table.masked_fill(beyond.unsqueeze(-1), math.inf)
+        self._scales = torch.cat([new, self._scales])
+        self._table = torch.cat([table, self._table], dim=1)
+
+    def _unsettled(self) -> Bool[Tensor, " b"]:
+        """Whether length scales below those of the grid may be better, for each process.
+
+        They may where the shortest so far is the best one, or where what a process leaves unexplained is no white
+        noise.
+        """
+        best = self._table.flatten(1).argmin(1)
+        scale, ratio = best // len(self._ratios), best % len(self._ratios)
+        if not self._levels:
+            return torch.zeros_like(best, dtype=torch.bool)
+        residual = self.evidence.residual(self._scales[scale][:, None], self._ratios[ratio])
+        residual = residual[:, self._observations.inputs[:, 0].argsort()]
+        total = residual.square().sum(1).clamp_min(1e-300)
+        products = [(residual[:, lag:] * residual[:, :-lag]).sum(1) / total for lag in range(1, _LAGS + 1)]
+        return (scale == 0) | (residual.shape[1] * torch.stack(products).square().sum(0) > _NOT_WHITE)
+
+    def _valleys(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Length scales (b, v, e), noise ratios (b, v) and loss (b, v) of the deepest local minima, in nats.
+
+        The evidence often has one optimum where the data are signal and one where they are noise, with a plateau
+        between. Where there are fewer than v the loss is infinite, and the length scale the shortest.
+        """
+        surrounding = -max_pool2d(-self._table, _AROUND, stride=1, padding=(_AROUND[0] // 2, _AROUND[1] // 2))
+        minima = torch.where(self._table <= surrounding, self._table, math.inf).flatten(1)
+        most = min(1 + self._options.n_restarts, minima.shape[1])
+        loss, place = minima.topk(most, dim=1, largest=False)
+        place = torch.where(loss.isfinite(), place, 0)
+        scale = self._scales[place // len(self._ratios)].unsqueeze(-1) if self._fixed is None else self._fixed
+        length_scale = scale.expand(*place.shape, self._observations.inputs.shape[1])
+        return length_scale, self._ratios[place % len(self._ratios)], loss
+
+    def _descend(self, chosen: Int64[Tensor, " a"]) -> Float[Tensor, "a c"]:
+        """BFGS from the deepest valleys of the chosen processes; of each the best end."""
+        evidence, lowest_ratio = self.evidence, float(self._ratios[0])
+        coordinates = Coordinates(evidence, self._fixed, self.bases[-1][0], self._longest, lowest_ratio)
+        length_scale, noise_ratio, loss = (part[chosen] for part in self._valleys())
+        # The deepest is taken in any case, even if the grid takes it for singular, by a strict rule.
+        hopeful = (loss <= loss[:, :1] + _HOPEFUL * evidence.n_inputs) & loss.isfinite()
+        hopeful[:, 0] = True
+        number, valley = hopeful.nonzero().unbind(1)
+        process = chosen[number]
+        starts = coordinates.encode(length_scale[number, valley], noise_ratio[number, valley], process)
+        size, first, final = _together(evidence.basis), torch.full_like(loss, math.inf), torch.full_like(loss, math.inf)
+        points = torch.empty_like(starts)
+        for part in torch.arange(len(starts), device=starts.device).split(size):
+            points[part], report = minimize_batch(
+                lambda z, index, rows=process[part]: coordinates.loss(z, rows[index]),
+                starts[part],
+                max_iter=self._options.max_iter,
+                tol=self._options.tol,
+            )
+            first[number[part], valley[part]] = report.start_loss.nan_to_num(nan=math.inf)
+            final[number[part], valley[part]] = report.loss.nan_to_num(nan=math.inf)
+            self.n_iter = max(self.n_iter, report.n_iter)
+            self.statuses.append(report.status)
+        lowest, best = final.min(1)
+        if not bool(lowest.isfinite().all()):
+            raise NotPositiveDefiniteError(
+                "The kernel matrix is singular wherever the hyperparameters were searched. Allow for noise "
+                "(noise_scale=None), or give a shorter length_scale."
+            )
+        place = hopeful.flatten().cumsum(0).reshape(loss.shape).gather(1, best[:, None]).squeeze(1) - 1
+        scale, ratio = coordinates.decode(points[place], chosen)
+        amplitude = evidence.best_variance(scale, ratio, chosen).sqrt()
+        others = [part[:, None] for part in (ratio, amplitude, first.amin(1), lowest)]
+        return torch.cat([scale, *others], dim=1)
 
 
-def _maximize(grid: EvidenceGrid, search: EvidenceSearch) -> _Ends:
-    """Steps 1 to 4 of this module, until all processes have ended."""
-    grid.refine()
-    blank = torch.zeros(4, len(grid.processes)).to(grid.evidence.targets)
-    ends = _Ends(
-        blank[0][:, None].repeat(1, grid.evidence.basis.nodes.shape[1]), blank[0], blank[1], blank[2], blank[3]
-    )
-    while True:
-        left, level = grid.unsettled(), grid.next_level
-        if level is not None and bool(left.any()):
-            n_nodes = level.n_nodes or level.max_inputs or grid.evidence.n_inputs
-            # So cheap is the next level then that those that have settled go on to it too.
-            if len(left) * n_nodes**3 <= _FEW:
-                grid.refine()
-                continue
-        rows = (~left).nonzero().squeeze(1)
-        if len(rows):
-            found = _descend(grid, search, rows)
-            ends.put(grid.processes[rows], found)
-            if level is not None:  # the next one may take these further
-                left[rows[found.length_scale.amin(1) < _AT_BOUND * grid.shortest]] = True
-        if not bool(left.any()):
-            return ends
-        grid.keep(left)
-        grid.refine()
+def _noise_ratios(targets: Float[Tensor, "b n"], noise_scale: Tensor | None) -> Tensor:
+    """Noise ratios of the grid; a fixed noise must leave room for amplitudes a hundred times the targets."""
+    ratios = 10.0 ** targets.new_tensor(_LOG10_RATIOS)
+    if noise_scale is None:
+        return ratios
+    largest = float(targets.square().mean(1).max())
+    lowest = max(float(noise_scale.min()) ** 2 / max(1e4 * largest, 1e-200), 1e-40)
+    lower = range(math.ceil(math.log10(lowest)), int(_LOG10_RATIOS[0]))
+    below = [lowest] * (lowest < 0.999 * MIN_NOISE_RATIO) + [10.0**exponent for exponent in lower]
+    return torch.cat([ratios.new_tensor(sorted(set(below))), ratios])
 
 
-def _descend(grid: EvidenceGrid, search: EvidenceSearch, chosen: Int64[Tensor, " a"]) -> _Ends:
-    """BFGS from the deepest valleys of some of a grid's processes; of each the best end."""
-    evidence, coordinates = grid.evidence, grid.coordinates()
-    length_scale, noise_ratio, loss = (part[chosen] for part in grid.valleys(1 + search.n_restarts))
-    # The deepest is taken in any case, even if the grid takes it for singular, by a strict rule.
-    hopeful = (loss <= loss[:, :1] + _HOPEFUL * evidence.n_inputs) & loss.isfinite()
-    hopeful[:, 0] = True
-    number, valley = hopeful.nonzero().unbind(1)
-    process = chosen[number]
-    starts = coordinates.encode(length_scale[number, valley], noise_ratio[number, valley], process)
-    size, points, reports = together(evidence.basis), [], []
-    for part, rows in zip(starts.split(size), process.split(size), strict=True):
-        point, report = minimize_batch(
-            lambda z, index, rows=rows: coordinates.loss(z, rows[index]), part, max_iter=search.max_iter, tol=search.tol
-        )
-        points.append(point)
-        reports.append(report)
-    never = torch.full_like(loss, math.inf)
-    first, final = (
-        never.index_put((number, valley), torch.cat(values).nan_to_num(nan=math.inf))
-        for values in zip(*((report.start_loss, report.loss) for report in reports), strict=True)
-    )
-    lowest, best = final.min(1)
-    if not bool(lowest.isfinite().all()):
-        raise NotPositiveDefiniteError(
-            "The kernel matrix is singular wherever the hyperparameters were searched. Allow for noise "
-            "(noise_scale=None), or give a shorter length_scale."
-        )
-    place = torch.zeros_like(loss, dtype=torch.long)
-    place[number, valley] = torch.arange(len(number), device=loss.device)
-    scale, ratio = coordinates.decode(torch.cat(points)[place.gather(1, best[:, None]).squeeze(1)], chosen)
-    amplitude = evidence.best_variance(scale, ratio, chosen).sqrt()
-    n_iter, status = max(report.n_iter for report in reports), first_failure(report.status for report in reports)
-    return _Ends(scale, ratio, amplitude, first.amin(1), lowest, n_iter, status)
+def _together(basis: Basis) -> int:
+    """How many covariances are treated at a time."""
+    return max(1, _ENTRIES // len(basis.nodes) ** 2)

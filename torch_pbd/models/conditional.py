@@ -1,7 +1,7 @@
-"""Fitted models: a normal distribution of y given x in the data's units, and the protocol of the cores inside."""
+"""Fitted models: the cores of CD and WP, and any core's normal distribution of y given x in the data's units."""
 
 import json
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -14,96 +14,36 @@ from torch_pbd.files.memory import require_memory
 from torch_pbd.gp import Hyperparameters, LatentGP
 from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import scale_tril_from_root, symmetrize
-
-VARIANCE_FLOOR = 1e-12
-"""Added to every variance, relative to one plus the sum of the variances; outputs have unit variance."""
-
-Shapes = Mapping[str, torch.Size]
-
-
-def with_floor(root: Float[Tensor, "*b d r"]) -> Float[Tensor, "*b d s"]:
-    """Root of a covariance with the floor added: positive definite, whatever ``root`` is.
-
-    It is in the losses as well as in predictions: a likelihood is then bounded, and the fit knows what is predicted.
-    """
-    floor = (VARIANCE_FLOOR * (1.0 + root.square().sum((-2, -1), keepdim=True))).sqrt()
-    return torch.cat([root, floor * torch.eye(root.shape[-2], dtype=root.dtype, device=root.device)], dim=-1)
-
-
-class Core(nn.Module, ABC):
-    """Mean and covariance of standardized outputs, given standardized inputs: all that a model has learned.
-
-    It is in ``config()`` and in the ``state_dict``, which files and pickles hold; the ``skeleton`` of the one takes up
-    the other.
-    """
-
-    kind: ClassVar[str]
-    """Name of the class in files."""
-
-    @abstractmethod
-    def forward(
-        self, x: Float[Tensor, "n e"], prior_tril: Float[Tensor, "n d d"] | None = None
-    ) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d r"]]:
-        """Mean, and a root of the covariance; ``prior_tril`` replaces the prior of the fit, if there is one."""
-
-    def predict_mean(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d"]:
-        """Mean alone, equal to the bit."""
-        return self(x)[0]
-
-    def predict_root(
-        self, x: Float[Tensor, "n e"], prior_tril: Float[Tensor, "n d d"] | None = None
-    ) -> Float[Tensor, "n d r"]:
-        """Root of the covariance alone, equal to the bit."""
-        return self(x, prior_tril)[1]
-
-    def variability(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d r"]:
-        """Root of the covariance with the prior taken out, if there is one: Type II uncertainty."""
-        return self.predict_root(x)
-
-    @abstractmethod
-    def type1(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
-        """Type I uncertainty: 0 on data, 1 where only the prior speaks."""
-
-    def degrees(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"] | None:
-        """Degrees of freedom of the predictive Student's t; None where the density is normal everywhere."""
-        return None
-
-    @abstractmethod
-    def config(self) -> dict[str, Any]:
-        """All that is not in the ``state_dict``, as JSON can hold it; ``kind`` under "covariance"."""
-
-    @classmethod
-    @abstractmethod
-    def skeleton(cls, config: Mapping[str, Any], shapes: Shapes, n_features: int, n_outputs: int) -> "Core":
-        """Core of a ``config()`` without numbers, as large as the arrays of these names and shapes say."""
-
-
-def beside_prior(
-    root: Float[Tensor, "*n d r"], values: Float[Tensor, "*n d r"], prior: Float[Tensor, "*m d r"]
-) -> Float[Tensor, "*n d r"]:
-    """Root of a covariance whose part beside ``values``, those without prior, is kept between nothing and the prior.
-
-    It is the prior times one less an interpolation of ones, which swings to 1.14 between two inputs: of a prior far
-    above the values, as of a movement of many standard deviations, it would take more away than there is.
-    """
-    return values + (root - values).clamp(prior.clamp_max(0.0), prior.clamp_min(0.0))
+from torch_pbd.models import Core, Shapes, blank, size_of, with_floor
+from torch_pbd.models.links import CholeskyLink, Link, WishartLink, padded
 
 
 class MeanAndCovariance(Core):
-    """Gaussian processes for the mean beside a covariance of latent processes, by its root (CD and WP).
+    """Gaussian processes for the mean beside the latent processes of a covariance's root (CD and WP).
 
-    ``covariance`` maps inputs, and another prior, to roots; it has ``latent``, ``bounded`` and ``variability``.
+    ``bounded`` is whether the part of the prior in the root is kept between nothing and the prior.
     """
 
-    def __init__(self, mean: LatentGP, covariance: Any) -> None:
+    covariance: Any
+    """Module of the latent processes and the prior, whose name is in files."""
+    _prior: ClassVar[str]
+    """Name of the prior there."""
+
+    def __init__(self, mean: LatentGP, latent: LatentGP, link: Link, *, bounded: bool = False) -> None:
         super().__init__()
-        self.mean, self.covariance = mean, covariance
+        self.mean, self.covariance, self.bounded = mean, nn.Module(), bounded
+        self.covariance.latent = latent
+        self.covariance.register_buffer(self._prior, link.prior)
+
+    @abstractmethod
+    def link(self, prior_tril: Float[Tensor, "*n d d"] | None = None) -> Link:
+        """From the processes to the root, with the prior of the fit or another."""
 
     def forward(
         self, x: Float[Tensor, "n e"], prior_tril: Float[Tensor, "n d d"] | None = None
     ) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d r"]]:
         """Mean, and a root of the covariance."""
-        return self.mean(x), self.covariance(x, prior_tril)
+        return self.mean(x), self.predict_root(x, prior_tril)
 
     def predict_mean(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d"]:
         """Mean alone."""
@@ -113,11 +53,14 @@ class MeanAndCovariance(Core):
         self, x: Float[Tensor, "n e"], prior_tril: Float[Tensor, "n d d"] | None = None
     ) -> Float[Tensor, "n d r"]:
         """Root of the covariance alone."""
-        return self.covariance(x, prior_tril)
+        deviation, values = self.covariance.latent.both(x)
+        link = self.link(prior_tril)
+        root = link.root(deviation)
+        return link.bounded(root, values) if self.bounded else root
 
     def variability(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d r"]:
         """Root of the covariance with the prior taken out: zero far from data."""
-        return self.covariance.variability(x)
+        return self.link().unflatten(self.covariance.latent.values(x))
 
     def type1(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
         """Type I uncertainty of the covariance's latent processes."""
@@ -125,24 +68,76 @@ class MeanAndCovariance(Core):
 
     def config(self) -> dict[str, Any]:
         """Kernels, and whether the part of the prior is bounded."""
-        latent, bounded = self.covariance.latent, self.covariance.bounded
-        return {"covariance": self.kind, "mean_kernel": self.mean.kernel, "kernel": latent.kernel, "bounded": bounded}
+        kernels = {"mean_kernel": self.mean.kernel, "kernel": self.covariance.latent.kernel}
+        return {"covariance": self.kind, **kernels, "bounded": self.bounded}
+
+    @classmethod
+    def skeleton(
+        cls, config: Mapping[str, Any], shapes: Shapes, n_features: int, n_outputs: int
+    ) -> "MeanAndCovariance":
+        """Core without numbers."""
+        link, n_processes = cls._blank_link(config, shapes, n_outputs)
+        mean = _blank_processes(shapes, "mean", n_outputs, n_features, config["mean_kernel"])
+        latent = _blank_processes(shapes, "covariance.latent", n_processes, n_features, config["kernel"])
+        return cls(mean, latent, link, bounded=bool(config.get("bounded", False)))
+
+    @classmethod
+    @abstractmethod
+    def _blank_link(cls, config: Mapping[str, Any], shapes: Shapes, n_outputs: int) -> tuple[Link, int]:
+        """Link without numbers, and its number of processes."""
 
 
-def blank(*shape: int) -> Tensor:
-    """Tensor of a skeleton: a shape that takes no memory."""
-    return torch.empty(shape, dtype=torch.float64, device="meta")
+class MeanAndCholesky(MeanAndCovariance):
+    """Core of the Cholesky decomposition approach."""
+
+    kind, _prior = "cholesky", "prior_tril"
+
+    def __init__(self, mean: LatentGP, latent: LatentGP, link: Link, *, bounded: bool = False) -> None:
+        super().__init__(mean, latent, link, bounded=bounded)
+        self.log_diagonal = link.log_diagonal
+
+    def link(self, prior_tril: Float[Tensor, "*n d d"] | None = None) -> CholeskyLink:
+        """From the processes to the lower factor."""
+        return CholeskyLink(self.covariance.prior_tril if prior_tril is None else prior_tril, self.log_diagonal)
+
+    def config(self) -> dict[str, Any]:
+        """Kernels, and on what the processes act."""
+        return {**super().config(), "log_diagonal": self.log_diagonal}
+
+    @classmethod
+    def _blank_link(cls, config: Mapping[str, Any], shapes: Shapes, n_outputs: int) -> tuple[CholeskyLink, int]:
+        link = CholeskyLink(blank(n_outputs, n_outputs), bool(config["log_diagonal"]))
+        return link, n_outputs * (n_outputs + 1) // 2
 
 
-def size_of(shapes: Shapes, name: str, dimension: int = 0) -> int:
-    """Size of an array, one or more."""
-    shape = shapes.get(name, ())
-    if len(shape) <= dimension or not shape[dimension]:
-        raise ValueError(f"array {name!r} is missing or empty, or has too few dimensions")
-    return shape[dimension]
+class MeanAndWishart(MeanAndCovariance):
+    """Core of the Wishart process approach, at the mean of its latent processes.
+
+    The prior is L, the lower factor of the scale matrix, times the means of the vectors: its square is the covariance
+    far from data, and stays so while L is trained.
+    """
+
+    kind, _prior = "wishart", "prior_root"
+
+    def __init__(self, mean: LatentGP, latent: LatentGP, link: Link, *, bounded: bool = False) -> None:
+        super().__init__(mean, latent, link, bounded=bounded)
+        matrix = torch.eye(len(link.prior)).to(link.prior) if link.scale_matrix_tril is None else link.scale_matrix_tril
+        self.covariance.scale_matrix_tril = nn.Parameter(matrix.detach())
+
+    def link(self, prior_tril: Float[Tensor, "*n d d"] | None = None) -> WishartLink:
+        """From the processes to the vectors."""
+        prior = self.covariance.prior_root
+        prior = prior if prior_tril is None else padded(prior_tril, prior.shape[1])
+        return WishartLink(prior, scale_matrix_tril=self.covariance.scale_matrix_tril)
+
+    @classmethod
+    def _blank_link(cls, config: Mapping[str, Any], shapes: Shapes, n_outputs: int) -> tuple[WishartLink, int]:
+        df = size_of(shapes, "covariance.prior_root", 1)
+        link = WishartLink(blank(n_outputs, df), scale_matrix_tril=blank(n_outputs, n_outputs))
+        return link, n_outputs * df
 
 
-def latent_skeleton(shapes: Shapes, prefix: str, n_processes: int, n_features: int, kernel: Any) -> LatentGP:
+def _blank_processes(shapes: Shapes, prefix: str, n_processes: int, n_features: int, kernel: Any) -> LatentGP:
     """Latent processes without numbers, for the arrays whose names start with ``prefix``."""
     n_inputs, n_scales = size_of(shapes, f"{prefix}.inputs"), size_of(shapes, f"{prefix}.length_scale")
     n_scales = min(n_scales, n_processes)  # all share one, or each has its own
@@ -153,9 +148,7 @@ def latent_skeleton(shapes: Shapes, prefix: str, n_processes: int, n_features: i
     weights = blank(n_processes, n_inputs), blank(n_processes, n_inputs)
     root = blank(size_of(shapes, f"{prefix}.root"), n_inputs) if f"{prefix}.root" in shapes else None
     checks.choice(kernel, "kernel", KERNELS)
-    return LatentGP(
-        blank(n_inputs, n_features), *weights, Hyperparameters(*scales), blank(n_inputs), kernel=kernel, root=root
-    )
+    return LatentGP(blank(n_inputs, n_features), *weights, Hyperparameters(*scales), blank(n_inputs), kernel, root)
 
 
 class ConditionalNormal(nn.Module):

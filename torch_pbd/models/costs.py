@@ -1,40 +1,28 @@
-"""The paper's cost functions, eq. (9), (11) and (12), with gradient and curvature in closed form."""
+"""The paper's likelihoods, eq. (11) and (12), and their maximization over latent values under their prior."""
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
-from torch_pbd.linalg import scale_tril_from_root, tril_to_vector
-from torch_pbd.models.cholesky import CholeskyLink
-from torch_pbd.models.conditional import VARIANCE_FLOOR, with_floor
-from torch_pbd.models.wishart import WishartLink
+from torch_pbd.gp import LatentValues
+from torch_pbd.linalg import cholesky_with_jitter, scale_tril_from_root
+from torch_pbd.models import VARIANCE_FLOOR, with_floor
+from torch_pbd.models.links import Blocks, Link, WishartLink
+from torch_pbd.optim import FitReport, Progress, minimize, minimize_scoring
 
-Link = CholeskyLink | WishartLink
+Solver = Literal["auto", "fisher", "lbfgs"]
 
 
-@dataclass(frozen=True)
 class Covariances:
-    """Covariances at the inputs: the root without the floor, and the Cholesky factor C with it."""
+    """Covariances at the inputs by a root without the floor, and their Cholesky factors C with it."""
 
-    root: Float[Tensor, "n d r"]
-    scale_tril: Float[Tensor, "n d d"]
-
-    @classmethod
-    def at(cls, link: Link, deviation: Float[Tensor, "n b"]) -> "Covariances":
-        """Covariances of latent deviations; not differentiable."""
-        root = link.root(deviation)
-        # As scale_tril_from_root, without the orthogonal part, which only a gradient needs.
-        upper = torch.linalg.qr(with_floor(root).mT, mode="r").R
-        diagonal = upper.diagonal(dim1=-2, dim2=-1)
-        return cls(root, (upper * torch.ones_like(diagonal).copysign(diagonal).unsqueeze(-1)).mT)
+    def __init__(self, root: Float[Tensor, "n d r"]) -> None:
+        self.root, self.scale_tril = root, scale_tril_from_root(with_floor(root))
 
     @cached_property
     def inverse(self) -> Float[Tensor, "n d d"]:
@@ -42,133 +30,164 @@ class Covariances:
         return torch.linalg.inv(self.scale_tril).tril()
 
 
-class _ClosedForm(torch.autograd.Function):
-    """A scalar whose gradient is computed with it."""
-
-    @staticmethod
-    def forward(ctx: Any, deviation: Tensor, cost: "Cost") -> Tensor:
-        value, gradient = cost.value_and_gradient(Covariances.at(cost.link, deviation))
-        ctx.save_for_backward(gradient)
-        return value
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
-        return gradients[0] * ctx.saved_tensors[0], None
-
-
-class Cost(ABC):
-    """Function of the covariances at the inputs, and through a link of the latent deviations there.
-
-    All of it is written in D, the change of a covariance over itself: dSigma = C D C'.
-    """
-
-    link: Link
-    has_exact_curvature = False
-    relative_tol = 0.0
-
-    def __call__(self, deviation: Float[Tensor, "n b"]) -> Float[Tensor, ""]:
-        """Cost of the deviations, differentiable once."""
-        value: Tensor = _ClosedForm.apply(deviation, self)
-        return value
-
-    def at_root(self, root: Float[Tensor, "n d r"]) -> Float[Tensor, ""]:
-        """Cost of any roots, differentiable by autograd: eq. (9) and (11) as printed, where L is trained too."""
-        return self.value(Covariances(root, scale_tril_from_root(with_floor(root))))
-
-    def value(self, point: Covariances) -> Float[Tensor, ""]:
-        """Cost alone."""
-        return self._value_and_residual(point)[0]
-
-    def value_and_gradient(self, point: Covariances) -> tuple[Float[Tensor, ""], Float[Tensor, "n b"]]:
-        """Cost, and its gradient in the deviations."""
-        value, residual = self._value_and_residual(point)
-        # With G the gradient in D, that in Sigma is C^-T G C^-1. Sigma is root root' and a floor that grows with the
-        # trace of that, so the root's gradient is twice (C^-T G C^-1 + floor tr(C^-T G C^-1) I) root.
-        in_covariance = point.inverse.mT @ self._in_change(residual, point) @ point.inverse
-        by_floor = VARIANCE_FLOOR * in_covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
-        in_covariance.diagonal(dim1=-2, dim2=-1).add_(by_floor.unsqueeze(-1))
-        return value, self.link.vjp(point.root, 2.0 * in_covariance @ point.root)
-
-    @abstractmethod
-    def _value_and_residual(self, point: Covariances) -> tuple[Tensor, Tensor]:
-        """Cost, and the residual that its gradient is made of."""
-
-    @abstractmethod
-    def _in_change(self, residual: Tensor, point: Covariances) -> Tensor:
-        """Gradient (n, d, d) in D, symmetric."""
-
-    @abstractmethod
-    def curvature(self, point: Covariances, share: float) -> Iterator[tuple[Tensor, Tensor]]:
-        """Second derivatives in the deviations at each input: indices of processes (m,), and their block (n, m, m).
-
-        Positive semidefinite ones for a ``share`` of zero, exact ones for one, if there are any.
-        """
-
-
-class Likelihood(Cost):
+class Likelihood:
     """Negative log likelihood of all rows, eq. (11) and (12), times a weight: one over their number for nats per row.
 
-    ``scatter_root`` is a root of the sums of ``w w'`` at each distinct input, w the residuals from the mean, as
-    ``TrainingSet.scatter_root`` gives it; ``counts`` are the rows there.
+    It is a function of the covariances at the inputs, and through a link of the latent deviations there. Derivatives
+    are written in D, the change of a covariance over itself: dSigma = C D C'.
+
+    Parameters
+    ----------
+    link : Link
+    scatter_root : Tensor of shape (n, d, r)
+        Root of the sums of ``w w'`` at each distinct input, w the residuals from the mean, as
+        ``TrainingSet.scatter_root`` gives it.
+    counts : Tensor of shape (n,)
+        Rows there.
+    weight : float
     """
 
     def __init__(
         self, link: Link, scatter_root: Float[Tensor, "n d r"], counts: Float[Tensor, " n"], weight: float
     ) -> None:
-        self.link, self._scatter_root, self._weight = link, scatter_root, weight
+        self.link, self._scatter_root, self.weight = link, scatter_root, weight
         self._counts = counts[:, None, None]
         size = scatter_root.shape[1]
         self._identity = self._counts * torch.eye(size).to(scatter_root)
         self._constant = 0.5 * size * math.log(2 * math.pi) * counts.sum()
-        self.has_exact_curvature = isinstance(link, WishartLink)
 
-    def _value_and_residual(self, point: Covariances) -> tuple[Tensor, Tensor]:
+    def __call__(self, deviation: Float[Tensor, "n b"]) -> Float[Tensor, ""]:
+        """Value at deviations; differentiable by autograd, in the link's scale matrix too."""
+        return self.at_root(self.link.root(deviation))
+
+    def at_root(self, root: Float[Tensor, "n d r"]) -> Float[Tensor, ""]:
+        """Value of any roots."""
         # Sum over all rows of w' Sigma^-1 w / 2 + log det C + d log(2 pi) / 2, the sum of squares by input.
-        whitened = torch.linalg.solve_triangular(point.scale_tril, self._scatter_root, upper=False)
-        log_det = self._counts[:, 0, 0] @ point.scale_tril.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-        return self._weight * (0.5 * whitened.square().sum() + log_det + self._constant), whitened
+        scale_tril = Covariances(root).scale_tril
+        whitened = torch.linalg.solve_triangular(scale_tril, self._scatter_root, upper=False)
+        log_det = self._counts[:, 0, 0] @ scale_tril.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        return self.weight * (0.5 * whitened.square().sum() + log_det + self._constant)
 
-    def _in_change(self, residual: Tensor, point: Covariances) -> Tensor:
-        # (n I - Z) / 2 with Z the whitened scatter.
-        return torch.baddbmm(self._identity, residual, residual.mT, beta=0.5 * self._weight, alpha=-0.5 * self._weight)
+    def gradient(self, point: Covariances) -> Float[Tensor, "n b"]:
+        """Gradient in the deviations, in closed form."""
+        # In D it is G = (n I - Z) / 2 with Z the whitened scatter, and in Sigma C^-T G C^-1. Sigma is root root' and a
+        # floor that grows with the trace of that, so the root's gradient is twice
+        # (C^-T G C^-1 + floor tr(C^-T G C^-1) I) root.
+        in_change = 0.5 * self.weight * (self._identity - self._scatter(point))
+        in_covariance = point.inverse.mT @ in_change @ point.inverse
+        by_floor = VARIANCE_FLOOR * in_covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
+        in_covariance.diagonal(dim1=-2, dim2=-1).add_(by_floor.unsqueeze(-1))
+        return self.link.vjp(point.root, 2.0 * in_covariance @ point.root)
 
-    def curvature(self, point: Covariances, share: float) -> Iterator[tuple[Tensor, Tensor]]:
-        """Expected Fisher information, and of a Wishart process a share of the observed one."""
+    def curvature(self, point: Covariances, share: float) -> Blocks:
+        """Expected Fisher information in the deviations at each input; of a Wishart process a share of the observed."""
         for members, information in self.link.information(point.root, point.inverse):
-            total = information * (self._weight * self._counts)
+            total = information * (self.weight * self._counts)
             if share and isinstance(self.link, WishartLink):
-                whitened = point.inverse @ self._scatter_root
-                scatter = whitened @ whitened.mT
+                scatter = self._scatter(point)
                 observed = self.link.observed_information(point.root, point.inverse, scatter, self._counts)
-                total = total.lerp(self._weight * observed, share)
+                total = total.lerp(self.weight * observed, share)
             yield members, total
 
+    def _scatter(self, point: Covariances) -> Float[Tensor, "n d d"]:
+        whitened = point.inverse @ self._scatter_root
+        return whitened @ whitened.mT
 
-class FactorDistance(Cost):
-    """Mean squared distance J_MSE of the vectorized Cholesky factors to a target, eq. (9).
 
-    Its curvature is Gauss and Newton's. The target are factors of the empirical covariances.
+class _Posterior:
+    """Negative log posterior density of whitened values, which a priori are standard normal, times the weight."""
+
+    def __init__(self, likelihood: Likelihood, latent: LatentValues) -> None:
+        self._likelihood, self._latent = likelihood, latent
+        self._share = 0.0  # of the observed information in the curvature of the last step
+
+    def __call__(self, whitened: Tensor) -> Tensor:
+        """Loss, differentiable by autograd."""
+        return self._likelihood(self._latent(whitened)) + 0.5 * self._likelihood.weight * whitened.square().sum()
+
+    def newton(self, whitened: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradient, and Newton's step.
+
+        Its matrix is the expected information with as large a share of the observed one as leaves it positive
+        definite: expected, it knows nothing of the bend of the valleys in which the vectors of a Wishart process turn.
+        """
+        point = Covariances(self._likelihood.link.root(self._latent(whitened)))
+        gradient = self._latent.vjp(self._likelihood.gradient(point)) + self._likelihood.weight * whitened
+        # Quarters, from one more than in the last step downwards: each that fails costs a decomposition.
+        self._share = min(1.0, self._share + 0.25) if isinstance(self._likelihood.link, WishartLink) else 0.0
+        factors = self.factors(point, self._share)
+        while not factors:
+            self._share -= 0.25
+            factors = self.factors(point, self._share)
+        step = torch.empty_like(gradient)
+        for members, factor in factors:
+            solved = torch.cholesky_solve(gradient[members].reshape(-1, 1), factor)
+            step[members] = -solved.reshape(len(members), -1)
+        return gradient, step
+
+    def factors(self, point: Covariances, share: float = 0.0) -> list[tuple[Tensor, Tensor]]:
+        """Indices of processes, and Cholesky factors of their curvature; none where a share leaves it indefinite."""
+        factors = []
+        for members, weight in self._likelihood.curvature(point, share):
+            matrix = self._latent.normal_matrix(members, weight)
+            matrix.diagonal().add_(self._likelihood.weight)
+            factor, info = torch.linalg.cholesky_ex(matrix)
+            if info > 0 and share > 0.0:
+                return []
+            if info > 0:
+                factor = cholesky_with_jitter(matrix, name="the information of the latent values")[0]
+            factors.append((members, factor))
+        return factors
+
+    def preconditioned(self, start: Tensor) -> Callable[[Tensor], Tensor]:
+        """Whitened values of coordinates in which the curvature at a start, which is zero there, is the unit matrix."""
+        with torch.no_grad():
+            blocks = self.factors(Covariances(self._likelihood.link.root(self._latent(start))))
+
+        # With the curvature P = F F' and step = inv(F') z the quadratic form step' P step is |z|^2.
+        def whitened(z: Tensor) -> Tensor:
+            step = torch.zeros_like(z)
+            for members, factor in blocks:
+                solved = torch.linalg.solve_triangular(factor.mT, z[members].reshape(-1, 1), upper=True)
+                step = step.index_copy(0, members, solved.reshape(len(members), -1))
+            return start + step
+
+        return whitened
+
+
+def train(
+    likelihood: Likelihood,
+    latent: LatentValues,
+    *,
+    solver: Solver = "auto",
+    max_iter: int,
+    tol: float,
+    callback: Callable[[Progress], None] | None = None,
+) -> FitReport:
+    """Maximize a likelihood times the prior density of latent values, in place, hyperparameters held.
+
+    Latent values with hyperparameters that are trained, and the link's scale matrix with them, maximize the likelihood
+    alone, as printed, by L-BFGS.
+
+    Else the solver "fisher" takes Newton's steps. "lbfgs" is ``torch.optim.LBFGS`` in coordinates in which the
+    curvature at the start is the unit matrix, unless a block of it exceeds the link's ``largest_block``. "auto" takes
+    the first unless it does.
     """
-
-    link: WishartLink
-    relative_tol = 1e-3  # at more inputs than the kernel matrix has rank no vectors reach the target
-
-    def __init__(self, link: WishartLink, target: Float[Tensor, "n d d"]) -> None:
-        self.link, self._target = link, target
-
-    def _value_and_residual(self, point: Covariances) -> tuple[Tensor, Tensor]:
-        difference = point.scale_tril - self._target
-        return difference.square().sum((-2, -1)).mean(), difference
-
-    def _in_change(self, residual: Tensor, point: Covariances) -> Tensor:
-        # dC = C tril(D) with half of the diagonal.
-        in_factor = (point.scale_tril.mT @ residual).tril() * (2.0 / len(residual))
-        lower = in_factor - 0.5 * torch.diag_embed(in_factor.diagonal(dim1=-2, dim2=-1))
-        return 0.5 * (lower + lower.mT)
-
-    def curvature(self, point: Covariances, share: float) -> Iterator[tuple[Tensor, Tensor]]:
-        """Squares of the derivatives of the factors."""
-        for members, derivative in self.link.jacobian(point.root, point.scale_tril, point.inverse):
-            entries = tril_to_vector(derivative)
-            yield members, 2.0 / len(entries) * entries @ entries.mT
+    limits: Any = {"max_iter": max_iter, "tol": tol, "callback": callback}
+    if latent.train_hyperparameters:
+        matrix = likelihood.link.scale_matrix_tril
+        trained = [*latent.trained(), *([] if matrix is None else [matrix])]
+        return minimize(lambda: likelihood(latent()), trained, **limits)
+    posterior = _Posterior(likelihood, latent)
+    start = latent.whitened.detach().clone()
+    small = likelihood.link.block_size * start.shape[1] <= likelihood.link.largest_block
+    if solver == "fisher" or (solver == "auto" and small):
+        found, report = minimize_scoring(posterior, posterior.newton, start, **limits)
+    else:
+        whitened = posterior.preconditioned(start) if small else start.add
+        z = torch.zeros_like(start, requires_grad=True)
+        report = minimize(lambda: posterior(whitened(z)), [z], **limits)
+        found = whitened(z.detach())
+    with torch.no_grad():
+        latent.whitened.copy_(found)
+    return report

@@ -9,10 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torch_pbd import checks
-from torch_pbd.exceptions import InvalidParameterError, NotPositiveDefiniteError
-from torch_pbd.linalg import scale_tril_from_root
-from torch_pbd.models.conditional import Core, Shapes, blank, size_of
+from torch_pbd.exceptions import NotPositiveDefiniteError
+from torch_pbd.linalg import scale_tril_from_root, triangular_inverse
+from torch_pbd.models import Core, Shapes, blank, size_of
 from torch_pbd.optim import FitReport, Progress, Status, minimize
 
 _BLOCK = 1 << 13  # rows that an E step holds at a time: what it makes of them stays in the cache
@@ -48,7 +47,8 @@ class GaussianMixture(Core):
     """Gaussian mixture over the joint vector [x, y] of p = e + d variables; as a core, Gaussian mixture regression.
 
     Components have weights, of whose logarithms a common constant does not matter, means, and Cholesky factors of
-    covariances; the ``n_features`` inputs are the leading variables.
+    covariances, by the logarithms of their diagonals and what is below; the ``n_features`` inputs are the leading
+    variables.
     """
 
     kind = "mixture"
@@ -58,20 +58,14 @@ class GaussianMixture(Core):
         self,
         log_weight: Float[Tensor, " k"],
         mean: Float[Tensor, "k p"],
-        scale_tril: Float[Tensor, "k p p"],
+        log_diagonal: Float[Tensor, "k p"],
+        strict_lower: Float[Tensor, "k p p"],
         n_features: int,
     ) -> None:
         super().__init__()
-        self.n_features = checks.count(n_features, "n_features", most=mean.shape[-1] - 1)
-        diagonal, lower = scale_tril.detach().diagonal(dim1=-2, dim2=-1), scale_tril.detach()
-        if not lower.is_meta:  # a skeleton holds no numbers, and arithmetic on it loads torch's compiler, for seconds
-            if not (diagonal > 0).all():
-                raise InvalidParameterError("scale_tril has a diagonal entry that is not positive.")
-            diagonal, lower = diagonal.log(), lower.tril(-1)
-        self.log_weight = nn.Parameter(log_weight.detach().clone())
-        self.mean = nn.Parameter(mean.detach().clone())
-        self.log_diagonal = nn.Parameter(diagonal.clone())
-        self.strict_lower = nn.Parameter(lower)
+        self.n_features = n_features
+        self.log_weight, self.mean = nn.Parameter(log_weight), nn.Parameter(mean)
+        self.log_diagonal, self.strict_lower = nn.Parameter(log_diagonal), nn.Parameter(strict_lower)
         self.register_buffer("log_density_floor", torch.full_like(mean[:1, 0], -math.inf))
 
     @property
@@ -122,7 +116,7 @@ class GaussianMixture(Core):
     def skeleton(cls, config: Mapping[str, Any], shapes: Shapes, n_features: int, n_outputs: int) -> "GaussianMixture":
         """Mixture without numbers."""
         k, p = size_of(shapes, "log_weight"), n_features + n_outputs
-        return cls(blank(k), blank(k, p), blank(k, p, p), n_features)
+        return cls(blank(k), blank(k, p), blank(k, p), blank(k, p, p), n_features)
 
     def components(self, size: int | None = None) -> Components:
         """Components over the first ``size`` variables, or over all."""
@@ -181,8 +175,8 @@ def refine(
     A A^T + reg_covar I with A free: the floor that EM keeps, but maximized with, not added afterwards. Means
     and A are measured in the components' frames at the start, where the problem is nearly isotropic.
 
-    ``mixture``, ``data`` and ``reg_covar``, which is above zero, are as in :func:`expectation_maximization`, whose loss
-    this lowers, the others as in :func:`~torch_pbd.optim.minimize`.
+    The arguments are those of :func:`expectation_maximization`, whose loss this lowers (``reg_covar`` above zero), and
+    of :func:`~torch_pbd.optim.minimize`.
     """
     with torch.no_grad():
         start = mixture.components()
@@ -206,19 +200,18 @@ def refine(
 @torch.no_grad()
 def _with_density_floor(components: Components, inputs: Float[Tensor, "n e"]) -> GaussianMixture:
     """Mixture of these components, which knows the lowest density of the training inputs."""
-    mixture = GaussianMixture(components.log_weight, components.mean, components.scale_tril, inputs.shape[1])
+    log_diagonal = components.scale_tril.diagonal(dim1=-2, dim2=-1).log()
+    parts = components.log_weight, components.mean, log_diagonal, components.scale_tril.tril(-1)
+    mixture = GaussianMixture(*parts, inputs.shape[1])
     mixture.log_density_floor.fill_(mixture.log_prob(inputs).min())
     return mixture
 
 
 def _spread_above(scale_tril: Float[Tensor, "k p p"], reg_covar: float) -> Float[Tensor, "k p p"]:
     """Factor B with which scale_tril B B^T scale_tril^T + reg_covar I are the covariances."""
-    identity = torch.eye(scale_tril.shape[-1]).to(scale_tril).expand_as(scale_tril)
-    inverse = torch.linalg.solve_triangular(scale_tril, identity, upper=False)
-    # Of C B B' C' = C C' - reg_covar I follows B B' = I - reg_covar C^-1 C^-T.
-    excess, axes = torch.linalg.eigh(identity - reg_covar * inverse @ inverse.mT)
-    if not reg_covar > 0 or (excess < -(torch.finfo(excess.dtype).eps ** 0.5)).any():
-        raise ValueError(f"reg_covar is {reg_covar:g}: it must be above 0, and at most what the mixture has.")
+    # From C B B' C' = C C' - reg_covar I follows B B' = I - reg_covar C^-1 C^-T.
+    inverse = triangular_inverse(scale_tril)
+    excess, axes = torch.linalg.eigh(torch.eye(len(inverse[0])).to(inverse) - reg_covar * inverse @ inverse.mT)
     return axes * excess.clamp_min(0).sqrt().unsqueeze(-2)
 
 

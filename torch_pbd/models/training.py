@@ -112,6 +112,12 @@ def pooled_tril(training: TrainingSet) -> Float[Tensor, "d d"]:
     return scale_tril_from_root(residual.mT) / degrees**0.5
 
 
+def residual_tril(residual: Tensor) -> Tensor:
+    """Factor of the covariance of all residuals, where the training of a likelihood starts."""
+    floor = 1e-6 * torch.eye(residual.shape[1]).to(residual)
+    return scale_tril_from_root(torch.cat([residual.mT / len(residual) ** 0.5, floor], dim=1))
+
+
 def default_prior_tril(y: Tensor) -> Tensor:
     """Factor of a wide prior: four times the covariance of all of y around its mean.
 

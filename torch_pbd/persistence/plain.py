@@ -39,8 +39,8 @@ def decode_parameters(description: Any, known: Mapping[str, str] = ESTIMATORS) -
         raise ValueError(f"it holds a {name!r:.80}; known are {', '.join(known)}")
     if name == "DMPController":  # files from before there was a choice are of the printed equation
         parameters = {"adaptation": "additive", **parameters}
-    if name == "HeteroscedasticGPRegressor":  # what files from before learned with it is in their arrays
-        parameters = {key: value for key, value in parameters.items() if key != "shared_length_scale"}
+    former = {"HeteroscedasticGPRegressor": "shared_length_scale", "WishartProcessRegressor": "start"}.get(name)
+    parameters = {key: value for key, value in parameters.items() if key != former}  # learned is what it led to
     estimator = load_class(name)(**_decoded(name, parameters))
     device = getattr(estimator, "device", None)
     if not isinstance(device, str | None) or (device or "").startswith("meta"):  # which holds no numbers

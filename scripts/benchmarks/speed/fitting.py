@@ -117,7 +117,6 @@ def _paper_problem(plan: Plan) -> list[Row]:
     models = {
         "CD": CholeskyCovRegressor(),
         "WP by eq. (9)": WishartProcessRegressor(),
-        "WP by eq. (9) from a random start": WishartProcessRegressor(start="random"),
     }
     times = alternate({name: lambda m=model: m.fit(X, y) for name, model in models.items()}, plan.n_repetitions)
     inputs, empirical = empirical_covariances(X, y)

@@ -18,9 +18,8 @@ from torch_pbd.data.synthetic import paper_mean
 from torch_pbd.gp import LatentValues
 from torch_pbd.kernels import correlation
 from torch_pbd.linalg import safe_cholesky, scale_tril_from_root
-from torch_pbd.models.cholesky import CholeskyLink, tril_deviation
-from torch_pbd.models.costs import Likelihood
-from torch_pbd.models.scoring import Solver, train_by_scoring
+from torch_pbd.models.costs import Likelihood, Solver, train
+from torch_pbd.models.links import CholeskyLink
 from torch_pbd.optim import Progress, minimize
 
 N_ROWS, LENGTH_SCALE = 500, 0.2
@@ -39,7 +38,7 @@ class Problem:
         self.prior_tril = 2.0 * pooled
         # Of the logarithms on the diagonal, and of the entry below.
         self.amplitude = torch.tensor([2.0, float(self.prior_tril[1].norm()), 2.0], dtype=torch.float64)
-        start = tril_deviation(pooled, self.prior_tril, log_diagonal=True)
+        start = CholeskyLink(self.prior_tril, True).deviation(pooled)
         self.start = start.expand(n_rows, -1).mT.contiguous()
 
 
@@ -66,7 +65,7 @@ def by_scoring(problem: Problem, watch: Watch, solver: Solver, tol: float = 1e-1
     length_scale = torch.tensor([[LENGTH_SCALE]], dtype=torch.float64)
     latent = LatentValues(problem.inputs, problem.start, problem.amplitude, length_scale)
     cost = Likelihood(CholeskyLink(problem.prior_tril, True), problem.scatter_root, problem.counts, 1.0 / n_rows)
-    train_by_scoring(cost, latent, prior_weight=1.0 / n_rows, solver=solver, max_iter=200, tol=tol, callback=watch)
+    train(cost, latent, solver=solver, max_iter=200, tol=tol, callback=watch)
 
 
 def plain(problem: Problem, watch: Watch, tol: float = 1e-9) -> None:

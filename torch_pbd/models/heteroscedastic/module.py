@@ -14,7 +14,7 @@ from torch_pbd import checks
 from torch_pbd.gp.observations import spacing
 from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky, symmetrize
-from torch_pbd.models.conditional import Core, Shapes, blank, size_of
+from torch_pbd.models import Core, Shapes, blank, size_of
 from torch_pbd.models.heteroscedastic.covariance import FactorMoments, LatentCovariance, degrees_of_freedom
 from torch_pbd.models.heteroscedastic.fit import HeteroscedasticFit
 from torch_pbd.models.heteroscedastic.mean import LatentMean
