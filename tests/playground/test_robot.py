@@ -7,7 +7,9 @@ import pytest
 
 from torch_pbd import DMPController, GMMBaseline
 from torch_pbd.data import make_tunnel_demonstrations
-from torch_pbd.playground.robot import Robot
+
+pytest.importorskip("uvicorn", reason="the extra 'playground' is not installed")
+from torch_pbd.playground.server import Robot
 
 
 @pytest.fixture(scope="module")

@@ -134,9 +134,8 @@ def _files(data: Any) -> list[Path]:
         files = find_files(data)
     except (FileNotFoundError, ValueError) as error:
         raise ConfigError(f"data: {error}") from error
-    for file in files:
-        if not file.exists():
-            raise ConfigError(f"data: there is no file {str(file)!r}; give one with --data FILE.")
+    if missing := [file for file in files if not file.exists()]:
+        raise ConfigError(f"data: there is no file {str(missing[0])!r}; give one with --data FILE.")
     return files
 
 

@@ -138,21 +138,18 @@ class MovementDisplay:
 
     def plot(self, ax: Axes | None = None) -> Self:
         """Draw into ``ax``, the path or the band of one output only, or into a new figure."""
-        shown = self.outputs
-        in_space = len(shown) in (2, 3)
+        shown, in_space = self.outputs, len(self.outputs) in (2, 3)
         if ax is not None:
-            self.axes_: list[Any] = [ax]
-            if not in_space:
-                self._plot_band(ax, shown[0])
+            plane, bands = ([ax], []) if in_space else ([], [ax])
         else:
             figure, plane, bands = style.panels(len(shown), len(shown) if in_space else 0)
-            for band, output in zip(bands, shown, strict=True):
-                self._plot_band(band, output)
-            self.axes_ = plane + bands
+        for band, output in zip(bands, shown, strict=False):
+            self._plot_band(band, output)
+        for path in plane:
+            self._plot_path(path)
+        self.axes_: list[Any] = [*plane, *bands]
         self.ax_ = self.axes_[0]
         self.figure_ = self.ax_.figure
-        if in_space:
-            self._plot_path(self.ax_)
         if ax is None:
             style.legend_below(figure, self.axes_)
         return self
