@@ -85,9 +85,9 @@ def evenly(n: int, most: int) -> Int64[Tensor, " m"]:
 def scale_tril_from_root(root: Float[Tensor, "*b d r"]) -> Float[Tensor, "*b d d"]:
     """Lower Cholesky factor of ``root @ root.mT``, its diagonal not negative.
 
-    By a QR decomposition of the transpose, so the product is never formed: small variances keep all their
-    digits beside large ones, and a root of rank below d (fewer demonstrations than outputs, an output that
-    is constant) gives zeros on the diagonal instead of a failure.
+    A QR decomposition of the transpose never forms the product: small variances keep all their digits beside large
+    ones, and a root of rank below d (fewer demonstrations than outputs, a constant output) gives zeros on the diagonal
+    instead of a failure.
     """
     n_outputs, rank = root.shape[-2:]
     if rank < n_outputs:

@@ -67,8 +67,8 @@ def matrix(quaternion: Floats) -> Floats:
 def from_matrix(rotation: Floats) -> Floats:
     """Quaternion (..., 4) with w >= 0 of a rotation matrix (..., 3, 3).
 
-    4 q q' is linear in the matrix; its largest column is q times a number that is far from zero (S. W. Shepperd,
-    "Quaternion from rotation matrix", Journal of Guidance and Control 1, 1978).
+    4 q q' is linear in the matrix, and q its eigenvector (I. Y. Bar-Itzhack, "New method for extracting the quaternion
+    from a rotation matrix", Journal of Guidance, Control, and Dynamics 23, 2000).
     """
     r = np.moveaxis(rotation, (-2, -1), (0, 1))
     diagonal = np.stack([r[0, 0], r[1, 1], r[2, 2]])
@@ -78,10 +78,7 @@ def from_matrix(rotation: Floats) -> Floats:
         outer[i + 1, i + 1] = 1.0 + 2.0 * diagonal[i] - diagonal.sum(axis=0)
         outer[0, i + 1] = outer[i + 1, 0] = r[k, j] - r[j, k]
         outer[i + 1, j + 1] = outer[j + 1, i + 1] = r[i, j] + r[j, i]
-    outer = np.moveaxis(outer, (0, 1), (-2, -1))
-    largest = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
-    column = np.take_along_axis(outer, largest[..., np.newaxis, np.newaxis], axis=-1)[..., 0]
-    quaternion = column / np.linalg.norm(column, axis=-1, keepdims=True)
+    quaternion = np.linalg.eigh(np.moveaxis(outer, (0, 1), (-2, -1)))[1][..., -1]
     return np.where(quaternion[..., :1] < 0.0, -quaternion, quaternion)
 
 
@@ -114,7 +111,7 @@ def continuous(quaternion: Floats) -> Floats:
 def mean(quaternion: Floats) -> Floats:
     """Rotation (4,), with w >= 0, that has the least sum of squared angles to those given (n, 4): the Frechet mean.
 
-    From the mean in the chordal metric, an eigenvector and so blind to signs, by Karcher's iteration.
+    Karcher's iteration from the mean in the chordal metric, an eigenvector that is blind to signs.
     """
     found = np.linalg.eigh(quaternion.T @ quaternion)[1][:, -1]
     for _ in range(_MAX_STEPS):

@@ -106,7 +106,7 @@ class CovarianceRegressor(TorchEstimator):
         X : array-like of shape (n_samples, n_features)
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
         sample_weight : array-like of shape (n_samples,), default=None
-            Of the rows in the mean. A pipeline asks for it where metadata are routed.
+            Weights of the rows in the mean. A pipeline asks for them where metadata are routed.
         """
         densities = self.log_likelihood(X, y)
         if sample_weight is None:

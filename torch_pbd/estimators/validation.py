@@ -133,7 +133,7 @@ def without_rounding(X: Floats) -> Floats:
     """X with values of a column made equal that a rounding to float32 has told apart.
 
     They are within its resolution of the range, or one is the other rounded, and far nearer than usual in the column.
-    Of many, as of recordings of two precisions, it warns; in many irregular inputs some come as near by chance.
+    Many, as in recordings of two precisions, bring a warning; a few come as near by chance in irregular inputs.
     """
     X = X.copy()
     for number, column in enumerate(X.T):

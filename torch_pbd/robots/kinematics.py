@@ -10,12 +10,11 @@ from torch_pbd.checks import Floats
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.registry import optional
 
-# Of a row: by Newton's steps the error is squared, so that what remains is rounding.
+# Newton's steps for a row square the error, so that what remains is rounding.
 _MAX_STEPS, _REACHED, _SETTLED = 200, 1e-9, 1e-7
-# In rad a step, as linear goes so far; and the share of the easiest direction at which another counts as lost.
+# Longest step in rad, as far as an arm is nearly linear; share of the easiest direction below which another is lost.
 _LONGEST_STEP, _SINGULAR = 0.3, 1e-4
-# In rad (or m, of a slide), beyond the limits of a joint: recorded angles overshoot, and those in degrees go further.
-_OVERSHOT = 0.1
+_OVERSHOT = 0.1  # rad (or m) beyond the limits of a joint: recorded angles overshoot, those in degrees go further
 
 
 class ToolState(NamedTuple):
@@ -127,13 +126,13 @@ def arm(model: Any, tool: str) -> Arm:
 def operational_inertia(model: Any, joints: ArrayLike, tool: str) -> Floats:
     """Inertia that is felt at the tool of an arm, ``Lambda = (J M^-1 J')^-1``, in world axes.
 
-    What `torch_pbd.control.Schedule.with_inertia` takes: a torque-controlled arm that is pushed moves with it, and not
-    with 1 kg.
+    `torch_pbd.control.Schedule.with_inertia` takes it: a torque-controlled arm that is pushed moves with it, not with
+    1 kg.
 
     Parameters
     ----------
     model : mujoco.MjModel or pinocchio.Model
-        Of an arm with six joints or more before the tool; joints beside them, of fingers, are locked.
+        An arm with six joints or more before the tool; others, such as those of fingers, are locked.
     joints : array_like of shape (..., n)
         Joint angles in rad, from the base to the tool.
     tool : str
@@ -187,7 +186,7 @@ def inverse_kinematics(
     ----------
     model : mujoco.MjModel or pinocchio.Model
     position : array_like of shape (T, 3)
-        Of the tool, m, as ``schedule.position``.
+        Path of the tool, m, as ``schedule.position``.
     orientation : array_like of shape (T, 4)
         Unit quaternions w x y z, as ``schedule.orientation``.
     tool : str
@@ -200,7 +199,7 @@ def inverse_kinematics(
     Returns
     -------
     ndarray of shape (T, n)
-        In rad, the pose met to 1e-9 m and rad.
+        Joint angles in rad, at which the pose is met to 1e-9 m and rad.
 
     Raises
     ------
@@ -219,10 +218,8 @@ def inverse_kinematics(
         last, joints = joints, _reach(chain, guess, place, turn, near, row)
         found[row] = joints
     low, high = chain.limits
-    must = "within the limits of its joint"
-    checks.require(
-        (found >= low) & (found <= high), found, "joints", must, "move the path, or change start and posture"
-    )
+    possible, remedy = (found >= low) & (found <= high), "move the path, or change start and posture"
+    checks.require(possible, found, "joints", "within the limits of its joint", remedy)
     return found
 
 

@@ -35,16 +35,12 @@ def panda_mjcf(*, hand: bool = True, armature: float = 0.1, timestep: float = 1e
     Parameters
     ----------
     hand : bool, default=True
-        With the manufacturer's hand of 0.73 kg, closed; the tool is then its tip, 0.1034 m beyond the flange, else
-        the flange.
+        Whether the arm carries the manufacturer's hand of 0.73 kg, closed. The tool is its tip, 0.1034 m beyond the
+        flange, or else the flange.
     armature : float, default=0.1
         Inertia of each motor at its joint, kg m^2; libfranka's model has none.
     timestep : float, default=1e-3
-        Of the simulation, s.
-
-    Returns
-    -------
-    str
+        Time step of the simulation, s.
 
     References
     ----------
@@ -85,11 +81,10 @@ class ArmRun:
     Attributes
     ----------
     time : (T,), s
-    position, orientation : (T, 3) in m and (T, 4), w x y z
-        Of the tool.
+    position, orientation : (T, 3) in m and (T, 4), w x y z; the tool
     twist : (T, 6), m/s and rad/s
     deviation : (T, 6), m and rad
-        From the schedule: translation, and the rotation vector that turns the desired orientation into the true one.
+        Translation from the schedule, and the rotation vector that turns the desired orientation into the true one.
     wrench : (T, 6), N and Nm
         External, at the tool.
     joints, torque : (T, n), rad and Nm
@@ -136,9 +131,9 @@ def run(
     Parameters
     ----------
     model : mujoco.MjModel
-        With one torque motor for each joint, in their order; `torch_pbd.robots.panda` is one.
+        An arm with one torque motor for each joint, in their order; `torch_pbd.robots.panda` is one.
     schedule : Schedule
-        Of poses, its rows the ticks of the controller: evenly spaced, at 1 kHz for stiff gains
+        Poses, whose rows are the ticks of the controller: evenly spaced, at 1 kHz for stiff gains
         (``schedule.resample(1000.0)``), a whole number of the model's time steps apart.
     joints : array_like of shape (T, n)
         Joint angles in rad along the schedule, from `torch_pbd.robots.inverse_kinematics`: the arm starts at the first,

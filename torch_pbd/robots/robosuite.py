@@ -38,14 +38,14 @@ def to_actions(schedule: Schedule, control_freq: float = 20.0) -> Floats:
     Parameters
     ----------
     schedule : Schedule
-        Of poses, in m and world axes, with a mass of one number or none, which counts as 1 kg.
+        Poses, in m and world axes, with a mass of one number or none, which counts as 1 kg.
     control_freq : float, default=20.0
-        Of the environment.
+        Actions a second, as the environment has them.
 
     Warns
     -----
     UserWarning
-        Of what the diagonals of stiffness and damping lose: the controller takes no more.
+        If the diagonals of stiffness and damping, which are all that the controller takes, lose something.
 
     Raises
     ------

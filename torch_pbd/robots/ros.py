@@ -34,7 +34,7 @@ def to_messages(schedule: Schedule, *, gains: Gains = "matrix") -> Iterator[tupl
     Parameters
     ----------
     schedule : Schedule
-        Of poses, in m; its ``frame`` is the messages', or ``base``.
+        Poses, in m; its ``frame`` is the messages', or ``base``.
     gains : {"matrix", "diagonal"}, default="matrix"
         36 numbers, row by row, or the diagonals alone.
 
@@ -43,14 +43,14 @@ def to_messages(schedule: Schedule, *, gains: Gains = "matrix") -> Iterator[tupl
     topic : str
         ``target_pose``, ``target_twist`` (world axes), ``target_stiffness`` or ``target_damping``.
     time : int
-        Of the schedule, ns; the same in the header.
-    message
-        Of rosbags, with the fields of ROS.
+        Time of the schedule, ns; the same in the header.
+    message : object
+        Message of rosbags, with the fields of ROS.
 
     Warns
     -----
     UserWarning
-        Of what diagonal gains lose.
+        If diagonal gains lose something.
     """
     types = _store().types
     position, orientation = poses(schedule)
@@ -83,7 +83,7 @@ def to_bag(schedule: Schedule, path: str | os.PathLike[str], *, gains: Gains = "
     ----------
     schedule : Schedule
     path : path
-        Of the folder, which must not exist.
+        The folder, which must not exist.
     gains : {"matrix", "diagonal"}, default="matrix"
 
     Raises

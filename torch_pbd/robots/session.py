@@ -29,9 +29,9 @@ class RobotLimits:
     Parameters
     ----------
     speed, acceleration : float, default=1.7, 13.0
-        Of the tool, m/s and m/s^2.
+        Limits of the tool's motion, m/s and m/s^2.
     angular_speed, angular_acceleration : float, default=2.5, 25.0
-        In rad/s and rad/s^2.
+        Limits of its rotation, rad/s and rad/s^2.
     stiffness, rotational_stiffness : (float, float), default=(10.0, 3000.0), (1.0, 300.0)
         Smallest and largest eigenvalue of the blocks, N/m and Nm/rad.
     """
@@ -119,11 +119,10 @@ class RobotRun:
 
     Attributes
     ----------
-    time : (m,), s
-        In the schedule.
+    time : (m,), s, within the schedule
     position, orientation : (m, 3) in m and (m, 4), w x y z
     deviation : (m, 6), m and rad
-        From the schedule: translation, and the rotation vector that turns the desired orientation into the true one.
+        Translation from the schedule, and the rotation vector that turns the desired orientation into the true one.
     """
 
     time: Floats
