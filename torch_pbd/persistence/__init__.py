@@ -25,6 +25,7 @@ from torch_pbd.control.primitive.reproduction import Reproduction, primitive
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.exceptions import ModelFileError
 from torch_pbd.files import LOADERS, Arrays, read_checksummed, write_checksummed
+from torch_pbd.movement.law import check_arrays
 from torch_pbd.persistence import plain
 from torch_pbd.registry import ESTIMATORS, MOVEMENTS, REGRESSORS
 
@@ -240,19 +241,16 @@ def _restore_controller(controller: Any, own: Arrays) -> None:
     own = {_HOLES: np.zeros(2), **own}  # none at the start, none at the end
     shapes: dict[str, tuple[int | str, ...]] = dict.fromkeys((*_NOISE, *_MOTION), (d,))
     shapes |= {"forcing": ("m", d), _HOLES: ("m",)}
-    if set(_OF_POSES) & set(own):
-        shapes |= dict(zip(_OF_POSES, ((4,), (d, d)), strict=True))
-    plain.check_entries(own, set(shapes), "its arrays")
-    for name, array in own.items():
-        checks.array(array, name, shapes[name])
+    if any(name in own for name in _OF_POSES):
+        shapes |= {"rotation_reference": (4,), "output_axes": (d, d)}
+    check_arrays(own, shapes)
     checks.require((own[_HOLES] >= 0.0) & (own[_HOLES] <= 1.0), own[_HOLES], _HOLES, "a share from 0 to 1")
     if min(len(own["forcing"]), len(own[_HOLES])) < 2:
         raise ValueError(f"forcing and {_HOLES} must have a row at the start and one at the end")
-    reference, axes = (own.pop(name, None) for name in _OF_POSES)
-    unit = reference is None or abs(float(np.linalg.norm(reference)) - 1.0) < 1e-9
-    if not unit or (axes is not None and not np.linalg.cond(axes) < 1e12):
+    reference, axes = own.pop("rotation_reference", None), own.pop("output_axes", np.eye(d))
+    if reference is not None and not (abs(np.linalg.norm(reference) - 1.0) < 1e-9 and np.linalg.cond(axes) < 1e12):
         raise ValueError("its rotation_reference must be a unit quaternion, and its output_axes independent")
-    controller.outputs_ = outputs = Outputs(d if reference is None else d - 3, reference, axes)
+    controller.outputs_ = outputs = Outputs(d) if reference is None else Outputs(d - 3, reference, axes)
     controller.law_.blocks(d)
     for name in (*_NOISE, _HOLES):
         setattr(controller, name, own.pop(name))

@@ -14,9 +14,8 @@ from torch_pbd.registry import ESTIMATORS, MOVEMENTS, REGRESSORS, load_class
 Check = Callable[[Any, str], Any]
 
 _LAW = "stiffness_law"
-# Types of arrays; those of objects are names of columns.
 _INTEGERS = [f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)]
-_DTYPES = ["float64", "float32", "float16", *_INTEGERS, "bool", "object"]
+_DTYPES = ["float64", "float32", "float16", *_INTEGERS, "bool", "object"]  # of objects are names of columns
 
 
 def is_ours(estimator: Any) -> bool:
