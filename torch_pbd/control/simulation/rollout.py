@@ -147,45 +147,57 @@ class Loop:
     def __init__(self, task: Task, state: State, generator: torch.Generator | None) -> None:
         self._task = task
         self._deviation, self._velocity = state[0] - task.position[..., 0, :], state[1]
-        loop, sensor, wanted = task.position_loop, task.sensor, task.stiffness_filter
-        self._robot = None if loop is None else loop.start(*state, task.dt)
-        self._read = None if sensor is None else sensor.start(state[0], task.dt, generator)
+        self._robot = task.position_loop and task.position_loop.start(*state, task.dt)
+        self._read = task.sensor and task.sensor.start(state[0], task.dt, generator)
         gains = task.stiffness, task.damping, task.mass
+        wanted = task.stiffness_filter
         self._filter = None if wanted is None else wanted.start(*gains, tick_change)
         self._maps = (each for _, maps in tick_maps(task, task.dt / task.substeps) for each in maps.unbind(-3))
 
     def run(self, tick: int, force: Tensor) -> dict[str, Tensor]:
         """One tick under a force (..., d): measure, choose the gains, move; fields of a Rollout at its start."""
-        task = self._task
-        desired = task.position[..., tick, :]
+        task, robot = self._task, self._robot
+        desired, mass = task.position[..., tick, :], mass_at(task.mass, tick)
         stiffness, damping = task.stiffness[..., tick, :, :], task.damping[..., tick, :, :]
         commanded = self._deviation + desired
-        at = (commanded, self._velocity) if self._robot is None else (self._robot.position, self._robot.velocity)
-        total = force + self._wall(*at)
+        at = (commanded, self._velocity) if robot is None else (robot.position, robot.velocity)
+        measured = total = force + self._wall(*at)
         record = {"position": at[0], "velocity": at[1], "commanded_position": commanded, "force": total}
-        if self._filter is not None:
-            self._filter.select(stiffness, damping, mass_at(task.mass, tick), task.dt, self._deviation)
-            stiffness, damping, record["filter_share"] = self._filter.gains
-            if self._filter.tank_energy is not None:
-                record["tank_energy"] = self._filter.tank_energy
-        measured = total
         if self._read is not None:
             measured, record["saturated"] = self._read(total)
-        push = (damping @ task.velocity[..., tick, :].unsqueeze(-1)).squeeze(-1) + task.inertial_force[..., tick, :]
         if self._filter is None:
             each = next(self._maps)
         else:
-            each = tick_map(stiffness, damping, mass_at(task.mass, tick), task.dt)
-        self._move(each, (force, measured), push, desired)
+            self._filter.select(stiffness, damping, mass, task.dt, self._deviation)
+            stiffness, damping, record["filter_share"] = self._filter.gains
+            if self._filter.tank_energy is not None:
+                record["tank_energy"] = self._filter.tank_energy
+            each = tick_map(stiffness, damping, mass, task.dt)
+        push = (damping @ task.velocity[..., tick, :].unsqueeze(-1)).squeeze(-1) + task.inertial_force[..., tick, :]
+        for part in range(task.substeps):
+            before = self._deviation, self._velocity
+            if part:  # the walls are evaluated anew in each part of the tick
+                measured = force + self._wall(before[0] + desired, before[1])
+            held = (measured + push).expand_as(before[0])
+            state = torch.cat([*before, held], dim=-1)
+            after = state @ each.mT if each.ndim == 2 else (each @ state.unsqueeze(-1)).squeeze(-1)
+            self._deviation, self._velocity = after.chunk(2, dim=-1)
+            if self._filter is not None:
+                self._filter.settle(before, (self._deviation, self._velocity), held)
+        if tick + 1 < task.n_ticks:
+            self._move_on(tick, commanded)
+        return record | {"stiffness": stiffness, "damping": damping}
+
+    def _move_on(self, tick: int, commanded: Tensor) -> None:
+        """Let the robot follow its command, and count all from the desired place of the next tick."""
+        task = self._task
+        step = task.position[..., tick + 1, :] - task.position[..., tick, :]
+        self._deviation = task.carry(tick, self._deviation) - step
         if self._robot is not None:
             self._robot(commanded)
-        if tick + 1 < task.n_ticks:
-            self._deviation = task.carry(tick, self._deviation) - (task.position[..., tick + 1, :] - desired)
-            if self._robot is not None:
-                self._robot.carry(partial(task.carry, tick))
-            if self._filter is not None and task.turning is not None:
-                self._filter.carry(task.turning.transport[..., tick, :, :])
-        return record | {"stiffness": stiffness, "damping": damping}
+            self._robot.carry(partial(task.carry, tick))
+        if self._filter is not None and task.turning is not None:
+            self._filter.carry(task.turning.transport[..., tick, :, :])
 
     def _wall(self, position: Tensor, velocity: Tensor) -> Tensor:
         walls, p = self._task.environment, self._task.n_positions
@@ -193,20 +205,6 @@ class Loop:
             return torch.zeros_like(position)
         force = walls.force(position[..., :p], velocity[..., :p])
         return torch.nn.functional.pad(force, (0, position.shape[-1] - p))  # on a point: without a torque
-
-    def _move(self, each: Tensor, forces: tuple[Tensor, Tensor], push: Tensor, desired: Tensor) -> None:
-        """Move over the tick by its map and the measured force; the walls are evaluated anew in each of its parts."""
-        outside, force = forces
-        for part in range(self._task.substeps):
-            before = self._deviation, self._velocity
-            if part:
-                force = outside + self._wall(before[0] + desired, before[1])
-            held = (force + push).expand_as(before[0])
-            state = torch.cat([*before, held], dim=-1)
-            after = state @ each.mT if each.ndim == 2 else (each @ state.unsqueeze(-1)).squeeze(-1)
-            self._deviation, self._velocity = after.chunk(2, dim=-1)
-            if self._filter is not None:
-                self._filter.settle(before, (self._deviation, self._velocity), held)
 
 
 def run_task(

@@ -83,16 +83,10 @@ class RolloutSummary:
 
 @final
 class Chunk:
-    """Neighbours among the rollouts that move on together, each under one push: a squared sine over time.
+    """Columns of all rollouts that move on together, each under one push: a squared sine over time.
 
-    Parameters
-    ----------
-    columns : slice
-        Which of all rollouts.
-    onset, duration : Tensor of shape (r,)
-        Of the pushes in s, from the first tick on; onsets do not decrease, so that those of a block are neighbours.
-    peak : Tensor of shape (d, r)
-        In N and Nm.
+    Onsets and durations are in s, (r,), from the first tick on, and onsets in order, so that the rollouts that are
+    pushed in a block of ticks are neighbours; peaks (d, r) are in N and Nm.
     """
 
     def __init__(self, columns: slice, onset: Tensor, duration: Tensor, peak: Tensor) -> None:

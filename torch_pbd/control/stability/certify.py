@@ -82,13 +82,18 @@ def certify(
     alpha, margin, worst = knots.certificate()
     rate, fastest = common_function(dynamics)
     # The rule is of one function that no axis is special to: of one inertia, and of outputs of one unit.
-    squared = dynamics.modes.squared
+    squared = dynamics.modes[0]
     ratio = float(squared.max() / squared.min()) if len(inertia) == 1 and schedule.orientation is None else math.nan
     pressed = [math.nan] * 2
     if len(inertia) == 1:  # an inertia that varies is an arm's own: there is no position loop
         for i, block in enumerate((slice(None), block, block) for block in schedule.blocks):
             gains = stiffness[block], damping[block], inertia[block][0]
             pressed[i] = stiffest_environment(*gains, loop, force_cutoff, dt)
+    # One number, one matrix, or None where the rows differ.
+    number, identity = float(inertia[0, 0, 0]), torch.eye(inertia.shape[-1]).to(inertia)
+    is_number = torch.equal(inertia[0], number * identity)
+    shown = None if len(inertia) > 1 else number if is_number else tuple(map(tuple, inertia[0].tolist()))
+    eigenvalues = [torch.linalg.eigvalsh(inertia[:, block, block]) for block in schedule.blocks]
     return StabilityReport(
         damping_ratio=_damping_ratio(dynamics),
         stiffness_ratio=ratio,
@@ -105,24 +110,10 @@ def certify(
         environment_stiffness=pressed[0],
         environment_rotation=pressed[1],
         speed=float(speed),
-        mass=_as_given(inertia),
-        inertia=tuple(_range(inertia[:, block, block]) for block in schedule.blocks),
+        mass=shown,
+        inertia=tuple((float(each.min()), float(each.max())) for each in eigenvalues),
         units=tuple("Nm/rad" if i or schedule.units == "rad" else "N/m" for i in range(len(schedule.blocks))),
     )
-
-
-def _as_given(inertia: Tensor) -> float | tuple[tuple[float, ...], ...] | None:
-    """One number, one matrix, or None where the rows differ."""
-    if len(inertia) > 1:
-        return None
-    number = float(inertia[0, 0, 0])
-    is_number = torch.equal(inertia[0], number * torch.eye(inertia.shape[-1]).to(inertia))
-    return number if is_number else tuple(map(tuple, inertia[0].tolist()))
-
-
-def _range(matrices: Tensor) -> tuple[float, float]:
-    eigenvalues = torch.linalg.eigvalsh(matrices)
-    return float(eigenvalues.min()), float(eigenvalues.max())
 
 
 def _damping_ratio(dynamics: ErrorDynamics) -> float:
@@ -145,11 +136,10 @@ def stiffest_environment(
 ) -> float:
     """Stiffest spring, N/m, that the robot can press on without vibrating, the least over the gains given.
 
-    The robot reads the force through a low-pass of ``force_cutoff`` Hz, and follows the admittance by its
-    position loop: the closed loop along an axis of the damping, tick by tick, is a matrix, and the spring is the
-    stiffest up to which its eigenvalues stay within the unit circle; about ``damping / (lag of loop and sensor)``.
-    Gains are held, and axes taken one by one; of more than 200 knots, 200 are looked at and those with the least
-    damping and stiffness.
+    The robot reads the force through a low-pass, and follows the admittance by its position loop: the closed loop along
+    an axis of the damping, tick by tick, is a matrix, and the spring is the stiffest up to which its eigenvalues stay
+    within the unit circle; about ``damping / (lag of loop and sensor)``. Gains are held, and axes taken one by one; of
+    more than 200 knots, 200 are looked at and those with the least damping and stiffness.
     """
     identity = torch.eye(stiffness.shape[-1]).to(stiffness)
     softest = [
@@ -157,10 +147,9 @@ def stiffest_environment(
         for gain in (stiffness, damping)
     ]
     chosen = torch.cat([evenly(len(stiffness), _MAX_KNOTS), torch.tensor(softest)])
-    axes = torch.linalg.eigh(symmetrize(damping[chosen])).eigenvectors
-    along = [
-        (axes * (matrix @ axes)).sum(-2).reshape(-1, 1, 1) for matrix in (stiffness[chosen], damping[chosen], mass)
-    ]
+    stiffness, damping = stiffness[chosen], damping[chosen]
+    axes = torch.linalg.eigh(symmetrize(damping)).eigenvectors
+    along = [(axes * (matrix @ axes)).sum(-2).reshape(-1, 1, 1) for matrix in (stiffness, damping, mass)]
     ticks = transition(admittance_rate(*along), dt)[:, :2]
 
     def is_stable(each: Tensor, environment: float) -> Tensor:

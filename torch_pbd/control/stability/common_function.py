@@ -51,13 +51,11 @@ def common_function(dynamics: ErrorDynamics) -> tuple[float, float]:
     if dynamics.stiffness.shape[-1] > _MAX_OUTPUTS:
         return math.nan, 0.0
     rows, frequency = scaled(dynamics)
-    function = searched_function(rows)
-    largest = math.inf if function is None else function.largest(rows)
-    if function is None or largest >= 0.0:
+    function, n = searched_function(rows), len(dynamics.time)
+    if function is None or (largest := function.largest(rows)) >= 0.0:
         return math.nan, 0.0
     if dynamics.transport is None:
         return -largest * frequency, math.inf
-    n = len(dynamics.time)
 
     def carried(some: Tensor, q: float, p: float) -> Tensor:
         moving, at_rest = (function.change(rows.restrict(each)) for each in (some, some + n))
@@ -79,13 +77,11 @@ def scaled(dynamics: ErrorDynamics) -> tuple[ErrorDynamics, float]:
     values = torch.linalg.eigvalsh(stiffness)
     frequency = math.sqrt(math.sqrt(float(values.min())) * math.sqrt(float(values.max())))
     rows = ErrorDynamics(dynamics.time, stiffness / frequency**2, damping / frequency, mass)
-    if dynamics.transport is None:
-        return rows, frequency
-    upper = torch.linalg.cholesky(mean).mT
-    transport = torch.linalg.solve_triangular(upper, upper @ dynamics.transport, upper=True, left=False) / frequency
-    rows = replace(
-        rows.restrict(torch.arange(len(rows.time)).repeat(2)), transport=torch.cat([transport, 0.0 * transport])
-    )
+    if dynamics.transport is not None:
+        upper = torch.linalg.cholesky(mean).mT
+        transport = torch.linalg.solve_triangular(upper, upper @ dynamics.transport, upper=True, left=False) / frequency
+        rows = rows.restrict(torch.arange(len(rows.time)).repeat(2))
+        rows = replace(rows, transport=torch.cat([transport, 0.0 * transport]))
     return rows, frequency
 
 
@@ -123,16 +119,16 @@ class Function:
 
     def above(self, rows: ErrorDynamics, limit: float) -> Int64[Tensor, " k"]:
         """Rows with an eigenvalue above a limit."""
-        identity = torch.eye(len(self.root)).to(self.root)
-        return rows_below(
-            lambda part, q, p: p * identity - q * self.change(rows.restrict(part)), -limit, len(rows.time)
-        )
+
+        def pencil(some: Tensor, q: float, p: float) -> Tensor:
+            return p * torch.eye(len(self.root)).to(self.root) - q * self.change(rows.restrict(some))
+
+        return rows_below(pencil, -limit, len(rows.time))
 
     def largest(self, rows: ErrorDynamics) -> float:
         """Largest eigenvalue of all rows, and what rounding may add to it."""
         some = self.eigenvalues(rows.restrict(evenly(len(rows.time), _N_ROWS)))
-        above = self.above(rows, float(some.max()))
-        values = torch.cat([some, self.eigenvalues(rows.restrict(above))])
+        values = torch.cat([some, self.eigenvalues(rows.restrict(self.above(rows, float(some.max()))))])
         return float(values.max()) + _ROUNDING * float(values.abs().max())
 
 

@@ -3,7 +3,6 @@
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int64
@@ -20,33 +19,13 @@ _AT_ONCE = 64
 _MAX_ROWS, _MAX_PARTS = 150, 64
 
 
-class Modes(NamedTuple):
-    """Rows along their own axes, for coordinates ``q = Q' C' e`` in which the mass ``M = C C'`` is 1.
-
-    The stiffness ``C^-1 K C'^-1 = Q diag(squared) Q'`` is diagonal there. ``damping`` is, too, if it is one number for
-    each mode, (n, d), as that made from stiffness and mass; else it couples them, (n, d, d).
-    """
-
-    squared: Float[Tensor, "n d"]
-    axes: Float[Tensor, "n d d"]
-    damping: Float[Tensor, "n d *d"]
-
-
 @dataclass(frozen=True)
 class ErrorDynamics:
     """``M v' + D v + K e = 0`` and ``e' = v + W e`` at n rows: the deviation e, and v that of the velocity.
 
     A rotation deviates by a rotation vector in world axes, which the desired angular velocity w carries along:
-    ``W = blkdiag(0, [w]x)``. Coriolis forces are taken for compensated.
-
-    Parameters
-    ----------
-    time : Tensor of shape (n,)
-    stiffness, damping : Tensor of shape (n, d, d)
-    mass : Tensor of shape (m, d, d)
-        m = n, or 1 where it is one for all rows.
-    transport : Tensor of shape (n, d, d), default=None
-        W; None is none.
+    ``W = blkdiag(0, [w]x)``, the ``transport``. There are m = n masses, or 1 where it is one for all rows. Coriolis
+    forces are taken for compensated.
     """
 
     time: Float[Tensor, "*a n"]
@@ -61,13 +40,17 @@ class ErrorDynamics:
         return len(self.mass) == 1 and self.transport is None
 
     @cached_property
-    def modes(self) -> Modes:
-        """Rows along their own axes, each with its own mass."""
+    def modes(self) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d d"], Float[Tensor, "n d *d"]]:
+        """Squared frequencies, axes Q and damping of rows in coordinates ``q = Q' C' e``, where ``M = C C'`` is 1.
+
+        The stiffness ``C^-1 K C'^-1 = Q diag(squared) Q'`` is diagonal there. The damping is, too, if it is one number
+        for each mode, (n, d), as that made from stiffness and mass; else it couples them, (n, d, d).
+        """
         squared, axes = torch.linalg.eigh(self.per_mass(self.stiffness))
         damping = symmetrize(axes.mT @ self.per_mass(self.damping) @ axes)
         own = damping.diagonal(dim1=-2, dim2=-1)
         coupled = (damping - torch.diag_embed(own)).abs().amax((1, 2)) > _COUPLED * damping.abs().amax((1, 2))
-        return Modes(squared, axes, damping if bool(coupled.any()) else own)
+        return squared, axes, damping if bool(coupled.any()) else own
 
     def restrict(self, rows: Tensor) -> "ErrorDynamics":
         """Some of the rows."""

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from functools import partial
+from itertools import product
 
 import torch
 from jaxtyping import Float
@@ -50,31 +51,26 @@ class Knots:
         step, transport = dynamics.time.diff()[:, None, None], dynamics.transport
         self._n_intervals, self._is_plain = len(step), dynamics.is_plain
         gains = (dynamics.stiffness, dynamics.damping, dynamics.mass)
-        self._stiffness, self._damping, self._mass = (_at_points(each, transport is not None) for each in gains)
-        self._stiffness_rate, self._damping_rate, self._mass_rate = (
-            (each.diff(dim=0) / step if len(each) > 1 else torch.zeros_like(each))[None] for each in gains
-        )
-        self._coupling_rate = self._mass_rate
+        self._gains = [_at_points(each, transport is not None) for each in gains]
+        rates = [each.diff(dim=0) / step if len(each) > 1 else torch.zeros_like(each) for each in gains]
+        stiffness_rate, damping_rate, mass_rate = (each[None] for each in rates)
+        coupling_rate = mass_rate
         if transport is not None:
             stiff, damp, massive = (_turned(each, transport) for each in gains)
-            self._stiffness_rate = self._stiffness_rate + (stiff + stiff.mT)
-            self._damping_rate = self._damping_rate + (damp + damp.mT)
-            self._coupling_rate = self._mass_rate + massive.mT  # W' = -W
+            stiffness_rate, damping_rate = stiffness_rate + (stiff + stiff.mT), damping_rate + (damp + damp.mT)
+            coupling_rate = mass_rate + massive.mT  # W' = -W
+        self._rates = [stiffness_rate, damping_rate, mass_rate, coupling_rate]
         # Largest alpha of a schedule that stands still, 1/s.
-        damping = dynamics.modes.damping
+        damping = dynamics.modes[2]
         self._fastest = float((damping if damping.ndim == 2 else torch.linalg.eigvalsh(damping)).min())
 
     def certificate(self) -> tuple[float, float, int]:
         """Alpha with the largest rate, that rate, and the interval where it is smallest."""
-        alpha_max = self._fastest
-        if len(self._mass) > 1:
-            damped = self._damping - 0.5 * self._mass_rate
-            alpha_max = min(
-                alpha_max,
-                least_eigenvalue(lambda rows, q, p: q * damped[:, rows] + p * self._mass[:, rows], self._n_intervals)[
-                    0
-                ],
-            )
+        alpha_max, (_, damping, mass), mass_rate = self._fastest, self._gains, self._rates[2]
+        if len(mass) > 1:
+            damped = damping - 0.5 * mass_rate
+            alpha = least_eigenvalue(lambda rows, q, p: q * damped[:, rows] + p * mass[:, rows], self._n_intervals)[0]
+            alpha_max = min(alpha_max, alpha)
 
         def pencil(alpha: float, rows: Tensor, q: float, p: float) -> Tensor:
             return self.form(alpha, rows, q, q, p)
@@ -92,16 +88,15 @@ class Knots:
         # The speed is at most one over the largest eigenvalue of what moving adds to -Q, relative to Q held. If nothing
         # but K and D moves, that is of the deviation alone; it is linear in 1 / alpha then, and in alpha otherwise.
         def of_deviation(lag: float, rows: Tensor, q: float, p: float) -> Tensor:
-            rise = lag * self._stiffness_rate[:, rows] + self._damping_rate[:, rows]
-            return p * self._stiffness[:, rows] - 0.5 * q * rise
+            rise = lag * self._rates[0][:, rows] + self._rates[1][:, rows]
+            return p * self._gains[0][:, rows] - 0.5 * q * rise
 
         def of_state(alpha: float, rows: Tensor, q: float, p: float) -> Tensor:
             return self.form(alpha, rows, p, q, 0.0)
 
         if self._is_plain:
-            least = _maximize_smallest(
-                of_deviation, 1.0 / self._fastest, 1.0 / (_LEAST * self._fastest), self._n_intervals, _NO_RISE
-            )[1]
+            low, high = 1.0 / self._fastest, 1.0 / (_LEAST * self._fastest)
+            least = _maximize_smallest(of_deviation, low, high, self._n_intervals, _NO_RISE)[1]
         else:  # at the largest alpha Q of a schedule that stands still is singular
             high = (1.0 - 1e-6) * self._fastest
             least = _maximize_smallest(of_state, _LEAST * high, high, self._n_intervals, _NO_RISE)[1]
@@ -113,21 +108,19 @@ class Knots:
         def at(points: Tensor) -> Tensor:
             return points if points.shape[1] == 1 else points[:, rows]
 
-        stiffness, damping, mass = map(at, (self._stiffness, self._damping, self._mass))
-        rates = (self._stiffness_rate, self._damping_rate, self._coupling_rate, self._mass_rate)
-        stiffness_rate, damping_rate, coupling_rate, mass_rate = (0.5 * moving * at(each) for each in rates)
+        stiffness, damping, mass = map(at, self._gains)
+        stiffness_rate, damping_rate, mass_rate, coupling_rate = (0.5 * moving * at(each) for each in self._rates)
         first = (still * alpha + function) * stiffness + function * alpha * damping
         last = still * damping + (function - still * alpha) * mass - mass_rate
         cross = alpha * (function * mass - coupling_rate)
         return _blocks(first - stiffness_rate - alpha * damping_rate, cross, last)
 
 
-def _blocks(first: Tensor, cross: Tensor | float, last: Tensor) -> Tensor:
+def _blocks(first: Tensor, cross: Tensor, last: Tensor) -> Tensor:
     """Matrices ``[[first, cross], [cross', last]]``."""
     d = last.shape[-1]
     whole = first.new_empty(*first.shape[:-2], 2 * d, 2 * d)
-    whole[..., :d, :d], whole[..., d:, d:], whole[..., :d, d:] = first, last, cross
-    whole[..., d:, :d] = cross.mT if isinstance(cross, Tensor) else cross
+    whole[..., :d, :d], whole[..., d:, d:], whole[..., :d, d:], whole[..., d:, :d] = first, last, cross, cross.mT
     return whole
 
 
@@ -160,9 +153,8 @@ def _maximize_smallest(
     parts: list[Tensor] = []
     cuts, best = torch.empty(4, 0).double(), math.sqrt(low * high)
     while True:
-        forms = [
-            pencil(end, joining, *which).flatten(0, 1) for end in (low, high) for which in ((1.0, 0.0), (0.0, 1.0))
-        ]
+        ends = product((low, high), ((1.0, 0.0), (0.0, 1.0)))
+        forms = [pencil(end, joining, *which).flatten(0, 1) for end, which in ends]
         parts.append(torch.stack(forms).unflatten(0, (2, 2)))
         best, cuts = _maximize_bound(torch.cat(parts, dim=2), low, high, best, cuts)
         values = smallest_eigenvalues(partial(pencil, best), rows).amin(0)
@@ -172,10 +164,7 @@ def _maximize_smallest(
         if not len(below):
             return best, least, int(rows[values.argmin()])
         tried = below[evenly(len(below), 8 * _N_WORST)]
-        lowest = (
-            smallest_eigenvalues(partial(pencil, best), tried).amin(0).topk(min(_N_WORST, len(tried)), largest=False)
-        )
-        joining = tried[lowest.indices]
+        joining = tried[smallest_eigenvalues(partial(pencil, best), tried).amin(0).argsort()[:_N_WORST]]
         rows = torch.cat([rows, joining])
 
 
@@ -222,7 +211,7 @@ def held_growth(dynamics: ErrorDynamics, maps: Float[Tensor, "k s s"], alpha: fl
     lag, identity = squared.rsqrt(), torch.eye(squared.shape[-1]).to(squared)
     damping = torch.diag_embed(damping) if damping.ndim == 2 else damping
     delayed, across = lag[:, :, None] * damping * lag[:, None, :], torch.diag_embed(lag)
-    least = math.nan
+    growths = []
     for each in (alpha, alpha / 2.0, alpha / 4.0) if alpha > 0.0 else ():
         function = _blocks(identity + each * delayed, each * across, identity)
 
@@ -230,8 +219,7 @@ def held_growth(dynamics: ErrorDynamics, maps: Float[Tensor, "k s s"], alpha: fl
             return p * function[rows] - q * maps[rows].mT @ function[rows + 1] @ maps[rows]
 
         grown = rows_below(pencil, -1.0 - GROWTH_ROUNDING, len(maps))
-        growth = -float(smallest_eigenvalues(pencil, grown).min()) if len(grown) else 1.0
-        least = growth if math.isnan(least) else min(least, growth)
-        if least <= 1.0 + GROWTH_ROUNDING:
+        growths.append(-float(smallest_eigenvalues(pencil, grown).min()) if len(grown) else 1.0)
+        if growths[-1] <= 1.0 + GROWTH_ROUNDING:
             break
-    return least
+    return min(growths, default=math.nan)

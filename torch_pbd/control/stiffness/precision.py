@@ -25,11 +25,9 @@ _STIFFEST = 1e6
 
 
 def matched_effort(mass: Float[Tensor, "*b d d"], scale: float, stiffness: float) -> float:
-    """Effort r, in kg/N^2, under which a standard deviation along an axis of a mean mass gets this stiffness.
-
-    ``k = m^1/2 / (r^1/2 scale)``. The mean of masses is geometric, over axes and rows: it turns with no axes, and has
-    no unit to choose.
-    """
+    """Effort r, in kg/N^2, under which a standard deviation along an axis of a mean mass gets this stiffness."""
+    # k = m^1/2 / (r^1/2 scale). The mean of masses is geometric, over axes and rows: it turns with no axes, and has no
+    # unit to choose.
     mean = float((torch.linalg.slogdet(mass.detach()).logabsdet / mass.shape[-1]).mean().exp())
     if scale <= 0.0:
         raise InvalidParameterError("covariance is zero: effort='match' needs deviations; give effort as a number.")
