@@ -111,7 +111,7 @@ def as_rows(value: Any, name: str, n_dims: int) -> Tensor:
     """Tensor of finite real floats with at least ``n_dims`` dimensions, none of them empty."""
     rows = as_tensor(value, name)
     if rows.ndim < n_dims or not rows.numel():
-        shape = ", ".join(["...", "T", "d"][-n_dims - 1 :] if n_dims > 1 else ["...", "d"])
+        shape = "..., d" if n_dims == 1 else "..., T, d"
         raise InvalidParameterError(
             f"{name} has shape {tuple(rows.shape)}, must have shape ({shape}), none of it empty."
         )

@@ -24,6 +24,7 @@ Kind = Literal["linear", "precision"]
 _QUANTILES = (0.1, 0.9)
 # Smallest deviation that counts: squares of smaller ones are no numbers.
 _SMALLEST = 1e-150
+_LIMITS = ("stiffness_min", "stiffness_max", "sigma_low", "sigma_high")
 
 
 @final
@@ -91,7 +92,7 @@ class StiffnessLaw:
     effort: Literal["match"] | Limit = "match"
 
     def __post_init__(self) -> None:
-        for name in ("stiffness_min", "stiffness_max", "sigma_low", "sigma_high", "effort"):
+        for name in (*_LIMITS, "effort"):
             if not isinstance(getattr(self, name), Real | str | None):
                 object.__setattr__(self, name, tuple(checks.array(getattr(self, name), name, ("d",)).tolist()))
         checks.flag(self.smooth, "smooth")
@@ -172,21 +173,19 @@ class StiffnessLaw:
     def blocks(self, n_outputs: int) -> list[Block]:
         """Blocks of so many outputs, in order."""
         rotation, n_positions = self.rotation, n_outputs - (0 if self.rotation is None else 3)
-        rows: list[Any] = [self.stiffness_min, self.stiffness_max, self.sigma_low, self.sigma_high]
+        rows = [getattr(self, name) for name in _LIMITS]
         sizes = {len(row) for row in rows if isinstance(row, tuple)}
         if n_positions < 1 or not sizes <= {n_positions}:
             wanted = " or ".join(map(str, sorted(sizes))) or "one or more"
-            more = " and then 3 of rotation" if rotation is not None else ""
-            raise InvalidParameterError(
-                f"covariance is of {n_outputs} outputs, must be of {wanted}{more}, as the law is."
-            )
+            wanted += " and then 3 of rotation" if rotation is not None else ""
+            raise InvalidParameterError(f"covariance is of {n_outputs} outputs, must be of {wanted}, as the law is.")
         if sizes:
             each = zip(*(row if isinstance(row, tuple) else [row] * n_positions for row in rows), strict=True)
             blocks = [Block(slice(i, i + 1), *row, name=f"output {i}") for i, row in enumerate(each)]
         else:
             blocks = [Block(slice(0, n_positions), *rows, name="positions" if rotation is not None else "")]
         if rotation is not None:
-            own = rotation.stiffness_min, rotation.stiffness_max, rotation.sigma_low, rotation.sigma_high
+            own = (getattr(rotation, name) for name in _LIMITS)
             blocks.append(Block(slice(n_positions, n_outputs), *own, name="rotations"))
         return blocks
 
@@ -238,7 +237,7 @@ class StiffnessLaw:
         efforts: Any = self.effort if isinstance(self.effort, tuple) else [self.effort] * len(blocks)
         if len(efforts) != len(blocks):
             raise InvalidParameterError(
-                f"effort has {len(efforts)} numbers, must be one, or {len(blocks)}: one a block."
+                f"effort has {len(efforts)} numbers, must be one, or {len(blocks)}, one a block."
             )
         if self.effort == "match":
             efforts = [matched_effort(block.of(masses), block.sigma_high, block.stiffness_min) for block in blocks]

@@ -1,7 +1,7 @@
 """Limits of the stiffness of outputs that share a unit, and the standard deviations from which they hold."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, final
 
@@ -59,7 +59,7 @@ def of_outputs(blocks: Sequence[Block], name: str) -> list[Any]:
 
 def check_stiffness(law: Any, unit: str) -> None:
     """Refuse limits of stiffness, numbers or one for each output, that are not 0 < min <= max."""
-    for (low_name, low), (high_name, high) in _pairs(law, "stiffness_min", "stiffness_max"):
+    for low_name, low, high_name, high in _pairs(law, "stiffness_min", "stiffness_max"):
         checks.number(low, low_name, above=0.0, unit=unit)
         checks.number(high, high_name, least=low, unit=unit)
 
@@ -67,22 +67,22 @@ def check_stiffness(law: Any, unit: str) -> None:
 def check_scales(law: Any, prefix: str) -> None:
     """Refuse bounds of standard deviations, numbers or one for each output, that are not 0 <= low < high."""
     remedy = "or let bounds='quantile' take both from the covariances"
-    for (low_name, low), (high_name, high) in _pairs(law, "sigma_low", "sigma_high", prefix):
-        above = checks.number(low, low_name, least=0.0, remedy=remedy)
-        checks.number(high, high_name, above=above, remedy=remedy)
+    for low_name, low, high_name, high in _pairs(law, "sigma_low", "sigma_high"):
+        above = checks.number(low, prefix + low_name, least=0.0, remedy=remedy)
+        checks.number(high, prefix + high_name, above=above, remedy=remedy)
 
 
-def _pairs(law: Any, low_name: str, high_name: str, prefix: str = "") -> list[Any]:
-    """Names and values of two limits, output by output where one of them is of each."""
-    sides = []
-    for name in (low_name, high_name):
-        value, name = getattr(law, name), prefix + name
-        of_each = isinstance(value, tuple)
-        sides.append([(f"{name}[{i}]", entry) for i, entry in enumerate(value)] if of_each else [(name, value)])
+def _pairs(law: Any, *names: str) -> Iterator[tuple[str, Any, str, Any]]:
+    """Name and value of the lower and of the higher limit, once, or for each output where one is a tuple."""
+    sides = [value if isinstance(value, tuple) else (value,) for value in (getattr(law, name) for name in names)]
     size = max(map(len, sides))
     if any(len(side) not in (1, size) for side in sides):
         raise InvalidParameterError(
-            f"{low_name} has {len(sides[0])} numbers and {high_name} has {len(sides[1])}, must have as many: one for "
+            f"{names[0]} has {len(sides[0])} numbers and {names[1]} has {len(sides[1])}, must have as many: one for "
             "each output, or one for all."
         )
-    return list(zip(*(side * (size // len(side)) for side in sides), strict=True))
+    for i in range(size):
+        low, high = (
+            (name, side[0]) if len(side) == 1 else (f"{name}[{i}]", side[i]) for name, side in zip(names, sides)
+        )
+        yield *low, *high
