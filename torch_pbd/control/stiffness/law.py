@@ -236,9 +236,7 @@ class StiffnessLaw:
         masses = masses_like(as_mass(mass), like, "covariance")
         efforts: Any = self.effort if isinstance(self.effort, tuple) else [self.effort] * len(blocks)
         if len(efforts) != len(blocks):
-            raise InvalidParameterError(
-                f"effort has {len(efforts)} numbers, must be one, or {len(blocks)}, one a block."
-            )
+            raise InvalidParameterError(f"effort has {len(efforts)} numbers, must be one, or {len(blocks)}.")
         if self.effort == "match":
             efforts = [matched_effort(block.of(masses), block.sigma_high, block.stiffness_min) for block in blocks]
         return [block._replace(effort=effort) for block, effort in zip(blocks, efforts, strict=True)], masses

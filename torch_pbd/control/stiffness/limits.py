@@ -82,7 +82,6 @@ def _pairs(law: Any, *names: str) -> Iterator[tuple[str, Any, str, Any]]:
             "each output, or one for all."
         )
     for i in range(size):
-        low, high = (
-            (name, side[0]) if len(side) == 1 else (f"{name}[{i}]", side[i]) for name, side in zip(names, sides)
-        )
+        each = zip(names, sides, strict=True)
+        low, high = ((f"{name}[{i}]", side[i]) if len(side) > 1 else (name, side[0]) for name, side in each)
         yield *low, *high
