@@ -9,7 +9,7 @@ import torch
 
 from torch_pbd import CholeskyCovRegressor, Demonstrations, DMPController, load_demonstrations
 from torch_pbd.control import DMP
-from torch_pbd.control.primitive.adaptation import _QUINTICS
+from torch_pbd.control.primitive.dmp import _QUINTICS
 
 SHARES = (0.0, 0.3, 0.5, 0.7, 0.9, 1.0, 1.8)  # of the way to the demonstrated goal
 AWAY = np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.1], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0], [1.0, 1.0]])

@@ -245,7 +245,7 @@ CALLS = [
     (lambda: SCHEDULE.retime(1e-300), "speed is 1e-300, must be a finite number of at least"),
     (lambda: AdmittancePlant(sensor=ForceSensor(noise_scale=1.0)).simulate(
         STILL, STILL, GAIN, DAMPING, dt=0.001, generator=np.random.default_rng(0)), "must be a Generator or None"),
-    (lambda: DMP().forcing(STILL.T, STILL, STILL, np.ones(2)), "velocity has shape .* that of position"),
+    (lambda: DMP().forcing(STILL.T, STILL, STILL, np.ones(2)), "shapes are .*velocity.*, must be of the same"),
     (lambda: check_unimodal([1, 2]), r"demonstrations is \[1, 2\], must be a Demonstrations"),
     (lambda: make_tunnel_demonstrations(duration="10"), "duration is '10' s, must be a finite number above 0"),
     (lambda: make_tunnel_demonstrations(n_demos=10**9), "n_demos=1000000000 needs about"),

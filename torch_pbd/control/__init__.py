@@ -4,22 +4,29 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from torch_pbd.control.controller import DMPController
-    from torch_pbd.control.filters import EnergyTank, RateLimit
-    from torch_pbd.control.matrices import damping_from_stiffness, required_damping_ratio
-    from torch_pbd.control.planning import MotionLimits
-    from torch_pbd.control.primitive.dmp import DMP
-    from torch_pbd.control.realtime import RealTimeAdmittance, TickStatus
-    from torch_pbd.control.schedule.schedule import Schedule
-    from torch_pbd.control.simulation.plant import AdmittancePlant
-    from torch_pbd.control.simulation.rollout import Rollout
-    from torch_pbd.control.simulation.rollouts import RolloutSummary
-    from torch_pbd.control.simulation.run import simulate, simulate_many
-    from torch_pbd.control.simulation.sensor import ForceSensor, PositionLoop
-    from torch_pbd.control.simulation.walls import Tunnel
-    from torch_pbd.control.stability.certify import certify
-    from torch_pbd.control.stability.report import StabilityReport
-    from torch_pbd.control.stiffness import RotationLimits, StiffnessLaw, lqt
+    from torch_pbd.control.controller import DMPController as DMPController
+    from torch_pbd.control.filters import EnergyTank as EnergyTank
+    from torch_pbd.control.filters import RateLimit as RateLimit
+    from torch_pbd.control.matrices import damping_from_stiffness as damping_from_stiffness
+    from torch_pbd.control.matrices import required_damping_ratio as required_damping_ratio
+    from torch_pbd.control.planning import MotionLimits as MotionLimits
+    from torch_pbd.control.primitive.dmp import DMP as DMP
+    from torch_pbd.control.realtime import RealTimeAdmittance as RealTimeAdmittance
+    from torch_pbd.control.realtime import TickStatus as TickStatus
+    from torch_pbd.control.schedule.schedule import Schedule as Schedule
+    from torch_pbd.control.simulation.plant import AdmittancePlant as AdmittancePlant
+    from torch_pbd.control.simulation.rollout import Rollout as Rollout
+    from torch_pbd.control.simulation.rollouts import RolloutSummary as RolloutSummary
+    from torch_pbd.control.simulation.run import simulate as simulate
+    from torch_pbd.control.simulation.run import simulate_many as simulate_many
+    from torch_pbd.control.simulation.sensor import ForceSensor as ForceSensor
+    from torch_pbd.control.simulation.sensor import PositionLoop as PositionLoop
+    from torch_pbd.control.simulation.walls import Tunnel as Tunnel
+    from torch_pbd.control.stability.certify import certify as certify
+    from torch_pbd.control.stability.report import StabilityReport as StabilityReport
+    from torch_pbd.control.stiffness import RotationLimits as RotationLimits
+    from torch_pbd.control.stiffness import StiffnessLaw as StiffnessLaw
+    from torch_pbd.control.stiffness import lqt as lqt
 
 # Where each name lives: the controller of the control loop must load without torch.
 _HOMES = {
@@ -48,31 +55,7 @@ _HOMES = {
     "simulate_many": "simulation.run",
 }
 
-__all__ = [
-    "DMP",
-    "AdmittancePlant",
-    "DMPController",
-    "EnergyTank",
-    "ForceSensor",
-    "MotionLimits",
-    "PositionLoop",
-    "RateLimit",
-    "RealTimeAdmittance",
-    "Rollout",
-    "RolloutSummary",
-    "RotationLimits",
-    "Schedule",
-    "StabilityReport",
-    "StiffnessLaw",
-    "TickStatus",
-    "Tunnel",
-    "certify",
-    "damping_from_stiffness",
-    "lqt",
-    "required_damping_ratio",
-    "simulate",
-    "simulate_many",
-]
+__all__ = [*_HOMES]
 
 
 def __getattr__(name: str) -> Any:

@@ -12,8 +12,7 @@ from torch_pbd.control import parameters
 from torch_pbd.control.impedance import OnUnknown, fit_covariance, fit_law, outputs_under
 from torch_pbd.control.planning import Planning
 from torch_pbd.control.primitive import smoothing
-from torch_pbd.control.primitive.adaptation import Adaptation
-from torch_pbd.control.primitive.dmp import Gate
+from torch_pbd.control.primitive.dmp import Adaptation, Gate
 from torch_pbd.control.primitive.outputs import counts_as_metres, in_si
 from torch_pbd.control.primitive.reproduction import Reproduction, primitive
 from torch_pbd.control.stiffness import StiffnessLaw
@@ -44,17 +43,15 @@ class DMPController(Planning):
     alpha, beta, gamma, tau : float, default=25.0, None, 0.7, 1.0
         Of the movement primitive, see :class:`~torch_pbd.control.DMP`; the paper's are 1, 1, 0.7, 1. With
         adaptation="safe" tau is that of a movement of 10 s, like the paper's, and goes with the duration.
-    adaptation : {"safe", "additive"}, default="safe"
-        How it moves to other goals, and from other starts; "additive", the paper's, throws the robot.
-    gate : {"time", "phase", "none"}, default="time"
-        How the forcing ends after an "additive" movement, so that it comes to rest at the goal; "none" is the paper's.
-        A "safe" one is over with its duration, see :meth:`schedule`.
+    adaptation, gate : default="safe", "time"
+        How it moves to other goals, and from other starts, and how the forcing of an "additive" movement ends, see
+        there; the paper's are "additive", which throws the robot, and "none".
     phase_input : {"time", "log_s", "s"}, default="time"
-        Input of the regressors: movement time, or the phase s of eq. (17) or its logarithm, which is time in
-        other units. "s" is the paper's; scripts/benchmarks/phase_input.py compares them.
+        Input of the regressors: movement time, or the phase s of eq. (17), the paper's, or its logarithm, which is time
+        in other units; scripts/benchmarks/phase_input.py compares them.
     variability : {"position", "forcing"}, default="position"
-        Covariance of what becomes stiffness: of positions, in their units; or of the forcing, which the paper
-        takes: second derivatives, in units of acceleration times s^2.
+        What becomes stiffness by its covariance: positions, in their units; or the forcing, as in the paper, in units
+        of acceleration times s^2.
     goal : {"common", "each"}, default="common"
         Goal in eq. (18): the mean end of all demonstrations, or that of each.
     cutoff : float, "auto" or None, default="auto"
@@ -69,9 +66,8 @@ class DMPController(Planning):
         poses with ``RotationLimits()``, 2.5 to 50 Nm/rad. Of angles the two are in Nm/rad.
     mass : float or array-like of shape (d, d), default=None
         Virtual mass of the admittance. A number counts in kg, and as many kg m^2 for angles and rotations. None is 1,
-        but for the rotation of poses 0.0289 kg m^2, that of 1 kg at 0.17 m, as the inertia at the tool of an arm has
-        it: 1 kg m^2 is a heavy wrist, which lags behind soft rotations. A robot's own, which changes along the
-        movement, is what :meth:`Schedule.with_inertia` takes.
+        but for the rotation of poses 0.0289 kg m^2, as 1 kg at 0.17 m has it: 1 kg m^2 is a heavy wrist, which lags
+        behind soft rotations. A robot's own, which changes along the movement, goes to :meth:`Schedule.with_inertia`.
     damping_ratio : float or "paper", default=1.0
         See :func:`~torch_pbd.control.damping_from_stiffness`.
     on_unknown : {"soft", "prior", "raise"}, default="soft"

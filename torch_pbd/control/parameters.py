@@ -12,8 +12,7 @@ from sklearn.utils.validation import check_X_y
 from torch_pbd import checks
 from torch_pbd.control.impedance import OnUnknown
 from torch_pbd.control.matrices import as_damping_ratio, as_mass
-from torch_pbd.control.primitive.adaptation import Adaptation
-from torch_pbd.control.primitive.dmp import Gate
+from torch_pbd.control.primitive.dmp import Adaptation, Gate
 from torch_pbd.control.primitive.outputs import common_unit
 from torch_pbd.control.primitive.smoothing import CUTOFF_HZ
 from torch_pbd.control.stiffness import StiffnessLaw
@@ -101,9 +100,7 @@ def check_against_duration(controller: Any) -> None:
 def as_demonstrations(X: Demonstrations | ArrayLike, y: ArrayLike | None, groups: ArrayLike | None) -> Demonstrations:
     """Two demonstrations or more: as they are, or of samples X (n, 1), y (n, d) whose groups (n,) tell them apart.
 
-    Refused are also outputs that are unit quaternions, or angles that jump by a turn. Warns of more than one way; of
-    outputs in different units, which no turned axis of stiffness can have, in none, or in one that is neither a length
-    nor an angle; and of timing that was taken out by dynamic time warping.
+    Warns of more than one way, of units that stiffness cannot have, and of timing that was taken out by warping.
     """
     if isinstance(X, Demonstrations) and not (y is None and groups is None):
         raise ValueError("X is Demonstrations, which have their positions: give neither y nor groups with them.")
@@ -132,20 +129,19 @@ def _warn_of_units(units: Sequence[str] | None) -> None:
     """Warn of what becomes of positions whose units are not given, differ, or are no lengths and no angles."""
     common = common_unit(units)
     if units is None:
-        text = "The demonstrations tell no units: positions are taken to be in m. Say so, or in what else: units='m'."
+        checks.warn(
+            "The demonstrations tell no units: positions are taken to be in m. Say so, or in what else: units='m'."
+        )
     elif common is None:
-        text = (
+        checks.warn(
             f"The outputs are in different units, {', '.join(units)}: their principal axes mix them, and nothing is "
             "converted to m. Bring them to one unit, or control them apart."
         )
     elif common not in LENGTHS | ANGLES:
-        text = (
+        checks.warn(
             f"The positions are in {common!r}, which is no known length or angle ({', '.join(LENGTHS | ANGLES)}): "
             "stiffness is in N per that unit, and no limits of motion apply."
         )
-    else:
-        return
-    checks.warn(text)
 
 
 def _grouped(X: ArrayLike, y: ArrayLike | None, groups: ArrayLike | None) -> Demonstrations:
@@ -178,13 +174,10 @@ def _grouped(X: ArrayLike, y: ArrayLike | None, groups: ArrayLike | None) -> Dem
 
 
 def check_steps(n_steps: int, n_demos: int, d: int, *, learned: bool) -> None:
-    """Refuse more points of a movement than fit in memory: smoothed ones, and what learning the forcing of them takes.
-
-    Gaussian processes of the forcing have matrices of all pairs of points, unless a few nodes carry it.
-    """
+    """Refuse more points of a movement than fit in memory: smoothed, and for a fit with the forcing of them learned."""
     n = float(n_steps)
     needed = _SMOOTHED * n * n_demos * d
-    if learned:
+    if learned:  # Gaussian processes have matrices of all pairs of points, unless a few nodes carry the forcing
         needed += n * (max(_PAIRED, _PAIRED_AXIS * d) * n + _TABULATED * d)
     require_much(
         8.0 * needed,

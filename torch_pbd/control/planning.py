@@ -73,8 +73,7 @@ class Planning(BaseEstimator):
     def mass_(self) -> float | Floats:
         """Virtual mass that gains are made for: a number of kg, or of kg m^2 for angles; or a matrix (d, d)."""
         check_is_fitted(self)
-        given: float | Floats = self.outputs_.mass(self.mass)
-        return given
+        return self.outputs_.mass(self.mass)
 
     def predict(self, X: ArrayLike) -> Floats:
         """Reproduced outputs (n, d) at times X (n, 1), which count as those of the demonstrations do.
@@ -85,13 +84,7 @@ class Planning(BaseEstimator):
         return self._path(self._movement_time(X))
 
     def predict_pose(self, X: ArrayLike) -> tuple[Floats, Floats]:
-        """Reproduced positions (n, p) and orientations (n, 4), unit quaternions w x y z, at times X (n, 1).
-
-        Raises
-        ------
-        ValueError
-            If no rotation was demonstrated.
-        """
+        """Reproduced positions (n, p) and orientations (n, 4), unit quaternions w x y z, at times X (n, 1)."""
         path = self.predict(X)
         if self.outputs_.reference is None:
             raise ValueError("The demonstrations have no rotation: predict(X) is all of the movement.")

@@ -109,16 +109,14 @@ class Outputs:
         """
         if self.axes is None:
             return learned
-        turn = self.axes if path is None else self.to_world(path) @ self.axes
+        turn = self.axes
+        if path is not None:
+            p = self.n_positions
+            to_world = np.tile(np.eye(p + 3), (len(path), 1, 1))  # of small changes of outputs
+            to_world[:, p:, p:] = self._chart.to_world(path[:, p:])
+            turn = to_world @ turn
         whole = turn @ learned @ np.swapaxes(turn, -1, -2)
         return 0.5 * (whole + np.swapaxes(whole, -1, -2))
-
-    def to_world(self, path: Floats) -> Floats:
-        """Matrices (n, d, d) from small changes of outputs, at poses (n, d), to those in world axes."""
-        p = self.n_positions
-        whole = np.tile(np.eye(p + 3), (len(path), 1, 1))
-        whole[:, p:, p:] = self._chart.to_world(path[:, p:])
-        return whole
 
     def poses(self, path: Floats) -> tuple[Floats, Floats]:
         """Positions (n, p) and quaternions (n, 4) of outputs (n, d)."""
@@ -138,7 +136,7 @@ class Outputs:
             "orientation": orientation,
         }
 
-    def mass(self, given: Any) -> Any:
+    def mass(self, given: float | Floats | None) -> float | Floats:
         """Virtual mass as given; None is 1 kg, and of poses 1 kg that turns as if it were ``LEVER`` away, a matrix."""
         if given is not None:
             return given
@@ -219,7 +217,14 @@ def common_axes(deviation: Floats, degrees: NDArray[np.integer], least: float) -
     Signal Processing 58, 2010.
     """
     scatter, free = np.einsum("kni,knj->nij", deviation, deviation), np.maximum(degrees, 0)[:, np.newaxis, np.newaxis]
-    covariances = _shrunk(scatter / np.maximum(free, 1) + least**2 * np.eye(scatter.shape[-1]), free)
+    unit, d = np.eye(scatter.shape[-1]), scatter.shape[-1]
+    covariances = scatter / np.maximum(free, 1) + least**2 * unit
+    # Nearer to spheres: the nearer, the rounder they are, and the fewer degrees they have; Chen's equation (23).
+    trace = np.trace(covariances, axis1=1, axis2=2)[:, np.newaxis, np.newaxis]
+    square = (covariances**2).sum(axis=(1, 2), keepdims=True)
+    chance = (1.0 - 2.0 / d) * square + trace**2
+    share = chance / np.maximum(chance, (free + 1.0 - 2.0 / d) * (square - trace**2 / d))
+    covariances = (1.0 - share) * covariances + share * trace / d * unit
     axes = np.linalg.eigh(scatter.sum(axis=0))[1]  # of the pooled covariance, which stay where no shape tells anything
     found = _along(covariances, axes)
     for _ in range(_STEPS):
@@ -229,7 +234,7 @@ def common_axes(deviation: Floats, degrees: NDArray[np.integer], least: float) -
         slope = (free * (axes.T @ covariances @ axes) * (inverse - np.swapaxes(inverse, 1, 2))).sum(axis=0)
         angles = slope / (free * (ratio + np.swapaxes(ratio, 1, 2) - 2.0 + _FLAT)).sum(axis=0)
         tried = axes @ expm(angles)
-        while _rise(free, found, ahead := _along(covariances, tried)) > _ROUNDING:
+        while (free[:, 0] * np.log((ahead := _along(covariances, tried)) / found)).sum() > _ROUNDING * free.sum():
             angles = 0.5 * angles
             tried = axes @ expm(angles)
         axes, found = tried, ahead
@@ -241,17 +246,3 @@ def common_axes(deviation: Floats, degrees: NDArray[np.integer], least: float) -
 def _along(covariances: Floats, axes: Floats) -> Floats:
     """Variances (n, d) along axes."""
     return np.asarray(np.einsum("ia,nij,ja->na", axes, covariances, axes), dtype=np.float64)
-
-
-def _rise(free: Floats, before: Floats, after: Floats) -> float:
-    """Rise of the mean log variance."""
-    return float((free[:, 0] * np.log(after / before)).sum() / free.sum())
-
-
-def _shrunk(covariances: Floats, free: Floats) -> Floats:
-    """Covariances (n, d, d) nearer to spheres: the nearer, the rounder they are, and the fewer degrees they have."""
-    d, trace = covariances.shape[-1], np.trace(covariances, axis1=1, axis2=2)[:, np.newaxis, np.newaxis]
-    square = (covariances**2).sum(axis=(1, 2), keepdims=True)
-    chance = (1.0 - 2.0 / d) * square + trace**2
-    share = chance / np.maximum(chance, (free + 1.0 - 2.0 / d) * (square - trace**2 / d))
-    return (1.0 - share) * covariances + share * trace / d * np.eye(d)

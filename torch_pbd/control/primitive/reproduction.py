@@ -12,8 +12,7 @@ from torch import Tensor
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.control.primitive.adaptation import adapt
-from torch_pbd.control.primitive.dmp import DMP
+from torch_pbd.control.primitive.dmp import DMP, adapt
 from torch_pbd.control.primitive.smoothing import Movements, check_range
 from torch_pbd.estimators.torch_estimator import Standardization
 from torch_pbd.gp import EvidenceSearch, Observations, condition, fit_together

@@ -93,8 +93,9 @@ def smooth(
         motions.append([spline(own, order) * stretch**order for order in range(3)])
         removed.append(position - spline(time))
         known.append(unsampled(time, own) <= UNKNOWN)
-        sampled = make_interp_spline(time, position, k=1)(own)
-        recorded.append(np.where(known[-1][:, np.newaxis], sampled, motions[-1][0]))
+        recorded.append(
+            np.where(known[-1][:, np.newaxis], make_interp_spline(time, position, k=1)(own), motions[-1][0])
+        )
     position, velocity, acceleration = (np.stack(parts) for parts in zip(*motions, strict=True))
     if not noise:
         for number, path in enumerate(position):
@@ -124,7 +125,7 @@ def _splines(
     """Spline of each demonstration over its time from its start."""
     margin = 0.5 * _MOST_BEYOND * np.ptp(bounds, axis=0)
     splines = [_spline(*recording, cutoff) for recording in zip(times, positions, strict=True)]
-    bridged = list(splines)
+    bridged = splines.copy()
     # Holes are filled at the recording's own spacing, by the splines before any was, so that no order matters.
     for number, (time, filled) in enumerate(zip(times, positions, strict=True)):
         samples = time
@@ -171,9 +172,8 @@ def white_noise(n_samples: Sequence[int], scale: Floats) -> list[Floats]:
 
 def variance_share(part: Floats, whole: Floats) -> Floats:
     """Variance between demonstrations of one set of movements (K, n, d) over that of another, (d,), at most 1."""
-    variance = whole.var(axis=0, ddof=1).mean(axis=0)
-    share = part.var(axis=0, ddof=1).mean(axis=0) / np.where(variance > 0.0, variance, np.inf)
-    return np.minimum(share, 1.0)
+    own, variance = (values.var(axis=0, ddof=1).mean(axis=0) for values in (part, whole))
+    return np.minimum(own / np.where(variance > 0.0, variance, np.inf), 1.0)
 
 
 def merge_bursts(demonstrations: Demonstrations) -> Demonstrations:
