@@ -43,9 +43,10 @@ class DMPController(Planning):
     alpha, beta, gamma, tau : float, default=25.0, None, 0.7, 1.0
         Of the movement primitive, see :class:`~torch_pbd.control.DMP`; the paper's are 1, 1, 0.7, 1. With
         adaptation="safe" tau is that of a movement of 10 s, like the paper's, and goes with the duration.
-    adaptation, gate : default="safe", "time"
-        How it moves to other goals, and from other starts, and how the forcing of an "additive" movement ends, see
-        there; the paper's are "additive", which throws the robot, and "none".
+    adaptation : {"safe", "additive"}, default="safe"
+        How it moves to other goals, and from other starts; "additive", the paper's, throws the robot.
+    gate : {"time", "phase", "none"}, default="time"
+        How the forcing of an "additive" movement ends, so that it comes to rest at the goal; "none" is the paper's.
     phase_input : {"time", "log_s", "s"}, default="time"
         Input of the regressors: movement time, or the phase s of eq. (17), the paper's, or its logarithm, which is time
         in other units; scripts/benchmarks/phase_input.py compares them.
