@@ -19,9 +19,8 @@ from movement_primitives.promp import ProMP
 from scipy.stats import multivariate_normal, multivariate_t
 
 from torch_pbd import KMPBaseline, ProMPBaseline, TrajectoryRegressor, load_demonstrations
+from torch_pbd.experiments.comparison import MOVEMENT_STATISTICS, movement_statistics
 from torch_pbd.metrics import gaussian_kl
-from torch_pbd.movement import movement_statistics
-from torch_pbd.movement.judging import MOVEMENT_STATISTICS
 
 Floats = Any
 DATA = Path(__file__).parents[3] / "shared" / "data"

@@ -11,19 +11,20 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import clone
 
-from torch_pbd import plotting
+from torch_pbd import checks, plotting
 from torch_pbd.checks import Floats
 from torch_pbd.console import format_table, steps
 from torch_pbd.data import Demonstrations
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.experiments.run_folder import FinishedFits, RunFolder, fit_once, slug
 from torch_pbd.metrics import covariance_mse, mahalanobis_coverage, negative_log_likelihood, relative_frobenius_error
-from torch_pbd.movement import judge_movement
-from torch_pbd.movement.judging import MOVEMENT_STATISTICS
 from torch_pbd.plotting import style
 
 Align = Literal["auto", "none", "phase", "dtw"]
 Input = Literal["time", "phase"]
+
+MOVEMENT_STATISTICS = ("deviation", "offset", "length", "largest")
+"""Statistics of whole movements, of :func:`movement_statistics`."""
 
 
 class Score(NamedTuple):
@@ -119,7 +120,7 @@ def score_fold(
     """Fit without a demonstration, and score how well its rows are predicted, and if asked for it as a whole.
 
     "log_likelihood" is in nats per sample, "coverage" the share of samples within the 95 % ellipse; of the whole there
-    is what :func:`~torch_pbd.movement.judge_movement` returns.
+    is what :func:`judge_movement` returns.
     """
     left = groups == demonstration
     # Of this thread: what else runs on the machine does not count.
@@ -133,6 +134,45 @@ def score_fold(
     likelihood = -negative_log_likelihood(model, X[left], y[left]) if is_movement else model.score(X[left], y[left])
     row = {"log_likelihood": likelihood, "coverage": float(coverage), "fit_seconds": seconds}
     return row | judge_movement(model, X[left], y[left]) if whole else row
+
+
+def movement_statistics(movements: ArrayLike, mean: ArrayLike, std: ArrayLike) -> Floats:
+    """Statistics of whole movements (s, n, d), by mean and std (n, d) of each step: (s, 4), as ``MOVEMENT_STATISTICS``.
+
+    The mean squared deviation and the length of the time-averaged offset, in standard deviations of each step and
+    output; the length of the path, in units of the outputs; the largest deviation, in standard deviations.
+    """
+    movements = checks.array(movements, "movements", ("s", "n", "d"))
+    mean, std = (checks.array(part, name, movements.shape[1:]) for part, name in ((mean, "mean"), (std, "std")))
+    standardized = (movements - mean) / std
+    offset = np.linalg.norm(standardized.mean(axis=1), axis=1)
+    length = np.linalg.norm(np.diff(movements, axis=1), axis=2).sum(axis=1)
+    columns = np.square(standardized).mean(axis=(1, 2)), offset, length, np.abs(standardized).max(axis=(1, 2))
+    return np.stack(columns, axis=1)
+
+
+def judge_movement(
+    model: Any, X: ArrayLike, y: ArrayLike, *, level: float = 0.9, n_draws: int = 500, random_state: Any = 0
+) -> dict[str, float]:
+    """Joint log density of one demonstration X (n, 1), y (n, d), in nats, and whether regions of movements hold it.
+
+    Of a model of movements it is the law of whole movements that is judged, of a regressor that of independent rows.
+    Regions have the share ``level`` of the draws, as many below as above, for each of ``MOVEMENT_STATISTICS``. Returned
+    are "joint", and 1.0 or 0.0 for each statistic.
+    """
+    mean, covariance = model.predict(X, return_cov=True)
+    shape = covariance.shape[:2]
+    if hasattr(model, "sample_demonstrations"):
+        draws = model.sample_demonstrations(X, n_draws, random_state)
+        joint = float(model.score_demonstrations(X, y)[0])
+    else:
+        # Rows of a regressor are independent of each other: a movement is one draw of each.
+        draws = model.sample_y(X, n_draws, random_state).reshape(*shape, n_draws).transpose(2, 0, 1)
+        joint = float(np.sum(model.log_likelihood(X, y)))
+    moments = mean.reshape(shape), np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    low, high = np.quantile(movement_statistics(draws, *moments), [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0)
+    own = movement_statistics(np.reshape(y, (1, *shape)), *moments)[0]
+    return {"joint": joint} | dict(zip(MOVEMENT_STATISTICS, ((low <= own) & (own <= high)).astype(float), strict=True))
 
 
 def empirical_covariances(X: Floats, y: Floats) -> tuple[Floats, Floats | None]:

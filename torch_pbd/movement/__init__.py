@@ -1,6 +1,5 @@
 """Whole movements: the joint law of a demonstration, drawn from, judged by, and conditioned."""
 
-from torch_pbd.movement.judging import judge_movement, movement_statistics
 from torch_pbd.movement.kmp import KMPBaseline
 from torch_pbd.movement.promp import ProMPBaseline
 from torch_pbd.movement.trajectory import TrajectoryRegressor
@@ -9,6 +8,4 @@ __all__ = [
     "KMPBaseline",
     "ProMPBaseline",
     "TrajectoryRegressor",
-    "judge_movement",
-    "movement_statistics",
 ]

@@ -1,5 +1,6 @@
 """Probabilistic movement primitives (ProMP): a normal law of the weights of basis functions."""
 
+import itertools
 from functools import partial
 from typing import Any, ClassVar
 
@@ -10,7 +11,7 @@ from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.movement.base import MovementRegressor
 from torch_pbd.movement.joint import JointNormal
-from torch_pbd.movement.law import Recording, check_arrays
+from torch_pbd.movement.law import Recording, as_rows, check_arrays
 
 _N_BASES = (8, 12, 16, 20)  # tried by "auto", as far as recordings have samples for them
 _REACHES = (1.0, 2.0, 4.0)  # of the smooth prior, in bases
@@ -86,20 +87,15 @@ class ProMPBaseline(MovementRegressor):
         self.random_state = random_state
 
     def _check_parameters(self) -> None:
-        if self.n_basis != "auto":
-            checks.count(self.n_basis, "n_basis", least=2)
-        if self.overlap != "auto":
-            checks.number(self.overlap, "overlap", above=0.0, below=1.0)
+        for name in ("n_basis", "overlap", "shrinkage"):
+            if getattr(self, name) != "auto":
+                self._learned[f"{name}_"](getattr(self, name), name)
         checks.number(self.ridge, "ridge", least=0.0)
-        if self.shrinkage != "auto":
-            checks.number(self.shrinkage, "shrinkage", least=0.0, most=1.0)
         checks.seed(self.random_state)
 
     def _fit(self, recordings: list[Recording]) -> None:
-        low = min(recording.time[0] for recording in recordings)
-        high = max(recording.time[-1] for recording in recordings)
-        checks.number(high - low, "the range of X", above=0.0)
-        self._range = float(low), float(high - low)
+        X, *_ = as_rows(recordings)
+        self._range = float(X.min()), checks.number(float(np.ptp(X)), "the range of X", above=0.0)
         scaled = [Recording(self._scaled(time), position) for time, position in recordings]
         most = max(2, min(len(time) for time, _ in recordings) - 1)
         sizes = _N_BASES if self.n_basis == "auto" else (int(self.n_basis),)
@@ -110,7 +106,7 @@ class ProMPBaseline(MovementRegressor):
             for overlap in overlaps
         ]
         shares = _SHARES if self.shrinkage == "auto" else (float(self.shrinkage),)
-        choices = [(weights, reach, share) for weights in candidates for reach in _REACHES for share in shares]
+        choices = itertools.product(candidates, _REACHES, shares)
         weights, reach, share = max(choices, key=lambda choice: choice[0].left_out(*choice[1:]))
         self.n_basis_, self.overlap_, self.reach_, self.shrinkage_ = weights.n_basis, weights.overlap, reach, share
         self.weight_mean_ = weights.values.mean(axis=0)
@@ -181,9 +177,7 @@ class _Weights:
         if len(self.values) < 3:
             return -float(np.log(self.noise_scale).sum())  # one other demonstration has no covariance
         total = 0.0
-        for k, (bases, position) in enumerate(zip(self._bases, self._positions, strict=True)):
-            if k == _MOST_LEFT_OUT:
-                break
+        for k, (bases, position) in enumerate(zip(self._bases[:_MOST_LEFT_OUT], self._positions, strict=False)):
             others = np.delete(self.values, k, axis=0)
             covariance = self.covariance(others, reach, share)
             residual = (position - bases @ others.mean(axis=0)) / self.noise_scale

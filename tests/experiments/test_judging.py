@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from torch_pbd import GMMBaseline, ProMPBaseline, TrajectoryRegressor
-from torch_pbd.movement import judge_movement, movement_statistics
-from torch_pbd.movement.judging import MOVEMENT_STATISTICS
+from torch_pbd.experiments.comparison import MOVEMENT_STATISTICS, judge_movement, movement_statistics
 
 
 def test_statistics_of_whole_movements():
