@@ -35,15 +35,7 @@ class Gains(NamedTuple):
 
 
 def gains_at(controller: Any, time: Floats, path: Floats) -> Gains:
-    """Gains of a fitted :class:`~torch_pbd.control.DMPController` at movement times (n,) and desired outputs (n, d).
-
-    Of poses in world axes: the covariance of a chart is brought to the desired pose, and the law applied there.
-
-    Raises
-    ------
-    ValueError
-        With on_unknown="raise", if the Type I uncertainty is above 0.5 somewhere.
-    """
+    """Gains of a fitted controller at movement times (n,) and desired outputs (n, d); of poses in world axes."""
     cuts = range(_AT_ONCE, len(time), _AT_ONCE)
     parts = [_gains(controller, *part) for part in zip(np.split(time, cuts), np.split(path, cuts), strict=True)]
     return Gains(*map(np.concatenate, zip(*parts, strict=True)))
@@ -72,14 +64,12 @@ def _gains(controller: Any, time: Floats, path: Floats) -> Gains:
 
 
 def _at_pose(outputs: Outputs, law: StiffnessLaw, learned: Floats, path: Floats) -> Floats:
-    """Covariances (n, d, d) of what was learned, at the poses (n, d); between blocks only where the law asks for it.
-
-    All outputs are learned at once, but what few demonstrations say of how positions and rotations vary together does
-    not hold for others: without it, those left out are as likely, or likelier.
-    """
+    """Covariances (n, d, d) of what was learned, at the poses (n, d); between blocks only where the law asks for it."""
     covariance = outputs.covariance(learned, path)
     if len(outputs.blocks) == 1 or law.cross_terms:
         return covariance
+    # All outputs are learned at once, but what few demonstrations say of how positions and rotations vary together does
+    # not hold for others: without it, those left out are as likely, or likelier.
     cut = np.zeros_like(covariance)
     for block in outputs.blocks:
         cut[:, block, block] = covariance[:, block, block]
@@ -114,10 +104,7 @@ def fit_covariance(
     known: NDArray[np.bool_],
     outputs: Outputs,
 ) -> CovarianceRegressor:
-    """Clone of the regressor, fitted to what varies (K, n, d) at inputs (n, 1), where two or more know it (K, n).
-
-    From one demonstration alone nothing is known of how they vary, and the others stay aligned.
-    """
+    """Clone of the regressor, fitted to what varies (K, n, d) at inputs (n, 1), where two or more know it (K, n)."""
     fitted: Any = clone(HeteroscedasticGPRegressor() if regressor is None else regressor)
     between, extents = varying - varying[:1], outputs.extents(varying)
     varying = varying.copy()

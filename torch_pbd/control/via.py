@@ -79,10 +79,7 @@ def planned(
 ) -> tuple[Any, Floats | None, Floats | None]:
     """Controller of a movement to a goal, from a start, through points; and the goal and start left to its primitive.
 
-    Warns
-    -----
-    UserWarning
-        If a point deviates by more than 95 % of demonstrations do; it is passed all the same.
+    A point that deviates by more than 95 % of demonstrations do is told, and passed all the same.
     """
     if via is None and (not can_bend(controller) or (goal is None and start is None)):
         return controller, goal, start

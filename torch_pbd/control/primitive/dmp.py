@@ -232,9 +232,9 @@ def adapt(
     time: Float[Tensor, " t"],
     whole: tuple[Float[Tensor, "*b m d"], Float[Tensor, " m"]],
     *,
-    own_goal: Float[Tensor, "*b d"],
-    goals: Float[Tensor, "*b t d"],
-    start: Float[Tensor, "*b d"],
+    own_goal: Float[Tensor, "*#b d"],
+    goals: Float[Tensor, "*#b t d"],
+    start: Float[Tensor, "*#b d"],
     duration: float,
 ) -> tuple[Tensor, ...]:
     """Position, velocity and acceleration at times of a path of these, from another start, to other goals.

@@ -105,10 +105,7 @@ class Reproduction:
         return errors[0]
 
     def warn_if_cut(self, metres: float) -> None:
-        """Warn of a movement that was cut while moving, which a robot at rest cannot follow at once.
-
-        A unit of position is so many ``metres``.
-        """
+        """Warn of a movement, in units of so many metres, that was cut while moving: a robot at rest cannot follow."""
         velocity, parts = self._curve(self.time, 1), zip(("m/s", "rad/s"), (metres, 1.0), _STOPPED, strict=True)
         for own, (unit, scale, stopped) in zip(self.blocks, parts, strict=False):
             speed = scale * np.linalg.norm(velocity[:, own], axis=1)
@@ -121,11 +118,7 @@ class Reproduction:
                 )
 
     def motion(self, time: Floats) -> tuple[Floats, Floats, Floats]:
-        """Position, velocity and acceleration (n, d) at any times (n,): at rest before 0, and long after the end.
-
-        The primitive is solved exactly at 4000 ticks in the duration, and interpolated by cubics between. With
-        adaptation="safe" it is over with the duration.
-        """
+        """Position, velocity and acceleration (n, d) at any times (n,): at rest before 0, and long after the end."""
         curve, end = self._curve, self._curve.x[-1]
         within = np.clip(time, 0.0, end)
         moving = ((time >= 0.0) & (time <= end))[:, np.newaxis]
@@ -133,7 +126,7 @@ class Reproduction:
 
     @cached_property
     def _curve(self) -> CubicHermiteSpline:
-        """Movement to the demonstrated goal over all times until it is at rest."""
+        """Movement to the demonstrated goal, until it is at rest: exact at its ticks, and cubics between."""
         step, dmp, time = float(self.time[1]), self.dmp, self.time
         if dmp.adaptation != "safe":
             slowest = max(2.0 * dmp.tau / dmp.alpha, dmp.tau / dmp.gamma if dmp.gate == "phase" else 0.0)

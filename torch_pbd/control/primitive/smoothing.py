@@ -60,17 +60,14 @@ def smooth(
 ) -> Movements:
     """Smooth each demonstration, times (T_k,) and positions (T_k, d), and sample all at ``n_steps`` common times.
 
-    With a cutoff each output is the cubic smoothing spline whose weight halves the amplitude at the cutoff: at
-    even sampling it is a Butterworth filter of second order run forward and backward, and it takes the times
-    as they are, even or not. Without one it is the spline of degree 5 (3 below six samples) through all
-    samples: exact for polynomials, and noise goes through, times the square of its frequency in the
-    acceleration.
+    With a cutoff, in Hz of the movement, each output is the cubic smoothing spline whose weight halves the amplitude
+    there: at even sampling it is a Butterworth filter of second order run forward and backward, and it takes the times
+    as they are. Without one it is the spline of degree 5 (3 below six samples) through all samples: exact for
+    polynomials, and noise goes through, times the square of its frequency in the acceleration.
 
     In a hole it follows the mean of those that have none there, plus the least bent curve that joins the differences
-    from it on both sides, a cubic; not beyond the recorded range by more than a twentieth of it.
-
-    A cutoff in Hz is of the movement whose ``duration`` is the median of the demonstrations'. Refused are too few
-    samples and, unless it is ``noise``, a path that leaves the recorded range of an output by a tenth of it.
+    from it on both sides, a cubic; not beyond the recorded range by more than a twentieth of it. Unless it is
+    ``noise``, a path that leaves that range by a tenth is refused.
     """
     least = _LEAST_SAMPLES[cutoff is not None]
     for number, n_samples in enumerate(map(len, times)):
@@ -97,11 +94,9 @@ def smooth(
             np.where(known[-1][:, np.newaxis], make_interp_spline(time, position, k=1)(own), motions[-1][0])
         )
     position, velocity, acceleration = (np.stack(parts) for parts in zip(*motions, strict=True))
-    if not noise:
-        for number, path in enumerate(position):
-            check_range(path, bounds, f"demonstration {number}, smoothed,")
-    noise_scale = np.sqrt(np.mean(np.concatenate(removed) ** 2, axis=0))
-    mean = np.mean(recorded, axis=0)
+    for number, path in enumerate(() if noise else position):
+        check_range(path, bounds, f"demonstration {number}, smoothed,")
+    mean, noise_scale = np.mean(recorded, axis=0), np.sqrt(np.mean(np.concatenate(removed) ** 2, axis=0))
     return Movements(grid, position, velocity, acceleration, mean, bounds, np.stack(known), noise_scale)
 
 
@@ -177,10 +172,7 @@ def variance_share(part: Floats, whole: Floats) -> Floats:
 
 
 def merge_bursts(demonstrations: Demonstrations) -> Demonstrations:
-    """Demonstrations whose samples closer than a thousandth of the mean spacing are one, at their mean.
-
-    The median spacing is no measure: of bursts it is the distance within them. Warns of how many there were, and where.
-    """
+    """Demonstrations whose samples closer than a thousandth of the mean spacing are one, at their mean; told of."""
     merged = [_merge(*recording) for recording in demonstrations]
     lost = [(k, n, n - len(merged[k][0])) for k, n in enumerate(demonstrations.n_steps) if n > len(merged[k][0])]
     if not lost:
@@ -196,7 +188,8 @@ def merge_bursts(demonstrations: Demonstrations) -> Demonstrations:
 
 
 def _merge(time: Floats, position: Floats) -> tuple[Floats, Floats]:
-    # Bursts make the mean spacing short, which grows as they are merged: again until none is left.
+    # The median spacing is no measure: of bursts it is the distance within them. They make the mean spacing short,
+    # which grows as they are merged: again until none is left.
     while not (apart := np.diff(time) >= _RESOLUTION * (time[-1] - time[0]) / (len(time) - 1)).all():
         first = np.flatnonzero(np.r_[True, apart])
         counts = np.diff(np.r_[first, len(time)])
@@ -217,8 +210,8 @@ def unsampled(time: Floats, at: Floats) -> Floats:
 def tabulate_unsampled(demonstrations: Demonstrations, lasting: float, on_unknown: str) -> Floats:
     """Type I uncertainty at 4001 even times from the start to the end to which all recordings are stretched.
 
-    It is the second lowest of the recordings' there: from one alone nothing is known of how they vary. Warns of the
-    holes that all share but one, at times in a movement of ``lasting``.
+    From one recording alone nothing is known of how they vary: it is the second lowest of theirs. Holes that all share
+    but one are told, at times in a movement of ``lasting``.
     """
     share, each = np.linspace(0.0, 1.0, _INTERVALS + 1), []
     inside = np.zeros(len(share))
@@ -240,10 +233,7 @@ def tabulate_unsampled(demonstrations: Demonstrations, lasting: float, on_unknow
 
 
 def duration_of(demonstrations: Demonstrations, duration: float | None) -> tuple[float, float]:
-    """Duration of a movement in s, None for the median of the demonstrations; and seconds of one unit of their time.
-
-    Warns where it is None and their times are no seconds: one unit then counts as one.
-    """
+    """Duration of a movement in s, None for the median of the demonstrations; and seconds of one unit of their time."""
     own = float(np.median([time[-1] - time[0] for time in demonstrations.times]))
     if duration is not None:
         return float(duration), duration / own
