@@ -25,7 +25,6 @@
 #include "schedule.hpp"
 #include "steps.hpp"
 #include "table.hpp"
-#include "timer.hpp"
 
 namespace torch_pbd {
 
@@ -72,13 +71,12 @@ public:
     };
 
     explicit Admittance(const Schedule& schedule, const Options& options = {})
-        : unit_(virtual_mass(schedule, options.mass)),
-          timer_(checked(options.rate, 0.0 < options.rate && options.rate < infinity, "rate", "above 0"),
+        : timer_(checked(options.rate, 0.0 < options.rate && options.rate < infinity, "rate", "above 0"),
                  options.max_step, options.max_bad_ticks),
-          channel_(unit_, options.force_limit, options.deadband, options.force_rate_limit, options.hold_ticks),
+          channel_(options.force_limit, options.deadband, options.force_rate_limit, options.hold_ticks),
           limits_(options.velocity_limit, options.acceleration_limit),
-          pull_limit_(checked<N, M>(options.spring_limit.value_or(options.force_limit), "spring_limit")),
-          table_(std::make_shared<const ScheduleTable<N, M>>(schedule, unit_, options.rate, pull_limit_)),
+          table_(std::make_shared<const ScheduleTable<N, M>>(schedule, virtual_mass(schedule, options.mass),
+                                                             options.rate, pull_limit(options))),
           clock_(table_, options.soft_start, options.approach_speed, limits_.acceleration, options.catches_up) {
         const Limit stop = checked<N, M>(options.stop_deceleration.value_or(kDeceleration), "stop_deceleration");
         deceleration_ =
@@ -86,13 +84,10 @@ public:
                      clock_.least(limits_.acceleration));
         // Impulse responses of velocity to force integrate, in absolute values, to 2 / damping at most along each mode,
         // for any mass: twice what damping alone lets them do, where not all modes are met at their worst at once.
-        const Limit force = options.force_limit;
-        const Limit answer =
-            table_->mobility({force.position + pull_limit_.position, force.rotation + pull_limit_.rotation});
-        const auto due = [&](std::size_t b) {
-            return limits_.speed[b] < infinity ? limits_.speed[b] : clock_.speed / clock_.scale(b) + 2.0 * answer[b];
-        };
-        speed_due_ = {due(0), kIsPose ? due(1) : 0.0};
+        const Limit answer = 2.0 * table_->mobility(options.force_limit + pull_limit(options));
+        for (std::size_t b = 0; b < kBlocks.size(); ++b)
+            speed_due_[b] =
+                limits_.speed[b] < infinity ? limits_.speed[b] : clock_.speed / clock_.scale(b) + answer[b];
         desired_ = clock_.begin(0.0, 0.0, {}, {}, {}, state_.place);
     }
 
@@ -109,21 +104,20 @@ public:
         if (orientation) {
             const double length = linalg::norm(*orientation);
             checked(length, kIsPose && std::abs(length - 1.0) <= kOff, "the length of orientation", "1, of a pose");
-            orientation = linalg::scaled(1.0 / length, *orientation);
+            orientation = (1.0 / length) * *orientation;
         }
-        Limit speed{0.0, 0.0};
+        top_speed_ = speed_due_;
         for (std::size_t b = 0; b < kBlocks.size(); ++b) {
             const double along = linalg::norm(from.velocity, kBlocks[b]);
             checked(along, along <= limits_.speed[b], b == 0 ? "the speed" : "the angular speed",
                     "velocity_limit at most");
-            (b == 0 ? speed.position : speed.rotation) = along;
+            top_speed_[b] = std::max(top_speed_[b], along);
         }
         timer_.begin(now);
         channel_.begin(from.force_bias);
         scale_ = {1.0, 1.0};
         desired_ = clock_.begin(now, from.at, from.position, orientation, from.velocity, state_.place);
         state_.velocity = from.velocity;
-        top_speed_ = {std::max(speed_due_.position, speed.position), std::max(speed_due_.rotation, speed.rotation)};
         is_started_ = true;
         is_stopped_ = false;
         faults_ = 0;
@@ -153,12 +147,12 @@ public:
     Faults faults() const { return faults_; }  ///< all since `start`
 
     /// External force that acted in the last tick, in N and Nm.
-    Vector<N> force() const { return linalg::scaled(unit_, channel_.push); }
+    const Vector<N>& force() const { return channel_.push; }
     Position desired_position() const { return position_of(desired_); }  ///< of the last tick
     /// Desired orientation of the last tick; of poses.
     Quaternion desired_orientation() const {
         const Quaternion turned = orientation_of(desired_);
-        return linalg::scaled(1.0 / linalg::norm(turned), turned);
+        return (1.0 / linalg::norm(turned)) * turned;
     }
     const Vector<N>& desired_velocity() const { return desired_.velocity; }  ///< of the last tick
     /// Stiffness of the last tick in N/m and Nm/rad, as `spring_limit` let it be.
@@ -184,6 +178,10 @@ private:
         return checked(mass, !schedule.mass || mass == *schedule.mass, "mass", "that of the schedule's damping");
     }
 
+    static Limit pull_limit(const Options& options) {
+        return checked<N, M>(options.spring_limit.value_or(options.force_limit), "spring_limit");
+    }
+
     template <std::size_t K>
     static void check_finite(const Vector<K>& values, const char* name) {
         for (const double value : values) checked(value, std::isfinite(value), name, "finite");
@@ -206,20 +204,16 @@ private:
             return 0;
         }
         const State<N, M> before = state_;
-        const Vector<N>& push = channel_.push;
-        const double pull_limit = pull_limit_.position / unit_;
+        Vector<N> push = channel_.push;
         desired_ = clock_.row(timer_.last, step);
-        if (clock_.is_boosted) {
-            const Vector<N> boosted = linalg::sum(push, table_->forced(clock_.boost, clock_.index));
-            scale_ = table_->advance(clock_.index, desired_, boosted, state_, step, pull_limit);
-            clock_.spare(table_->accelerated(push, clock_.index), before.velocity, state_.velocity, step);
-        } else {
-            scale_ = table_->advance(clock_.index, desired_, push, state_, step, pull_limit);
-        }
+        if (clock_.boost) push = push + table_->forced(*clock_.boost, clock_.index);
+        scale_ = table_->advance(clock_.index, desired_, push, state_, step);
+        if (clock_.boost)
+            clock_.spare(table_->accelerated(channel_.push, clock_.index), before.velocity, state_.velocity, step);
         Faults faults = 0;
-        if (scale_.position != 1.0 || scale_.rotation != 1.0) faults = kSpringLimited;
+        if (scale_ != Limit{1.0, 1.0}) faults = kSpringLimited;
         // No block is beyond its own top speed where all together are within the least of them.
-        const double least = kIsPose ? std::min(top_speed_.position, top_speed_.rotation) : top_speed_.position;
+        const double least = kIsPose ? std::min(top_speed_[0], top_speed_[1]) : top_speed_[0];
         if (limits_.is_any || linalg::norm(state_.velocity) > least)
             faults |= limits_.apply(state_, before, step, top_speed_);
         timer_.last = now;
@@ -250,11 +244,9 @@ private:
         timer_.last = now;
     }
 
-    double unit_;  // kg of one mass in all directions; 1 where it is a matrix
     TickTimer timer_;
     ForceChannel<N, M> channel_;
     CommandLimits<N, M> limits_;
-    Limit pull_limit_;
     std::shared_ptr<const ScheduleTable<N, M>> table_;
     ScheduleClock<N, M> clock_;
     double deceleration_;

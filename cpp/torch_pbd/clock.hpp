@@ -40,18 +40,18 @@ public:
         : table_(std::move(table)),
           soft_start_(checked(soft_start, 0.0 <= soft_start && soft_start < infinity, "soft_start", "of at least 0")),
           approach_(checked<N, M>(approach_speed, "approach_speed")),
-          approach_speed_(approach_.position),
+          approach_speed_(approach_[0]),
           catches_up_(catches_up) {
         double own = 0.0, fastest = 0.0, spin = 0.0;
         const std::size_t last = table_->last();
-        speeds_.resize(last + 1);
+        // Velocity of the schedule at a row, also at the last one.
+        const auto motion = [&](std::size_t i) {
+            return i == last ? table_->velocity_at_end : table_->rows[i].velocity;
+        };
         for (std::size_t i = 0; i <= last; ++i) {
-            speeds_[i] = norm(motion(i));
-            fastest = std::max(fastest, speeds_[i]);
-            if (i > 0) {
-                const Vector<N> change = linalg::difference(motion(i), motion(i - 1));
-                own = std::max(own, norm(change) / (table_->time(i) - table_->time(i - 1)));
-            }
+            fastest = std::max(fastest, norm(motion(i)));
+            if (i > 0)
+                own = std::max(own, norm(motion(i) - motion(i - 1)) / (table_->time(i) - table_->time(i - 1)));
             if constexpr (M != N) spin = std::max(spin, linalg::norm(motion(i), blocks<N, M>[1]));
         }
         const double limit = least(acceleration_limit);
@@ -67,7 +67,23 @@ public:
         const double room = own > 0.0 ? (acceleration - gain_) / (kOvershoot * own) : infinity;
         fastest_ = catches_up ? std::min(kSpeed, std::sqrt(room)) : 1.0;
         acceleration += approach_speed_ * spin;
-        find_ends();
+        // Largest squares of the pace before the end, where it acts, and from when on.
+        squared_limits_.assign(last + 1, 0.0);
+        double left = 0.0;  // integral of dt / |x'| to the end; where the schedule rests it is long, not endless
+        for (std::size_t i = last; i-- > 0;) {
+            const double mean = std::max(0.5 * (norm(motion(i + 1)) + norm(motion(i))), 1e-9 * speed);
+            left += (table_->time(i + 1) - table_->time(i)) / mean;
+            squared_limits_[i] = 2.0 * gain_ * left;
+        }
+        const auto count = [this](double most) {
+            const auto is_fast = [most](double square) { return square >= most; };
+            return static_cast<std::size_t>(std::count_if(squared_limits_.begin(), squared_limits_.end(), is_fast));
+        };
+        tail_ = count(fastest_ * fastest_);
+        // Where a schedule that ends while moving is slower if it may take one half of `gain` for that.
+        const std::size_t fast = count(2.0);
+        const bool ends_moving = norm(motion(last)) * table_->rate > gain_;
+        slow_from_ = ends_moving ? table_->time(fast > 0 ? fast - 1 : last) : infinity;
     }
 
     /// Norm of velocities: their length, or of poses the larger one of that of positions and lever times rotations.
@@ -79,7 +95,7 @@ public:
     }
 
     /// What speeds of a block count in this norm: what a soft start does not tell apart counts as equally fast.
-    double scale(std::size_t block) const { return approach_.position / approach_[block]; }
+    double scale(std::size_t block) const { return approach_[0] / approach_[block]; }
 
     /// Smaller one of the speeds or accelerations of positions and rotations, as the norm tells them.
     double least(Limit limit) const {
@@ -96,11 +112,10 @@ public:
                       const std::optional<Quaternion>& orientation, const Vector<N>& velocity, Vector<M>& place) {
         at_ = at;
         origin_ = now - at;
-        lag_ = 0.0;
+        lag_ = ahead_ = 0.0;
         is_soft_ = false;
-        clear_boost();
+        boost.reset();
         spare_ = gain_;
-        ahead_ = 0.0;
         end_share_ = 1.0;
         double squared_limit;
         const State<N, M> row = desired(at, squared_limit);
@@ -120,7 +135,7 @@ public:
             blend_ = time_of(way, room);
             squared_limit *= end_share_;
         }
-        is_soft_ = !linalg::is_zero(distance_) && soft_start_ > 0.0;
+        is_soft_ = distance_ != Vector<N>{} && soft_start_ > 0.0;
         // At a pace of 1 the approach leaves this much less than `gain` to changes of pace.
         if (is_soft_) taken_ = std::clamp(gain_ + kSharpest * way / blend_ / blend_ - room_, 0.0, gain_);
         // The pace at which the desired motion is nearest to that of the robot.
@@ -146,7 +161,7 @@ public:
         double squared_limit;
         const State<N, M> row = desired(now - origin_, squared_limit);
         if (!is_soft_) return pace_ * norm(row.velocity);
-        return norm(linalg::sum(linalg::scaled(pace_, row.velocity), linalg::scaled(free_, slope_)));
+        return norm(pace_ * row.velocity + free_ * slope_);
     }
 
     /// Motion that is desired in a tick, whose gains are those of the row `index`.
@@ -159,7 +174,7 @@ public:
             }
             if (begin - origin_ >= table_->end) {
                 index = table_->last();
-                clear_boost();
+                boost.reset();
                 return table_->rows[index];
             }
         }
@@ -183,7 +198,7 @@ public:
         }
         shift(passed - ran);
         lag_ = std::max(0.0, lag_ + (catches_up_ ? passed - ran : 0.0));
-        clear_boost();
+        boost.reset();
         is_steady_ = false;
         // The spring pulls at the braked robot as hard as before, and a rise of the pace would add to it: the next tick
         // tells how much it may.
@@ -195,8 +210,7 @@ public:
     /// The acceleration is that of a push from outside: while it is not taken out, a robot that is shaken comes back to
     /// its schedule seconds later.
     void spare(const Vector<N>& pushed, const Vector<N>& before, const Vector<N>& after, double step) {
-        const Vector<N> boosted = linalg::sum(before, linalg::scaled(step, boost));
-        spare_ = acceleration + norm(pushed) - norm(linalg::difference(after, boosted)) / step;
+        spare_ = acceleration + norm(pushed) - norm(after - before - step * *boost) / step;
     }
 
     /// Lets so much time of the loop's clock pass without schedule time.
@@ -204,36 +218,9 @@ public:
 
     double speed, acceleration;  ///< most that the desired motion takes
     std::size_t index = 0;
-    Vector<N> boost{};
-    bool is_boosted = false;
+    std::optional<Vector<N>> boost;
 
 private:
-    /// Velocity of the schedule at a row, also at the last one.
-    const Vector<N>& motion(std::size_t row) const {
-        return row == table_->last() ? table_->velocity_at_end : table_->rows[row].velocity;
-    }
-
-    /// Largest squares of the pace before the end, where it acts, and from when on.
-    void find_ends() {
-        const std::size_t last = table_->last();
-        squared_limits_.assign(last + 1, 0.0);
-        double left = 0.0;  // integral of dt / |x'| to the end; where the schedule rests it is long, not endless
-        for (std::size_t i = last; i-- > 0;) {
-            const double mean = std::max(0.5 * (speeds_[i + 1] + speeds_[i]), 1e-9 * speed);
-            left += (table_->time(i + 1) - table_->time(i)) / mean;
-            squared_limits_[i] = 2.0 * gain_ * left;
-        }
-        const auto count = [this](double least) {
-            return static_cast<std::size_t>(std::count_if(squared_limits_.begin(), squared_limits_.end(),
-                                                          [least](double limit) { return limit >= least; }));
-        };
-        tail_ = count(fastest_ * fastest_);
-        // Where a schedule that ends while moving is slower if it may take one half of `gain` for that.
-        const std::size_t fast = count(2.0);
-        const bool ends_moving = speeds_.back() * table_->rate > gain_;
-        slow_from_ = ends_moving ? table_->time(fast > 0 ? fast - 1 : last) : infinity;
-    }
-
     State<N, M> ramped(double begin, double step) {
         const double time = begin - origin_, last_pace = pace_;
         double squared_limit;
@@ -241,9 +228,9 @@ private:
         const Vector<N> moving = row.velocity;
         // Most ticks of an approach: at a pace of 1 nothing changes it, for nothing is caught up.
         if (is_soft_ && last_pace == 1.0 && free_ == 1.0 && 1.0 <= squared_limit) {
-            clear_boost();
+            boost.reset();
             spare_ = 0.0;
-            row.velocity = linalg::sum(moving, slope_);
+            row.velocity = moving + slope_;
             return row;
         }
         double motion_speed = norm(moving), last_free = last_pace, gain = gain_;
@@ -251,23 +238,21 @@ private:
             last_free = free_;
             gain -= taken_ * last_free * last_free;
             // Where the schedule is slower than its approach, `gain` is for the changes of both.
-            motion_speed = last_pace < last_free ? motion_speed + norm(slope_) : norm(linalg::sum(moving, slope_));
+            motion_speed = last_pace < last_free ? motion_speed + norm(slope_) : norm(moving + slope_);
         }
         const auto [faster, free] = freely(last_free, gain, motion_speed, step);
         const double pace = pace_ = std::min({last_pace + faster, free, std::sqrt(squared_limit)});
         // Where the pace is even nothing says what is spare, and the first tick of a rise finds out.
-        is_boosted = pace != last_pace || (free != last_free && is_soft_);
-        if (is_boosted) {
-            boost = linalg::scaled((pace - last_pace) / step, moving);
-        } else {
-            clear_boost();
+        boost.reset();
+        if (pace != last_pace || (free != last_free && is_soft_))
+            boost = ((pace - last_pace) / step) * moving;
+        else
             spare_ = 0.0;
-        }
-        row.velocity = linalg::scaled(pace, moving);
+        row.velocity = pace * moving;
         if (is_soft_) {
-            if (is_boosted) boost = linalg::sum(boost, linalg::scaled((free - last_free) / step, slope_));
+            if (boost) boost = *boost + ((free - last_free) / step) * slope_;
             ahead_ += 0.5 * step * (free + last_free - pace - last_pace);
-            row.velocity = linalg::sum(row.velocity, linalg::scaled(free, slope_));
+            row.velocity = row.velocity + free * slope_;
         }
         free_ = is_soft_ ? free : pace;
         const double lost = step - 0.5 * step * (pace + last_pace);
@@ -279,18 +264,14 @@ private:
             origin_ += then - std::nearbyint(then * table_->rate) / table_->rate;
         }
         if (!is_soft_ && (time >= table_->end || (pace == 1.0 && last_pace == 1.0 && lag_ == 0.0))) {
-            clear_boost();
+            boost.reset();
             is_steady_ = true;
         }
         return row;
     }
 
-    struct Pace {
-        double faster, free;
-    };
-
     /// Largest rise of the pace in a tick, and the pace after it where the end of the schedule does not limit it.
-    Pace freely(double pace, double gain, double motion_speed, double step) const {
+    std::pair<double, double> freely(double pace, double gain, double motion_speed, double step) const {
         // The pace changes by `rise` a second at most. From a pace of 1 + p, p^2 / (2 rise) of the lag is made up for
         // by the time it is down to 1 again: the p of the whole lag is the one to go for, once an approach is over.
         const double rise = motion_speed > 0.0 ? gain / motion_speed : infinity;
@@ -319,8 +300,8 @@ private:
             row = table_->rows[index];
             const State<N, M>& after = table_->rows[index + 1];
             // Of quaternions that are so near, lengths and angles change evenly enough, and lengths do not matter.
-            for (std::size_t i = 0; i < M; ++i) row.place[i] += share * (after.place[i] - row.place[i]);
-            for (std::size_t i = 0; i < N; ++i) row.velocity[i] += share * (after.velocity[i] - row.velocity[i]);
+            row.place = row.place + share * (after.place - row.place);
+            row.velocity = row.velocity + share * (after.velocity - row.velocity);
             const double low = squared_limits_[index], high = squared_limits_[index + 1];
             squared_limit = low + share * (high - low);
         }
@@ -331,12 +312,12 @@ private:
             // Rest of a way of 1 by minimum jerk, and its slope over the phase.
             const double left = 1.0 - phase * phase * phase * (10.0 - 15.0 * phase + 6.0 * (phase * phase));
             const double slope = 30.0 * (phase * phase) * ((1.0 - phase) * (1.0 - phase)) / blend_;
-            const Vector<N> away = linalg::scaled(-left, distance_);
+            const Vector<N> away = -left * distance_;
             row.place = places::moved(row.place, away);
             if constexpr (M != N)
                 places::set_tail(row.velocity,
                                  rotations::rotated(places::rotation_of(row.velocity), places::rotation_of(away)));
-            slope_ = linalg::scaled(slope, distance_);
+            slope_ = slope * distance_;
             squared_limit *= end_share_;
         }
         return row;
@@ -345,11 +326,6 @@ private:
     /// Time of an approach within its largest speed and this acceleration.
     double time_of(double way, double room) const {
         return std::max({soft_start_, kSteepest * way / approach_speed_, std::sqrt(kSharpest * way / room)});
-    }
-
-    void clear_boost() {
-        is_boosted = false;
-        boost = {};
     }
 
     // The desired motion may be 1.5 times as fast as the schedule, and accelerate so much more: one half of that
@@ -372,7 +348,7 @@ private:
     double approach_speed_;  ///< in the norm
     bool catches_up_;
     double gain_, room_, fastest_, slow_from_;
-    std::vector<double> speeds_, squared_limits_;
+    std::vector<double> squared_limits_;
     std::size_t tail_;
     double at_ = 0.0, origin_ = 0.0, lag_ = 0.0, spare_ = 0.0, ahead_ = 0.0, end_share_ = 1.0, blend_ = 1.0;
     double taken_ = 0.0, free_ = 1.0, pace_ = 1.0;

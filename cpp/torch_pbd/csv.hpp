@@ -2,6 +2,7 @@
 #pragma once
 
 #include <algorithm>
+#include <array>
 #include <charconv>
 #include <cmath>
 #include <cstddef>
@@ -16,89 +17,123 @@
 #include <utility>
 #include <vector>
 
-#include "sha256.hpp"
-
 namespace torch_pbd {
-
 namespace file {
 
-/// Value of JSON with the entries of its objects in the order of their keys, as `json.dumps(..., sort_keys=True)`.
-class SortedJson {
+/// SHA-256 (FIPS 180-4) of bytes that come piece by piece.
+class Sha256 {
 public:
-    explicit SortedJson(std::string_view text) : text_(text) {}
+    void update(std::string_view bytes) {
+        for (const char byte : bytes) push(static_cast<std::uint8_t>(byte));
+    }
 
-    std::string whole() {
-        std::string sorted = value(0);
-        if (place_ != text_.size()) fail();
-        return sorted;
+    /// Digest as 64 hexadecimal digits; nothing may follow.
+    std::string digest() {
+        const std::uint64_t bits = 8 * n_bytes_;
+        push(0x80);
+        while (n_bytes_ % 64 != 56) push(0);
+        for (int shift = 56; shift >= 0; shift -= 8) push(static_cast<std::uint8_t>(bits >> shift));
+        std::string text;
+        for (const std::uint32_t word : state_)
+            for (int shift = 28; shift >= 0; shift -= 4) text += "0123456789abcdef"[(word >> shift) & 15];
+        return text;
     }
 
 private:
-    [[noreturn]] static void fail() { throw std::runtime_error("its labels are not JSON"); }
-
-    std::string value(int depth) {
-        if (place_ == text_.size() || depth > kDeepest) fail();
-        const char first = text_[place_];
-        if (first == '"') return string();
-        if (first == '[' || first == '{') return members(depth, first == '{');
-        const std::size_t end = std::min(text_.find_first_of(",]} ", place_), text_.size());
-        const std::size_t start = std::exchange(place_, end);
-        return std::string(text_.substr(start, end - start));
+    void push(std::uint8_t byte) {
+        const std::size_t place = n_bytes_++ % 64;
+        words_[place / 4] = words_[place / 4] << 8 | byte;
+        if (place == 63) compress();
     }
 
-    std::string string() {
-        const std::size_t start = place_;
-        while (++place_ < text_.size() && text_[place_] != '"') place_ += text_[place_] == '\\';
-        if (place_ >= text_.size()) fail();
-        return std::string(text_.substr(start, ++place_ - start));
-    }
-
-    std::string members(int depth, bool is_object) {
-        const char close = is_object ? '}' : ']';
-        std::vector<std::pair<std::u16string, std::string>> entries;
-        ++place_;
-        while (!take(close)) {
-            if (!entries.empty() && !(take(',') && take(' '))) fail();
-            const std::string key = is_object ? string() : "";
-            if (is_object && !(take(':') && take(' '))) fail();
-            entries.emplace_back(letters(key), (is_object ? key + ": " : "") + value(depth + 1));
+    void compress() {
+        std::array<std::uint32_t, 64> w;
+        for (std::size_t i = 0; i < 16; ++i) w[i] = words_[i];
+        for (std::size_t i = 16; i < 64; ++i)
+            w[i] = w[i - 16] + (turned(w[i - 15], 7) ^ turned(w[i - 15], 18) ^ w[i - 15] >> 3) + w[i - 7] +
+                   (turned(w[i - 2], 17) ^ turned(w[i - 2], 19) ^ w[i - 2] >> 10);
+        auto [a, b, c, d, e, f, g, h] = state_;
+        for (std::size_t i = 0; i < 64; ++i) {
+            const std::uint32_t first =
+                h + (turned(e, 6) ^ turned(e, 11) ^ turned(e, 25)) + ((e & f) ^ (~e & g)) + kRounds[i] + w[i];
+            const std::uint32_t second = (turned(a, 2) ^ turned(a, 13) ^ turned(a, 22)) + ((a & b) ^ (a & c) ^ (b & c));
+            h = g, g = f, f = e, e = d + first, d = c, c = b, b = a, a = first + second;
         }
-        if (is_object) std::sort(entries.begin(), entries.end());
-        std::string joined(1, is_object ? '{' : '[');
-        for (const auto& [key, entry] : entries) joined += (joined.size() > 1 ? ", " : "") + entry;
-        return joined + close;
+        const std::array<std::uint32_t, 8> added{a, b, c, d, e, f, g, h};
+        for (std::size_t i = 0; i < 8; ++i) state_[i] += added[i];
     }
 
-    bool take(char wanted) {
-        if (place_ >= text_.size() || text_[place_] != wanted) return false;
-        ++place_;
-        return true;
-    }
+    static std::uint32_t turned(std::uint32_t word, int bits) { return word >> bits | word << (32 - bits); }
 
-    /// Letters of a key, which stands in ASCII with escapes, whose order is another one.
-    static std::u16string letters(std::string_view key) {
-        constexpr std::string_view escapes = "nrtbf", meant = "\n\r\t\b\f";
-        std::u16string decoded;
-        for (std::size_t i = 1; i + 1 < key.size(); ++i) {
-            char16_t letter = static_cast<unsigned char>(key[i]);
-            if (letter == u'\\') {
-                const char escape = key[++i];
-                const std::size_t known = escapes.find(escape);
-                letter = static_cast<unsigned char>(known < escapes.size() ? meant[known] : escape);
-                if (escape == 'u') {
-                    letter = static_cast<char16_t>(std::stoul(std::string(key.substr(i + 1, 4)), nullptr, 16));
-                    i += 4;
-                }
-            }
-            decoded += letter;
-        }
-        return decoded;
-    }
-
-    static constexpr int kDeepest = 200;
-    std::string_view text_;
-    std::size_t place_ = 0;
+    static constexpr std::array<std::uint32_t, 64> kRounds{
+        0x428a2f98, 0x71374491, 0xb5c0fbcf, 0xe9b5dba5, 0x3956c25b, 0x59f111f1, 0x923f82a4, 0xab1c5ed5,
+        0xd807aa98, 0x12835b01, 0x243185be, 0x550c7dc3, 0x72be5d74, 0x80deb1fe, 0x9bdc06a7, 0xc19bf174,
+        0xe49b69c1, 0xefbe4786, 0x0fc19dc6, 0x240ca1cc, 0x2de92c6f, 0x4a7484aa, 0x5cb0a9dc, 0x76f988da,
+        0x983e5152, 0xa831c66d, 0xb00327c8, 0xbf597fc7, 0xc6e00bf3, 0xd5a79147, 0x06ca6351, 0x14292967,
+        0x27b70a85, 0x2e1b2138, 0x4d2c6dfc, 0x53380d13, 0x650a7354, 0x766a0abb, 0x81c2c92e, 0x92722c85,
+        0xa2bfe8a1, 0xa81a664b, 0xc24b8b70, 0xc76c51a3, 0xd192e819, 0xd6990624, 0xf40e3585, 0x106aa070,
+        0x19a4c116, 0x1e376c08, 0x2748774c, 0x34b0bcb5, 0x391c0cb3, 0x4ed8aa4a, 0x5b9cca4f, 0x682e6ff3,
+        0x748f82ee, 0x78a5636f, 0x84c87814, 0x8cc70208, 0x90befffa, 0xa4506ceb, 0xbef9a3f7, 0xc67178f2};
+    std::array<std::uint32_t, 8> state_{0x6a09e667, 0xbb67ae85, 0x3c6ef372, 0xa54ff53a,
+                                        0x510e527f, 0x9b05688c, 0x1f83d9ab, 0x5be0cd19};
+    std::array<std::uint32_t, 16> words_{};
+    std::uint64_t n_bytes_ = 0;
 };
+
+/// Letters of a key of JSON, which stands in ASCII with escapes, whose order is another one.
+inline std::u16string letters(std::string_view key) {
+    constexpr std::string_view escapes = "nrtbf", meant = "\n\r\t\b\f";
+    std::u16string decoded;
+    for (std::size_t i = 1; i + 1 < key.size(); ++i) {
+        char16_t letter = static_cast<unsigned char>(key[i]);
+        if (letter == u'\\') {
+            const char escape = key[++i];
+            const std::size_t known = escapes.find(escape);
+            letter = static_cast<unsigned char>(known < escapes.size() ? meant[known] : escape);
+            if (escape == 'u') {
+                letter = static_cast<char16_t>(std::stoul(std::string(key.substr(i + 1, 4)), nullptr, 16));
+                i += 4;
+            }
+        }
+        decoded += letter;
+    }
+    return decoded;
+}
+
+/// Takes so many letters off the front of JSON; they must be there, and what is expected.
+inline std::string take(std::string_view& text, std::size_t n_letters, std::string_view expected = "") {
+    if (n_letters == 0 || n_letters > text.size() || text.compare(0, expected.size(), expected) != 0)
+        throw std::runtime_error("its labels are not JSON");
+    const std::string taken(text.substr(0, n_letters));
+    text.remove_prefix(n_letters);
+    return taken;
+}
+
+/// Takes a value off the front of JSON: with the entries of its objects in the order of their keys, as Python's
+/// `json.dumps(..., sort_keys=True)` has them.
+inline std::string take_sorted(std::string_view& text, int depth = 0) {
+    constexpr int deepest = 200;
+    if (text.empty() || depth > deepest) take(text, 0);
+    const bool is_object = text.front() == '{';
+    if (text.front() == '"') {
+        std::size_t end = 1;
+        while (end < text.size() && text[end] != '"') end += text[end] == '\\' ? 2 : 1;
+        return take(text, end + 1);
+    }
+    if (!is_object && text.front() != '[') return take(text, std::min(text.find_first_of(",]} "), text.size()));
+    std::string joined = take(text, 1);
+    const char close = is_object ? '}' : ']';
+    std::vector<std::pair<std::u16string, std::string>> entries;
+    while (text.empty() || text.front() != close) {
+        if (!entries.empty()) take(text, 2, ", ");
+        const std::string key = is_object ? take_sorted(text, depth + 1) : "";
+        const std::string colon = is_object ? take(text, 2, ": ") : "";
+        entries.emplace_back(letters(key), key + colon + take_sorted(text, depth + 1));
+    }
+    if (is_object) std::sort(entries.begin(), entries.end());
+    for (const auto& [key, entry] : entries) joined += (joined.size() > 1 ? ", " : "") + entry;
+    return joined + take(text, 1);
+}
 
 /// Number of a cell; the decimal point is a point in every locale.
 inline double number(std::string_view cell, std::size_t line) {
@@ -130,67 +165,56 @@ inline std::vector<std::string> cells(std::string_view line) {
     return found;
 }
 
-/// The table of a file as arrays: columns of one array stand side by side, of matrices their upper triangles.
+/// The table of a file, whose arrays are taken one after another; of matrices it has the upper triangles.
 class Table {
 public:
-    /// Titles are `time`, `position[x]`, `stiffness[x][y]`.
-    explicit Table(const std::vector<std::string>& titles) : n_columns_(titles.size()) {
-        for (const std::string& title : titles) {
-            const std::string name = title.substr(0, title.find('['));
-            if (arrays_.empty() || arrays_.back().name != name) arrays_.push_back({name, {}, {}});
-            const bool is_indexed = name.size() < title.size() && title.back() == ']';
-            arrays_.back().places.push_back(is_indexed ? title.substr(name.size() + 1, title.size() - name.size() - 2)
-                                                       : "");
-        }
-    }
+    explicit Table(std::string_view titles) : titles_(cells(titles)) {}
 
     void add(std::string_view line, std::size_t number_of_line) {
-        std::size_t column = 0;
-        for (Array& array : arrays_) {
-            for (std::size_t i = 0; i < array.places.size(); ++i, ++column) {
-                const std::size_t end = std::min(line.find(','), line.size());
-                if ((end == line.size()) != (column + 1 == n_columns_))
-                    throw std::runtime_error("line " + std::to_string(number_of_line) +
-                                             " has not as many cells as the " + std::to_string(n_columns_) +
-                                             " columns");
-                array.values.push_back(number(line.substr(0, end), number_of_line));
-                line.remove_prefix(std::min(end + 1, line.size()));
-            }
+        for (std::size_t column = 0; column < titles_.size(); ++column) {
+            const std::size_t end = std::min(line.find(','), line.size());
+            if ((end == line.size()) != (column + 1 == titles_.size()))
+                throw std::runtime_error("line " + std::to_string(number_of_line) + " has not as many cells as the " +
+                                         std::to_string(titles_.size()) + " columns");
+            values_.push_back(number(line.substr(0, end), number_of_line));
+            line.remove_prefix(std::min(end + 1, line.size()));
         }
         ++n_rows;
     }
 
-    /// Places of the columns of an array: names of outputs; none where it is absent.
-    std::vector<std::string> places(const std::string& name) {
-        const auto array = find(name);
-        return array == arrays_.end() ? std::vector<std::string>() : array->places;
+    /// Names in the titles of an array, such as x of position[x].
+    std::vector<std::string> places(const std::string& name) const {
+        std::vector<std::string> found;
+        const std::size_t start = name.size() + 1;
+        for (const std::string& title : titles_)
+            if (title.compare(0, start, name + "[") == 0) found.push_back(title.substr(start, title.size() - start - 1));
+        return found;
     }
-    bool has(const std::string& name) { return !places(name).empty(); }
-    bool is_empty() const { return arrays_.empty(); }
 
-    /// Removes an array whose columns have these places, and returns its values.
-    std::vector<double> take(const std::string& name, const std::vector<std::string>& places_expected) {
-        if (places(name) != places_expected)
-            throw std::runtime_error("its columns of " + name + " are not " + std::to_string(places_expected.size()) +
+    /// Values of the next array, whose columns have these titles.
+    std::vector<double> take(const std::string& name, const std::vector<std::string>& titles) {
+        const auto first = titles_.begin() + static_cast<std::ptrdiff_t>(next_);
+        const std::size_t n = titles_.size(), k = titles.size();
+        if (next_ + k > n || !std::equal(titles.begin(), titles.end(), first))
+            throw std::runtime_error("its columns of " + name + " are not " + std::to_string(k) +
                                      " in the order of the outputs");
-        const auto array = find(name);
-        std::vector<double> values = std::move(array->values);
-        arrays_.erase(array);
+        std::vector<double> values;
+        for (std::size_t row = 0; row < n_rows; ++row)
+            for (std::size_t column = next_; column < next_ + k; ++column) values.push_back(values_[row * n + column]);
+        next_ += k;
         return values;
     }
 
-    /// Removes an array of upper triangles, and returns the whole symmetric matrices (n, d, d).
+    /// Values of the next array: whole symmetric matrices (n, d, d).
     std::vector<double> take_matrices(const std::string& name, const std::vector<std::string>& outputs) {
         // Files once had titles with commas, stiffness[x,y].
-        std::vector<std::string> triangle, triangle_once;
         const std::size_t d = outputs.size();
-        for (std::size_t i = 0; i < d; ++i) {
-            for (std::size_t j = i; j < d; ++j) {
-                triangle.push_back(outputs[i] + "][" + outputs[j]);
-                triangle_once.push_back(outputs[i] + "," + outputs[j]);
-            }
-        }
-        const std::vector<double> upper = take(name, places(name) == triangle_once ? triangle_once : triangle);
+        const bool is_old = next_ + 1 < titles_.size() && titles_[next_].find("][") == std::string::npos;
+        std::vector<std::string> titles;
+        for (std::size_t i = 0; i < d; ++i)
+            for (std::size_t j = i; j < d; ++j)
+                titles.push_back(name + "[" + outputs[i] + (is_old ? "," : "][") + outputs[j] + "]");
+        const std::vector<double> upper = take(name, titles);
         std::vector<double> whole(n_rows * d * d);
         std::size_t next = 0;
         for (std::size_t row = 0; row < n_rows; ++row)
@@ -200,21 +224,14 @@ public:
         return whole;
     }
 
+    bool is_taken() const { return next_ == titles_.size(); }
+
     std::size_t n_rows = 0;
 
 private:
-    struct Array {
-        std::string name;
-        std::vector<std::string> places;
-        std::vector<double> values;
-    };
-
-    std::vector<Array>::iterator find(const std::string& name) {
-        return std::find_if(arrays_.begin(), arrays_.end(), [&](const Array& array) { return array.name == name; });
-    }
-
-    std::size_t n_columns_;
-    std::vector<Array> arrays_;
+    std::vector<std::string> titles_;
+    std::vector<double> values_;
+    std::size_t next_ = 0;
 };
 
 /// SHA-256 of what a file says, not of how it is written: line ends and spelling of numbers are free.
@@ -222,8 +239,11 @@ class Digest {
 public:
     explicit Digest(const std::map<std::string, std::string>& labels) {
         std::string header;
-        for (const auto& [key, value] : labels)
-            if (key != "sha256") header += (header.empty() ? "{\"" : ", \"") + key + "\": " + SortedJson(value).whole();
+        for (const auto& [key, value] : labels) {
+            std::string_view rest = value;
+            if (key != "sha256") header += (header.empty() ? "{\"" : ", \"") + key + "\": " + take_sorted(rest);
+            if (key != "sha256" && !rest.empty()) take(rest, 0);
+        }
         sha256_.update(header + "}");
     }
 

@@ -1,4 +1,4 @@
-/// Limits of the force that comes in and of the command that goes out, and the faults of a tick where they acted.
+/// Limits of the force and the time that come in, and of the command that goes out, and the faults where they acted.
 #pragma once
 
 #include <algorithm>
@@ -32,11 +32,7 @@ enum Fault : unsigned {
 using Faults = unsigned;
 
 /// Option that positions and rotations have each their own of; without an orientation the second is not used.
-struct Limit {
-    double position = 0.0, rotation = 0.0;
-
-    double operator[](std::size_t block) const { return block == 0 ? position : rotation; }
-};
+using Limit = Vector<2>;
 
 /// Refuses a number: one sentence that says which it was, and what it must be.
 inline double checked(double value, bool is_good, const char* name, const char* must) {
@@ -57,16 +53,15 @@ Limit checked(Limit limit, const char* name, bool may_be_zero = false, bool may_
     return limit;
 }
 
-/// The force that acts, and of poses the torque, over `unit` kg.
+/// The force that acts, and of poses the torque.
 ///
 /// One that is lost is replaced by the median of the last good ones, on each axis, which fades to nothing over
 /// `hold_ticks`: neither a wild reading before the loss nor an old push can carry the robot away.
 template <std::size_t N, std::size_t M>
 class ForceChannel {
 public:
-    ForceChannel(double unit, Limit limit, Limit deadband, Limit rate_limit, int hold_ticks)
-        : unit_(unit),
-          limit_(checked<N, M>(limit, "force_limit")),
+    ForceChannel(Limit limit, Limit deadband, Limit rate_limit, int hold_ticks)
+        : limit_(checked<N, M>(limit, "force_limit")),
           deadband_(checked<N, M>(deadband, "deadband", true)),
           rate_limit_(checked<N, M>(rate_limit, "force_rate_limit", false, true)),
           hold_ticks_(static_cast<int>(checked(hold_ticks, hold_ticks >= 0, "hold_ticks", "at least 0"))) {}
@@ -100,11 +95,11 @@ private:
 
     Faults take(const Vector<N>& force, double step, std::size_t b) {
         const Block block = blocks<N, M>[b];
-        const double deadband = deadband_[b] / unit_, limit = limit_[b] / unit_, most = rate_limit_[b] / unit_ * step;
+        const double deadband = deadband_[b], most = rate_limit_[b] * step;
         Vector<N> measured = push;
         for (std::size_t i = block.begin; i < block.end; ++i) {
-            measured[i] = (force[i] - bias_[i]) / unit_;
-            measured[i] -= std::max(-deadband, std::min(deadband, measured[i]));
+            measured[i] = force[i] - bias_[i];
+            measured[i] -= std::clamp(measured[i], -deadband, deadband);
         }
         const double length = linalg::norm(measured, block);
         Faults faults = 0;
@@ -112,11 +107,11 @@ private:
             bridge(block, channels_[b]);
             return kForceInvalid;
         }
-        if (length > limit) {
-            for (std::size_t i = block.begin; i < block.end; ++i) measured[i] = measured[i] / length * limit;
+        if (length > limit_[b]) {
+            for (std::size_t i = block.begin; i < block.end; ++i) measured[i] = measured[i] / length * limit_[b];
             faults = kForceSaturated;
         }
-        const double change = linalg::norm(linalg::difference(measured, push), block);
+        const double change = linalg::norm(measured - push, block);
         if (change > most) {
             for (std::size_t i = block.begin; i < block.end; ++i)
                 measured[i] = push[i] + most / change * (measured[i] - push[i]);
@@ -141,11 +136,71 @@ private:
         }
     }
 
-    double unit_;
     Limit limit_, deadband_, rate_limit_;
     int hold_ticks_;
     Vector<N> bias_{};
     std::array<Channel, blocks<N, M>.size()> channels_{};
+};
+
+/// Ticks of at most `max_step` s; `last` is until when the motion is known, `step` how long ticks last.
+class TickTimer {
+public:
+    TickTimer(double rate, double longest, int max_bad_ticks)
+        : max_step(checked(longest, 1.0 / rate < longest && longest < infinity, "max_step", "above 1 / rate, finite")),
+          rate_(rate),
+          max_bad_ticks_(static_cast<int>(checked(max_bad_ticks, max_bad_ticks >= 1, "max_bad_ticks", "at least 1"))) {}
+
+    /// Counts from `now`.
+    void begin(double now) {
+        // A reading must tell ticks apart to 1 %: times since 1970 in s do, in ns they do not.
+        const double resolution = std::nextafter(std::abs(now), infinity) - std::abs(now);
+        checked(now, resolution * rate_ <= 0.01, "now", "small enough to tell ticks apart: give seconds");
+        last = newest_ = now;
+        step = 1.0 / rate_;
+        is_regular = false;
+        n_bad_ = n_late_ = 0;
+    }
+
+    /// Whether bad or late ticks are too many on end for the robot to go on.
+    bool is_failed() const { return n_bad_ >= max_bad_ticks_ || n_late_ >= kLateOnEnd; }
+
+    /// Fault of a tick that is not like the last one; `shift` is the time by which `last` was put forward.
+    ///
+    /// Where the clock does not say how long a tick took, it is taken to be as long as they are.
+    Faults read(double now, double& shift) {
+        shift = 0.0;
+        if (is_regular) {
+            is_regular = false;
+            newest_ = last;
+        }
+        if (!(newest_ < now && now < infinity)) {
+            ++n_bad_;
+            return kClock;
+        }
+        // The clock has lost what bad ticks have lived through.
+        if (n_bad_ && now < last + 0.5 * step) {
+            shift = now - step - last;
+            last = now - step;
+        }
+        newest_ = now;
+        n_bad_ = 0;
+        if (now - last > max_step) {
+            ++n_late_;
+            return kLate;
+        }
+        is_regular = true;
+        n_late_ = 0;
+        return 0;
+    }
+
+    double last = std::numeric_limits<double>::quiet_NaN();
+    double step = 0.0, max_step;
+    bool is_regular = false;
+
+private:
+    static constexpr int kLateOnEnd = 3;  // one late tick is a stall, two may be; three are a loop that is too slow
+    double newest_ = 0.0, rate_;
+    int max_bad_ticks_, n_bad_ = 0, n_late_ = 0;
 };
 
 /// Largest speed and acceleration of the command; infinite where there is none.
@@ -161,41 +216,36 @@ public:
 
     /// Brings a state that a tick of `step` s led to within limits; returns which of them acted.
     Faults apply(State<N, M>& state, const State<N, M>& last, double step, Limit top_speed) const {
-        Vector<N> move = places::deviation<N>(state.place, last.place);
-        Faults faults = 0;
-        for (std::size_t b = 0; b < blocks<N, M>.size(); ++b)
-            faults |=
-                apply(move, state.velocity, last.velocity, step, blocks<N, M>[b], top_speed[b], acceleration[b] * step);
-        if (faults) state.place = places::moved(last.place, move);
-        return faults;
+        Vector<N> move = places::deviation<N>(state.place, last.place), &velocity = state.velocity;
+        Faults all = 0;
+        for (std::size_t b = 0; b < blocks<N, M>.size(); ++b) {
+            // The change of velocity is shortened first, then the velocity: the second never undoes the first.
+            const Block block = blocks<N, M>[b];
+            const double change = linalg::norm(velocity - last.velocity, block), most = acceleration[b] * step;
+            Faults faults = 0;
+            if (change > most) {
+                for (std::size_t i = block.begin; i < block.end; ++i)
+                    velocity[i] = last.velocity[i] + most / change * (velocity[i] - last.velocity[i]);
+                faults |= kAccelerationLimited;
+            }
+            const double along = linalg::norm(velocity, block);
+            if (along > top_speed[b]) {
+                for (std::size_t i = block.begin; i < block.end; ++i) velocity[i] *= top_speed[b] / along;
+                faults |= kVelocityLimited;
+            } else if (linalg::norm(move, block) > top_speed[b] * step) {
+                faults |= kVelocityLimited;  // a swing within one tick, from rest to rest, is too fast as well
+            }
+            if (faults)
+                for (std::size_t i = block.begin; i < block.end; ++i)
+                    move[i] = 0.5 * step * (last.velocity[i] + velocity[i]);
+            all |= faults;
+        }
+        if (all) state.place = places::moved(last.place, move);
+        return all;
     }
 
     Limit speed, acceleration;
     bool is_any = false;
-
-private:
-    /// The same for move and velocity of one block, whose velocity changes by `most` at most.
-    static Faults apply(Vector<N>& move, Vector<N>& velocity, const Vector<N>& last, double step, Block block,
-                        double top_speed, double most) {
-        // The change of velocity is shortened first, then the velocity: the second never undoes the first.
-        const double change = linalg::norm(linalg::difference(velocity, last), block);
-        Faults faults = 0;
-        if (change > most) {
-            for (std::size_t i = block.begin; i < block.end; ++i)
-                velocity[i] = last[i] + most / change * (velocity[i] - last[i]);
-            faults |= kAccelerationLimited;
-        }
-        const double speed = linalg::norm(velocity, block);
-        if (speed > top_speed) {
-            for (std::size_t i = block.begin; i < block.end; ++i) velocity[i] *= top_speed / speed;
-            faults |= kVelocityLimited;
-        } else if (linalg::norm(move, block) > top_speed * step) {
-            faults |= kVelocityLimited;  // a swing within one tick, from rest to rest, is too fast as well
-        }
-        if (faults)
-            for (std::size_t i = block.begin; i < block.end; ++i) move[i] = 0.5 * step * (last[i] + velocity[i]);
-        return faults;
-    }
 };
 
 }  // namespace torch_pbd

@@ -15,6 +15,24 @@ using Vector = std::array<double, N>;
 template <std::size_t N>
 using Matrix = std::array<Vector<N>, N>;
 
+template <class T, std::size_t N>
+std::array<T, N> operator+(std::array<T, N> a, const std::array<T, N>& b) {
+    for (std::size_t i = 0; i < N; ++i) a[i] = a[i] + b[i];
+    return a;
+}
+
+template <class T, std::size_t N>
+std::array<T, N> operator-(std::array<T, N> a, const std::array<T, N>& b) {
+    for (std::size_t i = 0; i < N; ++i) a[i] = a[i] - b[i];
+    return a;
+}
+
+template <class T, std::size_t N>
+std::array<T, N> operator*(double factor, std::array<T, N> a) {
+    for (T& part : a) part = factor * part;
+    return a;
+}
+
 namespace linalg {
 
 template <std::size_t N>
@@ -22,32 +40,6 @@ double dot(const Vector<N>& a, const Vector<N>& b) {
     double sum = 0.0;
     for (std::size_t i = 0; i < N; ++i) sum += a[i] * b[i];
     return sum;
-}
-
-template <std::size_t N>
-Vector<N> sum(const Vector<N>& a, const Vector<N>& b) {
-    Vector<N> result;
-    for (std::size_t i = 0; i < N; ++i) result[i] = a[i] + b[i];
-    return result;
-}
-
-template <std::size_t N>
-Vector<N> difference(const Vector<N>& a, const Vector<N>& b) {
-    Vector<N> result;
-    for (std::size_t i = 0; i < N; ++i) result[i] = a[i] - b[i];
-    return result;
-}
-
-template <std::size_t N>
-Vector<N> scaled(double factor, const Vector<N>& a) {
-    Vector<N> result;
-    for (std::size_t i = 0; i < N; ++i) result[i] = factor * a[i];
-    return result;
-}
-
-template <std::size_t N>
-bool is_zero(const Vector<N>& a) {
-    return std::all_of(a.begin(), a.end(), [](double part) { return part == 0.0; });
 }
 
 /// Some of the components of a vector, from `begin` to before `end`.
@@ -58,14 +50,13 @@ struct Block {
 /// Length of a block of a vector; infinite or NaN only where a component is.
 template <std::size_t N>
 double norm(const Vector<N>& a, Block block) {
-    double square = 0.0;
+    double square = 0.0, scale = 0.0, sum = 0.0;
     for (std::size_t i = block.begin; i < block.end; ++i) square += a[i] * a[i];
     if (1e-280 < square && square < 1e280) return std::sqrt(square);
-    double scale = 0.0;  // squares have overflown, or lost digits
+    // Squares have overflown, or lost digits.
     for (std::size_t i = block.begin; i < block.end; ++i)
         if (std::abs(a[i]) > scale || std::isnan(a[i])) scale = std::abs(a[i]);
     if (scale == 0.0 || !std::isfinite(scale)) return scale;
-    double sum = 0.0;
     for (std::size_t i = block.begin; i < block.end; ++i) sum += (a[i] / scale) * (a[i] / scale);
     return scale * std::sqrt(sum);
 }
@@ -73,11 +64,6 @@ double norm(const Vector<N>& a, Block block) {
 template <std::size_t N>
 double norm(const Vector<N>& a) {
     return norm(a, {0, N});
-}
-
-template <std::size_t N>
-double distance(const Vector<N>& a, const Vector<N>& b) {
-    return norm(difference(a, b));
 }
 
 template <std::size_t N>
@@ -110,13 +96,6 @@ Matrix<N> product(const Matrix<N>& a, const Matrix<N>& b) {
     for (std::size_t i = 0; i < N; ++i)
         for (std::size_t k = 0; k < N; ++k)
             for (std::size_t j = 0; j < N; ++j) result[i][j] += a[i][k] * b[k][j];
-    return result;
-}
-
-template <std::size_t N>
-Matrix<N> scaled(double factor, const Matrix<N>& a) {
-    Matrix<N> result;
-    for (std::size_t i = 0; i < N; ++i) result[i] = scaled(factor, a[i]);
     return result;
 }
 
@@ -213,16 +192,10 @@ Matrix<N> expm1(const Matrix<N>& matrix) {
     std::frexp(size, &exponent);
     const int doublings = std::max(0, exponent + 1);
     // The norm is now 1/2 at most, for which 14 terms have all digits.
-    const Matrix<N> small = scaled(std::ldexp(1.0, -doublings), matrix);
-    Matrix<N> power = scaled(1.0 / 14.0, small);
-    for (int order = 13; order > 0; --order) {
-        power = product(small, power);
-        for (std::size_t i = 0; i < N; ++i) power[i] = scaled(1.0 / order, sum(small[i], power[i]));
-    }
-    for (int i = 0; i < doublings; ++i) {
-        const Matrix<N> square = product(power, power);
-        for (std::size_t j = 0; j < N; ++j) power[j] = sum(scaled(2.0, power[j]), square[j]);
-    }
+    const Matrix<N> small = std::ldexp(1.0, -doublings) * matrix;
+    Matrix<N> power = (1.0 / 14.0) * small;
+    for (int order = 13; order > 0; --order) power = (1.0 / order) * (small + product(small, power));
+    for (int i = 0; i < doublings; ++i) power = 2.0 * power + product(power, power);
     return power;
 }
 

@@ -57,13 +57,13 @@ inline Vector<3> log(const Quaternion& q) {
     const Vector<3> axis{q[1], q[2], q[3]};
     const double sine = linalg::norm(axis);
     if (sine == 0.0) return {};
-    return linalg::scaled(std::copysign(2.0 * std::atan2(sine, std::abs(q[0])) / sine, q[0]), axis);
+    return std::copysign(2.0 * std::atan2(sine, std::abs(q[0])) / sine, q[0]) * axis;
 }
 
 /// x + b v x x + c v x (v x x).
 inline Vector<3> mixed(const Vector<3>& v, const Vector<3>& x, double b, double c) {
-    const Vector<3> once = cross(v, x), twice = cross(v, once);
-    return linalg::sum(x, linalg::sum(linalg::scaled(b, once), linalg::scaled(c, twice)));
+    const Vector<3> once = cross(v, x);
+    return x + b * once + c * cross(v, once);
 }
 
 /// Vector turned by a unit quaternion.
@@ -99,6 +99,8 @@ inline Vector<3> left_jacobian_inverse(const Vector<3>& v, const Vector<3>& turn
 
 namespace places {
 
+using namespace rotations;
+
 template <std::size_t N>
 Vector<3> rotation_of(const Vector<N>& twist) {
     return {twist[N - 3], twist[N - 2], twist[N - 1]};
@@ -125,8 +127,7 @@ Vector<N> deviation(const Vector<M>& place, const Vector<M>& goal) {
         const Quaternion turned = orientation_of(place), still = orientation_of(goal);
         // Products of equal quaternions are not zero to the last bit.
         const bool is_equal = turned == still;
-        set_tail(move,
-                 is_equal ? Vector<3>{} : rotations::log(rotations::multiply(turned, rotations::conjugate(still))));
+        set_tail(move, is_equal ? Vector<3>{} : log(multiply(turned, conjugate(still))));
     }
     return move;
 }
@@ -136,8 +137,8 @@ template <std::size_t N, std::size_t M>
 Vector<M> moved(Vector<M> place, const Vector<N>& move) {
     for (std::size_t i = 0; i < n_positions<N, M>; ++i) place[i] += move[i];
     if constexpr (M != N) {
-        const Quaternion turned = rotations::multiply(rotations::exp(rotation_of(move)), orientation_of(place));
-        set_tail(place, linalg::scaled(1.0 / linalg::norm(turned), turned));
+        const Quaternion turned = multiply(exp(rotation_of(move)), orientation_of(place));
+        set_tail(place, (1.0 / linalg::norm(turned)) * turned);
     }
     return place;
 }

@@ -120,19 +120,22 @@ inline Schedule read(std::istream& stream) {
     if (label("format") != "\"torch_pbd.schedule\"") throw std::runtime_error("it is no schedule");
     if (label("version") != "1" && label("version") != "2")
         throw std::runtime_error("it has version " + label("version") + ", must have 1 or 2");
-    Table table(cells(line));
+    Table table(line);
     while (next())
         if (!line.empty()) table.add(line, n_lines);
     const std::vector<std::string> positions = table.places("position"), outputs = table.places("velocity");
+    const bool is_pose = !table.places("orientation").empty();
     const std::size_t n = schedule.n_rows = table.n_rows, p = schedule.n_positions = positions.size();
     const std::size_t d = schedule.n_outputs = outputs.size();
-    if (d != p + (table.has("orientation") ? 3 : 0) || !std::equal(positions.begin(), positions.end(), outputs.begin()))
+    if (d != p + (is_pose ? 3 : 0) || !std::equal(positions.begin(), positions.end(), outputs.begin()))
         throw std::runtime_error("its columns of velocity are not those of position, and three of an orientation");
     Digest digest(schedule.labels);
     const std::string rows = std::to_string(n) + ",", columns = " " + std::to_string(d);
-    const auto take = [&](const char* name, const std::vector<std::string>& places) {
-        std::vector<double> values = table.take(name, places);
-        digest.add(name, places.front().empty() ? rows : rows + " " + std::to_string(places.size()), values);
+    const auto take = [&](const std::string& name, const std::vector<std::string>& places) {
+        std::vector<std::string> titles;
+        for (const std::string& place : places) titles.push_back(name + "[" + place + "]");
+        std::vector<double> values = table.take(name, places.empty() ? std::vector<std::string>{name} : titles);
+        digest.add(name, places.empty() ? rows : rows + " " + std::to_string(places.size()), values);
         return values;
     };
     const auto take_matrices = [&](const char* name) {
@@ -140,17 +143,17 @@ inline Schedule read(std::istream& stream) {
         digest.add(name, rows + columns + "," + columns, values);
         return values;
     };
-    schedule.time = take("time", {""});
+    schedule.time = take("time", {});
     schedule.position = take("position", positions);
     schedule.velocity = take("velocity", outputs);
     schedule.stiffness = take_matrices("stiffness");
     schedule.damping = take_matrices("damping");
     schedule.covariance = take_matrices("covariance");
-    schedule.type1 = take("type1", {""});
-    if (table.has("acceleration")) schedule.acceleration = take("acceleration", outputs);
-    if (table.has("orientation")) schedule.orientation = take("orientation", {"w", "x", "y", "z"});
-    if (table.has("mass")) schedule.inertia = take_matrices("mass");
-    if (!table.is_empty()) throw std::runtime_error("it has columns that are unknown");
+    schedule.type1 = take("type1", {});
+    if (!table.places("acceleration").empty()) schedule.acceleration = take("acceleration", outputs);
+    if (is_pose) schedule.orientation = take("orientation", {"w", "x", "y", "z"});
+    if (!table.places("mass").empty()) schedule.inertia = take_matrices("mass");
+    if (!table.is_taken()) throw std::runtime_error("it has columns that are unknown");
     if (label("mass") != "null") schedule.mass = number(label("mass"), 1);
     if (!label("sha256").empty() && label("sha256") != '"' + digest.text() + '"')
         throw std::runtime_error(

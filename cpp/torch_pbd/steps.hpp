@@ -48,11 +48,10 @@ inline Responses responses(double stiffness, double decay, double step) {
 
 /// Modes that stiffness and damping share, and their gains.
 ///
-/// Modes, the columns of P, are such that P' M P = 1, while P' K P and P' D P are diagonal. For a mass in all
-/// directions they are its axes, with all per kg.
+/// Modes, the columns of P, are such that P' M P = 1, while P' K P and P' D P are diagonal. Where they share none, P is
+/// the inverse of the transposed factor L of M = L L'.
 template <std::size_t N>
 struct Modes {
-    double top;  ///< largest stiffness
     Vector<N> stiffness, decay;  ///< of each mode, and half its damping
     Matrix<N> tells, shapes;  ///< rows of P' M, which tell y from e = P y, and those of P'
 };
@@ -61,30 +60,25 @@ struct Modes {
 template <std::size_t N>
 struct Drive {
     Vector<N> push, off, desired_velocity;  ///< external force, e = x - x_d, v_d
-    double step, pull_limit;
+    double step;
 };
 
-/// Scale of the stiffness at which the spring pulls at `limit` most, from the largest pull that e'K e allows.
-inline double spring_scale(double pull, double limit) { return pull > limit * limit ? limit / std::sqrt(pull) : 1.0; }
-
-/// Move in a tick, each mode by itself; changes the velocity, and tells the scale of the stiffness.
+/// Move in a tick, each mode by itself, with a stiffness scaled; changes the velocity.
 ///
 /// With f of a mode that of P' f, each y follows y'' + 2 a y' + k y = f + 2 a v_d. With the responses S and B of
 /// `responses` and q = f + 2 a v_d - k y, y grows by S v + B q and v by S q - (2 a S + k B) v: increments, which keep
 /// their digits in short ticks.
 template <std::size_t N>
-Vector<N> along_modes(const Modes<N>& modes, const Drive<N>& drive, Vector<N>& velocity, double& scale) {
+Vector<N> along_modes(const Modes<N>& modes, double scale, const Drive<N>& drive, Vector<N>& velocity) {
     using linalg::dot;
-    const Vector<N> y = linalg::product(modes.tells, drive.off), before = velocity;
-    double pull = 0.0;
-    for (std::size_t i = 0; i < N; ++i) pull += modes.stiffness[i] * y[i] * y[i];
-    scale = spring_scale(modes.top * pull, drive.pull_limit);
+    const Vector<N> before = velocity;
     Vector<N> move{};
     for (std::size_t i = 0; i < N; ++i) {
         const Vector<N>&tell = modes.tells[i], &shape = modes.shapes[i];
         const double k = scale * modes.stiffness[i], a = modes.decay[i], v = dot(tell, before);
         const auto [s, b] = responses(k, a, drive.step);
-        const double q = dot(shape, drive.push) + 2.0 * a * dot(tell, drive.desired_velocity) - k * y[i];
+        const double f = dot(shape, drive.push) + 2.0 * a * dot(tell, drive.desired_velocity);
+        const double q = f - k * dot(tell, drive.off);
         const double dy = s * v + b * q, dv = s * q - (2.0 * a * s + k * b) * v;
         for (std::size_t j = 0; j < N; ++j) {
             move[j] += dy * shape[j];
@@ -95,32 +89,26 @@ Vector<N> along_modes(const Modes<N>& modes, const Drive<N>& drive, Vector<N>& v
 }
 
 /// As `along_modes` for matrices that share none: exp(X) - 1 of the whole system, time in ticks.
-///
-/// Of the modes, `shapes` is the inverse of the factor L of a mass matrix; without one the gains are per kg.
 template <std::size_t N>
-Vector<N> coupled(const Modes<N>& modes, bool has_mass, const Matrix<N>& stiffness, const Matrix<N>& damping,
-                  const Drive<N>& drive, Vector<N>& velocity, double& scale) {
+Vector<N> coupled(const Modes<N>& modes, const Matrix<N>& stiffness, const Matrix<N>& damping, const Drive<N>& drive,
+                  Vector<N>& velocity) {
     const double step = drive.step;
-    scale = spring_scale(modes.top * linalg::dot(drive.off, linalg::product(stiffness, drive.off)), drive.pull_limit);
-    const Vector<N> held = linalg::sum(drive.push, linalg::product(damping, drive.desired_velocity));
-    const auto per_mass = [&](const Vector<N>& force) {
-        return has_mass ? linalg::transposed_product(modes.shapes, linalg::product(modes.shapes, force)) : force;
-    };
     const Matrix<N> k = linalg::transposed(stiffness), d = linalg::transposed(damping);
     Matrix<2 * N + 1> rate{};
-    const auto set_column = [&rate](std::size_t column, double factor, const Vector<N>& acceleration) {
+    const auto set_column = [&](std::size_t column, double factor, const Vector<N>& force) {
+        const Vector<N> acceleration = linalg::transposed_product(modes.shapes, linalg::product(modes.shapes, force));
         for (std::size_t i = 0; i < N; ++i) rate[N + i][column] = factor * acceleration[i];
     };
     Vector<2 * N + 1> start{};
     start[2 * N] = 1.0;
     for (std::size_t i = 0; i < N; ++i) {
         rate[i][N + i] = 1.0;
-        set_column(i, -(step * step) * scale, per_mass(k[i]));
-        set_column(N + i, -step, per_mass(d[i]));
+        set_column(i, -step * step, k[i]);
+        set_column(N + i, -step, d[i]);
         start[i] = drive.off[i];
         start[N + i] = step * velocity[i];
     }
-    set_column(2 * N, step * step, per_mass(held));
+    set_column(2 * N, step * step, drive.push + linalg::product(damping, drive.desired_velocity));
     const Vector<2 * N + 1> change = linalg::product(linalg::expm1(rate), start);
     Vector<N> move;
     for (std::size_t i = 0; i < N; ++i) {
@@ -130,21 +118,13 @@ Vector<N> coupled(const Modes<N>& modes, bool has_mass, const Matrix<N>& stiffne
     return move;
 }
 
-/// Move in a time in which the velocity changes evenly.
-template <std::size_t N>
-Vector<N> mean_move(const Vector<N>& before, const Vector<N>& after, double time) {
-    Vector<N> move;
-    for (std::size_t i = 0; i < N; ++i) move[i] = 0.5 * time * (before[i] + after[i]);
-    return move;
-}
-
 /// State after braking for `step` s, all axes alike, from a speed, or until standing still.
 template <std::size_t N, std::size_t M>
 State<N, M> braked(const State<N, M>& state, double speed, double deceleration, double step) {
     const double braking = std::min(step, speed / deceleration);
     const double left = braking == step ? 1.0 - deceleration * step / speed : 0.0;
-    const Vector<N> slower = linalg::scaled(left, state.velocity);
-    return {places::moved<N>(state.place, mean_move(state.velocity, slower, braking)), slower};
+    const Vector<N> slower = left * state.velocity;
+    return {places::moved<N>(state.place, 0.5 * braking * (state.velocity + slower)), slower};
 }
 
 }  // namespace torch_pbd

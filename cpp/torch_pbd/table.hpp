@@ -21,32 +21,48 @@ namespace torch_pbd {
 ///
 /// Between its own rows the schedule is what `Schedule.resample` of Python says: gains and masses on straight lines,
 /// positions on the cubic through positions and velocities, orientations on that of the rotation vector from the row
-/// before. Gains of the modes are per kg of a mass that is the same in all directions, `unit`.
+/// before. The mass is the inertia of the schedule, or one mass in all directions.
 template <std::size_t N, std::size_t M>
 class ScheduleTable {
 public:
     ScheduleTable(const Schedule& schedule, double mass, double ticks_per_second, Limit pull_limit)
-        : rate(ticks_per_second), unit(mass), has_mass(!schedule.inertia.empty()) {
+        : rate(ticks_per_second) {
         if (schedule.n_outputs != N || schedule.n_positions != n_positions<N, M>)
             throw std::invalid_argument("the schedule has " + std::to_string(schedule.n_positions) + " positions of " +
                                         std::to_string(schedule.n_outputs) + " outputs, must have " +
                                         std::to_string(n_positions<N, M>) + " of " + std::to_string(N) + ".");
-        end = schedule.time.back() - schedule.time.front();
-        times_ = grid();
-        rows.resize(times_.size());
-        stiffness.resize(times_.size());
-        damping.resize(times_.size());
-        modes_.resize(times_.size());
-        springs_.resize(times_.size());
+        const std::vector<double>& knots = schedule.time;
+        end = knots.back() - knots.front();
+        constexpr double rounding = 1e-3, most = 4e6;  // of a tick; rows: an hour at 1 kHz
+        // A schedule shorter than a tick of the loop is begun and ended; 10 s at 1 kHz are 10001 rows, however
+        // 10 * 1000 is rounded.
+        const double n_ticks = std::max(1.0, std::ceil(end * rate - rounding));
+        checked(rate, n_ticks + 1.0 <= most, "rate", "low enough for a table of 4,000,000 rows");
+        const std::size_t n = static_cast<std::size_t>(n_ticks) + 1;
+        rows.resize(n);
+        stiffness.resize(n);
+        damping.resize(n);
+        modes_.resize(n);
+        springs_.resize(n);
         std::size_t knot = 0;
-        for (std::size_t i = 0; i < times_.size(); ++i) {
-            const std::vector<double>& knots = schedule.time;
-            while (knot + 2 < knots.size() && knots[knot + 1] - knots[0] <= times_[i]) ++knot;
-            fill(schedule, knot, i);
-            if (!share_axes(schedule, knot, i)) is_shared_ = false;
-            springs_[i] = {stiffest(i, 0, pull_limit), blocks<N, M>.size() > 1 ? stiffest(i, 1, pull_limit) : 0.0};
-            const double limit = pull_limit.position;
-            modes_[i].top = std::max(springs_[i].position, springs_[i].rotation) * (limit * limit / unit);
+        for (std::size_t row = 0; row < n; ++row) {
+            const double now = time(row);
+            while (knot + 2 < knots.size() && knots[knot + 1] - knots[0] <= now) ++knot;
+            const double start = knots[knot] - knots[0], step = (knots[knot + 1] - knots[0]) - start;
+            const Place at{knot, (now - start) / step, step};
+            set_motion(schedule, at, rows[row]);
+            stiffness[row] = blended(schedule.stiffness, at);
+            damping[row] = blended(schedule.damping, at);
+            Matrix<N> inertia{};
+            for (std::size_t i = 0; i < N; ++i) inertia[i][i] = mass;
+            if (!schedule.inertia.empty()) inertia = blended(schedule.inertia, at);
+            if (!share_modes(inertia, row)) is_shared_ = false;
+            // |K e|^2 <= k_max e'K e in each block, with k_max that of the block, also where others are displaced, for
+            // |B'K e|^2 <= |B'K B| e'K e for any B.
+            for (std::size_t b = 0; b < kBlocks.size(); ++b) {
+                const double stiffest = spectral_norm(stiffness[row], kBlocks[b], kBlocks[b]);
+                springs_[row][b] = stiffest / (pull_limit[b] * pull_limit[b]);
+            }
         }
         is_apart_ = are_apart();
         velocity_at_end = rows.back().velocity;
@@ -58,45 +74,35 @@ public:
     /// The angular velocity is integrated over the tick as that of a fixed axis would be, and turns the robot in world
     /// axes. The deviation is then told anew from where both are, so that the transport of it by the desired rotation,
     /// which turns e by w_d x e, comes out by itself.
-    ///
-    /// Where positions and rotations have springs apart, each has a potential, a limit and a scale of its own: twisted
-    /// beyond its torque, a tool keeps its stiffness along the way. Where a limit acts, modes are no longer shared.
-    Limit advance(std::size_t row, const State<N, M>& desired, const Vector<N>& push, State<N, M>& state, double step,
-                  double pull_limit) const {
-        const Vector<N> off = places::deviation<N>(state.place, desired.place);
-        const Modes<N>& modes = modes_[row];
-        Limit scale{1.0, 1.0};
-        if (is_apart_)
-            scale = {spring_scale(pull(row, off, 0), 1.0), spring_scale(pull(row, off, blocks<N, M>.size() - 1), 1.0)};
-        const Drive<N> drive{push, off, desired.velocity, step, is_apart_ ? infinity : pull_limit};
-        double whole;
-        const Vector<N> move = is_shared_ && scale.position == 1.0 && scale.rotation == 1.0
-                                   ? along_modes(modes, drive, state.velocity, whole)
-                                   : coupled(modes, has_mass, linalg::scaled(1.0 / unit, scaled_stiffness(scale, row)),
-                                             linalg::scaled(1.0 / unit, damping[row]), drive, state.velocity, whole);
+    Limit advance(std::size_t row, const State<N, M>& desired, const Vector<N>& push, State<N, M>& state,
+                  double step) const {
+        const Drive<N> drive{push, places::deviation<N>(state.place, desired.place), desired.velocity, step};
+        const Limit scale = scales(row, drive.off);
+        // Where one of two springs is limited, modes are no longer shared.
+        const Vector<N> move =
+            is_shared_ && scale[0] == scale[kBlocks.size() - 1]
+                ? along_modes(modes_[row], scale[0], drive, state.velocity)
+                : coupled(modes_[row], scaled_stiffness(scale, row), damping[row], drive, state.velocity);
         state.place = places::moved(state.place, move);
-        return is_apart_ ? scale : Limit{whole, whole};
+        return scale;
     }
 
     /// Stiffness of a row in N/m and Nm/rad, in a tick that scaled it.
     Matrix<N> scaled_stiffness(Limit scale, std::size_t row) const {
         Matrix<N> scaled = stiffness[row];
-        for (std::size_t b = 0; b < blocks<N, M>.size(); ++b)
-            for (std::size_t i = blocks<N, M>[b].begin; i < blocks<N, M>[b].end; ++i)
-                scaled[i] = linalg::scaled(scale[b], scaled[i]);
+        for (std::size_t b = 0; b < kBlocks.size(); ++b)
+            for (std::size_t i = kBlocks[b].begin; i < kBlocks[b].end; ++i) scaled[i] = scale[b] * scaled[i];
         return scaled;
     }
 
-    /// Push, as ticks take it, that causes an acceleration: a force, or that per kg.
+    /// Force that causes an acceleration.
     Vector<N> forced(const Vector<N>& acceleration, std::size_t row) const {
-        if (!has_mass) return acceleration;
         return linalg::transposed_product(modes_[row].tells, linalg::product(modes_[row].tells, acceleration));
     }
 
-    /// Acceleration that such a push causes.
-    Vector<N> accelerated(const Vector<N>& push, std::size_t row) const {
-        if (!has_mass) return push;
-        return linalg::transposed_product(modes_[row].shapes, linalg::product(modes_[row].shapes, push));
+    /// Acceleration that a force causes.
+    Vector<N> accelerated(const Vector<N>& force, std::size_t row) const {
+        return linalg::transposed_product(modes_[row].shapes, linalg::product(modes_[row].shapes, force));
     }
 
     /// Largest norm, over the rows, of each block of D^-1, times what acts on the blocks: velocities of positions and
@@ -106,85 +112,61 @@ public:
         Matrix<2> most{};
         for (const Matrix<N>& gain : damping) {
             const auto [values, axes] = linalg::eigh(gain);
-            const double scale = linalg::largest(gain), least = *std::min_element(values.begin(), values.end());
-            if (!(least > singular * scale)) return {infinity, infinity};
+            if (!(*std::min_element(values.begin(), values.end()) > singular * linalg::largest(gain)))
+                return {infinity, infinity};
             Matrix<N> inverse{};
             for (std::size_t i = 0; i < N; ++i)
-                for (std::size_t j = 0; j < N; ++j)
-                    for (std::size_t k = 0; k < N; ++k) inverse[j][k] += axes[i][j] * axes[i][k] / values[i];
-            for (std::size_t b = 0; b < blocks<N, M>.size(); ++b)
-                for (std::size_t c = 0; c < blocks<N, M>.size(); ++c)
-                    most[b][c] = std::max(most[b][c], spectral_norm(inverse, blocks<N, M>[b], blocks<N, M>[c]));
+                for (std::size_t j = 0; j < N; ++j) inverse[j] = inverse[j] + (axes[i][j] / values[i]) * axes[i];
+            for (std::size_t b = 0; b < kBlocks.size(); ++b)
+                for (std::size_t c = 0; c < kBlocks.size(); ++c)
+                    most[b][c] = std::max(most[b][c], spectral_norm(inverse, kBlocks[b], kBlocks[c]));
         }
-        const Vector<2> reached = linalg::product(most, Vector<2>{force.position, force.rotation});
+        const Vector<2> reached = linalg::product(most, Vector<2>{force[0], force[1]});
         return {reached[0], reached[1]};
     }
 
     std::size_t last() const { return rows.size() - 1; }
-    double time(std::size_t row) const { return times_[row]; }  ///< in s
+    double time(std::size_t row) const { return row == last() ? end : static_cast<double>(row) / rate; }  ///< in s
 
-    double rate, unit, end;
-    bool has_mass;  ///< that is a matrix
+    double rate, end;
     std::vector<State<N, M>> rows;
     std::vector<Matrix<N>> stiffness, damping;  ///< N/m and N s/m
     Vector<N> velocity_at_end;  ///< before the last row was stopped
 
 private:
-    /// Times of the rows: every `1 / rate`, where 10 s at 1 kHz are 10001 rows, however 10 * 1000 is rounded.
-    std::vector<double> grid() const {
-        constexpr double rounding = 1e-3, most = 4e6;  // of a tick; rows: an hour at 1 kHz
-        const double counted = std::max(1.0, std::ceil(end * rate - rounding));
-        checked(rate, counted + 1.0 <= most, "rate", "low enough for a table of 4,000,000 rows");
-        // A schedule shorter than a tick of the loop is begun and ended.
-        std::vector<double> times(static_cast<std::size_t>(counted) + 1, end);
-        for (std::size_t i = 0; i + 1 < times.size(); ++i) times[i] = static_cast<double>(i) / rate;
-        return times;
-    }
+    static constexpr auto kBlocks = blocks<N, M>;
 
-    /// Interval of the schedule from a knot on, and where a row is in it.
+    /// Place between the rows of the schedule: the row before, the share of the interval, and its length in s.
     struct Place {
+        std::size_t knot;
         double share, step;
     };
 
-    Place place(const Schedule& schedule, std::size_t knot, std::size_t row) const {
-        const double first = schedule.time[0], start = schedule.time[knot] - first;
-        const double step = (schedule.time[knot + 1] - first) - start;
-        return {(times_[row] - start) / step, step};
-    }
-
-    void fill(const Schedule& schedule, std::size_t knot, std::size_t row) {
-        const Place at = place(schedule, knot, row);
+    static void set_motion(const Schedule& schedule, Place at, State<N, M>& state) {
+        using namespace rotations;
         constexpr std::size_t p = n_positions<N, M>;
-        const double *position = &schedule.position[knot * p], *velocity = &schedule.velocity[knot * N];
-        State<N, M>& state = rows[row];
+        const double *position = &schedule.position[at.knot * p], *velocity = &schedule.velocity[at.knot * N];
         for (std::size_t i = 0; i < p; ++i)
             cubic(position[i], position[p + i], velocity[i], velocity[N + i], at, state.place[i], state.velocity[i]);
         if constexpr (M != N) {
-            const double* q = &schedule.orientation[knot * 4];
-            turn({q[0], q[1], q[2], q[3]}, {q[4], q[5], q[6], q[7]}, velocity, at, state);
+            // Cubic of the rotation vector y from the first row, R = R_row Exp(y).
+            const double* q = &schedule.orientation[at.knot * 4];
+            const Quaternion start{q[0], q[1], q[2], q[3]}, end{q[4], q[5], q[6], q[7]};
+            const Vector<3> way = log(multiply(conjugate(start), end));
+            const auto rate = [&](const double* twist) {
+                return turned(conjugate(start), {twist[N - 3], twist[N - 2], twist[N - 1]});
+            };
+            const Vector<3> begins = rate(velocity), ends = left_jacobian_inverse(way, rate(velocity + N));
+            Vector<3> vector, slope;
+            for (std::size_t i = 0; i < 3; ++i) cubic(0.0, way[i], begins[i], ends[i], at, vector[i], slope[i]);
+            places::set_tail(state.place, multiply(start, exp(vector)));
+            places::set_tail(state.velocity, turned(start, left_jacobian(vector, slope)));
         }
-        stiffness[row] = blended(schedule.stiffness, knot, at.share);
-        damping[row] = blended(schedule.damping, knot, at.share);
-    }
-
-    /// Cubic of the rotation vector y from the first row, R = R_row Exp(y).
-    static void turn(const Quaternion& start, const Quaternion& end, const double* velocity, Place at,
-                     State<N, M>& state) {
-        using namespace rotations;
-        const Vector<3> way = log(multiply(conjugate(start), end));
-        const auto rate = [&](const double* twist) {
-            return turned(conjugate(start), {twist[N - 3], twist[N - 2], twist[N - 1]});
-        };
-        const Vector<3> begins = rate(velocity), ends = left_jacobian_inverse(way, rate(velocity + N));
-        Vector<3> vector, slope;
-        for (std::size_t i = 0; i < 3; ++i) cubic(0.0, way[i], begins[i], ends[i], at, vector[i], slope[i]);
-        places::set_tail(state.place, multiply(start, exp(vector)));
-        places::set_tail(state.velocity, turned(start, left_jacobian(vector, slope)));
     }
 
     /// Cubic from the first to the last value with the rates at start and end, and its derivative.
     static void cubic(double first, double last, double start, double end, Place at, double& value, double& slope) {
-        const auto [s, h] = at;
+        const double s = at.share, h = at.step;
         const double bend = h * s * (1.0 - s) * ((1.0 - s) * start - s * end);
         value = blend(first, last, s * s * (3.0 - 2.0 * s)) + bend;
         slope = blend(start, end, s) + 3.0 * s * (1.0 - s) * (2.0 * (last - first) / h - start - end);
@@ -195,11 +177,11 @@ private:
         return share < 0.5 ? start + share * (end - start) : end - (1.0 - share) * (end - start);
     }
 
-    static Matrix<N> blended(const std::vector<double>& matrices, std::size_t knot, double share) {
-        const double *start = &matrices[knot * N * N], *end = start + N * N;
+    static Matrix<N> blended(const std::vector<double>& matrices, Place at) {
+        const double *start = &matrices[at.knot * N * N], *end = start + N * N;
         Matrix<N> result;
         for (std::size_t i = 0; i < N; ++i)
-            for (std::size_t j = 0; j < N; ++j) result[i][j] = blend(start[N * i + j], end[N * i + j], share);
+            for (std::size_t j = 0; j < N; ++j) result[i][j] = blend(start[N * i + j], end[N * i + j], at.share);
         return result;
     }
 
@@ -208,26 +190,22 @@ private:
     /// With M = L L' they are P = L'^-1 Q, P' M = Q' L', where Q are the axes of L^-1 K L'^-1 and L^-1 D L'^-1. Axes of
     /// the sum are those of both, also where equal values of one leave its own undetermined. A weight other than 1
     /// tells apart two axes of which one is as stiff as the other is damped.
-    bool share_axes(const Schedule& schedule, std::size_t knot, std::size_t row) {
+    bool share_modes(const Matrix<N>& mass, std::size_t row) {
         constexpr double rounding = 1e-9, tiny = std::numeric_limits<double>::min();
+        using linalg::product;
         Modes<N>& modes = modes_[row];
-        Matrix<N> k = linalg::scaled(1.0 / unit, stiffness[row]), d = linalg::scaled(1.0 / unit, damping[row]);
-        if (has_mass) {
-            const double share = place(schedule, knot, row).share;
-            const Matrix<N> factor = linalg::cholesky(blended(schedule.inertia, knot, share));
-            modes.tells = linalg::transposed(factor);
-            modes.shapes = linalg::inverse_lower(factor);
-            for (Matrix<N>* gain : {&k, &d})
-                *gain = linalg::product(linalg::product(modes.shapes, *gain), linalg::transposed(modes.shapes));
-        }
+        const Matrix<N> factor = linalg::cholesky(mass);
+        modes.tells = linalg::transposed(factor);
+        modes.shapes = linalg::inverse_lower(factor);
+        const auto per_mass = [&](const Matrix<N>& gain) {
+            const Matrix<N> scaled = product(product(modes.shapes, gain), linalg::transposed(modes.shapes));
+            return 0.5 * (scaled + linalg::transposed(scaled));
+        };
+        const Matrix<N> k = per_mass(stiffness[row]), d = per_mass(damping[row]);
         const double k_most = std::max(linalg::largest(k), tiny), d_most = std::max(linalg::largest(d), tiny);
-        Matrix<N> both;
-        for (std::size_t a = 0; a < N; ++a)
-            for (std::size_t b = 0; b < N; ++b)
-                both[a][b] = 0.5 * ((k[a][b] + k[b][a]) / k_most + 0.6 * (d[a][b] + d[b][a]) / d_most);
-        const Matrix<N> axes = linalg::eigh(both).axes;
+        const Matrix<N> axes = linalg::eigh((1.0 / k_most) * k + (0.6 / d_most) * d).axes;
         for (std::size_t a = 0; a < N; ++a) {
-            const Vector<N> force = linalg::product(k, axes[a]), drag = linalg::product(d, axes[a]);
+            const Vector<N> force = product(k, axes[a]), drag = product(d, axes[a]);
             for (std::size_t b = 0; b < N; ++b) {
                 if (a != b && !(std::abs(linalg::dot(axes[b], force)) <= rounding * k_most &&
                                 std::abs(linalg::dot(axes[b], drag)) <= rounding * d_most))
@@ -236,26 +214,32 @@ private:
             modes.stiffness[a] = std::max(linalg::dot(axes[a], force), 0.0);
             modes.decay[a] = 0.5 * std::max(linalg::dot(axes[a], drag), 0.0);
         }
-        modes.tells = has_mass ? linalg::product(axes, modes.tells) : axes;
-        modes.shapes = has_mass ? linalg::product(axes, modes.shapes) : axes;
+        modes.tells = product(axes, modes.tells);
+        modes.shapes = product(axes, modes.shapes);
         return true;
     }
 
-    /// Largest stiffness of a block over its squared limit.
+    /// Scales of the springs at a deviation: of positions and rotations each its own where nothing couples them.
     ///
-    /// |K e|^2 <= k_max e'K e in each block, with k_max that of the block, also where others are displaced, for
-    /// |B'K e|^2 <= |B'K B| e'K e for any B.
-    double stiffest(std::size_t row, std::size_t b, Limit pull_limit) const {
-        return spectral_norm(stiffness[row], blocks<N, M>[b], blocks<N, M>[b]) / (pull_limit[b] * pull_limit[b]);
+    /// Each has a potential and a limit then: twisted beyond its torque, a tool keeps its stiffness along the way.
+    Limit scales(std::size_t row, const Vector<N>& off) const {
+        const auto scale = [](double pull) { return pull > 1.0 ? 1.0 / std::sqrt(pull) : 1.0; };
+        const auto [top, other] = springs_[row];
+        if (is_apart_)
+            return {scale(top * pull(row, off, kBlocks.front())), scale(other * pull(row, off, kBlocks.back()))};
+        const double whole = scale(std::max(top, other) * pull(row, off, {0, N}));
+        return {whole, whole};
     }
 
-    /// Square of the largest pull of the spring of a block, over that of its limit.
-    double pull(std::size_t row, const Vector<N>& off, std::size_t b) const {
-        const Block block = blocks<N, M>[b];
+    /// e'K e of a block.
+    double pull(std::size_t row, const Vector<N>& off, Block block) const {
         double sum = 0.0;
-        for (std::size_t i = block.begin; i < block.end; ++i)
-            for (std::size_t j = block.begin; j < block.end; ++j) sum += off[i] * stiffness[row][i][j] * off[j];
-        return springs_[row][b] * sum;
+        for (std::size_t i = block.begin; i < block.end; ++i) {
+            double force = 0.0;
+            for (std::size_t j = block.begin; j < block.end; ++j) force += stiffness[row][i][j] * off[j];
+            sum += off[i] * force;
+        }
+        return sum;
     }
 
     /// Whether no stiffness couples positions and rotations.
@@ -283,7 +267,6 @@ private:
     }
 
     bool is_shared_ = true, is_apart_ = false;
-    std::vector<double> times_;
     std::vector<Limit> springs_;  ///< largest stiffness over squared limit
     std::vector<Modes<N>> modes_;
 };
