@@ -21,7 +21,6 @@
 #include "clock.hpp"
 #include "limits.hpp"
 #include "linalg.hpp"
-#include "places.hpp"
 #include "schedule.hpp"
 #include "steps.hpp"
 #include "table.hpp"

@@ -11,7 +11,6 @@
 
 #include "limits.hpp"
 #include "linalg.hpp"
-#include "places.hpp"
 #include "steps.hpp"
 #include "table.hpp"
 
@@ -19,19 +18,8 @@ namespace torch_pbd {
 
 /// Schedule time, which runs at a pace from 0 to 1, or a little more to catch up, and the motion desired then.
 ///
-/// At a pace r the desired velocity is r x' and its acceleration r^2 x'' + r' x'. The second term is at most `gain`,
-/// also towards the end of a schedule that ends while moving: there r^2 <= 2 gain times the integral of dt / |x'| over
-/// what is left. `boost` is that term, to be fed forward, so that no change of pace displaces the robot. At a pace of 1
-/// schedule time is a difference of two times of the loop's clock, which adds up no rounding.
-///
-/// The desired motion stays within `acceleration`, and with it a robot that nobody pushes: an approach from elsewhere
-/// takes what the schedule's own acceleration leaves, and a change of pace what both leave; nothing is caught up
-/// meanwhile; and the pace rises no faster than the pull of the spring leaves room for (see `spare`). The end of the
-/// schedule does not slow an approach, which has a pace of its own, `free_`, and is `ahead_` of the schedule then.
-///
-/// Speeds and accelerations of poses are those of `norm`, with a lever: both blocks then keep to all of the above. An
-/// approach turns the desired orientation by A, a share of the way in between: A R_d moves at w_A + A w_d, and the
-/// acceleration of that has w_A x A w_d besides, which is allowed for at full speed.
+/// At a pace r the desired velocity is r x', and its acceleration r^2 x'' + r' x': the second term is `gain` at most,
+/// and `boost` is what of it is fed forward. What an approach takes, and why, is said in realtime/clock.py.
 template <std::size_t N, std::size_t M>
 class ScheduleClock {
 public:
@@ -328,18 +316,9 @@ private:
         return std::max({soft_start_, kSteepest * way / approach_speed_, std::sqrt(kSharpest * way / room)});
     }
 
-    // The desired motion may be 1.5 times as fast as the schedule, and accelerate so much more: one half of that
-    // changes the pace, the other is left for the square of the pace while it catches up.
-    static constexpr double kSpeed = 1.5, kShare = 0.25;
-    // Share of `gain` that a rise of the pace may always take, so that nobody who shakes the robot makes its schedule
-    // stand.
-    static constexpr double kLeastSpare = 0.1;
-    // Share of a row: time that was put onto a row takes that row, to whichever side it was rounded.
-    static constexpr double kOnRow = 1e-6;
-    // A critically damped spring answers a step of the desired acceleration by 1 + (w t - 1) e^(-w t) of it: at most by
-    // this, 1 + e^-2.
-    static constexpr double kOvershoot = 1.1353352832366128;
-    // A minimum jerk of 1 over a time of 1 has a velocity of 15/8 and an acceleration of 10 / sqrt(3).
+    // The reasons for these are beside those of realtime/clock.py.
+    static constexpr double kSpeed = 1.5, kShare = 0.25, kLeastSpare = 0.1, kOnRow = 1e-6;
+    static constexpr double kOvershoot = 1.1353352832366128;  // 1 + e^-2
     static constexpr double kSteepest = 1.875, kSharpest = 5.7735;
 
     std::shared_ptr<const ScheduleTable<N, M>> table_;

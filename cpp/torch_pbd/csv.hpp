@@ -27,6 +27,14 @@ public:
         for (const char byte : bytes) push(static_cast<std::uint8_t>(byte));
     }
 
+    void update(const std::vector<double>& values) {
+        for (const double value : values) {
+            std::uint64_t bits;
+            std::memcpy(&bits, &value, sizeof bits);
+            for (int i = 0; i < 8; ++i) push(static_cast<std::uint8_t>(bits >> (8 * i)));
+        }
+    }
+
     /// Digest as 64 hexadecimal digits; nothing may follow.
     std::string digest() {
         const std::uint64_t bits = 8 * n_bytes_;
@@ -187,7 +195,7 @@ public:
         std::vector<std::string> found;
         const std::size_t start = name.size() + 1;
         for (const std::string& title : titles_)
-            if (title.compare(0, start, name + "[") == 0) found.push_back(title.substr(start, title.size() - start - 1));
+            if (title.substr(0, start) == name + "[") found.push_back(title.substr(start, title.size() - start - 1));
         return found;
     }
 
@@ -234,36 +242,17 @@ private:
     std::size_t next_ = 0;
 };
 
-/// SHA-256 of what a file says, not of how it is written: line ends and spelling of numbers are free.
-class Digest {
-public:
-    explicit Digest(const std::map<std::string, std::string>& labels) {
-        std::string header;
-        for (const auto& [key, value] : labels) {
-            std::string_view rest = value;
-            if (key != "sha256") header += (header.empty() ? "{\"" : ", \"") + key + "\": " + take_sorted(rest);
-            if (key != "sha256" && !rest.empty()) take(rest, 0);
-        }
-        sha256_.update(header + "}");
+/// JSON of the labels, which the checksum of a file begins with: but for itself, in the order of their keys.
+inline std::string header_of(const std::map<std::string, std::string>& labels) {
+    std::string header;
+    for (const auto& [key, value] : labels) {
+        if (key == "sha256") continue;
+        std::string_view rest = value;
+        header += (header.empty() ? "{\"" : ", \"") + key + "\": " + take_sorted(rest);
+        if (!rest.empty()) take(rest, 0);
     }
-
-    /// Adds an array of a shape, such as "100, 2".
-    void add(const std::string& name, const std::string& shape, const std::vector<double>& values) {
-        sha256_.update(name + " (" + shape + ") ");
-        for (const double value : values) {
-            std::uint64_t bits;
-            std::memcpy(&bits, &value, sizeof bits);
-            char bytes[8];
-            for (int i = 0; i < 8; ++i) bytes[i] = static_cast<char>(bits >> (8 * i));
-            sha256_.update({bytes, 8});
-        }
-    }
-
-    std::string text() { return sha256_.digest(); }
-
-private:
-    Sha256 sha256_;
-};
+    return header + "}";
+}
 
 }  // namespace file
 }  // namespace torch_pbd

@@ -10,7 +10,6 @@
 #include <stdexcept>
 
 #include "linalg.hpp"
-#include "places.hpp"
 #include "steps.hpp"
 
 namespace torch_pbd {

@@ -151,34 +151,6 @@ Eigen<N> eigh(Matrix<N> a) {
     return result;
 }
 
-/// Lower factor L of a positive definite matrix A = L L'.
-template <std::size_t N>
-Matrix<N> cholesky(const Matrix<N>& a) {
-    Matrix<N> factor{};
-    for (std::size_t i = 0; i < N; ++i) {
-        for (std::size_t j = 0; j <= i; ++j) {
-            double rest = a[i][j];
-            for (std::size_t k = 0; k < j; ++k) rest -= factor[i][k] * factor[j][k];
-            factor[i][j] = i == j ? std::sqrt(rest) : rest / factor[j][j];
-        }
-    }
-    return factor;
-}
-
-/// Inverse of a lower triangle.
-template <std::size_t N>
-Matrix<N> inverse_lower(const Matrix<N>& factor) {
-    Matrix<N> inverse{};
-    for (std::size_t j = 0; j < N; ++j) {
-        for (std::size_t i = j; i < N; ++i) {
-            double rest = i == j ? 1.0 : 0.0;
-            for (std::size_t k = j; k < i; ++k) rest -= factor[i][k] * inverse[k][j];
-            inverse[i][j] = rest / factor[i][i];
-        }
-    }
-    return inverse;
-}
-
 /// exp(matrix) - 1 by Taylor series and doubling: without the 1, slow motions keep their digits beside fast ones.
 template <std::size_t N>
 Matrix<N> expm1(const Matrix<N>& matrix) {

@@ -129,19 +129,23 @@ inline Schedule read(std::istream& stream) {
     const std::size_t d = schedule.n_outputs = outputs.size();
     if (d != p + (is_pose ? 3 : 0) || !std::equal(positions.begin(), positions.end(), outputs.begin()))
         throw std::runtime_error("its columns of velocity are not those of position, and three of an orientation");
-    Digest digest(schedule.labels);
-    const std::string rows = std::to_string(n) + ",", columns = " " + std::to_string(d);
+    // SHA-256 of what a file says, not of how it is written: line ends and spelling of numbers are free.
+    Sha256 digest;
+    digest.update(header_of(schedule.labels));
+    const std::string rows = std::to_string(n), columns = ", " + std::to_string(d);
+    const auto digested = [&](const std::string& name, const std::string& shape, std::vector<double> values) {
+        digest.update(name + " (" + shape + ") ");
+        digest.update(values);
+        return values;
+    };
     const auto take = [&](const std::string& name, const std::vector<std::string>& places) {
         std::vector<std::string> titles;
         for (const std::string& place : places) titles.push_back(name + "[" + place + "]");
-        std::vector<double> values = table.take(name, places.empty() ? std::vector<std::string>{name} : titles);
-        digest.add(name, places.empty() ? rows : rows + " " + std::to_string(places.size()), values);
-        return values;
+        if (places.empty()) return digested(name, rows + ",", table.take(name, {name}));
+        return digested(name, rows + ", " + std::to_string(places.size()), table.take(name, titles));
     };
-    const auto take_matrices = [&](const char* name) {
-        std::vector<double> values = table.take_matrices(name, outputs);
-        digest.add(name, rows + columns + "," + columns, values);
-        return values;
+    const auto take_matrices = [&](const std::string& name) {
+        return digested(name, rows + columns + columns, table.take_matrices(name, outputs));
     };
     schedule.time = take("time", {});
     schedule.position = take("position", positions);
@@ -155,7 +159,7 @@ inline Schedule read(std::istream& stream) {
     if (!table.places("mass").empty()) schedule.inertia = take_matrices("mass");
     if (!table.is_taken()) throw std::runtime_error("it has columns that are unknown");
     if (label("mass") != "null") schedule.mass = number(label("mass"), 1);
-    if (!label("sha256").empty() && label("sha256") != '"' + digest.text() + '"')
+    if (!label("sha256").empty() && label("sha256") != '"' + digest.digest() + '"')
         throw std::runtime_error(
             "it does not match its checksum: it is damaged, or, if edited on purpose, delete its line that starts with "
             "'# sha256:'");

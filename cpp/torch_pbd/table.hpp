@@ -11,7 +11,6 @@
 
 #include "limits.hpp"
 #include "linalg.hpp"
-#include "places.hpp"
 #include "schedule.hpp"
 #include "steps.hpp"
 
@@ -187,16 +186,18 @@ private:
 
     /// Finds the modes that stiffness and damping share; false where they share none.
     ///
-    /// With M = L L' they are P = L'^-1 Q, P' M = Q' L', where Q are the axes of L^-1 K L'^-1 and L^-1 D L'^-1. Axes of
-    /// the sum are those of both, also where equal values of one leave its own undetermined. A weight other than 1
-    /// tells apart two axes of which one is as stiff as the other is damped.
+    /// With M = L L', by the axes of M, they are P = L'^-1 Q, P' M = Q' L', where Q are the axes of L^-1 K L'^-1 and of
+    /// L^-1 D L'^-1. Axes of the sum are those of both, also where equal values of one leave its own undetermined. A
+    /// weight other than 1 tells apart two axes of which one is as stiff as the other is damped.
     bool share_modes(const Matrix<N>& mass, std::size_t row) {
         constexpr double rounding = 1e-9, tiny = std::numeric_limits<double>::min();
         using linalg::product;
         Modes<N>& modes = modes_[row];
-        const Matrix<N> factor = linalg::cholesky(mass);
-        modes.tells = linalg::transposed(factor);
-        modes.shapes = linalg::inverse_lower(factor);
+        const auto [masses, main] = linalg::eigh(mass);
+        for (std::size_t i = 0; i < N; ++i) {
+            modes.tells[i] = std::sqrt(masses[i]) * main[i];
+            modes.shapes[i] = (1.0 / std::sqrt(masses[i])) * main[i];
+        }
         const auto per_mass = [&](const Matrix<N>& gain) {
             const Matrix<N> scaled = product(product(modes.shapes, gain), linalg::transposed(modes.shapes));
             return 0.5 * (scaled + linalg::transposed(scaled));
