@@ -199,22 +199,17 @@ class Demonstrations(Editing):
         Returns
         -------
         X : ndarray of shape (n, 1)
-            Time in ``time_unit``, or phase.
+            Time in ``time_unit``, or phase. By time it is a ValueError if what all demonstrations have in common is
+            shorter than half of their median duration.
         y : ndarray of shape (n, d)
         groups : ndarray of shape (n,)
             Number of the demonstration, for GroupKFold and LeaveOneGroupOut.
-
-        Raises
-        ------
-        ValueError
-            By time, if what all demonstrations have in common is shorter than half of their median duration.
         """
         checks.choice(input, "input", ("time", "phase"))
         if input == "time":
             check_overlap(self.times, self.time_unit)
-        inputs = self.times if input == "time" else unit_phases(self.times)
-        groups = np.repeat(np.arange(len(self)), self.n_steps)
-        return np.concatenate(inputs)[:, np.newaxis], np.concatenate(self.positions), groups
+        X = np.concatenate(self.times if input == "time" else unit_phases(self.times))[:, np.newaxis]
+        return X, np.concatenate(self.positions), np.repeat(np.arange(len(self)), self.n_steps)
 
     def split(self, k: int | Sequence[int]) -> tuple["Demonstrations", "Demonstrations"]:
         """Leave demonstrations out: ``(train, test)``, where ``test`` has those numbered ``k``, and ``train`` some."""

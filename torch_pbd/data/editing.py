@@ -24,21 +24,17 @@ class Editing(Resampling):
 
     @classmethod
     def from_frame(cls, table: Any, **options: Any) -> Self:
-        """Demonstrations of a table of pandas, polars, pyarrow or another library that narwhals knows, a row a sample.
-
-        Demonstrations are in the order in which they first appear.
+        """Demonstrations of a table, a row a sample, in the order in which they first appear.
 
         Parameters
         ----------
         table : dataframe
-            An index is ignored.
+            Of pandas, polars, pyarrow or another library that narwhals knows. An index is ignored.
         **options
             Those of `torch_pbd.data.load_demonstrations`, from ``outputs`` to ``from_start``.
 
         Raises
         ------
-        TypeError
-            If an option is not one of these.
         ValueError
             If it is no dataframe, or does not have the columns that the options name, or no numbers in them.
         """
@@ -104,10 +100,9 @@ class Editing(Resampling):
 
         Returns
         -------
-        positions : list of K ndarray of shape (T_k, p)
-            The other outputs, p = d - 3 of them.
+        positions : list of K ndarray of shape (T_k, d - 3)
         quaternions : list of K ndarray of shape (T_k, 4)
-            Unit quaternions w x y z; signs go on along time and from one demonstration to the next.
+            w x y z; signs go on along time and from one demonstration to the next.
         """
         if self.rotation_reference is None:
             raise InvalidParameterError("the demonstrations have no rotation: name its columns by rotation=, w x y z.")
@@ -141,11 +136,6 @@ class Editing(Resampling):
             A length or an angle, of the outputs that are such; outputs of other kinds, and rotations, stay as they are.
         time_unit : str, default=None
             h, min, s, ms, us or ns.
-
-        Raises
-        ------
-        ValueError
-            If the units are not known, or none is of that kind.
         """
         times, positions, units = self.times, self.positions, self.units
         if unit is not None:
@@ -192,10 +182,7 @@ class Editing(Resampling):
         return self._replace([time[a:b] for a, b in spans], [position[a:b] for a, b in spans], suspects=())
 
     def trim(self, method: Literal["still"] = "still", *, pause: float = 0.5) -> Self:
-        """Each demonstration without what is still at its ends.
-
-        ``pause`` is the shortest stretch of stillness that counts, in ``time_unit``, as in :meth:`cut`.
-        """
+        """Each demonstration without what is still at its ends, for longer than a ``pause`` as of :meth:`cut`."""
         checks.choice(method, "method", ("still",))
         times, positions = [], []
         for time, position in zip(self.times, self.positions, strict=True):

@@ -100,12 +100,8 @@ def load_demonstrations(
     in_units : str or sequence of str, default=None
         Convert to these units, as `Demonstrations.in_units` does: "m", or ["m", "s"] with that of the times. ``units``
         and ``time_unit`` say what the numbers in the file are, and change none of them.
-    cut : "pauses" or sequence of (start, end), default=None
-        Make several demonstrations of one long recording: `Demonstrations.cut`.
-    trim : "still", default=None
-        Leave out what is still at both ends: `Demonstrations.trim`.
-    from_start : bool, default=False
-        Count the times of each demonstration from its start: `Demonstrations.from_start`.
+    cut, trim, from_start
+        One recording as several, no stillness at ends, times from 0: see the methods of `Demonstrations`.
     max_bytes : int, default=512 MiB
         Larger files (.npz: unpacked) are refused before they are read.
     **options
@@ -115,14 +111,10 @@ def load_demonstrations(
 
     Raises
     ------
-    FileNotFoundError
-        If there is no such file.
-    ModuleNotFoundError
-        If the format needs a library that is not installed; names the command that does.
-    ValueError
-        If the suffix is not known, or an option is not as described.
-    TypeError
-        If an option is not one of the format's.
+    FileNotFoundError, ModuleNotFoundError
+        If there is no such file, or its format needs a library that is not installed.
+    ValueError, TypeError
+        If the suffix is not known, or an option is not as described, or not one of the format's.
     DataFormatError
         If the file is not what its suffix says, with the array, or the line and the column; or too large.
     """

@@ -81,11 +81,9 @@ def make_paper_simulation(
         Demonstration by demonstration; the inputs repeat exactly.
     y : ndarray of shape (n_inputs * n_demos, 2)
     groups : ndarray of shape (n_inputs * n_demos,)
-        Number of the demonstration.
     """
-    checks.count(n_inputs, "n_inputs")
-    checks.count(n_demos, "n_demos")
-    require_much(80.0 * n_inputs * n_demos, what=f"n_inputs={n_inputs}, n_demos={n_demos}", remedy="Make fewer.")
+    n = checks.count(n_inputs, "n_inputs") * checks.count(n_demos, "n_demos")
+    require_much(80.0 * n, what=f"n_inputs={n_inputs}, n_demos={n_demos}", remedy="Make fewer.")
     xi = np.linspace(-100.0, 100.0, n_inputs)
     scale = np.sqrt(np.diagonal(paper_covariance(xi, reading), axis1=1, axis2=2))
     y = paper_mean(xi) + scale * generator(random_state).normal(size=(n_demos, n_inputs, 2))
@@ -135,10 +133,10 @@ def make_tunnel_demonstrations(
     """A hand that moves through a tunnel which narrows: free where it is wide, precise where it is narrow.
 
     The hand moves along y at constant speed over 0.6 m. Across, it is at ``tunnel_center(y) + 0.85
-    tunnel_half_width(y) tanh(lane + 0.12 w(t) + 0.04 c(t))`` with a lane drawn uniformly from [-0.6, 0.6] for
-    each demonstration, w wandering (up to 0.25 Hz) and c correcting (0.25 to 1 Hz) with unit variance. A
-    tremor in x (0.1 mm rms, 8 to 12 Hz), noise in y (2 um rms) and quantization to 5 um are added. The
-    standard deviation of x over demonstrations is 35 mm at the start and 2.9 mm at the end.
+    tunnel_half_width(y) tanh(lane + 0.12 w(t) + 0.04 c(t))`` with a lane drawn uniformly from [-0.6, 0.6] for each
+    demonstration, w wandering (up to 0.25 Hz) and c correcting (0.25 to 1 Hz) with unit variance. A tremor in x (0.1 mm
+    rms, 8 to 12 Hz), noise in y (2 um rms) and quantization to 5 um are added. The standard deviation of x over
+    demonstrations, `tunnel_deviation`, is 35 mm at the start and 2.9 mm at the end.
 
     Parameters
     ----------
@@ -155,12 +153,9 @@ def make_tunnel_demonstrations(
         - "jitter": each sample but the ends is taken up to 20 % of a step early or late;
         - "outlier": the last demonstration leaves the tunnel, by 10 cm where it is narrow;
         - "two_path": lanes keep to one side or the other, 0.4 to 0.6 from the middle, in equal numbers.
-    common_start : bool, default=False
-        Start all demonstrations on the centre line; they reach their lanes by a minimum-jerk blend in the
-        first 15 % of the duration.
-    common_goal : bool, default=False
-        End all demonstrations on the centre line, which they reach from their lanes by the same blend in the last 15 %.
-        See `tunnel_deviation`.
+    common_start, common_goal : bool, default=False
+        All start, or end, on the centre line, with a minimum-jerk blend from and to their lanes in the first and the
+        last 15 % of the duration.
 
     Returns
     -------
@@ -184,33 +179,26 @@ def make_tunnel_demonstrations(
             time = time[kept]
         if variant == "jitter":
             time[1:-1] += random.uniform(-0.2, 0.2, size=len(time) - 2) / rate
+        bands = ((0.0, 0.25), (0.25, 1.0), (8.0, 12.0))
+        wander, correction, tremor = (band_noise(time, low, high, random) for low, high in bands)
+        # The lane is between the walls, whatever its noise adds: tanh keeps it within 0.85 of the half-width.
+        along = PATH_LENGTH * time / lasting
+        across = _WITHIN * tunnel_half_width(along) * np.tanh(lane + _WANDER * wander + _CORRECTION * correction)
+        x = tunnel_center(along) + across * _blend(along, common_start, common_goal) + _TREMOR * tremor
         times.append(time)
-        positions.append(_tunnel_path(time, lasting, lane, (common_start, common_goal), random))
+        positions.append(np.column_stack([x, along + _NOISE * random.normal(size=len(time))]))
     if variant == "outlier":
         positions[-1][:, 0] += 0.1 * np.exp(-(((positions[-1][:, 1] - 0.5) / 0.05) ** 2))
     quantized = [np.round(position / _QUANTUM) * _QUANTUM for position in positions]
     return Demonstrations(times, quantized, names=("x", "y"), units="m")
 
 
-def _tunnel_path(time: Floats, duration: float, lane: float, common: tuple[bool, bool], random: Random) -> Floats:
-    wander, correction, tremor = (
-        band_noise(time, low, high, random) for low, high in [(0.0, 0.25), (0.25, 1.0), (8.0, 12.0)]
-    )
-    # The lane is between the walls, whatever its noise adds: tanh keeps it within 0.85 of the half-width.
-    along = PATH_LENGTH * time / duration
-    across = _WITHIN * tunnel_half_width(along) * np.tanh(lane + _WANDER * wander + _CORRECTION * correction)
-    across *= _blend(along, *common)
-    x = tunnel_center(along) + across + _TREMOR * tremor
-    return np.column_stack([x, along + _NOISE * random.normal(size=len(time))])
-
-
 def _blend(along: Floats, common_start: bool, common_goal: bool) -> Floats:
     """Share of the lanes that the ends leave, by minimum jerk (Flash, Hogan 1985): smooth where it becomes one."""
     result = np.ones_like(along)
-    for is_common, distance in ((common_start, along), (common_goal, PATH_LENGTH - along)):
-        if is_common:
-            s = np.clip(distance / (_BLENDED * PATH_LENGTH), 0.0, 1.0)
-            result = result * (s**3 * (10.0 - 15.0 * s + 6.0 * s**2))
+    for distance in [along] * common_start + [PATH_LENGTH - along] * common_goal:
+        s = np.clip(distance / (_BLENDED * PATH_LENGTH), 0.0, 1.0)
+        result = result * (s**3 * (10.0 - 15.0 * s + 6.0 * s**2))
     return result
 
 

@@ -28,7 +28,6 @@ _LETTERS = {
 _ALONG = 0.5  # of the deviation across: people keep a path better than its pace
 _TREMOR = 2e-4  # rms in m, up to 2 Hz: no output is ever free of it
 
-
 _HOLE = np.array([0.55, 0.15, 0.18])  # bottom of the hole in the frame of a robot's base, in m
 # The tool in the hole: its z axis down, then leaning by 0.35 rad. No axis of the task is one of the world.
 _TURN = multiply(exp(np.array([0.3, 0.18, 0.0])), exp(np.array([np.pi, 0.0, 0.0])))
@@ -167,14 +166,8 @@ def make_pose_demonstrations(
     ----------
     n_demos : int, default=8
         Six and fewer leave open how six outputs vary together.
-    duration : float, default=4.0
-        In s; of each demonstration where ``timing`` is 0.
-    rate : float, default=100.0
-        Samples a second.
-    timing : float, default=0.1
-        Relative standard deviation of durations and of the pace within a demonstration, below 0.5. With 0 all
-        demonstrations share one grid, and time / duration is the phase of the truth.
-    random_state : int, Generator, RandomState or None, default=None
+    duration, rate, timing, random_state
+        As in `make_handwriting_demonstrations`.
 
     Returns
     -------
@@ -198,10 +191,9 @@ def make_pose_demonstrations(
         tremor = np.stack([band_noise(time, 0.0, 2.0, random) for _ in range(6)], axis=1)
         *own, common = deviations * random.normal(size=deviations.shape)
         deviation = weights(phase) @ np.array(own) + common + _POSE_TREMOR * tremor
-        # In the axes of the tool: R = R_d Exp(deviation).
-        poses = np.hstack([place + deviation[:, :3] @ matrix(_TURN).T, multiply(turn, exp(deviation[:, 3:]))])
         times.append(time)
-        positions.append(poses)
+        # In the axes of the tool: R = R_d Exp(deviation).
+        positions.append(np.hstack([place + deviation[:, :3] @ matrix(_TURN).T, multiply(turn, exp(deviation[:, 3:]))]))
     return Demonstrations(times, positions, names=("x", "y", "z", *QUATERNION), units="m", rotation=QUATERNION)
 
 
@@ -211,23 +203,22 @@ def _via_law(shape: Shape, via_precision: ArrayLike | None) -> tuple[Floats, Flo
     table = np.array(_LETTERS[shape], dtype=np.float64)
     means, across = 1e-2 * table[:, :2], 1e-3 * table[:, 2]
     if via_precision is not None:
-        given = checks.real_floats(via_precision, "via_precision")
-        given = np.broadcast_to(given, len(means)) if given.ndim == 0 else given
-        across = checks.array(given, "via_precision", (len(means),))
+        one = np.ndim(via_precision) == 0
+        across = checks.array(
+            np.full(len(means), via_precision) if one else via_precision, "via_precision", means.shape[:1]
+        )
         checks.require(across > 0.0, across, "via_precision", "above zero", "a standard deviation in m")
-    # The direction of the path is that of the chord between the neighbours.
+    # The direction of the path is that of the chord between the neighbours. Across it is t t' off the identity.
     chord = np.gradient(means, axis=0)
     tangent = chord / np.linalg.norm(chord, axis=1, keepdims=True)
-    normal = tangent[:, ::-1] * [-1.0, 1.0]
-    outer = [np.einsum("ki,kj->kij", axis, axis) for axis in (tangent, normal)]
-    return means, across[:, np.newaxis, np.newaxis] ** 2 * (_ALONG**2 * outer[0] + outer[1])
+    along = np.einsum("ki,kj->kij", tangent, tangent)
+    return means, across[:, np.newaxis, np.newaxis] ** 2 * (_ALONG**2 * along + (np.eye(2) - along))
 
 
 def _peg_law() -> tuple[Floats, Floats, BSpline]:
     """Means (k, 6) and standard deviations (k + 1, 6) of via points in m and rad, and their weights over phases."""
-    means, given = _PEG[:, :6], _PEG[:, 6:]
-    units = np.array([1e-3, 1e-3, np.pi / 180.0, np.pi / 180.0])
-    return means[:-1], (units * given)[:, [0, 0, 1, 2, 2, 3]], _minimum_jerk(means[:-1, :3])
+    means, deviations = _PEG[:-1, :6], _PEG[:, 6:] * [1e-3, 1e-3, np.pi / 180.0, np.pi / 180.0]
+    return means, deviations[:, [0, 0, 1, 2, 2, 3]], _minimum_jerk(means[:, :3])
 
 
 def _paces(

@@ -46,11 +46,9 @@ def read(path: Path, wanted: Wanted, delimiter: str | None = None, decimal: str 
 def write(demonstrations: Demonstrations, handle: BinaryIO) -> None:
     """Write columns ``demo,time,<names>``; the shortest decimals that come back to the last bit."""
     names, columns = as_columns(demonstrations)
-    unusable = [name for name in names if name != name.strip()]
-    if unusable:
-        raise ValueError(
-            f"an output named {unusable[0]!r} has blanks at its ends, which files of text lose: rename it."
-        )
+    for name in names:
+        if name != name.strip():
+            raise ValueError(f"an output named {name!r} has blanks at its ends, which text loses: rename it.")
     text = io.TextIOWrapper(handle, encoding="utf-8", newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["demo", "time", *names])
@@ -96,35 +94,28 @@ class _Table:
     def read_lines(self) -> dict[str, NDArray[Any]]:
         """Chosen columns by name: numbers of the demonstrations, times as integers where all are, and outputs."""
         demo, time = (place and place[0] for place in (self.chosen.demo, self.chosen.time))
-        places = {name: i for i, name in enumerate(self.header)}
         numbers: dict[str, int] = {}
+
+        def number_of(label: str) -> int:
+            if not label.strip():
+                raise ValueError("the cell is blank.")
+            return numbers.setdefault(label.strip(), len(numbers))
+
+        converters: dict[Any, Any] = {demo: number_of, time: self._time} | dict.fromkeys(
+            self.chosen.names, self._number
+        )
+        converters.pop(None, None)
         # Arrays of numbers take 8 bytes for each, where lists take 32.
-        own, outputs, times = array("i"), array("d"), list[float]()
-        is_clock = False
+        columns: dict[str, Any] = {name: [] if name == time else array("d") for name in converters}
         self.file.seek(self.start)
         for line, cells in self._rows():
-            name: str | None = demo
-            try:
-                if demo is not None:
-                    label = cells[places[demo]].strip()
-                    if not label:
-                        raise ValueError("the cell is blank.")
-                    own.append(numbers.setdefault(label, len(numbers)))
-                for name in self.chosen.names:
-                    outputs.append(self._number(cells[places[name]]))
-                if time is not None:
-                    name, cell = time, cells[places[time]].strip()
-                    is_clock = _CLOCK.fullmatch(cell) is not None if not times else is_clock
-                    times.append(
-                        _clock_ns(cell) if is_clock else int(cell) if _WHOLE.fullmatch(cell) else self._number(cell)
-                    )
-            except ValueError as error:
-                raise ValueError(f"line {line}, column {name!r}: {error}") from error
-        signals: dict[str, NDArray[Any]] = {} if demo is None else {demo: np.array(own)}
-        signals |= dict(zip(self.chosen.names, np.array(outputs).reshape(-1, len(self.chosen.names)).T, strict=True))
-        if time is not None:
-            signals[time] = np.array(times, "M8[ns]" if is_clock else None)
-        return signals
+            row = dict(zip(self.header, cells, strict=True))
+            for name, convert in converters.items():
+                try:
+                    columns[name].append(convert(row[name]))
+                except ValueError as error:
+                    raise ValueError(f"line {line}, column {name!r}: {error}") from error
+        return {name: np.array(values) for name, values in columns.items()}
 
     def _rows(self) -> Iterator[tuple[int, list[str]]]:
         """Cells of each line that has some, with the number of the line: a quoted cell may go on for several."""
@@ -132,9 +123,9 @@ class _Table:
         try:
             for cells in reader:
                 if cells and len(cells) != len(self.header):
+                    marks = f"delimiter {self.delimiter!r}, decimal mark {self.decimal!r}"
                     raise ValueError(
-                        f"line {line}: {len(cells)} cells under {len(self.header)} column names (delimiter "
-                        f"{self.delimiter!r}, decimal mark {self.decimal!r})."
+                        f"line {line}: {len(cells)} cells under {len(self.header)} column names ({marks})."
                     )
                 if cells:
                     yield line, cells
@@ -152,22 +143,19 @@ class _Table:
                 value = float(text.replace(self.decimal, "."))
         if not isfinite(value):
             what = f"{text!r} is not a finite number" if text else "the cell is blank"
-            raise ValueError(
-                f"{what} (decimal mark {self.decimal!r}). Drop the line (missing='drop' does, where the cell is blank "
-                "or nan), fill the value in, or leave the column out by outputs=."
-            )
+            remedy = "missing='drop' does without lines with blanks and nan, outputs= without columns"
+            raise ValueError(f"{what} (decimal mark {self.decimal!r}): {remedy}.")
         return value
 
-
-def _clock_ns(cell: str) -> int:
-    """Nanoseconds of a date and time of day, since 1970, or of a time of day, since midnight."""
-    match = _CLOCK.fullmatch(cell)
-    if match is None:
-        raise ValueError(f"{cell!r} is no date or time of day, as the first one is.")
-    day, hours, minutes, seconds, fraction = match.groups()
-    days = int(np.datetime64(day or "1970-01-01", "D").astype(int))
-    whole = days * 86_400 + int(hours) * 3600 + int(minutes) * 60 + int(seconds or 0)
-    return whole * 10**9 + int((fraction or "0").ljust(9, "0"))
+    def _time(self, cell: str) -> Any:
+        """Time of a cell: stamps in ns as integers, dates and times of day since 1970 or midnight as those of NumPy."""
+        match = _CLOCK.fullmatch(cell.strip())
+        if match is None:
+            return int(cell) if _WHOLE.fullmatch(cell.strip()) else self._number(cell)
+        day, hours, minutes, seconds, fraction = match.groups()
+        whole = int(hours) * 3600 + int(minutes) * 60 + int(seconds or 0)
+        clock = np.timedelta64(whole * 10**9 + int((fraction or "0").ljust(9, "0")), "ns")
+        return np.datetime64(day or "1970-01-01", "ns") + clock
 
 
 def _open_table(file: TextIO, delimiter: str | None, decimal: str, wanted: Wanted) -> _Table:
@@ -175,8 +163,6 @@ def _open_table(file: TextIO, delimiter: str | None, decimal: str, wanted: Wante
     first, n_before = _header_line(file)
     candidates = [delimiter] if delimiter else [mark for mark in _DELIMITERS if mark != decimal]
     try:
-        if len(first) == _LONGEST_HEADER:
-            raise ValueError(f"it is longer than {_LONGEST_HEADER} characters; it must name the columns.")
         if first.startswith("# format:"):
             raise ValueError(f"no columns of demonstrations, but {first.strip()!r:.80}. {LOADERS}")
         headers = [[name.strip() for name in next(csv.reader([first], delimiter=c), [])] for c in candidates]
@@ -191,9 +177,8 @@ def _open_table(file: TextIO, delimiter: str | None, decimal: str, wanted: Wante
             raise ValueError(f"it must name the columns, and has numbers: {preview(header)}.")
     except (ValueError, csv.Error) as error:
         raise ValueError(f"line {n_before}: {str(error).rstrip('.')}.") from error
-    return _Table(
-        file, header, n_before, file.tell(), candidates[headers.index(header)], decimal, chosen, wanted.missing
-    )
+    mark = candidates[headers.index(header)]
+    return _Table(file, header, n_before, file.tell(), mark, decimal, chosen, wanted.missing)
 
 
 def _header_line(file: TextIO) -> tuple[str, int]:

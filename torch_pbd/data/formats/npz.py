@@ -23,9 +23,7 @@ _NUMBERED = r"[tx]_(\d+)"
 
 def read(path: Path, wanted: Wanted) -> Arguments:
     """Read the format of `torch_pbd.data.load_demonstrations`."""
-    members = read_members(
-        path.read_bytes(), wanted.max_bytes, remedy=f"Raise max_bytes={wanted.max_bytes} to read it."
-    )
+    members = read_members(path.read_bytes(), wanted.max_bytes, remedy=f"Raise max_bytes={wanted.max_bytes}.")
     numbers = {int(match[1]) for name in members if (match := re.fullmatch(_NUMBERED, name))}
     if not ({"meta", "x"} & set(members) or [*members] == ["t"] or numbers):
         return _read_other({name: _read(members, name) for name in members}, wanted)
@@ -42,7 +40,7 @@ def read(path: Path, wanted: Wanted) -> Arguments:
             raise ValueError(f"it has {has}; it has: {preview([*members])}. {LOADERS}")
         recordings = [{letter: _read(members, f"{letter}_{k}") for letter in "tx"} for k in sorted(numbers)]
     n_outputs = (*recordings[0]["x"].shape, 1)[1] if recordings else 0
-    for key, count in {"K": len(recordings), "d": n_outputs}.items():
+    for key, count in (("K", len(recordings)), ("d", n_outputs)):
         if meta.get(key, count) != count:
             raise ValueError(f"meta says {key} = {meta[key]}, but the arrays have {count}.")
     names = as_names(meta.get("dims"), n_outputs)
@@ -104,17 +102,9 @@ def write(demonstrations: Demonstrations, handle: BinaryIO) -> None:
     """Write the format of `torch_pbd.data.load_demonstrations`."""
     aligned, lengths = demonstrations.is_aligned, demonstrations.n_steps
     reference = demonstrations.rotation_reference
-    meta = {
-        "K": len(demonstrations),
-        "T": lengths[0] if aligned else [min(lengths), max(lengths)],
-        "d": demonstrations.n_outputs,
-        "aligned": aligned,
-        "dims": demonstrations.names,
-        "units": demonstrations.units,
-        "time_unit": demonstrations.time_unit,
-        "frame": demonstrations.frame,
-        "alignment": demonstrations.alignment,
-    }
+    meta: dict[str, Any] = {"K": len(demonstrations), "T": lengths[0] if aligned else [min(lengths), max(lengths)]}
+    meta |= {"d": demonstrations.n_outputs, "aligned": aligned, "dims": demonstrations.names}
+    meta |= {name: getattr(demonstrations, name) for name in ("units", "time_unit", "frame", "alignment")}
     meta |= {} if reference is None else {"rotation_reference": reference.tolist()}
     arrays: dict[str, Any] = {"meta": np.array(json.dumps(meta))}
     if aligned:
@@ -159,9 +149,9 @@ def _units(meta: dict[str, Any]) -> Any:
     units, names = meta.get("units"), meta.get("dims") or ()
     if not isinstance(units, dict):
         return _without_remark(meta.get("unit")) if units is None else units
-    missing = [name for name in names if name not in units]
-    if missing:
-        raise ValueError(f"units in meta has no entry for output {missing[0]!r}; it has {preview([*units])}.")
+    for name in names:
+        if name not in units:
+            raise ValueError(f"units in meta has no entry for output {name!r}; it has {preview([*units])}.")
     return [units[name] for name in names]
 
 

@@ -1,12 +1,13 @@
 """Recordings of ROS: rosbag2 (SQLite or MCAP) and ROS 1 bags; one topic, a sample a message."""
 
 from array import array
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import chain, pairwise
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,8 +54,7 @@ def read(path: Path, wanted: Wanted, topic: str | None = None, child: str | None
     # SQLite bags of older versions do not hold the definitions of their messages: standard ones did not change.
     types = stores.get_typestore(stores.Stores.ROS2_HUMBLE)
     with highlevel.AnyReader([path], default_typestore=types) as reader:
-        _check_topics(reader.topics, topic, wanted.demo)
-        name = topic or next(name for name, info in reader.topics.items() if info.msgtype in _KINDS and info.msgcount)
+        name = _topic(reader.topics, topic, wanted.demo)
         info = reader.topics[name]
         # A sample is 8 bytes for each of its stamp and, with room for joints, 31 outputs.
         wanted.require(256.0 * info.msgcount, f"topic {name!r}")
@@ -63,24 +63,25 @@ def read(path: Path, wanted: Wanted, topic: str | None = None, child: str | None
         return _read_messages(info.msgtype, messages, marks, wanted, child)
 
 
-def _check_topics(topics: dict[str, Any], topic: str | None, demo: str | None) -> None:
-    """Check that a topic, or the only one, is a movement, and that the other one tells the demonstrations apart."""
-    moving = [name for name, info in topics.items() if info.msgtype in _KINDS and info.msgcount]
-    known, wrong = ", ".join(sorted(kind.split("/")[-1] for kind in _KINDS)), ""
-    if topic is None and len(moving) != 1:
+def _topic(topics: dict[str, Any], topic: str | None, demo: str | None) -> str:
+    """Topic wanted, or the only one with a movement; checks the one that tells the demonstrations apart, too."""
+    kinds = {name: info.msgtype for name, info in topics.items()}
+    moving = [topic] if topic else [name for name, kind in kinds.items() if kind in _KINDS and topics[name].msgcount]
+    wrong = ""
+    if len(moving) != 1:
         several = "several topics of movements: say which by"
         wrong = f"it has {several if moving else 'no topic of poses, joints or forces to take by'} topic="
-    elif topic is not None and topic not in topics:
-        wrong = f"it has no topic {topic!r}"
-    elif topic is not None and topics[topic].msgtype not in _KINDS:
-        wrong = f"topic {topic!r} is of {topics[topic].msgtype}, must be of one of {known}"
-    elif demo is not None and (demo not in topics or topics[demo].msgtype not in _MARKS):
-        what = f"is of {topics[demo].msgtype}" if demo in topics else "is not there"
-        must = "must be of Bool, String or a whole number of std_msgs"
-        wrong = f"topic {demo!r}, by which demo= tells the demonstrations apart, {what}, {must}"
+    elif kinds.get(moving[0]) not in _KINDS:
+        known = ", ".join(sorted(kind.split("/")[-1] for kind in _KINDS))
+        is_of = f"topic {topic!r} is of {kinds.get(moving[0])}, must be of one of {known}"
+        wrong = is_of if topic in kinds else f"it has no topic {topic!r}"
+    elif demo is not None and kinds.get(demo) not in _MARKS:
+        what = f"topic {demo!r}, by which demo= tells the demonstrations apart, is of {kinds.get(demo, 'no kind')}"
+        wrong = f"{what}, must be of Bool, String or a whole number of std_msgs"
     if wrong:
         listed = ", ".join(f"{name} ({info.msgtype}, {info.msgcount} messages)" for name, info in topics.items())
         raise ValueError(f"{wrong}; it has: {listed or 'none'}.")
+    return moving[0]
 
 
 def _messages(reader: Any, topic: str, demo: str | None, marks: list[Any]) -> Iterator[tuple[int, int, Any]]:
@@ -106,10 +107,10 @@ def _read_messages(
     first = next(messages, None)
     if first is None:
         raise ValueError("the topic has no messages.")
-    fields = _joints(first[2]) if kind == _JOINTS else _parts(*_PARTS[kind])
-    signals = {name: field.columns for name, field in fields.items()}
-    chosen = replace(wanted, demo=None).choose({**signals, "time": ("time",)}, time="time", outputs=next(iter(signals)))
-    getters = [fields[name].get(i) for name, i in chosen.outputs]
+    columns, units = _getters(kind, first[2])
+    signals = {field: tuple(own) for field, own in columns.items()} | {"time": ("time",)}
+    chosen = replace(wanted, demo=None).choose(signals, time="time", outputs=next(iter(signals)))
+    getters = [columns[field][signals[field][i]] for field, i in chosen.outputs]
     # Arrays of numbers take 8 bytes for each, where lists of tuples take 60.
     numbers, stamps, coordinates = array("i"), array("q"), array("d")
     has_header = hasattr(first[2], "header")
@@ -124,7 +125,7 @@ def _read_messages(
     return wanted.read_each(
         chosen._replace(outputs=[("y", i) for i in range(len(getters))]),
         _recordings(arrays, numbers, marks, wanted.demo),
-        units=[fields[name].unit for name, _ in chosen.outputs],
+        units=[units[field] for field, _ in chosen.outputs],
         frame=getattr(getattr(first[2], "header", None), "frame_id", "") or None,
     )
 
@@ -172,7 +173,7 @@ def _of_child(messages: Iterator[tuple[int, int, Any]], child: str | None) -> It
             seen.add(transform.child_frame_id)
             if child is None and len(seen) > 1:
                 raise ValueError(
-                    f"its transforms are of several frames, {', '.join(sorted(seen))}: say which by child=."
+                    f"its transforms are of several frames, {', '.join(sorted(seen))}: name one by child=."
                 )
             if child in (None, transform.child_frame_id):
                 yield number, stamp, transform
@@ -180,33 +181,27 @@ def _of_child(messages: Iterator[tuple[int, int, Any]], child: str | None) -> It
         raise ValueError(f"it has no transforms of {child!r}, but of {', '.join(sorted(seen))}.")
 
 
-class _Field(NamedTuple):
-    """Part of a message that is outputs: its columns, its unit, and what gets the i-th of them from a message."""
-
-    columns: tuple[str, ...]
-    unit: str
-    get: Callable[[int], Callable[[Any], float]]
-
-
-def _parts(kind: str, part: str) -> dict[str, _Field]:
-    def field(place: str, letters: str, prefix: str, unit: str) -> _Field:
-        columns = tuple(prefix + letter for letter in letters)
-        return _Field(columns, unit, lambda i: attrgetter(part + place + letters[i]))
-
-    return {name: field(*entry) for name, entry in _FIELDS[kind].items()}
-
-
-def _joints(message: Any) -> dict[str, _Field]:
+def _getters(kind: str, message: Any) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
+    """What gets each column of each field from a message, and the unit of each field."""
+    if kind != _JOINTS:
+        part, place = _PARTS[kind]
+        fields = _FIELDS[part].items()
+        columns = {
+            field: {prefix + letter: attrgetter(place + own + letter) for letter in letters}
+            for field, (own, letters, prefix, _) in fields
+        }
+        return columns, {field: unit for field, (*_, unit) in fields}
     names = [str(name) for name in message.name]
+    given = [field for field in _JOINT_UNITS if len(getattr(message, field)) == len(names) > 0]
 
-    def get(field: str, i: int, message: Any) -> float:
+    def joint(field: str, i: int, message: Any) -> float:
         if message.name[i] != names[i]:  # the order of joints may change
             raise ValueError(f"a message has joints {', '.join(message.name)}, others {', '.join(names)}.")
         return float(getattr(message, field)[i])
 
-    def field(name: str) -> _Field:
-        columns = tuple(names if name == "position" else (f"{name}.{joint}" for joint in names))
-        return _Field(columns, _JOINT_UNITS[name], lambda i: lambda message: get(name, i, message))
-
-    given = [name for name in _JOINT_UNITS if len(getattr(message, name)) == len(names) > 0]
-    return {name: field(name) for name in given or ["position"]}
+    return {
+        field: {
+            f"{'' if field == 'position' else f'{field}.'}{n}": partial(joint, field, i) for i, n in enumerate(names)
+        }
+        for field in given or ["position"]
+    }, _JOINT_UNITS
