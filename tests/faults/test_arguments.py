@@ -20,7 +20,6 @@ from torch_pbd.control import (
     simulate_many,
 )
 from torch_pbd.data import check_unimodal, make_paper_simulation, make_tunnel_demonstrations, paper_mean
-from torch_pbd.data.alignment import dtw_path
 from torch_pbd.metrics import (
     covariance_mse,
     gaussian_kl,
@@ -80,7 +79,6 @@ DOORS = {
     "schedule time": (lambda value: Schedule(**{**ROWS, "time": value}, covariance=GAIN, type1=TIME), TIME, "time"),
     "schedule path": (lambda v: Schedule(**{**ROWS, "position": v}, covariance=GAIN, type1=TIME), STILL, "position"),
     "tunnel": (Tunnel().penetration, STILL, "position"),
-    "dtw": (lambda value: dtw_path(value, STILL), STILL, "a"),
     "positions": (lambda value: Demonstrations(TIME, value), np.stack([STILL] * 3), "positions"),
     "times": (lambda value: Demonstrations(value, np.stack([STILL] * 3)), TIME, "times"),
     "paper": (paper_mean, TIME, "xi"),

@@ -3,9 +3,8 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.data.units import exact, nanoseconds_hint
 from torch_pbd.exceptions import InvalidParameterError
@@ -57,48 +56,35 @@ def check_overlap(times: Sequence[Floats], time_unit: str) -> None:
         raise InvalidParameterError(
             f"the demonstrations have {common:.3g} of a median duration of {duration:.3g} {time_unit} in common: "
             f"number {last} starts last, at {exact(starts[last])}, {first} ends first, at {exact(ends[first])}. Count "
-            "each from its start by .from_start() (from_start=True of load_demonstrations), or take a phase for all by "
-            f".align('phase').{nanoseconds_hint(starts)}"
+            f"from each start, .from_start() or from_start=True, or .align('phase').{nanoseconds_hint(starts)}"
         )
 
 
-def dtw_path(a: ArrayLike, b: ArrayLike) -> NDArray[np.intp]:
-    """Pairs of samples that dynamic time warping matches between two curves.
+def dtw_path(a: Floats, b: Floats) -> NDArray[np.intp]:
+    """Pairs (p, 2) of samples that dynamic time warping matches between curves (n, d) and (m, d), ends with ends.
 
     The path minimizes the sum of squared distances over its pairs; each step advances one of the curves or
-    both by one sample, and of equally good steps the one that advances both is taken.
-
-    Parameters
-    ----------
-    a, b : array_like of shape (n, d) and (m, d)
-        In the same units; n and m may differ.
-
-    Returns
-    -------
-    ndarray of shape (p, 2)
-        Indices into ``a`` and ``b``, from (0, 0) to (n - 1, m - 1), never decreasing; p < n + m.
-
-    Raises
-    ------
-    ValueError
-        If a curve is not 2-D, is empty, or the curves have different numbers of outputs.
-
-    References
-    ----------
-    H. Sakoe, S. Chiba, "Dynamic programming algorithm optimization for spoken word recognition", IEEE
-    Transactions on Acoustics, Speech, and Signal Processing 26, 1978.
+    both by one sample, and of equally good steps the one that advances both is taken (H. Sakoe, S. Chiba, IEEE
+    Transactions on Acoustics, Speech, and Signal Processing 26, 1978).
     """
-    first = checks.array(a, "a", ("n", "d"))
-    second = checks.array(b, "b", ("m", first.shape[1]))
-    if not first.size or not second.size:
-        raise InvalidParameterError(f"a has shape {first.shape} and b {second.shape}, must have samples and outputs.")
-    total = _accumulated_cost(first, second)
-    i, j = len(first), len(second)
-    path = [(i, j)]
-    while (i, j) != (1, 1):
-        steps = [(i - 1, j - 1), (i - 1, j), (i, j - 1)]
-        i, j = min(steps, key=lambda step: total[step])  # the border is infinite but for its corner
-        path.append((i, j))
+    n, m = len(a), len(b)
+    require_much(24.0 * n * m, what=f"dynamic time warping of {n} by {m} samples", remedy="Take fewer, by n.")
+    cost = np.zeros((n, m))  # squared distances; scipy's cdist takes a second to import
+    for column_a, column_b in zip(a.T, b.T, strict=True):
+        cost += np.subtract.outer(column_a, column_b) ** 2
+    # D(i, j) = c(i, j) + min(D(i-1, j-1), D(i-1, j), D(i, j-1)), with a border of infinities before the first samples:
+    # pairs with one i + j depend on earlier diagonals only, so that each diagonal is one operation.
+    total = np.full((n + 1, m + 1), np.inf)
+    total[0, 0] = 0.0
+    for diagonal in range(n + m - 1):
+        i = np.arange(max(0, diagonal - m + 1), min(n, diagonal + 1))
+        j = diagonal - i
+        before = np.minimum(total[i, j], np.minimum(total[i, j + 1], total[i + 1, j]))
+        total[i + 1, j + 1] = cost[i, j] + before
+    path = [(n, m)]
+    while path[-1] != (1, 1):
+        row, column = path[-1]
+        path.append(min((row - 1, column - 1), (row - 1, column), (row, column - 1), key=lambda step: total[step]))
     return np.array(path[::-1], dtype=np.intp) - 1
 
 
@@ -136,22 +122,3 @@ def comparable_scale(curves: Floats, units: Sequence[str] | None) -> Floats:
     # leave of float64's 1e-16.
     rounding = 1e-12 * np.abs(curves).max(axis=(0, 1))
     return np.where(scale > rounding, scale, np.inf)
-
-
-def _accumulated_cost(a: Floats, b: Floats) -> Floats:
-    """Least cost (n + 1, m + 1) of a path to each pair; row and column 0 are the border."""
-    n, m = len(a), len(b)
-    require_much(24.0 * n * m, what=f"dynamic time warping of {n} by {m} samples", remedy="Take fewer, by n.")
-    cost = np.zeros((n, m))  # squared distances; scipy's cdist takes a second to import
-    for column_a, column_b in zip(a.T, b.T, strict=True):
-        cost += np.subtract.outer(column_a, column_b) ** 2
-    total = np.full((n + 1, m + 1), np.inf)
-    total[0, 0] = 0.0
-    # D(i, j) = c(i, j) + min(D(i-1, j-1), D(i-1, j), D(i, j-1)): pairs with one i + j depend on earlier diagonals only,
-    # so that each diagonal is one operation.
-    for diagonal in range(n + m - 1):
-        i = np.arange(max(0, diagonal - m + 1), min(n, diagonal + 1))
-        j = diagonal - i
-        before = np.minimum(total[i, j], np.minimum(total[i, j + 1], total[i + 1, j]))
-        total[i + 1, j + 1] = cost[i, j] + before
-    return total

@@ -17,8 +17,7 @@ from torch_pbd.files.memory import require_much
 Alignment = Literal["phase", "dtw"]
 
 _ROUNDING = 1e-12  # of a recording's time: a point of an even grid that is so near to a sample lies on it
-MAX_DEFAULT_STEPS = 200
-"""Most points `Demonstrations.align` takes of its own accord: dynamic time warping takes time in their square."""
+_MOST_STEPS = 200  # that align takes of its own accord: dynamic time warping takes time in their square
 
 
 class Resampling:
@@ -51,10 +50,13 @@ class Resampling:
             In ``time_unit``. Points between samples that are further apart are left out, so that holes stay holes and
             nothing counts as seen that was not; None bridges them by straight lines.
         """
-        grids = [np.linspace(time[0], time[-1], _checked_n(n)) for time in self.times]
-        if max_gap is not None:
-            checks.number(max_gap, "max_gap", above=0.0, unit=self.time_unit)
-            grids = [grid[_between_samples(time, grid, max_gap)] for time, grid in zip(self.times, grids, strict=True)]
+        most = np.inf if max_gap is None else checks.number(max_gap, "max_gap", above=0.0, unit=self.time_unit)
+        grids = []
+        for time in self.times:
+            grid = np.linspace(time[0], time[-1], _checked_n(n))
+            after = np.searchsorted(time, grid).clip(1, len(time) - 1)
+            gap, distance = time[after] - time[after - 1], np.minimum(grid - time[after - 1], time[after] - grid)
+            grids.append(grid[(gap <= most) | (distance <= _ROUNDING * (time[-1] - time[0]))])
         return self._replace(grids, list(map(interpolate, self.times, self.positions, grids)))
 
     def low_pass(self, cutoff: float) -> Self:
@@ -96,11 +98,10 @@ class Resampling:
         """
         checks.choice(method, "method", Alignment)
         typical = round(float(np.median(list(map(len, self.times)))))
-        n = _checked_n(min(typical, MAX_DEFAULT_STEPS) if n is None else n)
-        units = self.units
+        grid = np.linspace(0.0, 1.0, _checked_n(min(typical, _MOST_STEPS) if n is None else n))
+        units, phases = self.units, unit_phases(self.times)
         if units is None and self.rotation_reference is not None:
             units = (*[""] * (len(self.names) - 3), *["rad"] * 3)
-        grid, phases = np.linspace(0.0, 1.0, n), unit_phases(self.times)
         positions = [interpolate(own, position, grid) for own, position in zip(phases, self.positions, strict=True)]
         if method == "dtw":
             warps = dtw_warps(np.stack(positions) / comparable_scale(np.stack(positions), units))
@@ -118,13 +119,6 @@ def _checked_n(n: int) -> int:
     checks.count(n, "n", least=MIN_SAMPLES)
     require_much(64.0 * n, what=f"n={n} points", remedy="Lower it.")
     return n
-
-
-def _between_samples(time: Floats, grid: Floats, max_gap: float) -> NDArray[np.bool_]:
-    """Points of a grid, as a mask, on a sample or between two that are not further apart than ``max_gap``."""
-    after = np.searchsorted(time, grid).clip(1, len(time) - 1)
-    gap, distance = time[after] - time[after - 1], np.minimum(grid - time[after - 1], time[after] - grid)
-    return (gap <= max_gap) | (distance <= _ROUNDING * (time[-1] - time[0]))
 
 
 # A movement is known up to 2.5 spacings from a sample, as in a dropout of three whose neighbours jitter, and no longer

@@ -82,16 +82,17 @@ class Wanted:
         A signal of several columns may be named for all of them. ``demo``, ``time`` and ``outputs`` are the signals
         that the format means by default; an absent one is no fault but of the time, where no ``rate`` is given.
         """
-        places = {column: (signal, i) for signal, columns in signals.items() for i, column in enumerate(columns)}
+        places: dict[Any, tuple[str, int]] = {
+            column: (signal, i) for signal, columns in signals.items() for i, column in enumerate(columns)
+        }
         demo = demo if self.demo is None and demo in places else self.demo
         time = self.time or time
-        if self.rate is not None:
-            time = time if time in places else None
-        elif time is not None and time not in places:
-            likely = [name for name in places if re.search(r"(?i)time|stamp|^t$|^sec|^t_", name)]
-            if len(likely) == 1:
-                self.refuse(f"no column {time!r} among {preview([*places])}: say time={likely[0]!r}, if that is it.")
-                time = likely[0]
+        likely = [name for name in places if re.search(r"(?i)time|stamp|^t$|^sec|^t_", name)]
+        if time not in places and self.rate is not None:
+            time = None
+        elif time is not None and time not in places and len(likely) == 1:
+            self.refuse(f"no column {time!r} among {preview([*places])}: say time={likely[0]!r}, if that is it.")
+            time = likely[0]
         taken = [name for name in (demo, time) if name is not None]
         named = self.outputs if self.outputs is not None or outputs not in signals else [str(outputs)]
         if named is not None:
@@ -100,22 +101,14 @@ class Wanted:
         else:
             names = [name for name in places if name not in (*taken, *_UNNAMED)]
             for place in [i for i, name in enumerate(places) if name in _UNNAMED and name not in taken]:
-                self.refuse(
-                    f"column {place + 1} has no name, as the index of a table that was written without index=False. "
-                    f"Leave it out, or say by outputs= which of {preview(names)} are movements."
-                )
-        absent = [f"no column {name!r}" for name in (*taken, *names) if name not in places]
-        if absent or not names:
-            raise ValueError(
-                f"{absent[0] if absent else 'no column of outputs'} among {preview([*places])}. Name the columns by "
-                "the options demo=, time= (or rate=, in Hz, where there are no times) and outputs=."
-            )
-        return Chosen(
-            None if demo is None else places[demo],
-            None if time is None or self.rate is not None else places[time],
-            [places[name] for name in names],
-            names,
-        )
+                index = f"column {place + 1} has no name, as the index of a table written without index=False"
+                self.refuse(f"{index}: leave it out, or say by outputs= which of {preview(names)} are movements.")
+        absent = [repr(name) for name in (*taken, *names) if name not in places] or ["of outputs"] * (not names)
+        if absent:
+            remedy = "name the columns by demo=, time= (or rate=, in Hz, where there are none) and outputs="
+            raise ValueError(f"no column {absent[0]} among {preview([*places])}: {remedy}.")
+        own_time = None if self.rate is not None else places.get(time)
+        return Chosen(places.get(demo), own_time, [places[name] for name in names], names)
 
     def refuse(self, message: str) -> None:
         """Raise ValueError, or note the message where notes are taken and the caller knows a way around."""
@@ -136,9 +129,8 @@ class Wanted:
         heads = np.flatnonzero(np.r_[True, demo[1:] != demo[:-1]][:n_rows])
         blank = [row for row in heads if demo[row] is None or demo[row] != demo[row]]
         if chosen.demo and blank:
-            raise ValueError(
-                f"column {chosen.demo[0]!r} is blank in row {blank[0]}: it tells the demonstrations apart."
-            )
+            what = f"column {chosen.demo[0]!r} is blank in row {blank[0]}"
+            raise ValueError(f"{what}: it tells the demonstrations apart.")
         each = ({name: values[own] for name, values in signals.items()} for own in _rows_of(demo, heads))
         return self.read_each(chosen, each, **labels)
 
@@ -147,13 +139,11 @@ class Wanted:
         times, positions = [], Fresh()
         for signals in recordings:
             columns = [_column(signals, place) for place in chosen.outputs]
-            position = np.empty((len(columns[0]), len(columns)))
-            for i, (name, values) in enumerate(zip(chosen.names, columns, strict=True)):
+            for name, values in zip(chosen.names, columns, strict=True):
                 if values.dtype.kind not in "biuf":
                     raise ValueError(f"column {name!r} holds {values.dtype}, no numbers: leave it out by outputs=.")
-                position[:, i] = values
-            positions.append(position)
-            times.append(_column(signals, chosen.time) if chosen.time else np.arange(len(position)))
+            positions.append(np.stack(columns, axis=1, dtype=np.float64))
+            times.append(_column(signals, chosen.time) if chosen.time else np.arange(len(columns[0])))
         labels = {"names": chosen.names, "time_unit": "s"} | {k: v for k, v in labels.items() if v is not None}
         given = {name: getattr(self, name) for name in ("units", "frame", "rotation", "angles", "time_unit")}
         labels |= {name: value for name, value in given.items() if value is not None}
@@ -203,10 +193,8 @@ class Wanted:
         kept = [i for i, name in enumerate(names) if name not in found]
         for name, what in found.items():
             apart = f", and demo={name!r} if it tells the demonstrations apart" if what.startswith("numbers") else ""
-            self.refuse(
-                f"column {name!r}: it {what}, and is no movement. Leave it out, or say which columns are: "
-                f"outputs={[names[i] for i in kept]}{apart}."
-            )
+            movements = f"outputs={[names[i] for i in kept]}{apart}"
+            self.refuse(f"column {name!r}: it {what}, and is no movement: leave it out, or say {movements}.")
         if not found or not kept:
             return positions, labels
         each = {key: [labels[key][i] for i in kept] for key in ("names", "units") if isinstance(labels.get(key), list)}
