@@ -127,7 +127,7 @@ def test_units_may_be_one_a_list_or_by_name(tmp_path, units):
         ({"a": X}, "no column 'time' among [a_0]"),
         ({"t": T}, "has no array 'x'; it has: [t]"),
         ({"t": T, "x": X[0]}, "x has shape (3, 1), must have shape (K, T, d)"),
-        ({"t_0": T, "x_0": X[0], "t_2": T, "x_2": X[0]}, "has demonstration 2 but no t_1, x_1"),
+        ({"t_0": T, "x_0": X[0], "t_2": T, "x_2": X[0]}, "has no array 't_1'"),
         ({"t_0": T, "x_0": X[0], "t_1": T}, "has no array 'x_1'"),
         ({"t": T, "x": X.astype(object)}, "array 'x' cannot be read"),
         ({"t": T[::-1], "x": X}, "times[0] must increase strictly"),

@@ -9,7 +9,6 @@ from torch_pbd.data.synthetic import (
     paper_covariance,
     paper_mean,
     tunnel_center,
-    tunnel_deviation,
     tunnel_half_width,
 )
 from torch_pbd.data.via_points import (
@@ -38,6 +37,5 @@ __all__ = [
     "pose_mean",
     "save_demonstrations",
     "tunnel_center",
-    "tunnel_deviation",
     "tunnel_half_width",
 ]

@@ -11,7 +11,7 @@ from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.data.alignment import check_overlap, unit_phases
 from torch_pbd.data.editing import Editing
-from torch_pbd.data.poses import as_outputs, unwrapped
+from torch_pbd.data.poses import as_outputs
 from torch_pbd.data.recordings import Missing, as_recordings, frozen, preview
 from torch_pbd.data.sampling import Alignment
 from torch_pbd.data.units import TIMES, check_unit, find_suspects
@@ -110,21 +110,17 @@ class Demonstrations(Editing):
         angles: str | Sequence[str] | None = None,
         rotation_reference: ArrayLike | None = None,
     ) -> None:
-        outputs = as_outputs(times, positions, names, units, rotation, rotation_reference, missing)
-        if angles is not None:
-            turned = unwrapped(*outputs[:4], angles)
-            outputs = outputs._replace(positions=as_recordings(outputs.times, turned, "raise")[1])
         if not isinstance(time_unit, str) or not time_unit:
             raise checks.refusal(time_unit, "time_unit", "the unit of the times", "'s', or '1' for phase")
         check_unit(time_unit, "time_unit", TIMES)
         # A frozen class sets its attributes by its dictionary.
         vars(self).update(
-            outputs._asdict(),
+            as_outputs(times, positions, names, units, rotation, rotation_reference, angles, missing),
             frame=checks.text(frame, "frame", optional=True),
             time_unit=time_unit,
             alignment=alignment if alignment is None else checks.choice(alignment, "alignment", Alignment),
-            suspects=find_suspects(outputs.positions, outputs.names, outputs.units),
         )
+        vars(self)["suspects"] = find_suspects(self.positions, self.names, self.units)
         if self.suspects:
             checks.warn(" ".join(self.suspects))
 
@@ -158,19 +154,18 @@ class Demonstrations(Editing):
         chosen = np.arange(len(self))[index]
         if chosen.ndim == 0:
             return Demonstration(self.times[chosen], self.positions[chosen])
-        times, positions = [self.times[k] for k in chosen], [self.positions[k] for k in chosen]
+        times, positions = ([arrays[k] for k in chosen] for arrays in (self.times, self.positions))
         suspects = find_suspects(positions, self.names, self.units) if self.suspects else ()
         return self._replace(times, positions, suspects=suspects)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Demonstrations):
             return NotImplemented
-        if any(getattr(self, name) != getattr(other, name) for name in ("names", "units", "frame", "time_unit")):
-            return False
-        if len(self) != len(other) or not np.array_equal(self.rotation_reference, other.rotation_reference):  # type: ignore[arg-type]
-            return False
-        arrays = zip((*self.times, *self.positions), (*other.times, *other.positions), strict=True)
-        return all(np.array_equal(mine, theirs) for mine, theirs in arrays)
+        mine, theirs = (
+            [(d.names, d.units, d.frame, d.time_unit, len(d)), d.rotation_reference, *d.times, *d.positions]
+            for d in (self, other)
+        )
+        return mine[0] == theirs[0] and all(map(np.array_equal, mine[1:], theirs[1:]))  # type: ignore[arg-type]
 
     def __repr__(self) -> str:
         n_steps = "..".join(map(str, sorted({min(self.n_steps), max(self.n_steps)})))
@@ -185,10 +180,7 @@ class Demonstrations(Editing):
         return _rebuild, (self.times, self.positions, vars(self))
 
     def stack(self, input: Literal["time", "phase"] = "time") -> tuple[Floats, Floats, NDArray[np.intp]]:
-        """All samples below each other, as scikit-learn's estimators want them.
-
-        Names, units, and that three outputs are a rotation stay behind: ``DMPController.fit`` takes demonstrations
-        whole.
+        """All samples below each other, as scikit-learn's estimators want them: without names, units and rotations.
 
         Parameters
         ----------
@@ -217,8 +209,7 @@ class Demonstrations(Editing):
         try:
             held_out[np.asarray(k)] = True
         except IndexError as error:
-            must = f"the number of a demonstration, or a list of them, numbered 0 to {len(self) - 1}"
-            raise checks.refusal(k, "k", must) from error
+            raise checks.refusal(k, "k", f"one or some of the demonstrations, numbered 0 to {len(self) - 1}") from error
         if held_out.all():
             raise InvalidParameterError(f"k leaves out all {len(self)} demonstrations: both parts need some.")
         return self[~held_out], self[held_out]
@@ -238,11 +229,7 @@ class Demonstrations(Editing):
         outputs : sequence of int or str, default=None
             Numbers or names of at most nine outputs; None is the first nine.
         ax : matplotlib.axes.Axes, default=None
-            None makes a figure of pyplot. Of projection "3d" for three outputs.
-
-        Returns
-        -------
-        matplotlib.axes.Axes, or a list of them
+            None makes a figure of pyplot. Of projection "3d" for three outputs. It, or a list of some, is returned.
         """
         from torch_pbd.plotting.display import plot_movements  # here: matplotlib takes a while to import
 

@@ -9,6 +9,7 @@ import numpy as np
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.data.alignment import check_overlap
+from torch_pbd.data.recordings import preview
 from torch_pbd.data.sampling import Resampling, extents, still
 from torch_pbd.data.units import ANGLES, LENGTHS, TIMES, quaternions
 from torch_pbd.exceptions import InvalidParameterError, UnimodalityWarning
@@ -25,8 +26,7 @@ _N_STEPS, _LEAST_DEMOS = 20, 6  # at which ways may part, and with which they ca
 # Gain of the criterion in nats, and distance of the two means in standard deviations within the groups. The best of all
 # splits of a sample from one normal distribution gains something too, and two halves of a uniform one lie 3.5 apart:
 # both bounds are above that, the second more so for whole demonstrations, in which there are more directions to choose.
-_GAIN_WHOLE, _SEPARATION_WHOLE = 8.0, 6.0
-_GAIN_STEP, _SEPARATION_STEP = 10.0, 4.5
+_WHOLE, _STEP = (8.0, 6.0), (10.0, 4.5)
 # Two ways around an obstacle part for a while, and each is taken by some.
 _SHARE_OF_STEPS, _SHARE_OF_DEMOS = 0.25, 0.2
 
@@ -53,9 +53,8 @@ class Description:
     rotation: str = ""
 
     def __str__(self) -> str:
-        rows = _table(self.recordings[:_MOST_ROWS])
-        if len(self.recordings) > _MOST_ROWS:
-            rows += f"\n... {len(self.recordings)} recordings in all"
+        n, rows = len(self.recordings), _table(self.recordings[:_MOST_ROWS])
+        rows += f"\n... {n} recordings in all" if n > _MOST_ROWS else ""
         findings = [f"{i}. {sentence}" for i, sentence in enumerate(self.mistakes, 1)] or ["Nothing looks wrong."]
         return "\n\n".join(filter(None, [rows, _table(self.outputs), self.rotation, "\n".join(findings)]))
 
@@ -81,10 +80,8 @@ def describe(demonstrations: Any, notes: Sequence[str] = ()) -> Description:
     rotation = ""
     if reference is not None:
         shown, furthest = ", ".join(f"{q:.4f}" for q in reference), np.linalg.norm(together[:, -3:], axis=1).max()
-        rotation = (
-            f"Rotations are {', '.join(names[-3:])} around the quaternion w x y z of {shown}; the furthest is "
-            f"{np.degrees(furthest):.0f} degrees from it."
-        )
+        rotation = f"Rotations are {', '.join(names[-3:])} around the quaternion w x y z of {shown}; the furthest is "
+        rotation += f"{np.degrees(furthest):.0f} degrees from it."
     mistakes = [*notes, *_of_times(demonstrations, second), *_of_ends(demonstrations, recordings)]
     mistakes += [*demonstrations.suspects, *_flips(demonstrations), *_of_outputs(demonstrations.units, outputs, notes)]
     return Description(recordings, outputs, tuple(mistakes), rotation)
@@ -129,21 +126,18 @@ def _of_ends(demonstrations: Any, recordings: list[dict[str, Any]]) -> Iterator[
         held, longest = [row["#"] for row in recordings if row[rest] > 0.0], max(row[rest] for row in recordings)
         if held:
             lasting = f"{longest:.3g} {demonstrations.time_unit}"
-            yield f"Nothing moves at the {end} of {_numbers(held)}, for up to {lasting}: say trim='still'."
+            yield f"Nothing moves at the {end} of recordings {preview(held)}, for up to {lasting}: say trim='still'."
         if cut[end]:
-            are = f"{_numbers(cut[end])} {'is' if len(cut[end]) == 1 else 'are'}"
-            yield f"At the {end}, {are} moving. Record from rest to rest, or give settle= to schedule()."
+            moving = f"At the {end}, recordings {preview(cut[end])} are moving"
+            yield f"{moving}: record from rest to rest, or give settle= to schedule()."
 
 
 def _of_outputs(units: Any, outputs: list[dict[str, Any]], notes: Sequence[str]) -> Iterator[str]:
     covers = {row["output"]: row["extent"] for row in outputs}
     if units is None and not any("units=" in note for note in notes):
-        name = max(covers, key=lambda output: covers[output])
-        far = f" Output {name} covers {covers[name]:.4g}: as metres that is far, 'mm'?"
-        yield (
-            "The outputs have no units: give units=, as 'm', 'mm', 'rad', or one for each."
-            f"{far if covers[name] > _FURTHEST else ''}"
-        )
+        largest, name = max((extent, name) for name, extent in covers.items())
+        far = f" Output {name} covers {largest:.4g}: as metres that is far." if largest > _FURTHEST else ""
+        yield f"The outputs have no units: give units=, as 'm', 'mm', 'rad', or one for each.{far}"
     for row in outputs:
         unit, extent = row["unit"], row["extent"]
         if LENGTHS.get(unit, 0.0) * extent > _FURTHEST or ANGLES.get(unit, 0.0) * extent > _MOST_TURNED:
@@ -163,12 +157,7 @@ def _flips(demonstrations: Any) -> Iterator[str]:
         each = [position[:, place : place + 4] for position in demonstrations.positions]
         flips = [k for k, q in enumerate(each) if ((q[1:] * q[:-1]).sum(axis=1) < 0.0).any() or q[0] @ each[0][0] < 0.0]
         if flips:
-            yield f"{name} is -q where it was q, in {_numbers(flips)}: rotation= takes either sign."
-
-
-def _numbers(numbers: list[int]) -> str:
-    shown = ", ".join(map(str, numbers[:6])) + (f", ... ({len(numbers)} in all)" if len(numbers) > 6 else "")
-    return f"recording{'' if len(numbers) == 1 else 's'} {shown}"
+            yield f"{name} is -q where it was q, in recordings {preview(flips)}: rotation= takes either sign."
 
 
 def _table(rows: list[dict[str, Any]]) -> str:
@@ -193,14 +182,10 @@ def check_unimodal(demonstrations: Any) -> bool:
     demonstrations : Demonstrations
         Aligned by phase here, if they are not.
 
-    Returns
-    -------
-    bool
-
     Warns
     -----
     UnimodalityWarning
-        If there are two groups, or one demonstration far from all others.
+        If there are two groups, or one demonstration far from all others; then it returns False.
     """
     is_recorded = isinstance(demonstrations, Resampling)
     if not is_recorded:
@@ -213,19 +198,17 @@ def check_unimodal(demonstrations: Any) -> bool:
     deviation = residual.std(axis=(0, 1))
     residual = residual / np.where(deviation > 0, deviation, 1.0)
     gain, separation, few = _best_split(residual.reshape(n_demos, -1))
-    if gain <= _GAIN_WHOLE or separation <= _SEPARATION_WHOLE:
-        splits = [_best_split(residual[:, t]) for t in np.linspace(0, residual.shape[1] - 1, _N_STEPS).astype(int)]
-        clear = [s for s in splits if s[0] > _GAIN_STEP and s[1] > _SEPARATION_STEP]
-        clear = [split for split in clear if len(split[2]) >= _SHARE_OF_DEMOS * n_demos]
+    if gain <= _WHOLE[0] or separation <= _WHOLE[1]:
+        steps = np.linspace(0, residual.shape[1] - 1, _N_STEPS).astype(int)
+        splits = [split for split in (_best_split(residual[:, t]) for t in steps) if split[0] > _STEP[0]]
+        clear = [split for split in splits if split[1] > _STEP[1] and len(split[2]) >= _SHARE_OF_DEMOS * n_demos]
         if len(clear) < _SHARE_OF_STEPS * _N_STEPS:
             return True
         few = max(clear)[2]
     message = f"Demonstration {few[0]} is far from the other {n_demos - 1}: look at it, and leave it out if it failed."
     if len(few) > 1:
-        message = (
-            f"The demonstrations seem to follow two ways: {', '.join(map(str, sorted(few)))} differ from the others. "
-            "A normal distribution puts its mean between them; learn each way by itself."
-        )
+        others = f"{', '.join(map(str, sorted(few)))} differ from the others, and a mean would lie between them"
+        message = f"The demonstrations seem to follow two ways: {others}. Learn each way by itself."
     checks.warn(message, UnimodalityWarning)
     return False
 

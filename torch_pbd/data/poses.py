@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -23,49 +23,57 @@ _FAR, _FURTHEST = 120.0, 150.0
 _N_PHASES = 201  # of each recording in the mean: it does not hang on how long or how densely each was sampled
 
 
-class Outputs(NamedTuple):
-    """Recordings and labels as `torch_pbd.data.Demonstrations` holds them."""
-
-    times: tuple[Floats, ...]
-    positions: tuple[Floats, ...]
-    names: tuple[str, ...]
-    units: tuple[str, ...] | None
-    rotation_reference: Floats | None
-
-
 def as_outputs(
-    times: Any, positions: Any, names: Any, units: Any, rotation: Any, rotation_reference: Any, missing: Any
-) -> Outputs:
-    """Recordings with their labels; a rotation is three outputs in the last places."""
-    times_, positions_ = as_recordings(times, positions, missing)
-    names_ = as_names(names, positions_[0].shape[1])
+    times: Any, positions: Any, names: Any, units: Any, rotation: Any, reference: Any, angles: Any, missing: Any
+) -> dict[str, Any]:
+    """Recordings and labels as `torch_pbd.data.Demonstrations` holds them; a rotation is three outputs, the last."""
+    times, positions = as_recordings(times, positions, missing)
+    names = as_names(names, positions[0].shape[1])
     if rotation is None:
-        outputs = Outputs(times_, positions_, names_, as_units(units, len(names_)), None)
-        return outputs if rotation_reference is None else _in_chart(outputs, rotation_reference)
-    if rotation_reference is not None:
-        raise checks.refusal(rotation_reference, "rotation_reference", "None where rotation= names quaternions")
+        units = as_units(units, len(names))
+        reference = None if reference is None else _as_reference(reference, times, positions, names, units)
+    elif reference is None:
+        times, positions, names, units, reference = _as_chart(times, positions, names, units, rotation, missing)
+    else:
+        raise checks.refusal(reference, "rotation_reference", "None where rotation= names quaternions")
+    if angles is not None:
+        positions = as_recordings(times, unwrapped(times, positions, names, units, angles), "raise")[1]
+    return {"times": times, "positions": positions, "names": names, "units": units, "rotation_reference": reference}
+
+
+def _as_reference(reference: Any, times: Any, positions: Any, names: Any, units: Any) -> Floats:
+    """Reference of the chart in which the last three outputs were before, as in a file."""
+    quaternion = checks.array(reference, "rotation_reference", (4,))
+    if abs(float(quaternion @ quaternion) - 1.0) > checks.ROUNDING:
+        raise checks.refusal(reference, "rotation_reference", "a unit quaternion w x y z")
+    if len(names) < 3 or (units is not None and set(units[-3:]) != {"rad"}):
+        must = f"given for outputs that end with three of a rotation in rad, not for {preview(names)}"
+        raise checks.refusal(reference, "rotation_reference", must)
+    _check_reach(times, [position[:, -3:] for position in positions])
+    return frozen(quaternion)
+
+
+def _as_chart(times: Any, positions: Any, names: Any, units: Any, rotation: Any, missing: Any) -> tuple[Any, ...]:
+    """Recordings and labels whose four columns of a quaternion have become three in the chart, and its reference."""
     chosen = as_texts(rotation, "rotation")
-    if not len(chosen) == len(set(chosen)) == len(set(chosen) & set(names_)) == 4:
-        must = f"four different ones of {preview(names_)}, in the order w x y z, wherever these stand"
+    if not len(chosen) == len(set(chosen)) == len(set(chosen) & set(names)) == 4:
+        must = f"four different ones of {preview(names)}, in the order w x y z, wherever these stand"
         raise checks.refusal(rotation, "rotation", must)
-    columns = [names_.index(name) for name in chosen]
-    lost = [~position[:, columns].any(axis=1, keepdims=True) for position in positions_]
+    columns = [names.index(name) for name in chosen]
+    lost = [~position[:, columns].any(axis=1, keepdims=True) for position in positions]
     if missing == "drop" and any(map(np.any, lost)):  # a tracker that saw nothing wrote zeros
-        holes = [np.where(gone, np.nan, position) for gone, position in zip(lost, positions_, strict=True)]
-        times_, positions_ = as_recordings(times_, holes, "drop")
-    turns = [_unit(position[:, columns], k, chosen) for k, position in enumerate(positions_)]
-    kept = [i for i in range(len(names_)) if i not in columns]
-    if units is not None and not isinstance(units, str) and len(units) == len(names_):
+        holes = [np.where(gone, np.nan, position) for gone, position in zip(lost, positions, strict=True)]
+        times, positions = as_recordings(times, holes, "drop")
+    turns = [_unit(position[:, columns], k, chosen) for k, position in enumerate(positions)]
+    kept = [i for i in range(len(names)) if i not in columns]
+    if units is not None and not isinstance(units, str) and len(units) == len(names):
         units = [units[i] for i in kept]
     own = () if units is not None and not kept else as_units(units, len(kept))
-    labels = (*(names_[i] for i in kept), *ROTATION)
-    reference = mean_rotation(times_, turns)
-    return Outputs(
-        *as_recordings(times_, charted(times_, [y[:, kept] for y in positions_], turns, reference), "raise"),
-        as_names(labels, len(labels)),
-        own if own is None else (*own, "rad", "rad", "rad"),
-        frozen(reference),
-    )
+    labels = as_names([*(names[i] for i in kept), *ROTATION], len(kept) + 3)
+    reference = mean_rotation(times, turns)
+    charts = charted(times, [position[:, kept] for position in positions], turns, reference)
+    units = own if own is None else (*own, "rad", "rad", "rad")
+    return *as_recordings(times, charts, "raise"), labels, units, frozen(reference)
 
 
 def mean_rotation(times: Sequence[Floats], quaternions: Sequence[Floats]) -> Floats:
@@ -130,18 +138,6 @@ def unwrapped(times: Any, positions: Any, names: Any, units: Any, angles: Any) -
         for position, curve, n in zip(positions, curves, turns, strict=True):
             position[:, i] = curve - n * turn
     return positions
-
-
-def _in_chart(outputs: Outputs, rotation_reference: Any) -> Outputs:
-    """Outputs whose last three were in the chart around a reference before, as in a file."""
-    reference = checks.array(rotation_reference, "rotation_reference", (4,))
-    if abs(float(reference @ reference) - 1.0) > checks.ROUNDING:
-        raise checks.refusal(rotation_reference, "rotation_reference", "a unit quaternion w x y z")
-    if len(outputs.names) < 3 or (outputs.units is not None and set(outputs.units[-3:]) != {"rad"}):
-        must = f"given for outputs that end with three of a rotation in rad, not for {preview(outputs.names)}"
-        raise checks.refusal(rotation_reference, "rotation_reference", must)
-    _check_reach(outputs.times, [position[:, -3:] for position in outputs.positions])
-    return outputs._replace(rotation_reference=frozen(reference))
 
 
 def _unit(quaternion: Floats, k: int, names: Sequence[str]) -> Floats:

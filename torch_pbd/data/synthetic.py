@@ -104,22 +104,6 @@ def tunnel_half_width(y: ArrayLike) -> Floats:
     return 0.12 - 0.11 * s**2 * (3.0 - 2.0 * s)
 
 
-def tunnel_deviation(y: ArrayLike, *, common_start: bool = False, common_goal: bool = False) -> Floats:
-    """Standard deviation of x over demonstrations of the tunnel task, in m, at y in m.
-
-    That of the law of `make_tunnel_demonstrations` with equal durations: ``0.85 tunnel_half_width(y)`` times the blends
-    at the ends, times the deviation of tanh of a lane with its wandering and correcting; and the tremor.
-    """
-    # Mean square of tanh over the uniform lanes, by the midpoint rule, and the normal numbers, by Gauss and Hermite.
-    lanes = (np.arange(400) + 0.5) / 400 * 1.2 - 0.6
-    node, weight = np.polynomial.hermite_e.hermegauss(40)
-    lane = lanes[:, np.newaxis] + np.hypot(_WANDER, _CORRECTION) * node
-    square = np.square(np.tanh(lane)).mean(axis=0) @ weight / weight.sum()
-    along = checks.real_floats(y, "y")
-    across = _WITHIN * tunnel_half_width(along) * _blend(along, common_start, common_goal)
-    return np.sqrt(np.square(across) * square + _TREMOR**2)
-
-
 def make_tunnel_demonstrations(
     n_demos: int = 6,
     duration: float = 10.0,
@@ -136,7 +120,7 @@ def make_tunnel_demonstrations(
     tunnel_half_width(y) tanh(lane + 0.12 w(t) + 0.04 c(t))`` with a lane drawn uniformly from [-0.6, 0.6] for each
     demonstration, w wandering (up to 0.25 Hz) and c correcting (0.25 to 1 Hz) with unit variance. A tremor in x (0.1 mm
     rms, 8 to 12 Hz), noise in y (2 um rms) and quantization to 5 um are added. The standard deviation of x over
-    demonstrations, `tunnel_deviation`, is 35 mm at the start and 2.9 mm at the end.
+    demonstrations is 35 mm at the start and 2.9 mm at the end.
 
     Parameters
     ----------

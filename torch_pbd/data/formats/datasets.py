@@ -13,7 +13,7 @@ from torch_pbd.data.recordings import preview
 from torch_pbd.data.wanted import Arguments, Wanted, column_names, natural, numeric
 from torch_pbd.registry import optional
 
-_LARGEST_INFO = 2**22  # bytes
+_LARGEST_INFO = 2**22  # letters of meta/info.json
 # Zarr's codecs of numbers; another one, pickle, would execute what is in the file.
 _CODECS = {"bytes", "blosc", "zstd", "lz4", "gzip", "zlib", "bz2", "lzma", "shuffle", "bitshuffle", "delta", "crc32c"}
 _CODECS |= {"transpose", "sharding_indexed", "numcodecs.shuffle", "numcodecs.delta", "numcodecs.zlib", "numcodecs.lz4"}
@@ -22,10 +22,8 @@ _CODECS |= {"transpose", "sharding_indexed", "numcodecs.shuffle", "numcodecs.del
 def read_lerobot(path: Path, wanted: Wanted) -> Arguments:
     """Read a folder of LeRobot, version 2 or 3: Parquet files, and what they hold in meta/."""
     opened = partial(open_file, extra="lerobot", what=f"{path.name}, as all of LeRobot,")
-    info_file = path / "meta" / "info.json"
-    if info_file.stat().st_size > _LARGEST_INFO:
-        raise ValueError(f"meta/info.json has more than {_LARGEST_INFO} bytes.")
-    info = json.loads(info_file.read_text(encoding="utf-8"))
+    with (path / "meta" / "info.json").open(encoding="utf-8") as file:
+        info = json.loads(file.read(_LARGEST_INFO))
     version = info.get("codebase_version") if isinstance(info, dict) else None
     if not str(version).startswith(("v2", "v3")) or not isinstance(info.get("features"), dict):
         raise ValueError(f"meta/info.json is of version {version!s:.20}, must be v2 or v3, with features.")
@@ -36,10 +34,8 @@ def read_lerobot(path: Path, wanted: Wanted) -> Arguments:
     }
     chosen = wanted.choose(signals, demo="episode_index", time="timestamp", outputs="observation.state")
     if wanted.units is None:
-        wanted.refuse(
-            f"it does not tell the units of {preview(chosen.names, 6)}: give units=, 'deg' or 'rad' of joints, "
-            "'percent' where they go from -100 to 100, or one for each."
-        )
+        joints = "'deg' or 'rad' of joints, 'percent' where they go from -100 to 100, or one for each"
+        wanted.refuse(f"it does not tell the units of {preview(chosen.names, 6)}: give units=, {joints}.")
     # Several episodes a file in version 3, one in version 2; the numbers in the names are in order.
     files = sorted((path / "data").rglob("*.parquet"), key=lambda file: natural(file.relative_to(path).as_posix()))
     if not files:
@@ -55,10 +51,8 @@ def read_lerobot(path: Path, wanted: Wanted) -> Arguments:
     declared = _declared_lengths(path, opened, wanted) or found
     for number in sorted(declared.keys() | found.keys()):
         if declared.get(number) != found.get(number):
-            raise ValueError(
-                f"episode {number} has {found.get(number, 0)} samples in data/, but {declared.get(number, 0)} by "
-                "meta/episodes: files are missing or cut."
-            )
+            has = f"episode {number} has {found.get(number, 0)} samples in data/"
+            raise ValueError(f"{has}, but {declared.get(number, 0)} by meta/episodes: files are missing or cut.")
     return wanted.read_rows(chosen, columns)
 
 
@@ -150,9 +144,7 @@ def read_zarr(path: Path, wanted: Wanted) -> Arguments:
     try:
         keys = [*group["data"].array_keys()] if "data" in group else []
         if not keys or "meta/episode_ends" not in group:
-            raise ValueError(
-                f"it has no data and meta/episode_ends, as replay buffers have, but {preview([*group.keys()])}."
-            )
+            raise ValueError(f"it has no data and meta/episode_ends, but {preview([*group.keys()])}.")
         arrays = numeric({key: group[f"data/{key}"] for key in keys})
         ends = _read_zarr_array(group["meta/episode_ends"], wanted, "meta/episode_ends").astype(np.int64)
         signals = {key: column_names(key, array.shape) for key, array in arrays.items()}

@@ -24,19 +24,16 @@ def read(path: Path, wanted: Wanted, variable: str | None = None) -> Arguments:
     name = variable or next((name for name in ("demos", "data") if name in content), None)
     if name not in content:
         what = f"variable {variable!r}" if variable else "variables demos or data"
-        raise ValueError(
-            f"it has no {what}, but {preview([*content])}: say by variable= which one holds the recordings."
-        )
+        raise ValueError(f"it has no {what}, but {preview([*content])}: say by variable= which is the recordings.")
     cells = content[name] if isinstance(content[name], list) else [content[name]]
     step = _number(content.get("dt"))
     recordings = [_signals(cell, f"{name}{{{k + 1}}}", step) for k, cell in enumerate(cells)]
-    if not recordings:
-        raise ValueError(f"{name} is empty.")
-    columns = {key: column_names(key, value.shape) for key, value in recordings[0].items()}
-    absent = [(k, key) for k, own in enumerate(recordings) for key in columns if key not in own]
+    columns = {key: column_names(key, value.shape) for key, value in (recordings or [{}])[0].items()}
+    chosen = wanted.choose(columns, time="t" if "t" in columns else None, outputs="pos")
+    absent = [(k, key) for k, own in enumerate(recordings, 1) for key in chosen.signals if key not in own]
     if absent:
-        raise ValueError(f"{name}{{{absent[0][0] + 1}}} has no {absent[0][1]!r}, which {name}{{1}} has.")
-    return wanted.read_each(wanted.choose(columns, time="t" if "t" in columns else None, outputs="pos"), recordings)
+        raise ValueError(f"{name}{{{absent[0][0]}}} has no {absent[0][1]!r}, which {name}{{1}} has.")
+    return wanted.read_each(chosen, recordings)
 
 
 def _signals(cell: Any, place: str, step: float | None) -> dict[str, NDArray[Any]]:

@@ -34,31 +34,24 @@ def read(path: Path, wanted: Wanted) -> Arguments:
             raise ValueError(f"x has shape {positions.shape}, must have shape (K, T, d).")
         recordings = [{"t": _read(members, "t"), "x": position} for position in positions]
     else:
-        absent = set(range(len(numbers))) - numbers
-        if absent or not numbers:
-            has = f"demonstration {max(numbers)} but no t_{min(absent)}, x_{min(absent)}" if numbers else "no t and x"
-            raise ValueError(f"it has {has}; it has: {preview([*members])}. {LOADERS}")
-        recordings = [{letter: _read(members, f"{letter}_{k}") for letter in "tx"} for k in sorted(numbers)]
+        # Of one that lacks, the first is told.
+        ks = range(max(numbers, default=0) + 1)
+        recordings = [{letter: _read(members, f"{letter}_{k}") for letter in "tx"} for k in ks]
     n_outputs = (*recordings[0]["x"].shape, 1)[1] if recordings else 0
     for key, count in (("K", len(recordings)), ("d", n_outputs)):
         if meta.get(key, count) != count:
             raise ValueError(f"meta says {key} = {meta[key]}, but the arrays have {count}.")
     names = as_names(meta.get("dims"), n_outputs)
     outputs, reference = with_whole_rotation(wanted.outputs or names, names, meta.get("rotation_reference"))
-    chosen = replace(wanted, outputs=outputs).choose({"x": names})
+    wanted = replace(wanted, outputs=outputs)
+    chosen = wanted.choose({"x": names})
     # Times are known by the name of their array, which an output may have too.
     chosen = chosen if wanted.rate else chosen._replace(time=("t", 0))
     units = None if wanted.units is not None else as_units(_units(meta), n_outputs)
-    return replace(wanted, outputs=outputs).read_each(
-        chosen,
-        recordings,
-        units=units and [units[i] for _, i in chosen.outputs],
-        frame=_text(meta, "frame"),
-        # Public recordings say unit and t_unit, with a remark in brackets: "s (100 Hz)".
-        time_unit=_text(meta, "time_unit") or _without_remark(_text(meta, "t_unit")),
-        alignment=meta.get("alignment"),
-        rotation_reference=reference,
-    )
+    # Public recordings say unit and t_unit, with a remark in brackets: "s (100 Hz)".
+    labels = {"frame": _text(meta, "frame"), "time_unit": _text(meta, "time_unit") or _plain(_text(meta, "t_unit"))}
+    labels |= {"units": units and [units[i] for _, i in chosen.outputs], "rotation_reference": reference}
+    return wanted.read_each(chosen, recordings, alignment=meta.get("alignment"), **labels)
 
 
 def read_array_file(path: Path, wanted: Wanted) -> Arguments:
@@ -117,7 +110,7 @@ def write(demonstrations: Demonstrations, handle: BinaryIO) -> None:
 
 def _read(members: Mapping[str, bytes], name: str) -> NDArray[Any]:
     if name not in members:
-        raise ValueError(f"it has no array {name!r}; it has: {preview([*members])}.")
+        raise ValueError(f"it has no array {name!r}; it has: {preview([*members])}. {LOADERS}")
     try:
         return read_array(name, members[name])
     except ValueError as error:
@@ -148,12 +141,12 @@ def _units(meta: dict[str, Any]) -> Any:
     """Units of the outputs: in the order of ``dims``, by their names, or one for all."""
     units, names = meta.get("units"), meta.get("dims") or ()
     if not isinstance(units, dict):
-        return _without_remark(meta.get("unit")) if units is None else units
+        return _plain(meta.get("unit")) if units is None else units
     for name in names:
         if name not in units:
             raise ValueError(f"units in meta has no entry for output {name!r}; it has {preview([*units])}.")
     return [units[name] for name in names]
 
 
-def _without_remark(unit: Any) -> Any:
+def _plain(unit: Any) -> Any:
     return unit.partition(" (")[0] if isinstance(unit, str) else unit
