@@ -7,14 +7,19 @@ from typing import TYPE_CHECKING, Any
 from torch_pbd.registry import ESTIMATORS
 
 if TYPE_CHECKING:
-    from torch_pbd.control.controller import DMPController
-    from torch_pbd.data import Demonstrations, load_demonstrations, save_demonstrations
-    from torch_pbd.estimators.cholesky import CholeskyCovRegressor
-    from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
-    from torch_pbd.estimators.mixture import GMMBaseline
-    from torch_pbd.estimators.wishart import WishartProcessRegressor
-    from torch_pbd.movement import KMPBaseline, ProMPBaseline, TrajectoryRegressor
-    from torch_pbd.persistence import load, save
+    from torch_pbd.control.controller import DMPController as DMPController
+    from torch_pbd.data import Demonstrations as Demonstrations
+    from torch_pbd.data import load_demonstrations as load_demonstrations
+    from torch_pbd.data import save_demonstrations as save_demonstrations
+    from torch_pbd.estimators.cholesky import CholeskyCovRegressor as CholeskyCovRegressor
+    from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor as HeteroscedasticGPRegressor
+    from torch_pbd.estimators.mixture import GMMBaseline as GMMBaseline
+    from torch_pbd.estimators.wishart import WishartProcessRegressor as WishartProcessRegressor
+    from torch_pbd.movement import KMPBaseline as KMPBaseline
+    from torch_pbd.movement import ProMPBaseline as ProMPBaseline
+    from torch_pbd.movement import TrajectoryRegressor as TrajectoryRegressor
+    from torch_pbd.persistence import load as load
+    from torch_pbd.persistence import save as save
 
 __version__ = "0.1.0"
 
@@ -28,21 +33,7 @@ _HOMES = {
     "save": "torch_pbd.persistence",
 }
 
-__all__ = [
-    "CholeskyCovRegressor",
-    "DMPController",
-    "Demonstrations",
-    "GMMBaseline",
-    "HeteroscedasticGPRegressor",
-    "KMPBaseline",
-    "ProMPBaseline",
-    "TrajectoryRegressor",
-    "WishartProcessRegressor",
-    "load",
-    "load_demonstrations",
-    "save",
-    "save_demonstrations",
-]
+__all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str) -> Any:

@@ -228,20 +228,24 @@ def warn(message: str, category: type[Warning] = UserWarning) -> None:
     warnings.warn(message, category, stacklevel=level)
 
 
-def real_array(values: Any, name: str) -> NDArray[Any]:
-    """``values`` as an array of real numbers, in their own type: lists, tensors, series; not checked for NaN.
-
-    Raises TypeError for entries that are no numbers at all, and ValueError if they are ragged, masked, complex, or hold
-    text, dates or records.
-    """
+def as_array(values: Any, name: str) -> NDArray[Any]:
+    """``values`` as an array of any type: lists, tensors, series; a ValueError if they are ragged or masked."""
     if hasattr(values, "detach"):
         values = from_tensor(values, name)
     if np.ma.is_masked(values):
         raise ValueError(f"{name} has masked entries: leave them out, or fill them in first.")
     try:
-        array = np.asarray(values)
+        return np.asarray(values)
     except (RuntimeError, ValueError) as error:  # RuntimeError of a list of tensors that need gradients
         raise ValueError(f"{name} is ragged, or no array: {error}") from error
+
+
+def real_array(values: Any, name: str) -> NDArray[Any]:
+    """:func:`as_array` of real numbers in their own type; not checked for NaN.
+
+    Raises TypeError for entries that are no numbers at all, and ValueError for complex numbers, text, dates or records.
+    """
+    array = as_array(values, name)
     kind = array.dtype.kind
     if kind in "US" or (kind == "O" and any(isinstance(entry, str | bytes) for entry in array.flat)):
         # scikit-learn's own checks ask for the words in the middle.

@@ -157,16 +157,9 @@ def without_rounding(X: Floats) -> Floats:
 
 def check_groups(groups: Any, n_samples: int) -> NDArray[np.intp]:
     """Number of each row's demonstration, from labels of any kind, none of which is missing."""
-    if hasattr(groups, "detach"):
-        groups = checks.from_tensor(groups, "groups")
-    if np.ma.is_masked(groups):
-        raise ValueError("groups has masked entries: say of every row which demonstration it is of.")
     if isinstance(groups, list | tuple) and len({isinstance(label, str) for label in groups}) > 1:
         groups = np.fromiter(groups, dtype=object, count=len(groups))  # NumPy would make text of the numbers
-    try:
-        labels = np.asarray(groups)
-    except ValueError as error:
-        raise ValueError(f"groups is ragged: give one label for each row of X ({error}).") from error
+    labels = checks.as_array(groups, "groups")
     if labels.shape != (n_samples,):
         raise ValueError(
             f"groups has shape {labels.shape}, must have shape ({n_samples},): the demonstration of each row of X."
