@@ -95,9 +95,9 @@ def gaussian_kl(
     reference_mean, estimated_mean : array_like of shape (n, d) or (n,), default=None
         Both or none: None compares the covariances alone, as if the means were equal.
     """
-    reference = _covariances(reference, "reference")
-    estimated = _covariances(estimated, "estimated", reference.shape)
-    n, d, _ = reference.shape
+    reference_tril = _factors(reference, "reference")
+    estimated_tril = _factors(estimated, "estimated", reference_tril.shape)
+    n, d, _ = reference_tril.shape
     if (reference_mean is None) != (estimated_mean is None):
         raise InvalidParameterError("reference_mean and estimated_mean go together: give both or none.")
     shift = np.zeros((n, d))
@@ -105,8 +105,6 @@ def gaussian_kl(
         shift = _rows(reference_mean, "reference_mean", n, d) - _rows(estimated_mean, "estimated_mean", n, d)
     # With reference S = R R' and estimate L L': tr(S^-1_est S) is the squared norm of L^-1 R, the distance of the means
     # that of L^-1 shift. Both are solved at once.
-    reference_tril = _definite_factor(reference, "reference")
-    estimated_tril = _definite_factor(estimated, "estimated")
     whitened = np.linalg.solve(estimated_tril, np.concatenate([reference_tril, shift[..., None]], axis=-1))
     log_ratio = _log_det(estimated_tril) - _log_det(reference_tril)
     divergence = 0.5 * (np.square(whitened).sum(axis=(-2, -1)) - d) + log_ratio
@@ -191,10 +189,9 @@ def log_likelihood_scorer(estimator: Any, X: ArrayLike, y: ArrayLike) -> float:
 
 def _whitened_residual(mean: ArrayLike, covariance: ArrayLike, y: ArrayLike) -> tuple[Floats, Floats]:
     """L^-1 (y - mean), and the Cholesky factors L of the covariances."""
-    covariance = _covariances(covariance, "covariance")
-    n, d, _ = covariance.shape
+    scale_tril = _factors(covariance, "covariance")
+    n, d, _ = scale_tril.shape
     residual = _rows(y, "y", n, d) - _rows(mean, "mean", n, d)
-    scale_tril = _definite_factor(covariance, "covariance")
     return np.linalg.solve(scale_tril, residual[..., None])[..., 0], scale_tril
 
 
@@ -218,8 +215,9 @@ def _log_det(scale_tril: Floats) -> Floats:
     return np.log(np.diagonal(scale_tril, axis1=-2, axis2=-1)).sum(-1)
 
 
-def _definite_factor(matrices: Floats, name: str) -> Floats:
-    """Cholesky factors of positive definite matrices."""
+def _factors(values: ArrayLike, name: str, shape: Sequence[int | str] = ("n", "d", "d")) -> Floats:
+    """Cholesky factors of positive definite covariances, one a row."""
+    matrices = _covariances(values, name, shape)
     try:
         return np.linalg.cholesky(matrices)
     except np.linalg.LinAlgError:
