@@ -49,12 +49,27 @@ def model():
     return TrajectoryRegressor().fit(X, y, groups=groups)
 
 
-def sample_series(kernel, length_scale, n_demos=8):
+def sample_series(kernel, length_scale, n_demos=8, seed=3):
     """Draws of a kernel's process of unit variance: (n_demos, n, 2)."""
     unit = correlation(*2 * [torch.from_numpy(GRID)[:, None]], torch.tensor([length_scale]).double(), kernel)
     root = torch.linalg.cholesky(unit + 1e-6 * torch.eye(len(GRID)))
-    normal = torch.from_numpy(np.random.default_rng(3).standard_normal((n_demos, len(GRID), 2)))
+    normal = torch.from_numpy(np.random.default_rng(seed).standard_normal((n_demos, len(GRID), 2)))
     return root @ normal
+
+
+def found_kernel(residual, *kernels):
+    """Time kernel of residuals whose deviations are one."""
+    grid = torch.from_numpy(GRID)
+    return fit_time_kernel(grid, residual, torch.ones_like(residual[0]), list(kernels), None)
+
+
+def whole_correlation(along):
+    """Correlation (n d, n d) of all entries, of that of each output (d, n, n)."""
+    d, n, _ = along.shape
+    whole = np.zeros((n, d, n, d))
+    for output in range(d):
+        whole[:, output, :, output] = along[output]
+    return whole.reshape(n * d, n * d)
 
 
 def dense(model, X):
@@ -70,7 +85,8 @@ def test_the_law_is_that_of_the_dense_reference(recordings, monkeypatch):
     spec = importlib.util.spec_from_file_location("trajectory_dense", file)
     oracle = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(oracle)
-    demos, X = movements(), GRID[:, np.newaxis]
+    # It has one time kernel for all outputs: here there is one.
+    demos, X = movements()[..., :1], GRID[:, np.newaxis]
     X_fit, y, groups = stacked(demos)
     regressor = HeteroscedasticGPRegressor().fit(X_fit, y, groups=groups)
     moments = regressor.predict(X, return_cov=True)
@@ -185,14 +201,15 @@ def test_a_movement_that_was_seen_halfway_is_foretold(recordings):
     assert fitted.score(X, y) > fitted.regressor_.score(X, y) + 2.0
 
 
-def test_steps_that_a_recording_has_not_are_left_out_of_it_not_drawn_through():
+def test_steps_that_a_recording_has_not_are_left_out_of_it_not_drawn_through(monkeypatch):
+    monkeypatch.setattr(time_kernel, "_RATIOS", ())  # without tremble
     demos = movements(8)
     time = [GRID] * 7 + [np.delete(GRID, slice(8, 20))]
     hole = [*demos[:7], np.delete(demos[7], slice(8, 20), axis=0)]
     without = TrajectoryRegressor(HeteroscedasticGPRegressor()).fit(Demonstrations([GRID] * 7, list(demos[:7])))
     fitted = TrajectoryRegressor(HeteroscedasticGPRegressor()).fit(Demonstrations(time, hole))
     # A straight line through the hole would be a far smoother series than the others, or a jump.
-    assert fitted.length_scale_ == pytest.approx(without.length_scale_, rel=0.4)
+    np.testing.assert_allclose(fitted.length_scale_, without.length_scale_, rtol=0.4)
     assert np.median(fitted.nugget_scale_) < 0.05
 
 
@@ -200,41 +217,62 @@ def test_nuggets_take_missing_steps_for_missing():
     residual = torch.from_numpy(movements(6, seed=2) - movements(6, seed=2).mean(0))
     holed = residual.clone()
     holed[0, 10:15] = torch.nan
-    grid = torch.from_numpy(GRID)
-    whole, part = (fit_time_kernel(grid, values, ["squared_exponential"], None) for values in (residual, holed))
-    assert float(part.scales[0, 0]) == pytest.approx(float(whole.scales[0, 0]), rel=0.4)
+    whole, part = (found_kernel(values, "squared_exponential") for values in (residual, holed))
+    torch.testing.assert_close(part.scales[:, 0], whole.scales[:, 0], rtol=0.4, atol=0.0)
     assert not part.residual.isnan().any()
     # What stands in the hole is near to what was cut out of it.
     assert (part.residual[0, 10:15] - whole.residual[0, 10:15]).abs().max() < 0.3
 
 
-def test_the_length_scale_that_made_the_movements_is_found():
-    residual = torch.from_numpy(movements(30, seed=5))
-    residual = residual - residual.mean(0)
-    found = fit_time_kernel(torch.from_numpy(GRID), residual / residual.std(0), ["squared_exponential"], None)
-    assert float(found.scales[0, 0]) == pytest.approx(0.2, rel=0.2)
+def test_the_length_scale_that_made_the_movements_is_found(monkeypatch):
+    monkeypatch.setattr(time_kernel, "_RATIOS", ())  # without tremble
+    found = found_kernel(sample_series("squared_exponential", 0.2, n_demos=30), "squared_exponential")
+    assert found.scales[:, 0].tolist() == pytest.approx([0.2, 0.2], rel=0.2)
 
 
 @pytest.mark.parametrize("kernel", ["squared_exponential", "matern52"])
 def test_the_likelier_kernel_is_that_of_the_movements(kernel):
     series = sample_series(kernel, 0.2)
-    assert fit_time_kernel(torch.from_numpy(GRID), series, ["matern52", "squared_exponential"], None).kernel == kernel
+    assert found_kernel(series, "matern52", "squared_exponential").kernel == kernel
 
 
 def test_two_length_scales_are_found_where_movements_have_them():
     # Slow deviations, and a tenth of their variance that changes four times as fast.
     slow, fast = sample_series("matern52", 0.6, n_demos=24), sample_series("matern52", 0.15, n_demos=24).flip(0)
-    found = fit_time_kernel(torch.from_numpy(GRID), 0.9**0.5 * slow + 0.1**0.5 * fast, ["matern52"], None)
-    (long, share), (short, rest) = found.scales.tolist()
-    assert (long, short) == (pytest.approx(0.6, rel=0.4), pytest.approx(0.15, rel=0.4))
-    assert share + rest == pytest.approx(1.0)
-    assert 0.03 < rest < 0.35
+    found = found_kernel(0.9**0.5 * slow + 0.1**0.5 * fast, "matern52")
+    for (long, short), fine in zip(found.scales.tolist(), found.fine, strict=True):
+        assert (long, short) == (pytest.approx(0.6, rel=0.4), pytest.approx(0.15, rel=0.4))
+        assert 0.03 < float(fine[0]) < 0.5  # it is 0.11 of the slow part's
+
+
+def test_each_output_has_the_correlation_of_its_own_movements():
+    lengths = (0.6, 0.1)
+    series = [sample_series("matern52", length, n_demos=24)[..., :1] for length in lengths]
+    found = found_kernel(torch.cat(series, dim=2), "matern52")
+    for own, length in zip(found.correlation(found.grid, found.grid), lengths, strict=True):
+        truth = correlation(*2 * [found.grid[:, None]], torch.tensor([length]).double(), "matern52")
+        assert (own - truth).abs().max() < 0.15
+
+
+def test_a_tremble_is_of_one_size_in_the_units_of_the_outputs():
+    # Deviations grow from a fifth to five, and a tremble has a standard deviation of 0.1 everywhere.
+    grid = np.linspace(0.0, 1.0, 30)
+    size = 0.2 * 25.0**grid
+    slow, fast = (sample_series("matern52", length, 24, seed)[..., :1].numpy() for seed, length in ((3, 0.4), (4, 0.1)))
+    demos = size[:, None] * slow + 0.1 * fast
+    X, y, groups = stacked(demos, grid)
+    model = TrajectoryRegressor().fit(X, y.ravel(), groups=groups)
+    drawn = model.sample_demonstrations(grid[:, None], n_samples=400, random_state=0).reshape(400, 30, 1)
+    thirds = [np.split(np.diff(each, 2, axis=1)[:, 2:-2], 3, axis=1) for each in (drawn, demos)]
+    for of_drawn, of_demos in zip(*thirds, strict=True):
+        assert 0.7 < of_drawn.std() / of_demos.std() < 1.4
 
 
 @pytest.mark.parametrize("kernel", ["squared_exponential", "matern52"])
 def test_the_share_is_the_likeliest_of_demonstrations_left_out(kernel):
     # Dense: the law of z under the others, with the blocks of the diagonal brought to one.
-    found = fit_time_kernel(torch.from_numpy(GRID), sample_series("matern52", 0.4, n_demos=4), [kernel], None)
+    series = torch.cat([sample_series("matern52", 0.4, 4)[..., :1], sample_series("matern52", 0.2, 4)[..., 1:]], dim=2)
+    found = found_kernel(series, kernel)
     along, residual = found.correlation(found.grid, found.grid).numpy(), found.residual.numpy()
     (n_demos, n, d), shares = residual.shape, np.array([1.0, 0.9, 0.75, 0.6, 0.45, 0.3, 0.2, 0.1, 0.05])
     values = []
@@ -242,7 +280,7 @@ def test_the_share_is_the_likeliest_of_demonstrations_left_out(kernel):
         total = 0.0
         for own in range(n_demos):
             others = np.delete(residual, own, axis=0).reshape(n_demos - 1, -1)
-            whole = share * np.kron(along, np.eye(d)) + (1.0 - share) * others.T @ others / (n_demos - 1)
+            whole = share * whole_correlation(along) + (1.0 - share) * others.T @ others / (n_demos - 1)
             blocks = [np.linalg.inv(np.linalg.cholesky(whole[i : i + d, i : i + d])) for i in range(0, n * d, d)]
             unit = block_diag(*blocks) @ whole @ block_diag(*blocks).T
             total += multivariate_normal(np.zeros(n * d), unit, allow_singular=True).logpdf(residual[own].ravel())

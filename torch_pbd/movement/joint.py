@@ -16,20 +16,21 @@ from torch_pbd.linalg import safe_cholesky, symmetrize
 class JointNormal:
     """Normal law of n steps of d outputs whose covariance is never formed unless it is asked for.
 
-    A movement is ``x_t = mean_t + A_t (g_t + U_t c)``: g has the correlation R over the steps, independently in each
-    output, and c is standard normal. Its covariance is ``A ((R - W W') kron I + U U') A' - V V'``, with A block
-    diagonal; W is what observations of whole steps have taken off, V what those of single entries have. Costs grow with
-    n^3 + n^2 d + n d (k + p)^2; those of what single steps are, given others, with n alone.
+    A movement is ``x_t = mean_t + A_t (g_t + U_t c)``: entry j of g has the correlation R_j over the steps, whatever
+    the others are, and c is standard normal. Its covariance is ``A (R - W W' + U U') A' - V V'``, with A block diagonal
+    in the steps, and R and W in the outputs, of which one may stand for all; W is what observations of whole steps have
+    taken off, V what those of single entries have. Costs grow with d n^3 + n d (k + p)^2; those of what single steps
+    are, given others, with n alone.
     """
 
     mean: Float[Tensor, "n d"]
     factor: Float[Tensor, "n d d"]
     """A, one block a step."""
-    prior_correlation: Float[Tensor, "n n"]
+    prior_correlation: Float[Tensor, "c n n"]
     """R, positive semidefinite."""
     loadings: Float[Tensor, "n d k"]
     """U."""
-    taken: Float[Tensor, "n m"]
+    taken: Float[Tensor, "c n m"]
     """W."""
     explained: Float[Tensor, "n d p"]
     """V."""
@@ -39,11 +40,11 @@ class JointNormal:
         cls,
         mean: Float[Tensor, "n d"],
         factor: Float[Tensor, "n d d"],
-        correlation: Float[Tensor, "n n"],
+        correlation: Float[Tensor, "c n n"],
         loadings: Float[Tensor, "n d k"],
     ) -> "JointNormal":
         """Law before anything is observed."""
-        return cls(mean, factor, correlation, loadings, correlation[:, :0], loadings[:, :, :0])
+        return cls(mean, factor, correlation, loadings, correlation[..., :0], loadings[..., :0])
 
     @classmethod
     def with_noise(
@@ -51,38 +52,41 @@ class JointNormal:
     ) -> "JointNormal":
         """Law of ``mean_t + loadings_t c`` and of noise of this scale, independent in all steps and outputs."""
         n, d = mean.shape
-        return cls.prior(mean, scale.diag().expand(n, d, d), torch.eye(n).to(mean), loadings / scale[:, None])
+        return cls.prior(mean, scale.diag().expand(n, d, d), torch.eye(n).to(mean)[None], loadings / scale[:, None])
 
     @cached_property
-    def _correlation(self) -> Float[Tensor, "n n"]:
+    def _correlation(self) -> Float[Tensor, "c n n"]:
         """R - W W'."""
         return symmetrize(self.prior_correlation - self.taken @ self.taken.mT)
 
     @cached_property
-    def correlation_root(self) -> Float[Tensor, "n n"]:
+    def correlation_root(self) -> Float[Tensor, "c n n"]:
         """Lower Cholesky factor of R - W W'."""
         return safe_cholesky(self._correlation, name="the correlation along the movement")
 
     def at(self, steps: Int[Tensor, " m"]) -> "JointNormal":
         """Law of some of the steps."""
-        rows = (part[steps] for part in (self.mean, self.factor, self.prior_correlation[:, steps]))
-        return JointNormal(*rows, *(part[steps] for part in (self.loadings, self.taken, self.explained)))
+        mean, factor, loadings, explained = (
+            part[steps] for part in (self.mean, self.factor, self.loadings, self.explained)
+        )
+        between = self.prior_correlation[:, steps][:, :, steps]
+        return JointNormal(mean, factor, between, loadings, self.taken[:, steps], explained)
 
-    def joined(self, other: "JointNormal", between: Float[Tensor, "n m"]) -> "JointNormal":
+    def joined(self, other: "JointNormal", between: Float[Tensor, "c n m"]) -> "JointNormal":
         """Law of the steps of both, of which nothing is observed, and which are correlated between each other."""
-        upper = torch.cat([self.prior_correlation, between], dim=1)
+        upper = torch.cat([self.prior_correlation, between], dim=2)
         return JointNormal.prior(
             torch.cat([self.mean, other.mean]),
             torch.cat([self.factor, other.factor]),
-            torch.cat([upper, torch.cat([between.mT, other.prior_correlation], dim=1)]),
+            torch.cat([upper, torch.cat([between.mT, other.prior_correlation], dim=2)], dim=1),
             torch.cat([self.loadings, other.loadings]),
         )
 
     def covariance(self) -> Float[Tensor, "n d n d"]:
         """Whole covariance: n d squared numbers."""
-        # The inner part (R - W W') kron I + U U' first, and then a block of A on either side.
+        # The inner part R - W W' + U U' first, and then a block of A on either side.
         n, d = self.mean.shape
-        inner = torch.einsum("ij,ab->iajb", self._correlation, torch.eye(d).to(self.mean))
+        inner = torch.diag_embed(self._correlation.expand(d, n, n).permute(1, 2, 0)).transpose(1, 2)
         flat = self.loadings.reshape(n * d, -1)
         inner = inner + (flat @ flat.mT).reshape(n, d, n, d)
         explained = self.explained.reshape(n * d, -1)
@@ -91,9 +95,9 @@ class JointNormal:
 
     def marginal(self) -> Float[Tensor, "n d d"]:
         """Covariance of the outputs at each step."""
-        variance = self.prior_correlation.diagonal() - self.taken.square().sum(1)
+        variance = self.prior_correlation.diagonal(dim1=1, dim2=2) - self.taken.square().sum(2)
         inner = self.loadings @ self.loadings.mT
-        inner.diagonal(dim1=1, dim2=2).add_(variance[:, None])
+        inner.diagonal(dim1=1, dim2=2).add_(variance.mT)
         return symmetrize(self.factor @ inner @ self.factor.mT - self.explained @ self.explained.mT)
 
     def log_density(self, x: Float[Tensor, "n d"], df: float) -> float:
@@ -101,14 +105,16 @@ class JointNormal:
         root, loadings = self.correlation_root, self.loadings
 
         def solve_correlation(right: Float[Tensor, "n d s"]) -> Float[Tensor, "n d s"]:
-            return torch.cholesky_solve(right.flatten(1), root).reshape(right.shape)
+            return torch.cholesky_solve(right.transpose(0, 1), root).transpose(0, 1)
 
-        # The inner matrix S = R kron I + U U' by Woodbury, with R for R kron I: inv(R) - inv(R) U inv(C) U' inv(R) of
-        # the capacitance C = I + U' inv(R) U; its determinant is det(R)^d det(C).
+        # The inner matrix S = R + U U' by Woodbury: inv(R) - inv(R) U inv(C) U' inv(R) of the capacitance
+        # C = I + U' inv(R) U; its determinant is det(R) det(C).
         whitened = solve_correlation(loadings)
         gram = torch.einsum("ndk,ndl->kl", loadings, whitened)
         capacitance_root = torch.linalg.cholesky(symmetrize(gram) + torch.eye(len(gram)).to(gram))
-        log_det = 2.0 * (x.shape[1] * root.diagonal().log().sum() + capacitance_root.diagonal().log().sum())
+        n_alike = x.shape[1] // len(root)
+        along = n_alike * root.diagonal(dim1=1, dim2=2).log().sum()
+        log_det = 2.0 * (along + capacitance_root.diagonal().log().sum())
         log_det = log_det + 2.0 * torch.linalg.slogdet(self.factor).logabsdet.sum()
 
         def solve_inner(right: Float[Tensor, "n d s"]) -> Float[Tensor, "n d s"]:
@@ -171,16 +177,16 @@ class Conditioned:
         steps, n_loadings = self._steps, prior.loadings.shape[-1]
         if not len(steps):
             return
-        between = prior.prior_correlation[:, steps]
-        root = safe_cholesky(between[steps], name="the correlation of the steps given")
+        between = prior.prior_correlation[:, :, steps]
+        root = safe_cholesky(between[:, steps], name="the correlation of the steps given")
         self._taken = torch.linalg.solve_triangular(root.mT, between, upper=True, left=False)
         self._gain = torch.linalg.solve_triangular(root, self._taken, upper=False, left=False)
-        loadings = prior.loadings[steps]
-        half = torch.linalg.solve_triangular(root, loadings.flatten(1), upper=False)
-        self._whitened = torch.linalg.solve_triangular(root.mT, half, upper=True).reshape(loadings.shape)
+        loadings = prior.loadings[steps].transpose(0, 1)  # (d, m, k)
+        half = torch.linalg.solve_triangular(root, loadings, upper=False)
+        self._whitened = torch.linalg.solve_triangular(root.mT, half, upper=True)
         half = half.reshape(-1, n_loadings)
         self._precision_root = torch.linalg.cholesky(half.mT @ half + torch.eye(n_loadings).to(loadings))
-        self._open = prior.loadings - (self._gain @ loadings.flatten(1)).reshape(prior.loadings.shape)
+        self._open = prior.loadings - (self._gain @ loadings).transpose(0, 1)
 
     @cached_property
     def law(self) -> JointNormal:
@@ -211,8 +217,8 @@ class Conditioned:
         """
         prior = self._prior
         n, d, n_loadings = prior.loadings.shape
-        along = (prior.correlation_root @ normal((n, n_draws * d))).reshape(n, n_draws, d)
-        inner = along.permute(1, 0, 2) + torch.einsum("ndk,ks->snd", prior.loadings, normal((n_loadings, n_draws)))
+        along = prior.correlation_root @ normal((d * n, n_draws)).reshape(d, n, n_draws)
+        inner = along.permute(2, 1, 0) + torch.einsum("ndk,ks->snd", prior.loadings, normal((n_loadings, n_draws)))
         drawn = torch.einsum("nab,snb->sna", prior.factor, inner)
         if len(self._steps):
             drawn = drawn - self._from_steps(drawn[:, self._steps])
@@ -227,17 +233,17 @@ class Conditioned:
         """Change of the mean by what steps that are known whole deviate from it."""
         factor = self._prior.factor
         inner = torch.linalg.solve(factor[self._steps], residual[..., None])[..., 0]
-        projected = inner.flatten(1) @ self._whitened.flatten(0, 1)  # (s, k)
+        projected = torch.einsum("smd,dmk->sk", inner, self._whitened)
         common = torch.cholesky_solve(projected.mT, self._precision_root)
-        change = torch.einsum("nm,smd->snd", self._gain, inner) + (self._open @ common).permute(2, 0, 1)
+        change = (self._gain @ inner.permute(2, 1, 0)).permute(2, 1, 0) + (self._open @ common).permute(2, 0, 1)
         return torch.einsum("nab,snb->sna", factor, change)
 
     def _entries(self, law: JointNormal) -> tuple[Float[Tensor, "n d p"], Float[Tensor, "p p"]]:
         """Covariances of everything with the single entries, given the exact steps, and the root of their own."""
         steps, directions = self._entry_steps, self._directions
         rows = torch.einsum("pc,pcd->pd", directions, law.factor[steps])
-        between = law.prior_correlation[:, steps] - law.taken @ law.taken[steps].mT
-        inner = torch.einsum("np,pd->ndp", between, rows)
+        between = law.prior_correlation[:, :, steps] - law.taken @ law.taken[:, steps].mT
+        inner = between.transpose(0, 1) * rows.mT
         inner = inner + law.loadings @ torch.einsum("pd,pdk->kp", rows, law.loadings[steps])
         columns = law.factor @ inner
         own = torch.einsum("pd,pdq->pq", directions, columns[steps]) + torch.diag(self._entry_noise.square())

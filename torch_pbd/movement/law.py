@@ -72,7 +72,7 @@ class MovementLaw(BaseEstimator, ABC):
 
     def _between(self, time: Floats, other: Floats) -> Tensor:
         """Correlation between other times, that of :class:`JointNormal`: noise has none."""
-        return torch.zeros(len(time), len(other), dtype=torch.float64)
+        return torch.zeros(1, len(time), len(other), dtype=torch.float64)
 
     @abstractmethod
     def _arrays(self) -> dict[str, Floats]:

@@ -1,12 +1,14 @@
-"""Correlation of a demonstration along its course: a kernel of time, a nugget at each step, and the loadings.
+"""Correlation of a demonstration along its course: a kernel of time for each output, nuggets, and the loadings.
 
-Whitened residuals ``z`` of the demonstrations, of unit covariance at each step, are taken for ``g_t + eps_t``: g has a
-stationary kernel over time, eps_t is independent with a variance e_t, the nugget. One nugget for all steps would have
-to be as large as where movements start or end in one point, which marginals mistrack, and would spoil all others.
+Whitened residuals ``z`` of the demonstrations, of unit covariance at each step, are taken for ``g_t + eps_t`` in each
+output: g has a kernel over time, eps_t is independent with a variance e_t, the nugget. One nugget for all steps would
+have to be as large as where movements start or end in one point, which marginals mistrack, and would spoil all others.
 
-The kernel is of one length scale, or of two that are added: what people vary slowly and what little they tremble. One
-alone must be as short as the tremble, which the likelihood sees best, and then draws are rougher and longer than
-demonstrations.
+The kernel has one length scale, or is the sum of two: what people vary slowly, and what little they tremble. The slow
+part is a share of the deviation at each step, which whitening makes one. A tremble is of one size in the units of the
+outputs, however much people vary there: in whitened residuals it is large where the deviation is small, and in the
+outputs that have little left of their own. One kernel for all must be as rough as the roughest of them, and draws are
+then rougher and longer than demonstrations.
 """
 
 import math
@@ -20,19 +22,29 @@ from torch import Tensor, nn
 from torch_pbd.kernels import correlation
 from torch_pbd.linalg import safe_cholesky, symmetrize
 
-Scales = Sequence[Sequence[float]]  # length scales and weights
-
 # Length scales in ranges of the time, from the spacing of some fifty steps to a movement that bends once; and nuggets
 # shared by all steps.
 _LENGTHS = torch.logspace(math.log10(0.02), 0.0, 14, dtype=torch.float64).tolist()
 _NUGGETS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1)
-_FINE_WEIGHTS, _RATIOS = (0.03, 0.1, 0.3, 0.6), (2.0, 4.0)  # of the shorter of two scales; and of the longer over it
+_FINE_WEIGHTS, _RATIOS = (
+    (0.03, 0.1, 0.3, 0.6),
+    (2.0, 4.0),
+)  # of the tremble at a usual step; of slow length over its own
 _LEAST, _MOST, _FIRST = 1e-6, 1e3, 1e-2  # nuggets: smallest, largest, and where expectation maximization starts
 _N_STEPS, _TOLERANCE = 40, 0.02  # of expectation maximization: iterations, and change of a logarithm that ends it
 _SMOOTH = 1e-3  # nugget of a step that is told apart from noise: such steps decide on the length scale
+_NEAR = 2.5  # factor of a length scale, in which it is looked for again once there are nuggets
 _USUAL = 2.0  # factor of the median, in which the size of a step's residuals lies
 _ROUNDS = 3  # of nuggets and length scale, which depend on each other
 _SHARES = (1.0, 0.9, 0.75, 0.6, 0.45, 0.3, 0.2, 0.1, 0.05)  # of the kernel, the rest being the demonstrations' own
+
+
+class Scales(NamedTuple):
+    """Length scales of the slow part and of the tremble, and the tremble's weight at a usual step, zero without one."""
+
+    slow: float
+    fine: float
+    weight: float
 
 
 class Found(NamedTuple):
@@ -44,15 +56,17 @@ class Found(NamedTuple):
 
 
 class TimeKernel(nn.Module):
-    """Correlation along the movement as it was found on a grid of T steps, from K demonstrations.
+    """Correlation along the movement as it was found on a grid of T steps, from K demonstrations of d outputs.
 
-    ``scales`` (s, 2) are length scales, the longest first, and the weights of their correlations, which add up to one;
-    ``nugget`` (T,) is that of each step, ``residual`` (K, T, d) are whitened residuals without holes. ``share`` is the
-    weight of the kernel's correlation; the rest is that of the demonstrations' own residuals.
+    ``scales`` (d, 2) are the length scales of the slow part and of the tremble of each output, ``fine`` (d, T) is the
+    variance of the tremble over that of the slow part, ``nugget`` (d, T) that of the independent part over both, and
+    ``residual`` (K, T, d) are whitened residuals without holes. ``share`` is the weight of the kernel's correlation;
+    the rest is that of the demonstrations' own residuals.
     """
 
     grid: Tensor
     scales: Tensor
+    fine: Tensor
     nugget: Tensor
     residual: Tensor
     share: Tensor
@@ -60,113 +74,177 @@ class TimeKernel(nn.Module):
     _left: Tensor
 
     def __init__(
-        self, kernel: str, grid: Tensor, scales: Tensor, nugget: Tensor, residual: Tensor, share: Tensor
+        self, kernel: str, grid: Tensor, scales: Tensor, fine: Tensor, nugget: Tensor, residual: Tensor, share: Tensor
     ) -> None:
         super().__init__()
         self.kernel = kernel
-        buffers = {"grid": grid, "scales": scales, "nugget": nugget, "residual": residual, "share": share}
+        buffers = {"grid": grid, "scales": scales, "fine": fine, "nugget": nugget, "residual": residual, "share": share}
         for name, value in buffers.items():
             self.register_buffer(name, value)
-        # Weights of the kernel that make up the smooth parts of all residuals, and what these leave of them: (T, d K).
-        rows = residual.permute(1, 2, 0).reshape(len(grid), -1)
-        own = self._correlation(grid, grid)
-        root = safe_cholesky(own + torch.diag(nugget), name="the time kernel")
+        # Weights of the kernel that make up the smooth parts of all residuals, and what these leave of them: (d, T, K).
+        rows, own = residual.permute(2, 1, 0), self._correlation(grid, grid)
+        root = safe_cholesky(own + torch.diag_embed(nugget), name="the time kernel")
         self.register_buffer("_weights", torch.cholesky_solve(rows, root), persistent=False)
         self.register_buffer("_left", rows - own @ self._weights, persistent=False)
 
-    def correlation(self, time: Float[Tensor, " n"], other: Float[Tensor, " m"]) -> Float[Tensor, "n m"]:
+    def correlation(self, time: Float[Tensor, " n"], other: Float[Tensor, " m"]) -> Float[Tensor, "d n m"]:
         """Correlation between any times: nuggets are linear between steps; equal times are one."""
-        own, nugget = (_interpolated(self.grid, self.nugget[:, None], part)[:, 0] for part in (time, other))
-        whole = self._correlation(time, other) + torch.where(time[:, None] == other, nugget, 0.0)
-        return (1.0 + own).rsqrt()[:, None] * whole * (1.0 + nugget).rsqrt()
+        own, nugget = (_interpolated(self.grid, self.nugget, part) for part in (time, other))
+        whole = self._correlation(time, other)
+        whole = whole + torch.where(time[:, None] == other, nugget[:, None], 0.0)
+        return (1.0 + own).rsqrt()[:, :, None] * whole * (1.0 + nugget).rsqrt()[:, None]
 
     def loadings(self, time: Float[Tensor, " n"]) -> Float[Tensor, "n d K"]:
         """Residuals of the demonstrations at any times: smooth parts by the kernel, what is left of them linear."""
-        n_demos, _, d = self.residual.shape
-        whole = self._correlation(time, self.grid) @ self._weights + _interpolated(self.grid, self._left, time)
-        return whole.reshape(len(time), d, n_demos)
+        left = _interpolated(self.grid, self._left.mT.flatten(0, 1), time).reshape(*self._left.mT.shape[:2], -1)
+        return (self._correlation(time, self.grid) @ self._weights + left.mT).transpose(0, 1)
 
-    def _correlation(self, time: Tensor, other: Tensor) -> Tensor:
-        return _correlation(time, other, self.scales.tolist(), self.kernel)
+    def _correlation(self, time: Tensor, other: Tensor) -> Float[Tensor, "d n m"]:
+        own, fine = (_interpolated(self.grid, self.fine, part) for part in (time, other))
+        return _smooth(time, other, self.scales, own, fine, self.kernel)
 
 
 def fit_time_kernel(
-    grid: Float[Tensor, " T"], residual: Float[Tensor, "K T d"], kernels: Sequence[str], share: float | None
+    grid: Float[Tensor, " T"],
+    residual: Float[Tensor, "K T d"],
+    deviation: Float[Tensor, "T d"],
+    kernels: Sequence[str],
+    share: float | None,
 ) -> TimeKernel:
     """Time kernel of whitened residuals, NaN where a demonstration has no sample near, over times of a range of one.
 
-    The likeliest of the ``kernels`` is taken, and for ``share`` None that under which demonstrations left out in turn
-    are likeliest.
+    The residuals of an output were divided by its ``deviation``, after those before it were taken out. The likeliest of
+    the ``kernels`` is taken, and for ``share`` None that under which demonstrations left out in turn are likeliest.
     """
-    residual = _unit_rms(residual)
-    sizes = residual.square().nanmean((0, 2)).sqrt()
-    usual = (sizes > sizes.nanmedian() / _USUAL) & (sizes < sizes.nanmedian() * _USUAL)
-    kernel = max(kernels, key=lambda name: _search(grid, residual, usual, name, 1).log_likelihood)
+    outputs = [_unit_rms(part) for part in residual.split(1, dim=2)]
+    usual = [_usual_steps(part) for part in outputs]
+    found = {name: [_search(grid, *each, name) for each in zip(outputs, usual, strict=True)] for name in kernels}
+    kernel = max(kernels, key=lambda name: sum(each.log_likelihood for each in found[name]))
     shares = _SHARES if share is None else (share,)
-    # A second scale is likelier for residuals by themselves, not always beside those of the others.
-    results = [_fit_scales(grid, residual, usual, kernel, n_scales) for n_scales in (1, 2)]
-    likelihood, chosen = zip(*(_left_out(result, shares) for result in results), strict=True)
-    best = int(likelihood[1] > likelihood[0])
-    results[best].share.fill_(chosen[best])
-    return results[best]
+    tremble = deviation.median(0).values / deviation
+    fitted = []
+    for part, steps, size, single in zip(outputs, usual, tremble.mT, found[kernel], strict=True):
+        # A tremble is likelier for residuals by themselves, not always beside those of the others.
+        results = [_fit_output(grid, part, steps, size, kernel, single, is_sum) for is_sum in (False, True)]
+        fitted.append(max(results, key=lambda result: _left_out(result, shares)[0]))
+    stacked = {name: torch.cat([getattr(each, name) for each in fitted]) for name in ("scales", "fine", "nugget")}
+    filled = torch.cat([each.residual for each in fitted], dim=2)
+    whole = TimeKernel(kernel, grid, **stacked, residual=filled, share=grid.new_ones(()))
+    whole.share.fill_(_left_out(whole, shares)[1])
+    return whole
 
 
-def _fit_scales(grid: Tensor, residual: Tensor, usual: Bool[Tensor, " T"], kernel: str, n_scales: int) -> TimeKernel:
-    """Scales and nuggets by turns, from the scales of the usual steps on; the share is open."""
-    found = _search(grid, residual, usual, kernel, n_scales)
-    unit = _correlation(grid, grid, found.scales, kernel)
+def _usual_steps(residual: Float[Tensor, "K T 1"]) -> Bool[Tensor, " T"]:
+    """Steps at which residuals are about as large as elsewhere."""
+    sizes = residual.square().nanmean((0, 2)).sqrt()
+    return (sizes > sizes.nanmedian() / _USUAL) & (sizes < sizes.nanmedian() * _USUAL)
+
+
+def _fit_output(
+    grid: Tensor,
+    residual: Float[Tensor, "K T 1"],
+    usual: Bool[Tensor, " T"],
+    tremble: Float[Tensor, " T"],
+    kernel: str,
+    single: Found,
+    is_sum: bool,
+) -> TimeKernel:
+    """Scales and nuggets of one output by turns, from what is likeliest of the usual steps on."""
+    found = _with_tremble(grid, residual, usual, kernel, single, tremble) if is_sum else single
+    unit = _candidates(grid, tremble, [found.scales], kernel)[0]
     nugget = _step_nuggets(unit, residual, _LEAST)
     for _ in range(_ROUNDS):
         smooth = nugget <= _SMOOTH
         steps = smooth if 2 * smooth.sum() >= len(grid) else nugget <= nugget.median()
-        before, found = found, _search(grid, residual, steps, kernel, n_scales)
+        before, single = found, _search(grid, residual, steps, kernel, single.scales.slow)
+        found = _with_tremble(grid, residual, steps, kernel, single, tremble) if is_sum else single
         if found[1:] == before[1:]:
             break
-        unit = _correlation(grid, grid, found.scales, kernel)
+        unit = _candidates(grid, tremble, [found.scales], kernel)[0]
         nugget = _step_nuggets(unit, residual, min(found.nugget, 0.1 * _SMOOTH))
     filled = residual.clone()
     for k, own in enumerate(residual):  # the kernel's expectation where there were no samples
         seen = ~own.isnan().any(1)
         root = safe_cholesky(unit[seen][:, seen] + torch.diag(nugget[seen]), name="the time kernel")
         filled[k, ~seen] = unit[~seen][:, seen] @ torch.cholesky_solve(own[seen], root)
-    return TimeKernel(kernel, grid, grid.new_tensor(found.scales), nugget, filled, grid.new_ones(()))
+    scales, fine = _tensors(tremble, [found.scales])
+    return TimeKernel(kernel, grid, scales, fine, nugget[None], filled, grid.new_ones(()))
 
 
-def _correlation(
-    time: Float[Tensor, " n"], other: Float[Tensor, " m"], scales: Scales, kernel: str
-) -> Float[Tensor, "n m"]:
-    """Correlation of the smooth part, of unit variance."""
-    rows, columns = time[:, None], other[:, None]
-    each = [w * correlation(rows, columns, time.new_tensor([length]), kernel) for length, w in scales]
-    return torch.stack(each).sum(0)
+def _tensors(
+    tremble: Float[Tensor, " n"], scales: Sequence[Scales]
+) -> tuple[Float[Tensor, "b 2"], Float[Tensor, "b n"]]:
+    """Length scales, and variances of the tremble over those of the slow part."""
+    whole = tremble.new_tensor(scales)
+    weight = whole[:, 2:]
+    return whole[:, :2], weight / (1.0 - weight) * tremble.square()
 
 
-def _search(grid: Tensor, residual: Tensor, steps: Bool[Tensor, " T"], kernel: str, n_scales: int) -> Found:
-    """Likeliest of one scale, or of two on either side of it: the finer takes what a part of the nugget stood for."""
-    steps = steps if 2 * int(steps.sum()) >= len(grid) else torch.ones_like(steps)
-    groups, time = _by_pattern(_unit_rms(residual[:, steps])), grid[steps]
-    found = _likeliest(time, groups, kernel, [((length, 1.0),) for length in _LENGTHS], _NUGGETS)
-    single = found.scales[0][0]
-    pairs = [
-        ((long, 1.0 - weight), (long / ratio, weight))
+def _candidates(
+    time: Float[Tensor, " n"], tremble: Float[Tensor, " n"], scales: Sequence[Scales], kernel: str
+) -> Float[Tensor, "b n n"]:
+    lengths, fine = _tensors(tremble, scales)
+    return _smooth(time, time, lengths, fine, fine, kernel)
+
+
+def _smooth(
+    time: Float[Tensor, " n"],
+    other: Float[Tensor, " m"],
+    scales: Float[Tensor, "b 2"],
+    fine: Float[Tensor, "b n"],
+    other_fine: Float[Tensor, "b m"],
+    kernel: str,
+) -> Float[Tensor, "b n m"]:
+    """Correlation of the smooth part, of unit variance: of a slow one, and of a tremble of these variances over it."""
+    # Many share a length scale, and exponentials are what this costs.
+    lengths, places = torch.unique(scales, return_inverse=True)
+    each = correlation(time[:, None], other[:, None], lengths[:, None], kernel)
+    slow = each[places[:, 0]]
+    if not bool(fine.any()):
+        return slow
+    whole = slow + fine.sqrt()[:, :, None] * each[places[:, 1]] * other_fine.sqrt()[:, None]
+    return (1.0 + fine).rsqrt()[:, :, None] * whole * (1.0 + other_fine).rsqrt()[:, None]
+
+
+def _search(
+    grid: Tensor, residual: Float[Tensor, "K T 1"], steps: Bool[Tensor, " T"], kernel: str, near: float | None = None
+) -> Found:
+    """Likeliest length scale, of all or of those near one that was likely, at some steps of an output."""
+    lengths = [length for length in _LENGTHS if near is None or near / _NEAR <= length <= near * _NEAR]
+    candidates = [Scales(length, length, 0.0) for length in lengths]
+    return _likeliest(grid, residual, steps, kernel, candidates, _NUGGETS, torch.zeros_like(grid))
+
+
+def _with_tremble(
+    grid: Tensor, residual: Tensor, steps: Tensor, kernel: str, single: Found, tremble: Float[Tensor, " T"]
+) -> Found:
+    """Likeliest of one length scale, and of two on either side of it: a tremble takes a part of the nugget's place."""
+    length = single.scales.slow
+    candidates = [
+        Scales(slow, slow / ratio, weight)
         for ratio in _RATIOS
-        for long in _LENGTHS
-        if n_scales == 2 and single <= long <= ratio * single
+        for slow in _LENGTHS
+        if length <= slow <= ratio * length
         for weight in _FINE_WEIGHTS
     ]
-    nuggets = [nugget for nugget in _NUGGETS if nugget <= found.nugget]
-    return max(found, _likeliest(time, groups, kernel, pairs, nuggets)) if pairs else found
+    nuggets = [nugget for nugget in _NUGGETS if nugget <= single.nugget]
+    pairs = [_likeliest(grid, residual, steps, kernel, candidates, nuggets, tremble)] if candidates else []
+    return max([single, *pairs])
 
 
 def _likeliest(
-    time: Tensor,
-    groups: list[tuple[Tensor, Tensor]],
+    grid: Tensor,
+    residual: Float[Tensor, "K T 1"],
+    steps: Bool[Tensor, " T"],
     kernel: str,
     candidates: Sequence[Scales],
     nuggets: Sequence[float],
+    tremble: Float[Tensor, " T"],
 ) -> Found:
     """Highest log likelihood of ``(1 - eta) K + eta I``, and its scales and shared nugget eta."""
-    unit = torch.stack([_correlation(time, time, scales, kernel) for scales in candidates])
+    steps = steps if 2 * int(steps.sum()) >= len(grid) else torch.ones_like(steps)
+    groups, time = _by_pattern(_unit_rms(residual[:, steps])), grid[steps]
+    unit = _candidates(time, tremble[steps], candidates, kernel)
     values = []
     for nugget in nuggets:
         whole = (1.0 - nugget) * unit + nugget * torch.eye(len(time)).to(time)
@@ -214,7 +292,7 @@ def _step_nuggets(unit: Float[Tensor, "T T"], residual: Float[Tensor, "K T d"], 
 def _left_out(kernel: TimeKernel, shares: Sequence[float]) -> tuple[float, float]:
     """Highest log likelihood of each demonstration under the law that the others' residuals give, and its share.
 
-    Their law is ``z = C^-1 y``, y of the covariance ``S = share R kron I + (1 - share) / (K - 1) sum z z'`` over the
+    Their law is ``z = C^-1 y``, y of the covariance ``S = share R + (1 - share) / (K - 1) sum z z'`` over the
     others and ``C_t = chol S_tt``, which keeps the marginals: it bends the smooth part, and costs where that has little
     variance. With the Gram matrix G of all under R^-1, ``M = G + a I``, ``a = share (K - 1) / (1 - share)`` and
     ``c = Z' R^-1 y``, the squared distance is ``(y' R^-1 y - c' M^-1 c) / share`` and the determinant that of M over
@@ -225,7 +303,11 @@ def _left_out(kernel: TimeKernel, shares: Sequence[float]) -> tuple[float, float
         return 0.0, shares[0]
     root = safe_cholesky(kernel.correlation(kernel.grid, kernel.grid), name="the correlation along the movement")
     residual = kernel.residual
-    whitened = torch.linalg.solve_triangular(root, residual, upper=False).flatten(1)
+
+    def whiten(rows: Float[Tensor, "K T d"]) -> Float[Tensor, "K s"]:
+        return torch.linalg.solve_triangular(root, rows.permute(2, 1, 0), upper=False).flatten(0, 1).mT
+
+    whitened = whiten(residual)
     gram, outer = symmetrize(whitened @ whitened.mT), residual[..., None] * residual[..., None, :]
     unit, others = torch.eye(d).to(gram), (outer.sum(0) - outer) / (n_demos - 1)
 
@@ -233,7 +315,7 @@ def _left_out(kernel: TimeKernel, shares: Sequence[float]) -> tuple[float, float
         if share == 1.0:
             return -0.5 * float(gram.trace())
         factor = torch.linalg.cholesky(share * unit + (1.0 - share) * others)
-        inner = torch.linalg.solve_triangular(root, (factor @ residual[..., None])[..., 0], upper=False).flatten(1)
+        inner = whiten((factor @ residual[..., None])[..., 0])
         ridge = share * (n_demos - 1) / (1.0 - share)
         inverse = torch.linalg.inv(gram + ridge * torch.eye(n_demos).to(gram))
         own = inverse.diagonal()
@@ -245,7 +327,8 @@ def _left_out(kernel: TimeKernel, shares: Sequence[float]) -> tuple[float, float
         log_det = n_steps * d * math.log(share) - (n_demos - 1) * math.log(ridge) + own.log() - torch.logdet(inverse)
         return float((factor.diagonal(dim1=-2, dim2=-1).log().sum((1, 2)) - 0.5 * (square + log_det)).sum())
 
-    unit_log_det = n_demos * d * float(root.diagonal().log().sum())  # the same for all shares, but not for all kernels
+    # The same for all shares, but not for all kernels.
+    unit_log_det = n_demos * float(root.diagonal(dim1=1, dim2=2).log().sum())
     values = list(map(left_out, shares))
     return max(values) - unit_log_det, shares[values.index(max(values))]
 
@@ -267,8 +350,10 @@ def _unit_rms(residual: Tensor) -> Tensor:
     return residual / residual.square().nanmean().sqrt().clamp_min(torch.finfo(residual.dtype).tiny)
 
 
-def _interpolated(grid: Float[Tensor, " T"], values: Float[Tensor, "T c"], time: Float[Tensor, " n"]) -> Tensor:
+def _interpolated(
+    grid: Float[Tensor, " T"], values: Float[Tensor, "c T"], time: Float[Tensor, " n"]
+) -> Float[Tensor, "c n"]:
     """Values at other times, linear between steps and constant beyond them."""
     right = torch.searchsorted(grid, time.contiguous()).clamp(1, len(grid) - 1)
-    weight = ((time - grid[right - 1]) / (grid[right] - grid[right - 1])).clamp(0.0, 1.0)[:, None]
-    return torch.lerp(values[right - 1], values[right], weight)
+    weight = ((time - grid[right - 1]) / (grid[right] - grid[right - 1])).clamp(0.0, 1.0)
+    return torch.lerp(values[:, right - 1], values[:, right], weight)

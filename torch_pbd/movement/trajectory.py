@@ -31,9 +31,10 @@ _WHOLE = 2.0
 class TrajectoryLaw(nn.Module):
     """Joint law of a movement, as a torch module: differentiable in the times.
 
-    With marginals of mean m_t and covariance ``C_t = L_t L_t'``, the correlation R of the time kernel and the residuals
-    z_k of K demonstrations, the covariance is ``Sigma = A S A'``, ``S = w R kron I + (1 - w) / K sum_k z_k z_k'`` and
-    ``A_t = L_t chol(S_tt)^-1``: its blocks ``Sigma_tt`` are the marginals' C_t.
+    With marginals of mean m_t and covariance ``C_t = L_t L_t'``, the correlation R_j of the time kernel of each output
+    and the whitened residuals z_k of K demonstrations, the covariance is ``Sigma = A S A'``, of
+    ``S = w blockdiag(R_1, R_2, ...) + (1 - w) / K sum_k z_k z_k'`` and ``A_t = L_t chol(S_tt)^-1``: its blocks
+    ``Sigma_tt`` are the marginals' C_t.
     """
 
     x_shift: Tensor
@@ -69,10 +70,12 @@ class TrajectoryLaw(nn.Module):
 class TrajectoryRegressor(TimedMovement):
     """Law of a whole demonstration: the marginals of a covariance regressor, and a correlation along the movement.
 
-    Marginals stay the regressor's. Demonstrations are smooth: what one deviates by now it deviates by soon after. The
-    correlation is a stationary kernel of time with a nugget at each step, shrunk towards that of the demonstrations
-    themselves. The law is one Student's t, with one chi-squared a movement, for draws and scores; it is conditioned by
-    the normal formulas. No matrix of all steps and outputs is formed but for :meth:`predict_joint`.
+    Marginals stay the regressor's. Demonstrations are smooth: what one deviates by now it deviates by soon after. Each
+    output, after those before it are taken out, has a kernel of time and a nugget at each step: a slow part that is a
+    share of the deviation there, and a tremble of one size in the output's units. This is shrunk towards the
+    correlation of the demonstrations themselves. The law is one Student's t, with one chi-squared a movement, for draws
+    and scores; it is conditioned by the normal formulas. No matrix of all steps and outputs is formed but for
+    :meth:`predict_joint`.
 
     Parameters
     ----------
@@ -99,9 +102,9 @@ class TrajectoryRegressor(TimedMovement):
     module_ : TrajectoryLaw
         The fitted torch module: maps times (n, 1) to joint mean (n, d) and covariance (n, d, n, d), differentiably.
     time_kernel_ : str
-    length_scale_ : float
-        Of the correlation along the movement, in units of X; the longer one, where the sum of two is likelier.
-    nugget_scale_ : ndarray of shape (n_steps,)
+    length_scale_ : ndarray of shape (n_outputs,)
+        Length scale of each output's slow deviation along the movement, in units of X.
+    nugget_scale_ : ndarray of shape (n_steps, n_outputs)
         Standard deviation of the independent part of each step of the fit's grid, whose smooth part has 1.
     shrinkage_ : float
     df_ : float
@@ -129,8 +132,6 @@ class TrajectoryRegressor(TimedMovement):
     _learned: ClassVar[Any] = {
         "df_": partial(checks.number, least=_FEWEST_DF, most=_MOST_DF),
         "time_kernel_": partial(checks.choice, choices=tuple(KERNELS)),
-        "length_scale_": partial(checks.number, above=0.0),
-        "shrinkage_": partial(checks.number, least=0.0, below=1.0),
     }
 
     def __init__(
@@ -177,20 +178,22 @@ class TrajectoryRegressor(TimedMovement):
         mean, covariance = self._regressor_rows(grid)
         residual = np.stack([sampled(recording, grid) for recording in recordings]) - mean
         # Of z = inv(L_t) (y_t - m_t), of unit covariance at each step, the correlation along time is left to be found.
-        whitened = np.linalg.solve(np.linalg.cholesky(covariance), residual[..., np.newaxis])[..., 0]
+        root = np.linalg.cholesky(covariance)
+        whitened = np.linalg.solve(root, residual[..., np.newaxis])[..., 0]
         kernels = ("matern52", "squared_exponential") if self.time_kernel == "auto" else (self.time_kernel,)
         share = None if self.shrinkage == "auto" else 1.0 - float(self.shrinkage)
         scaled = torch.from_numpy((grid - low) / (high - low))
-        found = fit_time_kernel(scaled, torch.from_numpy(whitened), kernels, share)
+        deviation = torch.from_numpy(root).diagonal(dim1=1, dim2=2)
+        found = fit_time_kernel(scaled, torch.from_numpy(whitened), deviation, kernels, share)
         self._set_law(found, low, high - low)
         degrees = self.regressor_.predict_df(grid[:, np.newaxis])
         self.df_ = float(np.clip(np.median(degrees) / _WHOLE, _FEWEST_DF, _MOST_DF))
-        self.time_kernel_, self.length_scale_ = found.kernel, float(found.scales[0, 0]) * (high - low)
-        self.shrinkage_ = 1.0 - float(found.share)
+        self.time_kernel_ = found.kernel
 
     def _set_law(self, time_kernel: TimeKernel, low: float, width: float) -> None:
         self.module_ = TrajectoryLaw(getattr(self.regressor_, "module_", None), time_kernel, low, width)
-        self.nugget_scale_, self._range = np.sqrt(time_kernel.nugget.numpy()), (low, width)
+        self.length_scale_, self.shrinkage_ = width * time_kernel.scales[:, 0].numpy(), 1.0 - float(time_kernel.share)
+        self.nugget_scale_, self._range = np.sqrt(time_kernel.nugget.numpy().T), (low, width)
 
     def predict(self, X: ArrayLike, *, return_std: bool = False, return_cov: bool = False) -> Any:
         """Prediction of the regressor; given what is known, mean and covariance of the rest of the movement."""
@@ -223,10 +226,10 @@ class TrajectoryRegressor(TimedMovement):
 
     def _restore(self, arrays: dict[str, Floats]) -> None:
         arrays = self._restore_timing(arrays)
-        n_steps = len(np.atleast_1d(arrays["grid"]))
+        n_steps, d = len(np.atleast_1d(arrays["grid"])), self.n_outputs_
         shapes: dict[str, tuple[int | str, ...]] = {
-            "grid": (n_steps,), "scales": ("S", 2), "nugget": (n_steps,), "residual": ("K", n_steps, self.n_outputs_),
-            "share": (), "x_shift": (), "x_scale": (),
+            "grid": (n_steps,), "scales": (d, 2), "fine": (d, n_steps), "nugget": (d, n_steps),
+            "residual": ("K", n_steps, d), "share": (), "x_shift": (), "x_scale": (),
         }  # fmt: skip
         check_arrays(arrays, shapes)
         for name in ("nugget", "scales"):
