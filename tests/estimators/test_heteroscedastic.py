@@ -173,6 +173,15 @@ def test_a_goal_of_the_tunnel_is_followed():
     assert rms.max() < 2.0
 
 
+def test_where_demonstrations_agree_at_an_end_nothing_of_the_prior_is_left():
+    """The tunnel's y agrees at the start to 2 um of noise; a start that is no inducing input left 0.8 mm of a prior."""
+    X, y, groups = make_tunnel_demonstrations(6, rate=25.0, random_state=0).stack()
+    model = HeteroscedasticGPRegressor().fit(X, y, groups=groups)
+    ends = model.predict_cov(X[[0, 250]])
+    assert np.sqrt(ends[:, 1, 1]).max() < 2e-5
+    assert model.predict_uncertainty(X[[0, 250]]).type1.max() < 1e-9
+
+
 def test_no_end_is_stretched_without_need():
     model, _ = fitted_to_collapsing(None, 100)
     assert not hasattr(model.module_.core, "stretch")

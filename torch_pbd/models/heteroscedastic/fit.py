@@ -146,7 +146,7 @@ class HeteroscedasticFit:
         """
         before = self.families.log_variance
         squares = squares_within(self.training, self.normal(), noise)
-        after = stretched(before, self.training.inputs, squares, self.options)
+        after = stretched(before, self.training.inputs, squares)
         if after is not before or noise is not None:
             self.covariance = None
             self._begin_covariance(after)

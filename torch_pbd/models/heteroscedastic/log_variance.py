@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from operator import itemgetter
 
 import torch
 from jaxtyping import Float, Int64
@@ -19,7 +20,7 @@ from torch_pbd.linalg import safe_cholesky, triangular_inverse
 from torch_pbd.models.heteroscedastic.processes import FixedFeatures, ProcessFamily
 from torch_pbd.models.heteroscedastic.regression import LinearEvidence, Weights, weights_factor
 from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation
-from torch_pbd.models.heteroscedastic.search import Evidence, Gradient, Search, SearchOptions
+from torch_pbd.models.heteroscedastic.search import Evidence, Gradient, Search, grid_evidence
 from torch_pbd.models.training import TrainingSet
 
 LEAST_SQUARE = 1e-6
@@ -255,43 +256,33 @@ def squares_within(training: TrainingSet, normal: Tensor, noise: NoiseCorrelatio
     return Squares(squares.mT, degrees, noise)
 
 
-def stretched(
-    family: ProcessFamily, inputs: Float[Tensor, "n e"], squares: Squares, options: SearchOptions
-) -> ProcessFamily:
+def stretched(family: ProcessFamily, inputs: Float[Tensor, "n e"], squares: Squares) -> ProcessFamily:
     """Family with the inputs stretched at ends where the evidence for the log variances of residuals is higher so.
 
-    Each end at which deviations fall is tried by itself, and two together, by the best points of the searches' grid
-    and, where these say so, by what searches find.
+    At the best points of the searches' grid: what is asked is whether twenty nats are gained.
     """
     if inputs.shape[1] > 1 or family.period is not None or family.fixed_length_scale is not None:
         return family
     falling = [end for end in (0, 1) if _falls(squares, inputs[:, 0], end)]
     if not falling:
         return family
-    # From the best point of the grid, to a tenth of a nat: what is asked is whether twenty are gained.
-    options = replace(options, n_restarts=0, tol=max(options.tol, 0.1))
 
-    def evidence(family: ProcessFamily, *, at_once: bool) -> float:
+    def evidence(family: ProcessFamily) -> float:
         of_theta = log_variance_evidence(family, FixedFeatures(family, inputs), squares, squares.log_pooled.clone())
-        search = Search(family, len(squares.total), options)
-        return (search.best_of_grid if at_once else search.maximum)(of_theta, len(inputs))
+        return float(grid_evidence(of_theta, family, *squares.total.shape).amax(0).sum())
 
-    result, stretch = family, inputs.new_tensor([[0.0, 1.0], [0.0, 1.0]])
-    on_grid, highest = evidence(family, at_once=True), None
-    widths = [max(width, width / _WIDTHS[0] * spacing(inputs)) for width in _WIDTHS]
+    result, highest, stretch = family, evidence(family), inputs.new_tensor([[0.0, 1.0], [0.0, 1.0]])
+    # Each end by itself, and both: where one is stretched the other still asks for a short length scale.
     for ends in ([0], [1], [0, 1]) if len(falling) > 1 else [falling]:
-        stretches = [stretch.clone() for _ in widths]
-        for each, width in zip(stretches, widths, strict=True):
-            each[ends] = inputs.new_tensor([_LENGTH, width])
-        tried = [on_stretched_inputs(family, inputs, each) for each in stretches]
-        found = [evidence(each, at_once=True) for each in tried]
-        best = max(range(len(found)), key=found.__getitem__)
-        if found[best] < on_grid + _CLEARLY:
-            continue
-        highest = evidence(result, at_once=False) if highest is None else highest
-        now = evidence(tried[best], at_once=False)
-        if now > highest + _CLEARLY:
-            on_grid, highest, result, stretch = found[best], now, tried[best], stretches[best]
+        tried = []
+        for width in _WIDTHS:
+            each = stretch.clone()
+            each[ends] = inputs.new_tensor([_LENGTH, max(width, width / _WIDTHS[0] * spacing(inputs))])
+            candidate = on_stretched_inputs(family, inputs, each)
+            tried.append((evidence(candidate), candidate, each))
+        found, candidate, each = max(tried, key=itemgetter(0))
+        if found > highest + _CLEARLY:
+            result, highest, stretch = candidate, found, each
     return result
 
 

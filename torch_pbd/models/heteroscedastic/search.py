@@ -28,8 +28,6 @@ _OF_ONE, _OF_SEVERAL, _MOST, _TOGETHER, _FEWEST = 48, 128, 128, (800, 400), 12
 # Length scales, in ranges of the inputs, short to long by threes; and logarithms of amplitudes, weak and strong.
 _STARTS = tuple(product((0.04, 0.12, 0.35, 1.0), (-1.0, 0.5)))
 _SMALL = 10_000  # entries of all processes' features
-_DIFFERENCE = 1e-3  # of hyperparameters, whose gradients' differences tell the curvature at a start
-_LEAST_CURVATURE = 0.2  # about half of the prior's
 
 Gradient = Callable[[], Float[Tensor, "a q"]]
 Evidence = Callable[[Float[Tensor, "a q"], Int64[Tensor, " a"]], tuple[Float[Tensor, " a"], Gradient]]
@@ -156,66 +154,45 @@ class Search:
             return -found - prior, -gradient() - of_prior
 
         if self.theta is None or self._inverse_hessian is None:
-            table = self._grid(value, n_observed)
-            best = (-table).argsort(0)[: 1 + self.options.n_restarts]
-            starts = [(start, _inverse_hessian(loss, start)) for start in self._points()[best]]
+            table = grid_evidence(value, self.family, self.n_processes, n_observed)
+            best = table.argsort(0, descending=True)[: 1 + self.options.n_restarts]
+            starts, inverse_hessian = grid_points(self.family)[best], None
         else:
-            starts = [(self.theta, self._inverse_hessian)]
+            starts, inverse_hessian = self.theta[None], self._inverse_hessian
         tol = self.options.slack * self.options.tol
-        ends = [
-            minimize_batch(loss, start, max_iter=self.options.max_iter, tol=tol, inverse_hessian=inverse_hessian)
-            for start, inverse_hessian in starts
-        ]
-        points, reports = zip(*ends, strict=True)
-        lowest = torch.stack([report.loss for report in reports]).nan_to_num(nan=math.inf).argmin(0)
+        # All starts of all processes side by side, and of each process the best end.
+        points, report = minimize_batch(
+            lambda theta, rows: loss(theta, rows % self.n_processes),
+            starts.flatten(0, 1),
+            max_iter=self.options.max_iter,
+            tol=tol,
+            inverse_hessian=inverse_hessian,
+        )
+        shape = len(starts), self.n_processes
+        lowest = report.loss.reshape(shape).nan_to_num(nan=math.inf).argmin(0)
         row = torch.arange(self.n_processes, device=lowest.device)
-        self.theta = torch.stack(points)[lowest, row]
-        self._inverse_hessian = torch.stack([report.inverse_hessian for report in reports])[lowest, row]
-        status = first_failure(report.status for report in reports)
-        self.options.ends.append((max(report.n_iter for report in reports), status))
+        self.theta = points.unflatten(0, shape)[lowest, row]
+        self._inverse_hessian = report.inverse_hessian.unflatten(0, shape)[lowest, row]
+        self.options.ends.append((report.n_iter, report.status))
         return self.theta
 
-    def best_of_grid(self, evidence: Evidence, n_observed: int) -> float:
-        """Highest log evidence times prior that a search would start from, of all processes together."""
-        return float(self._grid(evidence, n_observed).amax(0).sum())
 
-    def maximum(self, evidence: Evidence, n_observed: int) -> float:
-        """Highest log evidence times prior that a search finds, of all processes together."""
-        theta = self.run(evidence, n_observed)
-        value, _ = evidence(theta, torch.arange(self.n_processes, device=theta.device))
-        return float((value + self.family.log_prior(theta)[0]).sum())
-
-    def _points(self) -> Float[Tensor, "s q"]:
-        inducing = self.family.inducing
-        return inducing.new_tensor(
-            [[math.log(scale)] * inducing.shape[1] + [amplitude] for scale, amplitude in _STARTS]
-        )
-
-    def _grid(self, evidence: Evidence, n_observed: int) -> Float[Tensor, "s b"]:
-        """Log evidence times prior at the points where a search may begin.
-
-        Those of one length scale are tried together, as they take as many features; all, where calls cost more.
-        """
-        points = self._points()
-        every = torch.arange(self.n_processes, device=points.device)
-        small = n_observed * self.n_processes * len(self.family.inducing) < _SMALL
-        parts = [
-            evidence(part.repeat_interleave(len(every), dim=0), every.repeat(len(part)))[0].reshape(-1, len(every))
-            for part in points.split(len(points) if small else 2)
-        ]
-        return (torch.cat(parts) + self.family.log_prior(points)[0][:, None]).nan_to_num(nan=-math.inf)
+def grid_points(family: ProcessFamily) -> Float[Tensor, "s q"]:
+    """Hyperparameters where a search may begin."""
+    rows = [[math.log(scale)] * family.inducing.shape[1] + [amplitude] for scale, amplitude in _STARTS]
+    return family.inducing.new_tensor(rows)
 
 
-def _inverse_hessian(
-    objective: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]], start: Float[Tensor, "b p"]
-) -> Float[Tensor, "b p p"]:
-    """By differences of gradients; of directions with less or negative curvature as if they had its size."""
-    n_problems, size = start.shape
-    steps = torch.cat([start.new_zeros(1, size), _DIFFERENCE * torch.eye(size).to(start)])
-    points = (start + steps[:, None]).flatten(0, 1)
-    rows = torch.arange(n_problems, device=start.device).repeat(size + 1)
-    _, gradients = objective(points, rows)
-    gradients = gradients.reshape(size + 1, n_problems, size)
-    hessian = ((gradients[1:] - gradients[0]) / _DIFFERENCE).transpose(0, 1)
-    curvature, axes = torch.linalg.eigh(0.5 * (hessian + hessian.mT).nan_to_num())
-    return axes @ torch.diag_embed(1.0 / curvature.abs().clamp_min(_LEAST_CURVATURE)) @ axes.mT
+def grid_evidence(evidence: Evidence, family: ProcessFamily, n_processes: int, n_observed: int) -> Float[Tensor, "s b"]:
+    """Log evidence times prior of each process at these points, of so many observations of each.
+
+    Those of one length scale are tried together, as they take as many features; all, where calls cost more.
+    """
+    points = grid_points(family)
+    every = torch.arange(n_processes, device=points.device)
+    small = n_observed * n_processes * len(family.inducing) < _SMALL
+    parts = [
+        evidence(part.repeat_interleave(n_processes, dim=0), every.repeat(len(part)))[0].reshape(-1, n_processes)
+        for part in points.split(len(points) if small else 2)
+    ]
+    return (torch.cat(parts) + family.log_prior(points)[0][:, None]).nan_to_num(nan=-math.inf)
