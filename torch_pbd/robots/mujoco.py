@@ -7,7 +7,6 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
-from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,45 +22,26 @@ from torch_pbd.robots.session import RobotStoppedError, accelerations, check_sta
 HOME = (0.0, -math.pi / 4, 0.0, -3 * math.pi / 4, 0.0, math.pi / 2, math.pi / 4)
 """Joint angles of the Panda in rad, far from limits and singularities: the hand points down, 0.31 m before the base."""
 
-# A tick is a whole number of steps of the simulation, to what rounding leaves of both.
-_UNEVEN = 1e-6
+_UNEVEN = 1e-6  # a tick is a whole number of steps of the simulation, to what rounding leaves of both
+_POSTURE_RATE = 5.0  # 1/s, at which free joint motion returns, critically damped: slower than what the tool feels
 
 
-def panda_mjcf(*, hand: bool = True, armature: float = 0.1, timestep: float = 1e-3) -> str:
-    """Text of an MJCF file of the arm: joints ``joint1`` to ``joint7`` with torque motors, and a site ``tool``.
+def panda_mjcf() -> str:
+    """Text of an MJCF file of the Franka Emika Panda with its closed hand; edit it for another tool.
 
-    Joints have no friction, and bodies do not collide.
-
-    Parameters
-    ----------
-    hand : bool, default=True
-        Whether the arm carries the manufacturer's hand of 0.73 kg, closed. The tool is its tip, 0.1034 m beyond the
-        flange, or else the flange.
-    armature : float, default=0.1
-        Inertia of each motor at its joint, kg m^2; libfranka's model has none.
-    timestep : float, default=1e-3
-        Time step of the simulation, s.
+    Joints ``joint1`` to ``joint7`` have torque motors, 0.1 kg m^2 of inertia each and no friction; bodies do not
+    collide. The site ``tool`` is the tip of the hand, 0.1034 m beyond the flange, at which the body ``hand`` begins.
 
     References
     ----------
     C. Gaz et al., IEEE Robotics and Automation Letters 4(4), 2019, for the inertia; Franka Control Interface,
     "Robot and interface specifications", for all other figures.
     """
-    checks.number(armature, "armature", least=0.0, unit="kg m^2")
-    checks.number(timestep, "timestep", above=0.0, most=0.01, unit="s")
-    model: Any = ElementTree.parse(Path(__file__).with_name("panda.xml")).getroot()
-    model.find("option").set("timestep", repr(timestep))
-    model.find("default/joint").set("armature", repr(armature))
-    if not checks.flag(hand, "hand"):
-        last = model.find(".//body[@name='link7']")
-        flange = last.find("body").get("pos")
-        last.remove(last.find("body"))
-        ElementTree.SubElement(last, "site", name="tool", pos=flange, size="0.005")
-    return ElementTree.tostring(model, encoding="unicode")
+    return Path(__file__).with_name("panda.xml").read_text(encoding="utf-8")
 
 
-def panda(*, hand: bool = True, armature: float = 0.1, timestep: float = 1e-3) -> Any:
-    """Franka Emika Panda as a ``mujoco.MjModel``, with the parameters of `panda_mjcf`; needs the extra ``robot``.
+def panda() -> Any:
+    """Franka Emika Panda of `panda_mjcf` as a ``mujoco.MjModel``; needs the extra ``robot``.
 
     Examples
     --------
@@ -69,8 +49,7 @@ def panda(*, hand: bool = True, armature: float = 0.1, timestep: float = 1e-3) -
     >>> operational_inertia(panda(), HOME, "tool").diagonal()[:3].round(1)  # kg; a schedule without mass assumes 1
     array([12.5,  5.1,  6.5])
     """
-    library = optional("mujoco", "robot", "a model for MuJoCo")
-    return library.MjModel.from_xml_string(panda_mjcf(hand=hand, armature=armature, timestep=timestep))
+    return optional("mujoco", "robot", "a model for MuJoCo").MjModel.from_xml_string(panda_mjcf())
 
 
 @final
@@ -120,7 +99,6 @@ def run(
     *,
     tool: str = "tool",
     wrench: ArrayLike | None = None,
-    posture_rate: float = 5.0,
 ) -> ArmRun:
     """Follow a schedule of poses by torques, ``J' (Lambda a_d - K e - D e') + h + N' M (...)``.
 
@@ -142,8 +120,6 @@ def run(
         Name of a site or body.
     wrench : array_like of shape (T, 6), default=None
         External force and torque at the tool in N and Nm, world axes; None is none.
-    posture_rate : float, default=5.0
-        Rate in 1/s at which the free joint motion returns to ``joints``, critically damped.
 
     Returns
     -------
@@ -166,7 +142,7 @@ def run(
     O. Khatib, IEEE Journal of Robotics and Automation 3(1), 1987, eq. (27) and (50); C. Ott, "Cartesian impedance
     control of redundant and flexible-joint robots", Springer 2008, section 3.2, for the inertia that is kept.
     """
-    simulation = _Simulation(model, tool, schedule, joints, posture_rate)
+    simulation = _Simulation(model, tool, schedule, joints)
     pushes = np.zeros((len(schedule), 6)) if wrench is None else checks.array(wrench, "wrench", (len(schedule), 6))
     ticks = [simulation.tick(row, push) for row, push in enumerate(pushes)]
     measured = {name: np.stack([tick[name] for tick in ticks]) for name in ticks[0]}
@@ -189,7 +165,7 @@ def _steps_a_tick(time: Floats, timestep: float) -> int:
 class _Simulation:
     """An arm in MuJoCo that a controller has follow a schedule."""
 
-    def __init__(self, model: Any, tool: str, schedule: Schedule, joints: ArrayLike, posture_rate: float) -> None:
+    def __init__(self, model: Any, tool: str, schedule: Schedule, joints: ArrayLike) -> None:
         self._mujoco = mujoco = optional("mujoco", "robot", "an arm in MuJoCo")
         checks.instance(model, "model", mujoco.MjModel)
         self._schedule, self._poses, self._acceleration = schedule, poses(schedule), accelerations(schedule)
@@ -202,7 +178,6 @@ class _Simulation:
                 f"model has {model.nu} motors and {model.nv} degrees of freedom for the {n_joints} joints before "
                 f"{tool!r}, must have one motor for each and no others: lock fingers and leave out objects."
             )
-        self._rate = checks.number(posture_rate, "posture_rate", least=0.0, unit="1/s")
         self._joints = checks.array(joints, "joints", (len(schedule), n_joints))
         self._speed = np.gradient(self._joints, schedule.time, axis=0)
         self._rise = np.gradient(self._speed, schedule.time, axis=0)
@@ -226,7 +201,7 @@ class _Simulation:
         wrench = mass @ (self._acceleration[row] - self._chain.bias(data))
         wrench -= planned.stiffness[row] @ error + planned.damping[row] @ (twist - planned.velocity[row])
         away, slower = self._joints[row] - data.qpos, self._speed[row] - data.qvel
-        drift = self._rate**2 * away + 2.0 * self._rate * slower + self._rise[row]
+        drift = _POSTURE_RATE**2 * away + 2.0 * _POSTURE_RATE * slower + self._rise[row]
         # N' M drift, N = I - M^-1 J' Lambda J (50): an acceleration of the joints that the tool does not feel.
         free = state.mass_matrix @ (drift - inverse @ (mass @ (state.jacobian @ drift)))
         torque = state.jacobian.T @ wrench + data.qfrc_bias + free
