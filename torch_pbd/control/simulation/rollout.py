@@ -131,14 +131,7 @@ class Rollout:
     @property
     def interventions(self) -> Any:
         """Times (n,) of a single run at which a filter held the stiffness back; of a batch, see ``filter_share``."""
-        if self.filter_share is None:
-            return self.time[:0]
-        if self.filter_share.ndim > 1:
-            batch = tuple(self.filter_share.shape[:-1])
-            raise ValueError(
-                f"interventions is of a batch {batch}, must be of one run: take filter_share of the batch."
-            )
-        return self.time[self.filter_share < 1.0]
+        return self.time[:0] if self.filter_share is None else self.time[self.filter_share < 1.0]
 
 
 class Loop:
@@ -257,24 +250,23 @@ def _start(task: Task, position0: Tensor | None, orientation0: Tensor | None) ->
     if task.turning is None:
         return start
     desired = task.turning.orientation[..., 0, :]
-    rotation = torch.zeros_like(desired[..., 1:]) if orientation0 is None else rotation_between(desired, orientation0)
+    rotation = rotation_between(desired, desired if orientation0 is None else orientation0)
     position = start[..., : task.n_positions]
     batch = broadcast_shapes(position.shape[:-1], rotation.shape[:-1])
     return torch.cat([position.expand(*batch, -1), rotation.expand(*batch, -1)], dim=-1)
 
 
 def _check_memory(task: Task, n_rollouts: int) -> None:
+    if task.position.device.type != "cpu":  # elsewhere torch raises by itself
+        return
     # Measured: five motions are held, of poses six and two orientations, and where rollouts differ in their gains,
     # twelve matrices.
     d = task.position.shape[-1]
     of_each = 5 * d + (12 * d * d if task.stiffness.ndim > 3 or task.stiffness_filter is not None else 0)
     of_each += 0 if task.turning is None else d + 8
-    if task.position.device.type == "cpu":  # elsewhere torch raises by itself
-        require_memory(
-            of_each * n_rollouts * task.n_ticks * task.position.element_size(),
-            what=f"a simulation of {n_rollouts} rollouts of {task.n_ticks} ticks",
-            remedy="Simulate fewer at a time, or take simulate_many, which keeps no trajectories.",
-        )
+    needed = of_each * n_rollouts * task.n_ticks * task.position.element_size()
+    remedy = "Simulate fewer at a time, or take simulate_many, which keeps no trajectories."
+    require_memory(needed, what=f"a simulation of {n_rollouts} rollouts of {task.n_ticks} ticks", remedy=remedy)
 
 
 def warn_if_far(angle: float) -> None:

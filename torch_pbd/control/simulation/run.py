@@ -1,6 +1,7 @@
 """A schedule on a simulated robot: once, under a given force, or thousands of times, under random pushes."""
 
 from dataclasses import replace
+from itertools import count
 from typing import Any, Literal
 
 import numpy as np
@@ -156,11 +157,15 @@ def simulate_many(
     levels = checks.array(quantiles, "quantiles", ("n_quantiles",)).copy()
     checks.require((levels >= 0.0) & (levels <= 1.0), levels, "quantiles", "from 0 to 1")
     task = _task_of(schedule, plant)
-    _check_memory(n_rollouts, schedule, len(levels))
+    # Per rollout the block of deviations, its order, and some numbers; per tick the gains and their maps.
+    d = schedule.n_outputs
+    needed = n_rollouts * (3 * block_length(d) + 10 * d + 16) + len(schedule) * (4 * d * d + 4 * d + len(levels))
+    require_memory(
+        8.0 * needed, what=f"n_rollouts={n_rollouts}", remedy="Simulate fewer at a time, with several seeds."
+    )
     draw = checks.seed(random_state)
     begin, lasting, push = _draw_pushes(draw, n_rollouts, schedule, [peak, torque], duration, onset)
-    seeds = draw.randint(2**31 - 1, size=n_rollouts).tolist()  # at most so many sensors
-    generators = (torch.Generator().manual_seed(seed) for seed in seeds)
+    generators = (torch.Generator().manual_seed(int(draw.randint(2**31 - 1))) for _ in count())
     tallies = [Tally(n_rollouts, block) for block in schedule.blocks]
     with torch.no_grad():
         pushes = torch.tensor(begin), torch.tensor(lasting), torch.tensor(push).mT.contiguous()
@@ -257,15 +262,3 @@ def _ends(limits: Range, name: str, unit: str, *, pair: bool = False, **bounds: 
     low, high = checks.array(limits, name, (2,)) if pair or np.ndim(limits) else (limits, limits)
     low = checks.number(low, name, unit=unit, **bounds)
     return low, checks.number(high, name, unit=unit, **(bounds | {"least": low}))
-
-
-def _check_memory(n_rollouts: int, schedule: Schedule, n_levels: int) -> None:
-    # Per rollout the block of deviations, its order, and some numbers; per tick the gains and their maps.
-    d = schedule.n_outputs
-    of_each = 3 * block_length(d) + 10 * d + 16
-    of_ticks = len(schedule) * (4 * d * d + 4 * d + n_levels)
-    require_memory(
-        8.0 * (n_rollouts * of_each + of_ticks),
-        what=f"n_rollouts={n_rollouts}",
-        remedy="Simulate fewer at a time, with several seeds.",
-    )

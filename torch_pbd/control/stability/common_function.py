@@ -271,10 +271,8 @@ def _minimize_convex(function: Callable[[float], float], low: float, high: float
     for _ in range(_N_GOLDEN):
         if at_left <= at_right:
             high, right, at_right = right, left, at_left
-            left = high - _GOLDEN * (high - low)
-            at_left = function(left)
+            at_left = function(left := high - _GOLDEN * (high - low))
         else:
             low, left, at_left = left, right, at_right
-            right = low + _GOLDEN * (high - low)
-            at_right = function(right)
+            at_right = function(right := low + _GOLDEN * (high - low))
     return min((first, last, left, right), key=function)
