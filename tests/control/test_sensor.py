@@ -1,13 +1,14 @@
 import math
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import scipy.signal
 import torch
 
-from torch_pbd.control.simulation.sensor import ForceSensor, Reading
+from torch_pbd.control.simulation.sensor import ForceSensor
 
 DT = 1e-3
 EVERYTHING = ForceSensor(0.3, 0.05, 0.02, 5.0, cutoff=125.0, delay_steps=3, deadband=0.1)
@@ -17,7 +18,7 @@ def measure(sensor, force, dt=DT, generator=None):
     """Readings of a force (..., T, d), tick by tick."""
     reader = sensor.start(force[..., 0, :], dt, generator)
     readings, saturated = zip(*(reader(tick) for tick in force.unbind(-2)), strict=True)
-    return Reading(torch.stack(readings, dim=-2), torch.stack(saturated, dim=-1))
+    return SimpleNamespace(force=torch.stack(readings, dim=-2), saturated=torch.stack(saturated, dim=-1))
 
 
 def forces(rng, *shape, scale=3.0):

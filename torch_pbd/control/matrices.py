@@ -29,9 +29,9 @@ def damping_from_stiffness(
     Parameters
     ----------
     stiffness : Tensor of shape (..., d, d)
-        In N/m, symmetric and positive semidefinite.
+        Stiffness in N/m, symmetric and positive semidefinite.
     mass : float or Tensor of shape (..., d, d), default=1.0
-        In kg; a matrix must be symmetric and positive definite.
+        Mass in kg; a matrix must be symmetric and positive definite.
     damping_ratio : float or "paper", default=1.0
         1 is critical, and makes any schedule stable whose largest stiffness is below 33.9 times its smallest; see
         :func:`required_damping_ratio`.
@@ -85,7 +85,8 @@ def required_damping_ratio(stiffness_ratio: float) -> float:
     checks.number(stiffness_ratio, "stiffness_ratio", least=1.0, remedy="it is the largest over the smallest")
     root = stiffness_ratio**0.25
     largest = root + 1.0 / root
-    # Of u in the Notes. Up to 4 the b of zeta <= 3^(1/2) serves the interval [2, u], above it that of larger zeta.
+    # The largest u of the Notes. Up to 4 the b of zeta <= 3^(1/2) serves the interval [2, u], above it that of larger
+    # zeta.
     if largest <= 4.0:
         return (root - 1.0 / root) / 2.0
     share = (largest - 2.0) / 4.0

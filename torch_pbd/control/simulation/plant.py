@@ -32,7 +32,7 @@ _SHAPES = {
     "orientation0": "4",
     "velocity0": "d",
 }
-# Of the squared norm of quaternions, as in schedules: those of seven digits count as unit ones.
+# How far squared norms of unit quaternions may be from 1, as in schedules: those of seven digits pass.
 _NEARLY_UNIT = 1e-6
 
 
@@ -128,29 +128,27 @@ class AdmittancePlant:
     ) -> Rollout:
         """Run T ticks of ``dt`` seconds.
 
-        Of positions, d = p; or with ``orientation_desired`` of poses, d = p + 3: the last three of all axes are then
-        of rotation, in world axes, in rad/s, rad/s^2, Nm, Nm/rad and Nm s/rad.
+        Positions alone have d = p axes. With ``orientation_desired`` it is a run of poses, of d = p + 3 axes: the last
+        three are rotations in world axes, in rad/s, rad/s^2, Nm, Nm/rad and Nm s/rad.
 
         Parameters
         ----------
-        position_desired : Tensor of shape (..., T, p)
-            In m.
-        velocity_desired : Tensor of shape (..., T, d)
-            In m/s.
+        position_desired, velocity_desired : Tensor of shape (..., T, p) and (..., T, d)
+            Desired motion in m and m/s. Leading dimensions of all arguments are those of the batch, and broadcast.
         stiffness, damping : Tensor of shape (..., T, d, d)
-            In N/m and N s/m, symmetric and positive semidefinite; they need not commute.
+            Gains in N/m and N s/m, symmetric and positive semidefinite; they need not commute.
         force : Tensor of shape (..., T, d), default=None
-            External force in N; None is none. Leading dimensions are those of the batch, and broadcast.
+            External force in N; None is none.
         dt : float
-            In s.
+            Length of a tick in s.
         position0, velocity0, orientation0 : Tensor of shape (..., p), (..., d) and (..., 4), default=None
             State at the start; None is the desired one.
         acceleration_desired : Tensor of shape (..., T, d), default=None
-            In m/s^2, for ``feed_forward``; None takes the differences of ``velocity_desired``.
+            Desired acceleration in m/s^2, for ``feed_forward``; None takes the differences of ``velocity_desired``.
         orientation_desired : Tensor of shape (..., T, 4), default=None
-            Unit quaternions w x y z, for poses.
+            Unit quaternions w x y z, which make it a run of poses.
         generator : torch.Generator, default=None
-            For the noise of the sensor.
+            Source of the sensor's noise.
 
         Returns
         -------

@@ -36,22 +36,21 @@ _N_DIMS = {"position": 2, "velocity": 2, "force": 2, "commanded_position": 2, "s
 class Rollout:
     """States at the start of each tick of a simulated run, tensors or, by ``numpy()``, arrays.
 
-    Of positions alone p = d. Of poses p = d - 3, and the last three of velocity, force and gains are of rotation, in
-    world axes: rad/s, Nm, Nm/rad and Nm s/rad.
+    Runs of positions alone have p = d. Those of poses have p = d - 3, and the last three axes of velocity, force and
+    gains are rotations in world axes: rad/s, Nm, Nm/rad and Nm s/rad.
 
     Attributes
     ----------
     time : (T,), s
-    position : (..., T, p), m
-        Of the robot.
-    velocity : (..., T, d), m/s
+    position, velocity : (..., T, p), m, and (..., T, d), m/s
+        Motion of the robot.
     force : (..., T, d), N
         External force on the robot, that of walls included.
     stiffness, damping : (..., T, d, d), N/m and N s/m
-        In effect during the tick, behind the filter.
+        Gains in effect during the tick, behind the filter.
     desired_position : (..., T, p), m
     commanded_position : (..., T, p), m
-        By the admittance, of the robot's position loop; without such a loop, ``position``.
+        What the admittance asks of the robot's position loop; without such a loop, ``position``.
     filter_share : (..., T) or None
         Share of the step in stiffness that a filter let through, 1 where it did not intervene.
     tank_energy : (..., T) or None
@@ -59,12 +58,12 @@ class Rollout:
     saturated : (..., T) of bool or None
         Whether the force sensor was out of its range.
     orientation, desired_orientation, commanded_orientation : (..., T, 4) or None
-        Of poses, as unit quaternions w x y z.
+        Unit quaternions w x y z, in runs of poses.
     pose_deviation : (..., T, d) or None, m and rad
-        Of poses, position less desired position, and rotation vector e from the desired orientation in world axes,
-        ``R = exp([e]) R_d``.
+        In runs of poses, position less desired position, and the rotation vector e from the desired orientation in
+        world axes, ``R = exp([e]) R_d``.
     units : str or None
-        Of the schedule's positions: "rad" of joints, which have rad for m above, and Nm for N; None where unknown.
+        Units of the schedule's positions: "rad" for joints, which have rad for m above, and Nm for N; None if unknown.
     """
 
     time: Any

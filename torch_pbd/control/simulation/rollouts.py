@@ -27,8 +27,8 @@ _SHARE = 0.1
 class RolloutSummary:
     """Effect of R random pushes on a robot; NumPy arrays.
 
-    Of poses, these are of the positions; ``rotation`` is the same of the rotation vectors. Where ``units`` are "rad",
-    as there and of joints, read rad for m and Nm for N.
+    For poses, ``rotation`` is the same for the rotation vectors as this for the positions. Where ``units`` are "rad",
+    as there and for joints, read rad for m and Nm for N.
 
     Attributes
     ----------
@@ -40,16 +40,15 @@ class RolloutSummary:
         Largest distance of each rollout; rollouts are in the order in which they are pushed.
     peak_time : (R,), s
     return_time : (R,), s
-        From the end of the push until the distance stays below a tenth of its peak; inf where it is above it at the
-        end.
+        Time from the end of the push until the distance stays below a tenth of its peak; inf if it never does.
     final_deviation : (R,), m
     onset, duration : (R,), s
-        Of the push.
+        When the push begins, and how long it lasts.
     push : (R, p), N
-        Force at its peak.
+        Force of the push at its peak.
     rotation : RolloutSummary or None
     units : str or None
-        Of the schedule's positions; None where it is not known.
+        Units of the schedule's positions; None where they are not known.
     """
 
     time: Floats
@@ -173,7 +172,7 @@ class Tally:
             when = torch.where(squared == highest, numbers, -1.0).amax(0)
             torch.where(higher, when, tick, out=tick)
             torch.maximum(peak, highest, out=peak)
-        # Of its own peak so far: what is counted before that peak is reached, the peak itself overrules.
+        # The limit is a share of the peak so far: what is counted before the peak is reached, the peak overrules.
         limit, last = _SHARE**2 * peak, self.last_above[columns]
         if is_over and bool((highest > limit).any()):
             torch.maximum(last, torch.where(squared > limit, numbers, -1.0).amax(0), out=last)

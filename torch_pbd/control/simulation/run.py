@@ -21,9 +21,9 @@ from torch_pbd.files.memory import require_memory
 
 Range = float | tuple[float, float]
 
-# Of a tick: rounding of times; those of an hour at 1 kHz are off by 5e-10 of it in float64.
+# Share of a tick that is rounding of times; those of an hour at 1 kHz are off by 5e-10 of it in float64.
 _UNEVEN = 1e-6
-# Of a mass: a function of time is not linear between rows 10 ms apart, and a ratio that is off by half as much no harm.
+# Share of a mass: a function of time is not linear between rows 10 ms apart, and half as much does a ratio no harm.
 _SAME_MASS = 1e-3
 
 
@@ -47,12 +47,12 @@ def simulate(
     plant : AdmittancePlant, default=None
         None is ``AdmittancePlant(None)``, with the mass of the schedule, or 1 kg where it tells none.
     random_state : int, RandomState or None, default=None
-        Of the noise of the plant's sensor.
+        Seed of the sensor's noise.
 
     Returns
     -------
     Rollout
-        Of arrays.
+        The run, in arrays.
 
     Warns
     -----
@@ -115,22 +115,22 @@ def simulate_many(
         As for :func:`simulate`. With a sensor or walls, thousands of rollouts take five to ten times longer; with a
         filter, ten to two hundred times.
     peak : float or (float, float), default=5.0
-        Largest force of a push, N; of two numbers, uniform between them.
+        Largest force of a push, N; two numbers are the ends of a uniform distribution.
     torque : float or (float, float), default=0.0
-        Largest torque of a push, Nm, of poses: ``peak=0.0`` leaves pushes by torque alone.
+        Largest torque of a push on a pose, Nm: ``peak=0.0`` leaves pushes by torque alone.
     duration : float or (float, float), default=0.8
-        Of a push, s; of two numbers, uniform between them.
+        How long a push lasts, s; two numbers are the ends of a uniform distribution.
     onset : (float, float), default=None
         Time at which pushes begin, uniform between these, s; None is so that they end within the schedule.
     reference : {"desired", "undisturbed"}, default="desired"
         Deviation from the desired position, or from where the robot would be without push and noise: it lags behind
         the desired position.
     quantiles : tuple of float, default=(0.05, 0.5, 0.95)
-        Of the deviations at a tick, by linear interpolation.
+        Which quantiles of the deviations at a tick are taken, by linear interpolation.
     every : int, default=1
         Ticks from one row of quantiles to the next. To order 10^5 rollouts takes about as long as to simulate them.
     random_state : int, RandomState or None, default=None
-        Of pushes and the sensor's noise.
+        Seed of pushes and of the sensor's noise.
 
     Warns
     -----
@@ -213,7 +213,7 @@ def _task_of(schedule: Schedule, plant: AdmittancePlant | None) -> Task:
     mass = plant.inertia(stiffness, schedule.time, schedule.mass)
     if schedule.mass is not None and plant.mass is not None:
         own = mass_rows(schedule.mass, stiffness)
-        # By entries, in units of their axes.
+        # Entries are compared in units of their axes.
         root = own.diagonal(dim1=-2, dim2=-1).sqrt()
         off = float(((mass - own).abs() / (root.unsqueeze(-1) * root.unsqueeze(-2))).max())
         if off > _SAME_MASS:

@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import NamedTuple, final
+from typing import final
 
 import torch
 from jaxtyping import Float
@@ -17,11 +17,8 @@ from torch_pbd.exceptions import InvalidParameterError
 _OF_AXES = ("bias", "noise_scale", "resolution", "range", "deadband")
 
 
-class Reading(NamedTuple):
-    """Force read (..., d) in N, and of torques in Nm, and whether any of its axes was clipped (...)."""
-
-    force: Tensor
-    saturated: Tensor
+Reading = tuple[Tensor, Tensor]
+"""Force read (..., d) in N, and of torques in Nm, and whether any of its axes was clipped (...)."""
 
 
 @final
@@ -157,8 +154,8 @@ class ForceReader:
             at, like = self._generator.device, self._bias
             noise = torch.randn(like.shape, generator=self._generator, dtype=like.dtype, device=at)
             level = level + self._noise_scale * noise.to(like.device)
-        reading = self._convert(level)
-        self._under_way.append(Reading(reading.force.masked_fill(lost, math.nan), reading.saturated))
+        reading, saturated = self._convert(level)
+        self._under_way.append((reading.masked_fill(lost, math.nan), saturated))
         return self._under_way.popleft()
 
     def _convert(self, level: Tensor) -> Reading:
@@ -167,7 +164,7 @@ class ForceReader:
         level = level.clamp(-self._range, self._range)
         step = torch.where(self._resolution > 0.0, self._resolution, 1.0)
         level = torch.where(self._resolution > 0.0, step * torch.round(level / step), level)
-        return Reading(level - level.clamp(-self._deadband, self._deadband), saturated)
+        return level - level.clamp(-self._deadband, self._deadband), saturated
 
 
 @final
@@ -181,7 +178,7 @@ class PositionLoop:
     Parameters
     ----------
     bandwidth : float, default=20.0
-        In Hz.
+        Natural frequency of the loop in Hz.
     delay_steps : int, default=1
         Ticks between a command and its effect, at least 0.
     """

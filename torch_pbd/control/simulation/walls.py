@@ -60,9 +60,9 @@ class Tunnel:
     Parameters
     ----------
     stiffness : float, default=1e4
-        Of the wall [N/m].
+        Stiffness of the walls [N/m].
     damping : float or None, default=None
-        Of the wall [N s/m]. None is ``sqrt(stiffness)``: half the critical damping of 1 kg, 100 N s/m by default.
+        Damping of the walls [N s/m]. None is ``sqrt(stiffness)``: half the critical damping of 1 kg.
     virtual : bool, default=False
         A drawn wall, as on the display of the paper: penetration counts but there is no force.
 

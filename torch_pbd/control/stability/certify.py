@@ -39,16 +39,16 @@ def certify(
     Parameters
     ----------
     schedule : Schedule
-        Whose times, gains and, for poses, angular velocities are checked.
+        Its times, gains and, for poses, angular velocities are what is checked.
     mass : float, array_like of shape (d, d) or (n, d, d), or callable, default=None
         Virtual mass of the admittance, or inertia of the arm at each row, in kg, for poses also kg m and kg m^2; or a
         function of time (n,), in s, that returns it. None is the schedule's own, or 1 kg.
     speed : float, default=1.0
         Replay speed: 2 is twice as fast.
     position_loop : PositionLoop, default=None
-        For the stiffest environment; None is 20 Hz behind one tick.
+        What the robot follows the admittance by, for the stiffest environment; None is 20 Hz behind one tick.
     force_cutoff : float, default=500.0
-        Of the force sensor's low-pass, Hz; None is none.
+        Corner frequency of the force sensor's low-pass, Hz; None is none.
     dt : float, default=0.001
         Tick of the controller, s.
 
@@ -161,7 +161,7 @@ def stiffest_environment(
     while len(ticks):
         low, high = 0.0, least
         for _ in range(_BISECTIONS):
-            # By the logarithm while that is wide: the answer may lie anywhere between a feather and a wall.
+            # Wide intervals are halved by logarithm: the answer may lie anywhere between a feather and a wall.
             middle = math.sqrt(max(low, 1.0) * high) if high > 1e3 * max(low, 1.0) else 0.5 * (low + high)
             low, high = (middle, high) if is_stable(ticks[:1], middle) else (low, middle)
         least = low

@@ -13,9 +13,9 @@ from torch_pbd.control.stability.dynamics import ErrorDynamics
 from torch_pbd.linalg import evenly, least_eigenvalue, rows_below, symmetrize, tril_to_vector, vector_to_tril
 from torch_pbd.optim.batch import minimize_batch
 
-# Of the summands of a matrix whose smallest eigenvalue must be positive: a margin over rounding, 1e-13 of them.
+# Share of the summands of a matrix whose smallest eigenvalue must be positive: a margin over rounding, 1e-13 of them.
 _ROUNDING = 1e-10
-# Of cuts, and rows of the first; where K and D commute one is enough, and three have been the most that was needed.
+# Rounds of cuts, and rows of the first; where K and D commute one is enough, and three have been the most needed.
 _ROUNDS, _N_CUT = 12, 200
 # Outputs up to which a function with axes of its own is searched for, and rows that it is searched among at first.
 _MAX_OUTPUTS, _N_ROWS = 9, 24

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torch_pbd.linalg import symmetrize
 
-# Of the damping: smaller entries between the modes of the stiffness are rounding of its root.
+# Share of the damping: smaller entries between the modes of the stiffness are rounding of its root.
 _COUPLED = 1e-12
 # Matrices of 27 outputs that stay in the cache together.
 _AT_ONCE = 64

@@ -49,15 +49,15 @@ class StabilityReport:
     alpha : float
         Constant of the certificate, 1/s.
     margin : float
-        Of the certificate, 1/s: rate at which the root of Kronander and Billard's V falls at least, the smallest
-        eigenvalue of ``-dV/dt`` relative to V, halved. Not negative: V never grows without a force, and the motion is
+        Rate at which the root of Kronander and Billard's V falls at least, 1/s: the smallest eigenvalue of ``-dV/dt``
+        relative to V, halved. Not negative: V never grows without a force, and the motion is
         passive with respect to the force and ``v + alpha e``. Exact for gains that are linear between the rows.
         Negative says that this certificate does not hold, not that the schedule is unstable.
     held_growth : float
         Largest growth of such a V, of this alpha, a half or a quarter of it, over an interval between rows in which
         the gains are held instead, as at the ticks of a controller: 1 is none. NaN without an alpha.
     margin_time : float
-        Where the margin is smallest, s.
+        Time at which the margin is smallest, s.
     max_speed : float
         Largest replay speed at which the margin is not negative; 1 is the schedule's own.
     gain : float
@@ -74,7 +74,7 @@ class StabilityReport:
     inertia : tuple of (float, float)
         Smallest and largest of the positions, kg, and of the rotation, kg m^2.
     units : tuple of str
-        Of the stiffness of these.
+        Units of the stiffness of positions, and of the rotation.
     """
 
     damping_ratio: float

@@ -61,7 +61,7 @@ class StiffnessLaw:
         a mass M: ``K = (M # Sigma^-1) / r^1/2`` with the geometric mean # of matrices, then held within the limits.
         Its own damping ratio is 1/sqrt(2); where limits hold, 1 costs less (scripts/benchmarks/precision_law.py).
     rotation : RotationLimits, default=None
-        Of the last three outputs, if they are a rotation in rad.
+        Limits of the last three outputs, if they are a rotation in rad.
     cross_terms : bool, default=False
         Whether covariances between blocks couple them in the stiffness. Without, they do not count.
     effort : "match", float or sequence of float, default="match"

@@ -19,8 +19,8 @@ from torch_pbd.control.matrices import as_mass, as_semidefinite, damping_from_st
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.linalg import spectral_map, symmetrize
 
-# Of the lightest mass over the heaviest stiffness: deviations of no variance would be infinitely stiff. What is stiffer
-# than a million times the limit is held at the limit all the same, and leaves ten digits to what is not.
+# Times the limit: deviations of no variance would be infinitely stiff. What is stiffer than a million times the limit
+# is held at the limit all the same, and leaves ten digits to what is not.
 _STIFFEST = 1e6
 
 
@@ -79,9 +79,9 @@ def lqt(
     covariance : Tensor of shape (n, d, d)
         Positive definite, at ticks of ``dt``, each held over its tick.
     mass : float or Tensor of shape (d, d) or (n, d, d)
-        In kg.
+        Mass in kg.
     dt : float
-        In s.
+        Length of a tick in s.
     effort : float, default=1e-6
         The r, in kg/N^2.
     horizon : float, default=None
