@@ -9,7 +9,7 @@ from sklearn.utils.validation import check_is_fitted
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control import parameters
-from torch_pbd.control.impedance import OnUnknown, fit_covariance, fit_law, outputs_under
+from torch_pbd.control.impedance import fit_covariance, fit_law, outputs_under
 from torch_pbd.control.planning import Planning
 from torch_pbd.control.primitive import smoothing
 from torch_pbd.control.primitive.dmp import Adaptation, Gate
@@ -116,16 +116,16 @@ class DMPController(Planning):
     tau: float = 1.0
     adaptation: Adaptation = "safe"
     gate: Gate = "time"
-    phase_input: parameters.PhaseInput = "time"
-    variability: parameters.Variability = "position"
-    goal: parameters.Goals = "common"
+    phase_input: Literal["time", "log_s", "s"] = "time"
+    variability: Literal["position", "forcing"] = "position"
+    goal: Literal["common", "each"] = "common"
     cutoff: float | Literal["auto"] | None = "auto"
     duration: float | None = None
     n_steps: int = 100
     stiffness_law: StiffnessLaw | None = None
     mass: float | Floats | None = None
     damping_ratio: float | Literal["paper"] = 1.0
-    on_unknown: OnUnknown = "soft"
+    on_unknown: Literal["soft", "prior", "raise"] = "soft"
 
     def fit(
         self, X: Demonstrations | ArrayLike, y: ArrayLike | None = None, *, groups: ArrayLike | None = None

@@ -1,7 +1,7 @@
 """Variability of demonstrations, learned; and stiffness and damping from what is known of it, and what is not."""
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -18,8 +18,6 @@ from torch_pbd.data import Demonstrations
 from torch_pbd.estimators.base import CovarianceRegressor, prior_covariance
 from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
 from torch_pbd.estimators.validation import fit_with_groups
-
-OnUnknown = Literal["soft", "prior", "raise"]
 
 _FAR = 1e6  # ranges of the input: only the prior speaks there
 _AT_ONCE = 2**14  # times: a regressor may need a hundred times the memory of what it predicts

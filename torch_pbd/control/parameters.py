@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any, Literal, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,9 +10,8 @@ from scipy.sparse import issparse
 from sklearn.utils.validation import check_X_y
 
 from torch_pbd import checks
-from torch_pbd.control.impedance import OnUnknown
 from torch_pbd.control.matrices import as_damping_ratio, as_mass
-from torch_pbd.control.primitive.dmp import Adaptation, Gate
+from torch_pbd.control.primitive.dmp import DMP
 from torch_pbd.control.primitive.outputs import common_unit
 from torch_pbd.control.primitive.smoothing import CUTOFF_HZ
 from torch_pbd.control.stiffness import StiffnessLaw
@@ -22,10 +21,6 @@ from torch_pbd.data.poses import ROTATION
 from torch_pbd.data.units import ANGLES, LENGTHS, TIMES
 from torch_pbd.estimators.validation import check_groups, check_squares, checked_values
 from torch_pbd.files.memory import require_much
-
-PhaseInput = Literal["time", "log_s", "s"]
-Variability = Literal["position", "forcing"]
-Goals = Literal["common", "each"]
 
 _BRIEFEST = 1e-100  # s: squares of what is briefer, or of its inverse, are no numbers
 _CYCLES = 0.01, 1e6  # of the cutoff in a movement: fewer smooth it to a line, more leave what was recorded
@@ -38,21 +33,15 @@ _DECAY = {"s": (1e-6, 30.0), "log_s": (1e-6, 1e12)}
 # Measured, in numbers: of each of a demonstration's positions while it is smoothed; of each pair of steps while the
 # forcing is learned, in all and of each axis where they are many; of each axis at a step, while it is tabulated.
 _SMOOTHED, _PAIRED, _PAIRED_AXIS, _TABULATED = 10.0, 34.0, 5.0, 16e3
-_CHOICES = {
-    "gate": Gate, "adaptation": Adaptation, "phase_input": PhaseInput, "variability": Variability, "goal": Goals,
-    "on_unknown": OnUnknown,
-}  # fmt: skip
 _NEEDED = ("get_params", "fit", "predict_cov", "predict_uncertainty")
 
 
 def check_parameters(controller: Any) -> None:
     """Refuse the parameters of a DMPController that cannot be used, before any work."""
-    for name, kind in _CHOICES.items():
-        checks.choice(getattr(controller, name), name, kind)
-    for name, unit in (("alpha", ""), ("gamma", ""), ("tau", "s")):
-        checks.number(getattr(controller, name), name, above=0.0, unit=unit)
-    checks.number(controller.beta, "beta", above=0.0, optional=True)
-    checks.number(controller.duration, "duration", above=0.0, unit="s", optional=True)
+    for name, kind in get_type_hints(type(controller)).items():
+        if get_origin(kind) is Literal:
+            checks.choice(getattr(controller, name), name, kind)
+    DMP(controller.alpha, controller.beta, controller.gamma, controller.tau, duration=controller.duration)
     checks.count(controller.n_steps, "n_steps", least=5)
     if controller.cutoff != "auto":
         checks.number(controller.cutoff, "cutoff", above=0.0, unit="Hz", optional=True, remedy="leave it 'auto'")
