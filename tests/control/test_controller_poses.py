@@ -299,6 +299,7 @@ def test_priors_are_of_the_outputs(kind, rng):
     prior = covariance if kind == "array" else lambda X: np.tile(covariance, (len(X), 1, 1))
     controller = fitted(poses(), CholeskyCovRegressor(max_iter=2, prior=prior))
     np.testing.assert_allclose(controller.predict_cov([[1e5]])[0], covariance, rtol=1e-6, atol=1e-9)
+    assert "prior" in controller.schedule(10.0).provenance["covariance"]["CholeskyCovRegressor"]
 
 
 def test_a_controller_of_poses_plans_the_same_from_its_file(controller, tmp_path):
