@@ -30,7 +30,7 @@ from scipy.stats import multivariate_t
 from torch_pbd import HeteroscedasticGPRegressor
 from torch_pbd.control.primitive import outputs
 from torch_pbd.data import make_pose_demonstrations, pose_covariance, pose_mean
-from torch_pbd.rotations import Chart, conjugate, exp, left_jacobian, log, matrix, mean, multiply, right_jacobian
+from torch_pbd.rotations import Chart, conjugate, exp, left_jacobian, log, matrix, mean, multiply
 
 SEEDS = {"chosen on": range(12), "confirmed on": range(100, 112)}
 SIZES, STEPS, FRESH = (5, 6, 8, 12, 16), 60, 12
@@ -112,7 +112,7 @@ def judge_poses(n_demos, seed, stays, choices):
     fresh, middle = np.concatenate([position, chart.log(turn)], axis=-1), shown.mean(axis=0)
     to_world = np.tile(np.eye(6), (STEPS, 1, 1))
     to_world[:, 3:, 3:] = chart.to_world(middle[:, 3:])
-    frames, scores = {"tool": right_jacobian(middle[:, 3:]), "world": left_jacobian(middle[:, 3:])}, []
+    frames, scores = {"tool": left_jacobian(-middle[:, 3:]), "world": left_jacobian(middle[:, 3:])}, []
     for choice in choices:
         frame = np.tile(np.eye(6), (STEPS, 1, 1))
         frame[:, 3:, 3:] = frames.get(choice, np.eye(3))

@@ -217,14 +217,7 @@ def common_axes(deviation: Floats, degrees: NDArray[np.integer], least: float) -
     Signal Processing 58, 2010.
     """
     scatter, free = np.einsum("kni,knj->nij", deviation, deviation), np.maximum(degrees, 0)[:, np.newaxis, np.newaxis]
-    unit, d = np.eye(scatter.shape[-1]), scatter.shape[-1]
-    covariances = scatter / np.maximum(free, 1) + least**2 * unit
-    # Nearer to spheres: the nearer, the rounder they are, and the fewer degrees they have; Chen's equation (23).
-    trace = np.trace(covariances, axis1=1, axis2=2)[:, np.newaxis, np.newaxis]
-    square = (covariances**2).sum(axis=(1, 2), keepdims=True)
-    chance = (1.0 - 2.0 / d) * square + trace**2
-    share = chance / np.maximum(chance, (free + 1.0 - 2.0 / d) * (square - trace**2 / d))
-    covariances = (1.0 - share) * covariances + share * trace / d * unit
+    covariances = _shrunk(scatter / np.maximum(free, 1) + least**2 * np.eye(scatter.shape[-1]), free)
     axes = np.linalg.eigh(scatter.sum(axis=0))[1]  # of the pooled covariance, which stay where no shape tells anything
     found = _along(covariances, axes)
     for _ in range(_STEPS):
@@ -241,6 +234,15 @@ def common_axes(deviation: Floats, degrees: NDArray[np.integer], least: float) -
         if np.abs(angles).max() < _ROUNDING:
             break
     return np.array(axes[:, np.argsort((free[:, 0] * np.log(found)).sum(axis=0))], dtype=np.float64)
+
+
+def _shrunk(covariances: Floats, free: Floats) -> Floats:
+    """Covariances (n, d, d) nearer to spheres: the nearer, the rounder they are, and the fewer degrees they have."""
+    d, trace = covariances.shape[-1], np.trace(covariances, axis1=1, axis2=2)[:, np.newaxis, np.newaxis]
+    square = (covariances**2).sum(axis=(1, 2), keepdims=True)
+    chance = (1.0 - 2.0 / d) * square + trace**2  # Chen's equation (23)
+    share = chance / np.maximum(chance, (free + 1.0 - 2.0 / d) * (square - trace**2 / d))
+    return (1.0 - share) * covariances + share * trace / d * np.eye(d)
 
 
 def _along(covariances: Floats, axes: Floats) -> Floats:
