@@ -11,7 +11,6 @@ from sklearn.utils.validation import check_X_y
 
 from torch_pbd import checks
 from torch_pbd.control.matrices import as_damping_ratio, as_mass
-from torch_pbd.control.primitive.dmp import DMP
 from torch_pbd.control.primitive.outputs import common_unit
 from torch_pbd.control.primitive.smoothing import CUTOFF_HZ
 from torch_pbd.control.stiffness import StiffnessLaw
@@ -41,7 +40,10 @@ def check_parameters(controller: Any) -> None:
     for name, kind in get_type_hints(type(controller)).items():
         if get_origin(kind) is Literal:
             checks.choice(getattr(controller, name), name, kind)
-    DMP(controller.alpha, controller.beta, controller.gamma, controller.tau, duration=controller.duration)
+    for name, unit in (("alpha", ""), ("gamma", ""), ("tau", "s")):
+        checks.number(getattr(controller, name), name, above=0.0, unit=unit)
+    checks.number(controller.beta, "beta", above=0.0, optional=True)
+    checks.number(controller.duration, "duration", above=0.0, unit="s", optional=True)
     checks.count(controller.n_steps, "n_steps", least=5)
     if controller.cutoff != "auto":
         checks.number(controller.cutoff, "cutoff", above=0.0, unit="Hz", optional=True, remedy="leave it 'auto'")

@@ -219,7 +219,8 @@ def primitive(controller: Any) -> DMP:
     """Primitive of a controller whose duration is known; with adaptation="safe" its tau is that of 10 s."""
     tau = float(controller.tau) * (controller.duration_ / 10.0 if controller.adaptation == "safe" else 1.0)
     options = {"duration": controller.duration_, "gate": controller.gate, "adaptation": controller.adaptation}
-    return DMP(controller.alpha, controller.beta, controller.gamma, tau, **options)
+    beta = None if controller.beta is None else float(controller.beta)
+    return DMP(float(controller.alpha), beta, float(controller.gamma), tau, **options)
 
 
 def _process_mean(X: Floats, forcing: Floats, n_demos: int, at: Floats) -> Floats:
