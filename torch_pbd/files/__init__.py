@@ -49,11 +49,8 @@ _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0
 def replacing(path: Path) -> Iterator[BinaryIO]:
     """A new file beside ``path``, open for writing, that takes its place once it is complete and on the disk.
 
-    A reader sees the old file or the new one; on an error the old one is as it was. The new one has the permissions
-    of the old one. Where ``path`` is a link, the file that it leads to is replaced, and the link stays.
-
-    Raises FileNotFoundError if its folder does not exist, and OSError, with the path (which a full disk does not say),
-    if it cannot be written, or is a folder, a pipe or a device.
+    On an error the old file is as it was. The new one has its permissions; where ``path`` is a link, the file that it
+    leads to is replaced. An OSError has the path, which a full disk does not say.
     """
     file_path = _target(path)
     # In the same folder, as only within one file system a file takes another's place at once.
@@ -76,10 +73,9 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 
 
 def remove_drafts(folder: Path) -> int:
-    """Remove what :func:`replacing` has left in a folder where a process was killed or the power failed.
+    """Number of files that :func:`replacing` left in a folder where a process was killed, and that are now removed.
 
-    Nothing else may write files there meanwhile: drafts of what still runs cannot be told from others. Folders in it
-    are left alone; what comes back is the number of drafts.
+    Nothing else may write files there meanwhile: drafts of what still runs cannot be told from others.
     """
     drafts = [entry for entry in folder.iterdir() if _DRAFT.fullmatch(entry.name) and not entry.is_dir()]
     for draft in drafts:
@@ -116,8 +112,8 @@ def _sync_folder(folder: Path) -> None:
 def read_members(content: bytes, max_bytes: int, *, remedy: str) -> dict[str, bytes]:
     """Members of an archive by their names, without ``.npy``; nothing is written to the disk, whatever they say.
 
-    Raises ValueError if it is damaged or not as NumPy writes it, has two members of one name, or unpacks to more than
-    ``max_bytes`` or than the memory can take; ``remedy`` says what to do about ``max_bytes``.
+    A ValueError tells of an archive that NumPy does not write, or that unpacks to more than ``max_bytes``, for which
+    ``remedy`` says what to do, or than the memory can take.
     """
     needed = _ENTRY_BYTES * content.count(b"PK\x01\x02") + len(content)
     require_memory(needed, what="its list of members", remedy="Pack fewer arrays together.")
@@ -140,8 +136,7 @@ def read_members(content: bytes, max_bytes: int, *, remedy: str) -> dict[str, by
 def read_array(name: str, content: bytes) -> NDArray[Any]:
     """Array of numbers, bools or text, as NumPy writes it; read-only, it takes no memory of its own.
 
-    ``numpy.load`` would allocate whatever shape the header declares. Raises ValueError, which starts with ``name``, if
-    the content is no such array, or has not as many bytes as its shape needs.
+    ``numpy.load`` would allocate whatever shape the header declares: here a ValueError, by ``name``, tells of it.
     """
     head = io.BytesIO(content[:_LONGEST_HEADER])
     try:
@@ -159,11 +154,7 @@ def read_array(name: str, content: bytes) -> NDArray[Any]:
 def write_checksummed(path: Path, key: str, header: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
     """Write arrays of numbers, and a header of what JSON can hold, to one safetensors file that is there whole or not.
 
-    ``key`` is the kind of the file: the name of the header in the metadata of safetensors. The header has
-    ``format_version``; ``sha256`` is added to it.
-
-    Raises TypeError if the header is not for JSON, ValueError if it is longer than 4 MiB, and OSError, with the path,
-    if the file cannot be written.
+    ``key`` is the kind of the file: the name of the header in the metadata of safetensors. ``sha256`` is added to it.
     """
     from safetensors.numpy import save  # here: schedules and the loop load where only NumPy is installed
 
@@ -183,9 +174,8 @@ def write_checksummed(path: Path, key: str, header: Mapping[str, Any], arrays: M
 def read_checksummed(path: Path, key: str, format_version: int) -> tuple[dict[str, Any], Arrays]:
     """Header, less its checksum, and arrays of a file that :func:`write_checksummed` wrote; nothing is executed.
 
-    Raises FileNotFoundError if there is no such file, and ModelFileError if it is not of this kind, of another
-    ``format_version``, too large for the memory, or not as it was written: to the byte, but for the spelling of what
-    safetensors says of the arrays.
+    A ModelFileError tells of another kind or ``format_version``, of a file that the memory cannot take, or that is not
+    as it was written: to the byte, but for the spelling of what safetensors says of the arrays.
     """
     if not path.is_file():
         raise FileNotFoundError(f"no model file at {path}")

@@ -19,8 +19,7 @@ _MOUNT = Path("/sys/fs/cgroup")
 def available_bytes() -> int:
     """Memory of this machine in bytes, or the limit of the control group that the process runs in, if lower.
 
-    Containers and batch systems set such limits (cgroup v2 or v1). What other processes use is not taken off. A system
-    that does not tell its memory has no end of it.
+    Containers and batch systems set such limits (cgroup v2 or v1). A system that does not tell has no end of memory.
     """
     try:
         physical = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
