@@ -53,6 +53,7 @@ MODELS = {
 
 A mixture has as many components as in the paper's Table I. Models of whole movements are compared on files alone."""
 
+_MODULES = {name: module for known in CLASSES.values() for name, module in known.items()}
 _CLASS_KEYS = ("class_path", "init_args")
 _HELP_WIDTH = 80  # of the terminals that people start with
 
@@ -72,12 +73,8 @@ class Option(NamedTuple):
 def parse(usage: str, about: str, options: Mapping[str, Option], arguments: Sequence[str]) -> tuple[Namespace, str]:
     """Values of a command line as objects, and the YAML that gives them again.
 
-    Raises
-    ------
-    ConfigError
-        If an argument or a key of a file cannot be used.
-    SystemExit
-        After ``--help``, ``--NAME.help CLASS`` and ``--print_config`` are answered.
+    Raises ConfigError if an argument or a key of a file cannot be used, and SystemExit once ``--help``,
+    ``--NAME.help CLASS`` or ``--print_config`` is answered.
     """
     if {"-h", "--help"} & set(arguments):
         _answer(_help(usage, about, options))
@@ -132,22 +129,20 @@ def _help(usage: str, about: str, options: Mapping[str, Option]) -> str:
 
 def _class_help(text: str, place: Place) -> str:
     """Parameters of a class, and what its docstring says of them."""
-    table = {name: module for known in CLASSES.values() for name, module in known.items()}
-    spec = _take_class(text, table, place, None)
+    spec = _take_class(text, _MODULES, place, None)
     lines = [f"  {name}: {described(hint)}; default {default}" for name, (hint, default) in spec.parameters().items()]
     return "\n".join([f"parameters of {spec.name}:", *lines, "", inspect.getdoc(spec.load()) or ""])
 
 
 @dataclass(frozen=True)
 class _Spec:
-    """An object yet to be made: its class, of a table of modules by name, and the parameters given."""
+    """An object yet to be made: its class and the parameters given."""
 
     name: str
-    table: Mapping[str, str]
     init_args: dict[str, Any]
 
     def load(self) -> Any:
-        return getattr(import_module(self.table[self.name]), self.name)
+        return getattr(import_module(_MODULES[self.name]), self.name)
 
     def parameters(self) -> dict[str, tuple[Any, Any]]:
         """Type and default of each parameter of the class."""
@@ -269,7 +264,7 @@ def _take_class(value: Any, table: Mapping[str, str], place: Place, before: _Spe
     for key in set(value).difference(_CLASS_KEYS):
         raise place.below(key).error(unknown(key, _CLASS_KEYS, "a key here; parameters stand below init_args"))
     # Parameters that were given before stay, unless the class is another.
-    spec = _Spec(name, table, dict(before.init_args) if before and before.name == name else {})
+    spec = _Spec(name, dict(before.init_args) if before and before.name == name else {})
     given = value.get("init_args")
     given = read_yaml(given, "init_args").content if isinstance(given, _Text) else given
     if not isinstance(given, dict | None):

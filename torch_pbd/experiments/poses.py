@@ -71,7 +71,10 @@ def run_poses(
     """Run each controller; writes figures, models, schedules, metrics, reports; returns tables and reports as text."""
     if demonstrations.n_outputs != 6:
         raise ConfigError(f"data: a pose has three positions and a rotation, not the outputs {demonstrations.names}.")
-    folder.write_figure(task_figure(demonstrations), "figure6_task")
+    figure, space, bands = style.panels(3, 3, _figure)
+    poses.draw_recorded_poses(demonstrations, space[0], bands)
+    plotting.legend_below(figure, space)
+    folder.write_figure(figure, "figure6_task")
     rows, reports = [], []
     for name, controller in steps(controllers.items(), "controller", len(controllers)):
         fitted, _ = fit_once(clone(controller), demonstrations, finished=folder.finished)
@@ -162,14 +165,6 @@ def _wrench(schedule: Schedule, largest: float, kind: style.Kind, axis: int) -> 
 def _push_rows(schedule: Schedule) -> list[int]:
     """Rows in the middle of pushes."""
     return [round(centre * (len(schedule) - 1)) for centre in PUSHES]
-
-
-def task_figure(demonstrations: Demonstrations) -> Figure:
-    """Demonstrated paths with frames of the tool, and rotations over time: Figure 6."""
-    figure, space, bands = style.panels(3, 3, _figure)
-    poses.draw_recorded_poses(demonstrations, space[0], bands)
-    plotting.legend_below(figure, space)
-    return figure
 
 
 def schedule_figure(run: PoseRun, demonstrations: Demonstrations, name: str) -> Figure:

@@ -62,9 +62,8 @@ def plot_std_band(
 ) -> tuple[Line2D, PolyCollection]:
     """Draw a mean (n,) over x (n,) with a band of ``n_std`` standard deviations (n,) on either side."""
     style.check_axes("ax", [ax])
-    across, middle, half = (checks.array(*named, None).ravel() for named in ((x, "x"), (mean, "mean"), (std, "std")))
-    for part, name in ((middle, "mean"), (half, "std")):
-        checks.array(part, name, (len(across),))
+    across = checks.array(x, "x", None).ravel()
+    middle, half = (checks.array(part, name, (len(across),)) for part, name in ((mean, "mean"), (std, "std")))
     checks.require(half >= 0.0, half, "std", "at least zero", "give standard deviations")
     (line,) = ax.plot(across, middle, color=color, lw=1.5, label=label, zorder=3)
     band = ax.fill_between(

@@ -40,14 +40,10 @@ class Kind(NamedTuple):
 
 POSITION = Kind(slice(0, 3), "along", "force", "N", "mm", 1e3, "N/m")
 ROTATION = Kind(slice(3, 6), "about", "torque", "Nm", "deg", 180.0 / np.pi, "Nm/rad")
-AXES = ("most precise axis", "middle axis", "freest axis")
 
 
 def figure_grid(n_rows: int, n_columns: int, size: tuple[float, float], **options: Any) -> tuple[Figure, Any]:
-    """Figure of ``size`` in inches and its Axes (n_rows, n_columns); pyplot does not know it, so nothing needs closing.
-
-    ``options`` are those of ``Figure.subplots``.
-    """
+    """Figure of ``size`` in inches that pyplot does not know, so that nothing needs closing, and its Axes."""
     figure = Figure(figsize=size)
     return figure, figure.subplots(n_rows, n_columns, squeeze=False, **options)
 
@@ -124,7 +120,9 @@ def kind_of(unit: str | None, n_outputs: int) -> Kind:
 
 def axis_names(schedule: Any, n_axes: int) -> Sequence[str]:
     """Names of principal axes of a block, the most precise first: one name, one dash in both blocks."""
-    return AXES if schedule.position.shape[1] == 3 else [AXES[0], *(f"axis {i + 2}" for i in range(n_axes - 1))]
+    if schedule.position.shape[1] == 3:
+        return ("most precise axis", "middle axis", "freest axis")
+    return ("most precise axis", *(f"axis {i + 2}" for i in range(n_axes - 1)))
 
 
 def output_label(demonstrations: Any, output: int) -> str:
