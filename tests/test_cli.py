@@ -254,7 +254,6 @@ def test_a_push_against_its_axis_is_refused(name, capsys):
 @pytest.mark.parametrize(("task", "n_demos"), [("tunnel", 6), ("peg", 8)])
 def test_made_demonstrations_are_enough_for_their_outputs(task, n_demos, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("torch_pbd.experiments.robot.run_robot", lambda *args, **options: "")
-    monkeypatch.setattr("torch_pbd.experiments.poses.run_poses", lambda *args, **options: "")
     assert main(["experiment", "--task", task, "--arm", "none", "--output", str(tmp_path)]) == 0
     assert f"{task} task: {n_demos} demonstrations" in capsys.readouterr().out
 

@@ -12,14 +12,8 @@ from torch_pbd.cli.main import main
 from torch_pbd.control import RotationLimits, Schedule, StiffnessLaw
 from torch_pbd.data import make_pose_demonstrations, pose_covariance, pose_mean
 from torch_pbd.exceptions import ConfigError
-from torch_pbd.experiments.poses import (
-    damping_ratio,
-    empirical_covariances,
-    push_rows,
-    pushed,
-    run_poses,
-    with_panda,
-)
+from torch_pbd.experiments.pushes import damping_ratio, push, push_rows, with_panda
+from torch_pbd.experiments.robot import empirical_covariances, run_robot
 from torch_pbd.experiments.run_folder import RunFolder
 from torch_pbd.plotting.style import POSITION, ROTATION
 
@@ -38,7 +32,7 @@ def controller():
 
 @pytest.fixture(scope="module")
 def run(controller, recorded):
-    return pushed(controller.fit(recorded), rate=200.0, peak=12.0, torque=1.2, arm="none")
+    return push(controller.fit(recorded), rate=200.0, peak=12.0)
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +112,7 @@ def test_empirical_covariances_are_those_of_the_law():
 
 def test_a_run_leaves_its_tables_figures_schedules_and_models(controller, recorded, tmp_path):
     folder = RunFolder(tmp_path, {})
-    text = run_poses({"a b": controller}, recorded, folder, rate=100.0, arm="none")
+    text = run_robot({"a b": controller}, recorded, folder, rate=100.0)
     assert "a b         tool z" in text
     assert "a b: a movement of" in text
     assert {path.name for path in (tmp_path / "figures").iterdir()} == {
@@ -127,14 +121,15 @@ def test_a_run_leaves_its_tables_figures_schedules_and_models(controller, record
     assert Schedule.load(tmp_path / "schedule" / "a_b.npz").orientation.shape[1] == 4
     assert (tmp_path / "model" / "a_b_controller.safetensors").is_file()
     assert len((tmp_path / "metrics.csv").read_text().splitlines()) == 1 + 6
-    flat = Demonstrations([0.0, 1.0], np.zeros((2, 2, 2)), names=("x", "y"))
-    with pytest.raises(ConfigError, match=r"a pose has three positions and a rotation, not the outputs \('x', 'y'\)"):
-        run_poses({"a": controller}, flat, folder)
+    still = np.tile([0.0, 1.0, 0.0, 0.0, 0.0], (2, 2, 1))
+    flat = Demonstrations([0.0, 1.0], still, names=("x", "qw", "qx", "qy", "qz"), rotation=("qw", "qx", "qy", "qz"))
+    with pytest.raises(ConfigError, match="a pose has three positions and a rotation, not the outputs"):
+        run_robot({"a": controller}, flat, folder)
 
 
 def test_without_pushes_there_is_no_ratio_and_the_mass_is_the_controllers(controller, recorded, tmp_path):
     heavy = clone(controller).set_params(mass=3.0)
-    text = run_poses({"a": heavy}, recorded, RunFolder(tmp_path, {}), peak=0.0, torque=0.0, rate=100.0, arm="none")
+    text = run_robot({"a": heavy}, recorded, RunFolder(tmp_path, {}), peak=0.0, torque=0.0, rate=100.0)
     assert text.split("\n")[3].split()[3:5] == ["0", "0"]
     assert " s; of 3 kg and 3 kg m^2\n" in text
 
@@ -172,7 +167,7 @@ def test_an_arm_in_mujoco_is_pushed_as_far_as_its_plant():
 
     law = StiffnessLaw(stiffness_min=300.0, stiffness_max=1500.0, rotation=RotationLimits(5.0, 60.0))
     controller = DMPController(GMMBaseline(n_components=3), stiffness_law=law)
-    run = pushed(controller.fit(make_pose_demonstrations(random_state=0)), 1000.0, 12.0, 1.2, "panda")
+    run = push(controller.fit(make_pose_demonstrations(random_state=0)), peak=12.0, arm="panda")
     schedule, model = run.schedule, panda()
     joints = inverse_kinematics(model, schedule.position, schedule.orientation, "tool", start=HOME)
     still = mujoco.run(model, schedule, joints).deviation

@@ -4,7 +4,8 @@ import pytest
 from torch_pbd import CholeskyCovRegressor, Demonstrations, DMPController
 from torch_pbd.control import Schedule
 from torch_pbd.data import make_tunnel_demonstrations
-from torch_pbd.experiments.robot import push_profile, push_row, run_controller, run_robot
+from torch_pbd.experiments.pushes import push, push_profile, push_row
+from torch_pbd.experiments.robot import run_robot
 from torch_pbd.experiments.run_folder import RunFolder
 
 
@@ -20,9 +21,9 @@ def test_pushes_are_two_pulses_of_the_peak_and_0_8_s():
 
 def test_the_table_has_what_the_run_shows():
     recorded = make_tunnel_demonstrations(random_state=0, rate=50.0)
-    run = run_controller(DMPController(), recorded, rate=200.0)
+    run = push(DMPController().fit(recorded), rate=200.0)
     row = push_row("mine", run)
-    deviation = np.abs(run.rollout.position - run.controller.simulate(rate=200.0).position)[:, 0]
+    deviation = np.abs(run.pushes["force"][0].position - run.controller.simulate(rate=200.0).position)[:, 0]
     assert row["early [mm]"] == pytest.approx(1e3 * deviation[:1000].max())
     assert row["ratio"] == pytest.approx(row["early [mm]"] / row["late [mm]"])
     assert row["K x early"] == pytest.approx(run.schedule.stiffness[400, 0, 0])

@@ -184,7 +184,6 @@ def experiment(options: Any, folder: Any) -> str:
     """A skill, learned and reproduced on a simulated robot that is pushed."""
     from torch_pbd.data import load_demonstrations, make_pose_demonstrations, make_tunnel_demonstrations
     from torch_pbd.experiments.comparison import describe
-    from torch_pbd.experiments.poses import run_poses
     from torch_pbd.experiments.robot import framework_figure, run_robot
     from torch_pbd.registry import optional
 
@@ -198,21 +197,20 @@ def experiment(options: Any, folder: Any) -> str:
             options.n_demos or 6, random_state=options.seed, common_start=options.common_start
         )
     say(describe(demonstrations, source))
-    where = "at 20 % and 80 % of the movement; K is the stiffness there"
-    sizes = {"peak": options.push, "rate": options.rate}
-    if demonstrations.rotation_reference is not None:
+    if demonstrations.rotation_reference is None:
+        turns = set(demonstrations.units or ()) in ({"rad"}, {"deg"})
+        along, unit = ("Nm about", ", Nm/rad") if turns else ("N along", ", N/m")
+        pushes = f"{options.push:g} {along} {demonstrations.names[0]}"
+        folder.write_figure(framework_figure(), "figure5_framework")
+    else:
         if options.arm == "panda":
             try:
                 optional("mujoco", "robot", "a Panda")  # before anything is learned
             except ModuleNotFoundError as error:
                 raise ConfigError(f"arm: {error} Or leave the arm out by --arm none.") from error
-        say(f"pushes of {options.push:g} N along and {options.torque:g} Nm about each axis of the tool,\n{where}\n")
-        sizes |= {"torque": options.torque}
-        return run_poses(options.controllers, demonstrations, folder, arm=options.arm, **sizes)
-    turns = set(demonstrations.units or ()) in ({"rad"}, {"deg"})
-    along, unit = ("Nm about", "Nm/rad") if turns else ("N along", "N/m")
-    say(f"pushes of {options.push:g} {along} {demonstrations.names[0]},\n{where}, {unit}\n")
-    folder.write_figure(framework_figure(), "figure5_framework")
+        pushes, unit = f"{options.push:g} N along and {options.torque:g} Nm about each axis of the tool", ""
+    say(f"pushes of {pushes},\nat 20 % and 80 % of the movement; K is the stiffness there{unit}\n")
+    sizes = {"peak": options.push, "torque": options.torque, "rate": options.rate, "arm": options.arm}
     return run_robot(options.controllers, demonstrations, folder, in_tunnel=made, **sizes)
 
 

@@ -1,7 +1,7 @@
-"""The robotic experiment of Section V: learn, reproduce, push twice (Figures 5 to 8), on any demonstrations."""
+"""The robotic experiment of Section V, Figures 5 to 8, on any demonstrations, of a tool that turns too."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -9,82 +9,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from sklearn.base import clone
 
-from torch_pbd import plotting
+from torch_pbd import plotting, rotations
 from torch_pbd.checks import Floats
 from torch_pbd.console import format_table, steps
 from torch_pbd.control.controller import DMPController
-from torch_pbd.control.primitive.outputs import in_si
-from torch_pbd.control.schedule.schedule import Schedule
-from torch_pbd.control.simulation.rollout import Rollout
-from torch_pbd.control.stability.report import StabilityReport
 from torch_pbd.data import Demonstrations, tunnel_center, tunnel_half_width
-from torch_pbd.experiments.run_folder import FinishedFits, RunFolder, fit_once
-from torch_pbd.plotting import parts, style
+from torch_pbd.exceptions import ConfigError
+from torch_pbd.experiments.pushes import KINDS, TOOL, Run, damping_ratio, guarantees, push, push_row, push_rows
+from torch_pbd.experiments.run_folder import RunFolder, fit_once
+from torch_pbd.plotting import parts, poses, style
 
-PUSHES = (0.2, 0.8)  # of the duration: 2 s and 8 s of the paper's 10 s
-_PUSH_LENGTH = 0.08  # of the duration: 0.8 s
 _N_ELLIPSES = 13  # one every 0.8 s of the paper's movement: more would cover each other
 _MOST_OUTPUTS = 6  # panels of Figure 7 that a page holds
-
-
-@dataclass(frozen=True)
-class Run:
-    """One controller on one task: what it plans, what pushes do to it, and what is guaranteed."""
-
-    controller: DMPController
-    schedule: Schedule
-    rollout: Rollout
-    unpushed: Rollout
-    report: StabilityReport
-
-
-def push_profile(time: Floats, duration: float, peak: float, n_outputs: int) -> Floats:
-    """Forces (n, d) in N: pulses of a squared sine along the first output, early and late in the movement."""
-    force = np.zeros((len(time), n_outputs))
-    force[:, 0] = peak * sum(pulse(time / duration, centre) for centre in PUSHES)
-    return force
-
-
-def pulse(phase: Floats, centre: float) -> Floats:
-    """Squared sine (n,) of height 1 around a phase: at the ends of a push it has neither force nor slope."""
-    return np.sin(np.pi * np.clip((phase - centre) / _PUSH_LENGTH + 0.5, 0.0, 1.0)) ** 2
-
-
-def run_controller(
-    controller: DMPController,
-    demonstrations: Demonstrations,
-    *,
-    peak: float = 5.0,
-    rate: float = 1000.0,
-    finished: FinishedFits | None = None,
-) -> Run:
-    """Fit, or take from the finished fits; plan, push and certify."""
-    fitted, _ = fit_once(clone(controller), demonstrations, finished=finished)
-    schedule = fitted.schedule(rate)
-    force = push_profile(schedule.time, fitted.duration_, peak, fitted.n_outputs_)
-    rollout = fitted.simulate(force=force, rate=rate)
-    return Run(fitted, schedule, rollout, fitted.simulate(rate=rate), schedule.certify())
-
-
-def push_row(name: str, run: Run) -> dict[str, Any]:
-    """Row of the table: displacement by the two pushes, against the run without them, and stiffness there."""
-    kind = style.kind_of(run.schedule.units, run.schedule.n_outputs)
-    unit, scale = kind.unit, kind.scale
-    time, stiffness = run.schedule.time, run.schedule.stiffness
-    early, late = (int(np.searchsorted(time, centre * run.controller.duration_)) for centre in PUSHES)
-    # Against the run without pushes: how far the robot lags behind by itself does not count.
-    deviation = np.abs(run.rollout.position - run.unpushed.position)[:, 0]
-    half = len(time) // 2
-    first, second = scale * deviation[:half].max(), scale * deviation[half:].max()
-    names = style.schedule_names(run.schedule)
-    row = {"controller": name, f"early [{unit}]": float(first), f"late [{unit}]": float(second)}
-    row |= {"ratio": float(first / second)}
-    for output, label in list(enumerate(names))[:2]:
-        row |= {f"K {label} early": float(stiffness[early, output, output])}
-        row |= {f"K {label} late": float(stiffness[late, output, output])}
-    recorded = run.controller.outputs_.units(run.controller.units_)
-    row |= {f"path error [{unit}]": scale * in_si(recorded) * run.controller.reproduction_error_}
-    return row
+_N_STEPS = 101  # of poses, at which demonstrations are compared
+_figure = partial(Figure, layout="constrained")
 
 
 def run_robot(
@@ -92,39 +30,70 @@ def run_robot(
     demonstrations: Demonstrations,
     folder: RunFolder,
     *,
-    peak: float = 5.0,
-    rate: float = 1000.0,
     in_tunnel: bool = False,
     metrics: str = "metrics",
+    **options: Any,
 ) -> str:
-    """Run each controller; writes figures, models, schedules, metrics, reports; returns table and reports as text."""
-    table, rows, reports = [], [], []
+    """Learn, reproduce, push and certify with each controller, by options of ``push``; returns tables and reports.
+
+    Writes figures, models, schedules, metrics and reports.
+    """
+    of_poses = demonstrations.rotation_reference is not None
+    if of_poses:
+        if demonstrations.n_outputs != 6:
+            raise ConfigError(
+                f"data: a pose has three positions and a rotation, not the outputs {demonstrations.names}."
+            )
+        figure, space, bands = style.panels(3, 3, _figure)
+        poses.draw_recorded_poses(demonstrations, space[0], bands)
+        plotting.legend_below(figure, space)
+        folder.write_figure(figure, "figure6_task")
+    table: list[dict[str, Any]] = []
+    rows: list[dict[str, Any]] = []
+    reports = []
     for name, controller in steps(controllers.items(), "controller", len(controllers)):
-        run = run_controller(controller, demonstrations, peak=peak, rate=rate, finished=folder.finished)
-        schedule, report = run.schedule, run.report
-        rates = np.diff(schedule.stiffness, axis=0) / np.diff(schedule.time)[:, np.newaxis, np.newaxis]
-        guarantees = {
-            "stable": "yes" if report.stable else "NO",
-            "margin": report.margin,
-            "max speed": report.max_speed,
-            "gain": report.gain,
-            "environment": report.environment_stiffness,
-            "max |dK/dt|": float(np.linalg.norm(rates, ord=2, axis=(1, 2)).max()),
-        }
-        table.append(push_row(name, run))
-        rows.append(table[-1] | guarantees)
-        reports.append(f"{name}: a movement of {schedule.duration:.3g} s\n{report}")
-        folder.write_controller(
-            name,
-            run.controller,
-            schedule,
-            figure6_task=task_figure(run.controller, demonstrations, name, in_tunnel=in_tunnel),
-            figure7_variability=variability_figure(run, demonstrations, name),
-            figure8_pushes=pushes_figure(run, name),
-        )
+        fitted, _ = fit_once(clone(controller), demonstrations, finished=folder.finished)
+        run = push(fitted, **options)
+        note = ""
+        if of_poses:
+            rows += [row for kind in KINDS for row in push_rows(name, run, kind)]
+            note = f"; {_inertia(run)}"
+            figures = {
+                "figure7_variability": pose_variability_figure(run, demonstrations, name),
+                "figure8_pushes": pose_pushes_figure(run, name),
+            }
+        else:
+            table.append(push_row(name, run))
+            rows.append(table[-1] | guarantees(run))
+            figures = {
+                "figure6_task": task_figure(fitted, demonstrations, name, in_tunnel=in_tunnel),
+                "figure7_variability": variability_figure(run, demonstrations, name),
+                "figure8_pushes": pushes_figure(run, name),
+            }
+        reports.append(f"{name}: a movement of {run.schedule.duration:.3g} s{note}\n{run.report}")
+        folder.write_controller(name, fitted, run.schedule, **figures)
     folder.write_metrics(rows, metrics)
     folder.write_text("stability.txt", "\n\n".join(reports) + "\n")
-    return "\n\n".join([format_table(table), *reports])
+    tables = [_pose_table(rows, kind) for kind in KINDS] if of_poses else [format_table(table)]
+    return "\n\n".join([*tables, *reports])
+
+
+def _inertia(run: Run) -> str:
+    mass = np.asarray(run.controller.mass_)
+    low, high = (f"{mass if mass.ndim == 0 else mass[i, i]:.3g}" for i in (0, -1))
+    if run.schedule is run.planned:
+        return f"of {low} kg and {high} kg m^2"
+    plain = damping_ratio(run.schedule, run.planned.damping)
+    return f"a damping made for {low} kg and {high} kg m^2 would have a ratio of {plain:.2f} here"
+
+
+def _pose_table(rows: Sequence[Mapping[str, Any]], kind: style.Kind) -> str:
+    """Table of pushes of one kind."""
+    units = {"early": kind.unit, "late": kind.unit, "K early": kind.stiffness_unit, "K late": kind.stiffness_unit}
+    names = {key: f"{key} [{unit}]" for key, unit in units.items()} | {"axis": f"{kind.push} {kind.where}"}
+    own = [row for row in rows if row["push"] == kind.push]
+    hidden = ("push", "unit")  # which stand in the header
+    return format_table([{names.get(key, key): row[key] for key in row if key not in hidden} for row in own])
 
 
 _BOXES = (
@@ -219,7 +188,50 @@ def pushes_figure(run: Run, name: str) -> Figure:
     """Deviation, force and stiffness along the first output over time: Figure 8."""
     figure, axes = style.figure_grid(3, 1, (6.4, 6.0), sharex=True)
     names = style.schedule_names(run.schedule)
-    plotting.plot_rollout(run.rollout, axes[:, 0], outputs=[0], names=names, unpushed=run.unpushed)
+    plotting.plot_rollout(run.pushes["force"][0], axes[:, 0], outputs=[0], names=names, unpushed=run.unpushed)
     axes[0, 0].set_title(name, fontsize=10)
     plotting.legend_below(figure, axes[:, 0])
+    return figure
+
+
+def pose_variability_figure(run: Run, demonstrations: Demonstrations, name: str) -> Figure:
+    """Planned path, deviations and empirical ones in principal axes, and stiffness there, of both blocks: Figure 7."""
+    figure, (space,), bands = style.panels(4, 3, _figure)
+    for path in demonstrations.to_poses()[0]:
+        space.plot(*path.T, color=plotting.DATA, lw=0.8)
+    poses.draw_pose_schedule(run.schedule, space, bands)
+    phase, covariances = empirical_covariances(demonstrations)
+    for kind, band in zip(KINDS, bands, strict=False):
+        deviation = kind.scale * np.sqrt(np.linalg.eigvalsh(covariances[:, kind.outputs, kind.outputs]).clip(0.0))
+        parts.plot_outputs(
+            run.schedule.duration * phase, deviation, band, ["empirical", "_", "_"], [plotting.EMPIRICAL]
+        )
+    bands[0].set_title(name, fontsize=10)
+    plotting.legend_below(figure, [space, *bands])
+    return figure
+
+
+def empirical_covariances(demonstrations: Demonstrations) -> tuple[Floats, Floats]:
+    """Phases (n,) and covariances (n, 6, 6) of recorded poses there, at their mean, in world axes."""
+    aligned = demonstrations.align(n=_N_STEPS)
+    places, turns = map(np.array, aligned.to_poses())
+    means = np.stack([rotations.mean(turns[:, i]) for i in range(_N_STEPS)])
+    deviations = np.concatenate([places - places.mean(axis=0), rotations.between(means, turns)], axis=-1)
+    return aligned.times[0], np.einsum("kni,knj->nij", deviations, deviations) / (len(demonstrations) - 1)
+
+
+def pose_pushes_figure(run: Run, name: str) -> Figure:
+    """Deviation, push and stiffness in each axis of the tool over time, of forces and of torques: Figure 8."""
+    figure, grid = style.figure_grid(3, 2, (9.6, 6.6), sharex=True)
+    time, labels = run.schedule.time, [f"tool {letter}" for letter in TOOL]
+    for kind, (above, middle, below) in zip(KINDS, grid.T, strict=True):
+        parts.plot_outputs(time, run.moved(kind), above, labels)
+        above.set_ylabel(f"moved [{kind.unit}]")
+        size = np.linalg.norm(run.pushes[kind.push][0].force, axis=1)
+        middle.plot(time, size, color=plotting.FORCE, lw=1.5, label="push")
+        middle.set_ylabel(f"{kind.push} [{kind.push_unit}]")
+        parts.plot_outputs(time, run.along(run.schedule.stiffness, kind), below, labels)
+        below.set(xlabel="time [s]", ylabel=f"stiffness [{kind.stiffness_unit}]", ylim=(0.0, None))
+        above.set_title(f"{name}: pushed {kind.where} each axis", fontsize=10)
+    plotting.legend_below(figure, grid[:, 0])
     return figure

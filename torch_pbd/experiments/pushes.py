@@ -1,0 +1,165 @@
+"""What a learned robot does when it is pushed early and late: along its first output, or in each axis of a tool."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+
+from torch_pbd import rotations
+from torch_pbd.checks import Floats
+from torch_pbd.control.controller import DMPController
+from torch_pbd.control.primitive.outputs import in_si
+from torch_pbd.control.schedule.schedule import Schedule
+from torch_pbd.control.simulation.plant import AdmittancePlant
+from torch_pbd.control.simulation.rollout import Rollout
+from torch_pbd.control.simulation.run import simulate
+from torch_pbd.control.stability.report import StabilityReport
+from torch_pbd.plotting import style
+
+Arm = Literal["panda", "none"]
+KINDS = (style.POSITION, style.ROTATION)
+TOOL = "xyz"
+
+_PUSHES = (0.2, 0.8)  # of the duration: 2 s and 8 s of the paper's 10 s
+_LENGTH = 0.08  # of the duration: 0.8 s
+_ROWS = 50.0  # Hz; along a path the inertia of an arm changes with its joints, within seconds
+
+
+@dataclass(frozen=True)
+class Run:
+    """One controller on one task: what it plans, what pushes do to it, and what is guaranteed."""
+
+    controller: DMPController
+    planned: Schedule
+    schedule: Schedule
+    """The planned one, or with the inertia of an arm."""
+    unpushed: Rollout
+    pushes: Mapping[str, list[Rollout]]
+    """By "force" along the first output; of poses by "force" and "torque", in each axis of the tool."""
+    report: StabilityReport
+
+    def along(self, values: Floats, kind: style.Kind) -> Floats:
+        """Matrices (n, 6, 6), or vectors (n, 6), in each axis (n, 3) of the tool, in the outputs of a kind."""
+        axes = rotations.matrix(np.asarray(self.schedule.orientation))
+        if values.ndim == 3:
+            return np.einsum("nia,nij,nja->na", axes, values[:, kind.outputs, kind.outputs], axes)
+        return np.einsum("nia,ni->na", axes, values[:, kind.outputs])
+
+    def moved(self, kind: style.Kind) -> Floats:
+        """Displacement (n, 3) by a push in each axis of the tool, along it, against the run without; in units shown."""
+        still = self.unpushed.deviation
+        moves = [self.along(run.deviation - still, kind)[:, i] for i, run in enumerate(self.pushes[kind.push])]
+        return kind.scale * np.stack(moves, axis=1)
+
+
+def push(
+    controller: DMPController, *, peak: float = 5.0, torque: float = 1.2, rate: float = 1000.0, arm: Arm = "none"
+) -> Run:
+    """Plan, push early and late, and certify; ``peak`` in N, ``torque`` in Nm, the arm's inertia for poses only."""
+    planned = controller.schedule(rate)
+    if planned.orientation is None:
+        force = push_profile(planned.time, controller.duration_, peak, controller.n_outputs_)
+        still, pushed = controller.simulate(rate=rate), controller.simulate(force=force, rate=rate)
+        return Run(controller, planned, planned, still, {"force": [pushed]}, planned.certify())
+    schedule = with_panda(planned) if arm == "panda" else planned
+    # As torque control of an arm, which feeds its inertia times the acceleration forward.
+    run = partial(simulate, schedule, plant=AdmittancePlant(None, feed_forward=True))
+    pushes = {
+        kind.push: [run(_wrench(schedule, largest, kind, axis)) for axis in range(3)]
+        for kind, largest in zip(KINDS, (peak, torque), strict=True)
+    }
+    return Run(controller, planned, schedule, run(), pushes, schedule.certify())
+
+
+def push_profile(time: Floats, duration: float, peak: float, n_outputs: int) -> Floats:
+    """Forces (n, d) in N: pulses of a squared sine along the first output, early and late in the movement."""
+    force = np.zeros((len(time), n_outputs))
+    force[:, 0] = peak * sum(_pulse(time / duration, centre) for centre in _PUSHES)
+    return force
+
+
+def _wrench(schedule: Schedule, largest: float, kind: style.Kind, axis: int) -> Floats:
+    """Wrenches (n, 6): pulses of a squared sine in an axis that the tool has in their middle."""
+    wrench, phase = np.zeros((len(schedule), 6)), (schedule.time - schedule.time[0]) / schedule.duration
+    for row in _middles(schedule):
+        tool = rotations.matrix(np.asarray(schedule.orientation)[row])
+        wrench[:, kind.outputs] += largest * np.outer(_pulse(phase, phase[row]), tool[:, axis])
+    return wrench
+
+
+def _middles(schedule: Schedule) -> list[int]:
+    """Rows in the middle of pushes."""
+    return [round(centre * (len(schedule) - 1)) for centre in _PUSHES]
+
+
+def _pulse(phase: Floats, centre: float) -> Floats:
+    """Squared sine (n,) of height 1 around a phase: at the ends of a push it has neither force nor slope."""
+    return np.sin(np.pi * np.clip((phase - centre) / _LENGTH + 0.5, 0.0, 1.0)) ** 2
+
+
+def with_panda(schedule: Schedule) -> Schedule:
+    """Schedule with the inertia of a Panda along it, and the damping for that."""
+    from torch_pbd.robots import HOME, inverse_kinematics, operational_inertia, panda  # here: it needs the extra robot
+
+    arm, few = panda(), schedule.resample(_ROWS)
+    joints = inverse_kinematics(arm, few.position, np.asarray(few.orientation), "tool", start=HOME)
+    inertia = few.with_inertia(operational_inertia(arm, joints, "tool")).resample(times=schedule.time)
+    return schedule.with_inertia(np.asarray(inertia.mass))
+
+
+def damping_ratio(schedule: Schedule, damping: Floats) -> float:
+    """Smallest damping ratio of the modes of ``M e'' + D e' + K e = 0`` over the rows of a schedule."""
+    d, mass = schedule.n_outputs, np.asarray(1.0 if schedule.mass is None else schedule.mass)
+    mass = mass if mass.ndim else mass * np.eye(d)
+    system = np.zeros((len(schedule), 2 * d, 2 * d))
+    system[:, :d, d:] = np.eye(d)
+    system[:, d:] = -np.linalg.solve(mass, np.concatenate([schedule.stiffness, damping], axis=-1))
+    modes = np.linalg.eigvals(system)
+    return float((-modes.real / np.abs(modes)).min())
+
+
+def push_row(name: str, run: Run) -> dict[str, Any]:
+    """Row of the table: displacement by the two pushes, against the run without them, and stiffness there."""
+    kind = style.kind_of(run.schedule.units, run.schedule.n_outputs)
+    time, stiffness = run.schedule.time, run.schedule.stiffness
+    early, late = (int(np.searchsorted(time, centre * run.controller.duration_)) for centre in _PUSHES)
+    # Against the run without pushes: how far the robot lags behind by itself does not count.
+    deviation = np.abs(run.pushes["force"][0].position - run.unpushed.position)[:, 0]
+    half = len(time) // 2
+    first, second = kind.scale * deviation[:half].max(), kind.scale * deviation[half:].max()
+    row = {"controller": name, f"early [{kind.unit}]": float(first), f"late [{kind.unit}]": float(second)}
+    row |= {"ratio": float(first / second)}
+    for output, label in list(enumerate(style.schedule_names(run.schedule)))[:2]:
+        row |= {f"K {label} early": float(stiffness[early, output, output])}
+        row |= {f"K {label} late": float(stiffness[late, output, output])}
+    recorded = run.controller.outputs_.units(run.controller.units_)
+    return row | {f"path error [{kind.unit}]": kind.scale * in_si(recorded) * run.controller.reproduction_error_}
+
+
+def guarantees(run: Run) -> dict[str, Any]:
+    """Columns on stability, beside those of a row."""
+    report, schedule = run.report, run.schedule
+    rates = np.diff(schedule.stiffness, axis=0) / np.diff(schedule.time)[:, np.newaxis, np.newaxis]
+    return {
+        "stable": "yes" if report.stable else "NO",
+        "margin": report.margin,
+        "max speed": report.max_speed,
+        "gain": report.gain,
+        "environment": report.environment_stiffness,
+        "max |dK/dt|": float(np.linalg.norm(rates, ord=2, axis=(1, 2)).max()),
+    }
+
+
+def push_rows(name: str, run: Run, kind: style.Kind) -> list[dict[str, Any]]:
+    """Rows of the table of poses: what pushes do in each axis of the tool, and stiffness there."""
+    moved, stiffness = np.abs(run.moved(kind)), run.along(run.schedule.stiffness, kind)
+    half, (early, late) = len(moved) // 2, stiffness[_middles(run.schedule)]
+    rows = []
+    for axis, letter in enumerate(TOOL):
+        first, second = float(moved[:half, axis].max()), float(moved[half:, axis].max())
+        row: dict[str, Any] = {"controller": name, "push": kind.push, "axis": f"tool {letter}", "unit": kind.unit}
+        row |= {"early": first, "late": second, "ratio": first / second if second else np.nan}
+        rows.append(row | {"K early": float(early[axis]), "K late": float(late[axis])})
+    return rows
