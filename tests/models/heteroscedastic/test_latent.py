@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from torch_pbd.models.heteroscedastic.covariance import FactorMoments, LatentCovariance
+from torch_pbd.models.heteroscedastic.posterior import FactorMoments, LatentCovariance
 from torch_pbd.models.heteroscedastic.regression import Weights
 
 

@@ -5,8 +5,8 @@ from scipy.linalg import block_diag
 
 from torch_pbd.kernels import correlation
 from torch_pbd.models.heteroscedastic import ProcessFamily, SearchOptions
-from torch_pbd.models.heteroscedastic.mean import fit_mean
 from torch_pbd.models.heteroscedastic.search import Search
+from torch_pbd.models.heteroscedastic.steps import fit_mean
 
 
 def search_of(family, d):

@@ -18,9 +18,8 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from torch_pbd.linalg import scale_tril_from_root
-from torch_pbd.models.heteroscedastic.covariance import CovarianceSearch, LatentCovariance, fit_covariance
 from torch_pbd.models.heteroscedastic.log_variance import on_stretched_inputs, squares_within, stretched
-from torch_pbd.models.heteroscedastic.mean import MOST_INPUTS, LatentMean, fit_mean, mean_start
+from torch_pbd.models.heteroscedastic.posterior import LatentCovariance, LatentMean
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
 from torch_pbd.models.heteroscedastic.residuals import (
     LAGS,
@@ -31,6 +30,7 @@ from torch_pbd.models.heteroscedastic.residuals import (
     is_signal,
 )
 from torch_pbd.models.heteroscedastic.search import Families, Search, SearchOptions
+from torch_pbd.models.heteroscedastic.steps import MOST_INPUTS, CovarianceSearch, fit_covariance, fit_mean, mean_start
 from torch_pbd.models.training import TrainingSet, pooled_tril
 from torch_pbd.optim import Progress
 

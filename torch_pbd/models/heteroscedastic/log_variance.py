@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import itemgetter
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int64
@@ -71,8 +72,7 @@ class Squares:
         return mean.clamp_min(LEAST_SQUARE).log().expand_as(self.total)
 
 
-@dataclass(frozen=True)
-class LogVariance:
+class LogVariance(NamedTuple):
     """Posterior of ``log_variance = features @ weights``, the weights standard normal numbers a priori.
 
     The last feature is a constant.
@@ -80,20 +80,13 @@ class LogVariance:
 
     evidence: Float[Tensor, " b"]
     """Log evidence of the features, in nats."""
-    weights_mean: Float[Tensor, "b p"]
-    factor: Float[Tensor, "b p p"]
-    """Upper triangular; ``factor.mT @ factor`` is the precision of the weights."""
+    weights: Weights
     location: Float[Tensor, "b n"]
     """Expected log variances."""
     variance: Float[Tensor, "b n"]
     """Variances of the log variances."""
     gradient: Callable[[], Float[Tensor, "b n p"]]
     """Computes the gradient of the evidence in the features."""
-
-    @property
-    def weights(self) -> Weights:
-        """Posterior of the weights."""
-        return Weights(self.weights_mean, triangular_inverse(self.factor, upper=True))
 
 
 def search_log_variance(
@@ -166,7 +159,8 @@ def _fit_independent(squares: Squares, features: Tensor, start: Tensor) -> LogVa
         in_log_det = (slope - half.unsqueeze(-1)) * spread
         return in_log_det - half.unsqueeze(-1) * through_variance - slope * mean.unsqueeze(-2)
 
-    return LogVariance(evidence, mean, factor, location, variance, gradient)
+    weights = Weights(mean, triangular_inverse(factor, upper=True))
+    return LogVariance(evidence, weights, location, variance, gradient)
 
 
 def _fit_correlated(squares: Squares, noise: NoiseCorrelation, features: Tensor) -> LogVariance:
@@ -186,10 +180,9 @@ def _fit_correlated(squares: Squares, noise: NoiseCorrelation, features: Tensor)
     location = (features @ linear.mean.unsqueeze(-1)).squeeze(-1)
     variance = ((features @ linear.covariance) * features).sum(-1)
 
-    def gradient() -> Tensor:
-        return whitener.mT @ linear.gradient(design, response)
-
-    return LogVariance(evidence, linear.mean, linear.factor, location, variance, gradient)
+    return LogVariance(
+        evidence, linear.weights, location, variance, lambda: whitener.mT @ linear.gradient(design, response)
+    )
 
 
 def _maximize(features: Tensor, target: Tensor, half: Tensor, pooled: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:

@@ -15,11 +15,13 @@ from torch_pbd.gp.observations import spacing
 from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky, symmetrize
 from torch_pbd.models import Core, Shapes, blank, size_of
-from torch_pbd.models.heteroscedastic.covariance import FactorMoments, LatentCovariance, degrees_of_freedom
 from torch_pbd.models.heteroscedastic.fit import HeteroscedasticFit
-from torch_pbd.models.heteroscedastic.mean import LatentMean
-from torch_pbd.models.heteroscedastic.predictive import (
+from torch_pbd.models.heteroscedastic.posterior import (
+    FactorMoments,
+    LatentCovariance,
+    LatentMean,
     as_inverse_gamma,
+    degrees_of_freedom,
     log_correlation_variance,
     shrink_correlation,
     under_expected_noise,
@@ -49,7 +51,7 @@ class _Prepared(NamedTuple):
 class HeteroscedasticModel(Core):
     """Predictive density in standardized units: Student's t, its moments from the latent processes.
 
-    Where samples of demonstrations are correlated it is that of ``predictive.py``.
+    Where samples of demonstrations are correlated it is that of ``posterior.py``.
 
     Parameters
     ----------

@@ -1,124 +1,140 @@
-"""Covariance by latent processes, the log variances and coefficients of its factor, and their fit to residuals."""
+"""Steps of a turn: the mean under the noise by generalized least squares, and the covariance of the residuals.
 
+Also where the mean begins if a first one does not follow the data: at what the evidence finds together with the noise.
+"""
+
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torch_pbd.gp import EvidenceSearch, Hyperparameters, Observations, fit_hyperparameters, negative_log_evidence
+from torch_pbd.gp.observations import resolved_length_scale
+from torch_pbd.linalg import triangular_inverse
 from torch_pbd.models.heteroscedastic.log_variance import LEAST_SQUARE, Squares, fit_log_variance, search_log_variance
-from torch_pbd.models.heteroscedastic.processes import FixedFeatures, Processes
-from torch_pbd.models.heteroscedastic.regression import Regression, Weights
+from torch_pbd.models.heteroscedastic.posterior import LatentCovariance, LatentMean
+from torch_pbd.models.heteroscedastic.processes import FixedFeatures, inducing_inputs
+from torch_pbd.models.heteroscedastic.regression import LinearEvidence, Regression, Weights
 from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation
 from torch_pbd.models.heteroscedastic.search import Families, Gradient, Search, SearchOptions
+from torch_pbd.models.training import TrainingSet, pooled_tril
+
+MOST_INPUTS = 1024
+"""Inputs that short length scales are searched with, and that correlated rows are fitted at: some seconds."""
+
+_MOST_ROWS, _TOGETHER = 16384, 2048  # inputs to fit at, and inducing ones, of all outputs together
+# Length scale down to which a search takes a few matrices of 168 rows; and noise, of outputs of unit variance, below
+# which nothing is left to be found with shorter ones: a smooth signal's residual is never white.
+_CHEAP, _NONE = 0.025, 1e-4
+_LEAST_NOISE = 3e-5  # with less, kernel matrices are singular
+_LONGEST = 10.0  # length scale, in ranges of the inputs: a trend
+_CLEARLY = 5.0  # nats: 150 to one. Sound draws gain less than one, signals that were missed 25 and more
 
 # Sweeps over log variances and coefficients, and how many search the coefficients' hyperparameters: one of each more
 # gains less than a nat.
 _SWEEPS, _SEARCHES = 2, 1
 # An input with at least so many degrees of freedom left gives a conditional variance by itself.
 _ENOUGH_DEGREES = 2.0
-_LEAST_DEGREES = 3.0  # below two, Student's t has no covariance
 
 
-@dataclass(frozen=True)
-class FactorMoments:
-    """Moments of the entries of the lower factor of a covariance at n inputs, as independent normal numbers."""
+def fit_mean(
+    search: Search,
+    inputs: Float[Tensor, "n e"],
+    means: Float[Tensor, "n d"],
+    counts: Float[Tensor, " n"],
+    noise_tril: Float[Tensor, "n d d"],
+    whitener: Float[Tensor, "d n n"] | None,
+) -> LatentMean:
+    """Posterior given means of ``counts`` rows, whose noise has the factor ``noise_tril``.
 
-    log_variance: Float[Tensor, "n d"]
-    log_variance_variance: Float[Tensor, "n d"]
-    below: Float[Tensor, "n d d"]
-    """Entries below the diagonal."""
-    below_variance: Float[Tensor, "n d d"]
-
-    @property
-    def degrees(self) -> Float[Tensor, " n"]:
-        """Squares from which the variances are known, in the mean."""
-        return degrees_of_freedom(self.log_variance_variance.mean(-1))
-
-    def tril(self) -> Float[Tensor, "n d d"]:
-        """The factor at the means of the latent processes."""
-        return self.below + torch.diag_embed(torch.exp(0.5 * self.log_variance))
-
-    def expected_root(self, most: float) -> Float[Tensor, "n d 2*d"]:
-        """Root of the expected covariance.
-
-        With a normal log variance of mean l and variance v the deviation's mean is exp(l / 2 + v / 8), and the variance
-        exceeds its square by a factor exp(v / 4). No v is above ``most`` in it, as where nothing is known an
-        expectation has little to say.
-        """
-        variance = self.log_variance_variance / (1.0 + self.log_variance_variance / most)
-        deviation = torch.exp(0.5 * self.log_variance + 0.125 * variance)
-        excess = deviation.square() * torch.expm1(0.25 * variance) + self.below_variance.sum(-1)
-        return torch.cat([self.below + torch.diag_embed(deviation), torch.diag_embed(excess.sqrt())], dim=-1)
-
-
-def degrees_of_freedom(variance: Tensor) -> Tensor:
-    """Squares from which a variance is known whose logarithm has this variance.
-
-    It is trigamma(degrees / 2), and ``trigamma(z)`` is taken for ``1 / z + 1 / (2 z^2)``.
+    Hyperparameters are chosen for each output by its own evidence, as if its noise were independent of the others';
+    the posterior is that of all outputs together. ``whitener`` makes the means at different inputs independent.
     """
-    return ((1.0 + (1.0 + 2.0 * variance).sqrt()) / variance).clamp_min(_LEAST_DEGREES)
+    # One output: its mean over the deviation of its noise is features times weights, and noise of unit variance. In the
+    # search alone no noise is less than _NONE. Rounding of kernels, 1e-16, changes the evidence of n inputs by about n
+    # 1e-16 over the variance of the noise: of 1e-12 by .02 nats, and rounding of y then led to other length scales.
+    scale = (counts.sqrt()[:, None] / noise_tril.square().sum(-1).sqrt()).clamp_max(1.0 / _NONE).mT.unsqueeze(-1)
+    noise_whitener = scale if whitener is None else whitener * scale.mT
+    response = _times(noise_whitener, means.mT.unsqueeze(-1)).squeeze(-1)
+    information = noise_whitener.square().sum((-2, -1))
+    family, fixed = search.family, FixedFeatures(search.family, inputs)
+
+    def evidence(theta: Tensor, rows: Int64[Tensor, " a"]) -> tuple[Tensor, Gradient]:
+        design, vjp = family.design_vjp(fixed, theta, information[rows])
+        chosen, its_response = noise_whitener[rows], response[rows]
+        whitened = _times(chosen, design)
+        linear = LinearEvidence.fit(whitened, its_response)
+        transposed = chosen if whitener is None else chosen.mT
+        return linear.value, lambda: vjp(_times(transposed, linear.gradient(whitened, its_response)))
+
+    theta = search.run(evidence, len(means))
+    # All outputs: sqrt(count) inv(T) mean, with T the factor of the noise, has independent entries at an input.
+    processes = family.prepared(theta)
+    whitening = counts.sqrt()[:, None, None] * triangular_inverse(noise_tril)
+    design = torch.einsum("nij,jnp->nijp", whitening, processes(inputs)).flatten(2)
+    response = (whitening @ means.unsqueeze(-1)).squeeze(-1)
+    if whitener is not None:
+        design = torch.einsum("imn,niq->miq", whitener, design)
+        response = torch.einsum("imn,ni->mi", whitener, response)
+    return LatentMean(theta, processes, LinearEvidence.fit(design.flatten(0, 1), response.flatten()).weights)
 
 
-@dataclass(frozen=True)
-class LatentCovariance:
-    """Posterior of the lower factor of a covariance.
+def _times(whitener: Tensor, values: Tensor) -> Tensor:
+    """Whitened values: by a matrix, or by its diagonal (..., n, 1) where it has no more."""
+    return whitener * values if whitener.shape[-1] == 1 else whitener @ values
 
-    The diagonal is the root of the conditional variances, whose logarithms are d processes; row i below it
-    holds the coefficients of output i on the standardized outputs before it, which are i more.
+
+class MeanStart(NamedTuple):
+    """Beginning of a mean."""
+
+    search: Search
+    """Holds the hyperparameters that were found, on the inducing inputs that they need."""
+    noise_tril: Float[Tensor, "d d"]
+    """Factor of the noise of a row, the same everywhere."""
+    rows: TrainingSet
+    """Rows at as many inputs as are needed."""
+
+
+def mean_start(
+    rows: TrainingSet, first: LatentMean, noise_tril: Float[Tensor, "d d"], options: SearchOptions
+) -> MeanStart | None:
+    """Start where inducing inputs are too few for the means at the inputs, or their noise was taken for too large.
+
+    None unless the evidence is clearly higher, of any output, than that of the ``first`` one under its noise. Residuals
+    that are not white by chance, or under noise that is louder in places, are no reason to begin here: these
+    hyperparameters stay, and noise that depends on the input would have led to others.
     """
-
-    log_variance_theta: Float[Tensor, "d q"]
-    log_variances: Processes
-    log_variance: Weights
-    coefficient_theta: Float[Tensor, "d-1 q"]
-    rows: Processes
-    """Those of the coefficients of one output, of each but the first, which share one kernel."""
-    coefficients: Sequence[Weights]
-    """Weights of one coefficient after another, of outputs 1, 2, ..."""
-
-    def log_variance_at(self, x: Float[Tensor, "n e"]) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d"]]:
-        """Means and variances of the log variances at x."""
-        features = self.log_variances(x)
-        mean = (features @ self.log_variance.mean.unsqueeze(-1)).squeeze(-1).mT
-        variance = (features @ self.log_variance.root).square().sum(-1)
-        return mean, (variance + self.log_variances.unexplained(features)).mT
-
-    def at(self, x: Float[Tensor, "n e"]) -> FactorMoments:
-        """Moments of the entries of the factor at x."""
-        mean, variance = self.log_variance_at(x)
-        n_outputs = mean.shape[1]
-        rows, variances = [pad(0.0 * mean[:, :1], (0, n_outputs - 1))], [pad(0.0 * mean[:, :1], (0, n_outputs - 1))]
-        features = self.rows(x)
-        unexplained = self.rows.unexplained(features)
-        # Coefficients of one output share their features, and each has a block of the weights.
-        for i, (weights, own) in enumerate(zip(self.coefficients, features, strict=True), start=1):
-            blocks = weights.root.reshape(i, own.shape[1], -1)
-            known = (own @ blocks).square().sum(-1).mT
-            rows.append(pad(own @ weights.mean.reshape(i, -1).mT, (0, n_outputs - i)))
-            variances.append(pad(known + unexplained[i - 1, :, None], (0, n_outputs - i)))
-        return FactorMoments(mean, variance, torch.stack(rows, dim=1), torch.stack(variances, dim=1))
-
-    def draw(self, x: Float[Tensor, "n e"], normal: Sequence[Float[Tensor, "*s _"]]) -> Float[Tensor, "*s n d d"]:
-        """Factors at x of functions drawn from the posterior, made of standard normal numbers.
-
-        Those of each output's log variance first, and then those of each output's coefficients.
-        """
-        n_outputs = len(self.log_variance.mean)
-        diagonal = []
-        for i, features in enumerate(self.log_variances(x)):
-            weights = self.log_variance.mean[i] + normal[i] @ self.log_variance.root[i].mT
-            diagonal.append(torch.exp(0.5 * (weights @ features.mT)))
-        factor = torch.diag_embed(torch.stack(diagonal, dim=-1))
-        rows = zip(self.coefficients, self.rows(x), normal[n_outputs:], strict=True)
-        for i, (posterior, features, numbers) in enumerate(rows, start=1):
-            weights = posterior.mean + numbers @ posterior.root.mT
-            factor[..., i, :i] = features @ weights.unflatten(-1, (i, -1)).mT
-        return factor
+    training = rows.merged(MOST_INPUTS)
+    rows_at_input = training.counts.mean()
+    observations = Observations(training.inputs, training.means().mT.contiguous(), training.counts / rows_at_input)
+    noise = pooled_tril(rows).norm(dim=1) / rows_at_input.sqrt()
+    # Rows that repeat inputs show the noise, unless they are copies.
+    known = noise if 2 * len(rows.inputs) <= len(rows.x) and bool((noise > _LEAST_NOISE).all()) else None
+    least = resolved_length_scale(training.inputs)
+    for shortest in (max(_CHEAP, least), least):
+        search = EvidenceSearch(length_scale_bounds=(shortest, _LONGEST), noise_scale=known)
+        found, loss, _ = fit_hyperparameters(observations, search)
+        noise_scale = found.amplitude * found.noise_ratio.sqrt()
+        if bool((noise_scale < _NONE).all()):
+            break
+    processes, family, n_outputs = first.processes, first.processes.family, len(loss)
+    noise_ratio = noise_tril.square().sum(1) / rows_at_input / processes.amplitude.square()
+    before = Hyperparameters(processes.length_scale, processes.amplitude, noise_ratio)
+    # What is too smooth to be evaluated is NaN, and no mean to keep.
+    if bool((negative_log_evidence(observations, before, family.kernel) - loss < _CLEARLY).all()):
+        return None
+    # As many inducing inputs as resolve the shortest length scale with room to spare.
+    needed = math.ceil(min(family.n_needed(float(found.length_scale.min())), len(training.inputs)))
+    inducing = inducing_inputs(training.inputs, max(len(family.inducing), min(needed, _TOGETHER // n_outputs)))
+    family = replace(family, inducing=inducing, exact=len(inducing) == len(rows.inputs))
+    held = Search(family, n_outputs, options, family.theta_of(found.length_scale, found.amplitude), held=True)
+    return MeanStart(held, (noise_scale * rows_at_input.sqrt()).diag(), rows.merged(_MOST_ROWS // n_outputs))
 
 
 class CovarianceSearch:

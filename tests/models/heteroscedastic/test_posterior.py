@@ -7,7 +7,7 @@ from scipy.integrate import quad
 from scipy.special import polygamma
 from scipy.stats import invgamma
 
-from torch_pbd.models.heteroscedastic.predictive import (
+from torch_pbd.models.heteroscedastic.posterior import (
     as_inverse_gamma,
     log_correlation_variance,
     shrink_correlation,

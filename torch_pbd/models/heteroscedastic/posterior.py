@@ -1,0 +1,235 @@
+"""Posterior of mean and covariance: what they are at x, and what few demonstrations leave open.
+
+Where samples of a demonstration are correlated Student's t is the law of a new deviation, as where the covariance Sigma
+is known from n independent ones: at an input n is told by the posterior of the log variances, which knows of K
+demonstrations at independent places.
+
+- A variance known from n squares has an inverse gamma posterior; its logarithm has variance trigamma(n / 2), and its
+  expectation is n / (n - 2) times the scale of the t.
+- The error of the mean, Sigma / K where the data decide, is of the same unknown Sigma: it is in the tails too, and what
+  is expected of it is the error under noise n / (n - 2) times that which fits best.
+- The correlations R have the logarithm G = log R, which is for two outputs Fisher's z of their correlation. Entries of
+  an estimate of G err by 1 / n whatever R is (Archakov and Hansen, "A new parametrization of correlation matrices",
+  Econometrica 89, 2021). With the prior N(0, tau^2) of the entries, G is expected to be ``tau^2 / (tau^2 + 1 / n)``
+  times its estimate. The recordings themselves tell tau^2.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torch_pbd.linalg import spectral_map
+from torch_pbd.models.heteroscedastic.processes import Processes
+from torch_pbd.models.heteroscedastic.regression import Weights
+from torch_pbd.models.training import TrainingSet
+
+_CHUNK = 1024  # rows at a time: bounds the memory
+_LEAST_DEGREES = 3.0  # below two, Student's t has no covariance
+# Variance of Fisher's z of a correlation that is uniform from -1 to 1.
+_UNIFORM = math.pi**2 / 12.0
+_LEAST_EIGENVALUE = 1e-12  # of correlations: rounding, where outputs are copies of each other
+
+
+@dataclass(frozen=True)
+class LatentMean:
+    """Posterior of the mean: weights of one output after another."""
+
+    theta: Float[Tensor, "d q"]
+    processes: Processes
+    weights: Weights
+
+    def at(self, x: Float[Tensor, "n e"]) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d d"]]:
+        """Expected mean at x, and the covariance of its error between the outputs."""
+        features = self.processes(x)
+        n_outputs, _, size = features.shape
+        root = (features @ self.weights.root.reshape(n_outputs, size, -1)).transpose(0, 1)
+        unexplained = torch.diag_embed(self.processes.unexplained(features).mT)
+        return self._expected(features), root @ root.mT + unexplained
+
+    def expected_at(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d"]:
+        """Expected mean at x, equal to the bit to that of :meth:`at`."""
+        return self._expected(self.processes(x))
+
+    def _expected(self, features: Tensor) -> Float[Tensor, "n d"]:
+        return (features @ self.weights.mean.reshape(len(features), -1, 1)).squeeze(-1).mT
+
+    def expected_at_all(self, training: TrainingSet) -> Float[Tensor, "rows d"]:
+        """Expected mean of all rows; where they do not repeat inputs a bounded number at a time."""
+        if training.repeats_inputs:
+            return self.expected_at(training.inputs)[training.index]
+        processes = self.processes
+        weights = processes.amplitude[:, None] * self.weights.mean.reshape(len(self.theta), -1)
+        # Weights of the kernel with the inducing inputs, from those of the features: no equations are solved for
+        # each row.
+        weights = torch.linalg.solve_triangular(processes.factor.mT, weights.unsqueeze(-1), upper=True)
+        return torch.cat([(processes.cross(part) @ weights).squeeze(-1).mT for part in training.x.split(_CHUNK)])
+
+
+@dataclass(frozen=True)
+class FactorMoments:
+    """Moments of the entries of the lower factor of a covariance at n inputs, as independent normal numbers."""
+
+    log_variance: Float[Tensor, "n d"]
+    log_variance_variance: Float[Tensor, "n d"]
+    below: Float[Tensor, "n d d"]
+    """Entries below the diagonal."""
+    below_variance: Float[Tensor, "n d d"]
+
+    @property
+    def degrees(self) -> Float[Tensor, " n"]:
+        """Squares from which the variances are known, in the mean."""
+        return degrees_of_freedom(self.log_variance_variance.mean(-1))
+
+    def tril(self) -> Float[Tensor, "n d d"]:
+        """The factor at the means of the latent processes."""
+        return self.below + torch.diag_embed(torch.exp(0.5 * self.log_variance))
+
+    def expected_root(self, most: float) -> Float[Tensor, "n d 2*d"]:
+        """Root of the expected covariance.
+
+        With a normal log variance of mean l and variance v the deviation's mean is exp(l / 2 + v / 8), and the variance
+        exceeds its square by a factor exp(v / 4). No v is above ``most`` in it, as where nothing is known an
+        expectation has little to say.
+        """
+        variance = self.log_variance_variance / (1.0 + self.log_variance_variance / most)
+        deviation = torch.exp(0.5 * self.log_variance + 0.125 * variance)
+        excess = deviation.square() * torch.expm1(0.25 * variance) + self.below_variance.sum(-1)
+        return torch.cat([self.below + torch.diag_embed(deviation), torch.diag_embed(excess.sqrt())], dim=-1)
+
+
+def degrees_of_freedom(variance: Tensor) -> Tensor:
+    """Squares from which a variance is known whose logarithm has this variance.
+
+    It is trigamma(degrees / 2), and ``trigamma(z)`` is taken for ``1 / z + 1 / (2 z^2)``.
+    """
+    return ((1.0 + (1.0 + 2.0 * variance).sqrt()) / variance).clamp_min(_LEAST_DEGREES)
+
+
+@dataclass(frozen=True)
+class LatentCovariance:
+    """Posterior of the lower factor of a covariance.
+
+    The diagonal is the root of the conditional variances, whose logarithms are d processes; row i below it
+    holds the coefficients of output i on the standardized outputs before it, which are i more.
+    """
+
+    log_variance_theta: Float[Tensor, "d q"]
+    log_variances: Processes
+    log_variance: Weights
+    coefficient_theta: Float[Tensor, "d-1 q"]
+    rows: Processes
+    """Those of the coefficients of one output, of each but the first, which share one kernel."""
+    coefficients: Sequence[Weights]
+    """Weights of one coefficient after another, of outputs 1, 2, ..."""
+
+    def log_variance_at(self, x: Float[Tensor, "n e"]) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d"]]:
+        """Means and variances of the log variances at x."""
+        features = self.log_variances(x)
+        mean = (features @ self.log_variance.mean.unsqueeze(-1)).squeeze(-1).mT
+        variance = (features @ self.log_variance.root).square().sum(-1)
+        return mean, (variance + self.log_variances.unexplained(features)).mT
+
+    def at(self, x: Float[Tensor, "n e"]) -> FactorMoments:
+        """Moments of the entries of the factor at x."""
+        mean, variance = self.log_variance_at(x)
+        n_outputs = mean.shape[1]
+        rows, variances = [pad(0.0 * mean[:, :1], (0, n_outputs - 1))], [pad(0.0 * mean[:, :1], (0, n_outputs - 1))]
+        features = self.rows(x)
+        unexplained = self.rows.unexplained(features)
+        # Coefficients of one output share their features, and each has a block of the weights.
+        for i, (weights, own) in enumerate(zip(self.coefficients, features, strict=True), start=1):
+            blocks = weights.root.reshape(i, own.shape[1], -1)
+            known = (own @ blocks).square().sum(-1).mT
+            rows.append(pad(own @ weights.mean.reshape(i, -1).mT, (0, n_outputs - i)))
+            variances.append(pad(known + unexplained[i - 1, :, None], (0, n_outputs - i)))
+        return FactorMoments(mean, variance, torch.stack(rows, dim=1), torch.stack(variances, dim=1))
+
+    def draw(self, x: Float[Tensor, "n e"], normal: Sequence[Float[Tensor, "*s _"]]) -> Float[Tensor, "*s n d d"]:
+        """Factors at x of functions drawn from the posterior, made of standard normal numbers.
+
+        Those of each output's log variance first, and then those of each output's coefficients.
+        """
+        n_outputs = len(self.log_variance.mean)
+        diagonal = []
+        for i, features in enumerate(self.log_variances(x)):
+            weights = self.log_variance.mean[i] + normal[i] @ self.log_variance.root[i].mT
+            diagonal.append(torch.exp(0.5 * (weights @ features.mT)))
+        factor = torch.diag_embed(torch.stack(diagonal, dim=-1))
+        rows = zip(self.coefficients, self.rows(x), normal[n_outputs:], strict=True)
+        for i, (posterior, features, numbers) in enumerate(rows, start=1):
+            weights = posterior.mean + numbers @ posterior.root.mT
+            factor[..., i, :i] = features @ weights.unflatten(-1, (i, -1)).mT
+        return factor
+
+
+def as_inverse_gamma(variance: Tensor) -> Tensor:
+    """Variances of normal logarithms whose exponentials have the mean that an inverse gamma's has.
+
+    The logarithm of an inverse gamma number of n degrees of freedom and mean m is expected at
+    ``log m + log(n / 2 - 1) - digamma(n / 2)``, that of a normal one at ``log m`` less half its variance.
+    """
+    half = 0.5 * degrees_of_freedom(variance)
+    return 2.0 * (torch.digamma(half) - (half - 1.0).log())
+
+
+def under_expected_noise(
+    error_root: Float[Tensor, "n d d"], degrees: Float[Tensor, " n"], prior_variance: Float[Tensor, " d"]
+) -> Float[Tensor, "n d d"]:
+    """Root of the covariance of the mean's error, were the noise s = n / (n - 2) times as large.
+
+    With the covariance E of the error and A of the mean's prior, the data's part of the precision is inv(E) - inv(A):
+    it becomes ``inv(inv(E) / s + (1 - 1 / s) inv(A)) = s L inv(I + (s - 1) L' inv(A) L) L'`` of the root L of E.
+    """
+    scale = (degrees / (degrees - 2.0))[:, None, None]
+    beside_prior = error_root / prior_variance.sqrt()[:, None]
+    inner = torch.eye(len(prior_variance)).to(error_root) + (scale - 1.0) * (beside_prior.mT @ beside_prior)
+    solved = torch.linalg.solve_triangular(torch.linalg.cholesky(inner), error_root.mT, upper=False)
+    return scale.sqrt() * solved.mT
+
+
+def log_correlation_variance(
+    root: Float[Tensor, "n d r"], degrees: Float[Tensor, " n"], n_places: float
+) -> Float[Tensor, ""]:
+    """Variance tau^2 of the logarithms of correlations, by moments: their mean square less that of their errors.
+
+    Of as many numbers as there are pairs of outputs and ``n_places`` independent places along a demonstration, and of
+    one more, as of two outputs whose correlation may be anything.
+    """
+    logarithm, _ = _log_correlation(root)
+    i, j = torch.tril_indices(*logarithm.shape[1:], offset=-1, device=root.device)
+    number = n_places * len(i)
+    square = logarithm[:, i, j].square().mean() if len(i) else root.new_zeros(())
+    excess = square - (1.0 / degrees).mean()
+    return ((number * excess + _UNIFORM) / (number + 1.0)).clamp_min(0.0)
+
+
+def shrink_correlation(
+    root: Float[Tensor, "n d r"],
+    degrees: Float[Tensor, " n"],
+    variance: Float[Tensor, ""],
+    draws: Float[Tensor, "*s n d d"] | None = None,
+) -> Float[Tensor, "*s n d d"]:
+    """Roots with the correlations expected of a prior of this variance, the deviations as they are.
+
+    Of ``draws`` from the posterior without that prior, around this root, draws from the posterior with it.
+    """
+    logarithm, deviation = _log_correlation(root)
+    total = (variance + 1.0 / degrees)[:, None, None]
+    shrunk = variance / total * logarithm
+    if draws is not None:
+        drawn, deviation = _log_correlation(draws)
+        shrunk = shrunk + variance.sqrt() * total.rsqrt() * (drawn - logarithm)
+    half = spectral_map(0.5 * shrunk, torch.exp)
+    return deviation / half.norm(dim=-1, keepdim=True) * half
+
+
+def _log_correlation(root: Float[Tensor, "*s n d r"]) -> tuple[Float[Tensor, "*s n d d"], Float[Tensor, "*s n d 1"]]:
+    """Logarithms of the correlations, and the deviations."""
+    deviation = root.norm(dim=-1, keepdim=True)
+    unit = root / deviation
+    return spectral_map(unit @ unit.mT, lambda values: values.clamp_min(_LEAST_EIGENVALUE).log()), deviation
