@@ -30,7 +30,7 @@ _FORMATS = {
     ".csv": "csv.read",
     ".txt": "csv.read",
     ".tsv": "csv.read",
-    ".parquet": "parquet.read",
+    ".parquet": "datasets.read_parquet",
     ".hdf5": "datasets.read_hdf5",
     ".h5": "datasets.read_hdf5",
     ".mat": "mat.read",

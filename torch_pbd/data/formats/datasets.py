@@ -1,27 +1,76 @@
-"""Data sets of robot learning: LeRobot's folders, HDF5 of robomimic and robosuite, replay buffers in Zarr."""
+"""Parquet, and data sets of robot learning: LeRobot's folders, HDF5 of robomimic, replay buffers in Zarr."""
 
 import json
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torch_pbd import checks
-from torch_pbd.data.formats.parquet import open_file, read_columns
 from torch_pbd.data.recordings import preview
 from torch_pbd.data.wanted import Arguments, Wanted, column_names, natural, numeric
 from torch_pbd.registry import optional
 
+# Piece by piece: what is packed and unpacked at a time would be several times the numbers. With four times as many rows
+# what the library keeps is half of the numbers more; without a buffer, in bytes, it holds all of a row group.
+_ROWS, _BUFFER = 2**14, 2**20
 _LARGEST_INFO = 2**22  # letters of meta/info.json
 # Zarr's codecs of numbers; another one, pickle, would execute what is in the file.
 _CODECS = {"bytes", "blosc", "zstd", "lz4", "gzip", "zlib", "bz2", "lzma", "shuffle", "bitshuffle", "delta", "crc32c"}
 _CODECS |= {"transpose", "sharding_indexed", "numcodecs.shuffle", "numcodecs.delta", "numcodecs.zlib", "numcodecs.lz4"}
 
 
+def read_parquet(path: Path, wanted: Wanted) -> Arguments:
+    """Read a long table, a row a sample."""
+    with _open_parquet(path, "parquet", f"{path.name}, as all of Parquet,") as file:
+        chosen = wanted.choose({name: (name,) for name in file.schema_arrow.names}, demo="demo", time="time")
+        return wanted.read_rows(chosen, _read_columns(file, chosen.signals, wanted))
+
+
+def _open_parquet(path: Path, extra: str, what: str) -> Any:
+    """Open Parquet file; ``extra`` and ``what`` are for the error where the library is not installed."""
+    return optional("pyarrow.parquet", extra, what).ParquetFile(path, buffer_size=_BUFFER, pre_buffer=False)
+
+
+def _read_columns(file: Any, names: Sequence[str], wanted: Wanted) -> dict[str, NDArray[Any]]:
+    """Columns of an open Parquet file by name; lists of one length are rows of a matrix."""
+    metadata = file.metadata
+    packed = sum(metadata.row_group(i).total_byte_size for i in range(metadata.num_row_groups))
+    wanted.require(max(packed, 8.0 * metadata.num_rows * len(names)), "it")
+    columns: dict[str, NDArray[Any]] = {}
+    n = 0
+    for batch in file.iter_batches(_ROWS, columns=list(names), use_threads=False):
+        for name in names:
+            values = _array(batch.column(name))
+            if name not in columns:
+                columns[name] = np.empty((metadata.num_rows, *values.shape[1:]), values.dtype)
+            column = columns[name]
+            if column.shape[1:] != values.shape[1:]:
+                raise ValueError(f"column {name!r} has lists that differ in length.")
+            # Whole numbers become floats where some are absent.
+            columns[name] = column.astype(np.result_type(column, values), copy=False)
+            columns[name][n : n + len(values)] = values
+        n += batch.num_rows
+    if n != metadata.num_rows:
+        raise ValueError(f"it says that it has {metadata.num_rows} rows, and has {n}.")
+    return {name: columns.get(name, np.empty(0)) for name in names}
+
+
+def _array(column: Any) -> NDArray[Any]:
+    if hasattr(column.type, "value_type") and not hasattr(column.type, "index_type"):
+        values = column.flatten().to_numpy(zero_copy_only=False)
+        if column.null_count or len(values) % len(column):
+            raise ValueError(f"it has lists of {column.type}, which are absent in some rows or differ in length.")
+        return values.reshape(len(column), -1)
+    return column.to_numpy(zero_copy_only=False)
+
+
 def read_lerobot(path: Path, wanted: Wanted) -> Arguments:
     """Read a folder of LeRobot, version 2 or 3: Parquet files, and what they hold in meta/."""
-    opened = partial(open_file, extra="lerobot", what=f"{path.name}, as all of LeRobot,")
+    opened = partial(_open_parquet, extra="lerobot", what=f"{path.name}, as all of LeRobot,")
     with (path / "meta" / "info.json").open(encoding="utf-8") as file:
         info = json.loads(file.read(_LARGEST_INFO))
     version = info.get("codebase_version") if isinstance(info, dict) else None
@@ -43,7 +92,7 @@ def read_lerobot(path: Path, wanted: Wanted) -> Arguments:
     parts = []
     for name in files:
         with opened(name) as file:
-            parts.append(read_columns(file, list(dict.fromkeys(["episode_index", *chosen.signals])), wanted))
+            parts.append(_read_columns(file, list(dict.fromkeys(["episode_index", *chosen.signals])), wanted))
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     # A missing file would be fewer demonstrations.
     numbers, counts = np.unique(columns["episode_index"], return_counts=True)
@@ -71,7 +120,7 @@ def _declared_lengths(path: Path, opened: Any, wanted: Wanted) -> dict[int, int]
     declared: dict[int, int] = {}
     for name in (path / "meta" / "episodes").rglob("*.parquet"):
         with opened(name) as file:
-            columns = read_columns(file, ["episode_index", "length"], wanted)
+            columns = _read_columns(file, ["episode_index", "length"], wanted)
             declared |= dict(zip(columns["episode_index"].tolist(), columns["length"].tolist(), strict=True))
     lines = path / "meta" / "episodes.jsonl"
     if lines.is_file():

@@ -27,16 +27,11 @@ _FIELDS = {
     "Twist": {"linear": ("linear.", "xyz", "linear_", "m/s"), "angular": ("angular.", "xyz", "angular_", "rad/s")},
 }
 # Where the part that has the fields lies in a message.
-_PARTS = {
-    "geometry_msgs/msg/PointStamped": ("Point", "point."),
-    "geometry_msgs/msg/PoseStamped": ("Pose", "pose."),
-    "geometry_msgs/msg/PoseWithCovarianceStamped": ("Pose", "pose.pose."),
-    "nav_msgs/msg/Odometry": ("Pose", "pose.pose."),
-    "geometry_msgs/msg/TransformStamped": ("Transform", "transform."),
-    "geometry_msgs/msg/WrenchStamped": ("Wrench", "wrench."),
-    "geometry_msgs/msg/TwistStamped": ("Twist", "twist."),
-    **{f"geometry_msgs/msg/{kind}": (kind, "") for kind in ("Pose", "Point", "Wrench", "Twist")},
-}
+_PARTS = {f"geometry_msgs/msg/{kind}": (kind, "") for kind in _FIELDS}
+_PARTS |= {f"geometry_msgs/msg/{kind}Stamped": (kind, f"{kind.lower()}.") for kind in _FIELDS}
+_PARTS |= dict.fromkeys(
+    ["geometry_msgs/msg/PoseWithCovarianceStamped", "nav_msgs/msg/Odometry"], ("Pose", "pose.pose.")
+)
 _JOINTS, _TRANSFORMS = "sensor_msgs/msg/JointState", ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _KINDS = (*_PARTS, _JOINTS, *_TRANSFORMS)
 # Of these, a topic may tell the demonstrations apart.
@@ -153,10 +148,8 @@ def _recordings(
             own = {name: values[order[~repeated]] for name, values in own.items()}
         recordings.append(own)
     if n_late or n_repeated:
-        checks.warn(
-            f"{n_late} of {len(numbers)} messages came after later ones, and are put in order; {n_repeated} repeat the "
-            "stamp of another one, of which the first is kept."
-        )
+        late = f"{n_late} of {len(numbers)} messages came after later ones, and are put in order"
+        checks.warn(f"{late}; {n_repeated} repeat the stamp of another one, of which the first is kept.")
     return recordings
 
 
@@ -172,9 +165,7 @@ def _of_child(messages: Iterator[tuple[int, int, Any]], child: str | None) -> It
         for transform in message.transforms:
             seen.add(transform.child_frame_id)
             if child is None and len(seen) > 1:
-                raise ValueError(
-                    f"its transforms are of several frames, {', '.join(sorted(seen))}: name one by child=."
-                )
+                raise ValueError(f"its transforms are of frames {', '.join(sorted(seen))}: name one by child=.")
             if child in (None, transform.child_frame_id):
                 yield number, stamp, transform
     if child is not None and child not in seen:
@@ -199,9 +190,7 @@ def _getters(kind: str, message: Any) -> tuple[dict[str, dict[str, Any]], dict[s
             raise ValueError(f"a message has joints {', '.join(message.name)}, others {', '.join(names)}.")
         return float(getattr(message, field)[i])
 
+    prefix = {field: "" if field == "position" else f"{field}." for field in given or ["position"]}
     return {
-        field: {
-            f"{'' if field == 'position' else f'{field}.'}{n}": partial(joint, field, i) for i, n in enumerate(names)
-        }
-        for field in given or ["position"]
+        field: {own + name: partial(joint, field, i) for i, name in enumerate(names)} for field, own in prefix.items()
     }, _JOINT_UNITS
