@@ -11,9 +11,8 @@ from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.files.memory import require_much
 
 TIMING_REMOVED = (
-    "The demonstrations were aligned by dynamic time warping, which took differences of timing out that every new "
-    "demonstration has: on recorded ones that cost 3.7 nats a step, and 95 % ellipses held 42 to 65 %. Learn from "
-    ".align('phase'), or from the recordings as they are."
+    "The demonstrations were aligned by dynamic time warping, which took timing out that every new one has: on recorded "
+    "ones that cost 3.7 nats a step, and 95 % ellipses held 42 to 65 %. Learn from .align('phase'), or without it."
 )
 
 

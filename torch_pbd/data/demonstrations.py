@@ -155,8 +155,7 @@ class Demonstrations(Editing):
         if chosen.ndim == 0:
             return Demonstration(self.times[chosen], self.positions[chosen])
         times, positions = ([arrays[k] for k in chosen] for arrays in (self.times, self.positions))
-        suspects = find_suspects(positions, self.names, self.units) if self.suspects else ()
-        return self._replace(times, positions, suspects=suspects)
+        return self._replace(times, positions, anew=bool(self.suspects))
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Demonstrations):
@@ -235,8 +234,11 @@ class Demonstrations(Editing):
 
         return plot_movements(self, outputs, ax)
 
-    def _replace(self, times: Any, positions: Any, **changes: Any) -> "Demonstrations":
-        return _rebuild(times, positions, {**vars(self), **changes})
+    def _replace(self, times: Any, positions: Any, *, anew: bool = False, **changes: Any) -> "Demonstrations":
+        made = _rebuild(times, positions, vars(self) | changes)
+        if anew:
+            vars(made)["suspects"] = find_suspects(made.positions, made.names, made.units)
+        return made
 
 
 def _rebuild(times: Any, positions: Any, attributes: dict[str, Any]) -> Demonstrations:

@@ -10,7 +10,7 @@ from torch_pbd.checks import Floats
 from torch_pbd.data.poses import as_columns, charted, mean_rotation, unwrapped, with_whole_rotation
 from torch_pbd.data.recordings import MIN_SAMPLES, as_texts, preview
 from torch_pbd.data.sampling import Resampling, still
-from torch_pbd.data.units import ANGLES, LENGTHS, TIMES, check_unit, find_suspects
+from torch_pbd.data.units import ANGLES, LENGTHS, TIMES, check_unit
 from torch_pbd.data.wanted import OPTIONS, Wanted, check_options
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.rotations import Chart
@@ -85,15 +85,13 @@ class Editing(Resampling):
                     raise InvalidParameterError(f"parts[{i}] has {label} {mine}, {must}.")
         times, positions = ([a for part in sets for a in getattr(part, name)] for name in ("times", "positions"))
         alignment = sets[0].alignment if len({part.alignment for part in sets}) == 1 else None
-        suspects = find_suspects(positions, sets[0].names, sets[0].units)
         reference = sets[0].rotation_reference
         if not all(np.array_equal(part.rotation_reference, reference) for part in sets):
             pairs = [pair for part in sets for pair in zip(*part.to_poses(), strict=True)]
             places, turns = [place for place, _ in pairs], [turn for _, turn in pairs]
             reference = mean_rotation(times, turns)
             positions = charted(times, places, turns, reference)
-        changes = {"alignment": alignment, "suspects": suspects, "rotation_reference": reference}
-        return sets[0]._replace(times, positions, **changes)
+        return sets[0]._replace(times, positions, anew=True, alignment=alignment, rotation_reference=reference)
 
     def to_poses(self) -> tuple[list[Floats], list[Floats]]:
         """Poses of which the last three outputs are the rotation.
@@ -120,12 +118,13 @@ class Editing(Resampling):
         positions = [position[:, kept] for position in self.positions]
         units = self.units and tuple(self.units[i] for i in kept)
         labels = {"names": chosen, "units": units, "rotation_reference": reference}
-        return self._replace(self.times, positions, suspects=find_suspects(positions, chosen, units), **labels)
+        return self._replace(self.times, positions, anew=True, **labels)
 
     def unwrap(self, angles: str | Sequence[str]) -> Self:
         """These demonstrations with named angles that go on over a turn, along time and between demonstrations."""
-        positions = unwrapped(self.times, self.positions, self.names, self.units, angles)
-        return self._replace(self.times, positions, suspects=find_suspects(positions, self.names, self.units))
+        return self._replace(
+            self.times, unwrapped(self.times, self.positions, self.names, self.units, angles), anew=True
+        )
 
     def in_units(self, unit: str | None = None, time_unit: str | None = None) -> Self:
         """These demonstrations in another unit of length or angle, and of time.

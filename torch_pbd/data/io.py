@@ -24,21 +24,12 @@ _COPIES = 10
 
 # Readers take (path, wanted, **options) and hand over arguments of Demonstrations; what they raise gets the path here.
 # Their modules are imported when a file of their kind is met, and what they need from extras with them.
-_FORMATS = {
-    ".npz": "npz.read",
-    ".npy": "npz.read_array_file",
-    ".csv": "csv.read",
-    ".txt": "csv.read",
-    ".tsv": "csv.read",
-    ".parquet": "datasets.read_parquet",
-    ".hdf5": "datasets.read_hdf5",
-    ".h5": "datasets.read_hdf5",
-    ".mat": "mat.read",
-    ".zip": "datasets.read_zarr",
-    ".bag": "rosbag.read",
-    ".mcap": "rosbag.read",
-    ".db3": "rosbag.read",
-}
+_FORMATS = {".npz": "npz.read", ".npy": "npz.read_array_file", ".mat": "mat.read"}
+_FORMATS |= dict.fromkeys([".csv", ".txt", ".tsv"], "csv.read") | dict.fromkeys(
+    [".bag", ".mcap", ".db3"], "rosbag.read"
+)
+_FORMATS |= {".parquet": "datasets.read_parquet", ".zip": "datasets.read_zarr"}
+_FORMATS |= dict.fromkeys([".hdf5", ".h5"], "datasets.read_hdf5")
 _WRITTEN = {".npz": "npz.write", ".csv": "csv.write"}
 # Formats that are folders, by a file that only they have.
 _FOLDERS = {
@@ -145,17 +136,17 @@ def find_files(source: Source) -> list[Path]:
         return [file for entry in source for file in find_files(entry)]
     path = Path(source)
     if any(mark in path.name for mark in "*?[") and not path.exists():
-        found = sorted(path.parent.glob(path.name), key=lambda file: natural(file.name))
-        if not found:
+        within = list(path.parent.glob(path.name))
+        if not within:
             raise FileNotFoundError(f"{path} matches no file.")
-        return found
-    if not path.is_dir() or _reader_of(path):
+    elif path.is_dir() and not _reader_of(path):
+        within = list(filter(_reader_of, path.iterdir()))
+        kinds = sorted({file.suffix.lower() for file in within})
+        if len(kinds) != 1:
+            what = f"files of several formats, {', '.join(kinds)}" if kinds else f"no file of {', '.join(_FORMATS)}"
+            raise FileNotFoundError(f"the folder {path} has {what}: name those to read, as by {str(path / '*.csv')!r}.")
+    else:
         return [path]
-    within = [file for file in path.iterdir() if _reader_of(file)]
-    kinds = sorted({file.suffix.lower() for file in within})
-    if len(kinds) != 1:
-        what = f"files of several formats, {', '.join(kinds)}" if kinds else f"no file of {', '.join(_FORMATS)}"
-        raise FileNotFoundError(f"the folder {path} has {what}: name those to read, as by {str(path / '*.csv')!r}.")
     return sorted(within, key=lambda file: natural(file.name))
 
 

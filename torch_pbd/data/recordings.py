@@ -46,11 +46,9 @@ def as_recordings(times: Any, positions: Any, missing: str) -> tuple[tuple[Float
                 f"{names[k]} has {len(grid)} samples but positions[{k}] has {len(sample)}, of lengths "
                 f"{preview(list(map(len, samples)))}: give each demonstration its own times. {_ALONE}"
             )
-        if sample.shape[1] != samples[0].shape[1]:
-            n, first = sample.shape[1], samples[0].shape[1]
-            raise InvalidParameterError(
-                f"positions[{k}] has {n} outputs but positions[0] has {first}: select the same."
-            )
+        n, first = sample.shape[1], samples[0].shape[1]
+        if n != first:
+            raise InvalidParameterError(f"positions[{k}] has {n} outputs but positions[0] has {first}: select some.")
     kept = [np.arange(len(grid)) for grid in grids]
     if drop:
         kept = _not_missing(grids, samples)

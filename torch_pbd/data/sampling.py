@@ -33,7 +33,7 @@ class Resampling:
     rotation_reference: Floats | None
     suspects: tuple[str, ...]
 
-    def _replace(self, times: Any, positions: Any, **changes: Any) -> Self:
+    def _replace(self, times: Any, positions: Any, *, anew: bool = False, **changes: Any) -> Self:
         raise NotImplementedError
 
     def resample(self, n: int, *, max_gap: float | None = None) -> Self:

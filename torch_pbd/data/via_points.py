@@ -80,7 +80,7 @@ def make_handwriting_demonstrations(
     Each movement starts and ends at rest and has the least jerk of those that pass its via points at their phases
     (T. Flash, N. Hogan, Journal of Neuroscience 5, 1985): the quintic spline through them. Via points are normal and
     independent; across the path with the deviation ``via_precision``, along it with half of that. A tremor of 0.2 mm
-    rms up to 2 Hz is added.
+    rms up to 2 Hz is added. Over the phase, `handwriting_mean` and `handwriting_covariance` are the law, exactly.
 
     Parameters
     ----------
@@ -103,10 +103,6 @@ def make_handwriting_demonstrations(
     -------
     Demonstrations
         Outputs x and y in m, times in s.
-
-    See Also
-    --------
-    handwriting_mean, handwriting_covariance : The law over the phase, exactly.
 
     Examples
     --------
@@ -160,7 +156,7 @@ def make_pose_demonstrations(
     Position and rotation are minimum-jerk movements through five via points, as in `make_handwriting_demonstrations`,
     in the workspace of an arm of 0.8 m whose base is the origin; the tool turns by 76 degrees. On the way the hand is
     free. In the hole, which leans by 20 degrees, the peg is precise across (0.7 mm, 0.7 degrees about two axes), and
-    free along (8 mm) and about its own axis (20 degrees).
+    free along (8 mm) and about its own axis (20 degrees). `pose_mean` and `pose_covariance` are the law.
 
     Parameters
     ----------
@@ -173,10 +169,6 @@ def make_pose_demonstrations(
     -------
     Demonstrations
         Outputs x, y, z in m and rx, ry, rz in rad; times in s.
-
-    See Also
-    --------
-    pose_mean, pose_covariance : The law over the phase, exactly.
 
     Examples
     --------
@@ -204,9 +196,8 @@ def _via_law(shape: Shape, via_precision: ArrayLike | None) -> tuple[Floats, Flo
     means, across = 1e-2 * table[:, :2], 1e-3 * table[:, 2]
     if via_precision is not None:
         one = np.ndim(via_precision) == 0
-        across = checks.array(
-            np.full(len(means), via_precision) if one else via_precision, "via_precision", means.shape[:1]
-        )
+        given = np.full(len(means), via_precision) if one else via_precision
+        across = checks.array(given, "via_precision", (len(means),))
         checks.require(across > 0.0, across, "via_precision", "above zero", "a standard deviation in m")
     # The direction of the path is that of the chord between the neighbours. Across it is t t' off the identity.
     chord = np.gradient(means, axis=0)
