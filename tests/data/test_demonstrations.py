@@ -190,9 +190,9 @@ def _changed(array, index, value):
             [np.zeros((3, 2)), np.zeros((3, 1))],
             "positions[1] has 1 outputs but positions[0] has 2",
         ),
-        (TIME, _changed(TWO, (1, 2, 0), np.nan), "positions[1] is nan at sample 2, output 0"),
-        (TIME, _changed(TWO, (0, 1, 0), -np.inf), "positions[0] is -inf at sample 1"),
-        ([TIME, _changed(TIME, 1, np.nan)], TWO, "times[1] is nan at sample 1"),
+        (TIME, _changed(TWO, (1, 2, 0), np.nan), "positions[1][2, 0] is nan, must be finite"),
+        (TIME, _changed(TWO, (0, 1, 0), -np.inf), "positions[0][1, 0] is -inf"),
+        ([TIME, _changed(TIME, 1, np.nan)], TWO, "times[1][1] is nan"),
         (
             [TIME, [0.0, 2.0, 2.0]],
             TWO,

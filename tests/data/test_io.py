@@ -131,7 +131,7 @@ def test_units_may_be_one_a_list_or_by_name(tmp_path, units):
         ({"t_0": T, "x_0": X[0], "t_1": T}, "has no array 'x_1'"),
         ({"t": T, "x": X.astype(object)}, "array 'x' cannot be read"),
         ({"t": T[::-1], "x": X}, "times[0] must increase strictly"),
-        ({"t": T, "x": X * np.nan}, "positions[0] is nan at sample 0"),
+        ({"t": T, "x": X * np.nan}, "positions[0][0, 0] is nan"),
         ({"t": T, "x": X, "meta": np.array("{")}, "meta must be a 0-d string with a JSON object"),
         (
             {"t": T, "x": X, "meta": np.array("[1]")},

@@ -84,12 +84,12 @@ def test_7_unequal_lengths_are_no_array_until_they_are_aligned():
 def test_8_what_is_not_finite_is_told_with_its_place(door, value, tmp_path):
     with pytest.raises(ValueError) as caught:
         door(TIME, with_entry(POSITIONS, (1, 4, 1), value), tmp_path)
-    place = "line 12, column 'y1'" if door is as_csv else f"positions[1] is {value} at sample 4, output 1"
+    place = "line 12, column 'y1'" if door is as_csv else f"positions[1][4, 1] is {value}, must be finite"
     assert place in str(caught.value)
     assert ("missing='drop'" in str(caught.value)) == (np.isnan(value) or door is as_csv)
     with pytest.raises(ValueError) as caught:
         door([TIME, TIME, with_entry(TIME, 3, value)], POSITIONS, tmp_path)
-    place = "line 17, column 'time'" if door is as_csv else f"times[2] is {value} at sample 3"
+    place = "line 17, column 'time'" if door is as_csv else f"times[2][3] is {value}, must be finite"
     assert place in str(caught.value)
 
 
@@ -118,9 +118,9 @@ def test_9_infinity_is_not_missing(door, tmp_path):
     holed = with_entry(with_entry(POSITIONS, (1, 2, 0), np.nan), (1, 4, 1), np.inf)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MissingDataWarning)
-        with pytest.raises(ValueError, match=r"positions\[1\] is inf at sample 4|line 12, column 'y1'"):
+        with pytest.raises(ValueError, match=r"positions\[1\]\[4, 1\] is inf|line 12, column 'y1'"):
             door(TIME, holed, tmp_path, missing="drop")
-        with pytest.raises(ValueError, match=r"times\[0\] is inf at sample 5|line 7, column 'time'"):
+        with pytest.raises(ValueError, match=r"times\[0\]\[5\] is inf|line 7, column 'time'"):
             door([with_entry(TIME, 5, np.inf)] * 3, POSITIONS, tmp_path, missing="drop")
 
 

@@ -11,7 +11,7 @@ from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.files.memory import require_much
 
 TIMING_REMOVED = (
-    "The demonstrations were aligned by dynamic time warping, which took timing out that every new one has: on recorded "
+    "The demonstrations were aligned by dynamic time warping, which took timing out that every new one has: on real "
     "ones that cost 3.7 nats a step, and 95 % ellipses held 42 to 65 %. Learn from .align('phase'), or without it."
 )
 

@@ -57,7 +57,7 @@ def as_recordings(times: Any, positions: Any, missing: str) -> tuple[tuple[Float
     fresh = drop or isinstance(positions, Fresh)
     return (
         tuple(map(_rising, _from_common_origin(grids), grids, names, kept)),
-        tuple(_finite(frozen(sample, fresh), k, kept[k]) for k, sample in enumerate(samples)),
+        tuple(frozen(sample, fresh) for sample in samples),
     )
 
 
@@ -121,11 +121,14 @@ def _as_list(values: Any, name: str) -> list[Any]:
 
 
 def _numbers(values: Any, name: str, drop: bool) -> NDArray[Any]:
-    """Real numbers in their own type, as whole numbers beyond 2**53 are exact in none else."""
+    """Finite numbers in their own type, as whole ones beyond 2**53 are exact in none else; if wanted, and NaN."""
     if drop and np.ma.is_masked(values):
         values = np.ma.filled(np.ma.asarray(values, dtype=np.float64), np.nan)
     array = checks.real_array(values, name)
-    return array if array.dtype.kind in "fiu" else checks.real_floats(array, name)
+    array = array if array.dtype.kind in "fiu" else checks.real_floats(array, name)
+    checks.require(~np.isinf(array), array, name, "finite")
+    checks.require(drop | ~np.isnan(array), array, name, "finite", "missing='drop' leaves such samples out")
+    return array
 
 
 def _samples(values: Any, name: str, drop: bool) -> NDArray[Any]:
@@ -168,15 +171,6 @@ def _not_missing(grids: Arrays, samples: Arrays) -> list[NDArray[np.intp]]:
     return [np.flatnonzero(~hole) for hole in holes]
 
 
-def _finite(position: Floats, k: int, numbers: NDArray[np.intp]) -> Floats:
-    if not np.isfinite(position).all():
-        i, j = np.argwhere(~np.isfinite(position))[0]
-        where = f"positions[{k}] is {position[i, j]} at sample {numbers[i]}, output {j}, must be finite"
-        remedy = "drop the sample (missing='drop') or fill it in" if np.isnan(position[i, j]) else "correct it"
-        raise InvalidParameterError(f"{where}: {remedy}.")
-    return position
-
-
 def _from_common_origin(grids: Arrays) -> Arrays:
     """Times; where whole numbers are beyond what float64 holds, from the first of them on, so that steps stay exact."""
     beyond = [grid for grid in grids if grid.dtype.kind in "iu" and max(grid.max(), -int(grid.min())) > 2**53]
@@ -190,9 +184,6 @@ def _from_common_origin(grids: Arrays) -> Arrays:
 def _rising(grid: NDArray[Any], original: NDArray[Any], name: str, numbers: NDArray[np.intp]) -> Floats:
     """Times that rise strictly; messages show them as in ``original``."""
     time = frozen(grid)
-    if not np.isfinite(time).all():
-        i = int(np.argmin(np.isfinite(time)))
-        raise InvalidParameterError(f"{name} is {time[i]} at sample {numbers[i]}, must be finite.")
     if np.ptp(0.25 * time) > _LONGEST:
         far = f"{name} goes from {time.min():.3g} to {time.max():.3g}"
         raise InvalidParameterError(f"{far}, further than float64 can tell: take another unit of time.")
