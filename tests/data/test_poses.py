@@ -237,7 +237,7 @@ def test_quaternions_of_files_are_rounded(recorded, posed, decimals):
             {"rotation": WXYZ[:3]},
             "rotation is ('qw', 'qx', 'qy'), must be four different ones of [x, qx, qy, grip, qz, qw]",
         ),
-        ({"rotation": ("qw", "qx", "qy", "x")}, "the quaternion qw, qx, qy, x has norm"),
+        ({"rotation": ("qw", "qx", "qy", "x")}, "the norm of qw, qx, qy, x in positions[0][0] is"),
         ({"rotation": ("qw", "qw", "qy", "qz")}, "must be four different ones of"),
         ({"rotation": ("w", "x", "y", "z")}, "in the order w x y z, wherever these stand"),
         (
@@ -271,7 +271,7 @@ def test_lost_quaternions_are_dropped_or_refused(recorded):
     times, places, turns = recorded
     positions = [columns(p, turn.as_quat(scalar_first=True)) for p, turn in zip(places, turns, strict=True)]
     positions[1][5, [1, 2, 4, 5]] = 0.0
-    with pytest.raises(ValueError, match=r"has norm 0 at sample 5 of recording 1, must have 1.*missing='drop' leaves"):
+    with pytest.raises(ValueError, match=r"in positions\[1\]\[5\] is 0\.0, must be 1.*missing='drop' leaves"):
         Demonstrations(times, positions, names=NAMES, rotation=WXYZ)
     positions[2][7, 5] = np.nan
     with pytest.warns(MissingDataWarning) as told:

@@ -142,14 +142,13 @@ def unwrapped(times: Any, positions: Any, names: Any, units: Any, angles: Any) -
 
 def _unit(quaternion: Floats, k: int, names: Sequence[str]) -> Floats:
     """Quaternions (T, 4) of norm one of recorded ones, which are rounded."""
-    square = np.square(quaternion).sum(axis=1)
-    wrong = np.flatnonzero(np.abs(square - 1.0) > OFF_SPHERE)
-    if len(wrong):
-        i = int(wrong[0])
-        what = f"the quaternion {', '.join(names)} has norm {math.sqrt(square[i]):.4g} at sample {i} of recording {k}"
-        remedy = "missing='drop' leaves such samples out" if square[i] == 0.0 else "name the columns of a rotation"
-        raise InvalidParameterError(f"{what}, must have 1: {remedy}.")
-    return quaternion / np.sqrt(square)[:, np.newaxis]
+    norm = np.linalg.norm(quaternion, axis=1)
+    what, remedy = (
+        f"the norm of {', '.join(names)} in positions[{k}]",
+        "name a rotation; missing='drop' leaves zeros out",
+    )
+    checks.require(np.abs(norm**2 - 1.0) <= OFF_SPHERE, norm, what, "1", remedy)
+    return quaternion / norm[:, np.newaxis]
 
 
 def _check_reach(times: Sequence[Floats], turns: Sequence[Floats]) -> None:
