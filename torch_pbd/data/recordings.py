@@ -61,17 +61,21 @@ def as_recordings(times: Any, positions: Any, missing: str) -> tuple[tuple[Float
     )
 
 
-def as_texts(values: Any, name: str) -> tuple[str, ...]:
-    """Several texts, or one."""
+def as_texts(values: Any, name: str, n_outputs: int | None = None) -> tuple[str, ...]:
+    """Several texts, or one; one for each output, if their number is given."""
     if not isinstance(values, str | list | tuple | np.ndarray):
         raise checks.refusal(values, name, "strings")
     entries = (values,) if isinstance(values, str) else values
-    return tuple(checks.text(entry, f"{name}[{i}]") for i, entry in enumerate(entries))
+    texts = tuple(checks.text(entry, f"{name}[{i}]") for i, entry in enumerate(entries))
+    if n_outputs is not None and len(texts) != n_outputs:
+        has = f"{name} has {len(texts)} entries {preview(texts)}"
+        raise InvalidParameterError(f"{has} but the demonstrations have {n_outputs} outputs: give one for each.")
+    return texts
 
 
 def as_names(names: Any, n_outputs: int) -> tuple[str, ...]:
     """Name for each output, all different; y0, y1, ... where none are given."""
-    values = _one_each([f"y{i}" for i in range(n_outputs)] if names is None else names, n_outputs, "names")
+    values = as_texts([f"y{i}" for i in range(n_outputs)] if names is None else names, "names", n_outputs)
     if len(set(values)) < n_outputs:
         raise InvalidParameterError(f"names must differ from each other; got {preview(values)}.")
     return values
@@ -82,7 +86,7 @@ def as_units(units: Any, n_outputs: int) -> tuple[str, ...] | None:
     if units is None:
         return None
     one = isinstance(units, str)
-    values = (units,) * n_outputs if one else _one_each(units, n_outputs, "units")
+    values = (units,) * n_outputs if one else as_texts(units, "units", n_outputs)
     for i, unit in enumerate(values):
         check_unit(unit, "units" if one else f"units[{i}]", LENGTHS | ANGLES)
     return values
@@ -100,14 +104,6 @@ def frozen(array: NDArray[Any], fresh: bool = False) -> Floats:
     copy = np.array(array, dtype=np.float64, order="C", copy=None if fresh and array.base is None else True)
     copy.setflags(write=False)
     return copy
-
-
-def _one_each(values: Any, n_outputs: int, name: str) -> tuple[str, ...]:
-    labels = as_texts(values, name)
-    if len(labels) != n_outputs:
-        has = f"{name} has {len(labels)} entries {preview(labels)}"
-        raise InvalidParameterError(f"{has} but the demonstrations have {n_outputs} outputs: give one for each.")
-    return labels
 
 
 def _as_list(values: Any, name: str) -> list[Any]:

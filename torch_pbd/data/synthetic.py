@@ -180,7 +180,7 @@ def make_tunnel_demonstrations(
 def _blend(along: Floats, common_start: bool, common_goal: bool) -> Floats:
     """Share of the lanes that the ends leave, by minimum jerk (Flash, Hogan 1985): smooth where it becomes one."""
     result = np.ones_like(along)
-    for distance in [along] * common_start + [PATH_LENGTH - along] * common_goal:
+    for distance in [along] * bool(common_start) + [PATH_LENGTH - along] * bool(common_goal):
         s = np.clip(distance / (_BLENDED * PATH_LENGTH), 0.0, 1.0)
         result = result * (s**3 * (10.0 - 15.0 * s + 6.0 * s**2))
     return result

@@ -62,10 +62,8 @@ def nanoseconds_hint(times: Any) -> str:
     largest = float(np.abs(stamps.astype(np.float64)).max())
     if not _LIKE_NS <= largest < math.inf or (stamps != np.round(stamps)).any():
         return ""
-    coarse = f", of which float64 tells {np.spacing(largest):.0f} apart: give integers"
-    return (
-        f" Whole numbers above {_LIKE_NS:g} look like ns (time_unit='ns'){coarse if stamps.dtype.kind == 'f' else ''}."
-    )
+    coarse = f", float64 tells {np.spacing(largest):.0f} apart: give integers" if stamps.dtype.kind == "f" else ""
+    return f" Whole numbers above {_LIKE_NS:g} look like ns (time_unit='ns'){coarse}."
 
 
 def find_suspects(positions: Sequence[Floats], names: Sequence[str], units: Sequence[str] | None) -> tuple[str, ...]:
@@ -75,18 +73,14 @@ def find_suspects(positions: Sequence[Floats], names: Sequence[str], units: Sequ
         four = names[first : first + 4]
         order = tuple(sorted(four, key=lambda name: name[-1:]))
         known = [name[-1:] for name in order] == [*"wxyz"]
-        found.append(
-            f"Outputs {', '.join(four)} have the squared sum 1, as unit quaternions do, of which q and -q are one "
-            "rotation and no mean is one: say which they are, in the order w x y z, "
-            f"rotation={order if known else '(w, x, y, z), of which only you know the names'}, or leave them out."
-        )
+        what = f"Outputs {', '.join(four)} have the squared sum 1, as unit quaternions do, whose mean is no rotation"
+        given = order if known else "(w, x, y, z), of which only you know the names"
+        found.append(f"{what}: say which they are, in the order w x y z, rotation={given}, or leave them out.")
     for i, name in enumerate(names):
         angle = _wrapped(positions, i, None if units is None else units[i])
         if angle:
-            found.append(
-                f"Output {name} jumps by a turn, {2.0 * math.pi / ANGLES[angle]:.4g} {angle}, between two samples, and "
-                f"a robot would turn back the long way. Say angles=[{name!r}], and that its unit is {angle!r}."
-            )
+            what = f"Output {name} jumps by a turn, {2.0 * math.pi / ANGLES[angle]:.4g} {angle}, between two samples"
+            found.append(f"{what}, and so does a mean. Say angles=[{name!r}], and that its unit is {angle!r}.")
     return tuple(found)
 
 
