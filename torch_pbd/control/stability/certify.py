@@ -11,7 +11,7 @@ from torch_pbd import checks, rotations
 from torch_pbd.control.matrices import mass_rows, required_damping_ratio
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.sensor import PositionLoop
-from torch_pbd.control.simulation.ticks import admittance_rate, transition
+from torch_pbd.control.simulation.ticks import tick_map
 from torch_pbd.control.stability.common_function import common_function
 from torch_pbd.control.stability.dynamics import ErrorDynamics, largest_gain
 from torch_pbd.control.stability.lyapunov import Knots, held_growth
@@ -150,7 +150,7 @@ def stiffest_environment(
     stiffness, damping = stiffness[chosen], damping[chosen]
     axes = torch.linalg.eigh(symmetrize(damping)).eigenvectors
     along = [(axes * (matrix @ axes)).sum(-2).reshape(-1, 1, 1) for matrix in (stiffness, damping, mass)]
-    ticks = transition(admittance_rate(*along), dt)[:, :2]
+    ticks = tick_map(along[0], along[1], along[2], dt)
 
     def is_stable(each: Tensor, environment: float) -> Tensor:
         closed = _closed_loop(each, position_loop, force_cutoff, dt, environment)
@@ -172,20 +172,15 @@ def stiffest_environment(
 def _closed_loop(
     ticks: Float[Tensor, "n 2 3"], loop: PositionLoop, force_cutoff: float | None, dt: float, environment: float
 ) -> Float[Tensor, "n m m"]:
-    """Matrices of [admittance position, velocity; robot position, velocity; filtered force; commands waiting]."""
-    robot, filtered, waiting, n_waiting = 2, 4, 5, loop.delay_steps
-    closed = ticks.new_zeros(len(ticks), waiting + n_waiting, waiting + n_waiting)
-    closed[:, :2, :2] = ticks[:, :, :2]
-    if force_cutoff is None:
-        closed[:, :2, robot] = -environment * ticks[:, :, 2]
-    else:
+    """Matrices that move the state of admittance, robot, filter of the force and waiting commands on by a tick."""
+    identity = torch.eye(5 + loop.delay_steps).to(ticks).expand(len(ticks), -1, -1)
+    # Each is a row of the identity: what the next state is made of it, is a row of the matrix.
+    position, velocity, robot, robot_velocity, filtered, *waiting = identity.unbind(1)
+    commands, force = [*waiting, position], -environment * robot
+    read, after = force, 0.0 * filtered
+    if force_cutoff is not None:
         gain = -math.expm1(-2.0 * math.pi * force_cutoff * dt)
-        closed[:, :2, filtered] = ticks[:, :, 2]
-        closed[:, filtered, filtered] = 1.0 - gain
-        closed[:, filtered, robot] = -environment * gain
-    follow = loop.transition(dt, ticks)
-    closed[:, robot : robot + 2, robot : robot + 2] = follow[:, :2]
-    closed[:, robot : robot + 2, waiting if n_waiting else 0] = follow[:, 2]
-    for step in range(n_waiting):  # the oldest command comes first, and the last is the admittance's position
-        closed[:, waiting + step, waiting + step + 1 if step < n_waiting - 1 else 0] = 1.0
-    return closed
+        read, after = filtered, torch.lerp(filtered, force, gain)
+    moved = ticks @ torch.stack([position, velocity, read], dim=1)
+    followed = loop.transition(dt, ticks) @ torch.stack([robot, robot_velocity, commands[0]], dim=1)
+    return torch.cat([moved, followed, torch.stack([after, *commands[1:]], dim=1)], dim=1)
