@@ -187,7 +187,7 @@ class _SpectralMap(torch.autograd.Function):
             raise RuntimeError("spectral_map has no second derivatives: call autograd without create_graph=True.")
         eigenvalues, axes, mapped, slope = ctx.saved_tensors
         gap = eigenvalues.unsqueeze(-1) - eigenvalues.unsqueeze(-2)
-        # Of closer ones the difference has lost half its digits, and the mean slope is at least as good.
+        # The difference of closer ones has lost half its digits, and the mean slope is at least as good.
         nearest = torch.finfo(gap.dtype).eps ** 0.5 * eigenvalues.abs().amax(-1)
         equal = gap.abs() <= nearest[..., None, None]
         rise = mapped.unsqueeze(-1) - mapped.unsqueeze(-2)

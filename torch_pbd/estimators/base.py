@@ -19,7 +19,7 @@ from torch_pbd.linalg import gaussian_log_density, safe_cholesky, student_log_de
 Prior = float | list[list[float]] | str | Callable[[Any], Any] | None  # what YAML can say; or any array-like
 
 _SHORTEST_PERIOD = 1e-8  # of the range: standardized inputs have ten decimals, and so this phase two
-# Of the variance of y: beyond these the floor under variances shows far from data, or the prior near them.
+# Shares of the variance of y beyond which the floor under variances shows far from data, or the prior near them.
 _LOWEST, _HIGHEST = 1e-6, 1e6
 _CHUNK = 1024  # rows: what a prediction needs on the way is then some tens of MB for ten outputs
 
@@ -183,7 +183,7 @@ def shaped_as_y(mean: Floats, covariance: Floats, *, y_is_1d: bool, return_cov: 
     mean = mean.ravel() if y_is_1d else mean
     if return_cov:
         return mean, covariance
-    # Of an output that is known the variance is zero but for rounding, which may be below.
+    # Where an output is known its variance is zero but for rounding, which may be below.
     std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).clip(0.0))
     return mean, std.ravel() if y_is_1d else std
 

@@ -144,7 +144,7 @@ def without_rounding(X: Floats) -> Floats:
         near = gap <= np.finfo(np.float32).eps * np.ptp(value)
         near[:-1] |= (single[1:] == value[:-1]) | (single[:-1] == value[1:])
         near &= gap < _NEAR * np.quantile(gap, 0.9, method="lower")
-        # Of values that follow each other closely all take the first.
+        # Values that follow each other closely all take the first.
         first = np.maximum.accumulate(np.where(np.append(False, near[:-1]), 0, np.arange(len(value))))
         column[:] = value[first[index]]
         if near.mean() > _MANY:

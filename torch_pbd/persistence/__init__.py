@@ -1,9 +1,9 @@
 """Save and load fitted estimators: one safetensors file whose header is JSON; nothing in it is ever executed.
 
-A file of format 1 holds of a regressor its class, its parameters, what its fit learned ("fitted"), the ``config()`` of
-its model's core ("module"), and as arrays the ``state_dict`` of the model. Of a controller it holds class, parameters,
-what its fit learned, as arrays its movement, and under "covariance_" all that of its regressor. A model of movements is
-written like a controller, with a regressor of its own, if it has one, under "regressor_".
+A file of format 1 holds an estimator's class, parameters, and what its fit learned ("fitted"). A regressor adds the
+``config()`` of its model's core ("module"), and as arrays the model's ``state_dict``; a controller the arrays of its
+movement, and under "covariance_" all that of its regressor. A model of movements is written like a controller, with a
+regressor of its own, if it has one, under "regressor_".
 """
 
 import os
@@ -35,16 +35,6 @@ _PARTS = {"DMPController": "covariance_", **dict.fromkeys(MOVEMENTS, "regressor_
 _FOREIGN = re.compile(
     r"\.(pkl|pickle|joblib|skops|pt|pth|ckpt|bin|onnx|np[yz]|h5|hdf5|mat|zip|json|ya?ml|toml|csv|txt|parquet)", re.I
 )
-# What parts that do not fit together raise.
-_UNSOUND = (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError)
-
-# Arrays of a model by the last part of their name. Infinite ones mean that there is none; logarithms above 300 are of
-# factors whose squares are no numbers.
-_MAY_BE_INFINITE = ("period", "log_density_floor")
-_POSITIVE = ("x_scale", "y_scale", "length_scale", "counts", "period")
-_NOT_NEGATIVE = ("amplitude", "noise_ratio", "correlation_variance")
-_FACTORS = ("prior_tril", "pooled_tril")
-_LARGEST_LOGARITHM = 300.0
 
 # Arrays of a controller: for each output one number, but for the forcing.
 _NOISE, _MOTION = ("noise_scale_", "noise_share_"), ("start", "velocity", "goal", "forcing")
@@ -84,7 +74,7 @@ def save(estimator: CovarianceRegressor | DMPController, path: str | os.PathLike
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of a device that is not here: who loads the file is warned
             _restored(description, arrays)
-    except _UNSOUND as error:
+    except Exception as error:  # parts that do not fit together raise errors of all kinds
         raise ValueError(f"the {name} cannot be saved, as it is not sound: {_brief(error)}.") from error
     versions = {package: version(package) for package in ("torch", "scikit-learn", "numpy")}
     header = {"format_version": FORMAT_VERSION, **description, "versions": versions}
@@ -118,7 +108,7 @@ def load(path: str | os.PathLike[str]) -> Any:
         if not isinstance(header.pop("versions", None), dict) or header.pop("format_version") != FORMAT_VERSION:
             raise ValueError("it does not say what wrote it")
         return _restored(header, arrays)
-    except _UNSOUND as error:
+    except Exception as error:
         what = f"{header.get('class')!s:.80}"
         raise ModelFileError(f"{path} does not describe a whole {what} ({_brief(error)}).") from error
 
@@ -204,16 +194,19 @@ def _check_numbers(name: str, array: Any) -> None:
     if array.dtype != np.float64:
         raise ValueError(f"array {name!r:.80} is of {array.dtype}, must be of float64")
     last = name.rpartition(".")[2]
-    finite = ~np.isnan(array) if last in _MAY_BE_INFINITE else np.isfinite(array)
+    # An infinite one means that there is none.
+    finite = ~np.isnan(array) if last in ("period", "log_density_floor") else np.isfinite(array)
     checks.require(finite, array, name, "finite")
-    if last.endswith(_POSITIVE):
+    if last.endswith(("x_scale", "y_scale", "length_scale", "counts", "period")):
         checks.require(array > 0.0, array, name, "above 0")
-    if last.endswith(_NOT_NEGATIVE):
+    if last.endswith(("amplitude", "noise_ratio", "correlation_variance")):
         checks.require(array >= 0.0, array, name, "at least 0")
-    if last == "log_diagonal":
-        checks.require(np.abs(array) < _LARGEST_LOGARITHM, array, name, f"below {_LARGEST_LOGARITHM:g} in size")
+    if last == "log_diagonal":  # beyond, the squares of factors are no numbers
+        checks.require(np.abs(array) < 300.0, array, name, "below 300 in size")
     factor = np.atleast_2d(array)
-    if last in _FACTORS and ((factor != np.tril(factor)).any() or (np.diagonal(factor) <= 0.0).any()):
+    if last in ("prior_tril", "pooled_tril") and (
+        (factor != np.tril(factor)).any() or (np.diagonal(factor) <= 0.0).any()
+    ):
         raise ValueError(f"array {name!r:.80} must be the lower factor of a positive definite matrix")
 
 

@@ -24,7 +24,7 @@ CONTROLLER: dict[str, Any] = {
 }
 """Settings of an arm's controller that `to_actions` is for: ``controller_configs["body_parts"]["right"]``."""
 
-# Of the motion alone: gains are limited as kp is, which robosuite clips without a word.
+# Limits of the motion alone: gains are limited as kp is, which robosuite clips without a word.
 _LIMITS = RobotLimits(stiffness=(0.0, np.inf), rotational_stiffness=(0.0, np.inf))
 
 

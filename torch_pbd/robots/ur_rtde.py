@@ -13,7 +13,7 @@ from torch_pbd.control.schedule import Schedule
 from torch_pbd.robots import session
 from torch_pbd.robots.session import RobotLimits, RobotRun, RobotStoppedError
 
-# Of the tool, as these arms are delivered; they servo to positions, so that stiffness is a matter of the loop here.
+# Limits of the tool as these arms are delivered; they servo to positions, so that stiffness is a matter of the loop.
 _LIMITS = RobotLimits(speed=1.0, angular_speed=3.1, stiffness=(0.0, np.inf), rotational_stiffness=(0.0, np.inf))
 _ASKED = 10.0  # poses a second of which the robot is asked whether it reaches them: each takes it some ms
 
