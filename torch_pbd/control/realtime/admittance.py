@@ -20,7 +20,7 @@ from torch_pbd.control.realtime.limits import (
     options_of_blocks,
     unit_quaternion,
 )
-from torch_pbd.control.realtime.motion import Motion, TickTimer
+from torch_pbd.control.realtime.motion import Motion
 from torch_pbd.control.realtime.steps import Vector
 from torch_pbd.control.realtime.table import ScheduleTable, virtual_mass
 from torch_pbd.control.schedule import Schedule
@@ -141,12 +141,12 @@ class RealTimeAdmittance:
         given |= {"acceleration_limit": acceleration_limit, "approach_speed": approach_speed}
         limits = options_of_blocks(given | {"stop_deceleration": stop_deceleration}, len(schedule.blocks))
         self._mass = virtual_mass(schedule, mass)
-        self._timer = TickTimer(rate, max_step, max_bad_ticks)
+        rate = checks.number(rate, "rate", above=0.0, unit="1/s")
         self._channel = ForceChannel(limits, schedule.blocks, hold_ticks)
         steady, pulls = stiffness_filter is not None, limits["spring_limit"]
-        self._table = table = ScheduleTable(schedule, self._mass, float(rate), pulls, steady=steady)
+        self._table = table = ScheduleTable(schedule, self._mass, rate, pulls, steady=steady)
         self._clock = ScheduleClock(table, soft_start, limits["approach_speed"], limits["acceleration_limit"], on_gap)
-        self._motion = Motion(table, self._timer, self._clock, limits, stiffness_filter)
+        self._motion = Motion(table, self._clock, limits, stiffness_filter, max_step, max_bad_ticks)
         self._is_pose, self._speeds, self._turn = len(table.blocks) == 2, limits["velocity_limit"], threading.Lock()
         still = (0.0,) * table.n_axes
         self._begin(math.nan, 0.0, None, None, still, still)
@@ -231,10 +231,10 @@ class RealTimeAdmittance:
                 now = float(now)
             except (TypeError, ValueError, OverflowError):
                 raise checks.refusal(now, "now", "a time in s") from None
-            timer, channel, motion = self._timer, self._channel, self._motion
-            step = now - timer.last
-            is_regular = timer.is_regular and 0.0 < step <= timer.max_step
-            status = channel.take(force, step if is_regular else timer.step)
+            channel, motion = self._channel, self._motion
+            step = now - motion.last
+            is_regular = motion.is_regular and 0.0 < step <= motion.max_step
+            status = channel.take(force, step if is_regular else motion.step)
             if status is not FINE:
                 motion.is_stopped = motion.is_stopped or channel.is_lost
             push = channel.push
@@ -309,7 +309,7 @@ class RealTimeAdmittance:
     @property
     def schedule_time(self) -> float:
         """Time in the schedule, in s."""
-        return self._clock.time_at(self._timer.last)
+        return self._clock.time_at(self._motion.last)
 
     def _begin(
         self, now: float, at: float, position: Vector | None, orientation: Vector | None, velocity: Vector, bias: Vector

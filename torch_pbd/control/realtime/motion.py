@@ -27,75 +27,29 @@ _SMOOTHING = 0.1
 
 
 @final
-class TickTimer:
-    """Ticks of at most ``max_step`` s; ``last`` is until when the motion is known, ``step`` how long ticks last."""
-
-    def __init__(self, rate: float, max_step: float, max_bad_ticks: int) -> None:
-        self._rate = checks.number(rate, "rate", above=0.0, unit="1/s")
-        self.max_step = checks.number(max_step, "max_step", above=1.0 / self._rate, unit="s", remedy="give some ticks")
-        self._max_bad_ticks = checks.count(max_bad_ticks, "max_bad_ticks")
-
-    def begin(self, now: float) -> None:
-        """Count from ``now``."""
-        if math.ulp(now) * self._rate > _COARSE:
-            must = f"small enough to tell ticks of {1.0 / self._rate:g} s apart"
-            raise checks.refusal(now, "now", must, "give seconds", unit="s")
-        self.last = self._newest = now
-        self.step = 1.0 / self._rate
-        self.is_regular, self._is_new = False, True
-        self._n_bad = self._n_late = 0
-
-    @property
-    def is_failed(self) -> bool:
-        """True if bad or late ticks are too many on end for the robot to go on."""
-        return self._n_bad >= self._max_bad_ticks or self._n_late >= _LATE_ON_END
-
-    def read(self, now: float) -> tuple[TickStatus, float]:
-        """Fault of a tick that is not like the last one, and the time by which ``last`` was put forward.
-
-        Where the clock does not say how long a tick took, it is taken to be as long as they are.
-        """
-        if math.isnan(self.last):
-            raise RuntimeError("tick before start: call start(now) with the time of the same clock first.")
-        if self.is_regular:
-            self.is_regular, self._newest = False, self.last
-        if not self._newest < now < math.inf:
-            self._n_bad += 1
-            return TickStatus.CLOCK, 0.0
-        shift = 0.0
-        # The clock has lost what bad ticks have lived through.
-        if self._n_bad and now < self.last + 0.5 * self.step:
-            shift, self.last = now - self.step - self.last, now - self.step
-        self._newest, self._n_bad, step = now, 0, now - self.last
-        if step > self.max_step:
-            self._n_late += 1
-            if self._is_new and self._n_late >= _LATE_ON_END:
-                must = f"longer than a tick: all {self._n_late} since start were longer, the last of {step:.4g} s"
-                raise checks.refusal(self.max_step, "max_step", must, "give some ticks, and times in s", unit="s")
-            return TickStatus.LATE, shift
-        self.is_regular, self._is_new, self._n_late = True, False, 0
-        return FINE, shift
-
-
-@final
 class Motion:
-    """Place and velocity of the command, what moves them, and whether the robot is to brake for good."""
+    """Place and velocity of the command, what moves them, and whether the robot is to brake for good.
+
+    Ticks take at most ``max_step`` s; ``last`` is until when the motion is known, ``step`` how long ticks last.
+    """
 
     row: Vector
     place: Vector
     velocity: Vector
     scale: Scale
-    is_stopped: bool
 
     def __init__(
         self,
         table: ScheduleTable,
-        timer: TickTimer,
         clock: ScheduleClock,
         options: Mapping[str, Vector],
         wanted: StiffnessFilter | None,
+        max_step: float,
+        max_bad_ticks: int,
     ) -> None:
-        self._table, self._timer, self._clock = table, timer, clock
+        self._table, self._clock = table, clock
+        self.max_step = checks.number(max_step, "max_step", above=1.0 / table.rate, unit="s", remedy="give some ticks")
+        self._max_bad_ticks = checks.count(max_bad_ticks, "max_bad_ticks")
         speeds, rises, stops = (options[name] for name in ("velocity_limit", "acceleration_limit", "stop_deceleration"))
         self._limits = CommandLimits(speeds, rises, table.blocks)
         self.filtered = None if wanted is None else FilteredGains(wanted, table)
@@ -112,13 +66,18 @@ class Motion:
         self, now: float, at: float, position: Vector | None, orientation: Vector | None, velocity: Vector
     ) -> None:
         """Forget all, and be at a place, or where the schedule is at that time."""
-        self._timer.begin(now)
+        if math.ulp(now) * self._table.rate > _COARSE:
+            must = f"small enough to tell ticks of {1.0 / self._table.rate:g} s apart"
+            raise checks.refusal(now, "now", must, "give seconds", unit="s")
+        self.last = self._newest = now
+        self.step = 1.0 / self._table.rate
+        self.is_regular, self._is_new, self.is_stopped = False, True, False
+        self._n_bad = self._n_late = 0
         self.row, self.place = self._clock.begin(now, at, position, orientation, velocity)
         self.velocity, self.scale = velocity, 1.0
         speeds = [math.hypot(*velocity[block]) for block in self._table.blocks]
         self._top_speeds = tuple(map(max, self._speeds_due, speeds))
         self._least_top = -1.0 if self._limits.is_any else min(self._top_speeds)
-        self.is_stopped = False
         if self.filtered is not None:
             self.filtered.begin(self._clock.index)
 
@@ -139,9 +98,9 @@ class Motion:
         if self.is_stopped:
             self._brake(now, step, self._deceleration)
             return FINE
-        timer, clock, table = self._timer, self._clock, self._table
+        clock, table = self._clock, self._table
         here = self.place, self.velocity
-        row = clock.row(timer.last, step)
+        row = clock.row(self.last, step)
         acting = tuple(map(add, push, table.forced(clock.boost, clock.index))) if clock.boost else push
         state, self.scale = self._advance(row, clock.index, acting, here, step)
         if clock.boost:
@@ -154,29 +113,50 @@ class Motion:
         if self.filtered is not None:
             self.filtered.settle(row, acting, here, state)
         self.row, (self.place, self.velocity) = row, state
-        timer.last = now
-        timer.step += _SMOOTHING * (step - timer.step)
+        self.last = now
+        self.step += _SMOOTHING * (step - self.step)
         return status
 
     def live_irregular(self, now: float, push: Vector) -> TickStatus:
         """Status of a tick that is not like the last one, if ``now`` can be."""
-        timer = self._timer
-        status, shift = timer.read(now)
-        self._clock.shift(shift)
-        self.is_stopped |= timer.is_failed
+        status = self._read(now)
+        self.is_stopped |= self._n_bad >= self._max_bad_ticks or self._n_late >= _LATE_ON_END
         if status is FINE:
-            return self.live(now, now - timer.last, push)
-        if status is TickStatus.CLOCK:
-            now = timer.last + timer.step
+            return self.live(now, now - self.last, push)
+        if status is TickStatus.CLOCK:  # a tick is then taken to be as long as they are
+            now = self.last + self.step
         # In 1 + sqrt(2) times as long as it brakes the robot can be back: after a longer gap, without commands, it
         # rests where it was told to be last, and is not thrown from there.
-        passed, speed = now - timer.last, max(self._clock.norm(self.velocity), self._clock.speed_at(timer.last))
+        passed, speed = now - self.last, max(self._clock.norm(self.velocity), self._clock.speed_at(self.last))
         can_be_back = status is TickStatus.LATE and passed * self._deceleration > 3.0 * speed
         self._brake(now, passed, math.inf if can_be_back else self._deceleration)
         return status
 
+    def _read(self, now: float) -> TickStatus:
+        """Fault of a tick that is not like the last one."""
+        if math.isnan(self.last):
+            raise RuntimeError("tick before start: call start(now) with the time of the same clock first.")
+        if self.is_regular:
+            self.is_regular, self._newest = False, self.last
+        if not self._newest < now < math.inf:
+            self._n_bad += 1
+            return TickStatus.CLOCK
+        # The clock has lost what bad ticks have lived through.
+        if self._n_bad and now < self.last + 0.5 * self.step:
+            self._clock.shift(now - self.step - self.last)
+            self.last = now - self.step
+        self._newest, self._n_bad, step = now, 0, now - self.last
+        if step > self.max_step:
+            self._n_late += 1
+            if self._is_new and self._n_late >= _LATE_ON_END:
+                must = f"longer than a tick: all {self._n_late} since start were longer, the last of {step:.4g} s"
+                raise checks.refusal(self.max_step, "max_step", must, "give some ticks, and times in s", unit="s")
+            return TickStatus.LATE
+        self.is_regular, self._is_new, self._n_late = True, False, 0
+        return FINE
+
     def _brake(self, now: float, passed: float, deceleration: float) -> None:
         norm = self._clock.norm
-        self._clock.brake(self._timer.last, passed, deceleration, norm(self.velocity))
+        self._clock.brake(self.last, passed, deceleration, norm(self.velocity))
         self.place, self.velocity = braked((self.place, self.velocity), norm, deceleration, passed)
-        self._timer.last = now
+        self.last = now
