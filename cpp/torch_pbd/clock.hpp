@@ -214,13 +214,6 @@ private:
         double squared_limit;
         State<N, M> row = desired(time, squared_limit);
         const Vector<N> moving = row.velocity;
-        // Most ticks of an approach: at a pace of 1 nothing changes it, for nothing is caught up.
-        if (is_soft_ && last_pace == 1.0 && free_ == 1.0 && 1.0 <= squared_limit) {
-            boost.reset();
-            spare_ = 0.0;
-            row.velocity = moving + slope_;
-            return row;
-        }
         double motion_speed = norm(moving), last_free = last_pace, gain = gain_;
         if (is_soft_) {
             last_free = free_;

@@ -76,7 +76,32 @@ public:
     /// Lets a force as measured act, as far as it may, `step` s after the last one.
     Faults take(const Vector<N>& force, double step) {
         Faults faults = 0;
-        for (std::size_t b = 0; b < channels_.size(); ++b) faults |= take(force, step, b);
+        for (std::size_t b = 0; b < channels_.size(); ++b) {
+            const Block block = blocks<N, M>[b];
+            Channel& channel = channels_[b];
+            Vector<N> measured = force - bias_;
+            for (double& part : measured) part -= std::clamp(part, -deadband_[b], deadband_[b]);
+            const double length = linalg::norm(measured, block);
+            if (!(length < infinity)) {
+                is_lost = ++channel.n_lost > hold_ticks_ || is_lost;
+                set(block, std::max(0.0, 1.0 - channel.n_lost / (hold_ticks_ + 1.0)) * median(channel.recent));
+                faults |= kForceInvalid;
+                continue;
+            }
+            if (length > limit_[b]) {
+                measured = (limit_[b] / length) * measured;
+                faults |= kForceSaturated;
+            }
+            const double change = linalg::norm(measured - push, block), most = rate_limit_[b] * step;
+            if (change > most) {
+                measured = push + (most / change) * (measured - push);
+                faults |= kForceRateLimited;
+            }
+            set(block, measured);
+            channel.n_lost = 0;
+            channel.newest = (channel.newest + 1) % kRecent;
+            channel.recent[channel.newest] = push;
+        }
         return faults;
     }
 
@@ -92,47 +117,19 @@ private:
         std::size_t newest = 0;
     };
 
-    Faults take(const Vector<N>& force, double step, std::size_t b) {
-        const Block block = blocks<N, M>[b];
-        const double deadband = deadband_[b], most = rate_limit_[b] * step;
-        Vector<N> measured = push;
-        for (std::size_t i = block.begin; i < block.end; ++i) {
-            measured[i] = force[i] - bias_[i];
-            measured[i] -= std::clamp(measured[i], -deadband, deadband);
-        }
-        const double length = linalg::norm(measured, block);
-        Faults faults = 0;
-        if (!(length < infinity)) {
-            bridge(block, channels_[b]);
-            return kForceInvalid;
-        }
-        if (length > limit_[b]) {
-            for (std::size_t i = block.begin; i < block.end; ++i) measured[i] = measured[i] / length * limit_[b];
-            faults = kForceSaturated;
-        }
-        const double change = linalg::norm(measured - push, block);
-        if (change > most) {
-            for (std::size_t i = block.begin; i < block.end; ++i)
-                measured[i] = push[i] + most / change * (measured[i] - push[i]);
-            faults |= kForceRateLimited;
-        }
-        push = measured;
-        Channel& channel = channels_[b];
-        channel.n_lost = 0;
-        channel.newest = (channel.newest + 1) % kRecent;
-        channel.recent[channel.newest] = push;
-        return faults;
+    void set(Block block, const Vector<N>& values) {
+        std::copy(values.begin() + block.begin, values.begin() + block.end, push.begin() + block.begin);
     }
 
-    void bridge(Block block, Channel& channel) {
-        is_lost = ++channel.n_lost > hold_ticks_ || is_lost;
-        const double share = std::max(0.0, 1.0 - channel.n_lost / (hold_ticks_ + 1.0));
-        for (std::size_t i = block.begin; i < block.end; ++i) {
+    static Vector<N> median(const std::array<Vector<N>, kRecent>& recent) {
+        Vector<N> middle;
+        for (std::size_t i = 0; i < N; ++i) {
             std::array<double, kRecent> parts;
-            for (std::size_t k = 0; k < kRecent; ++k) parts[k] = channel.recent[k][i];
+            for (std::size_t k = 0; k < kRecent; ++k) parts[k] = recent[k][i];
             std::nth_element(parts.begin(), parts.begin() + kRecent / 2, parts.end());
-            push[i] = share * parts[kRecent / 2];
+            middle[i] = parts[kRecent / 2];
         }
+        return middle;
     }
 
     Limit limit_, deadband_, rate_limit_;

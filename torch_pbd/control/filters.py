@@ -143,10 +143,6 @@ class ActiveFilter(ABC):
     gains: Any = None
     tank_energy: Array = None
 
-    def begin(self) -> None:
-        """Forget all: the next tick is given what it asks for."""
-        self.gains = None
-
     def select(
         self, stiffness: Array, damping: Array, mass: Array, step: float, off: Array, scale: Array = 1.0
     ) -> None:
@@ -188,10 +184,6 @@ class ActiveFilter(ABC):
 class _ActiveTank(ActiveFilter):
     def __init__(self, tank: EnergyTank) -> None:
         self._tank, self.tank_energy = tank, tank.energy
-
-    def begin(self) -> None:
-        super().begin()
-        self.tank_energy = self._tank.energy
 
     def select(
         self, stiffness: Array, damping: Array, mass: Array, step: float, off: Array, scale: Array = 1.0

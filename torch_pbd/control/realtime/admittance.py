@@ -9,22 +9,13 @@ from numpy.typing import ArrayLike
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control.filters import StiffnessFilter
+from torch_pbd.control.realtime import limits
 from torch_pbd.control.realtime.clock import ScheduleClock
-from torch_pbd.control.realtime.limits import (
-    FINE,
-    ForceChannel,
-    Numbers,
-    Option,
-    TickStatus,
-    finite_floats,
-    options_of_blocks,
-    unit_quaternion,
-)
+from torch_pbd.control.realtime.limits import FINE, ForceChannel, Numbers, Option, TickStatus
 from torch_pbd.control.realtime.motion import Motion
 from torch_pbd.control.realtime.steps import Vector
 from torch_pbd.control.realtime.table import ScheduleTable, virtual_mass
 from torch_pbd.control.schedule import Schedule
-from torch_pbd.exceptions import InvalidParameterError
 
 _SHARED = "this controller is in a tick already: two threads share it. Give each its own."
 
@@ -139,17 +130,17 @@ class RealTimeAdmittance:
         given = {"force_limit": force_limit, "spring_limit": spring_limit, "deadband": deadband}
         given |= {"force_rate_limit": force_rate_limit, "velocity_limit": velocity_limit}
         given |= {"acceleration_limit": acceleration_limit, "approach_speed": approach_speed}
-        limits = options_of_blocks(given | {"stop_deceleration": stop_deceleration}, len(schedule.blocks))
+        options = limits.options_of_blocks(given | {"stop_deceleration": stop_deceleration}, len(schedule.blocks))
         self._mass = virtual_mass(schedule, mass)
         rate = checks.number(rate, "rate", above=0.0, unit="1/s")
-        self._channel = ForceChannel(limits, schedule.blocks, hold_ticks)
-        steady, pulls = stiffness_filter is not None, limits["spring_limit"]
-        self._table = table = ScheduleTable(schedule, self._mass, rate, pulls, steady=steady)
-        self._clock = ScheduleClock(table, soft_start, limits["approach_speed"], limits["acceleration_limit"], on_gap)
-        self._motion = Motion(table, self._clock, limits, stiffness_filter, max_step, max_bad_ticks)
-        self._is_pose, self._speeds, self._turn = len(table.blocks) == 2, limits["velocity_limit"], threading.Lock()
+        self._channel = ForceChannel(options, schedule.blocks, hold_ticks)
+        steady = stiffness_filter is not None
+        self._table = table = ScheduleTable(schedule, self._mass, rate, options["spring_limit"], steady=steady)
+        self._clock = ScheduleClock(table, soft_start, options["approach_speed"], options["acceleration_limit"], on_gap)
+        self._motion = Motion(table, self._clock, options, stiffness_filter, max_step, max_bad_ticks)
+        self._is_pose, self._speeds, self._turn = len(table.blocks) == 2, options["velocity_limit"], threading.Lock()
         still = (0.0,) * table.n_axes
-        self._begin(math.nan, 0.0, None, None, still, still)
+        self._begin(math.nan, 0.0, (None, None, still), still)
 
     def __repr__(self) -> str:
         mass = f"{self._mass:g} kg" if isinstance(self._mass, float) else str(self._mass.shape[-2:])
@@ -191,20 +182,12 @@ class RealTimeAdmittance:
         """
         now = checks.number(now, "now", unit="s")
         at = checks.number(at, "at", least=0.0, most=self._table.end, unit="s")
-        blocks, d = self._table.blocks, self._table.n_axes
-        here = None if position is None else finite_floats(position, "position", blocks[0].stop)
-        if orientation is not None and not self._is_pose:
-            raise InvalidParameterError("orientation is given, must be None for a schedule without: leave it out.")
-        turned = None if orientation is None else unit_quaternion(orientation)
-        moving, bias = finite_floats(velocity, "velocity", d), finite_floats(force_bias, "force_bias", d)
-        kinds = ("the speed", "units/s"), ("the angular speed", "rad/s")
-        for (name, unit), block, most in zip(kinds, blocks, self._speeds, strict=False):
-            remedy = "slow it down, or raise velocity_limit"
-            checks.number(math.hypot(*moving[block]), name, most=most, unit=unit, remedy=remedy)
+        state = limits.start_state(position, orientation, velocity, self._table.blocks, self._speeds)
+        bias = limits.finite_floats(force_bias, "force_bias", self._table.n_axes)
         if not self._turn.acquire(False):
             raise RuntimeError(_SHARED)
         try:
-            self._begin(now, at, here, turned, moving, bias)
+            self._begin(now, at, state, bias)
         finally:
             self._turn.release()
 
@@ -311,9 +294,7 @@ class RealTimeAdmittance:
         """Time in the schedule, in s."""
         return self._clock.time_at(self._motion.last)
 
-    def _begin(
-        self, now: float, at: float, position: Vector | None, orientation: Vector | None, velocity: Vector, bias: Vector
-    ) -> None:
+    def _begin(self, now: float, at: float, start: limits.StartState, bias: Vector) -> None:
         self._channel.begin(bias)
-        self._motion.begin(now, at, position, orientation, velocity)
+        self._motion.begin(now, at, *start)
         self.faults = FINE

@@ -6,8 +6,8 @@ from typing import final
 
 import numpy as np
 
-from torch_pbd import checks
-from torch_pbd.control.realtime.steps import Vector, deviation, moved, norm_with, rotated
+from torch_pbd import checks, rotations
+from torch_pbd.control.realtime.steps import Vector, deviation, moved, norm_with
 from torch_pbd.control.realtime.table import ScheduleTable
 
 # The desired motion may be 1.5 times as fast as the schedule, and accelerate so much more: one half of that changes the
@@ -79,8 +79,8 @@ class ScheduleClock:
         self.acceleration = max((1.0 + _SHARE) * own + self.gain, _SHARPEST / _STEEPEST * soft)
         # What the schedule's own acceleration, with what the robot overshoots it by, leaves to an approach.
         self._room = max(self.gain, self.acceleration - (1.0 + _SHARE) * own)
-        room = (self.acceleration - self.gain) / (_OVERSHOOT * own) if own else math.inf
-        self._fastest = min(_SPEED, math.sqrt(room)) if self._catches_up else 1.0
+        spare = (self.acceleration - self.gain) / (_OVERSHOOT * own) if own else math.inf
+        self._fastest = min(_SPEED, math.sqrt(spare)) if self._catches_up else 1.0
         self._approach_speed, self.acceleration = approach_speed, self.acceleration + approach_speed * spin
         # Integral of dt / |x'| from each row to the end; where the schedule rests it is long, not endless.
         times = np.append(np.arange(table.last) / table.rate, table.end)
@@ -123,9 +123,11 @@ class ScheduleClock:
             taken = self.gain + _SHARPEST * way / self._blend / self._blend - self._room
             self._taken = min(max(taken, 0.0), self.gain)
         # The pace at which the desired motion is nearest to that of the robot.
-        scales = (1.0,) * d if self._lever is None else (*[1.0] * (d - 3), *[self._lever**2] * 3)
-        scaled = tuple(map(mul, scales, row[self._motion]))
-        square, along = sum(map(mul, scaled, row[self._motion])), sum(map(mul, scaled, velocity))
+        square = along = 0.0
+        for scale, block in zip(self.scales, self._table.blocks, strict=True):
+            desired = row[self._motion][block]
+            square += scale**2 * sum(map(mul, desired, desired))
+            along += scale**2 * sum(map(mul, desired, velocity[block]))
         pace = max(0.0, along / square) if square and self._soft_start else 1.0
         self._free = min(1.0, pace)
         self._pace = min(self._free, math.sqrt(squared_limit))
@@ -197,11 +199,6 @@ class ScheduleClock:
         time, last_pace = begin - self._origin, self._pace
         row, squared_limit = self._desired(time)
         motion = row[self._motion]
-        # Most ticks of an approach: at a pace of 1 nothing changes it, for nothing is caught up.
-        if self._is_soft and last_pace == self._free == 1.0 <= squared_limit:
-            self.boost, self._spare = (), 0.0
-            row[self._motion] = map(add, motion, self._slope)
-            return tuple(row)
         speed, last_free, gain = self.norm(motion), last_pace, self.gain
         if self._is_soft:
             slope, last_free = self._slope, self._free
@@ -274,7 +271,7 @@ class ScheduleClock:
             row[:n_place] = moved(row[:n_place], away)
             if self._lever is not None:
                 turning = slice(n_place + self._d - 3, n_place + self._d)
-                row[turning] = rotated(row[turning], away[-3:])
+                row[turning] = (rotations.matrix(rotations.exp(np.array(away[-3:]))) @ row[turning]).tolist()
             self._slope = [slope * part for part in self._distance]
             squared_limit *= self._end_share
         return row, squared_limit

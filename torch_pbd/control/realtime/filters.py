@@ -1,6 +1,7 @@
 """Filters of the stiffness in the real-time loop: those of the simulation, on NumPy's arrays of one robot."""
 
 import math
+from copy import copy
 from typing import final
 
 import numpy as np
@@ -37,11 +38,11 @@ class FilteredGains:
                 "before the loop whether the damping pays for what turns or grows. Take EnergyTank()."
             )
         self._table, self._start = table, table.n_place + table.n_axes
-        self.active: ActiveFilter = wanted.start(table.stiffness, table.damping, mass, _tick_change)
+        self._fresh = wanted.start(table.stiffness, table.damping, mass, _tick_change)
 
     def begin(self, index: int) -> None:
-        """Forget all, at a row of the table."""
-        self.active.begin()
+        """Forget all, at a row of the table: the next tick is given what it asks for."""
+        self.active: ActiveFilter = copy(self._fresh)
         self.gains = self._table.stiffness[index], self._table.damping[index]
 
     def advance(self, row: Vector, index: int, push: Vector, here: State, step: float) -> tuple[State, Scale]:

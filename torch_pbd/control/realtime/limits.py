@@ -12,10 +12,14 @@ import numpy as np
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control.realtime.steps import State, Vector, deviation, mean_move, moved
+from torch_pbd.exceptions import InvalidParameterError
 
 Numbers = Sequence[float] | Floats
 Option = float | tuple[float, float] | None
 """Number for positions; for poses a pair, of positions and of rotations; None is the default."""
+
+StartState = tuple[Vector | None, Vector | None, Vector]
+"""Position, orientation and velocity; places are None where they are those of the schedule."""
 
 # What rotations have for a unit of positions.
 _ANGULAR = {"N": "Nm", "N/s": "Nm/s", "units/s": "rad/s", "units/s^2": "rad/s^2"}
@@ -93,13 +97,28 @@ def finite_floats(values: Numbers | None, name: str, d: int) -> Vector:
     return (0.0,) * d if values is None else tuple(checks.array(values, name, (d,)).tolist())
 
 
-def unit_quaternion(values: Numbers) -> Vector:
-    """Unit quaternion, exactly, of the orientation of a robot."""
-    quaternion = checks.array(values, "orientation", (4,))
-    length = float(np.linalg.norm(quaternion))
-    remedy = "give a unit quaternion w x y z"
-    checks.number(length, "the length of orientation", least=1.0 - _OFF, most=1.0 + _OFF, remedy=remedy)
-    return tuple((quaternion / length).tolist())
+def start_state(
+    position: Numbers | None,
+    orientation: Numbers | None,
+    velocity: Numbers | None,
+    blocks: Sequence[slice],
+    speed_limits: Vector,
+) -> StartState:
+    """State of a robot that begins, checked: at rest where no velocity is given."""
+    here = None if position is None else finite_floats(position, "position", blocks[0].stop)
+    turned: Vector | None = None
+    if orientation is not None:
+        if len(blocks) == 1:
+            raise InvalidParameterError("orientation is given, must be None for a schedule without: leave it out.")
+        quaternion = checks.array(orientation, "orientation", (4,))
+        length, remedy = float(np.linalg.norm(quaternion)), "give a unit quaternion w x y z"
+        checks.number(length, "the length of orientation", least=1.0 - _OFF, most=1.0 + _OFF, remedy=remedy)
+        turned = tuple((quaternion / length).tolist())
+    moving, remedy = finite_floats(velocity, "velocity", blocks[-1].stop), "slow it down, or raise velocity_limit"
+    kinds = ("the speed", "units/s"), ("the angular speed", "rad/s")
+    for (name, unit), block, most in zip(kinds, blocks, speed_limits, strict=False):
+        checks.number(math.hypot(*moving[block]), name, most=most, unit=unit, remedy=remedy)
+    return here, turned, moving
 
 
 @final
@@ -197,36 +216,30 @@ class CommandLimits:
     """Largest speed and acceleration of the command, for each block; infinite where there is none."""
 
     def __init__(self, speeds: Vector, accelerations: Vector, blocks: Sequence[slice]) -> None:
-        self.speeds, self.accelerations, self._blocks = speeds, accelerations, blocks
+        self._accelerations, self._blocks = accelerations, blocks
         self.is_any = min(*speeds, *accelerations) < math.inf
 
     def applied(self, state: State, last: State, step: float, top_speeds: Vector) -> tuple[State, TickStatus]:
         """Place and velocity that a tick of ``step`` s leads to, within limits, and which of these acted."""
         (place, velocity), (last_place, last_velocity) = state, last
-        move, reached = deviation(place, last_place, len(velocity)), FINE
+        move, status = deviation(place, last_place, len(velocity)), FINE
         moves: Vector = ()
         velocities: Vector = ()
-        for block, top_speed, most in zip(self._blocks, top_speeds, self.accelerations, strict=True):
-            of_block = move[block], velocity[block], last_velocity[block]
-            part, slower, acted = _limited(*of_block, step, top_speed, most * step)
-            moves, velocities, reached = moves + part, velocities + slower, reached | acted
-        return ((moved(last_place, moves), velocities) if reached else state), reached
-
-
-def _limited(
-    move: Vector, velocity: Vector, last_velocity: Vector, step: float, top_speed: float, most: float
-) -> tuple[Vector, Vector, TickStatus]:
-    """Move and velocity of a block in a tick in which the velocity changes by ``most`` at most."""
-    # The change of velocity is shortened first, then the velocity: the second never undoes the first.
-    change, reached = math.dist(velocity, last_velocity), FINE
-    if change > most:
-        velocity = tuple([v + most / change * (w - v) for v, w in zip(last_velocity, velocity, strict=True)])
-        reached |= TickStatus.ACCELERATION_LIMITED
-    speed = math.hypot(*velocity)
-    if speed > top_speed:
-        velocity = tuple([top_speed / speed * component for component in velocity])
-        reached |= TickStatus.VELOCITY_LIMITED
-    # A swing within one tick, from rest to rest, is too fast as well.
-    elif math.hypot(*move) > top_speed * step:
-        reached |= TickStatus.VELOCITY_LIMITED
-    return (mean_move(last_velocity, velocity, step) if reached else move), velocity, reached
+        for block, top_speed, rise in zip(self._blocks, top_speeds, self._accelerations, strict=True):
+            before, after, reached = last_velocity[block], velocity[block], FINE
+            # The change of velocity is shortened first, then the velocity: the second never undoes the first.
+            change = math.dist(after, before)
+            if change > rise * step:
+                share = rise * step / change
+                after = tuple([v + share * (w - v) for v, w in zip(before, after, strict=True)])
+                reached |= TickStatus.ACCELERATION_LIMITED
+            speed = math.hypot(*after)
+            if speed > top_speed:
+                after = tuple([top_speed / speed * component for component in after])
+                reached |= TickStatus.VELOCITY_LIMITED
+            # A swing within one tick, from rest to rest, is too fast as well.
+            elif math.hypot(*move[block]) > top_speed * step:
+                reached |= TickStatus.VELOCITY_LIMITED
+            moves += mean_move(before, after, step) if reached else move[block]
+            velocities, status = velocities + after, status | reached
+        return ((moved(last_place, moves), velocities) if status else state), status

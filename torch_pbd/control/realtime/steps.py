@@ -61,23 +61,6 @@ def moved(place: Sequence[float], move: Sequence[float]) -> Vector:
     return (*map(add, place, move[:-3]), *[part / length for part in turned])
 
 
-def rotated(vector: Sequence[float], rotation: Sequence[float]) -> Vector:
-    """Vector of three that is turned by a rotation vector; O. Rodrigues, 1840."""
-    angle = math.hypot(*rotation)
-    if not angle:
-        return tuple(vector)
-    along = math.sin(angle) / angle
-    # 1 - cos t, without its cancellation.
-    across = 2.0 * (math.sin(0.5 * angle) / angle) ** 2
-    once = _cross(rotation, vector)
-    return tuple([v + along * u + across * w for v, u, w in zip(vector, once, _cross(rotation, once), strict=True)])
-
-
-def _cross(left: Sequence[float], right: Sequence[float]) -> Vector:
-    (a, b, c), (x, y, z) = left, right
-    return b * z - c * y, c * x - a * z, a * y - b * x
-
-
 def norm_with(lever: float | None) -> Norm:
     """Norm of velocities: their length, or with a lever that of their positions or lever times that of the rotation.
 
