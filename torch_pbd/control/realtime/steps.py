@@ -147,17 +147,15 @@ def _dot(left: Vector, right: Vector) -> float:
 
 
 def coupled(
-    stiffness: Floats, damping: Floats, inverse: Floats, push: Vector, off: Vector, motion: State, step: float
+    stiffness: Floats, damping: Floats, mass: float | Floats, push: Vector, off: Vector, motion: State, step: float
 ) -> tuple[Vector, Vector]:
-    """Move and velocity as `along_modes`, of matrices that share no modes: exp(X) - 1 of the whole system, in ticks.
-
-    They are K, D, and the inverse of the mass.
-    """
+    """Move and velocity as `along_modes`, of matrices that share no modes: exp(X) - 1 of the whole system, in ticks."""
     (goal_velocity, velocity), d = motion, len(push)
     held = (push + damping @ goal_velocity)[:, np.newaxis]
     rate = np.zeros((2 * d + 1, 2 * d + 1))
     rate[:d, d:-1] = np.eye(d)
-    rate[d:-1] = inverse @ np.concatenate([-(step**2) * stiffness, -step * damping, step**2 * held], axis=1)
+    gains = np.concatenate([-(step**2) * stiffness, -step * damping, step**2 * held], axis=1)
+    rate[d:-1] = gains / mass if isinstance(mass, float) else np.linalg.solve(mass, gains)
     change = expm1(rate) @ np.concatenate([off, np.multiply(step, velocity), [1.0]])
     return tuple(change[:d].tolist()), tuple(np.add(velocity, change[d:-1] / step).tolist())
 

@@ -78,11 +78,9 @@ class ScheduleTable:
         self._one_mass = mass if isinstance(mass, float) else None
         one = mass * np.eye(self.n_axes) if isinstance(mass, float) else mass
         masses = between.linear(one) if one.ndim == 3 else one[np.newaxis]
-        shape = self.stiffness.shape
-        self.mass, self._inverse = np.broadcast_to(masses, shape), np.broadcast_to(np.linalg.inv(masses), shape)
-        springs = self._springs(
-            _shared_modes(self.stiffness, self.damping, masses, self._one_mass), pull_limits, steady
-        )
+        self.mass = np.broadcast_to(masses, self.stiffness.shape)
+        modes = _shared_modes(self.stiffness, self.damping, masses, self._one_mass)
+        springs = self._springs(modes, pull_limits, steady)
         # Rows are packed, for the garbage collector would hold up the loop to walk over a list of a million rows.
         rows = np.concatenate([part.reshape(len(grid), -1) for part in (place, velocity, *springs)], axis=1)
         self.packed, self.layout = rows.tobytes(), struct.Struct(f"{rows.shape[1]}d")
@@ -93,7 +91,7 @@ class ScheduleTable:
         is_apart = len(blocks) == 2 and _are_apart(self.stiffness, *blocks)
         self.springs, self._are_shared = blocks if is_apart else (slice(0, self.n_axes),), modes is not None
         self._is_plane = modes is not None and mass is not None and self.n_place == self.n_axes == 2
-        self._start = self.n_place + self.n_axes
+        self._start = self._modes = self.n_place + self.n_axes
         # |K e|^2 <= k_max e'K e in each block, with k_max that of the block, also where others are displaced, for
         # |B'K e|^2 <= |B'K B| e'K e for any B.
         if modes is not None and mass is not None and len(blocks) == 1:
@@ -110,6 +108,7 @@ class ScheduleTable:
         if self._is_plane and mass is not None:  # along axes, with all per kg
             return [*tops, *modes[:2], modes[2][:, 0] / math.sqrt(mass), np.full(len(tops[0]), mass)]
         if is_apart:  # no spring is limited as a whole
+            self._modes += 2 + sum((block.stop - block.start) ** 2 for block in blocks)
             return [*tops, *[self.stiffness[:, block, block] for block in blocks], 0.0 * tops[0], *modes]
         return [*tops, *modes]
 
@@ -130,27 +129,23 @@ class ScheduleTable:
             return advance_plane(row, push, state, step)
         place, velocity = state
         motion, off = (row[self.n_place : self._start], velocity), deviation(place, row[: self.n_place], self.n_axes)
-        at = self._start
-        if gains is None and self._are_shared:
-            if len(self.springs) == 1:
-                move, velocity, scale = along_modes(row[at:], push, off, motion, step)
-                return (moved(place, move), velocity), scale
-            p = self.n_axes - 3
-            middle, end = at + 2 + p * p, at + 11 + p * p
-            pulls = (
-                row[at] * _quadratic(row[at + 2 : middle], off[:p]),
-                row[at + 1] * _quadratic(row[middle:end], off[p:]),
-            )
-            if pulls[0] <= 1.0 >= pulls[1]:
-                move, velocity, _ = along_modes(row[end:], push, off, motion, step)
-                return (moved(place, move), velocity), 1.0
+        if gains is None and self._are_shared and (len(self.springs) == 1 or self._is_within_limits(row, off)):
+            move, velocity, scale = along_modes(row[self._modes :], push, off, motion, step)
+            return (moved(place, move), velocity), scale
         # Where one of two springs is limited, modes are no longer shared: twisted beyond its torque, a tool keeps its
         # stiffness along the way.
         stiffness, damping = (self.stiffness[index], self.damping[index]) if gains is None else gains
         scales = self.scales(row, stiffness, np.array(off))
         scaled = self.scaled(stiffness, scales)
-        move, velocity = coupled(scaled, damping, self._inverse[index], push, off, motion, step)
+        move, velocity = coupled(scaled, damping, self._one_mass or self.mass[index], push, off, motion, step)
         return (moved(place, move), velocity), scales[0] if scales[0] == scales[-1] else scales
+
+    def _is_within_limits(self, row: Vector, off: Vector) -> bool:
+        """True if neither of two springs apart is limited at a deviation."""
+        p, at = self.n_axes - 3, self._start
+        middle = at + 2 + p * p
+        pull, torque = _quadratic(row[at + 2 : middle], off[:p]), _quadratic(row[middle : middle + 9], off[p:])
+        return row[at] * pull <= 1.0 >= row[at + 1] * torque
 
     def scales(self, row: Vector, stiffness: Floats, off: Floats) -> Vector:
         """Scale of each spring of a stiffness (d, d) at a deviation, as its limit lets it be."""
@@ -174,7 +169,7 @@ class ScheduleTable:
         """Acceleration that a force causes."""
         if self._one_mass is not None:
             return tuple([part / self._one_mass for part in force])
-        return tuple((self._inverse[index] @ force).tolist())
+        return tuple(np.linalg.solve(self.mass[index], force).tolist())
 
 
 def _are_apart(stiffness: Floats, first: slice, second: slice) -> bool:
