@@ -87,7 +87,7 @@ def test_2_a_likelihood_of_fewer_demonstrations_than_outputs_is_told(name):
     messages = warned(model, *demonstrations(5, n_demos=3))
     assert len(messages) == 1
     assert "y has 3 demonstrations at an input but 5 outputs: the likelihood takes for certain" in messages[0]
-    assert "6 or more demonstrations determine the covariance; objective='auto' shrinks it" in messages[0]
+    assert "objective='auto' shrinks it. 6 or more demonstrations determine the covariance" in messages[0]
     assert_covariances(model.predict_cov(demonstrations(5)[0][:8]), 8, 5)
 
 

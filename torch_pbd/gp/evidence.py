@@ -87,13 +87,7 @@ class Evidence:
         inverse, log_det = _inverse_and_log_det(covariance)
         targets = self.targets[rows].unsqueeze(-1)
         alpha = inverse @ targets
-        quadratic = (targets * alpha).sum((-2, -1))
-        if self.n_outside:
-            outside = self.remainder[rows] / noise_ratio
-            quadratic = quadratic + outside
-            log_det = log_det + self.n_outside * noise_ratio.log()
-        variance = self._variance(quadratic, noise_ratio, rows)
-        loss = self._density(quadratic, log_det, variance)
+        loss, quadratic, variance = self._density((targets * alpha).sum((-2, -1)), log_det, noise_ratio, rows)
         # With M = inv(A) - alpha alpha' / v and alpha = inv(A) y, a change of A changes the value by tr(M dA) / 2: the
         # best amplitude changes nothing to first order. The squared distance s is inversely proportional to the square
         # of the length scale, ds = -2 s d log(scale).
@@ -102,7 +96,7 @@ class Evidence:
         by_length = (by_distance @ self.square_difference.flatten(1).mT) * -inverse_square
         by_ratio = noise_ratio * matrix.diagonal(dim1=-2, dim2=-1).sum(-1)
         if self.n_outside:
-            by_ratio = by_ratio + (self.n_outside - outside / variance)
+            by_ratio = by_ratio + (self.n_outside - self.remainder[rows] / noise_ratio / variance)
         if self.noise_scale is not None:  # the variance is inversely proportional to the ratio
             by_ratio = by_ratio + (quadratic / variance - self.n_inputs)
         return loss, torch.cat([by_length, 0.5 * by_ratio[:, None]], dim=1)
@@ -121,11 +115,7 @@ class Evidence:
         sound = eigenvalue[:, :1] + noise_ratios > rounding * spectrum[..., -1]
         quadratic = square @ (1.0 / spectrum.clamp_min(1e-300)).mT  # (s, b, q)
         log_det = spectrum.clamp_min(1e-300).log().sum(-1).unsqueeze(1)
-        if self.n_outside:
-            quadratic = quadratic + self.remainder[:, None] / noise_ratios
-            log_det = log_det + self.n_outside * noise_ratios.log()
-        variance = self._variance(quadratic, noise_ratios, (slice(None), None))
-        loss = self._density(quadratic, log_det, variance)
+        loss, _, _ = self._density(quadratic, log_det, noise_ratios, (slice(None), None))
         return loss.where(sound.unsqueeze(1), math.inf).transpose(0, 1)
 
     def residual(self, length_scale: Float[Tensor, "b e"], noise_ratio: Float[Tensor, " b"]) -> Float[Tensor, "b n"]:
@@ -141,18 +131,22 @@ class Evidence:
         """Squared amplitude; that of the targets themselves where the covariance is singular."""
         targets = self.targets[rows]
         quadratic = (targets * self._solved(length_scale, noise_ratio, rows)).sum(-1)
-        if self.n_outside:
-            quadratic = quadratic + self.remainder[rows] / noise_ratio
-        variance = self._variance(quadratic, noise_ratio, rows)
+        _, _, variance = self._density(quadratic, torch.zeros_like(quadratic), noise_ratio, rows)
         return torch.where(variance.isnan(), targets.square().mean(1).clamp_min(_LEAST_VARIANCE), variance)
 
-    def _variance(self, quadratic: Tensor, noise_ratio: Tensor, rows: Tensor | tuple[slice, None]) -> Tensor:
+    def _density(
+        self, quadratic: Tensor, log_det: Tensor, noise_ratio: Tensor, rows: Tensor | tuple[slice, None]
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Value, quadratic form and variance, from quadratic form and log determinant within the basis."""
+        if self.n_outside:
+            quadratic = quadratic + self.remainder[rows] / noise_ratio
+            log_det = log_det + self.n_outside * noise_ratio.log()
         if self.noise_scale is None:
-            return (quadratic / self.n_inputs).clamp_min(_LEAST_VARIANCE)
-        return (self.noise_scale[rows].square() / noise_ratio).expand_as(quadratic)
-
-    def _density(self, quadratic: Tensor, log_det: Tensor, variance: Tensor) -> Tensor:
-        return 0.5 * (quadratic / variance + log_det + self.n_inputs * variance.log() + self._constant)
+            variance = (quadratic / self.n_inputs).clamp_min(_LEAST_VARIANCE)
+        else:
+            variance = (self.noise_scale[rows].square() / noise_ratio).expand_as(quadratic)
+        value = 0.5 * (quadratic / variance + log_det + self.n_inputs * variance.log() + self._constant)
+        return value, quadratic, variance
 
     def _solved(self, length_scale: Tensor, noise_ratio: Tensor, rows: Tensor | slice) -> Float[Tensor, "a r"]:
         """``inv(A) y``; NaN where A is singular."""

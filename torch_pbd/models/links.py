@@ -65,7 +65,7 @@ class Link(ABC):
             root.diagonal(dim1=-2, dim2=-1).clamp_max_(_LARGEST_LOGARITHM).exp_()
         return root
 
-    def deviation(self, root: Float[Tensor, "*n d r"]) -> Float[Tensor, "*n b"]:
+    def deviation(self, root: Float[Tensor, "*n d r"]) -> Float[Tensor, "*m b"]:
         """Deviations that give this root."""
         return self.flatten(self._linked(root) - self._linked(self.prior))
 

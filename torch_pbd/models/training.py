@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from torch_pbd.gp.observations import neighbourhoods, sum_by
 from torch_pbd.linalg import scale_tril_from_root
@@ -74,23 +75,17 @@ class TrainingSet:
         decomposition: no product is formed, and K <= d rows are no special case. Inputs whose numbers of rows lie
         between the same powers of two are treated together, so memory is linear in the rows.
         """
-        counts = torch.bincount(self.index, minlength=len(self.inputs))
-        n_outputs, order = residual.shape[1], self.index.argsort(stable=True)
+        counts, n_outputs = torch.bincount(self.index, minlength=len(self.inputs)), residual.shape[1]
+        rows = residual[self.index.argsort(stable=True)]
         if int(counts.min()) == int(counts.max()):
-            return _reduced(residual[order].reshape(len(counts), -1, n_outputs))
+            return _reduced(rows.reshape(len(counts), -1, n_outputs))
+        parts = rows.split(counts.tolist())
         result = residual.new_zeros(len(counts), n_outputs, min(n_outputs, int(counts.max())))
-        group = self.index[order]
-        position = torch.arange(len(order), device=order.device) - (counts.cumsum(0) - counts)[group]
         size = counts.clamp_min(1).log2().ceil()
-        # Rows of an input lie in its slot one after the other; zeros, which add nothing, fill up the shorter ones.
         for exponent in size.unique():
             members = (size == exponent).nonzero().squeeze(-1)
-            rows = size[group] == exponent
-            slot = torch.zeros_like(counts)
-            slot[members] = torch.arange(len(members), device=members.device)
-            root = residual.new_zeros(len(members), int(counts[members].max()), n_outputs)
-            root[slot[group[rows]], position[rows]] = residual[order[rows]]
-            root = _reduced(root)
+            # Zeros, which add nothing, fill up those that have fewer rows.
+            root = _reduced(pad_sequence([parts[i] for i in members.tolist()], batch_first=True))
             result[members, :, : root.shape[-1]] = root
         return result
 
