@@ -220,8 +220,6 @@ class TorchEstimator(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
 
     def _progress(self) -> Callable[[Progress], None] | None:
         """Callback that prints the loss to the error output, more often for higher ``verbose``; None if it is 0."""
-        if not self.verbose:
-            return None
 
         def show(progress: Progress) -> None:
             count = progress.n_evaluations
@@ -229,7 +227,7 @@ class TorchEstimator(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
                 text = f"evaluation {count:5d}  loss {progress.loss:14.6f}  {progress.elapsed:7.2f} s"
                 say(f"{type(self).__name__}: {text}", sys.stderr)
 
-        return show
+        return show if self.verbose else None
 
     def _assemble(self, core: Any, scaling: Standardization) -> ConditionalNormal:
         parts = (scaling.x_shift, scaling.x_scale, scaling.y_shift, scaling.y_scale)
