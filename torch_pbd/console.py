@@ -83,7 +83,7 @@ def progress() -> Iterator[None]:
 
 
 def steps(items: Iterable[_Item], what: str, n_items: int) -> Iterator[_Item]:
-    """So many items, one after another, of which `progress` tells: ``fit 2 of 4``."""
+    """The first ``n_items`` items; `progress` tells which is at work: ``fit 2 of 4``."""
     remaining = iter(items)
     for number in range(1, n_items + 1):
         _LINE.steps.append(f"{what} {number} of {n_items}")

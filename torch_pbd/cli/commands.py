@@ -34,13 +34,13 @@ _DATA = "file or folder of demonstrations, several, or a pattern such as 'trial_
 _FILE = {
     "data": Option(str | list[str] | None, None, f"{_DATA}; none: made or simulated ones"),
     "loader": Option(dict[str, Any] | None, None, "options of load_demonstrations: --loader.outputs [x, y]"),
-    "missing": Option(Literal["raise", "drop"], "raise", "of the file's samples: refuse, or leave out"),
+    "missing": Option(Literal["raise", "drop"], "raise", "samples without a value: refuse them, or leave them out"),
     "from_start": Option(bool, False, "count the times of each of the file's demonstrations from 0"),
 }
 _GRID = {
     "align": Option(Literal["auto", "none", "phase", "dtw"], "auto", "auto: by phase where sampling times differ"),
     "input": Option(Literal["time", "phase"], "time", "what the covariance depends on"),
-    "n_steps": Option(_Count | None, None, "resample to so many points"),
+    "n_steps": Option(_Count | None, None, "number of points to resample to"),
 }
 _CLASS_HELP = "by name, or class_path and init_args; see"
 OPTIONS: dict[str, dict[str, Option]] = {
@@ -57,7 +57,7 @@ OPTIONS: dict[str, dict[str, Option]] = {
         **_MADE,
         "n_demos": Option(_Count | None, None, "demonstrations to make; null: 6, and of poses 8"),
         "common_start": Option(bool, False, "made demonstrations of the tunnel start at one point"),
-        "task": Option(Literal["tunnel", "peg"], "tunnel", "to make demonstrations of: peg turns a tool"),
+        "task": Option(Literal["tunnel", "peg"], "tunnel", "task of made demonstrations: peg turns a tool"),
         "controllers": Option(
             dict[str, "DMPController"],  # type: ignore[name-defined]  # a key of CLASSES, as "Model" below
             {"recommended": "DMPController"},
@@ -65,7 +65,7 @@ OPTIONS: dict[str, dict[str, Option]] = {
         ),
         "push": Option(Annotated[float, (0.0, 1e6)], 5.0, "peak of the two pushes along the first output, N"),
         "torque": Option(Annotated[float, (0.0, 1e6)], 1.2, "peak of two pushes of poses by torque, Nm"),
-        "arm": Option(Literal["panda", "none"], "panda", "whose inertia a robot of poses has; none: a virtual one"),
+        "arm": Option(Literal["panda", "none"], "panda", "arm whose inertia a robot of poses has; none: a virtual one"),
         "rate": Option(Annotated[float, (1e-3, 1e6)], 1000.0, "ticks of the controller, Hz"),
     },
     "compare": {
@@ -75,12 +75,12 @@ OPTIONS: dict[str, dict[str, Option]] = {
             MODELS,
             f"estimators {_CLASS_HELP} --models.help NAME",
         ),
-        "max_folds": Option(Annotated[int, (0, math.inf)], 10, "demonstrations to leave out, one by one"),
+        "max_folds": Option(Annotated[int, (0, math.inf)], 10, "how many demonstrations to leave out, one by one"),
         "n_jobs": Option(
             Annotated[int, (-math.inf, -1)] | _Count | None, None, "fits at the same time; -1: all cores"
         ),
         "readings": Option(
-            list[Literal["bell", "printed", "bowl"]], ["bell", "printed", "bowl"], "of eq. (14), which is ambiguous"
+            list[Literal["bell", "printed", "bowl"]], ["bell", "printed", "bowl"], "readings of the ambiguous eq. (14)"
         ),
         "n_seeds": Option(_Count, 10, "simulations to take the median of"),
         "n_inputs": Option(_Count, 10, "inputs of the simulation"),
@@ -88,7 +88,7 @@ OPTIONS: dict[str, dict[str, Option]] = {
         **_GRID,
     },
     "playground": {
-        "port": Option(Annotated[int, (0, 65535)], 0, "of this machine to serve the page at; 0: a free one"),
+        "port": Option(Annotated[int, (0, 65535)], 0, "port of this machine for the page; 0: a free one"),
         "browse": Option(bool, True, "open the page in a browser"),
     },
 }  # fmt: skip

@@ -34,10 +34,10 @@ class Run:
     controller: DMPController
     planned: Schedule
     schedule: Schedule
-    """The planned one, or with the inertia of an arm."""
+    """The planned one, or the same with the inertia of an arm."""
     unpushed: Rollout
     pushes: Mapping[str, list[Rollout]]
-    """By "force" along the first output; of poses by "force" and "torque", in each axis of the tool."""
+    """Runs by kind: "force" along the first output, or for poses "force" and "torque" in each axis of the tool."""
     report: StabilityReport
 
     def along(self, values: Floats, kind: style.Kind) -> Floats:
