@@ -155,9 +155,10 @@ def _check_reach(times: Sequence[Floats], turns: Sequence[Floats]) -> None:
     angles = [np.degrees(np.linalg.norm(turn, axis=1)) for turn in turns]
     k = int(np.argmax([angle.max() for angle in angles]))
     i = int(np.argmax(angles[k]))
-    what = f"ecording {k} is {angles[k][i]:.1f} degrees from the mean rotation at {times[k][i]:.6g}"
+    furthest = angles[k][i]
+    what = f"ecording {k} is {furthest:.1f} degrees from the mean rotation at {times[k][i]:.6g}"
     remedy = "leave a wrong sample out, or, as of screws, learn deviations from the mean rotation of each time"
-    if angles[k][i] > _FURTHEST:
+    if furthest > _FURTHEST:
         raise InvalidParameterError(f"r{what}, must be at most {_FURTHEST:.0f}: {remedy}.")
-    if angles[k][i] > _FAR:
+    if furthest > _FAR:
         checks.warn(f"R{what}, and {_FURTHEST:.0f} are refused: {remedy}.")
