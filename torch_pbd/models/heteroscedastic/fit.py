@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from torch_pbd.linalg import scale_tril_from_root
-from torch_pbd.models.heteroscedastic.log_variance import on_stretched_inputs, squares_within, stretched
+from torch_pbd.models.heteroscedastic.log_variance import squares_within
 from torch_pbd.models.heteroscedastic.posterior import LatentCovariance, LatentMean
 from torch_pbd.models.heteroscedastic.processes import ProcessFamily
 from torch_pbd.models.heteroscedastic.residuals import (
@@ -29,7 +29,7 @@ from torch_pbd.models.heteroscedastic.residuals import (
     demonstration_correlation,
     is_signal,
 )
-from torch_pbd.models.heteroscedastic.search import Families, Search, SearchOptions
+from torch_pbd.models.heteroscedastic.search import Families, Search, SearchOptions, on_stretched_inputs, stretched
 from torch_pbd.models.heteroscedastic.steps import MOST_INPUTS, CovarianceSearch, fit_covariance, fit_mean, mean_start
 from torch_pbd.models.training import TrainingSet, pooled_tril
 from torch_pbd.optim import Progress
@@ -146,7 +146,7 @@ class HeteroscedasticFit:
         """
         before = self.families.log_variance
         squares = squares_within(self.training, self.normal(), noise)
-        after = stretched(before, self.training.inputs, squares)
+        after = stretched(before, self.training.inputs, squares, self.options)
         if after is not before or noise is not None:
             self.covariance = None
             self._begin_covariance(after)

@@ -1,27 +1,19 @@
-"""Logarithms of conditional variances as Gaussian processes, their latent values integrated out.
-
-Movements that start or end at one point have deviations that collapse there. One process has one length scale, and that
-of a deviation which is even for nineteen twentieths of a movement and falls by thirty in the last is neither the one
-nor the other. Where the evidence is clearly higher so the inputs of the covariance's processes are stretched at an end.
-"""
+"""Logarithms of conditional variances as Gaussian processes, their latent values integrated out."""
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from operator import itemgetter
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from torch_pbd.gp.observations import spacing
 from torch_pbd.linalg import safe_cholesky, triangular_inverse
-from torch_pbd.models.heteroscedastic.processes import FixedFeatures, ProcessFamily
+from torch_pbd.models.heteroscedastic.processes import Evidence, FixedFeatures, Gradient, ProcessFamily
 from torch_pbd.models.heteroscedastic.regression import LinearEvidence, Weights, weights_factor
 from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation
-from torch_pbd.models.heteroscedastic.search import Evidence, Gradient, Search, grid_evidence
 from torch_pbd.models.training import TrainingSet
 
 LEAST_SQUARE = 1e-6
@@ -32,16 +24,6 @@ logarithm."""
 _MAX_ITER, _TOL = 60, 1e-5
 _HALVINGS, _ROUNDING = 20, 1e-12  # of a step that does not descend, and what counts as none of a loss
 _LEAST_RESIDUAL = -40.0  # bounds exp(-x) where a start is far below its target
-
-# An end gets as much length as the whole range has, most of it within the first of these shares of the range (a spacing
-# of the inputs at least) or the second: a process of a usual length scale is then as free there as elsewhere in all.
-_LENGTH, _WIDTHS = 1.0, (0.02, 0.06)
-# An end is tried where deviations in its first hundredth are below this share of those from 5 to 15 % of the range, of
-# some output: a process of a usual length scale follows what falls less.
-_FALLS = 1.0 / 3.0
-# Nats: an end that falls by thirty gains some fifty from six demonstrations. One of nine recorded sets gained up to
-# eleven, and lost a tenth of a nat a step of what was left out.
-_CLEARLY = 20.0
 
 
 @dataclass(frozen=True)
@@ -87,16 +69,6 @@ class LogVariance(NamedTuple):
     """Variances of the log variances."""
     gradient: Callable[[], Float[Tensor, "b n p"]]
     """Computes the gradient of the evidence in the features."""
-
-
-def search_log_variance(
-    search: Search, fixed: FixedFeatures, squares: Squares, near: Float[Tensor, "b n"] | None
-) -> LogVariance:
-    """Posterior with the hyperparameters of the highest evidence, of log variances that are ``near`` those given."""
-    near = (squares.log_pooled if near is None else near).clone()
-    theta = search.run(log_variance_evidence(search.family, fixed, squares, near), squares.total.shape[1])
-    information = 0.5 * squares.degrees.sum(-1)
-    return fit_log_variance(squares, search.family.design_vjp(fixed, theta, information)[0], near)
 
 
 def log_variance_evidence(
@@ -247,52 +219,3 @@ def squares_within(training: TrainingSet, normal: Tensor, noise: NoiseCorrelatio
     squares = training.sums((normal - means[training.index]).square())
     degrees = torch.where(counts > 1.0, counts - 1.0, counts).expand(normal.shape[1], -1)
     return Squares(squares.mT, degrees, noise)
-
-
-def stretched(family: ProcessFamily, inputs: Float[Tensor, "n e"], squares: Squares) -> ProcessFamily:
-    """Family with the inputs stretched at ends where the evidence for the log variances of residuals is higher so.
-
-    At the best points of the searches' grid: what is asked is whether twenty nats are gained.
-    """
-    if inputs.shape[1] > 1 or family.period is not None or family.fixed_length_scale is not None:
-        return family
-    falling = [end for end in (0, 1) if _falls(squares, inputs[:, 0], end)]
-    if not falling:
-        return family
-
-    def evidence(family: ProcessFamily) -> float:
-        of_theta = log_variance_evidence(family, FixedFeatures(family, inputs), squares, squares.log_pooled.clone())
-        return float(grid_evidence(of_theta, family, *squares.total.shape).amax(0).sum())
-
-    result, highest, stretch = family, evidence(family), inputs.new_tensor([[0.0, 1.0], [0.0, 1.0]])
-    # Each end by itself, and both: where one is stretched the other still asks for a short length scale.
-    for ends in ([0], [1], [0, 1]) if len(falling) > 1 else [falling]:
-        tried = []
-        for width in _WIDTHS:
-            each = stretch.clone()
-            each[ends] = inputs.new_tensor([_LENGTH, max(width, width / _WIDTHS[0] * spacing(inputs))])
-            candidate = on_stretched_inputs(family, inputs, each)
-            tried.append((evidence(candidate), candidate, each))
-        found, candidate, each = max(tried, key=itemgetter(0))
-        if found > highest + _CLEARLY:
-            result, highest, stretch = candidate, found, each
-    return result
-
-
-def _falls(squares: Squares, x: Float[Tensor, " n"], end: int) -> bool:
-    """Whether deviations of an output fall at the start (0) or the goal (1) of the range."""
-    far = (x - x.min() if end == 0 else x.max() - x) / (x.max() - x.min())
-    outer, inner = far <= 0.01, (far >= 0.05) & (far <= 0.15)
-    variances = [squares.total[:, part].sum(1) / squares.degrees[:, part].sum(1) for part in (outer, inner)]
-    return bool((variances[0] < _FALLS**2 * variances[1]).any())  # of no inputs there the quotient is not a number
-
-
-def on_stretched_inputs(
-    family: ProcessFamily, inputs: Float[Tensor, "n e"], stretch: Float[Tensor, "2 2"] | None
-) -> ProcessFamily:
-    """Family with as many inducing inputs, evenly over the stretched range."""
-    family = replace(family, stretch=stretch)
-    if family.exact or stretch is None:
-        return family
-    chosen = replace(family, inducing=inputs).farthest_first[: len(family.inducing)]
-    return replace(family, inducing=inputs[chosen.sort().values])

@@ -33,6 +33,11 @@ _SPREAD_LENGTH_SCALE, _SPREAD_AMPLITUDE = 1.0, 1.5  # prior deviations of the lo
 _NEGLIGIBLE = 1e-7
 
 
+Gradient = Callable[[], Float[Tensor, "a q"]]
+Evidence = Callable[[Float[Tensor, "a q"], Int64[Tensor, " a"]], tuple[Float[Tensor, " a"], Gradient]]
+"""Log evidence of hyperparameters of some of the processes, given which ones; and what computes its gradients."""
+
+
 @dataclass(frozen=True)
 class ProcessFamily:
     """``constant + amplitude * process(x / length_scale)``: b of them, each with hyperparameters of its own.

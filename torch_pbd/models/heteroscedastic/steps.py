@@ -17,12 +17,18 @@ from torch.nn.functional import pad
 from torch_pbd.gp import EvidenceSearch, Hyperparameters, Observations, fit_hyperparameters, negative_log_evidence
 from torch_pbd.gp.observations import resolved_length_scale
 from torch_pbd.linalg import triangular_inverse
-from torch_pbd.models.heteroscedastic.log_variance import LEAST_SQUARE, Squares, fit_log_variance, search_log_variance
+from torch_pbd.models.heteroscedastic.log_variance import (
+    LEAST_SQUARE,
+    LogVariance,
+    Squares,
+    fit_log_variance,
+    log_variance_evidence,
+)
 from torch_pbd.models.heteroscedastic.posterior import LatentCovariance, LatentMean
-from torch_pbd.models.heteroscedastic.processes import FixedFeatures, inducing_inputs
+from torch_pbd.models.heteroscedastic.processes import FixedFeatures, Gradient, inducing_inputs
 from torch_pbd.models.heteroscedastic.regression import LinearEvidence, Regression, Weights
 from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation
-from torch_pbd.models.heteroscedastic.search import Families, Gradient, Search, SearchOptions
+from torch_pbd.models.heteroscedastic.search import Families, Search, SearchOptions
 from torch_pbd.models.training import TrainingSet, pooled_tril
 
 MOST_INPUTS = 1024
@@ -158,6 +164,16 @@ class _Row(NamedTuple):
 
 _FitRow = Callable[[int, Regression], tuple[Tensor, Tensor, Tensor, Tensor | float]]
 """Features (n, p) of the coefficients of output i, mean and covariance of their weights, and the divergence."""
+
+
+def search_log_variance(
+    search: Search, fixed: FixedFeatures, squares: Squares, near: Float[Tensor, "b n"] | None
+) -> LogVariance:
+    """Posterior with the hyperparameters of the highest evidence, of log variances that are ``near`` those given."""
+    near = (squares.log_pooled if near is None else near).clone()
+    theta = search.run(log_variance_evidence(search.family, fixed, squares, near), squares.total.shape[1])
+    information = 0.5 * squares.degrees.sum(-1)
+    return fit_log_variance(squares, search.family.design_vjp(fixed, theta, information)[0], near)
 
 
 def fit_covariance(
