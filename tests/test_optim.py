@@ -208,21 +208,6 @@ def test_scoring_stays_where_no_step_lowers_the_loss():
     assert report.loss == 1.0
 
 
-def test_scoring_stops_at_a_share_of_the_loss():
-    """Halving the distance at each step: of sums of squares a quarter is left."""
-    start = torch.tensor([1.0], dtype=torch.float64)
-
-    def newton(x):
-        return 2 * x, -0.5 * x
-
-    reports = [
-        minimize_scoring(lambda x: 1.0 + x.square().sum(), newton, start, tol=1e-12, relative_tol=share)[1]
-        for share in (1e-2, 1e-4, 0.0)
-    ]
-    assert reports[0].n_iter < reports[1].n_iter < reports[2].n_iter
-    assert all(report.converged for report in reports)
-
-
 def test_scoring_needs_a_finite_start():
     start = torch.tensor([-1.0], dtype=torch.float64)
     with pytest.raises(ValueError, match="cannot start"):

@@ -41,18 +41,13 @@ def _matern52(square_distance: Tensor) -> Tensor:
     return (1.0 + distance + distance.square() / 3.0) * torch.exp(-distance)
 
 
-def _matern52_slope(square_distance: Tensor, _: Tensor) -> Tensor:
-    distance = (5.0 * square_distance).sqrt()
-    return (-5.0 / 6.0) * (1.0 + distance) * torch.exp(-distance)
-
-
 KernelName = Literal["squared_exponential", "matern32", "matern52"]
 """Names for signatures of estimators; what is below takes any name of the table."""
 
 KERNELS: dict[str, Kernel] = {
     "squared_exponential": Kernel(lambda s: torch.exp(-0.5 * s), lambda _, k: -0.5 * k, on_nodes=True),
     "matern32": Kernel(_matern32, lambda s, _: -1.5 * torch.exp(-(3.0 * s).sqrt())),
-    "matern52": Kernel(_matern52, _matern52_slope),
+    "matern52": Kernel(_matern52, lambda s, _: (-5.0 / 6.0) * (1.0 + (5.0 * s).sqrt()) * torch.exp(-(5.0 * s).sqrt())),
 }
 """All kernels by name: the one place to add another."""
 

@@ -57,22 +57,23 @@ class CovarianceRegressor(TorchEstimator):
             raise ValueError("At most one of return_std and return_cov can be True.")
         inputs = checked_queries(self, X)
         if not (return_std or return_cov):
-            mean = self._mean(inputs)
+            mean = self._arrays(lambda x: (self.module_.mean(x),), inputs)[0]
             return mean.ravel() if self._y_is_1d else mean
-        return shaped_as_y(*self._moments(inputs), y_is_1d=self._y_is_1d, return_cov=return_cov)
+        moments = self._arrays(lambda x: self.module_.moments(x, *self._prior_tril_at(x)), inputs)
+        return shaped_as_y(*moments, y_is_1d=self._y_is_1d, return_cov=return_cov)
 
     def predict_cov(self, X: ArrayLike) -> Floats:
         """Covariances of the outputs at X: (n_samples, n_outputs, n_outputs), also for one output.
 
         Symmetric to the last bit, positive definite, in squared units of y.
         """
-        return self._covariance(checked_queries(self, X))
+        inputs = checked_queries(self, X)
+        return self._arrays(lambda x: (self.module_.covariance(x, *self._prior_tril_at(x)),), inputs)[0]
 
     def predict_uncertainty(self, X: ArrayLike) -> Uncertainty:
         """Both kinds of uncertainty at X, apart (Section IV-C)."""
         inputs = checked_queries(self, X)
-        type1 = self._arrays(lambda x: (self.module_.type1(x),), inputs)[0]
-        return Uncertainty(type1, self._variability(inputs))
+        return Uncertainty(*self._arrays(lambda x: (self.module_.type1(x), self.module_.type2(x)), inputs))
 
     def predict_df(self, X: ArrayLike) -> Floats:
         """Degrees of freedom of the predictive density at X: (n_samples,), infinite where it is normal."""
@@ -141,18 +142,6 @@ class CovarianceRegressor(TorchEstimator):
             normal *= np.sqrt((degrees - 2.0) / squares)[:, np.newaxis]
         samples = mean[:, :, np.newaxis] + scale_tril @ normal
         return samples[:, 0] if self._y_is_1d else samples
-
-    def _mean(self, X: Floats) -> Floats:
-        return self._arrays(lambda x: (self.module_.mean(x),), X)[0]
-
-    def _covariance(self, X: Floats) -> Floats:
-        return self._arrays(lambda x: (self.module_.covariance(x, *self._prior_tril_at(x)),), X)[0]
-
-    def _variability(self, X: Floats) -> Floats:
-        return self._arrays(lambda x: (self.module_.type2(x),), X)[0]
-
-    def _moments(self, X: Floats) -> tuple[Floats, ...]:
-        return self._arrays(lambda x: self.module_.moments(x, *self._prior_tril_at(x)), X)
 
     def _degrees(self, X: Floats) -> Floats:
         def degrees(x: Tensor) -> tuple[Tensor]:

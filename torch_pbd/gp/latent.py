@@ -149,16 +149,8 @@ class LatentValues(nn.Module):
     makes them easy to train. While the hyperparameters are held, the basis is that of the eigenvectors
     which matter: far fewer than inputs for a smooth kernel.
 
-    Parameters
-    ----------
-    inputs : Tensor of shape (n, e)
-    deviation : Tensor of shape (b, n)
-        Where training starts.
-    amplitude : Tensor of shape (b,)
-    length_scale : Tensor of shape (1, e) or (b, e)
-    kernel : str
-    train_hyperparameters : bool
-        Whether amplitude and length scale, then one for each process, are trained with the values.
+    Training starts at ``deviation``. Amplitude and length scale, then one for each process, are trained with the values
+    if ``train_hyperparameters``.
     """
 
     inputs: Tensor

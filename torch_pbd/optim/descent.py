@@ -157,7 +157,6 @@ def minimize_scoring(
     *,
     max_iter: int = 100,
     tol: float = 1e-8,
-    relative_tol: float = 0.0,
     callback: Callback = None,
 ) -> tuple[Tensor, FitReport]:
     """Minimize a loss whose gradient and curvature are known in closed form; never ends above the start.
@@ -179,8 +178,6 @@ def minimize_scoring(
     tol : float, default=1e-8
         Stop after a step that promises a fall below a hundredth of it, or brings one below a tenth, times the loss at
         the start where that is above one.
-    relative_tol : float, default=0.0
-        Or that promises one below this share of the loss. For sums of squares, whose smallest value is zero.
     callback : callable, optional
         Called with a :class:`~torch_pbd.optim.Progress` after each improvement.
 
@@ -213,11 +210,10 @@ def minimize_scoring(
             break
         found, lowest = _line_search(evaluate, x, value, step, slope) if slope < 0 else (x, value)
         # A fall below the rounding of the loss cannot be seen.
-        promise, rounding = -0.5 * slope, 1e-14 * max(1.0, abs(value))
-        little = max(enough, relative_tol * abs(value), rounding)
+        promise, little = -0.5 * slope, max(enough, 1e-14 * max(1.0, abs(value)))
         # A step that falls far short of its promise is short because of a bend, not because of an end.
         arrived = value - lowest <= 10.0 * enough and promise <= _SHORTFALL * little
-        if found is x and promise > max(enough, rounding):
+        if found is x and promise > little:
             status = Status.LINE_SEARCH_FAILED
         elif promise <= little or arrived:
             status = Status.CONVERGED
