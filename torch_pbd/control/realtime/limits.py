@@ -150,13 +150,13 @@ class ForceChannel:
     def take(self, force: Numbers, step: float) -> TickStatus:
         """Let a force as measured act, as far as it may, ``step`` s after the last one."""
         try:
-            push = tuple(map(float, force))
+            push = (*map(float, force),)  # tuple() of an iterator leaves one more tuple on Python's free list each time
         except (TypeError, ValueError, OverflowError):
             push = ()
         if len(push) != self._n_axes:
             raise checks.refusal(force, "force", f"{self._n_axes} numbers in N and Nm")
         if self._bias:
-            push = tuple(map(sub, push, self._bias))
+            push = (*map(sub, push, self._bias),)
         if self._only:
             status = self._only.take(push, step)
             self.push = self._only.push
