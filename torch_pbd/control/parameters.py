@@ -6,8 +6,7 @@ from typing import Any, Literal, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.sparse import issparse
-from sklearn.utils.validation import check_X_y
+from sklearn.base import BaseEstimator
 
 from torch_pbd import checks
 from torch_pbd.control.matrices import as_damping_ratio, as_mass
@@ -18,7 +17,7 @@ from torch_pbd.data import Demonstrations, check_unimodal
 from torch_pbd.data.alignment import TIMING_REMOVED
 from torch_pbd.data.poses import ROTATION
 from torch_pbd.data.units import ANGLES, LENGTHS, TIMES
-from torch_pbd.estimators.validation import check_groups, check_squares, checked_values
+from torch_pbd.estimators.validation import check_groups, check_squares, checked_rows
 from torch_pbd.files.memory import require_much
 
 _BRIEFEST = 1e-100  # s: squares of what is briefer, or of its inverse, are no numbers
@@ -138,21 +137,16 @@ def _warn_of_units(units: Sequence[str] | None) -> None:
 def _grouped(X: ArrayLike, y: ArrayLike | None, groups: ArrayLike | None) -> Demonstrations:
     if y is None:
         raise ValueError("y is None: give Demonstrations, or times X (n, 1), positions y (n, d) and groups (n,).")
-    if issparse(y):
-        raise TypeError("Sparse data was passed for y, but dense data is required. Use '.toarray()'.")
-    times, positions = check_X_y(
-        checked_values(X, "X"), checked_values(y, "y"), dtype=np.float64, multi_output=True, y_numeric=True
-    )
+    times, positions = checked_rows(BaseEstimator(), X, y)
     check_squares(times, "X")
     check_squares(positions, "y")
     if times.shape[1] != 1:
         raise ValueError(f"X has {times.shape[1]} columns, must have 1: the time of each sample.")
     labels = np.zeros(len(times), dtype=int) if groups is None else check_groups(groups, len(times))
-    if groups is None and (np.diff(times[:, 0]) <= 0.0).any():
-        row = int(np.argmax(np.diff(times[:, 0]) <= 0.0)) + 1
+    if groups is None and (back := np.diff(times[:, 0]) <= 0.0).any():
         raise ValueError(
-            f"X does not increase at row {row}: if another demonstration starts there, give groups, the number of the "
-            "demonstration of each row."
+            f"X does not increase at row {int(np.argmax(back)) + 1}: if another demonstration starts there, give "
+            "groups, the number of the demonstration of each row."
         )
     names = [str(name) for name in y.columns] if hasattr(y, "columns") else None
     if set(ROTATION) <= set(names or ()):
