@@ -18,7 +18,7 @@ import torch_pbd
 from torch_pbd import Demonstrations, DMPController, GMMBaseline
 from torch_pbd.cli.main import main
 from torch_pbd.control import Schedule
-from torch_pbd.control.parameters import as_demonstrations
+from torch_pbd.control.controller import as_demonstrations
 from torch_pbd.control.primitive.outputs import common_unit, in_si
 from torch_pbd.control.primitive.smoothing import duration_of
 from torch_pbd.data import load_demonstrations, make_tunnel_demonstrations, save_demonstrations

@@ -1,24 +1,29 @@
 """The controller as an estimator: demonstrations in, a stiffness schedule out (Section V)."""
 
+from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import Literal, Self
 
+import numpy as np
 from numpy.typing import ArrayLike
+from sklearn.base import BaseEstimator
 from sklearn.utils.validation import check_is_fitted
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.control import parameters
-from torch_pbd.control.impedance import fit_covariance, fit_law, outputs_under
+from torch_pbd.control.impedance import check_parameters, fit_covariance, fit_law, outputs_under
 from torch_pbd.control.planning import Planning
 from torch_pbd.control.primitive import smoothing
 from torch_pbd.control.primitive.dmp import Adaptation, Gate
-from torch_pbd.control.primitive.outputs import counts_as_metres, in_si
-from torch_pbd.control.primitive.reproduction import Reproduction, primitive
+from torch_pbd.control.primitive.outputs import common_unit, counts_as_metres, in_si
+from torch_pbd.control.primitive.reproduction import Reproduction, check_against_duration, primitive
 from torch_pbd.control.stiffness import StiffnessLaw
-from torch_pbd.data import Demonstrations
-from torch_pbd.data.units import TIMES
+from torch_pbd.data import Demonstrations, check_unimodal
+from torch_pbd.data.alignment import TIMING_REMOVED
+from torch_pbd.data.poses import ROTATION
+from torch_pbd.data.units import ANGLES, LENGTHS, TIMES
 from torch_pbd.estimators.base import CovarianceRegressor
+from torch_pbd.estimators.validation import check_groups, check_squares, checked_rows
 from torch_pbd.movement.base import MovementRegressor
 
 
@@ -155,9 +160,9 @@ class DMPController(Planning):
         """
         for name in ("law_", "_bend", "_shown"):  # a fit that fails leaves no mixture of two
             self.__dict__.pop(name, None)
-        parameters.check_parameters(self)
+        check_parameters(self)
         # 1. Recordings. Samples whose times are one are merged; the table of holes is Type I uncertainty.
-        shown = smoothing.merge_bursts(parameters.as_demonstrations(X, y, groups))
+        shown = smoothing.merge_bursts(as_demonstrations(X, y, groups))
         self.names_, self.frame_, self.units_, self.time_unit_ = shown.names, shown.frame, shown.units, shown.time_unit
         self.n_demos_, self.n_outputs_ = len(shown), shown.n_outputs
         outputs = outputs_under(self, shown)
@@ -167,8 +172,8 @@ class DMPController(Planning):
         automatic = smoothing.automatic_cutoff(self.duration_, knows_seconds=seconds)
         self.cutoff_ = automatic if self.cutoff == "auto" else self.cutoff
         self.dmp_ = primitive(self)
-        parameters.check_against_duration(self)
-        parameters.check_steps(self.n_steps, self.n_demos_, self.n_outputs_, learned=True)
+        check_against_duration(self)
+        smoothing.check_steps(self.n_steps, self.n_demos_, self.n_outputs_, learned=True)
         self.unsampled_ = smoothing.tabulate_unsampled(shown, self.duration_ / self.time_scale_, self.on_unknown)
         # 2. Smoothing. Splines at the true times give positions, velocities and accelerations at common times.
         movements = smoothing.smooth(shown.times, shown.positions, self.cutoff_, self.n_steps, self.duration_)
@@ -205,7 +210,7 @@ class DMPController(Planning):
         if demonstrations.n_outputs != self.n_outputs_:
             raise ValueError(f"n_outputs of demonstrations is {demonstrations.n_outputs}, must be {self.n_outputs_}.")
         n_steps = self.n_steps if n_steps is None else checks.count(n_steps, "n_steps", least=2)
-        parameters.check_steps(n_steps, len(demonstrations), self.n_outputs_, learned=False)
+        smoothing.check_steps(n_steps, len(demonstrations), self.n_outputs_, learned=False)
         shown = smoothing.merge_bursts(demonstrations)
         return smoothing.smooth(shown.times, shown.positions, self.cutoff_, n_steps, self.duration_)
 
@@ -216,3 +221,74 @@ class DMPController(Planning):
 
     def __sklearn_is_fitted__(self) -> bool:
         return "law_" in vars(self)
+
+
+def as_demonstrations(X: Demonstrations | ArrayLike, y: ArrayLike | None, groups: ArrayLike | None) -> Demonstrations:
+    """Two demonstrations or more: as they are, or of samples X (n, 1), y (n, d) whose groups (n,) tell them apart.
+
+    Warns of more than one way, of units that stiffness cannot have, and of timing that was taken out by warping.
+    """
+    if isinstance(X, Demonstrations) and not (y is None and groups is None):
+        raise ValueError("X is Demonstrations, which have their positions: give neither y nor groups with them.")
+    demonstrations = X if isinstance(X, Demonstrations) else _grouped(X, y, groups)
+    if len(demonstrations) < 2:
+        raise ValueError(
+            "DMPController needs >= 2 demonstrations, got 1: what varies between demonstrations cannot be learned "
+            "from one. Record more, or give groups that tell the samples of several apart."
+        )
+    if demonstrations.suspects:
+        raise ValueError(f"A controller cannot be learned of these outputs. {' '.join(demonstrations.suspects)}")
+    if demonstrations.rotation_reference is not None and demonstrations.n_outputs == 3:
+        raise ValueError(
+            f"The demonstrations have a rotation alone, {', '.join(demonstrations.names)}, must have positions beside "
+            "it: record them too."
+        )
+    check_unimodal(demonstrations)
+    if isinstance(X, Demonstrations):  # arrays have no units: they are in m and s
+        _warn_of_units(X.units if X.units is None or X.rotation_reference is None else X.units[:-3])
+    if demonstrations.alignment == "dtw":
+        checks.warn(TIMING_REMOVED)
+    return demonstrations
+
+
+def _warn_of_units(units: Sequence[str] | None) -> None:
+    """Warn of what becomes of positions whose units are not given, differ, or are no lengths and no angles."""
+    common = common_unit(units)
+    if units is None:
+        checks.warn(
+            "The demonstrations tell no units: positions are taken to be in m. Say so, or in what else: units='m'."
+        )
+    elif common is None:
+        checks.warn(
+            f"The outputs are in different units, {', '.join(units)}: their principal axes mix them, and nothing is "
+            "converted to m. Bring them to one unit, or control them apart."
+        )
+    elif common not in LENGTHS | ANGLES:
+        checks.warn(
+            f"The positions are in {common!r}, which is no known length or angle ({', '.join(LENGTHS | ANGLES)}): "
+            "stiffness is in N per that unit, and no limits of motion apply."
+        )
+
+
+def _grouped(X: ArrayLike, y: ArrayLike | None, groups: ArrayLike | None) -> Demonstrations:
+    if y is None:
+        raise ValueError("y is None: give Demonstrations, or times X (n, 1), positions y (n, d) and groups (n,).")
+    times, positions = checked_rows(BaseEstimator(), X, y)
+    check_squares(times, "X")
+    check_squares(positions, "y")
+    if times.shape[1] != 1:
+        raise ValueError(f"X has {times.shape[1]} columns, must have 1: the time of each sample.")
+    labels = np.zeros(len(times), dtype=int) if groups is None else check_groups(groups, len(times))
+    if groups is None and (back := np.diff(times[:, 0]) <= 0.0).any():
+        raise ValueError(
+            f"X does not increase at row {int(np.argmax(back)) + 1}: if another demonstration starts there, give "
+            "groups, the number of the demonstration of each row."
+        )
+    names = [str(name) for name in y.columns] if hasattr(y, "columns") else None
+    if set(ROTATION) <= set(names or ()):
+        raise ValueError(
+            f"y has columns {', '.join(ROTATION)}, as rotations of poses are called, which would count in m: give "
+            "Demonstrations."
+        )
+    members = [labels == label for label in dict.fromkeys(labels.tolist())]
+    return Demonstrations([times[m, 0] for m in members], [positions[m] for m in members], names=names)

@@ -1,7 +1,7 @@
 """Variability of demonstrations, learned; and stiffness and damping from what is known of it, and what is not."""
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_origin, get_type_hints
 
 import numpy as np
 import torch
@@ -10,7 +10,7 @@ from sklearn.base import clone
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.control.matrices import damping_from_stiffness
+from torch_pbd.control.matrices import as_damping_ratio, as_mass, damping_from_stiffness
 from torch_pbd.control.primitive.outputs import RESOLUTION, Outputs, in_si
 from torch_pbd.control.primitive.smoothing import UNKNOWN
 from torch_pbd.control.stiffness import RotationLimits, StiffnessLaw
@@ -20,7 +20,35 @@ from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
 from torch_pbd.estimators.validation import fit_with_groups
 
 _FAR = 1e6  # ranges of the input: only the prior speaks there
+_NEEDED = ("get_params", "fit", "predict_cov", "predict_uncertainty")  # of a covariance regressor
 _AT_ONCE = 2**14  # times: a regressor may need a hundred times the memory of what it predicts
+
+
+def check_parameters(controller: Any) -> None:
+    """Refuse the parameters of a DMPController that cannot be used, before any work."""
+    for name, kind in get_type_hints(type(controller)).items():
+        if get_origin(kind) is Literal:
+            checks.choice(getattr(controller, name), name, kind)
+    for name, unit in (("alpha", ""), ("gamma", ""), ("tau", "s")):
+        checks.number(getattr(controller, name), name, above=0.0, unit=unit)
+    checks.number(controller.beta, "beta", above=0.0, optional=True)
+    checks.number(controller.duration, "duration", above=0.0, unit="s", optional=True)
+    checks.count(controller.n_steps, "n_steps", least=5)
+    if controller.cutoff != "auto":
+        checks.number(controller.cutoff, "cutoff", above=0.0, unit="Hz", optional=True, remedy="leave it 'auto'")
+    regressor = controller.covariance
+    if regressor is not None and (isinstance(regressor, type) or not all(hasattr(regressor, need) for need in _NEEDED)):
+        raise checks.refusal(regressor, "covariance", "a covariance regressor, not yet fitted or fitted, or None")
+    if (timing := getattr(regressor, "timing", "none")) != "none":
+        raise checks.refusal(
+            timing, "timing of covariance", "'none'", "a controller sets the time of its movement itself"
+        )
+    checks.instance(controller.stiffness_law, "stiffness_law", StiffnessLaw, optional=True)
+    mass: Any = 1.0 if controller.mass is None else controller.mass
+    if np.ndim(mass) < 2:
+        checks.number(mass, "mass", above=0.0, unit="kg", remedy="or give a matrix (d, d)")
+    as_mass(mass)
+    as_damping_ratio(controller.damping_ratio)
 
 
 class Gains(NamedTuple):

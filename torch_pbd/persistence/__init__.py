@@ -19,7 +19,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from torch_pbd import checks
 from torch_pbd.control.controller import DMPController
-from torch_pbd.control.parameters import check_parameters
+from torch_pbd.control.impedance import check_parameters
 from torch_pbd.control.primitive.outputs import Outputs
 from torch_pbd.control.primitive.reproduction import Reproduction, primitive
 from torch_pbd.estimators.base import CovarianceRegressor

@@ -1,5 +1,6 @@
 """The mean movement of demonstrations as a movement primitive drives it."""
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -13,7 +14,8 @@ from torch import Tensor
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control.primitive.dmp import DMP, adapt
-from torch_pbd.control.primitive.smoothing import Movements, check_range
+from torch_pbd.control.primitive.smoothing import CUTOFF_HZ, Movements, check_range
+from torch_pbd.data.units import TIMES
 from torch_pbd.estimators.torch_estimator import Standardization
 from torch_pbd.gp import EvidenceSearch, Observations, condition, fit_together
 
@@ -28,6 +30,14 @@ _BRAKE = 0.2  # of the duration: the most that the stop of a movement that was c
 # 5 m/s^2, and 0.3 rad/s within 0.3 degrees at 10 rad/s^2.
 _CUT, _STEADY, _STOPPED = 0.1, 0.5, (0.1, 0.3)
 _ROUNDING = 1e-9  # of the duration, or of the largest position
+_BRIEFEST = 1e-100  # s: squares of what is briefer, or of its inverse, are no numbers
+_CYCLES = 0.01, 1e6  # of the cutoff in a movement: fewer smooth it to a line, more leave what was recorded
+# Time constants in a movement. A reach of 0.6 m is reproduced to 0.1 mm with 1e10 of alpha; rounding of the spring's
+# force moves it by 41 mm with 1e13, and out of its range with 1e16; so does the forcing, integrated twice, with 0.01.
+# With 0.02 of alpha, or 0.01 of the gamma of a gate, an additive movement is at rest a hundred durations late.
+_CONSTANTS, _GATE_CONSTANTS = (0.02, 1e12), (0.01, math.inf)
+# The phase must tell times apart: exp(-30) is 1e-13, and 1e-6 leaves ten digits. Its logarithm is time in other units.
+_DECAY = {"s": (1e-6, 30.0), "log_s": (1e-6, 1e12)}
 
 _Path = tuple[Floats, Floats, Floats]  # position, velocity and acceleration (n, d)
 
@@ -221,6 +231,32 @@ def primitive(controller: Any) -> DMP:
     options = {"duration": controller.duration_, "gate": controller.gate, "adaptation": controller.adaptation}
     beta = None if controller.beta is None else float(controller.beta)
     return DMP(float(controller.alpha), beta, float(controller.gamma), tau, **options)
+
+
+def check_against_duration(controller: Any) -> None:
+    """Refuse parameters that only the duration of the movement makes too small or too large."""
+    dmp, duration, cutoff = controller.dmp_, controller.duration_, controller.cutoff_
+    checks.number(duration, "duration", least=_BRIEFEST, most=1.0 / _BRIEFEST, unit="s")
+    if cutoff is not None and not _CYCLES[0] <= cutoff * duration <= _CYCLES[1]:
+        # Where the automatic one too would be out of range, the times are in another unit than they say.
+        suspect = controller.cutoff == "auto" or CUTOFF_HZ * duration > _CYCLES[1]
+        units = f"the unit of the times is suspect, time_unit={controller.time_unit_!r} (known: {', '.join(TIMES)})"
+        remedy = units if suspect else "leave it 'auto'"
+        raise ValueError(
+            f"cutoff is {cutoff:g} Hz, {cutoff * duration:.3g} cycles in a movement of {duration:.3g} s, must be "
+            f"{_CYCLES[0]:g} to {_CYCLES[1]:g} of them: {remedy}."
+        )
+    ranges = [("alpha", dmp.alpha, _CONSTANTS), ("beta", math.sqrt(dmp.alpha) * math.sqrt(dmp.beta), (0.0, 1e12))]
+    ranges += [("gamma", dmp.gamma, _GATE_CONSTANTS)] if dmp.gate == "phase" else []
+    ranges += [("gamma", dmp.gamma, _DECAY[controller.phase_input])] if controller.phase_input != "time" else []
+    for name, rate, (least, most) in ranges:
+        constants = rate * duration / dmp.tau
+        if not least <= constants <= most:
+            raise ValueError(
+                f"{name} is {getattr(dmp, name):g} and tau is {dmp.tau:g} s, {constants:.3g} time constants in a "
+                f"movement of {duration:.3g} s, must be {least:g} to {most:g} of them with gate={dmp.gate!r}, "
+                f"phase_input={controller.phase_input!r}: leave them as they are by default."
+            )
 
 
 def _process_mean(X: Floats, forcing: Floats, n_demos: int, at: Floats) -> Floats:

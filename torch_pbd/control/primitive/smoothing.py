@@ -14,6 +14,7 @@ from torch_pbd.data import Demonstrations
 from torch_pbd.data.recordings import preview
 from torch_pbd.data.sampling import KNOWN, LEAST_SAMPLES, LOST, holes_of, smoothing_spline, spacing_of
 from torch_pbd.data.units import TIMES
+from torch_pbd.files.memory import require_much
 
 UNKNOWN = 0.5
 """Type I uncertainty above which nothing is known: ``on_unknown="raise"`` raises."""
@@ -28,6 +29,9 @@ CUTOFF_HZ = 4.0
 _CUTOFF_CYCLES = 40.0  # in a movement, the least cutoff of any: fast ones have detail above 4 Hz
 _LEAST_SAMPLES = {True: LEAST_SAMPLES, False: 3}  # with a cutoff and without one
 _MOST_BEYOND = 0.1  # of the range of an output in all recordings; paths through holes keep half of it
+# Measured, in numbers: of each of a demonstration's positions while it is smoothed; of each pair of steps while the
+# forcing is learned, in all and of each axis where they are many; of each axis at a step, while it is tabulated.
+_SMOOTHED, _PAIRED, _PAIRED_AXIS, _TABULATED = 10.0, 34.0, 5.0, 16e3
 
 
 @dataclass(frozen=True)
@@ -98,6 +102,19 @@ def smooth(
         check_range(path, bounds, f"demonstration {number}, smoothed,")
     mean, noise_scale = np.mean(recorded, axis=0), np.sqrt(np.mean(np.concatenate(removed) ** 2, axis=0))
     return Movements(grid, position, velocity, acceleration, mean, bounds, np.stack(known), noise_scale)
+
+
+def check_steps(n_steps: int, n_demos: int, d: int, *, learned: bool) -> None:
+    """Refuse more points of a movement than fit in memory: smoothed, and for a fit with the forcing of them learned."""
+    n = float(n_steps)
+    needed = _SMOOTHED * n * n_demos * d
+    if learned:  # Gaussian processes have matrices of all pairs of points, unless a few nodes carry the forcing
+        needed += n * (max(_PAIRED, _PAIRED_AXIS * d) * n + _TABULATED * d)
+    require_much(
+        8.0 * needed,
+        what=f"n_steps={n_steps} of {n_demos} demonstrations of {d} axes",
+        remedy="Lower n_steps: 100 to 500 follow most movements.",
+    )
 
 
 def check_range(path: Floats, bounds: Floats, name: str) -> None:
