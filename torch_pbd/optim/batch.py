@@ -115,8 +115,8 @@ def minimize_batch(
     ----------
     objective : callable
         Given parameters (a, p), of order one, of a problems and their indices in the batch, returns their losses (a,)
-        and gradients (a, p). Problems at whose points it raises an ArithmeticError, ValueError, RuntimeError or
-        IndexError count as not finite there; which they are it is asked one by one.
+        and gradients (a, p). Problems at whose points it raises one of ``FAILURES`` count as not finite there; which
+        they are it is asked one by one.
     start : Tensor of shape (b, p)
         A problem whose loss there is not finite stays there.
     max_iter : int, default=100

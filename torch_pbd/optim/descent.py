@@ -89,8 +89,8 @@ def minimize(
     Parameters
     ----------
     objective : callable
-        Returns the loss, a scalar tensor, at the present values of ``parameters``. An ArithmeticError, ValueError,
-        RuntimeError or IndexError that it raises counts as a loss that is not finite.
+        Returns the loss, a scalar tensor, at the present values of ``parameters``. One of ``FAILURES`` that it raises
+        counts as a loss that is not finite.
     parameters : sequence of Tensor
         Leaf tensors, changed in place.
     max_iter : int, default=200
@@ -167,8 +167,8 @@ def minimize_scoring(
     Parameters
     ----------
     loss : callable
-        Maps a point to its loss, a scalar tensor; a value that is not finite counts as too far, and so does an
-        ArithmeticError, ValueError, RuntimeError or IndexError that it raises.
+        Maps a point to its loss, a scalar tensor; a value that is not finite counts as too far, and so does one of
+        ``FAILURES`` that it raises.
     newton : callable
         Maps a point to gradient and step there, both shaped like it. The step is minus the gradient, multiplied
         by the inverse of a positive definite matrix.

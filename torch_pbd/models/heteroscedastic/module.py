@@ -11,7 +11,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from torch_pbd import checks
-from torch_pbd.gp.observations import spacing
 from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky, symmetrize
 from torch_pbd.models import Core, Shapes, blank, size_of
@@ -23,6 +22,7 @@ from torch_pbd.models.heteroscedastic.posterior import (
     as_inverse_gamma,
     degrees_of_freedom,
     log_correlation_variance,
+    nearness,
     shrink_correlation,
     under_expected_noise,
 )
@@ -31,9 +31,6 @@ from torch_pbd.models.heteroscedastic.regression import Weights
 
 # Far from data a log variance may be anything: of its variance no more than this enters an expectation.
 _MOST_LOG_VARIANCE = 2.0
-# Longest length scale by which distance from the data is judged, in ranges of the input times the number of inputs;
-# but two spacings of the inducing inputs at least.
-_REACH = 0.1
 _FAMILIES = ("mean", "log_variance", "coefficient")
 
 
@@ -107,7 +104,7 @@ class HeteroscedasticModel(Core):
         self.medians = [(family.length_scale, family.amplitude, family.constant) for family in families]
         if fit.correlation is not None and fit.correlation.matters:
             n_places = float(fit.correlation.share.mean()) * len(fit.training.x) / fit.n_demos
-            root, degrees = self._root_of_demonstrations(*self._known(fit.training.inputs)[1:3])
+            root, degrees = self._root_of_demonstrations(*self._known(fit.training.inputs)[1:])
             self.register_buffer("correlation_variance", log_correlation_variance(root, degrees, n_places))
 
     def config(self) -> dict[str, Any]:
@@ -168,21 +165,21 @@ class HeteroscedasticModel(Core):
         return moments(x, prior_tril)
 
     def _moments(self, x: Tensor, prior_tril: Tensor | None) -> tuple[Tensor, Tensor]:
-        mean, factor, error_root, missing = self._known(x)
+        mean, factor, error_root = self._known(x)
         if hasattr(self, "correlation_variance"):
             root = self._shrunk(*self._root_of_demonstrations(factor, error_root))
         else:
             root = torch.cat([self.pooled_tril @ factor.expected_root(_MOST_LOG_VARIANCE), error_root], dim=-1)
-        return mean, self._with_prior(root, missing, prior_tril)
+        return mean, self._with_prior(root, self.type1(x), prior_tril)
 
-    def _known(self, x: Tensor) -> tuple[Tensor, FactorMoments, Tensor, Tensor]:
-        """Mean, moments of the factor, root of the covariance of the mean's error, and share (n,) of the prior."""
+    def _known(self, x: Tensor) -> tuple[Tensor, FactorMoments, Tensor]:
+        """Mean, moments of the factor, and root of the covariance of the mean's error."""
         prepared = self._prepared()
         mean, error = prepared.mean.at(x)
         # Where the data leave nothing to err about, rounding must not make it negative.
         least = 1e-12 * torch.diag_embed(1e-30 + error.diagonal(dim1=-2, dim2=-1))
         error_root = safe_cholesky(symmetrize(error) + least, name="the covariance of the mean's error")
-        return mean, prepared.covariance.at(x), error_root, self.type1(x)
+        return mean, prepared.covariance.at(x), error_root
 
     def _root_of_demonstrations(self, factor: FactorMoments, error_root: Tensor) -> tuple[Tensor, Tensor]:
         """Root of the expected covariance of correlated samples before its correlations are shrunk, and degrees."""
@@ -214,11 +211,9 @@ class HeteroscedasticModel(Core):
         return _square_root(1.0 - self.type1(x))[:, None, None] * root
 
     def degrees(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
-        """Degrees of freedom of the predictive density; infinite (a normal distribution) where only the prior
-        speaks.
+        """Degrees of freedom of the predictive density, infinite where only the prior speaks.
 
-        A variance known from as many squares has a logarithm whose variance is here the mean of those of the log
-        variances.
+        They are of a variance whose logarithm has the mean of the variances of the log variances.
         """
         variance = self.covariance_process.log_variance_at(x)[1].mean(-1)
         # Of the prior they are infinite: with the share of the data, 1 - missing, going to zero the law becomes normal.
@@ -226,8 +221,8 @@ class HeteroscedasticModel(Core):
 
     def type1(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
         """Type I uncertainty: eq. (6) without noise over the prior variance, 0 at the inducing inputs."""
-        nearness = self._prepared().nearness
-        return nearness.unexplained(nearness(x))[0]
+        process = self._prepared().nearness
+        return process.unexplained(process(x))[0]
 
     def draw(
         self,
@@ -269,42 +264,26 @@ class HeteroscedasticModel(Core):
 
     def _prepare(self, buffers: tuple[Tensor | None, ...], versions: tuple[int, ...]) -> _Prepared:
         # The mean rests on inducing inputs of its own, and is never stretched.
-        inducing, stretch = self.inducing, getattr(self, "stretch", None)
-        own = ((self.mean_inducing, None), (inducing, stretch), (inducing, stretch))
-        mean_family, log_variance_family, coefficient_family = (
-            ProcessFamily(
-                own[i][0],
-                *self.medians[i],
-                getattr(self, f"{name}_length_scale", None),
-                self.kernel,
-                getattr(self, "period", None),
-                self.exact[i],
-                own[i][1],
-            )
-            for i, name in enumerate(_FAMILIES)
-        )
-        processes = mean_family.prepared(self.mean_theta)
+        processes = self._family(0, self.mean_inducing, None).prepared(self.mean_theta)
         mean = LatentMean(self.mean_theta, processes, Weights(self.mean_weights, self.mean_root))
+        stretch = getattr(self, "stretch", None)
         coefficients = [
             Weights(getattr(self, f"coefficient_weights_{i}"), getattr(self, f"coefficient_root_{i}"))
             for i in range(1, len(self.coefficient_theta) + 1)
         ]
         covariance = LatentCovariance(
             self.log_variance_theta,
-            log_variance_family.prepared(self.log_variance_theta),
+            self._family(1, self.inducing, stretch).prepared(self.log_variance_theta),
             Weights(self.log_variance_weights, self.log_variance_root),
             self.coefficient_theta,
-            coefficient_family.prepared(self.coefficient_theta),
+            self._family(2, self.inducing, stretch).prepared(self.coefficient_theta),
             coefficients,
         )
-        # What is missing is told by one process with the length scale of the log variances (their mean, weighted by
-        # squared amplitudes), as far as that does not reach too far: a smooth process without noise claims to know
-        # what is two of its length scales away, in gaps and beyond the data.
-        weight = covariance.log_variances.amplitude.square()
-        scale = ((weight / weight.sum()) @ covariance.log_variances.length_scale.log()).exp()
-        scale = scale.clamp_max(_REACH * inducing.shape[1]).clamp_min(2.0 * spacing(inducing))
-        near = replace(log_variance_family, kernel="squared_exponential", stretch=None, constant=0.0)
-        return _Prepared(buffers, versions, mean, covariance, near.processes(scale[None], torch.ones_like(scale[:1])))
+        return _Prepared(buffers, versions, mean, covariance, nearness(covariance.log_variances))
+
+    def _family(self, i: int, inducing: Tensor, stretch: Tensor | None) -> ProcessFamily:
+        length_scale, period = getattr(self, f"{_FAMILIES[i]}_length_scale", None), getattr(self, "period", None)
+        return ProcessFamily(inducing, *self.medians[i], length_scale, self.kernel, period, self.exact[i], stretch)
 
     def __getstate__(self) -> dict[str, Any]:
         """State for copies and pickle: without what is computed from the buffers."""

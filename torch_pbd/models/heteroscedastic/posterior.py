@@ -16,13 +16,14 @@ demonstrations at independent places.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torch_pbd.gp.observations import spacing
 from torch_pbd.linalg import spectral_map
 from torch_pbd.models.heteroscedastic.processes import Processes
 from torch_pbd.models.heteroscedastic.regression import Weights
@@ -30,6 +31,9 @@ from torch_pbd.models.training import TrainingSet
 
 _CHUNK = 1024  # rows at a time: bounds the memory
 _LEAST_DEGREES = 3.0  # below two, Student's t has no covariance
+# Longest length scale by which distance from the data is judged, in ranges of the input times the number of inputs;
+# but two spacings of the inducing inputs at least.
+_REACH = 0.1
 # Variance of Fisher's z of a correlation that is uniform from -1 to 1.
 _UNIFORM = math.pi**2 / 12.0
 _LEAST_EIGENVALUE = 1e-12  # of correlations: rounding, where outputs are copies of each other
@@ -165,6 +169,19 @@ class LatentCovariance:
             weights = posterior.mean + numbers @ posterior.root.mT
             factor[..., i, :i] = features @ weights.unflatten(-1, (i, -1)).mT
         return factor
+
+
+def nearness(log_variances: Processes) -> Processes:
+    """Process of unit variance without noise that tells how far data are.
+
+    It has the length scale of the log variances (their mean, weighted by squared amplitudes), as far as that does not
+    reach too far: a smooth process claims to know what is two of its length scales away, in gaps and beyond the data.
+    """
+    family, weight = log_variances.family, log_variances.amplitude.square()
+    scale = ((weight / weight.sum()) @ log_variances.length_scale.log()).exp()
+    scale = scale.clamp_max(_REACH * len(scale)).clamp_min(2.0 * spacing(family.inducing))
+    family = replace(family, kernel="squared_exponential", stretch=None, constant=0.0)
+    return family.processes(scale[None], torch.ones_like(scale[:1]))
 
 
 def as_inverse_gamma(variance: Tensor) -> Tensor:
