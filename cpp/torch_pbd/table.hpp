@@ -25,7 +25,7 @@ template <std::size_t N, std::size_t M>
 class ScheduleTable {
 public:
     ScheduleTable(const Schedule& schedule, double mass, double ticks_per_second, Limit pull_limit)
-        : rate(ticks_per_second) {
+        : rate(ticks_per_second), one_mass_(schedule.inertia.empty() ? mass : 0.0) {
         if (schedule.n_outputs != N || schedule.n_positions != n_positions<N, M>)
             throw std::invalid_argument("the schedule has " + std::to_string(schedule.n_positions) + " positions of " +
                                         std::to_string(schedule.n_outputs) + " outputs, must have " +
@@ -96,11 +96,13 @@ public:
 
     /// Force that causes an acceleration.
     Vector<N> forced(const Vector<N>& acceleration, std::size_t row) const {
+        if (one_mass_ > 0.0) return one_mass_ * acceleration;
         return linalg::transposed_product(modes_[row].tells, linalg::product(modes_[row].tells, acceleration));
     }
 
     /// Acceleration that a force causes.
     Vector<N> accelerated(const Vector<N>& force, std::size_t row) const {
+        if (one_mass_ > 0.0) return (1.0 / one_mass_) * force;
         return linalg::transposed_product(modes_[row].shapes, linalg::product(modes_[row].shapes, force));
     }
 
@@ -199,6 +201,7 @@ private:
             modes.shapes[i] = (1.0 / std::sqrt(masses[i])) * main[i];
         }
         const auto per_mass = [&](const Matrix<N>& gain) {
+            if (one_mass_ > 0.0) return (1.0 / one_mass_) * gain;
             const Matrix<N> scaled = product(product(modes.shapes, gain), linalg::transposed(modes.shapes));
             return 0.5 * (scaled + linalg::transposed(scaled));
         };
@@ -228,7 +231,10 @@ private:
         const auto [top, other] = springs_[row];
         if (is_apart_)
             return {scale(top * pull(row, off, kBlocks.front())), scale(other * pull(row, off, kBlocks.back()))};
-        const double whole = scale(std::max(top, other) * pull(row, off, {0, N}));
+        double stretch = 0.0;  // e'K e, which modes tell to more digits
+        const Vector<N> y = linalg::product(modes_[row].tells, off);
+        for (std::size_t i = 0; i < N; ++i) stretch += modes_[row].stiffness[i] * y[i] * y[i];
+        const double whole = scale(std::max(top, other) * (is_shared_ ? stretch : pull(row, off, {0, N})));
         return {whole, whole};
     }
 
@@ -267,6 +273,7 @@ private:
         return std::sqrt(*std::max_element(values.begin(), values.end()));
     }
 
+    double one_mass_;  ///< in all directions, in kg; 0 where the schedule has an inertia
     bool is_shared_ = true, is_apart_ = false;
     std::vector<Limit> springs_;  ///< largest stiffness over squared limit
     std::vector<Modes<N>> modes_;
