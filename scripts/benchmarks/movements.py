@@ -160,16 +160,16 @@ def drawn(joint: tuple[Floats, Floats, float], seed: int) -> Floats:
     return mean + normal.T.reshape(N_DRAWS, *mean.shape)
 
 
-def fold(name: str, left_out: int, n_train: int) -> list[dict[str, Any]]:
-    """All models on one left-out demonstration of one set."""
+def fold(name: str, left_out: int, n_train: int, models: list[str]) -> list[dict[str, Any]]:
+    """Models, the first of them TrajectoryRegressor, on one left-out demonstration of one set."""
     grid, y = load(name)
     train = np.delete(y, left_out, axis=0)
     train = train[np.random.default_rng(left_out).permutation(len(train))[:n_train]]
     n_demos, n, d = train.shape
     X, rows, groups = np.tile(grid, n_demos)[:, None], train.reshape(-1, d), np.repeat(np.arange(n_demos), n)
     at, trajectory, results = grid[:, None], None, []
-    for model, make in MODELS.items():
-        start = time.process_time()
+    for model in models:
+        make, start = MODELS[model], time.process_time()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             if make is not None:
@@ -232,17 +232,18 @@ def made(law: str, kernel: str, length: float, n_demos: int, seed: int) -> list[
 
 def table_of_sets(rows: list[dict[str, Any]]) -> str:
     """Joint log likelihood of each set, paired differences to ProMPBaseline, and errors of what is planned anew."""
+    models = list(dict.fromkeys(row["model"] for row in rows))
     names = list(dict.fromkeys(row["set"] for row in rows))
     values: dict[tuple[str, str], list[float]] = {}
     for row in rows:
         values.setdefault((row["set"], row["model"]), []).append(row["joint"])
-    lines = ["| set | " + " | ".join(MODELS) + " | ahead of ProMPBaseline | planned anew | moving |"]
-    lines.append("|" + " --- |" * (len(MODELS) + 4))
+    lines = ["| set | " + " | ".join(models) + " | ahead of ProMPBaseline | planned anew | moving |"]
+    lines.append("|" + " --- |" * (len(models) + 4))
     ahead = []
     for name in names:
         difference = np.subtract(values[name, "TrajectoryRegressor"], values[name, "ProMPBaseline"])
         error = difference.std(ddof=1) / math.sqrt(len(difference)) if len(difference) > 1 else math.nan
-        means = " | ".join(f"{np.mean(values[name, model]):.0f}" for model in MODELS)
+        means = " | ".join(f"{np.mean(values[name, model]):.0f}" for model in models)
         own = [row for row in rows if (row["set"], row["model"]) == (name, "TrajectoryRegressor")]
         ratios = [np.exp(np.mean([np.log(row[f"{case}_rmse"]) for row in own])) for case in ("replanned", "moving")]
         lines.append(
@@ -251,7 +252,7 @@ def table_of_sets(rows: list[dict[str, Any]]) -> str:
         ahead.append(difference.mean())
     if len(ahead) > 1:
         error = np.std(ahead, ddof=1) / math.sqrt(len(ahead))
-        lines.append(f"| mean of the sets {'| ' * len(MODELS)}| {np.mean(ahead):.0f} +- {error:.0f} | | |")
+        lines.append(f"| mean of the sets {'| ' * len(models)}| {np.mean(ahead):.0f} +- {error:.0f} | | |")
     return "\n".join(lines)
 
 
@@ -283,7 +284,7 @@ def table_of_models(rows: list[dict[str, Any]]) -> str:
     columns = [key for key in rows[0] if key not in left_out and not key.startswith("moving")]
     lines = ["| model | " + " | ".join(column.replace("_", " ") for column in columns) + " |"]
     lines.append("|" + " --- |" * (len(columns) + 1))
-    for model in MODELS:
+    for model in dict.fromkeys(row["model"] for row in rows):
         entries = []
         for column in columns:
             each = [
@@ -326,6 +327,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--output", type=Path, default=Path("runs/movements"))
     parser.add_argument("--sets", nargs="*", default=SETS)
+    parser.add_argument("--models", nargs="*", default=list(MODELS), choices=list(MODELS))
     parser.add_argument("--folds", type=int, default=N_FOLDS)
     parser.add_argument("--n_train", type=int, default=MOST_TRAINED, help="demonstrations learned from, at most")
     parser.add_argument("--seeds", type=int, default=4, help="of made data; 0 leaves them out")
@@ -333,7 +335,7 @@ def main() -> None:
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
     jobs = [
-        delayed(fold)(name, left_out, options.n_train)
+        delayed(fold)(name, left_out, options.n_train, [model for model in MODELS if model in options.models])
         for name in options.sets
         for left_out in range(min(options.folds, len(load(name)[1])))
     ]
