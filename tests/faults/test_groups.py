@@ -11,7 +11,13 @@ from sklearn.model_selection import GridSearchCV, GroupKFold
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
-from torch_pbd import CholeskyCovRegressor, GMMBaseline, HeteroscedasticGPRegressor, WishartProcessRegressor
+from torch_pbd import (
+    CholeskyCovRegressor,
+    GMMBaseline,
+    HeteroscedasticGPRegressor,
+    WishartProcessRegressor,
+    load_demonstrations,
+)
 from torch_pbd.exceptions import DataRankWarning
 
 REGRESSORS = {
@@ -111,6 +117,18 @@ def test_82_regions_of_three_demonstrations_of_six_outputs_hold_what_they_say():
     (half, most), (half_before, most_before) = np.mean(held, axis=0), np.mean(before, axis=0)
     assert half > 0.42 > half_before
     assert 0.98 > most > 0.93 > most_before
+
+
+def test_82_joints_that_move_together_are_not_taken_for_apart(recordings):
+    """Twelve joints of a hand: shrunk as two outputs are, what six demonstrations show of them lost a nat a step."""
+    hand = load_demonstrations(recordings / "adroit_door_joints.npz").align(n=50).to_array()[..., ::2][..., :12]
+    X, groups = np.tile(np.linspace(0.0, 1.0, 50), 6)[:, np.newaxis], np.repeat(np.arange(6), 50)
+    with pytest.warns(DataRankWarning):
+        model = HeteroscedasticGPRegressor().fit(X, hand[:6].reshape(-1, 12), groups=groups)
+    apart = copy.deepcopy(model)
+    apart.module_.core._buffers.pop("correlation_error")
+    rows = np.tile(X[:50], (19, 1)), hand[6:].reshape(-1, 12)
+    assert model.score(*rows) > apart.score(*rows) + 0.5
 
 
 def test_82_the_law_of_few_demonstrations_is_one():

@@ -21,7 +21,7 @@ from torch_pbd.models.heteroscedastic.posterior import (
     LatentMean,
     as_inverse_gamma,
     degrees_of_freedom,
-    log_correlation_variance,
+    log_correlation_moments,
     nearness,
     shrink_correlation,
     under_expected_noise,
@@ -69,6 +69,7 @@ class HeteroscedasticModel(Core):
     coefficient_theta: Tensor
     pooled_tril: Tensor
     prior_tril: Tensor
+    correlation_error: Tensor
     correlation_variance: Tensor
     _kept: _Prepared | None = None
 
@@ -105,7 +106,9 @@ class HeteroscedasticModel(Core):
         if fit.correlation is not None and fit.correlation.matters:
             n_places = float(fit.correlation.share.mean()) * len(fit.training.x) / fit.n_demos
             root, degrees = self._root_of_demonstrations(*self._known(fit.training.inputs)[1:])
-            self.register_buffer("correlation_variance", log_correlation_variance(root, degrees, n_places))
+            moments = log_correlation_moments(root, degrees, n_places, fit.n_demos)
+            for name, moment in zip(("correlation_error", "correlation_variance"), moments, strict=True):
+                self.register_buffer(name, moment)
 
     def config(self) -> dict[str, Any]:
         """Kernel, and what the three families of processes are but for their length scales."""
@@ -144,7 +147,7 @@ class HeteroscedasticModel(Core):
         for i in range(1, d):
             sizes |= {f"coefficient_weights_{i}": (i * in_row,), f"coefficient_root_{i}": (i * in_row, i * in_row)}
         optional: dict[str, tuple[int, ...]] = {f"{name}_length_scale": (e,) for name in _FAMILIES}
-        optional |= {"period": (e,), "stretch": (2, 2), "correlation_variance": ()}
+        optional |= {"period": (e,), "stretch": (2, 2), "correlation_error": (d, d), "correlation_variance": ()}
         model = cls.__new__(cls)
         nn.Module.__init__(model)
         for name, size in (sizes | {name: size for name, size in optional.items() if name in shapes}).items():
@@ -192,7 +195,8 @@ class HeteroscedasticModel(Core):
         """Root, or draws around it, with correlations shrunk where samples of demonstrations are correlated."""
         if not hasattr(self, "correlation_variance"):
             return root if draws is None else draws
-        return shrink_correlation(root, degrees, self.correlation_variance, draws)
+        error = getattr(self, "correlation_error", None)
+        return shrink_correlation(root, degrees, error, self.correlation_variance, draws)
 
     def _with_prior(self, root: Tensor, missing: Tensor, prior_tril: Tensor | None) -> Tensor:
         """Root of a covariance and of the prior, each with its share."""

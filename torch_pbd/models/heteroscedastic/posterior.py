@@ -11,7 +11,7 @@ demonstrations at independent places.
 - The correlations R have the logarithm G = log R, which is for two outputs Fisher's z of their correlation. Entries of
   an estimate of G err by 1 / n whatever R is (Archakov and Hansen, "A new parametrization of correlation matrices",
   Econometrica 89, 2021). With the prior N(0, tau^2) of the entries, G is expected to be ``tau^2 / (tau^2 + 1 / n)``
-  times its estimate. The recordings themselves tell tau^2.
+  times its estimate. The recordings themselves tell tau^2. Of many outputs the fit has shrunk them already.
 """
 
 import math
@@ -209,38 +209,54 @@ def under_expected_noise(
     return scale.sqrt() * solved.mT
 
 
-def log_correlation_variance(
-    root: Float[Tensor, "n d r"], degrees: Float[Tensor, " n"], n_places: float
-) -> Float[Tensor, ""]:
-    """Variance tau^2 of the logarithms of correlations, by moments: their mean square less that of their errors.
+def log_correlation_moments(
+    root: Float[Tensor, "n d r"], degrees: Float[Tensor, " n"], n_places: float, n_demos: int
+) -> tuple[Float[Tensor, "d d"], Float[Tensor, ""]]:
+    """What of the mean logarithm of correlations is taken for error, and the variance tau^2 of all logarithms.
 
-    Of as many numbers as there are pairs of outputs and ``n_places`` independent places along a demonstration, and of
-    one more, as of two outputs whose correlation may be anything.
+    By moments: the mean square less that of the errors, of as many numbers as there are pairs of outputs and
+    ``n_places`` independent places along a demonstration, and of one more, as of two outputs whose correlation may be
+    anything. The mean is over these places, and errs as much less.
     """
     logarithm, _ = _log_correlation(root)
     i, j = torch.tril_indices(*logarithm.shape[1:], offset=-1, device=root.device)
-    number = n_places * len(i)
-    square = logarithm[:, i, j].square().mean() if len(i) else root.new_zeros(())
-    excess = square - (1.0 / degrees).mean()
-    return ((number * excess + _UNIFORM) / (number + 1.0)).clamp_min(0.0)
+    mean = logarithm.mean(0)
+
+    def variance(square: Tensor, error: Tensor | float, number: float) -> Tensor:
+        excess = square.mean() - error if square.numel() else square.new_zeros(())
+        return ((number * excess + _UNIFORM) / (number + 1.0)).clamp_min(0.0)
+
+    error = 1.0 / ((n_demos - 1) * max(n_places, 1.0))
+    share = error / (variance(mean[i, j].square(), error, len(i)) + error)
+    whole = variance(logarithm[:, i, j].square(), (1.0 / degrees).mean(), n_places * len(i))
+    return share * mean, whole
 
 
 def shrink_correlation(
     root: Float[Tensor, "n d r"],
     degrees: Float[Tensor, " n"],
+    error: Float[Tensor, "d d"] | None,
     variance: Float[Tensor, ""],
     draws: Float[Tensor, "*s n d d"] | None = None,
 ) -> Float[Tensor, "*s n d d"]:
     """Roots with the correlations expected of a prior of this variance, the deviations as they are.
 
+    The coefficients of an output have been shrunk by the fit, to an amplitude that is learned from all of them: of
+    one, which tells little of it, the prior acts in full; the more there are, the more only the ``error`` of the mean
+    along a demonstration is taken off, which the fit does not see. A file of before that has none.
+
     Of ``draws`` from the posterior without that prior, around this root, draws from the posterior with it.
     """
     logarithm, deviation = _log_correlation(root)
-    total = (variance + 1.0 / degrees)[:, None, None]
-    shrunk = variance / total * logarithm
+    weight = (variance / (variance + 1.0 / degrees))[:, None, None]
+    shrunk = weight * logarithm
+    if error is not None:
+        more = max(0.5 * len(error) - 1.0, 0.0)  # coefficients of an output beyond the first, in the mean
+        shrunk = (shrunk + more * (logarithm - error)) / (1.0 + more)
+        weight = (weight + more) / (1.0 + more)
     if draws is not None:
         drawn, deviation = _log_correlation(draws)
-        shrunk = shrunk + variance.sqrt() * total.rsqrt() * (drawn - logarithm)
+        shrunk = shrunk + weight.sqrt() * (drawn - logarithm)
     half = spectral_map(0.5 * shrunk, torch.exp)
     return deviation / half.norm(dim=-1, keepdim=True) * half
 
