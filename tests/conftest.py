@@ -9,12 +9,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small: th
 import shapes
 
 TORCH_CONTROL = [
-    "damping", "matrices", "stiffness", "primitive.dmp", "stability.certify",
-    *(f"stability.{part}" for part in ("common_function", "dynamics", "environment", "gain", "lyapunov")),
-    *(f"simulation.{part}" for part in (
-        "walls", "filters", "plant", "sensor", "rollout", "rollouts", "position_loop", "ticks")),
+    "matrices", "stiffness", "primitive.dmp", "stability.certify",
+    *(f"stability.{part}" for part in ("common_function", "dynamics", "lyapunov")),
+    *(f"simulation.{part}" for part in ("walls", "plant", "sensor", "rollout", "rollouts", "ticks")),
 ]  # fmt: skip
-TORCH_MOVEMENT = [f"movement.{part}" for part in ("joint", "conditioning", "time_kernel", "timing")]
+TORCH_MOVEMENT = [f"movement.{part}" for part in ("joint", "time_kernel", "time_kernel_fit", "timing")]
 TORCH_FLOORS = [
     "linalg",
     "kernels",

@@ -8,6 +8,7 @@ import math
 from collections import Counter
 from dataclasses import is_dataclass
 from functools import partial, wraps
+from pathlib import Path
 
 import jaxtyping
 
@@ -19,6 +20,9 @@ _jaxtyped = jaxtyping.jaxtyped
 
 def install(modules):
     """Check these modules, which are not imported yet."""
+    files = [Path(__file__).parents[1] / module.replace(".", "/") for module in modules]
+    missing = [file for file in files if not file.is_dir() and not file.with_suffix(".py").is_file()]
+    assert not missing, f"modules whose shapes are checked are not there: {missing}"
     jaxtyping.jaxtyped = _first_calls_checked  # what the hook decorates with
     jaxtyping.install_import_hook(modules, "beartype.beartype")
 

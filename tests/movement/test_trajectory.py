@@ -22,8 +22,8 @@ from torch_pbd import (
     load_demonstrations,
 )
 from torch_pbd.kernels import correlation
-from torch_pbd.movement import time_kernel
-from torch_pbd.movement.time_kernel import fit_time_kernel
+from torch_pbd.movement import time_kernel_fit
+from torch_pbd.movement.time_kernel_fit import fit_time_kernel
 
 GRID = np.linspace(0.0, 1.0, 30)
 
@@ -92,9 +92,9 @@ def test_the_law_is_that_of_the_dense_reference(recordings, monkeypatch):
     moments = regressor.predict(X, return_cov=True)
     mean, covariance, df, found = oracle.joint(GRID, demos, *moments, regressor.predict_df(X))
     # It has its own smallest nugget, and chooses the shrinkage as if that left the marginals what they are.
-    monkeypatch.setattr(time_kernel, "_LEAST", min(oracle.NUGGETS))
-    monkeypatch.setattr(time_kernel, "_NUGGETS", oracle.NUGGETS)
-    monkeypatch.setattr(time_kernel, "_RATIOS", ())  # and one length scale
+    monkeypatch.setattr(time_kernel_fit, "_LEAST", min(oracle.NUGGETS))
+    monkeypatch.setattr(time_kernel_fit, "_NUGGETS", oracle.NUGGETS)
+    monkeypatch.setattr(time_kernel_fit, "_RATIOS", ())  # and one length scale
     own = TrajectoryRegressor(time_kernel="matern52", shrinkage=1.0 - found["weight"]).fit(X_fit, y, groups=groups)
     assert own.length_scale_ == pytest.approx(found["length"])
     assert own.df_ == max(3.0, 0.5 * df)
@@ -202,7 +202,7 @@ def test_a_movement_that_was_seen_halfway_is_foretold(recordings):
 
 
 def test_steps_that_a_recording_has_not_are_left_out_of_it_not_drawn_through(monkeypatch):
-    monkeypatch.setattr(time_kernel, "_RATIOS", ())  # without tremble
+    monkeypatch.setattr(time_kernel_fit, "_RATIOS", ())  # without tremble
     demos = movements(8)
     time = [GRID] * 7 + [np.delete(GRID, slice(8, 20))]
     hole = [*demos[:7], np.delete(demos[7], slice(8, 20), axis=0)]
@@ -225,7 +225,7 @@ def test_nuggets_take_missing_steps_for_missing():
 
 
 def test_the_length_scale_that_made_the_movements_is_found(monkeypatch):
-    monkeypatch.setattr(time_kernel, "_RATIOS", ())  # without tremble
+    monkeypatch.setattr(time_kernel_fit, "_RATIOS", ())  # without tremble
     found = found_kernel(sample_series("squared_exponential", 0.2, n_demos=30), "squared_exponential")
     assert found.scales[:, 0].tolist() == pytest.approx([0.2, 0.2], rel=0.2)
 

@@ -19,7 +19,8 @@ from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import safe_cholesky
 from torch_pbd.movement.joint import JointNormal
 from torch_pbd.movement.law import Recording, as_rows, check_arrays
-from torch_pbd.movement.time_kernel import TimeKernel, fit_time_kernel
+from torch_pbd.movement.time_kernel import TimeKernel
+from torch_pbd.movement.time_kernel_fit import fit_time_kernel
 from torch_pbd.movement.timed import TimedMovement, n_grid_steps, sampled
 
 _FEWEST_DF, _MOST_DF = 3.0, 200.0  # of the joint law: a variance must exist, and beyond it is normal to all purposes
