@@ -1,4 +1,4 @@
-"""Learn how precise people are from demonstrations: covariance that depends on the input."""
+"""Learning input-dependent covariance, how precise people are at each point, from demonstrations."""
 
 from importlib import import_module
 from pkgutil import iter_modules

@@ -1,4 +1,4 @@
-"""Predictions of the covariance regressors; and priors and other parameters in the units of the data."""
+"""Predictions of the covariance regressors, and their priors and other parameters in the units of the data."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ from torch_pbd.linalg import gaussian_log_density, safe_cholesky, student_log_de
 
 Prior = float | list[list[float]] | str | Callable[[Any], Any] | None  # what YAML can say; or any array-like
 
-_SHORTEST_PERIOD = 1e-8  # of the range: standardized inputs have ten decimals, and so this phase two
+_SHORTEST_PERIOD = 1e-8  # share of the input's range: ten decimals of a standardized input leave such a phase two
 # Shares of the variance of y beyond which the floor under variances shows far from data, or the prior near them.
 _LOWEST, _HIGHEST = 1e-6, 1e6
 _CHUNK = 1024  # rows: what a prediction needs on the way is then some tens of MB for ten outputs
@@ -45,8 +45,8 @@ class CovarianceRegressor(TorchEstimator):
         return_std : bool, default=False
             Also return the standard deviation of each output, shaped like the mean.
         return_cov : bool, default=False
-            Also return the covariances of the outputs (n_samples, n_outputs, n_outputs). Not those between
-            rows, which ``return_cov`` of scikit-learn's GaussianProcessRegressor are.
+            Also return the covariance of the outputs in each row (n_samples, n_outputs, n_outputs), unlike
+            scikit-learn's GaussianProcessRegressor, whose ``return_cov`` gives the covariances between rows.
 
         Returns
         -------
@@ -65,13 +65,13 @@ class CovarianceRegressor(TorchEstimator):
     def predict_cov(self, X: ArrayLike) -> Floats:
         """Covariances of the outputs at X: (n_samples, n_outputs, n_outputs), also for one output.
 
-        Symmetric to the last bit, positive definite, in squared units of y.
+        They are symmetric to the last bit, positive definite, and in squared units of y.
         """
         inputs = checked_queries(self, X)
         return self._arrays(lambda x: (self.module_.covariance(x, *self._prior_tril_at(x)),), inputs)[0]
 
     def predict_uncertainty(self, X: ArrayLike) -> Uncertainty:
-        """Both kinds of uncertainty at X, apart (Section IV-C)."""
+        """Missing data (``type1``) and variability (``type2``) at X, separately (Section IV-C)."""
         inputs = checked_queries(self, X)
         return Uncertainty(*self._arrays(lambda x: (self.module_.type1(x), self.module_.type2(x)), inputs))
 
@@ -100,14 +100,14 @@ class CovarianceRegressor(TorchEstimator):
     def score(self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None) -> float:
         """Mean log density of the rows of y at X, in nats: higher is better.
 
-        R^2, which scikit-learn's regressors score, does not see the covariance.
+        The R^2 score of scikit-learn's regressors ignores the covariance.
 
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
         sample_weight : array-like of shape (n_samples,), default=None
-            Weights of the rows in the mean. A pipeline asks for them where metadata are routed.
+            Weights of the rows in the mean; accepted through scikit-learn's metadata routing.
         """
         densities = self.log_likelihood(X, y)
         if sample_weight is None:

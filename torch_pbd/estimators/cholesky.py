@@ -13,40 +13,40 @@ from torch_pbd.models.links import CholeskyLink
 from torch_pbd.models.training import empirical_tril, mean_over_geometric, pooled_tril, residual_tril
 from torch_pbd.optim import FitReport
 
-# Logarithms of the empirical diagonal are taken of no less than this of its root mean square over the inputs: an exact
-# zero at one input, as where all recordings start at the origin, would else dominate its neighbours. With a thousandth
-# the smoothed entries beside it err by more than is left, and the snooker players lose 58 nats at their first step.
+# The empirical diagonal is clamped to this share of its root mean square over the inputs before its logarithm is taken:
+# an exact zero at one input, as where all recordings start at the origin, would dominate its neighbours. With 1e-3 the
+# smoothed entries beside it err by more than their own size, and the snooker players lose 58 nats at their first step.
 _LEAST_DIAGONAL = 1e-2
-_LARGEST_NOISE = 1e100  # in deviations of y: its square is a number
+_LARGEST_NOISE = 1e100  # in standard deviations of y: float64 still holds its square
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class CholeskyCovRegressor(LatentCovarianceRegressor):
     """Covariance by Gaussian processes on the entries of its Cholesky factor (the paper's "CD").
 
-    The mean of y is learned by one Gaussian process an output, the lower Cholesky factor of its covariance
-    by one an entry; far from data they return to the mean of y and to ``prior``.
+    One Gaussian process per output learns the mean of y, and one per entry the lower Cholesky factor of its
+    covariance; far from data they return to the mean of y and to ``prior``.
 
     Parameters
     ----------
     objective : {"auto", "empirical", "likelihood"}, default="auto"
-        "empirical": processes through the factors of the empirical covariances (aligned data: every row of
-        X at least twice), hyperparameters by marginal likelihood. "likelihood": eq. (12), the factor at the
-        inputs by L-BFGS, for data anywhere. "auto" takes the first where every input repeats.
+        "empirical" fits the processes to the Cholesky factors of the empirical covariances, with hyperparameters by
+        marginal likelihood; it needs aligned data, every row of X at least twice. "likelihood" optimizes the factor at
+        the inputs by L-BFGS, eq. (12), for any data. "auto" takes "empirical" where every input repeats.
     noise_scale : float or None, default=None
-        Standard deviation, in units of y, of the error of the entries of the empirical factors; None learns
-        it, 0.0 interpolates them, which is what Table I of the paper does. Only for "empirical".
+        Standard deviation of the error of the empirical factors' entries, in units of y; None learns it, and
+        0.0 interpolates them, as Table I of the paper does. Only for "empirical".
     diagonal : {"auto", "raw", "log"}, default="auto"
-        Whether the processes of the diagonal entries act on the entries themselves, as in the paper, or on
-        their logarithm, which keeps them from crossing zero between inputs. "auto" takes "raw" where a
-        ``noise_scale``, which is of entries, is given for "empirical", and else "log".
+        Whether the processes of the diagonal entries model the entries themselves, as in the paper, or their
+        logarithms, which cannot cross zero between inputs. "auto" takes "raw" where ``noise_scale`` is given
+        for "empirical", since it is the error of the entries themselves, and "log" otherwise.
     bias_correction : bool, default=False
-        Divide the empirical factors by their expectation for normal data (Bartlett), which few
-        demonstrations make too small: six of two outputs by 5 and 16 %. Only for "empirical".
+        Divide the empirical factors by their expected share of the true ones for normal data (Bartlett). With few
+        demonstrations they are too small: by 5 and 16 % for six of two outputs. Only for "empirical".
     {shared}
     loss_ : float
-        "empirical": negative log marginal likelihood of the factors' entries, in nats. "likelihood": negative
-        log posterior density (or likelihood) of the latent values, in nats per row. Both of standardized y.
+        Negative log marginal likelihood of the factors' entries, in nats, for "empirical"; negative log posterior
+        density (or likelihood) of the latent values, in nats per row, for "likelihood". Both for standardized y.
 
     References
     ----------
@@ -84,11 +84,11 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
         if link.log_diagonal:
             diagonal = scale_tril.diagonal(dim1=-2, dim2=-1)
             diagonal = diagonal.maximum(_LEAST_DIAGONAL * diagonal.square().mean(0).sqrt())
-            # Smoothed logarithms give the geometric mean of the entries, which for chi numbers is below their mean by a
-            # factor that is known.
+            # Smoothed logarithms give the geometric mean of the entries, which for chi-distributed numbers is below
+            # their mean by a known factor.
             diagonal = diagonal * mean_over_geometric(training) if smoothed else diagonal
             linked = scale_tril.tril(-1) + torch.diag_embed(diagonal)
-        # An entry of the factor of K rows has an error whose variance falls with K - 1.
+        # The error of an entry of the factor from K rows has a variance proportional to 1 / (K - 1).
         degrees = training.counts - 1.0
         targets = link.deviation(linked).mT.contiguous()
         observations = Observations(training.inputs, targets, degrees / degrees.mean())

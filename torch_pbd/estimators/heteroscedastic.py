@@ -1,4 +1,4 @@
-"""The recommended regressor: covariance by latent Gaussian processes that are integrated out."""
+"""The recommended regressor: covariance from latent Gaussian processes that are integrated out."""
 
 from dataclasses import dataclass
 from typing import Any, Literal, Self
@@ -26,53 +26,53 @@ from torch_pbd.models.heteroscedastic import (
 )
 from torch_pbd.models.training import TrainingSet, default_prior_tril
 
-_DRAWN = 65536  # matrices drawn at a time: memory stays bounded
+_DRAWN = 65536  # covariance matrices drawn at a time, to bound memory
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class HeteroscedasticGPRegressor(CovarianceRegressor):
-    """Mean and covariance by Gaussian processes, honest about what few demonstrations leave open.
+    """Mean and covariance by Gaussian processes, with the estimation error that few demonstrations leave.
 
-    The covariance has a lower factor whose diagonal entries are exponentials of Gaussian processes of the input, and
-    whose other entries are such processes; the mean is d more. Their values are integrated out; their length scales
-    and amplitudes maximize the evidence. The mean is refitted under the covariance learned, by generalized least
+    The covariance has a lower factor whose diagonal entries are exponentials of Gaussian processes of the input and
+    whose other entries are Gaussian processes; d more model the mean. Their values are integrated out; their length
+    scales and amplitudes maximize the evidence. The mean is refitted under the learned covariance by generalized least
     squares.
 
-    What is predicted is Student's t. Its covariance contains the variability, the error of its estimate and
-    that of the mean, and far from data it is ``prior``.
+    The prediction is a Student's t. Its covariance contains the variability, the error of its estimate and
+    that of the mean; far from data it is ``prior``.
 
     Parameters
     ----------
     kernel : {"squared_exponential", "matern32", "matern52", "periodic"}, default="squared_exponential"
         Kernel of all processes; "periodic" is the squared exponential of the chord on a circle.
     period : float or array-like of shape (n_features,), default=None
-        Circumference of that circle in units of X, such as 1.0 for a phase; ``inf`` for inputs that do not
-        repeat. Needed for "periodic", and allowed with the other kernels.
+        Period of each input in units of X, such as 1.0 for a phase; ``inf`` for inputs that do not repeat. Required
+        for "periodic" and allowed with the other kernels.
     prior : None, float, array-like of shape (d, d) or callable, default=None
-        Covariance far from data, in squared units of y. A float stands for that times the unit matrix; a
-        callable maps X (n, e) to (n, d, d). None learns a wide one: four times the covariance of all of y.
+        Covariance far from data, in squared units of y. A float multiplies the identity matrix; a callable
+        maps X (n, e) to (n, d, d). None takes a wide one: four times the covariance of all of y.
     length_scale : float, array-like of shape (n_features,) or None, default=None
         Length scale of the covariance's processes, in units of X; None learns it.
     n_inducing : int or None, default=None
-        Inputs on which the processes rest. None takes all distinct inputs up to 48 and of more the centres of as
-        many neighbourhoods; if the length scales that are found come near their distances, 128; at once for
-        several columns of X. All outputs together have at most 400 (the mean 800). A mean that does not follow the
-        data on these gets as many as its length scales need, 2048 for all outputs at most.
+        Number of inducing inputs of the processes. None takes all distinct inputs up to 48, and the centres of 48
+        clusters if there are more; 128 if the learned length scales come near the clusters' distances, or X has
+        several columns. All outputs together have at most 400 (the mean 800). A mean that does not follow the data
+        with these gets as many as its length scales need, at most 2048 for all outputs.
     max_inputs : int, default=512
-        Where X has more distinct rows, neighbours are merged into this many; into fewer where samples of a
-        demonstration turn out correlated, so that each input has rows of about all demonstrations. A mean that
-        does not follow the data on these is fitted at up to 16384 / d of the distinct rows, and its length scales are
-        looked for with 1024: about 170 cycles over the range.
+        Largest number of distinct rows of X; if there are more, neighbours are merged. They are merged into fewer
+        where samples of a demonstration are correlated, so that each input has rows of nearly all demonstrations. A
+        mean that does not follow the data at these is fitted at up to 16384 / d of the distinct rows, with length
+        scales searched on 1024 of them, which resolve about 170 cycles over the range.
     max_iter : int, default=100
-        Largest number of BFGS iterations of a search for hyperparameters.
+        Largest number of BFGS iterations in each hyperparameter search.
     tol : float, default=1e-3
-        Stop such a search when no gradient entry is above it, or a step promises less than a hundredth of it, in nats.
+        Stop a search when no gradient entry exceeds it, or a step promises a gain below a hundredth of it, in nats.
     n_restarts : int, default=0
-        Starts of the first searches beside the best of a small grid.
+        Extra starts of the first searches, besides the best point of a small grid.
     random_state : int, RandomState instance or None, default=0
-        Not used: the fit is deterministic. It is here so that estimators can be exchanged.
+        Not used, since the fit is deterministic; present so that estimators are interchangeable.
     device : str or None, default=None
-        Where the torch module lives.
+        Device of the torch module.
     verbose : int, default=0
 
     Attributes
@@ -80,35 +80,35 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
     module_ : ConditionalNormal
         The fitted torch module: maps x (n, e) to mean (n, d) and Cholesky factor (n, d, d), differentiably.
     effective_share_ : float
-        Independent samples that a sample of a demonstration counts for, mean of the outputs; 1.0 without ``groups``.
+        Effective number of independent samples per recorded sample, averaged over outputs; 1.0 without ``groups``.
     n_features_in_, n_outputs_ : int
     loss_ : float
-        Negative log evidence of the covariance's processes at the end, in nats, but for a constant.
+        Final negative log evidence of the covariance's processes, in nats, up to a constant.
     loss_curve_ : list of float
-        ``loss_`` after each turn of mean and covariance, of the residuals from that turn's mean.
+        ``loss_`` after each alternation of mean and covariance, for the residuals from the mean of that alternation.
     n_iter_ : int
-        Largest number of iterations of a search.
+        Largest number of iterations of any search.
     converged_ : bool
     jitter_ : float
         Jitter of the kernel matrices, relative to their diagonal.
 
     Notes
     -----
-    Rows that repeat an input enter as count, mean and scatter: after that the cost of a fit is in the number n
-    of distinct inputs (at most ``max_inputs``), outputs d, and inducing inputs m, of which smooth processes take only
-    the r that carry something: n d (d r)^2 + d (d r)^3 for each evaluation of the evidence, and once a turn with m
-    instead of r. As d m is bounded by default, it grows linearly with many outputs.
+    Rows that repeat an input enter as count, mean and scatter, so the cost of a fit depends on the number n of
+    distinct inputs (at most ``max_inputs``), the number d of outputs and the number m of inducing inputs, of which
+    smooth processes use an effective rank r: n d (d r)^2 + d (d r)^3 per evaluation of the evidence, and once per
+    alternation with m instead of r. As d m is bounded by default, the cost grows linearly with many outputs.
 
-    Where demonstrations start or end at one point, and the evidence says so, the input of the covariance's processes
-    is stretched there: their length scale is then short next to that end alone. With one column of X, and unless
-    ``length_scale`` or ``period`` is given.
+    Where demonstrations start or end at one point, and the evidence favours it, the input of the covariance's
+    processes is stretched there, so that their length scale is short only near that end. This needs a single column
+    of X, and neither ``length_scale`` nor ``period``.
 
-    With ``groups`` the correlation of a demonstration's residuals is estimated and enters the likelihood, as its
-    neighbouring samples are nearly copies. It is taken for exponential, with the integral of the one estimated:
-    demonstrations are smoother than that, but a model that trusts their smoothness takes it for signal. The law then
-    has the mean's error, of the same unknown covariance, in its tails, and correlations shrunk by their own errors.
+    With ``groups`` the correlation of a demonstration's residuals is estimated and enters the likelihood, since
+    neighbouring samples are nearly copies. An exponential correlation of the same integral stands for the estimated
+    one: demonstrations are smoother, but a model that trusts their smoothness takes it for signal. The tails of the
+    predictive law then include the mean's error, and correlations are shrunk by their own errors.
 
-    The fit depends on the order of the outputs, as its factor does: with six demonstrations a variance by up to 20 %.
+    The fit depends on the order of the outputs, as its factor does: by up to 20 % of a variance with six demonstrations.
 
     References
     ----------
@@ -151,10 +151,10 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         X : array-like of shape (n_samples, n_features)
             Time, phase or position of each sample.
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
-            What was recorded there.
+            Recorded outputs of each sample.
         groups : array-like of shape (n_samples,), default=None
-            Demonstration of each sample; without it rows count as independent, and recorded demonstrations look more
-            certain than they are.
+            Label of each sample's demonstration; without it rows count as independent, and recorded demonstrations
+            look more certain than they are.
 
         Returns
         -------
@@ -163,15 +163,15 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         Raises
         ------
         ValueError
-            If X, y, groups or a parameter cannot be used; the message names it and says what to do.
+            If X, y, groups or a parameter is invalid; the message names it and the remedy.
 
         Warns
         -----
         UnimodalityWarning
-            If demonstrations (of one input) seem to follow several ways.
+            If demonstrations over one input seem to have several modes.
         DataRankWarning
-            If there are no more demonstrations than outputs. If no groups are given and rows nearly repeat those beside
-            them, as samples of a demonstration do: in the order of their recording, or repeating inputs in any order.
+            If there are no more demonstrations than outputs, or no groups are given although neighbouring rows are
+            nearly equal, as samples of a demonstration are, in recorded order or at repeated inputs in any order.
         UserWarning
             If the mean does not follow the data.
         """
@@ -184,16 +184,16 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         ----------
         X : array-like of shape (n_samples, n_features)
         missing_knowledge : bool, default=True
-            False gives the variability alone, type2 of :meth:`predict_uncertainty`: without the prior and the errors
-            of mean and covariance.
+            False gives the variability alone, ``type2`` of :meth:`predict_uncertainty`, without the prior and the
+            errors of mean and covariance.
         """
         return super().predict_cov(X) if missing_knowledge else self.predict_uncertainty(X).type2
 
     def sample_cov(self, X: ArrayLike, n_samples: int = 1, random_state: Any = None) -> Floats:
-        """Draw covariance functions from their posterior, at X.
+        """Draw covariance functions from their posterior and evaluate them at X.
 
-        A draw is one function: its values at different inputs belong together. The spread of the draws is what few
-        demonstrations leave open; where data are missing each draw is the prior, which is one matrix.
+        Each draw is one function, so that its values at different inputs belong together. The spread of the draws is
+        the uncertainty of the covariance; where data are missing every draw equals the prior, a single matrix.
 
         Parameters
         ----------
@@ -240,7 +240,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         prior_tril = self._prior_tril(X, training, scaling)
         warn_if_few(len(y), y.shape[1])
         warn_if_identical(training)
-        # A mean that does not follow the data at the merged inputs begins again, from all rows.
+        # A mean that does not follow the data at the merged inputs is fitted anew, from all rows.
         rows, training = training, training.merged(self.max_inputs)
         group = None if groups is None else self._door(groups).long()
         options = SearchOptions(self.max_iter, self.tol, self.n_restarts, self._progress())

@@ -1,4 +1,4 @@
-"""Base of the two regressors on latent Gaussian processes (CD and WP), and the mean that both have."""
+"""Base of the two regressors on latent Gaussian processes (CD and WP), and the mean that both share."""
 
 import inspect
 from abc import abstractmethod
@@ -39,16 +39,16 @@ from torch_pbd.models.links import Link
 from torch_pbd.models.training import TrainingSet, default_prior_tril
 from torch_pbd.optim import FitReport
 
-# An amplitude of so many times the values: where a process can follow them it is up to 2.
+# A process is stretched if its amplitude exceeds its values by this factor; where it can follow them it is up to 2.
 _STRETCHED = 10.0
-# Spacings of the inputs that an interpolating process may be as short as, and ranges that a mean may be as long as.
+# Shortest length scale of an interpolating process in spacings of the inputs, and longest of a mean in their ranges.
 _SHORTEST, _LONGEST_MEAN = 0.75, 10.0
 
-_LEVEL = 1e-4  # of the tests: how often a mean that is right is taken for wrong
-_CLEAR = 5.0  # standard errors of the means, however few rows tell them: of twice two the test would allow for 100
-_LEAST_SPREAD = 0.03  # of the pooled one: how small that at an input is believed to be
-_UNRESOLVED = 1e-10  # squared, of standardized outputs: what a smooth process may be off by in any case
-_SHARE, _LEAST_NOISE = 0.1, 1e-6  # of the smallest error of a mean, and of the outputs' deviation
+_LEVEL = 1e-4  # significance level of the lack-of-fit tests: how often a right mean is rejected
+_CLEAR = 5.0  # standard errors that always reject a mean: with two rows at two inputs the t test would allow 100
+_LEAST_SPREAD = 0.03  # smallest credible spread at one input, as a share of the pooled spread
+_UNRESOLVED = 1e-10  # squared error in standardized outputs that a smooth process may always have
+_SHARE, _LEAST_NOISE = 0.1, 1e-6  # noise of a mean: share of its smallest error, and least share of the outputs' scale
 
 _SHARED = """latent_prior : bool, default=True
     Only for "likelihood". True maximizes the posterior density of the processes at the inputs, with hyperparameters
@@ -153,7 +153,7 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         aligned = self._works_on_empirical(_in_units(training, scaling), counts, y.shape[1])
         length_scale = check_length_scale(self.length_scale, X.shape[1])
         if not aligned:
-            # Those that repeat inputs have been counted.
+            # Where every input repeats, its rows have been counted already.
             warn_if_few(len(y), y.shape[1], groups if counts.min() < 2 else None)
             training = training.merged(self.max_inputs)
         held = None if length_scale is None else self._door(length_scale / scaling.x_scale)
@@ -211,7 +211,7 @@ class LatentCovarianceRegressor(CovarianceRegressor):
     ) -> EvidenceSearch:
         shortest = resolved_length_scale(inputs)
         if noise_scale is not None and not bool((noise_scale > 0).any()):
-            # Interpolated: longer than where inputs come closest, and the process swings between the others.
+            # A longer length scale than where inputs are closest makes an interpolating process swing between others.
             shortest = min(0.5, max(1e-6, _SHORTEST * spacing(inputs, 0.1)))
         limits = self.max_inputs, self.n_restarts, max(100, self.max_iter)
         return EvidenceSearch(self.kernel, (shortest, longest), length_scale, noise_scale, *limits)
@@ -223,11 +223,11 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         return observations, self._search(training.inputs, _LONGEST_MEAN)
 
     def _fit_mean(self, training: TrainingSet, found: Found | None = None) -> tuple[LatentGP, FitReport]:
-        """Processes that the evidence finds; or ones through the means, where rows that repeat inputs contradict them.
+        """Processes by evidence, or processes through the means where rows that repeat inputs contradict the first.
 
         The evidence sees the mean at each input, not how far the rows there differ. With few inputs, or jumps between
         them, it may take for noise what all demonstrations agree on. A process that could follow the means only by
-        swinging far beyond them between the inputs is not taken, with a warning.
+        swinging far beyond them between the inputs is rejected with a warning.
         """
         observations, search = job = self._mean_job(training)
         found = fit_together([job])[0] if found is None else found
@@ -256,9 +256,9 @@ class LatentCovarianceRegressor(CovarianceRegressor):
     def _likelihood_and_values(
         self, problem: Problem, link: Link, residual: Tensor, start: Tensor
     ) -> tuple[Likelihood, LatentValues]:
-        """Likelihood in nats per row, and the latent values at the inputs from where it is trained: those of a root.
+        """Likelihood in nats per row, and latent values at the inputs from which training starts, those of a root.
 
-        Length scales that are not given are a fifth of the range of the inputs, and less beside a hole.
+        Length scales default to a fifth of the range of the inputs, and to less beside a gap in them.
         """
         training, length_scale = problem.training, problem.length_scale
         n_inputs, n_features = training.inputs.shape
@@ -272,7 +272,7 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         return likelihood, latent
 
     def _train(self, likelihood: Likelihood, latent: LatentValues) -> tuple[Tensor, FitReport]:
-        """Roots at the inputs where the likelihood has its maximum; the latent values are left there."""
+        """Roots at the inputs at the likelihood's maximum; ``latent`` keeps its values there."""
         limits: Any = {"max_iter": self.max_iter, "tol": self.tol, "callback": self._progress()}
         report = train(likelihood, latent, solver=self.solver, **limits)
         with torch.no_grad():
@@ -315,9 +315,9 @@ def warn_if_stretched(problem: Problem, hyperparameters: Hyperparameters, observ
 def _contradicted(
     training: TrainingSet, residual: Float[Tensor, "d n"]
 ) -> tuple[Bool[Tensor, " d"], Float[Tensor, " d"]]:
-    """Whether the means at the inputs are too far from where a process has them; and the smallest error of a mean.
+    """Whether a process misses the means at the inputs, and the smallest standard error of a mean.
 
-    Together, by the F test of lack of fit; or at one input, by Student's t.
+    All inputs together are tested by the F test of lack of fit, each single one by Student's t.
     """
     counts, squares = training.counts, training.squares()
     degrees = counts - 1.0
@@ -328,5 +328,5 @@ def _contradicted(
     together = squared.mean(0) > limit * pooled + _UNRESOLVED
     each = squared.new_tensor(stdtrit(degrees.cpu().numpy(), 0.5 * _LEVEL / n_inputs))
     alone = squared > each.square()[:, None] * local + _UNRESOLVED
-    # The error is of rows that are counted as in the evidence, by their mean.
+    # The evidence counts rows by their mean count, and so does this error.
     return together | alone.any(0), (local.amin(0) / counts.mean()).sqrt()

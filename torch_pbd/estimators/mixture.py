@@ -1,4 +1,4 @@
-"""Gaussian mixture regression: the baseline of the paper, and what many use today."""
+"""Gaussian mixture regression, the baseline of the paper."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,9 +16,9 @@ from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.files.memory import require_much
 from torch_pbd.models.mixture import GaussianMixture, expectation_maximization, refine
 
-# An output's residual scale is not taken below this of its whole spread.
+# Least residual scale of an output, as a share of its whole spread.
 _SMALLEST_RESIDUAL = 1e-6
-# Of rows of unit variance: k-means works on squares of distances, and float64 has 16.
+# Decimals kept of rows with unit variance: k-means works on squared distances, and float64 has 16 digits.
 _DECIMALS = 7
 
 
@@ -26,27 +26,27 @@ _DECIMALS = 7
 class GMMBaseline(CovarianceRegressor):
     """Gaussian mixture over [x, y] and Gaussian mixture regression.
 
-    The mean and covariance of y given x are those of the mixture's conditional density, with the spread
-    between components in the covariance. A mixture has no prior to return to: far from data it repeats its
-    nearest component, and its mean goes on in a straight line.
+    The mean and covariance of y given x are the moments of the mixture's conditional density, so the covariance
+    includes the spread between components. Far from data there is no prior to return to: the nearest component
+    decides, and the mean continues in a straight line.
 
     Parameters
     ----------
     n_components : int, default=5
     solver : {"em", "lbfgs"}, default="em"
-        "em": expectation maximization from k-means. "lbfgs": the same, then L-BFGS on the likelihood.
+        "em" runs expectation maximization from k-means; "lbfgs" then adds L-BFGS on the likelihood.
     reg_covar : float, default=1e-6
-        Added to the variances of every component, relative: to the variance of each input, and to the
-        variance of each output between neighbouring inputs. An absolute one would destroy small variances.
+        Regularization of every component's variances, relative to the variance of each input and to the variance
+        of each output between neighbouring inputs. An absolute value would swamp small variances.
     max_iter : int, default=1000
     tol : float, default=1e-7
-        Stop when the mean log-likelihood rises by less, in nats per row.
+        Smallest rise of the mean log-likelihood, in nats per row, that continues the fit.
     n_restarts : int, default=2
-        k-means starts beside the first; the likeliest mixture is kept.
+        Extra k-means starts after the first; the likeliest mixture is kept.
     random_state : int, RandomState instance or None, default=0
         Seed of k-means.
     device : str or None, default=None
-        Where the torch module lives.
+        Device of the torch module.
     verbose : int, default=0
 
     Attributes
@@ -55,7 +55,7 @@ class GMMBaseline(CovarianceRegressor):
         The fitted torch module: maps x (n, e) to mean (n, d) and Cholesky factor (n, d, d), differentiably.
     n_features_in_, n_outputs_ : int
     loss_ : float
-        Negative mean log-likelihood of the rows [x, y], standardized, in nats.
+        Negative mean log-likelihood of the standardized rows [x, y], in nats.
     loss_curve_ : list of float
     n_iter_ : int
     converged_ : bool
@@ -64,8 +64,8 @@ class GMMBaseline(CovarianceRegressor):
 
     Notes
     -----
-    ``predict_uncertainty`` gives a ``type1`` from the density of the inputs, since a mixture's variance does
-    not grow where data are missing (Section IV-C); ``type2`` is its whole covariance.
+    ``predict_uncertainty`` takes ``type1`` from the density of the inputs, since a mixture's variance does not
+    grow where data are missing (Section IV-C); ``type2`` is the whole covariance.
 
     References
     ----------
@@ -141,16 +141,16 @@ def _points(X: Floats, y: Floats) -> Floats:
 
 
 def _by_residual(X: Floats, y: Floats) -> Standardization:
-    """Standardization of inputs by their deviation, of outputs by that between neighbouring inputs.
+    """Standardization of inputs by their standard deviation, and of outputs by that between neighbouring inputs.
 
-    So a regularization of the joint covariance is relative to what the covariance of y given x will be,
+    A regularization of the joint covariance is then relative to the size of the covariance of y given x,
     and not to how far y moves.
     """
     whole = Standardization.fit(X, y)
     x_scale = spread_of(X)
-    # Neighbours at equal distances are so in all units.
+    # Standardized, so that neighbours at equal distances are equally far in all units.
     scaled = replace(whole, x_scale=x_scale).inputs(X)
-    # Of the same or the nearest input: the row itself may come first or second among equals.
+    # Neighbour at the same or the nearest input: the row itself may come first or second among equals.
     neighbour = NearestNeighbors(n_neighbors=2).fit(scaled).kneighbors(scaled, return_distance=False)
     other = np.where(neighbour[:, 0] == np.arange(len(X)), neighbour[:, 1], neighbour[:, 0])
     residual = np.sqrt(0.5 * np.square((y - y[other]) / whole.y_scale).mean(axis=0))

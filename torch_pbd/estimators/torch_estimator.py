@@ -1,4 +1,4 @@
-"""Fits of torch modules to NumPy arrays: rows checked, ordered and standardized, and a module into pickles and back."""
+"""Base of estimators with a torch module: rows are checked, ordered and standardized, and the module is pickled."""
 
 import sys
 from abc import ABC, abstractmethod
@@ -24,8 +24,8 @@ from torch_pbd.models.conditional import ConditionalNormal
 from torch_pbd.models.training import TrainingSet
 from torch_pbd.optim import FitReport, Progress, Status
 
-# Standardized numbers keep this many decimals, so that other units are the same numbers: an optimizer with flat
-# directions would turn a difference in the last bit into digits.
+# Standardized numbers keep this many decimals, so that data in other units give the same numbers: an optimizer with
+# flat directions would amplify a difference in the last bit.
 _DECIMALS = 10
 
 Integers = NDArray[np.intp]
@@ -39,8 +39,8 @@ class Standardization:
     x_scale: Floats
     y_shift: Floats
     y_scale: Floats
-    # A value that the column has, and the shift less that value. A difference of values is exact, so that what is made
-    # of these two is the same numbers wherever the origin is.
+    # One value of each column, and the shift minus that value. Differences of values are exact, so that the
+    # standardized numbers do not depend on the origin.
     x_parts: tuple[Floats, Floats]
     y_parts: tuple[Floats, Floats]
 
@@ -48,8 +48,8 @@ class Standardization:
     def fit(cls, X: Floats, y: Floats) -> "Standardization":
         """Standardization of the columns of X and y.
 
-        A constant output gets the largest scale of the others, so that it is precise beside them; a
-        constant input its magnitude, beside which rounding is nothing, in all units.
+        A constant output gets the largest scale of the others, so that it is precise beside them. A constant
+        input gets its magnitude, beside which rounding is negligible in all units.
         """
         low, span = X.min(axis=0), np.ptp(X, axis=0)
         x_scale = _or_magnitude(span, np.abs(X).max(axis=0))
@@ -80,7 +80,7 @@ class Standardization:
 
 
 def spread_of(columns: Floats) -> Floats:
-    """Standard deviation of each column; the magnitude of one that is constant but for rounding."""
+    """Standard deviation of each column, or the magnitude of a column that is constant up to rounding."""
     return _or_magnitude(columns.std(axis=0), np.abs(columns).max(axis=0))
 
 
@@ -89,9 +89,9 @@ def _or_magnitude(spread: Floats, magnitude: Floats) -> Floats:
 
 
 def distinct_rows(X: Floats) -> tuple[Floats, Integers]:
-    """Distinct rows of X in lexicographic order, and the index of each row's own among them.
+    """Distinct rows of X in lexicographic order, and the index of each row of X among them.
 
-    As ``numpy.unique`` along an axis, which takes up to 80 times as long.
+    ``numpy.unique`` along an axis gives the same but takes up to 80 times as long.
     """
     X = X + 0.0  # minus zero is zero
     order = X[:, 0].argsort() if X.shape[1] == 1 else np.lexsort(X.T[::-1])
@@ -111,10 +111,10 @@ class Fitted(NamedTuple):
 
 
 class TorchEstimator(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
-    """Base of regressors that keep what they learned in a torch module, ``module_``, on ``device``.
+    """Base of regressors whose fitted state is a torch module, ``module_``, on ``device``.
 
-    Estimators are dataclasses, whose fields are the parameters: scikit-learn asks of ``__init__`` that it store them
-    and do no more.
+    Estimators are dataclasses whose fields are the parameters: scikit-learn requires ``__init__`` to store them
+    and do nothing else.
     """
 
     device: str | None
@@ -143,9 +143,9 @@ class TorchEstimator(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         X : array-like of shape (n_samples, n_features)
             Time, phase or position of each sample. Rows that repeat exactly are aligned demonstrations.
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
-            What was recorded there.
+            Recorded outputs of each sample.
         groups : array-like of shape (n_samples,), default=None
-            Demonstration of each sample: counted, to warn of too few; rows are taken for independent.
+            Label of each sample's demonstration, used only to warn of too few; rows are taken as independent.
 
         Returns
         -------
@@ -154,11 +154,11 @@ class TorchEstimator(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         Raises
         ------
         ValueError
-            If X, y, groups or a parameter cannot be used; the message names it and says what to do.
+            If X, y, groups or a parameter is invalid; the message names it and the remedy.
         """
         self.__dict__.pop("module_", None)  # a fit that fails leaves no mixture of two
         self._check_parameters()
-        # Columns side by side: what is asked of each is many times as fast.
+        # Column-major order makes operations on each column many times as fast.
         inputs, targets = map(np.asfortranarray, validation.checked_rows(self, X, y, ensure_min_samples=2))
         validation.check_squares(inputs, "X")
         validation.check_squares(targets, "y")
@@ -167,7 +167,7 @@ class TorchEstimator(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
         self._y_is_1d = targets.ndim == 1
         self.n_outputs_ = 1 if self._y_is_1d else targets.shape[1]
         targets = targets.reshape(len(inputs), -1, order="F")
-        # An order of the rows that does not depend on the one they come in, so that no result does.
+        # Rows are sorted, so that results do not depend on the order in which they are given.
         order = np.lexsort(np.hstack([inputs, targets]).T)
         numbers = None if groups is None else validation.check_groups(groups, len(inputs))[order]
         with torch.inference_mode(False), torch.enable_grad():

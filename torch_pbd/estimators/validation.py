@@ -1,4 +1,4 @@
-"""Checks of rows and of demonstrations among them before any work starts, and warnings where something is amiss."""
+"""Checks of rows and demonstrations before a fit, and warnings about suspicious data."""
 
 from contextvars import ContextVar
 from typing import Any
@@ -19,18 +19,18 @@ from torch_pbd.models.training import TrainingSet
 CONSTANT = 1e-11
 """A column whose spread is below this share of its largest value differs only by rounding."""
 
-# Distance of values that are made equal, in usual distances; and of all, how many are worth saying.
+# Largest distance of values that are made equal, in usual distances, and the share of such values that warns.
 _NEAR, _MANY = 1e-3, 0.1
-_LARGEST = 1e140  # of a value, so that its square, and a thousand of them added up, is a number
-_COVERED = 0.5  # of the range of the input, by a demonstration that is compared with others
-# Whether a fit is not to warn of several ways; of the context, so that other threads are warned as before.
+_LARGEST = 1e140  # largest magnitude of a value: float64 holds the sum of a thousand squares
+_COVERED = 0.5  # least share of the input's range that a demonstration covers to be compared with others
+# Whether the warning about several modes is suppressed in this context; other threads still warn.
 _unimodality_reported: ContextVar[bool] = ContextVar("_unimodality_reported", default=False)
 
 
 def checked_values(values: Any, name: str) -> Any:
-    """``values``, all of them finite numbers, a torch tensor turned into an array.
+    """``values``, checked to be finite numbers, with a torch tensor turned into an array.
 
-    They are refused where their type is too coarse for their spread: unix time in float32 has steps of 128 s.
+    A type too coarse for their spread raises an error: unix time in float32 has steps of 128 s.
     """
     if hasattr(values, "detach"):
         values = checks.from_tensor(values, name)
@@ -60,7 +60,7 @@ def _check_numbers(array: NDArray[Any], name: str) -> None:
 
 
 def checked_rows(estimator: Any, X: ArrayLike, y: ArrayLike, **options: Any) -> tuple[Floats, Floats]:
-    """X (n, e) and y (n,) or (n, d) in float64, checked by scikit-learn and by us."""
+    """X (n, e) and y (n,) or (n, d) in float64, checked by scikit-learn and by this package."""
     if issparse(y):
         raise TypeError("Sparse data was passed for y, but dense data is required. Use '.toarray()'.")
     X, y = checked_values(X, "X"), checked_values(y, "y")
@@ -71,7 +71,7 @@ def checked_rows(estimator: Any, X: ArrayLike, y: ArrayLike, **options: Any) -> 
 
 
 def checked_queries(estimator: Any, X: ArrayLike) -> Floats:
-    """Rows to predict at (n, e) in float64; none at all is allowed, though scikit-learn asks for one."""
+    """Query rows (n, e) in float64; n = 0 is allowed, though scikit-learn requires one row."""
     if _is_plain(X, vars(estimator)):
         return np.asarray(X)
     check_is_fitted(estimator)
@@ -81,9 +81,9 @@ def checked_queries(estimator: Any, X: ArrayLike) -> Floats:
 
 
 def _is_plain(X: Any, fitted: dict[str, Any]) -> bool:
-    """Whether scikit-learn's checks, which take longer than predicting a row, would give X back as it is.
+    """Whether scikit-learn's checks, which take longer than predicting a row, would return X unchanged.
 
-    ``fitted`` are the attributes of the estimator. One that was fitted to a data frame compares names.
+    ``fitted`` are the attributes of the estimator; one fitted to a data frame must compare column names.
     """
     return (
         type(X) is np.ndarray
@@ -98,7 +98,7 @@ def _is_plain(X: Any, fitted: dict[str, Any]) -> bool:
 
 
 def check_squares(array: Floats, name: str) -> None:
-    """Check that variances of the columns of ``array`` are numbers that float64 holds."""
+    """Check that float64 holds the variances of the columns of ``array``."""
     largest = np.asarray(np.abs(array).max(axis=0), dtype=np.float64)  # which holds the bounds
     fine = (largest == 0) | ((largest >= 1.0 / _LARGEST) & (largest <= _LARGEST))
     must = f"zero, or between {1.0 / _LARGEST:g} and {_LARGEST:g} as its square is"
@@ -106,9 +106,9 @@ def check_squares(array: Floats, name: str) -> None:
 
 
 def check_inputs_vary(X: Floats) -> None:
-    """Check that X tells rows apart; warn of columns that are constant or combinations of others.
+    """Check that the rows of X differ, and warn of columns that are constant or combinations of others.
 
-    The length scale of such a column is not determined.
+    The data do not determine the length scale of such a column.
     """
     spread = np.ptp(X, axis=0)
     constant = spread <= CONSTANT * np.abs(X).max(axis=0)
@@ -117,7 +117,7 @@ def check_inputs_vary(X: Floats) -> None:
             f"X is constant: its columns have the same value in all {len(X)} rows, so nothing can depend on X. Give "
             "the time, phase or position of each row."
         )
-    # In their own ranges, so that the rank is the same in all units.
+    # Columns are scaled by their ranges, so that the rank does not depend on units.
     centred = (X - X.mean(axis=0)) / np.where(constant, 1.0, spread)
     rank = np.linalg.matrix_rank(centred[:, ~constant], tol=1e-9 * np.sqrt(len(X)))
     if constant.any() or rank < X.shape[1] - constant.sum():
@@ -130,10 +130,10 @@ def check_inputs_vary(X: Floats) -> None:
 
 
 def without_rounding(X: Floats) -> Floats:
-    """X with values of a column made equal that a rounding to float32 has told apart.
+    """X, with values of a column that differ only by rounding to float32 made equal.
 
-    They are within its resolution of the range, or one is the other rounded, and far nearer than usual in the column.
-    Many, as in recordings of two precisions, bring a warning; a few come as near by chance in irregular inputs.
+    Such values are within float32's resolution of the range, or one is the other rounded, and far nearer than usual in
+    the column. Many, as in recordings of two precisions, raise a warning; irregular inputs have a few by chance.
     """
     X = X.copy()
     for number, column in enumerate(X.T):
@@ -156,7 +156,7 @@ def without_rounding(X: Floats) -> Floats:
 
 
 def check_groups(groups: Any, n_samples: int) -> NDArray[np.intp]:
-    """Number of each row's demonstration, from labels of any kind, none of which is missing."""
+    """Number of each row's demonstration, from labels of any type; missing labels raise an error."""
     if isinstance(groups, list | tuple) and len({isinstance(label, str) for label in groups}) > 1:
         groups = np.fromiter(groups, dtype=object, count=len(groups))  # NumPy would make text of the numbers
     labels = checks.as_array(groups, "groups")
@@ -176,9 +176,9 @@ def check_groups(groups: Any, n_samples: int) -> NDArray[np.intp]:
 
 
 def check_demonstrations(X: Floats, y: Floats, groups: Any) -> None:
-    """Warn where demonstrations are too few to tell their correlation or covariance, or seem to follow several ways.
+    """Warn of demonstrations too few to estimate their correlation or covariance, or with several modes.
 
-    The ways are looked for along one input, among demonstrations that cover most of it.
+    Modes are looked for along a single input, among demonstrations that cover half of its range or more.
     """
     counts = np.bincount(groups)
     if len(counts) < 2:
@@ -191,7 +191,7 @@ def check_demonstrations(X: Floats, y: Floats, groups: Any) -> None:
         warn_if_few_demonstrations(groups, y.shape[1])
     if _unimodality_reported.get() or X.shape[1] > 1 or len(counts) < 2 or counts.min() < 2:
         return
-    # Each time of a demonstration once: of two rows at one time the first counts.
+    # Of rows of a demonstration at the same time only the first counts.
     times, positions = [], []
     for rows in np.split(np.argsort(groups, kind="stable"), np.cumsum(counts)[:-1]):
         time, first = np.unique(X[rows, 0], return_index=True)
@@ -202,7 +202,7 @@ def check_demonstrations(X: Floats, y: Floats, groups: Any) -> None:
 
 
 def warn_if_few(n_rows: int, n_outputs: int, groups: NDArray[np.intp] | None = None) -> None:
-    """Warn of no more rows than outputs, whose covariance is singular; or of no more demonstrations."""
+    """Warn if there are no more rows, or no more demonstrations, than outputs: their covariance is singular."""
     if n_rows <= n_outputs:
         checks.warn(
             f"y has {n_rows} rows but {n_outputs} outputs: they leave directions of the covariance undetermined, "
@@ -214,7 +214,7 @@ def warn_if_few(n_rows: int, n_outputs: int, groups: NDArray[np.intp] | None = N
 
 
 def warn_if_few_demonstrations(groups: NDArray[np.intp] | None, n_outputs: int) -> None:
-    """Warn of no more demonstrations than outputs: samples of one repeat each other, however many there are."""
+    """Warn if there are no more demonstrations than outputs: samples of one demonstration repeat each other."""
     if groups is not None and (n_demos := int(groups.max()) + 1) <= n_outputs:
         checks.warn(
             f"y has {n_demos} demonstrations but {n_outputs} outputs: they leave open how the outputs vary together. "
@@ -224,7 +224,7 @@ def warn_if_few_demonstrations(groups: NDArray[np.intp] | None, n_outputs: int) 
 
 
 def warn_if_identical(training: TrainingSet) -> None:
-    """Warn of outputs that never vary where inputs repeat, or nowhere if none does; but for rounding."""
+    """Warn of outputs that, up to rounding, never vary at repeated inputs, or anywhere if no input repeats."""
     repeated = len(training.y) - len(training.inputs)
     squares = training.squares() if repeated else (training.y - training.y.mean(0)).square()
     if float(squares.sum(0).max()) < 1e-18 * max(1, repeated or len(training.y) - 1):
@@ -236,7 +236,7 @@ def warn_if_identical(training: TrainingSet) -> None:
 
 
 def warn_of_residuals(fit: HeteroscedasticFit, given: Tensor) -> None:
-    """Warn where rows, ``given`` in this order without groups, are of demonstrations; or the mean misses a signal."""
+    """Warn if rows ``given`` in this order without groups look like demonstrations, or the mean misses a signal."""
     if fit.group is None and are_copies(fit.whitened(), fit.training, given):
         message = (
             "y has rows that nearly repeat those beside them along X, as samples of a demonstration do. Without groups "
@@ -254,9 +254,9 @@ def warn_of_residuals(fit: HeteroscedasticFit, given: Tensor) -> None:
 
 
 def fit_with_groups(regressor: Any, X: ArrayLike, y: ArrayLike, groups: ArrayLike) -> Any:
-    """Regressor fitted with the demonstrations' numbers, if its ``fit`` takes them: what users bring along need not.
+    """Regressor fitted with the demonstrations' numbers if its ``fit`` accepts ``groups``; a user's need not.
 
-    That the demonstrations follow several ways is not said here: whoever has them as demonstrations says it once.
+    The warning about several modes is suppressed here: the caller has the demonstrations and warns once.
     """
     if not has_fit_parameter(regressor, "groups"):
         return regressor.fit(X, y)

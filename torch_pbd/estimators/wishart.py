@@ -15,35 +15,34 @@ from torch_pbd.models.links import WishartLink, padded
 from torch_pbd.models.training import empirical_tril, residual_tril
 from torch_pbd.optim import FitReport
 
-_PAPER_MEAN = 8.0  # of all latent processes, in the paper's simulation
-_FEW_ROWS = 8  # whose empirical deviation may by chance be near zero, so that what is drawn through it crosses zero
-_CERTAIN = 1e-8  # ratio of noise: it keeps kernel matrices positive definite, and hides nothing
-_SPREAD = 0.01  # of the random part of whitened values at the start
+_PAPER_MEAN = 8.0  # prior mean of all latent processes in the paper's simulation
+_FEW_ROWS = 8  # fewer rows may by chance have a deviation near zero, through which interpolated vectors cross zero
+_CERTAIN = 1e-8  # noise ratio that keeps kernel matrices positive definite and is otherwise negligible
+_SPREAD = 0.01  # standard deviation of the random part of whitened values at the start
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class WishartProcessRegressor(LatentCovarianceRegressor):
     """Covariance as a Wishart process, a sum of outer products of Gaussian process vectors ("WP").
 
-    The mean of y is learned by one Gaussian process an output, its covariance by ``df`` vectors of d
-    processes at their means, eq. (8); far from data they return to the mean of y and to ``prior``.
+    One Gaussian process per output learns the mean of y; ``df`` vectors of d processes, at their means, give its
+    covariance, eq. (8). Far from data they return to the mean of y and to ``prior``.
 
     Parameters
     ----------
     objective : {"auto", "mse", "likelihood"}, default="auto"
-        "mse": eq. (9), the mean squared distance of the Cholesky factors to those of the empirical covariances (aligned
-        data: every row of X at least twice), whose minimum, zero, is where the vectors are the columns of these
-        factors. "likelihood": eq. (11), for data anywhere, from the pooled covariance, which is then the prior of the
-        vectors too.
-        "auto" takes the first where every input repeats; where one has fewer than 8 rows with a noise that is
-        learned, since interpolated vectors then cross zero.
+        "mse" minimizes eq. (9), the mean squared distance of the Cholesky factors to the empirical ones; it needs
+        aligned data, every row of X at least twice. Its minimum is zero, where the vectors are the columns of the
+        empirical factors. "likelihood" maximizes eq. (11) for any data, starting from the pooled covariance, which is
+        then the prior of the vectors too. "auto" takes "mse" where every input repeats, with a learned noise if an
+        input has fewer than 8 rows, since interpolated vectors then cross zero.
     df : int, "auto" or None, default=None
-        Number of vectors, the degrees of freedom nu; at least d. None or "auto" is d + 1.
+        Number of vectors, the degrees of freedom nu, at least d; None or "auto" is d + 1.
     {shared}
     df_ : int
     loss_ : float
-        "mse": eq. (9). "likelihood": negative log posterior density (or likelihood) of the latent values, in
-        nats per row. Both of standardized y.
+        Eq. (9) for "mse"; negative log posterior density (or likelihood) of the latent values, in nats per row, for
+        "likelihood". Both for standardized y.
 
     References
     ----------
@@ -88,12 +87,12 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
             vectors = gp.Observations(inputs, link.flatten(root).mT.contiguous(), torch.ones_like(inputs[:, 0]))
             return gp.merge_observations(vectors, self.max_inputs)
 
-        # The evidence of the vectors, not of their deviations: a prior far from them would allow for any swing.
+        # Evidence of the vectors themselves, not of their deviations from the prior: a far prior would allow any swing.
         observations = observed(root)
         hyperparameters, report = self._smoothing(observations, problem)
         warn_if_stretched(problem, hyperparameters, observations)
         latent, jitter = gp.condition(observations, hyperparameters, self.kernel)
-        # That the vectors are noisy is no reason for the prior to have a share in them where there are data.
+        # Noise of the vectors must not pull them towards the prior where there are data.
         certain = replace(hyperparameters, noise_ratio=hyperparameters.noise_ratio.clamp_max(_CERTAIN))
         with torch.no_grad():
             latent.weight -= gp.condition(observed(link.prior.expand_as(root)), certain, self.kernel)[0].weight
@@ -103,7 +102,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         return MeanAndWishart(mean, latent, link.far(), bounded=True), report, jitter
 
     def _smoothing(self, observations: gp.Observations, problem: Problem) -> tuple[gp.Hyperparameters, FitReport]:
-        """Hyperparameters without noise; with a learned one where "auto" has few rows, or inputs are too near."""
+        """Hyperparameters without noise, or with a learned one where "auto" has few rows or inputs are too near."""
         inputs, none = observations.inputs, torch.zeros_like(observations.targets[:, 0])
 
         def found(noise_scale: Tensor | None) -> tuple[gp.Hyperparameters, FitReport]:
@@ -125,13 +124,13 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
     def _fit_likelihood(self, problem: Problem, mean: gp.LatentGP) -> tuple[MeanAndWishart, FitReport, float]:
         prior_root, residual = self._prior_root(problem), problem.training.residual(mean)
         pooled = padded(residual_tril(residual), self.df_)
-        # Around a prior far from them the vectors might swing through zero from one input to the next. A free L would
-        # grow while the whitened values shrink, and so escape their prior.
+        # Around a distant prior the vectors might swing through zero between inputs. A free L would grow while the
+        # whitened values shrink, and so escape their prior.
         link = WishartLink(pooled)
         if not self.latent_prior:
             link = WishartLink(prior_root, scale_matrix_tril=torch.eye(len(pooled)).to(pooled).requires_grad_())
         likelihood, latent = self._likelihood_and_values(problem, link, residual, pooled)
-        # Vectors that start equal, or at zero, stay so by symmetry: tell those apart that come after the first d.
+        # Vectors that start equal, or at zero, stay so by symmetry: noise separates those after the first d.
         noise = self._door(checks.seed(self.random_state).standard_normal(latent.whitened.shape))
         with torch.no_grad():
             latent.whitened[len(pooled) ** 2 :] += _SPREAD * noise[len(pooled) ** 2 :]
