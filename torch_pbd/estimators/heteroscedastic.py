@@ -108,7 +108,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
     one: demonstrations are smoother, but a model that trusts their smoothness takes it for signal. The tails of the
     predictive law then include the mean's error, and correlations are shrunk by their own errors.
 
-    The fit depends on the order of the outputs, as its factor does: by up to 20 % of a variance with six demonstrations.
+    The fit depends on the order of the outputs, as its factor does: a variance by up to 20 % with six demonstrations.
 
     References
     ----------

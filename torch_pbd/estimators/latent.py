@@ -52,34 +52,34 @@ _SHARE, _LEAST_NOISE = 0.1, 1e-6  # noise of a mean: share of its smallest error
 
 _SHARED = """latent_prior : bool, default=True
     Only for "likelihood". True maximizes the posterior density of the processes at the inputs, with hyperparameters
-    held. False is the likelihood as printed in the paper, which trains them too and overfits: without bound where
-    inputs do not repeat.
+    fixed. False maximizes the paper's likelihood, which trains the hyperparameters too and overfits, without bound
+    where inputs do not repeat.
 solver : {"auto", "fisher", "lbfgs"}, default="auto"
     Only for "likelihood". "fisher" is Newton's method with the Fisher information, "lbfgs" is torch's L-BFGS,
-    preconditioned with that information at the start: both end at the same optimum. "auto" takes "fisher", and "lbfgs"
-    where too many numbers would have to be solved for together: 2500 for CD, the rank of the kernel matrix times d, and
-    600 for WP, that times ``df`` too. Without ``latent_prior`` it is L-BFGS always.
+    preconditioned with the initial Fisher information; both reach the same optimum. "auto" takes "fisher", but "lbfgs"
+    for linear systems that are too large: above 2500 unknowns for CD, the rank of the kernel matrix times d, and above
+    600 for WP, that times ``df``. Without ``latent_prior`` it is always L-BFGS.
 kernel : {"squared_exponential", "matern32", "matern52"}, default="squared_exponential"
 prior : None, float, array-like of shape (d, d), callable or "paper", default=None
-    Covariance far from data, in squared units of y. A float stands for that times the unit matrix; a callable maps
-    X (n, e) to (n, d, d). None learns a wide one: four times the covariance of all of y. "paper" is for CD a unit
-    factor in the units of y, and for WP vectors whose means are all 8, which give a covariance of rank one.
+    Covariance far from data, in squared units of y. A float multiplies the identity matrix; a callable maps
+    X (n, e) to (n, d, d). None takes a wide one: four times the covariance of all of y. "paper" is an identity
+    factor in the units of y for CD, and vectors whose means are all 8 for WP, which give a covariance of rank one.
 length_scale : float, array-like of shape (n_features,) or None, default=None
-    Of the covariance's processes, in units of X. None learns it from empirical covariances, and else takes a fifth of
-    the range.
+    Length scale of the covariance's processes, in units of X. None learns it from empirical covariances, and takes a
+    fifth of the range otherwise.
 max_inputs : int, default=256
-    Where X has more distinct rows, neighbours are merged into this many: the cost of a fit is cubic in it and linear in
-    the rows. CD merges aligned data on a line only for length scales below a fortieth of the range; longer ones of the
-    squared exponential are carried by 32 to 168 nodes, whatever the number of rows.
+    Largest number of distinct rows of X; if there are more, neighbours are merged. A fit costs the cube of it, and is
+    linear in the rows. CD merges aligned data over one input only for length scales below a fortieth of the range;
+    the squared exponential of longer ones is represented by 32 to 168 nodes, whatever the number of rows.
 max_iter : int, default=1000
 tol : float, default=1e-4
-    Stop when no gradient entry, or the fall of the loss, is above it; in nats per row.
+    Stop when no gradient entry, or the decrease of the loss, exceeds it, in nats per row.
 n_restarts : int, default=2
-    Starting points of each hyperparameter search beside the first.
+    Extra starting points of each hyperparameter search.
 random_state : int, RandomState instance or None, default=0
-    Seed of the start of a Wishart process by its likelihood; other fits are deterministic.
+    Seed of the initial values of a Wishart process with "likelihood"; other fits are deterministic.
 device : str or None, default=None
-    Where the torch module lives.
+    Device of the torch module.
 verbose : int, default=0
 
 Attributes

@@ -1,4 +1,4 @@
-"""Whole movements: the joint law of a demonstration, drawn from, judged by, and conditioned."""
+"""Models of whole movements: the joint law of a demonstration, for draws, scores and conditioning."""
 
 from torch_pbd.movement.kmp import KMPBaseline
 from torch_pbd.movement.promp import ProMPBaseline

@@ -1,4 +1,4 @@
-"""Interface of the models of whole movements: fit, marginals, draws and scores, all from one joint law."""
+"""Interface of the models of whole movements: fit, marginals, draws and scores from one joint law."""
 
 import math
 from abc import abstractmethod
@@ -30,12 +30,12 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         Parameters
         ----------
         X : Demonstrations, or array-like of shape (n_samples, 1)
-            Demonstrations are learned over time if all share their times, else over phase, 0 to 1 (``input_``). An
-            array has the time or the phase of each sample.
+            Demonstrations are learned over time if all share their times, and over phase, 0 to 1, otherwise
+            (``input_``). An array holds the time or the phase of each sample.
         y : array-like of shape (n_samples,) or (n_samples, n_outputs), default=None
-            Positions, where X is an array.
+            Position of each sample, where X is an array.
         groups : array-like of shape (n_samples,), default=None
-            Demonstration of each sample, where X is an array: required, two or more.
+            Label of each sample's demonstration, required where X is an array; there must be two or more.
 
         Returns
         -------
@@ -44,8 +44,8 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         Raises
         ------
         ValueError
-            If X has more than one column, y or groups are missing, there is one demonstration only, or a parameter
-            cannot be used.
+            If X has more than one column, y or groups are missing, there is only one demonstration, or a parameter
+            is invalid.
         """
         for name in ("_known", "_kept"):
             self.__dict__.pop(name, None)
@@ -68,7 +68,7 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         """Fit to two or more demonstrations."""
 
     def _components(self, time: Floats) -> tuple[Floats, list[tuple[Self, Floats]]]:
-        """Mixture that the law is: weights, and for each the law and its inputs; one, but for unknown timing."""
+        """Mixture components: weights, and for each the law and its inputs; only one unless timing is unknown."""
         return np.ones(1), [(self, time)]
 
     def _rows(self, time: Floats) -> tuple[Floats, Floats]:
@@ -88,7 +88,8 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         ----------
         X : array-like of shape (n_samples, 1)
         return_std, return_cov : bool, default=False
-            As of the covariance regressors; covariances (n_samples, n_outputs, n_outputs) are those of each row.
+            Also return the standard deviations, shaped like the mean, or the covariance of the outputs in each row
+            (n_samples, n_outputs, n_outputs).
 
         Returns
         -------
@@ -110,11 +111,10 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         return np.full(len(self._times(X)), self.df_)
 
     def predict_uncertainty(self, X: ArrayLike) -> Uncertainty:
-        """Both kinds of uncertainty at X, apart (Section IV-C).
+        """Missing data (``type1``) and variability (``type2``) at X, separately (Section IV-C).
 
-        ``type1``: missing data are where they are for the regressor, whatever is known of this movement; basis
-        functions know nothing of missing data, and have 0 within the times of the fit and 1 beyond them. ``type2`` is
-        the variability that what is known leaves.
+        ``type1`` is that of the regressor, whatever is known of this movement; basis functions cannot detect missing
+        data and have 0 within the times of the fit and 1 beyond them. ``type2`` is the variability given observations.
         """
         weight, parts = self._components(self._times(X))
         mean, type1, type2 = zip(*(law._uncertainty(own) for law, own in parts), strict=True)
@@ -134,7 +134,7 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         -------
         mean : ndarray of shape (n_samples, n_outputs)
         covariance : ndarray of shape (n_samples, n_outputs, n_samples, n_outputs)
-            Between all outputs at all rows: with n_samples n_outputs squared numbers.
+            Covariance between all outputs at all rows.
         """
         time = self._times(X)
         require_much(
@@ -150,7 +150,7 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         return mixed(weight, moments, "kia,kjb->iajb")
 
     def sample_demonstrations(self, X: ArrayLike, n_samples: int = 1, random_state: Any = None) -> Floats:
-        """Draw whole demonstrations at the rows of X: smooth, and passing through what is known.
+        """Draw whole demonstrations at the rows of X, smooth and consistent with the observations so far.
 
         Parameters
         ----------
@@ -173,7 +173,7 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         weight, parts = self._components(time)
         counts = generator.multinomial(n_samples, weight).tolist()
         own = [law._draws(x, n, generator) for (law, x), n in zip(parts, counts, strict=True) if n]
-        # They were made component by component: the first few must not be of one.
+        # Draws come component by component; shuffled, so that the first few do not all come from the same one.
         return own[0] if len(parts) == 1 else np.asarray(generator.permutation(np.concatenate(own)))
 
     def _draws(self, time: Floats, n_draws: int, generator: np.random.RandomState) -> Floats:
@@ -181,7 +181,7 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         conditioned, rows = self._conditioned(time)
         normal = conditioned.deviations(n_draws, lambda size: torch.from_numpy(generator.standard_normal(size)))
         deviations = normal[:, rows].numpy()
-        # One chi-squared a movement: it is unusual as a whole.
+        # One chi-squared variable per movement, which is unusual as a whole.
         if math.isfinite(self.df_):
             scale = np.sqrt((self.df_ - 2.0) / generator.chisquare(self.df_, n_draws))
             deviations *= scale[:, np.newaxis, np.newaxis]
@@ -207,7 +207,7 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         return samples[:, 0] if self._y_is_1d else samples
 
     def log_likelihood(self, X: ArrayLike, y: ArrayLike) -> Floats:
-        """Log density of each row of y at X, by itself, in nats: (n_samples,)."""
+        """Marginal log density (n_samples,) of each row of y at X, in nats."""
         check_is_fitted(self)
         X, targets = checked_rows(self, X, y, reset=False)
         mean, covariance = map(torch.from_numpy, self._marginals(self._times(X)))
@@ -220,14 +220,14 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         return student_log_density(residual, root, torch.from_numpy(degrees)).numpy()
 
     def score_demonstrations(self, X: Any, y: ArrayLike | None = None, *, groups: ArrayLike | None = None) -> Floats:
-        """Joint log density of each demonstration, in nats, given what is known.
+        """Joint log density of each demonstration, in nats, given the observations of :meth:`condition`.
 
         Parameters
         ----------
         X : Demonstrations, or array-like of shape (n_samples, 1)
         y : array-like of shape (n_samples,) or (n_samples, n_outputs), default=None
         groups : array-like of shape (n_samples,), default=None
-            Demonstration of each row; None takes all rows for one.
+            Label of each row's demonstration; None takes all rows as one demonstration.
 
         Returns
         -------
@@ -236,19 +236,19 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         Raises
         ------
         ValueError
-            If a demonstration has a time twice, or one that is known without noise, where it has no density.
+            If a demonstration has a time twice, or a time known without noise: no density exists there.
         """
         check_is_fitted(self)
         return np.array([self._score(*recording) for recording in as_recordings(self, X, y, groups, is_fit=False)])
 
     def score(self, X: Any, y: ArrayLike | None = None, *, groups: ArrayLike | None = None) -> float:
-        """Joint log density of the demonstrations over their number of steps: nats a step, higher is better."""
+        """Joint log density of the demonstrations per step, in nats: higher is better."""
         recordings = as_recordings(self, X, y, groups, is_fit=False)
         return float(sum(self._score(*each) for each in recordings) / sum(len(each.time) for each in recordings))
 
     def _score(self, time: Floats, position: Floats) -> float:
         """Joint log density of one demonstration."""
-        # Of a step that is known, or is there twice, no variance is left, and so no density.
+        # A step that is known or repeated has no variance left, and so no density.
         own, known = self._rounded(time), self._rounded(self.known_times())[self._known.exact.any(axis=1)]
         if len(np.unique(own)) < len(own) or np.isin(own, known).any():
             raise ValueError(
@@ -260,7 +260,7 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
 
 
 def mixed(weight: Floats, moments: list[tuple[Floats, Floats]], outer: str) -> tuple[Floats, Floats]:
-    """Mean and covariance of a mixture whose components have these; ``outer`` are products of deviations, summed."""
+    """Mean and covariance of a mixture of components with these ``moments``; ``outer`` is the einsum of deviations."""
     if len(moments) == 1:
         return moments[0]
     mean, covariance = map(np.stack, zip(*moments, strict=True))

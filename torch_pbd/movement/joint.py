@@ -1,4 +1,4 @@
-"""Joint normal law of a whole movement, a correlation along time, times outputs, plus loadings; and conditioned."""
+"""Joint normal law of a whole movement, a correlation along time per output plus loadings, and its conditioning."""
 
 import math
 from collections.abc import Callable
@@ -14,13 +14,13 @@ from torch_pbd.linalg import safe_cholesky, symmetrize
 
 @dataclass(frozen=True)
 class JointNormal:
-    """Normal law of n steps of d outputs whose covariance is never formed unless it is asked for.
+    """Normal law of n steps of d outputs whose covariance is formed only by :meth:`covariance`.
 
-    A movement is ``x_t = mean_t + A_t (g_t + U_t c)``: entry j of g has the correlation R_j over the steps, whatever
-    the others are, and c is standard normal. Its covariance is ``A (R - W W' + U U') A' - V V'``, with A block diagonal
-    in the steps, and R and W in the outputs, of which one may stand for all; W is what observations of whole steps have
-    taken off, V what those of single entries have. Costs grow with d n^3 + n d (k + p)^2; those of what single steps
-    are, given others, with n alone.
+    A movement is ``x_t = mean_t + A_t (g_t + U_t c)``: entry j of g has the correlation R_j over the steps and is
+    independent of the others, and c is standard normal. The covariance is ``A (R - W W' + U U') A' - V V'``, with A
+    block diagonal in the steps, and R and W in the outputs, of which one may stand for all; W is the reduction by
+    observations of whole steps, V that by single entries. Costs grow with d n^3 + n d (k + p)^2; the marginals of
+    single steps, given others, cost n alone.
     """
 
     mean: Float[Tensor, "n d"]
@@ -50,13 +50,13 @@ class JointNormal:
     def with_noise(
         cls, mean: Float[Tensor, "n d"], loadings: Float[Tensor, "n d k"], scale: Float[Tensor, " d"]
     ) -> "JointNormal":
-        """Law of ``mean_t + loadings_t c`` and of noise of this scale, independent in all steps and outputs."""
+        """Law of ``mean_t + loadings_t c`` plus noise of this scale, independent in all steps and outputs."""
         n, d = mean.shape
         return cls.prior(mean, scale.diag().expand(n, d, d), torch.eye(n).to(mean)[None], loadings / scale[:, None])
 
     @cached_property
     def _correlation(self) -> Float[Tensor, "c n n"]:
-        """R - W W'."""
+        """Correlation R - W W' given the observations of whole steps."""
         return symmetrize(self.prior_correlation - self.taken @ self.taken.mT)
 
     @cached_property
@@ -65,7 +65,7 @@ class JointNormal:
         return safe_cholesky(self._correlation, name="the correlation along the movement")
 
     def at(self, steps: Int[Tensor, " m"]) -> "JointNormal":
-        """Law of some of the steps."""
+        """Law of the selected steps."""
         mean, factor, loadings, explained = (
             part[steps] for part in (self.mean, self.factor, self.loadings, self.explained)
         )
@@ -73,7 +73,7 @@ class JointNormal:
         return JointNormal(mean, factor, between, loadings, self.taken[:, steps], explained)
 
     def joined(self, other: "JointNormal", between: Float[Tensor, "c n m"]) -> "JointNormal":
-        """Law of the steps of both, of which nothing is observed, and which are correlated between each other."""
+        """Law of the steps of two unobserved laws with the correlation ``between`` them."""
         upper = torch.cat([self.prior_correlation, between], dim=2)
         return JointNormal.prior(
             torch.cat([self.mean, other.mean]),
@@ -83,7 +83,7 @@ class JointNormal:
         )
 
     def covariance(self) -> Float[Tensor, "n d n d"]:
-        """Whole covariance: n d squared numbers."""
+        """Covariance of all outputs at all steps."""
         # The inner part R - W W' + U U' first, and then a block of A on either side.
         n, d = self.mean.shape
         inner = torch.diag_embed(self._correlation.expand(d, n, n).permute(1, 2, 0)).transpose(1, 2)
@@ -137,23 +137,23 @@ class JointNormal:
         half, size = 0.5 * float(log_det), x.numel()
         if not math.isfinite(df):
             return -0.5 * (float(square) + size * math.log(2.0 * math.pi)) - half
-        # As linalg.student_log_density, which takes a factor of the covariance: there is none here.
+        # linalg.student_log_density is the same but takes a factor of the covariance, which is never formed here.
         constant = math.lgamma(0.5 * (df + size)) - math.lgamma(0.5 * df) - 0.5 * size * math.log((df - 2.0) * math.pi)
         return constant - half - 0.5 * (df + size) * math.log1p(float(square) / (df - 2.0))
 
 
 class Conditioned:
-    """Joint law given what was observed; normal, by the usual formulas.
+    """Joint normal law given observations.
 
-    Of observations at some of the steps, values (m, d) are NaN where not given, noise (m, d) is the standard deviation
-    of their errors, of the outputs x or, with axes, of ``axes x``. Steps known whole and without noise keep the
-    structure of the law; all other entries are conditioned on one by one.
+    The observations at some of the steps have values (m, d), NaN where not given, and noise (m, d), the standard
+    deviation of their errors; they are of the outputs x or, with axes, of ``axes x``. Steps known whole and without
+    noise keep the structure of the law; all other entries are conditioned on one by one.
 
-    Exact steps E, with ``L L' = R_EE``: of ``r = A_E^-1 (x_E - mean_E)``, G = R_:E R_EE^-1 and the loadings'
-    coefficients c, whose posterior has the precision ``P = I + U_E' R_EE^-1 U_E`` and the mean ``P^-1 U_E' R_EE^-1 r``,
-    a movement is ``mean + A (G r + (U - G U_E) c + g)``, g of the correlation ``R - W W'`` with ``W = R_:E L'^-1``.
-    That is a law of the same form. Single entries then take ``V V'`` off, with V their covariances with all the rest
-    over the root of their own.
+    For exact steps E with ``L L' = R_EE``, let ``r = A_E^-1 (x_E - mean_E)`` and G = R_:E R_EE^-1. The loadings'
+    coefficients c have the posterior precision ``P = I + U_E' R_EE^-1 U_E`` and mean ``P^-1 U_E' R_EE^-1 r``, and a
+    movement is ``mean + A (G r + (U - G U_E) c + g)``, with g of the correlation ``R - W W'``, ``W = R_:E L'^-1``: a
+    law of the same form. Single entries then subtract ``V V'``, V being their covariances with all steps times the
+    inverse root of their own.
     """
 
     def __init__(
@@ -190,7 +190,7 @@ class Conditioned:
 
     @cached_property
     def law(self) -> JointNormal:
-        """Law of all steps; those that are known have no variance left."""
+        """Law of all steps; known ones have no variance left."""
         law, steps = self._prior, self._steps
         if len(steps):
             law = replace(
@@ -210,10 +210,10 @@ class Conditioned:
         return replace(law, mean=law.mean + explained @ whitened, explained=explained)
 
     def deviations(self, n_draws: int, normal: Callable[[tuple[int, int]], Tensor]) -> Float[Tensor, "s n d"]:
-        """Draws of the deviation from the mean, from standard normal numbers of the shapes that are asked for.
+        """Draws of the deviation from the mean; ``normal`` gives standard normal numbers of a requested shape.
 
-        Draws of the unconditioned law, less what it would have made of their own values at what was observed: no
-        root of a singular matrix is needed (Matheron's rule).
+        Each is a draw of the unconditioned law minus its conditional mean given its own values at the observed
+        entries (Matheron's rule), so that no root of a singular matrix is needed.
         """
         prior = self._prior
         n, d, n_loadings = prior.loadings.shape
@@ -230,7 +230,7 @@ class Conditioned:
         return drawn - torch.einsum("ndp,ps->snd", columns, torch.cholesky_solve(errors, root))
 
     def _from_steps(self, residual: Float[Tensor, "s m d"]) -> Float[Tensor, "s n d"]:
-        """Change of the mean by what steps that are known whole deviate from it."""
+        """Change of the mean by the residuals of steps that are known whole."""
         factor = self._prior.factor
         inner = torch.linalg.solve(factor[self._steps], residual[..., None])[..., 0]
         projected = torch.einsum("smd,dmk->sk", inner, self._whitened)
@@ -239,7 +239,7 @@ class Conditioned:
         return torch.einsum("nab,snb->sna", factor, change)
 
     def _entries(self, law: JointNormal) -> tuple[Float[Tensor, "n d p"], Float[Tensor, "p p"]]:
-        """Covariances of everything with the single entries, given the exact steps, and the root of their own."""
+        """Covariances of all steps with the single entries, given the exact steps, and the root of the entries' own."""
         steps, directions = self._entry_steps, self._directions
         rows = torch.einsum("pc,pcd->pd", directions, law.factor[steps])
         between = law.prior_correlation[:, :, steps] - law.taken @ law.taken[:, steps].mT

@@ -1,4 +1,4 @@
-"""Kernelized movement primitives (KMP): a kernel through a reference of means and covariances."""
+"""Kernelized movement primitives (KMP): kernel regression through a reference of means and covariances."""
 
 from typing import Any, ClassVar
 
@@ -17,7 +17,7 @@ from torch_pbd.movement.base import MovementRegressor
 from torch_pbd.movement.joint import Conditioned, JointNormal
 from torch_pbd.movement.law import NOTHING, Recording, as_rows, check_arrays
 
-_ARRAYS = ("reference.time", "reference.mean", "reference.covariance", "range", "deviation")  # of model files
+_ARRAYS = ("reference.time", "reference.mean", "reference.covariance", "range", "deviation")  # names in model files
 
 
 class KMPBaseline(MovementRegressor):
@@ -25,30 +25,30 @@ class KMPBaseline(MovementRegressor):
 
     With the reference's means mu_i and covariances S_i at N times, block diagonal S, the mean at t is
     ``k_t (K + lambda_mean S)^-1 mu`` and the covariance between t and t' is
-    ``N / lambda_cov (k(t, t') I - k_t (K + lambda_cov S)^-1 k_t')``. Via points are put into the reference, in place
-    of what is nearest to them, as its authors do: the law is not that of a conditioned movement.
+    ``N / lambda_cov (k(t, t') I - k_t (K + lambda_cov S)^-1 k_t')``. Via points replace the nearest points of the
+    reference, as in the reference paper; this is not the law of a conditioned movement.
 
     Parameters
     ----------
     regressor : covariance regressor or None, default=None
-        Cloned into ``regressor_``; None is ``GMMBaseline()``.
+        Model of the reference, cloned into ``regressor_``; None is ``GMMBaseline()``.
     n_reference : int, default=100
-        Times of the reference.
+        Number of times in the reference.
     length_scale : float, default=0.144
-        Of the squared exponential kernel, in ranges of X; the authors' ``kh = 6`` in 2 s.
+        Length scale of the squared exponential kernel, in ranges of X; the paper's ``kh = 6`` in 2 s.
     lambda_mean, lambda_cov : float, default=1.0 and 60.0
-        Regularizations of the mean and the covariance, the authors' values.
+        Regularization of the mean and of the covariance; defaults are the paper's.
     nugget : float, default=1e-4
-        Variance of an independent part of each step, relative to the outputs'; without one a movement of a squared
-        exponential kernel has no density.
+        Variance of an independent part of each step, relative to the outputs' variance; without it a movement of a
+        squared exponential kernel has no density.
     random_state : int, RandomState instance or None, default=0
-        Not used: the seed is the regressor's.
+        Not used, since the regressor has its own seed.
 
     Attributes
     ----------
     regressor_ : covariance regressor
     df_ : float
-        Infinite: the law is normal.
+        Degrees of freedom; infinite, as the law is normal.
     n_features_in_, n_outputs_ : int
 
     References
@@ -116,14 +116,14 @@ class KMPBaseline(MovementRegressor):
         )
         mean, whitened, level = self._through_reference(time)
         explained = whitened.transpose(0, 2, 1).reshape(n * d, -1)
-        # All outputs of one time after another: the kernel of the times, for each output by itself.
+        # Time by time, all outputs of each: the kernel of the times acts on each output separately.
         gram = np.kron(self._kernel(time, time), np.eye(d))
         values, vectors = np.linalg.eigh(level * (gram - explained @ explained.T))
         root = (vectors * np.sqrt(values.clip(0.0))).reshape(n, d, -1)
         return JointNormal.with_noise(*map(torch.from_numpy, (mean, root, self._nugget_scale())))
 
     def _rows(self, time: Floats) -> tuple[Floats, Floats]:
-        # Rows need no covariance with each other, whose factor is cubic in their number.
+        # Each row alone: the covariance between rows would cost the cube of their number to factorize.
         mean, whitened, level = self._through_reference(time)
         explained = whitened.transpose(0, 2, 1) @ whitened
         nugget = np.diag(np.square(self._nugget_scale()))
@@ -149,13 +149,13 @@ class KMPBaseline(MovementRegressor):
         return np.asarray(np.exp(-0.5 * np.square(difference / self.length_scale)))
 
     def _with_via_points(self) -> tuple[Floats, Floats, Floats]:
-        """Reference with what is known in place of its nearest times; outputs that are not given stay."""
+        """Reference whose nearest times are replaced by the via points; outputs that are not given stay."""
         if not len(self._known.time):
             return self._reference
         axes = np.eye(self.n_outputs_) if self._axes is None else self._axes
         time, means = self._reference[0].copy(), self._reference[1] @ axes.T
         covariances = axes @ self._reference[2] @ axes.T
-        # A point without noise, of whose variance the authors take 1e-6.
+        # The paper gives a point without noise the variance 1e-6.
         least = 1e-6 * np.square(axes * self._scale).sum(axis=1)
         for at, value, noise in zip(*self._known, strict=True):
             nearest = int(np.abs(self._reference[0] - at).argmin())
@@ -168,7 +168,7 @@ class KMPBaseline(MovementRegressor):
         return time, means @ back.T, back @ covariances @ back.T
 
     def _conditioned(self, time: Floats) -> tuple[Conditioned, torch.Tensor]:
-        # What is known is in the reference, and is not conditioned on.
+        # Via points are in the reference, so nothing is conditioned on.
         union, rows, _ = self._union(time, NOTHING)
         nothing = torch.empty(0, self.n_outputs_, dtype=torch.float64)
         law = Conditioned(self._prior(union), nothing.new_empty(0, dtype=torch.long), nothing, nothing)

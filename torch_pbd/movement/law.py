@@ -1,4 +1,4 @@
-"""What models of whole movements are made of: recordings, what is known of a movement, and its joint law given that."""
+"""Base of the models of whole movements: recordings, observations of a movement, and its joint law given them."""
 
 import copy
 from abc import ABC, abstractmethod
@@ -17,20 +17,20 @@ from torch_pbd.data.alignment import TIMING_REMOVED
 from torch_pbd.estimators.validation import check_groups, checked_queries, checked_rows
 from torch_pbd.movement.joint import Conditioned, JointNormal
 
-_DECIMALS = 10  # of a time, in ranges of those of the fit: nearer ones are equal, as 0.1 + 0.2 and 0.3 are
-_MOST_KEPT = 1024  # times whose law is kept
-_MOST_ENTRIES = 4096  # conditioned on one by one: a matrix of their size squared is factorized
+_DECIMALS = 10  # decimals kept of a time over the range of the fit's times, so that 0.1 + 0.2 and 0.3 are equal
+_MOST_KEPT = 1024  # most times whose law is cached
+_MOST_ENTRIES = 4096  # most entries conditioned on one by one: a matrix of their number squared is factorized
 
 
 class Recording(NamedTuple):
-    """One demonstration: increasing times (T,) and positions (T, d)."""
+    """A demonstration: increasing times (T,) and positions (T, d)."""
 
     time: Floats
     position: Floats
 
 
 class Known(NamedTuple):
-    """Observations of a movement: times (m,), values (m, d), NaN where not given, and noise (m, d)."""
+    """Observations of a movement: times (m,), values (m, d) with NaN where not given, and noise (m, d)."""
 
     time: Floats
     value: Floats
@@ -51,10 +51,10 @@ NOTHING = Known(np.empty(0), np.empty((0, 1)), np.empty((0, 1)))
 
 
 class MovementLaw(BaseEstimator, ABC):
-    """Law of a movement at any times, given what is known of it.
+    """Law of a movement at any times, given observations of it.
 
-    A subclass has the joint law of a demonstration, :meth:`_prior`, and its degrees of freedom ``df_``, infinite for a
-    normal law.
+    A subclass provides the joint law of a demonstration, :meth:`_prior`, and its degrees of freedom ``df_``, infinite
+    for a normal law.
     """
 
     df_: float
@@ -62,8 +62,8 @@ class MovementLaw(BaseEstimator, ABC):
     _range: tuple[float, float]
     """First of the times of the fit, and their range."""
     _known: Known = NOTHING
-    _axes: Floats | None = None  # of the coordinates of observations; None: the outputs
-    _kept: dict[str, tuple[Floats, JointNormal]]  # last times and their law, which conditioned copies share
+    _axes: Floats | None = None  # axes of the coordinates of observations; None are the outputs
+    _kept: dict[str, tuple[Floats, JointNormal]]  # cached last times and their law, shared by conditioned copies
     _y_is_1d: bool
 
     @abstractmethod
@@ -71,49 +71,49 @@ class MovementLaw(BaseEstimator, ABC):
         """Joint law at times (n,), all different, before anything is known of the movement."""
 
     def _between(self, time: Floats, other: Floats) -> Tensor:
-        """Correlation between other times, that of :class:`JointNormal`: noise has none."""
+        """Correlation between different times, as in :class:`JointNormal`, to which noise adds nothing."""
         return torch.zeros(1, len(time), len(other), dtype=torch.float64)
 
     @abstractmethod
     def _arrays(self) -> dict[str, Floats]:
-        """Arrays that the law consists of, beside the regressor, for model files."""
+        """Arrays of the law for model files, without the regressor's."""
 
     @abstractmethod
     def _restore(self, arrays: dict[str, Floats]) -> None:
-        """Take up such arrays, whose numbers are finite; a ValueError tells of shapes that do not fit."""
+        """Restore the law from finite arrays of a model file; wrong shapes raise a ValueError."""
 
     def _scaled(self, time: Floats) -> Floats:
         """Times in ranges of those of the fit."""
         return np.asarray((time - self._range[0]) / self._range[1])
 
     def _rounded(self, time: Floats) -> Floats:
-        """Times that are equal where they count as one."""
+        """Times rounded so that those that count as one are equal."""
         return np.round(self._scaled(time), _DECIMALS)
 
     def observed_along(self, axes: Floats | None) -> Self:
-        """Copy whose :meth:`condition` takes rows, noise and NaN of ``axes @ y``, axes (d, d); None are the outputs."""
+        """Copy whose :meth:`condition` takes rows and noise of ``axes @ y``, axes (d, d); None are the outputs."""
         copied = self._copy()
         copied._axes = axes
         return copied
 
     def condition(self, X: ArrayLike, y: ArrayLike, *, noise_scale: ArrayLike = 0.0) -> Self:
-        """Fitted copy, of a movement that is at y at X: a start, a goal, a via point, the part seen so far.
+        """Fitted copy, conditioned on passing y at X: a start, a goal, via points or the part observed so far.
 
-        Normal formulas on the joint covariance; the degrees of freedom stay. A copy can be conditioned again.
+        The normal formulas apply to the joint covariance; the degrees of freedom stay. A copy can be conditioned again.
 
         Parameters
         ----------
         X : array-like of shape (n_points, 1)
             Times or phases, as in the fit.
         y : array-like of shape (n_points, n_outputs), or (n_points,) if y was 1-D
-            NaN where an output is not given.
+            Observed outputs, NaN where one is not given.
         noise_scale : float or array-like of shape (n_outputs,), default=0.0
-            Standard deviation of the error of y, in its units. Without noise the movement passes there exactly.
+            Standard deviation of the error of y, in its units. At 0 the movement passes y exactly.
 
         Raises
         ------
         ValueError
-            If a time is given twice, or is known already, without noise.
+            If a time without noise is given twice or was known before.
         """
         time = self._times(X)
         value = checks.real_floats(y, "y")
@@ -125,7 +125,7 @@ class MovementLaw(BaseEstimator, ABC):
             )
         scale = np.broadcast_to(checks.real_floats(noise_scale, "noise_scale"), (self.n_outputs_,))
         checks.require((scale >= 0.0) & np.isfinite(scale), scale, "noise_scale", "a finite number of at least 0")
-        # Rows of which nothing is given say nothing.
+        # Rows of NaN alone carry no information.
         given = ~np.isnan(value).all(axis=1)
         copied = self._copy()
         copied._known = known = self._known.and_also(time[given], value[given], np.tile(scale, (int(given.sum()), 1)))
@@ -141,27 +141,27 @@ class MovementLaw(BaseEstimator, ABC):
         return copied
 
     def known_times(self) -> Floats:
-        """Times (m,) at which something is known of the movement."""
+        """Times (m,) of the observations."""
         return self._known.time
 
     def _times(self, X: ArrayLike) -> Floats:
-        """Times (n,) of rows to predict at."""
+        """Times (n,) of query rows."""
         return np.ascontiguousarray(checked_queries(self, X)[:, 0])
 
     def _union(self, time: Floats, known: Known) -> tuple[Floats, NDArray[np.intp], NDArray[np.intp]]:
-        """Distinct times of queries and of what is known, and the places of both among them."""
+        """Distinct times of queries and observations, and the indices of both among them."""
         both = np.concatenate([time, known.time])
         _, first, index = np.unique(self._rounded(both), return_index=True, return_inverse=True)
         return both[first], index[: len(time)], index[len(time) :]
 
     def _conditioned(self, time: Floats) -> tuple[Conditioned, Tensor]:
-        """Law of all times that matter, given what is known, and the places of ``time`` among them."""
+        """Law at query and observation times given the observations, and the indices of ``time`` among them."""
         union, rows, places = self._union(time, self._known)
         law, index = self._prior_with(union)
         return self._given(law, index[places]), torch.from_numpy(index[rows])
 
     def _given(self, law: JointNormal, places: NDArray[np.intp]) -> Conditioned:
-        """Law given what is known, at these places among its steps."""
+        """Law given the observations, which are at these indices among its steps."""
         value, noise = (torch.from_numpy(part.reshape(-1, self.n_outputs_)) for part in self._known[1:])
         axes = None if self._axes is None else torch.from_numpy(self._axes)
         return Conditioned(law, torch.from_numpy(places), value, noise, axes)
@@ -171,9 +171,9 @@ class MovementLaw(BaseEstimator, ABC):
         return conditioned.law, rows
 
     def _prior_with(self, time: Floats) -> tuple[JointNormal, NDArray[np.intp]]:
-        """Joint law at increasing times, maybe at others too, and their places in it.
+        """Joint law at increasing times, possibly at others too, and their indices in it.
 
-        Times that were asked for last take no work again.
+        The law of the last times is cached.
         """
         kept = self.__dict__.setdefault("_kept", {})
         if kept and len(time):
@@ -195,7 +195,7 @@ class MovementLaw(BaseEstimator, ABC):
         return law, np.arange(len(time))
 
     def _copy(self) -> Self:
-        """Copy with the same law before anything is known, which both keep."""
+        """Copy that shares the unconditioned law and its cache."""
         copied = copy.copy(self)
         copied._kept = self.__dict__.setdefault("_kept", {})
         return copied
@@ -205,9 +205,9 @@ class MovementLaw(BaseEstimator, ABC):
 
 
 def as_recordings(model: Any, X: Any, y: Any, groups: Any, *, is_fit: bool) -> list[Recording]:
-    """Demonstrations of what was passed to a model of movements, each in the order of its times.
+    """Demonstrations from the arguments of a model of movements, each in the order of its times.
 
-    A fit learns from them what its input is, and how many outputs there are: ``input_``, ``n_outputs_``.
+    A fit sets the kind of its input, ``input_``, and the number of outputs, ``n_outputs_``.
     """
     if isinstance(X, Demonstrations):
         if y is not None or groups is not None:
@@ -218,7 +218,7 @@ def as_recordings(model: Any, X: Any, y: Any, groups: Any, *, is_fit: bool) -> l
             if X.alignment == "dtw":
                 checks.warn(TIMING_REMOVED)
         shown, (X, y, groups) = X, X.stack(input="phase" if timed else model.input_)
-        if timed:  # of durations that have little in common, only phases stack
+        if timed:  # demonstrations of different durations would otherwise be stacked over phase
             X = np.concatenate(shown.from_start().times)[:, np.newaxis]
     elif is_fit:
         model.input_ = "array"
@@ -251,7 +251,7 @@ def as_rows(recordings: list[Recording]) -> tuple[Floats, Floats, NDArray[np.int
 
 
 def check_arrays(arrays: dict[str, Floats], shapes: dict[str, tuple[int | str, ...]]) -> None:
-    """Refuse arrays of a model file that have not these names and shapes."""
+    """Check that the arrays of a model file have these names and shapes."""
     if set(arrays) != set(shapes):
         raise ValueError(f"its arrays are {', '.join(arrays)}, must be {', '.join(shapes)}")
     for name, shape in shapes.items():

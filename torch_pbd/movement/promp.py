@@ -1,4 +1,4 @@
-"""Probabilistic movement primitives (ProMP): a normal law of the weights of basis functions."""
+"""Probabilistic movement primitives (ProMP): a normal distribution of the weights of basis functions."""
 
 import itertools
 from functools import partial
@@ -13,16 +13,16 @@ from torch_pbd.movement.base import MovementRegressor
 from torch_pbd.movement.joint import JointNormal
 from torch_pbd.movement.law import Recording, as_rows, check_arrays
 
-_N_BASES = (8, 12, 16, 20)  # tried by "auto", as far as recordings have samples for them
-_REACHES = (1.0, 2.0, 4.0)  # of the smooth prior, in bases
-_SHARES = (0.9, 0.7, 0.5, 0.3, 0.1, 0.03)  # of the smooth prior
-_OVERLAPS = (0.7, 0.85, 0.92)  # narrow bases follow bends, wide ones are smooth: 0.7 is movement_primitives'
-_LEAST_NOISE = 1e-4  # of an output's deviation: below it a law has no density to speak of
-_MOST_LEFT_OUT = 40  # demonstrations that are left out in turn
+_N_BASES = (8, 12, 16, 20)  # candidates of "auto", as far as recordings have enough samples
+_REACHES = (1.0, 2.0, 4.0)  # candidate length scales of the smooth prior, in bases
+_SHARES = (0.9, 0.7, 0.5, 0.3, 0.1, 0.03)  # candidate weights of the smooth prior
+_OVERLAPS = (0.7, 0.85, 0.92)  # narrow bases follow bends, wide ones are smooth; movement_primitives uses 0.7
+_LEAST_NOISE = 1e-4  # least noise as a share of an output's deviation: below it the law is nearly singular
+_MOST_LEFT_OUT = 40  # most demonstrations that are left out in turn
 
 
 class ProMPBaseline(MovementRegressor):
-    """Probabilistic movement primitive: x_t = Psi_t w + noise, with a normal law of the weights w.
+    """Probabilistic movement primitive: x_t = Psi_t w + noise, with normally distributed weights w.
 
     Bases are normalized Gaussians over the time; the weights of each demonstration are found by ridge regression. Their
     covariance is singular for fewer demonstrations than weights: it is shrunk towards a smooth one, a squared
@@ -31,29 +31,29 @@ class ProMPBaseline(MovementRegressor):
     Parameters
     ----------
     n_basis : int or "auto", default="auto"
-        Bases; "auto" takes 8 to 20 by the likelihood of demonstrations left out in turn.
+        Number of bases; "auto" takes 8 to 20 by the likelihood of demonstrations left out in turn.
     overlap : float or "auto", default="auto"
-        Of a basis with its neighbours, in the middle between two before they are normalized, 0 to 1; "auto" takes 0.7,
-        0.85 or 0.92 by that likelihood.
+        Value of a basis, before normalization, midway to its neighbour's centre, 0 to 1; "auto" takes 0.7, 0.85 or 0.92
+        by the same likelihood.
     ridge : float, default=1e-6
-        Of the regression of the weights, relative to the mean diagonal of its matrix.
+        Ridge of the regression of the weights, relative to the mean diagonal of its matrix.
     shrinkage : float or "auto", default="auto"
-        Weight of the smooth covariance, 0 to 1; "auto" takes it, and how far it reaches, by that likelihood too.
+        Weight of the smooth covariance, 0 to 1; "auto" takes it and its length scale by the same likelihood.
     random_state : int, RandomState instance or None, default=0
-        Not used: the fit is deterministic.
+        Not used, since the fit is deterministic.
 
     Attributes
     ----------
     n_basis_ : int
     overlap_ : float
     shrinkage_, reach_ : float
-        Weight of the smooth covariance, and its length scale in bases.
+        Weight of the smooth covariance and its length scale in bases.
     weight_mean_ : ndarray of shape (n_basis, n_outputs)
     weight_covariance_ : ndarray of shape (n_basis n_outputs, n_basis n_outputs)
     noise_scale_ : ndarray of shape (n_outputs,)
-        Deviation of the samples from what the bases follow, in units of y.
+        Standard deviation of the samples around the fitted bases, in units of y.
     df_ : float
-        Infinite: the law is normal.
+        Degrees of freedom; infinite, as the law is normal.
     n_features_in_, n_outputs_ : int
 
     References
@@ -136,7 +136,7 @@ class ProMPBaseline(MovementRegressor):
 
 
 class _Weights:
-    """Weights of each demonstration, and what is needed to judge a covariance of them."""
+    """Weights of each demonstration, and the statistics that score a covariance of them."""
 
     def __init__(self, recordings: list[Recording], n_basis: int, overlap: float, ridge: float) -> None:
         self.n_basis, self.overlap = n_basis, overlap
@@ -153,17 +153,17 @@ class _Weights:
         positions = np.concatenate(self._positions)
         deviation = positions.std(axis=0)
         least = _LEAST_NOISE * np.where(deviation > 0.0, deviation, 1.0)
-        # Samples, less the weights that were fitted to them.
+        # Degrees of freedom: samples minus the weights that were fitted to them.
         freedoms = max(1, len(positions) - n_basis * len(recordings))
         self.noise_scale: Floats = np.maximum(np.sqrt(np.sum(squares, axis=0) / freedoms), least)
 
     def covariance(self, values: Floats, reach: float, share: float) -> Floats:
-        """Covariance of weights (K, B, d), shrunk: (B d, B d)."""
+        """Shrunk covariance (B d, B d) of weights (K, B, d)."""
         centred = values - values.mean(axis=0)
         flat = centred.reshape(len(values), -1)
         own = flat.T @ flat / (len(values) - 1)
         outputs = np.einsum("kbi,kbj->ij", centred, centred) / (len(values) - 1) / self.n_basis
-        # Weights of near bases vary alike, and the outputs of each as those of all do.
+        # Weights of near bases vary together, and the outputs of each covary as over all bases.
         number = np.arange(self.n_basis)
         smooth = np.exp(-0.5 * np.square((number[:, np.newaxis] - number) / reach))
         return np.asarray((1.0 - share) * own + share * np.kron(smooth, outputs))
@@ -171,8 +171,8 @@ class _Weights:
     def left_out(self, reach: float, share: float) -> float:
         """Log likelihood of demonstrations under the law of the others, in nats.
 
-        With y = Psi w + noise, r = y - Psi mean, M = Psi' Psi / s^2, b = Psi' r / s^2 and the weights' covariance S, it
-        is -(log det(I + M S) + r' r / s^2 - b' S (I + M S)^-1 b + log det s^2 + n log 2 pi) / 2.
+        For y = Psi w + noise, with r = y - Psi mean, M = Psi' Psi / s^2, b = Psi' r / s^2 and the weights' covariance
+        S, it is -(log det(I + M S) + r' r / s^2 - b' S (I + M S)^-1 b + log det s^2 + n log 2 pi) / 2.
         """
         if len(self.values) < 3:
             return -float(np.log(self.noise_scale).sum())  # one other demonstration has no covariance
@@ -191,7 +191,7 @@ class _Weights:
 
 
 def basis_functions(time: Floats, n_basis: int, overlap: float) -> Floats:
-    """Normalized Gaussian bases (n, n_basis) at times from 0 to 1, by their centres evenly from 0 to 1."""
+    """Normalized Gaussian bases (n, n_basis) at times from 0 to 1, with centres evenly spaced from 0 to 1."""
     centres = np.linspace(0.0, 1.0, n_basis)
     width = -1.0 / (8.0 * n_basis**2 * np.log(overlap))
     exponent = -0.5 * np.square(time[:, np.newaxis] - centres) / width

@@ -1,14 +1,14 @@
-"""Correlation of a demonstration along its course: a kernel of time for each output, nuggets, and the loadings.
+"""Correlation of a demonstration along time: a time kernel for each output, nuggets, and loadings.
 
-Whitened residuals ``z`` of the demonstrations, of unit covariance at each step, are taken for ``g_t + eps_t`` in each
+Whitened residuals ``z`` of the demonstrations, of unit covariance at each step, are modelled as ``g_t + eps_t`` in each
 output: g has a kernel over time, eps_t is independent with a variance e_t, the nugget. One nugget for all steps would
-have to be as large as where movements start or end in one point, which marginals mistrack, and would spoil all others.
+have to be as large as where movements start or end at one point, which marginals mistrack, and would spoil all others.
 
-The kernel has one length scale, or is the sum of two: what people vary slowly, and what little they tremble. The slow
-part is a share of the deviation at each step, which whitening makes one. A tremble is of one size in the units of the
-outputs, however much people vary there: in whitened residuals it is large where the deviation is small, and in the
-outputs that have little left of their own. One kernel for all must be as rough as the roughest of them, and draws are
-then rougher and longer than demonstrations.
+The kernel has one length scale, or is the sum of two: slow variation and a small tremor. The slow part is proportional
+to the deviation at each step, which whitening makes one. A tremor has a constant size in the units of the outputs,
+however much people vary there: in whitened residuals it is large where the deviation is small, and in outputs with
+little variance left of their own. A single kernel for all outputs must be as rough as the roughest of them, and draws
+are then rougher and longer than demonstrations.
 """
 
 import torch
@@ -20,10 +20,10 @@ from torch_pbd.linalg import safe_cholesky
 
 
 class TimeKernel(nn.Module):
-    """Correlation along the movement as it was found on a grid of T steps, from K demonstrations of d outputs.
+    """Correlation along the movement, learned on a grid of T steps from K demonstrations of d outputs.
 
-    ``scales`` (d, 2) are the length scales of the slow part and of the tremble of each output, ``fine`` (d, T) is the
-    variance of the tremble over that of the slow part, ``nugget`` (d, T) that of the independent part over both, and
+    ``scales`` (d, 2) are the length scales of the slow part and of the tremor of each output, ``fine`` (d, T) is the
+    variance of the tremor over that of the slow part, ``nugget`` (d, T) that of the independent part over both, and
     ``residual`` (K, T, d) are whitened residuals without holes. ``share`` is the weight of the kernel's correlation;
     the rest is that of the demonstrations' own residuals.
     """
@@ -45,21 +45,21 @@ class TimeKernel(nn.Module):
         buffers = {"grid": grid, "scales": scales, "fine": fine, "nugget": nugget, "residual": residual, "share": share}
         for name, value in buffers.items():
             self.register_buffer(name, value)
-        # Weights of the kernel that make up the smooth parts of all residuals, and what these leave of them: (d, T, K).
+        # Kernel weights of the smooth parts of all residuals, and the remainders of these: (d, T, K).
         rows, own = residual.permute(2, 1, 0), self._correlation(grid, grid)
         root = safe_cholesky(own + torch.diag_embed(nugget), name="the time kernel")
         self.register_buffer("_weights", torch.cholesky_solve(rows, root), persistent=False)
         self.register_buffer("_left", rows - own @ self._weights, persistent=False)
 
     def correlation(self, time: Float[Tensor, " n"], other: Float[Tensor, " m"]) -> Float[Tensor, "d n m"]:
-        """Correlation between any times: nuggets are linear between steps; equal times are one."""
+        """Correlation between any times; nuggets are linear between steps, and equal times have correlation 1."""
         own, nugget = (_interpolated(self.grid, self.nugget, part) for part in (time, other))
         whole = self._correlation(time, other)
         whole = whole + torch.where(time[:, None] == other, nugget[:, None], 0.0)
         return (1.0 + own).rsqrt()[:, :, None] * whole * (1.0 + nugget).rsqrt()[:, None]
 
     def loadings(self, time: Float[Tensor, " n"]) -> Float[Tensor, "n d K"]:
-        """Residuals of the demonstrations at any times: smooth parts by the kernel, what is left of them linear."""
+        """Residuals of the demonstrations at any times: smooth parts by the kernel, remainders linear between steps."""
         left = _interpolated(self.grid, self._left.mT.flatten(0, 1), time).reshape(*self._left.mT.shape[:2], -1)
         return (self._correlation(time, self.grid) @ self._weights + left.mT).transpose(0, 1)
 
@@ -76,8 +76,8 @@ def smooth_correlation(
     other_fine: Float[Tensor, "b m"],
     kernel: str,
 ) -> Float[Tensor, "b n m"]:
-    """Correlation of the smooth part, of unit variance: of a slow one, and of a tremble of these variances over it."""
-    # Many share a length scale, and exponentials are what this costs.
+    """Correlation, of unit variance, of a slow part and a tremor of these variances relative to it."""
+    # Many share a length scale, and the exponentials dominate the cost.
     lengths, places = torch.unique(scales, return_inverse=True)
     each = correlation(time[:, None], other[:, None], lengths[:, None], kernel)
     slow = each[places[:, 0]]

@@ -1,4 +1,4 @@
-"""Fit of time kernels: length scales by likelihood, nuggets by expectation maximization, in turn; and the share."""
+"""Fit of time kernels: length scales by likelihood alternating with nuggets by EM, then the kernel's share."""
 
 import math
 from collections.abc import Sequence
@@ -11,23 +11,23 @@ from torch import Tensor
 from torch_pbd.linalg import safe_cholesky, symmetrize
 from torch_pbd.movement.time_kernel import TimeKernel, smooth_correlation
 
-# Length scales in ranges of the time, from the spacing of some fifty steps to a movement that bends once; and nuggets
-# shared by all steps.
+# Candidate length scales in ranges of the time, from the spacing of fifty steps to a movement that bends once, and
+# candidate nuggets shared by all steps.
 _LENGTHS = torch.logspace(math.log10(0.02), 0.0, 14, dtype=torch.float64).tolist()
 _NUGGETS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 0.1)
-_FINE_WEIGHTS = (0.03, 0.1, 0.3, 0.6)  # of the tremble in the variance of a usual step
-_RATIOS = (2.0, 4.0)  # of the slow length scale to the tremble's
+_FINE_WEIGHTS = (0.03, 0.1, 0.3, 0.6)  # candidate shares of the tremor in the variance at a usual step
+_RATIOS = (2.0, 4.0)  # candidate ratios of the slow length scale to the tremor's
 _LEAST, _MOST, _FIRST = 1e-6, 1e3, 1e-2  # nuggets: smallest, largest, and where expectation maximization starts
-_N_STEPS, _TOLERANCE = 40, 0.02  # of expectation maximization: iterations, and change of a logarithm that ends it
-_SMOOTH = 1e-3  # nugget of a step that is told apart from noise: such steps decide on the length scale
-_NEAR = 2.5  # factor of a length scale, in which it is looked for again once there are nuggets
-_USUAL = 2.0  # factor of the median, in which the size of a step's residuals lies
-_ROUNDS = 3  # of nuggets and length scale, which depend on each other
-_SHARES = (1.0, 0.9, 0.75, 0.6, 0.45, 0.3, 0.2, 0.1, 0.05)  # of the kernel, the rest being the demonstrations' own
+_N_STEPS, _TOLERANCE = 40, 0.02  # expectation maximization: most iterations, and change of a logarithm that ends it
+_SMOOTH = 1e-3  # largest nugget of a step that is distinguished from noise: such steps determine the length scale
+_NEAR = 2.5  # factor around a length scale within which it is searched again once there are nuggets
+_USUAL = 2.0  # factor around the median within which the size of a step's residuals is usual
+_ROUNDS = 3  # alternations of nuggets and length scale, which depend on each other
+_SHARES = (1.0, 0.9, 0.75, 0.6, 0.45, 0.3, 0.2, 0.1, 0.05)  # candidate weights of the kernel in the correlation
 
 
 class Scales(NamedTuple):
-    """Length scales of the slow part and of the tremble, and the tremble's weight at a usual step, zero without one."""
+    """Length scales of the slow part and of the tremor, and the tremor's weight at a usual step, 0 without one."""
 
     slow: float
     fine: float
@@ -49,10 +49,10 @@ def fit_time_kernel(
     kernels: Sequence[str],
     share: float | None,
 ) -> TimeKernel:
-    """Time kernel of whitened residuals, NaN where a demonstration has no sample near, over times of a range of one.
+    """Time kernel of whitened residuals, NaN where a demonstration has no sample near, over times of range one.
 
-    The residuals of an output were divided by its ``deviation``, after those before it were taken out. The likeliest of
-    the ``kernels`` is taken, and for ``share`` None that under which demonstrations left out in turn are likeliest.
+    Each output's residuals, given the outputs before it, were divided by its ``deviation``. The likeliest of the
+    ``kernels`` is taken, and for ``share`` None the share under which demonstrations left out in turn are likeliest.
     """
     outputs = [_unit_rms(part) for part in residual.split(1, dim=2)]
     usual = [_usual_steps(part) for part in outputs]
@@ -62,7 +62,7 @@ def fit_time_kernel(
     tremble = deviation.median(0).values / deviation
     fitted = []
     for part, steps, size, single in zip(outputs, usual, tremble.mT, found[kernel], strict=True):
-        # A tremble is likelier for residuals by themselves, not always beside those of the others.
+        # A tremor that makes the residuals of one output likelier need not do so jointly with those of the others.
         results = [_fit_output(grid, part, steps, size, kernel, single, is_sum) for is_sum in (False, True)]
         fitted.append(max(results, key=lambda result: _left_out(result, shares)[0]))
     stacked = {name: torch.cat([getattr(each, name) for each in fitted]) for name in ("scales", "fine", "nugget")}
@@ -73,7 +73,7 @@ def fit_time_kernel(
 
 
 def _usual_steps(residual: Float[Tensor, "K T 1"]) -> Bool[Tensor, " T"]:
-    """Steps at which residuals are about as large as elsewhere."""
+    """Steps at which residuals are of about the median size."""
     sizes = residual.square().nanmean((0, 2)).sqrt()
     return (sizes > sizes.nanmedian() / _USUAL) & (sizes < sizes.nanmedian() * _USUAL)
 
@@ -87,7 +87,7 @@ def _fit_output(
     single: Found,
     is_sum: bool,
 ) -> TimeKernel:
-    """Scales and nuggets of one output by turns, from what is likeliest of the usual steps on."""
+    """Scales and nuggets of one output in alternation, starting from the likeliest scales of the usual steps."""
     found = _with_tremble(grid, residual, usual, kernel, single, tremble) if is_sum else single
     unit = _candidates(grid, tremble, [found.scales], kernel)[0]
     nugget = _step_nuggets(unit, residual, _LEAST)
@@ -112,7 +112,7 @@ def _fit_output(
 def _tensors(
     tremble: Float[Tensor, " n"], scales: Sequence[Scales]
 ) -> tuple[Float[Tensor, "b 2"], Float[Tensor, "b n"]]:
-    """Length scales, and variances of the tremble over those of the slow part."""
+    """Length scales, and variances of the tremor over those of the slow part."""
     whole = tremble.new_tensor(scales)
     weight = whole[:, 2:]
     return whole[:, :2], weight / (1.0 - weight) * tremble.square()
@@ -128,7 +128,7 @@ def _candidates(
 def _search(
     grid: Tensor, residual: Float[Tensor, "K T 1"], steps: Bool[Tensor, " T"], kernel: str, near: float | None = None
 ) -> Found:
-    """Likeliest length scale, of all or of those near one that was likely, at some steps of an output."""
+    """Likeliest length scale at some steps of an output, among all or among those near a previous one."""
     lengths = [length for length in _LENGTHS if near is None or near / _NEAR <= length <= near * _NEAR]
     candidates = [Scales(length, length, 0.0) for length in lengths]
     return _likeliest(grid, residual, steps, kernel, candidates, _NUGGETS, torch.zeros_like(grid))
@@ -137,7 +137,7 @@ def _search(
 def _with_tremble(
     grid: Tensor, residual: Tensor, steps: Tensor, kernel: str, single: Found, tremble: Float[Tensor, " T"]
 ) -> Found:
-    """Likeliest of one length scale, and of two on either side of it: a tremble takes a part of the nugget's place."""
+    """Likeliest of one length scale and of two on either side of it, where a tremor replaces part of the nugget."""
     length = single.scales.slow
     candidates = [
         Scales(slow, slow / ratio, weight)
@@ -160,7 +160,7 @@ def _likeliest(
     nuggets: Sequence[float],
     tremble: Float[Tensor, " T"],
 ) -> Found:
-    """Highest log likelihood of ``(1 - eta) K + eta I``, and its scales and shared nugget eta."""
+    """Highest log likelihood of ``(1 - eta) K + eta I``, with its scales and shared nugget eta."""
     steps = steps if 2 * int(steps.sum()) >= len(grid) else torch.ones_like(steps)
     groups, time = _by_pattern(_unit_rms(residual[:, steps])), grid[steps]
     unit = _candidates(time, tremble[steps], candidates, kernel)
@@ -175,7 +175,7 @@ def _likeliest(
 
 
 def _log_likelihood(covariance: Float[Tensor, "b n n"], rows: Float[Tensor, "n s"]) -> Float[Tensor, " b"]:
-    """Log density of the series in ``rows``, but for a constant; minus infinity where a matrix is singular."""
+    """Log density of the series in ``rows``, up to a constant; minus infinity where a matrix is singular."""
     root, info = torch.linalg.cholesky_ex(covariance)
     whitened = torch.linalg.solve_triangular(root, rows.expand(len(root), *rows.shape), upper=False)
     value = -0.5 * whitened.square().sum((1, 2)) - rows.shape[1] * root.diagonal(dim1=1, dim2=2).log().sum(1)
@@ -209,16 +209,16 @@ def _step_nuggets(unit: Float[Tensor, "T T"], residual: Float[Tensor, "K T d"], 
 
 
 def _left_out(kernel: TimeKernel, shares: Sequence[float]) -> tuple[float, float]:
-    """Highest log likelihood of each demonstration under the law that the others' residuals give, and its share.
+    """Highest log likelihood of the demonstrations, each under the law of the others' residuals, and its share.
 
-    Their law is ``z = C^-1 y``, y of the covariance ``S = share R + (1 - share) / (K - 1) sum z z'`` over the
-    others and ``C_t = chol S_tt``, which keeps the marginals: it bends the smooth part, and costs where that has little
+    In this law ``z = C^-1 y``, y has the covariance ``S = share R + (1 - share) / (K - 1) sum z z'`` over the
+    others, and ``C_t = chol S_tt`` keeps the marginals: it bends the smooth part, at a cost where that has little
     variance. With the Gram matrix G of all under R^-1, ``M = G + a I``, ``a = share (K - 1) / (1 - share)`` and
     ``c = Z' R^-1 y``, the squared distance is ``(y' R^-1 y - c' M^-1 c) / share`` and the determinant that of M over
-    the others, whose inverse is that of all without what one row of it adds.
+    the others, whose inverse follows from that of all by removing one row.
     """
     n_demos, n_steps, d = kernel.residual.shape
-    if n_demos < 3:  # one other demonstration tells nothing
+    if n_demos < 3:  # a single other demonstration has no covariance
         return 0.0, shares[0]
     root = safe_cholesky(kernel.correlation(kernel.grid, kernel.grid), name="the correlation along the movement")
     residual = kernel.residual

@@ -1,4 +1,4 @@
-"""Movements whose duration and pace are not known: mixtures over both of models of phase."""
+"""Movements of unknown duration and pace, as mixtures of models of phase over both."""
 
 import copy
 from typing import Any, Self
@@ -16,20 +16,20 @@ from torch_pbd.movement.base import MovementRegressor
 from torch_pbd.movement.law import Known, Recording
 from torch_pbd.movement.timing import Likelihood, Nodes, Timing, phase_of, register, time_of
 
-_FEWEST = 4  # demonstrations that say how two numbers vary together
-_N_STEPS = 100  # of a curve whose pace is found
-# Samples a movement by which its timing is found. Nearer ones repeat each other but for their smoothness, of which the
-# law knows little: with 25 and 50 the posterior was two and three times too narrow.
+_FEWEST = 4  # demonstrations needed to estimate how duration and pace vary together
+_N_STEPS = 100  # steps of a curve whose pace is estimated
+# Samples per movement from which its timing is estimated. Nearer ones repeat each other except for their smoothness,
+# which the law hardly models: with 25 and 50 the posterior was two and three times too narrow.
 _SEEN = 12.0
 _MOST_FOLDS = 5
-_SLACK = 1e-3  # of a duration: where all last equally long, the last sample may be later by rounding
-# Steps on which the correlation is learned: the nuggets' iterations are cubic in them, and movements are smooth.
+_SLACK = 1e-3  # share of a duration: where all last equally long, rounding may put the last sample later
+# Most steps on which the correlation is learned: the nuggets' iterations are cubic in them, and movements are smooth.
 _MOST_STEPS = 200
-_GAP = 2.0  # sample spacings of a recording: a step farther than that from its samples was not seen in it
+_GAP = 2.0  # sample spacings of a recording: a step farther than that from its samples counts as missing
 
 
 class TimedMovement(MovementRegressor):
-    """Model of movements whose law is over phase and whose input is time, where ``timing`` is not "none"."""
+    """Base of models whose law is over phase and whose input is time, where ``timing`` is not "none"."""
 
     regressor: Any
     timing: str
@@ -39,7 +39,7 @@ class TimedMovement(MovementRegressor):
     _nodes: Nodes  # posterior of duration and pace
 
     def predict_phase(self, X: ArrayLike) -> tuple[Floats, Floats]:
-        """Phase estimation: how far the movement is at times X, given what is known of it.
+        """Phase of the movement at times X, estimated from the observations of :meth:`condition`.
 
         Parameters
         ----------
@@ -49,7 +49,7 @@ class TimedMovement(MovementRegressor):
         Returns
         -------
         mean, std : ndarray of shape (n_samples,)
-            Of the phase: 0 at the start, 1 from the end on.
+            Mean and standard deviation of the phase, which is 0 at the start and 1 from the end on.
 
         Raises
         ------
@@ -64,9 +64,9 @@ class TimedMovement(MovementRegressor):
         return mean, np.sqrt(weight @ np.square(phases - mean))
 
     def condition(self, X: ArrayLike, y: ArrayLike, *, noise_scale: ArrayLike = 0.0) -> Self:
-        """Fitted copy, of a movement that is at y at X; see ``MovementRegressor.condition``.
+        """Fitted copy, conditioned on passing y at X; see ``MovementRegressor.condition``.
 
-        With timing, X is the time of the running movement, and it runs at the last of them.
+        With unknown timing, X is the time since the start of a movement that still runs at the last of them.
         """
         copied = super().condition(X, y, noise_scale=noise_scale)
         if copied._timing is not None:
@@ -75,7 +75,7 @@ class TimedMovement(MovementRegressor):
         return copied
 
     def _components(self, time: Floats) -> tuple[Floats, list[tuple[Self, Floats]]]:
-        """Weights of durations and paces, and for each the law over phase and the phases of these times."""
+        """Weights of durations and paces, with the law over phase and the phases of these times for each."""
         if self._timing is None:
             return super()._components(time)
         nodes = self._nodes
@@ -146,7 +146,7 @@ class TimedMovement(MovementRegressor):
         return log_likelihood
 
     def _timed(self, recordings: list[Recording]) -> list[Recording]:
-        """Recordings over the input of the law, after it was decided whether their timing varies."""
+        """Recordings over the input of the law, once it is decided whether their timing varies."""
         self._timing, self.timing_ = None, self.timing
         if self.timing == "none":
             return recordings
@@ -178,7 +178,7 @@ class TimedMovement(MovementRegressor):
             size = curves.std((0, 1))
             pace = register(torch.from_numpy(curves / np.where(size > 0.0, size, 1.0)))
         self._set_timing(Timing.learn(durations, pace) if timing == "warp" else Timing.even(durations))
-        # On phases that all share, as of aligned demonstrations.
+        # On shared phases, as if the demonstrations were aligned.
         shared = np.linspace(0.0, 1.0, n_grid_steps(recordings))
         phased = []
         for (time, position), own in zip(recordings, pace, strict=True):
@@ -191,9 +191,9 @@ class TimedMovement(MovementRegressor):
         self._timing, self._nodes = timing, timing.posterior(_flat)
 
     def _gain(self, recordings: list[Recording]) -> float:
-        """Nats a step by which a warp makes left-out demonstrations likelier than the mean duration at an even pace.
+        """Gain of a warp over the mean duration at an even pace, in nats per step of left-out demonstrations.
 
-        Of steps a twelfth of a movement apart, as far as both have the movement run.
+        Steps are a twelfth of a movement apart, as long as the movement runs under both.
         """
         n_folds, mean = min(_MOST_FOLDS, len(recordings)), np.mean([recording.time[-1] for recording in recordings])
         gain, n_steps = 0.0, 0
@@ -212,7 +212,7 @@ class TimedMovement(MovementRegressor):
         return gain / n_steps
 
     def _timing_arrays(self) -> dict[str, Floats]:
-        """Arrays of model files; none where timing is "none"."""
+        """Arrays of the timing for model files; none where timing is "none"."""
         if self._timing is None:
             return {}
         arrays = {name: np.asarray(getattr(self._timing, name)) for name in ("location", "root", "df")}
@@ -220,7 +220,7 @@ class TimedMovement(MovementRegressor):
         return {f"timing_{name}": array for name, array in arrays.items()}
 
     def _restore_timing(self, arrays: dict[str, Floats]) -> dict[str, Floats]:
-        """Take up such arrays; the others are returned."""
+        """Restore the timing from the arrays of a model file, and return the others."""
         self.timing_ = self.timing
         if self.timing == "none":
             return arrays
@@ -255,7 +255,7 @@ def n_grid_steps(recordings: list[Recording]) -> int:
 
 
 def sampled(recording: Recording, grid: Floats) -> Floats:
-    """Positions of a recording at the steps of a grid, linear between samples; NaN where it has no sample near."""
+    """Positions of a recording at the steps of a grid, linear between samples; NaN where no sample is near."""
     time, position = recording
     columns = [np.interp(grid, time, column) for column in position.T]
     right = np.clip(np.searchsorted(time, grid), 1, len(time) - 1)

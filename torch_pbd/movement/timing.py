@@ -1,10 +1,10 @@
-"""Timing of movements: how long one takes and how its pace changes, learned from demonstrations, found while it runs.
+"""Duration and pace of movements: learned from demonstrations, and estimated while a movement runs.
 
-A movement passes its phase s, 0 to 1, in the time u = t / T since its start over its duration T:
+A movement at time t of its duration T, u = t / T, has the phase s from 0 to 1:
 
     ``s = (1 - exp(-a u)) / (1 - exp(-a))``, so that ``exp(a)`` is its pace at the start over that at the end.
 
-That increases for every a, and a = 0 is an even pace. What is learned is the law of ``(log T, a)``.
+The phase increases for every a, and a = 0 is an even pace. The law of ``(log T, a)`` is learned.
 """
 
 import math
@@ -17,22 +17,22 @@ from jaxtyping import Float
 from torch import Tensor
 
 _PACES = torch.linspace(-3.0, 3.0, 121, dtype=torch.float64)  # exp(3): twenty times as fast at the start as at the end
-_ROUNDS = 10  # of registration: the mean and the paces depend on each other
-_EVEN = 1e-5  # below it the series in a is exact to rounding
-_SAME = 1e-4  # spread of log durations that counts as none: of sampling
-# Nodes along a side of lattices that follow each other until the posterior is wider than their cells, and of the last,
-# whose nodes all predict. They reach over four standard deviations: a sum over nodes 4/3 of them apart is a normal
+_ROUNDS = 10  # rounds of registration: the mean and the paces depend on each other
+_EVEN = 1e-5  # magnitude of a below which its series is exact to rounding
+_SAME = 1e-4  # spread of log durations that counts as none, since sampling makes as much
+# Nodes along a side of successively finer lattices, until the posterior is wider than their cells, and of the last one,
+# whose nodes all predict. They reach over four standard deviations: with nodes 4/3 of one apart, a sum is a normal
 # integral to 1e-4. A normal density 0.7 cells wide has the weight of 2.5 nodes along each axis.
 _SIDE, _SIDE_LAST, _REACH, _MOST_LATTICES, _FEW = 13, 6, 4.0, 20, 2.5
 _LEAST_POWER = 1e-9
-_RARE = 7.0  # nats below the density of the middle, where the first lattice ends
+_RARE = 7.0  # the first lattice ends where the density is this many nats below that of its middle
 
 
 Likelihood = Callable[[Tensor, Tensor], Tensor]
 
 
 class Nodes(NamedTuple):
-    """Posterior of duration and pace, as weights of nodes, and log of the integral of prior times likelihood."""
+    """Posterior of duration and pace as weighted nodes, and log of the integral of prior times likelihood."""
 
     duration: Float[Tensor, " b"]
     pace: Float[Tensor, " b"]
@@ -45,14 +45,14 @@ class Nodes(NamedTuple):
 
 
 def phase_of(time: Tensor, pace: Tensor) -> Tensor:
-    """Phase at times over the duration; after the end it is 1."""
+    """Phase at times in durations of the movement; 1 after the end."""
     u, even = time.clamp(max=1.0), pace.abs() < _EVEN
     safe = torch.where(even, 1.0, pace)
     return torch.where(even, u + 0.5 * pace * u * (1.0 - u), torch.expm1(-safe * u) / torch.expm1(-safe))
 
 
 def time_of(phase: Tensor, pace: Tensor) -> Tensor:
-    """Time over the duration at which a phase is passed: the inverse of :func:`phase_of`."""
+    """Time in durations of the movement at which a phase is reached: the inverse of :func:`phase_of`."""
     even = pace.abs() < _EVEN
     safe = torch.where(even, 1.0, pace)
     series = phase - 0.5 * pace * phase * (1.0 - phase)
@@ -60,9 +60,9 @@ def time_of(phase: Tensor, pace: Tensor) -> Tensor:
 
 
 def register(curves: Float[Tensor, "K n d"]) -> Float[Tensor, " K"]:
-    """Paces under which curves, sampled evenly over their durations, are nearest to their mean; zero in the mean.
+    """Paces, of mean zero, under which curves sampled evenly over their durations are nearest to their mean.
 
-    Curves are in comparable units. Least squares over a grid of paces, in turn with the mean.
+    Curves must be in comparable units. Least squares over a grid of paces alternates with the mean.
     """
     n_demos, n, _ = curves.shape
     paces, each = _PACES.to(curves), torch.arange(n_demos)
@@ -73,7 +73,7 @@ def register(curves: Float[Tensor, "K n d"]) -> Float[Tensor, " K"]:
     for _ in range(_ROUNDS):
         before, mean = chosen, warped[each, chosen].mean(0)
         chosen = (warped - mean).square().sum((2, 3)).argmin(1)
-        # The mean curve has no pace of its own: all may be shifted.
+        # The pace of the mean curve is arbitrary, so that all paces may be shifted.
         chosen = (chosen + len(paces) // 2 - chosen.double().mean().round().long()).clamp(0, len(paces) - 1)
         if torch.equal(chosen, before):
             break
@@ -82,7 +82,7 @@ def register(curves: Float[Tensor, "K n d"]) -> Float[Tensor, " K"]:
 
 @dataclass(frozen=True)
 class Timing:
-    """Student's t of (log T, a): what K demonstrations, normal in both, say of the next."""
+    """Predictive Student's t of (log T, a) for the next movement, given K demonstrations that are normal in both."""
 
     location: Float[Tensor, " 2"]
     root: Float[Tensor, "2 2"]
@@ -91,10 +91,10 @@ class Timing:
 
     @classmethod
     def learn(cls, duration: Float[Tensor, " K"], pace: Float[Tensor, " K"]) -> "Timing":
-        """Predictive law of more than two demonstrations, whose mean and covariance (2, 2) are estimates.
+        """Predictive law from three or more demonstrations, whose mean and covariance (2, 2) are estimates.
 
-        With mean m and sums of squares S of K normal pairs, the next is a t of K - 2 degrees of freedom around m, with
-        the scale matrix ``(1 + 1 / K) S / (K - 2)``, under Jeffreys' prior.
+        For K normal pairs with mean m and sums of squares S, under Jeffreys' prior, the next pair has a t of K - 2
+        degrees of freedom around m with the scale matrix ``(1 + 1 / K) S / (K - 2)``.
         """
         values = torch.stack([duration.log(), pace], dim=1)
         n_demos = len(values)
@@ -108,18 +108,18 @@ class Timing:
 
     @classmethod
     def even(cls, duration: Float[Tensor, " K"]) -> "Timing":
-        """Movements that all take the mean duration, at an even pace."""
+        """Timing of movements that all take the mean duration at an even pace."""
         return cls(torch.stack([duration.mean().log(), duration.new_zeros(())]), torch.zeros(2, 2).to(duration), 1.0)
 
     def longest(self) -> float:
-        """Duration that movements do not exceed."""
+        """Longest duration of movements."""
         return float((self.location[0] + self._reach() * self.root[0, 0]).exp())
 
     def posterior(self, log_likelihood: Likelihood, last: float = 0.0, *, exact: Likelihood | None = None) -> Nodes:
         """Posterior of duration and pace, given a log likelihood of durations (b,) and paces (b,).
 
-        The movement still runs at the time ``last``, at most :meth:`longest`: it takes no less. A likelihood that costs
-        more, ``exact``, counts on last lattices of its own.
+        The movement still runs at the time ``last``, at most :meth:`longest`, so its duration is no less. The more
+        expensive likelihood ``exact`` is evaluated on last lattices of its own.
         """
         center, root = torch.zeros_like(self.location), self._reach() / _REACH * torch.eye(2).to(self.root)
         cut = -math.inf
@@ -138,10 +138,10 @@ class Timing:
     def _lattice(
         self, log_likelihood: Likelihood, center: Tensor, root: Tensor, cut: float, side: int
     ) -> tuple[Nodes, Tensor, Tensor, bool]:
-        """Midpoints of the cells of a lattice, center and root of the next, and whether this one is fine enough.
+        """Midpoints of a lattice's cells, center and root of the next lattice, and whether this one is fine enough.
 
         Durations depend on the first axis alone, as ``root`` is a lower factor; it is cut where movements would have
-        ended. Where too few nodes carry the weight a power of the likelihood lays the next lattice.
+        ended. Where too few nodes carry the weight, a power of the likelihood places the next lattice.
         """
         low = min(max(float((cut - center[0]) / root[0, 0]), -_REACH), 0.9 * _REACH)
         axes, cell = [], root.new_ones(2)
@@ -156,7 +156,7 @@ class Timing:
         n_varying = int((self.root.diagonal() > 0.0).sum())
         log_prior = -0.5 * (self.df + n_varying) * torch.log1p(z.square().sum(1) / self.df)
         value, power = log_likelihood(duration, pace), 1.0
-        # Of the prior alone, at the least: it may be narrow itself on a first lattice.
+        # At power zero only the prior is left, which may itself be narrow on a first lattice.
         while float((wide := (log_prior + power * value).softmax(0)).square().sum()) > _FEW**-n_varying and power:
             power = 0.5 * power if power > _LEAST_POWER else 0.0
         log_weight = log_prior + value

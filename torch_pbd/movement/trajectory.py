@@ -23,9 +23,9 @@ from torch_pbd.movement.time_kernel import TimeKernel
 from torch_pbd.movement.time_kernel_fit import fit_time_kernel
 from torch_pbd.movement.timed import TimedMovement, n_grid_steps, sampled
 
-_FEWEST_DF, _MOST_DF = 3.0, 200.0  # of the joint law: a variance must exist, and beyond it is normal to all purposes
-# Degrees of freedom of a row over those of a movement: how unusual a whole demonstration can be is seen in the few that
-# there are, how unusual a row is in its neighbours too. 1, 1.5, 2, 3 and 4 were tried on half of the recorded sets.
+_FEWEST_DF, _MOST_DF = 3.0, 200.0  # bounds of the joint law's df: its variance must exist; above 200 it is normal
+# Ratio of a row's degrees of freedom to a movement's: only the few demonstrations show how unusual a whole one can be,
+# while a row is also seen in its neighbours. 1, 1.5, 2, 3 and 4 were tried on half of the recorded sets.
 _WHOLE = 2.0
 
 
@@ -33,8 +33,8 @@ class TrajectoryLaw(nn.Module):
     """Joint law of a movement, as a torch module: differentiable in the times.
 
     With marginals of mean m_t and covariance ``C_t = L_t L_t'``, the correlation R_j of the time kernel of each output
-    and the whitened residuals z_k of K demonstrations, the covariance is ``Sigma = A S A'``, of
-    ``S = w blockdiag(R_1, R_2, ...) + (1 - w) / K sum_k z_k z_k'`` and ``A_t = L_t chol(S_tt)^-1``: its blocks
+    and the whitened residuals z_k of K demonstrations, the covariance is ``Sigma = A S A'`` with
+    ``S = w blockdiag(R_1, R_2, ...) + (1 - w) / K sum_k z_k z_k'`` and ``A_t = L_t chol(S_tt)^-1``, so that its blocks
     ``Sigma_tt`` are the marginals' C_t.
     """
 
@@ -61,7 +61,7 @@ class TrajectoryLaw(nn.Module):
         """Joint law at times that are all different, of these marginals."""
         kernel, time = self.time_kernel, (x - self.x_shift) / self.x_scale
         loadings = ((1.0 - kernel.share) / len(kernel.residual)).sqrt() * kernel.loadings(time)
-        # S_tt, whose factor A_t takes out, so that the blocks of the joint law are those of the marginals.
+        # A_t divides by the factor of S_tt, so that the blocks of the joint law are those of the marginals.
         own = loadings @ loadings.mT + kernel.share * torch.eye(mean.shape[1]).to(mean)
         root = safe_cholesky(covariance, name="the covariance at a step")
         factor = torch.linalg.solve_triangular(torch.linalg.cholesky(own), root, upper=False, left=False)
@@ -69,51 +69,51 @@ class TrajectoryLaw(nn.Module):
 
 
 class TrajectoryRegressor(TimedMovement):
-    """Law of a whole demonstration: the marginals of a covariance regressor, and a correlation along the movement.
+    """Joint law of a whole demonstration: marginals of a covariance regressor and a correlation along the movement.
 
-    Marginals stay the regressor's. Demonstrations are smooth: what one deviates by now it deviates by soon after. Each
-    output, after those before it are taken out, has a kernel of time and a nugget at each step: a slow part that is a
-    share of the deviation there, and a tremble of one size in the output's units. This is shrunk towards the
-    correlation of the demonstrations themselves. The law is one Student's t, with one chi-squared a movement, for draws
-    and scores; it is conditioned by the normal formulas. No matrix of all steps and outputs is formed but for
-    :meth:`predict_joint`.
+    The marginals stay those of the regressor. Demonstrations are smooth: a deviation now persists for a while. Each
+    output, given those before it, has a time kernel and a nugget at each step. The kernel has a slow part proportional
+    to the standard deviation at each step, and a tremor of constant size in the output's units. This correlation is
+    shrunk towards that of the demonstrations themselves. Draws and scores use a Student's t with one chi-squared
+    variable per movement; conditioning uses the normal formulas. Only :meth:`predict_joint` forms a matrix of all steps
+    and outputs.
 
     Parameters
     ----------
     regressor : covariance regressor or None, default=None
-        Cloned into ``regressor_``; None is ``HeteroscedasticGPRegressor()``. Its X has one column, time or phase.
+        Model of the marginals over time or phase, cloned into ``regressor_``; None is ``HeteroscedasticGPRegressor()``.
     time_kernel : {"auto", "squared_exponential", "matern32", "matern52"}, default="auto"
-        "auto" takes "matern52" or "squared_exponential", whichever is likelier.
+        Kernel along the movement; "auto" takes "matern52" or "squared_exponential", whichever is likelier.
     shrinkage : float or "auto", default="auto"
-        Weight of the demonstrations' own correlation, 0 to 0.95; "auto" takes that under which demonstrations left
-        out in turn are likeliest.
+        Weight of the demonstrations' own correlation, 0 to 0.95; "auto" maximizes the likelihood of demonstrations
+        left out in turn.
     timing : {"none", "warp", "auto"}, default="none"
-        "none" takes the phase of a movement for known. With "warp", X is the time since the start of a movement whose
-        duration and pace are not known but as demonstrations vary in them, four or more: what is given to
-        :meth:`condition` says how far it is (:meth:`predict_phase`), and the rest is foretold over all that is left
-        possible. "auto" takes "warp" if left-out demonstrations are likelier so than by the mean duration at an even
-        pace, which costs ten fits; X is time in both cases.
+        "none" takes the phase of a movement as known. With "warp", X is the time since the start of a movement of
+        unknown duration and pace, whose distribution is learned from four or more demonstrations. Observations passed
+        to :meth:`condition` locate the movement (:meth:`predict_phase`), and predictions average over the remaining
+        durations and paces. "auto" takes "warp" if left-out demonstrations are likelier than with the mean duration at
+        an even pace, which costs ten fits; X is time in both cases.
     random_state : int, RandomState instance or None, default=0
-        Not used: the fit is deterministic where the regressor's is. It is here so that models can be exchanged.
+        Not used, since the fit is as deterministic as the regressor's; present so that models are interchangeable.
 
     Attributes
     ----------
     regressor_ : covariance regressor
-        As fitted to the rows.
+        Regressor fitted to the rows.
     module_ : TrajectoryLaw
         The fitted torch module: maps times (n, 1) to joint mean (n, d) and covariance (n, d, n, d), differentiably.
     time_kernel_ : str
     length_scale_ : ndarray of shape (n_outputs,)
         Length scale of each output's slow deviation along the movement, in units of X.
     nugget_scale_ : ndarray of shape (n_steps, n_outputs)
-        Standard deviation of the independent part of each step of the fit's grid, whose smooth part has 1.
+        Standard deviation of the independent part at each step of the fit's grid, relative to the smooth part's.
     shrinkage_ : float
     df_ : float
-        Degrees of freedom of the joint law, half the median of the regressor's, 3 to 200.
+        Degrees of freedom of the joint law: half the median of the regressor's, clipped to 3 to 200.
     timing_ : {"none", "warp"}
     timing_gain_ : float
-        With timing="auto": nats a step by which "warp" makes left-out demonstrations likelier, at steps a twelfth of a
-        movement apart.
+        Only with timing="auto": gain of "warp" in the log-likelihood of left-out demonstrations, in nats per step, at
+        steps a twelfth of a movement apart.
     input_ : {"time", "phase", "array"}
     n_features_in_, n_outputs_ : int
 
@@ -178,7 +178,7 @@ class TrajectoryRegressor(TimedMovement):
         grid = np.linspace(low, high, n_grid_steps(recordings))
         mean, covariance = self._regressor_rows(grid)
         residual = np.stack([sampled(recording, grid) for recording in recordings]) - mean
-        # Of z = inv(L_t) (y_t - m_t), of unit covariance at each step, the correlation along time is left to be found.
+        # z = inv(L_t) (y_t - m_t) has unit covariance at each step; only its correlation along time is to be found.
         root = np.linalg.cholesky(covariance)
         whitened = np.linalg.solve(root, residual[..., np.newaxis])[..., 0]
         kernels = ("matern52", "squared_exponential") if self.time_kernel == "auto" else (self.time_kernel,)
@@ -197,19 +197,19 @@ class TrajectoryRegressor(TimedMovement):
         self.nugget_scale_, self._range = np.sqrt(time_kernel.nugget.numpy().T), (low, width)
 
     def predict(self, X: ArrayLike, *, return_std: bool = False, return_cov: bool = False) -> Any:
-        """Prediction of the regressor; given what is known, mean and covariance of the rest of the movement."""
+        """Prediction of the regressor, or after :meth:`condition` mean and covariance of the rest of the movement."""
         if not self._is_regressor:
             return super().predict(X, return_std=return_std, return_cov=return_cov)
         self._times(X)
         return self.regressor_.predict(X, return_std=return_std, return_cov=return_cov)
 
     def predict_df(self, X: ArrayLike) -> Floats:
-        """Degrees of freedom of the marginals; given what is known, of the joint law."""
+        """Degrees of freedom (n_samples,) of the marginals, or of the joint law after :meth:`condition`."""
         return self.regressor_.predict_df(X) if self._is_regressor else super().predict_df(X)
 
     @property
     def _is_regressor(self) -> bool:
-        """Whether marginals are the regressor's, at X."""
+        """Whether the marginals at X are those of the regressor."""
         return self._timing is None and not len(self._known.time)
 
     def _uncertainty(self, time: Floats) -> tuple[Floats, Floats, Floats]:
