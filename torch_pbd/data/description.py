@@ -187,13 +187,17 @@ def check_unimodal(demonstrations: Any) -> bool:
     UnimodalityWarning
         If there are two groups, or one demonstration far from all others; then it returns False.
     """
-    is_recorded = isinstance(demonstrations, Resampling)
+    is_recorded = isinstance(demonstrations, Resampling)  # of which Demonstrations, which it cannot import, are
     if not is_recorded:
         raise checks.refusal(demonstrations, "demonstrations", "a Demonstrations")
-    n_demos = len(demonstrations)
+    return follow_one_way((demonstrations if demonstrations.is_aligned else demonstrations.align()).to_array())
+
+
+def follow_one_way(curves: Floats) -> bool:
+    """Whether aligned demonstrations (K, T, d) look like one way to do the task; warns if they do not."""
+    n_demos = len(curves)
     if n_demos < _LEAST_DEMOS:
         return True
-    curves = (demonstrations if demonstrations.is_aligned else demonstrations.align()).to_array()
     residual = curves - curves.mean(axis=0)
     deviation = residual.std(axis=(0, 1))
     residual = residual / np.where(deviation > 0, deviation, 1.0)

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.data import Demonstrations, check_unimodal
+from torch_pbd.data.alignment import interpolate, unit_phases
+from torch_pbd.data.description import follow_one_way
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.models.heteroscedastic import HeteroscedasticFit, are_copies
 from torch_pbd.models.training import TrainingSet
@@ -22,6 +23,7 @@ CONSTANT = 1e-11
 # Largest distance of values that are made equal, in usual distances, and the share of such values that warns.
 _NEAR, _MANY = 1e-3, 0.1
 _LARGEST = 1e140  # largest magnitude of a value: float64 holds the sum of a thousand squares
+_MOST_PHASES = 200  # largest number of phases on which demonstrations are compared
 _COVERED = 0.5  # least share of the input's range that a demonstration covers to be compared with others
 # Whether the warning about several modes is suppressed in this context; other threads still warn.
 _unimodality_reported: ContextVar[bool] = ContextVar("_unimodality_reported", default=False)
@@ -198,7 +200,8 @@ def check_demonstrations(X: Floats, y: Floats, groups: Any) -> None:
         times.append(time)
         positions.append(y[rows][first])
     if min(len(time) for time in times) > 1 and min(np.ptp(time) for time in times) > _COVERED * np.ptp(X):
-        check_unimodal(Demonstrations(times, positions))
+        phases, grid = unit_phases(times), np.linspace(0.0, 1.0, min(_MOST_PHASES, round(float(np.median(counts)))))
+        follow_one_way(np.stack([interpolate(phase, own, grid) for phase, own in zip(phases, positions, strict=True)]))
 
 
 def warn_if_few(n_rows: int, n_outputs: int, groups: NDArray[np.intp] | None = None) -> None:
