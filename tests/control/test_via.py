@@ -132,6 +132,8 @@ def test_any_model_of_movements_bends(controller):
         ([(1.0, [0.2])], "the position of via\\[0\\] is \\[0.2\\], must be 2 numbers, NaN where free"),
         ([(1.0, [np.nan, np.nan])], "must be 2 numbers, NaN where free"),
         ([1.0], "via\\[0\\] is 1.0, must be a time in s and a position"),
+        (1.0, "via is 1.0, must be a list of pairs, each a time in s and a position"),
+        (np.array([[1.0, 0.2, 0.1]]), "via\\[0\\] is array.*, must be a time in s and a position"),
         ([(1.0, [0.2, 0.1]), (1.0, [0.2, 0.1])], "given twice"),
     ],
 )

@@ -46,6 +46,12 @@ def can_bend(controller: Any) -> bool:
     return hasattr(controller.covariance_, "condition") and controller.variability == "position"
 
 
+def _check_can_bend(controller: Any) -> None:
+    if not can_bend(controller):
+        must = "a model of whole movements, with variability='position', to be bent"
+        raise checks.refusal(controller.covariance, "covariance", must, "take DMPController(TrajectoryRegressor())")
+
+
 def conditioned(
     controller: Any, time: Floats, change: Floats, noise_scale: Any = 0.0, pins: Sequence[float] = ()
 ) -> Any:
@@ -54,10 +60,8 @@ def conditioned(
     At the movement times ``pins`` the path stays, without a part in the gains. Changes are from the path, as it is not
     the model's mean: they differ by the error of the reproduction.
     """
+    _check_can_bend(controller)
     outputs, phase = controller.outputs_, controller.reproduction_.phase
-    if not can_bend(controller):
-        must = "a model of whole movements, with variability='position', to be bent"
-        raise checks.refusal(controller.covariance, "covariance", must, "take DMPController(TrajectoryRegressor())")
     # What is known is told in outputs, which may be free one by one; poses are learned along other axes.
     model = controller.covariance_.observed_along(outputs.axes)
     shown, inputs, stays = getattr(controller, "_shown", model), phase(time), phase(np.array(pins))
@@ -83,6 +87,10 @@ def planned(
     """
     if via is None and (not can_bend(controller) or (goal is None and start is None)):
         return controller, goal, start
+    _check_can_bend(controller)
+    if via is not None and not np.iterable(via):
+        raise checks.refusal(via, "via", "a list of pairs, each a time in s and a position")
+    points = [] if via is None else list(via)
     rest, known, pins = {"goal": goal, "start": start}, [], []
     for name, at, own in (("start", 0.0, controller.start_), ("goal", controller.duration_, controller.goal_)):
         target = rest[name]
@@ -97,8 +105,8 @@ def planned(
         rest[name] = None if share == 1.0 else own + (1.0 - share) * change
         known.append((at, share * change))
     even = np.linspace(0.0, controller.duration_, 2 * controller.n_steps)
-    path = CubicSpline(even, controller._motion(even, rest["goal"], rest["start"], 1.0)[0]) if via else None
-    for number, point in enumerate(via or ()):
+    path = CubicSpline(even, controller._motion(even, rest["goal"], rest["start"], 1.0)[0]) if points else None
+    for number, point in enumerate(points):
         at, position = _checked_point(point, f"via[{number}]", controller)
         change = position - path(at)
         distance, limit = _distance(controller, at, change)
@@ -110,7 +118,7 @@ def planned(
         known.append((at, change))
     times, changes = np.array([at for at, _ in known]), [change for _, change in known]
     # A controller that was conditioned may know its start or its end already.
-    phase, before = controller.reproduction_.phase, controller.covariance_.known_times() if can_bend(controller) else []
+    phase, before = controller.reproduction_.phase, controller.covariance_.known_times()
     pins = [at for at in pins if at not in times and not np.isclose(phase(np.array([at]))[0, 0], before).any()]
     bent = conditioned(controller, times, np.reshape(changes, (-1, controller.n_outputs_)), pins=pins)
     return bent, rest["goal"], rest["start"]
