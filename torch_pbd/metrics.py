@@ -1,10 +1,10 @@
 """Scores of predicted covariances: plain functions of arrays, and scorers ``scorer(estimator, X, y)``.
 
-Covariances have shape (n, d, d), one matrix a row, in the squared units of y. Scorers go to ``scoring=`` of
-``cross_val_score`` and ``GridSearchCV``, which take the highest score for the best: select models by
-:func:`log_likelihood_scorer`; :func:`negative_log_likelihood` and :func:`mahalanobis_coverage` are to report.
+Covariances have shape (n, d, d), one matrix per row, in the squared units of y. Scorers are for ``scoring=`` of
+``cross_val_score`` and ``GridSearchCV``, which prefer the highest score: select models by
+:func:`log_likelihood_scorer`, and report :func:`negative_log_likelihood` and :func:`mahalanobis_coverage`.
 
-All raise ValueError, by the name of the argument, where shapes disagree, an entry is not finite, a matrix is not
+All raise a ValueError that names the argument where shapes disagree, an entry is not finite, a matrix is not
 symmetric or, where its Cholesky factor is needed, not positive definite.
 """
 
@@ -33,25 +33,25 @@ __all__ = [
 
 Floats = NDArray[np.floating[Any]]
 _Scorer = Callable[[Any, ArrayLike, ArrayLike], float]
-# A pivot of a Cholesky factorization below it is rounding, relative to the diagonal: float64 makes errors of 1e-16, of
-# which a row of a factor collects some.
+# Cholesky pivots below this share of the diagonal are rounding: float64 makes errors of 1e-16, which add up along a
+# row of the factor.
 _ZERO_PIVOT = 1e-14
 
 
 def covariance_mse(estimated: ArrayLike, reference: ArrayLike, on: Literal["cholesky", "matrix"] = "cholesky") -> float:
     """Mean over the rows of the squared distance between covariances, or between their Cholesky factors.
 
-    ``on="cholesky"`` is the error of Table I: section IV-A takes the Euclidean norm of the difference of the
-    vectorized lower factors, diagonals not negative. A singular matrix has the factor that
-    ``matrix + epsilon * I`` tends to. ``on="matrix"`` is (9) as printed, the squared Frobenius norm. Their
-    units are those of y to the power of two and of four.
+    ``on="cholesky"`` is the error of Table I: Section IV-A takes the Euclidean norm of the difference of the
+    vectorized lower factors, whose diagonals are not negative. The factor of a singular matrix is the limit of
+    that of ``matrix + epsilon * I``. ``on="matrix"`` is eq. (9) as printed, the squared Frobenius norm. The units
+    are those of y to the power of two and of four.
 
     Parameters
     ----------
     estimated, reference : array_like of shape (n, d, d)
-        Positive semidefinite for ``on="cholesky"``.
+        Covariances, positive semidefinite for ``on="cholesky"``.
     on : {"cholesky", "matrix"}, default="cholesky"
-        What is compared.
+        Whether Cholesky factors or matrices are compared.
     """
     checks.choice(on, "on", ("cholesky", "matrix"))
     first = _covariances(estimated, "estimated")
@@ -62,12 +62,12 @@ def covariance_mse(estimated: ArrayLike, reference: ArrayLike, on: Literal["chol
 
 
 def relative_frobenius_error(estimated: ArrayLike, reference: ArrayLike) -> float:
-    """Mean over the rows of ||estimated - reference||_F / ||reference||_F, of symmetric matrices; it has no unit.
+    """Mean over the rows of ||estimated - reference||_F / ||reference||_F for symmetric matrices, without unit.
 
     Parameters
     ----------
     estimated, reference : array_like of shape (n, d, d)
-        No reference is zero.
+        Symmetric matrices; no reference may be zero.
     """
     estimated = _covariances(estimated, "estimated")
     reference = _covariances(reference, "reference", estimated.shape)
@@ -86,14 +86,14 @@ def gaussian_kl(
 ) -> float:
     """Mean over the rows of the Kullback-Leibler divergence KL(reference || estimated) of Gaussians, in nats.
 
-    What a draw from the reference loses under the estimate: zero for equal Gaussians, whatever their units.
+    Expected loss in log density under the estimate for draws from the reference: zero for equal Gaussians, unit-free.
 
     Parameters
     ----------
     reference, estimated : array_like of shape (n, d, d)
         Positive definite covariances; mind the order.
     reference_mean, estimated_mean : array_like of shape (n, d) or (n,), default=None
-        Both or none: None compares the covariances alone, as if the means were equal.
+        Means, both or none; None compares the covariances alone, as if the means were equal.
     """
     reference_tril = _factors(reference, "reference")
     estimated_tril = _factors(estimated, "estimated", reference_tril.shape)
@@ -103,20 +103,20 @@ def gaussian_kl(
     shift = np.zeros((n, d))
     if reference_mean is not None and estimated_mean is not None:
         shift = _rows(reference_mean, "reference_mean", n, d) - _rows(estimated_mean, "estimated_mean", n, d)
-    # With reference S = R R' and estimate L L': tr(S^-1_est S) is the squared norm of L^-1 R, the distance of the means
+    # With reference R R' and estimate L L', the trace term is the squared norm of L^-1 R, and the distance of the means
     # that of L^-1 shift. Both are solved at once.
     whitened = np.linalg.solve(estimated_tril, np.concatenate([reference_tril, shift[..., None]], axis=-1))
     log_ratio = _log_det(estimated_tril) - _log_det(reference_tril)
     divergence = 0.5 * (np.square(whitened).sum(axis=(-2, -1)) - d) + log_ratio
-    return float(divergence.clip(0.0).mean())  # of equal ones it may round to below zero
+    return float(divergence.clip(0.0).mean())  # rounding may make that of equal Gaussians negative
 
 
 def negative_log_likelihood(mean: Any, covariance: ArrayLike, y: ArrayLike) -> float:
     """Mean over the rows of the negative log density of y, in nats; lower is better.
 
-    As ``negative_log_likelihood(mean, covariance, y)``, under the Gaussians N(mean, covariance). As a scorer,
-    ``negative_log_likelihood(estimator, X, y)``, under the estimator's own predictive density, whatever its
-    form: from its ``log_likelihood(X, y)``, or that of a Pipeline's last step.
+    ``negative_log_likelihood(mean, covariance, y)`` uses the Gaussians N(mean, covariance). The scorer
+    ``negative_log_likelihood(estimator, X, y)`` uses the estimator's own predictive density, of any form, from its
+    ``log_likelihood(X, y)`` or that of a Pipeline's last step.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def negative_log_likelihood(mean: Any, covariance: ArrayLike, y: ArrayLike) -> f
         last = mean[-1] if isinstance(mean, Pipeline) else mean
         if not hasattr(last, "log_likelihood"):
             raise TypeError(f"{type(last).__name__} has no log_likelihood(X, y): pass a covariance regressor.")
-        # A pipeline passes on score, its mean, and not log_likelihood itself.
+        # A pipeline delegates score, the mean, but not log_likelihood itself.
         return -float(np.mean(mean.log_likelihood(covariance, y)) if last is mean else mean.score(covariance, y))
     whitened, scale_tril = _whitened_residual(mean, covariance, y)
     nll = 0.5 * np.square(whitened).sum(-1) + _log_det(scale_tril)
@@ -149,10 +149,10 @@ def mahalanobis_coverage(
 ) -> Any:
     """Fraction of the rows of y inside the ellipsoid that should hold ``level`` of them.
 
-    Three forms: ``mahalanobis_coverage(mean, covariance, y, level=0.95)`` of arrays;
-    ``mahalanobis_coverage(estimator, X, y, level=0.95)`` of ``estimator.predict(X, return_cov=True)``; and
-    ``mahalanobis_coverage(0.95)``, the scorer ``(estimator, X, y)`` for that level, which pickles. The
-    ellipsoid is the Gaussian's: squared Mahalanobis distance up to chi-squared's quantile for d outputs.
+    There are three forms: ``mahalanobis_coverage(mean, covariance, y, level=0.95)`` takes arrays;
+    ``mahalanobis_coverage(estimator, X, y, level=0.95)`` uses ``estimator.predict(X, return_cov=True)``; and
+    ``mahalanobis_coverage(0.95)`` returns a picklable scorer ``(estimator, X, y)`` for that level. The ellipsoid
+    is the Gaussian's: squared Mahalanobis distance up to the chi-squared quantile for d outputs.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ def mahalanobis_coverage(
     covariance : array_like of shape (n, d, d), or inputs X
     y : array_like of shape (n, d) or (n,)
     level : float, default=0.95
-        Between 0 and 1, both excluded.
+        Nominal coverage, between 0 and 1 exclusive.
 
     Raises
     ------
@@ -181,7 +181,7 @@ def mahalanobis_coverage(
 
 
 def log_likelihood_scorer(estimator: Any, X: ArrayLike, y: ArrayLike) -> float:
-    """``estimator.score(X, y)``, the mean log-likelihood in nats: what to select covariance models by."""
+    """Mean log-likelihood in nats, ``estimator.score(X, y)``, by which to select covariance models."""
     if not hasattr(estimator, "score"):
         raise TypeError(f"estimator is {estimator!r}, must be a fitted covariance regressor.")
     return float(estimator.score(X, y))
@@ -196,7 +196,7 @@ def _whitened_residual(mean: ArrayLike, covariance: ArrayLike, y: ArrayLike) -> 
 
 
 def _covariances(values: ArrayLike, name: str, shape: Sequence[int | str] = ("n", "d", "d")) -> Floats:
-    """Symmetric matrices, one a row."""
+    """Checked symmetric matrices (n, d, d)."""
     matrices = checks.array(values, name, shape)
     if not len(matrices):
         raise InvalidParameterError(f"{name} has shape {matrices.shape}, must have at least one row.")
@@ -205,18 +205,18 @@ def _covariances(values: ArrayLike, name: str, shape: Sequence[int | str] = ("n"
 
 
 def _rows(values: ArrayLike, name: str, n: int, d: int) -> Floats:
-    """Rows (n, d) that belong to n covariances of d outputs; of one output also (n,)."""
+    """Checked rows (n, d) for n covariances of d outputs; for one output also from (n,)."""
     rows = checks.real_floats(values, name)
     return checks.array(rows[:, np.newaxis] if rows.ndim == d == 1 else rows, name, (n, d))
 
 
 def _log_det(scale_tril: Floats) -> Floats:
-    """Log determinants of factors: half those of their covariances."""
+    """Log determinants of Cholesky factors, half those of the covariances."""
     return np.log(np.diagonal(scale_tril, axis1=-2, axis2=-1)).sum(-1)
 
 
 def _factors(values: ArrayLike, name: str, shape: Sequence[int | str] = ("n", "d", "d")) -> Floats:
-    """Cholesky factors of positive definite covariances, one a row."""
+    """Cholesky factors (n, d, d) of positive definite covariances."""
     matrices = _covariances(values, name, shape)
     try:
         return np.linalg.cholesky(matrices)
@@ -226,11 +226,11 @@ def _factors(values: ArrayLike, name: str, shape: Sequence[int | str] = ("n", "d
 
 
 def _semidefinite_factor(matrices: Floats, name: str) -> Floats:
-    """Cholesky factors of matrices that may be singular: columns of zeros where a pivot is zero to rounding."""
+    """Cholesky factors of possibly singular matrices, with columns of zeros where a pivot is zero up to rounding."""
     checks.semidefinite(matrices, name)
     remainder, factor = matrices.copy(), np.zeros_like(matrices)
     rounding = _ZERO_PIVOT * np.diagonal(matrices, axis1=-2, axis2=-1)
-    # Outer products: column j of the factor is that of what columns before it leave over, by the root of its pivot.
+    # Outer products: column j of the factor is that of the remaining matrix, divided by the root of its pivot.
     for j in range(matrices.shape[-1]):
         pivot = remainder[:, j, j]
         root = np.sqrt(np.where(pivot > rounding[:, j], pivot, np.inf))

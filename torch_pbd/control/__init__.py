@@ -1,4 +1,4 @@
-"""From covariance to control: movement primitives, stiffness, the simulated robot, and what is stable."""
+"""From covariance to control: movement primitives, variable stiffness, simulation and stability."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any

@@ -29,81 +29,81 @@ from torch_pbd.movement.base import MovementRegressor
 
 @dataclass(eq=False, repr=False)
 class DMPController(Planning):
-    """Learn a movement and its variability from demonstrations, and how stiffly to follow it.
+    """Movement, variability and variable-stiffness gains, learned from demonstrations.
 
     A dynamic movement primitive, eq. (16) to (18), whose forcing is the mean of a Gaussian process, reproduces the mean
-    movement; a covariance regressor learns the variability, whose principal axes get stiffness by eq. (19) and (20),
-    and damping from it. Demonstrations may be of any lengths and sampling times: each is smoothed at its true times,
-    and stretched linearly, from its first to its last sample, to the median duration: one that was cut short too.
+    movement; a covariance regressor learns the variability, whose principal axes determine the stiffness by eq. (19)
+    and (20), and with it the damping. Demonstrations may have any durations and sampling times: each is smoothed at its
+    true times and stretched linearly, from first to last sample, to the median duration, even one that was cut short.
 
-    Of poses (``Demonstrations(rotation=...)``) position and rotation are learned as one movement in a chart around the
-    mean rotation; covariance and gains are those of deviations at the desired pose, in axes of the world, and in blocks
-    of N/m and Nm/rad. Nothing depends on signs of quaternions, on how the world and the tool are turned, or on units.
+    Position and rotation of poses (``Demonstrations(rotation=...)``) are learned as one movement in a chart around the
+    mean rotation; covariance and gains are those of deviations at the desired pose, in world axes, with blocks in N/m
+    and Nm/rad. Results do not depend on quaternion signs, on the world and tool frames, or on units.
 
     Parameters
     ----------
     covariance : covariance regressor or movement model, default=None
-        Cloned before it is fitted; None is ``HeteroscedasticGPRegressor()``. A model of whole movements, such as
-        ``TrajectoryRegressor()``, lets movements be bent: see :meth:`condition` and :meth:`schedule`.
+        Model of the variability, cloned before it is fitted; None is ``HeteroscedasticGPRegressor()``. A model of whole
+        movements, such as ``TrajectoryRegressor()``, allows bent movements: see :meth:`condition` and :meth:`schedule`.
     alpha, beta, gamma, tau : float, default=25.0, None, 0.7, 1.0
-        Of the movement primitive, see :class:`~torch_pbd.control.DMP`; the paper's are 1, 1, 0.7, 1. With
-        adaptation="safe" tau is that of a movement of 10 s, like the paper's, and goes with the duration.
+        Parameters of the movement primitive, see :class:`~torch_pbd.control.DMP`; the paper uses 1, 1, 0.7, 1. With
+        adaptation="safe" tau is given for a movement of 10 s, like the paper's, and scales with the duration.
     adaptation : {"safe", "additive"}, default="safe"
-        How it moves to other goals, and from other starts; "additive", the paper's, throws the robot.
+        Adaptation of the movement to other goals and starts; the paper's "additive" throws the robot.
     gate : {"time", "phase", "none"}, default="time"
-        How the forcing of an "additive" movement ends, so that it comes to rest at the goal; "none" is the paper's.
+        How the forcing of an "additive" movement fades, so that it comes to rest at the goal; "none" is the paper's.
     phase_input : {"time", "log_s", "s"}, default="time"
-        Input of the regressors: movement time, or the phase s of eq. (17), the paper's, or its logarithm, which is time
+        Input of the regressors: movement time, the phase s of eq. (17) as in the paper, or its logarithm, which is time
         in other units; scripts/benchmarks/phase_input.py compares them.
     variability : {"position", "forcing"}, default="position"
-        What becomes stiffness by its covariance: positions, in their units; or the forcing, as in the paper, in units
-        of acceleration times s^2.
+        Quantity whose covariance determines the stiffness: the position, in its units, or as in the paper the forcing,
+        in units of acceleration times s^2.
     goal : {"common", "each"}, default="common"
-        Goal in eq. (18): the mean end of all demonstrations, or that of each.
+        Goal in eq. (18): the mean end of all demonstrations, or the end of each.
     cutoff : float, "auto" or None, default="auto"
-        Of the smoothing before derivatives are taken, in Hz: amplitudes are halved there. "auto" is 40 cycles a
-        movement, and not below 4 Hz; None does not smooth.
+        Cutoff frequency in Hz, at which amplitudes are halved, of the smoothing before differentiation. "auto" is 40
+        cycles per movement, at least 4 Hz; None does not smooth.
     duration : float, default=None
-        Of the movement, in s; None is the median of the demonstrations. Needed where their times are phases.
+        Duration of the movement in s; None is the median of the demonstrations. Required if their times are phases.
     n_steps : int, default=100
-        Points of a movement at which forcing and variability are learned.
+        Number of points along the movement at which forcing and variability are learned.
     stiffness_law : StiffnessLaw, default=None
-        None is ``StiffnessLaw()``: 50 to 1000 N/m between quantiles of the standard deviations along the movement; of
-        poses with ``RotationLimits()``, 2.5 to 50 Nm/rad. Of angles the two are in Nm/rad.
+        Map from covariance to stiffness. None is ``StiffnessLaw()``: 50 to 1000 N/m (Nm/rad for joint angles) between
+        quantiles of the standard deviations along the movement; rotations of poses get ``RotationLimits()``, 2.5 to
+        50 Nm/rad.
     mass : float or array-like of shape (d, d), default=None
-        Virtual mass of the admittance. A number counts in kg, and as many kg m^2 for angles and rotations. None is 1,
-        but for the rotation of poses 0.0289 kg m^2, as 1 kg at 0.17 m has it: 1 kg m^2 is a heavy wrist, which lags
-        behind soft rotations. A robot's own, which changes along the movement, goes to :meth:`Schedule.with_inertia`.
+        Virtual mass of the admittance, in kg, and for angles and rotations in kg m^2. None is 1, but 0.0289 kg m^2 for
+        the rotation of poses, that of 1 kg at 0.17 m: 1 kg m^2 is a heavy wrist, which lags behind soft rotations. The
+        inertia of a robot, which changes along the movement, goes to :meth:`Schedule.with_inertia`.
     damping_ratio : float or "paper", default=1.0
-        See :func:`~torch_pbd.control.damping_from_stiffness`.
+        Damping ratio of every mode, see :func:`~torch_pbd.control.damping_from_stiffness`.
     on_unknown : {"soft", "prior", "raise"}, default="soft"
-        Where data are missing, fewer than two demonstrations having samples near (Type I uncertainty u): "soft" takes
-        the share u of the way to the least stiffness; "prior" trusts the covariance there, the regressor's prior;
-        "raise" raises where u is above 0.5. Separate from variability (Type II), which people showed.
+        Policy where data are missing, i.e. fewer than two demonstrations have samples near (Type I uncertainty u):
+        "soft" moves the stiffness by the share u towards its minimum; "prior" uses the covariance there, the
+        regressor's prior; "raise" raises where u exceeds 0.5. Demonstrated variability (Type II) is separate.
 
     Attributes
     ----------
     covariance_ : fitted covariance regressor
-        Its input is what ``phase_input`` says, its output what ``variability`` says; of poses in the coordinates that
-        ``outputs_.decode`` takes to outputs, see :meth:`predict_cov`.
+        Regressor from the input ``phase_input`` to the quantity ``variability``; those of poses are in the coordinates
+        that ``outputs_.decode`` maps to outputs, see :meth:`predict_cov`.
     dmp_, law_ : DMP, StiffnessLaw
-        With the duration, and the bounds, of this movement.
+        Movement primitive with the duration, and stiffness law with the bounds, of this movement.
     duration_, start_time_, time_scale_ : float
-        Of the movement, in s; time at which all demonstrations start, 0 where they differ; s in a unit of their time.
+        Duration in s; common start time of the demonstrations, 0 if they differ; seconds per unit of their time.
     start_, goal_ : ndarray of shape (d,)
     noise_scale_, noise_share_ : ndarray of shape (d,)
-        Root mean square of what the smoothing took away; share of the variance that white noise as large would make.
+        Root mean square of the residual of the smoothing; share of the variance that white noise of that size makes.
     unsampled_ : ndarray of shape (m,)
-        Type I uncertainty of the recordings' times, at evenly spaced times of the movement: 0 up to 2.5 spacings from
-        a sample, 1 from five (a 40th of the movement at least), in the recording that knows second most.
+        Type I uncertainty at evenly spaced times of the movement, from the recording with the second best coverage:
+        0 up to 2.5 sample spacings from a sample, 1 from five (at least a 40th of the movement).
     cutoff_, reproduction_error_ : float
-        Hz; root mean square distance of the reproduced path from the mean of the demonstrations as recorded, of poses
-        that of the positions.
+        Cutoff in Hz; root mean square distance of the reproduced path (positions) from the mean of the recordings.
     mass_ : float or ndarray of shape (d, d)
-        The virtual mass.
+        Virtual mass.
     n_outputs_, n_demos_ : int
     outputs_ : Outputs
-        Which outputs share a unit, and the chart and the axes in which those of poses are learned.
+        Outputs that share a unit, and the chart and axes in which poses are learned.
 
     Examples
     --------
@@ -140,28 +140,28 @@ class DMPController(Planning):
         Parameters
         ----------
         X : Demonstrations, or array-like of shape (n_samples, 1)
-            Or the times of samples, in s, which increase within each demonstration; for phases, give ``duration``.
+            Demonstrations, or sample times in s that increase within each demonstration; phases need ``duration``.
         y : array-like of shape (n_samples, n_outputs), default=None
-            Positions at these times, in m: arrays have no units and no rotations, which Demonstrations have. What
-            ``stack()`` gives of poses would count rad as m; a table whose columns are named so is refused.
+            Positions at these times, in m. Arrays have neither units nor rotations, which Demonstrations do: the
+            rotations that ``stack()`` gives for poses would count rad as m; tables with such columns raise an error.
         groups : array-like of shape (n_samples,), default=None
-            Demonstration of each sample.
+            Label of each sample's demonstration.
 
         Raises
         ------
         ValueError
-            If there are fewer than two demonstrations, too few samples in one, a parameter cannot be used, there is
-            not the memory for ``n_steps``, or a path leaves the recorded range by more than a tenth of it.
+            If there are fewer than two demonstrations, one has too few samples, a parameter is invalid, ``n_steps``
+            does not fit in memory, or a path leaves the recorded range by more than a tenth of it.
 
         Warns
         -----
         UserWarning
-            Of samples that were merged, as their times are too close; of holes, with their times.
+            If samples at nearly equal times were merged, or recordings have gaps, with their times.
         """
         for name in ("law_", "_bend", "_shown"):  # a fit that fails leaves no mixture of two
             self.__dict__.pop(name, None)
         check_parameters(self)
-        # 1. Recordings. Samples whose times are one are merged; the table of holes is Type I uncertainty.
+        # 1. Recordings. Samples at equal times are merged; the table of gaps is Type I uncertainty.
         shown = smoothing.merge_bursts(as_demonstrations(X, y, groups))
         self.names_, self.frame_, self.units_, self.time_unit_ = shown.names, shown.frame, shown.units, shown.time_unit
         self.n_demos_, self.n_outputs_ = len(shown), shown.n_outputs
@@ -177,8 +177,8 @@ class DMPController(Planning):
         self.unsampled_ = smoothing.tabulate_unsampled(shown, self.duration_ / self.time_scale_, self.on_unknown)
         # 2. Smoothing. Splines at the true times give positions, velocities and accelerations at common times.
         movements = smoothing.smooth(shown.times, shown.positions, self.cutoff_, self.n_steps, self.duration_)
-        # 3. Mean movement. Eq. (16) is driven by the mean over demonstrations of the forcing of eq. (18), through which
-        # goes a Gaussian process, eq. (5), over the phase of eq. (17) or another input that is a function of time.
+        # 3. Mean movement. Eq. (16) is driven by the mean over demonstrations of the forcing of eq. (18), regressed by
+        # a Gaussian process, eq. (5), over the phase of eq. (17) or another input that is a function of time.
         self.reproduction_ = Reproduction.learn(
             self.dmp_, movements, self.phase_input, own_goals=self.goal == "each", blocks=outputs.blocks
         )
@@ -186,20 +186,20 @@ class DMPController(Planning):
         self.reproduction_error_ = self.reproduction_.check_against(movements)
         if seconds and counts_as_metres(outputs.units(self.units_)):
             self.reproduction_.warn_if_cut(in_si(outputs.units(self.units_)))
-        # 4. Variability. The regressor learns the covariance over the same input, of positions or of the forcing; of
-        # poses along axes of each block that its covariances have in common.
+        # 4. Variability. The regressor learns the covariance of positions or of the forcing over the same input; for
+        # poses, along common axes of each block's covariances.
         varying, phase = self.varying(movements), self.reproduction_.phase
         self.outputs_ = outputs.with_axes(varying, movements.known)
         self.covariance_ = fit_covariance(
             self.covariance, phase(movements.time), varying, movements.known, self.outputs_
         )
-        # White noise as large as what the smoothing took away, smoothed: its share of the variance is no variability.
+        # Share of the variance that white noise as large as the smoothing's residual would make: not variability.
         self.noise_scale_ = movements.noise_scale
         noise = smoothing.white_noise(shown.n_steps, self.noise_scale_)
         smoothed = smoothing.smooth(shown.times, noise, self.cutoff_, self.n_steps, self.duration_, noise=True)
         self.noise_share_ = smoothing.variance_share(self.varying(smoothed), varying)
-        # 5. Gains. The bounds of eq. (20) are quantiles of the deviations where there are samples; eq. (19) then gives
-        # each principal axis its stiffness, and the damping follows from stiffness and mass.
+        # 5. Gains. The bounds of eq. (20) are quantiles of the standard deviations where there are samples; eq. (19)
+        # then gives each principal axis its stiffness, and the damping follows from stiffness and mass.
         self.law_ = fit_law(self, varying)
         return self
 
@@ -224,9 +224,9 @@ class DMPController(Planning):
 
 
 def as_demonstrations(X: Demonstrations | ArrayLike, y: ArrayLike | None, groups: ArrayLike | None) -> Demonstrations:
-    """Two demonstrations or more: as they are, or of samples X (n, 1), y (n, d) whose groups (n,) tell them apart.
+    """Two or more demonstrations, as given or from samples X (n, 1), y (n, d) with labels ``groups`` (n,).
 
-    Warns of more than one way, of units that stiffness cannot have, and of timing that was taken out by warping.
+    Warns of several modes, of units that stiffness cannot have, and of timing that was removed by warping.
     """
     if isinstance(X, Demonstrations) and not (y is None and groups is None):
         raise ValueError("X is Demonstrations, which have their positions: give neither y nor groups with them.")
@@ -252,7 +252,7 @@ def as_demonstrations(X: Demonstrations | ArrayLike, y: ArrayLike | None, groups
 
 
 def _warn_of_units(units: Sequence[str] | None) -> None:
-    """Warn of what becomes of positions whose units are not given, differ, or are no lengths and no angles."""
+    """Warn if units of positions are missing, differ, or are neither lengths nor angles."""
     common = common_unit(units)
     if units is None:
         checks.warn(

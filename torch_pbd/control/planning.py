@@ -1,4 +1,4 @@
-"""Motions and gains of a fitted controller: predicted, bent, planned for a robot, and run in simulation."""
+"""Methods of a fitted controller: prediction, conditioning, schedules and simulation."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -30,16 +30,16 @@ _UNITS = {"duration": "s", "distance": "m", "speed": "m/s"}
 @final
 @dataclass(frozen=True)
 class MotionLimits:
-    """What is beyond what robots do, so that a schedule is refused: its units cannot be right.
+    """Limits that no robot motion exceeds, so that a schedule beyond them must have wrong units.
 
     Parameters
     ----------
     duration : float, default=600.0
-        Of the movement, s.
+        Largest duration of a movement in s.
     distance : float, default=10.0
-        Diagonal of the box around the path, m; where it lies does not matter.
+        Largest diagonal of the path's bounding box in m.
     speed : float, default=10.0
-        In m/s.
+        Largest speed in m/s.
     """
 
     duration: float = 600.0
@@ -71,15 +71,15 @@ class Planning(BaseEstimator):
 
     @property
     def mass_(self) -> float | Floats:
-        """Virtual mass that gains are made for: a number of kg, or of kg m^2 for angles; or a matrix (d, d)."""
+        """Virtual mass that the gains assume, in kg or for angles kg m^2: a number or a matrix (d, d)."""
         check_is_fitted(self)
         return self.outputs_.mass(self.mass)
 
     def predict(self, X: ArrayLike) -> Floats:
-        """Reproduced outputs (n, d) at times X (n, 1), which count as those of the demonstrations do.
+        """Reproduced outputs (n, d) at times X (n, 1), in the time units and origin of the demonstrations.
 
-        Positions, and of poses three coordinates of a rotation, see :meth:`predict_pose`. From ``start_time_``; the
-        movement is over ``duration_`` later, and then stays at the goal.
+        Outputs are positions, and for poses also three coordinates of the rotation, see :meth:`predict_pose`. The
+        movement starts at ``start_time_``, ends ``duration_`` later, and then stays at the goal.
         """
         return self._path(self._movement_time(X))
 
@@ -91,25 +91,25 @@ class Planning(BaseEstimator):
         return self.outputs_.poses(path)
 
     def predict_cov(self, X: ArrayLike) -> Floats:
-        """Covariance (n, d, d) of the outputs at times X (n, 1), in their squared units: of poses in their chart."""
+        """Covariance (n, d, d) of the outputs at times X (n, 1), in squared units; poses are in their chart."""
         inputs = self.reproduction_.phase(self._movement_time(X))
         return self.outputs_.covariance(self.covariance_.predict_cov(inputs))
 
     def condition(self, times: ArrayLike, positions: ArrayLike, *, noise_scale: ArrayLike = 0.0) -> Self:
-        """Fitted copy of a movement that passes there: where a robot was pushed to, what was seen so far, a via point.
+        """Fitted copy, conditioned on passing positions: a via point, the part observed so far, or a push.
 
-        The rest of the movement, and its gains, follow as demonstrations make likely. ``covariance`` must be a model of
-        whole movements, with variability="position". A copy can be conditioned again.
+        The rest of the movement and its gains follow from the demonstrations' correlation. ``covariance`` must be a
+        model of whole movements, with variability="position". A copy can be conditioned again.
 
         Parameters
         ----------
         times : array-like of shape (m,)
-            Times, which count as those of the demonstrations do.
+            Times in the units and origin of the demonstrations.
         positions : array-like of shape (m, d), or (m, p + 4) for poses
-            In their units; NaN where an output is not given. Of poses p positions and a quaternion w x y z, or outputs;
-            a rotation is given whole or not at all.
+            Positions in the units of the recordings, NaN where an output is not given. Poses are p positions and a
+            quaternion w x y z, or outputs; a rotation is given as a whole or not at all.
         noise_scale : float or array-like of shape (d,), default=0.0
-            Standard deviation of the error of positions; of poses p numbers, and three in rad.
+            Standard deviation of the error of positions, for poses p numbers in their units and three in rad.
         """
         time = self._movement_time(checks.array(times, "times", ("m",))[:, np.newaxis])
         position = self.outputs_.rows(positions, "positions")
@@ -121,7 +121,7 @@ class Planning(BaseEstimator):
         return conditioned(self, time, position - self._path(time), noise_scale)
 
     def predict_stiffness(self, X: ArrayLike) -> Floats:
-        """Stiffness (n, d, d) at times X (n, 1): in N/m, of angles in Nm/rad, of poses in both and in world axes."""
+        """Stiffness (n, d, d) at times X (n, 1), in N/m, Nm/rad for angles, and both in world axes for poses."""
         time = self._movement_time(X)
         return gains_at(self, time, self._path(time)).stiffness
 
@@ -141,37 +141,36 @@ class Planning(BaseEstimator):
         speed: float = 1.0,
         limits: MotionLimits | None = _LIMITS,
     ) -> Schedule:
-        """Motion and gains at ``rate``, for a robot: in s, m and rad, if the demonstrations tell units.
+        """Motion and gains at ``rate`` for a robot, in s, m and rad if the demonstrations have units.
 
-        It begins at the speed that was shown. Where recordings were cut while moving, a robot at rest needs a ramp.
+        It begins at the demonstrated speed; where recordings begin while moving, a robot at rest needs a ramp.
 
         Parameters
         ----------
         rate : float, default=1000.0
-            In Hz; the last row is at the end, ``duration_ / speed + settle``, and may follow sooner.
+            Rate of the rows in Hz; the last row is at the end, ``duration_ / speed + settle``, and may follow sooner.
         settle : float, default=0.0
-            How long to go on after the movement, in s: it then comes to rest at the goal. One that was cut while moving
-            brakes on its own path, half before its end and half after. Of what comes after it nothing was shown, so
-            that on_unknown="soft" makes the robot compliant there.
+            Extra time in s after the movement, in which it comes to rest at the goal. A movement that was cut while
+            moving brakes along its path, half before its end and half after. No data exist after the end, so that
+            on_unknown="soft" makes the robot compliant there.
         goal, start : array-like of shape (d,), default=None
-            In the units of the recordings; None are ``goal_`` and ``start_``. A goal (n, d) is that at each row. Of
-            poses, here and in ``via``, p positions and a unit quaternion w x y z, p + 4 numbers; or the p + 3 outputs.
+            Goal and start in the units of the recordings; None are ``goal_`` and ``start_``. A moving goal is (n, d),
+            one row each. Poses, here and in ``via``, are p positions and a unit quaternion w x y z, or p + 3 outputs.
         via : sequence of (time, position), default=None
-            Points that the movement passes, with the stiffness of what must be met there: movement time in s from its
-            start, and position (d,) in the units of the recordings, NaN where an output is free (a rotation as a
-            whole). ``covariance`` must be a model of whole movements: with one, goals and starts too bend the movement
-            as far as demonstrations make likely, and the primitive does the rest. A warning tells of points that they
-            make unlikely.
+            Points that the movement passes, stiff enough to meet them: movement time in s from its start, and position
+            (d,) in the units of the recordings, NaN where an output is free (a rotation as a whole). ``covariance``
+            must be a model of whole movements. With one, goals and starts too bend the movement as far as
+            demonstrations make likely, and the primitive does the rest. Unlikely points raise a warning.
         speed : float, default=1.0
-            How fast movement time passes: at 0.5 the movement takes twice as long. Gains are those of movement time.
+            Rate of movement time: at 0.5 the movement takes twice as long. Gains are those at the movement time.
         limits : MotionLimits or None
-            What no robot does, default 600 s, 10 m, 10 m/s; None is no limits. They hold for recordings in units of
-            length, and such without units.
+            Limits beyond which units must be wrong, by default 600 s, 10 m, 10 m/s; None is no limits. They apply to
+            recordings in units of length or without units.
 
         Raises
         ------
         ValueError
-            If there are less than two ticks, they do not fit in memory, or the motion is beyond ``limits``.
+            If there are fewer than two ticks, they do not fit in memory, or the motion exceeds ``limits``.
         """
         check_is_fitted(self)
         speed = checks.number(speed, "speed", above=0.0)
@@ -207,18 +206,18 @@ class Planning(BaseEstimator):
         Parameters
         ----------
         plant : AdmittancePlant, default=None
-            None is ``AdmittancePlant(mass)`` with the mass of this controller; a warning tells of another mass.
+            Simulated robot; None is ``AdmittancePlant(mass)`` with this controller's mass. Another mass warns.
         force : array-like of shape (T, d), default=None
-            External force in N, one row for each of the schedule's ticks; None is none.
+            External force in N, one row per tick of the schedule; None is no force.
         rate : float, default=1000.0
-            Of the ticks, Hz. The last one, which may be later than the end of the movement, follows its last row.
+            Rate of the ticks in Hz. The last tick may be after the end of the movement and follows its last row.
         random_state : int, RandomState or None, default=None
-            Of the noise of the plant's sensor.
+            Seed of the plant's sensor noise.
         """
         return simulate(self.schedule(rate), force, plant=plant, random_state=random_state)
 
     def phase(self, time: ArrayLike) -> Floats:
-        """Inputs (n, 1) of ``covariance_`` at movement times (n,), which start at 0: what ``phase_input`` says."""
+        """Inputs (n, 1) of ``covariance_`` at movement times (n,) from 0 on, as ``phase_input`` selects."""
         check_is_fitted(self)
         return self.reproduction_.phase(checks.array(time, "time", ("n",)))
 
@@ -248,7 +247,7 @@ class Planning(BaseEstimator):
         return np.asarray(self.time_scale_ * (times[:, 0] - self.start_time_))
 
     def _refuse_beyond(self, limits: MotionLimits | None, name: str, value: float) -> None:
-        """Refuse a duration, distance or speed, by name, beyond the limits."""
+        """Raise if a duration, distance or speed, by ``name``, exceeds the limits."""
         if limits is not None and value > (most := getattr(limits, name)):
             units = ", ".join(self.outputs_.units(self.units_) or ["none"])
             raise ValueError(
@@ -259,7 +258,7 @@ class Planning(BaseEstimator):
 
 
 def _labels(controller: Any) -> dict[str, Any]:
-    """Names, units and limits of the schedules of a fitted controller, and what they come from, as JSON can hold it."""
+    """Names, units, limits and JSON-compatible provenance of the schedules of a fitted controller."""
     law, mass = controller.law_, controller.mass_
     return {
         "names": controller.names_,
@@ -282,7 +281,7 @@ def _labels(controller: Any) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Parameter as JSON can hold it."""
+    """Parameter in JSON-compatible form."""
     if isinstance(value, BaseEstimator):
         return {type(value).__name__: {k: _plain(v) for k, v in value.get_params(deep=False).items()}}
     if isinstance(value, StiffnessLaw):

@@ -1,8 +1,8 @@
-"""Movements that are bent by what is known of them: through via points, to likely goals, on from where a robot is.
+"""Movements bent by observations: through via points, to likely goals, or on from where a robot is.
 
-A model of whole movements, conditioned, says how the rest of a movement changes. That change, over movement time, is
-added to the reproduced path; gains come from the conditioned covariance. What demonstrations make unlikely is left to
-the movement primitive, which reaches any goal.
+A conditioned model of whole movements predicts how the rest of a movement changes. That change, over movement time, is
+added to the reproduced path; gains come from the conditioned covariance. Goals that the demonstrations make unlikely
+are left to the movement primitive, which reaches any goal.
 """
 
 import copy
@@ -19,8 +19,8 @@ from scipy.stats import chi2, f
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 
-_N_KNOTS = 200  # of a change over a movement: length scales are no shorter than a fiftieth of it
-_LIKELY = 0.95  # of demonstrations: what deviates further is not what they make likely
+_N_KNOTS = 200  # knots of a change over a movement, whose length scales are at least a fiftieth of it
+_LIKELY = 0.95  # share of demonstrations beyond whose deviation a point counts as unlikely
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Bend:
 
 
 def can_bend(controller: Any) -> bool:
-    """True if a controller's covariance is a model of whole movements, of positions."""
+    """Whether a controller's covariance is a model of whole movements of positions."""
     return hasattr(controller.covariance_, "condition") and controller.variability == "position"
 
 
@@ -57,17 +57,17 @@ def conditioned(
 ) -> Any:
     """Copy of a fitted controller whose path changes by (m, d), NaN where free, at movement times (m,).
 
-    At the movement times ``pins`` the path stays, without a part in the gains. Changes are from the path, as it is not
-    the model's mean: they differ by the error of the reproduction.
+    At the movement times ``pins`` the path stays, without effect on the gains. Changes are relative to the path, which
+    differs from the model's mean by the error of the reproduction.
     """
     _check_can_bend(controller)
     outputs, phase = controller.outputs_, controller.reproduction_.phase
-    # What is known is told in outputs, which may be free one by one; poses are learned along other axes.
+    # Observations are in outputs, any of which may be free, while poses are learned along other axes.
     model = controller.covariance_.observed_along(outputs.axes)
     shown, inputs, stays = getattr(controller, "_shown", model), phase(time), phase(np.array(pins))
     bent = model.condition(inputs, outputs.decode(model.predict(inputs)) + change, noise_scale=noise_scale)
     moved = bent.condition(stays, outputs.decode(model.predict(stays))) if len(pins) else bent
-    # Even knots, but for those beside a time that is known, where the change is to be exact.
+    # Knots are even, except next to observed times, where the change must be exact.
     own = np.append(time, pins).clip(0.0, controller.duration_)
     even = np.linspace(0.0, controller.duration_, _N_KNOTS)
     far = np.abs(even[:, np.newaxis] - own).min(axis=1, initial=np.inf) > 0.25 * even[1]
@@ -81,9 +81,9 @@ def conditioned(
 def planned(
     controller: Any, goal: Floats | None, start: Floats | None, via: Sequence[tuple[float, ArrayLike]] | None
 ) -> tuple[Any, Floats | None, Floats | None]:
-    """Controller of a movement to a goal, from a start, through points; and the goal and start left to its primitive.
+    """Controller conditioned on a goal, a start and via points, and the goal and start left to its primitive.
 
-    A point that deviates by more than 95 % of demonstrations do is told, and passed all the same.
+    A point that deviates by more than 95 % of demonstrations raises a warning and is passed all the same.
     """
     if via is None and (not can_bend(controller) or (goal is None and start is None)):
         return controller, goal, start
@@ -139,7 +139,7 @@ def _checked_point(point: Any, name: str, controller: Any) -> tuple[float, Float
 
 
 def _distance(controller: Any, at: float, change: Floats) -> tuple[float, float]:
-    """Mahalanobis distance of a change of the outputs that are given, and how far 95 % of demonstrations deviate."""
+    """Mahalanobis distance of a change of the given outputs, and that within which 95 % of demonstrations lie."""
     given = ~np.isnan(change)
     inputs, size = controller.reproduction_.phase(np.array([at])), int(given.sum())
     covariance = controller.outputs_.covariance(controller.covariance_.predict_cov(inputs))[0][np.ix_(given, given)]

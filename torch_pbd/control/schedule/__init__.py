@@ -1,4 +1,4 @@
-"""Schedules of motion and gains: rows, checks, files. They load where only NumPy is installed."""
+"""Schedules of motion and gains: rows, checks and files, which need only NumPy."""
 
 from torch_pbd.control.schedule.schedule import Schedule
 

@@ -1,4 +1,4 @@
-"""Contents of a schedule: shapes, finite numbers, gains that can be followed, labels that JSON can hold."""
+"""Checks of a schedule's contents: shapes, finite numbers, feasible gains, JSON-compatible labels."""
 
 import math
 import reprlib
@@ -31,9 +31,9 @@ OPTIONAL = frozenset({"acceleration", "orientation", "mass"})
 
 LABELS = ("names", "units", "frame", "stiffness_limits", "covariance_of", "mass", "provenance")
 
-# Of the squared norm: quaternions rounded to seven digits count as unit ones, and are made so to rounding.
+# Tolerances of the squared norm: quaternions rounded to seven digits pass as unit ones and are normalized to rounding.
 _NEARLY_UNIT, _UNIT = 1e-6, 1e-14
-# JSON's reader and Python's own stack take more levels than this, on every system.
+# Deepest nesting of labels, which JSON's reader and Python's stack exceed on every system.
 _DEEPEST = 100
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -42,7 +42,7 @@ Limits = tuple[float, float] | tuple[tuple[float, ...], tuple[float, ...]]
 
 
 def checked_fields(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of a schedule that a robot can follow: read-only copies in float64, and labels that cannot change.
+    """Checked fields of a schedule: read-only float64 copies and immutable labels.
 
     Matrices are symmetric to the last bit.
     """
@@ -87,7 +87,7 @@ def _checked_orientation(orientation: Floats) -> Floats:
 
 
 def _checked_limits(limits: Any, stiffness: Floats) -> Limits | None:
-    """Two numbers, or two tuples of one for each axis, between which the stiffness lies, to rounding; or None."""
+    """Lower and upper limits of the stiffness up to rounding, each a number or one per axis; or None."""
     if limits is None:
         return None
     if not isinstance(limits, list | tuple | np.ndarray) or len(limits) != 2:
@@ -99,7 +99,7 @@ def _checked_limits(limits: Any, stiffness: Floats) -> Limits | None:
         where = f"[{axis[0]}]" if axis else ""
         least = checks.number(float(low[axis]), f"stiffness_limits[0]{where}", least=0.0)
         checks.number(float(high[axis]), f"stiffness_limits[1]{where}", above=0.0, least=least)
-    # K_min <= K <= K_max as matrices, diagonal both, in units of K_max: those of lengths and angles then do not matter.
+    # K_min <= K <= K_max as matrices, both diagonal, scaled by K_max so that units of lengths and angles cancel.
     scale = 1.0 / np.sqrt(high * np.ones(d))
     relative, softest = scale[:, np.newaxis] * stiffness * scale, low / high * np.eye(d)
     bound = -checks.ROUNDING
@@ -114,7 +114,7 @@ def _checked_limits(limits: Any, stiffness: Floats) -> Limits | None:
 
 
 def _check_held(stiffness: Floats, damping: Floats) -> None:
-    """Refuse rows in which neither stiffness nor damping acts along some axis: nothing else would stop the robot."""
+    """Raise if neither stiffness nor damping acts along some axis of a row: nothing else would stop the robot."""
     scales = [checks.ROUNDING * np.abs(gain).max(axis=(1, 2)) for gain in (stiffness, damping)]
     if checks.eigenvalues_above(stiffness, scales[0]):
         return
@@ -125,13 +125,13 @@ def _check_held(stiffness: Floats, damping: Floats) -> None:
 
 
 def _checked_labels(labels: Labels, n_outputs: int) -> dict[str, Any]:
-    """Labels of a schedule that are sound, as tuples and a copy of the provenance."""
+    """Checked labels of a schedule, as tuples and a copy of the provenance."""
     names = labels["names"]
     if names is not None:
         listed = list(names) if isinstance(names, list | tuple) else []
         if not (all(isinstance(name, str) for name in listed) and len(set(listed)) == len(listed) == n_outputs):
             raise checks.refusal(names, "names", f"{n_outputs} different strings, one for each output")
-        # Names are titles of columns; other texts stand in JSON, which can hold line ends and controls too.
+        # Names are column titles; other texts are stored as JSON, which can hold line ends and control characters.
         names = tuple(checks.text(name, f"names[{i}]") for i, name in enumerate(listed))
     checks.instance(labels["provenance"], "provenance", Mapping)
     return {
@@ -145,7 +145,7 @@ def _checked_labels(labels: Labels, n_outputs: int) -> dict[str, Any]:
 
 
 def _json_copy(value: Any, where: str, depth: int = 0) -> Any:
-    """Copy of what comes back from JSON as it was; tuples come back as lists."""
+    """Copy of a value that survives a JSON round trip; tuples come back as lists."""
     if depth > _DEEPEST:
         raise InvalidParameterError(
             f"provenance is more than {_DEEPEST} levels deep, or holds itself, at {where:.80}...: take fewer levels."

@@ -37,7 +37,7 @@ _DAMAGE = (ArithmeticError, LookupError, MemoryError, RuntimeError, TypeError, V
 
 
 def write_schedule(path: Path, arrays: Arrays, labels: Labels) -> None:
-    """Write one file in the format of its suffix, as :meth:`Schedule.save` says."""
+    """Write one file in the format of its suffix; see :meth:`Schedule.save`."""
     encode, _ = _FORMATS[_known_suffix(path)]
     header = {"format": FORMAT, "version": VERSION, **labels}
     content = encode({**header, "sha256": _digest(header, arrays)}, arrays)
@@ -61,7 +61,7 @@ def read_schedule(path: Path, build: Callable[..., Built]) -> Built:
     try:
         if suffix != ".npz":
             require_memory(parsed_bytes([content]), what="what it says", remedy="Save it as .npz.")
-        # The arrays are read once the header is known to be of a version that can be.
+        # The arrays are read only once the header's version is known to be readable.
         parts = _FORMATS[suffix][1](content)
         header = next(parts)
         _check_header(header, optional={"sha256"} if suffix == ".csv" else set())
@@ -97,7 +97,7 @@ def _check_header(header: Any, optional: set[str]) -> None:
 
 
 def _digest(header: Labels, arrays: Arrays) -> str:
-    """SHA-256 of what the file says, not of how it is written: line ends and spelling of numbers are free."""
+    """SHA-256 of the content, independent of the format, line ends and spelling of numbers."""
     digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name in (name for name in SHAPES if name in arrays):
         digest.update(f"{name} {arrays[name].shape} ".encode())
@@ -147,9 +147,9 @@ def _decode_npz(content: bytes) -> Iterator[Any]:
 
 
 def _columns(names: Sequence[str] | None, sizes: Mapping[str, int], between: str = "][") -> list[Column]:
-    """Title, array and place in its rows of each column; of symmetric matrices the upper triangle.
+    """Title, array and index in its rows of each column; symmetric matrices have only their upper triangle.
 
-    ``sizes`` has the number of columns of every array that is there, of matrices that of their columns.
+    ``sizes`` has the length of the last axis of every array that is present.
     """
     named = names or [str(i) for i in range(sizes["velocity"])]
     columns: list[Column] = []
@@ -167,7 +167,7 @@ def _encode_csv(header: Labels, arrays: Arrays) -> bytes:
     text.writelines(f"# {key}: {json.dumps(value)}\n" for key, value in header.items())
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([title for title, _, _ in columns])
-    writer.writerows(table.tolist())  # as the shortest decimals that come back to the last bit
+    writer.writerows(table.tolist())  # shortest decimals that read back to the last bit
     return text.getvalue().encode()
 
 
@@ -194,7 +194,7 @@ def _read_table(names: Any, reader: Any, n_lines_before: int) -> Arrays:
         raise ValueError(f"names is {names}, but there are {d} columns of velocities.")
     there = {name: shape for name, shape in SHAPES.items() if counts[name] or name not in OPTIONAL}
     sizes = {name: {"n": 1, "p": p, "d": d, 4: 4}[shape[-1]] for name, shape in there.items()}
-    # Counted before they are named, for titles of thousands of outputs would take gigabytes.
+    # Columns are counted before they are named, since titles of thousands of outputs would take gigabytes.
     n_columns = sum(math.comb(size + len(there[name]) - 2, len(there[name]) - 1) for name, size in sizes.items())
     if len(titles) != n_columns:
         raise ValueError(

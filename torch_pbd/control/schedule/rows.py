@@ -1,4 +1,4 @@
-"""Rows made of a schedule's own: between them, damped for an inertia, in another frame, with diagonal gains."""
+"""Rows derived from a schedule's: interpolated, damped for an inertia, in another frame, with diagonal gains."""
 
 import math
 from collections.abc import Sequence
@@ -13,26 +13,26 @@ from torch_pbd.checks import Floats
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.files.memory import require_memory
 
-# Of a tick: 10 s at 1 kHz are 10001 rows, however 10 * 1000 is rounded; and stamps tell a duration to the thousandth of
-# their spacing, beyond which they count as one, so that a last interval shorter than that is none.
+# Share of a tick that counts as rounding: 10 s at 1 kHz are 10001 rows, however 10 * 1000 is rounded, and time stamps
+# resolve a duration to a thousandth of their spacing, so that a shorter last interval counts as none.
 _ROUNDING = 1e-3
 
 
 def count_rows(duration: float, rate: float) -> int:
-    """Rows every ``1 / rate`` within a duration, and one at its end; 1 if it is shorter than a tick."""
+    """Number of rows every ``1 / rate`` within a duration and one at its end; 1 if it is shorter than a tick."""
     ticks = duration * rate
     return math.ceil(ticks - _ROUNDING) + 1 if ticks + _ROUNDING >= 1.0 else 1
 
 
 def row_times(duration: float, rate: float) -> Floats:
-    """Times (n,) of these rows: the last interval may be shorter."""
+    """Times (n,) of the rows of :func:`count_rows`; the last interval may be shorter."""
     return np.append(np.arange(count_rows(duration, rate) - 1) / rate, duration)
 
 
 def tick_times(duration: float, rate: float, d: int, *, settle: float = 0.0) -> Floats:
-    """Times (n,), n >= 2, of the rows of a schedule of d axes at a rate in Hz, if they fit in memory.
+    """Times (n,), n >= 2, of the rows of a schedule of d axes at a rate in Hz, checked to fit in memory.
 
-    Rate, and the time in s by which the schedule ends after the duration, are checked.
+    The rate, and ``settle``, the time in s after the duration, are checked.
     """
     rate = checks.number(rate, "rate", above=0.0, unit="Hz")
     duration += checks.number(settle, "settle", least=0.0, unit="s")
@@ -48,7 +48,7 @@ def tick_times(duration: float, rate: float, d: int, *, settle: float = 0.0) -> 
 
 
 class Between:
-    """Places of times (m,) between the rows of a schedule at ``knots`` (n,), n >= 2."""
+    """Interpolation at times (m,) between the rows of a schedule at ``knots`` (n,), n >= 2."""
 
     def __init__(self, knots: Floats, times: Floats) -> None:
         self._row = np.clip(np.searchsorted(knots, times, side="right") - 1, 0, len(knots) - 2)
@@ -56,11 +56,11 @@ class Between:
         self._share = (times - knots[self._row]) / self._step
 
     def linear(self, values: Floats) -> Floats:
-        """Values (n, ...) on straight lines, (m, ...)."""
+        """Linear interpolation (m, ...) of values (n, ...)."""
         return _blend(values[self._row], values[self._row + 1], self._share)
 
     def motion(self, schedule: Any) -> tuple[Floats, Floats, Floats | None]:
-        """Position (m, p), velocity (m, d) and orientation (m, 4), or None, of a schedule whose rows these are."""
+        """Position (m, p), velocity (m, d) and orientation (m, 4) or None, of the schedule with these rows."""
         p, row = schedule.position.shape[1], self._row
         first, second = (schedule.velocity[rows] for rows in (row, row + 1))
         places = schedule.position[row], schedule.position[row + 1]
@@ -88,16 +88,16 @@ class Between:
 
 
 def _blend(start: Floats, end: Floats, share: Floats) -> Floats:
-    """Straight line from start to end, exact at both and where they agree, which (1 - s) a + s b is not."""
+    """Straight line from start to end, exact at both and where they are equal, unlike (1 - s) a + s b."""
     share = share.reshape(-1, *[1] * (start.ndim - 1))
     return np.where(share < 0.5, start + share * (end - start), end - (1.0 - share) * (end - start))
 
 
 def damped_rows(schedule: Any, damping_ratio: float, law: Any) -> dict[str, Any]:
-    """Damping, and stiffness if there is a law, for the mass of a schedule; see :meth:`Schedule.with_inertia`.
+    """Damping, and with a law also stiffness, for the mass of a schedule; see :meth:`Schedule.with_inertia`.
 
-    The damping is ``2 zeta L (L^-1 K L^-T)^1/2 L'`` with M = L L'. It is twice zeta times the geometric mean of M and
-    K, whatever the factor L: that of :func:`~torch_pbd.control.damping_from_stiffness`, which takes the root of M.
+    The damping is ``2 zeta L (L^-1 K L^-T)^1/2 L'`` with M = L L'. For every factor L it is twice zeta times the
+    geometric mean of M and K, as in :func:`~torch_pbd.control.damping_from_stiffness`, which takes the root of M.
     """
     ratio = checks.number(damping_ratio, "damping_ratio", least=0.0, most=1e6, remedy="1 is critical")
     rows, unit = {"stiffness": schedule.stiffness}, np.eye(schedule.n_outputs)
@@ -116,7 +116,7 @@ def damped_rows(schedule: Any, damping_ratio: float, law: Any) -> dict[str, Any]
 
 
 def turned_rows(schedule: Any, rotation: ArrayLike, translation: ArrayLike | None) -> dict[str, Any]:
-    """Arrays of a schedule that a rotation and a translation change; see :meth:`Schedule.transform`."""
+    """Arrays of a schedule after a rotation and a translation; see :meth:`Schedule.transform`."""
     p = schedule.position.shape[1]
     if schedule.units in ("rad", "deg"):
         raise InvalidParameterError(
@@ -149,17 +149,17 @@ def turned_rows(schedule: Any, rotation: ArrayLike, translation: ArrayLike | Non
 @final
 @dataclass(frozen=True)
 class DiagonalLoss:
-    """Error of a controller that takes the diagonals of stiffness and damping only, 0 if they are all there is.
+    """Error of a controller that uses only the diagonals of stiffness and damping; 0 if these are diagonal.
 
     Attributes
     ----------
     displacement : float
-        Largest ||x - x_diagonal|| / ||x|| over all times and forces, or torques, which displace the robot by x with the
-        whole stiffness. 1 is an error as large as the displacement.
+        Largest ||x - x_diagonal|| / ||x|| over all times and all forces or torques, which displace the robot by x under
+        the full stiffness. At 1 the error is as large as the displacement.
     velocity : float
-        The same of the velocity under a force where damping alone acts.
+        Largest relative error of the velocity under a force where damping alone acts.
     time : float
-        When the displacement is off most, in s.
+        Time of the largest error of the displacement, in s.
     """
 
     displacement: float
@@ -174,7 +174,7 @@ class DiagonalLoss:
 
 
 def diagonal_gains(schedule: Any) -> tuple[Floats, Floats, DiagonalLoss]:
-    """Diagonal stiffness and damping (n, d, d) of a schedule, and what they lose."""
+    """Diagonal stiffness and damping (n, d, d) of a schedule, and the error they cause."""
     # The nearest diagonal matrix, in the Frobenius norm, is the diagonal itself. It lies between the least and the
     # largest eigenvalue, so within the limits too; rounding may leave it below zero.
     gains = schedule.stiffness, schedule.damping
@@ -186,7 +186,7 @@ def diagonal_gains(schedule: Any) -> tuple[Floats, Floats, DiagonalLoss]:
 
 
 def _diagonal_error(gain: Floats, blocks: Sequence[slice]) -> Floats:
-    """Largest error (n,) of what a force, or a torque, causes, if of gains (n, d, d) the diagonals D are taken.
+    """Largest relative error (n,) of the response to a force or torque if gains (n, d, d) are reduced to diagonals D.
 
     x = K^-1 f and D^-1 f differ by (I - D^-1 K) x: by its spectral norm, for the worst x.
     """

@@ -1,4 +1,4 @@
-"""The schedule of a controller: position, velocity, stiffness and damping over time, and how sure the model was."""
+"""The schedule of a controller: position, velocity, stiffness and damping over time, with the model's uncertainty."""
 
 import os
 from collections.abc import Mapping
@@ -24,50 +24,50 @@ if TYPE_CHECKING:
 @final
 @dataclass(frozen=True, eq=False, repr=False)
 class Schedule:
-    """Position, velocity, stiffness and damping over time, with the covariance they come from.
+    """Position, velocity, stiffness and damping over time, with the underlying covariance.
 
-    Of positions alone, d = p; or of poses, d = p + 3: twists, wrenches and gains then have the positions first and
-    rotations last, all in world axes. The stiffness acts on the deviation ``(x - x_d, Log(R R_d'))``, whose last three
-    are a rotation vector in rad. Between its rows it is what `resample` says. It is immutable; its arrays are read-only
-    float64 copies.
+    For positions alone d = p; for poses d = p + 3, and twists, wrenches and gains have positions first and rotations
+    last, all in world axes. The stiffness acts on the deviation ``(x - x_d, Log(R R_d'))``, whose last three entries
+    are a rotation vector in rad. Values between rows are defined by `resample`. A schedule is immutable, and its arrays
+    are read-only float64 copies.
 
     Parameters
     ----------
     time : array_like of shape (n,)
-        In s, strictly increasing, n >= 2.
+        Times in s, strictly increasing, n >= 2.
     position : array_like of shape (n, p)
-        Desired, in ``units``.
+        Desired position in ``units``.
     velocity : array_like of shape (n, d)
-        Desired, in ``units``/s; of rotations in rad/s.
+        Desired velocity in ``units``/s, and rad/s for rotations.
     stiffness, damping : array_like of shape (n, d, d)
-        In N/m and N s/m, and for rotations Nm/rad and Nm s/rad; symmetric and positive semidefinite. Where the
+        Gains in N/m and N s/m, and for rotations Nm/rad and Nm s/rad; symmetric and positive semidefinite. Where the
         stiffness is singular, the damping must be positive definite: nothing else would stop the robot.
     covariance : array_like of shape (n, d, d)
         Covariance of the demonstrations, at the desired pose; symmetric and positive semidefinite.
     type1 : array_like of shape (n,)
-        How little the model knows: 0 (on data) to 1 (the prior alone).
+        Type I uncertainty, the model's lack of data: 0 (on data) to 1 (the prior alone).
     acceleration : array_like of shape (n, d), default=None
-        Desired, in ``units``/s^2 and rad/s^2; None where it is not known.
+        Desired acceleration in ``units``/s^2 and rad/s^2; None if unknown.
     orientation : array_like of shape (n, 4), default=None
-        Desired, as unit quaternions w x y z that turn the tool's vectors into the world's. Signs are made continuous.
+        Desired orientation as unit quaternions w x y z that rotate tool vectors to the world; signs become continuous.
     names : sequence of d str, default=None
         Names of the outputs.
     units, frame : str, default="m", None
-        Unit of the position, name of the coordinate frame; None where it is not known.
+        Unit of the position, and name of the coordinate frame or None if unknown.
     stiffness_limits : (low, high), default=None
-        Least and largest stiffness, each a number for all axes, in N/m, or d numbers: ``diag(low) <= K <= diag(high)``.
+        Least and largest stiffness in N/m, each a number or d numbers: ``diag(low) <= K <= diag(high)``.
     covariance_of : {"position", "forcing"}, default="position"
-        Quantity that the covariance belongs to: a forcing is that of eq. (18).
+        Quantity of the covariance; the forcing is that of eq. (18).
     mass : float, or array_like of shape (d, d) or (n, d, d), default=None
         Inertia that the damping was computed for: the virtual mass of an admittance in kg, or that of an arm along the
         schedule in kg, kg m and kg m^2, symmetric and positive definite.
     provenance : mapping, default={}
-        Whatever JSON can hold about where the schedule comes from.
+        JSON-compatible data about the origin of the schedule.
 
     Raises
     ------
     InvalidParameterError
-        If an argument is not as described; a ValueError that names the row.
+        If an argument is invalid; it is a ValueError and names the row.
     """
 
     time: Floats
@@ -94,12 +94,12 @@ class Schedule:
 
     @property
     def n_outputs(self) -> int:
-        """Number of outputs d: of positions, and three of an orientation."""
+        """Number of outputs d: positions, plus three with an orientation."""
         return self.velocity.shape[1]
 
     @property
     def blocks(self) -> tuple[slice, ...]:
-        """Outputs that share a unit: the positions, and the rotation if there is an orientation."""
+        """Slices of outputs that share a unit: the positions, and the rotation if there is an orientation."""
         p, d = self.position.shape[1], self.n_outputs
         return (slice(0, p), slice(p, d)) if d > p else (slice(0, p),)
 
@@ -137,28 +137,28 @@ class Schedule:
         return f"Schedule({', '.join(parts)}, frame={self.frame!r})"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Copies go through the constructor: NumPy forgets that an array is read-only when it is pickled or copied.
+        # Copies go through the constructor, since pickling or copying makes NumPy arrays writable again.
         return partial(Schedule, **self._labels() | self._arrays()), ()
 
     def resample(self, rate: float | None = None, *, times: ArrayLike | None = None) -> "Schedule":
         """Rows at other times, all within the schedule.
 
         Stiffness, damping, covariance, mass, acceleration and type1 are piecewise linear, so that matrices stay
-        symmetric, positive semidefinite and within their limits. The position is the cubic of each interval through
-        positions and velocities of its ends (Hermite), the velocity its derivative: damping acts on no motion that the
-        position does not make. Orientations are such cubics of the rotation vector from the row before.
+        symmetric, positive semidefinite and within their limits. The position is the cubic Hermite interpolation of
+        positions and velocities, and the velocity its derivative, so that the two are consistent for the damping.
+        Orientations are such cubics of the rotation vector from the row before.
 
         Parameters
         ----------
         rate : float, default=None
-            In Hz: rows every 1/rate from the first time on, and one at the end.
+            Rate in Hz: rows every 1/rate from the first time on, and one at the end.
         times : array_like of shape (m,), default=None
-            Strictly increasing, m >= 2, in s; either this or ``rate``. What the rows say in between is lost.
+            Times in s, strictly increasing, m >= 2; either this or ``rate``. Details between them are lost.
 
         Raises
         ------
         ValueError
-            If not exactly one is given, ``rate`` leaves less than two rows, or a time is outside.
+            If not exactly one is given, ``rate`` leaves fewer than two rows, or a time is outside the schedule.
         """
         if (rate is None) == (times is None):
             raise InvalidParameterError(f"give either rate or times; got rate={rate!r} and times={times!r}.")
@@ -174,21 +174,21 @@ class Schedule:
         return replace(self, **made | motion | {"time": grid})
 
     def retime(self, speed: float, *, mass: Any = None) -> "Schedule":
-        """Schedule that is ``speed`` times as fast: time / speed, velocity * speed, gains and masses as they are.
+        """Schedule that is ``speed`` times as fast: time / speed, velocity * speed, same gains and masses.
 
         Parameters
         ----------
         speed : float
-            From 1e-9 to 1e9; the stiffness rises that much faster too.
+            Factor from 1e-9 to 1e9, by which the stiffness changes faster too.
         mass : float, array_like of shape (d, d) or (n, d, d), or callable, default=None
-            As for :func:`~torch_pbd.control.certify`, to check the stability at the new speed. None: not checked.
+            Mass with which :func:`~torch_pbd.control.certify` checks the stability at the new speed; None for no check.
 
         Raises
         ------
         ValueError
-            If ``speed`` is not within these, or none of the guarantees of the report holds at it with ``mass``.
+            If ``speed`` is out of range, or no guarantee of the report holds at that speed with ``mass``.
         """
-        # Beyond these, a year for a second, speeds are mistakes; within, times and velocities keep their digits.
+        # Speeds beyond these bounds, a year for a second, are mistakes; within, times and velocities keep their digits.
         speed = checks.number(speed, "speed", least=1e-9, most=1e9)
         report = None if mass is None else self.certify(mass=mass, speed=speed)
         if report is not None and not report.stable:
@@ -201,21 +201,21 @@ class Schedule:
         return replace(self, time=self.time / speed, velocity=self.velocity * speed, acceleration=acceleration)
 
     def with_inertia(self, mass: Any, damping_ratio: float = 1.0, *, law: Any = None) -> "Schedule":
-        """Schedule for a robot of this inertia: with it, and with the damping that gives all modes this ratio.
+        """Schedule for a robot of this inertia, with damping that gives all modes this damping ratio.
 
-        ``D = 2 zeta M^1/2 (M^-1/2 K M^-1/2)^1/2 M^1/2`` at every row, as
-        :func:`~torch_pbd.control.damping_from_stiffness`. A torque-controlled arm moves with its operational inertia:
-        damping made for 1 kg leaves a Panda with a ratio of 0.26.
+        ``D = 2 zeta M^1/2 (M^-1/2 K M^-1/2)^1/2 M^1/2`` at every row, as in
+        :func:`~torch_pbd.control.damping_from_stiffness`. A torque-controlled arm moves with its operational-space
+        inertia: damping for 1 kg leaves a Panda with a ratio of 0.26.
 
         Parameters
         ----------
         mass : float, array_like of shape (d, d) or (n, d, d), or callable
-            In kg, for poses also kg m and kg m^2, in world axes; or a function of time (n,), in s, that returns it.
+            Inertia in kg, for poses also kg m and kg m^2, in world axes; or a function of times (n,) in s.
         damping_ratio : float, default=1.0
-            Ratio zeta; 1 is critical.
+            Damping ratio zeta; 1 is critical.
         law : StiffnessLaw, default=None
-            Makes the stiffness anew, from the covariance and the inertia of each row, softer where the model knows
-            less, as on_unknown="soft". One with effort="match" matches it to this inertia. None keeps the stiffness.
+            Law that recomputes the stiffness from the covariance and inertia of each row, softer where data are
+            missing, as on_unknown="soft"; effort="match" matches this inertia. None keeps the stiffness.
 
         Raises
         ------
@@ -228,37 +228,37 @@ class Schedule:
     def transform(
         self, rotation: ArrayLike, translation: ArrayLike | None = None, *, frame: str | None = None
     ) -> "Schedule":
-        """Schedule in another frame of the world, into which ``R x + t`` brings the positions x.
+        """Schedule in another frame, to which ``R x + t`` maps positions x.
 
         Parameters
         ----------
         rotation : array_like of shape (p, p) or (4,)
             Matrix R, or for p = 3 a unit quaternion w x y z.
         translation : array_like of shape (p,), default=None
-            In ``units``; None is none.
+            Translation t in ``units``; None is zero.
         frame : str, default=None
             Name of the new frame.
 
         Raises
         ------
         ValueError
-            If the matrix is no rotation, positions are joint angles, or axes have limits of their own.
+            If the matrix is not a rotation, positions are joint angles, or axes have limits of their own.
         """
         return replace(self, **rows.turned_rows(self, rotation, translation), frame=frame)
 
     def certify(self, *, mass: Any = None, **options: Any) -> "StabilityReport":
-        """:func:`torch_pbd.control.certify` of this schedule, whose options it takes; no mass is its own, or 1 kg."""
+        """Stability report of :func:`torch_pbd.control.certify`, with its options; mass defaults to the schedule's."""
         from torch_pbd.control.stability.certify import certify  # here: it needs torch, a schedule does not
 
         return certify(self, mass=mass, **options)
 
     def diagonal(self) -> tuple["Schedule", rows.DiagonalLoss]:
-        """Schedule with diagonal stiffness and damping, for controllers that take no other, and what that loses."""
+        """Schedule with diagonal gains, for controllers that need them, and the error that this causes."""
         stiffness, damping, loss = rows.diagonal_gains(self)
         return replace(self, stiffness=stiffness, damping=damping), loss
 
     def plot(self) -> Any:
-        """Draw motion, standard deviation and stiffness; returns the list of matplotlib Axes of a new figure."""
+        """Plot motion, standard deviation and stiffness in a new figure; returns its list of matplotlib Axes."""
         from torch_pbd.plotting.display import plot_schedule  # here: it needs matplotlib, a schedule does not
 
         return plot_schedule(self)
@@ -266,28 +266,28 @@ class Schedule:
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write one file, in the format of its suffix: .npz, .json or .csv.
 
-        All of them hold everything to the last bit, with a version and a checksum. In .csv the labels are lines
-        ``# key: JSON`` before the header, matrices their upper triangles, ``stiffness[x][y]``. The file appears
-        whole or not at all, and replaces one that is there.
+        Each format holds everything to the last bit, with a version and a checksum. A .csv has labels as lines
+        ``# key: JSON`` before the header, and the upper triangles of matrices, ``stiffness[x][y]``. The file is
+        written atomically and replaces an existing one.
 
         Raises
         ------
         ValueError, OSError
-            If the suffix is another, or the file would be larger than 1 GiB; if it cannot be written.
+            If the suffix is not one of these, the file would exceed 1 GiB, or it cannot be written.
         """
         write_schedule(Path(path), self._arrays(), self._labels())
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Self:
-        """Read a file of `save`; nothing in it is executed.
+        """Load a file written by `save`; nothing in it is executed.
 
         Raises
         ------
         FileNotFoundError, ValueError
-            If there is no such file; if its suffix is none of .npz, .json and .csv.
+            If there is no such file, or its suffix is not .npz, .json or .csv.
         ModelFileError
-            If the file is torn, changed, of a newer version, or does not hold a schedule. A .csv that was
-            edited on purpose loads once its line ``# sha256: ...`` is deleted.
+            If the file is truncated, changed, of a newer version, or not a schedule. A .csv that was edited on
+            purpose loads once its line ``# sha256: ...`` is deleted.
         """
         return read_schedule(Path(path), build=cls)
 

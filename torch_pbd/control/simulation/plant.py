@@ -22,7 +22,7 @@ _PARTS = {
     "environment": Environment,
     "stiffness_filter": StiffnessFilter,
 }
-# Sizes of arguments behind those of the batch; those that are not here are motions of all axes, (T, d).
+# Shapes of arguments after the batch dimensions; arguments not listed are motions of all axes, (T, d).
 _SHAPES = {
     "position_desired": "Tp",
     "orientation_desired": "T4",
@@ -32,43 +32,43 @@ _SHAPES = {
     "orientation0": "4",
     "velocity0": "d",
 }
-# How far squared norms of unit quaternions may be from 1, as in schedules: those of seven digits pass.
+# Tolerance of the squared norms of unit quaternions, as in schedules: those of seven digits pass.
 _NEARLY_UNIT = 1e-6
 
 
 @final
 @dataclass(eq=False, repr=False)
 class AdmittancePlant:
-    """A mass on a spring and a damper that a desired motion drags along, in d axes, batched over rollouts.
+    """Mass, spring and damper in d axes, pulled along a desired motion and batched over rollouts.
 
     ``M a = f + K (x_d - x) + D (v_d - v)``, eq. (15) as admittance. All inputs are held over a tick (zero-order hold),
-    in which the desired position stands still; states are those at the start of ticks. Of poses, ``x - x_d`` is
-    ``(p - p_d, Log(R R_d'))`` in world axes, v the twist. That is linear in the rotation away from the desired
-    orientation, which itself may turn as it likes: peaks under pushes are right to 1 % up to 1 rad away, the paths to
-    them off by 3 % at 0.2 rad and 16 % at 1 rad.
+    in which the desired position stands still; states are those at the start of ticks. For poses, ``x - x_d`` is
+    ``(p - p_d, Log(R R_d'))`` in world axes and v the twist. The model is linear in the deviation from the desired
+    orientation, which itself may turn arbitrarily: peaks under pushes are right to 1 % up to 1 rad, while the paths to
+    them err by 3 % at 0.2 rad and 16 % at 1 rad.
 
     Parameters
     ----------
     mass : float, Tensor of shape (d, d) or (..., T, d, d), callable or None, default=1.0
-        Virtual mass in kg, or inertia of the robot, for poses in kg, kg m and kg m^2, at all ticks or at each: it
-        does not change the velocity when it changes. Matrices must be symmetric and positive definite. A function
-        maps times (T,) in s to such matrices. None is the mass of the schedule, or 1 kg where there is none.
+        Virtual mass or robot inertia in kg, for poses also kg m and kg m^2, constant or per tick; its changes leave
+        the velocity as it is. Matrices must be symmetric and positive definite. A function maps times (T,) in s
+        to such matrices. None is the mass of the schedule, or 1 kg where it has none.
     integrator : {"exact"}, default="exact"
-        It solves the tick, whatever its length.
+        Integrator of a tick; "exact" is exact for any length.
     feed_forward : bool, default=False
-        Add ``M a_d``, which eq. (15) lacks: the robot then follows but for half a tick's motion, the mean lag of
-        a desired position that stands still in each tick.
+        Add ``M a_d``, which eq. (15) lacks: the robot then lags by only half a tick's motion, the mean lag of a
+        desired position that stands still in each tick.
     sensor : ForceSensor, default=None
-        Between the external force and the admittance; None measures it as it is.
+        Sensor between the external force and the admittance; None measures the force exactly.
     position_loop : PositionLoop, default=None
-        Between the admittance and the robot; None follows at once.
+        Position loop between the admittance and the robot; None follows at once.
     environment : Tunnel, default=None
-        Walls, whose force adds to the external one; or any object with a method ``force(position, velocity)``.
+        Walls, whose force adds to the external one, or any object with a method ``force(position, velocity)``.
     substeps : int, default=1
-        Times a tick that walls are evaluated. A wall of 1e5 N/m needs about 4 at 1 kHz. Sensors, position loops and
-        filters act once a tick, as on a real robot: with one of them it must be 1.
+        Evaluations of the walls per tick. A wall of 1e5 N/m needs about 4 at 1 kHz. Sensors, position loops and
+        filters act once per tick, as on a real robot, and require 1.
     stiffness_filter : RateLimit or EnergyTank, default=None
-        Holds back what would feed energy into the robot.
+        Filter that holds back stiffness changes that would feed energy into the robot.
 
     Examples
     --------
@@ -128,25 +128,25 @@ class AdmittancePlant:
     ) -> Rollout:
         """Run T ticks of ``dt`` seconds.
 
-        Positions alone have d = p axes. With ``orientation_desired`` it is a run of poses, of d = p + 3 axes: the last
-        three are rotations in world axes, in rad/s, rad/s^2, Nm, Nm/rad and Nm s/rad.
+        Positions alone have d = p axes. With ``orientation_desired`` the run is of poses with d = p + 3 axes, the last
+        three being rotations in world axes, in rad/s, rad/s^2, Nm, Nm/rad and Nm s/rad.
 
         Parameters
         ----------
         position_desired, velocity_desired : Tensor of shape (..., T, p) and (..., T, d)
-            Desired motion in m and m/s. Leading dimensions of all arguments are those of the batch, and broadcast.
+            Desired motion in m and m/s. Leading dimensions of all arguments are batch dimensions and broadcast.
         stiffness, damping : Tensor of shape (..., T, d, d)
             Gains in N/m and N s/m, symmetric and positive semidefinite; they need not commute.
         force : Tensor of shape (..., T, d), default=None
-            External force in N; None is none.
+            External force in N; None is no force.
         dt : float
             Length of a tick in s.
         position0, velocity0, orientation0 : Tensor of shape (..., p), (..., d) and (..., 4), default=None
-            State at the start; None is the desired one.
+            Initial state; None is the desired one.
         acceleration_desired : Tensor of shape (..., T, d), default=None
             Desired acceleration in m/s^2, for ``feed_forward``; None takes the differences of ``velocity_desired``.
         orientation_desired : Tensor of shape (..., T, 4), default=None
-            Unit quaternions w x y z, which make it a run of poses.
+            Desired unit quaternions w x y z, for runs of poses.
         generator : torch.Generator, default=None
             Source of the sensor's noise.
 
@@ -194,7 +194,7 @@ class AdmittancePlant:
         acceleration_desired: Tensor | None = None,
         orientation_desired: Tensor | None = None,
     ) -> Task:
-        """Task of arguments of :meth:`simulate` that were checked, as this plant is to follow it."""
+        """Task of this plant from checked arguments of :meth:`simulate`."""
         stiffness, damping = torch.broadcast_tensors(stiffness, damping)
         if mass.ndim > 2:
             stiffness, damping, mass = torch.broadcast_tensors(stiffness, damping, mass)
@@ -210,7 +210,7 @@ class AdmittancePlant:
 
 
 def _check(given: dict[str, Tensor]) -> None:
-    """Refuse arguments of several dtypes, shapes that disagree, and values that cannot be followed."""
+    """Check that dtypes and shapes of the arguments agree, and that their values are feasible."""
     kinds = sorted({f"{value.dtype} on {value.device}" for value in given.values()})
     if len(kinds) > 1:
         raise InvalidParameterError(

@@ -25,19 +25,19 @@ from torch_pbd.control.simulation.ticks import (
 from torch_pbd.files.memory import require_memory
 from torch_pbd.linalg import broadcast_shapes
 
-# rad. The path of a push is off by about a sixth of its largest angle, of that angle: a quarter here.
+# Angle in rad beyond which a run warns: there the path of a push errs by a quarter of its largest angle.
 _FAR = 0.5 * math.pi
-# Dimensions of a run's values behind those of the batch; of what is not here it is that of ticks alone.
+# Number of dimensions of a run's values after the batch; values not listed have ticks alone.
 _N_DIMS = {"position": 2, "velocity": 2, "force": 2, "commanded_position": 2, "stiffness": 3, "damping": 3}
 
 
 @final
 @dataclass(frozen=True, eq=False, repr=False)
 class Rollout:
-    """States at the start of each tick of a simulated run, tensors or, by ``numpy()``, arrays.
+    """States at the start of each tick of a simulated run, as tensors or, by ``numpy()``, arrays.
 
-    Runs of positions alone have p = d. Those of poses have p = d - 3, and the last three axes of velocity, force and
-    gains are rotations in world axes: rad/s, Nm, Nm/rad and Nm s/rad.
+    Runs of positions have p = d. Runs of poses have p = d - 3, and the last three axes of velocity, force and gains are
+    rotations in world axes, in rad/s, Nm, Nm/rad and Nm s/rad.
 
     Attributes
     ----------
@@ -45,25 +45,25 @@ class Rollout:
     position, velocity : (..., T, p), m, and (..., T, d), m/s
         Motion of the robot.
     force : (..., T, d), N
-        External force on the robot, that of walls included.
+        External force on the robot, including that of walls.
     stiffness, damping : (..., T, d, d), N/m and N s/m
-        Gains in effect during the tick, behind the filter.
+        Gains in effect during the tick, after the filter.
     desired_position : (..., T, p), m
     commanded_position : (..., T, p), m
-        What the admittance asks of the robot's position loop; without such a loop, ``position``.
+        Command of the admittance to the robot's position loop; ``position`` if there is no loop.
     filter_share : (..., T) or None
-        Share of the step in stiffness that a filter let through, 1 where it did not intervene.
+        Share of the stiffness step that a filter passed, 1 where it did not intervene.
     tank_energy : (..., T) or None
         Energy in the tank during the tick, J.
     saturated : (..., T) of bool or None
-        Whether the force sensor was out of its range.
+        Whether the force sensor was saturated.
     orientation, desired_orientation, commanded_orientation : (..., T, 4) or None
-        Unit quaternions w x y z, in runs of poses.
+        Unit quaternions w x y z in runs of poses.
     pose_deviation : (..., T, d) or None, m and rad
-        In runs of poses, position less desired position, and the rotation vector e from the desired orientation in
+        In runs of poses, position minus desired position, and the rotation vector e from the desired orientation in
         world axes, ``R = exp([e]) R_d``.
     units : str or None
-        Units of the schedule's positions: "rad" for joints, which have rad for m above, and Nm for N; None if unknown.
+        Units of the schedule's positions, None if unknown. For "rad" (joints), read rad for m and Nm for N above.
     """
 
     time: Any
@@ -94,24 +94,24 @@ class Rollout:
         )
 
     def numpy(self) -> "Rollout":
-        """The run as NumPy arrays, on the CPU."""
+        """Copy of the run as NumPy arrays."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         arrays: dict[str, Any] = {k: v.detach().cpu().numpy() for k, v in values.items() if isinstance(v, Tensor)}
         return replace(self, **arrays)
 
     def plot(self, *, unpushed: "Rollout | None" = None, names: Sequence[str] | None = None) -> Any:
-        """Draw deviation, external force and stiffness over time, below each other in a new figure; rotations beside.
+        """Plot deviation, external force and stiffness over time in a new figure, with rotations in a second column.
 
         Parameters
         ----------
         unpushed : Rollout, default=None
-            The same run without pushes, drawn behind.
+            The same run without pushes, drawn in the background.
         names : sequence of d str, default=None
             Names of the outputs; None calls them y0, y1, ...
 
         Returns
         -------
-        list of three matplotlib Axes, or of six of poses: three of positions, three of rotations
+        list of three matplotlib Axes, or for poses of six: three of positions, then three of rotations
 
         Raises
         ------
@@ -124,17 +124,17 @@ class Rollout:
 
     @property
     def deviation(self) -> Any:
-        """Position less desired position, and of poses the rotation vector away from the desired one, (..., T, d)."""
+        """Position minus desired position, and for poses the rotation vector from the desired one: (..., T, d)."""
         return self.position - self.desired_position if self.pose_deviation is None else self.pose_deviation
 
     @property
     def interventions(self) -> Any:
-        """Times (n,) of a single run at which a filter held the stiffness back; of a batch, see ``filter_share``."""
+        """Times (n,) in s at which a filter held back the stiffness of a single run; batches have ``filter_share``."""
         return self.time[:0] if self.filter_share is None else self.time[self.filter_share < 1.0]
 
 
 class Loop:
-    """State (..., d) of a run with what acts in it, which moves on tick by tick."""
+    """State (..., d) of a run with sensor, loop, walls and filter, advanced tick by tick."""
 
     def __init__(self, task: Task, state: State, generator: torch.Generator | None) -> None:
         self._task = task
@@ -147,7 +147,7 @@ class Loop:
         self._maps = (each for _, maps in tick_maps(task, task.dt / task.substeps) for each in maps.unbind(-3))
 
     def run(self, tick: int, force: Tensor) -> dict[str, Tensor]:
-        """One tick under a force (..., d): measure, choose the gains, move; fields of a Rollout at its start."""
+        """Fields of a Rollout at the start of a tick under a force (..., d): measure, choose the gains, move."""
         task, robot = self._task, self._robot
         desired, mass = task.position[..., tick, :], mass_at(task.mass, tick)
         stiffness, damping = task.stiffness[..., tick, :, :], task.damping[..., tick, :, :]
@@ -181,7 +181,7 @@ class Loop:
         return record | {"stiffness": stiffness, "damping": damping}
 
     def _move_on(self, tick: int, commanded: Tensor) -> None:
-        """Let the robot follow its command, and count all from the desired place of the next tick."""
+        """Let the robot follow its command, and express all relative to the next tick's desired place."""
         task = self._task
         step = task.position[..., tick + 1, :] - task.position[..., tick, :]
         self._deviation = task.carry(tick, self._deviation) - step
@@ -208,7 +208,7 @@ def run_task(
     *,
     generator: torch.Generator | None = None,
 ) -> Rollout:
-    """Run of a task under a force (..., T, d) and from a start (..., p), (..., d), (..., 4) that were checked."""
+    """Run of a task under a checked force (..., T, d) from a checked start (..., p), (..., d), (..., 4)."""
     force = torch.zeros_like(task.velocity) if force is None else force
     start, speed = _start(task, position0, orientation0), task.velocity[..., 0, :] if velocity0 is None else velocity0
     parts = [*task.motions, force, task.stiffness[..., 0]]
@@ -244,7 +244,7 @@ def run_task(
 
 
 def _start(task: Task, position0: Tensor | None, orientation0: Tensor | None) -> Tensor:
-    """Pose at the start, as :class:`Task` has them."""
+    """Initial pose in the coordinates of :class:`Task`."""
     start = task.position[..., 0, :] if position0 is None else position0
     if task.turning is None:
         return start
@@ -256,7 +256,7 @@ def _start(task: Task, position0: Tensor | None, orientation0: Tensor | None) ->
 
 
 def _check_memory(task: Task, n_rollouts: int) -> None:
-    if task.position.device.type != "cpu":  # elsewhere torch raises by itself
+    if task.position.device.type != "cpu":  # torch raises by itself on other devices
         return
     # Measured: five motions are held, of poses six and two orientations, and where rollouts differ in their gains,
     # twelve matrices.
@@ -269,7 +269,7 @@ def _check_memory(task: Task, n_rollouts: int) -> None:
 
 
 def warn_if_far(angle: float) -> None:
-    """Warn where the robot is so far from the desired orientation that a linear model is no longer one."""
+    """Warn where the robot is too far from the desired orientation for the linear model."""
     if angle > _FAR:
         checks.warn(
             f"The robot is turned by up to {angle:.2g} rad from the desired orientation, where the linear plant "

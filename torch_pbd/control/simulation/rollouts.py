@@ -1,4 +1,4 @@
-"""Many rollouts of one task under pushes, a block of ticks at a time, of which only a summary is kept."""
+"""Many rollouts of one task under pushes, computed in blocks of ticks and kept only as a summary."""
 
 import math
 from bisect import bisect_right
@@ -15,40 +15,40 @@ from torch_pbd.checks import Floats
 from torch_pbd.control.simulation.rollout import Loop
 from torch_pbd.control.simulation.ticks import Task, block_length, block_responses
 
-# Rollouts that move on together: at d = 2 the forces, states and deviations of a block of them are 4 MB, which stay in
-# a processor's cache.
+# Rollouts advanced together: at d = 2 the forces, states and deviations of a block of them are 4 MB, which fit a
+# processor's cache.
 _CHUNK = 4096
-# A deviation has returned at a tenth of its own peak: by then a critically damped one takes four time constants.
+# A deviation has returned at this share of its peak, which takes a critically damped one four time constants.
 _SHARE = 0.1
 
 
 @final
 @dataclass(frozen=True, eq=False, repr=False)
 class RolloutSummary:
-    """Effect of R random pushes on a robot; NumPy arrays.
+    """Effect of R random pushes on a robot, as NumPy arrays.
 
-    For poses, ``rotation`` is the same for the rotation vectors as this for the positions. Where ``units`` are "rad",
-    as there and for joints, read rad for m and Nm for N.
+    For poses this describes the positions, and ``rotation`` the rotation vectors. Where ``units`` are "rad", as for
+    rotations and joints, read rad for m and Nm for N.
 
     Attributes
     ----------
     time : (n,), s
     quantiles : (n_quantiles,)
     deviation : (n, n_quantiles), m
-        Quantiles over the rollouts of the distance from the reference at these times.
+        Quantiles over the rollouts of the distance from the reference at each time.
     peak_deviation : (R,), m
-        Largest distance of each rollout; rollouts are in the order in which they are pushed.
+        Largest distance of each rollout; rollouts are ordered by the onset of their push.
     peak_time : (R,), s
     return_time : (R,), s
         Time from the end of the push until the distance stays below a tenth of its peak; inf if it never does.
     final_deviation : (R,), m
     onset, duration : (R,), s
-        When the push begins, and how long it lasts.
+        Start and duration of each push.
     push : (R, p), N
-        Force of the push at its peak.
+        Peak force of each push.
     rotation : RolloutSummary or None
     units : str or None
-        Units of the schedule's positions; None where they are not known.
+        Units of the schedule's positions, None if unknown.
     """
 
     time: Floats
@@ -82,10 +82,10 @@ class RolloutSummary:
 
 @final
 class Chunk:
-    """Columns of all rollouts that move on together, each under one push: a squared sine over time.
+    """Rollouts that are advanced together as columns, each under one push, a squared sine over time.
 
-    Onsets and durations are in s, (r,), from the first tick on, and onsets in order, so that the rollouts that are
-    pushed in a block of ticks are neighbours; peaks (d, r) are in N and Nm.
+    Onsets and durations (r,) are in s from the first tick on. Onsets are sorted, so that the rollouts that are pushed
+    in a block of ticks are neighbours. Peaks (d, r) are in N and Nm.
     """
 
     def __init__(self, columns: slice, onset: Tensor, duration: Tensor, peak: Tensor) -> None:
@@ -110,7 +110,7 @@ Part = tuple[slice, Chunk, Float[Tensor, "d l r"]]
 
 
 def _blocks(task: Task) -> Iterator[tuple[slice, Tensor]]:
-    """Ticks of each block, and times of as many as blocks have."""
+    """Ticks of each block, and times of a whole block's ticks."""
     length = block_length(task.position.shape[-1])
     for first in range(0, task.n_ticks, length):
         times = task.dt * torch.arange(first, first + length).to(task.position)
@@ -118,15 +118,15 @@ def _blocks(task: Task) -> Iterator[tuple[slice, Tensor]]:
 
 
 def _linear(task: Task, chunks: Sequence[Chunk]) -> Iterator[Part]:
-    """Deviations where nothing acts in the loop, of each block those of all chunks.
+    """Deviations where nothing acts in the loop, block by block for all chunks.
 
-    A tick is linear in the state and the force, with matrices that all rollouts share: so is a block of ticks, and it
-    is one product of matrices.
+    A tick is linear in the state and the force, with matrices that all rollouts share. So is a block of ticks, which
+    is thus a single matrix product.
     """
     d, length = task.position.shape[-1], block_length(task.position.shape[-1])
     start = torch.nn.functional.pad(task.velocity[0], (d, 0))[:, None]
     states = [start.repeat(1, len(chunk)) for chunk in chunks]
-    # Memory that is used again stays in the cache.
+    # Buffers are reused, so that they stay in the cache.
     inputs, outputs = start.new_ones(2 * d + 1, len(chunks[0])), start.new_empty(length * d + 2 * d, len(chunks[0]))
     for (ticks, times), each in zip(_blocks(task), block_responses(task, length), strict=True):
         # Deviations axis by axis, and then the state after the block.
@@ -156,7 +156,7 @@ def _looped(task: Task, chunks: Sequence[Chunk], generators: Iterator[torch.Gene
 
 
 class Tally:
-    """Squared peak of each of R rollouts in some axes, its tick, the last above a share of the peak, and the end."""
+    """Squared peak of each of R rollouts in some axes, its tick, the last tick above a share of it, and the end."""
 
     def __init__(self, n_rollouts: int, axes: slice) -> None:
         self.axes = axes
@@ -164,7 +164,7 @@ class Tally:
         self.last_above = torch.full_like(self.squared_last, -1.0)
 
     def add(self, ticks: slice, columns: slice, squared: Float[Tensor, "l r"], *, is_over: bool) -> None:
-        """Note squared distances at some ticks; ``is_over`` if a push may be over by then."""
+        """Record squared distances at some ticks; ``is_over`` if a push may be over by then."""
         numbers = torch.arange(ticks.start, ticks.stop, dtype=squared.dtype)[:, None]
         highest, peak, tick = squared.amax(0), self.squared_peak[columns], self.peak_tick[columns]
         higher = highest > peak
@@ -172,7 +172,7 @@ class Tally:
             when = torch.where(squared == highest, numbers, -1.0).amax(0)
             torch.where(higher, when, tick, out=tick)
             torch.maximum(peak, highest, out=peak)
-        # The limit is a share of the peak so far: what is counted before the peak is reached, the peak overrules.
+        # The limit is a share of the peak so far; ticks counted before the peak are superseded by later ones.
         limit, last = _SHARE**2 * peak, self.last_above[columns]
         if is_over and bool((highest > limit).any()):
             torch.maximum(last, torch.where(squared > limit, numbers, -1.0).amax(0), out=last)
@@ -188,7 +188,7 @@ def push_many(
     every: int,
     away: Tensor | None,
 ) -> Iterator[list[Floats]]:
-    """Move R rollouts under pushes, onsets (R,), durations (R,) and peaks (d, R), block by block.
+    """Simulate R rollouts under pushes of onsets (R,), durations (R,) and peaks (d, R), block by block.
 
     Yields the quantiles (L, n_quantiles) of the distances in the axes of each tally at each ``every``-th tick: from
     the desired position, or from where the robot is ``away`` (d, T) from it.
@@ -216,7 +216,7 @@ def push_many(
 
 
 def _quantiles(squares: Floats, levels: Floats) -> Floats:
-    """Quantiles (L, n_quantiles) of the roots of squares (L, R), whose rows are put in order."""
+    """Quantiles (L, n_quantiles) of the roots of squares (L, R), whose rows are sorted in place."""
     place = levels * (squares.shape[1] - 1)
     below = np.floor(place).astype(np.intp)
     squares.sort(axis=1)  # ten times as fast as torch's

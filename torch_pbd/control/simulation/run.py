@@ -1,4 +1,4 @@
-"""A schedule on a simulated robot: once, under a given force, or thousands of times, under random pushes."""
+"""Simulation of a schedule on a robot, once under a given force or thousands of times under random pushes."""
 
 from dataclasses import replace
 from itertools import count
@@ -21,9 +21,9 @@ from torch_pbd.files.memory import require_memory
 
 Range = float | tuple[float, float]
 
-# Share of a tick that is rounding of times; those of an hour at 1 kHz are off by 5e-10 of it in float64.
+# Share of a tick that counts as rounding of times: in float64, those of an hour at 1 kHz err by 5e-10 of a tick.
 _UNEVEN = 1e-6
-# Share of a mass: a function of time is not linear between rows 10 ms apart, and half as much does a ratio no harm.
+# Share of a mass that counts as equal: functions of time are not linear between rows, and damping ratios vary by half.
 _SAME_MASS = 1e-3
 
 
@@ -34,25 +34,25 @@ def simulate(
     plant: AdmittancePlant | None = None,
     random_state: Any = None,
 ) -> Rollout:
-    """Run a schedule, as learned or from a file, on a simulated robot that a given force pushes.
+    """Run a schedule, learned or loaded, on a simulated robot under a given external force.
 
-    Each row of the schedule is a tick, which holds its gains and desired place; of a last row that is nearer, too.
+    Each row of the schedule is a tick, which holds its gains and desired pose; a nearer last row lasts a tick too.
 
     Parameters
     ----------
     schedule : Schedule
-        Motion and gains to follow, whose rows are evenly spaced: else ``schedule.resample(rate)`` makes them so.
+        Motion and gains to follow, with evenly spaced rows, as ``schedule.resample(rate)`` makes them.
     force : array-like of shape (T, d), default=None
-        External force in N, and of poses torque in Nm, in world axes, at each of the T rows; None is none.
+        External force in N, and for poses torque in Nm, in world axes, at each of the T rows; None is no force.
     plant : AdmittancePlant, default=None
-        None is ``AdmittancePlant(None)``, with the mass of the schedule, or 1 kg where it tells none.
+        Simulated robot; None is ``AdmittancePlant(None)``, with the mass of the schedule, or 1 kg if it has none.
     random_state : int, RandomState or None, default=None
         Seed of the sensor's noise.
 
     Returns
     -------
     Rollout
-        The run, in arrays.
+        Run as NumPy arrays.
 
     Warns
     -----
@@ -62,7 +62,7 @@ def simulate(
     Raises
     ------
     ValueError
-        If an argument is not as described, or the motion diverges.
+        If an argument is invalid, or the motion diverges.
 
     Examples
     --------
@@ -98,39 +98,39 @@ def simulate_many(
     every: int = 1,
     random_state: Any = None,
 ) -> RolloutSummary:
-    """Push a robot at random, many times over, while it follows a schedule.
+    """Simulate many rollouts of a schedule, each with one random push.
 
-    Each rollout gets one push: a squared sine over its duration, in a direction that is uniform on the sphere of the
-    axes of position; and of poses, by a torque at the same time, in a direction of its own. Trajectories are not kept,
-    so that memory goes with ``n_rollouts`` and not with their length. The result depends on the arguments and
-    ``random_state`` only; pushes do not depend on the number of rows.
+    A push is a squared sine over its duration, in a direction uniform on the sphere of the position axes; for poses a
+    torque in an independent direction acts at the same time. Trajectories are not kept, so that memory grows with
+    ``n_rollouts`` and not with their length. The result depends only on the arguments and ``random_state``; pushes do
+    not depend on the number of rows.
 
     Parameters
     ----------
     schedule : Schedule
-        As for :func:`simulate`.
+        Motion and gains to follow, with evenly spaced rows.
     n_rollouts : int, default=1000
         Number of rollouts R.
     plant : AdmittancePlant, default=None
-        As for :func:`simulate`. With a sensor or walls, thousands of rollouts take five to ten times longer; with a
-        filter, ten to two hundred times.
+        Simulated robot; None as in :func:`simulate`. With a sensor or walls, thousands of rollouts take five to ten
+        times longer; with a filter, ten to two hundred times.
     peak : float or (float, float), default=5.0
-        Largest force of a push, N; two numbers are the ends of a uniform distribution.
+        Peak force of each push in N; a pair draws it uniformly between both.
     torque : float or (float, float), default=0.0
-        Largest torque of a push on a pose, Nm: ``peak=0.0`` leaves pushes by torque alone.
+        Peak torque of each push on a pose in Nm; ``peak=0.0`` leaves pushes by torque alone.
     duration : float or (float, float), default=0.8
-        How long a push lasts, s; two numbers are the ends of a uniform distribution.
+        Duration of each push in s; a pair draws it uniformly between both.
     onset : (float, float), default=None
-        Time at which pushes begin, uniform between these, s; None is so that they end within the schedule.
+        Start time of each push in s, drawn uniformly between both; None lets all pushes end within the schedule.
     reference : {"desired", "undisturbed"}, default="desired"
-        Deviation from the desired position, or from where the robot would be without push and noise: it lags behind
-        the desired position.
+        Origin of deviations: the desired position, or the position without push and noise, which lags behind the
+        desired one.
     quantiles : tuple of float, default=(0.05, 0.5, 0.95)
-        Which quantiles of the deviations at a tick are taken, by linear interpolation.
+        Levels of the quantiles of the deviations at a tick, by linear interpolation.
     every : int, default=1
-        Ticks from one row of quantiles to the next. To order 10^5 rollouts takes about as long as to simulate them.
+        Ticks between rows of quantiles. Sorting 10^5 rollouts takes about as long as simulating them.
     random_state : int, RandomState or None, default=None
-        Seed of pushes and of the sensor's noise.
+        Seed of the pushes and of the sensor's noise.
 
     Warns
     -----
@@ -140,7 +140,7 @@ def simulate_many(
     Raises
     ------
     ValueError
-        If an argument is not as described, or the rollouts do not fit in memory.
+        If an argument is invalid, or the rollouts do not fit in memory.
 
     Examples
     --------
@@ -199,7 +199,7 @@ def simulate_many(
 
 
 def _task_of(schedule: Schedule, plant: AdmittancePlant | None) -> Task:
-    """Task of a plant that follows a schedule, row by row; warns where its mass is not that of the schedule."""
+    """Task of a plant that follows a schedule row by row; warns if its mass is not that of the schedule."""
     checks.instance(schedule, "schedule", Schedule)
     plant = checks.instance(plant, "plant", AdmittancePlant, optional=True) or AdmittancePlant(None)
     steps = np.diff(schedule.time)
@@ -235,7 +235,7 @@ def _draw_pushes(
     duration: Range,
     onset: tuple[float, float] | None,
 ) -> tuple[Floats, Floats, Floats]:
-    """Onsets, from the start of the schedule on and in order, durations (R,), and forces and torques (R, d)."""
+    """Sorted onsets (R,) from the start of the schedule, durations (R,), and forces and torques (R, d)."""
     longest, (start, end) = schedule.duration, schedule.time[[0, -1]].tolist()
     lasting = np.asarray(draw.uniform(*_ends(duration, "duration", "s", above=0.0, most=longest), size=n_rollouts))
     share = draw.uniform(size=n_rollouts)
@@ -258,7 +258,7 @@ def _draw_pushes(
 
 
 def _ends(limits: Range, name: str, unit: str, *, pair: bool = False, **bounds: Any) -> tuple[float, float]:
-    """Least and largest of a range within bounds; one number is both, unless a pair is asked for."""
+    """Ends of a range within bounds; one number is both, unless a pair is required."""
     low, high = checks.array(limits, name, (2,)) if pair or np.ndim(limits) else (limits, limits)
     low = checks.number(low, name, unit=unit, **bounds)
     return low, checks.number(high, name, unit=unit, **(bounds | {"least": low}))

@@ -1,4 +1,4 @@
-"""What stands between the simulated hand, the controller and the robot: a force-torque sensor, and a position loop."""
+"""Force-torque sensor and position loop of the simulated robot."""
 
 import math
 from collections import deque
@@ -26,33 +26,33 @@ Reading = tuple[Tensor, Tensor]
 class ForceSensor:
     """Model of a 6-axis force-torque sensor; works for any number of axes.
 
-    In this order: the true force plus ``bias``, low-pass, noise, saturation, quantization, delay, deadband. The
-    default is an ideal sensor of 200 N. The force is held over each tick and a reading is taken at its start, so a
-    filtered reading knows the forces before its tick only, and an unfiltered one that of its own tick too. Before the
-    first tick the force was zero and the filter had settled at the bias.
+    The stages are, in order: true force plus ``bias``, low-pass, noise, saturation, quantization, delay, deadband. The
+    default is an ideal sensor of 200 N. The force is held over each tick and read at its start, so that a filtered
+    reading depends only on forces before its tick, and an unfiltered one also on that of its own tick. Before the
+    first tick the force is zero and the filter has settled at the bias.
 
     A force that is not finite is a lost sample: its reading is NaN (after the delay), never zero, and the filter
-    holds through it. What to do about it is the controller's to decide.
+    holds through it. The controller decides how to react.
 
-    Quantities in N are of all axes, or d numbers of each: of a pose three in N, then three in Nm.
+    Quantities in N are one number for all axes or d numbers; for poses, p numbers in N and three in Nm.
 
     Parameters
     ----------
     bias : float or sequence of d float, default=0.0
         Constant error [N].
     noise_scale : float or sequence of d float, default=0.0
-        Standard deviation of white noise on the reading [N]; it is added behind the filter, which does not lower it.
+        Standard deviation of white noise on the reading [N], added after the filter.
     resolution : float or sequence of d float, default=0.0
         Quantization step [N], at most ``range``; 0 for none. A step that does not divide ``range`` may round a
         clipped reading to half a step beyond it.
     range : float or sequence of d float, default=200.0
-        Force at which an axis saturates, either sign [N]; ``math.inf`` for never.
+        Absolute force at which an axis saturates [N]; ``math.inf`` for never.
     cutoff : float or None, default=None
         Corner frequency of the first-order low-pass [Hz], discretized exactly; None for none.
     delay_steps : int, default=0
-        Ticks by which the reading is late, beside the filter.
+        Ticks by which the reading is late, in addition to the filter.
     deadband : float or sequence of d float, default=0.0
-        Readings up to it are zero, those above are nearer to zero by it [N]: continuous. It acts on the bias too.
+        Soft threshold [N]: smaller readings are zero, larger ones shrink by it. It acts on the bias too.
 
     Examples
     --------
@@ -74,7 +74,7 @@ class ForceSensor:
 
     def __post_init__(self) -> None:
         for name in _OF_AXES:
-            if isinstance(getattr(self, name), list):  # which would be neither frozen nor hashable
+            if isinstance(getattr(self, name), list):  # lists are neither immutable nor hashable
                 object.__setattr__(self, name, tuple(getattr(self, name)))
             for value in self._values(name):
                 above, least = (0.0, None) if name == "range" else (None, None if name == "bias" else 0.0)
@@ -92,28 +92,28 @@ class ForceSensor:
 
     @property
     def is_noisy(self) -> bool:
-        """True if readings are drawn at random."""
+        """Whether readings are random."""
         return any(self._values("noise_scale"))
 
     @classmethod
     def jr3(cls, cutoff: float = 500.0, rate: float = 1000.0) -> "ForceSensor":
-        """A sensor like the paper's JR3, by plausible figures that are not from a data sheet or a measurement.
+        """Sensor like the paper's JR3, with plausible values that are not from a data sheet or a measurement.
 
-        A range of 200 N in 2^13 steps, noise of 0.05 N, a bias of 0.3 N on each axis (0.2 to 0.5 N of drift are
-        usual), and a delay of about ``1 / cutoff`` in all, rounded to ticks of ``rate`` Hz; what the first-order filter
-        lacks of it is ``delay_steps``. The JR3's digital filters have 500, 125, 31.25, 7.813, 1.953 and 0.4883 Hz.
+        It has a range of 200 N in 2^13 steps, noise of 0.05 N, a bias of 0.3 N on each axis (a drift of 0.2 to 0.5 N is
+        usual), and a total delay of about ``1 / cutoff``, rounded to ticks of ``rate`` Hz; ``delay_steps`` adds to the
+        first-order filter's delay. The JR3's digital filters have 500, 125, 31.25, 7.813, 1.953 and 0.4883 Hz.
         """
         checks.number(cutoff, "cutoff", above=0.0, unit="Hz")
         checks.number(rate, "rate", above=0.0, unit="Hz")
-        # The sampled filter follows a ramp late by the mean of its response, a geometric series: in ticks.
+        # Lag, in ticks, of the sampled filter behind a ramp: the mean of its impulse response, a geometric series.
         lag = -1.0 / math.expm1(-2.0 * math.pi * cutoff / rate)
         delay_steps = max(0, round(rate / cutoff - lag))
         return cls(0.3, noise_scale=0.05, resolution=200.0 / 2**13, cutoff=cutoff, delay_steps=delay_steps)
 
     def start(self, like: Float[Tensor, "*b d"], dt: float, generator: torch.Generator | None = None) -> "ForceReader":
-        """Sensor at rest, to be called with the true force (..., d) in N once a tick of ``dt`` s.
+        """Sensor at rest, to be called with the true force (..., d) in N once per tick of ``dt`` s.
 
-        The forces to come are of the shape, dtype and device of ``like``; noise is drawn from the ``generator``.
+        Forces must have the shape, dtype and device of ``like``; the ``generator`` draws the noise.
         """
         for name in _OF_AXES:
             if (n_values := len(self._values(name))) not in (1, like.shape[-1]):
@@ -128,7 +128,7 @@ class ForceSensor:
 
 @final
 class ForceReader:
-    """Sensor in use, called with the true force once a tick: state of the filter, and readings still under way."""
+    """Running sensor, called with the true force once per tick: filter state and delayed readings."""
 
     def __init__(
         self, sensor: ForceSensor, like: Float[Tensor, "*b d"], dt: float, generator: torch.Generator | None
@@ -139,7 +139,7 @@ class ForceReader:
         self._bias = torch.zeros_like(like) + bias
         self._gain = None if sensor.cutoff is None else -math.expm1(-2.0 * math.pi * sensor.cutoff * dt)
         self._filtered = self._bias
-        # Each its own: whoever subtracts a bias in place must not change the next one.
+        # Separate tensors, so that subtracting a bias in place from one does not change the next.
         self._under_way = deque(self._convert(self._bias) for _ in range(sensor.delay_steps))
 
     def __call__(self, force: Float[Tensor, "*b d"]) -> Reading:
@@ -147,10 +147,10 @@ class ForceReader:
         lost = ~torch.isfinite(force)
         level = torch.where(lost, self._filtered, force + self._bias)
         if self._gain is not None:
-            # The state of dx/dt = 2 pi cutoff (level - x) at the start of the tick, over which it moves on.
+            # State of dx/dt = 2 pi cutoff (level - x) at the start of the tick, then advanced over it.
             level, self._filtered = self._filtered, torch.lerp(self._filtered, level, self._gain)
         if self._generator is not None:
-            # Drawn where the generator lives: the same seed is the same noise on every device.
+            # Drawn on the generator's device, so that a seed gives the same noise on every device.
             at, like = self._generator.device, self._bias
             noise = torch.randn(like.shape, generator=self._generator, dtype=like.dtype, device=at)
             level = level + self._noise_scale * noise.to(like.device)
@@ -159,7 +159,7 @@ class ForceReader:
         return self._under_way.popleft()
 
     def _convert(self, level: Tensor) -> Reading:
-        """Clip, round, and take the deadband off, which may come before the delay: it has no memory."""
+        """Clip, round and apply the deadband, which may precede the delay since it has no memory."""
         saturated = (level.abs() >= self._range).any(-1)
         level = level.clamp(-self._range, self._range)
         step = torch.where(self._resolution > 0.0, self._resolution, 1.0)
@@ -170,10 +170,10 @@ class ForceReader:
 @final
 @dataclass(frozen=True)
 class PositionLoop:
-    """The robot's inner position loop, critically damped and of second order behind a delay of whole ticks.
+    """Inner position loop of the robot, critically damped and of second order, after a delay of whole ticks.
 
-    ``x'' = w^2 (x_commanded - x) - 2 w x'`` with ``w = 2 pi bandwidth``: it follows a ramp ``2 / w``, the
-    delay, and half a tick of hold late.
+    ``x'' = w^2 (x_commanded - x) - 2 w x'`` with ``w = 2 pi bandwidth``. It lags behind a ramp by ``2 / w``, the
+    delay, and half a tick of hold.
 
     Parameters
     ----------
@@ -202,7 +202,7 @@ class PositionLoop:
         return like.new_tensor(rows)
 
     def start(self, position: Float[Tensor, "*b d"], velocity: Float[Tensor, "*b d"], dt: float) -> "FollowingRobot":
-        """Robot at ``position``, which its commands are at until the first takes effect."""
+        """Robot at ``position``, with commands to stay there until the first one takes effect."""
         return FollowingRobot(position, velocity, self.transition(dt, position), [position] * self.delay_steps)
 
 
@@ -216,11 +216,11 @@ class FollowingRobot:
     commands: list[Tensor]
 
     def carry(self, change: Callable[[Tensor], Tensor]) -> None:
-        """Count position and waiting commands from another origin."""
+        """Express position and waiting commands relative to another origin."""
         self.position, self.commands = change(self.position), [change(each) for each in self.commands]
 
     def __call__(self, command: Tensor) -> None:
-        """Move on by a tick in which this command is given."""
+        """Advance by a tick in which this command is given."""
         self.commands.append(command)
         state = torch.stack([self.position, self.velocity, self.commands.pop(0)], dim=-1)
         self.position, self.velocity = (state @ self.transition.mT).unbind(-1)

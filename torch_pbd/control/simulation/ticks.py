@@ -1,4 +1,4 @@
-"""The ticks behind :class:`~torch_pbd.control.AdmittancePlant`, with and without what acts in the loop.
+"""Ticks of :class:`~torch_pbd.control.AdmittancePlant`, for open loops and with sensors, loops and filters.
 
 With the deviation y from the desired position, ``M a = u - K y - D v``. Everything is held over a tick, in which the
 matrix exponential is then exact, whatever its length; at its end the desired position moves on.
@@ -47,7 +47,7 @@ def transition(rate: Float[Tensor, "*b n n"], dt: float) -> Float[Tensor, "*b n 
 
 
 def mass_at(mass: Tensor, ticks: int | slice) -> Tensor:
-    """Mass at some ticks, of one (d, d) or of those of all ticks (..., T, d, d)."""
+    """Mass at some ticks, from one mass (d, d) or those of all ticks (..., T, d, d)."""
     return mass if mass.ndim == 2 else mass[..., ticks, :, :]
 
 
@@ -56,7 +56,7 @@ class Environment(Protocol):
     """Surroundings of the robot."""
 
     def force(self, position: Tensor, velocity: Tensor) -> Tensor:
-        """Force in N on a robot at these positions, in m, and velocities (..., p); of a pose its position alone."""
+        """Force (..., p) in N on a robot at these positions in m and velocities in m/s, without the rotation."""
 
 
 def multiply(first: Float[Tensor, "*a 4"], second: Float[Tensor, "*b 4"]) -> Float[Tensor, "*c 4"]:
@@ -75,7 +75,7 @@ def rotation_between(start: Float[Tensor, "*a 4"], end: Float[Tensor, "*b 4"]) -
     """Rotation vector in world axes from one orientation to another, the shorter way: at most pi long."""
     nearer = torch.where((end * start).sum(-1, keepdim=True) < 0.0, -end, end)
     conjugate = torch.cat([start[..., :1], -start[..., 1:]], dim=-1)
-    # Of the difference, so that small rotations keep their digits: q2 q1' = 1 + (q2 - q1) q1'.
+    # The difference keeps the digits of small rotations: q2 q1' = 1 + (q2 - q1) q1'.
     away, xyz = multiply(nearer - start, conjugate).split([1, 3], dim=-1)
     length = torch.linalg.vector_norm(xyz, dim=-1, keepdim=True)
     tiny = length < torch.finfo(length.dtype).tiny
@@ -86,7 +86,7 @@ def rotation_between(start: Float[Tensor, "*a 4"], end: Float[Tensor, "*b 4"]) -
 class Turning(NamedTuple):
     """Desired orientations (..., T, 4) of a task, with the turns (..., T, 3) that end its ticks, none the last.
 
-    ``transport`` (..., T, 3, 3) is ``exp([turn])``, which takes along what turns with the desired orientation.
+    ``transport`` (..., T, 3, 3) is ``exp([turn])``, which rotates vectors along with the desired orientation.
     """
 
     orientation: Tensor
@@ -104,10 +104,10 @@ def turning(orientation: Float[Tensor, "*b t 4"]) -> Turning:
 
 @dataclass(frozen=True)
 class Task:
-    """Run to come, checked: motions (..., T, d), gains (..., T, d, d), and the parts that act in the loop, or None.
+    """Checked inputs of a run: motions (..., T, d), gains (..., T, d, d), and the parts that act in the loop, or None.
 
-    The mass is one (d, d), or one for each tick (..., T, d, d). Positions of poses end in zeros: their rotations are
-    counted from the desired orientation, in ``turning``.
+    The mass is (d, d), or (..., T, d, d) with one for each tick. Positions of poses end in zeros, since their rotations
+    are relative to the desired orientation, in ``turning``.
     """
 
     position: Tensor
@@ -136,19 +136,19 @@ class Task:
 
     @property
     def motions(self) -> list[Tensor]:
-        """What moves in the desired motion (..., T, d), and of poses the turns (..., T, 3)."""
+        """Tensors of the desired motion (..., T, d), and for poses the turns (..., T, 3)."""
         turns = [] if self.turning is None else [self.turning.turns]
         return [self.position, self.velocity, self.inertial_force, *turns]
 
     @property
     def is_linear(self) -> bool:
-        """True if nothing acts in the loop, and all rollouts of a batch have the same gains and desired motion."""
+        """Whether nothing acts in the loop and all rollouts of a batch share gains and desired motion."""
         acting = (self.sensor, self.position_loop, self.environment, self.stiffness_filter)
         is_shared = self.stiffness.ndim == 3 and all(motion.ndim == 2 for motion in self.motions)
         return is_shared and all(part is None for part in acting)
 
     def carry(self, tick: int, pose: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
-        """Positions, and rotations counted from the desired orientation after a tick instead of that before it."""
+        """Positions, and rotations relative to the desired orientation after a tick instead of before it."""
         if self.turning is None:
             return pose
         transport, turn = self.turning.transport[..., tick, :, :], self.turning.turns[..., tick, :]
@@ -174,19 +174,19 @@ def open_loop(task: Task, force: Tensor, state: State) -> State:
 
 
 def block_length(d: int, n_forces: int = 64) -> int:
-    """Ticks of a block with up to so many components of forces, a power of 2, at least 4.
+    """Number of ticks in a block with at most ``n_forces`` force components, a power of 2 and at least 4.
 
-    The longer, the fewer steps, but the work of each grows with its square.
+    Longer blocks need fewer steps, but the work of each grows with the square of its length.
     """
     return 1 << max(2, (n_forces // d).bit_length() - 1)
 
 
 def block_responses(task: Task, length: int) -> Iterator[Float[Tensor, "l1 m n"]]:
-    """States at the ticks of each block of L ticks, as a matrix on what acts there, for a task without a batch.
+    """Matrix that maps the inputs of each block of L ticks to its states, for a task without a batch.
 
-    A matrix (L + 1, 2 d, 2 d + 1 + L d): of the deviation and velocity at the start of the block, of 1, and of its
-    forces, tick by tick. The last of the L + 1 states is that at the start of the next block; ticks beyond the
-    last one of the task are as that one.
+    The matrix (L + 1, 2 d, 2 d + 1 + L d) acts on the deviation and velocity at the start of the block, on 1, and on
+    its forces, tick by tick. The last of the L + 1 states is that at the start of the next block; ticks beyond the
+    last one of the task repeat that one.
     """
     d = task.position.shape[-1]
     unit = torch.eye(2 * d + 1 + length * d).to(task.position)
@@ -210,7 +210,7 @@ def block_responses(task: Task, length: int) -> Iterator[Float[Tensor, "l1 m n"]
 
 
 def tick_maps(task: Task, dt: float) -> Iterator[tuple[slice, Tensor]]:
-    """Maps of stretches of ticks of the task's own gains over ``dt``, (..., n, 2 d, 3 d), and which ticks."""
+    """Stretches of n ticks, each with its maps (..., n, 2 d, 3 d) over ``dt`` under the task's gains."""
     batch = max(1, task.stiffness[..., 0, 0, 0].numel())
     n_together = max(1, _MATRICES_AT_ONCE // batch)
     for first in range(0, task.n_ticks, n_together):
@@ -225,6 +225,6 @@ def tick_map(stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> Ten
 
 
 def tick_change(stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> Tensor:
-    """Map of ``[deviation, velocity, force]`` to what changes in deviation and velocity over a tick of ``dt`` s."""
+    """Map of ``[deviation, velocity, force]`` to the change of deviation and velocity over a tick of ``dt`` s."""
     each = tick_map(stiffness, damping, mass, dt)
     return each - torch.eye(each.shape[-1]).to(each)[: each.shape[-2]]

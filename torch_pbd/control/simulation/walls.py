@@ -1,4 +1,4 @@
-"""The walls of the tunnel task, around the simulated robot."""
+"""Walls of the tunnel task around the simulated robot."""
 
 import math
 from dataclasses import dataclass
@@ -33,13 +33,13 @@ class ContactReport(NamedTuple):
     Attributes
     ----------
     max_penetration : (...), m
-        Greatest depth beyond a wall; 0 where it was not touched.
+        Largest depth beyond a wall; 0 without contact.
     time_in_wall : (...), s
         Number of ticks that start beyond a wall, times dt.
     impulse : (...), N s
-        Sum of the size of the wall's force times dt; 0 for a virtual wall.
+        Sum of the wall force's magnitude times dt; 0 for a virtual wall.
     n_contacts : (...)
-        Number of times that a wall was entered; to start in it counts.
+        Number of times that a wall was entered; starting inside counts.
     """
 
     max_penetration: Float[Tensor, "*b"]
@@ -51,11 +51,11 @@ class ContactReport(NamedTuple):
 @final
 @dataclass(frozen=True)
 class Tunnel:
-    """The corridor of the task in the plane, along y, between two smooth walls without friction.
+    """Corridor of the task in the plane, along y, between two smooth walls without friction.
 
     The wall is a spring and a damper along its normal, only while it is penetrated, and it never pulls. Depth and
     normal are to first order at the y of the position, with a relative error of about the depth times the curvature
-    of the wall. Positions (..., 2) are x and y in m; where one is NaN, so is what comes of it.
+    of the wall. Positions (..., 2) are x and y in m; NaN propagates.
 
     Parameters
     ----------
@@ -64,12 +64,12 @@ class Tunnel:
     damping : float or None, default=None
         Damping of the walls [N s/m]. None is ``sqrt(stiffness)``: half the critical damping of 1 kg.
     virtual : bool, default=False
-        A drawn wall, as on the display of the paper: penetration counts but there is no force.
+        Whether the wall is only displayed, as in the paper: penetration counts but there is no force.
 
     Notes
     -----
-    A force that is held for a tick h makes the wall give back more energy than it took, unless there is enough
-    damping; too much overshoots. A free mass m pressed against the wall can rest there if and only if
+    A force that is held for a tick h makes the wall return more energy than it absorbed unless the damping is large
+    enough; too much overshoots. A free mass m pressed against the wall can rest there if and only if
     ``stiffness h / 2 < damping < 2 m / h`` (Jury's test on the sampled mass). The default damping meets it below
     4 MN/m at 1 kHz, for masses above 0.05 kg (0.16 kg at 1e5 N/m). Where it is not met, compute the force several
     times a tick. Behind a position loop that lags, the limit is lower by far: about the damping of the admittance
@@ -101,7 +101,7 @@ class Tunnel:
     def force(
         self, position: Float[Tensor, "*b 2"] | Any, velocity: Float[Tensor, "*b 2"] | Any
     ) -> Float[Tensor, "*b 2"]:
-        """Force of the wall [N] on a robot at ``position`` of ``velocity`` (..., 2), in m/s."""
+        """Force of the wall [N] on a robot at ``position`` with ``velocity`` (..., 2), in m and m/s."""
         position, velocity = as_tensor(position, "position"), as_tensor(velocity, "velocity")
         depth, normal = self._contact(position)
         if position.shape != velocity.shape:

@@ -1,4 +1,4 @@
-"""Stiffness from covariance: eq. (19) and (20), for each block of outputs, and the law of minimal intervention."""
+"""Stiffness from covariance, per block of outputs: eq. (19) and (20), or the minimal intervention principle."""
 
 import math
 from collections.abc import Sequence
@@ -20,9 +20,9 @@ from torch_pbd.linalg import spectral_map
 Bounds = Literal["quantile", "sigma", "variance"]
 Kind = Literal["linear", "precision"]
 
-# On the tunnel task these spread K_xx over 50 to 1000 N/m, and it rises at 214 N/m/s: at 1155 with the paper's bounds.
+# On the tunnel task these spread K_xx over 50 to 1000 N/m, rising at 214 N/m/s, and at 1155 with the paper's bounds.
 _QUANTILES = (0.1, 0.9)
-# Smallest deviation that counts: squares of smaller ones are no numbers.
+# Smallest standard deviation that counts, since float64 does not hold squares of smaller ones.
 _SMALLEST = 1e-150
 _LIMITS = ("stiffness_min", "stiffness_max", "sigma_low", "sigma_high")
 
@@ -33,40 +33,38 @@ class StiffnessLaw:
     """Stiff where the standard deviation is small, compliant where it is large: eq. (19) and (20).
 
     Each principal axis of a covariance gets ``stiffness_max`` up to a standard deviation of ``sigma_low``,
-    ``stiffness_min`` from ``sigma_high``, and a straight line between them. As a function of the covariance
-    the result is continuous, through crossings of eigenvalues too, where its principal axes are not; its
-    gradient is finite there.
+    ``stiffness_min`` from ``sigma_high``, and linear interpolation between them. The stiffness is a continuous
+    function of the covariance with finite gradients, even where eigenvalues cross and principal axes jump.
 
-    Outputs of different units, or with limits of their own, are blocks, of which each has its own bounds: positions
-    and the ``rotation`` of a pose; each joint of an arm, where a limit is one number for each output. The stiffness
-    is of these blocks alone unless ``cross_terms`` are asked for, and lies between the limits as a matrix either way.
+    Outputs of different units, or with separate limits, form blocks with bounds of their own: positions and the
+    ``rotation`` of a pose, or each joint of an arm where a limit has one number per output. The stiffness is
+    block-diagonal unless ``cross_terms`` is set, and as a matrix always lies between the limits.
 
     Parameters
     ----------
     stiffness_min, stiffness_max : float or sequence of float, default=50.0, 1000.0
-        In N/m (or force per unit of output: Nm/rad of angles), 0 < stiffness_min <= stiffness_max. The paper's,
-        Table II. One for each output makes each a block.
+        Limits of the stiffness in N/m (or force per unit of output, Nm/rad for angles), 0 < stiffness_min <=
+        stiffness_max; defaults are those of Table II. One number per output makes each output a block.
     sigma_low, sigma_high : float or sequence of float, default=None
-        Bounds of the standard deviation in its units, 0 <= sigma_low < sigma_high. With bounds="quantile" they are
-        taken from the covariances of each call, or once for all by :meth:`fitted`.
+        Bounds of the standard deviation, in units of the outputs, 0 <= sigma_low < sigma_high. With bounds="quantile"
+        they follow from the covariances of each call, or are fixed by :meth:`fitted`.
     bounds : {"quantile", "sigma", "variance"}, default="quantile"
-        What the two bounds are. "sigma": standard deviations, eq. (20) as printed. "variance": variances, whose
-        roots are taken; the paper's 3.5e-4 and 1.2e-3 give its Figure 8 only so. "quantile": the 10 % and 90 %
-        quantiles of the standard deviations along all axes of all covariances given, block by block; leave the two
-        None.
+        Meaning of the two bounds. "sigma" is standard deviations, eq. (20) as printed. "variance" is variances, whose
+        roots are taken: only so do the paper's 3.5e-4 and 1.2e-3 reproduce its Figure 8. "quantile" takes the 10 % and
+        90 % quantiles of the standard deviations along all axes of all covariances, per block, and needs both None.
     smooth : bool, default=False
         Replace the straight line by ``3 u^2 - 2 u^3``: the stiffness then has a continuous derivative.
     kind : {"linear", "precision"}, default="linear"
-        "precision" is what minimizes the expected cost ``e' Sigma^-1 e + r f' M^-1 f`` of deviations e and forces f of
-        a mass M: ``K = (M # Sigma^-1) / r^1/2`` with the geometric mean # of matrices, then held within the limits.
-        Its own damping ratio is 1/sqrt(2); where limits hold, 1 costs less (scripts/benchmarks/precision_law.py).
+        "linear" is eq. (20). "precision" minimizes the expected cost ``e' Sigma^-1 e + r f' M^-1 f`` of deviations e
+        and forces f on a mass M: ``K = (M # Sigma^-1) / r^1/2`` with the geometric mean # of matrices, clipped to the
+        limits. Its damping ratio is 1/sqrt(2); at the limits, 1 costs less (scripts/benchmarks/precision_law.py).
     rotation : RotationLimits, default=None
-        Limits of the last three outputs, if they are a rotation in rad.
+        Limits of the last three outputs if they are a rotation in rad.
     cross_terms : bool, default=False
-        Whether covariances between blocks couple them in the stiffness. Without, they do not count.
+        Whether covariances between blocks couple these in the stiffness; otherwise they are ignored.
     effort : "match", float or sequence of float, default="match"
-        The r of kind="precision", for all blocks or one for each, in kg/N^2. "match": the r that gives
-        ``stiffness_min`` to a mean mass where the standard deviation is ``sigma_high``, block by block.
+        Weight r of the forces for kind="precision", for all blocks or one per block, in kg/N^2. "match" takes, per
+        block, the r that gives a mean mass ``stiffness_min`` at a standard deviation of ``sigma_high``.
 
     Examples
     --------
@@ -116,9 +114,9 @@ class StiffnessLaw:
                 )
 
     def __call__(self, covariance: Float[Tensor, "*b d d"] | Any, mass: Any = None) -> Float[Tensor, "*b d d"]:
-        """Stiffness in N/m of covariances (..., d, d), positive semidefinite; symmetric to the last bit.
+        """Stiffness in N/m for positive semidefinite covariances (..., d, d), symmetric to the last bit.
 
-        The ``mass``, a number in kg or matrices (..., d, d), is what kind="precision" needs; else it does not count.
+        Only kind="precision" uses ``mass``, a number in kg or matrices (..., d, d).
         """
         matrix, spectrum = as_semidefinite(covariance, "covariance")
         blocks = self.blocks(matrix.shape[-1])
@@ -148,9 +146,9 @@ class StiffnessLaw:
         resolution: float | Sequence[float] = 0.0,
         mass: Any = None,
     ) -> "StiffnessLaw":
-        """Law with its bounds fixed, as standard deviations, and its effort, to those of ``covariance`` (..., d, d).
+        """Law whose bounds, as standard deviations, and effort are fixed to those of ``covariance`` (..., d, d).
 
-        For quantiles, smaller standard deviations count as ``resolution``, a number or one for each output. If the
+        For quantiles, standard deviations are raised to at least ``resolution``, a number or one per output. If the
         covariances do not vary at all, every axis counts as precise, with a warning.
         """
         matrix = as_semidefinite(covariance, "covariance")[0].detach()
@@ -171,7 +169,7 @@ class StiffnessLaw:
         return replace(self, bounds="sigma", **changes)
 
     def blocks(self, n_outputs: int) -> list[Block]:
-        """Blocks of so many outputs, in order."""
+        """Blocks of ``n_outputs`` outputs, in order."""
         rotation, n_positions = self.rotation, n_outputs - (0 if self.rotation is None else 3)
         rows = [getattr(self, name) for name in _LIMITS]
         sizes = {len(row) for row in rows if isinstance(row, tuple)}
@@ -190,7 +188,7 @@ class StiffnessLaw:
         return blocks
 
     def limits(self, n_outputs: int) -> tuple[Limit, Limit]:
-        """Least and largest stiffness of so many outputs: numbers, or one for each output where there are blocks."""
+        """Least and largest stiffness of ``n_outputs`` outputs: numbers, or with several blocks one per output."""
         blocks = self.blocks(n_outputs)
         if len(blocks) == 1:
             return blocks[0].stiffness_min, blocks[0].stiffness_max
@@ -202,7 +200,7 @@ class StiffnessLaw:
         least, most = block.stiffness_min, block.stiffness_max
 
         def stiffness(variance: Tensor) -> Tensor:
-            # The root is taken of what is above the lower bound, so its gradient at zero is never asked for.
+            # The variance is clipped at the lower bound before the root, whose gradient at zero is infinite.
             scale = variance.clamp_min(max(low**2, torch.finfo(variance.dtype).tiny)).sqrt()
             share = ((scale - low) / (high - low)).clamp(0.0, 1.0)
             return most - (most - least) * self._eased(share)
@@ -210,12 +208,12 @@ class StiffnessLaw:
         return spectral_map(matrix, stiffness, spectrum)
 
     def _coupled(self, blocks: list[Block], matrix: Tensor) -> Tensor:
-        """Stiffness of all blocks with what couples them, equal to :meth:`_linear` of each where nothing does.
+        """Stiffness of all blocks with the coupling between them; without coupling, :meth:`_linear` of each.
 
-        Eq. (20) is, with the share u = clip(g (1 - s / s_high)), g = s_high / (s_high - s_low), of the way from the
-        least to the largest stiffness, ``k_min + e^1/2 u e^1/2``, e = k_max - k_min. With diagonal matrices H of
-        1 / s_high, G and E, and U = clip(G^1/2 (1 - (H Sigma H)^1/2) G^1/2), which has no unit, all of it is a law of
-        matrices: 0 <= U <= 1, so that K lies within its limits, and no length makes rotations of positions.
+        Eq. (20) is ``k_min + e^1/2 u e^1/2`` with e = k_max - k_min, where the share u = clip(g (1 - s / s_high)),
+        g = s_high / (s_high - s_low), leads from the least to the largest stiffness. It becomes a law of matrices with
+        diagonal H of 1 / s_high, G and E, and the unitless U = clip(G^1/2 (1 - (H Sigma H)^1/2) G^1/2): 0 <= U <= 1, so
+        that K lies within its limits, and no length is needed to compare rotations with positions.
         """
         names = ("sigma_low", "sigma_high", "stiffness_min", "stiffness_max")
         low, high, least, most = (_vector(blocks, name, matrix) for name in names)
@@ -230,7 +228,7 @@ class StiffnessLaw:
         return share * share * (3.0 - 2.0 * share) if self.smooth else share
 
     def _with_efforts(self, blocks: list[Block], mass: Any, like: Tensor) -> tuple[list[Block], Tensor]:
-        """Blocks with their effort r, as given, or matched to their bounds; and the mass, as matrices."""
+        """Blocks with their effort r, as given or matched to their bounds, and the mass as matrices."""
         if mass is None:
             raise checks.refusal(None, "mass", "given", "the stiffness of kind='precision' depends on it")
         masses = masses_like(as_mass(mass), like, "covariance")
@@ -244,9 +242,9 @@ class StiffnessLaw:
     def _with_bounds(
         self, block: Block, matrix: Tensor, spectrum: tuple[Tensor, Tensor] | None = None, resolution: float = 0.0
     ) -> Block:
-        """Block with bounds of its standard deviation: as given, or quantiles of those along all axes of its part.
+        """Block with bounds of its standard deviation, as given or quantiles along all axes of its covariances.
 
-        Smaller ones count as ``resolution``. Warns where they do not vary.
+        Standard deviations are raised to at least ``resolution``. Warns where they do not vary.
         """
         if self.bounds != "quantile":
             root = math.sqrt if self.bounds == "variance" else float
@@ -258,7 +256,7 @@ class StiffnessLaw:
             )
         scales = variances.clamp_min(0.0).sqrt().clamp_min(resolution).flatten()
         low, high = torch.quantile(scales, scales.new_tensor(_QUANTILES)).tolist()
-        # Quantiles that differ by rounding only would make a step of the line between them.
+        # Quantiles that differ only by rounding would turn the line between them into a step.
         if high <= low * (1.0 + checks.ROUNDING):
             checks.warn(
                 f"The covariances {f'of {block.name} ' if block.name else ''}do not vary: their standard deviations "

@@ -21,10 +21,10 @@ class RotationLimits:
     Parameters
     ----------
     stiffness_min, stiffness_max : float, default=2.5, 50.0
-        In Nm/rad, 0 < stiffness_min <= stiffness_max: what 50 to 1000 N/m are at a lever of 0.22 m. Arms take 1 to 300.
+        Limits in Nm/rad, 0 < min <= max: 50 to 1000 N/m at a lever of 0.22 m. Robot arms accept 1 to 300.
     sigma_low, sigma_high : float, default=None
-        Bounds of the standard deviation in rad, or of the variance, as ``bounds`` of the law says; None with quantiles,
-        which are those of the rotation alone.
+        Bounds of the standard deviation in rad, or of the variance, by ``bounds`` of the law; None for quantiles, which
+        are taken over the rotation alone.
     """
 
     stiffness_min: float = 2.5
@@ -37,7 +37,7 @@ class RotationLimits:
 
 
 class Block(NamedTuple):
-    """Outputs of one unit, the limits of their stiffness, and what decides between these: see `StiffnessLaw`."""
+    """Outputs of one unit, with the limits of their stiffness and the bounds of their standard deviation."""
 
     outputs: slice
     stiffness_min: float
@@ -53,19 +53,19 @@ class Block(NamedTuple):
 
 
 def of_outputs(blocks: Sequence[Block], name: str) -> list[Any]:
-    """Values of blocks, each as often as its block has outputs."""
+    """Values of blocks, each repeated for every output of its block."""
     return [getattr(block, name) for block in blocks for _ in range(block.outputs.start, block.outputs.stop)]
 
 
 def check_stiffness(law: Any, unit: str) -> None:
-    """Refuse limits of stiffness, numbers or one for each output, that are not 0 < min <= max."""
+    """Check that limits of the stiffness, numbers or one per output, satisfy 0 < min <= max."""
     for low_name, low, high_name, high in _pairs(law, "stiffness_min", "stiffness_max"):
         checks.number(low, low_name, above=0.0, unit=unit)
         checks.number(high, high_name, least=low, unit=unit)
 
 
 def check_scales(law: Any, prefix: str) -> None:
-    """Refuse bounds of standard deviations, numbers or one for each output, that are not 0 <= low < high."""
+    """Check that bounds of standard deviations, numbers or one per output, satisfy 0 <= low < high."""
     remedy = "or let bounds='quantile' take both from the covariances"
     for low_name, low, high_name, high in _pairs(law, "sigma_low", "sigma_high"):
         above = checks.number(low, prefix + low_name, least=0.0, remedy=remedy)
@@ -73,7 +73,7 @@ def check_scales(law: Any, prefix: str) -> None:
 
 
 def _pairs(law: Any, *names: str) -> Iterator[tuple[str, Any, str, Any]]:
-    """Name and value of the lower and of the higher limit, once, or for each output where one is a tuple."""
+    """Name and value of the lower and the upper limit, once, or per output where one is a tuple."""
     sides = [value if isinstance(value, tuple) else (value,) for value in (getattr(law, name) for name in names)]
     size = max(map(len, sides))
     if any(len(side) not in (1, size) for side in sides):

@@ -1,4 +1,4 @@
-"""Stiffness of minimal intervention: what an optimal regulator does whose cost of deviations is their precision.
+"""Minimal intervention stiffness: the optimal regulator whose cost of deviations is weighted by their precision.
 
 With the cost ``e' Sigma^-1 e + r f' M^-1 f`` of deviations e and forces f of a mass, ``M e" = f``, the Riccati equation
 of the gains ``f = -K e - D e'`` is ``K M^-1 K = Sigma^-1 / r`` and ``D M^-1 D = 2 K``. Its solution is the geometric
@@ -19,15 +19,15 @@ from torch_pbd.control.matrices import as_mass, as_semidefinite, damping_from_st
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.linalg import spectral_map, symmetrize
 
-# Times the limit: deviations of no variance would be infinitely stiff. What is stiffer than a million times the limit
-# is held at the limit all the same, and leaves ten digits to what is not.
+# Largest stiffness before clipping, as a multiple of the limit: axes without variance would be infinitely stiff. Those
+# stiffer than a million times the limit are clipped to it anyway, and leave ten digits to the others.
 _STIFFEST = 1e6
 
 
 def matched_effort(mass: Float[Tensor, "*b d d"], scale: float, stiffness: float) -> float:
     """Effort r, in kg/N^2, under which a standard deviation along an axis of a mean mass gets this stiffness."""
-    # k = m^1/2 / (r^1/2 scale). The mean of masses is geometric, over axes and rows: it turns with no axes, and has no
-    # unit to choose.
+    # k = m^1/2 / (r^1/2 scale). The mean mass is geometric, over axes and rows, which depends neither on the frame nor
+    # on units.
     mean = float((torch.linalg.slogdet(mass.detach()).logabsdet / mass.shape[-1]).mean().exp())
     if scale <= 0.0:
         raise InvalidParameterError("covariance is zero: effort='match' needs deviations; give effort as a number.")
@@ -41,10 +41,10 @@ def precision_stiffness(
     low: Float[Tensor, " d"],
     high: Float[Tensor, " d"],
 ) -> Float[Tensor, "*b d d"]:
-    """Stiffness ``M # (W Sigma^-1 W)``, ``W = diag(effort)^-1/2``, held between diagonal matrices of low and high.
+    """Stiffness ``M # (W Sigma^-1 W)``, ``W = diag(effort)^-1/2``, clipped between the diagonal matrices low and high.
 
-    In the metric of ``E = high - low``, in which nothing has a unit but time: ``T (A # B) T' = (T A T') # (T B T')``.
-    There K is ``low + U``, and 0 <= U <= 1 by its eigenvalues.
+    Clipping uses the metric of ``E = high - low``, where time is the only unit: ``T (A # B) T' = (T A T') # (T B T')``.
+    In it K is ``low + U`` with the eigenvalues of U clipped to 0 to 1.
     """
     extent = (high - low).sqrt()
     metric = torch.where(extent > 0.0, extent, high.sqrt())  # where the limits are one, any metric does
@@ -67,30 +67,29 @@ def lqt(
     effort: float = 1e-6,
     horizon: float | None = None,
 ) -> tuple[Float[Tensor, "n d d"], Float[Tensor, "n d d"]]:
-    """Stiffness and damping (n, d, d) that minimize the expected cost of what is ahead, not of what is now.
+    """Stiffness and damping (n, d, d) that minimize the expected cost over the time ahead.
 
     The cost is that of ``StiffnessLaw(kind="precision")``, ``e' Sigma^-1 e + r f' M^-1 f``, from each row to the end of
-    its horizon, whose end cost is that of the row there, held for ever. A free end would leave nothing to do but in
-    time, and stiffness grows without bound for it. Where the covariance does not change this is the precision law with
-    a damping ratio of 1/sqrt(2), without limits.
+    its horizon, plus the infinite-horizon cost of the row there, since a free end would distort the gains before it.
+    For a constant covariance this is the precision law with a damping ratio of 1/sqrt(2), without limits.
 
     Parameters
     ----------
     covariance : Tensor of shape (n, d, d)
-        Positive definite, at ticks of ``dt``, each held over its tick.
+        Positive definite covariances at ticks of ``dt``, each held over its tick.
     mass : float or Tensor of shape (d, d) or (n, d, d)
         Mass in kg.
     dt : float
         Length of a tick in s.
     effort : float, default=1e-6
-        The r, in kg/N^2.
+        Weight r of the forces in kg/N^2.
     horizon : float, default=None
-        How far ahead each row sees, in s; None is to the last row.
+        Horizon of each row in s; None is to the last row.
 
     Returns
     -------
     stiffness, damping : Tensor of shape (n, d, d)
-        The symmetric part of the optimal stiffness, which is not symmetric where axes turn; of no limits.
+        Symmetric part of the optimal stiffness, which is not symmetric where axes turn, and damping; without limits.
     """
     matrix = as_semidefinite(covariance, "covariance")[0]
     if matrix.ndim != 3 or not bool((torch.linalg.eigvalsh(matrix)[:, 0] > 0.0).all()):
@@ -101,15 +100,15 @@ def lqt(
     masses = masses_like(as_mass(mass), matrix, "covariance").expand(matrix.shape)
     precision, lightness = torch.linalg.inv(matrix), torch.linalg.inv(masses)
     still, moving = slice(0, d), slice(d, 2 * d)
-    # Over a tick the costate P z of the state z = (e, e') and the state are moved by one matrix exponential.
+    # One matrix exponential moves the state z = (e, e') and its costate P z over a tick.
     flow = matrix.new_zeros(n, 4 * d, 4 * d)
     flow[:, still, moving] = torch.eye(d).to(matrix)
     flow[:, moving, 3 * d :] = -lightness / r
     flow[:, 2 * d : 3 * d, still] = -precision
     flow[:, 3 * d :, 2 * d : 3 * d] = -torch.eye(d).to(matrix)
     back = torch.linalg.matrix_exp(-dt * flow)
-    # The cost for ever under one covariance is that of the precision law: its stiffness M # (Sigma^-1 / r) is the
-    # geometric mean of mass and stiffness, which is the damping of a ratio of a half.
+    # The infinite-horizon cost under one covariance is that of the precision law: its stiffness M # (Sigma^-1 / r) is a
+    # geometric mean, and so equals the damping of ratio 1/2 for the stiffness Sigma^-1 / r.
     stiffness = damping_from_stiffness(precision / r, masses, 0.5)
     damping = damping_from_stiffness(stiffness, masses, 0.5**0.5)
     whole = torch.cat([stiffness @ lightness @ damping, stiffness], dim=-1)
@@ -127,7 +126,7 @@ def lqt(
 
 
 def _before(cost: Tensor, back: Tensor) -> Tensor:
-    """Cost P of states at the start of a tick, of that at its end: the costate is P z at both."""
+    """Cost P of states at the start of a tick, given that at its end; the costate is P z at both."""
     k = cost.shape[-1]
     state = back[..., :k, :k] + back[..., :k, k:] @ cost
     costate = back[..., k:, :k] + back[..., k:, k:] @ cost
