@@ -110,7 +110,8 @@ def load(path: str | os.PathLike[str]) -> Any:
         return _restored(header, arrays)
     except Exception as error:
         what = f"{header.get('class')!s:.80}"
-        raise ModelFileError(f"{path} does not describe a whole {what} ({_brief(error)}).") from error
+        remedy = "if an earlier version of torch_pbd wrote it, fit and save it again"
+        raise ModelFileError(f"{path} does not describe a whole {what} ({_brief(error)}): {remedy}.") from error
 
 
 def _brief(error: BaseException) -> str:
