@@ -1,4 +1,4 @@
-"""The controller inside a robot's 1 kHz loop: no torch, nothing that grows."""
+"""Controller for a robot's 1 kHz loop, without torch and with constant memory."""
 
 from torch_pbd.control.realtime.admittance import RealTimeAdmittance
 from torch_pbd.control.realtime.limits import TickStatus

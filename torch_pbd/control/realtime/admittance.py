@@ -1,4 +1,4 @@
-"""The controller inside a robot's 1 kHz loop: measured force in, commanded motion out; no torch, nothing that grows."""
+"""Controller for a robot's 1 kHz loop, from measured force to commanded motion, without torch, in constant memory."""
 
 import math
 import threading
@@ -22,65 +22,65 @@ _SHARED = "this controller is in a tick already: two threads share it. Give each
 
 @final
 class RealTimeAdmittance:
-    """Robot that moves as ``M a = f + K (x_d - x) + D (v_d - v)``, eq. (15) as admittance, one tick at a time.
+    """Admittance ``M a = f + K (x_d - x) + D (v_d - v)``, eq. (15), computed one tick at a time.
 
     A tick is solved exactly over the time that really passed, with force and schedule held over it: irregular and
     late ticks add no energy where the gains are constant. (Where they change, see `certify`.) The schedule is copied
-    to a table of rows ``1 / rate`` apart, as `Schedule.resample` makes them. A tick takes the row nearest to its
-    beginning, and after the end the last one, with no velocity. Schedule time comes up to speed and slows down before
-    the end, so that desired motion begins as fast as the robot moves and ends at rest, within 1.5 times the schedule's
-    own acceleration, or that of a soft start if it is more: also where it does several of these at a time.
+    to a table of rows ``1 / rate`` apart, as by `Schedule.resample`. A tick takes the row nearest to its beginning, and
+    after the end the last one, with zero velocity. Schedule time accelerates at the start and slows down before the
+    end, so that the desired motion begins at the robot's velocity and ends at rest, within 1.5 times the schedule's own
+    acceleration, or that of a soft start if larger, even where these coincide.
 
-    On poses the deviation ``x - x_d`` ends with the rotation vector Log(R R_d'), v with the angular velocity, and f is
-    a wrench, all in world axes; a spring that is not as stiff about all axes is a potential only to the second order of
-    that vector, and ticks are exact to its first. Limits are then pairs, of lengths and of rotations, in N and Nm or in
-    m/s and rad/s: ``force_limit=(50.0, 5.0)``. Speeds as far apart as the two approach speeds count as equal where the
-    motion is braked or catches up as a whole; the two stop together.
+    For poses the deviation ``x - x_d`` ends with the rotation vector Log(R R_d'), v with the angular velocity, and f is
+    a wrench, all in world axes. A spring of unequal rotational stiffness is a potential only to second order in that
+    vector, and ticks are exact to first order. Limits are then pairs for positions and rotations, in N and Nm or in m/s
+    and rad/s: ``force_limit=(50.0, 5.0)``. Braking and catching up treat linear and angular speeds in the ratio of the
+    two approach speeds as equal; both stop together.
 
-    Where damping shares the modes of stiffness and mass in every row, as that of `Schedule.with_inertia` does, a tick
-    takes microseconds, else 0.1 ms, for a matrix exponential: interpolation between rows loses the sharing, so sample
-    the schedule at ``rate``, and then tell it the inertia. The table of a minute at 1 kHz takes 10 MB for d = 2, 100 MB
-    for poses; ticks keep no memory. Nothing is fed forward: ``schedule.acceleration`` is not used.
+    Where damping shares the modes of stiffness and mass in every row, as after `Schedule.with_inertia`, a tick takes
+    microseconds, otherwise 0.1 ms for a matrix exponential. Interpolation between rows loses the shared modes, so
+    resample the schedule at ``rate`` before `Schedule.with_inertia`. The table of a minute at 1 kHz takes 10 MB for
+    d = 2 and 100 MB for poses; ticks allocate no lasting memory. ``schedule.acceleration`` is not fed forward.
 
     Parameters
     ----------
     schedule : Schedule
     mass : float or array_like of shape (d, d), default=None
-        Virtual mass in kg, for poses also kg m and kg m^2; None takes the schedule's, row by row, or 1 kg. Another one
-        is told.
+        Virtual mass in kg, for poses also kg m and kg m^2; None takes the schedule's, row by row, or 1 kg. A mass other
+        than the schedule's raises a warning.
     rate, max_step : float, default=1000.0, 0.01
-        Rate of the loop in 1/s and longest tick in s. Over a longer one the robot has braked, or rests at its last
-        command if there was time to be back; after three on end it stops.
+        Rate of the loop in Hz and longest tick in s. Over a longer tick the robot brakes, or rests at its last command
+        if there was time to return to it; after three consecutive ones it stops.
     force_limit, deadband : float or (float, float), default=None
-        Range of the sensor, as the length of the vector; and force on an axis that counts as none and is taken off
-        larger ones, against drift and noise. None is 200 N and 20 Nm, and no deadband.
+        Largest norm of the force, the range of the sensor; and soft threshold of the force per axis, against drift and
+        noise. None is 200 N and 20 Nm, and no deadband.
     spring_limit : float or (float, float), default=None
-        Largest pull of the spring ``K e``, e = x_d - x; None takes ``force_limit``. Beyond it, K is scaled by
+        Largest force of the spring ``K e``, e = x_d - x; None takes ``force_limit``. Beyond it, K is scaled by
         ``spring_limit / sqrt(k_max e'K e)``, k_max its largest eigenvalue: the force of a potential that is concave in
-        e'K e, and so adds no energy where K is constant, whatever the mass. On poses each spring by itself, or both by
-        the smaller scale where K couples them.
+        e'K e, and so adds no energy where K is constant, whatever the mass. For poses each spring is scaled by itself,
+        or both by the smaller scale where K couples them.
     velocity_limit, acceleration_limit : float or (float, float), default=None
         Largest speed and acceleration of the command; where they act, ticks are not exact. None is the most that the
-        desired motion and ``force_limit`` can cause where the damping is least.
+        desired motion and ``force_limit`` can cause where the damping is smallest.
     hold_ticks, max_bad_ticks : int, default=10
-        Ticks on end with a force that is not finite, or a time that is not or does not increase, before the robot
-        stops. Until then the median of the last five good forces acts, fading to nothing, or the robot brakes.
+        Consecutive ticks with a non-finite force, or with a non-finite or non-increasing time, before the robot stops.
+        Until then the median of the last five good forces acts, fading to zero, or the robot brakes.
     stop_deceleration : float or (float, float), default=None
-        Deceleration of a stop, and where time is wrong, within ``acceleration_limit``. None is 5 units/s2 and
-        10 rad/s2, or the most that the desired motion takes if that is more.
+        Deceleration of a stop and at invalid times, within ``acceleration_limit``. None is 5 units/s^2 and 10 rad/s^2,
+        or the largest acceleration of the desired motion if that is more.
     soft_start : float, default=1.0
-        Time in s in which the desired place moves from the robot's at ``start`` to the schedule's, by minimum jerk and
-        about one axis; longer where it would be beyond a limit. At 0 s the schedule begins at full speed.
+        Time in s in which the desired pose moves from the robot's at ``start`` to the schedule's, by minimum jerk and
+        about one axis; longer where a limit requires it. At 0 s the schedule begins at full speed.
     approach_speed : float or (float, float), default=None
-        Largest speed of that; None is 0.5 units/s and 1 rad/s.
+        Largest speed of the soft start; None is 0.5 units/s and 1 rad/s.
     on_gap : {"pause", "resume"}, default="pause"
-        After a tick longer than ``max_step`` the schedule goes on from where it was, or also catches up, within limits
-        and not before the end of a soft start.
+        After a tick longer than ``max_step`` the schedule continues from where it was, or with "resume" also catches
+        up, within limits and not before the end of a soft start.
     force_rate_limit : float or (float, float), default=None
-        Fastest change of the force, per s: a spike of the sensor moves the robot less, and a contact is felt later.
+        Largest rate of change of the force, per s; it attenuates sensor spikes and delays the response to contact.
     stiffness_filter : EnergyTank or RateLimit, default=None
-        Holds back what would feed energy into the robot. The k_max of ``spring_limit`` is then that of all rows. The
-        proof of a `RateLimit` is of springs that no limit scales, of one mass, and not of poses.
+        Filter that holds back stiffness changes that would feed energy into the robot. The k_max of ``spring_limit`` is
+        then that of all rows. The proof of `RateLimit` covers unscaled springs of one mass, and no poses.
 
     Attributes
     ----------
@@ -90,7 +90,7 @@ class RealTimeAdmittance:
     Raises
     ------
     ValueError
-        If a parameter is not as described.
+        If a parameter is invalid.
 
     Examples
     --------
@@ -159,26 +159,26 @@ class RealTimeAdmittance:
         at: float = 0.0,
         force_bias: Numbers | None = None,
     ) -> None:
-        """Begin, or begin again: faults, forces and motion are forgotten.
+        """Start or restart the controller, clearing faults, forces and motion.
 
         Parameters
         ----------
         now : float
             Time of a monotonic clock, in s, from which ticks count.
         position, velocity : sequence of p and d floats, default=None
-            State of the robot, in units and units/s; None is where the schedule is, and at rest.
+            State of the robot, in units and units/s; None is the schedule's position, at rest.
         orientation : sequence of 4 floats, default=None
             Unit quaternion w x y z of the robot; None is that of the schedule.
         at : float, default=0.0
-            Time in the schedule to begin at, in s; ``schedule_time`` goes on after a stop.
+            Start time in the schedule in s; pass ``schedule_time`` to continue after a stop.
         force_bias : sequence of d floats, default=None
-            Mean reading of the sensor, in N, while nothing touches it, which is taken off every force; None is none.
-            A bias of 0.5 N moves a robot of 50 N/m by 10 mm.
+            Mean sensor reading in N without contact, subtracted from every force; None is zero. A bias of 0.5 N moves
+            a robot of 50 N/m by 10 mm.
 
         Raises
         ------
         ValueError, RuntimeError
-            If an argument is not as described, or the velocity beyond ``velocity_limit``; in a tick of another thread.
+            If an argument is invalid, the velocity exceeds ``velocity_limit``, or another thread is in a tick.
         """
         now = checks.number(now, "now", unit="s")
         at = checks.number(at, "at", least=0.0, most=self._table.end, unit="s")
@@ -192,20 +192,20 @@ class RealTimeAdmittance:
             self._turn.release()
 
     def tick(self, now: float, force: Numbers) -> TickStatus:
-        """Move on to ``now``, and tell the faults, 0 if none; position, orientation and velocity are then the command.
+        """Advance to ``now`` and return the faults, 0 if none; position, orientation and velocity are the command.
 
         Parameters
         ----------
         now : float
-            Time of the clock that ``start`` was given, in s.
+            Time in s of the same clock as in ``start``.
         force : sequence of d floats
-            External force in N, and torque in Nm, as measured now; it acts over the time since the last tick.
+            External force in N and torque in Nm measured now; it acts over the time since the last tick.
 
         Raises
         ------
         ValueError, RuntimeError
-            If ``now`` is not a number or ``force`` not d numbers, or at the third tick on end since ``start`` that
-            takes longer than ``max_step``; before ``start``, or in a tick of another thread. Nothing has changed then.
+            If ``now`` is not a number or ``force`` not d numbers, at the third consecutive tick longer than
+            ``max_step``, before ``start``, or while another thread is in a tick. The state is then unchanged.
         """
         if not self._turn.acquire(False):
             raise RuntimeError(_SHARED)
@@ -234,17 +234,17 @@ class RealTimeAdmittance:
 
     @property
     def position(self) -> Vector:
-        """Position to command, p floats in units."""
+        """Commanded position, p floats in units."""
         return self._motion.place[: self._table.blocks[0].stop]
 
     @property
     def orientation(self) -> Vector | None:
-        """Orientation to command, a unit quaternion w x y z; None where the schedule has none."""
+        """Commanded orientation, a unit quaternion w x y z; None where the schedule has none."""
         return self._motion.place[-4:] if self._is_pose else None
 
     @property
     def velocity(self) -> Vector:
-        """Velocity to command, d floats in units/s, and of rotations in rad/s and world axes."""
+        """Commanded velocity, d floats in units/s, and for rotations in rad/s and world axes."""
         return self._motion.velocity
 
     @property
@@ -259,7 +259,7 @@ class RealTimeAdmittance:
 
     @property
     def desired_orientation(self) -> Vector | None:
-        """Desired orientation R_d of the last tick, as ``orientation``."""
+        """Desired orientation R_d of the last tick, a unit quaternion w x y z or None."""
         return self._motion.desired_place[-4:] if self._is_pose else None
 
     @property
@@ -269,7 +269,7 @@ class RealTimeAdmittance:
 
     @property
     def stiffness(self) -> Floats:
-        """Stiffness K (d, d) of the last tick in N/m, as ``spring_limit`` let it be."""
+        """Stiffness K (d, d) of the last tick in N/m, scaled by ``spring_limit``."""
         return self._table.scaled(self._motion.gains[0], self._motion.scale)
 
     @property
@@ -285,7 +285,7 @@ class RealTimeAdmittance:
 
     @property
     def tank_energy(self) -> float | None:
-        """Energy in the tank of an `EnergyTank` in J; None without."""
+        """Energy in the `EnergyTank` in J; None without one."""
         energy = None if self._motion.filtered is None else self._motion.filtered.active.tank_energy
         return None if energy is None else float(energy)
 

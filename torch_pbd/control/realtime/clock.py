@@ -1,4 +1,4 @@
-"""The clock of the schedule: where the real-time controller is in it, and the motion desired then."""
+"""Clock of the schedule in the real-time controller, and the desired motion at its time."""
 
 import math
 from operator import add, mul
@@ -10,14 +10,14 @@ from torch_pbd import checks, rotations
 from torch_pbd.control.realtime.steps import Vector, deviation, moved, norm_with
 from torch_pbd.control.realtime.table import ScheduleTable
 
-# The desired motion may be 1.5 times as fast as the schedule, and accelerate so much more: one half of that changes the
-# pace, the other is left for the square of the pace while it catches up.
+# The desired motion may be 1.5 times as fast as the schedule, with as much more acceleration: half of that changes the
+# pace, the other half is left for the square of the pace while it catches up.
 _SPEED, _SHARE = 1.5, 0.25
-# Share of `gain` that a rise of the pace may always take, so that nobody who shakes the robot makes its schedule stand.
+# Share of `gain` that a rise of the pace may always take, so that shaking the robot cannot stop its schedule.
 _LEAST_SPARE = 0.1
-# Share of a row: time that was put onto a row takes that row, to whichever side it was rounded.
+# Share of a row that counts as rounding: time aligned with a row takes that row, whichever way it was rounded.
 _ON_ROW = 1e-6
-# A critically damped spring answers a step of the desired acceleration by 1 + (w t - 1) e^(-w t) of it: this at most.
+# Maximum of 1 + (w t - 1) e^(-w t), the response of a critically damped spring to a step of desired acceleration.
 _OVERSHOOT = 1.0 + math.exp(-2.0)
 # A minimum jerk of 1 over a time of 1 has a velocity of 15/8 and an acceleration of 10 / sqrt(3).
 _STEEPEST, _SHARPEST = 1.875, 5.7735

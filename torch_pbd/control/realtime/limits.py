@@ -1,4 +1,4 @@
-"""Limits of the force that comes in and of the command that goes out, their options, and the status of a tick."""
+"""Limits of the measured force and of the command, their options, and the status of a tick."""
 
 import math
 from collections import deque
@@ -21,9 +21,9 @@ Option = float | tuple[float, float] | None
 StartState = tuple[Vector | None, Vector | None, Vector]
 """Position, orientation and velocity; places are None where they are those of the schedule."""
 
-# What rotations have for a unit of positions.
+# Units of rotations by the corresponding unit of positions.
 _ANGULAR = {"N": "Nm", "N/s": "Nm/s", "units/s": "rad/s", "units/s^2": "rad/s^2"}
-# Defaults and units; those that are empty depend on others.
+# Defaults and units of the options; empty defaults depend on other options.
 _OPTIONS: dict[str, tuple[Vector, str]] = {
     "force_limit": ((200.0, 20.0), "N"),
     "spring_limit": ((), "N"),
@@ -34,7 +34,7 @@ _OPTIONS: dict[str, tuple[Vector, str]] = {
     "approach_speed": ((0.5, 1.0), "units/s"),
     "stop_deceleration": ((), "units/s^2"),
 }
-_OFF = 1e-3  # of a quaternion's length: four rounded digits
+_OFF = 1e-3  # tolerance of a quaternion's length, which admits four rounded digits
 # A median of five is a good force after one or two wild ones, and 2 ms late at 1 kHz.
 _RECENT = 5
 
@@ -70,7 +70,7 @@ FINE = TickStatus(0)
 
 
 def options_of_blocks(given: Mapping[str, Any], n_blocks: int) -> dict[str, Vector]:
-    """Options for positions, and for poses those for rotations too."""
+    """Options for positions, and for poses also for rotations."""
     values = {}
     for name, (default, unit) in _OPTIONS.items():
         value = given[name]
@@ -93,7 +93,7 @@ def _checked(value: Any, name: str, unit: str) -> float:
 
 
 def finite_floats(values: Numbers | None, name: str, d: int) -> Vector:
-    """Finite floats, one for each of d axes; zeros for None."""
+    """Finite floats, one per axis; zeros for None."""
     return (0.0,) * d if values is None else tuple(checks.array(values, name, (d,)).tolist())
 
 
@@ -104,7 +104,7 @@ def start_state(
     blocks: Sequence[slice],
     speed_limits: Vector,
 ) -> StartState:
-    """State of a robot that begins, checked: at rest where no velocity is given."""
+    """Checked initial state of a robot, at rest where no velocity is given."""
     here = None if position is None else finite_floats(position, "position", blocks[0].stop)
     turned: Vector | None = None
     if orientation is not None:
@@ -123,7 +123,7 @@ def start_state(
 
 @final
 class ForceChannel:
-    """The force that acts, and of poses the torque, each within limits of its own."""
+    """Force, and for poses torque, that acts in a tick, each within its own limits."""
 
     push: Vector
 
@@ -137,18 +137,18 @@ class ForceChannel:
         self._n_axes, self._only = blocks[-1].stop, self._vectors[0][0] if len(blocks) == 1 else None
 
     def begin(self, bias: Vector) -> None:
-        """Forget all forces; before the first there was none."""
+        """Clear all forces; the force before the first tick is zero."""
         self.push, self._bias = (0.0,) * self._n_axes, bias if any(bias) else None
         for vector, block in self._vectors:
             vector.begin(block.stop - block.start)
 
     @property
     def is_lost(self) -> bool:
-        """True if the force or the torque is lost for longer than it is replaced."""
+        """Whether the force or the torque has been missing for longer than it is replaced."""
         return any(vector.is_lost for vector, _ in self._vectors)
 
     def take(self, force: Numbers, step: float) -> TickStatus:
-        """Let a force as measured act, as far as it may, ``step`` s after the last one."""
+        """Let a measured force act within the limits, ``step`` s after the last one."""
         try:
             push = (*map(float, force),)  # tuple() of an iterator leaves one more tuple on Python's free list each time
         except (TypeError, ValueError, OverflowError):
@@ -213,14 +213,14 @@ class _ForceVector:
 
 @final
 class CommandLimits:
-    """Largest speed and acceleration of the command, for each block; infinite where there is none."""
+    """Largest speed and acceleration of the command per block; infinite where there is no limit."""
 
     def __init__(self, speeds: Vector, accelerations: Vector, blocks: Sequence[slice]) -> None:
         self._accelerations, self._blocks = accelerations, blocks
         self.is_any = min(*speeds, *accelerations) < math.inf
 
     def applied(self, state: State, last: State, step: float, top_speeds: Vector) -> tuple[State, TickStatus]:
-        """Place and velocity that a tick of ``step`` s leads to, within limits, and which of these acted."""
+        """Place and velocity after a tick of ``step`` s within the limits, and the limits that acted."""
         (place, velocity), (last_place, last_velocity) = state, last
         move, status = deviation(place, last_place, len(velocity)), FINE
         moves: Vector = ()

@@ -1,4 +1,4 @@
-"""The motion of the real-time controller, tick by tick: along the law, whose gains may be filtered, or braked."""
+"""Motion of the real-time controller, tick by tick: by eq. (15), possibly with filtered gains, or braking."""
 
 import math
 from collections.abc import Mapping
@@ -19,19 +19,19 @@ from torch_pbd.exceptions import InvalidParameterError
 
 # From an approach at 0.5 m/s and 1 rad/s a robot is at rest in 0.1 s, after 25 mm and 3 degrees.
 _DECELERATION = (5.0, 10.0)
-# A reading must tell ticks apart to 1 %: times since 1970 in s do, in ns they do not.
+# Time readings must resolve ticks to 1 %: times since 1970 in s do, as floats in ns they do not.
 _COARSE = 0.01
-# One late tick is a stall, two may be; three on end are a loop that is too slow.
+# One late tick is a stall, and two may be; three consecutive ones mean that the loop is too slow.
 _LATE_ON_END = 3
-# Share of the newest tick in how long a tick lasts: neither one short tick nor one long counts for much.
+# Weight of the newest tick in the running mean of their duration, so that single short or long ones count little.
 _SMOOTHING = 0.1
 
 
 @final
 class Motion:
-    """Place and velocity of the command, what moves them, and whether the robot is to brake for good.
+    """Place and velocity of the command, their dynamics, and whether the robot brakes for good.
 
-    Ticks take at most ``max_step`` s; ``last`` is until when the motion is known, ``step`` how long ticks last.
+    Ticks take at most ``max_step`` s; ``last`` is the time up to which the motion is known, ``step`` the mean tick.
     """
 
     row: Vector
@@ -66,7 +66,7 @@ class Motion:
     def begin(
         self, now: float, at: float, position: Vector | None, orientation: Vector | None, velocity: Vector
     ) -> None:
-        """Forget all, and be at a place, or where the schedule is at that time."""
+        """Restart at a place, or at the schedule's place at that time."""
         if math.ulp(now) * self._table.rate > _COARSE:
             must = f"small enough to tell ticks of {1.0 / self._table.rate:g} s apart"
             raise checks.refusal(now, "now", must, "give seconds", unit="s")
@@ -89,13 +89,13 @@ class Motion:
 
     @property
     def gains(self) -> tuple[Floats, Floats]:
-        """Stiffness, before a limit scaled it, and damping (d, d) of the last tick."""
+        """Stiffness, before scaling by a limit, and damping (d, d) of the last tick."""
         if self.filtered is not None:
             return self.filtered.gains
         return self._table.stiffness[self._clock.index], self._table.damping[self._clock.index]
 
     def live(self, now: float, step: float, push: Vector) -> TickStatus:
-        """Move on to ``now``, ``step`` s after the last tick, under a push."""
+        """Advance to ``now``, ``step`` s after the last tick, under a push."""
         if self.is_stopped:
             self._brake(now, step, self._deceleration)
             return FINE
@@ -119,7 +119,7 @@ class Motion:
         return status
 
     def live_irregular(self, now: float, push: Vector) -> TickStatus:
-        """Status of a tick that is not like the last one, if ``now`` can be."""
+        """Status of a tick that differs from the last one, or of an invalid time ``now``."""
         status = self._read(now)
         self.is_stopped |= self._n_bad >= self._max_bad_ticks or self._n_late >= _LATE_ON_END
         if status is FINE:
@@ -134,7 +134,7 @@ class Motion:
         return status
 
     def _read(self, now: float) -> TickStatus:
-        """Fault of a tick that is not like the last one."""
+        """Fault of a tick that differs from the last one."""
         if math.isnan(self.last):
             raise RuntimeError("tick before start: call start(now) with the time of the same clock first.")
         if self.is_regular:
@@ -165,7 +165,7 @@ class Motion:
 
 @final
 class FilteredGains:
-    """Stiffness and damping in effect, (d, d), and the ticks that they make: those of the table if all is granted.
+    """Filtered stiffness and damping (d, d) in effect, and ticks with them; the table's where nothing is held back.
 
     The springs of a table that is ``steady`` are limited by the largest stiffness of all rows: their force is that of
     one potential that is concave in e'K e, also where K changes. A rise of e'K e then puts at most ``scale / 2`` times
@@ -190,7 +190,7 @@ class FilteredGains:
         self._fresh = wanted.start(table.stiffness, table.damping, mass, _tick_change)
 
     def begin(self, index: int) -> None:
-        """Forget all, at a row of the table: the next tick is given what it asks for."""
+        """Restart at a row of the table, whose gains the next tick gets unfiltered."""
         self.active: ActiveFilter = copy(self._fresh)
         self.gains = self._table.stiffness[index], self._table.damping[index]
 
@@ -210,7 +210,7 @@ class FilteredGains:
         return table.advance(row, index, push, here, step, self.gains if active.gains[2] < 1.0 else None)
 
     def settle(self, row: Vector, push: Vector, before: State, after: State) -> None:
-        """Take note of the tick: place and velocity at its start and end, and the push held in it."""
+        """Record the tick: place and velocity at its start and end, and the push held during it."""
         n_place, d = self._table.n_place, self._table.n_axes
         force = push + self.gains[1] @ row[n_place : self._start]
         start, end = ((np.array(deviation(place, row[:n_place], d)), np.array(v)) for place, v in (before, after))
@@ -226,7 +226,7 @@ class FilteredGains:
 
 
 def _tick_change(stiffness: Floats, damping: Floats, mass: Floats, step: float) -> Floats:
-    """What deviation and velocity change by over a tick: a matrix (2 d, 3 d) on them and on the force."""
+    """Matrix (2 d, 3 d) from deviation, velocity and force to the change of the first two over a tick."""
     d = len(mass)
     rate = np.zeros((3 * d, 3 * d))
     rate[:d, d : 2 * d] = np.eye(d)

@@ -17,16 +17,16 @@ Norm = Callable[[Sequence[float]], float]
 State = tuple[Vector, Vector]
 """Place and velocity."""
 
-# Of (w h)^2, w the frequency of an axis and h the step: below, two terms of a series in it have all digits.
+# Bound of (w h)^2, w the frequency of an axis and h the step, below which two terms of its series are exact.
 _CRITICAL = 1e-7
-# Of a h, a half the damping: below, five terms have.
+# Bound of a h, a half the damping, below which five terms of its series are exact.
 _SHORT = 0.01
 
 
 def deviation(place: Sequence[float], goal: Sequence[float], d: int) -> Vector:
-    """Move of d components that leads from a goal to a place: x - x_d, and the rotation vector Log(R R_d').
+    """Move of d components from a goal to a place: x - x_d, and the rotation vector Log(R R_d').
 
-    It takes the shorter way round, and is blind to the lengths and signs of quaternions.
+    It takes the shorter way round, and does not depend on the lengths and signs of quaternions.
     """
     if len(place) == d:
         return tuple(map(sub, place, goal))
@@ -43,7 +43,7 @@ def deviation(place: Sequence[float], goal: Sequence[float], d: int) -> Vector:
 
 
 def moved(place: Sequence[float], move: Sequence[float]) -> Vector:
-    """Place that a move leads to: x + dx, and Exp(dr) R, a unit quaternion again."""
+    """Place after a move: x + dx, and Exp(dr) R as a unit quaternion."""
     if len(place) == len(move):
         return tuple(map(add, place, move))
     x, y, z = move[-3:]
@@ -62,9 +62,9 @@ def moved(place: Sequence[float], move: Sequence[float]) -> Vector:
 
 
 def norm_with(lever: float | None) -> Norm:
-    """Norm of velocities: their length, or with a lever that of their positions or lever times that of the rotation.
+    """Norm of velocities: their length, or for poses the larger of linear speed and lever times angular speed.
 
-    The lever, in units/rad, says which speeds of the two count as equally fast; the larger one counts.
+    The lever, in units/rad, defines which linear and angular speeds count as equal.
     """
     if lever is None:
         return lambda vector: math.hypot(*vector)
@@ -72,12 +72,12 @@ def norm_with(lever: float | None) -> Norm:
 
 
 def mean_move(before: Vector, after: Vector, time: float) -> Vector:
-    """Move in a time in which the velocity changes evenly."""
+    """Move over a time in which the velocity changes linearly."""
     return tuple([0.5 * time * (v + w) for v, w in zip(before, after, strict=True)])
 
 
 def braked(state: State, norm: Norm, deceleration: float, step: float) -> State:
-    """Place and velocity after braking for ``step`` s, all axes alike, or until standing still."""
+    """Place and velocity after braking all axes in proportion for ``step`` s, or until standstill."""
     place, velocity = state
     speed = norm(velocity)
     braking = min(step, speed / deceleration)
@@ -113,7 +113,7 @@ def advance_plane(row: Vector, push: Vector, state: State, step: float) -> tuple
 
 
 def along_modes(row: Vector, push: Vector, off: Vector, motion: State, step: float) -> tuple[Vector, Vector, float]:
-    """Move and velocity after ``step`` s, and the scale of the stiffness; each mode by itself.
+    """Move and velocity after ``step`` s, and the scale of the stiffness, by independent modes.
 
     Modes, the columns of P, are such that P' M P = 1, while P' K P and P' D P are diagonal: with e = P y and f of a
     mode that of P' f, each y follows y'' + 2 a y' + k y = f + 2 a v_d. With the responses S and B of `_responses` and
@@ -149,7 +149,7 @@ def _dot(left: Vector, right: Vector) -> float:
 def coupled(
     stiffness: Floats, damping: Floats, mass: float | Floats, push: Vector, off: Vector, motion: State, step: float
 ) -> tuple[Vector, Vector]:
-    """Move and velocity as `along_modes`, of matrices that share no modes: exp(X) - 1 of the whole system, in ticks."""
+    """Move and velocity as `along_modes`, for gains without shared modes, by exp(X) - 1 of the whole system."""
     (goal_velocity, velocity), d = motion, len(push)
     held = (push + damping @ goal_velocity)[:, np.newaxis]
     rate = np.zeros((2 * d + 1, 2 * d + 1))

@@ -1,4 +1,4 @@
-"""The schedule of the real-time controller: in rows of equal time, ready for a tick."""
+"""Schedule of the real-time controller as a table of evenly spaced rows, prepared for ticks."""
 
 import math
 import struct
@@ -17,13 +17,13 @@ from torch_pbd.control.schedule.rows import Between, count_rows, row_times
 Scale = float | Vector
 """Scale of the stiffness: that of all, or those of positions and of rotations."""
 
-_LIGHTEST = 1e-50  # kg: products of gains with masses from this one to its inverse are numbers
-_SINGULAR = 1e-12  # of damping relative to its largest entry, units of lengths and angles apart
+_LIGHTEST = 1e-50  # kg: float64 holds products of gains with masses from this one to its inverse
+_SINGULAR = 1e-12  # damping that counts as singular, relative to its largest entry in the same units
 _MAX_ROWS = 4_000_000  # an hour at 1 kHz, which takes 670 MB for d = 2
 
 
 def virtual_mass(schedule: Schedule, given: Any) -> float | Floats:
-    """Virtual mass, that of the schedule if None is given; a warning where it is another.
+    """Virtual mass, by default that of the schedule; another mass raises a warning.
 
     A number in kg, or an array (d, d), or (n, d, d) where rows differ.
     """
@@ -46,7 +46,7 @@ def virtual_mass(schedule: Schedule, given: Any) -> float | Floats:
 
 @final
 class ScheduleTable:
-    """A schedule in rows of equal time, the last one at ``end`` s, with no velocity.
+    """Schedule in evenly spaced rows, the last one at ``end`` s with zero velocity.
 
     A row has the desired place, of ``n_place`` floats, and its velocity, of ``n_axes``; the largest stiffness of each
     of the ``springs`` over its squared limit; and what `advance` takes besides where modes are shared. ``stiffness``,
@@ -86,7 +86,7 @@ class ScheduleTable:
         self.packed, self.layout = rows.tobytes(), struct.Struct(f"{rows.shape[1]}d")
 
     def _springs(self, modes: Sequence[Floats] | None, pull_limits: Vector, steady: bool) -> list[Floats]:
-        """What a tick needs of each row besides the motion."""
+        """Columns of each row that a tick needs besides the motion."""
         blocks, mass = self.blocks, self._one_mass
         is_apart = len(blocks) == 2 and _are_apart(self.stiffness, *blocks)
         self.springs, self._are_shared = blocks if is_apart else (slice(0, self.n_axes),), modes is not None
@@ -119,7 +119,7 @@ class ScheduleTable:
     def advance(
         self, row: Vector, index: int, push: Vector, state: State, step: float, gains: Sequence[Floats] | None = None
     ) -> tuple[State, Scale]:
-        """Place and velocity after ``step`` s, and the scale of the stiffness; by other gains than the row's, if given.
+        """Place and velocity after ``step`` s, and the scale of the stiffness, by the row's gains or the given ones.
 
         For poses the angular velocity is integrated over the tick as that of a fixed axis would be, and turns the robot
         in world axes: ``R <- Exp(dr) R``. The deviation is then told anew from where both are, so that the transport of
@@ -141,20 +141,20 @@ class ScheduleTable:
         return (moved(place, move), velocity), scales[0] if scales[0] == scales[-1] else scales
 
     def _is_within_limits(self, row: Vector, off: Vector) -> bool:
-        """True if neither of two springs apart is limited at a deviation."""
+        """Whether neither of two uncoupled springs is limited at a deviation."""
         p, at = self.n_axes - 3, self._start
         middle = at + 2 + p * p
         pull, torque = _quadratic(row[at + 2 : middle], off[:p]), _quadratic(row[middle : middle + 9], off[p:])
         return row[at] * pull <= 1.0 >= row[at + 1] * torque
 
     def scales(self, row: Vector, stiffness: Floats, off: Floats) -> Vector:
-        """Scale of each spring of a stiffness (d, d) at a deviation, as its limit lets it be."""
+        """Scale of each spring of a stiffness (d, d) at a deviation, by its limit."""
         springs = zip(self.springs, row[self._start :], strict=False)
         pulls = [top * float(off[b] @ stiffness[b, b] @ off[b]) for b, top in springs]
         return tuple([1.0 / math.sqrt(max(pull, 1.0)) for pull in pulls])
 
     def scaled(self, stiffness: Floats, scale: Scale) -> Floats:
-        """Stiffness (d, d) as scaled in a tick."""
+        """Stiffness (d, d) scaled as in a tick."""
         if isinstance(scale, float):
             return scale * stiffness
         return np.repeat(scale, [b.stop - b.start for b in self.springs])[:, np.newaxis] * stiffness
@@ -173,7 +173,7 @@ class ScheduleTable:
 
 
 def _are_apart(stiffness: Floats, first: slice, second: slice) -> bool:
-    """True if no stiffness couples positions and rotations."""
+    """Whether no row's stiffness couples positions and rotations."""
     along = np.sqrt(np.abs(stiffness).max(axis=0).diagonal())
     coupling = np.abs(stiffness[:, first, second]).max(axis=0)
     return bool((coupling <= checks.ROUNDING * np.multiply.outer(along[first], along[second])).all())

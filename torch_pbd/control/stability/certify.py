@@ -1,4 +1,4 @@
-"""Guarantees of a stiffness schedule, each by its name, and what it may touch."""
+"""Stability guarantees of a stiffness schedule, and the stiffest environment it may touch."""
 
 import math
 from typing import Any
@@ -18,9 +18,9 @@ from torch_pbd.control.stability.lyapunov import Knots, held_growth
 from torch_pbd.control.stability.report import StabilityReport
 from torch_pbd.linalg import evenly, least_eigenvalue, symmetrize
 
-# N/m; stiffer than anything there is.
+# Upper bound of environment stiffnesses in N/m, above anything real.
 _STIFFEST = 1e9
-# Knots of a schedule that are coupled to an environment.
+# Most knots of a schedule that are coupled to an environment.
 _MAX_KNOTS = 200
 _BISECTIONS = 60
 
@@ -39,18 +39,18 @@ def certify(
     Parameters
     ----------
     schedule : Schedule
-        Its times, gains and, for poses, angular velocities are what is checked.
+        Schedule whose times, gains and, for poses, angular velocities are checked.
     mass : float, array_like of shape (d, d) or (n, d, d), or callable, default=None
         Virtual mass of the admittance, or inertia of the arm at each row, in kg, for poses also kg m and kg m^2; or a
-        function of time (n,), in s, that returns it. None is the schedule's own, or 1 kg.
+        function of times (n,) in s. None is the schedule's own, or 1 kg.
     speed : float, default=1.0
         Replay speed: 2 is twice as fast.
     position_loop : PositionLoop, default=None
-        What the robot follows the admittance by, for the stiffest environment; None is 20 Hz behind one tick.
+        Position loop of the robot, for the stiffest environment; None is 20 Hz after a delay of one tick.
     force_cutoff : float, default=500.0
-        Corner frequency of the force sensor's low-pass, Hz; None is none.
+        Corner frequency of the force sensor's low-pass in Hz; None is no filter.
     dt : float, default=0.001
-        Tick of the controller, s.
+        Tick of the controller in s.
 
     Raises
     ------
@@ -67,7 +67,7 @@ def certify(
     checks.number(force_cutoff, "force_cutoff", above=0.0, unit="Hz", optional=True)
     loop = checks.instance(position_loop, "position_loop", PositionLoop, optional=True) or PositionLoop()
     checks.instance(schedule, "schedule", Schedule)
-    # An axis that is free never returns: nothing is to be certified of it.
+    # A free axis never returns, so that nothing can be certified.
     checks.semidefinite(schedule.stiffness, "stiffness", definite=True)
     time, stiffness, damping = map(torch.tensor, (schedule.time, schedule.stiffness, schedule.damping))
     given = schedule.mass if mass is None else mass(schedule.time) if callable(mass) else mass
@@ -81,7 +81,7 @@ def certify(
     knots, maps = Knots(dynamics), dynamics.tick_maps()
     alpha, margin, worst = knots.certificate()
     rate, fastest = common_function(dynamics)
-    # The rule is of one function that no axis is special to: of one inertia, and of outputs of one unit.
+    # The rule holds for isotropic functions, and so for one inertia and outputs of one unit.
     squared = dynamics.modes[0]
     ratio = float(squared.max() / squared.min()) if len(inertia) == 1 and schedule.orientation is None else math.nan
     pressed = [math.nan] * 2
@@ -117,7 +117,7 @@ def certify(
 
 
 def _damping_ratio(dynamics: ErrorDynamics) -> float:
-    """Smallest damping ratio of all rows, each in its own mass."""
+    """Smallest damping ratio of all rows, each with its own mass."""
     squared, _, damping = dynamics.modes
     root, identity = squared.pow(-0.25), torch.eye(squared.shape[-1]).to(squared)
     if damping.ndim == 2:
@@ -134,12 +134,12 @@ def stiffest_environment(
     force_cutoff: float | None,
     dt: float,
 ) -> float:
-    """Stiffest spring, N/m, that the robot can press on without vibrating, the least over the gains given.
+    """Stiffest spring in N/m that the robot can press on without vibrating, the minimum over the given gains.
 
-    The robot reads the force through a low-pass, and follows the admittance by its position loop: the closed loop along
-    an axis of the damping, tick by tick, is a matrix, and the spring is the stiffest up to which its eigenvalues stay
-    within the unit circle; about ``damping / (lag of loop and sensor)``. Gains are held, and axes taken one by one; of
-    more than 200 knots, 200 are looked at and those with the least damping and stiffness.
+    The robot reads the force through a low-pass and follows the admittance by its position loop. Along an axis of the
+    damping, one tick of the closed loop is a matrix, and the result is the stiffest spring up to which its eigenvalues
+    stay within the unit circle, about ``damping / (lag of loop and sensor)``. Gains are held, and axes are independent;
+    of more than 200 knots, 200 are checked together with those of the least damping and stiffness.
     """
     identity = torch.eye(stiffness.shape[-1]).to(stiffness)
     softest = [
@@ -156,12 +156,12 @@ def stiffest_environment(
         closed = _closed_loop(each, position_loop, force_cutoff, dt, environment)
         return torch.linalg.eigvals(closed).abs().amax(-1) < 1.0
 
-    # Most axes are never the least: after that which is damped least, those for which what it bears is too much.
+    # Few axes are ever the weakest: after the least damped one, only those that its stiffest spring destabilizes.
     least, ticks = 2.0 * _STIFFEST, ticks[along[1].flatten().argsort()]
     while len(ticks):
         low, high = 0.0, least
         for _ in range(_BISECTIONS):
-            # Wide intervals are halved by logarithm: the answer may lie anywhere between a feather and a wall.
+            # Wide intervals are bisected by logarithm, as the answer may have any magnitude.
             middle = math.sqrt(max(low, 1.0) * high) if high > 1e3 * max(low, 1.0) else 0.5 * (low + high)
             low, high = (middle, high) if is_stable(ticks[:1], middle) else (low, middle)
         least = low
@@ -172,9 +172,9 @@ def stiffest_environment(
 def _closed_loop(
     ticks: Float[Tensor, "n 2 3"], loop: PositionLoop, force_cutoff: float | None, dt: float, environment: float
 ) -> Float[Tensor, "n m m"]:
-    """Matrices that move the state of admittance, robot, filter of the force and waiting commands on by a tick."""
+    """Matrices that advance the state of admittance, robot, force filter and waiting commands by a tick."""
     identity = torch.eye(5 + loop.delay_steps).to(ticks).expand(len(ticks), -1, -1)
-    # Each is a row of the identity: what the next state is made of it, is a row of the matrix.
+    # Each variable is a row of the identity, so that each expression for the next state is a row of the matrix.
     position, velocity, robot, robot_velocity, filtered, *waiting = identity.unbind(1)
     commands, force = [*waiting, position], -environment * robot
     read, after = force, 0.0 * filtered

@@ -1,4 +1,4 @@
-"""One function of the state that falls at every row of a schedule, in whatever order they come."""
+"""Common Lyapunov function of all rows of a schedule, which decays in whatever order they come."""
 
 import math
 from collections.abc import Callable
@@ -21,18 +21,18 @@ _ROUNDS, _N_CUT = 12, 200
 _MAX_OUTPUTS, _N_ROWS = 9, 24
 # The largest eigenvalue of all is smoothed, by and by less, over these shares of the natural frequency.
 _TEMPERATURES: tuple[float, ...] = (0.1, 0.01, 0.003)
-_MAX_ITER = 60  # at each of them
+_MAX_ITER = 60  # BFGS iterations at each temperature
 _MAX_SEARCHES = 6
-_NEAR = 0.03  # of the rate among some rows, by which that of all may be lower
+_NEAR = 0.03  # share by which the rate over all rows may be lower than that among some
 _GOLDEN, _N_GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0, 45  # sections: 4e-10 of the interval
-_UNBOUNDED = 1e6  # rate, of natural frequencies, that stands for none
+_UNBOUNDED = 1e6  # rate in natural frequencies that stands for an unbounded one
 
 
 def common_function(dynamics: ErrorDynamics) -> tuple[float, float]:
-    """Rate, in 1/s, at which the root of one function falls at least, and the speed up to which one falls.
+    """Smallest decay rate in 1/s of the root of a common Lyapunov function, and the speed up to which one exists.
 
-    Under any sequence of the rows (K, D, M, W) and blends of them, each held for any time or changing continuously, W
-    multiplied by anything from 0, where the schedule waits, to that speed. NaN and 0 where none is found.
+    It decays under any sequence of the rows (K, D, M, W) and their blends, each held for any time or changing
+    continuously, with W times any factor from 0, where the schedule waits, to that speed. NaN and 0 if none is found.
 
     Notes
     -----
@@ -114,11 +114,11 @@ class Function:
         return torch.linalg.solve_triangular(self.root.unsqueeze(-3), matrix, upper=True, left=False)
 
     def eigenvalues(self, rows: ErrorDynamics) -> Float[Tensor, "*a n r"]:
-        """Eigenvalues of these matrices."""
+        """Eigenvalues of the matrices of :meth:`change`."""
         return torch.linalg.eigvalsh(self.change(rows))
 
     def above(self, rows: ErrorDynamics, limit: float) -> Int64[Tensor, " k"]:
-        """Rows with an eigenvalue above a limit."""
+        """Indices of rows with an eigenvalue above a limit."""
 
         def pencil(some: Tensor, q: float, p: float) -> Tensor:
             return p * torch.eye(len(self.root)).to(self.root) - q * self.change(rows.restrict(some))
@@ -126,14 +126,14 @@ class Function:
         return rows_below(pencil, -limit, len(rows.time))
 
     def largest(self, rows: ErrorDynamics) -> float:
-        """Largest eigenvalue of all rows, and what rounding may add to it."""
+        """Largest eigenvalue of all rows plus the most that rounding may add."""
         some = self.eigenvalues(rows.restrict(evenly(len(rows.time), _N_ROWS)))
         values = torch.cat([some, self.eigenvalues(rows.restrict(self.above(rows, float(some.max()))))])
         return float(values.max()) + _ROUNDING * float(values.abs().max())
 
 
 def searched_function(rows: ErrorDynamics) -> Function | None:
-    """Function of the largest rate: of some rows, then of more, those above its largest eigenvalue among some."""
+    """Function of the largest rate, searched among some rows and then more, those above the eigenvalue bound."""
     chosen, at, inverse, temperatures = evenly(len(rows.time), _N_ROWS), None, None, _TEMPERATURES
     for _ in range(_MAX_SEARCHES):
         some = rows.restrict(chosen)
@@ -195,7 +195,7 @@ def _smoothed(
 
 
 def isotropic_rate(dynamics: ErrorDynamics) -> float:
-    """Rate, in 1/s, of a function to which no axis is special, for one mass; NaN if there is none.
+    """Rate in 1/s of an isotropic Lyapunov function, for one mass; NaN if there is none.
 
     Notes
     -----
@@ -264,7 +264,7 @@ def _monomials(log_a: float, log_b: float, like: Tensor) -> Tensor:
 
 
 def _minimize_convex(function: Callable[[float], float], low: float, high: float) -> float:
-    """Where a convex function of one variable is smallest, by golden section; the ends are tried too."""
+    """Minimizer of a convex function of one variable by golden section, including the ends."""
     first, last = low, high
     left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
     at_left, at_right = function(left), function(right)

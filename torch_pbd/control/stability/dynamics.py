@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torch_pbd.linalg import symmetrize
 
-# Share of the damping: smaller entries between the modes of the stiffness are rounding of its root.
+# Share of the damping below which entries between the modes of the stiffness are rounding of its root.
 _COUPLED = 1e-12
 # Matrices of 27 outputs that stay in the cache together.
 _AT_ONCE = 64
@@ -21,11 +21,11 @@ _MAX_ROWS, _MAX_PARTS = 150, 64
 
 @dataclass(frozen=True)
 class ErrorDynamics:
-    """``M v' + D v + K e = 0`` and ``e' = v + W e`` at n rows: the deviation e, and v that of the velocity.
+    """Dynamics ``M v' + D v + K e = 0``, ``e' = v + W e`` at n rows, with deviations e of position and v of velocity.
 
     A rotation deviates by a rotation vector in world axes, which the desired angular velocity w carries along:
-    ``W = blkdiag(0, [w]x)``, the ``transport``. There are m = n masses, or 1 where it is one for all rows. Coriolis
-    forces are taken for compensated.
+    ``W = blkdiag(0, [w]x)``, the ``transport``. There are m = n masses, or one for all rows. Coriolis forces count as
+    compensated.
     """
 
     time: Float[Tensor, "*a n"]
@@ -53,7 +53,7 @@ class ErrorDynamics:
         return squared, axes, damping if bool(coupled.any()) else own
 
     def restrict(self, rows: Tensor) -> "ErrorDynamics":
-        """Some of the rows."""
+        """Dynamics at the selected rows."""
         transport = None if self.transport is None else self.transport[rows]
         mass = self.mass if len(self.mass) == 1 else self.mass[rows]
         return ErrorDynamics(self.time[rows], self.stiffness[rows], self.damping[rows], mass, transport)
@@ -119,7 +119,7 @@ def largest_gain(steps: Float[Tensor, "k s s"]) -> float:
 
 
 def _largest_growth(steps: Float[Tensor, "k s s"]) -> tuple[float, int, int]:
-    """Growth of the part that grows the most, and the rows where it begins and ends."""
+    """Growth of the part that grows the most, and its first and last rows."""
     begun, identity = steps[:0], torch.eye(steps.shape[-1]).to(steps)
     since, largest, part = torch.empty(0, dtype=torch.long), 1.0, (0, 0)
     for row, each in enumerate(steps):
@@ -140,7 +140,7 @@ def _largest_growth(steps: Float[Tensor, "k s s"]) -> tuple[float, int, int]:
 
 
 def _products(steps: Float[Tensor, "k s s"], rows: Int64[Tensor, " c1"]) -> Float[Tensor, "c s s"]:
-    """Maps from each of some rows to the next of them."""
+    """Maps from each of the selected rows to the next one."""
     begins, lengths = rows[:-1], rows.diff()
     products = steps[begins]
     for later in range(1, int(lengths.max())):

@@ -1,4 +1,4 @@
-"""Kronander and Billard's function of the state along a schedule, and what it needs."""
+"""Kronander and Billard's Lyapunov function along a schedule."""
 
 import math
 from collections.abc import Callable
@@ -13,13 +13,13 @@ from torch_pbd.control.stability.dynamics import ErrorDynamics
 from torch_pbd.control.stability.report import GROWTH_ROUNDING
 from torch_pbd.linalg import evenly, least_eigenvalue, rows_below, smallest_eigenvalues, symmetrize
 
-# Intervals among which a minimum over all is looked for at a time: more change nothing, fewer are asked more often.
+# Intervals among which a minimum over all is searched at a time: more change nothing, fewer need more rounds.
 _N_WORST = 16
-# Relative: no interval is below the smallest eigenvalue found among some of them by more.
+# Relative tolerance by which an interval may be below the smallest eigenvalue found among some of them.
 _SLACK = 1e-10
-# s: a rise of the stiffness, relative to it and per unit of speed, that is none.
+# Rise of the stiffness, relative to it and per unit of speed, that counts as none.
 _NO_RISE = 1e-12
-_LEAST = 1e-9  # alpha that is tried, relative to the largest
+_LEAST = 1e-9  # smallest alpha that is tried, relative to the largest
 _GRID, _N_GRIDS = 32, 9  # points of which a logarithm is looked for to 1e-9, and of how many grids
 _MAX_CUTS, _CLOSE = 30, 1e-8  # rounds, and what is left of the relative difference between the bound and the value
 
@@ -28,7 +28,7 @@ Pencils = Callable[[float, Tensor, float, float], Tensor]
 
 
 class Knots:
-    """Rows of a schedule, linear in between, and the function of Kronander and Billard along it.
+    """Rows of a schedule, linear in between, with Kronander and Billard's Lyapunov function.
 
     ``V = 1/2 v'Mv + alpha e'Mv + 1/2 e'(K + alpha D)e = 1/2 z'Pz`` of the state z = (e, v) changes by ``-z'Qz``,
 
@@ -65,7 +65,7 @@ class Knots:
         self._fastest = float((damping if damping.ndim == 2 else torch.linalg.eigvalsh(damping)).min())
 
     def certificate(self) -> tuple[float, float, int]:
-        """Alpha with the largest rate, that rate, and the interval where it is smallest."""
+        """Alpha with the largest decay rate, that rate, and the interval where it is attained."""
         alpha_max, (_, damping, mass), mass_rate = self._fastest, self._gains, self._rates[2]
         if len(mass) > 1:
             damped = damping - 0.5 * mass_rate
@@ -81,7 +81,7 @@ class Knots:
         return _maximize_smallest(pencil, _LEAST * alpha_max, alpha_max, self._n_intervals)
 
     def max_speed(self) -> float:
-        """Largest factor on the rates for which some alpha has no negative rate."""
+        """Largest replay speed for which some alpha has a non-negative decay rate."""
         if self._fastest <= 0.0:
             return 0.0
 

@@ -1,14 +1,14 @@
-"""Report on the stability of a schedule."""
+"""Report on the stability of a schedule, as made by :func:`certify`."""
 
 import math
 from dataclasses import dataclass
 from textwrap import fill
 from typing import final
 
-# Gain of a schedule above which its report warns. The paper's own, with the roots of its bounds, has 1.53 at 1 kg and
-# 2.32 at 10 kg; the unstable one has 144.
+# Gain above which a report warns. The paper's schedule, with the roots of its bounds, has 1.53 at 1 kg and 2.32 at
+# 10 kg; the unstable one has 144.
 MAX_GAIN = 2.0
-# Growth over an interval that is none: rounding of an exact map.
+# Growth over an interval that counts as none, from rounding of an exact map.
 GROWTH_ROUNDING = 1e-9
 _WIDTH = 80
 _NOT_PROMISED = (
@@ -20,61 +20,61 @@ _NOT_PROMISED = (
 @final
 @dataclass(frozen=True)
 class StabilityReport:
-    """Stability of a schedule at one inertia and speed, as :func:`certify` found it; ``print`` it.
+    """Stability of a schedule at one inertia and speed, computed by :func:`certify`; ``print`` gives a summary.
 
-    Guaranteed is the motion of this inertia, integrated exactly, without a force. What a real robot adds to it, above
-    all lag, saturation and contact, is not in it; what a position loop and a filter of the force do against a spring is
-    in ``environment_stiffness`` only. All rates and ratios hold whatever the units; stiffnesses of positions and of
+    The guarantees hold for the force-free motion of this inertia, integrated exactly. They exclude the effects of a
+    real robot, above all lag, saturation and contact; only ``environment_stiffness`` covers a position loop and a force
+    filter in contact with a spring. All rates and ratios are independent of units; stiffnesses of positions and of
     rotations are never compared.
 
     Attributes
     ----------
     damping_ratio : float
-        Smallest over the schedule and its axes, at each row with its own inertia.
+        Smallest damping ratio over the schedule and its axes, at each row with its own inertia.
     stiffness_ratio : float
-        Largest over smallest stiffness R, of all axes and times. NaN for poses and for an inertia that varies: the rule
-        below is false of these.
+        Ratio R of the largest to the smallest stiffness over all axes and times. NaN for poses and for a varying
+        inertia, for which the rule below does not hold.
     required_damping_ratio : float
-        Of damping ``2 zeta (M K)^1/2`` with one zeta, from here on any schedule within these limits is exponentially
+        Smallest zeta of damping ``2 zeta (M K)^1/2`` from which any schedule within these limits is exponentially
         stable: :func:`~torch_pbd.control.required_damping_ratio`. NaN where R is.
     stable_at_any_schedule : bool
-        Whether one function of the state was found that falls at every row. Any schedule of these rows and of blends of
-        their gains and inertias is then exponentially stable: in any order, held for any time or linear between rows,
-        at any speed up to ``any_schedule_speed``. What :meth:`Schedule.diagonal` makes of it is asked anew.
+        Whether a common Lyapunov function of all rows was found. Any schedule of these rows and of blends of their
+        gains and inertias is then exponentially stable: in any order, held for any time or linear between rows, at any
+        speed up to ``any_schedule_speed``. The result of :meth:`Schedule.diagonal` must be certified anew.
     any_schedule_rate : float
-        Rate at which the root of that function falls at least, 1/s; NaN where none was found.
+        Smallest decay rate of the root of that function in 1/s; NaN where none was found.
     any_schedule_speed : float
-        Replay speed up to which it falls; infinite but for poses that turn, whose angular velocity must be within that
-        speed's.
+        Replay speed up to which it decays; infinite, except for poses that rotate, which bound the angular velocity by
+        that at this speed.
     alpha : float
-        Constant of the certificate, 1/s.
+        Constant of the certificate in 1/s.
     margin : float
-        Rate at which the root of Kronander and Billard's V falls at least, 1/s: the smallest eigenvalue of ``-dV/dt``
-        relative to V, halved. Not negative: V never grows without a force, and the motion is
-        passive with respect to the force and ``v + alpha e``. Exact for gains that are linear between the rows.
-        Negative says that this certificate does not hold, not that the schedule is unstable.
+        Smallest decay rate of the root of Kronander and Billard's V in 1/s: the smallest eigenvalue of ``-dV/dt``
+        relative to V, halved. If it is not negative, V never grows without a force, and the motion is passive with
+        respect to the force and ``v + alpha e``. It is exact for gains that are linear between the rows. A negative
+        margin means that this certificate does not hold, not that the schedule is unstable.
     held_growth : float
-        Largest growth of such a V, of this alpha, a half or a quarter of it, over an interval between rows in which
-        the gains are held instead, as at the ticks of a controller: 1 is none. NaN without an alpha.
+        Largest growth of such a V, with this alpha, a half or a quarter of it, over an interval between rows with gains
+        held instead, as in the ticks of a controller; 1 is no growth. NaN without an alpha.
     margin_time : float
-        Time at which the margin is smallest, s.
+        Time of the smallest margin in s.
     max_speed : float
         Largest replay speed at which the margin is not negative; 1 is the schedule's own.
     gain : float
-        Largest growth of ``sqrt(v'Mv + e'Ke)`` over a part of the schedule from any state, gains held between
-        rows: not conservative. 1 is no growth. Of parts that all grow at a time, the 100 that have grown the most.
+        Largest growth of ``sqrt(v'Mv + e'Ke)`` over a part of the schedule from any state, with gains held between
+        rows; not conservative. 1 is no growth. If many parts grow at a time, the 100 that grew most are followed.
     environment_stiffness, environment_rotation : float
-        Stiffest spring, N/m, and for poses Nm/rad, that the robot can press on in the softest phase without vibrating,
-        behind its position loop. NaN where there is none: for an inertia that varies, which is that of an arm without
-        a position loop, and the second without an orientation.
+        Stiffest spring in N/m, and for poses Nm/rad, that the robot can press on in the softest phase without vibrating
+        with its position loop. NaN for a varying inertia, which is that of an arm without a position loop, and for the
+        second without an orientation.
     speed : float
         Replay speed.
     mass : float, tuple of rows, or None
         Inertia in kg, for poses also kg m and kg m^2; None if it varies.
     inertia : tuple of (float, float)
-        Smallest and largest of the positions, kg, and of the rotation, kg m^2.
+        Smallest and largest inertia of the positions in kg, and of the rotation in kg m^2.
     units : tuple of str
-        Units of the stiffness of positions, and of the rotation.
+        Units of the stiffness of positions and of the rotation.
     """
 
     damping_ratio: float
