@@ -1,4 +1,4 @@
-"""Demonstrations: the container, files, alignment, and made ones."""
+"""Demonstrations: container, files, alignment and synthetic data."""
 
 from torch_pbd.data.demonstrations import Demonstrations
 from torch_pbd.data.description import check_unimodal

@@ -1,4 +1,4 @@
-"""Bringing demonstrations onto one grid: interpolation, phase, dynamic time warping."""
+"""Alignment of demonstrations on one grid: interpolation, phase, dynamic time warping."""
 
 from collections.abc import Sequence
 
@@ -17,7 +17,7 @@ TIMING_REMOVED = (
 
 
 def interpolate(times: Floats, positions: Floats, query: Floats) -> Floats:
-    """Positions (n, d) at other times (m,), linearly between the samples; beyond them the end point is held."""
+    """Positions (m, d) at query times (m,), linear between samples and constant beyond them."""
     return np.column_stack([np.interp(query, times, column) for column in positions.T])
 
 
@@ -27,7 +27,7 @@ def unit_phases(times: Sequence[Floats]) -> list[Floats]:
 
 
 def times_from_start(times: Sequence[Floats], units: Sequence[float] | None = None) -> list[Floats]:
-    """Times of each demonstration since its start, in a unit of its own if there are some.
+    """Times of each demonstration since its start, divided by its own unit if ``units`` are given.
 
     Grids that differ only by rounding become one to the last bit: an estimator would otherwise not see that the
     demonstrations are aligned.
@@ -37,15 +37,15 @@ def times_from_start(times: Sequence[Floats], units: Sequence[float] | None = No
     for time, unit in zip(times, units or [1.0] * len(times), strict=True):
         own = (time - time[0]) / unit
         grid = grids.setdefault(len(time), own)
-        # Rounding is a billionth of the duration, or what large stamps resolve: each difference has two, and two grids
-        # are compared.
+        # Rounding is a billionth of the duration, or the resolution of large stamps: each difference has two errors,
+        # and two grids are compared.
         rounding = max(1e-9 * own[-1], 4.0 * np.spacing(np.abs(time[[0, -1]]).max()) / unit)
         shared.append(grid if np.abs(own - grid).max() <= rounding else own)
     return shared
 
 
 def check_overlap(times: Sequence[Floats], time_unit: str) -> None:
-    """Refuse recordings with less than half of their median duration in common: most samples would have no match."""
+    """Check that recordings share half of their median duration; otherwise most samples would have no match."""
     starts, ends = (np.array([time[i] for time in times]) for i in (0, -1))
     last, first = starts.argmax(), ends.argmin()
     # Times may lie so far apart that their difference is infinite, which is no overlap either.
@@ -60,7 +60,7 @@ def check_overlap(times: Sequence[Floats], time_unit: str) -> None:
 
 
 def dtw_path(a: Floats, b: Floats) -> NDArray[np.intp]:
-    """Pairs (p, 2) of samples that dynamic time warping matches between curves (n, d) and (m, d), ends with ends.
+    """Pairs (p, 2) of samples matched by dynamic time warping between curves (n, d) and (m, d) with fixed ends.
 
     The path minimizes the sum of squared distances over its pairs; each step advances one of the curves or
     both by one sample, and of equally good steps the one that advances both is taken (H. Sakoe, S. Chiba, IEEE
@@ -91,9 +91,9 @@ def dtw_warps(curves: Floats) -> Floats:
     """Phase (K, n) of each of the curves (K, n, d) as a function of a phase common to all, from exactly 0 to exactly 1.
 
     Every curve is matched with the medoid, the one with the least total distance to the others at equal phase; where
-    several of its samples match one of the medoid their mean counts, which makes the match a monotone map. The common
-    phase is the mean of these maps, so that the result has the mean timing of the demonstrations, not that of the
-    medoid: w_k = h_k(h^-1(s)), with h the mean of the h_k, average to the identity.
+    several of its samples match one of the medoid, their mean makes the match a monotone map h_k. The common phase is
+    the mean h of these maps, so that the result has the mean timing of the demonstrations, not that of the medoid: the
+    warps w_k = h_k(h^-1(s)) average to the identity.
     """
     flat = curves.reshape(len(curves), -1)
     medoid = int(np.argmin([np.linalg.norm(flat - curve, axis=1).sum() for curve in flat]))
@@ -109,15 +109,15 @@ def dtw_warps(curves: Floats) -> Floats:
 
 
 def comparable_scale(curves: Floats, units: Sequence[str] | None) -> Floats:
-    """Divisor (d,) of each output of curves (K, n, d), after which distances over all of them mean something.
+    """Divisor (d,) of each output of curves (K, n, d) that makes distances over all outputs meaningful.
 
-    One for all outputs of a unit, among which distances mean something before: axes may be turned.
+    Outputs of the same unit share one divisor, so that the result does not depend on their axes.
     """
     if units is None or len(set(units)) == 1:
         return np.ones(curves.shape[2])
     same = np.equal.outer(np.array(units), np.array(units))
     scale = np.sqrt(same @ curves.var(axis=(0, 1)) / same.sum(axis=1))
-    # An output that is constant but for rounding tells nothing about timing: 1e-12 is what sums of thousands of samples
-    # leave of float64's 1e-16.
+    # An output that is constant up to rounding has no information on timing: 1e-12 is the rounding of sums of
+    # thousands of samples in float64.
     rounding = 1e-12 * np.abs(curves).max(axis=(0, 1))
     return np.where(scale > rounding, scale, np.inf)

@@ -1,4 +1,4 @@
-"""The container: K recordings of one task, checked once, never changed."""
+"""Immutable container of K recordings of one task, checked once."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -39,49 +39,49 @@ class Demonstrations(Editing):
         Strictly increasing times of the samples, or one array that all demonstrations share. Whole numbers beyond
         2**53 (stamps in ns since 1970), which float64 cannot hold, are counted from the first of all: steps are exact.
     positions : sequence of K array_like of shape (T_k, d), or array_like of shape (K, T, d)
-        What was recorded, in d columns. Demonstrations of one output may be 1-D.
+        Recorded outputs in d columns. Demonstrations of one output may be 1-D.
     names : sequence of d str, default=None
         Names of the outputs; None calls them y0, y1, ...
     units : str or sequence of d str, default=None
         Units of the outputs; one string is the unit of all of them. Known are km, m, dm, cm, mm, um, rad and deg;
-        other words ("pixels") are units of their own. With ``rotation``, those of the other columns.
+        other words ("pixels") are units of their own. With ``rotation``, they are units of the other columns.
     frame : str, default=None
         Name of the coordinate frame.
     time_unit : str, default="s"
         Unit of ``times``: h, min, s, ms, us, ns; "1" for phase.
     alignment : {"phase", "dtw"}, default=None
-        How `align` brought the demonstrations onto one grid; None where it did not.
+        Method by which `align` brought the demonstrations onto one grid; None if it did not.
     missing : {"raise", "drop"}, default="raise"
-        "drop" leaves out samples of which the time or a position is NaN or masked, and warns
-        (``MissingDataWarning``) of how many; each demonstration then has its own times. Infinity is an error.
+        "drop" removes samples whose time or a position is NaN or masked, and warns of their number
+        (``MissingDataWarning``); each demonstration then has its own times. Infinity is an error.
     rotation : sequence of 4 str, default=None
-        Columns of a unit quaternion, in the order w x y z, wherever they stand: nothing in recordings tells x y z w
-        from it. They become three outputs rx, ry, rz in rad, the last ones: y = Log(R0' R), around the Frechet mean R0
-        of all samples at common phases.
+        Names of the columns of a unit quaternion in the order w x y z, which data cannot tell from x y z w. They become
+        the last three outputs rx, ry, rz in rad: y = Log(R0' R), around the Frechet mean R0 of all samples at common
+        phases.
     angles : str or sequence of str, default=None
-        Outputs in rad or deg that may jump by a turn: they go on over it, along time and between demonstrations.
+        Outputs in rad or deg to unwrap, along time and between demonstrations.
     rotation_reference : array_like of shape (4,), default=None
-        R0, of recordings whose last three outputs are such a rotation already.
+        Reference R0 of recordings whose last three outputs already are such a rotation.
 
     Attributes
     ----------
     times, positions, names, units, frame, time_unit, alignment, rotation_reference
-        As above: tuples of K read-only arrays, tuples of d strings; None where there is no rotation.
+        Parameters as tuples of K read-only arrays and tuples of d strings; the reference is None without rotation.
     suspects : tuple of str
-        Sentences on outputs that have no mean as they are, each with its remedy.
+        Warnings about outputs without a meaningful mean, such as wrapped angles, each with its remedy.
 
     Raises
     ------
     ValueError
-        If there is no demonstration, lengths or numbers of outputs disagree, one has (left) fewer than two samples, a
-        value is no finite real number, times do not increase strictly or are too coarse to tell samples apart, or a
-        unit is a known one in another spelling ("MM", "sec"). If a quaternion is not of norm 1 to the rounding of
-        files, or further than 150 degrees from the mean.
+        If there is no demonstration, lengths or numbers of outputs disagree, one has fewer than two (remaining)
+        samples, a value is not a finite real number, times do not increase strictly or are too coarse to separate
+        samples, or a unit is misspelled ("MM", "sec"). If a quaternion is not of norm 1 up to rounding in files, or
+        more than 150 degrees from the mean.
 
     Warns
     -----
     UserWarning
-        On suspects, and rotations further than 120 degrees from the mean.
+        If there are suspects, or rotations more than 120 degrees from the mean.
 
     Examples
     --------
@@ -113,7 +113,7 @@ class Demonstrations(Editing):
         if not isinstance(time_unit, str) or not time_unit:
             raise checks.refusal(time_unit, "time_unit", "the unit of the times", "'s', or '1' for phase")
         check_unit(time_unit, "time_unit", TIMES)
-        # A frozen class sets its attributes by its dictionary.
+        # A frozen class can set its attributes only through its dictionary.
         vars(self).update(
             as_outputs(times, positions, names, units, rotation, rotation_reference, angles, missing),
             frame=checks.text(frame, "frame", optional=True),
@@ -136,7 +136,7 @@ class Demonstrations(Editing):
 
     @property
     def is_aligned(self) -> bool:
-        """True if all demonstrations share exactly one grid of times."""
+        """Whether all demonstrations share exactly the same times."""
         return all(np.array_equal(time, self.times[0]) for time in self.times)
 
     def __len__(self) -> int:
@@ -150,7 +150,7 @@ class Demonstrations(Editing):
     @overload
     def __getitem__(self, index: slice | Sequence[int] | NDArray[Any]) -> "Demonstrations": ...
     def __getitem__(self, index: int | slice | Sequence[int] | NDArray[Any]) -> "Demonstration | Demonstrations":
-        """One demonstration by its number; several by a slice, a list of numbers or a mask."""
+        """One demonstration by its index, or several by a slice, a list of indices or a mask."""
         chosen = np.arange(len(self))[index]
         if chosen.ndim == 0:
             return Demonstration(self.times[chosen], self.positions[chosen])
@@ -175,26 +175,26 @@ class Demonstrations(Editing):
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # By way of __init__: NumPy forgets that an array is read-only when it is pickled or copied.
+        # Through __init__, since pickling or copying makes NumPy arrays writable again.
         return _rebuild, (self.times, self.positions, vars(self))
 
     def stack(self, input: Literal["time", "phase"] = "time") -> tuple[Floats, Floats, NDArray[np.intp]]:
-        """All samples below each other, as scikit-learn's estimators want them: without names, units and rotations.
+        """All samples as arrays for scikit-learn's estimators, without names, units and rotations.
 
         Parameters
         ----------
         input : {"time", "phase"}, default="time"
-            "phase" maps the time of each demonstration affinely onto 0..1. Rows of demonstrations whose grids
-            differ only by offset and duration repeat to the last bit, by which estimators know aligned data.
+            "phase" maps the time of each demonstration affinely onto 0..1. Grids that differ only by offset and
+            duration become equal to the last bit, by which estimators recognize aligned data.
 
         Returns
         -------
         X : ndarray of shape (n, 1)
-            Time in ``time_unit``, or phase. By time it is a ValueError if what all demonstrations have in common is
-            shorter than half of their median duration.
+            Time in ``time_unit``, or phase. Times raise a ValueError if all demonstrations share less than half of
+            their median duration.
         y : ndarray of shape (n, d)
         groups : ndarray of shape (n,)
-            Number of the demonstration, for GroupKFold and LeaveOneGroupOut.
+            Index of the demonstration, for GroupKFold and LeaveOneGroupOut.
         """
         checks.choice(input, "input", ("time", "phase"))
         if input == "time":
@@ -203,7 +203,7 @@ class Demonstrations(Editing):
         return X, np.concatenate(self.positions), np.repeat(np.arange(len(self)), self.n_steps)
 
     def split(self, k: int | Sequence[int]) -> tuple["Demonstrations", "Demonstrations"]:
-        """Leave demonstrations out: ``(train, test)``, where ``test`` has those numbered ``k``, and ``train`` some."""
+        """Split into ``(train, test)``: ``test`` has the demonstrations of indices ``k``, ``train`` all others."""
         held_out = np.zeros(len(self), dtype=bool)
         try:
             held_out[np.asarray(k)] = True
@@ -214,21 +214,21 @@ class Demonstrations(Editing):
         return self[~held_out], self[held_out]
 
     def to_array(self) -> Floats:
-        """Positions (K, T, d) of aligned demonstrations; ValueError if they do not share one grid of times."""
+        """Positions (K, T, d) of aligned demonstrations; a ValueError if they do not share their times."""
         if not self.is_aligned:
             are = f"not aligned (lengths {preview(self.n_steps)}, or times that differ)"
             raise InvalidParameterError(f"the demonstrations are {are}: use .align(), or .resample(n) for equal times.")
         return np.stack(self.positions)
 
     def plot(self, outputs: Sequence[int | str] | None = None, *, ax: Any = None) -> Any:
-        """Draw every demonstration: two or three outputs against each other, one or more than three over time.
+        """Plot all demonstrations: two or three outputs as a path, one or more than three over time.
 
         Parameters
         ----------
         outputs : sequence of int or str, default=None
-            Numbers or names of at most nine outputs; None is the first nine.
+            Indices or names of at most nine outputs; None is the first nine.
         ax : matplotlib.axes.Axes, default=None
-            None makes a figure of pyplot. Of projection "3d" for three outputs. It, or a list of some, is returned.
+            Axes to draw into and return, with projection "3d" for three outputs; None makes a pyplot figure.
         """
         from torch_pbd.plotting.display import plot_movements  # here: matplotlib takes a while to import
 
@@ -242,7 +242,7 @@ class Demonstrations(Editing):
 
 
 def _rebuild(times: Any, positions: Any, attributes: dict[str, Any]) -> Demonstrations:
-    """Demonstrations made of others, whose labels were checked and whose suspects were warned of."""
+    """Demonstrations from the checked contents of others, without repeating warnings about suspects."""
     rebuilt = object.__new__(Demonstrations)
     times, positions = as_recordings(times, positions, "raise")
     vars(rebuilt).update(attributes, times=times, positions=positions)

@@ -1,4 +1,4 @@
-"""Contents of recordings, likely mistakes in them, each with its remedy, and whether they follow one way."""
+"""Description of recordings, likely mistakes in them with remedies, and a check for several modes."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -15,14 +15,14 @@ from torch_pbd.data.units import ANGLES, LENGTHS, TIMES, quaternions
 from torch_pbd.exceptions import InvalidParameterError, UnimodalityWarning
 
 _MOST_ROWS = 20
-_PAUSE = 0.5  # s; shorter stillness is part of a movement
+_PAUSE = 0.5  # s: shorter stillness is part of a movement
 _GAP = 5.0  # median steps: two lost samples are no gap, a second of a sensor's silence is
-_ENDS = 0.2  # of the largest speed: a recording that is cut while moving
+_ENDS = 0.2  # share of the largest speed above which a recording counts as cut while moving
 _UNIX = 1e8  # s: no recording is three years long
-_RATES = 4.0, 5000.0  # Hz, in which hands and robots are recorded
-_LONGEST, _FURTHEST, _MOST_TURNED = 600.0, 10.0, 100.0  # s, m and rad of one movement
+_RATES = 4.0, 5000.0  # plausible sampling rates of hands and robots in Hz
+_LONGEST, _FURTHEST, _MOST_TURNED = 600.0, 10.0, 100.0  # largest plausible movement in s, m and rad
 
-_N_STEPS, _LEAST_DEMOS = 20, 6  # at which ways may part, and with which they can be told
+_N_STEPS, _LEAST_DEMOS = 20, 6  # steps at which modes are looked for, and fewest demonstrations that can show them
 # Gain of the criterion in nats, and distance of the two means in standard deviations within the groups. The best of all
 # splits of a sample from one normal distribution gains something too, and two halves of a uniform one lie 3.5 apart:
 # both bounds are above that, the second more so for whole demonstrations, in which there are more directions to choose.
@@ -33,18 +33,18 @@ _SHARE_OF_STEPS, _SHARE_OF_DEMOS = 0.25, 0.2
 
 @dataclass(frozen=True, repr=False)
 class Description:
-    """Tables of recordings and outputs, and sentences on likely mistakes.
+    """Tables of recordings and outputs, and likely mistakes in them.
 
     Attributes
     ----------
     recordings : list of dict
-        Number, samples, start, duration, rate, largest gap, and stillness at both ends, of each recording.
+        Index, samples, start, duration, rate, largest gap, and stillness at both ends of each recording.
     outputs : list of dict
-        Name, unit, least, largest and extent of each output.
+        Name, unit, minimum, maximum and extent of each output.
     mistakes : tuple of str
-        Each with its remedy; empty where nothing looks wrong.
+        Likely mistakes, each with its remedy; empty where nothing looks wrong.
     rotation : str
-        Sentence on the chart of the rotations; empty where there are none.
+        Sentence about the chart of the rotations; empty if there are none.
     """
 
     recordings: list[dict[str, Any]] = field(default_factory=list)
@@ -148,7 +148,7 @@ def _of_outputs(units: Any, outputs: list[dict[str, Any]], notes: Sequence[str])
 
 
 def _flips(demonstrations: Any) -> Iterator[str]:
-    """Unit quaternions, of which nobody named the order, or of which some are -q where others are q."""
+    """Mistakes in unit quaternions: columns that were not named as such, or signs that differ."""
     for place in quaternions(demonstrations.positions, demonstrations.n_outputs):
         columns = demonstrations.names[place : place + 4]
         name = f"Quaternion {', '.join(columns)}"
@@ -161,7 +161,7 @@ def _flips(demonstrations: Any) -> Iterator[str]:
 
 
 def _table(rows: list[dict[str, Any]]) -> str:
-    """Text of rows with the same keys, at most 80 letters wide."""
+    """Text table of rows with the same keys, at most 80 characters wide."""
     cells = [[*rows[0]], *([f"{v:.4g}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     widths[0] = min(widths[0], max(80 - sum(widths[1:]) - 2 * (len(widths) - 1), 8))
@@ -170,22 +170,22 @@ def _table(rows: list[dict[str, Any]]) -> str:
 
 
 def check_unimodal(demonstrations: Any) -> bool:
-    """Check that the demonstrations look like one way to do the task; warns if they do not.
+    """Check that the demonstrations have a single mode, with a warning if they do not.
 
-    The paper assumes one mode (Section II): between two ways around an obstacle, a mean goes through it. Looked at
-    are the direction in which the whole demonstrations differ most, and that at each of 20 steps: their places
-    along it are split into two groups with a common variance, and the split must be worth it by the Bayesian
-    information criterion and lie wide apart. Subtle cases are missed, and fewer than six demonstrations pass.
+    The paper assumes one mode (Section II): between two ways around an obstacle, a mean goes through it. The
+    demonstrations are projected on the direction in which they differ most, as a whole and at each of 20 steps, and
+    split into two groups of common variance. The split must pay by the Bayesian information criterion, with groups
+    far apart. Subtle cases are missed, and fewer than six demonstrations always pass.
 
     Parameters
     ----------
     demonstrations : Demonstrations
-        Aligned by phase here, if they are not.
+        Demonstrations, which are aligned by phase if necessary.
 
     Warns
     -----
     UnimodalityWarning
-        If there are two groups, or one demonstration far from all others; then it returns False.
+        If there are two groups, or one demonstration is far from all others; the result is then False.
     """
     is_recorded = isinstance(demonstrations, Resampling)  # of which Demonstrations, which it cannot import, are
     if not is_recorded:
@@ -194,7 +194,7 @@ def check_unimodal(demonstrations: Any) -> bool:
 
 
 def follow_one_way(curves: Floats) -> bool:
-    """Whether aligned demonstrations (K, T, d) look like one way to do the task; warns if they do not."""
+    """Whether aligned demonstrations (K, T, d) have a single mode, with a warning if they do not."""
     n_demos = len(curves)
     if n_demos < _LEAST_DEMOS:
         return True
@@ -220,7 +220,7 @@ def follow_one_way(curves: Floats) -> bool:
 def _best_split(residual: Floats) -> tuple[float, float, list[int]]:
     """Best split of the rows in two along the direction in which they differ most.
 
-    Gain of the criterion, distance of the two means in deviations, and numbers of the rows in the smaller group.
+    Returns the gain of the criterion, the distance of the means in standard deviations, and the smaller group's rows.
     """
     left, singular, _ = np.linalg.svd(residual, full_matrices=False)
     place = left[:, 0] * singular[0]

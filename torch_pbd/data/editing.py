@@ -1,4 +1,4 @@
-"""Demonstrations made of tables and of others: joined, selected, in other units, cut."""
+"""Demonstrations from tables, and joined, selected, in other units or cut."""
 
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, Self
@@ -24,19 +24,19 @@ class Editing(Resampling):
 
     @classmethod
     def from_frame(cls, table: Any, **options: Any) -> Self:
-        """Demonstrations of a table, a row a sample, in the order in which they first appear.
+        """Demonstrations from a table with one row per sample, in the order in which they first appear.
 
         Parameters
         ----------
         table : dataframe
-            Of pandas, polars, pyarrow or another library that narwhals knows. An index is ignored.
+            Table of pandas, polars, pyarrow or another library that narwhals supports; its index is ignored.
         **options
-            Those of `torch_pbd.data.load_demonstrations`, from ``outputs`` to ``from_start``.
+            Options of `torch_pbd.data.load_demonstrations`, from ``outputs`` to ``from_start``.
 
         Raises
         ------
         ValueError
-            If it is no dataframe, or does not have the columns that the options name, or no numbers in them.
+            If it is not a dataframe, or lacks columns that the options name, or these hold no numbers.
         """
         import narwhals
 
@@ -51,12 +51,12 @@ class Editing(Resampling):
         return wanted.finish([cls(**wanted.read_rows(chosen, signals))])
 
     def to_frame(self, library: Any = "pandas") -> Any:
-        """Table with columns demo, time and the outputs, a row a sample; a rotation as its quaternion, qw to qz.
+        """Table of one row per sample with columns demo, time and the outputs; rotations are quaternions qw to qz.
 
         Parameters
         ----------
         library : {"pandas", "polars", "pyarrow"} or module, default="pandas"
-            It must be installed.
+            Library of the table, which must be installed.
         """
         import narwhals
 
@@ -70,9 +70,9 @@ class Editing(Resampling):
 
     @classmethod
     def concatenate(cls, parts: Iterable[Self]) -> Self:
-        """All demonstrations of several sets, one after another; outputs, units, frame and unit of time must agree.
+        """Demonstrations of several sets in order; outputs, units, frame and unit of time must agree.
 
-        Rotations around different references are brought into one chart, around the mean of all.
+        Rotations around different references are converted to one chart, around the mean of all.
         """
         sets = [checks.instance(part, f"parts[{i}]", cls) for i, part in enumerate(parts)]
         if not sets:
@@ -94,22 +94,22 @@ class Editing(Resampling):
         return sets[0]._replace(times, positions, anew=True, alignment=alignment, rotation_reference=reference)
 
     def to_poses(self) -> tuple[list[Floats], list[Floats]]:
-        """Poses of which the last three outputs are the rotation.
+        """Poses as positions and unit quaternions, where the last three outputs are a rotation.
 
         Returns
         -------
         positions : list of K ndarray of shape (T_k, d - 3)
         quaternions : list of K ndarray of shape (T_k, 4)
-            w x y z; signs go on along time and from one demonstration to the next.
+            Unit quaternions w x y z, whose signs are continuous along time and between demonstrations.
         """
         if self.rotation_reference is None:
             raise InvalidParameterError("the demonstrations have no rotation: name its columns by rotation=, w x y z.")
-        # w >= 0 against the reference: signs go on.
+        # w >= 0 relative to the reference makes signs continuous.
         turns = [Chart(self.rotation_reference).exp(position[:, -3:]) for position in self.positions]
         return [position[:, :-3] for position in self.positions], turns
 
     def select(self, outputs: str | Sequence[str]) -> Self:
-        """These demonstrations with some of the outputs, in the order given; a rotation, all of it, stays last."""
+        """Demonstrations with the selected outputs, in the order given; a rotation is kept whole and last."""
         chosen = as_texts(outputs, "outputs")
         if not 0 < len(chosen) == len(set(chosen) & set(self.names)):
             raise checks.refusal([*chosen], "outputs", f"different ones of {preview(self.names)}")
@@ -121,20 +121,20 @@ class Editing(Resampling):
         return self._replace(self.times, positions, anew=True, **labels)
 
     def unwrap(self, angles: str | Sequence[str]) -> Self:
-        """These demonstrations with named angles that go on over a turn, along time and between demonstrations."""
+        """Demonstrations with the named angles unwrapped, along time and between demonstrations."""
         return self._replace(
             self.times, unwrapped(self.times, self.positions, self.names, self.units, angles), anew=True
         )
 
     def in_units(self, unit: str | None = None, time_unit: str | None = None) -> Self:
-        """These demonstrations in another unit of length or angle, and of time.
+        """Demonstrations in another unit of length or angle, and of time.
 
         Parameters
         ----------
         unit : str, default=None
-            A length or an angle, of the outputs that are such; outputs of other kinds, and rotations, stay as they are.
+            New unit of all outputs of its kind, length or angle; other outputs, and rotations, stay as they are.
         time_unit : str, default=None
-            h, min, s, ms, us or ns.
+            New unit of time: h, min, s, ms, us or ns.
         """
         times, positions, units = self.times, self.positions, self.units
         if unit is not None:
@@ -155,16 +155,16 @@ class Editing(Resampling):
         return self._replace(times, positions, units=units, time_unit=time_unit or self.time_unit)
 
     def cut(self, at: Literal["pauses"] | Sequence[tuple[float, float]] = "pauses", *, pause: float = 0.5) -> Self:
-        """One long recording as several demonstrations.
+        """Split one long recording into several demonstrations.
 
-        Where a column of a file tells them apart, ``demo=`` of `torch_pbd.data.load_demonstrations` does it.
+        Where a column of a file labels them, use ``demo=`` of `torch_pbd.data.load_demonstrations`.
 
         Parameters
         ----------
         at : "pauses" or sequence of (start, end), default="pauses"
-            Times of each demonstration, in ``time_unit``; "pauses" takes what lies between them.
+            Start and end of each demonstration in ``time_unit``; "pauses" splits at pauses.
         pause : float, default=0.5
-            Shortest pause, in ``time_unit``: for so long, all outputs stay within 2 % of their extent.
+            Shortest pause in ``time_unit``, during which all outputs stay within 2 % of their extent.
         """
         if len(self.times) != 1:
             raise InvalidParameterError(f"there are {len(self.times)} recordings, must be one to be cut, as [:1].")
@@ -181,19 +181,19 @@ class Editing(Resampling):
         return self._replace([time[a:b] for a, b in spans], [position[a:b] for a, b in spans], suspects=())
 
     def trim(self, method: Literal["still"] = "still", *, pause: float = 0.5) -> Self:
-        """Each demonstration without what is still at its ends, for longer than a ``pause`` as of :meth:`cut`."""
+        """Demonstrations without stillness at their ends that lasts longer than a ``pause`` as in :meth:`cut`."""
         checks.choice(method, "method", ("still",))
         times, positions = [], []
         for time, position in zip(self.times, self.positions, strict=True):
             moving = np.flatnonzero(~still(time, position, self, pause))
-            # One sample of stillness is kept at each end: it is where the movement starts and stops.
+            # One still sample is kept at each end, where the movement starts and stops.
             span = slice(max(moving[0] - 1, 0), moving[-1] + 2) if len(moving) else slice(None)
             times.append(time[span])
             positions.append(position[span])
         return self._replace(times, positions)
 
     def describe(self) -> "Description":
-        """Contents of the recordings, and likely mistakes in them: tables to print, and ``mistakes``."""
+        """Description of the recordings: tables to print, and likely ``mistakes``."""
         from torch_pbd.data.description import describe
 
         return describe(self)
@@ -211,5 +211,5 @@ def _span(time: Floats, start_end: Any, i: int) -> tuple[int, int]:
 
 
 def _convert(values: Floats, here: Any, there: Any) -> Floats:
-    """Values in another unit; whole numbers are divided by, as 1000 is exact and 0.001 is not."""
+    """Values in another unit, by division where the factor is a whole number: 1000 is exact and 0.001 is not."""
     return np.where(here >= there, values * (here / there), values / (there / here))

@@ -1,4 +1,4 @@
-"""Demonstrations from files and to files: the doors; each format has its own module, named in one table."""
+"""Loading and saving of demonstrations; each format has its own module, listed in one table."""
 
 import inspect
 import os
@@ -19,11 +19,11 @@ from torch_pbd.files.memory import require_memory
 
 Source = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 
-# Bytes in memory for each of a file that is read; of CSV 1.5 are measured, more with shorter numbers, of Parquet 4.
+# Bytes in memory per byte of a file that is read: measured are 1.5 for CSV, more with shorter numbers, 4 for Parquet.
 _COPIES = 10
 
-# Readers take (path, wanted, **options) and hand over arguments of Demonstrations; what they raise gets the path here.
-# Their modules are imported when a file of their kind is met, and what they need from extras with them.
+# Readers take (path, wanted, **options) and return arguments of Demonstrations; the path is added to their errors here.
+# Their modules, with optional dependencies, are imported when a file of their kind is read.
 _FORMATS = {".npz": "npz.read", ".npy": "npz.read_array_file", ".mat": "mat.read"}
 _FORMATS |= dict.fromkeys([".csv", ".txt", ".tsv"], "csv.read") | dict.fromkeys(
     [".bag", ".mcap", ".db3"], "rosbag.read"
@@ -31,7 +31,7 @@ _FORMATS |= dict.fromkeys([".csv", ".txt", ".tsv"], "csv.read") | dict.fromkeys(
 _FORMATS |= {".parquet": "datasets.read_parquet", ".zip": "datasets.read_zarr"}
 _FORMATS |= dict.fromkeys([".hdf5", ".h5"], "datasets.read_hdf5")
 _WRITTEN = {".npz": "npz.write", ".csv": "csv.write"}
-# Formats that are folders, by a file that only they have.
+# Formats that are folders, recognized by a file that only they contain.
 _FOLDERS = {
     "meta/info.json": "datasets.read_lerobot",
     ".zgroup": "datasets.read_zarr",
@@ -60,43 +60,42 @@ def load_demonstrations(
     max_bytes: int = MAX_BYTES,
     **options: Any,
 ) -> Demonstrations:
-    """Demonstrations from a file, a folder, or several files, in the format that the suffix says.
+    """Load demonstrations from a file, a folder, or several files, in the format of the suffix.
 
-    Tables: ``.csv``, ``.txt``, ``.tsv``, ``.parquet``, a header and a row a sample, each demonstration's in order of
-    time. Arrays: ``.npz`` as `save_demonstrations` writes it (``t`` and ``x``, or ``t_0``, ``x_0``, ``t_1``, ...) or
-    with other names, ``.npy``, ``.mat``, ``.zarr`` and ``.zip`` of one. Data sets: folders of LeRobot (v2, v3),
-    ``.hdf5`` of robomimic. ROS: folders of rosbag2, ``.mcap``, ``.db3``, ``.bag``. The page "Recordings of every kind"
-    has their layouts. Pickled objects are never loaded.
+    Tables (``.csv``, ``.txt``, ``.tsv``, ``.parquet``) have a header and one row per sample, in order of time within
+    each demonstration. Arrays are ``.npz`` as written by `save_demonstrations` (``t`` and ``x``, or ``t_0``, ``x_0``,
+    ``t_1``, ...) or with other names, ``.npy``, ``.mat``, ``.zarr`` and its ``.zip``. Data sets are folders of LeRobot
+    (v2, v3) and ``.hdf5`` of robomimic. ROS recordings are folders of rosbag2, ``.mcap``, ``.db3`` and ``.bag``. The
+    page "Recordings of every kind" has their layouts. Pickled objects are never loaded.
 
     Parameters
     ----------
     source : str, path-like, or sequence of them
-        A file; a folder; several files or a pattern such as "trial_*.csv", in which demonstrations follow each other.
+        File, folder, several files, or a pattern such as "trial_*.csv", whose demonstrations are concatenated.
         Numbers in the names of a folder or a pattern are sorted as numbers.
     outputs : str or sequence of str, default=None
-        Columns of the outputs, in the order wanted; None takes what the format means, or all the others, if each has a
-        name, and none is a count of rows (``frame_index``) or a number of its demonstration (``task_index``).
+        Columns of the outputs, in this order; None takes the format's default, or all named columns that neither count
+        rows (``frame_index``) nor number demonstrations (``task_index``).
     demo : str, default=None
-        Column that tells the demonstrations apart, by any text. None takes "demo", if there is such a column; without
-        it a table is one demonstration. Of bags a second topic, of Bool, String or whole numbers (std_msgs): each
-        stretch over which it says the same is a demonstration, but for those of False, of an empty text, and of a 0
-        that it comes back to.
+        Column with a label of the demonstration, of any text; None takes "demo" if present, else a table is one
+        demonstration. For bags it is a second topic of Bool, String or whole numbers (std_msgs): each stretch of
+        constant value is a demonstration, except False, empty texts, and a 0 that recurs.
     time : str, default=None
-        Column of times; None takes "time", or what the format says.
+        Column of times; None takes "time", or the format's default.
     rate : float, default=None
-        Samples a second, where the samples are evenly spaced: times are counted from it, and those of the file ignored.
+        Sampling rate in Hz of evenly spaced samples, which replaces the times in the file.
     rotation, angles, units, time_unit, frame, missing
-        As in `Demonstrations`; None takes those in the file, if it holds them. Dates and times of day become seconds
-        from the first of all. Quaternions of ROS and robosuite stand as x y z w; ``rotation`` names them w x y z.
+        Parameters of `Demonstrations`; None takes those in the file, if any. Dates and times of day become seconds
+        since the first of all. Quaternions of ROS and robosuite are stored x y z w; ``rotation`` names them w x y z.
     in_units : str or sequence of str, default=None
-        Convert to these units, as `Demonstrations.in_units` does: "m", or ["m", "s"] with that of the times. ``units``
-        and ``time_unit`` say what the numbers in the file are, and change none of them.
+        Units to convert to, as by `Demonstrations.in_units`: "m", or ["m", "s"] with that of the times. ``units`` and
+        ``time_unit`` describe the numbers in the file without converting them.
     cut, trim, from_start
-        One recording as several, no stillness at ends, times from 0: see the methods of `Demonstrations`.
+        Whether to split one recording, remove stillness at ends, and count times from 0: see `Demonstrations`.
     max_bytes : int, default=512 MiB
-        Larger files (.npz: unpacked) are refused before they are read.
+        Largest size of a file (for .npz: unpacked) that is read.
     **options
-        Of a format. CSV: ``delimiter`` (None finds it among comma, semicolon and tab), ``decimal`` ("." or ",").
+        Options of a format. CSV: ``delimiter`` (None detects comma, semicolon or tab), ``decimal`` ("." or ",").
         ROS: ``topic``, and ``child``, the frame of transforms. HDF5: ``mask``, a list of demonstrations in the file.
         MATLAB: ``variable`` that holds the recordings.
 
@@ -105,18 +104,18 @@ def load_demonstrations(
     FileNotFoundError, ModuleNotFoundError
         If there is no such file, or its format needs a library that is not installed.
     ValueError, TypeError
-        If the suffix is not known, or an option is not as described, or not one of the format's.
+        If the suffix is unknown, or an option is invalid or not one of the format's.
     DataFormatError
-        If the file is not what its suffix says, with the array, or the line and the column; or too large.
+        If the file does not match its suffix, with the array, or the line and the column; or if it is too large.
     """
     given = locals()
     return _read(source, Wanted(**{name: given[name] for name in OPTIONS}), options)
 
 
 def inspect_demonstrations(source: Source, **options: Any) -> tuple[Demonstrations, Description]:
-    """Demonstrations as far as they can be read, and their description; takes the options of `load_demonstrations`.
+    """Load demonstrations as far as possible, with a description; takes the options of `load_demonstrations`.
 
-    What that function would refuse is left out or guessed, if there is a way, and said among the ``mistakes``.
+    Contents that raise an error there are left out or guessed where possible, and listed in ``mistakes``.
     """
     notes: list[str] = []
     common = {name: options.pop(name) for name in OPTIONS if name in options}
@@ -129,7 +128,7 @@ def inspect_demonstrations(source: Source, **options: Any) -> tuple[Demonstratio
 
 
 def find_files(source: Source) -> list[Path]:
-    """Files, or folders that are one recording, of a source; FileNotFoundError if there is none."""
+    """Files of a source, or folders that are one recording; a FileNotFoundError if there are none."""
     if isinstance(source, Sequence) and not isinstance(source, str):
         if not source:
             raise checks.refusal(source, "source", "a path, or a list of some")
@@ -174,22 +173,22 @@ def _load(file: Path, wanted: Wanted, options: dict[str, Any]) -> Demonstrations
 
 
 def save_demonstrations(demonstrations: Demonstrations, path: str | os.PathLike[str]) -> None:
-    """Write demonstrations to ``path``, in the format that its suffix says (.npz or .csv).
+    """Write demonstrations to ``path``, in the format of its suffix (.npz or .csv).
 
-    All numbers come back to the last bit. The file appears complete or not at all, and replaces one that is there.
-    CSV files hold no units, no frame and no checksum, and rotations as quaternions, columns qw, qx, qy, qz, which are
-    named by ``rotation`` to be read; .npz files hold them as they are, with their reference.
+    All numbers read back to the last bit. The file is written atomically and replaces an existing one. CSV files
+    have no units, frame or checksum, and store rotations as quaternion columns qw, qx, qy, qz, which ``rotation`` must
+    name on loading; .npz files store rotations as they are, with their reference.
 
     Parameters
     ----------
     demonstrations : Demonstrations
     path : str or path-like
-        Its folder must exist.
+        File to write, in an existing folder.
 
     Raises
     ------
     ValueError
-        If the suffix is not known, or a name of an output cannot be a column of a CSV file.
+        If the suffix is unknown, or an output's name cannot be a column of a CSV file.
     """
     file = Path(path)
     write = _function(file, _WRITTEN.get(file.suffix.lower()), _WRITTEN)
@@ -198,7 +197,7 @@ def save_demonstrations(demonstrations: Demonstrations, path: str | os.PathLike[
 
 
 def _reader_of(path: Path) -> str | None:
-    """Place of the reader of a file, or of a folder that is one recording; a .zip is a file."""
+    """Location of the reader of a file, or of a folder that is one recording; a .zip is a file."""
     own = None if path.is_dir() else _FORMATS.get(path.suffix.lower())
     return next((place for mark, place in _FOLDERS.items() if (path / mark).is_file()), own)
 

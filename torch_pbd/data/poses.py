@@ -1,4 +1,4 @@
-"""Outputs that turn: four columns of a quaternion as three in a chart around the mean rotation, and back; angles."""
+"""Rotations and angles: quaternions to and from a chart around their mean, and unwrapping."""
 
 import math
 from collections.abc import Sequence
@@ -20,13 +20,13 @@ QUATERNION = ("qw", "qx", "qy", "qz")
 # Degrees from the reference. The chart ends at 180, where y and -y are one rotation; a normal distribution in it that
 # is 15 degrees wide has two standard deviations left at 150.
 _FAR, _FURTHEST = 120.0, 150.0
-_N_PHASES = 201  # of each recording in the mean: it does not hang on how long or how densely each was sampled
+_N_PHASES = 201  # phases of each recording in the mean, so that duration and sampling rate do not weigh in
 
 
 def as_outputs(
     times: Any, positions: Any, names: Any, units: Any, rotation: Any, reference: Any, angles: Any, missing: Any
 ) -> dict[str, Any]:
-    """Recordings and labels as `torch_pbd.data.Demonstrations` holds them; a rotation is three outputs, the last."""
+    """Recordings and labels as in `torch_pbd.data.Demonstrations`, with a rotation as the last three outputs."""
     times, positions = as_recordings(times, positions, missing)
     names = as_names(names, positions[0].shape[1])
     if rotation is None:
@@ -42,7 +42,7 @@ def as_outputs(
 
 
 def _as_reference(reference: Any, times: Any, positions: Any, names: Any, units: Any) -> Floats:
-    """Reference of the chart in which the last three outputs were before, as in a file."""
+    """Checked reference of the chart in which the last three outputs already are, as in a file."""
     quaternion = checks.array(reference, "rotation_reference", (4,))
     if abs(float(quaternion @ quaternion) - 1.0) > checks.ROUNDING:
         raise checks.refusal(reference, "rotation_reference", "a unit quaternion w x y z")
@@ -54,7 +54,7 @@ def _as_reference(reference: Any, times: Any, positions: Any, names: Any, units:
 
 
 def _as_chart(times: Any, positions: Any, names: Any, units: Any, rotation: Any, missing: Any) -> tuple[Any, ...]:
-    """Recordings and labels whose four columns of a quaternion have become three in the chart, and its reference."""
+    """Recordings and labels with the four quaternion columns as three in the chart, and its reference."""
     chosen = as_texts(rotation, "rotation")
     if not len(chosen) == len(set(chosen)) == len(set(chosen) & set(names)) == 4:
         must = f"four different ones of {preview(names)}, in the order w x y z, wherever these stand"
@@ -87,14 +87,14 @@ def mean_rotation(times: Sequence[Floats], quaternions: Sequence[Floats]) -> Flo
 def charted(
     times: Sequence[Floats], places: Sequence[Floats], quaternions: Sequence[Floats], reference: Floats
 ) -> list[Floats]:
-    """Outputs (T_k, p + 3) of poses, the rotations in the chart around a reference; refuses those far from it."""
+    """Outputs (T_k, p + 3) of poses with rotations in the chart around a reference; far rotations raise an error."""
     turns = list(map(Chart(reference).log, quaternions))
     _check_reach(times, turns)
     return [np.column_stack([place, turn]) for place, turn in zip(places, turns, strict=True)]
 
 
 def as_columns(demonstrations: Any) -> tuple[tuple[str, ...], Sequence[Floats]]:
-    """Names and columns (T_k, ...) for tables: what other programs read, a rotation as its quaternion."""
+    """Names and columns (T_k, ...) for tables of other programs, with rotations as quaternions."""
     names, columns = demonstrations.names, demonstrations.positions
     if demonstrations.rotation_reference is not None:
         names = as_names((*names[:-3], *QUATERNION), len(names) + 1)
@@ -116,10 +116,10 @@ def with_whole_rotation(chosen: Sequence[str], names: Sequence[str], reference: 
 
 
 def unwrapped(times: Any, positions: Any, names: Any, units: Any, angles: Any) -> list[Floats]:
-    """Outputs (T_k, d) of which the named angles go on over a turn, along time, and from one recording to the next.
+    """Outputs (T_k, d) with the named angles unwrapped, along time and from one recording to the next.
 
-    Recordings are brought to the turn nearest to the direction that their means have in common. All of them are then
-    turned back together by what the median recording was turned by: joints keep the turn that a robot knows.
+    Recordings are shifted to the turn nearest to the direction that their means have in common. All are then shifted
+    back together by the turns of the median recording, so that joints keep the turn that a robot knows.
     """
     positions = [np.array(position) for position in positions]
     for name in as_texts(angles, "angles"):
@@ -141,7 +141,7 @@ def unwrapped(times: Any, positions: Any, names: Any, units: Any, angles: Any) -
 
 
 def _unit(quaternion: Floats, k: int, names: Sequence[str]) -> Floats:
-    """Quaternions (T, 4) of norm one of recorded ones, which are rounded."""
+    """Normalized quaternions (T, 4) from recorded, rounded ones."""
     norm = np.linalg.norm(quaternion, axis=1)
     what, remedy = (
         f"the norm of {', '.join(names)} in positions[{k}]",

@@ -1,4 +1,4 @@
-"""Recordings before they become ``Demonstrations``: rows of finite samples at times that rise, and their labels."""
+"""Checks of recordings before they become ``Demonstrations``: finite samples, increasing times, labels."""
 
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -20,13 +20,13 @@ Arrays = list[NDArray[Any]]
 
 
 class Fresh(list[NDArray[Any]]):
-    """Arrays that nobody else has: they need not be copied."""
+    """Arrays without other references, which need not be copied."""
 
 
 def as_recordings(times: Any, positions: Any, missing: str) -> tuple[tuple[Floats, ...], tuple[Floats, ...]]:
-    """Read-only float64 copies: K times (T_k,) and K positions (T_k, d), less the missing samples if these are dropped.
+    """Read-only float64 copies of K times (T_k,) and positions (T_k, d), without missing samples if these are dropped.
 
-    Messages number the samples as they were before. `Fresh` positions are no copies.
+    Messages use the original sample indices. `Fresh` positions are not copied.
     """
     drop = checks.choice(missing, "missing", Missing) == "drop"
     samples = [_samples(entry, f"positions[{k}]", drop) for k, entry in enumerate(_as_list(positions, "positions"))]
@@ -62,7 +62,7 @@ def as_recordings(times: Any, positions: Any, missing: str) -> tuple[tuple[Float
 
 
 def as_texts(values: Any, name: str, n_outputs: int | None = None) -> tuple[str, ...]:
-    """Several texts, or one; one for each output, if their number is given."""
+    """Several texts or one; one per output if their number is given."""
     if not isinstance(values, str | list | tuple | np.ndarray):
         raise checks.refusal(values, name, "strings")
     entries = (values,) if isinstance(values, str) else values
@@ -74,7 +74,7 @@ def as_texts(values: Any, name: str, n_outputs: int | None = None) -> tuple[str,
 
 
 def as_names(names: Any, n_outputs: int) -> tuple[str, ...]:
-    """Name for each output, all different; y0, y1, ... where none are given."""
+    """Distinct names of the outputs; y0, y1, ... by default."""
     values = as_texts([f"y{i}" for i in range(n_outputs)] if names is None else names, "names", n_outputs)
     if len(set(values)) < n_outputs:
         raise InvalidParameterError(f"names must differ from each other; got {preview(values)}.")
@@ -82,7 +82,7 @@ def as_names(names: Any, n_outputs: int) -> tuple[str, ...]:
 
 
 def as_units(units: Any, n_outputs: int) -> tuple[str, ...] | None:
-    """Unit for each output, or None; one string is that of all."""
+    """Unit of each output, or None; one string is the unit of all."""
     if units is None:
         return None
     one = isinstance(units, str)
@@ -93,7 +93,7 @@ def as_units(units: Any, n_outputs: int) -> tuple[str, ...] | None:
 
 
 def preview(values: Sequence[object], limit: int = 12) -> str:
-    """Values as a list, cut where it gets long."""
+    """Text of the values, truncated where it is long."""
     shown = ", ".join(str(value) for value in values[:limit])
     return f"[{shown}, ... {len(values)} in all]" if len(values) > limit else f"[{shown}]"
 
@@ -117,7 +117,7 @@ def _as_list(values: Any, name: str) -> list[Any]:
 
 
 def _numbers(values: Any, name: str, drop: bool) -> NDArray[Any]:
-    """Finite numbers in their own type, as whole ones beyond 2**53 are exact in none else; if wanted, and NaN."""
+    """Finite numbers, with ``drop`` also NaN, in their own type, since float64 rounds integers beyond 2**53."""
     if drop and np.ma.is_masked(values):
         values = np.ma.filled(np.ma.asarray(values, dtype=np.float64), np.nan)
     array = checks.real_array(values, name)
@@ -146,7 +146,7 @@ def _grid(values: Any, name: str, drop: bool) -> NDArray[Any]:
 
 
 def _not_missing(grids: Arrays, samples: Arrays) -> list[NDArray[np.intp]]:
-    """Numbers of the samples of which neither the time nor a position is NaN; warns of how many are."""
+    """Indices of the samples without NaN in time and position; warns of the number of others."""
     holes = [np.isnan(grid) | np.isnan(sample).any(1) for grid, sample in zip(grids, samples, strict=True)]
     lost = {k: (int(hole.sum()), len(hole)) for k, hole in enumerate(holes) if hole.any()}
     for k, (n_lost, n) in lost.items():
@@ -168,7 +168,7 @@ def _not_missing(grids: Arrays, samples: Arrays) -> list[NDArray[np.intp]]:
 
 
 def _from_common_origin(grids: Arrays) -> Arrays:
-    """Times; where whole numbers are beyond what float64 holds, from the first of them on, so that steps stay exact."""
+    """Times; integers too large for float64 are counted from the first one, so that steps stay exact."""
     beyond = [grid for grid in grids if grid.dtype.kind in "iu" and max(grid.max(), -int(grid.min())) > 2**53]
     if not beyond:
         return grids
@@ -178,7 +178,7 @@ def _from_common_origin(grids: Arrays) -> Arrays:
 
 
 def _rising(grid: NDArray[Any], original: NDArray[Any], name: str, numbers: NDArray[np.intp]) -> Floats:
-    """Times that rise strictly; messages show them as in ``original``."""
+    """Checked strictly increasing times; messages show them as in ``original``."""
     time = frozen(grid)
     if np.ptp(0.25 * time) > _LONGEST:
         far = f"{name} goes from {time.min():.3g} to {time.max():.3g}"
@@ -186,7 +186,7 @@ def _rising(grid: NDArray[Any], original: NDArray[Any], name: str, numbers: NDAr
     coarse = ""
     if original.dtype.kind == "f" and original.dtype.itemsize < 8:  # such as Unix time in float32
         resolution, step = float(np.spacing(np.abs(original).max())), (time[-1] - time[0]) / (len(time) - 1)
-        # A quarter of a step moves a derivative by as much: what is finer is left to smoothing.
+        # A resolution of a quarter of a step changes a derivative by as much; finer errors are left to smoothing.
         if resolution > 0.25 * step:
             coarse = f" It is {original.dtype}, which resolves {resolution:.3g} at {time[-1]:.6g}, where the mean step "
             coarse += f"is {step:.3g}: record times as float64, or count them from the start."

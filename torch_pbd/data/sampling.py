@@ -1,4 +1,4 @@
-"""Samples in time: how far apart they are, where they rest, and demonstrations at other times."""
+"""Sampling of demonstrations: spacing, gaps, stillness, smoothing and resampling."""
 
 from typing import Any, Literal, Self
 
@@ -16,8 +16,8 @@ from torch_pbd.files.memory import require_much
 
 Alignment = Literal["phase", "dtw"]
 
-_ROUNDING = 1e-12  # of a recording's time: a point of an even grid that is so near to a sample lies on it
-_MOST_STEPS = 200  # that align takes of its own accord: dynamic time warping takes time in their square
+_ROUNDING = 1e-12  # share of a recording's time within which a point of an even grid lies on a sample
+_MOST_STEPS = 200  # default limit of align's steps, as dynamic time warping takes time in their square
 
 
 class Resampling:
@@ -37,18 +37,18 @@ class Resampling:
         raise NotImplementedError
 
     def resample(self, n: int, *, max_gap: float | None = None) -> Self:
-        """Each demonstration at ``n`` points evenly spaced over its own time, by linear interpolation.
+        """Demonstrations at ``n`` points evenly spaced over each one's own time, by linear interpolation.
 
-        Rotations are interpolated in their chart, which between neighbouring samples is the shortest turn to second
-        order in its angle. Demonstrations that start and end at the same times are aligned afterwards.
+        Rotations are interpolated in their chart, which between neighbouring samples is the shortest rotation to second
+        order in its angle. Demonstrations that start and end at the same times become aligned.
 
         Parameters
         ----------
         n : int
             Number of points over the whole time of each demonstration.
         max_gap : float, default=None
-            In ``time_unit``. Points between samples that are further apart are left out, so that holes stay holes and
-            nothing counts as seen that was not; None bridges them by straight lines.
+            Largest gap between samples, in ``time_unit``, that is interpolated; points in larger gaps are left out, so
+            that missing data stay missing. None interpolates all.
         """
         most = np.inf if max_gap is None else checks.number(max_gap, "max_gap", above=0.0, unit=self.time_unit)
         grids = []
@@ -60,16 +60,16 @@ class Resampling:
         return self._replace(grids, list(map(interpolate, self.times, self.positions, grids)))
 
     def low_pass(self, cutoff: float) -> Self:
-        """These demonstrations without what is faster, at their own times.
+        """Low-pass filtered demonstrations at their own times.
 
-        Each is the cubic smoothing spline that halves amplitudes at the cutoff: a Butterworth filter of second order
-        forward and backward, without lag, at times that need not be even. ``DMPController`` smooths what it is given
-        itself; covariance regressors and movement models take recordings with all their noise.
+        Each is the cubic smoothing spline that halves amplitudes at the cutoff: a second-order Butterworth filter run
+        forward and backward, without lag, at even or uneven times. ``DMPController`` smooths its input itself;
+        covariance regressors and movement models use recordings with all their noise.
 
         Parameters
         ----------
         cutoff : float
-            In Hz; where ``time_unit`` is no time, in cycles per unit of it. Each needs five samples.
+            Cutoff frequency in Hz, or in cycles per unit of phase. Each demonstration needs five samples.
         """
         each = checks.number(cutoff, "cutoff", above=0.0, unit="Hz") * TIMES.get(self.time_unit, 1.0)
         smooth = []
@@ -87,11 +87,11 @@ class Resampling:
         Parameters
         ----------
         method : {"phase", "dtw"}, default="phase"
-            "phase" is linear time normalization. "dtw" then takes differences of timing out by dynamic time warping
+            "phase" is linear time normalization. "dtw" then removes differences of timing by dynamic time warping
             (``torch_pbd.data.alignment.dtw_warps``), keeping the ends of each demonstration and the mean timing of all.
-            It also takes for timing what only looks like it: use it where the shape is what matters, and not to predict
-            new demonstrations, in which the timing comes back (measured: 3.7 nats a step worse). It compares positions
-            in their units; outputs whose ``units`` differ in standard deviations of all outputs of one unit.
+            It also removes variation that only resembles timing: use it where shape matters, and not to predict new
+            demonstrations, whose timing varies again (measured: 3.7 nats per step worse). Positions are compared in
+            their units; if ``units`` differ, in standard deviations over all outputs of a unit.
         n : int, default=None
             Number of phases; None takes the median number of samples, at most 200. "dtw" takes time and memory in
             proportion to its square.
@@ -106,12 +106,12 @@ class Resampling:
         if method == "dtw":
             warps = dtw_warps(np.stack(positions) / comparable_scale(np.stack(positions), units))
             positions = list(map(interpolate, phases, self.positions, warps))
-        # Timing that was taken out stays out, whatever is done to the demonstrations afterwards.
+        # Timing that was removed stays so, whatever is done to the demonstrations afterwards.
         alignment = "dtw" if "dtw" in (method, self.alignment) else "phase"
         return self._replace(grid, positions, time_unit="1", alignment=alignment)
 
     def from_start(self) -> Self:
-        """These demonstrations, each counted from its start; grids that then agree but for rounding become one."""
+        """Demonstrations with times since each one's start; grids that then agree up to rounding become equal."""
         return self._replace(times_from_start(self.times), self.positions)
 
 
@@ -132,9 +132,9 @@ LEAST_SAMPLES = 5
 
 
 def spacing_of(time: Floats) -> float:
-    """Distance of neighbouring samples: the median of those that a 400th of the recording tells apart.
+    """Spacing of neighbouring samples: the median over samples at least a 400th of the recording apart.
 
-    Of recordings finer than 200 samples it is a 200th: their shortest hole is then a matter of the movement.
+    It is at least a 200th of the recording, so that the shortest gap of denser ones depends on the movement alone.
     """
     lasting = time[-1] - time[0]
     _, first = np.unique(np.floor(2 * _FINEST * ((time - time[0]) / lasting)), return_index=True)
@@ -142,15 +142,14 @@ def spacing_of(time: Floats) -> float:
 
 
 def holes_of(time: Floats) -> NDArray[np.intp]:
-    """Indices (m,) of the samples before a hole: 7.5 spacings or more, whose middle is unknown."""
+    """Indices (m,) of the samples before a gap of 7.5 spacings or more, whose middle is unknown."""
     return np.flatnonzero(np.diff(time) > (KNOWN + LOST) * spacing_of(time))
 
 
 def smoothing_spline(time: Floats, position: Floats, cutoff: float) -> BSpline:
     """Cubic smoothing spline of a recording that halves amplitudes at ``cutoff``, in cycles per unit of its time.
 
-    At even sampling it is a Butterworth filter of second order run forward and backward; it takes the times as they
-    are, even or not.
+    At even sampling it is a second-order Butterworth filter run forward and backward; times may be uneven.
     """
     # Weights by the spacing make the sum an integral: lam = 1 / w^4 then halves the amplitude at w. In units of
     # the mean spacing and of each output's spread, which keeps the spline's equations well conditioned. A sample
@@ -168,9 +167,9 @@ def smoothing_spline(time: Floats, position: Floats, cutoff: float) -> BSpline:
 
 
 def extents(position: Floats, demonstrations: Any) -> Floats:
-    """Extent (d,) of each output in a recording; of a rotation the largest of the three for all of them.
+    """Extent (d,) of each output in a recording; the three of a rotation share the largest one.
 
-    A tool that turns about one axis trembles about the others, and all axes are as good.
+    A tool that turns about one axis trembles about the others, and the choice of axes is arbitrary.
     """
     extent = np.ptp(position, axis=0)
     if demonstrations.rotation_reference is not None:
@@ -181,7 +180,7 @@ def extents(position: Floats, demonstrations: Any) -> Floats:
 def still(time: Floats, position: Floats, demonstrations: Any, pause: float) -> NDArray[np.bool_]:
     """Samples (T,) in a stretch of at least ``pause`` in which no output leaves 2 % of its extent."""
     checks.number(pause, "pause", above=0.0)
-    # Evenly spaced, as windows are of samples; ten of them in a pause.
+    # Resampled evenly, as windows count samples, with at least ten samples per pause.
     n = int(min(max(np.ceil(10.0 * (time[-1] - time[0]) / pause), len(time)), 100_000))
     grid = np.linspace(time[0], time[-1], n)
     width, extent = max(2, int(np.ceil(pause / (grid[1] - grid[0]))) + 1), extents(position, demonstrations)

@@ -1,4 +1,4 @@
-"""Demonstrations whose covariance is known: the simulation of the paper, and a tunnel that narrows."""
+"""Synthetic demonstrations of known covariance: the simulation of the paper and a narrowing tunnel."""
 
 from typing import Literal
 
@@ -18,12 +18,11 @@ Seed = int | Random | None
 PATH_LENGTH = 0.6
 """Distance that the tunnel task covers along y, in m."""
 
-# Of a good optical tracker: resolution of the recorded positions and noise along the path, in m; and of a hand.
+# Resolution of positions and noise along the path of a good optical tracker, and tremor of a hand, in m.
 _QUANTUM, _NOISE, _TREMOR = 5e-6, 2e-6, 1e-4
-# The wandering and the correcting that a lane has, normal numbers of unit variance times these; and the share of the
-# half-width that it leaves.
+# Scales of the unit-variance wandering and correcting of a lane, and the share of the half-width that it stays within.
 _WANDER, _CORRECTION, _WITHIN = 0.12, 0.04, 0.85
-_BLENDED = 0.15  # of the path, next to an end that is common
+_BLENDED = 0.15  # share of the path next to a common end in which lanes blend
 
 
 def paper_mean(xi: ArrayLike) -> Floats:
@@ -41,7 +40,7 @@ def paper_covariance(xi: ArrayLike, reading: Reading = "bell") -> Floats:
     Parameters
     ----------
     xi : array_like of shape (n,) or (n, 1)
-        Above -150, where the variances are positive; the paper uses -100 to 100.
+        Inputs above -150, where the variances are positive; the paper uses -100 to 100.
     reading : {"bell", "printed", "bowl"}, default="bell"
         The paper prints s as ``150 exp(-xi/50)^2``, which can be read as ``150 exp(-(xi/50)^2)`` ("bell"),
         as ``150 (exp(-xi/50))^2`` ("printed"), or with the sign inside the square, ``150 exp((xi/50)^2)``
@@ -70,15 +69,15 @@ def make_paper_simulation(
     ----------
     n_inputs : int, default=10
     n_demos : int, default=50
-        Draws at each input.
+        Number of draws at each input.
     reading : {"bell", "printed", "bowl"}, default="bell"
-        See `paper_covariance`.
+        Reading of eq. (14), see `paper_covariance`.
     random_state : int, Generator, RandomState or None, default=None
 
     Returns
     -------
     X : ndarray of shape (n_inputs * n_demos, 1)
-        Demonstration by demonstration; the inputs repeat exactly.
+        Inputs, demonstration by demonstration, which repeat exactly.
     y : ndarray of shape (n_inputs * n_demos, 2)
     groups : ndarray of shape (n_inputs * n_demos,)
     """
@@ -114,7 +113,7 @@ def make_tunnel_demonstrations(
     common_start: bool = False,
     common_goal: bool = False,
 ) -> Demonstrations:
-    """A hand that moves through a tunnel which narrows: free where it is wide, precise where it is narrow.
+    """Demonstrations of a hand in a narrowing tunnel: free where it is wide, precise where it is narrow.
 
     The hand moves along y at constant speed over 0.6 m. Across, it is at ``tunnel_center(y) + 0.85
     tunnel_half_width(y) tanh(lane + 0.12 w(t) + 0.04 c(t))`` with a lane drawn uniformly from [-0.6, 0.6] for each
@@ -126,9 +125,9 @@ def make_tunnel_demonstrations(
     ----------
     n_demos : int, default=6
     duration : float, default=10.0
-        In s.
+        Duration of each demonstration in s.
     rate : float, default=100.0
-        Samples a second.
+        Sampling rate in Hz.
     random_state : int, Generator, RandomState or None, default=None
     variant : str, default="plain"
         - "plain": aligned;
@@ -138,8 +137,8 @@ def make_tunnel_demonstrations(
         - "outlier": the last demonstration leaves the tunnel, by 10 cm where it is narrow;
         - "two_path": lanes keep to one side or the other, 0.4 to 0.6 from the middle, in equal numbers.
     common_start, common_goal : bool, default=False
-        All start, or end, on the centre line, with a minimum-jerk blend from and to their lanes in the first and the
-        last 15 % of the duration.
+        Whether all start, or end, on the centre line, with a minimum-jerk blend from and to their lanes in the first
+        and the last 15 % of the duration.
 
     Returns
     -------
@@ -178,7 +177,7 @@ def make_tunnel_demonstrations(
 
 
 def _blend(along: Floats, common_start: bool, common_goal: bool) -> Floats:
-    """Share of the lanes that the ends leave, by minimum jerk (Flash, Hogan 1985): smooth where it becomes one."""
+    """Weight of the lanes near common ends, by minimum jerk (Flash, Hogan 1985)."""
     result = np.ones_like(along)
     for distance in [along] * bool(common_start) + [PATH_LENGTH - along] * bool(common_goal):
         s = np.clip(distance / (_BLENDED * PATH_LENGTH), 0.0, 1.0)
@@ -187,7 +186,7 @@ def _blend(along: Floats, common_start: bool, common_goal: bool) -> Floats:
 
 
 def check_recording(n_demos: int, duration: float, rate: float, timing: float = 0.0, least_steps: float = 2.0) -> None:
-    """Check what makers of demonstrations are told of their number and times."""
+    """Check the number, duration and sampling of synthetic demonstrations."""
     checks.count(n_demos, "n_demos")
     checks.number(duration, "duration", above=0.0, unit="s")
     checks.number(rate, "rate", above=0.0, unit="Hz")
@@ -208,11 +207,11 @@ def band_noise(time: Floats, low: float, high: float, random: Random, n_waves: i
 
 
 def generator(random_state: Seed) -> Random:
-    """Source of random numbers of a seed; a Generator is taken as it is."""
+    """Random generator of a seed; a Generator is returned unchanged."""
     return random_state if isinstance(random_state, np.random.Generator) else checks.seed(random_state)
 
 
 def column(values: ArrayLike, name: str) -> Floats:
-    """Inputs (n,) of what was given as (n,) or (n, 1)."""
+    """Inputs as (n,), from (n,) or (n, 1)."""
     x = checks.real_floats(values, name)
     return checks.array(x.reshape(-1, 1) if x.ndim < 2 else x, name, ("n", 1))[:, 0]

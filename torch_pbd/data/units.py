@@ -1,4 +1,4 @@
-"""Units of outputs and times, and outputs that are no coordinates of a flat space: quaternions, wrapped angles."""
+"""Units of outputs and times, and detection of non-Euclidean outputs: quaternions and wrapped angles."""
 
 import difflib
 import math
@@ -22,7 +22,7 @@ _PREFIXES = ("", "kilo", "deci", "centi", "milli", "micro", "nano")
 _SPELLED = {prefix + stem for prefix in _PREFIXES for stem in ("meter", "metre", "second", "radian")}
 _SPELLED |= {"inch", "inches", "in", "foot", "feet", "ft", "yard", "mile", "micron", "μm", "degree", "°"}
 _SPELLED |= {"sec", "msec", "usec", "μsec", "nsec", "μs", "minute", "hour", "hr"}
-# Of long words a letter may be wrong or lacking; of short ones that would be another word.
+# Long words may have a wrong or missing letter; in short ones that would be another word.
 _LONG, _CLOSE = [word for word in _SPELLED if len(word) >= 5], 0.9
 # Seconds since 1970 are 1.7e9, and 1.7e18 in ns; no movement is counted in so many of anything coarser.
 _LIKE_NS = 1e14
@@ -30,17 +30,17 @@ _LIKE_NS = 1e14
 # Four numbers rounded to three decimals: their squared sum is off by up to 2 sum |q| 0.0005, at most 0.002. What varies
 # little around a point of norm 1 is a quaternion only if it keeps to the sphere far better than it varies.
 OFF_SPHERE, _OFF_SPHERE_SHARE = 2.5e-3, 0.1
-_SAMPLES_ON_SPHERE = 0.9  # what is interpolated between q and -q is off it
-# In turns: how far off one a jump may be, and how large other steps of an angle that was sampled densely enough.
+_SAMPLES_ON_SPHERE = 0.9  # least share of samples of norm 1, as interpolation between q and -q leaves the sphere
+# Tolerance in turns of a jump's size, and of other steps of an angle that was sampled densely enough.
 _QUARTER = 0.25
-_MOST_JUMPS = 0.1  # of all steps; a signal that jumps more often is another kind of signal
+_MOST_JUMPS = 0.1  # largest share of steps that jump; a signal that jumps more often is not an angle
 _LARGEST_ANGLE = 1e9  # differences of far larger numbers may overflow
 
 
 def check_unit(unit: str, name: str, known: dict[str, float]) -> None:
-    """Refuse what was meant to be a known unit but is none, as "millimeter", "inch" and, of those ``known``, "MM".
+    """Raise for misspelled units such as "millimeter", "inch" and, for those ``known``, "MM".
 
-    Those of other kinds may be other units in other cases: "Ns" is no nanosecond.
+    Units of other kinds may differ by case: "Ns" is no nanosecond.
     """
     folded = unit.strip(" .").casefold()
     forms = {folded, folded.removesuffix("s")}
@@ -52,12 +52,12 @@ def check_unit(unit: str, name: str, known: dict[str, float]) -> None:
 
 
 def exact(time: float | int) -> str:
-    """A time to its last digit: numbers that differ are never written alike."""
+    """Text of a time with all digits, so that different numbers have different texts."""
     return str(int(time)) if abs(time) >= _LIKE_NS and time == int(time) else str(time)
 
 
 def nanoseconds_hint(times: Any) -> str:
-    """Sentence on the unit of times that look like ns; empty for others."""
+    """Hint at the unit of times that look like ns; empty for others."""
     stamps = np.asarray(times)
     largest = float(np.abs(stamps.astype(np.float64)).max())
     if not _LIKE_NS <= largest < math.inf or (stamps != np.round(stamps)).any():
@@ -67,7 +67,7 @@ def nanoseconds_hint(times: Any) -> str:
 
 
 def find_suspects(positions: Sequence[Floats], names: Sequence[str], units: Sequence[str] | None) -> tuple[str, ...]:
-    """Sentences on outputs that are no coordinates, with the remedy; without units, an angle may be in rad or deg."""
+    """Warnings about non-Euclidean outputs, with remedies; without units, an angle may be in rad or deg."""
     found = []
     for first in quaternions(positions, len(names)):
         four = names[first : first + 4]
@@ -85,7 +85,7 @@ def find_suspects(positions: Sequence[Floats], names: Sequence[str], units: Sequ
 
 
 def quaternions(positions: Sequence[Floats], n_outputs: int) -> list[int]:
-    """Places of the outputs with which four that are unit quaternions begin."""
+    """Indices of outputs that begin four columns of unit quaternions."""
     found, first = [], 0
     while first + 4 <= n_outputs:
         columns = [_column(positions, i) for i in range(first, first + 4)]
@@ -98,12 +98,12 @@ def quaternions(positions: Sequence[Floats], n_outputs: int) -> list[int]:
 
 
 def _column(positions: Sequence[Floats], i: int) -> Floats:
-    """One output of all demonstrations, within what differences can be taken of."""
+    """One output of all demonstrations, clipped so that differences do not overflow."""
     return np.concatenate([position[:, i] for position in positions]).clip(-_LARGEST_ANGLE, _LARGEST_ANGLE)
 
 
 def _wrapped(positions: Sequence[Floats], i: int, unit: str | None) -> str | None:
-    """Unit in which an output jumps by a turn; None where it does not."""
+    """Unit in which an output jumps by a turn; None if it does not."""
     whole = max(float(y[:, i].max()) for y in positions) - min(float(y[:, i].min()) for y in positions)
     for angle in ANGLES if unit is None else {unit} & set(ANGLES):
         turn = 2.0 * math.pi / ANGLES[angle]
@@ -114,7 +114,7 @@ def _wrapped(positions: Sequence[Floats], i: int, unit: str | None) -> str | Non
         step = np.delete(np.abs(np.diff(_column(positions, i))), ends)
         jumps = np.abs(step - turn) <= _QUARTER * turn
         other = step[~jumps].max(initial=0.0)
-        # What goes on behind the jump is as smooth as elsewhere.
+        # An unwrapped signal continues after the jump as smoothly as elsewhere.
         smooth = np.abs(step[jumps] - turn) <= max(3.0 * other, 1e-3 * turn)
         if other < _QUARTER * turn and 0 < jumps.sum() <= _MOST_JUMPS * len(step) and smooth.all():
             return angle

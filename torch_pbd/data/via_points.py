@@ -1,4 +1,4 @@
-"""Movements of least jerk through via points, whose law is known: strokes of handwriting, and a peg for a hole."""
+"""Synthetic minimum-jerk movements through via points with a known law: handwriting and peg in hole."""
 
 from collections.abc import Iterator
 from typing import Literal
@@ -16,7 +16,7 @@ from torch_pbd.rotations import exp, matrix, multiply
 
 Shape = Literal["C", "G", "J", "S", "W", "Z"]
 
-# Via points of each letter, 10 cm high: x and y in cm, and how far people are from them, across the path, in mm.
+# Via points of each letter, 10 cm high: x and y in cm, and standard deviation across the path in mm.
 _LETTERS = {
     "C": [(7, 8.4, 2), (3.5, 10, 6), (0.2, 5, 9), (3.5, 0, 6), (7, 1.6, 1)],
     "G": [(7, 8.6, 2), (3.5, 10, 6), (0.1, 5, 9), (3.5, 0, 5), (7, 2, 3), (6.9, 4.4, 1), (4.2, 4.5, 1)],
@@ -25,11 +25,11 @@ _LETTERS = {
     "W": [(0, 10, 4), (2.3, 0, 1), (4.6, 8, 8), (6.9, 0, 1), (9.2, 10, 4)],
     "Z": [(0, 10, 1), (3.5, 10.1, 6), (7, 10, 1), (3.5, 5, 9), (0, 0, 1), (3.5, -0.1, 6), (7, 0, 1)],
 }
-_ALONG = 0.5  # of the deviation across: people keep a path better than its pace
-_TREMOR = 2e-4  # rms in m, up to 2 Hz: no output is ever free of it
+_ALONG = 0.5  # ratio of the deviation along the path to that across it
+_TREMOR = 2e-4  # rms in m of tremor up to 2 Hz, so that no output is ever constant
 
 _HOLE = np.array([0.55, 0.15, 0.18])  # bottom of the hole in the frame of a robot's base, in m
-# The tool in the hole: its z axis down, then leaning by 0.35 rad. No axis of the task is one of the world.
+# Orientation of the tool in the hole: z axis down, then leaning by 0.35 rad, so that no task axis is a world axis.
 _TURN = multiply(exp(np.array([0.3, 0.18, 0.0])), exp(np.array([np.pi, 0.0, 0.0])))
 
 # Via points: place and rotation vector against the hole, in m and rad, in the axes of the tool that is in it; standard
@@ -45,7 +45,7 @@ _PEG = np.array(
         (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, 0, 20),
     ]
 )
-_POSE_TREMOR = np.repeat([2e-4, 2e-3], 3)  # rms in m and rad, up to 2 Hz
+_POSE_TREMOR = np.repeat([2e-4, 2e-3], 3)  # rms in m and rad of tremor up to 2 Hz
 
 
 def handwriting_mean(phase: ArrayLike, shape: Shape = "S") -> Floats:
@@ -57,7 +57,7 @@ def handwriting_mean(phase: ArrayLike, shape: Shape = "S") -> Floats:
 def handwriting_covariance(phase: ArrayLike, shape: Shape = "S", *, via_precision: ArrayLike | None = None) -> Floats:
     """Covariance (n, 2, 2) over demonstrations of a letter in m^2, at phases (n,) or (n, 1) from 0 to 1.
 
-    ``via_precision`` is that of `make_handwriting_demonstrations`.
+    ``via_precision`` is the parameter of `make_handwriting_demonstrations`.
     """
     via_points, covariances = _via_law(shape, via_precision)
     # A movement is linear in its via points, which are independent: x = sum_k b_k p_k, so C = sum_k b_k^2 C_k.
@@ -75,12 +75,12 @@ def make_handwriting_demonstrations(
     timing: float = 0.1,
     random_state: Seed = None,
 ) -> Demonstrations:
-    """A letter written several times: minimum-jerk movements through via points that differ between demonstrations.
+    """Demonstrations of a written letter: minimum-jerk movements through randomly perturbed via points.
 
     Each movement starts and ends at rest and has the least jerk of those that pass its via points at their phases
     (T. Flash, N. Hogan, Journal of Neuroscience 5, 1985): the quintic spline through them. Via points are normal and
-    independent; across the path with the deviation ``via_precision``, along it with half of that. A tremor of 0.2 mm
-    rms up to 2 Hz is added. Over the phase, `handwriting_mean` and `handwriting_covariance` are the law, exactly.
+    independent, with the standard deviation ``via_precision`` across the path and half of it along the path. A tremor
+    of 0.2 mm rms up to 2 Hz is added. `handwriting_mean` and `handwriting_covariance` give the exact law over phase.
 
     Parameters
     ----------
@@ -88,12 +88,12 @@ def make_handwriting_demonstrations(
         Letters 10 cm high, of five to seven via points.
     n_demos : int, default=6
     duration : float, default=2.0
-        In s; of each demonstration where ``timing`` is 0.
+        Median duration in s.
     rate : float, default=100.0
-        Samples a second.
+        Sampling rate in Hz.
     via_precision : float or array_like of shape (n_via_points,), default=None
-        Standard deviation across the path at each via point, or at all of them, in m. None: those of the letter, 1 mm
-        where it is written precisely, up to 9 mm where it is free.
+        Standard deviation in m across the path at each via point, or at all of them. None takes the letter's own, from
+        1 mm where it is written precisely to 9 mm where it is free.
     timing : float, default=0.1
         Relative standard deviation of durations and of the pace within a demonstration, below 0.5. With 0 all
         demonstrations share one grid, and time / duration is the phase of the truth.
@@ -131,7 +131,7 @@ def pose_mean(phase: ArrayLike) -> tuple[Floats, Floats]:
 def pose_covariance(phase: ArrayLike) -> Floats:
     """Covariance (n, 6, 6) of poses over demonstrations, at phases (n,) or (n, 1) from 0 to 1, in m^2, m rad, rad^2.
 
-    It is that of ``(x - x_d, Log(R R_d'))`` at the mean pose, in axes of the world, as schedules have it.
+    It is the covariance of ``(x - x_d, Log(R R_d'))`` at the mean pose in world axes, as in schedules.
     """
     _, deviations, weights = _peg_law()
     # Deviations are linear in those of the via points, which are independent, as in handwriting_covariance.
@@ -151,7 +151,7 @@ def make_pose_demonstrations(
     timing: float = 0.1,
     random_state: Seed = None,
 ) -> Demonstrations:
-    """A peg that is brought over, turned and put into a hole, several times.
+    """Demonstrations of a peg that is moved, turned and inserted into a hole.
 
     Position and rotation are minimum-jerk movements through five via points, as in `make_handwriting_demonstrations`,
     in the workspace of an arm of 0.8 m whose base is the origin; the tool turns by 76 degrees. On the way the hand is
@@ -161,9 +161,9 @@ def make_pose_demonstrations(
     Parameters
     ----------
     n_demos : int, default=8
-        Six and fewer leave open how six outputs vary together.
+        Number of demonstrations; six or fewer cannot determine a covariance of six outputs.
     duration, rate, timing, random_state
-        As in `make_handwriting_demonstrations`.
+        Parameters of `make_handwriting_demonstrations`, in s and Hz.
 
     Returns
     -------
@@ -215,7 +215,7 @@ def _peg_law() -> tuple[Floats, Floats, BSpline]:
 def _paces(
     n_demos: int, duration: float, rate: float, timing: float, random_state: Seed
 ) -> Iterator[tuple[Floats, Floats, Random]]:
-    """Times (T,) and phases of each demonstration, of which duration and pace vary by ``timing``, and the generator."""
+    """Times (T,) and phases of demonstrations whose duration and pace vary by ``timing``, and the generator."""
     check_recording(n_demos, duration, rate, timing)
     random = generator(random_state)
     for _ in range(n_demos):
@@ -229,14 +229,14 @@ def _paces(
 
 def _minimum_jerk(via_points: Floats) -> BSpline:
     """Weights (n, k) of the via points over phases (n,), in the movement of least jerk from rest to rest."""
-    # Passed at phases by the square root of the distance: slower in narrow turns, as hands are.
+    # Phases advance by the square root of the distance: slower in narrow turns, as hands are.
     passes = np.append(0.0, np.linalg.norm(np.diff(via_points, axis=0), axis=1) ** 0.5).cumsum()
     rest = [(order, np.zeros(len(via_points))) for order in (1, 2)]
     return make_interp_spline(passes / passes[-1], np.eye(len(via_points)), k=5, bc_type=(rest, rest))
 
 
 def _phases(phase: ArrayLike) -> Floats:
-    """Phases (n,) from 0 to 1 of what was given as (n,) or (n, 1)."""
+    """Checked phases (n,) from 0 to 1, from (n,) or (n, 1)."""
     at = column(phase, "phase")
     checks.require((at >= 0.0) & (at <= 1.0), at, "phase", "from 0 to 1")
     return at

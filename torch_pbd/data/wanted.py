@@ -1,4 +1,4 @@
-"""Options of reading, whatever the format: columns by their names, times, units; the one way out of files."""
+"""Reading options common to all formats: columns by name, times, units."""
 
 import difflib
 import re
@@ -15,9 +15,9 @@ from torch_pbd.data.recordings import Fresh, Missing, as_texts, preview
 from torch_pbd.data.units import TIMES
 from torch_pbd.files.memory import require_memory
 
-_FEWEST_COUNTED = 5  # rows; fewer rise by one by chance
+_FEWEST_COUNTED = 5  # fewest rows that identify a count; fewer increase by one by chance
 MAX_BYTES = 512 * 2**20
-_UNNAMED = ("", "__index_level_0__")  # what pandas calls the index of a table in files
+_UNNAMED = ("", "__index_level_0__")  # names of a table's index in files written by pandas
 _DATE_UNITS = {"h": "h", "min": "m", "s": "s", "ms": "ms", "us": "us", "ns": "ns"}
 Arguments = dict[str, Any]
 
@@ -38,7 +38,7 @@ class Chosen(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Wanted:
-    """The options that all formats have, as `torch_pbd.data.load_demonstrations` describes them."""
+    """Options common to all formats, described in `torch_pbd.data.load_demonstrations`."""
 
     outputs: Sequence[str] | None = None
     demo: str | None = None
@@ -77,7 +77,7 @@ class Wanted:
         time: str | None = None,
         outputs: str | None = None,
     ) -> Chosen:
-        """Columns wanted of ``signals``, which give the names of the columns of each.
+        """Columns to read from ``signals``, which map each signal to the names of its columns.
 
         A signal of several columns may be named for all of them. ``demo``, ``time`` and ``outputs`` are the signals
         that the format means by default; an absent one is no fault but of the time, where no ``rate`` is given.
@@ -117,13 +117,13 @@ class Wanted:
         self.notes.append(message)
 
     def require(self, n_bytes: float, what: str) -> None:
-        """Refuse what unpacks to more than ``max_bytes`` or than the memory takes, before it is read."""
+        """Raise before reading if data unpack to more than ``max_bytes`` or than fits in memory."""
         if n_bytes > self.max_bytes:
             raise ValueError(f"{what} unpacks to {n_bytes:.0f} bytes, more than max_bytes={self.max_bytes}: raise it.")
         require_memory(3.0 * n_bytes, what=what, remedy="Name fewer outputs=, or split the file.")
 
     def read_rows(self, chosen: Chosen, signals: Mapping[str, NDArray[Any]], **labels: Any) -> Arguments:
-        """:meth:`read_each` of a long table, whose rows tell theirs; in the order of their first rows."""
+        """Arguments as from :meth:`read_each` for a long table, with demonstrations in order of their first rows."""
         n_rows = len(signals[chosen.signals[0]])
         demo = np.zeros(n_rows, bool) if chosen.demo is None else _column(signals, chosen.demo)
         heads = np.flatnonzero(np.r_[True, demo[1:] != demo[:-1]][:n_rows])
@@ -135,7 +135,7 @@ class Wanted:
         return self.read_each(chosen, each, **labels)
 
     def read_each(self, chosen: Chosen, recordings: Iterable[Mapping[str, NDArray[Any]]], **labels: Any) -> Arguments:
-        """Arguments of ``Demonstrations`` of the signals of each recording; ``labels`` are those in the file."""
+        """Arguments of ``Demonstrations`` from the signals of each recording; ``labels`` are those in the file."""
         times, positions = [], Fresh()
         for signals in recordings:
             columns = [_column(signals, place) for place in chosen.outputs]
@@ -173,7 +173,7 @@ class Wanted:
         return whole.from_start() if self.from_start else whole
 
     def _without_counts(self, positions: Fresh, labels: Arguments) -> tuple[Fresh, Arguments]:
-        """Columns but for those that count rows or number demonstrations, which nobody named as outputs."""
+        """Columns without those that count rows or number demonstrations, unless named as outputs."""
         names = labels["names"]
         found = {}
         for i, name in enumerate(names if positions else ()):
@@ -215,17 +215,17 @@ def check_options(options: Iterable[str], known: Sequence[str], what: str) -> No
 
 
 def natural(name: str) -> list[tuple[int, str]]:
-    """Key that sorts demo_10 after demo_9."""
+    """Sort key that places demo_10 after demo_9."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 def numeric(arrays: Mapping[str, Any]) -> dict[str, Any]:
-    """Arrays of numbers, (T,) or (T, d), among those of a file."""
+    """Numeric arrays (T,) or (T, d) of a file."""
     return {name: a for name, a in arrays.items() if a.dtype.kind in "biuf" and 1 <= a.ndim <= 2}
 
 
 def column_names(signal: str, shape: tuple[int, ...]) -> tuple[str, ...]:
-    """Names of the columns of a signal (T,) or (T, d) that has none for them; those of positions are x, y, z."""
+    """Default names of the columns of a signal (T,) or (T, d); positions have x, y, z."""
     n = (*shape, 1)[1]
     is_position = signal.endswith(("pos", "position")) and n in (2, 3)
     return (signal,) if n == 1 else tuple(f"{signal}_{'xyz'[i] if is_position else i}" for i in range(n))

@@ -1,4 +1,4 @@
-"""Figures of demonstrations, of what a model learned from them, and of what a robot did with it."""
+"""Figures of demonstrations, learned models, schedules and robot runs."""
 
 from torch_pbd.plotting.display import MovementDisplay
 from torch_pbd.plotting.parts import (

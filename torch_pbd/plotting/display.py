@@ -1,4 +1,4 @@
-"""Whole figures: what a model learned of a movement, demonstrations, schedules."""
+"""Whole figures of learned movements, demonstrations, schedules and simulated runs."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, Self, final
@@ -13,41 +13,41 @@ from torch_pbd.plotting import parts, poses, style
 Law = tuple[Floats, Floats]
 """Means (n, d) and covariances (n, d, d) over a grid of n times."""
 
-_N_STEPS = 201  # of the grid: bands and paths look smooth
-_MOST = 9  # outputs, in a grid of 3 x 3
+_N_STEPS = 201  # steps of the grid, at which bands and paths look smooth
+_MOST = 9  # most outputs in a figure, in a grid of 3 x 3
 _COLORS = (style.MODEL, style.OTHER)
 
 
 @final
 class MovementDisplay:
-    """Laws of a movement that models have learned: bands over time, and ellipses along the path of two outputs.
+    """Learned mean and covariance of a movement: bands over time, and ellipses along the path of two outputs.
 
-    It is made by `from_estimator`; `plot` draws it again.
+    Create it by `from_estimator`; `plot` draws it again.
 
     Parameters
     ----------
     demonstrations : Demonstrations
-        Drawn behind, grey.
+        Demonstrations, drawn grey in the background.
     grid : ndarray of shape (n,)
         Times or phases.
     laws : dict of str to (ndarray of shape (n, d), ndarray of shape (n, d, d))
         Mean and covariance by the name of the model, one or two; the first is blue.
     truth : (ndarray of shape (n, d), ndarray of shape (n, d, d)), default=None
-        Where it is known: dashed, black.
+        True mean and covariance, drawn dashed in black.
     outputs : list of int, default=None
         Outputs to draw; None is the first nine.
     input : {"time", "phase"}, default="time"
     n_std : float, default=2.0
-        Half the width of bands and ellipses, in standard deviations.
+        Half width of bands and ellipses in standard deviations.
     n_ellipses : int, default=21
 
     Attributes
     ----------
     figure_ : matplotlib.figure.Figure
     ax_ : matplotlib.axes.Axes
-        The path of two or three outputs; of other numbers the first band.
+        Axes of the path of two or three outputs, or else of the first band.
     axes_ : list of matplotlib.axes.Axes
-        All of them, ``ax_`` first.
+        All axes, ``ax_`` first.
 
     Examples
     --------
@@ -94,25 +94,25 @@ class MovementDisplay:
         ax: Axes | None = None,
         **options: Any,
     ) -> Self:
-        """Draw what a fitted model learned of demonstrations.
+        """Plot the learned mean and covariance of a fitted model with its demonstrations.
 
         Parameters
         ----------
         estimator : fitted covariance regressor, or model of whole movements
-            Of one input, time or phase.
+            Model over one input, time or phase.
         demonstrations : Demonstrations
-        other : the same, default=None
-            A second model, on the same axes.
+        other : fitted covariance regressor, or model of whole movements, default=None
+            Second model, drawn on the same axes.
         names : sequence of str, default=None
             Names of the models; None takes those of their classes.
         truth : callable, default=None
-            Maps the grid (n,) to (mean, covariance), where the truth is known.
+            Map from the grid (n,) to the true (mean, covariance).
         input : {"auto", "time", "phase"}, default="auto"
-            What the model was fitted on. "auto" is what a model of whole movements learned over, and time for others.
+            Input of the fit. "auto" is that of a model of whole movements, and time for others.
         ax : matplotlib.axes.Axes, default=None
-            Draws the path, or the band of one output, there only. None makes a figure.
+            Axes for the path, or for the band of a single output, alone; None makes a figure.
         **options
-            ``outputs`` (numbers or names), ``n_std`` and ``n_ellipses`` of `MovementDisplay`.
+            ``outputs`` (indices or names), ``n_std`` and ``n_ellipses`` of `MovementDisplay`.
 
         Returns
         -------
@@ -137,7 +137,7 @@ class MovementDisplay:
         return cls(demonstrations, grid, laws, truth=known, input=of_model, **options).plot(ax)
 
     def plot(self, ax: Axes | None = None) -> Self:
-        """Draw into ``ax``, the path or the band of one output only, or into a new figure."""
+        """Draw into a new figure, or only the path or the band of a single output into ``ax``."""
         shown, in_space = self.outputs, len(self.outputs) in (2, 3)
         if ax is not None:
             plane, bands = ([ax], []) if in_space else ([], [ax])
@@ -188,7 +188,7 @@ class MovementDisplay:
 
 
 def plot_movements(demonstrations: Any, outputs: Sequence[int | str] | None = None, ax: Axes | None = None) -> Any:
-    """Draw demonstrations: what `Demonstrations.plot` does."""
+    """Plot demonstrations; implementation of `Demonstrations.plot`."""
     shown = style.chosen_outputs(outputs, demonstrations.names, _MOST)
     if outputs is None and ax is None and demonstrations.rotation_reference is not None and len(shown) == 6:
         return poses.draw_poses(demonstrations, poses.draw_recorded_poses, 3)
@@ -210,7 +210,7 @@ def plot_movements(demonstrations: Any, outputs: Sequence[int | str] | None = No
 
 
 def plot_schedule(schedule: Any) -> list[Axes]:
-    """Draw a schedule: what `Schedule.plot` does."""
+    """Plot a schedule; implementation of `Schedule.plot`."""
     p, turns, unit = schedule.position.shape[1], schedule.orientation is not None, style.short_unit(schedule.units)
     if turns and p == 3:
         return poses.draw_poses(schedule, poses.draw_pose_schedule, 4)
@@ -234,7 +234,7 @@ def plot_schedule(schedule: Any) -> list[Axes]:
 
 
 def plot_pushes(rollout: Any, unpushed: Any = None, names: Sequence[str] | None = None) -> list[Axes]:
-    """Draw a simulated run: what `Rollout.plot` does."""
+    """Plot a simulated run; implementation of `Rollout.plot`."""
     n = 1 + (rollout.velocity.shape[-1] > rollout.position.shape[-1])
     figure = style.shown_figure((6.4 if n == 1 else 11.0, 6.6))
     axes = [figure.add_subplot(3, n, 1 + i % 3 * n + i // 3) for i in range(3 * n)]

@@ -1,4 +1,4 @@
-"""Poses in space: frames of a tool, how far its position and its axes spread, and the arm that holds it."""
+"""Poses in space: frames of a tool, the spread of its position and axes, and the robot arm."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -16,9 +16,9 @@ from torch_pbd.plotting.parts import plot_outputs, plot_stiffness
 from torch_pbd.rotations import matrix
 
 _TURN = np.linspace(0.0, 2.0 * np.pi, 21)
-_ARC = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 12)  # none on the equator: it has two rings
+_ARC = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 12)  # an even number skips the equator, which has two rings
 _SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-_LENGTH = 0.1  # of a frame's axes: share of the longest side of the path
+_LENGTH = 0.1  # length of a frame's axes as a share of the longest side of the path
 
 
 def plot_frames(
@@ -31,7 +31,7 @@ def plot_frames(
     n_std: float = 2.0,
     label: str | None = "tool",
 ) -> list[Line3DCollection]:
-    """Draw the axes of a tool in space, and around their tips where ``n_std`` standard deviations take them.
+    """Draw the axes of a tool in space, with the ``n_std`` standard deviation regions of their tips.
 
     Parameters
     ----------
@@ -39,18 +39,18 @@ def plot_frames(
     orientation : array_like of shape (n, 4)
         Unit quaternions w x y z.
     ax : matplotlib.axes.Axes
-        Of projection "3d".
+        Axes with projection "3d".
     length : float
-        Of the axes, in the unit of the position.
+        Length of the tool axes in the unit of the position.
     covariance : array_like of shape (n, 3, 3), default=None
-        Of rotation vectors in world axes, in rad^2.
+        Covariance of rotation vectors in world axes, in rad^2.
     n_std : float, default=2.0
     label : str or None, default="tool"
-        In the legend, before x, y and z.
+        Label in the legend, before x, y and z.
 
     Returns
     -------
-    list of three Line3DCollection, of the axes x, y and z
+    list of three Line3DCollection, for the axes x, y and z
     """
     style.check_axes("ax", [ax])
     places = checks.array(position, "position", ("n", 3))
@@ -80,16 +80,16 @@ def plot_covariance_ellipsoids(
     color: str = style.MODEL,
     label: str | None = None,
 ) -> Line3DCollection:
-    """Draw the ``n_std`` ellipsoids of covariances (n, 3, 3) around means (n, 3), by an ellipse in each main plane.
+    """Draw the ``n_std`` ellipsoids of covariances (n, 3, 3) around means (n, 3), as an ellipse in each main plane.
 
-    The axes are of projection "3d".
+    ``ax`` must have projection "3d".
     """
     curves = np.concatenate(style.ellipses(mean, covariance, ax, n_std, 3))
     return _lines(ax, curves, color, 0.7, label)
 
 
 def draw_poses(what: Any, draw: Callable[[Any, Axes, list[Axes]], None], n_bands: int) -> list[Axes]:
-    """Axes of a new figure of demonstrations or of a schedule, the space first."""
+    """Axes of a new figure of demonstrations or of a schedule, the 3D axes first."""
     figure, space, bands = style.panels(n_bands, 3)
     draw(what, space[0], bands)
     style.legend_below(figure, [*space, *bands])
@@ -117,7 +117,7 @@ def draw_recorded_poses(demonstrations: Any, ax: Axes, bands: Sequence[Axes], n_
 def draw_pose_schedule(schedule: Any, ax: Axes, bands: Sequence[Axes], n_poses: int = 7) -> None:
     """Draw a schedule of poses: its path with ellipsoids and frames; over time, deviations and stiffness."""
     length = _LENGTH * float(np.ptp(schedule.position, axis=0).max())
-    # At equal distances: at its ends a tool is slow.
+    # Frames are at equal distances, not times, since a tool is slow at its ends.
     way = np.append(0.0, np.linalg.norm(np.diff(schedule.position, axis=0), axis=1)).cumsum()
     some = np.searchsorted(way, np.linspace(0.0, way[-1], n_poses)).clip(max=len(schedule) - 1)
     path, spread = schedule.position[some], schedule.covariance[some]
@@ -131,7 +131,7 @@ def draw_pose_schedule(schedule: Any, ax: Axes, bands: Sequence[Axes], n_poses: 
 
 
 def draw_blocks(schedule: Any, bands: Sequence[Axes]) -> None:
-    """Draw deviations, and then stiffness, over time: of the outputs, and of poses in principal axes of both blocks."""
+    """Draw deviations and then stiffness over time, of the outputs or, for poses, in principal axes of both blocks."""
     kinds, n = (style.kind_of(schedule.units, schedule.position.shape[1]), style.ROTATION), len(schedule.blocks)
     for kind, block, spread, gains in zip(kinds, schedule.blocks, bands[:n], bands[n:], strict=False):
         covariance = schedule.covariance[:, block, block]
@@ -147,7 +147,7 @@ def draw_blocks(schedule: Any, bands: Sequence[Axes]) -> None:
 
 
 def _label(ax: Any, bands: Sequence[Axes], names: Sequence[str], unit: str | None) -> None:
-    """Name the axes of a space, on one scale, and let bands beside it have one axis of time."""
+    """Label 3D axes with one scale, and let the bands beside them share the time axis."""
     ax.set(**{f"{axis}label": f"{name} [{unit or 'unit'}]" for axis, name in zip("xyz", names, strict=True)})
     style.equal_scales(ax)
     ax.view_init(elev=22.0, azim=-35.0)
@@ -168,11 +168,11 @@ def plot_arm(model: Any, joints: ArrayLike, ax: Axes, *, alpha: float = 1.0) -> 
     Parameters
     ----------
     model : mujoco.MjModel
-        Such as `torch_pbd.robots.panda`, which has no meshes.
+        Model of the arm, such as `torch_pbd.robots.panda`, which has no meshes.
     joints : array_like of shape (n,)
-        Its ``qpos``, in rad.
+        Joint angles ``qpos`` in rad.
     ax : matplotlib.axes.Axes
-        Of projection "3d", in m.
+        Axes with projection "3d", in m.
     alpha : float, default=1.0
         Opacity.
 
@@ -207,7 +207,7 @@ def plot_arm(model: Any, joints: ArrayLike, ax: Axes, *, alpha: float = 1.0) -> 
 
 
 def _turned(width: Floats, height: Floats) -> Floats:
-    """Quadrilaterals (n, 4, 3) of a profile that is turned around z."""
+    """Quadrilaterals (n, 4, 3) of the surface of revolution of a profile around z."""
     width = np.maximum(width, 1e-3 * width.max())[:, np.newaxis]  # to have a normal, a face must have four corners
     rings = np.stack(np.broadcast_arrays(width * np.cos(_TURN), width * np.sin(_TURN), height[:, np.newaxis]), axis=-1)
     corners = rings[:-1, :-1], rings[:-1, 1:], rings[1:, 1:], rings[1:, :-1]

@@ -1,7 +1,7 @@
-"""Schedules on arms: their inertia, a simulated arm, and adapters to the interfaces of real ones.
+"""Schedules on robot arms: inertia, a simulated arm, and adapters to interfaces of real ones.
 
-One module for each robot: ``franky``, ``mujoco``, ``robosuite``, ``ros`` and ``ur_rtde``. They need NumPy, and the
-robot's own library once they are used; not torch.
+There is one module per interface: ``franky``, ``mujoco``, ``robosuite``, ``ros`` and ``ur_rtde``. They need NumPy, and
+the robot's own library when used, but not torch.
 """
 
 from torch_pbd.robots import franky as franky

@@ -1,4 +1,4 @@
-"""Schedules on a Franka arm by franky (franky-control 2.0): impedance control with all 6 x 6 gains."""
+"""Schedules on a Franka arm by franky (franky-control 2.0): impedance control with full 6 x 6 gains."""
 
 import math
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from torch_pbd.registry import optional
 from torch_pbd.robots import session
 from torch_pbd.robots.session import RobotLimits, RobotRun, RobotStoppedError
 
-_STEP = 1e-3  # s, along the joints' motion: squared, and so nothing beside what is differentiated
+_STEP = 1e-3  # s: step along the joints' motion in finite differences, whose error is its square
 
 
 def run(
@@ -30,36 +30,36 @@ def run(
 ) -> RobotRun:
     """Follow a schedule of poses with ``franky.CartesianImpedanceTracker``; the arm must be at its first pose.
 
-    franky's controller adds Coriolis forces and the inertia times the acceleration that it is told, which is
-    ``a_d - J' q'`` by the robot's own model. So the arm moves with its own inertia: make the schedule ``with_inertia``
-    of it (franky's default damping, 2 K^1/2, knows no mass). Gains lag by franky's filter, and are sent as much ahead.
-    Deviations count up to ``translational_error_clip`` (0.10 m) and ``rotational_error_clip`` (0.25 rad) on an axis:
-    beyond, the arm is softer than the schedule says. Friction of 1.5 N holds the tool 30 mm away at 50 N/m: learn with
-    ``stiffness_min`` of some hundred, and give ``friction``.
+    franky's controller adds Coriolis forces and the inertia times the commanded acceleration, which is ``a_d - J' q'``
+    by the robot's own model. The arm thus moves with its own inertia: make the schedule ``with_inertia`` of it
+    (franky's default damping, 2 K^1/2, ignores mass). Gains are sent ahead by the lag of franky's filter.
+    Deviations are clipped at ``translational_error_clip`` (0.10 m) and ``rotational_error_clip`` (0.25 rad) per axis,
+    beyond which the arm is softer than the schedule. Friction of 1.5 N holds the tool 30 mm away at 50 N/m: learn with
+    a ``stiffness_min`` of a few hundred N/m, and pass ``friction``.
 
     Parameters
     ----------
     robot : franky.Robot
-        In no motion, its end effector the tool of the schedule, its base the schedule's frame. Time is the robot's.
+        Robot at rest, whose end effector is the tool and whose base is the frame of the schedule. Time is the robot's.
     schedule : Schedule
-        Poses, in m.
+        Schedule of poses in m.
     on_fault : callable, default=None
-        Called with the fault, a ``RobotStoppedError``, once the arm was stopped; None raises it.
+        Function called with the fault, a ``RobotStoppedError``, once the arm was stopped; None raises it.
     limits : RobotLimits, default=None
         Limits that are checked before the arm moves; None is those of the Panda.
     period, max_step : float, default=0.005, 0.1
-        Time from one target to the next, and the longest without a new one, s; longer is a fault.
+        Time between targets, and longest time without a new one, in s; longer is a fault.
     settle : float, default=0.5
-        Time at the first row before the motion begins, s, in which gains are reached.
+        Time at the first row before the motion begins, in s, in which gains are reached.
     gains_time_constant : float, default=0.1
-        Time constant of franky's filter of gains, s.
+        Time constant of franky's gain filter in s.
     **tracker
         Options of ``franky.CartesianImpedanceTracker``: ``posture_task``, ``friction``, clips, ``max_delta_tau``.
 
     Returns
     -------
     RobotRun
-        The motion as far as it came.
+        Motion up to the end or a fault.
 
     Warns
     -----
@@ -69,7 +69,7 @@ def run(
     Raises
     ------
     ValueError
-        Before anything moves: if the schedule is beyond the limits, or the arm elsewhere.
+        Before anything moves, if the schedule exceeds the limits or does not begin at the arm's pose.
     RobotStoppedError
         If the arm stops by itself, the connection breaks, or a target comes late.
     """
@@ -77,7 +77,7 @@ def run(
     session.check_limits(schedule, RobotLimits() if limits is None else limits)
     session.warn_of_mass(schedule)
     checks.number(period, "period", above=0.0, below=max_step, unit="s")
-    # A target holds for a period: that of its middle is never further than half of it from the motion.
+    # A target holds for a period; taken at its middle, it is never more than half a period from the motion.
     rows = schedule.resample(times=np.arange(schedule.time[0] + 0.5 * period, schedule.time[-1], period))
     gains, targets = _planned(franky, rows)
     acceleration, ahead, model = session.accelerations(rows), round(gains_time_constant / period), robot.model
@@ -102,7 +102,7 @@ def run(
             if row >= 0:
                 passed.append((now - origin, pose.translation, np.roll(pose.quaternion, 1)))
                 tracking.set_gains(gains=gains[min(row + ahead, len(rows) - 1)])
-                # What the controller turns into J q'' is to be without what J' q' gives by itself.
+                # The controller commands J q'' only, so that the bias J' q' is subtracted.
                 rise = franky.TwistAcceleration(*np.split(acceleration[row] - _bias(franky, model, state), 2))
                 tracking.set_target(*targets[row], rise)
         else:
@@ -121,7 +121,7 @@ def _planned(franky: Any, rows: Schedule) -> tuple[list[Any], list[tuple[Any, An
 
 
 def _bias(franky: Any, model: Any, state: Any) -> Floats:
-    """Acceleration (6,) of the tool while its joints keep their speed, J' q': J beside the present angles, along q'."""
+    """Acceleration J' q' (6,) of the tool at constant joint speeds, by differences of J along q'."""
     ahead, behind = (
         model.zero_jacobian(franky.Frame.EndEffector, state.q + step * state.dq, state.F_T_EE, state.EE_T_K)
         for step in (_STEP, -_STEP)

@@ -10,11 +10,11 @@ from torch_pbd.checks import Floats
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.registry import optional
 
-# Newton's steps for a row square the error, so that what remains is rounding.
+# Newton's steps per row converge quadratically, so that the remaining error is rounding.
 _MAX_STEPS, _REACHED, _SETTLED = 200, 1e-9, 1e-7
-# Longest step in rad, as far as an arm is nearly linear; share of the easiest direction below which another is lost.
+# Longest step in rad, within which an arm is nearly linear; ratio of singular values below which a direction is lost.
 _LONGEST_STEP, _SINGULAR = 0.3, 1e-4
-_OVERSHOT = 0.1  # rad (or m) beyond the limits of a joint: recorded angles overshoot, those in degrees go further
+_OVERSHOT = 0.1  # allowed excess of joint limits in rad (or m): recorded angles overshoot, degrees exceed it by far
 
 
 class ToolState(NamedTuple):
@@ -28,7 +28,7 @@ class ToolState(NamedTuple):
 
 @final
 class MujocoArm:
-    """Joints that carry a tool, from the base on, of a ``mujoco.MjModel``; all others are locked."""
+    """Joints from base to tool of a ``mujoco.MjModel``; all others are locked."""
 
     def __init__(self, model: Any, tool: str) -> None:
         self._library = mujoco = optional("mujoco", "robot", "an arm in MuJoCo")
@@ -58,7 +58,7 @@ class MujocoArm:
         return self.measure(self._data)
 
     def bias(self, data: Any) -> Floats:
-        """Acceleration (6,) of the tool in a simulation while its joints keep their speed."""
+        """Acceleration (6,) of the tool in a simulation at constant joint speeds."""
         rate = np.empty((6, self._model.nv))
         self._library.mj_jacDot(self._model, data, rate[:3], rate[3:], self._frame(data).xpos, self._body)
         change: Floats = rate @ data.qvel
@@ -81,7 +81,7 @@ class MujocoArm:
 
 @final
 class PinocchioArm:
-    """Joints that carry a tool, from the base on, of a ``pinocchio.Model``; all others are locked."""
+    """Joints from base to tool of a ``pinocchio.Model``; all others are locked."""
 
     def __init__(self, model: Any, tool: str) -> None:
         self._library = pin = optional("pinocchio", "robot", "an arm in Pinocchio")
@@ -124,15 +124,15 @@ def arm(model: Any, tool: str) -> Arm:
 
 
 def operational_inertia(model: Any, joints: ArrayLike, tool: str) -> Floats:
-    """Inertia that is felt at the tool of an arm, ``Lambda = (J M^-1 J')^-1``, in world axes.
+    """Operational-space inertia at the tool of an arm, ``Lambda = (J M^-1 J')^-1``, in world axes.
 
-    `torch_pbd.control.Schedule.with_inertia` takes it: a torque-controlled arm that is pushed moves with it, not with
+    Pass it to `torch_pbd.control.Schedule.with_inertia`: a torque-controlled arm under a push moves with it, not with
     1 kg.
 
     Parameters
     ----------
     model : mujoco.MjModel or pinocchio.Model
-        An arm with six joints or more before the tool; others, such as those of fingers, are locked.
+        Arm with six joints or more before the tool; others, such as those of fingers, are locked.
     joints : array_like of shape (..., n)
         Joint angles in rad, from the base to the tool.
     tool : str
@@ -141,13 +141,13 @@ def operational_inertia(model: Any, joints: ArrayLike, tool: str) -> Floats:
     Returns
     -------
     ndarray of shape (..., 6, 6)
-        Symmetric; kg, kg m and kg m^2, translation before rotation.
+        Symmetric matrices in kg, kg m and kg m^2, translation before rotation.
 
     Raises
     ------
     ValueError
-        If the model has no such tool, joints are beyond their limits by more than 0.1 rad, or the arm is singular: it
-        then cannot be moved in some direction.
+        If the model has no such tool, joints exceed their limits by more than 0.1 rad, or the arm is singular, so that
+        it cannot move in some direction.
 
     References
     ----------
@@ -177,18 +177,18 @@ def inverse_kinematics(
     start: ArrayLike,
     posture: ArrayLike | None = None,
 ) -> Floats:
-    """Joint angles along a path of the tool, of all that reach it those nearest to a posture.
+    """Joint angles along a path of the tool, nearest to a posture among all solutions.
 
-    Newton's steps of least length, from row to row; what is redundant goes to the posture, so that angles depend on
-    the pose alone and not on the way to it.
+    Minimum-norm Newton steps from row to row, with the null space moving to the posture, so that angles depend on the
+    pose alone and not on the path to it.
 
     Parameters
     ----------
     model : mujoco.MjModel or pinocchio.Model
     position : array_like of shape (T, 3)
-        Path of the tool, m, as ``schedule.position``.
+        Positions of the tool in m, such as ``schedule.position``.
     orientation : array_like of shape (T, 4)
-        Unit quaternions w x y z, as ``schedule.orientation``.
+        Unit quaternions w x y z, such as ``schedule.orientation``.
     tool : str
         Name of a site or body (MuJoCo), or of a frame (Pinocchio).
     start : array_like of shape (n,)
@@ -199,12 +199,12 @@ def inverse_kinematics(
     Returns
     -------
     ndarray of shape (T, n)
-        Joint angles in rad, at which the pose is met to 1e-9 m and rad.
+        Joint angles in rad, which reach the poses to 1e-9 m and rad.
 
     Raises
     ------
     ValueError
-        If the tool cannot come there, or only beyond the limits of a joint.
+        If a pose is unreachable within the joint limits.
     """
     chain = arm(model, tool)
     n = chain.limits.shape[1]
@@ -224,7 +224,7 @@ def inverse_kinematics(
 
 
 def pose_error(state: ToolState, position: Floats, orientation: Floats) -> Floats:
-    """Translation and rotation vector (6,), in world axes, that take the tool to a pose."""
+    """Translation and rotation vector (6,) from the tool to a pose, in world axes."""
     return np.concatenate([position - state.position, rotations.between(state.orientation, orientation)])
 
 

@@ -1,6 +1,6 @@
-"""The Franka Panda in MuJoCo, and a schedule on an arm there: torque control with the arm's own inertia, and pushes.
+"""Franka Panda in MuJoCo, and schedules on a simulated arm: torque control with its own inertia, and pushes.
 
-``panda.xml`` says where its figures are from.
+``panda.xml`` cites the sources of its values.
 """
 
 import math
@@ -22,12 +22,12 @@ from torch_pbd.robots.session import RobotStoppedError, accelerations, check_sta
 HOME = (0.0, -math.pi / 4, 0.0, -3 * math.pi / 4, 0.0, math.pi / 2, math.pi / 4)
 """Joint angles of the Panda in rad, far from limits and singularities: the hand points down, 0.31 m before the base."""
 
-_UNEVEN = 1e-6  # a tick is a whole number of steps of the simulation, to what rounding leaves of both
-_POSTURE_RATE = 5.0  # 1/s, at which free joint motion returns, critically damped: slower than what the tool feels
+_UNEVEN = 1e-6  # tolerance within which a tick is a whole number of simulation steps
+_POSTURE_RATE = 5.0  # rate in 1/s of the critically damped null-space motion, slower than that of the tool
 
 
 def panda_mjcf() -> str:
-    """Text of an MJCF file of the Franka Emika Panda with its closed hand; edit it for another tool.
+    """MJCF text of the Franka Emika Panda with closed hand, to be edited for another tool.
 
     Joints ``joint1`` to ``joint7`` have torque motors, 0.1 kg m^2 of inertia each and no friction; bodies do not
     collide. The site ``tool`` is the tip of the hand, 0.1034 m beyond the flange, at which the body ``hand`` begins.
@@ -55,22 +55,22 @@ def panda() -> Any:
 @final
 @dataclass(frozen=True, eq=False, repr=False)
 class ArmRun:
-    """States of an arm at the start of each tick, and what acted during it; in world axes.
+    """States of an arm at the start of each tick, with the wrench and torques during it, in world axes.
 
     Attributes
     ----------
     time : (T,), s
-    position, orientation : (T, 3) in m and (T, 4), w x y z; the tool
+    position, orientation : (T, 3) in m and (T, 4), quaternions w x y z of the tool
     twist : (T, 6), m/s and rad/s
     deviation : (T, 6), m and rad
-        Translation from the schedule, and the rotation vector that turns the desired orientation into the true one.
+        Translation from the schedule, and the rotation vector from the desired to the true orientation.
     wrench : (T, 6), N and Nm
-        External, at the tool.
+        External wrench at the tool.
     joints, torque : (T, n), rad and Nm
-        Torques as commanded; ``saturated`` where a motor gives less.
+        Joint angles and commanded torques.
     mass : (T, 6, 6), kg, kg m and kg m^2
-        Inertia at the tool, where the arm really is.
-    saturated : (T,) of bool
+        Inertia at the tool at the true joint angles.
+    saturated : (T,) of bool, whether a motor gives less than the commanded torque
     """
 
     time: Floats
@@ -102,24 +102,24 @@ def run(
 ) -> ArmRun:
     """Follow a schedule of poses by torques, ``J' (Lambda a_d - K e - D e') + h + N' M (...)``.
 
-    The arm keeps its inertia Lambda(q) and feels gravity and Coriolis forces h compensated: pushed by f at the tool it
-    moves as ``Lambda (v' - a_d) + D (v - v_d) + K e = f``, which is the plant of a schedule that was made
-    ``with_inertia`` of that arm. What the six axes leave free follows ``joints``, by ``N'`` without effect on the tool.
+    The arm keeps its inertia Lambda(q), with gravity and Coriolis forces h compensated: under a force f at the tool it
+    moves as ``Lambda (v' - a_d) + D (v - v_d) + K e = f``, which is the plant of a schedule made ``with_inertia`` of
+    that arm. Redundant joints follow ``joints`` in the null space ``N'``, without effect on the tool.
 
     Parameters
     ----------
     model : mujoco.MjModel
-        An arm with one torque motor for each joint, in their order; `torch_pbd.robots.panda` is one.
+        Arm with one torque motor per joint, in their order, such as `torch_pbd.robots.panda`.
     schedule : Schedule
-        Poses, whose rows are the ticks of the controller: evenly spaced, at 1 kHz for stiff gains
+        Schedule of poses, whose rows are the ticks of the controller: evenly spaced, at 1 kHz for stiff gains
         (``schedule.resample(1000.0)``), a whole number of the model's time steps apart.
     joints : array_like of shape (T, n)
         Joint angles in rad along the schedule, from `torch_pbd.robots.inverse_kinematics`: the arm starts at the first,
         at the schedule's velocity.
     tool : str, default="tool"
-        Name of a site or body.
+        Name of a site or body of the model.
     wrench : array_like of shape (T, 6), default=None
-        External force and torque at the tool in N and Nm, world axes; None is none.
+        External force and torque at the tool in N and Nm, in world axes; None is zero.
 
     Returns
     -------
@@ -133,7 +133,7 @@ def run(
     Raises
     ------
     ValueError
-        If the schedule has no orientations, is uneven, or begins elsewhere than the arm.
+        If the schedule has no orientations, is uneven, or does not begin at the arm's pose.
     RobotStoppedError
         If a joint reaches its limit.
 
@@ -163,7 +163,7 @@ def _steps_a_tick(time: Floats, timestep: float) -> int:
 
 @final
 class _Simulation:
-    """An arm in MuJoCo that a controller has follow a schedule."""
+    """MuJoCo simulation of an arm whose controller follows a schedule."""
 
     def __init__(self, model: Any, tool: str, schedule: Schedule, joints: ArrayLike) -> None:
         self._mujoco = mujoco = optional("mujoco", "robot", "an arm in MuJoCo")
@@ -187,7 +187,7 @@ class _Simulation:
         self._data.qpos[:], self._data.qvel[:] = self._joints[0], np.linalg.pinv(start.jacobian) @ schedule.velocity[0]
 
     def tick(self, row: int, push: Floats) -> dict[str, Any]:
-        """State and commands at the start of a tick, which is then taken."""
+        """State and commands at the start of a tick, which is then simulated."""
         data, planned = self._data, self._schedule
         self._mujoco.mj_forward(self._model, data)  # of positions and velocities that the last step left
         state = self._chain.measure(data)

@@ -1,4 +1,4 @@
-"""Schedules on arms of robosuite (1.5) by its operational space controller, made for unit mass."""
+"""Schedules on robosuite (1.5) arms by its operational space controller, which imposes unit mass."""
 
 from typing import Any
 
@@ -24,33 +24,33 @@ CONTROLLER: dict[str, Any] = {
 }
 """Settings of an arm's controller that `to_actions` is for: ``controller_configs["body_parts"]["right"]``."""
 
-# Limits of the motion alone: gains are limited as kp is, which robosuite clips without a word.
+# Limits of the motion alone; gains are checked against those of kp, which robosuite clips silently.
 _LIMITS = RobotLimits(stiffness=(0.0, np.inf), rotational_stiffness=(0.0, np.inf))
 
 
 def to_actions(schedule: Schedule, control_freq: float = 20.0) -> Floats:
-    """Actions (n, 18) of the ``CONTROLLER``, for ``env.step``: damping ratios, kp, position, rotation vector.
+    """Actions (n, 18) for ``env.step`` with the ``CONTROLLER``: damping ratios, kp, position, rotation vector.
 
     The controller's wrench is ``Lambda (kp e - kd v)``, kp in 1/s^2: the arm moves as a unit mass, so that a schedule
-    of 1 kg (and 1 kg m^2) is right as it is, and its certificate holds. Goals lead by ``(D v_d + a_d) / K``, as the
-    controller knows no desired velocity. Its rotation error is sin(theta) along the axis.
+    for 1 kg (and 1 kg m^2) applies unchanged, and its certificate holds. Goals lead by ``(D v_d + a_d) / K``, as the
+    controller has no desired velocity. Its rotation error is sin(theta) along the axis.
 
     Parameters
     ----------
     schedule : Schedule
-        Poses, in m and world axes, with a mass of one number or none, which counts as 1 kg.
+        Schedule of poses in m and world axes, with a scalar mass, or none, which counts as 1 kg.
     control_freq : float, default=20.0
-        Actions a second, as the environment has them.
+        Actions per second of the environment.
 
     Warns
     -----
     UserWarning
-        If the diagonals of stiffness and damping, which are all that the controller takes, lose something.
+        If stiffness or damping are not diagonal, since the controller takes only their diagonals.
 
     Raises
     ------
     ValueError
-        If the schedule was made with the inertia of an arm, or its gains are beyond what the controller takes.
+        If the schedule was made with the inertia of an arm, or its gains exceed the controller's limits.
     """
     check_limits(schedule, _LIMITS)
     if isinstance(schedule.mass, np.ndarray):

@@ -1,4 +1,4 @@
-"""Schedules as ROS 2 messages, written with rosbags: no ROS is needed, and no robot."""
+"""Schedules as ROS 2 messages, written with rosbags, without a ROS installation."""
 
 import os
 from collections.abc import Iterator
@@ -24,33 +24,33 @@ _TOPICS = {
 
 
 def to_messages(schedule: Schedule, *, gains: Gains = "matrix") -> Iterator[tuple[str, int, Any]]:
-    """Topic, time in ns and message for each row of a schedule of poses: what a node publishes.
+    """Topic, time in ns and message for each row of a schedule of poses, as published by a node.
 
-    Poses and gains go to the topics of crisp_controllers, which takes ``gains="diagonal"``: six numbers, as the
-    admittance controller of ros2_control and FZI's cartesian controllers, which read them as parameters.
-    Torque-controlled arms have friction that none of them knows: 1.5 N hold the tool 30 mm away at 50 N/m, so learn
-    with ``stiffness_min`` of some hundred.
+    Poses and gains use the topics of crisp_controllers, which takes ``gains="diagonal"``: six numbers, like the
+    parameters of ros2_control's admittance controller and FZI's cartesian controllers. None of them compensates the
+    friction of torque-controlled arms: 1.5 N hold the tool 30 mm away at 50 N/m, so learn with a ``stiffness_min`` of
+    a few hundred N/m.
 
     Parameters
     ----------
     schedule : Schedule
-        Poses, in m; its ``frame`` is the messages', or ``base``.
+        Schedule of poses in m; the messages have its ``frame``, by default ``base``.
     gains : {"matrix", "diagonal"}, default="matrix"
-        36 numbers, row by row, or the diagonals alone.
+        Gains as 36 numbers, row by row, or as the diagonals alone.
 
     Yields
     ------
     topic : str
         ``target_pose``, ``target_twist`` (world axes), ``target_stiffness`` or ``target_damping``.
     time : int
-        Time of the schedule, ns; the same in the header.
+        Time of the schedule in ns, also in the header.
     message : object
-        Message of rosbags, with the fields of ROS.
+        Message of rosbags with the fields of ROS.
 
     Warns
     -----
     UserWarning
-        If diagonal gains lose something.
+        If gains with off-diagonal entries are reduced to diagonals.
     """
     types = _store().types
     position, orientation = poses(schedule)
@@ -77,19 +77,19 @@ def to_messages(schedule: Schedule, *, gains: Gains = "matrix") -> Iterator[tupl
 
 
 def to_bag(schedule: Schedule, path: str | os.PathLike[str], *, gains: Gains = "matrix") -> None:
-    """Write the messages of `to_messages` to a rosbag2: a new folder, which ``ros2 bag play`` publishes.
+    """Write the messages of `to_messages` to a rosbag2, a new folder for ``ros2 bag play``.
 
     Parameters
     ----------
     schedule : Schedule
     path : path
-        The folder, which must not exist.
+        Folder to create.
     gains : {"matrix", "diagonal"}, default="matrix"
 
     Raises
     ------
     FileExistsError
-        If there is something at the path.
+        If the path exists.
     """
     if Path(path).exists():
         raise FileExistsError(f"{path} exists: give a new folder, or remove it.")
@@ -108,6 +108,6 @@ def _store() -> Any:
 def _array(types: Any, matrix: Floats, gains: Gains) -> Any:
     values = np.diagonal(matrix) if gains == "diagonal" else matrix
     dimension, layout = types["std_msgs/msg/MultiArrayDimension"], types["std_msgs/msg/MultiArrayLayout"]
-    # The stride of an axis counts the numbers from it on.
+    # The stride of an axis is the number of entries from it on.
     axes = [dimension(name, 6, 6 ** (values.ndim - i)) for i, name in enumerate(("rows", "columns")[: values.ndim])]
     return types["std_msgs/msg/Float64MultiArray"](layout(axes, 0), values.flatten())

@@ -1,4 +1,4 @@
-"""Sessions with robots: checks before the first tick, and a stop whatever happens."""
+"""Sessions with robots: checks before the first tick, and a guaranteed stop at the end."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,28 +12,28 @@ from torch_pbd.checks import Floats
 from torch_pbd.control.schedule import Schedule
 from torch_pbd.exceptions import InvalidParameterError
 
-_NEAR, _TURNED = 0.01, 0.05  # m and rad: the first pose is that far from the robot at most
+_NEAR, _TURNED = 0.01, 0.05  # largest distance in m and rad of the first pose from the robot
 
 
 class RobotStoppedError(RuntimeError):
-    """A robot could not go on; it was stopped."""
+    """Error of a robot that could not continue and was stopped."""
 
 
 @final
 @dataclass(frozen=True)
 class RobotLimits:
-    """Limits of what a robot can follow; a schedule beyond them is refused before the first tick.
+    """Limits of a robot; a schedule that exceeds them raises an error before the first tick.
 
     Defaults are those of the Franka Panda's interface.
 
     Parameters
     ----------
     speed, acceleration : float, default=1.7, 13.0
-        Limits of the tool's motion, m/s and m/s^2.
+        Largest speed and acceleration of the tool in m/s and m/s^2.
     angular_speed, angular_acceleration : float, default=2.5, 25.0
-        Limits of its rotation, rad/s and rad/s^2.
+        Largest angular speed and acceleration of the tool in rad/s and rad/s^2.
     stiffness, rotational_stiffness : (float, float), default=(10.0, 3000.0), (1.0, 300.0)
-        Smallest and largest eigenvalue of the blocks, N/m and Nm/rad.
+        Smallest and largest eigenvalue of the stiffness blocks in N/m and Nm/rad.
     """
 
     speed: float = 1.7
@@ -56,14 +56,14 @@ def poses(schedule: Any) -> tuple[Floats, Floats]:
 
 
 def accelerations(schedule: Schedule) -> Floats:
-    """Planned accelerations (n, d); of a schedule that has none, differences of its velocities."""
+    """Planned accelerations (n, d), by default the differences of the schedule's velocities."""
     if schedule.acceleration is not None:
         return schedule.acceleration
     return np.gradient(schedule.velocity, schedule.time, axis=0)
 
 
 def check_limits(schedule: Schedule, limits: Any) -> None:
-    """Refuse a schedule of poses that is beyond limits, by row."""
+    """Check a schedule of poses against limits; the error names the row."""
     poses(schedule)
     checks.instance(limits, "limits", RobotLimits)
     for field, values, block, unit in (
@@ -86,7 +86,7 @@ def check_limits(schedule: Schedule, limits: Any) -> None:
 
 
 def warn_of_mass(schedule: Schedule) -> None:
-    """Warn of a damping that is not for the inertia with which an arm moves that is controlled by torques."""
+    """Warn if the damping is not for the own inertia of a torque-controlled arm."""
     words = "no known mass"
     if schedule.mass is not None:
         mass = schedule.mass if isinstance(schedule.mass, np.ndarray) else schedule.mass * np.eye(6)[np.newaxis]
@@ -102,7 +102,7 @@ def warn_of_mass(schedule: Schedule) -> None:
 
 
 def check_start(schedule: Schedule, position: Floats, orientation: Floats) -> None:
-    """Refuse a start away from where the robot is: it would jump."""
+    """Check that the schedule begins at the robot's pose, since it would jump otherwise."""
     away = float(np.linalg.norm(schedule.position[0] - position))
     turn = float(np.linalg.norm(rotations.between(orientation, poses(schedule)[1][0])))
     if not (away <= _NEAR and turn <= _TURNED):
@@ -115,14 +115,14 @@ def check_start(schedule: Schedule, position: Floats, orientation: Floats) -> No
 @final
 @dataclass(frozen=True, eq=False)
 class RobotRun:
-    """Poses of a tool that followed a schedule, as far as it came.
+    """Poses of a tool that followed a schedule, up to the end or a fault.
 
     Attributes
     ----------
     time : (m,), s, within the schedule
-    position, orientation : (m, 3) in m and (m, 4), w x y z
+    position, orientation : (m, 3) in m and (m, 4), quaternions w x y z
     deviation : (m, 6), m and rad
-        Translation from the schedule, and the rotation vector that turns the desired orientation into the true one.
+        Translation from the schedule, and the rotation vector from the desired to the true orientation.
     """
 
     time: Floats
@@ -138,7 +138,7 @@ class RobotRun:
 
 
 def recorded(schedule: Schedule, rows: list[tuple[float, Floats, Floats]]) -> RobotRun:
-    """The run of a robot that was at these times within the schedule, positions and orientations."""
+    """Run of a robot from rows of time within the schedule, position and orientation."""
     table = np.reshape([np.hstack(row) for row in rows], (-1, 8))
     time, position, orientation = table[:, 0], table[:, 1:4], table[:, 4:]
     ends = schedule.time[[0, -1]]
@@ -150,7 +150,7 @@ def recorded(schedule: Schedule, rows: list[tuple[float, Floats, Floats]]) -> Ro
 
 @contextmanager
 def stopping(stop: Callable[[], Any], on_fault: Callable[[RobotStoppedError], Any] | None) -> Iterator[None]:
-    """Stop a robot at the end, and at whatever goes wrong; then tell ``on_fault``, or raise where it is None."""
+    """Stop a robot at the end and at any fault; then call ``on_fault``, or raise if it is None."""
     cause: BaseException | None = None
     try:
         yield

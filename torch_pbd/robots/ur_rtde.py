@@ -1,4 +1,4 @@
-"""Schedules on arms of Universal Robots by ur_rtde: force and torque at the tool in, poses to servo to out."""
+"""Schedules on Universal Robots arms by ur_rtde, from force and torque at the tool to servoed poses."""
 
 import time
 from collections.abc import Callable
@@ -13,9 +13,9 @@ from torch_pbd.control.schedule import Schedule
 from torch_pbd.robots import session
 from torch_pbd.robots.session import RobotLimits, RobotRun, RobotStoppedError
 
-# Limits of the tool as these arms are delivered; they servo to positions, so that stiffness is a matter of the loop.
+# Default limits of the tool of these arms; they servo to positions, so that the stiffness is only that of the loop.
 _LIMITS = RobotLimits(speed=1.0, angular_speed=3.1, stiffness=(0.0, np.inf), rotational_stiffness=(0.0, np.inf))
-_ASKED = 10.0  # poses a second of which the robot is asked whether it reaches them: each takes it some ms
+_ASKED = 10.0  # poses per second that the robot checks for reachability, which takes it some ms each
 
 
 def run(
@@ -29,38 +29,38 @@ def run(
     gain: float = 300.0,
     **loop: Any,
 ) -> RobotRun:
-    """Follow a schedule of poses as an admittance: ``RealTimeAdmittance`` here, ``servoL`` there.
+    """Follow a schedule of poses as an admittance: ``RealTimeAdmittance`` on this computer, ``servoL`` on the robot.
 
-    The sensor is zeroed first: nothing may touch the tool. The arm lags ``lookahead_time`` behind; what the tool feels
-    is the virtual mass of the schedule, of which less than some kg may shake in contact with what is stiff.
+    The sensor is zeroed first, so that nothing may touch the tool. The arm lags by ``lookahead_time``. The apparent
+    mass is the virtual mass of the schedule; less than some kg may vibrate in contact with stiff environments.
 
     Parameters
     ----------
     control, receive : rtde_control.RTDEControlInterface, rtde_receive.RTDEReceiveInterface
-        Connected, the tool centre point that of the schedule, the robot's base its frame, the arm at its first pose.
+        Connected interfaces, with the schedule's tool centre point, the base as its frame, and the arm at its start.
     schedule : Schedule
-        Poses, in m.
+        Schedule of poses in m.
     on_fault : callable, default=None
-        Called with the fault, a ``RobotStoppedError``, once the arm was stopped; None raises it.
+        Function called with the fault, a ``RobotStoppedError``, once the arm was stopped; None raises it.
     limits : RobotLimits, default=None
-        Limits that are checked before the arm moves; None is 1 m/s and 3.1 rad/s. The robot is asked whether it can
-        come there.
+        Limits that are checked before the arm moves; None is 1 m/s and 3.1 rad/s. The robot itself checks whether it
+        can reach the poses.
     lookahead_time, gain : float, default=0.05, 300.0
-        Arguments of ``servoL``: 0.03 to 0.2 s, 100 to 2000.
+        Arguments of ``servoL``, 0.03 to 0.2 s and 100 to 2000.
     **loop
         Options of ``RealTimeAdmittance``: ``force_limit``, ``deadband``, ``velocity_limit``, ``soft_start``.
 
     Returns
     -------
     RobotRun
-        The motion as far as it came.
+        Motion up to the end or a fault.
 
     Raises
     ------
     ValueError
-        Before anything moves: if the schedule is beyond the limits or out of reach, or the arm elsewhere.
+        Before anything moves, if the schedule exceeds the limits, is out of reach, or starts away from the arm.
     RobotStoppedError
-        If the robot stops, refuses a pose, or its force or clock are lost.
+        If the robot stops, refuses a pose, or its force or clock is lost.
     """
     session.check_limits(schedule, _LIMITS if limits is None else limits)
     checks.number(lookahead_time, "lookahead_time", least=0.03, most=0.2, unit="s")

@@ -1,4 +1,4 @@
-"""Demonstrations as CSV text: one line a sample."""
+"""Demonstrations as CSV text with one line per sample."""
 
 import csv
 import io
@@ -31,7 +31,7 @@ _WHOLE = re.compile(r"[+-]?\d{16,19}")  # stamps in ns, which float64 does not h
 
 
 def read(path: Path, wanted: Wanted, delimiter: str | None = None, decimal: str = ".") -> Arguments:
-    """Read the format of `torch_pbd.data.load_demonstrations`, which describes the options."""
+    """Read a CSV file with the options of `torch_pbd.data.load_demonstrations`."""
     checks.choice(decimal, "decimal", (".", ","))
     if delimiter is not None and (not isinstance(delimiter, str) or len(delimiter) != 1 or delimiter == decimal):
         raise checks.refusal(delimiter, "delimiter", f"one character, and not the decimal mark {decimal!r}")
@@ -44,7 +44,7 @@ def read(path: Path, wanted: Wanted, delimiter: str | None = None, decimal: str 
 
 
 def write(demonstrations: Demonstrations, handle: BinaryIO) -> None:
-    """Write columns ``demo,time,<names>``; the shortest decimals that come back to the last bit."""
+    """Write columns ``demo,time,<names>`` with the shortest decimals that read back to the last bit."""
     names, columns = as_columns(demonstrations)
     for name in names:
         if name != name.strip():
@@ -71,7 +71,7 @@ class _Table:
     missing: str
 
     def read_at_once(self) -> dict[str, NDArray[Any]] | None:
-        """Result of :meth:`read_lines` in a sixth of the time; None where a cell needs to be looked at."""
+        """Same as :meth:`read_lines` in a sixth of the time; None if some cell needs special treatment."""
         demo, time = (place and place[0] for place in (self.chosen.demo, self.chosen.time))
         kinds = ["S8" if name == demo else "f8" if name in (time, *self.chosen.names) else "S1" for name in self.header]
         if self.decimal != "." or not self.file.readline().strip():
@@ -159,7 +159,7 @@ class _Table:
 
 
 def _open_table(file: TextIO, delimiter: str | None, decimal: str, wanted: Wanted) -> _Table:
-    """Table whose delimiter is the one that finds the columns wanted, and most columns."""
+    """Table with the delimiter that yields the wanted columns, and then the most columns."""
     first, n_before = _header_line(file)
     candidates = [delimiter] if delimiter else [mark for mark in _DELIMITERS if mark != decimal]
     try:
@@ -182,7 +182,7 @@ def _open_table(file: TextIO, delimiter: str | None, decimal: str, wanted: Wante
 
 
 def _header_line(file: TextIO) -> tuple[str, int]:
-    """The line that names the columns, and its number: the first that is no comment, or the comment above numbers."""
+    """Header line and its number: the first that is no comment, or a comment directly above numbers."""
     comment = ""
     for number in range(1, _MOST_COMMENTS + 1):
         here = file.tell()

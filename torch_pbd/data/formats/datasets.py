@@ -24,7 +24,7 @@ _CODECS |= {"transpose", "sharding_indexed", "numcodecs.shuffle", "numcodecs.del
 
 
 def read_parquet(path: Path, wanted: Wanted) -> Arguments:
-    """Read a long table, a row a sample."""
+    """Read a long Parquet table with one row per sample."""
     with _open_parquet(path, "parquet", f"{path.name}, as all of Parquet,") as file:
         chosen = wanted.choose({name: (name,) for name in file.schema_arrow.names}, demo="demo", time="time")
         return wanted.read_rows(chosen, _read_columns(file, chosen.signals, wanted))
@@ -69,7 +69,7 @@ def _array(column: Any) -> NDArray[Any]:
 
 
 def read_lerobot(path: Path, wanted: Wanted) -> Arguments:
-    """Read a folder of LeRobot, version 2 or 3: Parquet files, and what they hold in meta/."""
+    """Read a LeRobot folder, version 2 or 3: Parquet files with metadata in meta/."""
     opened = partial(_open_parquet, extra="lerobot", what=f"{path.name}, as all of LeRobot,")
     with (path / "meta" / "info.json").open(encoding="utf-8") as file:
         info = json.loads(file.read(_LARGEST_INFO))
