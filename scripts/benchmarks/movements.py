@@ -327,15 +327,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--output", type=Path, default=Path("runs/movements"))
     parser.add_argument("--sets", nargs="*", default=SETS)
-    parser.add_argument("--models", nargs="*", default=list(MODELS), choices=list(MODELS))
+    compared = ("TrajectoryRegressor", "ProMPBaseline")
+    parser.add_argument(
+        "--models", nargs="*", default=list(MODELS), choices=list(MODELS), help=f"besides {' and '.join(compared)}"
+    )
     parser.add_argument("--folds", type=int, default=N_FOLDS)
     parser.add_argument("--n_train", type=int, default=MOST_TRAINED, help="demonstrations learned from, at most")
     parser.add_argument("--seeds", type=int, default=4, help="of made data; 0 leaves them out")
     parser.add_argument("--n_jobs", type=int, default=2)
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
+    models = [model for model in MODELS if model in {*compared, *options.models}]
     jobs = [
-        delayed(fold)(name, left_out, options.n_train, [model for model in MODELS if model in options.models])
+        delayed(fold)(name, left_out, options.n_train, models)
         for name in options.sets
         for left_out in range(min(options.folds, len(load(name)[1])))
     ]

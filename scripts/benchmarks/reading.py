@@ -34,7 +34,7 @@ def run() -> int:
     failed = 0
     print("kind       MB  wall [s]  CPU [s]  bar [s]  memory / numbers  bar")
     with tempfile.TemporaryDirectory() as temporary:
-        folder = options.folder or Path(temporary)
+        folder = (options.folder or Path(temporary)).absolute()  # the process that reads has another directory
         folder.mkdir(exist_ok=True, parents=True)
         for kind in options.kinds:
             files = [folder / f"{n}.{kind}" for n in (1000, options.rows)]
