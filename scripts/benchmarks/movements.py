@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from joblib import Parallel, delayed
 from movement_primitives.promp import ProMP
 from scipy.stats import multivariate_normal, multivariate_t
 
-from torch_pbd import KMPBaseline, ProMPBaseline, TrajectoryRegressor, load_demonstrations
+from torch_pbd import GMMBaseline, KMPBaseline, ProMPBaseline, TrajectoryRegressor, load_demonstrations
 from torch_pbd.experiments.comparison import MOVEMENT_STATISTICS, movement_statistics
 from torch_pbd.metrics import gaussian_kl
 
@@ -314,6 +315,33 @@ def table_of_laws(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def speed(n_demos: int, n: int, d: int) -> str:
+    """CPU times on one thread: of the fit beyond the regressor's, of a hundred draws and a via point, best of five."""
+    torch.set_num_threads(1)
+    rng, grid = np.random.default_rng(0), np.linspace(0.0, 1.0, n)
+    unit = np.exp(-0.5 * np.square((grid[:, None] - grid) / 0.1)) + 1e-6 * np.eye(n)
+    mixed = (np.eye(d) + 0.3 * rng.standard_normal((d, d))) * (0.2 + grid[:, None, None])
+    series = np.linalg.cholesky(unit) @ rng.standard_normal((n_demos, n, d))
+    y = np.sin(3.0 * grid)[:, None] + np.einsum("kni,nij->knj", series, mixed)
+    rows, groups = (np.tile(grid, n_demos)[:, None], y.reshape(-1, d)), np.repeat(np.arange(n_demos), n)
+    regressor, at, half = GMMBaseline(), grid[:, None], slice(n // 2, n // 2 + 1)
+    model = TrajectoryRegressor(regressor)
+    fit = seconds(lambda: model.fit(*rows, groups=groups), 1) - seconds(lambda: regressor.fit(*rows), 1)
+    draws = seconds(lambda: model.sample_demonstrations(at, 100, random_state=0))
+    via = seconds(lambda: model.condition(at[half], y[0, half]).predict(at))
+    return f"| {n_demos} x {n} x {d} | {fit:.2f} | {1e3 * draws:.1f} | {1e3 * via:.1f} |"
+
+
+def seconds(call: Any, n_repetitions: int = 5) -> float:
+    """Least CPU time of some calls."""
+    times = []
+    for _ in range(n_repetitions):
+        start = time.process_time()
+        call()
+        times.append(time.process_time() - start)
+    return min(times)
+
+
 def write(path: Path, rows: list[dict[str, Any]]) -> None:
     """Rows as CSV."""
     with path.open("w", newline="") as file:
@@ -334,8 +362,13 @@ def main() -> None:
     parser.add_argument("--folds", type=int, default=N_FOLDS)
     parser.add_argument("--n_train", type=int, default=MOST_TRAINED, help="demonstrations learned from, at most")
     parser.add_argument("--seeds", type=int, default=4, help="of made data; 0 leaves them out")
+    parser.add_argument("--speed", action="store_true", help="print the table of times alone")
     parser.add_argument("--n_jobs", type=int, default=2)
     options = parser.parse_args()
+    if options.speed:
+        print("| K x T x d | fit beyond the regressor [s] | 100 draws [ms] | via point [ms] |\n|" + " --- |" * 4)
+        print(speed(6, 100, 2), speed(20, 1000, 14), sep="\n")
+        return
     options.output.mkdir(parents=True, exist_ok=True)
     models = [model for model in MODELS if model in {*compared, *options.models}]
     jobs = [
