@@ -1,37 +1,37 @@
-"""The few errors and warnings of this package that Python and scikit-learn do not have."""
+"""Errors and warnings of this package."""
 
 
 class InvalidParameterError(ValueError, TypeError):
-    """An argument has a type or a value that cannot be used; the message names it, and says what it must be."""
+    """Error for an invalid type or value of an argument; the message names it and what it must be."""
 
 
 class NotPositiveDefiniteError(ValueError):
-    """A matrix that must be positive definite is not, even with the largest jitter allowed."""
+    """Error for a matrix that is not positive definite, even with the largest jitter allowed."""
 
 
 class ModelFileError(ValueError):
-    """A model file is damaged, of a newer version, or not a model of this package."""
+    """Error for a file that is damaged, of a newer version, or not of this package."""
 
 
 class DataRankWarning(UserWarning):
-    """The data leave directions of the covariance undetermined; a documented fallback was used."""
+    """Warning that the data leave directions of the covariance undetermined and a fallback was used."""
 
 
 class MissingDataWarning(UserWarning):
-    """Samples with missing values were dropped, as was asked for."""
+    """Warning that samples with missing values were dropped, as requested."""
 
 
 class UnimodalityWarning(UserWarning):
-    """The demonstrations follow more than one way, or one of them is far from the others."""
+    """Warning that the demonstrations have several modes, or one of them is far from the others."""
 
 
 class DataFormatError(ValueError):
-    """A file of demonstrations cannot be read as what its suffix says."""
+    """Error for a file of demonstrations that does not match its suffix."""
 
 
 class ConfigError(ValueError):
-    """A configuration file or a command line cannot be used."""
+    """Error for an invalid configuration file or command line."""
 
 
 class FolderInUseError(RuntimeError):
-    """Another run writes the folder of results."""
+    """Error for a results folder that another run is writing."""

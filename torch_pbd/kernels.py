@@ -1,4 +1,4 @@
-"""Stationary correlation functions of inputs; an amplitude and a noise are the Gaussian process's matter."""
+"""Stationary correlation functions of inputs; amplitude and noise belong to the Gaussian process."""
 
 import math
 from collections.abc import Callable
@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-# Beyond it every correlation here is zero in float64; keeps inf * 0 away from inputs at 1e300.
+# Distance beyond which every correlation is zero in float64; it avoids inf * 0 for inputs at 1e300.
 _FARTHEST = 1e8
 
 
@@ -98,7 +98,7 @@ def correlation(
 def value_and_slope(
     square_differences: Float[Tensor, "e n m"], inverse_square: Float[Tensor, "b e"], kernel: str
 ) -> tuple[Float[Tensor, "b n m"], Float[Tensor, "b n m"]]:
-    """Correlation, and its derivative by the squared distance in length scales, for b sets of length scales.
+    """Correlation and its derivative by the squared distance in length scales, for b sets of length scales.
 
     Both from squares of differences in each dimension and the inverse squares of the length scales.
     """

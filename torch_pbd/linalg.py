@@ -16,12 +16,12 @@ MAX_JITTER = 1e-6
 Pencil = Callable[[Tensor, float, float], Tensor]
 """``q Q + p P`` of some of m rows, by their indices, q and p: symmetric Q and positive definite P (..., m, s, s)."""
 
-# Rows among which the least eigenvalue is looked for at first, and that are factored together, which stay in the cache.
+# Rows among which the least eigenvalue is searched first, and rows factored together, which fit the cache.
 _N_SOME, _AT_ONCE = 24, 64
 
 
 def symmetrize(matrix: Float[Tensor, "*b d d"]) -> Float[Tensor, "*b d d"]:
-    """Symmetric to the last bit, which ``factor @ factor.mT`` is not for every size."""
+    """Matrix made symmetric to the last bit, which ``factor @ factor.mT`` is not for every size."""
     return 0.5 * (matrix + matrix.mT)
 
 
@@ -52,7 +52,7 @@ def triangular_inverse(factor: Float[Tensor, "*b d d"], *, upper: bool = False) 
 
 
 def smallest_eigenvalues(pencil: Pencil, rows: Int64[Tensor, " m"]) -> Float[Tensor, "*b m"]:
-    """Smallest eigenvalues of Q relative to P."""
+    """Smallest eigenvalues of Q relative to P at the given rows of a pencil."""
     factor = torch.linalg.cholesky(pencil(rows, 0.0, 1.0))
     half = torch.linalg.solve_triangular(factor, pencil(rows, 1.0, 0.0), upper=False)
     whole = torch.linalg.solve_triangular(factor.mT, half, upper=True, left=False)
@@ -60,7 +60,7 @@ def smallest_eigenvalues(pencil: Pencil, rows: Int64[Tensor, " m"]) -> Float[Ten
 
 
 def rows_below(pencil: Pencil, value: float, n: int) -> Int64[Tensor, " k"]:
-    """Rows, of n, with an eigenvalue of Q relative to P below a value: a Cholesky factor tells sooner than they do."""
+    """Rows, of n, with an eigenvalue of Q relative to P below a value, by the cheaper Cholesky factorization."""
     found = []
     for rows in torch.arange(n).split(max(_AT_ONCE, n // _AT_ONCE)):
         failed = torch.linalg.cholesky_ex(pencil(rows, 1.0, -value)).info > 0
@@ -69,7 +69,7 @@ def rows_below(pencil: Pencil, value: float, n: int) -> Int64[Tensor, " k"]:
 
 
 def least_eigenvalue(pencil: Pencil, n: int) -> tuple[float, int]:
-    """Smallest of all eigenvalues of the n rows of a pencil, and its row: of some, and then of those below theirs."""
+    """Smallest eigenvalue over the n rows of a pencil, and its row, from some rows and then those below them."""
     some = evenly(n, _N_SOME)
     least = float(smallest_eigenvalues(pencil, some).min())
     rows = torch.cat([some, rows_below(pencil, least, n)])
@@ -78,7 +78,7 @@ def least_eigenvalue(pencil: Pencil, n: int) -> tuple[float, int]:
 
 
 def evenly(n: int, most: int) -> Int64[Tensor, " m"]:
-    """At most so many of n indices, the first and last among them."""
+    """At most ``most`` evenly spaced indices of n, including the first and last."""
     return torch.linspace(0, n - 1, min(n, most)).round().long().unique()
 
 

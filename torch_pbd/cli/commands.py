@@ -1,4 +1,4 @@
-"""Commands: the options of each, and its work in a folder of results, which ends with a text."""
+"""Commands: the options of each, its work in a results folder, and the closing text."""
 
 import json
 import math
@@ -239,7 +239,7 @@ WORK = {"demo": demo, "fit": fit, "inspect": inspect, "experiment": experiment, 
 
 
 def _loaded(options: Any, load: Callable[..., Any]) -> Any:
-    """What a loader makes of the files, with the options of the command line."""
+    """Result of a loader on the files, with the options of the command line."""
     loader = {"missing": options.missing, "from_start": options.from_start, **(options.loader or {})}
     try:
         return load(options.data, **loader)

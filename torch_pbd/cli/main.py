@@ -152,7 +152,7 @@ def _run_folder(path: str, command: str) -> Any:
 
 
 def _show_once() -> Callable[..., None]:
-    """What takes the place of ``warnings.showwarning``: each warning once, as one line on the standard error."""
+    """Replacement of ``warnings.showwarning`` that prints each warning once, as one line on standard error."""
     shown = set()
 
     def show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:

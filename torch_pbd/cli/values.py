@@ -1,4 +1,4 @@
-"""Values as people write them: YAML without surprises, types in words, and the remedies that can be guessed.
+"""Values of options: YAML without surprises, types in words, and suggested remedies.
 
 YAML is that of plain values only, with the scalars of version 1.2 and each key once, bounded in size and depth.
 """

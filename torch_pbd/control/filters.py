@@ -1,12 +1,12 @@
 """Online filters that keep a varying stiffness from feeding energy into the robot.
 
-Both stand between the stiffness that is asked for and the one in effect, at every tick, and take the largest
-share of the step that their invariant allows. Damping steps by the same share. State and gains are those of
+At every tick they move the stiffness in effect towards the wanted one, by the largest share of the step that
+their invariant allows. Damping steps by the same share. State and gains are those of
 ``M a = u - K y - D v`` held over a tick, y the deviation from the desired position.
 
-Where a desired orientation turns, deviations of rotation turn with it, and so do the gains that are held on to: what is
-held back is their change as the tool sees it. An inertia that varies, as that of an arm, changes the kinetic energy by
-``1/2 v' dM v`` from tick to tick at the same velocity; what each filter makes of that, it says.
+Where a desired orientation turns, deviations of rotation turn with it, and so do the retained gains: their change is
+held back in the tool frame. A varying inertia, as of an arm, changes the kinetic energy by ``1/2 v' dM v`` from tick to
+tick at the same velocity; the filters document how they treat that.
 
 The simulation runs them on tensors (..., d) of many rollouts, the real-time loop on NumPy's arrays of one robot: the
 arithmetic is the same, of functions that have the same names in both.
@@ -23,32 +23,32 @@ from torch_pbd.exceptions import InvalidParameterError
 
 # A tensor, or an array of NumPy.
 Array = Any
-# What deviation and velocity change by over a tick, as a matrix (..., 2 d, 3 d) on deviation, velocity and the force
-# that is held; of stiffness, damping, mass (..., d, d) and the length of the tick in s.
+# Matrix (..., 2 d, 3 d) from deviation, velocity and held force to the change of the first two over a tick, as a
+# function of stiffness, damping, mass (..., d, d) and the length of the tick in s.
 TickChange = Callable[[Array, Array, Array, float], Array]
 
 State = tuple[Array, Array]  # deviation and velocity (..., d)
-Energy = Callable[[Array, Array], Array]  # (...), in J, of stiffnesses (..., d, d) and deviations (..., d)
+Energy = Callable[[Array, Array], Array]  # energy (...) in J from stiffness (..., d, d) and deviation (..., d)
 
-# A share is smaller by this than the largest allowed, which pays for its own rounding: 2.2e-16, some hundred times.
+# Amount by which a share stays below the largest allowed, to cover rounding: some hundred times 2.2e-16.
 _MARGIN = 1e-13
 
 
 class StiffnessFilter(ABC):
-    """Filter of the gains, as :class:`~torch_pbd.control.AdmittancePlant` and the real-time loop take it."""
+    """Filter of the gains for :class:`~torch_pbd.control.AdmittancePlant` and the real-time loop."""
 
     @abstractmethod
     def start(self, stiffness: Array, damping: Array, mass: Array, change: TickChange) -> "ActiveFilter":
-        """Filter at work on a schedule with gains (..., T, d, d) and a mass (d, d) or (..., T, d, d)."""
+        """Running filter for a schedule with gains (..., T, d, d) and a mass (d, d) or (..., T, d, d)."""
 
 
 @final
 @dataclass(frozen=True)
 class RateLimit(StiffnessFilter):
-    """Raise the stiffness no faster than a common Lyapunov function allows.
+    """Limit of the stiffness rate by a common Lyapunov function.
 
     ``V = 1/2 (v + a y)' M (v + a y) + 1/2 y' (K + a D - a^2 M) y`` does not grow from one tick to the next
-    without an external force, whatever the schedule asks for: the discrete form, for gains held over a tick, of
+    without an external force, for any schedule: the discrete form, for gains held over a tick, of
     the conditions of K. Kronander and A. Billard, "Stability considerations for variable impedance control",
     IEEE Transactions on Robotics 32, 2016. It needs no measurement. The admittance is passive with respect to
     ``v + a y`` and a force that is held over each tick; behind a position loop that lags, a robot need not be.
@@ -61,8 +61,8 @@ class RateLimit(StiffnessFilter):
     Parameters
     ----------
     alpha : float, default=None
-        The constant a, in 1/s, below the smallest eigenvalue of ``M^-1/2 D M^-1/2`` in the schedule; None is
-        half of that. The larger, the faster the stiffness may rise.
+        Constant a in 1/s, below the smallest eigenvalue of ``M^-1/2 D M^-1/2`` in the schedule; None is half
+        of that. A larger value lets the stiffness rise faster.
     """
 
     alpha: float | None = None
@@ -92,7 +92,7 @@ class RateLimit(StiffnessFilter):
 @final
 @dataclass(frozen=True)
 class EnergyTank(StiffnessFilter):
-    """Pay for every rise of the stiffness from a tank that dissipation fills.
+    """Energy tank that dissipation fills and from which every rise of the stiffness is paid.
 
     A rise at deviation y puts ``1/2 y' (K_new - K) y`` into the spring: it comes out of the tank, and where the
     tank has less, only that share of the rise is made; the stiffness may always fall. With the energy H of
@@ -107,12 +107,12 @@ class EnergyTank(StiffnessFilter):
     Parameters
     ----------
     energy : float, default=0.0
-        In the tank at the start, J: what the schedule may inject beyond what the motion has dissipated.
+        Initial energy in J, which the schedule may inject beyond what the motion has dissipated.
     energy_max : float, default=10.0
-        Most the tank holds, J; what comes beyond is lost.
+        Capacity of the tank in J; any excess is lost.
     efficiency : float, default=0.5
         Share of the dissipated energy that goes into the tank, 0 <= efficiency < 1. With 1 the robot would be
-        passive but need never come to rest: all it dissipates could be injected again.
+        passive but might never come to rest, as all dissipated energy could be injected again.
     """
 
     energy: float = 0.0
@@ -134,7 +134,7 @@ def spring_energy(stiffness: Array, off: Array) -> Array:
 
 
 class ActiveFilter(ABC):
-    """Filter of the gains at work: `select` and then `settle` each tick, and `carry` where the orientation turns.
+    """Running filter of the gains: `select` and then `settle` each tick, and `carry` where the orientation turns.
 
     ``gains`` are the stiffness and damping (..., d, d) in effect, and the share (...) of the step towards the wanted
     ones; ``tank_energy`` (...) is in J, None where there is no tank.
@@ -146,9 +146,9 @@ class ActiveFilter(ABC):
     def select(
         self, stiffness: Array, damping: Array, mass: Array, step: float, off: Array, scale: Array = 1.0
     ) -> None:
-        """Choose the gains of a tick of ``step`` s, from the wanted ones, the mass and the deviation (..., d).
+        """Choose the gains of a tick of ``step`` s from the wanted ones, the mass and the deviation (..., d).
 
-        ``scale`` (..., d) is that of the springs where limits scale them.
+        ``scale`` (..., d) is the scale of springs that limits reduce.
         """
         if self.gains is None:
             library, shape = _library(off), (*off.shape, off.shape[-1])
@@ -163,7 +163,7 @@ class ActiveFilter(ABC):
         self._turn, self._tick = None, (*self.gains[:2], mass, step)
 
     def carry(self, turn: Array) -> None:
-        """Take the gains along where the desired orientation turns, by a matrix (..., 3, 3), at the end of a tick."""
+        """Rotate the gains with the desired orientation, by a matrix (..., 3, 3), at the end of a tick."""
         stiffness, damping, share = self.gains
         library, d = _library(turn), stiffness.shape[-1]
         whole = library.zeros((*turn.shape[:-2], d, d), dtype=turn.dtype, device=turn.device)
@@ -174,11 +174,11 @@ class ActiveFilter(ABC):
 
     @abstractmethod
     def settle(self, before: State, after: State, force: Array, energy: Energy = spring_energy) -> None:
-        """Take note of a tick: its start and end, the force (..., d) held in it, and the energy that springs have."""
+        """Record a tick: states at its start and end, the force (..., d) held during it, and the springs' energy."""
 
     @abstractmethod
     def _largest_share(self, stiffness: Array, damping: Array, mass: Array, off: Array, scaled: Array) -> Array:
-        """Largest share, of at most 1, of the step to these gains that is paid for."""
+        """Largest share, at most 1, of the step to these gains that is paid for."""
 
 
 class _ActiveTank(ActiveFilter):
@@ -204,7 +204,7 @@ class _ActiveTank(ActiveFilter):
         stiffness, _, mass, _ = self._tick
         stored = [energy(stiffness, off) + spring_energy(mass, velocity) for off, velocity in (before, after)]
         dissipated = stored[0] + (force * (after[0] - before[0])).sum(-1) - stored[1]
-        # What looks like negative dissipation is rounding, or a limit of the command: it is charged in full.
+        # Negative dissipation comes from rounding or from a limit of the command, and is charged in full.
         self._pay(-_library(force).where(dissipated > 0.0, self._tank.efficiency * dissipated, dissipated))
 
     def _pay(self, energy: Array) -> None:
@@ -216,7 +216,7 @@ class _ActiveRateLimit(ActiveFilter):
         self._alpha, self._change = alpha, change
 
     def settle(self, before: State, after: State, force: Array, energy: Energy = spring_energy) -> None:
-        """Note nothing: what a tick pays is known from its gains."""
+        """Record nothing, since the payment of a tick follows from its gains."""
 
     def _largest_share(self, stiffness: Array, damping: Array, mass: Array, off: Array, scaled: Array) -> Array:
         """Largest s in [0, 1] for which the last tick pays for the step ``s dP`` of the function P.
@@ -274,5 +274,5 @@ def _quadratic(matrix: Array, left: Array, right: Array) -> Array:
 
 
 def _library(array: Array) -> Any:
-    """NumPy or torch, where the functions for an array are."""
+    """NumPy or torch, by the type of the array."""
     return sys.modules[type(array).__module__]

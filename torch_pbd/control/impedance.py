@@ -1,4 +1,4 @@
-"""Variability of demonstrations, learned; and stiffness and damping from what is known of it, and what is not."""
+"""Learned variability of demonstrations, and stiffness and damping from it and from its uncertainty."""
 
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, get_origin, get_type_hints
@@ -19,13 +19,13 @@ from torch_pbd.estimators.base import CovarianceRegressor, prior_covariance
 from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
 from torch_pbd.estimators.validation import fit_with_groups
 
-_FAR = 1e6  # ranges of the input: only the prior speaks there
-_NEEDED = ("get_params", "fit", "predict_cov", "predict_uncertainty")  # of a covariance regressor
-_AT_ONCE = 2**14  # times: a regressor may need a hundred times the memory of what it predicts
+_FAR = 1e6  # distance in ranges of the input at which only the prior remains
+_NEEDED = ("get_params", "fit", "predict_cov", "predict_uncertainty")  # methods of a covariance regressor
+_AT_ONCE = 2**14  # times predicted at once: a regressor may need a hundred times the memory of its predictions
 
 
 def check_parameters(controller: Any) -> None:
-    """Refuse the parameters of a DMPController that cannot be used, before any work."""
+    """Check the parameters of a DMPController before any work."""
     for name, kind in get_type_hints(type(controller)).items():
         if get_origin(kind) is Literal:
             checks.choice(getattr(controller, name), name, kind)
@@ -61,7 +61,7 @@ class Gains(NamedTuple):
 
 
 def gains_at(controller: Any, time: Floats, path: Floats) -> Gains:
-    """Gains of a fitted controller at movement times (n,) and desired outputs (n, d); of poses in world axes."""
+    """Gains of a fitted controller at movement times (n,) and desired outputs (n, d), for poses in world axes."""
     cuts = range(_AT_ONCE, len(time), _AT_ONCE)
     parts = [_gains(controller, *part) for part in zip(np.split(time, cuts), np.split(path, cuts), strict=True)]
     return Gains(*map(np.concatenate, zip(*parts, strict=True)))
@@ -78,7 +78,7 @@ def _gains(controller: Any, time: Floats, path: Floats) -> Gains:
         )
     sampled, covariance = (_at_pose(controller.outputs_, law, each, path) for each in learned)
     if controller.on_unknown == "soft":
-        # The share u of the way to the least stiffness counts holes already; their prior would count them again.
+        # The share u towards the least stiffness already accounts for gaps; their prior would count them twice.
         stiffness = law(sampled, mass)
         softest = stiffness.new_tensor(law.limits(stiffness.shape[-1])[0])
         softest = softest * torch.eye(stiffness.shape[-1]).to(stiffness)
@@ -90,7 +90,7 @@ def _gains(controller: Any, time: Floats, path: Floats) -> Gains:
 
 
 def _at_pose(outputs: Outputs, law: StiffnessLaw, learned: Floats, path: Floats) -> Floats:
-    """Covariances (n, d, d) of what was learned, at the poses (n, d); between blocks only where the law asks for it."""
+    """Learned covariances (n, d, d) at the poses (n, d), between blocks only if the law couples them."""
     covariance = outputs.covariance(learned, path)
     if len(outputs.blocks) == 1 or law.cross_terms:
         return covariance
@@ -103,7 +103,7 @@ def _at_pose(outputs: Outputs, law: StiffnessLaw, learned: Floats, path: Floats)
 
 
 def _covariances(controller: Any, time: Floats) -> tuple[Floats, Floats, Floats]:
-    """Covariances (n, d, d) without and with holes, and Type I uncertainty (n,), at times (n,).
+    """Covariances (n, d, d) without and with gaps, and Type I uncertainty (n,), at times (n,).
 
     A regressor bridges holes that are short beside its length scale. Of the share of the time that is unsampled,
     the covariance is therefore its prior, at the input, or if that is the same everywhere, far from all inputs.
@@ -130,7 +130,7 @@ def fit_covariance(
     known: NDArray[np.bool_],
     outputs: Outputs,
 ) -> CovarianceRegressor:
-    """Clone of the regressor, fitted to what varies (K, n, d) at inputs (n, 1), where two or more know it (K, n)."""
+    """Clone of the regressor, fitted to movements (K, n, d) at inputs (n, 1) where two or more are known (K, n)."""
     fitted: Any = clone(HeteroscedasticGPRegressor() if regressor is None else regressor)
     between, extents = varying - varying[:1], outputs.extents(varying)
     varying = varying.copy()
@@ -162,7 +162,7 @@ class _PriorOfCoordinates:
 
 
 def fit_law(controller: Any, varying: Floats) -> StiffnessLaw:
-    """Law of a controller with its bounds fixed to covariances where there are samples, of what varies (K, n, d)."""
+    """Law of a controller with bounds fixed to the covariances of movements (K, n, d) where there are samples."""
     outputs, reproduction, unsampled = controller.outputs_, controller.reproduction_, controller.unsampled_
     time = np.linspace(0.0, controller.duration_, len(unsampled))[unsampled <= UNKNOWN][::4]
     law = _chosen(controller.stiffness_law, outputs)
@@ -178,7 +178,7 @@ def fit_law(controller: Any, varying: Floats) -> StiffnessLaw:
 
 
 def outputs_under(controller: Any, demonstrations: Demonstrations) -> Outputs:
-    """Outputs of demonstrations; a law or a mass of a controller that are of others are refused."""
+    """Outputs of demonstrations, checked to fit the controller's law and mass."""
     reference, d = demonstrations.rotation_reference, demonstrations.n_outputs
     outputs = Outputs(d if reference is None else d - 3, reference)
     _chosen(controller.stiffness_law, outputs).blocks(d)

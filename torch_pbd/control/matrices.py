@@ -1,4 +1,4 @@
-"""Stiffness, damping and mass matrices: the tensors that control is given, and the damping of a stiffness."""
+"""Stiffness, damping and mass matrices: checked tensors, and damping from stiffness."""
 
 import math
 from numbers import Real
@@ -12,7 +12,7 @@ from torch_pbd import checks
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.linalg import spectral_map, symmetrize
 
-# kg. Gains are at most 1e100, and float64 ends at 1e308: squares of gain over mass must be numbers still.
+# Smallest mass in kg: gains are at most 1e100, and float64 must hold squares of gain over mass.
 _LIGHTEST = 1e-50
 
 
@@ -33,9 +33,9 @@ def damping_from_stiffness(
     mass : float or Tensor of shape (..., d, d), default=1.0
         Mass in kg; a matrix must be symmetric and positive definite.
     damping_ratio : float or "paper", default=1.0
-        1 is critical, and makes any schedule stable whose largest stiffness is below 33.9 times its smallest; see
-        :func:`required_damping_ratio`.
-        "paper" is ``K^1/2`` whatever the mass: a ratio of ``1 / (2 sqrt(m))``, critical at 0.25 kg only.
+        Damping ratio zeta. 1 is critical, and stabilizes any schedule whose largest stiffness is below 33.9 times its
+        smallest; see :func:`required_damping_ratio`. "paper" is ``K^1/2`` for every mass: a ratio of
+        ``1 / (2 sqrt(m))``, which is critical only at 0.25 kg.
 
     Raises
     ------
@@ -56,23 +56,23 @@ def damping_from_stiffness(
 
 
 def required_damping_ratio(stiffness_ratio: float) -> float:
-    """Damping ratio from which a robot is exponentially stable under any schedule of stiffness whatever.
+    """Damping ratio from which a robot is exponentially stable under any stiffness schedule.
 
-    For damping ``2 zeta (m K)^1/2``, however fast K changes and its axes turn, as long as its eigenvalues stay between
-    ``k`` and ``stiffness_ratio * k``; held over ticks of any length, or blends of such pairs (linear between knots).
+    It holds for damping ``2 zeta (m K)^1/2``, however fast K changes and its axes turn, as long as its eigenvalues stay
+    between ``k`` and ``stiffness_ratio * k``, with gains held over ticks of any length or linear between knots.
 
-    ``(R^(1/4) - R^(-1/4)) / 2`` up to R = 194: 0.82 for R = 20, and critical damping does up to 33.9. Above 194
-    more is needed than this, and from 1154 on the proof gives no ratio: infinity.
+    The ratio is ``(R^(1/4) - R^(-1/4)) / 2`` up to R = 194: 0.82 for R = 20, and critical damping suffices up to 33.9.
+    Above 194 it is larger than this, and from 1154 on the proof gives no ratio: infinity.
 
     Parameters
     ----------
     stiffness_ratio : float
-        R, the largest stiffness over the smallest, of all axes and times; at least 1.
+        Ratio R of the largest to the smallest stiffness over all axes and times, at least 1.
 
     Raises
     ------
     ValueError
-        If it is below 1.
+        If the ratio is below 1.
 
     Notes
     -----
@@ -94,7 +94,7 @@ def required_damping_ratio(stiffness_ratio: float) -> float:
 
 
 def as_tensor(value: Any, name: str) -> Tensor:
-    """Dense tensor of float32 or float64; what is no tensor is copied in float64. Errors have ``name``."""
+    """Dense float32 or float64 tensor; other arrays are copied as float64. Errors contain ``name``."""
     if not isinstance(value, Tensor):
         # A copy: torch must alias no read-only array, and takes no negative strides.
         return torch.from_numpy(checks.real_floats(value, name).copy())
@@ -124,7 +124,7 @@ def as_rows(value: Any, name: str, n_dims: int) -> Tensor:
 
 
 def as_semidefinite(value: Any, name: str) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-    """Positive semidefinite matrices (..., d, d), and their eigenvalues (..., d) and axes; errors have ``name``."""
+    """Positive semidefinite matrices (..., d, d) with eigenvalues (..., d) and axes; errors contain ``name``."""
     matrix = as_tensor(value, name)
     plain = matrix.detach()
     checks.semidefinite(plain.cpu().numpy(), name)
@@ -133,7 +133,7 @@ def as_semidefinite(value: Any, name: str) -> tuple[Tensor, tuple[Tensor, Tensor
 
 
 def as_damping_ratio(value: Any) -> float | Literal["paper"]:
-    """Damping ratio, at least 0; or "paper", the damping K^1/2 whatever the mass."""
+    """Checked damping ratio, at least 0, or "paper", the damping K^1/2 for every mass."""
     if isinstance(value, str) and value == "paper":
         return "paper"
     # Above a million the damping overflows beside gains and masses that are still numbers.
@@ -153,7 +153,7 @@ def as_mass(mass: Any) -> float | Tensor:
 
 
 def masses_like(mass: float | Tensor, like: Tensor, name: str) -> Tensor:
-    """Mass as matrices (..., d, d) that broadcast with matrices (..., d, d) of this name, of their dtype and device."""
+    """Mass as matrices (..., d, d) that broadcast with ``like``, called ``name``, with its dtype and device."""
     matrix = torch.as_tensor(mass, dtype=like.dtype, device=like.device)
     matrix = matrix if matrix.ndim else matrix * torch.eye(like.shape[-1]).to(like)
     sizes = zip(reversed(matrix.shape), reversed(like.shape), strict=False)
@@ -166,11 +166,11 @@ def masses_like(mass: float | Tensor, like: Tensor, name: str) -> Tensor:
 
 
 def mass_rows(mass: Any, like: Tensor) -> Tensor:
-    """Inertia as one matrix (d, d), or as one for each tick (..., T, d, d), of gains (..., T, d, d)."""
+    """Inertia (d, d), or (..., T, d, d) with one per tick, for gains (..., T, d, d)."""
     rows = masses_like(as_mass(mass), like, "stiffness")
     if rows.ndim == 2:
         return rows
-    # Rows that are all the same are one mass; those that want gradients get them row by row.
+    # Equal rows are one mass, unless they require gradients, which are then per row.
     is_one = rows.ndim == 3 and not rows.requires_grad and bool((rows == rows[0]).all())
     return rows[0] if is_one else rows.expand(*rows.shape[:-3], *like.shape[-3:])
 

@@ -1,4 +1,4 @@
-"""Compare models on one data set, or on recordings: how well each repeats the data, and predicts a demonstration."""
+"""Comparison of models on one data set or on recordings: fit to the data, and prediction of a demonstration."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""What a learned robot does when it is pushed early and late: along its first output, or in each axis of a tool."""
+"""Response of a learned robot to early and late pushes, along its first output or in each axis of a tool."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

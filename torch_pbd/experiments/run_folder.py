@@ -1,4 +1,4 @@
-"""The folder a run writes: its files, the fits that it has finished, and the page that shows them.
+"""Results folder of a run: its files, the finished fits, and the page that shows them.
 
 Importing this module does not load torch: a folder that cannot be written is refused before.
 """

@@ -1,4 +1,4 @@
-"""Models on made data, whose truth is known: the paper's simulation (Section IV-E), and the demo's tunnel.
+"""Models on synthetic data of known truth: the paper's simulation (Section IV-E), and the demo's tunnel.
 
 Table I and Figures 1 to 3 are on data drawn from eq. (14). The demo is the main job, without arguments.
 """

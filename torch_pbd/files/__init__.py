@@ -1,4 +1,4 @@
-"""Files that are there whole or as they were before; arrays in them, read without taking their word for anything."""
+"""Atomic writing of files, and reading of arrays without trusting their contents."""
 
 import errno
 import hashlib

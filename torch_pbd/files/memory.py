@@ -1,4 +1,4 @@
-"""Memory asked for before it is taken: an error that says what to do, where the system would end the process."""
+"""Checks of available memory, with an error and its remedy before the system would end the process."""
 
 import os
 from collections.abc import Iterable, Iterator

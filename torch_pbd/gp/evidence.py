@@ -1,4 +1,4 @@
-"""Evidence of Gaussian processes in closed form, with its gradient, and what a search of it holds and allows."""
+"""Evidence of Gaussian processes in closed form, with its gradient, and the options of its search."""
 
 import math
 from dataclasses import dataclass
@@ -32,11 +32,11 @@ class EvidenceSearch:
         Standard deviation of the noise of one observation, held there if given; learned if None. Zero for all
         processes, or above zero for all.
     max_inputs : int or None
-        Inputs beyond which neighbours are merged, for length scales so short that no lower rank carries them.
+        Number of inputs above which neighbours are merged, for length scales too short for a lower rank.
     n_restarts : int
-        Valleys of the grid to descend into beside the deepest.
+        Number of the grid's valleys to descend into besides the deepest.
     max_iter, tol
-        Of the optimization that polishes the grid's points; the tolerance in nats, as in
+        Limit of iterations and tolerance of the optimization from the grid's points, in nats, as in
         :func:`~torch_pbd.optim.minimize_batch`.
     """
 

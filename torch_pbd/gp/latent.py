@@ -24,17 +24,17 @@ class LatentGP(nn.Module):
     inputs : Tensor of shape (n, e)
         Training inputs, or nodes that stand for them.
     weight : Tensor of shape (b, n)
-        What eq. (5) multiplies the correlations with the inputs by: the inverse of the matrix there, times
-        the squared amplitude and the observed deviations from the prior mean.
+        Weights of the correlations with the inputs in eq. (5): the inverse of the matrix there, times the squared
+        amplitude and the observed deviations from the prior mean.
     value_weight : Tensor of shape (b, n)
-        The same for what the model reads off without a prior: see :meth:`values`.
+        Weights of the values without a prior, see :meth:`values`.
     hyperparameters : Hyperparameters
-        Of the b processes; ``length_scale`` of shape (1, e) where all share it.
+        Hyperparameters of the b processes; ``length_scale`` has the shape (1, e) where all share it.
     counts : Tensor of shape (n,)
-        Observations behind each value; they divide the noise variance.
+        Number of observations of each value, which divides the noise variance.
     kernel : str
     root : Tensor of shape (r, n), default=None
-        Where the inputs are nodes: what was observed are r combinations of the values there.
+        Linear combinations of the values that were observed, where the inputs are nodes.
     """
 
     inputs: Tensor

@@ -1,4 +1,4 @@
-"""Observations of processes, and coordinates in which they are few: merged neighbours, or nodes for the inputs."""
+"""Observations of processes, reduced to few coordinates: merged neighbours, or nodes for the inputs."""
 
 import heapq
 import math

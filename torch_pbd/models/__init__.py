@@ -1,4 +1,4 @@
-"""Learned covariances as torch modules: the protocol of their cores, which know standardized numbers alone."""
+"""Learned covariances as torch modules, whose cores work on standardized data."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping

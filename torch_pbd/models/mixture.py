@@ -1,4 +1,4 @@
-"""Gaussian mixtures over inputs and outputs together: regression, expectation maximization, and L-BFGS after it."""
+"""Gaussian mixtures over inputs and outputs: regression, expectation maximization, and L-BFGS after it."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -100,7 +100,7 @@ class GaussianMixture(Core):
         return mean, torch.cat([within, between], dim=-1)
 
     def type1(self, x: Float[Tensor, "n e"]) -> Float[Tensor, " n"]:
-        """How far each row of ``x`` is from data: 0 on all training inputs, 1 far away.
+        """Distance of each row of ``x`` from data, as 0 on all training inputs to 1 far away.
 
         It is 1 - min(1, p(x) / p_min), p_min the lowest density of a training input (``log_density_floor``,
         set by the fits). A mixture knows only Type II uncertainty (paper, section IV-C): this measure is

@@ -1,4 +1,4 @@
-"""Training rows with their distinct inputs found, and the statistics of them that models are fitted to."""
+"""Training rows by distinct input, and the statistics of them to which models are fitted."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""L-BFGS that never loses its best point, for one objective and for many small ones side by side; Fisher scoring."""
+"""L-BFGS that keeps its best point, for one objective or many small ones in parallel, and Fisher scoring."""
 
 from torch_pbd.optim.batch import BatchReport, FitReport, Progress, Status, first_failure, minimize_batch
 from torch_pbd.optim.descent import minimize, minimize_scoring

@@ -1,4 +1,4 @@
-"""Many small unrelated optimizations side by side, and how optimizations end."""
+"""Many small independent optimizations in parallel, and reports of optimizations."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -26,7 +26,7 @@ ValueAndGradient = Callable[
 
 
 class Status(Enum):
-    """How an optimization ended; the value is the phrase for it."""
+    """Status of a finished optimization; the value is its description."""
 
     CONVERGED = "converged"
     MAX_ITER = "stopped at max_iter iterations"  # or at the most evaluations for these
@@ -54,7 +54,7 @@ Callback = Callable[[Progress], None] | None
 
 @dataclass(frozen=True)
 class FitReport:
-    """How an optimization ended, and what it came to."""
+    """Result of an optimization: loss, iterations and status."""
 
     loss: float
     loss_curve: tuple[float, ...]
@@ -66,16 +66,16 @@ class FitReport:
 
     @property
     def converged(self) -> bool:
-        """Whether it ended by itself."""
+        """Whether the optimization converged."""
         return self.status is Status.CONVERGED
 
     @property
     def message(self) -> str:
-        """How it ended, in words."""
+        """Description of the status in words."""
         return self.detail or self.status.value
 
     def after(self, other: "FitReport", name: str) -> "FitReport":
-        """Report with the status of the optimization before it, of this name, where that has not converged."""
+        """Report with the status of a previous optimization, called ``name``, where that has not converged."""
         if other.converged or not self.converged:
             return self
         return replace(self, status=other.status, detail=f"{name}: {other.message}")
@@ -83,7 +83,7 @@ class FitReport:
 
 @dataclass(frozen=True)
 class BatchReport:
-    """How the optimizations of a batch ended, each for itself."""
+    """Result of each optimization in a batch."""
 
     loss: Float[Tensor, " b"]
     start_loss: Float[Tensor, " b"]
@@ -118,15 +118,15 @@ def minimize_batch(
         and gradients (a, p). Problems at whose points it raises one of ``FAILURES`` count as not finite there; which
         they are it is asked one by one.
     start : Tensor of shape (b, p)
-        A problem whose loss there is not finite stays there.
+        Initial points; a problem with a non-finite loss stays at its start.
     max_iter : int, default=100
         Largest number of iterations.
     tol : float, default=1e-6
         A problem ends when its gradient, summed over its absolute entries, is below it, when its next step promises
         less than a hundredth of it, or when no step gained anything.
     inverse_hessian : Tensor of shape (b, p, p), default=None
-        At the start, positive definite. None finds it by differences of the gradient, in one batch too, with the
-        absolute values of the Hessian's eigenvalues.
+        Positive definite inverse Hessians at the start. None estimates them by differences of the gradient, in one
+        batch, with the absolute values of the Hessian's eigenvalues.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""L-BFGS and Fisher scoring on one objective; neither loses its best point."""
+"""L-BFGS and Fisher scoring on one objective; both keep their best point."""
 
 import math
 import time
@@ -104,7 +104,7 @@ def minimize(
     Returns
     -------
     FitReport
-        Its loss is never above that of the start.
+        Report whose loss is never above that of the start.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Classes, parameters and learned attributes of estimators as plain JSON, and back: only what closed tables name."""
+"""Conversion of estimators to plain JSON and back, restricted to the classes and attributes in closed tables."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict

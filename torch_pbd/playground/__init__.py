@@ -1,1 +1,1 @@
-"""A page in the browser: draw strokes, see their covariance, bend the movement, push the robot that follows it."""
+"""Browser page to draw strokes, see their covariance, bend the movement and push the robot that follows it."""

@@ -1,4 +1,4 @@
-"""Answers to a page: models of strokes, movements that are bent, schedules, files to take home."""
+"""Answers to the page: models of strokes, bent movements, schedules, and files to download."""
 
 import tempfile
 import time

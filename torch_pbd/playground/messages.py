@@ -1,4 +1,4 @@
-"""Messages of a page: plain JSON, held to types, sizes and ranges before anything is done with it."""
+"""Messages of the page: plain JSON whose types, sizes and ranges are checked first."""
 
 import base64
 import json

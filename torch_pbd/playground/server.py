@@ -1,4 +1,4 @@
-"""The page's server: loopback only, one secret address, small messages; the robot moves as frames are asked for."""
+"""Server of the page: loopback only, one secret address, small messages; the robot moves with requested frames."""
 
 import asyncio
 import contextlib

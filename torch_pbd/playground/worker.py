@@ -1,4 +1,4 @@
-"""The process that learns, so that the robot of the page is never kept waiting; torch is loaded there alone."""
+"""Process that learns models, so that the robot of the page never waits; only it loads torch."""
 
 import base64
 import multiprocessing
@@ -81,7 +81,7 @@ class _Newer(BaseException):
 
 
 class Desk:
-    """What each tab has learned, and the steps of its fit that are still to do: the newest strokes come first.
+    """Learned models of each tab, and the remaining steps of their fits, newest strokes first.
 
     A request interrupts the step under way, which begins again unless the request replaces the fit.
     """

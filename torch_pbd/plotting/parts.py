@@ -28,13 +28,13 @@ def plot_demonstrations(
     outputs : sequence of one to three int or str
         Outputs by number or by name.
     ax : matplotlib.axes.Axes
-        Of projection "3d" for three outputs.
+        Axes to draw into, with projection "3d" for three outputs.
     label : str or None, default="demonstrations"
-        In the legend, once.
+        Label of all demonstrations in the legend.
 
     Returns
     -------
-    list of Line2D, one a demonstration
+    list of Line2D, one per demonstration
     """
     style.check_kind(demonstrations, "demonstrations", "Demonstrations")
     chosen = style.chosen_outputs(outputs, demonstrations.names, 3)
@@ -110,9 +110,9 @@ def plot_model_bands(
     y : array-like of shape (n_samples, n_outputs)
     axes : sequence of n_outputs matplotlib Axes
     beyond : float, default=0.25
-        How far to draw on either side, in ranges of X.
+        Margin drawn on either side, in ranges of X.
     true_std : callable, default=None
-        Maps x (n, 1) to (mean, std), both (n, n_outputs), where the truth is known.
+        Map from x (n, 1) to the true (mean, std), both (n, n_outputs).
     """
     inputs, targets = checks.array(X, "X", ("n", 1)), checks.array(y, "y", None)
     targets = targets.reshape(len(inputs), -1)
@@ -198,7 +198,7 @@ def plot_rollout(
     rollout : Rollout
         One run, as NumPy arrays.
     axes : sequence of three matplotlib Axes, one above the other
-        Of poses six: three of positions, then three of rotations.
+        Axes to draw into; for poses six, three of positions and then three of rotations.
     outputs : sequence of int or str, default=None
         Outputs to draw, by number or by name; None is the first six.
     names : sequence of str, default=None

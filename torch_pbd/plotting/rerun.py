@@ -1,4 +1,4 @@
-"""Recordings, what was learned of them, schedules and runs as a file for the viewer of Rerun."""
+"""Recordings, learned models, schedules and runs as a file for the Rerun viewer."""
 
 import os
 from collections.abc import Sequence
@@ -34,12 +34,12 @@ def to_rerun(
     Parameters
     ----------
     path : path-like
-        Ends with .rrd; replaces a file that is there.
+        File to write, ending with .rrd; an existing one is replaced.
     demonstrations : Demonstrations, default=None
     display : MovementDisplay, default=None
-        What models learned of a movement: its mean, and bands.
+        Learned models of a movement, drawn as mean and bands.
     schedule : Schedule, default=None
-        With the eigenvalues of its stiffness, block by block.
+        Schedule, drawn with the eigenvalues of its stiffness per block.
     rollout : Rollout, default=None
         A single run, as ``simulate`` of a controller returns it.
 

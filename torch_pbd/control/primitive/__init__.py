@@ -1,1 +1,1 @@
-"""The movement primitive: from recordings to a reproduced motion, to other starts and goals (eq. 16 to 18)."""
+"""Movement primitive, eq. (16) to (18): reproduction of recordings and adaptation to other starts and goals."""

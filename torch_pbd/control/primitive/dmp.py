@@ -1,4 +1,4 @@
-"""Dynamic movement primitives, eq. (16) to (18), and their adaptation to other starts and goals without a throw."""
+"""Dynamic movement primitives, eq. (16) to (18), and their safe adaptation to other starts and goals."""
 
 from contextlib import suppress
 from itertools import pairwise
@@ -21,14 +21,14 @@ _QUINTICS = [
     [[0.0, 0.0, -30.0, 60.0, -30.0, 0.0], [1.0, 0.0, -18.0, 32.0, -15.0, 0.0], [0.0, 1.0, -4.5, 6.0, -2.5, 0.0]],
     [[0.0, -60.0, 180.0, -120.0, 0.0, 0.0], [0.0, -36.0, 96.0, -60.0, 0.0, 0.0], [1.0, -9.0, 18.0, -10.0, 0.0, 0.0]],
 ]
-_LEAST = 0.5  # of the duration, for a goal that changes late: four times the acceleration of one known at the start
-_BEYOND = 0.05  # of the hull: half of the 10 % that is promised, for what lies between the watched points
-_WATCHED = 256  # points of the path, of which none may leave the hull
+_LEAST = 0.5  # least share of the duration to reach a late goal, at four times the acceleration of an early one
+_BEYOND = 0.05  # allowed excess of the hull: half of the promised 10 %, as paths may exceed it between watched points
+_WATCHED = 256  # points of the path that are checked against the hull
 
 
 @final
 class DMP:
-    """A spring-damper towards a goal, and a forcing term over a phase that encodes the movement.
+    """Spring-damper towards a goal with a forcing term over a phase that encodes the movement.
 
     ``tau z' = alpha (beta (goal - x) - z) + gate f(s)``, ``tau x' = z``, ``tau s' = -gamma s`` with s(0) = 1. The
     forcing of a demonstration, eq. (18), drives it along that demonstration again.
@@ -37,36 +37,35 @@ class DMP:
     point at ``goal + tau v_end / beta``. A gate takes the forcing to zero after ``duration``; it is 1 before,
     where eq. (18) is therefore the inverse of eq. (16) with every gate.
 
-    As printed, another goal or start than those demonstrated adds the answer of the spring-damper, in 0.5 tau whatever
-    the movement takes: "additive". "safe" takes both along by minimum jerk over the duration. The acceleration is then
-    at most 1.5 times that of the movement plus such a blend, and no coordinate leaves the hull of start, goal and
-    demonstrated path by more than a tenth: where it would, the path is made flatter. A goal that changes on the way is
-    reached with the end of the movement, or half a duration after the change where that is later.
+    As printed ("additive"), another goal or start than the demonstrated one adds the response of the spring-damper, in
+    0.5 tau whatever the duration. "safe" shifts both by minimum jerk over the duration. The acceleration is then at
+    most 1.5 times that of the movement plus such a blend, and no coordinate leaves the hull of start, goal and
+    demonstrated path by more than a tenth, as the path is flattened where necessary. A goal that changes on the way is
+    reached at the end of the movement, or half a duration after the change if that is later.
 
     Parameters
     ----------
     alpha : float, default=25.0
-        Positive. The natural frequency is ``sqrt(alpha beta) / tau``.
+        Positive gain of the velocity; the natural frequency is ``sqrt(alpha beta) / tau``.
     beta : float, default=None
-        Positive; None is ``alpha / 4``, critical damping. The damping ratio is ``sqrt(alpha / beta) / 2``: the
-        paper's alpha = beta = 1 gives 0.5, and overshoots.
+        Positive gain of the position; None is ``alpha / 4``, critical damping. The damping ratio is
+        ``sqrt(alpha / beta) / 2``: the paper's alpha = beta = 1 gives 0.5, which overshoots.
     gamma : float, default=0.7
-        Decay of the phase, positive.
+        Positive decay rate of the phase.
     tau : float, default=1.0
-        Time constant in s; twice the tau is half the speed.
+        Time constant in s; doubling it halves the speed.
     duration : float, default=None
-        When the movement ends and the gate begins to close, in s, for this tau; None is never.
+        Time in s at which, for this tau, the movement ends and the gate begins to close; None is never.
     gate : {"time", "phase", "none"}, default="time"
-        "time": closes over ``0.1 duration`` along a minimum-jerk curve. "phase": as the phase decays after
-        ``duration``, s / s(duration). "none": the paper's.
+        Gate of the forcing: "time" closes over ``0.1 duration`` along a minimum-jerk curve, "phase" as the phase decays
+        after ``duration``, s / s(duration), and "none" never, as in the paper.
     adaptation : {"safe", "additive"}, default="safe"
-        How it moves to other goals, and from other starts; "additive" is the paper's. "safe" takes tau where there is
-        no ``duration``.
+        Adaptation to other goals and starts; "additive" is the paper's. "safe" uses tau if there is no ``duration``.
 
     Raises
     ------
     ValueError
-        If a parameter is not as described.
+        If a parameter is invalid.
 
     References
     ----------
@@ -108,7 +107,7 @@ class DMP:
         )
 
     def phase(self, time: Tensor | Any) -> Tensor:
-        """Phase s of eq. (17) at ``time`` in s: its solution ``exp(-gamma time / tau)``, never integrated."""
+        """Phase s of eq. (17) at ``time`` in s, by its solution ``exp(-gamma time / tau)``."""
         return torch.exp(-self.gamma * as_tensor(time, "time") / self.tau)
 
     def gate_at(self, time: Tensor | Any) -> Tensor:
@@ -128,7 +127,7 @@ class DMP:
         acceleration: Float[Tensor, "*b d"] | Any,
         goal: Float[Tensor, "*g d"] | Any,
     ) -> Float[Tensor, "*b d"]:
-        """Forcing that makes the primitive move like this: eq. (18), in the units of position.
+        """Forcing that reproduces a motion, eq. (18), in the units of position.
 
         Raises
         ------
@@ -158,15 +157,15 @@ class DMP:
         Parameters
         ----------
         forcing : Tensor of shape (..., T, d)
-            At the ticks, before the gate.
+            Forcing at the ticks, before the gate.
         dt : float
-            In s.
+            Length of a tick in s.
         goal : Tensor of shape (d,), (..., 1, d) or (..., T, d)
-            One goal, or the goal held over each tick: it may change at run time.
+            One goal, or the goal held over each tick, which may change during the movement.
         position0, velocity0 : Tensor of shape (..., d), default=None
-            State at the start; None is the origin, at rest.
+            Initial state; None is the origin, at rest.
         demonstrated_start, demonstrated_goal : Tensor of shape (..., d), default=None
-            Of the movement that forcing and ``velocity0`` are of, for "safe"; None: ``position0`` and the first goal.
+            Start and goal of the demonstrated movement, for "safe"; None takes ``position0`` and the first goal.
 
         Raises
         ------
@@ -186,7 +185,7 @@ class DMP:
         at_ticks, goals = at_ticks.expand(shape), goals.expand(shape)
         start, velocity = (given.get(name, goal.new_zeros(shape[-1])) for name in starts)
         own_start, own_goal = given.get("demonstrated_start", start), given.get("demonstrated_goal", goals[..., 0, :])
-        # A safe adaptation drives the movement as it was demonstrated, and takes its path to the other start and goals.
+        # A safe adaptation reproduces the demonstrated movement, and moves its path to the other start and goals.
         same = bool((own_start == start).all() and (goals == own_goal[..., None, :]).all())
         safe = self.adaptation == "safe" and not same
         driven = own_goal[..., None, :].expand(shape) if safe else goals
@@ -210,7 +209,7 @@ class DMP:
         rate[3, 4] = 1.0
         passed_on, added = torch.linalg.matrix_exp(rate)[:2].mT.split([2, 3])
         inputs = torch.stack([goals[..., :-1, :], forcing[..., :-1, :], forcing.diff(dim=-2)], dim=-1)
-        # What goal and forcing add is known of all ticks at once; one after another go the states alone.
+        # The effect of goal and forcing is computed for all ticks at once; only the states are sequential.
         states = [state]
         for increment in (inputs @ added).unbind(dim=-3):
             states.append(states[-1] @ passed_on + increment)
@@ -237,7 +236,7 @@ def adapt(
     start: Float[Tensor, "*#b d"],
     duration: float,
 ) -> tuple[Tensor, ...]:
-    """Position, velocity and acceleration at times of a path of these, from another start, to other goals.
+    """Position, velocity and acceleration of a path at given times, adapted to another start and other goals.
 
     With u the path relative to its own goal, the motion is ``goal + k u + c``: c takes start and goal along, by minimum
     jerk over the duration, so that with k = 1 the acceleration is the sum of both. Where this would leave the hull of
@@ -288,12 +287,12 @@ def _quintics(share: Float[Tensor, "*m"], horizon: Tensor) -> Float[Tensor, "*m 
 
 
 def _still(position: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d 3"]:
-    """States at rest."""
+    """States at rest at these positions."""
     return torch.nn.functional.pad(position.unsqueeze(-1), (0, 2))
 
 
 def _room(along: Tensor, bend: Tensor, low: Tensor, high: Tensor) -> Float[Tensor, "*b d"]:
-    """Share of a bend (..., m, d) that keeps motions within low and high (..., d), or as far out as without it."""
+    """Share of a bend (..., m, d) that keeps motions within low and high (..., d), or no further out than without."""
     margin = _BEYOND * (high - low)
     above, below = (high + margin).unsqueeze(-2) - along, along - (low - margin).unsqueeze(-2)
     space = torch.where(bend > 0.0, above, below).clamp_min(0.0)

@@ -1,4 +1,4 @@
-"""Outputs of a movement: which share a unit, which are a rotation, and the axes in which they are learned."""
+"""Outputs of a movement: blocks of one unit, rotations, and the axes in which they are learned."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -24,10 +24,10 @@ Of a Panda along the made pose task it is 5.01 to 16.1 kg and 0.0761 to 0.774 kg
 ratio are 0.12 and 0.22 m; this is their geometric mean, rounded.
 """
 
-_ROUNDING = 1e-11  # of the largest position; in rad
+_ROUNDING = 1e-11  # rounding as a share of the largest position, and in rad
 _STEPS, _FLAT = 100, 1e-3  # at most; of curvature, where two axes are as good turned
 _FURTHEST = 150.0  # degrees from the reference, as for demonstrations: at 180 a chart takes the other way round
-_NEARLY_UNIT = 1e-3  # of the norm of a quaternion: as people write them
+_NEARLY_UNIT = 1e-3  # tolerance of a quaternion's norm when typed by hand
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Outputs:
 
     @property
     def blocks(self) -> tuple[slice, ...]:
-        """Outputs that share a unit."""
+        """Slices of outputs that share a unit."""
         p = self.n_positions
         return (slice(0, p),) if self.reference is None else (slice(0, p), slice(p, p + 3))
 
@@ -55,7 +55,7 @@ class Outputs:
         return Chart(self.reference)
 
     def units(self, units: Sequence[str] | None) -> Sequence[str] | None:
-        """Units of the positions alone, of those of all outputs."""
+        """Units of the positions alone, from those of all outputs."""
         return None if units is None else units[: self.n_positions]
 
     def extents(self, varying: Floats) -> Floats:
@@ -98,7 +98,7 @@ class Outputs:
         return values if self.axes is None else values @ np.linalg.inv(self.axes).T
 
     def decode(self, coordinates: Floats) -> Floats:
-        """Outputs (..., d) of coordinates z."""
+        """Outputs (..., d) from coordinates z."""
         return coordinates if self.axes is None else coordinates @ self.axes.T
 
     def covariance(self, learned: Floats, path: Floats | None = None) -> Floats:
@@ -119,11 +119,11 @@ class Outputs:
         return 0.5 * (whole + np.swapaxes(whole, -1, -2))
 
     def poses(self, path: Floats) -> tuple[Floats, Floats]:
-        """Positions (n, p) and quaternions (n, 4) of outputs (n, d)."""
+        """Positions (n, p) and quaternions (n, 4) from outputs (n, d)."""
         return path[..., : self.n_positions], self._chart.exp(path[..., self.n_positions :])
 
     def motion(self, path: Floats, velocity: Floats, acceleration: Floats, unit: float) -> dict[str, Floats]:
-        """Rows of a schedule, of a motion (n, d) in units of position of so many m: in world axes."""
+        """Schedule rows in world axes from a motion (n, d) whose positions are in units of ``unit`` m."""
         if self.reference is None:
             return {"position": unit * path, "velocity": unit * velocity, "acceleration": unit * acceleration}
         p, chart = self.n_positions, self._chart
@@ -137,13 +137,13 @@ class Outputs:
         }
 
     def mass(self, given: float | Floats | None) -> float | Floats:
-        """Virtual mass as given; None is 1 kg, and of poses 1 kg that turns as if it were ``LEVER`` away, a matrix."""
+        """Virtual mass, by default 1 kg, and for poses a matrix with the inertia of 1 kg at a distance ``LEVER``."""
         if given is not None:
             return given
         return 1.0 if self.reference is None else np.diag([1.0] * self.n_positions + [LEVER**2] * 3)
 
     def scales(self, unit: float) -> Floats:
-        """Units of outputs (d,) in m and rad, where those of positions are so many m."""
+        """Units of outputs (d,) in m and rad, where positions are in units of ``unit`` m."""
         return np.concatenate([np.full(self.n_positions, unit), np.ones(0 if self.reference is None else 3)])
 
     def rows(self, values: Any, name: str) -> Floats:
@@ -178,14 +178,14 @@ class Outputs:
 
 
 def common_unit(units: Sequence[str] | None) -> str | None:
-    """The unit of all outputs; None if they have none, or several."""
+    """Common unit of all outputs; None if they have none, or several."""
     return units[0] if units is not None and len(set(units)) == 1 else None
 
 
 def in_si(units: Sequence[str] | None) -> float:
-    """Metres, or radians, of one unit of position; 1 where units are not known, differ, or are neither.
+    """Metres or radians per unit of position; 1 where units are unknown, differ, or are neither.
 
-    Those are taken as they are: stiffness is then in N per unit, and mass in N s^2 per unit.
+    Stiffness is then in N per unit, and mass in N s^2 per unit.
     """
     return (LENGTHS | ANGLES).get(common_unit(units) or "", 1.0)
 
@@ -197,7 +197,7 @@ def robot_unit(units: Sequence[str] | None) -> str | None:
 
 
 def counts_as_metres(units: Sequence[str] | None) -> bool:
-    """True if schedules of recordings in these units are in m, which is also assumed where there are none."""
+    """Whether schedules of recordings in these units are in m, which is also assumed without units."""
     return units is None or robot_unit(units) == "m"
 
 

@@ -1,4 +1,4 @@
-"""The mean movement of demonstrations as a movement primitive drives it."""
+"""Reproduction of the demonstrations' mean movement by a movement primitive."""
 
 import math
 from dataclasses import dataclass, replace
@@ -21,10 +21,10 @@ from torch_pbd.gp import EvidenceSearch, Observations, condition, fit_together
 
 # Ticks within the duration: with forcing that is linear between them eq. (16) reproduces 10 s to 1e-6 m.
 _TICKS = 4000
-_FAR = 0.01  # of the extent of a movement: a worse reproduction is worth a warning
+_FAR = 0.01  # reproduction error as a share of the movement's extent above which a warning is raised
 # Time constants after the end at which an additive movement is at rest: exp(-20) is 2e-9 of what it was.
 _SETTLE = 20.0
-_BRAKE = 0.2  # of the duration: the most that the stop of a movement that was cut may take
+_BRAKE = 0.2  # largest share of the duration for braking a movement that was cut
 # Of the largest speed, the last in m/s and rad/s. Who cuts more than 6 % of a minimum jerk has a tenth of its largest
 # there. Movements that keep above half of their largest are meant to pass, and a robot stops 0.1 m/s within 1 mm at
 # 5 m/s^2, and 0.3 rad/s within 0.3 degrees at 10 rad/s^2.
@@ -88,7 +88,7 @@ class Reproduction:
         return seen[:, np.newaxis]
 
     def forcing_of(self, movements: Movements) -> Floats:
-        """Forcing (K, n, d) that would reproduce each movement: eq. (18)."""
+        """Forcing (K, n, d) that reproduces each movement, eq. (18)."""
         goal = movements.position[:, -1:] if self.own_goals else self.goal
         goals = np.broadcast_to(goal, movements.position.shape)
         parts = (movements.position, movements.velocity, movements.acceleration, goals)
@@ -115,7 +115,7 @@ class Reproduction:
         return errors[0]
 
     def warn_if_cut(self, metres: float) -> None:
-        """Warn of a movement, in units of so many metres, that was cut while moving: a robot at rest cannot follow."""
+        """Warn of a movement, in units of ``metres``, that was cut while moving: a robot at rest cannot follow."""
         velocity, parts = self._curve(self.time, 1), zip(("m/s", "rad/s"), (metres, 1.0), _STOPPED, strict=True)
         for own, (unit, scale, stopped) in zip(self.blocks, parts, strict=False):
             speed = scale * np.linalg.norm(velocity[:, own], axis=1)
@@ -234,7 +234,7 @@ def primitive(controller: Any) -> DMP:
 
 
 def check_against_duration(controller: Any) -> None:
-    """Refuse parameters that only the duration of the movement makes too small or too large."""
+    """Check parameters whose valid range depends on the duration of the movement."""
     dmp, duration, cutoff = controller.dmp_, controller.duration_, controller.cutoff_
     checks.number(duration, "duration", least=_BRIEFEST, most=1.0 / _BRIEFEST, unit="s")
     if cutoff is not None and not _CYCLES[0] <= cutoff * duration <= _CYCLES[1]:

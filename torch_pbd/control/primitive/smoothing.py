@@ -1,4 +1,4 @@
-"""Recordings as a controller takes them: bursts merged, holes found, derivatives at true times by smoothing splines."""
+"""Preprocessing of recordings for a controller: merged bursts, gaps, and derivatives by smoothing splines."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -105,7 +105,7 @@ def smooth(
 
 
 def check_steps(n_steps: int, n_demos: int, d: int, *, learned: bool) -> None:
-    """Refuse more points of a movement than fit in memory: smoothed, and for a fit with the forcing of them learned."""
+    """Check that ``n_steps`` fit in memory, smoothed and, if ``learned``, with the forcing learned."""
     n = float(n_steps)
     needed = _SMOOTHED * n * n_demos * d
     if learned:  # Gaussian processes have matrices of all pairs of points, unless a few nodes carry the forcing
@@ -177,7 +177,7 @@ def automatic_cutoff(duration: float, *, knows_seconds: bool) -> float:
 
 
 def white_noise(n_samples: Sequence[int], scale: Floats) -> list[Floats]:
-    """White noise (T_k, d) of a scale (d,) at so many samples of each demonstration, which smoothing lets through."""
+    """White noise (T_k, d) of standard deviation ``scale`` (d,) at the samples of each demonstration."""
     random = np.random.default_rng(0)
     return [random.normal(size=(n, len(scale))) * scale for n in n_samples]
 
@@ -189,7 +189,7 @@ def variance_share(part: Floats, whole: Floats) -> Floats:
 
 
 def merge_bursts(demonstrations: Demonstrations) -> Demonstrations:
-    """Demonstrations whose samples closer than a thousandth of the mean spacing are one, at their mean; told of."""
+    """Demonstrations with samples closer than a thousandth of the mean spacing merged at their mean, with a warning."""
     merged = [_merge(*recording) for recording in demonstrations]
     lost = [(k, n, n - len(merged[k][0])) for k, n in enumerate(demonstrations.n_steps) if n > len(merged[k][0])]
     if not lost:
@@ -250,7 +250,7 @@ def tabulate_unsampled(demonstrations: Demonstrations, lasting: float, on_unknow
 
 
 def duration_of(demonstrations: Demonstrations, duration: float | None) -> tuple[float, float]:
-    """Duration of a movement in s, None for the median of the demonstrations; and seconds of one unit of their time."""
+    """Duration in s, by default the median of the demonstrations, and seconds per unit of their time."""
     own = float(np.median([time[-1] - time[0] for time in demonstrations.times]))
     if duration is not None:
         return float(duration), duration / own

@@ -166,7 +166,7 @@ class HeteroscedasticFit:
         return coarse or coarse_mean
 
     def correlate(self) -> None:
-        """How far samples of a demonstration repeat each other, by e = inv(L) w."""
+        """Estimate the correlation of a demonstration's samples from e = inv(L) w."""
         if self.group is None:
             return
         self.correlation = demonstration_correlation(self.training.x, self.whitened(), self.group)

@@ -112,7 +112,7 @@ def check_memory(n_inducing: int | None, max_inputs: int, shape: tuple[int, int,
 
 @dataclass
 class SearchOptions:
-    """How hyperparameters are searched, and how the searches ended."""
+    """Options of the hyperparameter searches, and the reports of these."""
 
     max_iter: int = 30
     tol: float = 1e-3
