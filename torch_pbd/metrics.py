@@ -176,7 +176,7 @@ def mahalanobis_coverage(
     if hasattr(mean, "predict"):
         mean, covariance = mean.predict(covariance, return_cov=True)
     whitened, _ = _whitened_residual(mean, covariance, y)
-    quantile = 2 * gammaincinv(0.5 * whitened.shape[-1], level)  # of chi-squared, d degrees of freedom
+    quantile = 2 * gammaincinv(0.5 * whitened.shape[-1], level)  # chi-squared quantile with d degrees of freedom
     return float(np.mean(np.square(whitened).sum(-1) <= quantile))
 
 

@@ -1,4 +1,4 @@
-"""What is imported once it is needed: estimators by name, the one table of classes, and libraries of extras."""
+"""Lazy imports: estimators by name, from the one table of classes, and optional libraries."""
 
 from importlib import import_module
 from typing import Any

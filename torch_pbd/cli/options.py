@@ -55,7 +55,7 @@ A mixture has as many components as in the paper's Table I. Models of whole move
 
 _MODULES = {name: module for known in CLASSES.values() for name, module in known.items()}
 _CLASS_KEYS = ("class_path", "init_args")
-_HELP_WIDTH = 80  # of the terminals that people start with
+_HELP_WIDTH = 80  # width of default terminals
 
 
 class Option(NamedTuple):

@@ -244,7 +244,7 @@ class _ActiveRateLimit(ActiveFilter):
             change = library.concatenate([self._turn @ position, velocity], axis=-2) - start
         before = lyapunov_matrix(last_stiffness, last_damping, last_mass, self._alpha)
         after = lyapunov_matrix(held_stiffness, held_damping, mass, self._alpha)
-        # Of E' P E - P for E = 1 + change the P is left out, which has none of the digits that count in short ticks.
+        # E' P E - P with E = 1 + change is expanded without P, which would swamp the digits that count in short ticks.
         given = forces.mT @ port - start.mT @ after @ change
         paid = start.mT @ (before - after) @ start + given + given.mT - change.mT @ after @ change
         try:

@@ -187,7 +187,7 @@ def check_unimodal(demonstrations: Any) -> bool:
     UnimodalityWarning
         If there are two groups, or one demonstration is far from all others; the result is then False.
     """
-    is_recorded = isinstance(demonstrations, Resampling)  # of which Demonstrations, which it cannot import, are
+    is_recorded = isinstance(demonstrations, Resampling)  # base of Demonstrations, whose import would be circular
     if not is_recorded:
         raise checks.refusal(demonstrations, "demonstrations", "a Demonstrations")
     return follow_one_way((demonstrations if demonstrations.is_aligned else demonstrations.align()).to_array())

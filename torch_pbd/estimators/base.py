@@ -16,7 +16,7 @@ from torch_pbd.estimators.validation import checked_queries, checked_rows
 from torch_pbd.files.memory import require_much
 from torch_pbd.linalg import gaussian_log_density, safe_cholesky, student_log_density
 
-Prior = float | list[list[float]] | str | Callable[[Any], Any] | None  # what YAML can say; or any array-like
+Prior = float | list[list[float]] | str | Callable[[Any], Any] | None  # forms that YAML can express; or any array-like
 
 _SHORTEST_PERIOD = 1e-8  # share of the input's range: ten decimals of a standardized input leave such a phase two
 # Shares of the variance of y beyond which the floor under variances shows far from data, or the prior near them.

@@ -240,7 +240,7 @@ class TorchEstimator(MultiOutputMixin, RegressorMixin, BaseEstimator, ABC):
     def _device_problem(self) -> str:
         """Why no tensor can be put on the device; empty if it can."""
         try:
-            self._door(0.0).cpu()  # of a meta tensor there are no numbers
+            self._door(0.0).cpu()  # a meta tensor has no values
         except (AssertionError, OverflowError, RuntimeError, TypeError, ValueError) as error:  # by build and by device
             return str(error).partition("\n")[0].rstrip(".")
         return ""

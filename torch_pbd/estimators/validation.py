@@ -39,7 +39,7 @@ def checked_values(values: Any, name: str) -> Any:
     if hasattr(values, "columns"):
         for label in values.columns:
             _check_numbers(checks.real_array(values[label], f"column {label} of {name}"), f"{name}[{label!r}]")
-    elif not issparse(values):  # of which scikit-learn says more
+    elif not issparse(values):  # scikit-learn has a better message for sparse matrices
         _check_numbers(checks.real_array(values, name), name)
     return values
 

@@ -156,7 +156,7 @@ def judge_movement(
 ) -> dict[str, float]:
     """Joint log density of one demonstration X (n, 1), y (n, d), in nats, and whether regions of movements hold it.
 
-    Of a model of movements it is the law of whole movements that is judged, of a regressor that of independent rows.
+    Models of movements are scored by their law of whole movements, regressors by that of independent rows.
     Regions have the share ``level`` of the draws, as many below as above, for each of ``MOVEMENT_STATISTICS``. Returned
     are "joint", and 1.0 or 0.0 for each statistic.
     """

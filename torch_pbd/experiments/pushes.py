@@ -22,8 +22,8 @@ Arm = Literal["panda", "none"]
 KINDS = (style.POSITION, style.ROTATION)
 TOOL = "xyz"
 
-_PUSHES = (0.2, 0.8)  # of the duration: 2 s and 8 s of the paper's 10 s
-_LENGTH = 0.08  # of the duration: 0.8 s
+_PUSHES = (0.2, 0.8)  # onsets of pushes as shares of the duration: 2 s and 8 s of the paper's 10 s
+_LENGTH = 0.08  # length of a push as a share of the duration: 0.8 s of 10 s
 _ROWS = 50.0  # Hz; along a path the inertia of an arm changes with its joints, within seconds
 
 

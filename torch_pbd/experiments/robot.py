@@ -21,7 +21,7 @@ from torch_pbd.plotting import parts, poses, style
 
 _N_ELLIPSES = 13  # one every 0.8 s of the paper's movement: more would cover each other
 _MOST_OUTPUTS = 6  # panels of Figure 7 that a page holds
-_N_STEPS = 101  # of poses, at which demonstrations are compared
+_N_STEPS = 101  # steps at which demonstrations of poses are compared
 _figure = partial(Figure, layout="constrained")
 
 

@@ -34,7 +34,7 @@ from torch_pbd.files import remove_drafts, replacing
 
 _PACKAGES = ("torch", "scikit-learn", "numpy", "matplotlib")
 _PARTS = ("figures", "model", "schedule", "finished")
-_SUFFIXES = (".csv", ".html", ".json", ".npz", ".png", ".safetensors", ".txt", ".yaml")  # of the files of results
+_SUFFIXES = (".csv", ".html", ".json", ".npz", ".png", ".safetensors", ".txt", ".yaml")  # suffixes of result files
 _FINISHED = re.compile(r"[0-9a-f]{64}-\d+\.\d{6}\.safetensors")
 _LONGEST = 180  # bytes of a name, to which titles, suffixes and marks of drafts are added: file systems take 255
 _DPI = 110  # a figure of 12 inches fills a screen

@@ -33,11 +33,11 @@ from torch_pbd.plotting import style
 # Table I: mean squared error on Cholesky entries, and seconds on "a standard laptop in Matlab".
 PAPER_TABLE_1 = {"CD": (3.54e-13, 0.167), "WP": (0.0206, 8.64), "GMM 8": (1.05, 0.515), "GMM 5": (7.71, 0.237)}
 _MEDIANS = ("MSE", "error to truth", "held-out LL", "fit [s]")
-_BEYOND = 0.5  # of the range, so that the prior is seen
+_BEYOND = 0.5  # margin around the inputs as a share of their range, so that the prior is visible
 _LEAST_XI = -149.0  # eq. (14) has a covariance above xi = -150 only
 _N_FRESH = 300  # demonstrations that stand for the truth: their covariance is known to 8 %
 _RATE = 25.0  # Hz; the movement has nothing of use above a few
-_EVERY = 10  # of their samples are scored: those 40 ms apart are nearly copies
+_EVERY = 10  # every tenth sample is scored, since those 40 ms apart are nearly copies
 
 
 def run_simulation(

@@ -38,7 +38,7 @@ MAX_HEADER_BYTES = 2**22
 
 _MAX_OUTER_BYTES = 4 * MAX_HEADER_BYTES  # the header of safetensors, in which ours is a string with escapes
 _COPIES = 3.0  # the file, the arrays in it, and one array's bytes under the checksum
-_ENTRY_BYTES = 1000  # of what zipfile keeps of a member
+_ENTRY_BYTES = 1000  # memory that zipfile needs per member
 # NumPy writes 118 bytes for an array of a few axes. Headers are Python literals: short ones cannot nest deeply.
 _LONGEST_HEADER = 1024
 # Version 3 differs from 2 by UTF-8 in names of fields, which numbers and text do not have.

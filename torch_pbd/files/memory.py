@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
-_SHARE = 0.8  # of what there is: the rest is for what else runs
+_SHARE = 0.8  # usable share of the available memory; the rest is for other processes
 _GIB = 2.0**30
 _MOST = 2.0**100  # bytes that are worth a number in a message
 # Asking the system takes a millisecond, which small arrays are not worth.

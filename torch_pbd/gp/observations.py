@@ -15,7 +15,7 @@ from torch_pbd.kernels import KERNELS
 _N_NODES, _WORTH = (32, 48, 88, 168), 1.5
 
 _SHORTEST = 0.75  # spacings of the inputs: shorter "needles" explain each point by itself
-_LONGEST = 0.35  # of the range: with longer ones the prior of a covariance would never take over
+_LONGEST = 0.35  # largest length scale as a share of the range: with longer ones a covariance never reached its prior
 # A hole is so much of the range, and so many spacings of the other inputs. It is to hold so many length scales: a
 # smooth process without noise claims to know what is two to three of them from many inputs.
 _HOLE, _SPACINGS, _IN_HOLE = 0.25, 5.0, 6.0

@@ -138,12 +138,12 @@ class _Search:
         self._scales, self._table = targets.new_zeros(0), targets.new_zeros(len(targets), 0, len(self._ratios))
         self._processes = torch.arange(len(targets), device=targets.device)  # those that are still searched
         self.bases: list[tuple[float, Basis]] = []  # shortest length scale of each level so far, and its basis
-        self.n_iter, self.statuses = 0, [Status.CONVERGED]  # of the descents
+        self.n_iter, self.statuses = 0, [Status.CONVERGED]  # iterations and statuses of the descents
 
     def _resolutions(self) -> list[tuple[float, int | None]]:
         """Shortest length scales of the levels, the coarsest first, and their nodes; None are the inputs themselves.
 
-        What nodes do not carry is treated as noise, so there must be some.
+        Variation that nodes do not represent is treated as noise, so there must be some.
         """
         inputs, most = self._observations.inputs, self._options.max_inputs or len(self._observations.counts)
         levels: list[tuple[float, int | None]] = [(0.0, None)]
@@ -291,5 +291,5 @@ def _noise_ratios(targets: Float[Tensor, "b n"], noise_scale: Tensor | None) -> 
 
 
 def _together(basis: Basis) -> int:
-    """How many covariances are treated at a time."""
+    """Number of covariances treated at a time."""
     return max(1, _ENTRIES // len(basis.nodes) ** 2)

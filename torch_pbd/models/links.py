@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torch_pbd.linalg import tril_to_vector, vector_to_tril
 
-_LARGEST_LOGARITHM = 300.0  # of a diagonal entry: its square is still a number
+_LARGEST_LOGARITHM = 300.0  # largest logarithm of a diagonal entry whose square float64 holds
 _LEAST_DIAGONAL = 1e-6  # in standardized units: an entry of zero has no logarithm, and the floor is of this size
 _LOG_AMPLITUDE = 2.0  # prior standard deviation of the logarithm of an entry: a factor of e^2 either way is usual
 

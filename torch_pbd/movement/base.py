@@ -197,7 +197,7 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         checks.count(n_samples, "n_samples")
         generator = checks.seed(random_state)
         mean, covariance = self._marginals(self._times(X))
-        values, vectors = np.linalg.eigh(covariance)  # of a row that is known the covariance is zero
+        values, vectors = np.linalg.eigh(covariance)  # the covariance of a known row is zero
         root = vectors * np.sqrt(values.clip(0.0))[:, np.newaxis]
         deviation = root @ generator.standard_normal((*mean.shape, n_samples))
         degrees = self.predict_df(X)[:, np.newaxis, np.newaxis]

@@ -14,8 +14,8 @@ FAILURES = (ArithmeticError, ValueError, RuntimeError, IndexError)
 """Exceptions of an evaluation at a bad point: Cholesky and eigenvalues, overflow. Others are mistakes, passed on."""
 
 _LONGEST_STEP = 1e3  # in steps of BFGS
-_DIFFERENCE = 1e-4  # of parameters of order one, for the first Hessian: errors of 1e-4 of it, or 1e-12 by rounding
-_LEAST_CURVATURE = 1e-3  # of a Hessian's largest: a flatter direction gets no longer step
+_DIFFERENCE = 1e-4  # step of the first Hessian in parameters of order one: relative error 1e-4, or 1e-12 by rounding
+_LEAST_CURVATURE = 1e-3  # share of a Hessian's largest curvature at which the curvature of flat directions is clamped
 _FIRST_REACH = 1.0  # largest change of any parameter in the first step
 _ARMIJO = 1e-4  # least share of the fall that the slope promises (Nocedal and Wright, section 3.1)
 _HALVINGS = 25  # down to 3e-8 of a step at most
@@ -137,7 +137,7 @@ def minimize_batch(
     rows = torch.arange(len(start), device=start.device)
     every = _start(objective, rows, start.detach().clone(), inverse_hessian)
     first = every.loss
-    size = every.gradient.abs().sum(-1)  # of no parameters it is zero, and there is nothing to do
+    size = every.gradient.abs().sum(-1)  # zero without parameters, where there is nothing to do
     finite = torch.isfinite(first + size)
     active = every.restrict(finite & (size > tol) & (every.promise > _negligible(first, tol)))
     n_iter, status = 0, Status.CONVERGED if bool(finite.all()) else Status.NOT_FINITE

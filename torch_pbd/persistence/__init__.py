@@ -39,7 +39,7 @@ _FOREIGN = re.compile(
 # Arrays of a controller: for each output one number, but for the forcing.
 _NOISE, _MOTION = ("noise_scale_", "noise_share_"), ("start", "velocity", "goal", "forcing")
 _HOLES = "unsampled_"  # where there are any: other files are as those of versions that knew of none
-_OF_POSES = "rotation_reference", "output_axes"  # of poses alone
+_OF_POSES = "rotation_reference", "output_axes"  # arrays that only poses have
 
 
 def save(estimator: CovarianceRegressor | DMPController, path: str | os.PathLike[str]) -> None:

@@ -15,7 +15,7 @@ Check = Callable[[Any, str], Any]
 
 _LAW = "stiffness_law"
 _INTEGERS = [f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)]
-_DTYPES = ["float64", "float32", "float16", *_INTEGERS, "bool", "object"]  # of objects are names of columns
+_DTYPES = ["float64", "float32", "float16", *_INTEGERS, "bool", "object"]  # column names are arrays of objects
 
 
 def is_ours(estimator: Any) -> bool:

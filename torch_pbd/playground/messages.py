@@ -15,7 +15,7 @@ MODELS = [*REGRESSORS, *(name for name in MOVEMENTS if name != "TrajectoryRegres
 """Models that a page can choose: regressors become whole movements by TrajectoryRegressor."""
 
 FILES = ["demonstrations.csv", "schedule.npz", "schedule.json", "schedule.csv", "skill.py", "skill.yaml"]
-MOST_BYTES = 2**21  # of a message: forty strokes of a minute at 60 Hz take less
+MOST_BYTES = 2**21  # largest message, above forty strokes of a minute at 60 Hz
 
 # What a person draws is far less: a minute of a stroke at 60 Hz has 3600 samples.
 _MOST_STROKES, _MOST_SAMPLES, _MOST_POINTS = 40, 4000, 12

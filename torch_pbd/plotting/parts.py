@@ -153,7 +153,7 @@ def draw_edges(x: Floats, mean: Floats, std: Floats, ax: Axes, label: str, color
 def plot_stiffness(schedule: Any, ax: Axes, block: slice | None = None) -> list[Line2D]:
     """Draw the stiffness of each output over time, the diagonal of the matrix, within its limits.
 
-    Of poses, whose tool turns, that of the principal axes of a block.
+    For poses, whose tool turns, it is the stiffness along the principal axes of a block.
 
     Parameters
     ----------

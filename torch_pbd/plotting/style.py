@@ -34,7 +34,7 @@ class Kind(NamedTuple):
     push: str
     push_unit: str
     unit: str
-    scale: float  # of the unit shown
+    scale: float  # factor to the unit shown
     stiffness_unit: str
 
 

@@ -189,7 +189,7 @@ class _Simulation:
     def tick(self, row: int, push: Floats) -> dict[str, Any]:
         """State and commands at the start of a tick, which is then simulated."""
         data, planned = self._data, self._schedule
-        self._mujoco.mj_forward(self._model, data)  # of positions and velocities that the last step left
+        self._mujoco.mj_forward(self._model, data)  # for the positions and velocities after the last step
         state = self._chain.measure(data)
         if np.any(data.qpos <= self._chain.limits[0]) or np.any(data.qpos >= self._chain.limits[1]):
             raise RobotStoppedError(f"a joint reached its limit, at {data.qpos.round(3).tolist()} rad")

@@ -15,7 +15,7 @@ from torch_pbd.data.units import ANGLES, LENGTHS
 from torch_pbd.rotations import Chart
 
 RESOLUTION = 1e-5
-"""Of the extent of a movement: smaller standard deviations count as none. Of rotations also of a radian."""
+"""Share of a movement's extent, for rotations of a radian, below which standard deviations count as none."""
 
 LEVER = 0.17
 """Radius of gyration of a virtual mass, m: that of the inertia which is felt at the tool of an arm.
@@ -104,15 +104,15 @@ class Outputs:
     def covariance(self, learned: Floats, path: Floats | None = None) -> Floats:
         """Covariances (n, d, d) of outputs from those of z; at poses ``path`` (n, d) in world axes.
 
-        Those of the chart are as large as in world axes only near its reference: its axes are turned by up to the half
-        of the angle to it, and stretched. What is in world axes is what a controller of the robot compares with it.
+        Covariances in the chart equal those in world axes only near its reference: its axes are turned by up to half
+        the angle to it, and stretched. A robot controller compares deviations in world axes.
         """
         if self.axes is None:
             return learned
         turn = self.axes
         if path is not None:
             p = self.n_positions
-            to_world = np.tile(np.eye(p + 3), (len(path), 1, 1))  # of small changes of outputs
+            to_world = np.tile(np.eye(p + 3), (len(path), 1, 1))  # Jacobian of small changes of outputs
             to_world[:, p:, p:] = self._chart.to_world(path[:, p:])
             turn = to_world @ turn
         whole = turn @ learned @ np.swapaxes(turn, -1, -2)

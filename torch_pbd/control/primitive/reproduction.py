@@ -29,9 +29,9 @@ _BRAKE = 0.2  # largest share of the duration for braking a movement that was cu
 # there. Movements that keep above half of their largest are meant to pass, and a robot stops 0.1 m/s within 1 mm at
 # 5 m/s^2, and 0.3 rad/s within 0.3 degrees at 10 rad/s^2.
 _CUT, _STEADY, _STOPPED = 0.1, 0.5, (0.1, 0.3)
-_ROUNDING = 1e-9  # of the duration, or of the largest position
+_ROUNDING = 1e-9  # rounding as a share of the duration or of the largest position
 _BRIEFEST = 1e-100  # s: squares of what is briefer, or of its inverse, are no numbers
-_CYCLES = 0.01, 1e6  # of the cutoff in a movement: fewer smooth it to a line, more leave what was recorded
+_CYCLES = 0.01, 1e6  # bounds of the cutoff in cycles per movement: fewer give a line, more do not smooth
 # Time constants in a movement. A reach of 0.6 m is reproduced to 0.1 mm with 1e10 of alpha; rounding of the spring's
 # force moves it by 41 mm with 1e13, and out of its range with 1e16; so does the forcing, integrated twice, with 0.01.
 # With 0.02 of alpha, or 0.01 of the gamma of a gate, an additive movement is at rest a hundred durations late.
@@ -73,7 +73,7 @@ class Reproduction:
         still = np.zeros((len(time), len(goal)))
         known = cls(dmp, phase_input, own_goals, start, velocity, goal, time, still, blocks)
         mean = known.forcing_of(movements).mean(axis=0)
-        # Of poses along the principal axes of each block: outputs are learned one by one, and frames must not matter.
+        # Poses use the principal axes of each block, since outputs are learned one by one and frames must not matter.
         axes, deviation = np.eye(len(goal)), mean - mean.mean(axis=0)
         for own in blocks if len(blocks) > 1 else ():
             axes[own, own] = np.linalg.eigh(deviation[:, own].T @ deviation[:, own])[1]

@@ -19,16 +19,16 @@ from torch_pbd.files.memory import require_much
 UNKNOWN = 0.5
 """Type I uncertainty above which nothing is known: ``on_unknown="raise"`` raises."""
 
-# Of the mean spacing: clocks do not jitter by as little, drivers that number repeated stamps do. Bursts of five samples
-# 1e-9 to 1e-6 s apart, differentiated as they are, make a path of 8.7e7 m of recordings that stay within 0.41 m.
+# Share of the mean spacing below which samples merge: clocks jitter by more, drivers that number repeated stamps by
+# less. Bursts of five samples 1e-9 to 1e-6 s apart, left unmerged, make a path of 8.7e7 m of recordings within 0.41 m.
 _RESOLUTION = 1e-3
-_INTERVALS = 4000  # of a table: 200 in the shortest hole, of 7.5 spacings
+_INTERVALS = 4000  # intervals of a table, which gives the shortest gap, of 7.5 spacings, 200 of them
 CUTOFF_HZ = 4.0
 """Cutoff of slow movements: hands move below it, and tremor (8 to 12 Hz) and encoders' steps are above."""
 
 _CUTOFF_CYCLES = 40.0  # in a movement, the least cutoff of any: fast ones have detail above 4 Hz
 _LEAST_SAMPLES = {True: LEAST_SAMPLES, False: 3}  # with a cutoff and without one
-_MOST_BEYOND = 0.1  # of the range of an output in all recordings; paths through holes keep half of it
+_MOST_BEYOND = 0.1  # allowed excess of an output's range in all recordings; paths through gaps keep to half of it
 # Measured, in numbers: of each of a demonstration's positions while it is smoothed; of each pair of steps while the
 # forcing is learned, in all and of each axis where they are many; of each axis at a step, while it is tabulated.
 _SMOOTHED, _PAIRED, _PAIRED_AXIS, _TABULATED = 10.0, 34.0, 5.0, 16e3

@@ -255,7 +255,7 @@ class ScheduleClock:
             share = (time - start) / (stop - start) if time < stop else 1.0
             row = list(self._unpack(self._packed, index * self._row_size))
             after = self._unpack(self._packed, (index + 1) * self._row_size)
-            # Of quaternions that are so near, lengths and angles change evenly enough, and lengths do not matter.
+            # Quaternions this close are interpolated linearly: angles change evenly enough, and lengths do not matter.
             for i in range(n_place + self._d):
                 row[i] += share * (after[i] - row[i])
             low, high = limits[index], limits[index + 1]

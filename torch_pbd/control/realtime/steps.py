@@ -37,7 +37,7 @@ def deviation(place: Sequence[float], goal: Sequence[float], d: int) -> Vector:
     sin_y = y * a - w * c - z * b + x * e
     sin_z = z * a - w * e - x * c + y * b
     sin = math.hypot(sin_x, sin_y, sin_z)
-    # Of two quaternions of a rotation the one with cos >= 0 turns by pi at most.
+    # The quaternion of a rotation with cos >= 0 turns by at most pi.
     share = math.copysign(2.0 * math.atan2(sin, abs(cos)) / sin, cos) if sin else 0.0
     return (*map(sub, place[:-4], goal[:-4]), share * sin_x, share * sin_y, share * sin_z)
 

@@ -102,8 +102,8 @@ def largest_gain(steps: Float[Tensor, "k s s"]) -> float:
     """Largest norm of a product of successive maps, in coordinates in which the squared length is the energy.
 
     That is ``||P_j^1/2 Phi(j, i) P_i^-1/2||`` over i < j, with P = diag(K, M) and the exact maps Phi.
-    Of long schedules it is looked for between 150 rows, the closer together the more the energy changes there, and then
-    among all rows around where such a part begins and ends.
+    In long schedules it is searched between 150 rows, closer together where the energy changes more, and then among all
+    rows around the beginning and end of such a part.
     """
     every = torch.arange(len(steps) + 1)
     if len(steps) <= _MAX_ROWS:

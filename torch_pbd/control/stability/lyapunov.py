@@ -204,7 +204,7 @@ def _largest_bound(cuts: Float[Tensor, "4 n"], low: float, high: float) -> tuple
 def held_growth(dynamics: ErrorDynamics, maps: Float[Tensor, "k s s"], alpha: float) -> float:
     """Largest eigenvalue of ``A' P_next A`` relative to P, if above 1: A the map of an interval with its gains held.
 
-    Of this alpha, or, where that grows, of a half or a quarter. Of maps as ``dynamics.tick_maps`` has them, in whose
+    It is for this alpha or, where that grows, a half or a quarter. ``maps`` are from ``dynamics.tick_maps``, in whose
     coordinates ``e'(K + alpha D)e + 2 alpha e'Mv + v'Mv`` is a form of the modes.
     """
     squared, _, damping = dynamics.modes

@@ -34,7 +34,7 @@ _PARTS |= dict.fromkeys(
 )
 _JOINTS, _TRANSFORMS = "sensor_msgs/msg/JointState", ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 _KINDS = (*_PARTS, _JOINTS, *_TRANSFORMS)
-# Of these, a topic may tell the demonstrations apart.
+# Message types of topics that may label the demonstrations.
 _MARKS = {f"std_msgs/msg/{sign}Int{bits}" for sign in ("", "U") for bits in (8, 16, 32, 64)}
 _MARKS |= {"std_msgs/msg/Bool", "std_msgs/msg/String"}
 _JOINT_UNITS = {"position": "rad", "velocity": "rad/s", "effort": "N m"}
@@ -173,7 +173,7 @@ def _of_child(messages: Iterator[tuple[int, int, Any]], child: str | None) -> It
 
 
 def _getters(kind: str, message: Any) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
-    """What gets each column of each field from a message, and the unit of each field."""
+    """Getters of each column of each field of a message, and the unit of each field."""
     if kind != _JOINTS:
         part, place = _PARTS[kind]
         fields = _FIELDS[part].items()

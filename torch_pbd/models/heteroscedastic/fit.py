@@ -51,7 +51,7 @@ _LEAST_OWN = 1e-4
 # Residuals of a first mean that are wrong: of less than this share of the variance taken for noise, or of more than
 # that share of y's variance, which is a mean of nothing and doubtful in few rows too.
 _MUCH_LESS, _NEARLY_ALL = 0.25, 0.9
-_WORTH_A_WARNING = 0.03  # of y's variance: what a smooth mean misses of a corner is less
+_WORTH_A_WARNING = 0.03  # share of y's variance missed by the mean that warns; at a corner, a smooth mean misses less
 
 
 @dataclass

@@ -127,7 +127,7 @@ class LatentCovariance:
     log_variance: Weights
     coefficient_theta: Float[Tensor, "d-1 q"]
     rows: Processes
-    """Those of the coefficients of one output, of each but the first, which share one kernel."""
+    """Processes of the coefficients of an output, for each output but the first; they share one kernel."""
     coefficients: Sequence[Weights]
     """Weights of one coefficient after another, of outputs 1, 2, ..."""
 

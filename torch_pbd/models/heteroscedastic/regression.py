@@ -15,7 +15,7 @@ _LARGEST_PRECISION = 1e9
 
 # Beside the scatter of standardized samples, which is one in every direction: keeps K <= d demonstrations regular.
 _RIDGE = 1e-8
-_NO_NEIGHBOUR = 1e-9  # of an inverse correlation's diagonal: rounding, of inputs that are no neighbours
+_NO_NEIGHBOUR = 1e-9  # share of an inverse correlation's diagonal that is rounding between inputs that do not adjoin
 
 
 class Weights(NamedTuple):

@@ -34,9 +34,9 @@ _SHARE_OF_THIRD = 0.433  # independent ones among third differences of white noi
 _CONSTANT = 1e-20  # variance of an output that does not vary
 _LEAST = 1e-300  # a divisor that is zero gives zero and not NaN
 
-_N_BINS = 50  # of the distance between samples, up to the range of the inputs
-_MAX_SAMPLES = 400  # of one demonstration; of longer ones a share
-_MAX_PAIRS = 100_000  # of samples that are compared at once: bounds the memory
+_N_BINS = 50  # bins of the distance between samples, up to the range of the inputs
+_MAX_SAMPLES = 400  # most samples used of one demonstration; longer ones are thinned
+_MAX_PAIRS = 100_000  # most pairs of samples compared at once, to bound memory
 # Samples that count at least for half an independent one are taken for independent: so little correlation
 # cannot be known from none.
 _INDEPENDENT = 0.5
