@@ -51,6 +51,7 @@ ERRORS = {
     r"the resolution of float16 in [Xy]": "the type holds less than a thousandth of the range",
     r"demonstration \d+, smoothed, leaves the recorded range": "through a few samples of noise a curve swings",
     r"The reproduced movement leaves the recorded range": "the same, of a primitive that they drive",
+    r"period is array.* of its value where it is constant": "digits of a column that stands at 1e9",
     r"n_components is \d+, must not be above the number of distinct samples": "a component each is the most there is",
 }
 # What it may warn of, and why; any other warning is a fault.

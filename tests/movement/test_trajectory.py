@@ -202,7 +202,7 @@ def test_a_movement_that_was_seen_halfway_is_foretold(recordings):
 
 
 def test_steps_that_a_recording_has_not_are_left_out_of_it_not_drawn_through(monkeypatch):
-    monkeypatch.setattr(time_kernel_fit, "_RATIOS", ())  # without tremble
+    monkeypatch.setattr(time_kernel_fit, "_RATIOS", ())  # without tremor
     demos = movements(8)
     time = [GRID] * 7 + [np.delete(GRID, slice(8, 20))]
     hole = [*demos[:7], np.delete(demos[7], slice(8, 20), axis=0)]
@@ -225,7 +225,7 @@ def test_nuggets_take_missing_steps_for_missing():
 
 
 def test_the_length_scale_that_made_the_movements_is_found(monkeypatch):
-    monkeypatch.setattr(time_kernel_fit, "_RATIOS", ())  # without tremble
+    monkeypatch.setattr(time_kernel_fit, "_RATIOS", ())  # without tremor
     found = found_kernel(sample_series("squared_exponential", 0.2, n_demos=30), "squared_exponential")
     assert found.scales[:, 0].tolist() == pytest.approx([0.2, 0.2], rel=0.2)
 
@@ -254,8 +254,8 @@ def test_each_output_has_the_correlation_of_its_own_movements():
         assert (own - truth).abs().max() < 0.15
 
 
-def test_a_tremble_is_of_one_size_in_the_units_of_the_outputs():
-    # Deviations grow from a fifth to five, and a tremble has a standard deviation of 0.1 everywhere.
+def test_a_tremor_is_of_one_size_in_the_units_of_the_outputs():
+    # Deviations grow from a fifth to five, and a tremor has a standard deviation of 0.1 everywhere.
     grid = np.linspace(0.0, 1.0, 30)
     size = 0.2 * 25.0**grid
     slow, fast = (sample_series("matern52", length, 24, seed)[..., :1].numpy() for seed, length in ((3, 0.4), (4, 0.1)))

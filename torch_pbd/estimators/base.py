@@ -207,7 +207,8 @@ def check_period(value: Any, kernel: str, x_scale: Floats) -> Floats | None:
         if kernel == "periodic":
             raise ValueError("kernel == 'periodic' needs a period, in units of X, such as period=1.0 for a phase.")
         return None
-    must = f"in the units of its column of X (or inf), no shorter than {_SHORTEST_PERIOD:g} of its range"
+    least = f"{_SHORTEST_PERIOD:g} of its range, or of its value where it is constant"
+    must = f"in the units of its column of X (or inf), no shorter than {least}"
     return _of_columns(value, "period", len(x_scale), lambda periods: periods >= _SHORTEST_PERIOD * x_scale, must)
 
 

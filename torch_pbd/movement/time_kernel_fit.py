@@ -59,9 +59,9 @@ def fit_time_kernel(
     found = {name: [_search(grid, *each, name) for each in zip(outputs, usual, strict=True)] for name in kernels}
     kernel = max(kernels, key=lambda name: sum(each.log_likelihood for each in found[name]))
     shares = _SHARES if share is None else (share,)
-    tremble = deviation.median(0).values / deviation
+    tremor = deviation.median(0).values / deviation
     fitted = []
-    for part, steps, size, single in zip(outputs, usual, tremble.mT, found[kernel], strict=True):
+    for part, steps, size, single in zip(outputs, usual, tremor.mT, found[kernel], strict=True):
         # A tremor that makes the residuals of one output likelier need not do so jointly with those of the others.
         results = [_fit_output(grid, part, steps, size, kernel, single, is_sum) for is_sum in (False, True)]
         fitted.append(max(results, key=lambda result: _left_out(result, shares)[0]))
@@ -82,46 +82,46 @@ def _fit_output(
     grid: Tensor,
     residual: Float[Tensor, "K T 1"],
     usual: Bool[Tensor, " T"],
-    tremble: Float[Tensor, " T"],
+    tremor: Float[Tensor, " T"],
     kernel: str,
     single: Found,
     is_sum: bool,
 ) -> TimeKernel:
     """Scales and nuggets of one output in alternation, starting from the likeliest scales of the usual steps."""
-    found = _with_tremble(grid, residual, usual, kernel, single, tremble) if is_sum else single
-    unit = _candidates(grid, tremble, [found.scales], kernel)[0]
+    found = _with_tremor(grid, residual, usual, kernel, single, tremor) if is_sum else single
+    unit = _candidates(grid, tremor, [found.scales], kernel)[0]
     nugget = _step_nuggets(unit, residual, _LEAST)
     for _ in range(_ROUNDS):
         smooth = nugget <= _SMOOTH
         steps = smooth if 2 * smooth.sum() >= len(grid) else nugget <= nugget.median()
         before, single = found, _search(grid, residual, steps, kernel, single.scales.slow)
-        found = _with_tremble(grid, residual, steps, kernel, single, tremble) if is_sum else single
+        found = _with_tremor(grid, residual, steps, kernel, single, tremor) if is_sum else single
         if found[1:] == before[1:]:
             break
-        unit = _candidates(grid, tremble, [found.scales], kernel)[0]
+        unit = _candidates(grid, tremor, [found.scales], kernel)[0]
         nugget = _step_nuggets(unit, residual, min(found.nugget, 0.1 * _SMOOTH))
     filled = residual.clone()
     for k, own in enumerate(residual):  # the kernel's expectation where there were no samples
         seen = ~own.isnan().any(1)
         root = safe_cholesky(unit[seen][:, seen] + torch.diag(nugget[seen]), name="the time kernel")
         filled[k, ~seen] = unit[~seen][:, seen] @ torch.cholesky_solve(own[seen], root)
-    scales, fine = _tensors(tremble, [found.scales])
+    scales, fine = _tensors(tremor, [found.scales])
     return TimeKernel(kernel, grid, scales, fine, nugget[None], filled, grid.new_ones(()))
 
 
 def _tensors(
-    tremble: Float[Tensor, " n"], scales: Sequence[Scales]
+    tremor: Float[Tensor, " n"], scales: Sequence[Scales]
 ) -> tuple[Float[Tensor, "b 2"], Float[Tensor, "b n"]]:
     """Length scales, and variances of the tremor over those of the slow part."""
-    whole = tremble.new_tensor(scales)
+    whole = tremor.new_tensor(scales)
     weight = whole[:, 2:]
-    return whole[:, :2], weight / (1.0 - weight) * tremble.square()
+    return whole[:, :2], weight / (1.0 - weight) * tremor.square()
 
 
 def _candidates(
-    time: Float[Tensor, " n"], tremble: Float[Tensor, " n"], scales: Sequence[Scales], kernel: str
+    time: Float[Tensor, " n"], tremor: Float[Tensor, " n"], scales: Sequence[Scales], kernel: str
 ) -> Float[Tensor, "b n n"]:
-    lengths, fine = _tensors(tremble, scales)
+    lengths, fine = _tensors(tremor, scales)
     return smooth_correlation(time, time, lengths, fine, fine, kernel)
 
 
@@ -134,8 +134,8 @@ def _search(
     return _likeliest(grid, residual, steps, kernel, candidates, _NUGGETS, torch.zeros_like(grid))
 
 
-def _with_tremble(
-    grid: Tensor, residual: Tensor, steps: Tensor, kernel: str, single: Found, tremble: Float[Tensor, " T"]
+def _with_tremor(
+    grid: Tensor, residual: Tensor, steps: Tensor, kernel: str, single: Found, tremor: Float[Tensor, " T"]
 ) -> Found:
     """Likeliest of one length scale and of two on either side of it, where a tremor replaces part of the nugget."""
     length = single.scales.slow
@@ -147,7 +147,7 @@ def _with_tremble(
         for weight in _FINE_WEIGHTS
     ]
     nuggets = [nugget for nugget in _NUGGETS if nugget <= single.nugget]
-    pairs = [_likeliest(grid, residual, steps, kernel, candidates, nuggets, tremble)] if candidates else []
+    pairs = [_likeliest(grid, residual, steps, kernel, candidates, nuggets, tremor)] if candidates else []
     return max([single, *pairs])
 
 
@@ -158,12 +158,12 @@ def _likeliest(
     kernel: str,
     candidates: Sequence[Scales],
     nuggets: Sequence[float],
-    tremble: Float[Tensor, " T"],
+    tremor: Float[Tensor, " T"],
 ) -> Found:
     """Highest log likelihood of ``(1 - eta) K + eta I``, with its scales and shared nugget eta."""
     steps = steps if 2 * int(steps.sum()) >= len(grid) else torch.ones_like(steps)
     groups, time = _by_pattern(_unit_rms(residual[:, steps])), grid[steps]
-    unit = _candidates(time, tremble[steps], candidates, kernel)
+    unit = _candidates(time, tremor[steps], candidates, kernel)
     values = []
     for nugget in nuggets:
         whole = (1.0 - nugget) * unit + nugget * torch.eye(len(time)).to(time)
