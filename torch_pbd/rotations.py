@@ -1,16 +1,21 @@
 """Rotations as unit quaternions w x y z, and the chart in which they are learned as three numbers.
 
 Quaternions (..., 4) turn vectors of the body, a tool, into vectors of the world; rotation vectors (..., 3) are in rad.
-NumPy alone, for schedules and the control loop: tests compare it with ``scipy.spatial.transform``, which has the same.
+NumPy alone is imported, for schedules and the control loop: tests compare it with ``scipy.spatial.transform``, which
+has the same. `multiply`, `exp`, `between` and `cross_matrix` take torch's tensors too, from the simulated robot.
 """
 
 import math
-from typing import final
+import sys
+from typing import Any, final
 
 import numpy as np
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
+
+Array = Any
+"""An array of NumPy, or a tensor."""
 
 # Coefficients of a rotation vector v of length t. Where a difference cancels, its error is relative to what the term of
 # v that it belongs to leaves of it, so that only t = 0 itself needs care: below these, the next term is below 1e-16.
@@ -18,43 +23,56 @@ _TINY, _SMALL = 1e-4, 1e-3
 _MAX_STEPS = 100
 
 
-def multiply(first: Floats, second: Floats) -> Floats:
+def _library(array: Array) -> Any:
+    """NumPy or torch, by the type of the array."""
+    return sys.modules[type(array).__module__.partition(".")[0]]
+
+
+def multiply(first: Array, second: Array) -> Array:
     """Product of quaternions: the rotation by ``second``, then by ``first``."""
-    a, b = np.moveaxis(first, -1, 0), np.moveaxis(second, -1, 0)
-    return np.stack(
-        [
-            a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
-            a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
-            a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
-            a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
-        ],
-        axis=-1,
-    )
+    (a0, a1, a2, a3), (b0, b1, b2, b3) = ([each[..., i] for i in range(4)] for each in (first, second))
+    product = [
+        a0 * b0 - a1 * b1 - a2 * b2 - a3 * b3,
+        a0 * b1 + a1 * b0 + a2 * b3 - a3 * b2,
+        a0 * b2 - a1 * b3 + a2 * b0 + a3 * b1,
+        a0 * b3 + a1 * b2 - a2 * b1 + a3 * b0,
+    ]
+    return _library(first).stack(product, -1)
 
 
-def conjugate(quaternion: Floats) -> Floats:
+def conjugate(quaternion: Array) -> Array:
     """Inverse rotation."""
-    return quaternion * np.array([1.0, -1.0, -1.0, -1.0])
+    return _library(quaternion).concatenate([quaternion[..., :1], -quaternion[..., 1:]], axis=-1)
 
 
-def exp(vector: Floats) -> Floats:
+def exp(vector: Array) -> Array:
     """Quaternion (..., 4) of a rotation vector (..., 3)."""
-    half = 0.5 * np.linalg.norm(vector, axis=-1, keepdims=True)
-    return np.concatenate([np.cos(half), 0.5 * np.sinc(half / math.pi) * vector], axis=-1)
+    library = _library(vector)
+    half = 0.5 * library.linalg.norm(vector, axis=-1, keepdims=True)
+    return library.concatenate([library.cos(half), 0.5 * library.sinc(half / math.pi) * vector], axis=-1)
 
 
 def log(quaternion: Floats) -> Floats:
     """Rotation vector (..., 3) of a quaternion (..., 4), the shorter way: at most pi long."""
     shorter = np.where(quaternion[..., :1] < 0.0, -quaternion, quaternion)
-    w, xyz = shorter[..., :1], shorter[..., 1:]
-    length = np.linalg.norm(xyz, axis=-1, keepdims=True)
-    tiny = length < np.finfo(float).tiny
-    return np.where(tiny, 2.0, 2.0 * np.arctan2(length, w) / np.where(tiny, 1.0, length)) * xyz
+    return _vector(shorter[..., :1], shorter[..., 1:])
 
 
-def between(start: Floats, end: Floats) -> Floats:
+def between(start: Array, end: Array) -> Array:
     """Rotation vector (..., 3) in world axes from one quaternion (..., 4) to another, the shorter way."""
-    return log(multiply(end, conjugate(start)))
+    library = _library(end)
+    nearer = library.where((end * start).sum(-1)[..., None] < 0.0, -end, end)
+    # The difference keeps the digits of small rotations: q2 q1' = 1 + (q2 - q1) q1'.
+    away = multiply(nearer - start, conjugate(start))
+    return _vector(1.0 + away[..., :1], away[..., 1:])
+
+
+def _vector(w: Array, xyz: Array) -> Array:
+    """Rotation vector (..., 3) of a quaternion with w >= 0."""
+    library = _library(xyz)
+    length = library.linalg.norm(xyz, axis=-1, keepdims=True)
+    tiny = length < library.finfo(length.dtype).tiny
+    return library.where(tiny, 2.0, 2.0 * library.arctan2(length, w) / library.where(tiny, 1.0, length)) * xyz
 
 
 def matrix(quaternion: Floats) -> Floats:
@@ -82,12 +100,11 @@ def from_matrix(rotation: Floats) -> Floats:
     return np.where(quaternion[..., :1] < 0.0, -quaternion, quaternion)
 
 
-def cross_matrix(vector: Floats) -> Floats:
+def cross_matrix(vector: Array) -> Array:
     """Matrix (..., 3, 3) of the cross product with a vector (..., 3) from the left."""
-    x, y, z = np.moveaxis(vector, -1, 0)
-    zero = np.zeros_like(x)
-    rows = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1)
-    return rows.reshape(*vector.shape, 3)
+    x, y, z = (vector[..., i] for i in range(3))
+    zero = 0.0 * x
+    return _library(vector).stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*vector.shape, 3)
 
 
 def left_jacobian(vector: Floats) -> Floats:

@@ -11,7 +11,7 @@ from torch_pbd.control.filters import EnergyTank, RateLimit, lyapunov_matrix
 from torch_pbd.control.matrices import damping_from_stiffness
 from torch_pbd.control.simulation import ticks
 from torch_pbd.control.simulation.plant import AdmittancePlant
-from torch_pbd.control.simulation.ticks import admittance_rate, transition
+from torch_pbd.control.simulation.ticks import admittance_rate
 
 SOFTEST, STIFFEST = 50.0, 1000.0
 MASS = torch.tensor([[1.5, 0.4], [0.4, 0.8]], dtype=torch.float64)
@@ -266,7 +266,7 @@ def test_a_rate_limit_needs_damping_and_stiffness(alpha, lowest, words):
 def test_a_filtered_tick_is_the_transition_of_the_gains_it_reports(generator):
     """The rollout's gains are those in effect: moving on by them gives the next state."""
     run, velocity = random_run(EnergyTank(energy=0.01), 0.02, generator, n_schedules=20, n_ticks=50)
-    maps = transition(admittance_rate(run.stiffness, run.damping, MASS), 0.02)[..., :4, :]
+    maps = torch.linalg.matrix_exp(0.02 * admittance_rate(run.stiffness, run.damping, MASS))[..., :4, :]
     held = run.force + (run.damping @ velocity.unsqueeze(-1)).squeeze(-1)
     state = torch.cat([run.deviation, run.velocity, held], dim=-1).unsqueeze(-1)
     after = (maps @ state).squeeze(-1)[:, :-1]

@@ -13,7 +13,7 @@ from torch_pbd import rotations
 from torch_pbd.control.filters import EnergyTank, RateLimit, lyapunov_matrix
 from torch_pbd.control.simulation.plant import AdmittancePlant
 from torch_pbd.control.simulation.sensor import ForceSensor, PositionLoop
-from torch_pbd.control.simulation.ticks import admittance_rate, exp, multiply, rotation_between, turning
+from torch_pbd.control.simulation.ticks import admittance_rate
 from torch_pbd.control.simulation.walls import Tunnel
 
 # Inertia of an arm's tool, as those of a Panda: kg, kg m and kg m2.
@@ -194,29 +194,39 @@ def test_a_tick_is_exact_for_an_inertia_that_varies():
     np.testing.assert_array_equal(run.desired_orientation, given["orientation_desired"])
 
 
+def task_of(orientation):
+    """Task of a tool that turns, with one position, which stands still."""
+    orientation = torch.tensor(orientation)
+    still, gain = torch.zeros(len(orientation), 4).double(), torch.eye(4).double().expand(len(orientation), 4, 4)
+    motion = (still[:, :1], still, gain, gain)
+    return AdmittancePlant().task(*motion, times=np.zeros(0), dt=0.01, orientation_desired=orientation)
+
+
 def test_what_turns_with_the_tool_keeps_its_deviation_exactly():
     """At any angle: R and R_d turned by the same delta in the world, from Log(R R_d') = e."""
     away, turn = np.array([1.2, -0.8, 0.5]), np.array([0.3, 0.4, -0.6])
     after = (Rotation.from_rotvec(turn) * Rotation.from_rotvec(away) * Rotation.from_rotvec(-turn)).as_rotvec()
     tools = np.stack([np.array([1.0, 0.0, 0.0, 0.0]), rotations.exp(turn)])
-    turns = turning(torch.tensor(tools))
-    carried = turns.transport[0] @ (torch.tensor(away + turn) - turns.turns[0])
-    np.testing.assert_allclose(carried, after, rtol=0, atol=1e-14)
+    carried = task_of(tools).carry(0, torch.tensor(np.r_[0.1, away + turn]))
+    np.testing.assert_allclose(carried, np.r_[0.1, after], rtol=0, atol=1e-14)
 
 
 def test_rotations_in_tensors_are_those_of_the_floor(rng):
     first, second = rotations.exp(rng.normal(size=(2, 50, 3)) * rng.choice([1e-12, 1.0, 2.0], size=(2, 50, 1)))
     moved = rng.normal(size=(50, 3))
-    np.testing.assert_allclose(multiply(torch.tensor(first), torch.tensor(second)), rotations.multiply(first, second))
-    np.testing.assert_allclose(exp(torch.tensor(moved)), rotations.exp(moved), rtol=0, atol=1e-15)
+    tensors = torch.tensor(first), torch.tensor(second)
+    np.testing.assert_allclose(rotations.multiply(*tensors), rotations.multiply(first, second))
+    np.testing.assert_allclose(rotations.exp(torch.tensor(moved)), rotations.exp(moved), rtol=0, atol=1e-15)
     between = rotations.log(rotations.multiply(second, rotations.conjugate(first)))
-    np.testing.assert_allclose(rotation_between(torch.tensor(first), torch.tensor(second)), between, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(
-        rotation_between(torch.tensor(-first), torch.tensor(second)), between, rtol=0, atol=1e-14
-    )
+    for start in tensors[0], -tensors[0]:
+        np.testing.assert_allclose(rotations.between(start, tensors[1]), between, rtol=0, atol=1e-14)
     vectors = torch.tensor(np.r_[np.zeros((1, 3)), moved[:2]], requires_grad=True)
-    reference = torch.tensor(first[:1])
-    assert torch.autograd.gradcheck(lambda v: rotation_between(reference, multiply(exp(v), reference)), vectors)
+    reference = tensors[0][:1]
+
+    def there_and_back(vector):
+        return rotations.between(reference, rotations.multiply(rotations.exp(vector), reference))
+
+    assert torch.autograd.gradcheck(there_and_back, vectors)
 
 
 def test_it_is_differentiable_in_everything():
@@ -355,8 +365,8 @@ def test_the_tank_holds_while_the_tool_turns_and_the_inertia_varies():
     """``H + T - W`` never grows, where W is the work of forces, of the desired motion, and of ``1/2 v' dM v``."""
     given, mass = pose_task(n_ticks=200)
     run = AdmittancePlant(mass, stiffness_filter=EnergyTank(efficiency=0.01)).simulate(**swinging(given)).numpy()
-    turns = turning(torch.tensor(given["orientation_desired"]))
-    step = np.c_[np.diff(given["position_desired"], axis=0), turns.turns[:-1].numpy()]
+    turns = task_of(given["orientation_desired"])
+    step = np.c_[np.diff(given["position_desired"], axis=0), turns.steps[:-1, 1:].numpy()]
     back = np.einsum("tji,tj->ti", turns.transport[:-1].numpy(), run.deviation[1:, 3:])
     moved = np.c_[run.deviation[1:, :3], back]  # as before the desired orientation turned, but for its step
     held = run.force + np.einsum("tij,tj->ti", run.damping, given["velocity_desired"])
@@ -401,7 +411,7 @@ def test_the_rate_limits_function_never_grows_between_two_motions(is_pose):
     given = swinging(given)
     tool = np.tile(np.eye(6), (200, 1, 1))
     if is_pose:
-        tool[:, 3:, 3:] = turning(torch.tensor(given["orientation_desired"])).transport
+        tool[:, 3:, 3:] = task_of(given["orientation_desired"]).transport
     else:
         given["position_desired"] = np.pad(given["position_desired"], ((0, 0), (0, 3)))
         del given["orientation_desired"]

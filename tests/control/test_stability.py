@@ -14,7 +14,7 @@ from control.loops import as_schedule
 from torch_pbd import CholeskyCovRegressor, DMPController, load_demonstrations
 from torch_pbd.control.matrices import damping_from_stiffness, required_damping_ratio
 from torch_pbd.control.simulation.plant import AdmittancePlant
-from torch_pbd.control.simulation.ticks import admittance_rate, transition
+from torch_pbd.control.simulation.ticks import admittance_rate
 from torch_pbd.control.stability import dynamics as module
 from torch_pbd.control.stability.common_function import isotropic_rate
 from torch_pbd.control.stability.dynamics import ErrorDynamics
@@ -317,7 +317,7 @@ def growth_in_a_tick(ratio, zeta, b, generator, n_ticks=20_000):
     stiffness = (49.0 * ratio ** (share - 0.5))[:, None, None]
     rate = admittance_rate(stiffness, damping_from_stiffness(stiffness, 1.0, zeta), torch.eye(1).double())[..., :2, :2]
     factor = torch.linalg.cholesky(torch.tensor([[49.0, 7.0 * b], [7.0 * b, 1.0]], dtype=torch.float64)).mT
-    carried = factor @ transition(rate * (1e-5 * 1e5 ** length[:, None, None]), 1.0) @ torch.linalg.inv(factor)
+    carried = factor @ torch.linalg.matrix_exp(rate * (1e-5 * 1e5 ** length[:, None, None])) @ torch.linalg.inv(factor)
     return torch.linalg.matrix_norm(carried, ord=2).max().item()
 
 
@@ -342,7 +342,7 @@ def test_any_schedule_at_the_required_damping_dies_out(generator):
     stiffness = turned(50.0 * 20.0**share, 6.3 * draws[..., 2])
     damping = damping_from_stiffness(stiffness, 3.0, zeta)
     rate = admittance_rate(stiffness, damping, 3.0 * torch.eye(2).double())[..., :4, :4]
-    maps = transition(rate * (1e-4 * 1e3 ** draws[..., 3])[..., None, None], 1.0)
+    maps = torch.linalg.matrix_exp(rate * (1e-4 * 1e3 ** draws[..., 3])[..., None, None])
     state = torch.randn(300, 4, 1, dtype=torch.float64, generator=generator)
     before = torch.full((300,), math.inf).double()
     for each in maps.unbind(1):
@@ -420,7 +420,7 @@ def test_one_function_is_found_where_a_search_over_all_finds_one_and_falls_whate
         rate = admittance_rate(*blends, torch.eye(2).double())[..., :4, :4]
         length = 10.0 ** (4.0 * torch.rand(40, 1, 1, dtype=torch.float64, generator=generator) - 4.0)
         factor = torch.linalg.cholesky(torch.tensor([[a, b], [b, 1.0]]).double().kron(torch.eye(2).double())).mT
-        maps = factor @ transition(rate * length, 1.0) @ torch.linalg.inv(factor)
+        maps = factor @ torch.linalg.matrix_exp(rate * length) @ torch.linalg.inv(factor)
         assert torch.linalg.matrix_norm(maps, ord=2).max() < 1.0
     assert 5 < sum(found) < len(found) - 5
 

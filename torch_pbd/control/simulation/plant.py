@@ -6,14 +6,15 @@ from typing import Any, Literal, final
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
-from torch_pbd import checks
+from torch_pbd import checks, rotations
 from torch_pbd.checks import Floats
 from torch_pbd.control.filters import StiffnessFilter
 from torch_pbd.control.matrices import as_mass, as_tensor, mass_rows
 from torch_pbd.control.simulation.rollout import Rollout, run_task
 from torch_pbd.control.simulation.sensor import ForceSensor, PositionLoop
-from torch_pbd.control.simulation.ticks import Environment, Task, turning
+from torch_pbd.control.simulation.ticks import Environment, Task
 from torch_pbd.exceptions import InvalidParameterError
 
 _PARTS = {
@@ -172,15 +173,7 @@ class AdmittancePlant:
         _check(tensors)
         acting = {name: tensors.pop(name, None) for name in ("force", "position0", "velocity0", "orientation0")}
         times = dt * torch.arange(tensors["stiffness"].shape[-3]).double()
-        mass = self.inertia(tensors["stiffness"], times.numpy())
-        return run_task(self.task(**tensors, mass=mass, dt=dt), **acting, generator=generator)
-
-    def inertia(self, like: Tensor, times: Any, own: Any = None) -> Tensor:
-        """Mass (d, d) or (..., T, d, d) at times (T,) in s, for gains (..., T, d, d); None is a schedule's own."""
-        mass = self.mass(times) if callable(self.mass) else self.mass
-        if mass is None:
-            mass = 1.0 if own is None else own
-        return mass_rows(mass, like)
+        return run_task(self.task(**tensors, times=times.numpy(), dt=dt), **acting, generator=generator)
 
     def task(
         self,
@@ -189,24 +182,32 @@ class AdmittancePlant:
         stiffness: Tensor,
         damping: Tensor,
         *,
-        mass: Tensor,
+        times: Floats,
         dt: float,
+        own_mass: Any = None,
         acceleration_desired: Tensor | None = None,
         orientation_desired: Tensor | None = None,
     ) -> Task:
-        """Task of this plant from checked arguments of :meth:`simulate`."""
+        """Task of this plant from checked arguments of :meth:`simulate`, the times of ticks and a schedule's mass."""
+        mass = self.mass(times) if callable(self.mass) else own_mass if self.mass is None else self.mass
+        mass = mass_rows(1.0 if mass is None else mass, stiffness)
         stiffness, damping = torch.broadcast_tensors(stiffness, damping)
         if mass.ndim > 2:
             stiffness, damping, mass = torch.broadcast_tensors(stiffness, damping, mass)
         inertial = torch.zeros_like(velocity_desired)
         if self.feed_forward:
             if acceleration_desired is None:  # that which takes the velocity of each tick to that of the next
-                acceleration_desired = torch.nn.functional.pad(velocity_desired.diff(dim=-2) / dt, (0, 0, 0, 1))
+                acceleration_desired = pad(velocity_desired.diff(dim=-2) / dt, (0, 0, 0, 1))
             inertial = (mass @ acceleration_desired.unsqueeze(-1)).squeeze(-1)
-        turns = None if orientation_desired is None else turning(orientation_desired)
-        pose = position_desired if turns is None else torch.nn.functional.pad(position_desired, (0, 3))
+        pose, transport, steps = position_desired, None, pad(position_desired.diff(dim=-2), (0, 0, 0, 1))
+        if orientation_desired is not None:
+            turns = rotations.between(orientation_desired[..., :-1, :], orientation_desired[..., 1:, :])
+            turns = pad(turns, (0, 0, 0, 1))
+            transport = torch.linalg.matrix_exp(rotations.cross_matrix(turns))
+            pose, steps = pad(pose, (0, 3)), pad(steps, (0, 3)) + pad(turns, (pose.shape[-1], 0))
+        motions, gains = (pose, velocity_desired, inertial, steps), (stiffness, damping, mass)
         acting = {name: getattr(self, name) for name in ("substeps", *_PARTS)}
-        return Task(pose, velocity_desired, inertial, stiffness, damping, mass, dt, **acting, turning=turns)
+        return Task(*motions, *gains, dt, **acting, orientation=orientation_desired, transport=transport)
 
 
 def _check(given: dict[str, Tensor]) -> None:

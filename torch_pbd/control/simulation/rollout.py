@@ -3,21 +3,18 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from functools import partial
 from typing import Any, final
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
-from torch_pbd import checks
+from torch_pbd import checks, rotations
 from torch_pbd.control.simulation.ticks import (
     State,
     Task,
-    exp,
     mass_at,
-    multiply,
     open_loop,
-    rotation_between,
     tick_change,
     tick_map,
     tick_maps,
@@ -137,9 +134,11 @@ class Loop:
     """State (..., d) of a run with sensor, loop, walls and filter, advanced tick by tick."""
 
     def __init__(self, task: Task, state: State, generator: torch.Generator | None) -> None:
-        self._task = task
+        self._task, loop = task, task.position_loop
         self._deviation, self._velocity = state[0] - task.position[..., 0, :], state[1]
-        self._robot = task.position_loop and task.position_loop.start(*state, task.dt)
+        # The robot behind its loop, and the commands that it has yet to follow, are deviations too.
+        self._robot, self._follow = (self._deviation, self._velocity), loop and loop.transition(task.dt, state[0])
+        self._commands = [self._deviation] * (loop.delay_steps if loop else 0)
         self._read = task.sensor and task.sensor.start(state[0], task.dt, generator)
         gains = task.stiffness, task.damping, task.mass
         wanted = task.stiffness_filter
@@ -148,19 +147,19 @@ class Loop:
 
     def run(self, tick: int, force: Tensor) -> dict[str, Tensor]:
         """Fields of a Rollout at the start of a tick under a force (..., d): measure, choose the gains, move."""
-        task, robot = self._task, self._robot
+        task, commanded = self._task, self._deviation
         desired, mass = task.position[..., tick, :], mass_at(task.mass, tick)
         stiffness, damping = task.stiffness[..., tick, :, :], task.damping[..., tick, :, :]
-        commanded = self._deviation + desired
-        at = (commanded, self._velocity) if robot is None else (robot.position, robot.velocity)
-        measured = total = force + self._wall(*at)
-        record = {"position": at[0], "velocity": at[1], "commanded_position": commanded, "force": total}
+        away, speed = (commanded, self._velocity) if self._follow is None else self._robot
+        measured = total = force + self._wall(away + desired, speed)
+        record = {"position": away + desired, "velocity": speed, "force": total}
+        record["commanded_position"] = commanded + desired
         if self._read is not None:
             measured, record["saturated"] = self._read(total)
         if self._filter is None:
             each = next(self._maps)
         else:
-            self._filter.select(stiffness, damping, mass, task.dt, self._deviation)
+            self._filter.select(stiffness, damping, mass, task.dt, commanded)
             stiffness, damping, record["filter_share"] = self._filter.gains
             if self._filter.tank_energy is not None:
                 record["tank_energy"] = self._filter.tank_energy
@@ -176,27 +175,28 @@ class Loop:
             self._deviation, self._velocity = after.chunk(2, dim=-1)
             if self._filter is not None:
                 self._filter.settle(before, (self._deviation, self._velocity), held)
-        if tick + 1 < task.n_ticks:
-            self._move_on(tick, commanded)
+        self._move_on(tick, commanded)
         return record | {"stiffness": stiffness, "damping": damping}
 
     def _move_on(self, tick: int, commanded: Tensor) -> None:
-        """Let the robot follow its command, and express all relative to the next tick's desired place."""
+        """Let the robot follow its command, and express all relative to the next tick's desired pose."""
         task = self._task
-        step = task.position[..., tick + 1, :] - task.position[..., tick, :]
-        self._deviation = task.carry(tick, self._deviation) - step
-        if self._robot is not None:
-            self._robot(commanded)
-            self._robot.carry(partial(task.carry, tick))
-        if self._filter is not None and task.turning is not None:
-            self._filter.carry(task.turning.transport[..., tick, :, :])
+        self._deviation = task.carry(tick, self._deviation)
+        if self._follow is not None:
+            self._commands.append(commanded)
+            state = torch.stack([*self._robot, self._commands.pop(0)], dim=-1)
+            away, speed = (state @ self._follow.mT).unbind(-1)
+            self._robot = task.carry(tick, away), speed
+            self._commands = [task.carry(tick, each) for each in self._commands]
+        if self._filter is not None and task.transport is not None:
+            self._filter.carry(task.transport[..., tick, :, :])
 
     def _wall(self, position: Tensor, velocity: Tensor) -> Tensor:
         walls, p = self._task.environment, self._task.n_positions
         if walls is None:
             return torch.zeros_like(position)
         force = walls.force(position[..., :p], velocity[..., :p])
-        return torch.nn.functional.pad(force, (0, position.shape[-1] - p))  # on a point: without a torque
+        return pad(force, (0, position.shape[-1] - p))  # on a point: without a torque
 
 
 def run_task(
@@ -210,49 +210,47 @@ def run_task(
 ) -> Rollout:
     """Run of a task under a checked force (..., T, d) from a checked start (..., p), (..., d), (..., 4)."""
     force = torch.zeros_like(task.velocity) if force is None else force
-    start, speed = _start(task, position0, orientation0), task.velocity[..., 0, :] if velocity0 is None else velocity0
-    parts = [*task.motions, force, task.stiffness[..., 0]]
-    batch = broadcast_shapes(*(part.shape[:-2] for part in parts), start.shape[:-1], speed.shape[:-1])
-    _check_memory(task, batch.numel())
+    p, start = task.n_positions, _start(task, position0, orientation0)
+    speed = task.velocity[..., 0, :] if velocity0 is None else velocity0
+    shapes = (part.shape[:-2] for part in (*task.motions, force, task.stiffness[..., 0]))
+    batch = broadcast_shapes(*shapes, start.shape[:-1], speed.shape[:-1])
     state = start.expand(*batch, -1), speed.expand(*batch, -1)
+    _check_memory(task, batch.numel())
     if task.is_linear:
-        position, velocity = open_loop(task, force, state)
-        record: dict[str, Any] = {"position": position, "velocity": velocity, "commanded_position": position}
-        record |= {"force": force, "stiffness": task.stiffness, "damping": task.damping}
+        record: dict[str, Any] = {"force": force, "stiffness": task.stiffness, "damping": task.damping}
+        record["position"], record["velocity"] = open_loop(task, force, state)
+        record["commanded_position"] = record["position"]
     else:
         loop = Loop(task, state, generator)
         ticks = [loop.run(tick, force[..., tick, :]) for tick in range(task.n_ticks)]
         record = {name: torch.stack([each[name] for each in ticks], dim=-_N_DIMS.get(name, 1)) for name in ticks[0]}
     record = {name: value.expand(*batch, *value.shape[-_N_DIMS.get(name, 1) :]) for name, value in record.items()}
-    finite = (torch.isfinite(record["position"]) & torch.isfinite(record["velocity"])).all(-1)
+    finite = torch.isfinite(record["position"] + record["velocity"]).all(-1)
     if not bool(finite.all()):
         tick = int((~finite.reshape(-1, task.n_ticks).all(0)).nonzero()[0])
         raise ValueError(
             f"the simulation diverged, and is not finite from tick {tick} on: take a shorter dt, or smaller stiffness, "
             "velocity and force."
         )
-    p = task.n_positions
-    if task.turning is not None:
-        desired, deviation = task.turning.orientation, record["position"] - task.position
+    if task.orientation is not None:
+        deviation = record["position"] - task.position
         warn_if_far(float(torch.linalg.vector_norm(deviation.detach()[..., p:], dim=-1).max()))
-        record |= {"desired_orientation": desired, "pose_deviation": deviation}
+        record |= {"desired_orientation": task.orientation, "pose_deviation": deviation}
         for name, turned in {"position": "orientation", "commanded_position": "commanded_orientation"}.items():
-            record[turned] = multiply(exp(record[name][..., p:]), desired)
+            record[turned] = rotations.multiply(rotations.exp(record[name][..., p:]), task.orientation)
             record[name] = record[name][..., :p]
     time = torch.arange(task.n_ticks, dtype=force.dtype, device=force.device) * task.dt
     return Rollout(time, desired_position=task.position[..., :p], **record)
 
 
 def _start(task: Task, position0: Tensor | None, orientation0: Tensor | None) -> Tensor:
-    """Initial pose in the coordinates of :class:`Task`."""
-    start = task.position[..., 0, :] if position0 is None else position0
-    if task.turning is None:
+    """Initial pose (..., d) in the coordinates of :class:`Task`."""
+    p, start = task.n_positions, task.position[..., 0, :]
+    if position0 is not None:
+        start = pad(position0, (0, start.shape[-1] - p))
+    if task.orientation is None or orientation0 is None:
         return start
-    desired = task.turning.orientation[..., 0, :]
-    rotation = rotation_between(desired, desired if orientation0 is None else orientation0)
-    position = start[..., : task.n_positions]
-    batch = broadcast_shapes(position.shape[:-1], rotation.shape[:-1])
-    return torch.cat([position.expand(*batch, -1), rotation.expand(*batch, -1)], dim=-1)
+    return start + pad(rotations.between(task.orientation[..., 0, :], orientation0), (p, 0))
 
 
 def _check_memory(task: Task, n_rollouts: int) -> None:
@@ -262,7 +260,7 @@ def _check_memory(task: Task, n_rollouts: int) -> None:
     # twelve matrices.
     d = task.position.shape[-1]
     of_each = 5 * d + (12 * d * d if task.stiffness.ndim > 3 or task.stiffness_filter is not None else 0)
-    of_each += 0 if task.turning is None else d + 8
+    of_each += 0 if task.orientation is None else d + 8
     needed = of_each * n_rollouts * task.n_ticks * task.position.element_size()
     remedy = "Simulate fewer at a time, or take simulate_many, which keeps no trajectories."
     require_memory(needed, what=f"a simulation of {n_rollouts} rollouts of {task.n_ticks} ticks", remedy=remedy)

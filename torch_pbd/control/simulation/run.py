@@ -210,21 +210,22 @@ def _task_of(schedule: Schedule, plant: AdmittancePlant | None) -> Task:
         )
     rows = (schedule.position, schedule.velocity, schedule.stiffness, schedule.damping)
     position, velocity, stiffness, damping = map(torch.tensor, rows)  # of copies: its own are read-only
-    mass = plant.inertia(stiffness, schedule.time, schedule.mass)
+    more = {"acceleration_desired": schedule.acceleration, "orientation_desired": schedule.orientation}
+    given: dict[str, Any] = {name: torch.tensor(row) for name, row in more.items() if row is not None}
+    given |= {"times": schedule.time, "dt": float(steps[0]), "own_mass": schedule.mass}
+    task = plant.task(position, velocity, stiffness, damping, **given)
     if schedule.mass is not None and plant.mass is not None:
         own = mass_rows(schedule.mass, stiffness)
         # Entries are compared in units of their axes.
         root = own.diagonal(dim1=-2, dim2=-1).sqrt()
-        off = float(((mass - own).abs() / (root.unsqueeze(-1) * root.unsqueeze(-2))).max())
+        off = float(((task.mass - own).abs() / (root.unsqueeze(-1) * root.unsqueeze(-2))).max())
         if off > _SAME_MASS:
             met = f"mass={schedule.mass:g} kg" if isinstance(schedule.mass, float) else "that of the schedule"
             checks.warn(
                 f"{plant} has another mass than its damping_ratio was met for, {met}, off by up to {off:.0%}: give "
                 "both the same, or mass=None, which is the schedule's."
             )
-    more = {"acceleration_desired": schedule.acceleration, "orientation_desired": schedule.orientation}
-    given = {name: torch.tensor(row) for name, row in more.items() if row is not None}
-    return plant.task(position, velocity, stiffness, damping, mass=mass, dt=float(steps[0]), **given)
+    return task
 
 
 def _draw_pushes(

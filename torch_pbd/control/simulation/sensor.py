@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import final
@@ -200,27 +200,3 @@ class PositionLoop:
             [-w * w * dt * decay, (1.0 - w * dt) * decay, w * w * dt * decay],
         ]
         return like.new_tensor(rows)
-
-    def start(self, position: Float[Tensor, "*b d"], velocity: Float[Tensor, "*b d"], dt: float) -> "FollowingRobot":
-        """Robot at ``position``, with commands to stay there until the first one takes effect."""
-        return FollowingRobot(position, velocity, self.transition(dt, position), [position] * self.delay_steps)
-
-
-@dataclass
-class FollowingRobot:
-    """Robot behind its position loop, and the commands that it has yet to follow."""
-
-    position: Tensor
-    velocity: Tensor
-    transition: Tensor
-    commands: list[Tensor]
-
-    def carry(self, change: Callable[[Tensor], Tensor]) -> None:
-        """Express position and waiting commands relative to another origin."""
-        self.position, self.commands = change(self.position), [change(each) for each in self.commands]
-
-    def __call__(self, command: Tensor) -> None:
-        """Advance by a tick in which this command is given."""
-        self.commands.append(command)
-        state = torch.stack([self.position, self.velocity, self.commands.pop(0)], dim=-1)
-        self.position, self.velocity = (state @ self.transition.mT).unbind(-1)

@@ -10,10 +10,9 @@ is exact: R and R_d are then both turned in the world, and e with them. It is th
 ``e' = w - w_d + w_d x e``, to first order in e.
 """
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -41,11 +40,6 @@ def admittance_rate(
     return rate
 
 
-def transition(rate: Float[Tensor, "*b n n"], dt: float) -> Float[Tensor, "*b n n"]:
-    """Map of ``[deviation, velocity, force]`` over a tick of ``dt`` s in which everything is held."""
-    return torch.linalg.matrix_exp(rate * dt)
-
-
 def mass_at(mass: Tensor, ticks: int | slice) -> Tensor:
     """Mass at some ticks, from one mass (d, d) or those of all ticks (..., T, d, d)."""
     return mass if mass.ndim == 2 else mass[..., ticks, :, :]
@@ -59,60 +53,19 @@ class Environment(Protocol):
         """Force (..., p) in N on a robot at these positions in m and velocities in m/s, without the rotation."""
 
 
-def multiply(first: Float[Tensor, "*a 4"], second: Float[Tensor, "*b 4"]) -> Float[Tensor, "*c 4"]:
-    """Product of quaternions w x y z: the rotation by ``second``, then by ``first``."""
-    (a, v), (b, w) = (each.split([1, 3], dim=-1) for each in torch.broadcast_tensors(first, second))
-    return torch.cat([a * b - (v * w).sum(-1, keepdim=True), a * w + b * v + torch.linalg.cross(v, w)], dim=-1)
-
-
-def exp(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4"]:
-    """Quaternion of a rotation vector."""
-    half = 0.5 * torch.linalg.vector_norm(vector, dim=-1, keepdim=True)
-    return torch.cat([torch.cos(half), 0.5 * torch.sinc(half / math.pi) * vector], dim=-1)
-
-
-def rotation_between(start: Float[Tensor, "*a 4"], end: Float[Tensor, "*b 4"]) -> Float[Tensor, "*c 3"]:
-    """Rotation vector in world axes from one orientation to another, the shorter way: at most pi long."""
-    nearer = torch.where((end * start).sum(-1, keepdim=True) < 0.0, -end, end)
-    conjugate = torch.cat([start[..., :1], -start[..., 1:]], dim=-1)
-    # The difference keeps the digits of small rotations: q2 q1' = 1 + (q2 - q1) q1'.
-    away, xyz = multiply(nearer - start, conjugate).split([1, 3], dim=-1)
-    length = torch.linalg.vector_norm(xyz, dim=-1, keepdim=True)
-    tiny = length < torch.finfo(length.dtype).tiny
-    angle = 2.0 * torch.atan2(length, 1.0 + away)
-    return torch.where(tiny, 2.0, angle / torch.where(tiny, 1.0, length)) * xyz
-
-
-class Turning(NamedTuple):
-    """Desired orientations (..., T, 4) of a task, with the turns (..., T, 3) that end its ticks, none the last.
-
-    ``transport`` (..., T, 3, 3) is ``exp([turn])``, which rotates vectors along with the desired orientation.
-    """
-
-    orientation: Tensor
-    turns: Tensor
-    transport: Tensor
-
-
-def turning(orientation: Float[Tensor, "*b t 4"]) -> Turning:
-    """Turns of unit quaternions from tick to tick."""
-    turns = rotation_between(orientation[..., :-1, :], orientation[..., 1:, :])
-    turns = torch.nn.functional.pad(turns, (0, 0, 0, 1))
-    rows = torch.linalg.cross(turns.unsqueeze(-2), torch.eye(3).to(turns).expand(*turns.shape, 3))
-    return Turning(orientation, turns, torch.linalg.matrix_exp(rows.mT))
-
-
 @dataclass(frozen=True)
 class Task:
     """Checked inputs of a run: motions (..., T, d), gains (..., T, d, d), and the parts that act in the loop, or None.
 
-    The mass is (d, d), or (..., T, d, d) with one for each tick. Positions of poses end in zeros, since their rotations
-    are relative to the desired orientation, in ``turning``.
+    At the end of each tick but the last, the desired pose moves on by its step. The mass is (d, d), or (..., T, d, d)
+    with one for each tick. Positions of poses end in zeros, since their rotations are relative to the desired
+    ``orientation`` (..., T, 4); vectors turn with it by ``transport`` (..., T, 3, 3).
     """
 
     position: Tensor
     velocity: Tensor
     inertial_force: Tensor
+    steps: Tensor
     stiffness: Tensor
     damping: Tensor
     mass: Tensor
@@ -122,7 +75,8 @@ class Task:
     environment: Environment | None
     substeps: int
     stiffness_filter: StiffnessFilter | None
-    turning: Turning | None = None
+    orientation: Tensor | None = None
+    transport: Tensor | None = None
 
     @property
     def n_ticks(self) -> int:
@@ -132,13 +86,12 @@ class Task:
     @property
     def n_positions(self) -> int:
         """Number of positions p among the d axes."""
-        return self.position.shape[-1] - (0 if self.turning is None else 3)
+        return self.position.shape[-1] - (0 if self.orientation is None else 3)
 
     @property
-    def motions(self) -> list[Tensor]:
-        """Tensors of the desired motion (..., T, d), and for poses the turns (..., T, 3)."""
-        turns = [] if self.turning is None else [self.turning.turns]
-        return [self.position, self.velocity, self.inertial_force, *turns]
+    def motions(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Tensors (..., T, d) that have all batch dimensions of the desired motion."""
+        return self.velocity, self.inertial_force, self.steps
 
     @property
     def is_linear(self) -> bool:
@@ -147,13 +100,12 @@ class Task:
         is_shared = self.stiffness.ndim == 3 and all(motion.ndim == 2 for motion in self.motions)
         return is_shared and all(part is None for part in acting)
 
-    def carry(self, tick: int, pose: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
-        """Positions, and rotations relative to the desired orientation after a tick instead of before it."""
-        if self.turning is None:
-            return pose
-        transport, turn = self.turning.transport[..., tick, :, :], self.turning.turns[..., tick, :]
-        rotation = (transport @ pose[..., -3:].unsqueeze(-1)).squeeze(-1) - turn
-        return torch.cat([pose[..., :-3].expand(*rotation.shape[:-1], -1), rotation], dim=-1)
+    def carry(self, tick: int, deviation: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
+        """Deviations from the desired pose after a tick instead of before it."""
+        if self.transport is not None:
+            turned = self.transport[..., tick, :, :] @ deviation[..., -3:].unsqueeze(-1)
+            deviation = torch.cat([deviation[..., :-3], turned.squeeze(-1)], dim=-1)
+        return deviation - self.steps[..., tick, :]
 
 
 def open_loop(task: Task, force: Tensor, state: State) -> State:
@@ -191,13 +143,11 @@ def block_responses(task: Task, length: int) -> Iterator[Float[Tensor, "l1 m n"]
     d = task.position.shape[-1]
     unit = torch.eye(2 * d + 1 + length * d).to(task.position)
     push = (task.damping @ task.velocity.unsqueeze(-1)).squeeze(-1) + task.inertial_force
-    steps = torch.nn.functional.pad(task.position.diff(dim=0), (0, d, 0, 1))  # none after the last tick
-    if task.turning is not None:
-        steps[:, d - 3 : d] += task.turning.turns
+    steps = torch.nn.functional.pad(task.steps, (0, d))
     for ticks, maps in tick_maps(task, task.dt):
-        if task.turning is not None:
+        if task.transport is not None:
             position, rotation, velocity = maps.split([d - 3, 3, d], dim=-2)
-            maps = torch.cat([position, task.turning.transport[ticks] @ rotation, velocity], dim=-2)
+            maps = torch.cat([position, task.transport[ticks] @ rotation, velocity], dim=-2)
         drift = maps[..., 2 * d :] @ push[ticks].unsqueeze(-1) - steps[ticks].unsqueeze(-1)
         each = torch.cat([maps[..., : 2 * d], drift, maps[..., 2 * d :]], dim=-1)
         surplus = -len(each) % length
@@ -221,7 +171,7 @@ def tick_maps(task: Task, dt: float) -> Iterator[tuple[slice, Tensor]]:
 
 def tick_map(stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> Tensor:
     """Map of ``[deviation, velocity, force]`` to the deviation and velocity after a tick of ``dt`` s."""
-    return transition(admittance_rate(stiffness, damping, mass), dt)[..., : 2 * stiffness.shape[-1], :]
+    return torch.linalg.matrix_exp(dt * admittance_rate(stiffness, damping, mass))[..., : 2 * stiffness.shape[-1], :]
 
 
 def tick_change(stiffness: Tensor, damping: Tensor, mass: Tensor, dt: float) -> Tensor:
