@@ -38,10 +38,8 @@ class RolloutSummary:
         Quantiles over the rollouts of the distance from the reference at each time.
     peak_deviation : (R,), m
         Largest distance of each rollout; rollouts are ordered by the onset of their push.
-    peak_time : (R,), s
     return_time : (R,), s
         Time from the end of the push until the distance stays below a tenth of its peak; inf if it never does.
-    final_deviation : (R,), m
     onset, duration : (R,), s
         Start and duration of each push.
     push : (R, p), N
@@ -55,9 +53,7 @@ class RolloutSummary:
     quantiles: Floats
     deviation: Floats
     peak_deviation: Floats
-    peak_time: Floats
     return_time: Floats
-    final_deviation: Floats
     onset: Floats
     duration: Floats
     push: Floats
@@ -156,46 +152,40 @@ def _looped(task: Task, chunks: Sequence[Chunk], generators: Iterator[torch.Gene
 
 
 class Tally:
-    """Squared peak of each of R rollouts in some axes, its tick, the last tick above a share of it, and the end."""
+    """Quantiles of the distances of R rollouts in some axes, squares of their peaks, and last ticks above a share."""
 
     def __init__(self, n_rollouts: int, axes: slice) -> None:
-        self.axes = axes
-        self.squared_peak, self.peak_tick, self.squared_last = torch.zeros(3, n_rollouts, dtype=torch.float64)
-        self.last_above = torch.full_like(self.squared_last, -1.0)
+        self.axes, self.quantiles = axes, list[Floats]()
+        self.squared_peak = torch.zeros(n_rollouts, dtype=torch.float64)
+        self.last_above = torch.full_like(self.squared_peak, -1.0)
 
     def add(self, ticks: slice, columns: slice, squared: Float[Tensor, "l r"], *, is_over: bool) -> None:
         """Record squared distances at some ticks; ``is_over`` if a push may be over by then."""
-        numbers = torch.arange(ticks.start, ticks.stop, dtype=squared.dtype)[:, None]
-        highest, peak, tick = squared.amax(0), self.squared_peak[columns], self.peak_tick[columns]
-        higher = highest > peak
-        if bool(higher.any()):
-            when = torch.where(squared == highest, numbers, -1.0).amax(0)
-            torch.where(higher, when, tick, out=tick)
-            torch.maximum(peak, highest, out=peak)
+        highest, peak, last = squared.amax(0), self.squared_peak[columns], self.last_above[columns]
+        torch.maximum(peak, highest, out=peak)
         # The limit is a share of the peak so far; ticks counted before the peak are superseded by later ones.
-        limit, last = _SHARE**2 * peak, self.last_above[columns]
+        limit = _SHARE**2 * peak
         if is_over and bool((highest > limit).any()):
+            numbers = torch.arange(ticks.start, ticks.stop, dtype=squared.dtype)[:, None]
             torch.maximum(last, torch.where(squared > limit, numbers, -1.0).amax(0), out=last)
-        self.squared_last[columns] = squared[-1]
 
 
 def push_many(
     task: Task,
     pushes: tuple[Tensor, Tensor, Tensor],
     generators: Iterator[torch.Generator],
-    tallies: Sequence[Tally],
+    blocks: Sequence[slice],
     levels: Floats,
     every: int,
-    away: Tensor | None,
-) -> Iterator[list[Floats]]:
-    """Simulate R rollouts under pushes of onsets (R,), durations (R,) and peaks (d, R), block by block.
+) -> list[Tally]:
+    """Distances from the desired position, in the axes of each block, of R rollouts under pushes.
 
-    Yields the quantiles (L, n_quantiles) of the distances in the axes of each tally at each ``every``-th tick: from
-    the desired position, or from where the robot is ``away`` (d, T) from it.
+    Pushes are onsets (R,), durations (R,) and peaks (d, R); quantiles (n_quantiles,) are of each ``every``-th tick.
     """
     n_rollouts = len(pushes[0])
     columns = [slice(first, min(first + _CHUNK, n_rollouts)) for first in range(0, n_rollouts, _CHUNK)]
     chunks = [Chunk(some, *(part[..., some] for part in pushes)) for some in columns]
+    tallies = [Tally(n_rollouts, block) for block in blocks]
     scratch, rows = torch.empty(0), list[Tensor]()
     for ticks, chunk, values in _linear(task, chunks) if task.is_linear else _looped(task, chunks, generators):
         if not rows:  # the first part is the largest
@@ -205,14 +195,15 @@ def push_many(
         squared = scratch[: values.shape[1], : values.shape[2]]
         chosen = slice(-ticks.start % every, None, every)
         for tally, row in zip(tallies, rows, strict=True):
-            own = values[tally.axes] if away is None else (values - away[:, ticks, None])[tally.axes]
+            own = values[tally.axes]
             torch.mul(own[0], own[0], out=squared)
             for axis in own[1:]:
                 squared.addcmul_(axis, axis)
             tally.add(ticks, chunk.columns, squared, is_over=is_over)
             row[: len(squared[chosen]), chunk.columns] = squared[chosen]
-        if chunk is chunks[-1]:
-            yield [_quantiles(row[: len(squared[chosen])].numpy(), levels) for row in rows]
+            if chunk is chunks[-1]:
+                tally.quantiles.extend(_quantiles(row[: len(squared[chosen])].numpy(), levels))
+    return tallies
 
 
 def _quantiles(squares: Floats, levels: Floats) -> Floats:

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from itertools import count
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from torch_pbd.control.matrices import mass_rows
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.plant import AdmittancePlant
 from torch_pbd.control.simulation.rollout import Rollout, run_task, warn_if_far
-from torch_pbd.control.simulation.rollouts import RolloutSummary, Tally, push_many
+from torch_pbd.control.simulation.rollouts import RolloutSummary, push_many
 from torch_pbd.control.simulation.ticks import Task, block_length
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.files.memory import require_memory
@@ -93,7 +93,6 @@ def simulate_many(
     torque: Range = 0.0,
     duration: Range = 0.8,
     onset: tuple[float, float] | None = None,
-    reference: Literal["desired", "undisturbed"] = "desired",
     quantiles: tuple[float, ...] = (0.05, 0.5, 0.95),
     every: int = 1,
     random_state: Any = None,
@@ -122,9 +121,6 @@ def simulate_many(
         Duration of each push in s; a pair draws it uniformly between both.
     onset : (float, float), default=None
         Start time of each push in s, drawn uniformly between both; None lets all pushes end within the schedule.
-    reference : {"desired", "undisturbed"}, default="desired"
-        Origin of deviations: the desired position, or the position without push and noise, which lags behind the
-        desired one.
     quantiles : tuple of float, default=(0.05, 0.5, 0.95)
         Levels of the quantiles of the deviations at a tick, by linear interpolation.
     every : int, default=1
@@ -153,7 +149,6 @@ def simulate_many(
     """
     checks.count(n_rollouts, "n_rollouts")
     checks.count(every, "every")
-    checks.choice(reference, "reference", ("desired", "undisturbed"))
     levels = checks.array(quantiles, "quantiles", ("n_quantiles",)).copy()
     checks.require((levels >= 0.0) & (levels <= 1.0), levels, "quantiles", "from 0 to 1")
     task = _task_of(schedule, plant)
@@ -166,27 +161,20 @@ def simulate_many(
     draw = checks.seed(random_state)
     begin, lasting, push = _draw_pushes(draw, n_rollouts, schedule, [peak, torque], duration, onset)
     generators = (torch.Generator().manual_seed(int(draw.randint(2**31 - 1))) for _ in count())
-    tallies = [Tally(n_rollouts, block) for block in schedule.blocks]
     with torch.no_grad():
         pushes = torch.tensor(begin), torch.tensor(lasting), torch.tensor(push).mT.contiguous()
-        away = None
-        if reference == "undisturbed":
-            silent = None if task.sensor is None else replace(task.sensor, noise_scale=0.0)
-            away = run_task(replace(task, sensor=silent)).deviation.mT
-        rows = zip(*push_many(task, pushes, generators, tallies, levels, every, away), strict=True)
+        tallies = push_many(task, pushes, generators, schedule.blocks, levels, every)
     shared = {"quantiles": levels, "onset": schedule.time[0] + begin, "duration": lasting}
     summaries = list[RolloutSummary]()
-    for tally, deviation, units in zip(tallies, rows, [schedule.units, "rad"], strict=False):
+    for tally, units in zip(tallies, [schedule.units, "rad"], strict=False):
         last_above = tally.last_above.numpy()
         returned = np.maximum(task.dt * (last_above + 1.0) - begin - lasting, 0.0)
         summaries.append(
             RolloutSummary(
                 time=schedule.time[::every],
-                deviation=np.concatenate(deviation),
+                deviation=np.stack(tally.quantiles),
                 peak_deviation=tally.squared_peak.sqrt().numpy(),
-                peak_time=schedule.time[tally.peak_tick.long().numpy()],
                 return_time=np.where(last_above < len(schedule) - 1, returned, np.inf),
-                final_deviation=tally.squared_last.sqrt().numpy(),
                 push=push[:, tally.axes],
                 units=units,
                 **shared,

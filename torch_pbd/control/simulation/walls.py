@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, final
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from torch_pbd import checks
@@ -38,14 +38,11 @@ class ContactReport(NamedTuple):
         Number of ticks that start beyond a wall, times dt.
     impulse : (...), N s
         Sum of the wall force's magnitude times dt; 0 for a virtual wall.
-    n_contacts : (...)
-        Number of times that a wall was entered; starting inside counts.
     """
 
     max_penetration: Float[Tensor, "*b"]
     time_in_wall: Float[Tensor, "*b"]
     impulse: Float[Tensor, "*b"]
-    n_contacts: Int[Tensor, "*b"]
 
 
 @final
@@ -123,9 +120,7 @@ class Tunnel:
         rollout_position, velocity = as_rows(rollout_position, "rollout_position", 2), as_rows(velocity, "velocity", 2)
         depth = self.penetration(rollout_position)
         press = torch.linalg.vector_norm(self.force(rollout_position, velocity), dim=-1)
-        inside = depth > 0.0
-        entered = inside & ~torch.nn.functional.pad(inside, (1, 0))[..., :-1]
-        return ContactReport(depth.amax(-1), dt * inside.sum(-1).to(depth), dt * press.sum(-1), entered.sum(-1))
+        return ContactReport(depth.amax(-1), dt * (depth > 0.0).sum(-1).to(depth), dt * press.sum(-1))
 
     def _contact(self, position: Tensor | Any) -> tuple[Tensor, Tensor]:
         """Depth along the normal, negative in the free corridor, and the normal."""
