@@ -108,12 +108,12 @@ def dtw_warps(curves: Floats) -> Floats:
     return np.stack([np.interp(grid, common, match) for match in matches])
 
 
-def comparable_scale(curves: Floats, units: Sequence[str] | None) -> Floats:
+def comparable_scale(curves: Floats, units: Sequence[str]) -> Floats:
     """Divisor (d,) of each output of curves (K, n, d) that makes distances over all outputs meaningful.
 
     Outputs of the same unit share one divisor, so that the result does not depend on their axes.
     """
-    if units is None or len(set(units)) == 1:
+    if len(set(units)) == 1:
         return np.ones(curves.shape[2])
     same = np.equal.outer(np.array(units), np.array(units))
     scale = np.sqrt(same @ curves.var(axis=(0, 1)) / same.sum(axis=1))

@@ -10,11 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.data.alignment import check_overlap, unit_phases
-from torch_pbd.data.editing import Editing
-from torch_pbd.data.poses import as_outputs
-from torch_pbd.data.recordings import Missing, as_recordings, frozen, preview
-from torch_pbd.data.sampling import Alignment
+from torch_pbd.data.description import Description, describe
+from torch_pbd.data.editing import Alignment, Editing
+from torch_pbd.data.poses import as_columns, as_outputs
+from torch_pbd.data.recordings import Missing, preview
 from torch_pbd.data.units import TIMES, check_unit, find_suspects
+from torch_pbd.data.wanted import OPTIONS, Wanted, check_options
 from torch_pbd.exceptions import InvalidParameterError
 
 
@@ -30,8 +31,8 @@ class Demonstration(NamedTuple):
 class Demonstrations(Editing):
     """K recordings of one task, of any lengths and sampling times, with the same d outputs.
 
-    The container is immutable: its arrays are read-only float64 copies, and every method returns a new one.
-    Axis order is (demonstration, step, output).
+    Immutable: arrays are read-only float64 copies, and every method returns a new container. Axis order is
+    (demonstration, step, output).
 
     Parameters
     ----------
@@ -48,7 +49,7 @@ class Demonstrations(Editing):
     frame : str, default=None
         Name of the coordinate frame.
     time_unit : str, default="s"
-        Unit of ``times``: h, min, s, ms, us, ns; "1" for phase.
+        h, min, s, ms, us or ns; "1" for phase.
     alignment : {"phase", "dtw"}, default=None
         Method by which `align` brought the demonstrations onto one grid; None if it did not.
     missing : {"raise", "drop"}, default="raise"
@@ -75,8 +76,8 @@ class Demonstrations(Editing):
     ValueError
         If there is no demonstration, lengths or numbers of outputs disagree, one has fewer than two (remaining)
         samples, a value is not a finite real number, times do not increase strictly or are too coarse to separate
-        samples, or a unit is misspelled ("MM", "sec"). If a quaternion is not of norm 1 up to rounding in files, or
-        more than 150 degrees from the mean.
+        samples, a unit is misspelled ("MM", "sec"), or a quaternion is not of norm 1 up to rounding in files or more
+        than 150 degrees from the mean.
 
     Warns
     -----
@@ -154,7 +155,7 @@ class Demonstrations(Editing):
         chosen = np.arange(len(self))[index]
         if chosen.ndim == 0:
             return Demonstration(self.times[chosen], self.positions[chosen])
-        times, positions = ([arrays[k] for k in chosen] for arrays in (self.times, self.positions))
+        times, positions = [self.times[k] for k in chosen], [self.positions[k] for k in chosen]
         return self._replace(times, positions, anew=bool(self.suspects))
 
     def __eq__(self, other: object) -> bool:
@@ -173,10 +174,6 @@ class Demonstrations(Editing):
             f"Demonstrations(n_demos={len(self)}, n_steps={n_steps}, {outputs}, "
             f"time_unit={self.time_unit!r}, aligned={self.is_aligned})"
         )
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        # Through __init__, since pickling or copying makes NumPy arrays writable again.
-        return _rebuild, (self.times, self.positions, vars(self))
 
     def stack(self, input: Literal["time", "phase"] = "time") -> tuple[Floats, Floats, NDArray[np.intp]]:
         """All samples as arrays for scikit-learn's estimators, without names, units and rotations.
@@ -223,30 +220,53 @@ class Demonstrations(Editing):
     def plot(self, outputs: Sequence[int | str] | None = None, *, ax: Any = None) -> Any:
         """Plot all demonstrations: two or three outputs as a path, one or more than three over time.
 
-        Parameters
-        ----------
-        outputs : sequence of int or str, default=None
-            Indices or names of at most nine outputs; None is the first nine.
-        ax : matplotlib.axes.Axes, default=None
-            Axes to draw into and return, with projection "3d" for three outputs; None makes a pyplot figure.
+        ``outputs`` are indices or names of at most nine, by default the first nine. ``ax`` are the matplotlib axes to
+        draw into and return, with projection "3d" for three outputs; None makes a pyplot figure.
         """
         from torch_pbd.plotting.display import plot_movements  # here: matplotlib takes a while to import
 
         return plot_movements(self, outputs, ax)
 
-    def _replace(self, times: Any, positions: Any, *, anew: bool = False, **changes: Any) -> "Demonstrations":
-        made = _rebuild(times, positions, vars(self) | changes)
-        if anew:
-            vars(made)["suspects"] = find_suspects(made.positions, made.names, made.units)
-        return made
+    @classmethod
+    def from_frame(cls, table: Any, **options: Any) -> "Demonstrations":
+        """Demonstrations from a table with one row per sample, in the order in which they first appear.
 
+        Parameters
+        ----------
+        table : dataframe
+            Table of pandas, polars, pyarrow or another library that narwhals supports; its index is ignored.
+        **options
+            Options of `torch_pbd.data.load_demonstrations`, from ``outputs`` to ``from_start``.
 
-def _rebuild(times: Any, positions: Any, attributes: dict[str, Any]) -> Demonstrations:
-    """Demonstrations from the checked contents of others, without repeating warnings about suspects."""
-    rebuilt = object.__new__(Demonstrations)
-    times, positions = as_recordings(times, positions, "raise")
-    vars(rebuilt).update(attributes, times=times, positions=positions)
-    reference = attributes["rotation_reference"]
-    if reference is not None:
-        vars(rebuilt)["rotation_reference"] = frozen(reference)
-    return rebuilt
+        Raises
+        ------
+        ValueError
+            If it is not a dataframe, or lacks columns that the options name, or these hold no numbers.
+        """
+        import narwhals
+
+        check_options(options, [name for name in OPTIONS if name != "max_bytes"], "frames")
+        rows = narwhals.from_native(table, eager_only=True, pass_through=True)
+        if not isinstance(rows, narwhals.DataFrame):
+            must = "a dataframe of pandas, polars, pyarrow or alike, with its rows"
+            raise checks.refusal(table, "table", must, "collect() lazy ones")
+        wanted = Wanted(**options)
+        chosen = wanted.choose({name: (name,) for name in rows.columns}, demo="demo", time="time")
+        signals = {name: rows.get_column(name).to_numpy() for name in chosen.signals}
+        return wanted.finish([cls(**wanted.read_rows(chosen, signals))])
+
+    def to_frame(self, library: Any = "pandas") -> Any:
+        """Table of one row per sample with columns demo, time and the outputs; rotations are quaternions qw to qz.
+
+        The table is of an installed ``library``: "pandas", "polars", "pyarrow", or such a module.
+        """
+        import narwhals
+
+        names, columns = as_columns(self)
+        table = {"demo": np.repeat(np.arange(len(self)), self.n_steps), "time": np.concatenate(self.times)}
+        table |= zip(names, np.concatenate(columns).T, strict=True)
+        return narwhals.from_dict(table, backend=library).to_native()
+
+    def describe(self) -> Description:
+        """Description of the recordings: tables to print, and likely ``mistakes``."""
+        return describe(self)

@@ -1,16 +1,18 @@
 """Description of recordings, likely mistakes in them with remedies, and a check for several modes."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
+from torch_pbd.console import format_table
 from torch_pbd.data.alignment import check_overlap
+from torch_pbd.data.editing import Editing
 from torch_pbd.data.recordings import preview
-from torch_pbd.data.sampling import Resampling, extents, still
+from torch_pbd.data.sampling import extents, still
 from torch_pbd.data.units import ANGLES, LENGTHS, TIMES, quaternions
 from torch_pbd.exceptions import InvalidParameterError, UnimodalityWarning
 
@@ -47,16 +49,16 @@ class Description:
         Sentence about the chart of the rotations; empty if there are none.
     """
 
-    recordings: list[dict[str, Any]] = field(default_factory=list)
-    outputs: list[dict[str, Any]] = field(default_factory=list)
-    mistakes: tuple[str, ...] = ()
-    rotation: str = ""
+    recordings: list[dict[str, Any]]
+    outputs: list[dict[str, Any]]
+    mistakes: tuple[str, ...]
+    rotation: str
 
     def __str__(self) -> str:
-        n, rows = len(self.recordings), _table(self.recordings[:_MOST_ROWS])
+        n, rows = len(self.recordings), format_table(self.recordings[:_MOST_ROWS])
         rows += f"\n... {n} recordings in all" if n > _MOST_ROWS else ""
         findings = [f"{i}. {sentence}" for i, sentence in enumerate(self.mistakes, 1)] or ["Nothing looks wrong."]
-        return "\n\n".join(filter(None, [rows, _table(self.outputs), self.rotation, "\n".join(findings)]))
+        return "\n\n".join(filter(None, [rows, format_table(self.outputs), self.rotation, "\n".join(findings)]))
 
     __repr__ = __str__
 
@@ -160,15 +162,6 @@ def _flips(demonstrations: Any) -> Iterator[str]:
             yield f"{name} is -q where it was q, in recordings {preview(flips)}: rotation= takes either sign."
 
 
-def _table(rows: list[dict[str, Any]]) -> str:
-    """Text table of rows with the same keys, at most 80 characters wide."""
-    cells = [[*rows[0]], *([f"{v:.4g}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows)]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    widths[0] = min(widths[0], max(80 - sum(widths[1:]) - 2 * (len(widths) - 1), 8))
-    lines = ([row[0][: widths[0]].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])] for row in cells)
-    return "\n".join("  ".join(line).rstrip() for line in lines)
-
-
 def check_unimodal(demonstrations: Any) -> bool:
     """Check that the demonstrations have a single mode, with a warning if they do not.
 
@@ -187,7 +180,7 @@ def check_unimodal(demonstrations: Any) -> bool:
     UnimodalityWarning
         If there are two groups, or one demonstration is far from all others; the result is then False.
     """
-    is_recorded = isinstance(demonstrations, Resampling)  # base of Demonstrations, whose import would be circular
+    is_recorded = isinstance(demonstrations, Editing)  # base of Demonstrations, whose import would be circular
     if not is_recorded:
         raise checks.refusal(demonstrations, "demonstrations", "a Demonstrations")
     return follow_one_way((demonstrations if demonstrations.is_aligned else demonstrations.align()).to_array())

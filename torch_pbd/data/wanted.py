@@ -5,7 +5,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ MAX_BYTES = 512 * 2**20
 _UNNAMED = ("", "__index_level_0__")  # names of a table's index in files written by pandas
 _DATE_UNITS = {"h": "h", "min": "m", "s": "s", "ms": "ms", "us": "us", "ns": "ns"}
 Arguments = dict[str, Any]
+_Recorded = TypeVar("_Recorded", bound=Any)  # Demonstrations, whose import would be circular
 
 
 class Chosen(NamedTuple):
@@ -161,7 +162,7 @@ class Wanted:
             times = [(time - origin).astype("m8[ns]") / step for time in times]
         return {"times": times, "positions": positions, "missing": self.missing, **labels}
 
-    def finish(self, parts: Sequence[Any]) -> Any:
+    def finish(self, parts: Sequence[_Recorded]) -> _Recorded:
         """Demonstrations of all files as one set, converted, cut and trimmed."""
         for unit in self.in_units or ():
             parts = [part.in_units(**{"time_unit" if unit in TIMES else "unit": unit}) for part in parts]
