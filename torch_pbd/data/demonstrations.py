@@ -12,8 +12,8 @@ from torch_pbd.checks import Floats
 from torch_pbd.data.alignment import check_overlap, unit_phases
 from torch_pbd.data.description import Description, describe
 from torch_pbd.data.editing import Alignment, Editing
-from torch_pbd.data.poses import as_columns, as_outputs
-from torch_pbd.data.recordings import Missing, preview
+from torch_pbd.data.poses import as_chart, as_columns, as_reference, unwrapped
+from torch_pbd.data.recordings import Missing, as_names, as_recordings, as_units, frozen, preview
 from torch_pbd.data.units import TIMES, check_unit, find_suspects
 from torch_pbd.data.wanted import OPTIONS, Wanted, check_options
 from torch_pbd.exceptions import InvalidParameterError
@@ -114,14 +114,27 @@ class Demonstrations(Editing):
         if not isinstance(time_unit, str) or not time_unit:
             raise checks.refusal(time_unit, "time_unit", "the unit of the times", "'s', or '1' for phase")
         check_unit(time_unit, "time_unit", TIMES)
+        checks.text(frame, "frame", optional=True)
+        if alignment is not None:
+            checks.choice(alignment, "alignment", Alignment)
+        grids, outputs = as_recordings(times, positions, missing)
+        labels, reference = as_names(names, outputs[0].shape[1]), None
+        if rotation is not None:
+            if rotation_reference is not None:
+                must = "None where rotation= names quaternions"
+                raise checks.refusal(rotation_reference, "rotation_reference", must)
+            grids, outputs, labels, own, reference = as_chart(grids, outputs, labels, units, rotation, missing)
+        else:
+            own = as_units(units, len(labels))
+            if rotation_reference is not None:
+                reference = as_reference(rotation_reference, grids, outputs, labels, own)
+        if angles is not None:
+            outputs = tuple(unwrapped(grids, outputs, labels, own, angles))
+        outputs = tuple(frozen(output, fresh=True) for output in outputs)
         # A frozen class can set its attributes only through its dictionary.
-        vars(self).update(
-            as_outputs(times, positions, names, units, rotation, rotation_reference, angles, missing),
-            frame=checks.text(frame, "frame", optional=True),
-            time_unit=time_unit,
-            alignment=alignment if alignment is None else checks.choice(alignment, "alignment", Alignment),
-        )
-        vars(self)["suspects"] = find_suspects(self.positions, self.names, self.units)
+        vars(self).update(times=grids, positions=outputs, names=labels, units=own, rotation_reference=reference)
+        vars(self).update(frame=frame, time_unit=time_unit, alignment=alignment)
+        vars(self)["suspects"] = find_suspects(outputs, labels, own)
         if self.suspects:
             checks.warn(" ".join(self.suspects))
 

@@ -17,7 +17,6 @@ from torch_pbd.data.units import ANGLES, LENGTHS, TIMES, quaternions
 from torch_pbd.exceptions import InvalidParameterError, UnimodalityWarning
 
 _MOST_ROWS = 20
-_PAUSE = 0.5  # s: shorter stillness is part of a movement
 _GAP = 5.0  # median steps: two lost samples are no gap, a second of a sensor's silence is
 _ENDS = 0.2  # share of the largest speed above which a recording counts as cut while moving
 _UNIX = 1e8  # s: no recording is three years long
@@ -35,24 +34,16 @@ _SHARE_OF_STEPS, _SHARE_OF_DEMOS = 0.25, 0.2
 
 @dataclass(frozen=True, repr=False)
 class Description:
-    """Tables of recordings and outputs, and likely mistakes in them.
-
-    Attributes
-    ----------
-    recordings : list of dict
-        Index, samples, start, duration, rate, largest gap, and stillness at both ends of each recording.
-    outputs : list of dict
-        Name, unit, minimum, maximum and extent of each output.
-    mistakes : tuple of str
-        Likely mistakes, each with its remedy; empty where nothing looks wrong.
-    rotation : str
-        Sentence about the chart of the rotations; empty if there are none.
-    """
+    """Tables of recordings and outputs, and likely mistakes in them, to be printed."""
 
     recordings: list[dict[str, Any]]
+    """Index, samples, start, duration, rate, largest gap, and stillness at both ends of each recording."""
     outputs: list[dict[str, Any]]
+    """Name, unit, minimum, maximum and extent of each output."""
     mistakes: tuple[str, ...]
+    """Likely mistakes, each with its remedy; empty where nothing looks wrong."""
     rotation: str
+    """Sentence about the chart of the rotations; empty if there are none."""
 
     def __str__(self) -> str:
         n, rows = len(self.recordings), format_table(self.recordings[:_MOST_ROWS])
@@ -69,7 +60,7 @@ def describe(demonstrations: Any, notes: Sequence[str] = ()) -> Description:
     second = 1.0 / TIMES.get(unit, 1.0)
     recordings = []
     for k, (time, position) in enumerate(demonstrations):
-        steps, moves = np.diff(time), ~still(time, position, demonstrations, _PAUSE * second)
+        steps, moves = np.diff(time), ~still(time, position, demonstrations)
         moving = time[moves] if moves.any() else time[-1:]
         row = {"#": k, "samples": len(time), f"start [{unit}]": time[0], f"lasts [{unit}]": time[-1] - time[0]}
         row |= {"rate [Hz]": second / np.median(steps), f"gap [{unit}]": steps.max()}
@@ -163,17 +154,12 @@ def _flips(demonstrations: Any) -> Iterator[str]:
 
 
 def check_unimodal(demonstrations: Any) -> bool:
-    """Check that the demonstrations have a single mode, with a warning if they do not.
+    """Whether ``Demonstrations``, aligned by phase if necessary, have a single mode.
 
     The paper assumes one mode (Section II): between two ways around an obstacle, a mean goes through it. The
     demonstrations are projected on the direction in which they differ most, as a whole and at each of 20 steps, and
     split into two groups of common variance. The split must pay by the Bayesian information criterion, with groups
     far apart. Subtle cases are missed, and fewer than six demonstrations always pass.
-
-    Parameters
-    ----------
-    demonstrations : Demonstrations
-        Demonstrations, which are aligned by phase if necessary.
 
     Warns
     -----

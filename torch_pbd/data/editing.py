@@ -129,7 +129,7 @@ class Editing:
             times = tuple(_convert(time, TIMES[self.time_unit], TIMES[time_unit]) for time in times)
         return self._replace(times, positions, units=units, time_unit=time_unit or self.time_unit)
 
-    def cut(self, at: Literal["pauses"] | Sequence[tuple[float, float]] = "pauses", *, pause: float = 0.5) -> Self:
+    def cut(self, at: Literal["pauses"] | Sequence[tuple[float, float]] = "pauses") -> Self:
         """Split one long recording into several demonstrations.
 
         Where a column of a file labels them, use ``demo=`` of `torch_pbd.data.load_demonstrations`.
@@ -137,30 +137,29 @@ class Editing:
         Parameters
         ----------
         at : "pauses" or sequence of (start, end), default="pauses"
-            Start and end of each demonstration in ``time_unit``; "pauses" splits at pauses.
-        pause : float, default=0.5
-            Shortest pause in ``time_unit``, during which all outputs stay within 2 % of their extent.
+            Start and end of each demonstration in ``time_unit``. "pauses" splits where all outputs stay within 2 % of
+            their extent for half a second.
         """
         if len(self.times) != 1:
             raise InvalidParameterError(f"there are {len(self.times)} recordings, must be one to be cut, as [:1].")
         time, position = self.times[0], self.positions[0]
         if isinstance(at, str):
             checks.choice(at, "at", ("pauses",))
-            moving = ~still(time, position, self, pause)
+            moving = ~still(time, position, self)
             edges = np.flatnonzero(np.diff(np.r_[False, moving, False]))
             spans = [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= MIN_SAMPLES]
             if not spans:
-                raise InvalidParameterError(f"nothing moves between pauses of {pause} {self.time_unit}: lower pause.")
+                raise InvalidParameterError("nothing moves between pauses of half a second: cut at times.")
         else:
             spans = [_span(time, start_end, i) for i, start_end in enumerate(at)]
         return self._replace([time[a:b] for a, b in spans], [position[a:b] for a, b in spans], anew=True)
 
-    def trim(self, method: Literal["still"] = "still", *, pause: float = 0.5) -> Self:
-        """Demonstrations without stillness at their ends that lasts longer than a ``pause`` as in :meth:`cut`."""
+    def trim(self, method: Literal["still"] = "still") -> Self:
+        """Demonstrations without the pauses at their ends, of half a second or more as in :meth:`cut`."""
         checks.choice(method, "method", ("still",))
         times, positions = [], []
         for time, position in zip(self.times, self.positions, strict=True):
-            moving = np.flatnonzero(~still(time, position, self, pause))
+            moving = np.flatnonzero(~still(time, position, self))
             # One still sample is kept at each end, where the movement starts and stops.
             span = slice(max(moving[0] - 1, 0), moving[-1] + 2) if len(moving) else slice(None)
             times.append(time[span])

@@ -101,10 +101,8 @@ def load_demonstrations(
 
     Raises
     ------
-    FileNotFoundError, ModuleNotFoundError
-        If there is no such file, or its format needs a library that is not installed.
-    ValueError, TypeError
-        If the suffix is unknown, or an option is invalid or not one of the format's.
+    FileNotFoundError, ModuleNotFoundError, ValueError, TypeError
+        If there is no such file, a library is missing, the suffix is unknown, or an option is invalid or another's.
     DataFormatError
         If the file does not match its suffix, with the array, or the line and the column; or if it is too large.
     """
@@ -179,16 +177,7 @@ def save_demonstrations(demonstrations: Demonstrations, path: str | os.PathLike[
     have no units, frame or checksum, and store rotations as quaternion columns qw, qx, qy, qz, which ``rotation`` must
     name on loading; .npz files store rotations as they are, with their reference.
 
-    Parameters
-    ----------
-    demonstrations : Demonstrations
-    path : str or path-like
-        File to write, in an existing folder.
-
-    Raises
-    ------
-    ValueError
-        If the suffix is unknown, or an output's name cannot be a column of a CSV file.
+    Raises a ValueError if the suffix is unknown, or an output's name cannot be a column of a CSV file.
     """
     file = Path(path)
     write = _function(file, _WRITTEN.get(file.suffix.lower()), _WRITTEN)

@@ -23,25 +23,7 @@ _FAR, _FURTHEST = 120.0, 150.0
 _N_PHASES = 201  # phases of each recording in the mean, so that duration and sampling rate do not weigh in
 
 
-def as_outputs(
-    times: Any, positions: Any, names: Any, units: Any, rotation: Any, reference: Any, angles: Any, missing: Any
-) -> dict[str, Any]:
-    """Recordings and labels as in `torch_pbd.data.Demonstrations`, with a rotation as the last three outputs."""
-    times, positions = as_recordings(times, positions, missing)
-    names = as_names(names, positions[0].shape[1])
-    if rotation is None:
-        units = as_units(units, len(names))
-        reference = None if reference is None else _as_reference(reference, times, positions, names, units)
-    elif reference is None:
-        times, positions, names, units, reference = _as_chart(times, positions, names, units, rotation, missing)
-    else:
-        raise checks.refusal(reference, "rotation_reference", "None where rotation= names quaternions")
-    if angles is not None:
-        positions = as_recordings(times, unwrapped(times, positions, names, units, angles), "raise")[1]
-    return {"times": times, "positions": positions, "names": names, "units": units, "rotation_reference": reference}
-
-
-def _as_reference(reference: Any, times: Any, positions: Any, names: Any, units: Any) -> Floats:
+def as_reference(reference: Any, times: Any, positions: Any, names: Any, units: Any) -> Floats:
     """Checked reference of the chart in which the last three outputs already are, as in a file."""
     quaternion = checks.array(reference, "rotation_reference", (4,))
     if abs(float(quaternion @ quaternion) - 1.0) > checks.ROUNDING:
@@ -53,27 +35,30 @@ def _as_reference(reference: Any, times: Any, positions: Any, names: Any, units:
     return frozen(quaternion)
 
 
-def _as_chart(times: Any, positions: Any, names: Any, units: Any, rotation: Any, missing: Any) -> tuple[Any, ...]:
-    """Recordings and labels with the four quaternion columns as three in the chart, and its reference."""
+def as_chart(times: Any, positions: Any, names: Any, units: Any, rotation: Any, missing: Any) -> tuple[Any, ...]:
+    """Recordings and labels with four columns of quaternions as three in the chart, and its reference."""
     chosen = as_texts(rotation, "rotation")
     if not len(chosen) == len(set(chosen)) == len(set(chosen) & set(names)) == 4:
         must = f"four different ones of {preview(names)}, in the order w x y z, wherever these stand"
         raise checks.refusal(rotation, "rotation", must)
     columns = [names.index(name) for name in chosen]
-    lost = [~position[:, columns].any(axis=1, keepdims=True) for position in positions]
-    if missing == "drop" and any(map(np.any, lost)):  # a tracker that saw nothing wrote zeros
-        holes = [np.where(gone, np.nan, position) for gone, position in zip(lost, positions, strict=True)]
+    if missing == "drop":  # a tracker that saw nothing wrote zeros
+        holes = [np.where(y[:, columns].any(axis=1, keepdims=True), y, np.nan) for y in positions]
         times, positions = as_recordings(times, holes, "drop")
-    turns = [_unit(position[:, columns], k, chosen) for k, position in enumerate(positions)]
+    turns = []
+    for k, position in enumerate(positions):
+        norm = np.linalg.norm(position[:, columns], axis=1)
+        what, remedy = f"the norm of {', '.join(chosen)} in positions[{k}]", "missing='drop' leaves zeros out"
+        checks.require(np.abs(norm**2 - 1.0) <= OFF_SPHERE, norm, what, "1", f"name a rotation; {remedy}")
+        turns.append(position[:, columns] / norm[:, np.newaxis])
     kept = [i for i in range(len(names)) if i not in columns]
     if units is not None and not isinstance(units, str) and len(units) == len(names):
         units = [units[i] for i in kept]
-    own = () if units is not None and not kept else as_units(units, len(kept))
+    own = as_units(units, len(kept))
     labels = as_names([*(names[i] for i in kept), *ROTATION], len(kept) + 3)
     reference = mean_rotation(times, turns)
     charts = charted(times, [position[:, kept] for position in positions], turns, reference)
-    units = own if own is None else (*own, "rad", "rad", "rad")
-    return *as_recordings(times, charts, "raise"), labels, units, frozen(reference)
+    return times, charts, labels, None if own is None else (*own, "rad", "rad", "rad"), frozen(reference)
 
 
 def mean_rotation(times: Sequence[Floats], quaternions: Sequence[Floats]) -> Floats:
@@ -138,17 +123,6 @@ def unwrapped(times: Any, positions: Any, names: Any, units: Any, angles: Any) -
         for position, curve, n in zip(positions, curves, turns, strict=True):
             position[:, i] = curve - n * turn
     return positions
-
-
-def _unit(quaternion: Floats, k: int, names: Sequence[str]) -> Floats:
-    """Normalized quaternions (T, 4) from recorded, rounded ones."""
-    norm = np.linalg.norm(quaternion, axis=1)
-    what, remedy = (
-        f"the norm of {', '.join(names)} in positions[{k}]",
-        "name a rotation; missing='drop' leaves zeros out",
-    )
-    checks.require(np.abs(norm**2 - 1.0) <= OFF_SPHERE, norm, what, "1", remedy)
-    return quaternion / norm[:, np.newaxis]
 
 
 def _check_reach(times: Sequence[Floats], turns: Sequence[Floats]) -> None:

@@ -6,15 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline, make_smoothing_spline
 
-from torch_pbd import checks
 from torch_pbd.checks import Floats
+from torch_pbd.data.units import TIMES
 
 # A movement is known up to 2.5 spacings from a sample, as in a dropout of three whose neighbours jitter, and no longer
 # at five. Of a finer sampling five count as a 40th of the movement.
 KNOWN, LOST = 2.5, 5.0
 _FINEST = 200
-# Within a pause all outputs stay within this share of their extent in the recording: a hand that waits trembles.
-_STILL = 0.02
+# Shorter stillness, in s, is part of a movement. Within a pause all outputs stay within a share of their extent in the
+# recording: a hand that waits trembles.
+_PAUSE, _STILL = 0.5, 0.02
 LEAST_SAMPLES = 5
 """Fewest samples of which there is a smoothing spline."""
 
@@ -65,9 +66,9 @@ def extents(position: Floats, demonstrations: Any) -> Floats:
     return extent
 
 
-def still(time: Floats, position: Floats, demonstrations: Any, pause: float) -> NDArray[np.bool_]:
-    """Samples (T,) in a stretch of at least ``pause`` in which no output leaves 2 % of its extent."""
-    checks.number(pause, "pause", above=0.0)
+def still(time: Floats, position: Floats, demonstrations: Any) -> NDArray[np.bool_]:
+    """Samples (T,) in a stretch of at least half a second in which no output leaves 2 % of its extent."""
+    pause = _PAUSE / TIMES.get(demonstrations.time_unit, 1.0)
     # Resampled evenly, as windows count samples, with at least ten samples per pause.
     n = int(min(max(np.ceil(10.0 * (time[-1] - time[0]) / pause), len(time)), 100_000))
     grid = np.linspace(time[0], time[-1], n)

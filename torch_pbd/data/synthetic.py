@@ -26,16 +26,13 @@ _BLENDED = 0.15  # share of the path next to a common end in which lanes blend
 
 
 def paper_mean(xi: ArrayLike) -> Floats:
-    """Mean of eq. (14): ``[30 sin(xi / 20), 30 tanh(xi / 20)]``.
-
-    The inputs have shape (n,) or (n, 1), the result (n, 2).
-    """
+    """Mean (n, 2) of eq. (14) at inputs (n,) or (n, 1): ``[30 sin(xi / 20), 30 tanh(xi / 20)]``."""
     x = column(xi, "xi")
     return np.column_stack([30.0 * np.sin(x / 20.0), 30.0 * np.tanh(x / 20.0)])
 
 
 def paper_covariance(xi: ArrayLike, reading: Reading = "bell") -> Floats:
-    """Covariance of eq. (14): ``diag(s(xi), xi + 150)``.
+    """Covariance (n, 2, 2) of eq. (14): ``diag(s(xi), xi + 150)``.
 
     Parameters
     ----------
@@ -45,10 +42,6 @@ def paper_covariance(xi: ArrayLike, reading: Reading = "bell") -> Floats:
         The paper prints s as ``150 exp(-xi/50)^2``, which can be read as ``150 exp(-(xi/50)^2)`` ("bell"),
         as ``150 (exp(-xi/50))^2`` ("printed"), or with the sign inside the square, ``150 exp((xi/50)^2)``
         ("bowl"). The paper's Table I fits "bell" and "printed", and rules "bowl" out.
-
-    Returns
-    -------
-    ndarray of shape (n, 2, 2)
     """
     checks.choice(reading, "reading", Reading)
     x = column(xi, "xi")
@@ -76,10 +69,8 @@ def make_paper_simulation(
 
     Returns
     -------
-    X : ndarray of shape (n_inputs * n_demos, 1)
-        Inputs, demonstration by demonstration, which repeat exactly.
-    y : ndarray of shape (n_inputs * n_demos, 2)
-    groups : ndarray of shape (n_inputs * n_demos,)
+    X, y, groups : ndarray of shape (n, 1), (n, 2) and (n,), n = n_inputs * n_demos
+        Inputs, which repeat exactly, draws and their indices, demonstration by demonstration.
     """
     n = checks.count(n_inputs, "n_inputs") * checks.count(n_demos, "n_demos")
     require_much(80.0 * n, what=f"n_inputs={n_inputs}, n_demos={n_demos}", remedy="Make fewer.")
@@ -95,10 +86,7 @@ def tunnel_center(y: ArrayLike) -> Floats:
 
 
 def tunnel_half_width(y: ArrayLike) -> Floats:
-    """Half the width of the tunnel, in m, at y in m.
-
-    12 cm up to y = 0.2 m, 1 cm from y = 0.45 m, and a smoothstep ``3 s^2 - 2 s^3`` between them.
-    """
+    """Half the width of the tunnel in m at y in m: 12 cm up to y = 0.2, 1 cm from y = 0.45, a smoothstep between."""
     s = np.clip((checks.real_floats(y, "y") - 0.2) / 0.25, 0.0, 1.0)
     return 0.12 - 0.11 * s**2 * (3.0 - 2.0 * s)
 
@@ -113,7 +101,7 @@ def make_tunnel_demonstrations(
     common_start: bool = False,
     common_goal: bool = False,
 ) -> Demonstrations:
-    """Demonstrations of a hand in a narrowing tunnel: free where it is wide, precise where it is narrow.
+    """Demonstrations, x and y in m, of a hand in a narrowing tunnel: free where it is wide, precise where it is narrow.
 
     The hand moves along y at constant speed over 0.6 m. Across, it is at ``tunnel_center(y) + 0.85
     tunnel_half_width(y) tanh(lane + 0.12 w(t) + 0.04 c(t))`` with a lane drawn uniformly from [-0.6, 0.6] for each
@@ -124,10 +112,8 @@ def make_tunnel_demonstrations(
     Parameters
     ----------
     n_demos : int, default=6
-    duration : float, default=10.0
-        Duration of each demonstration in s.
-    rate : float, default=100.0
-        Sampling rate in Hz.
+    duration, rate : float, default=10.0 and 100.0
+        Duration of each demonstration in s, and sampling rate in Hz.
     random_state : int, Generator, RandomState or None, default=None
     variant : str, default="plain"
         - "plain": aligned;
@@ -139,11 +125,6 @@ def make_tunnel_demonstrations(
     common_start, common_goal : bool, default=False
         Whether all start, or end, on the centre line, with a minimum-jerk blend from and to their lanes in the first
         and the last 15 % of the duration.
-
-    Returns
-    -------
-    Demonstrations
-        Outputs x and y in m, times in s.
     """
     checks.choice(variant, "variant", Variant)
     check_recording(n_demos, duration, rate, least_steps=0.5)

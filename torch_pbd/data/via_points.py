@@ -75,7 +75,7 @@ def make_handwriting_demonstrations(
     timing: float = 0.1,
     random_state: Seed = None,
 ) -> Demonstrations:
-    """Demonstrations of a written letter: minimum-jerk movements through randomly perturbed via points.
+    """Demonstrations, x and y in m, of a written letter: minimum-jerk movements through randomly perturbed via points.
 
     Each movement starts and ends at rest and has the least jerk of those that pass its via points at their phases
     (T. Flash, N. Hogan, Journal of Neuroscience 5, 1985): the quintic spline through them. Via points are normal and
@@ -87,10 +87,8 @@ def make_handwriting_demonstrations(
     shape : {"C", "G", "J", "S", "W", "Z"}, default="S"
         Letters 10 cm high, of five to seven via points.
     n_demos : int, default=6
-    duration : float, default=2.0
-        Median duration in s.
-    rate : float, default=100.0
-        Sampling rate in Hz.
+    duration, rate : float, default=2.0 and 100.0
+        Median duration in s, and sampling rate in Hz.
     via_precision : float or array_like of shape (n_via_points,), default=None
         Standard deviation in m across the path at each via point, or at all of them. None takes the letter's own, from
         1 mm where it is written precisely to 9 mm where it is free.
@@ -98,11 +96,6 @@ def make_handwriting_demonstrations(
         Relative standard deviation of durations and of the pace within a demonstration, below 0.5. With 0 all
         demonstrations share one grid, and time / duration is the phase of the truth.
     random_state : int, Generator, RandomState or None, default=None
-
-    Returns
-    -------
-    Demonstrations
-        Outputs x and y in m, times in s.
 
     Examples
     --------
@@ -151,7 +144,7 @@ def make_pose_demonstrations(
     timing: float = 0.1,
     random_state: Seed = None,
 ) -> Demonstrations:
-    """Demonstrations of a peg that is moved, turned and inserted into a hole.
+    """Demonstrations, x, y, z in m and rx, ry, rz in rad, of a peg that is moved, turned and inserted into a hole.
 
     Position and rotation are minimum-jerk movements through five via points, as in `make_handwriting_demonstrations`,
     in the workspace of an arm of 0.8 m whose base is the origin; the tool turns by 76 degrees. On the way the hand is
@@ -164,11 +157,6 @@ def make_pose_demonstrations(
         Number of demonstrations; six or fewer cannot determine a covariance of six outputs.
     duration, rate, timing, random_state
         Parameters of `make_handwriting_demonstrations`, in s and Hz.
-
-    Returns
-    -------
-    Demonstrations
-        Outputs x, y, z in m and rx, ry, rz in rad; times in s.
 
     Examples
     --------

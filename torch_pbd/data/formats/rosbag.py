@@ -1,7 +1,7 @@
 """Recordings of ROS: rosbag2 (SQLite or MCAP) and ROS 1 bags; one topic, a sample a message."""
 
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain, pairwise
@@ -37,7 +37,8 @@ _KINDS = (*_PARTS, _JOINTS, *_TRANSFORMS)
 # Message types of topics that may label the demonstrations.
 _MARKS = {f"std_msgs/msg/{sign}Int{bits}" for sign in ("", "U") for bits in (8, 16, 32, 64)}
 _MARKS |= {"std_msgs/msg/Bool", "std_msgs/msg/String"}
-_JOINT_UNITS = {"position": "rad", "velocity": "rad/s", "effort": "N m"}
+# Prefix and unit of the columns of each field of joints.
+_JOINT_FIELDS = {"position": ("", "rad"), "velocity": ("velocity.", "rad/s"), "effort": ("effort.", "N m")}
 
 
 def read(path: Path, wanted: Wanted, topic: str | None = None, child: str | None = None) -> Arguments:
@@ -50,12 +51,33 @@ def read(path: Path, wanted: Wanted, topic: str | None = None, child: str | None
     types = stores.get_typestore(stores.Stores.ROS2_HUMBLE)
     with highlevel.AnyReader([path], default_typestore=types) as reader:
         name = _topic(reader.topics, topic, wanted.demo)
-        info = reader.topics[name]
+        kind, n_messages = reader.topics[name].msgtype, reader.topics[name].msgcount
         # A sample is 8 bytes for each of its stamp and, with room for joints, 31 outputs.
-        wanted.require(256.0 * info.msgcount, f"topic {name!r}")
+        wanted.require(256.0 * n_messages, f"topic {name!r}")
         marks: list[Any] = []
         messages = _messages(reader, name, wanted.demo, marks)
-        return _read_messages(info.msgtype, messages, marks, wanted, child)
+        if kind in _TRANSFORMS:
+            messages, kind = _of_child(messages, child), "geometry_msgs/msg/TransformStamped"
+        first = next(messages, None)
+        if first is None:
+            raise ValueError("the topic has no messages.")
+        columns = _columns(kind, first[2])
+        signals = {field: tuple(own) for field, own in columns.items()} | {"time": ("time",)}
+        chosen = replace(wanted, demo=None).choose(signals, time="time", outputs=next(iter(signals)))
+        getters = [columns[field][name] for (field, _), name in zip(chosen.outputs, chosen.names, strict=True)]
+        # Arrays of numbers take 8 bytes for each, where lists of tuples take 60.
+        numbers, stamps, coordinates = array("i"), array("q"), array("d")
+        for number, stamp, message in chain([first], messages):
+            numbers.append(number)
+            stamps.append(stamp)
+            coordinates.extend([get(message) for get, _ in getters])
+    arrays = {"time": np.frombuffer(stamps, "M8[ns]"), "y": np.frombuffer(coordinates).reshape(len(stamps), -1)}
+    return wanted.read_each(
+        chosen._replace(outputs=[("y", i) for i in range(len(getters))]),
+        _recordings(arrays, numbers, marks, wanted.demo),
+        units=[unit for _, unit in getters],
+        frame=getattr(getattr(first[2], "header", None), "frame_id", "") or None,
+    )
 
 
 def _topic(topics: dict[str, Any], topic: str | None, demo: str | None) -> str:
@@ -80,49 +102,18 @@ def _topic(topics: dict[str, Any], topic: str | None, demo: str | None) -> str:
 
 
 def _messages(reader: Any, topic: str, demo: str | None, marks: list[Any]) -> Iterator[tuple[int, int, Any]]:
-    """Messages, each with its stamp and the number of the stretch over which topic ``demo`` has one of ``marks``.
+    """Messages, each with the number of the stretch over which topic ``demo`` has one of ``marks``, and a stamp in ns.
 
-    All in the order in which they were recorded: stamps in headers may be of another clock.
+    All in the order in which they were recorded: stamps in headers, where they have some, may be of another clock.
     """
     connections = [c for name in dict.fromkeys((topic, demo)) if name for c in reader.topics[name].connections]
     deserialize = reader.typestore.deserialize_cdr if reader.is2 else reader.typestore.deserialize_ros1
     for connection, stamp, raw in reader.messages(connections):
         message = deserialize(raw, connection.msgtype)
         if connection.topic == topic:
-            yield len(marks) - 1, stamp, message
+            yield len(marks) - 1, _stamp(message, stamp), message
         elif not marks or message.data != marks[-1]:
             marks.append(message.data)
-
-
-def _read_messages(
-    kind: str, messages: Iterator[tuple[int, int, Any]], marks: list[Any], wanted: Wanted, child: str | None
-) -> Arguments:
-    if kind in _TRANSFORMS:
-        messages, kind = _of_child(messages, child), "geometry_msgs/msg/TransformStamped"
-    first = next(messages, None)
-    if first is None:
-        raise ValueError("the topic has no messages.")
-    columns, units = _getters(kind, first[2])
-    signals = {field: tuple(own) for field, own in columns.items()} | {"time": ("time",)}
-    chosen = replace(wanted, demo=None).choose(signals, time="time", outputs=next(iter(signals)))
-    getters = [columns[field][signals[field][i]] for field, i in chosen.outputs]
-    # Arrays of numbers take 8 bytes for each, where lists of tuples take 60.
-    numbers, stamps, coordinates = array("i"), array("q"), array("d")
-    has_header = hasattr(first[2], "header")
-    for number, stamp, message in chain([first], messages):
-        if has_header:
-            time = message.header.stamp
-            stamp = time.sec * 10**9 + time.nanosec
-        numbers.append(number)
-        stamps.append(stamp)
-        coordinates.extend([get(message) for get in getters])
-    arrays = {"time": np.frombuffer(stamps, "M8[ns]"), "y": np.frombuffer(coordinates).reshape(len(stamps), -1)}
-    return wanted.read_each(
-        chosen._replace(outputs=[("y", i) for i in range(len(getters))]),
-        _recordings(arrays, numbers, marks, wanted.demo),
-        units=[units[field] for field, _ in chosen.outputs],
-        frame=getattr(getattr(first[2], "header", None), "frame_id", "") or None,
-    )
 
 
 def _recordings(
@@ -167,30 +158,35 @@ def _of_child(messages: Iterator[tuple[int, int, Any]], child: str | None) -> It
             if child is None and len(seen) > 1:
                 raise ValueError(f"its transforms are of frames {', '.join(sorted(seen))}: name one by child=.")
             if child in (None, transform.child_frame_id):
-                yield number, stamp, transform
+                yield number, _stamp(transform, stamp), transform
     if child is not None and child not in seen:
         raise ValueError(f"it has no transforms of {child!r}, but of {', '.join(sorted(seen))}.")
 
 
-def _getters(kind: str, message: Any) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
-    """Getters of each column of each field of a message, and the unit of each field."""
+def _stamp(message: Any, received: int) -> int:
+    """Stamp of a message's header in ns; the time at which it was received, where it has none."""
+    header = getattr(message, "header", None)
+    return received if header is None else header.stamp.sec * 10**9 + header.stamp.nanosec
+
+
+def _columns(kind: str, message: Any) -> dict[str, dict[str, tuple[Callable[[Any], float], str]]]:
+    """Columns of each field of a message by name: a getter and a unit."""
     if kind != _JOINTS:
         part, place = _PARTS[kind]
-        fields = _FIELDS[part].items()
-        columns = {
-            field: {prefix + letter: attrgetter(place + own + letter) for letter in letters}
-            for field, (own, letters, prefix, _) in fields
+        return {
+            field: {prefix + letter: (attrgetter(place + own + letter), unit) for letter in letters}
+            for field, (own, letters, prefix, unit) in _FIELDS[part].items()
         }
-        return columns, {field: unit for field, (*_, unit) in fields}
     names = [str(name) for name in message.name]
-    given = [field for field in _JOINT_UNITS if len(getattr(message, field)) == len(names) > 0]
+    given = [field for field in _JOINT_FIELDS if len(getattr(message, field)) == len(names) > 0]
 
     def joint(field: str, i: int, message: Any) -> float:
         if message.name[i] != names[i]:  # the order of joints may change
             raise ValueError(f"a message has joints {', '.join(message.name)}, others {', '.join(names)}.")
         return float(getattr(message, field)[i])
 
-    prefix = {field: "" if field == "position" else f"{field}." for field in given or ["position"]}
     return {
-        field: {own + name: partial(joint, field, i) for i, name in enumerate(names)} for field, own in prefix.items()
-    }, _JOINT_UNITS
+        field: {prefix + name: (partial(joint, field, i), unit) for i, name in enumerate(names)}
+        for field, (prefix, unit) in _JOINT_FIELDS.items()
+        if field in (given or ["position"])
+    }
