@@ -15,6 +15,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstddef>
+#include <limits>
 #include <memory>
 #include <optional>
 
@@ -70,23 +71,27 @@ public:
     };
 
     explicit Admittance(const Schedule& schedule, const Options& options = {})
-        : timer_(checked(options.rate, 0.0 < options.rate && options.rate < infinity, "rate", "above 0"),
-                 options.max_step, options.max_bad_ticks),
+        : rate_(checked(options.rate, 0.0 < options.rate && options.rate < infinity, "rate", "above 0")),
+          max_step_(checked(options.max_step, 1.0 / rate_ < options.max_step && options.max_step < infinity, "max_step",
+                            "above 1 / rate, finite")),
+          max_bad_ticks_(options.max_bad_ticks),
           channel_(options.force_limit, options.deadband, options.force_rate_limit, options.hold_ticks),
-          limits_(options.velocity_limit, options.acceleration_limit),
+          speed_limit_(checked<N, M>(options.velocity_limit, "velocity_limit", false, true)),
+          acceleration_limit_(checked<N, M>(options.acceleration_limit, "acceleration_limit", false, true)),
           table_(std::make_shared<const ScheduleTable<N, M>>(schedule, virtual_mass(schedule, options.mass),
-                                                             options.rate, pull_limit(options))),
-          clock_(table_, options.soft_start, options.approach_speed, limits_.acceleration, options.catches_up) {
+                                                             rate_, pull_limit(options))),
+          clock_(table_, options.soft_start, options.approach_speed, acceleration_limit_, options.catches_up) {
+        checked(max_bad_ticks_, max_bad_ticks_ >= 1, "max_bad_ticks", "at least 1");
         const Limit stop = checked<N, M>(options.stop_deceleration.value_or(kDeceleration), "stop_deceleration");
         deceleration_ =
             std::min(options.stop_deceleration ? clock_.least(stop) : std::max(clock_.least(stop), clock_.acceleration),
-                     clock_.least(limits_.acceleration));
+                     clock_.least(acceleration_limit_));
         // Impulse responses of velocity to force integrate, in absolute values, to 2 / damping at most along each mode,
         // for any mass: twice what damping alone lets them do, where not all modes are met at their worst at once.
         const Limit answer = 2.0 * table_->mobility(options.force_limit + pull_limit(options));
         for (std::size_t b = 0; b < kBlocks.size(); ++b)
             speed_due_[b] =
-                limits_.speed[b] < infinity ? limits_.speed[b] : clock_.speed / clock_.scale(b) + answer[b];
+                speed_limit_[b] < infinity ? speed_limit_[b] : clock_.speed / clock_.scale(b) + answer[b];
         desired_ = clock_.begin(0.0, 0.0, {}, {}, {}, state_.place);
     }
 
@@ -95,6 +100,9 @@ public:
 
     /// Begins, or begins again: faults, forces and motion are forgotten.
     void start(double now, const Start& from) {
+        // A reading must tell ticks apart to 1 %: times since 1970 in s do, in ns they do not.
+        const double resolution = std::nextafter(std::abs(now), infinity) - std::abs(now);
+        checked(now, resolution * rate_ <= 0.01, "now", "small enough to tell ticks apart: give seconds");
         checked(from.at, 0.0 <= from.at && from.at <= table_->end, "at", "a time of the schedule, in s");
         check_finite(from.position.value_or(Position{}), "position");
         check_finite(from.velocity, "velocity");
@@ -106,13 +114,19 @@ public:
             orientation = (1.0 / length) * *orientation;
         }
         top_speed_ = speed_due_;
+        least_top_ = infinity;
         for (std::size_t b = 0; b < kBlocks.size(); ++b) {
             const double along = linalg::norm(from.velocity, kBlocks[b]);
-            checked(along, along <= limits_.speed[b], b == 0 ? "the speed" : "the angular speed",
+            checked(along, along <= speed_limit_[b], b == 0 ? "the speed" : "the angular speed",
                     "velocity_limit at most");
             top_speed_[b] = std::max(top_speed_[b], along);
+            const bool is_limited = speed_limit_[b] < infinity || acceleration_limit_[b] < infinity;
+            least_top_ = std::min(least_top_, is_limited ? -1.0 : top_speed_[b]);
         }
-        timer_.begin(now);
+        last_ = newest_ = now;
+        step_ = 1.0 / rate_;
+        is_regular_ = false;
+        n_bad_ = n_late_ = 0;
         channel_.begin(from.force_bias);
         scale_ = {1.0, 1.0};
         desired_ = clock_.begin(now, from.at, from.position, orientation, from.velocity, state_.place);
@@ -128,9 +142,9 @@ public:
     /// stopped. (Python raises there, and at the third tick after `start` that is late, at which this stops too.)
     Faults tick(double now, const Vector<N>& force) noexcept {
         if (!is_started_) return kStopped;
-        const double step = now - timer_.last;
-        const bool is_regular = timer_.is_regular && 0.0 < step && step <= timer_.max_step;
-        Faults faults = channel_.take(force, is_regular ? step : timer_.step);
+        const double step = now - last_;
+        const bool is_regular = is_regular_ && 0.0 < step && step <= max_step_;
+        Faults faults = channel_.take(force, is_regular ? step : step_);
         is_stopped_ = is_stopped_ || channel_.is_lost;
         faults |= is_regular ? live(now, step) : live_irregular(now);
         if (is_stopped_) faults |= kStopped;
@@ -157,7 +171,7 @@ public:
     /// Stiffness of the last tick in N/m and Nm/rad, as `spring_limit` let it be.
     Matrix<N> stiffness() const { return table_->scaled_stiffness(scale_, clock_.index); }
     const Matrix<N>& damping() const { return table_->damping[clock_.index]; }  ///< of the last tick
-    double schedule_time() const { return clock_.time_at(timer_.last); }  ///< in s
+    double schedule_time() const { return clock_.time_at(last_); }  ///< in s
 
 private:
     static constexpr auto kBlocks = blocks<N, M>;
@@ -165,6 +179,7 @@ private:
     static constexpr Limit kDeceleration{5.0, 10.0};
     // Share of the newest tick in how long a tick lasts: neither one short tick nor one long counts for much.
     static constexpr double kSmoothing = 0.1;
+    static constexpr int kLateOnEnd = 3;  // one late tick is a stall, two may be; three are a loop that is too slow
     static constexpr double kOff = 1e-3;  // of a quaternion's length: four rounded digits
 
     static double virtual_mass(const Schedule& schedule, std::optional<double> given) {
@@ -199,59 +214,89 @@ private:
 
     Faults live(double now, double step) {
         if (is_stopped_) {
-            brake(now, step, deceleration_);
+            brake(now, deceleration_);
             return 0;
         }
         const State<N, M> before = state_;
         Vector<N> push = channel_.push;
-        desired_ = clock_.row(timer_.last, step);
+        desired_ = clock_.row(last_, step);
         if (clock_.boost) push = push + table_->forced(*clock_.boost, clock_.index);
         scale_ = table_->advance(clock_.index, desired_, push, state_, step);
         if (clock_.boost)
             clock_.spare(table_->accelerated(channel_.push, clock_.index), before.velocity, state_.velocity, step);
-        Faults faults = 0;
-        if (scale_ != Limit{1.0, 1.0}) faults = kSpringLimited;
+        Faults faults = scale_ == Limit{1.0, 1.0} ? 0u : kSpringLimited;
         // No block is beyond its own top speed where all together are within the least of them.
-        const double least = kIsPose ? std::min(top_speed_[0], top_speed_[1]) : top_speed_[0];
-        if (limits_.is_any || linalg::norm(state_.velocity) > least)
-            faults |= limits_.apply(state_, before, step, top_speed_);
-        timer_.last = now;
-        timer_.step += kSmoothing * (step - timer_.step);
+        if (linalg::norm(state_.velocity) > least_top_)
+            faults |= keep_within(state_, before, step, top_speed_, acceleration_limit_);
+        last_ = now;
+        step_ += kSmoothing * (step - step_);
         return faults;
     }
 
     Faults live_irregular(double now) {
-        double shift;
-        const Faults fault = timer_.read(now, shift);
-        clock_.shift(shift);
-        is_stopped_ = is_stopped_ || timer_.is_failed();
-        if (!fault) return live(now, now - timer_.last);
-        if (fault == kClock) now = timer_.last + timer_.step;
+        const Faults fault = read(now);
+        is_stopped_ = is_stopped_ || n_bad_ >= max_bad_ticks_ || n_late_ >= kLateOnEnd;
+        if (!fault) return live(now, now - last_);
+        if (fault == kClock) now = last_ + step_;  // a tick is then taken to be as long as they are
         // In 1 + sqrt(2) times as long as it brakes the robot can be back: after a longer gap, without commands, it
         // rests where it was told to be last, and is not thrown from there.
-        const double passed = now - timer_.last;
-        const double speed = std::max(clock_.norm(state_.velocity), clock_.speed_at(timer_.last));
-        const bool can_be_back = fault == kLate && passed * deceleration_ > 3.0 * speed;
-        brake(now, passed, can_be_back ? infinity : deceleration_);
+        const double speed = std::max(clock_.norm(state_.velocity), clock_.speed_at(last_));
+        const bool can_be_back = fault == kLate && (now - last_) * deceleration_ > 3.0 * speed;
+        brake(now, can_be_back ? infinity : deceleration_);
         return fault;
     }
 
-    void brake(double now, double passed, double deceleration) {
-        const double speed = clock_.norm(state_.velocity);
-        clock_.brake(timer_.last, passed, deceleration, speed);
-        state_ = braked(state_, speed, deceleration, passed);
-        timer_.last = now;
+    /// Fault of a tick that is not like the last one.
+    Faults read(double now) {
+        if (is_regular_) {
+            is_regular_ = false;
+            newest_ = last_;
+        }
+        if (!(newest_ < now && now < infinity)) {
+            ++n_bad_;
+            return kClock;
+        }
+        // The clock has lost what bad ticks have lived through.
+        if (n_bad_ && now < last_ + 0.5 * step_) {
+            clock_.shift(now - step_ - last_);
+            last_ = now - step_;
+        }
+        newest_ = now;
+        n_bad_ = 0;
+        if (now - last_ > max_step_) {
+            ++n_late_;
+            return kLate;
+        }
+        is_regular_ = true;
+        n_late_ = 0;
+        return 0;
     }
 
-    TickTimer timer_;
+    /// Brakes all axes alike until `now`, or until standing still.
+    void brake(double now, double deceleration) {
+        const double passed = now - last_, speed = clock_.norm(state_.velocity);
+        clock_.brake(last_, passed, deceleration, speed);
+        const double braking = std::min(passed, speed / deceleration);
+        const double left = braking == passed ? 1.0 - deceleration * passed / speed : 0.0;
+        const Vector<N> before = state_.velocity;
+        state_.velocity = left * before;
+        state_.place = places::moved<N>(state_.place, 0.5 * braking * (before + state_.velocity));
+        last_ = now;
+    }
+
+    double rate_, max_step_;
+    int max_bad_ticks_;
     ForceChannel<N, M> channel_;
-    CommandLimits<N, M> limits_;
+    Limit speed_limit_, acceleration_limit_;
     std::shared_ptr<const ScheduleTable<N, M>> table_;
     ScheduleClock<N, M> clock_;
-    double deceleration_;
+    double deceleration_, least_top_;
     Limit speed_due_{}, top_speed_{}, scale_{1.0, 1.0};
     State<N, M> state_{}, desired_{};
-    bool is_started_ = false, is_stopped_ = false;
+    double last_ = std::numeric_limits<double>::quiet_NaN();  ///< until when the motion is known
+    double newest_ = 0.0, step_ = 0.0;  ///< reading of the clock, and how long ticks last
+    int n_bad_ = 0, n_late_ = 0;
+    bool is_started_ = false, is_stopped_ = false, is_regular_ = false;
     Faults faults_ = 0;
 };
 

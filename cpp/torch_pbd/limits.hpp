@@ -138,110 +138,35 @@ private:
     std::array<Channel, blocks<N, M>.size()> channels_{};
 };
 
-/// Ticks of at most `max_step` s; `last` is until when the motion is known, `step` how long ticks last.
-class TickTimer {
-public:
-    TickTimer(double rate, double longest, int max_bad_ticks)
-        : max_step(checked(longest, 1.0 / rate < longest && longest < infinity, "max_step", "above 1 / rate, finite")),
-          rate_(rate),
-          max_bad_ticks_(static_cast<int>(checked(max_bad_ticks, max_bad_ticks >= 1, "max_bad_ticks", "at least 1"))) {}
-
-    /// Counts from `now`.
-    void begin(double now) {
-        // A reading must tell ticks apart to 1 %: times since 1970 in s do, in ns they do not.
-        const double resolution = std::nextafter(std::abs(now), infinity) - std::abs(now);
-        checked(now, resolution * rate_ <= 0.01, "now", "small enough to tell ticks apart: give seconds");
-        last = newest_ = now;
-        step = 1.0 / rate_;
-        is_regular = false;
-        n_bad_ = n_late_ = 0;
-    }
-
-    /// Whether bad or late ticks are too many on end for the robot to go on.
-    bool is_failed() const { return n_bad_ >= max_bad_ticks_ || n_late_ >= kLateOnEnd; }
-
-    /// Fault of a tick that is not like the last one; `shift` is the time by which `last` was put forward.
-    ///
-    /// Where the clock does not say how long a tick took, it is taken to be as long as they are.
-    Faults read(double now, double& shift) {
-        shift = 0.0;
-        if (is_regular) {
-            is_regular = false;
-            newest_ = last;
-        }
-        if (!(newest_ < now && now < infinity)) {
-            ++n_bad_;
-            return kClock;
-        }
-        // The clock has lost what bad ticks have lived through.
-        if (n_bad_ && now < last + 0.5 * step) {
-            shift = now - step - last;
-            last = now - step;
-        }
-        newest_ = now;
-        n_bad_ = 0;
-        if (now - last > max_step) {
-            ++n_late_;
-            return kLate;
-        }
-        is_regular = true;
-        n_late_ = 0;
-        return 0;
-    }
-
-    double last = std::numeric_limits<double>::quiet_NaN();
-    double step = 0.0, max_step;
-    bool is_regular = false;
-
-private:
-    static constexpr int kLateOnEnd = 3;  // one late tick is a stall, two may be; three are a loop that is too slow
-    double newest_ = 0.0, rate_;
-    int max_bad_ticks_, n_bad_ = 0, n_late_ = 0;
-};
-
-/// Largest speed and acceleration of the command; infinite where there is none.
+/// Brings a state that a tick of `step` s led to within the largest speed and acceleration; returns which acted.
 template <std::size_t N, std::size_t M>
-class CommandLimits {
-public:
-    CommandLimits(Limit velocity_limit, Limit acceleration_limit)
-        : speed(checked<N, M>(velocity_limit, "velocity_limit", false, true)),
-          acceleration(checked<N, M>(acceleration_limit, "acceleration_limit", false, true)) {
-        for (std::size_t b = 0; b < blocks<N, M>.size(); ++b)
-            is_any = is_any || speed[b] < infinity || acceleration[b] < infinity;
-    }
-
-    /// Brings a state that a tick of `step` s led to within limits; returns which of them acted.
-    Faults apply(State<N, M>& state, const State<N, M>& last, double step, Limit top_speed) const {
-        Vector<N> move = places::deviation<N>(state.place, last.place), &velocity = state.velocity;
-        Faults all = 0;
-        for (std::size_t b = 0; b < blocks<N, M>.size(); ++b) {
-            // The change of velocity is shortened first, then the velocity: the second never undoes the first.
-            const Block block = blocks<N, M>[b];
-            const double change = linalg::norm(velocity - last.velocity, block), most = acceleration[b] * step;
-            Faults faults = 0;
-            if (change > most) {
-                for (std::size_t i = block.begin; i < block.end; ++i)
-                    velocity[i] = last.velocity[i] + most / change * (velocity[i] - last.velocity[i]);
-                faults |= kAccelerationLimited;
-            }
-            const double along = linalg::norm(velocity, block);
-            if (along > top_speed[b]) {
-                for (std::size_t i = block.begin; i < block.end; ++i) velocity[i] *= top_speed[b] / along;
-                faults |= kVelocityLimited;
-            } else if (linalg::norm(move, block) > top_speed[b] * step) {
-                faults |= kVelocityLimited;  // a swing within one tick, from rest to rest, is too fast as well
-            }
-            if (faults)
-                for (std::size_t i = block.begin; i < block.end; ++i)
-                    move[i] = 0.5 * step * (last.velocity[i] + velocity[i]);
-            all |= faults;
+Faults keep_within(State<N, M>& state, const State<N, M>& last, double step, Limit top_speed, Limit acceleration) {
+    Vector<N> move = places::deviation<N>(state.place, last.place), &velocity = state.velocity;
+    Faults all = 0;
+    for (std::size_t b = 0; b < blocks<N, M>.size(); ++b) {
+        // The change of velocity is shortened first, then the velocity: the second never undoes the first.
+        const Block block = blocks<N, M>[b];
+        const double change = linalg::norm(velocity - last.velocity, block), most = acceleration[b] * step;
+        Faults faults = 0;
+        if (change > most) {
+            for (std::size_t i = block.begin; i < block.end; ++i)
+                velocity[i] = last.velocity[i] + most / change * (velocity[i] - last.velocity[i]);
+            faults |= kAccelerationLimited;
         }
-        if (all) state.place = places::moved(last.place, move);
-        return all;
+        const double along = linalg::norm(velocity, block);
+        if (along > top_speed[b]) {
+            for (std::size_t i = block.begin; i < block.end; ++i) velocity[i] *= top_speed[b] / along;
+            faults |= kVelocityLimited;
+        } else if (linalg::norm(move, block) > top_speed[b] * step) {
+            faults |= kVelocityLimited;  // a swing within one tick, from rest to rest, is too fast as well
+        }
+        if (faults)
+            for (std::size_t i = block.begin; i < block.end; ++i)
+                move[i] = 0.5 * step * (last.velocity[i] + velocity[i]);
+        all |= faults;
     }
-
-    Limit speed, acceleration;
-    bool is_any = false;
-};
+    if (all) state.place = places::moved(last.place, move);
+    return all;
+}
 
 }  // namespace torch_pbd

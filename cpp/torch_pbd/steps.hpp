@@ -252,13 +252,4 @@ Vector<N> coupled(const Modes<N>& modes, const Matrix<N>& stiffness, const Matri
     return move;
 }
 
-/// State after braking for `step` s, all axes alike, from a speed, or until standing still.
-template <std::size_t N, std::size_t M>
-State<N, M> braked(const State<N, M>& state, double speed, double deceleration, double step) {
-    const double braking = std::min(step, speed / deceleration);
-    const double left = braking == step ? 1.0 - deceleration * step / speed : 0.0;
-    const Vector<N> slower = left * state.velocity;
-    return {places::moved<N>(state.place, 0.5 * braking * (state.velocity + slower)), slower};
-}
-
 }  // namespace torch_pbd

@@ -154,8 +154,10 @@ class ActiveFilter(ABC):
             library, shape = _library(off), (*off.shape, off.shape[-1])
             wanted = [library.broadcast_to(gain, shape) for gain in (stiffness, damping)]
             self.gains = wanted[0], wanted[1], library.ones_like(off[..., 0])
+            if self.tank_energy is not None:
+                self.tank_energy = self.tank_energy * self.gains[2]
         else:
-            share = self._largest_share(stiffness, damping, mass, off, scale * off)
+            share = self._paid_share(stiffness, damping, mass, off, scale * off)
             kept = (1.0 - share)[..., None, None]  # zero where all is granted, which is then exactly what is wanted
             steps = zip((stiffness, damping), self.gains, strict=False)
             stiffness, damping = (wanted - kept * (wanted - last) for wanted, last in steps)
@@ -177,28 +179,20 @@ class ActiveFilter(ABC):
         """Record a tick: states at its start and end, the force (..., d) held during it, and the springs' energy."""
 
     @abstractmethod
-    def _largest_share(self, stiffness: Array, damping: Array, mass: Array, off: Array, scaled: Array) -> Array:
-        """Largest share, at most 1, of the step to these gains that is paid for."""
+    def _paid_share(self, stiffness: Array, damping: Array, mass: Array, off: Array, scaled: Array) -> Array:
+        """Largest share, at most 1, of the step to these gains that can be paid for, and is with that."""
 
 
 class _ActiveTank(ActiveFilter):
     def __init__(self, tank: EnergyTank) -> None:
         self._tank, self.tank_energy = tank, tank.energy
 
-    def select(
-        self, stiffness: Array, damping: Array, mass: Array, step: float, off: Array, scale: Array = 1.0
-    ) -> None:
-        last = self.gains
-        super().select(stiffness, damping, mass, step, off, scale)
-        if last is None:
-            self.tank_energy = self.tank_energy * self.gains[2]
-        else:
-            self._pay(0.5 * _quadratic(self.gains[0] - last[0], off, scale * off))
-
-    def _largest_share(self, stiffness: Array, damping: Array, mass: Array, off: Array, scaled: Array) -> Array:
+    def _paid_share(self, stiffness: Array, damping: Array, mass: Array, off: Array, scaled: Array) -> Array:
         asked, where = 0.5 * _quadratic(stiffness - self.gains[0], off, scaled), _library(off).where
         lacking = asked > self.tank_energy
-        return where(lacking, (1.0 - _MARGIN) * self.tank_energy / where(lacking, asked, 1.0), 1.0)
+        share = where(lacking, (1.0 - _MARGIN) * self.tank_energy / where(lacking, asked, 1.0), 1.0)
+        self._pay(share * asked)
+        return share
 
     def settle(self, before: State, after: State, force: Array, energy: Energy = spring_energy) -> None:
         stiffness, _, mass, _ = self._tick
@@ -218,7 +212,7 @@ class _ActiveRateLimit(ActiveFilter):
     def settle(self, before: State, after: State, force: Array, energy: Energy = spring_energy) -> None:
         """Record nothing, since the payment of a tick follows from its gains."""
 
-    def _largest_share(self, stiffness: Array, damping: Array, mass: Array, off: Array, scaled: Array) -> Array:
+    def _paid_share(self, stiffness: Array, damping: Array, mass: Array, off: Array, scaled: Array) -> Array:
         """Largest s in [0, 1] for which the last tick pays for the step ``s dP`` of the function P.
 
         Whatever its state x at the start and its force f: ``E' (P + s dP) E <= P + W`` with E the map of (x, f) to

@@ -9,14 +9,21 @@ from numpy.typing import ArrayLike
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control.filters import StiffnessFilter
-from torch_pbd.control.realtime import limits
 from torch_pbd.control.realtime.clock import ScheduleClock
-from torch_pbd.control.realtime.limits import FINE, ForceChannel, Numbers, Option, TickStatus
+from torch_pbd.control.realtime.limits import (
+    ForceChannel,
+    Numbers,
+    Option,
+    TickStatus,
+    finite_floats,
+    options_of_blocks,
+)
 from torch_pbd.control.realtime.motion import Motion
 from torch_pbd.control.realtime.steps import Vector
 from torch_pbd.control.realtime.table import ScheduleTable, virtual_mass
 from torch_pbd.control.schedule import Schedule
 
+_FINE = TickStatus(0)  # made once: to make one takes a third of a tick
 _SHARED = "this controller is in a tick already: two threads share it. Give each its own."
 
 
@@ -130,7 +137,7 @@ class RealTimeAdmittance:
         given = {"force_limit": force_limit, "spring_limit": spring_limit, "deadband": deadband}
         given |= {"force_rate_limit": force_rate_limit, "velocity_limit": velocity_limit}
         given |= {"acceleration_limit": acceleration_limit, "approach_speed": approach_speed}
-        options = limits.options_of_blocks(given | {"stop_deceleration": stop_deceleration}, len(schedule.blocks))
+        options = options_of_blocks(given | {"stop_deceleration": stop_deceleration}, len(schedule.blocks))
         self._mass = virtual_mass(schedule, mass)
         rate = checks.number(rate, "rate", above=0.0, unit="1/s")
         self._channel = ForceChannel(options, schedule.blocks, hold_ticks)
@@ -138,9 +145,9 @@ class RealTimeAdmittance:
         self._table = table = ScheduleTable(schedule, self._mass, rate, options["spring_limit"], steady=steady)
         self._clock = ScheduleClock(table, soft_start, options["approach_speed"], options["acceleration_limit"], on_gap)
         self._motion = Motion(table, self._clock, options, stiffness_filter, max_step, max_bad_ticks)
-        self._is_pose, self._speeds, self._turn = len(table.blocks) == 2, options["velocity_limit"], threading.Lock()
-        still = (0.0,) * table.n_axes
-        self._begin(math.nan, 0.0, (None, None, still), still)
+        self._is_pose, self._turn = len(table.blocks) == 2, threading.Lock()
+        self.start(0.0)
+        self._motion.last = math.nan  # the robot's own start is still to come
 
     def __repr__(self) -> str:
         mass = f"{self._mass:g} kg" if isinstance(self._mass, float) else str(self._mass.shape[-2:])
@@ -180,14 +187,13 @@ class RealTimeAdmittance:
         ValueError, RuntimeError
             If an argument is invalid, the velocity exceeds ``velocity_limit``, or another thread is in a tick.
         """
-        now = checks.number(now, "now", unit="s")
-        at = checks.number(at, "at", least=0.0, most=self._table.end, unit="s")
-        state = limits.start_state(position, orientation, velocity, self._table.blocks, self._speeds)
-        bias = limits.finite_floats(force_bias, "force_bias", self._table.n_axes)
+        bias = finite_floats(force_bias, "force_bias", self._table.n_axes)
         if not self._turn.acquire(False):
             raise RuntimeError(_SHARED)
         try:
-            self._begin(now, at, state, bias)
+            self._motion.begin(now, at, position, orientation, velocity)
+            self._channel.begin(bias)
+            self.faults = _FINE
         finally:
             self._turn.release()
 
@@ -218,17 +224,15 @@ class RealTimeAdmittance:
             step = now - motion.last
             is_regular = motion.is_regular and 0.0 < step <= motion.max_step
             status = channel.take(force, step if is_regular else motion.step)
-            if status is not FINE:
-                motion.is_stopped = motion.is_stopped or channel.is_lost
-            push = channel.push
-            reached = motion.live(now, step, push) if is_regular else motion.live_irregular(now, push)
-            if reached is not FINE:
-                status |= reached
+            if channel.is_lost:
+                motion.is_stopped = True
+            status |= motion.live(now, step, channel.push) if is_regular else motion.live_irregular(now, channel.push)
             if motion.is_stopped:
                 status |= TickStatus.STOPPED
-            if status is not FINE:
-                self.faults |= status
-            return status
+            if not status:
+                return _FINE
+            self.faults |= status
+            return TickStatus(status)
         finally:
             self._turn.release()
 
@@ -280,8 +284,7 @@ class RealTimeAdmittance:
     @property
     def filter_share(self) -> float:
         """Share of the last change of the gains that ``stiffness_filter`` granted, 0 to 1."""
-        filtered = self._motion.filtered
-        return 1.0 if filtered is None or filtered.active.gains is None else float(filtered.active.gains[2])
+        return float(self._motion.gains[2])
 
     @property
     def tank_energy(self) -> float | None:
@@ -293,8 +296,3 @@ class RealTimeAdmittance:
     def schedule_time(self) -> float:
         """Time in the schedule, in s."""
         return self._clock.time_at(self._motion.last)
-
-    def _begin(self, now: float, at: float, start: limits.StartState, bias: Vector) -> None:
-        self._channel.begin(bias)
-        self._motion.begin(now, at, *start)
-        self.faults = FINE

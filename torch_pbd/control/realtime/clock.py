@@ -1,13 +1,14 @@
 """Clock of the schedule in the real-time controller, and the desired motion at its time."""
 
 import math
+from collections.abc import Sequence
 from operator import add, mul
 from typing import final
 
 import numpy as np
 
 from torch_pbd import checks, rotations
-from torch_pbd.control.realtime.steps import Vector, deviation, moved, norm_with
+from torch_pbd.control.realtime.steps import Vector, deviation, moved
 from torch_pbd.control.realtime.table import ScheduleTable
 
 # The desired motion may be 1.5 times as fast as the schedule, with as much more acceleration: half of that changes the
@@ -37,7 +38,7 @@ class ScheduleClock:
     meanwhile; and the pace rises no faster than the pull of the spring leaves room for (see `spare`). The end of the
     schedule does not slow an approach, which has a pace of its own, ``_free``, and is ``_ahead`` of the schedule then.
 
-    Speeds and accelerations of poses are those of `norm_with` a lever: both blocks then keep to all of the above. An
+    Speeds and accelerations of poses are those of `norm`, with a lever: both blocks then keep to all of the above. An
     approach turns the desired orientation by A, a share of the way in between: ``A R_d`` moves at w_A + A w_d, and the
     acceleration of that has w_A x A w_d besides, which is allowed for at full speed.
     """
@@ -57,9 +58,8 @@ class ScheduleClock:
         self._soft_start = checks.number(soft_start, "soft_start", least=0.0, unit="s")
         # What a soft start does not tell apart counts as equally fast.
         self.scales = scales = tuple([approach_speeds[0] / speed for speed in approach_speeds])
-        lever = None if len(scales) == 1 else scales[1]
-        approach_speed = approach_speeds[0]
-        self._lever, self.norm, acceleration_limit = lever, norm_with(lever), self.least(acceleration_limits)
+        self._lever = None if len(scales) == 1 else scales[1]
+        approach_speed, acceleration_limit = approach_speeds[0], self.least(acceleration_limits)
         speeds, accelerations = (
             np.max(
                 [scale * np.linalg.norm(rows[:, b], axis=1) for scale, b in zip(scales, table.blocks, strict=True)],
@@ -68,7 +68,7 @@ class ScheduleClock:
             for rows in (table.velocity, table.acceleration)
         )
         own, fastest = float(accelerations.max()), float(speeds.max())
-        spin = float(np.linalg.norm(table.velocity[:, table.blocks[1]], axis=1).max()) if lever else 0.0
+        spin = float(np.linalg.norm(table.velocity[:, table.blocks[1]], axis=1).max()) if self._lever else 0.0
         if spin * approach_speed > _SHARE * acceleration_limit:
             approach_speed = _SHARE * acceleration_limit / spin
         # Acceleration of a soft start that comes up to speed; without one, a second is as long as its default.
@@ -133,6 +133,12 @@ class ScheduleClock:
         self._pace = min(self._free, math.sqrt(squared_limit))
         self._is_steady = self._pace == 1.0 and not self._is_soft
         return tuple(row), moved(place, (0.0,) * d)  # between two rows quaternions are shorter than 1
+
+    def norm(self, twist: Sequence[float]) -> float:
+        """Length of a velocity; for poses the larger of linear speed and lever, in units/rad, times angular speed."""
+        if self._lever is None:
+            return math.hypot(*twist)
+        return max(math.hypot(*twist[:-3]), self._lever * math.hypot(*twist[-3:]))
 
     def least(self, options: Vector) -> float:
         """Smaller one of the speeds or accelerations of positions and rotations, as the norm tells them."""

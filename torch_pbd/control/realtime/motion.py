@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from copy import copy
 from operator import add
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
@@ -12,8 +12,8 @@ from torch_pbd import checks, rotations
 from torch_pbd.checks import Floats
 from torch_pbd.control.filters import ActiveFilter, RateLimit, StiffnessFilter
 from torch_pbd.control.realtime.clock import ScheduleClock
-from torch_pbd.control.realtime.limits import FINE, CommandLimits, TickStatus
-from torch_pbd.control.realtime.steps import State, Vector, braked, deviation, expm1, moved
+from torch_pbd.control.realtime.limits import Numbers, TickStatus, finite_floats, within_limits
+from torch_pbd.control.realtime.steps import State, Vector, deviation, expm1, mean_move, moved
 from torch_pbd.control.realtime.table import Scale, ScheduleTable
 from torch_pbd.exceptions import InvalidParameterError
 
@@ -25,6 +25,7 @@ _COARSE = 0.01
 _LATE_ON_END = 3
 # Weight of the newest tick in the running mean of their duration, so that single short or long ones count little.
 _SMOOTHING = 0.1
+_OFF = 1e-3  # tolerance of a quaternion's length, which admits four rounded digits
 
 
 @final
@@ -52,7 +53,7 @@ class Motion:
         self.max_step = checks.number(max_step, "max_step", above=1.0 / table.rate, unit="s", remedy="give some ticks")
         self._max_bad_ticks = checks.count(max_bad_ticks, "max_bad_ticks")
         speeds, rises, stops = (options[name] for name in ("velocity_limit", "acceleration_limit", "stop_deceleration"))
-        self._limits = CommandLimits(speeds, rises, table.blocks)
+        self._speed_limits, self._rises = speeds, rises
         self.filtered = None if wanted is None else FilteredGains(wanted, table)
         self._advance = (self.filtered or table).advance
         stop = clock.least(stops) if stops else max(clock.least(_DECELERATION[: len(table.blocks)]), clock.acceleration)
@@ -64,23 +65,38 @@ class Motion:
         self._speeds_due = tuple([d if most == math.inf else most for d, most in zip(due, speeds, strict=True)])
 
     def begin(
-        self, now: float, at: float, position: Vector | None, orientation: Vector | None, velocity: Vector
+        self, now: float, at: float, position: Numbers | None, orientation: Numbers | None, velocity: Numbers | None
     ) -> None:
-        """Restart at a place, or at the schedule's place at that time."""
-        if math.ulp(now) * self._table.rate > _COARSE:
-            must = f"small enough to tell ticks of {1.0 / self._table.rate:g} s apart"
+        """Restart in a state of the robot, which is checked; None is the schedule's place at that time, at rest."""
+        table, blocks = self._table, self._table.blocks
+        now, at = checks.number(now, "now", unit="s"), checks.number(at, "at", least=0.0, most=table.end, unit="s")
+        if math.ulp(now) * table.rate > _COARSE:
+            must = f"small enough to tell ticks of {1.0 / table.rate:g} s apart"
             raise checks.refusal(now, "now", must, "give seconds", unit="s")
+        here = None if position is None else finite_floats(position, "position", blocks[0].stop)
+        turned: Vector | None = None
+        if orientation is not None:
+            if len(blocks) == 1:
+                raise InvalidParameterError("orientation is given, must be None for a schedule without: leave it out.")
+            quaternion = checks.array(orientation, "orientation", (4,))
+            length, remedy = float(np.linalg.norm(quaternion)), "give a unit quaternion w x y z"
+            checks.number(length, "the length of orientation", least=1.0 - _OFF, most=1.0 + _OFF, remedy=remedy)
+            turned = tuple((quaternion / length).tolist())
+        moving = finite_floats(velocity, "velocity", table.n_axes)
+        speeds = [math.hypot(*moving[block]) for block in blocks]
+        kinds = ("the speed", "units/s"), ("the angular speed", "rad/s")
+        for speed, most, (name, unit) in zip(speeds, self._speed_limits, kinds, strict=False):
+            checks.number(speed, name, most=most, unit=unit, remedy="slow it down, or raise velocity_limit")
         self.last = self._newest = now
-        self.step = 1.0 / self._table.rate
+        self.step = 1.0 / table.rate
         self.is_regular, self._is_new, self.is_stopped = False, True, False
         self._n_bad = self._n_late = 0
-        self.row, self.place = self._clock.begin(now, at, position, orientation, velocity)
-        self.velocity, self.scale = velocity, 1.0
-        speeds = [math.hypot(*velocity[block]) for block in self._table.blocks]
+        self.row, self.place = self._clock.begin(now, at, here, turned, moving)
+        self.velocity, self.scale = moving, 1.0
         self._top_speeds = tuple(map(max, self._speeds_due, speeds))
-        self._least_top = -1.0 if self._limits.is_any else min(self._top_speeds)
+        self._least_top = -1.0 if min(*self._speed_limits, *self._rises) < math.inf else min(self._top_speeds)
         if self.filtered is not None:
-            self.filtered.begin(self._clock.index)
+            self.filtered.begin()
 
     @property
     def desired_place(self) -> Vector:
@@ -88,17 +104,17 @@ class Motion:
         return moved(self.row[: self._table.n_place], (0.0,) * self._table.n_axes)
 
     @property
-    def gains(self) -> tuple[Floats, Floats]:
-        """Stiffness, before scaling by a limit, and damping (d, d) of the last tick."""
-        if self.filtered is not None:
-            return self.filtered.gains
-        return self._table.stiffness[self._clock.index], self._table.damping[self._clock.index]
+    def gains(self) -> tuple[Floats, Floats, Any]:
+        """Stiffness before scaling by a limit, damping (d, d), and the granted share of a change, of the last tick."""
+        if self.filtered is not None and self.filtered.active.gains is not None:
+            return self.filtered.active.gains
+        return self._table.stiffness[self._clock.index], self._table.damping[self._clock.index], 1.0
 
-    def live(self, now: float, step: float, push: Vector) -> TickStatus:
-        """Advance to ``now``, ``step`` s after the last tick, under a push."""
+    def live(self, now: float, step: float, push: Vector) -> int:
+        """Advance to ``now``, ``step`` s after the last tick, under a push; returns its faults."""
         if self.is_stopped:
-            self._brake(now, step, self._deceleration)
-            return FINE
+            self._brake(now, self._deceleration)
+            return 0
         clock, table = self._clock, self._table
         here = self.place, self.velocity
         row = clock.row(self.last, step)
@@ -106,10 +122,10 @@ class Motion:
         state, self.scale = self._advance(row, clock.index, acting, here, step)
         if clock.boost:
             clock.spare(table.accelerated(push, clock.index), here[1], state[1], step)
-        status = FINE if self.scale == 1.0 else TickStatus.SPRING_LIMITED
+        status: int = 0 if self.scale == 1.0 else TickStatus.SPRING_LIMITED
         # No block is beyond its own top speed where all together are within the least of them.
         if math.hypot(*state[1]) > self._least_top:
-            state, reached = self._limits.applied(state, here, step, self._top_speeds)
+            state, reached = within_limits(state, here, step, table.blocks, self._top_speeds, self._rises)
             status |= reached
         if self.filtered is not None:
             self.filtered.settle(row, acting, here, state)
@@ -118,22 +134,22 @@ class Motion:
         self.step += _SMOOTHING * (step - self.step)
         return status
 
-    def live_irregular(self, now: float, push: Vector) -> TickStatus:
-        """Status of a tick that differs from the last one, or of an invalid time ``now``."""
+    def live_irregular(self, now: float, push: Vector) -> int:
+        """Advance as `live` by a tick that differs from the last one, or to an invalid time ``now``."""
         status = self._read(now)
         self.is_stopped |= self._n_bad >= self._max_bad_ticks or self._n_late >= _LATE_ON_END
-        if status is FINE:
+        if not status:
             return self.live(now, now - self.last, push)
-        if status is TickStatus.CLOCK:  # a tick is then taken to be as long as they are
+        if status == TickStatus.CLOCK:  # a tick is then taken to be as long as they are
             now = self.last + self.step
         # In 1 + sqrt(2) times as long as it brakes the robot can be back: after a longer gap, without commands, it
         # rests where it was told to be last, and is not thrown from there.
         passed, speed = now - self.last, max(self._clock.norm(self.velocity), self._clock.speed_at(self.last))
-        can_be_back = status is TickStatus.LATE and passed * self._deceleration > 3.0 * speed
-        self._brake(now, passed, math.inf if can_be_back else self._deceleration)
+        can_be_back = status == TickStatus.LATE and passed * self._deceleration > 3.0 * speed
+        self._brake(now, math.inf if can_be_back else self._deceleration)
         return status
 
-    def _read(self, now: float) -> TickStatus:
+    def _read(self, now: float) -> int:
         """Fault of a tick that differs from the last one."""
         if math.isnan(self.last):
             raise RuntimeError("tick before start: call start(now) with the time of the same clock first.")
@@ -154,13 +170,17 @@ class Motion:
                 raise checks.refusal(self.max_step, "max_step", must, "give some ticks, and times in s", unit="s")
             return TickStatus.LATE
         self.is_regular, self._is_new, self._n_late = True, False, 0
-        return FINE
+        return 0
 
-    def _brake(self, now: float, passed: float, deceleration: float) -> None:
-        norm = self._clock.norm
-        self._clock.brake(self.last, passed, deceleration, norm(self.velocity))
-        self.place, self.velocity = braked((self.place, self.velocity), norm, deceleration, passed)
-        self.last = now
+    def _brake(self, now: float, deceleration: float) -> None:
+        """Brake all axes in proportion until ``now``, or until standstill."""
+        passed, speed = now - self.last, self._clock.norm(self.velocity)
+        self._clock.brake(self.last, passed, deceleration, speed)
+        braking = min(passed, speed / deceleration)
+        left = 1.0 - deceleration * passed / speed if braking == passed else 0.0
+        slower = tuple([left * component for component in self.velocity])
+        self.place = moved(self.place, mean_move(self.velocity, slower, braking))
+        self.velocity, self.last = slower, now
 
 
 @final
@@ -172,7 +192,7 @@ class FilteredGains:
     itself into it, with the scale before the rise, and a fall takes at least as much out.
     """
 
-    gains: tuple[Floats, Floats]
+    active: ActiveFilter
     _row: Vector
 
     def __init__(self, wanted: StiffnessFilter, table: ScheduleTable) -> None:
@@ -189,10 +209,9 @@ class FilteredGains:
         self._table, self._start = table, table.n_place + table.n_axes
         self._fresh = wanted.start(table.stiffness, table.damping, mass, _tick_change)
 
-    def begin(self, index: int) -> None:
-        """Restart at a row of the table, whose gains the next tick gets unfiltered."""
-        self.active: ActiveFilter = copy(self._fresh)
-        self.gains = self._table.stiffness[index], self._table.damping[index]
+    def begin(self) -> None:
+        """Restart: the next tick gets the gains of its row unfiltered."""
+        self.active = copy(self._fresh)
 
     def advance(self, row: Vector, index: int, push: Vector, here: State, step: float) -> tuple[State, Scale]:
         """Place and velocity after a tick of ``step`` s along a row of the table, and the scale of the stiffness."""
@@ -206,13 +225,13 @@ class FilteredGains:
             for spring, part in zip(table.springs, table.scales(row, active.gains[0], off), strict=True):
                 scale[spring] = part
         active.select(table.stiffness[index], table.damping[index], table.mass[index], step, off, scale)
-        self._row, self.gains = row, active.gains[:2]
-        return table.advance(row, index, push, here, step, self.gains if active.gains[2] < 1.0 else None)
+        self._row = row
+        return table.advance(row, index, push, here, step, active.gains[:2] if active.gains[2] < 1.0 else None)
 
     def settle(self, row: Vector, push: Vector, before: State, after: State) -> None:
         """Record the tick: place and velocity at its start and end, and the push held during it."""
         n_place, d = self._table.n_place, self._table.n_axes
-        force = push + self.gains[1] @ row[n_place : self._start]
+        force = push + self.active.gains[1] @ row[n_place : self._start]
         start, end = ((np.array(deviation(place, row[:n_place], d)), np.array(v)) for place, v in (before, after))
         self.active.settle(start, end, force, self._energy)
 

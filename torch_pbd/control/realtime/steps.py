@@ -5,7 +5,7 @@ components, and for poses three of a rotation besides, in world axes.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from operator import add, mul, sub
 
 import numpy as np
@@ -13,7 +13,6 @@ import numpy as np
 from torch_pbd.checks import Floats
 
 Vector = tuple[float, ...]
-Norm = Callable[[Sequence[float]], float]
 State = tuple[Vector, Vector]
 """Place and velocity."""
 
@@ -61,29 +60,9 @@ def moved(place: Sequence[float], move: Sequence[float]) -> Vector:
     return (*map(add, place, move[:-3]), *[part / length for part in turned])
 
 
-def norm_with(lever: float | None) -> Norm:
-    """Norm of velocities: their length, or for poses the larger of linear speed and lever times angular speed.
-
-    The lever, in units/rad, defines which linear and angular speeds count as equal.
-    """
-    if lever is None:
-        return lambda vector: math.hypot(*vector)
-    return lambda twist: max(math.hypot(*twist[:-3]), lever * math.hypot(*twist[-3:]))
-
-
 def mean_move(before: Vector, after: Vector, time: float) -> Vector:
     """Move over a time in which the velocity changes linearly."""
     return tuple([0.5 * time * (v + w) for v, w in zip(before, after, strict=True)])
-
-
-def braked(state: State, norm: Norm, deceleration: float, step: float) -> State:
-    """Place and velocity after braking all axes in proportion for ``step`` s, or until standstill."""
-    place, velocity = state
-    speed = norm(velocity)
-    braking = min(step, speed / deceleration)
-    left = 1.0 - deceleration * step / speed if braking == step else 0.0
-    slower = tuple([left * component for component in velocity])
-    return moved(place, mean_move(velocity, slower, braking)), slower
 
 
 def advance_plane(row: Vector, push: Vector, state: State, step: float) -> tuple[State, float]:
