@@ -178,8 +178,8 @@ def test_outputs_are_given_by_name_or_number_and_others_refused(strokes):
 @pytest.mark.parametrize("input", ["time", "phase"])
 def test_a_display_has_the_law_of_the_model(strokes, input):
     model = GMMBaseline().fit(*strokes.stack(input))
-    display = MovementDisplay.from_estimator(model, strokes, input=input, n_std=1.5, n_ellipses=5)
-    at = np.linspace(0.0, 2.0 if input == "time" else 1.0, 5)
+    display = MovementDisplay.from_estimator(model, strokes, input=input, n_std=1.5)
+    at = np.linspace(0.0, 2.0 if input == "time" else 1.0, 21)
     mean, covariance = model.predict(at[:, np.newaxis], return_cov=True)
     for path, centre, matrix in zip(display.ax_.collections[0].get_paths(), mean, covariance, strict=True):
         away = path.vertices - centre

@@ -35,12 +35,12 @@ def planned():
 def test_every_point_of_an_ellipsoid_is_n_std_from_its_centre(space, rng):
     roots = rng.normal(size=(4, 3, 3))
     covariance, centres = roots @ roots.transpose(0, 2, 1), rng.normal(size=(4, 3))
-    drawn = plot_covariance_ellipsoids(centres, covariance, space, n_std=1.5)
+    drawn = plot_covariance_ellipsoids(centres, covariance, space)
     curves = np.array(drawn._segments3d).reshape(4, -1, 3)
     for points, centre, matrix in zip(curves, centres, covariance, strict=True):
         away = points - centre
         distance = np.sqrt(np.einsum("ni,ij,nj->n", away, np.linalg.inv(matrix), away))
-        np.testing.assert_allclose(distance, 1.5, rtol=1e-7)  # the inverse loses digits
+        np.testing.assert_allclose(distance, 2.0, rtol=1e-7)  # the inverse loses digits
 
 
 def test_frames_are_the_columns_of_the_rotation_and_their_tips_spread_as_it_does(space):

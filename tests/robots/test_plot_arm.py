@@ -41,7 +41,7 @@ def test_corners_lie_on_the_surfaces(joint, space):
 
 
 def test_the_panda_is_drawn_whole(space):
-    drawn = plot_arm(panda(), HOME, space, alpha=0.5)
+    drawn = plot_arm(panda(), HOME, space)
     low, high = np.reshape(drawn._faces, (-1, 3)).min(axis=0), np.reshape(drawn._faces, (-1, 3)).max(axis=0)
     assert low[2] == pytest.approx(0.0, abs=1e-12)
     assert 0.7 < high[2] < 0.8

@@ -1,6 +1,7 @@
 """Whole figures of learned movements, demonstrations, schedules and simulated runs."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import KW_ONLY, dataclass
 from typing import Any, Literal, Self, final
 
 import numpy as np
@@ -14,11 +15,13 @@ Law = tuple[Floats, Floats]
 """Means (n, d) and covariances (n, d, d) over a grid of n times."""
 
 _N_STEPS = 201  # steps of the grid, at which bands and paths look smooth
+_N_ELLIPSES = 21  # along a path: more would cover each other
 _MOST = 9  # most outputs in a figure, in a grid of 3 x 3
 _COLORS = (style.MODEL, style.OTHER)
 
 
 @final
+@dataclass(eq=False, repr=False)
 class MovementDisplay:
     """Learned mean and covariance of a movement: bands over time, and ellipses along the path of two outputs.
 
@@ -39,7 +42,6 @@ class MovementDisplay:
     input : {"time", "phase"}, default="time"
     n_std : float, default=2.0
         Half width of bands and ellipses in standard deviations.
-    n_ellipses : int, default=21
 
     Attributes
     ----------
@@ -60,26 +62,18 @@ class MovementDisplay:
     ['y [m]', 'x [m]', 'y [m]']
     """
 
-    def __init__(
-        self,
-        demonstrations: Any,
-        grid: Floats,
-        laws: dict[str, Law],
-        *,
-        truth: Law | None = None,
-        outputs: Sequence[int | str] | None = None,
-        input: Literal["time", "phase"] = "time",
-        n_std: float = 2.0,
-        n_ellipses: int = 21,
-    ) -> None:
-        self.demonstrations = demonstrations
-        self.grid = grid
-        self.laws = laws
-        self.truth = truth
-        self.outputs = style.chosen_outputs(outputs, demonstrations.names, _MOST)
-        self.input = input
-        self.n_std = checks.number(n_std, "n_std", above=0.0)
-        self.n_ellipses = checks.count(n_ellipses, "n_ellipses", most=_N_STEPS)
+    demonstrations: Any
+    grid: Floats
+    laws: dict[str, Law]
+    _: KW_ONLY
+    truth: Law | None = None
+    outputs: Any = None
+    input: Literal["time", "phase"] = "time"
+    n_std: float = 2.0
+
+    def __post_init__(self) -> None:
+        self.outputs = style.chosen_outputs(self.outputs, self.demonstrations.names, _MOST)
+        self.n_std = checks.number(self.n_std, "n_std", above=0.0)
 
     @classmethod
     def from_estimator(
@@ -112,7 +106,7 @@ class MovementDisplay:
         ax : matplotlib.axes.Axes, default=None
             Axes for the path, or for the band of a single output, alone; None makes a figure.
         **options
-            ``outputs`` (indices or names), ``n_std`` and ``n_ellipses`` of `MovementDisplay`.
+            ``outputs`` (indices or names) and ``n_std`` of `MovementDisplay`.
 
         Returns
         -------
@@ -175,7 +169,7 @@ class MovementDisplay:
         for name, ((mean, _), color) in zip(self.laws, laws, strict=False):
             ax.plot(*mean.T[shown], color=color, lw=1.5, label=self._label(name), zorder=3)
         if len(shown) == 2:
-            some = np.linspace(0, len(self.grid) - 1, self.n_ellipses).round().astype(int)
+            some = np.linspace(0, len(self.grid) - 1, _N_ELLIPSES).round().astype(int)
             for (mean, covariance), color in laws if self.truth is None else [*laws, (self.truth, style.TRUTH)]:
                 look: Any = {"n_std": self.n_std, "color": color, "linestyle": "--" if color == style.TRUTH else "-"}
                 in_plane = covariance[some][:, shown][:, :, shown]
@@ -218,7 +212,7 @@ def plot_schedule(schedule: Any) -> list[Axes]:
     position = [f"{name} [{unit}]" for name in style.schedule_names(schedule)[:p]]
     # The path of two outputs takes the place of their positions over time.
     if plane:
-        path, some = schedule.position, np.linspace(0, len(schedule) - 1, 21).round().astype(int)
+        path, some = schedule.position, np.linspace(0, len(schedule) - 1, _N_ELLIPSES).round().astype(int)
         plane[0].plot(*path.T, color=style.MODEL, lw=1.5, label="planned: position, 2 sd")
         parts.plot_covariance_ellipses(path[some], schedule.covariance[some, :2, :2], plane[0])
         style.mark_ends(plane[0], path)
@@ -227,7 +221,7 @@ def plot_schedule(schedule: Any) -> list[Axes]:
     else:
         parts.plot_outputs(schedule.time, schedule.position, bands[0], position)
         bands[0].set_ylabel(f"position [{unit}]")
-    poses.draw_blocks(schedule, bands[p != 2 :])
+    parts.draw_blocks(schedule, bands[p != 2 :])
     bands[-2].set_xlabel("")
     style.legend_below(figure, [*plane, *bands[not turns :]])  # names of positions are those of other bands
     return [*plane, *bands]
@@ -237,9 +231,7 @@ def plot_pushes(rollout: Any, unpushed: Any = None, names: Sequence[str] | None 
     """Plot a simulated run; implementation of `Rollout.plot`."""
     n = 1 + (rollout.velocity.shape[-1] > rollout.position.shape[-1])
     figure = style.shown_figure((6.4 if n == 1 else 11.0, 6.6))
-    axes = [figure.add_subplot(3, n, 1 + i % 3 * n + i // 3) for i in range(3 * n)]
+    axes = list(figure.subplots(3, n, sharex=True, squeeze=False).T.flat)
     parts.plot_rollout(rollout.numpy(), axes, names=names, unpushed=None if unpushed is None else unpushed.numpy())
-    for i, ax in enumerate(axes):
-        ax.tick_params(labelbottom=i % 3 == 2)
     style.legend_below(figure, axes)
     return axes

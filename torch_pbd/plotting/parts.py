@@ -169,18 +169,40 @@ def plot_stiffness(schedule: Any, ax: Axes, block: slice | None = None) -> list[
     style.check_kind(schedule, "schedule", "Schedule")
     style.check_axes("ax", [ax])
     block = schedule.blocks[0] if block is None else block
-    kind = style.ROTATION if block.start else style.kind_of(schedule.units, block.stop)
-    if len(schedule.blocks) > 1:
-        gains = np.linalg.eigvalsh(schedule.stiffness[:, block, block])[:, ::-1]
-        lines = plot_outputs(schedule.time, gains, ax, style.axis_names(schedule, gains.shape[1]), [style.MODEL])
-    else:
-        labels = [f"{kind.where} {name}" for name in style.schedule_names(schedule)]
-        lines = plot_outputs(schedule.time, np.diagonal(schedule.stiffness, axis1=1, axis2=2), ax, labels)
+    kind, gains, labels, colors = _along_axes(schedule, schedule.stiffness, block)
+    # The most precise axis of a pose, which has the first label, is the stiffest.
+    gains = gains if len(schedule.blocks) == 1 else gains[:, ::-1]
+    lines = plot_outputs(schedule.time, gains, ax, labels, colors)
     limits = [np.broadcast_to(limit, schedule.n_outputs)[block] for limit in schedule.stiffness_limits or ()]
     for i, limit in enumerate(np.unique(limits)):
         ax.axhline(limit, color=style.DATA, lw=0.8, ls=":", label=None if i else "limits of the stiffness")
     ax.set(xlabel="time [s]", ylabel=f"stiffness [{kind.stiffness_unit}]", ylim=(0.0, None))
     return lines
+
+
+def draw_blocks(schedule: Any, bands: Sequence[Axes]) -> None:
+    """Draw the standard deviations of each block of a schedule over time, and then the stiffness of each."""
+    n = len(schedule.blocks)
+    for block, spread, gains in zip(schedule.blocks, bands[:n], bands[n:], strict=True):
+        kind, variance, labels, colors = _along_axes(schedule, schedule.covariance, block)
+        plot_outputs(schedule.time, kind.scale * np.sqrt(variance.clip(0.0)), spread, labels, colors)
+        spread.set(ylabel=f"1 sd [{kind.unit}]", ylim=(0.0, None))
+        plot_stiffness(schedule, gains, block)
+
+
+def _along_axes(schedule: Any, matrices: Floats, block: slice) -> tuple[style.Kind, Any, list[str], Sequence[str]]:
+    """Kind of a block, values (n, k) of matrices (n, d, d) along its axes, and labels and colours of these.
+
+    Axes are the outputs or, for poses, the principal axes, that of the least value first; they have the same name and
+    dash in both blocks.
+    """
+    kind, own = style.kind_of(schedule.units, block), matrices[:, block, block]
+    if len(schedule.blocks) == 1:
+        names = [f"{kind.where} {name}" for name in style.schedule_names(schedule)]
+        return kind, np.diagonal(own, axis1=1, axis2=2), names, style.SERIES
+    in_space = schedule.position.shape[1] == 3
+    others = ["middle axis", "freest axis"] if in_space else [f"axis {i + 2}" for i in range(own.shape[1] - 1)]
+    return kind, np.linalg.eigvalsh(own), ["most precise axis", *others], [style.MODEL]
 
 
 def plot_rollout(
@@ -214,9 +236,8 @@ def plot_rollout(
     style.check_axes("axes", axes, 3 if p == d else 6)
     names = names or (style.POSE_NAMES if d == p + 3 == 6 else [f"y{i}" for i in range(d)])
     chosen = style.chosen_outputs(outputs, names, 6)
-    kinds = [style.kind_of(rollout.units, p)] + ([style.ROTATION] if d > p else [])
-    for i, kind in enumerate(kinds):
-        above, middle, below = axes[3 * i : 3 * i + 3]
+    for i, block in enumerate((slice(0, p), slice(p, d))[: 1 + (d > p)]):
+        kind, (above, middle, below) = style.kind_of(rollout.units, block), axes[3 * i : 3 * i + 3]
         own = [output for output in chosen if (output >= p) == bool(i)]
         labels = [names[output].removeprefix("r") if i else names[output] for output in own]
         along = [f"{kind.where} {label}" for label in labels]

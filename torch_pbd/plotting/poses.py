@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.plotting import style
-from torch_pbd.plotting.parts import plot_outputs, plot_stiffness
+from torch_pbd.plotting.parts import draw_blocks
 from torch_pbd.rotations import matrix
 
 _TURN = np.linspace(0.0, 2.0 * np.pi, 21)
@@ -28,10 +28,9 @@ def plot_frames(
     *,
     length: float,
     covariance: ArrayLike | None = None,
-    n_std: float = 2.0,
     label: str | None = "tool",
 ) -> list[Line3DCollection]:
-    """Draw the axes of a tool in space, with the ``n_std`` standard deviation regions of their tips.
+    """Draw the axes of a tool in space, with the two standard deviation regions of their tips.
 
     Parameters
     ----------
@@ -44,7 +43,6 @@ def plot_frames(
         Length of the tool axes in the unit of the position.
     covariance : array_like of shape (n, 3, 3), default=None
         Covariance of rotation vectors in world axes, in rad^2.
-    n_std : float, default=2.0
     label : str or None, default="tool"
         Label in the legend, before x, y and z.
 
@@ -65,44 +63,39 @@ def plot_frames(
             spread = checks.array(covariance, "covariance", (len(places), 3, 3))
             # A small rotation e moves the tip a by e x a, and the tip stays on its sphere.
             arm = -np.cross(np.eye(3), tips[:, np.newaxis, :]).swapaxes(1, 2)
-            moved = tips[:, np.newaxis, :] + n_std * style.unit_ellipses(arm @ spread @ arm.swapaxes(1, 2))[:, 0]
+            moved = tips[:, np.newaxis, :] + 2.0 * style.unit_ellipses(arm @ spread @ arm.swapaxes(1, 2))[:, 0]
             on_sphere = moved / np.linalg.norm(moved, axis=-1, keepdims=True)
             _lines(ax, places[:, np.newaxis, :] + length * on_sphere, color, 0.8, None)
     return drawn
 
 
 def plot_covariance_ellipsoids(
-    mean: ArrayLike,
-    covariance: ArrayLike,
-    ax: Axes,
-    *,
-    n_std: float = 2.0,
-    color: str = style.MODEL,
-    label: str | None = None,
+    mean: ArrayLike, covariance: ArrayLike, ax: Axes, *, label: str | None = None
 ) -> Line3DCollection:
-    """Draw the ``n_std`` ellipsoids of covariances (n, 3, 3) around means (n, 3), as an ellipse in each main plane.
+    """Draw two standard deviations of covariances (n, 3, 3) around means (n, 3) as ellipses in the three main planes.
 
     ``ax`` must have projection "3d".
     """
-    curves = np.concatenate(style.ellipses(mean, covariance, ax, n_std, 3))
-    return _lines(ax, curves, color, 0.7, label)
+    return _lines(ax, np.concatenate(style.ellipses(mean, covariance, ax, 2.0, 3)), style.MODEL, 0.7, label)
 
 
-def draw_poses(what: Any, draw: Callable[[Any, Axes, list[Axes]], None], n_bands: int) -> list[Axes]:
+def draw_poses(
+    what: Any, draw: Callable[[Any, Axes, list[Axes]], None], n_bands: int, make: Any = style.shown_figure
+) -> list[Axes]:
     """Axes of a new figure of demonstrations or of a schedule, the 3D axes first."""
-    figure, space, bands = style.panels(n_bands, 3)
+    figure, space, bands = style.panels(n_bands, 3, make)
     draw(what, space[0], bands)
     style.legend_below(figure, [*space, *bands])
     return [*space, *bands]
 
 
-def draw_recorded_poses(demonstrations: Any, ax: Axes, bands: Sequence[Axes], n_frames: int = 4) -> None:
+def draw_recorded_poses(demonstrations: Any, ax: Axes, bands: Sequence[Axes]) -> None:
     """Draw demonstrated poses: paths in space with frames at a few phases, and rotations over time."""
     places, turns = demonstrations.to_poses()
     length = _LENGTH * float(np.ptp(np.concatenate(places), axis=0).max())
     for k, (path, turn) in enumerate(zip(places, turns, strict=True)):
         ax.plot(*path.T, color=style.DATA, lw=1.0, alpha=0.8, label=None if k else "demonstrations", zorder=1)
-        some = np.linspace(0, len(path) - 1, n_frames).round().astype(int)
+        some = np.linspace(0, len(path) - 1, 4).round().astype(int)
         plot_frames(path[some], turn[some], ax, length=length, label=None if k else "tool")
         style.mark_ends(ax, path, label=k == 0)
     for i, (band, name) in enumerate(zip(bands, demonstrations.names[-3:], strict=True)):
@@ -114,12 +107,12 @@ def draw_recorded_poses(demonstrations: Any, ax: Axes, bands: Sequence[Axes], n_
     _label(ax, bands, demonstrations.names[:3], None if demonstrations.units is None else demonstrations.units[0])
 
 
-def draw_pose_schedule(schedule: Any, ax: Axes, bands: Sequence[Axes], n_poses: int = 7) -> None:
+def draw_pose_schedule(schedule: Any, ax: Axes, bands: Sequence[Axes]) -> None:
     """Draw a schedule of poses: its path with ellipsoids and frames; over time, deviations and stiffness."""
     length = _LENGTH * float(np.ptp(schedule.position, axis=0).max())
     # Frames are at equal distances, not times, since a tool is slow at its ends.
     way = np.append(0.0, np.linalg.norm(np.diff(schedule.position, axis=0), axis=1)).cumsum()
-    some = np.searchsorted(way, np.linspace(0.0, way[-1], n_poses)).clip(max=len(schedule) - 1)
+    some = np.searchsorted(way, np.linspace(0.0, way[-1], 7)).clip(max=len(schedule) - 1)
     path, spread = schedule.position[some], schedule.covariance[some]
     ax.plot(*schedule.position.T, color=style.MODEL, lw=1.8, label="planned path", zorder=3)
     plot_covariance_ellipsoids(path, spread[:, :3, :3], ax, label="position: 2 sd")
@@ -128,22 +121,6 @@ def draw_pose_schedule(schedule: Any, ax: Axes, bands: Sequence[Axes], n_poses: 
     _label(ax, bands, (schedule.names or style.POSE_NAMES)[:3], schedule.units)
     draw_blocks(schedule, bands)
     bands[2].set_xlabel("")
-
-
-def draw_blocks(schedule: Any, bands: Sequence[Axes]) -> None:
-    """Draw deviations and then stiffness over time, of the outputs or, for poses, in principal axes of both blocks."""
-    kinds, n = (style.kind_of(schedule.units, schedule.position.shape[1]), style.ROTATION), len(schedule.blocks)
-    for kind, block, spread, gains in zip(kinds, schedule.blocks, bands[:n], bands[n:], strict=False):
-        covariance = schedule.covariance[:, block, block]
-        if n == 1:
-            variance, colors = np.diagonal(covariance, axis1=1, axis2=2), list(style.SERIES)
-            names: Sequence[str] = [f"{kind.where} {name}" for name in style.schedule_names(schedule)]
-        else:
-            variance, colors = np.linalg.eigvalsh(covariance).clip(0.0), [style.MODEL]
-            names = style.axis_names(schedule, variance.shape[1])
-        plot_outputs(schedule.time, kind.scale * np.sqrt(variance), spread, names, colors)
-        spread.set(ylabel=f"1 sd [{kind.unit}]", ylim=(0.0, None))
-        plot_stiffness(schedule, gains, block)
 
 
 def _label(ax: Any, bands: Sequence[Axes], names: Sequence[str], unit: str | None) -> None:
@@ -162,7 +139,7 @@ def _lines(ax: Any, curves: Floats, color: str, width: float, label: str | None)
     return collection
 
 
-def plot_arm(model: Any, joints: ArrayLike, ax: Axes, *, alpha: float = 1.0) -> Poly3DCollection:
+def plot_arm(model: Any, joints: ArrayLike, ax: Axes) -> Poly3DCollection:
     """Draw the capsules, cylinders and boxes of a model at joint angles; meshes are left out.
 
     Parameters
@@ -173,8 +150,6 @@ def plot_arm(model: Any, joints: ArrayLike, ax: Axes, *, alpha: float = 1.0) -> 
         Joint angles ``qpos`` in rad.
     ax : matplotlib.axes.Axes
         Axes with projection "3d", in m.
-    alpha : float, default=1.0
-        Opacity.
 
     Returns
     -------
@@ -200,7 +175,7 @@ def plot_arm(model: Any, joints: ArrayLike, ax: Axes, *, alpha: float = 1.0) -> 
         faces.append(shape @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom])
         colors.append(np.tile(model.geom_rgba[geom], (len(shape), 1)))
     light = LightSource(azdeg=250.0, altdeg=50.0)
-    look: dict[str, Any] = {"facecolors": np.concatenate(colors), "shade": True, "lightsource": light, "alpha": alpha}
+    look: dict[str, Any] = {"facecolors": np.concatenate(colors), "shade": True, "lightsource": light}
     drawn = Poly3DCollection(np.concatenate(faces), zorder=2, **look)
     ax.add_collection3d(drawn, autolim=True)  # type: ignore[attr-defined]
     return drawn

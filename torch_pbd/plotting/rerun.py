@@ -78,7 +78,7 @@ class _Writer:
     def write_demonstrations(self, demonstrations: Any) -> None:
         space, n_space = _space(demonstrations)
         for k, (time, position) in enumerate(_in_seconds(demonstrations)):
-            self._path(f"{space}/demonstrations/{k}", position[:, :n_space], DATA)
+            self._path(f"{space}/demonstrations/{k}", position, n_space, DATA)
             self._curves("outputs", f"demonstration {k}", time, position, demonstrations.names, DATA)
 
     def write_laws(self, display: Any) -> None:
@@ -88,8 +88,7 @@ class _Writer:
         if display.input == "time":
             time = time * (np.ptp(_in_seconds(demonstrations)[0].time) / np.ptp(demonstrations.times[0]))
         for (name, (mean, covariance)), color in zip(display.laws.items(), (MODEL, OTHER), strict=False):
-            self._path(f"{space}/{name}", mean[:, :n_space], color)
-            self._ellipsoids(f"{space}/{name}/covariance", mean, covariance, n_space, color)
+            self._path(f"{space}/{name}", mean, n_space, color, covariance)
             std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
             for label, shift in (("", 0.0), (" +2 sd", _N_STD), (" -2 sd", -_N_STD)):
                 self._curves("outputs", f"{name}{label}", time, mean + shift * std, demonstrations.names, color)
@@ -97,9 +96,8 @@ class _Writer:
     def write_schedule(self, schedule: Any) -> None:
         p = schedule.position.shape[1]
         n_space = p if p in (2, 3) and schedule.units in (None, "m") else 0
-        self._path("space/schedule", schedule.position[:, :n_space], MODEL)
-        if schedule.covariance_of == "position":
-            self._ellipsoids("space/schedule/covariance", schedule.position, schedule.covariance, n_space, MODEL)
+        covariance = schedule.covariance if schedule.covariance_of == "position" else None
+        self._path("space/schedule", schedule.position, n_space, MODEL, covariance)
         self._curves("outputs", "schedule", schedule.time, schedule.position, schedule_names(schedule)[:p], MODEL)
         if n_space == 3:
             self._frames("space/schedule/tool", schedule)
@@ -113,18 +111,19 @@ class _Writer:
             raise InvalidParameterError(f"rollout is {rollout!r}, must be a single run: take one of the batch.")
         run, p = rollout.numpy(), rollout.position.shape[1]
         names = names or [f"y{i}" for i in range(run.velocity.shape[1])]
-        self._path("space/run", run.position[:, : p if p in (2, 3) else 0], ROBOT)
+        self._path("space/run", run.position, p if p in (2, 3) else 0, ROBOT)
         if p == 3:
             self._frames("space/run/tool", run)
         self._curves("outputs", "run", run.time, run.position, names[:p], ROBOT)
         self._curves("force", "", run.time, run.force, names, FORCE)
 
-    def _path(self, entity: str, position: Floats, color: str) -> None:
-        if position.shape[1]:
-            self._stream.log(entity, self._rerun.LineStrips3D([_in_space(position)], colors=[_rgb(color)]), static=True)
-
-    def _ellipsoids(self, entity: str, mean: Floats, covariance: Floats, n_space: int, color: str) -> None:
+    def _path(self, entity: str, mean: Floats, n_space: int, color: str, covariance: Floats | None = None) -> None:
+        """Path of the first two or three outputs, if they are a point in space, and ellipsoids along it."""
         if not n_space:
+            return
+        path = np.pad(mean[:, :n_space], ((0, 0), (0, 3 - n_space)))
+        self._stream.log(entity, self._rerun.LineStrips3D([path], colors=[_rgb(color)]), static=True)
+        if covariance is None:
             return
         rows = np.linspace(0, len(mean) - 1, min(_N_ELLIPSOIDS, len(mean))).round().astype(int)
         variances, axes = np.linalg.eigh(covariance[rows, :n_space, :n_space])
@@ -134,12 +133,12 @@ class _Writer:
         if n_space == 2:
             half = np.column_stack([half, _FLAT * half.max(axis=1)])
         ellipsoids = self._rerun.Ellipsoids3D(
-            centers=_in_space(mean[rows, :n_space]),
+            centers=path[rows],
             half_sizes=half,
             quaternions=np.roll(rotations.from_matrix(turned), -1, axis=1),  # x y z w, as Rerun has them
             colors=[_rgb(color)],
         )
-        self._stream.log(entity, ellipsoids, static=True)
+        self._stream.log(f"{entity}/covariance", ellipsoids, static=True)
 
     def _frames(self, entity: str, moving: Any) -> None:
         """Tool of a schedule or a run, if it turns."""
@@ -175,10 +174,6 @@ def _space(demonstrations: Any) -> tuple[str, int]:
     n_space = n if n in (2, 3) and len(units) < 2 and not units & {"rad", "deg"} else 0
     first = (demonstrations.units or ("m",))[0]
     return "space" if first == "m" else f"space in {first}", n_space
-
-
-def _in_space(position: Floats) -> Floats:
-    return np.pad(position, ((0, 0), (0, 3 - position.shape[1])))
 
 
 def _rgb(color: str) -> list[int]:

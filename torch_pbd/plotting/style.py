@@ -110,19 +110,17 @@ def schedule_names(schedule: Any) -> Sequence[str]:
     return schedule.names or [f"y{i}" for i in range(schedule.n_outputs)]
 
 
-def kind_of(unit: str | None, n_outputs: int) -> Kind:
-    """Words and units of positions in this unit: joints are pushed by torques."""
+def kind_of(unit: str | None, block: slice) -> Kind:
+    """Words and units of a block of outputs: of positions in this unit, of which joints are pushed by torques.
+
+    A block that does not begin with the first output is a rotation.
+    """
+    if block.start:
+        return ROTATION
     if unit == "rad":
-        return Kind(slice(n_outputs), "about", "torque", "Nm", "rad", 1.0, "Nm/rad")
+        return Kind(block, "about", "torque", "Nm", "rad", 1.0, "Nm/rad")
     shown, scale = ("mm", 1000.0) if unit == "m" else (short_unit(unit), 1.0)  # deviations of metres are millimetres
-    return Kind(slice(n_outputs), "along", "force", "N", shown, scale, f"N/{short_unit(unit)}")
-
-
-def axis_names(schedule: Any, n_axes: int) -> Sequence[str]:
-    """Names of principal axes of a block, the most precise first: one name, one dash in both blocks."""
-    if schedule.position.shape[1] == 3:
-        return ("most precise axis", "middle axis", "freest axis")
-    return ("most precise axis", *(f"axis {i + 2}" for i in range(n_axes - 1)))
+    return Kind(block, "along", "force", "N", shown, scale, f"N/{short_unit(unit)}")
 
 
 def output_label(demonstrations: Any, output: int) -> str:
