@@ -27,7 +27,7 @@ def test_regions_of_a_law_hold_its_own_draws(model):
     demos = waves @ rng.standard_normal((8, 3, 2)) + 0.01 * rng.standard_normal((8, 20, 2))
     data = np.tile(grid, (8, 1)), demos.reshape(-1, 2)
     model.fit(*data, groups=np.repeat(np.arange(8), 20))
-    judged = [judge_movement(model, grid, draw, n_draws=200) for draw in model.sample_demonstrations(grid, 200, 1)]
+    judged = [judge_movement(model, grid, draw) for draw in model.sample_demonstrations(grid, 200, 1)]
     for name in MOVEMENT_STATISTICS:
         assert np.mean([row[name] for row in judged]) == pytest.approx(0.9, abs=0.08)
     assert judged[0]["joint"] == model.score_demonstrations(grid, model.sample_demonstrations(grid, 200, 1)[0])[0]

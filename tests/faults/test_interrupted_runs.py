@@ -177,7 +177,7 @@ def test_36_an_experiment_goes_on_with_the_controllers_that_are_left(recorded, t
         monkeypatch.setattr(robot, figure, lambda *_, **__: None)
     skill = DMPController(GMMBaseline(n_components=2), n_steps=20)
     controllers = {"stiff": skill, "soft": clone(skill).set_params(alpha=16.0)}
-    with RunFolder(tmp_path, {}) as folder, FinishedFits(tmp_path / "finished") as folder.finished:
+    with RunFolder(tmp_path, {}) as folder:
         with monkeypatch.context() as patched:
             watched(patched, signal.SIGINT, at=2)
             with pytest.raises(KeyboardInterrupt):
@@ -192,7 +192,7 @@ def test_36_an_experiment_goes_on_with_the_controllers_that_are_left(recorded, t
 def test_36_a_demo_goes_on_with_the_fits_that_are_left(tmp_path, monkeypatch):
     models = {"mixture": GMMBaseline(n_components=2)}
     fits = watched(monkeypatch)
-    with RunFolder(tmp_path, {}) as folder, FinishedFits(tmp_path / "finished") as folder.finished:
+    with RunFolder(tmp_path, {}) as folder:
         text = run_demo(models, folder, n_demos=3)
         assert fits == ["GMMBaseline", "DMPController"]
         assert len(finished(tmp_path)) == 2

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from torch_pbd.cli import options
-from torch_pbd.cli.options import MODELS, Option, made
+from torch_pbd.cli.options import MODELS, Option
 from torch_pbd.console import say
 from torch_pbd.exceptions import ConfigError, DataFormatError
 from torch_pbd.registry import MOVEMENTS
@@ -140,7 +140,8 @@ def demo(options: Any, folder: Any) -> str:
     from torch_pbd.experiments.simulation import run_demo
 
     say(f"{options.n_demos} made demonstrations of the tunnel task; the truth is that of 300 fresh ones\n")
-    models = made({name: MODELS[name] for name in ("HGP", "CD", "WP", "GMM 5")}, OPTIONS["compare"]["models"].type)
+    compared = parse("compare", [])[0].models
+    models = {name: compared[name] for name in ("HGP", "CD", "WP", "GMM 5")}
     return f"{run_demo(models, folder, n_demos=options.n_demos, seed=options.seed)}\n\n{_DEMO_LEGEND}"
 
 

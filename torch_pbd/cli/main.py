@@ -4,7 +4,7 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -101,26 +101,23 @@ def _run(arguments: Sequence[str]) -> None:
 
 
 def _work(command: str, options: Any, config: str) -> None:
-    from torch_pbd.experiments.run_folder import FinishedFits, check_names, write_report
+    from torch_pbd.experiments.run_folder import check_names, write_report
 
     if getattr(options, "data", None) is not None:
         options.data = _files(options.data)
     for argument in ("models", "controllers"):
         check_names(getattr(options, argument, ()), argument)
-    with _run_folder(options.output, command) as folder, warnings.catch_warnings():
-        warnings.simplefilter("default")
-        warnings.showwarning = _show_once()
+    with _notes(), _run_folder(options.output, command, resume=options.resume) as folder:
         try:
-            with FinishedFits(folder.path / "finished", options.resume) as folder.finished:
-                folder.write_text("config.yaml", config)
-                import torch
+            folder.write_text("config.yaml", config)
+            import torch
 
-                torch.set_num_threads(1)  # the matrices are small: threads would only wait for each other
-                text = commands.WORK[command](options, folder)
-                say(text)
-                report = write_report(folder, command, text)
+            torch.set_num_threads(1)  # the matrices are small: threads would only wait for each other
+            text = commands.WORK[command](options, folder)
+            say(text)
+            report = write_report(folder, command, text)
         except (KeyboardInterrupt, _Terminated) as stop:
-            if folder.finished and folder.finished.files():
+            if folder.finished.files():
                 stop.args = (f"torch-pbd {command} --config {folder.path / 'config.yaml'} --resume goes on",)
             raise
     say(f"\nreport:  {report}\nresults: {folder.path}")
@@ -139,20 +136,21 @@ def _files(data: Any) -> list[Path]:
     return files
 
 
-def _run_folder(path: str, command: str) -> Any:
+def _run_folder(path: str, command: str, *, resume: bool) -> Any:
     from torch_pbd.experiments.run_folder import RunFolder
 
     if not path:
         raise ConfigError("output: it is empty, must be a folder of results. Give one with --output FOLDER.")
     try:
-        return RunFolder(path, {"command": command})
+        return RunFolder(path, {"command": command}, resume=resume)
     except OSError as error:
         what = f"{path!r} cannot be a folder of results: {error.strerror or error}"
         raise ConfigError(f"output: {what}. Give another with --output FOLDER.") from error
 
 
-def _show_once() -> Callable[..., None]:
-    """Replacement of ``warnings.showwarning`` that prints each warning once, as one line on standard error."""
+@contextmanager
+def _notes() -> Iterator[None]:
+    """Warnings are printed once each, as one line on standard error."""
     shown = set()
 
     def show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
@@ -160,7 +158,10 @@ def _show_once() -> Callable[..., None]:
             shown.add(str(message))
             say(f"note ({category.__name__}): {message}", sys.stderr)
 
-    return show
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        warnings.showwarning = show
+        yield
 
 
 def _complain(message: str, code: int) -> int:

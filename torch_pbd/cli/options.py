@@ -102,11 +102,6 @@ def parse(usage: str, about: str, options: Mapping[str, Option], arguments: Sequ
     return Namespace(**{name: _build(value, name) for name, value in values.items()}), _as_yaml(complete)
 
 
-def made(value: Any, hint: Any) -> Any:
-    """Objects of a type, given as they would stand in a file."""
-    return _build(_take(value, hint, Place()), "value")
-
-
 def _answer(text: str) -> NoReturn:
     say(text.rstrip())
     raise SystemExit(0)

@@ -1,7 +1,7 @@
 """Comparison of models on one data set or on recordings: fit to the data, and prediction of a demonstration."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -23,19 +23,17 @@ from torch_pbd.plotting import style
 Align = Literal["auto", "none", "phase", "dtw"]
 Input = Literal["time", "phase"]
 
+_N_DRAWS = 500  # of a model's movements, of which 25 are beyond each end of the central 90 %
 MOVEMENT_STATISTICS = ("deviation", "offset", "length", "largest")
 """Statistics of whole movements, of :func:`movement_statistics`."""
 
 
 class Score(NamedTuple):
-    """Result of one model on one data set."""
+    """Model fitted to all the data, row of a table in which NaN is what is not known, and scores of the folds."""
 
     fitted: CovarianceRegressor
-    """The model, fitted to all the data."""
     row: dict[str, Any]
-    """Row of a table; NaN is what is not known."""
     folds: list[dict[str, float]]
-    """Scores of each demonstration left out, as :func:`score_fold` returns them."""
 
 
 def compare_models(
@@ -50,11 +48,10 @@ def compare_models(
     finished: FinishedFits | None = None,
     whole_movements: bool = False,
 ) -> dict[str, Score]:
-    """Fit every model on all the data, and once more without each of some demonstrations.
+    """Fit clones of models to all the data, and without each of at most ``max_folds`` demonstrations, spread evenly.
 
-    Models are cloned; ``truth`` maps X (n, e) to the true covariances (n, d, d). At most ``max_folds`` demonstrations,
-    spread evenly over all, are left out, each by itself, ``n_jobs`` of these fits at the same time; and judged as a
-    whole too if ``whole_movements``. Fits are kept in ``finished``, and not repeated if they are there.
+    ``truth`` maps X (n, e) to the true covariances (n, d, d). What is left out is judged as a whole too if
+    ``whole_movements``. Fits are kept in ``finished``, and not repeated if they are there.
     """
     inputs, empirical = empirical_covariances(X, y)
     true = None if truth is None else truth(inputs)
@@ -73,29 +70,25 @@ def compare_models(
     scores = {}
     for name, (fitted, seconds) in fits.items():
         held_out = [next(results) for _ in folds]
-        errors = _errors(fitted.predict_cov(inputs), empirical, true, held_out)
-        scores[name] = Score(fitted, {"model": name, **errors, "fit [s]": seconds}, held_out)
+        covariance, likelihoods = fitted.predict_cov(inputs), [fold["log_likelihood"] for fold in held_out]
+        mean, error = mean_and_error(likelihoods)
+        # Of covariances the smallest eigenvalue would tell the smallest unit: that of correlations tells singular ones.
+        scale = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+        correlation = covariance / scale[:, :, np.newaxis] / scale[:, np.newaxis]
+        row = {
+            "model": name,
+            "MSE": np.nan if empirical is None else covariance_mse(covariance, empirical),  # that of Table I
+            "error to truth": np.nan if true is None else relative_frobenius_error(covariance, true),
+            "held-out LL": mean,
+            "+-": error,
+            "median": float(np.median(likelihoods)) if held_out else np.nan,
+            "95 % holds": mean_and_error([fold["coverage"] for fold in held_out])[0],
+            "folds": len(held_out),
+            "least eig.": float(np.linalg.eigvalsh(correlation).min()),
+            "fit [s]": seconds,
+        }
+        scores[name] = Score(fitted, row, held_out)
     return scores
-
-
-def _errors(
-    covariance: Floats, empirical: Floats | None, true: Floats | None, folds: Sequence[dict[str, float]]
-) -> dict[str, Any]:
-    likelihoods = [fold["log_likelihood"] for fold in folds]
-    mean, error = mean_and_error(likelihoods)
-    # Of covariances the smallest eigenvalue would tell the smallest unit: that of correlations tells singular ones.
-    scale = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    correlation = covariance / scale[:, :, np.newaxis] / scale[:, np.newaxis]
-    return {
-        "MSE": np.nan if empirical is None else covariance_mse(covariance, empirical),  # that of Table I
-        "error to truth": np.nan if true is None else relative_frobenius_error(covariance, true),
-        "held-out LL": mean,
-        "+-": error,
-        "median": float(np.median(likelihoods)) if folds else np.nan,
-        "95 % holds": mean_and_error([fold["coverage"] for fold in folds])[0],
-        "folds": len(folds),
-        "least eig.": float(np.linalg.eigvalsh(correlation).min()),
-    }
 
 
 def left_out(groups: NDArray[np.intp], max_folds: int | None = None) -> NDArray[np.intp]:
@@ -117,10 +110,9 @@ def score_fold(
     *,
     whole: bool = False,
 ) -> dict[str, float]:
-    """Fit without a demonstration, and score how well its rows are predicted, and if asked for it as a whole.
+    """Fit without a demonstration, and score its rows, and by `judge_movement` all of it if ``whole``.
 
-    "log_likelihood" is in nats per sample, "coverage" the share of samples within the 95 % ellipse; of the whole there
-    is what :func:`judge_movement` returns.
+    "log_likelihood" is in nats per sample, "coverage" the share of samples within the 95 % ellipse.
     """
     left = groups == demonstration
     # Of this thread: what else runs on the machine does not count.
@@ -151,26 +143,23 @@ def movement_statistics(movements: ArrayLike, mean: ArrayLike, std: ArrayLike) -
     return np.stack(columns, axis=1)
 
 
-def judge_movement(
-    model: Any, X: ArrayLike, y: ArrayLike, *, level: float = 0.9, n_draws: int = 500, random_state: Any = 0
-) -> dict[str, float]:
-    """Joint log density of one demonstration X (n, 1), y (n, d), in nats, and whether regions of movements hold it.
+def judge_movement(model: Any, X: ArrayLike, y: ArrayLike) -> dict[str, float]:
+    """Joint log density, "joint", of one demonstration X (n, 1), y (n, d), in nats, and whether draws are like it.
 
-    Models of movements are scored by their law of whole movements, regressors by that of independent rows.
-    Regions have the share ``level`` of the draws, as many below as above, for each of ``MOVEMENT_STATISTICS``. Returned
-    are "joint", and 1.0 or 0.0 for each statistic.
+    For each of ``MOVEMENT_STATISTICS`` there is 1.0 if the central 90 % of the draws have that of the demonstration
+    among them, else 0.0.
     """
     mean, covariance = model.predict(X, return_cov=True)
     shape = covariance.shape[:2]
     if hasattr(model, "sample_demonstrations"):
-        draws = model.sample_demonstrations(X, n_draws, random_state)
+        draws = model.sample_demonstrations(X, _N_DRAWS, 0)
         joint = float(model.score_demonstrations(X, y)[0])
     else:
         # Rows of a regressor are independent of each other: a movement is one draw of each.
-        draws = model.sample_y(X, n_draws, random_state).reshape(*shape, n_draws).transpose(2, 0, 1)
+        draws = model.sample_y(X, _N_DRAWS, 0).reshape(*shape, _N_DRAWS).transpose(2, 0, 1)
         joint = float(np.sum(model.log_likelihood(X, y)))
     moments = mean.reshape(shape), np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    low, high = np.quantile(movement_statistics(draws, *moments), [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0)
+    low, high = np.quantile(movement_statistics(draws, *moments), [0.05, 0.95], axis=0)
     own = movement_statistics(np.reshape(y, (1, *shape)), *moments)[0]
     return {"joint": joint} | dict(zip(MOVEMENT_STATISTICS, ((low <= own) & (own <= high)).astype(float), strict=True))
 
@@ -193,11 +182,7 @@ def mean_and_error(values: ArrayLike) -> tuple[float, float]:
 
 
 def prepare(demonstrations: Demonstrations, align: Align = "auto", n_steps: int | None = None) -> Demonstrations:
-    """Demonstrations on one grid: "auto" aligns by phase what is not aligned already.
-
-    ``n_steps`` is the number of points of the grid; None keeps that of aligned data, and else takes the
-    median length, at most 200.
-    """
+    """Demonstrations on one grid of ``n_steps`` points: "auto" aligns by phase what is not aligned already."""
     if align == "none" or (align == "auto" and demonstrations.is_aligned):
         return demonstrations if n_steps is None else demonstrations.resample(n_steps)
     return demonstrations.align("phase" if align == "auto" else align, n=n_steps)
@@ -247,8 +232,7 @@ def figure_of_recordings(demonstrations: Demonstrations, name: str) -> Figure:
 
 def _panels(n: int, height: float) -> tuple[Figure, list[Any]]:
     """Figure with n Axes in three columns, 4 by ``height`` inches each."""
-    n_columns = min(3, n)
-    n_rows = -(-n // n_columns)
+    n_columns, n_rows = min(3, n), -(-n // 3)
     figure, grid = style.figure_grid(n_rows, n_columns, (4.0 * n_columns, height * n_rows))
     for ax in grid.flat[n:]:
         ax.set_visible(False)
@@ -262,10 +246,7 @@ def run_recordings(
     input: Input = "time",
     **options: Any,
 ) -> str:
-    """Compare models on demonstrations, with options of ``compare_models``.
-
-    Writes metrics, folds, models and figures; returns the tables, of rows and of whole movements, as text.
-    """
+    """Compare models by options of `compare_models`, write what was found, and return tables of rows and movements."""
     data = demonstrations.stack(input)
     scores = compare_models(models, *data, finished=folder.finished, whole_movements=True, **options)
     whole, metrics = [], []

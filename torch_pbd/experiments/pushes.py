@@ -122,15 +122,12 @@ def damping_ratio(schedule: Schedule, damping: Floats) -> float:
 
 def push_row(name: str, run: Run) -> dict[str, Any]:
     """Row of the table: displacement by the two pushes, against the run without them, and stiffness there."""
-    kind = style.kind_of(run.schedule.units, run.schedule.n_outputs)
+    kind = style.kind_of(run.schedule.units, run.schedule.blocks[0])
     time, stiffness = run.schedule.time, run.schedule.stiffness
     early, late = (int(np.searchsorted(time, centre * run.controller.duration_)) for centre in _PUSHES)
     # Against the run without pushes: how far the robot lags behind by itself does not count.
-    deviation = np.abs(run.pushes["force"][0].position - run.unpushed.position)[:, 0]
-    half = len(time) // 2
-    first, second = kind.scale * deviation[:half].max(), kind.scale * deviation[half:].max()
-    row = {"controller": name, f"early [{kind.unit}]": float(first), f"late [{kind.unit}]": float(second)}
-    row |= {"ratio": float(first / second)}
+    first, second, ratio = _largest(kind.scale * (run.pushes["force"][0].position - run.unpushed.position)[:, 0])
+    row = {"controller": name, f"early [{kind.unit}]": first, f"late [{kind.unit}]": second, "ratio": ratio}
     for output, label in list(enumerate(style.schedule_names(run.schedule)))[:2]:
         row |= {f"K {label} early": float(stiffness[early, output, output])}
         row |= {f"K {label} late": float(stiffness[late, output, output])}
@@ -154,12 +151,17 @@ def guarantees(run: Run) -> dict[str, Any]:
 
 def push_rows(name: str, run: Run, kind: style.Kind) -> list[dict[str, Any]]:
     """Rows of the table of poses: what pushes do in each axis of the tool, and stiffness there."""
-    moved, stiffness = np.abs(run.moved(kind)), run.along(run.schedule.stiffness, kind)
-    half, (early, late) = len(moved) // 2, stiffness[_middles(run.schedule)]
+    early, late = run.along(run.schedule.stiffness, kind)[_middles(run.schedule)]
     rows = []
-    for axis, letter in enumerate(TOOL):
-        first, second = float(moved[:half, axis].max()), float(moved[half:, axis].max())
-        row: dict[str, Any] = {"controller": name, "push": kind.push, "axis": f"tool {letter}", "unit": kind.unit}
-        row |= {"early": first, "late": second, "ratio": first / second if second else np.nan}
+    for axis, moved in enumerate(run.moved(kind).T):
+        row: dict[str, Any] = {"controller": name, "push": kind.push, "axis": f"tool {TOOL[axis]}", "unit": kind.unit}
+        row |= zip(("early", "late", "ratio"), _largest(moved), strict=True)
         rows.append(row | {"K early": float(early[axis]), "K late": float(late[axis])})
     return rows
+
+
+def _largest(moved: Floats) -> tuple[float, float, float]:
+    """Largest of displacements (n,) in the first half of the movement and in the second, and their ratio."""
+    half = len(moved) // 2
+    first, second = (float(np.abs(part).max()) for part in (moved[:half], moved[half:]))
+    return first, second, first / second if second else np.nan

@@ -34,30 +34,25 @@ def run_robot(
     metrics: str = "metrics",
     **options: Any,
 ) -> str:
-    """Learn, reproduce, push and certify with each controller, by options of ``push``; returns tables and reports.
-
-    Writes figures, models, schedules, metrics and reports.
-    """
+    """Learn, push by options of `push` and certify with each controller; write all, and return tables and reports."""
     of_poses = demonstrations.rotation_reference is not None
     if of_poses:
         if demonstrations.n_outputs != 6:
             raise ConfigError(
                 f"data: a pose has three positions and a rotation, not the outputs {demonstrations.names}."
             )
-        figure, space, bands = style.panels(3, 3, _figure)
-        poses.draw_recorded_poses(demonstrations, space[0], bands)
-        plotting.legend_below(figure, space)
-        folder.write_figure(figure, "figure6_task")
+        axes = poses.draw_poses(demonstrations, poses.draw_recorded_poses, 3, _figure)
+        folder.write_figure(axes[0].figure, "figure6_task")
     table: list[dict[str, Any]] = []
     rows: list[dict[str, Any]] = []
     reports = []
     for name, controller in steps(controllers.items(), "controller", len(controllers)):
         fitted, _ = fit_once(clone(controller), demonstrations, finished=folder.finished)
         run = push(fitted, **options)
-        note = ""
+        inertia = ""
         if of_poses:
             rows += [row for kind in KINDS for row in push_rows(name, run, kind)]
-            note = f"; {_inertia(run)}"
+            inertia = f"; {_inertia(run)}"
             figures = {
                 "figure7_variability": pose_variability_figure(run, demonstrations, name),
                 "figure8_pushes": pose_pushes_figure(run, name),
@@ -70,7 +65,7 @@ def run_robot(
                 "figure7_variability": variability_figure(run, demonstrations, name),
                 "figure8_pushes": pushes_figure(run, name),
             }
-        reports.append(f"{name}: a movement of {run.schedule.duration:.3g} s{note}\n{run.report}")
+        reports.append(f"{name}: a movement of {run.schedule.duration:.3g} s{inertia}\n{run.report}")
         folder.write_controller(name, fitted, run.schedule, **figures)
     folder.write_metrics(rows, metrics)
     folder.write_text("stability.txt", "\n\n".join(reports) + "\n")

@@ -55,41 +55,27 @@ _CAPTIONS = {
 
 @dataclass
 class FinishedFits:
-    """Folder of fitted models, named by the SHA-256 of all that a fit depends on, and the seconds that it took.
+    """Files of fitted models, named by the SHA-256 of all that a fit depends on, and the seconds that it took."""
 
-    It is made when the first fit ends. Worker processes write and read it too, each file whole. As a context manager it
-    begins with the fits of a run that was cut, or with none, and removes them at a good end.
-    """
-
-    folder: Path
-    resume: bool = False
-    """True if the next fit that is asked for should be there."""
-
-    def __enter__(self) -> Self:
-        if not self.resume and self.files():
-            checks.warn(f"{self.folder} of a run that was cut is cleared: --resume would have gone on with it.")
-            self._clear()
-        return self
-
-    def __exit__(self, error: object, *_: object) -> None:
-        if error is None:  # a run that fails or is cut keeps what is finished
-            self._clear()
+    folder: Path  # which worker processes write too, made when the first fit ends
+    resume: bool = False  # whether the next fit that is asked for should be there
 
     def files(self, key: str = "") -> list[Path]:
-        """Files of finished fits, one each: of a key, or all."""
+        """Files of all finished fits, or of the fit of a key."""
         return [file for file in self.folder.glob(f"{key}*") if _FINISHED.fullmatch(file.name)]
 
-    def _clear(self) -> None:
+    def clear(self) -> None:
+        """Remove the files, and the folder if nothing else is in it."""
         for file in self.files():
             file.unlink()
-        with suppress(OSError):  # of a folder that is not empty
+        with suppress(OSError):
             self.folder.rmdir()
 
 
 def fit_once(model: Any, *data: Any, finished: FinishedFits | None = None) -> tuple[Any, float]:
-    """The fitted model, loaded or fitted and kept, and the seconds that its fit took.
+    """Fitted model, loaded or fitted to X, y and groups, or to Demonstrations, and kept; and the seconds of its fit.
 
-    The data are X, y and groups, or Demonstrations. What is no class of this package is always fitted.
+    What is no class of this package is always fitted.
     """
     from torch_pbd.persistence import load, save
     from torch_pbd.persistence.plain import is_ours
@@ -138,16 +124,16 @@ def _key(model: Any, *data: Any) -> str:
 
 
 class RunFolder:
-    """A folder that one run at a time writes; a context manager, which gives it free again.
+    """Folder that one run at a time writes; a context manager, which gives it free again.
 
-    It is locked, and ``env.json`` with the settings is written at once, so that a folder that cannot be made or written
-    (OSError), or that another run writes (FolderInUseError), fails before the work. Every file is there whole or as it
-    was before; those of an earlier run are replaced. What a killed run left half written is removed.
+    One that cannot be made or written (OSError), or that another run writes (FolderInUseError), fails before the work.
+    Every file is there whole or as it was before; what a killed run left half written is removed. The finished fits of
+    a run that was cut are kept if it is to ``resume``.
     """
 
-    def __init__(self, path: str | Path, settings: Mapping[str, Any]) -> None:
+    def __init__(self, path: str | Path, settings: Mapping[str, Any], *, resume: bool = False) -> None:
         self.path = Path(path)
-        self.finished: FinishedFits | None = None  # where the run keeps its fits, if it does
+        self.finished = FinishedFits(self.path / "finished", resume)
         self.figures: list[Path] = []  # that the run has written so far
         self.path.mkdir(parents=True, exist_ok=True)
         # The operating system frees the lock of a process that is killed.
@@ -155,7 +141,11 @@ class RunFolder:
         try:
             self._lock.acquire()
         except Timeout:
-            raise FolderInUseError(f"{self.path} is being written by {self._owner()}.") from None
+            owner = "another run"
+            with suppress(OSError, ValueError, KeyError, TypeError):  # of one that has just begun there is no env.json
+                process = json.loads((self.path / "env.json").read_text(encoding="utf-8"))["process"]
+                owner = f"process {process['id']} on {process['host']}, since {process['started']}"
+            raise FolderInUseError(f"{self.path} is being written by {owner}.") from None
         try:
             for folder in (self.path, *filter(Path.exists, (self.path / part for part in _PARTS))):
                 if not folder.is_dir() or not os.access(folder, os.W_OK):
@@ -166,6 +156,10 @@ class RunFolder:
                         raise IsADirectoryError(f"{entry} stands where a file of results may have to: move it away")
                 remove_drafts(folder)
             self.write_text("env.json", json.dumps(_environment(settings), indent=2) + "\n")
+            if not resume and self.finished.files():
+                what = f"{self.finished.folder} of a run that was cut is cleared"
+                checks.warn(f"{what}: --resume would have gone on with it.")
+                self.finished.clear()
         except BaseException:
             self.close()
             raise
@@ -173,20 +167,14 @@ class RunFolder:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, error: object, *_: object) -> None:
+        if error is None:  # a run that fails or is cut keeps what is finished
+            self.finished.clear()
         self.close()
 
     def close(self) -> None:
         """Let another run have the folder."""
         self._lock.release()
-
-    def _owner(self) -> str:
-        """The run that writes the folder, as its env.json says."""
-        try:
-            process = json.loads((self.path / "env.json").read_text(encoding="utf-8"))["process"]
-            return f"process {process['id']} on {process['host']}, since {process['started']}"
-        except (OSError, ValueError, KeyError, TypeError):  # it has just begun
-            return "another run"
 
     def write_text(self, name: str, text: str) -> None:
         """Write a file of text."""
@@ -271,10 +259,7 @@ def check_names(names: Iterable[str], argument: str) -> None:
 
 
 def write_report(folder: RunFolder, command: str, text: str) -> Path:
-    """Write ``index.html``: the text of a run, its figures inside, and commands that go on from its files.
-
-    Nothing in it is read from elsewhere, so that the page can be sent by itself.
-    """
+    """Write ``index.html``, which can be sent by itself: text and figures of a run, and how to go on from its files."""
     figures = []
     for path in folder.figures:
         data = base64.b64encode(path.read_bytes()).decode()
@@ -282,18 +267,15 @@ def write_report(folder: RunFolder, command: str, text: str) -> Path:
         caption = html.escape(f"{path.stem}: {shows}")
         picture = f'<img alt="{caption}" src="data:image/png;base64,{data}">'
         figures.append(f"<figure>{picture}<figcaption>{caption}</figcaption></figure>")
-    texts = {"command": command, "text": text, "steps": "\n".join(_next_steps(folder.path, command))}
+    made = folder.path / "demonstrations.csv"
+    steps = [f"torch-pbd {each} --data {made}" for each in ("compare", "experiment") if made.is_file()]
+    steps.append(f"torch-pbd {command} --config {folder.path / 'config.yaml'}  # the same again")
+    loads = []
+    for files, load in (("model/*.safetensors", "load"), ("schedule/*.npz", "control.Schedule.load")):
+        loads += [f">>> torch_pbd.{load}({str(path)!r})" for path in sorted(folder.path.glob(files))]
+    steps += ["python", *loads] if loads else []
     page = Template(Path(__file__).with_name("report.html").read_text(encoding="utf-8"))
+    texts = {"command": command, "text": text, "steps": "\n".join(steps)}
     escaped = {name: html.escape(part) for name, part in texts.items()}
     folder.write_text("index.html", page.substitute(escaped, figures="\n".join(figures)))
     return folder.path / "index.html"
-
-
-def _next_steps(folder: Path, command: str) -> list[str]:
-    """Commands and lines of Python for the files that a run has left."""
-    made = folder / "demonstrations.csv"
-    steps = [f"torch-pbd {each} --data {made}" for each in ("compare", "experiment") if made.is_file()]
-    steps.append(f"torch-pbd {command} --config {folder / 'config.yaml'}  # the same again")
-    loads = [f">>> torch_pbd.load({str(path)!r})" for path in sorted(folder.glob("model/*.safetensors"))]
-    loads += [f">>> torch_pbd.control.Schedule.load({str(path)!r})" for path in sorted(folder.glob("schedule/*.npz"))]
-    return [*steps, "python", *loads] if loads else steps
