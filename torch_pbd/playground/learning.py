@@ -123,19 +123,15 @@ def picture(controller: DMPController, name: str, *, drawn: bool) -> Answer:
 
 def take_home(learned: Learned, name: str) -> bytes:
     """Content of a file: the strokes, the schedule, or the lines that make the schedule of the strokes."""
-    if name == "skill.py":
-        return _python(learned).encode()
-    if name == "skill.yaml":
-        return _yaml(learned).encode()
-    if learned.schedule is None:
-        follow(learned)
-    assert learned.schedule is not None
+    text = {"skill.py": _python, "skill.yaml": _yaml}.get(name)
+    if text is not None:
+        return text(learned).encode()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, name)
         if name == "demonstrations.csv":
             save_demonstrations(learned.strokes, path)
         else:
-            learned.schedule.save(path)
+            (learned.schedule or follow(learned)["schedule"]).save(path)
         return path.read_bytes()
 
 

@@ -142,13 +142,10 @@ class Tab:
 
     async def deliver(self, answer: dict[str, Any]) -> None:
         """Hand an answer of the worker on to the page, and its schedule to the robot."""
-        follow = answer.pop("then", None)
         if "schedule" in answer:
             schedule = answer.pop("schedule")
             self._robot.follow(schedule, await asyncio.to_thread(self._robot.prepare, schedule))
         await self.send(answer)
-        if follow is not None:
-            await self.deliver(follow)
 
     async def send(self, answer: dict[str, Any]) -> None:
         """Send to the page, if it is still there."""

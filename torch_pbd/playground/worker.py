@@ -170,4 +170,7 @@ class Desk:
         if kind == "adjust":
             return learning.adjust(learned, request["settings"])
         answer = learning.bend(learned, request["points"])
-        return answer if not request["follow"] else {**answer, "then": learning.follow(learned)}
+        if request["follow"]:
+            self._connection.send((tab, answer))
+            answer = learning.follow(learned)
+        return answer
