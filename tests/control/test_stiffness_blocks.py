@@ -261,10 +261,19 @@ def test_tracking_sees_what_is_ahead_and_no_further_than_its_horizon():
 @pytest.mark.parametrize(
     ("parameters", "words"),
     [
-        ({"stiffness_min": [1.0, 0.0]}, "stiffness_min[1] is 0.0, must be a finite number above 0"),
-        ({"stiffness_min": [1.0, 2.0], "stiffness_max": [3.0] * 3}, "stiffness_min has 2 numbers and stiffness_max"),
-        ({"rotation": RotationLimits(sigma_low=0.1, sigma_high=0.2)}, "rotation.sigma_low=0.1"),
-        ({"bounds": "sigma", "sigma_low": 0.1, "sigma_high": 0.2, "rotation": RotationLimits()}, "rotation.sigma_low"),
+        ({"stiffness_min": [1.0, 0.0]}, "stiffness_min of output 1 is 0.0, must be a finite number above 0"),
+        (
+            {"stiffness_min": [1.0, 2.0], "stiffness_max": [3.0] * 3},
+            "limits have 2 and 3 numbers, must have one, or one for each output",
+        ),
+        (
+            {"rotation": RotationLimits(sigma_low=0.1, sigma_high=0.2)},
+            "sigma_low=0.1 and sigma_high=0.2 of rotations are standard",
+        ),
+        (
+            {"bounds": "sigma", "sigma_low": 0.1, "sigma_high": 0.2, "rotation": RotationLimits()},
+            "sigma_low of rotations",
+        ),
         ({"kind": "precision", "smooth": True}, "smooth is True, must be False with kind='precision'"),
         ({"kind": "precision", "effort": -1.0}, "effort is -1.0 kg/N^2, must be a finite number above 0"),
     ],
@@ -275,7 +284,9 @@ def test_parameters_of_blocks_are_checked(parameters, words):
 
 
 def test_what_a_law_needs_is_asked_for():
-    with pytest.raises(ValueError, match=r"stiffness_max is 1\.0 Nm/rad, must be a finite number of at least 2"):
+    with pytest.raises(
+        ValueError, match=r"stiffness_max of rotations is 1\.0 Nm/rad, must be a finite number of at least 2"
+    ):
         RotationLimits(2.0, 1.0)
     with pytest.raises(ValueError, match="mass is None, must be given"):
         StiffnessLaw(kind="precision")(np.diag([1.0, 2.0, 3.0]))

@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, get_origin, get_type_hints
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from sklearn.base import clone
 
@@ -77,14 +76,8 @@ def _gains(controller: Any, time: Floats, path: Floats) -> Gains:
             "the demonstrations, or let on_unknown='soft' make the robot compliant there."
         )
     sampled, covariance = (_at_pose(controller.outputs_, law, each, path) for each in learned)
-    if controller.on_unknown == "soft":
-        # The share u towards the least stiffness already accounts for gaps; their prior would count them twice.
-        stiffness = law(sampled, mass)
-        softest = stiffness.new_tensor(law.limits(stiffness.shape[-1])[0])
-        softest = softest * torch.eye(stiffness.shape[-1]).to(stiffness)
-        stiffness = softest + torch.tensor(1.0 - type1)[:, None, None] * (stiffness - softest)
-    else:
-        stiffness = law(covariance, mass)
+    # The share u towards the least stiffness already accounts for gaps; their prior would count them twice.
+    stiffness = law(sampled, mass, type1=type1) if controller.on_unknown == "soft" else law(covariance, mass)
     damping = damping_from_stiffness(stiffness, mass, controller.damping_ratio)
     return Gains(stiffness.numpy(), damping.numpy(), covariance, type1)
 

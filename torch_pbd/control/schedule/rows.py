@@ -100,14 +100,13 @@ def damped_rows(schedule: Any, damping_ratio: float, law: Any) -> dict[str, Any]
     geometric mean of M and K, as in :func:`~torch_pbd.control.damping_from_stiffness`, which takes the root of M.
     """
     ratio = checks.number(damping_ratio, "damping_ratio", least=0.0, most=1e6, remedy="1 is critical")
-    rows, unit = {"stiffness": schedule.stiffness}, np.eye(schedule.n_outputs)
-    mass = schedule.mass * unit if isinstance(schedule.mass, float) else schedule.mass
+    rows = {"stiffness": schedule.stiffness}
+    mass = schedule.mass * np.eye(schedule.n_outputs) if isinstance(schedule.mass, float) else schedule.mass
     if law is not None:
         if not hasattr(law, "limits"):  # to name its class would need torch
             raise checks.refusal(law, "law", "a StiffnessLaw or None")
         rows["stiffness_limits"] = law.limits(schedule.n_outputs)
-        softest, known = rows["stiffness_limits"][0] * unit, 1.0 - schedule.type1[:, np.newaxis, np.newaxis]
-        rows["stiffness"] = softest + known * (np.asarray(law(schedule.covariance, mass)) - softest)
+        rows["stiffness"] = np.asarray(law(schedule.covariance, mass, type1=schedule.type1))
     factor = np.broadcast_to(np.linalg.cholesky(mass), schedule.stiffness.shape)
     half = np.linalg.solve(factor, rows["stiffness"])
     squared, axes = np.linalg.eigh(np.linalg.solve(factor, half.swapaxes(1, 2)))

@@ -11,8 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torch_pbd import checks
-from torch_pbd.control.matrices import as_mass, as_semidefinite, masses_like
-from torch_pbd.control.stiffness.limits import Block, Limit, RotationLimits, check_scales, check_stiffness, of_outputs
+from torch_pbd.control.matrices import as_mass, as_semidefinite, as_tensor, masses_like
+from torch_pbd.control.stiffness.limits import Block, Limit, RotationLimits, check_limits, of_outputs
 from torch_pbd.control.stiffness.precision import matched_effort, precision_stiffness
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.linalg import spectral_map
@@ -98,25 +98,24 @@ class StiffnessLaw:
         checks.choice(self.bounds, "bounds", Bounds)
         checks.choice(self.kind, "kind", Kind)
         checks.instance(self.rotation, "rotation", RotationLimits, optional=True)
-        of_each = isinstance(self.stiffness_min, tuple) or isinstance(self.stiffness_max, tuple)
-        check_stiffness(self, "" if of_each else "N/m")
         if self.kind == "precision" and self.smooth:
             raise checks.refusal(True, "smooth", "False with kind='precision'", "it smooths the straight line")
         for entry in self.effort if isinstance(self.effort, tuple) else () if self.effort == "match" else [self.effort]:
             checks.number(entry, "effort", above=0.0, unit="kg/N^2", remedy="or 'match'")
-        for own, prefix in ((self, ""), (self.rotation, "rotation.")):
-            if own is not None and self.bounds != "quantile":
-                check_scales(own, prefix)
-            elif own is not None and (own.sigma_low, own.sigma_high) != (None, None):
-                raise InvalidParameterError(
-                    f"{prefix}sigma_low={own.sigma_low} and {prefix}sigma_high={own.sigma_high} are standard "
-                    "deviations: give bounds='sigma' with them, or 'variance'; 'quantile' takes its own."
-                )
+        sizes = [len(limit) for limit in (getattr(self, name) for name in _LIMITS) if isinstance(limit, tuple)]
+        if len(set(sizes)) > 1:
+            listed = " and ".join(map(str, sizes))
+            raise InvalidParameterError(f"limits have {listed} numbers, must have one, or one for each output.")
+        for block in self.blocks(max(sizes, default=1) + (0 if self.rotation is None else 3)):
+            check_limits(block, block.name, self.bounds)
 
-    def __call__(self, covariance: Float[Tensor, "*b d d"] | Any, mass: Any = None) -> Float[Tensor, "*b d d"]:
+    def __call__(
+        self, covariance: Float[Tensor, "*b d d"] | Any, mass: Any = None, *, type1: Any = None
+    ) -> Float[Tensor, "*b d d"]:
         """Stiffness in N/m for positive semidefinite covariances (..., d, d), symmetric to the last bit.
 
-        Only kind="precision" uses ``mass``, a number in kg or matrices (..., d, d).
+        Only kind="precision" uses ``mass``, a number in kg or matrices (..., d, d). Type I uncertainties ``type1``
+        (...,) are the shares by which the stiffness moves to its minimum, as data are missing.
         """
         matrix, spectrum = as_semidefinite(covariance, "covariance")
         blocks = self.blocks(matrix.shape[-1])
@@ -132,59 +131,53 @@ class StiffnessLaw:
             outputs = slice(group[0].outputs.start, group[-1].outputs.stop)
             part = matrix[..., outputs, outputs]
             if self.kind == "precision":
-                given = (_vector(group, name, part) for name in ("effort", "stiffness_min", "stiffness_max"))
+                given = (of_outputs(group, name, part) for name in ("effort", "stiffness_min", "stiffness_max"))
                 own = precision_stiffness(part, masses[..., outputs, outputs], *given)
             else:
                 own = self._linear(group[0], part, known) if len(group) == 1 else self._coupled(group, part)
             stiffness[..., outputs, outputs] = own
-        return stiffness
+        if type1 is None:
+            return stiffness
+        softest = torch.diag(of_outputs(blocks, "stiffness_min", stiffness))
+        return softest + (1.0 - as_tensor(type1, "type1").to(stiffness))[..., None, None] * (stiffness - softest)
 
     def fitted(
-        self,
-        covariance: Float[Tensor, "*b d d"] | Any,
-        *,
-        resolution: float | Sequence[float] = 0.0,
-        mass: Any = None,
+        self, covariance: Float[Tensor, "*b d d"] | Any, *, resolution: Sequence[float] | None = None, mass: Any = None
     ) -> "StiffnessLaw":
         """Law whose bounds, as standard deviations, and effort are fixed to those of ``covariance`` (..., d, d).
 
-        For quantiles, standard deviations are raised to at least ``resolution``, a number or one per output. If the
-        covariances do not vary at all, every axis counts as precise, with a warning.
+        For quantiles, standard deviations are raised to at least ``resolution`` (d,). If the covariances do not vary at
+        all, every axis counts as precise, with a warning.
         """
         matrix = as_semidefinite(covariance, "covariance")[0].detach()
+        finest = [0.0] * matrix.shape[-1] if resolution is None else resolution
         blocks = self.blocks(matrix.shape[-1])
-        finest = [resolution] * matrix.shape[-1] if isinstance(resolution, float | int) else list(resolution)
-        for i, block in enumerate(blocks):
-            least = checks.number(finest[block.outputs.start], "resolution", least=0.0)
-            blocks[i] = self._with_bounds(block, matrix, resolution=least)
-        changes: dict[str, Any] = {}
+        blocks = [self._with_bounds(block, matrix, resolution=finest[block.outputs.start]) for block in blocks]
+        names, changes = ["sigma_low", "sigma_high"], dict[str, Any]()
         if self.kind == "precision":
             blocks = self._with_efforts(blocks, mass, matrix)[0]
-            changes["effort"] = _one_or_each([block.effort for block in blocks])
+            changes["effort"] = _one_or_each(blocks, "effort")
         if self.rotation is not None:
             *blocks, last = blocks
-            changes["rotation"] = replace(self.rotation, sigma_low=last.sigma_low, sigma_high=last.sigma_high)
-        changes["sigma_low"] = _one_or_each([block.sigma_low for block in blocks])
-        changes["sigma_high"] = _one_or_each([block.sigma_high for block in blocks])
-        return replace(self, bounds="sigma", **changes)
+            changes["rotation"] = replace(self.rotation, **{name: getattr(last, name) for name in names})
+        return replace(self, bounds="sigma", **changes, **{name: _one_or_each(blocks, name) for name in names})
 
     def blocks(self, n_outputs: int) -> list[Block]:
         """Blocks of ``n_outputs`` outputs, in order."""
-        rotation, n_positions = self.rotation, n_outputs - (0 if self.rotation is None else 3)
+        n_positions = n_outputs - (0 if self.rotation is None else 3)
         rows = [getattr(self, name) for name in _LIMITS]
-        sizes = {len(row) for row in rows if isinstance(row, tuple)}
-        if n_positions < 1 or not sizes <= {n_positions}:
-            wanted = " or ".join(map(str, sorted(sizes))) or "one or more"
-            wanted += " and then 3 of rotation" if rotation is not None else ""
+        size = next((len(row) for row in rows if isinstance(row, tuple)), None)
+        if n_positions < 1 or size not in (None, n_positions):
+            wanted = f"{size or 'one or more'}{'' if self.rotation is None else ' and then 3 of rotation'}"
             raise InvalidParameterError(f"covariance is of {n_outputs} outputs, must be of {wanted}, as the law is.")
-        if sizes:
-            each = zip(*(row if isinstance(row, tuple) else [row] * n_positions for row in rows), strict=True)
-            blocks = [Block(slice(i, i + 1), *row, name=f"output {i}") for i, row in enumerate(each)]
+        if size is not None:
+            each = zip(*(row if isinstance(row, tuple) else [row] * size for row in rows), strict=True)
+            blocks = [Block(slice(i, i + 1), f"output {i}", *row) for i, row in enumerate(each)]
         else:
-            blocks = [Block(slice(0, n_positions), *rows, name="positions" if rotation is not None else "")]
-        if rotation is not None:
-            own = (getattr(rotation, name) for name in _LIMITS)
-            blocks.append(Block(slice(n_positions, n_outputs), *own, name="rotations"))
+            blocks = [Block(slice(0, n_positions), "" if self.rotation is None else "positions", *rows)]
+        if self.rotation is not None:
+            own = (getattr(self.rotation, name) for name in _LIMITS)
+            blocks.append(Block(slice(n_positions, n_outputs), "rotations", *own))
         return blocks
 
     def limits(self, n_outputs: int) -> tuple[Limit, Limit]:
@@ -192,7 +185,8 @@ class StiffnessLaw:
         blocks = self.blocks(n_outputs)
         if len(blocks) == 1:
             return blocks[0].stiffness_min, blocks[0].stiffness_max
-        return tuple(of_outputs(blocks, "stiffness_min")), tuple(of_outputs(blocks, "stiffness_max"))
+        least, most = (of_outputs(blocks, name, torch.empty(0).double()).tolist() for name in _LIMITS[:2])
+        return tuple(least), tuple(most)
 
     def _linear(self, block: Block, matrix: Tensor, spectrum: tuple[Tensor, Tensor] | None) -> Tensor:
         """Stiffness of one block by eq. (19) and (20)."""
@@ -215,8 +209,7 @@ class StiffnessLaw:
         diagonal H of 1 / s_high, G and E, and the unitless U = clip(G^1/2 (1 - (H Sigma H)^1/2) G^1/2): 0 <= U <= 1, so
         that K lies within its limits, and no length is needed to compare rotations with positions.
         """
-        names = ("sigma_low", "sigma_high", "stiffness_min", "stiffness_max")
-        low, high, least, most = (_vector(blocks, name, matrix) for name in names)
+        least, most, low, high = (of_outputs(blocks, name, matrix) for name in _LIMITS)
         gain, extent = (high / (high - low)).sqrt(), (most - least).sqrt()
         tiny = torch.finfo(matrix.dtype).tiny
         root = spectral_map(matrix / torch.outer(high, high), lambda variance: variance.clamp_min(tiny).sqrt())
@@ -268,9 +261,6 @@ class StiffnessLaw:
         return block._replace(sigma_low=low, sigma_high=high)
 
 
-def _vector(blocks: list[Block], name: str, like: Tensor) -> Tensor:
-    return like.new_tensor(of_outputs(blocks, name))
-
-
-def _one_or_each(values: list[Any]) -> Any:
-    return values[0] if len(values) == 1 else tuple(values)
+def _one_or_each(blocks: Sequence[Block], name: str) -> Any:
+    values = tuple(getattr(block, name) for block in blocks)
+    return values[0] if len(values) == 1 else values
