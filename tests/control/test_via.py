@@ -142,6 +142,12 @@ def test_via_points_are_checked(controller, via, message):
         controller.schedule(via=via)
 
 
+def test_a_goal_that_moves_goes_without_via_points(controller):
+    moving = np.tile(controller.goal_, (201, 1))
+    with pytest.raises(ValueError, match=r"goal has shape \(201, 2\), must have shape \(2,\)"):
+        controller.schedule(rate=100.0, goal=moving, via=[(1.0, [0.2, 0.1])])
+
+
 def test_a_model_of_samples_cannot_bend():
     plain = DMPController(GMMBaseline()).fit(demonstrations())
     with pytest.raises(ValueError, match=r"covariance is GMMBaseline\(\), must be a model of whole movements"):

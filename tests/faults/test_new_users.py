@@ -18,8 +18,8 @@ import torch_pbd
 from torch_pbd import Demonstrations, DMPController, GMMBaseline
 from torch_pbd.cli.main import main
 from torch_pbd.control import Schedule
-from torch_pbd.control.controller import as_demonstrations
-from torch_pbd.control.primitive.outputs import common_unit, in_si
+from torch_pbd.control.learning import as_demonstrations
+from torch_pbd.control.primitive.outputs import Outputs
 from torch_pbd.control.primitive.smoothing import duration_of
 from torch_pbd.data import load_demonstrations, make_tunnel_demonstrations, save_demonstrations
 from torch_pbd.data.units import TIMES
@@ -261,8 +261,9 @@ def test_66_known_units_and_words_that_are_none_stay():
         assert Demonstrations([0.0, 1.0], np.zeros((1, 2, 1)), units=unit).units == (unit,)
     for unit in ("h", "min", "s", "ms", "us", "ns", "1", "phase", "frames", "normalized time in [0,1]"):
         assert Demonstrations([0.0, 1.0], np.zeros((1, 2, 1)), time_unit=unit).time_unit == unit
-    assert (in_si(["mm", "mm"]), in_si(["deg"]), in_si(["rad"]), in_si(None)) == (1e-3, np.pi / 180.0, 1, 1)
-    assert (common_unit(["mm", "mm"]), common_unit(["mm", "m"]), common_unit(None)) == ("mm", None, None)
+    shown = [Outputs(2, units) for units in (["mm", "mm"], ["deg", "deg"], ["rad", "rad"], ["mm", "m"], None)]
+    assert [each.si for each in shown] == [1e-3, np.pi / 180.0, 1, 1, 1]
+    assert [each.unit for each in shown] == ["mm", "deg", "rad", None, None]
 
 
 @pytest.mark.parametrize(

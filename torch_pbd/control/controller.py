@@ -1,30 +1,31 @@
 """The controller as an estimator: demonstrations in, a stiffness schedule out (Section V)."""
 
-from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
-from typing import Literal, Self
+from typing import Any, Literal, Self, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike
-from sklearn.base import BaseEstimator
 from sklearn.utils.validation import check_is_fitted
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.control.impedance import check_parameters, fit_covariance, fit_law, outputs_under
+from torch_pbd.control.learning import as_demonstrations, fit_covariance, fit_law, law_for, outputs_of
+from torch_pbd.control.matrices import as_damping_ratio, as_mass
 from torch_pbd.control.planning import Planning
 from torch_pbd.control.primitive import smoothing
 from torch_pbd.control.primitive.dmp import Adaptation, Gate
-from torch_pbd.control.primitive.outputs import common_unit, counts_as_metres, in_si
-from torch_pbd.control.primitive.reproduction import Reproduction, check_against_duration, primitive
+from torch_pbd.control.primitive.outputs import Outputs
+from torch_pbd.control.primitive.reproduction import Reproduction, primitive
 from torch_pbd.control.stiffness import StiffnessLaw
-from torch_pbd.data import Demonstrations, check_unimodal
-from torch_pbd.data.alignment import TIMING_REMOVED
-from torch_pbd.data.poses import ROTATION
-from torch_pbd.data.units import ANGLES, LENGTHS, TIMES
+from torch_pbd.data import Demonstrations
+from torch_pbd.data.units import TIMES
 from torch_pbd.estimators.base import CovarianceRegressor
-from torch_pbd.estimators.validation import check_groups, check_squares, checked_rows
 from torch_pbd.movement.base import MovementRegressor
+from torch_pbd.movement.law import check_arrays
+
+_NEEDED = ("get_params", "fit", "predict_cov", "predict_uncertainty")  # methods of a covariance regressor
+# Arrays of model files: for each output one number, but for the forcing.
+_NOISE, _MOTION = ("noise_scale_", "noise_share_"), ("start", "velocity", "goal", "forcing")
 
 
 @dataclass(eq=False, repr=False)
@@ -160,19 +161,19 @@ class DMPController(Planning):
         """
         for name in ("law_", "_bend", "_shown"):  # a fit that fails leaves no mixture of two
             self.__dict__.pop(name, None)
-        check_parameters(self)
+        self._check_parameters()
         # 1. Recordings. Samples at equal times are merged; the table of gaps is Type I uncertainty.
         shown = smoothing.merge_bursts(as_demonstrations(X, y, groups))
         self.names_, self.frame_, self.units_, self.time_unit_ = shown.names, shown.frame, shown.units, shown.time_unit
         self.n_demos_, self.n_outputs_ = len(shown), shown.n_outputs
-        outputs = outputs_under(self, shown)
+        outputs = outputs_of(shown)
+        law = law_for(self, outputs)
         self.duration_, self.time_scale_ = smoothing.duration_of(shown, self.duration)
         self.start_time_ = smoothing.common_start(shown)
         seconds = self.time_unit_ in TIMES
         automatic = smoothing.automatic_cutoff(self.duration_, knows_seconds=seconds)
         self.cutoff_ = automatic if self.cutoff == "auto" else self.cutoff
         self.dmp_ = primitive(self)
-        check_against_duration(self)
         smoothing.check_steps(self.n_steps, self.n_demos_, self.n_outputs_, learned=True)
         self.unsampled_ = smoothing.tabulate_unsampled(shown, self.duration_ / self.time_scale_, self.on_unknown)
         # 2. Smoothing. Splines at the true times give positions, velocities and accelerations at common times.
@@ -180,12 +181,12 @@ class DMPController(Planning):
         # 3. Mean movement. Eq. (16) is driven by the mean over demonstrations of the forcing of eq. (18), regressed by
         # a Gaussian process, eq. (5), over the phase of eq. (17) or another input that is a function of time.
         self.reproduction_ = Reproduction.learn(
-            self.dmp_, movements, self.phase_input, own_goals=self.goal == "each", blocks=outputs.blocks
+            movements, self.dmp_, self.phase_input, own_goals=self.goal == "each", blocks=outputs.blocks
         )
         self.start_, self.goal_ = self.reproduction_.start, self.reproduction_.goal
         self.reproduction_error_ = self.reproduction_.check_against(movements)
-        if seconds and counts_as_metres(outputs.units(self.units_)):
-            self.reproduction_.warn_if_cut(in_si(outputs.units(self.units_)))
+        if seconds and outputs.in_metres:
+            self.reproduction_.warn_if_cut(outputs.si)
         # 4. Variability. The regressor learns the covariance of positions or of the forcing over the same input; for
         # poses, along common axes of each block's covariances.
         varying, phase = self.varying(movements), self.reproduction_.phase
@@ -200,7 +201,7 @@ class DMPController(Planning):
         self.noise_share_ = smoothing.variance_share(self.varying(smoothed), varying)
         # 5. Gains. The bounds of eq. (20) are quantiles of the standard deviations where there are samples; eq. (19)
         # then gives each principal axis its stiffness, and the damping follows from stiffness and mass.
-        self.law_ = fit_law(self, varying)
+        self.law_ = fit_law(self, law, varying)
         return self
 
     def smooth(self, demonstrations: Demonstrations, n_steps: int | None = None) -> smoothing.Movements:
@@ -222,73 +223,74 @@ class DMPController(Planning):
     def __sklearn_is_fitted__(self) -> bool:
         return "law_" in vars(self)
 
+    def _check_parameters(self) -> None:
+        """Check the parameters, before any work."""
+        for name, kind in get_type_hints(type(self)).items():
+            if get_origin(kind) is Literal:
+                checks.choice(getattr(self, name), name, kind)
+        for name, unit in (("alpha", ""), ("gamma", ""), ("tau", "s")):
+            checks.number(getattr(self, name), name, above=0.0, unit=unit)
+        checks.number(self.beta, "beta", above=0.0, optional=True)
+        checks.number(self.duration, "duration", above=0.0, unit="s", optional=True)
+        checks.count(self.n_steps, "n_steps", least=5)
+        if self.cutoff != "auto":
+            checks.number(self.cutoff, "cutoff", above=0.0, unit="Hz", optional=True, remedy="leave it 'auto'")
+        regressor = self.covariance
+        able = not isinstance(regressor, type) and all(hasattr(regressor, need) for need in _NEEDED)
+        if regressor is not None and not able:
+            raise checks.refusal(regressor, "covariance", "a covariance regressor, not yet fitted or fitted, or None")
+        if (timing := getattr(regressor, "timing", "none")) != "none":
+            remedy = "a controller sets the time of its movement itself"
+            raise checks.refusal(timing, "timing of covariance", "'none'", remedy)
+        checks.instance(self.stiffness_law, "stiffness_law", StiffnessLaw, optional=True)
+        mass: Any = 1.0 if self.mass is None else self.mass
+        if np.ndim(mass) < 2:
+            checks.number(mass, "mass", above=0.0, unit="kg", remedy="or give a matrix (d, d)")
+        as_mass(mass)
+        as_damping_ratio(self.damping_ratio)
 
-def as_demonstrations(X: Demonstrations | ArrayLike, y: ArrayLike | None, groups: ArrayLike | None) -> Demonstrations:
-    """Two or more demonstrations, as given or from samples X (n, 1), y (n, d) with labels ``groups`` (n,).
+    def _arrays(self) -> dict[str, Floats]:
+        """Arrays of the movement for model files, without the regressor's."""
+        outputs = self.outputs_
+        arrays = {name: getattr(self, name) for name in _NOISE}
+        arrays |= {name: getattr(self.reproduction_, name) for name in _MOTION}
+        if self.unsampled_.any():  # other files are as those of versions that knew of no holes
+            arrays["unsampled_"] = self.unsampled_
+        if outputs.reference is not None and outputs.axes is not None:
+            arrays |= {"rotation_reference": outputs.reference, "output_axes": outputs.axes}
+        return arrays
 
-    Warns of several modes, of units that stiffness cannot have, and of timing that was removed by warping.
-    """
-    if isinstance(X, Demonstrations) and not (y is None and groups is None):
-        raise ValueError("X is Demonstrations, which have their positions: give neither y nor groups with them.")
-    demonstrations = X if isinstance(X, Demonstrations) else _grouped(X, y, groups)
-    if len(demonstrations) < 2:
-        raise ValueError(
-            "DMPController needs >= 2 demonstrations, got 1: what varies between demonstrations cannot be learned "
-            "from one. Record more, or give groups that tell the samples of several apart."
+    def _restore(self, arrays: dict[str, Floats]) -> None:
+        """Restore the movement from finite arrays of a model file; what does not fit raises a ValueError."""
+        if not hasattr(self, "covariance_"):
+            raise ValueError("its covariance is no regressor")
+        d, own = self.n_outputs_, {"unsampled_": np.zeros(2), **arrays}
+        shapes: dict[str, tuple[int | str, ...]] = dict.fromkeys((*_NOISE, *_MOTION), (d,))
+        shapes |= {"forcing": ("m", d), "unsampled_": ("m",)}
+        if {"rotation_reference", "output_axes"} & set(own):
+            shapes |= {"rotation_reference": (4,), "output_axes": (d, d)}
+        check_arrays(own, shapes)
+        holes, reference, axes = own["unsampled_"], own.get("rotation_reference"), own.get("output_axes")
+        checks.require((holes >= 0.0) & (holes <= 1.0), holes, "unsampled_", "a share from 0 to 1")
+        if min(len(own["forcing"]), len(holes)) < 2:
+            raise ValueError("forcing and unsampled_ must have a row at the start and one at the end")
+        if reference is not None and abs(float(np.linalg.norm(reference)) - 1.0) > 1e-9:
+            raise ValueError("its rotation_reference must be a unit quaternion")
+        if axes is not None and np.linalg.cond(axes) > 1e12:
+            raise ValueError("its output_axes must be independent")
+        for name in ("names_", "units_"):
+            if (value := getattr(self, name)) is not None:
+                if len(value) != d:
+                    raise ValueError(f"{name} has {len(value)} entries, must have {d}")
+                setattr(self, name, tuple(value))
+        n_positions = d if reference is None else d - 3
+        units = None if self.units_ is None else self.units_[:n_positions]
+        self.outputs_ = Outputs(n_positions, units, reference, axes)
+        self.law_.blocks(d)
+        for name in (*_NOISE, "unsampled_"):
+            setattr(self, name, own[name])
+        self.start_, self.goal_, self.dmp_ = own["start"], own["goal"], primitive(self)
+        motion = {name: own[name] for name in _MOTION}
+        self.reproduction_ = Reproduction(
+            self.dmp_, self.phase_input, own_goals=self.goal == "each", blocks=self.outputs_.blocks, **motion
         )
-    if demonstrations.suspects:
-        raise ValueError(f"A controller cannot be learned of these outputs. {' '.join(demonstrations.suspects)}")
-    if demonstrations.rotation_reference is not None and demonstrations.n_outputs == 3:
-        raise ValueError(
-            f"The demonstrations have a rotation alone, {', '.join(demonstrations.names)}, must have positions beside "
-            "it: record them too."
-        )
-    check_unimodal(demonstrations)
-    if isinstance(X, Demonstrations):  # arrays have no units: they are in m and s
-        _warn_of_units(X.units if X.units is None or X.rotation_reference is None else X.units[:-3])
-    if demonstrations.alignment == "dtw":
-        checks.warn(TIMING_REMOVED)
-    return demonstrations
-
-
-def _warn_of_units(units: Sequence[str] | None) -> None:
-    """Warn if units of positions are missing, differ, or are neither lengths nor angles."""
-    common = common_unit(units)
-    if units is None:
-        checks.warn(
-            "The demonstrations tell no units: positions are taken to be in m. Say so, or in what else: units='m'."
-        )
-    elif common is None:
-        checks.warn(
-            f"The outputs are in different units, {', '.join(units)}: their principal axes mix them, and nothing is "
-            "converted to m. Bring them to one unit, or control them apart."
-        )
-    elif common not in LENGTHS | ANGLES:
-        checks.warn(
-            f"The positions are in {common!r}, which is no known length or angle ({', '.join(LENGTHS | ANGLES)}): "
-            "stiffness is in N per that unit, and no limits of motion apply."
-        )
-
-
-def _grouped(X: ArrayLike, y: ArrayLike | None, groups: ArrayLike | None) -> Demonstrations:
-    if y is None:
-        raise ValueError("y is None: give Demonstrations, or times X (n, 1), positions y (n, d) and groups (n,).")
-    times, positions = checked_rows(BaseEstimator(), X, y)
-    check_squares(times, "X")
-    check_squares(positions, "y")
-    if times.shape[1] != 1:
-        raise ValueError(f"X has {times.shape[1]} columns, must have 1: the time of each sample.")
-    labels = np.zeros(len(times), dtype=int) if groups is None else check_groups(groups, len(times))
-    if groups is None and (back := np.diff(times[:, 0]) <= 0.0).any():
-        raise ValueError(
-            f"X does not increase at row {int(np.argmax(back)) + 1}: if another demonstration starts there, give "
-            "groups, the number of the demonstration of each row."
-        )
-    names = [str(name) for name in y.columns] if hasattr(y, "columns") else None
-    if set(ROTATION) <= set(names or ()):
-        raise ValueError(
-            f"y has columns {', '.join(ROTATION)}, as rotations of poses are called, which would count in m: give "
-            "Demonstrations."
-        )
-    members = [labels == label for label in dict.fromkeys(labels.tolist())]
-    return Demonstrations([times[m, 0] for m in members], [positions[m] for m in members], names=names)

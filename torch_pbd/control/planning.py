@@ -7,21 +7,22 @@ from typing import Any, Self, final
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
 from sklearn.base import BaseEstimator
 from sklearn.utils.validation import check_array, check_is_fitted
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.control.impedance import gains_at
-from torch_pbd.control.primitive.outputs import Outputs, counts_as_metres, in_si, robot_unit
-from torch_pbd.control.primitive.reproduction import Reproduction
+from torch_pbd.control.primitive.outputs import Outputs
+from torch_pbd.control.primitive.reproduction import Reproduction, held
 from torch_pbd.control.schedule.rows import tick_times
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.plant import AdmittancePlant
 from torch_pbd.control.simulation.rollout import Rollout
 from torch_pbd.control.simulation.run import simulate
 from torch_pbd.control.stiffness import StiffnessLaw
-from torch_pbd.control.via import Bend, conditioned, planned
+from torch_pbd.control.via import conditioned, planned
 from torch_pbd.estimators.validation import checked_values
 
 _UNITS = {"duration": "s", "distance": "m", "speed": "m/s"}
@@ -61,13 +62,12 @@ class Planning(BaseEstimator):
     reproduction_: Reproduction
     outputs_: Outputs
     n_outputs_: int
-    units_: tuple[str, ...] | None
     time_unit_: str
     duration_: float
     start_time_: float
     time_scale_: float
     mass: Any
-    _bend: Bend | None = None
+    _bend: CubicSpline | None = None
 
     @property
     def mass_(self) -> float | Floats:
@@ -155,7 +155,8 @@ class Planning(BaseEstimator):
             on_unknown="soft" makes the robot compliant there.
         goal, start : array-like of shape (d,), default=None
             Goal and start in the units of the recordings; None are ``goal_`` and ``start_``. A moving goal is (n, d),
-            one row each. Poses, here and in ``via``, are p positions and a unit quaternion w x y z, or p + 3 outputs.
+            one row each, without ``via``. Poses, here and in ``via``, are p positions and a unit quaternion w x y z, or
+            p + 3 outputs.
         via : sequence of (time, position), default=None
             Points that the movement passes, stiff enough to meet them: movement time in s from its start, and position
             (d,) in the units of the recordings, NaN where an output is free (a rotation as a whole). ``covariance``
@@ -175,22 +176,18 @@ class Planning(BaseEstimator):
         check_is_fitted(self)
         speed = checks.number(speed, "speed", above=0.0)
         checks.instance(limits, "limits", MotionLimits, optional=True)
-        units, outputs = self.outputs_.units(self.units_), self.outputs_
-        bounds = limits if counts_as_metres(units) else None
-        self._refuse_beyond(bounds, "duration", self.duration_ / speed)
+        outputs, bounds = self.outputs_, limits if self.outputs_.in_metres else None
+        self._refuse_beyond(bounds, duration=self.duration_ / speed)
         time = tick_times(self.duration_ / speed, rate, self.n_outputs_, settle=settle)
-        goal, start = (
-            None if value is None else outputs.rows(value, name) for name, value in (("goal", goal), ("start", start))
-        )
+        goal, start = self._place(goal, "goal", len(time) if via is None else 0), self._place(start, "start")
         bent, goal, start = planned(self, goal, start, via)
         path, velocity, acceleration, moved = bent._motion(time, goal, start, speed)
-        unit = in_si(units)
-        rows: dict[str, Any] = outputs.motion(path, velocity, acceleration, unit)
-        self._refuse_beyond(bounds, "distance", float(np.linalg.norm(np.ptp(rows["position"], axis=0))))
-        speeds = np.linalg.norm(rows["velocity"][:, : outputs.n_positions], axis=1)
-        self._refuse_beyond(bounds, "speed", float(speeds.max()))
-        gains, scales = gains_at(bent, moved, path), outputs.scales(unit)
-        rows |= gains._asdict() | {"covariance": np.multiply.outer(scales, scales) * gains.covariance}
+        rows: dict[str, Any] = outputs.motion(path, velocity, acceleration)
+        largest = np.linalg.norm(rows["velocity"][:, : outputs.n_positions], axis=1).max()
+        self._refuse_beyond(bounds, distance=np.linalg.norm(np.ptp(rows["position"], axis=0)), speed=largest)
+        gains = gains_at(bent, moved, path)
+        units = np.multiply.outer(outputs.scales, outputs.scales)
+        rows |= gains._asdict() | {"covariance": units * gains.covariance}
         return Schedule(time=time, **rows, **_labels(self))
 
     def simulate(
@@ -224,7 +221,7 @@ class Planning(BaseEstimator):
     def _path(self, time: Floats) -> Floats:
         """Reproduced position (n, d) at movement times (n,)."""
         position = self.reproduction_.motion(time)[0]
-        return position if self._bend is None else position + self._bend(time)
+        return position if self._bend is None else position + held(self._bend, time)
 
     def _motion(
         self, time: Floats, goal: Floats | None, start: Floats | None, speed: float
@@ -234,9 +231,17 @@ class Planning(BaseEstimator):
         if self._bend is not None:
             pace = np.gradient(moved, time)
             rate, slope = pace[:, np.newaxis], np.gradient(pace, time)[:, np.newaxis]
-            position, velocity = position + self._bend(moved), velocity + rate * self._bend(moved, 1)
-            acceleration = acceleration + rate**2 * self._bend(moved, 2) + slope * self._bend(moved, 1)
+            change, first, second = (held(self._bend, moved, order) for order in range(3))
+            position, velocity = position + change, velocity + rate * first
+            acceleration = acceleration + rate**2 * second + slope * first
         return position, velocity, acceleration, moved
+
+    def _place(self, value: ArrayLike | None, name: str, n_ticks: int = 0) -> Floats | None:
+        """Goal or start as outputs (d,), None as shown, or a goal that may move, (n_ticks, d)."""
+        if value is None:
+            return None
+        rows, d = self.outputs_.rows(value, name), self.n_outputs_
+        return checks.array(rows, name, (n_ticks, d) if n_ticks and rows.ndim > 1 else (d,))
 
     def _movement_time(self, X: ArrayLike) -> Floats:
         """Movement times (n,) of a column X (n, 1), which may be empty."""
@@ -246,15 +251,16 @@ class Planning(BaseEstimator):
             raise ValueError(f"X has {times.shape[1]} features, but DMPController is expecting 1 feature: the time.")
         return np.asarray(self.time_scale_ * (times[:, 0] - self.start_time_))
 
-    def _refuse_beyond(self, limits: MotionLimits | None, name: str, value: float) -> None:
-        """Raise if a duration, distance or speed, by ``name``, exceeds the limits."""
-        if limits is not None and value > (most := getattr(limits, name)):
-            units = ", ".join(self.outputs_.units(self.units_) or ["none"])
-            raise ValueError(
-                f"the {name} of the schedule is {value:.4g} {_UNITS[name]}, must be at most limits.{name}, {most:g} "
-                f"{_UNITS[name]}: correct units ({units}) or time_unit ({self.time_unit_}) of the recordings, or give "
-                f"limits=MotionLimits({name}=...) or None."
-            )
+    def _refuse_beyond(self, limits: MotionLimits | None, **values: Any) -> None:
+        """Raise if a duration, distance or speed of a schedule exceeds the limits."""
+        for name, value in values.items() if limits is not None else ():
+            if value > (most := getattr(limits, name)):
+                units = ", ".join(self.outputs_.units or ["none"])
+                raise ValueError(
+                    f"the {name} of the schedule is {value:.4g} {_UNITS[name]}, must be at most limits.{name}, "
+                    f"{most:g} {_UNITS[name]}: correct units ({units}) or time_unit ({self.time_unit_}) of the "
+                    f"recordings, or give limits=MotionLimits({name}=...) or None."
+                )
 
 
 def _labels(controller: Any) -> dict[str, Any]:
@@ -262,7 +268,7 @@ def _labels(controller: Any) -> dict[str, Any]:
     law, mass = controller.law_, controller.mass_
     return {
         "names": controller.names_,
-        "units": robot_unit(controller.outputs_.units(controller.units_)),
+        "units": controller.outputs_.robot_unit,
         "frame": controller.frame_,
         "stiffness_limits": law.limits(controller.n_outputs_),
         "covariance_of": controller.variability,

@@ -7,8 +7,6 @@ are left to the movement primitive, which reaches any goal.
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -23,33 +21,13 @@ _N_KNOTS = 200  # knots of a change over a movement, whose length scales are at 
 _LIKELY = 0.95  # share of demonstrations beyond whose deviation a point counts as unlikely
 
 
-@dataclass(frozen=True)
-class Bend:
-    """Change of a movement's position over movement time, at knots (m,) and (m, d)."""
-
-    time: Floats
-    change: Floats
-
-    @cached_property
-    def _spline(self) -> CubicSpline:
-        return CubicSpline(self.time, self.change)
-
-    def __call__(self, time: Floats, order: int = 0) -> Floats:
-        """Change (n, d) at movement times (n,), or its derivative; constant beyond the movement."""
-        inside = np.clip(time, self.time[0], self.time[-1])
-        values: Floats = self._spline(inside, order)
-        return values if order == 0 else values * (inside == time)[:, np.newaxis]
-
-
-def can_bend(controller: Any) -> bool:
-    """Whether a controller's covariance is a model of whole movements of positions."""
-    return hasattr(controller.covariance_, "condition") and controller.variability == "position"
-
-
-def _check_can_bend(controller: Any) -> None:
-    if not can_bend(controller):
-        must = "a model of whole movements, with variability='position', to be bent"
-        raise checks.refusal(controller.covariance, "covariance", must, "take DMPController(TrajectoryRegressor())")
+def can_bend(controller: Any, *, must: bool = False) -> bool:
+    """Whether the covariance is a model of whole movements of positions; if it must be, others are refused."""
+    able = hasattr(controller.covariance_, "condition") and controller.variability == "position"
+    if must and not able:
+        needed = "a model of whole movements, with variability='position', to be bent"
+        raise checks.refusal(controller.covariance, "covariance", needed, "take DMPController(TrajectoryRegressor())")
+    return able
 
 
 def conditioned(
@@ -60,7 +38,7 @@ def conditioned(
     At the movement times ``pins`` the path stays, without effect on the gains. Changes are relative to the path, which
     differs from the model's mean by the error of the reproduction.
     """
-    _check_can_bend(controller)
+    can_bend(controller, must=True)
     outputs, phase = controller.outputs_, controller.reproduction_.phase
     # Observations are in outputs, any of which may be free, while poses are learned along other axes.
     model = controller.covariance_.observed_along(outputs.axes)
@@ -74,7 +52,7 @@ def conditioned(
     knots = np.unique(np.append(even[far], own))
     result = copy.copy(controller)
     result.covariance_, result._shown = bent, shown
-    result._bend = Bend(knots, outputs.decode(moved.predict(phase(knots)) - shown.predict(phase(knots))))
+    result._bend = CubicSpline(knots, outputs.decode(moved.predict(phase(knots)) - shown.predict(phase(knots))))
     return result
 
 
@@ -87,16 +65,14 @@ def planned(
     """
     if via is None and (not can_bend(controller) or (goal is None and start is None)):
         return controller, goal, start
-    _check_can_bend(controller)
-    if via is not None and not np.iterable(via):
-        raise checks.refusal(via, "via", "a list of pairs, each a time in s and a position")
-    points = [] if via is None else list(via)
+    can_bend(controller, must=True)
+    points = _checked_points(via, controller)
     rest, known, pins = {"goal": goal, "start": start}, [], []
     for name, at, own in (("start", 0.0, controller.start_), ("goal", controller.duration_, controller.goal_)):
         target = rest[name]
-        if target is not None and np.ndim(target) != 1:
+        if target is not None and target.ndim > 1:
             continue  # a goal that moves
-        change = own - own if target is None else checks.array(target, name, own.shape) - own
+        change = own - own if target is None else target - own
         if not change.any():
             pins.append(at)
             continue
@@ -106,8 +82,7 @@ def planned(
         known.append((at, share * change))
     even = np.linspace(0.0, controller.duration_, 2 * controller.n_steps)
     path = CubicSpline(even, controller._motion(even, rest["goal"], rest["start"], 1.0)[0]) if points else None
-    for number, point in enumerate(points):
-        at, position = _checked_point(point, f"via[{number}]", controller)
+    for number, (at, position) in enumerate(points):
         change = position - path(at)
         distance, limit = _distance(controller, at, change)
         if distance > limit:
@@ -124,18 +99,23 @@ def planned(
     return bent, rest["goal"], rest["start"]
 
 
-def _checked_point(point: Any, name: str, controller: Any) -> tuple[float, Floats]:
-    """Movement time and outputs of a via point, NaN where free."""
-    try:
-        at, position = point
-    except (TypeError, ValueError):
-        raise checks.refusal(point, name, "a time in s and a position") from None
-    at = checks.number(at, f"the time of {name}", least=0.0, most=controller.duration_, unit="s")
-    name, n_outputs = f"the position of {name}", controller.n_outputs_
-    position = controller.outputs_.rows(position, name)
-    if position.shape != (n_outputs,) or np.isinf(position).any() or np.isnan(position).all():
-        raise checks.refusal(position.tolist(), name, f"{n_outputs} numbers, NaN where free")
-    return at, position
+def _checked_points(via: Any, controller: Any) -> list[tuple[float, Floats]]:
+    """Movement times and outputs of via points, NaN where free."""
+    if via is not None and not np.iterable(via):
+        raise checks.refusal(via, "via", "a list of pairs, each a time in s and a position")
+    points = []
+    for number, point in enumerate(() if via is None else via):
+        try:
+            at, position = point
+        except (TypeError, ValueError):
+            raise checks.refusal(point, f"via[{number}]", "a time in s and a position") from None
+        at = checks.number(at, f"the time of via[{number}]", least=0.0, most=controller.duration_, unit="s")
+        name, n_outputs = f"the position of via[{number}]", controller.n_outputs_
+        position = controller.outputs_.rows(position, name)
+        if position.shape != (n_outputs,) or np.isinf(position).any() or np.isnan(position).all():
+            raise checks.refusal(position.tolist(), name, f"{n_outputs} numbers, NaN where free")
+        points.append((at, position))
+    return points
 
 
 def _distance(controller: Any, at: float, change: Floats) -> tuple[float, float]:

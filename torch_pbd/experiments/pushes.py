@@ -10,7 +10,6 @@ import numpy as np
 from torch_pbd import rotations
 from torch_pbd.checks import Floats
 from torch_pbd.control.controller import DMPController
-from torch_pbd.control.primitive.outputs import in_si
 from torch_pbd.control.schedule.schedule import Schedule
 from torch_pbd.control.simulation.plant import AdmittancePlant
 from torch_pbd.control.simulation.rollout import Rollout
@@ -131,8 +130,8 @@ def push_row(name: str, run: Run) -> dict[str, Any]:
     for output, label in list(enumerate(style.schedule_names(run.schedule)))[:2]:
         row |= {f"K {label} early": float(stiffness[early, output, output])}
         row |= {f"K {label} late": float(stiffness[late, output, output])}
-    recorded = run.controller.outputs_.units(run.controller.units_)
-    return row | {f"path error [{kind.unit}]": kind.scale * in_si(recorded) * run.controller.reproduction_error_}
+    error = run.controller.outputs_.si * run.controller.reproduction_error_
+    return row | {f"path error [{kind.unit}]": kind.scale * error}
 
 
 def guarantees(run: Run) -> dict[str, Any]:

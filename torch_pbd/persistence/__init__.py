@@ -19,13 +19,9 @@ from sklearn.utils.validation import check_is_fitted
 
 from torch_pbd import checks
 from torch_pbd.control.controller import DMPController
-from torch_pbd.control.impedance import check_parameters
-from torch_pbd.control.primitive.outputs import Outputs
-from torch_pbd.control.primitive.reproduction import Reproduction, primitive
 from torch_pbd.estimators.base import CovarianceRegressor
 from torch_pbd.exceptions import ModelFileError
 from torch_pbd.files import LOADERS, Arrays, read_checksummed, write_checksummed
-from torch_pbd.movement.law import check_arrays
 from torch_pbd.persistence import plain
 from torch_pbd.registry import ESTIMATORS, MOVEMENTS, REGRESSORS
 
@@ -35,11 +31,6 @@ _PARTS = {"DMPController": "covariance_", **dict.fromkeys(MOVEMENTS, "regressor_
 _FOREIGN = re.compile(
     r"\.(pkl|pickle|joblib|skops|pt|pth|ckpt|bin|onnx|np[yz]|h5|hdf5|mat|zip|json|ya?ml|toml|csv|txt|parquet)", re.I
 )
-
-# Arrays of a controller: for each output one number, but for the forcing.
-_NOISE, _MOTION = ("noise_scale_", "noise_share_"), ("start", "velocity", "goal", "forcing")
-_HOLES = "unsampled_"  # where there are any: other files are as those of versions that knew of none
-_OF_POSES = "rotation_reference", "output_axes"  # arrays that only poses have
 
 
 def save(estimator: CovarianceRegressor | DMPController, path: str | os.PathLike[str]) -> None:
@@ -134,7 +125,7 @@ def _described(estimator: Any) -> tuple[dict[str, Any], Arrays]:
     elif {"_bend", "_known"} & set(vars(estimator)):
         raise TypeError("estimator was conditioned, which a file cannot hold: save it before, or pickle it.")
     else:
-        arrays = _controller_arrays(estimator) if isinstance(estimator, DMPController) else estimator._arrays()
+        arrays = estimator._arrays()
     if part is not None and hasattr(estimator, part):
         description[part], parts = _described(getattr(estimator, part))
         arrays |= {f"{part}.{key}": value for key, value in parts.items()}
@@ -163,12 +154,9 @@ def _restored(description: Any, arrays: Arrays, known: Mapping[str, str] = ESTIM
             raise ValueError(f"its regressor must have 1 input, time, and {estimator.n_outputs_} outputs")
         setattr(estimator, part, inner)
     rest = {key: value for key, value in arrays.items() if not key.startswith(prefix)}
-    if isinstance(estimator, DMPController):
-        _restore_controller(estimator, rest)
-    else:
-        estimator._check_parameters()
-        estimator._restore(rest)
-        estimator.predict_cov(np.zeros((1, 1)))  # of arrays that do not fit together
+    estimator._check_parameters()
+    estimator._restore(rest)
+    estimator.predict_cov(np.zeros((1, 1)))  # of arrays that do not fit together
     return estimator
 
 
@@ -209,48 +197,3 @@ def _check_numbers(name: str, array: Any) -> None:
         (factor != np.tril(factor)).any() or (np.diagonal(factor) <= 0.0).any()
     ):
         raise ValueError(f"array {name!r:.80} must be the lower factor of a positive definite matrix")
-
-
-def _controller_arrays(controller: DMPController) -> Arrays:
-    arrays = {name: getattr(controller, name) for name in _NOISE}
-    arrays |= {name: getattr(controller.reproduction_, name) for name in _MOTION}
-    if controller.unsampled_.any():
-        arrays[_HOLES] = controller.unsampled_
-    outputs = controller.outputs_
-    if outputs.reference is not None:
-        arrays |= dict(zip(_OF_POSES, (outputs.reference, outputs.axes), strict=True))
-    return arrays
-
-
-def _restore_controller(controller: Any, own: Arrays) -> None:
-    if not hasattr(controller, "covariance_"):
-        raise ValueError("its covariance is no regressor")
-    check_parameters(controller)
-    d = controller.n_outputs_
-    for name in ("names_", "units_"):
-        if (value := getattr(controller, name)) is not None:
-            if len(value) != d:
-                raise ValueError(f"{name} has {len(value)} entries, must have {d}")
-            setattr(controller, name, tuple(value))
-    own = {_HOLES: np.zeros(2), **own}  # none at the start, none at the end
-    shapes: dict[str, tuple[int | str, ...]] = dict.fromkeys((*_NOISE, *_MOTION), (d,))
-    shapes |= {"forcing": ("m", d), _HOLES: ("m",)}
-    if any(name in own for name in _OF_POSES):
-        shapes |= {"rotation_reference": (4,), "output_axes": (d, d)}
-    check_arrays(own, shapes)
-    checks.require((own[_HOLES] >= 0.0) & (own[_HOLES] <= 1.0), own[_HOLES], _HOLES, "a share from 0 to 1")
-    if min(len(own["forcing"]), len(own[_HOLES])) < 2:
-        raise ValueError(f"forcing and {_HOLES} must have a row at the start and one at the end")
-    reference, axes = own.pop("rotation_reference", None), own.pop("output_axes", np.eye(d))
-    if reference is not None and not (abs(np.linalg.norm(reference) - 1.0) < 1e-9 and np.linalg.cond(axes) < 1e12):
-        raise ValueError("its rotation_reference must be a unit quaternion, and its output_axes independent")
-    controller.outputs_ = outputs = Outputs(d) if reference is None else Outputs(d - 3, reference, axes)
-    controller.law_.blocks(d)
-    for name in (*_NOISE, _HOLES):
-        setattr(controller, name, own.pop(name))
-    controller.dmp_ = dmp = primitive(controller)
-    time = np.linspace(0.0, controller.duration_, len(own["forcing"]))
-    controller.reproduction_ = Reproduction(
-        dmp, controller.phase_input, controller.goal == "each", time=time, blocks=outputs.blocks, **own
-    )
-    controller.start_, controller.goal_ = own["start"], own["goal"]

@@ -34,12 +34,13 @@ _NEARLY_UNIT = 1e-3  # tolerance of a quaternion's norm when typed by hand
 class Outputs:
     """Outputs of a movement: ``n_positions``, and, of poses, three coordinates of a rotation in the chart around R0.
 
-    ``reference`` (4,) is R0, w x y z. What the regressor learns are z of ``y = axes z``: of poses the common axes of
-    each block, in units of its extent. Outputs are standardized one by one, which depends on their axes; and floors
-    are relative to other outputs, which must not mix m with rad.
+    ``units`` are those of the positions, if they have any; ``reference`` (4,) is R0, w x y z. What the regressor learns
+    are z of ``y = axes z``: of poses the common axes of each block, in units of its extent. Outputs are standardized
+    one by one, which depends on their axes; and floors are relative to other outputs, which must not mix m with rad.
     """
 
     n_positions: int
+    units: Sequence[str] | None = None
     reference: Floats | None = None
     axes: Floats | None = None
 
@@ -54,9 +55,30 @@ class Outputs:
         assert self.reference is not None
         return Chart(self.reference)
 
-    def units(self, units: Sequence[str] | None) -> Sequence[str] | None:
-        """Units of the positions alone, from those of all outputs."""
-        return None if units is None else units[: self.n_positions]
+    @property
+    def unit(self) -> str | None:
+        """Common unit of the positions; None if they have none, or several."""
+        return self.units[0] if self.units is not None and len(set(self.units)) == 1 else None
+
+    @property
+    def si(self) -> float:
+        """Metres or radians per unit of position; 1, and stiffness in N per unit, where it is neither or unknown."""
+        return (LENGTHS | ANGLES).get(self.unit or "", 1.0)
+
+    @property
+    def robot_unit(self) -> str | None:
+        """Unit of the positions of a robot that follows the movement."""
+        return "m" if self.unit in LENGTHS else "rad" if self.unit in ANGLES else self.unit
+
+    @property
+    def in_metres(self) -> bool:
+        """Whether a robot's positions are in m, which is also assumed without units."""
+        return self.units is None or self.robot_unit == "m"
+
+    @property
+    def scales(self) -> Floats:
+        """Metres or radians per unit of each output (d,)."""
+        return np.array([self.si] * self.n_positions + [1.0] * (0 if self.reference is None else 3))
 
     def extents(self, varying: Floats) -> Floats:
         """Extent (d,) of what varies (K, n, d), block by block: the diagonal of its box; of poses one that turns.
@@ -101,7 +123,7 @@ class Outputs:
         """Outputs (..., d) from coordinates z."""
         return coordinates if self.axes is None else coordinates @ self.axes.T
 
-    def covariance(self, learned: Floats, path: Floats | None = None) -> Floats:
+    def covariance(self, learned: Floats, path: Floats | None = None, *, cross_terms: bool = True) -> Floats:
         """Covariances (n, d, d) of outputs from those of z; at poses ``path`` (n, d) in world axes.
 
         Covariances in the chart equal those in world axes only near its reference: its axes are turned by up to half
@@ -116,19 +138,26 @@ class Outputs:
             to_world[:, p:, p:] = self._chart.to_world(path[:, p:])
             turn = to_world @ turn
         whole = turn @ learned @ np.swapaxes(turn, -1, -2)
-        return 0.5 * (whole + np.swapaxes(whole, -1, -2))
+        whole = 0.5 * (whole + np.swapaxes(whole, -1, -2))
+        if not cross_terms:
+            # All outputs are learned at once, but what few demonstrations say of how positions and rotations vary
+            # together does not hold for others: without it, those left out are as likely, or likelier.
+            positions, rotations = self.blocks
+            whole[:, positions, rotations] = whole[:, rotations, positions] = 0.0
+        return whole
 
     def poses(self, path: Floats) -> tuple[Floats, Floats]:
         """Positions (n, p) and quaternions (n, 4) from outputs (n, d)."""
         return path[..., : self.n_positions], self._chart.exp(path[..., self.n_positions :])
 
-    def motion(self, path: Floats, velocity: Floats, acceleration: Floats, unit: float) -> dict[str, Floats]:
-        """Schedule rows in world axes from a motion (n, d) whose positions are in units of ``unit`` m."""
+    def motion(self, path: Floats, velocity: Floats, acceleration: Floats) -> dict[str, Floats]:
+        """Schedule rows in m and rad, in world axes, from a motion (n, d)."""
+        unit = self.si
         if self.reference is None:
             return {"position": unit * path, "velocity": unit * velocity, "acceleration": unit * acceleration}
         p, chart = self.n_positions, self._chart
         position, orientation = self.poses(path)
-        y, rate, second = (part[:, p:] for part in (path, velocity, acceleration))
+        y, rate, second = path[:, p:], velocity[:, p:], acceleration[:, p:]
         return {
             "position": unit * position,
             "velocity": np.hstack([unit * velocity[:, :p], chart.velocity(y, rate)]),
@@ -141,10 +170,6 @@ class Outputs:
         if given is not None:
             return given
         return 1.0 if self.reference is None else np.diag([1.0] * self.n_positions + [LEVER**2] * 3)
-
-    def scales(self, unit: float) -> Floats:
-        """Units of outputs (d,) in m and rad, where positions are in units of ``unit`` m."""
-        return np.concatenate([np.full(self.n_positions, unit), np.ones(0 if self.reference is None else 3)])
 
     def rows(self, values: Any, name: str) -> Floats:
         """Outputs (..., d) of positions followed by a unit quaternion w x y z, or as they are; NaN where not given."""
@@ -177,44 +202,13 @@ class Outputs:
         return given
 
 
-def common_unit(units: Sequence[str] | None) -> str | None:
-    """Common unit of all outputs; None if they have none, or several."""
-    return units[0] if units is not None and len(set(units)) == 1 else None
-
-
-def in_si(units: Sequence[str] | None) -> float:
-    """Metres or radians per unit of position; 1 where units are unknown, differ, or are neither.
-
-    Stiffness is then in N per unit, and mass in N s^2 per unit.
-    """
-    return (LENGTHS | ANGLES).get(common_unit(units) or "", 1.0)
-
-
-def robot_unit(units: Sequence[str] | None) -> str | None:
-    """Unit of the positions of a robot that follows recordings in these units."""
-    common = common_unit(units)
-    return "m" if common in LENGTHS else "rad" if common in ANGLES else common
-
-
-def counts_as_metres(units: Sequence[str] | None) -> bool:
-    """Whether schedules of recordings in these units are in m, which is also assumed without units."""
-    return units is None or robot_unit(units) == "m"
-
-
 def common_axes(deviation: Floats, degrees: NDArray[np.integer], least: float) -> Floats:
     """Axes (d, d), its columns, that the covariances of deviations (K, n, d) within times have nearly in common.
 
-    Maximum likelihood of common principal components: the sum over times, ``degrees`` (n,) of freedom each, of the log
-    variances along the axes is least, so that each time counts by its shape, however large it is. Before, they are
-    shrunk towards spheres, by the oracle approximating estimate: times that are no less round than chance would have
-    it, of so few demonstrations, count little. Standard deviations below ``least`` count as none. In ascending order of
-    the mean log variance.
-
-    References
-    ----------
-    B. Flury, "Common principal components in k groups", Journal of the American Statistical Association 79, 1984.
-    Y. Chen, A. Wiesel, Y. Eldar, A. Hero, "Shrinkage algorithms for MMSE covariance estimation", IEEE Transactions on
-    Signal Processing 58, 2010.
+    Maximum likelihood of common principal components (B. Flury, Journal of the American Statistical Association 79,
+    1984): the sum over times, ``degrees`` (n,) of freedom each, of the log variances along the axes is least, so that
+    each time counts by its shape, however large it is. Before, they are shrunk towards spheres: times that are no less
+    round than chance would have it, of so few demonstrations, count little. Deviations below ``least`` count as none.
     """
     scatter, free = np.einsum("kni,knj->nij", deviation, deviation), np.maximum(degrees, 0)[:, np.newaxis, np.newaxis]
     covariances = _shrunk(scatter / np.maximum(free, 1) + least**2 * np.eye(scatter.shape[-1]), free)
@@ -237,10 +231,14 @@ def common_axes(deviation: Floats, degrees: NDArray[np.integer], least: float) -
 
 
 def _shrunk(covariances: Floats, free: Floats) -> Floats:
-    """Covariances (n, d, d) nearer to spheres: the nearer, the rounder they are, and the fewer degrees they have."""
+    """Covariances (n, d, d) nearer to spheres: the nearer, the rounder they are, and the fewer degrees they have.
+
+    Y. Chen, A. Wiesel, Y. Eldar, A. Hero, "Shrinkage algorithms for MMSE covariance estimation", IEEE Transactions on
+    Signal Processing 58, 2010, equation (23).
+    """
     d, trace = covariances.shape[-1], np.trace(covariances, axis1=1, axis2=2)[:, np.newaxis, np.newaxis]
     square = (covariances**2).sum(axis=(1, 2), keepdims=True)
-    chance = (1.0 - 2.0 / d) * square + trace**2  # Chen's equation (23)
+    chance = (1.0 - 2.0 / d) * square + trace**2
     share = chance / np.maximum(chance, (free + 1.0 - 2.0 / d) * (square - trace**2 / d))
     return (1.0 - share) * covariances + share * trace / d * np.eye(d)
 

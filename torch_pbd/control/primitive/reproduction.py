@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicHermiteSpline
+from scipy.interpolate import CubicHermiteSpline, PPoly
 from torch import Tensor
 
 from torch_pbd import checks
@@ -46,39 +46,39 @@ _Path = tuple[Floats, Floats, Floats]  # position, velocity and acceleration (n,
 class Reproduction:
     """Movement primitive with its forcing, and the motion that follows from them.
 
-    From ``start`` (d,) with ``velocity`` (d,) to ``goal`` (d,), by the ``forcing`` (m, d), which is linear between its
-    times (m,) from 0 to the duration, held after it, and was learned over what ``phase_input`` says. With ``own_goals``
-    the goal in eq. (18) is the end of each movement, else the common one. ``blocks`` of outputs share a unit.
+    From ``start`` (d,) with ``velocity`` (d,) to ``goal`` (d,), by the ``forcing`` (m, d), which is linear between even
+    times from 0 to the duration, held after it, and was learned over what ``phase_input`` says. With ``own_goals`` the
+    goal in eq. (18) is the end of each movement, else the common one. ``blocks`` of outputs share a unit.
     """
 
     dmp: DMP
     phase_input: str
     own_goals: bool
+    blocks: tuple[slice, ...]
     start: Floats
     velocity: Floats
     goal: Floats
-    time: Floats
     forcing: Floats
-    blocks: tuple[slice, ...]
 
     @classmethod
-    def learn(
-        cls, dmp: DMP, movements: Movements, phase_input: str, *, own_goals: bool, blocks: tuple[slice, ...]
-    ) -> "Reproduction":
+    def learn(cls, movements: Movements, *settings: Any, blocks: tuple[slice, ...], own_goals: bool) -> "Reproduction":
         """Fit the forcing of the mean movement, eq. (18), and tabulate it over the duration."""
-        position = movements.position
-        start, velocity = position[:, 0].mean(axis=0), movements.velocity[:, 0].mean(axis=0)
-        goal = position[:, -1].mean(axis=0)
-        time = np.linspace(0.0, movements.time[-1], _TICKS + 1)
-        still = np.zeros((len(time), len(goal)))
-        known = cls(dmp, phase_input, own_goals, start, velocity, goal, time, still, blocks)
+        start, goal = movements.position[:, 0].mean(axis=0), movements.position[:, -1].mean(axis=0)
+        ends = {"start": start, "velocity": movements.velocity[:, 0].mean(axis=0), "goal": goal}
+        still = np.zeros((_TICKS + 1, len(goal)))
+        known = cls(*settings, own_goals=own_goals, blocks=blocks, forcing=still, **ends)
         mean = known.forcing_of(movements).mean(axis=0)
         # Poses use the principal axes of each block, since outputs are learned one by one and frames must not matter.
         axes, deviation = np.eye(len(goal)), mean - mean.mean(axis=0)
         for own in blocks if len(blocks) > 1 else ():
             axes[own, own] = np.linalg.eigh(deviation[:, own].T @ deviation[:, own])[1]
-        learned = _process_mean(known.phase(movements.time), mean @ axes, len(position), known.phase(time))
-        return replace(known, forcing=learned @ axes.T)
+        n_demos, inputs = len(movements.position), known.phase(movements.time)
+        return replace(known, forcing=_process_mean(inputs, mean @ axes, n_demos, known.phase(known.time)) @ axes.T)
+
+    @cached_property
+    def time(self) -> Floats:
+        """Times (m,) of the forcing."""
+        return np.linspace(0.0, self.dmp.duration or 0.0, len(self.forcing))
 
     def phase(self, time: Floats) -> Floats:
         """Inputs (n, 1) of the regressors at movement times (n,): the phase, its logarithm, or the time itself."""
@@ -127,12 +127,10 @@ class Reproduction:
                     "robot at rest needs a ramp at the start, and settle > 0 at the end."
                 )
 
-    def motion(self, time: Floats) -> tuple[Floats, Floats, Floats]:
+    def motion(self, time: Floats) -> _Path:
         """Position, velocity and acceleration (n, d) at any times (n,): at rest before 0, and long after the end."""
-        curve, end = self._curve, self._curve.x[-1]
-        within = np.clip(time, 0.0, end)
-        moving = ((time >= 0.0) & (time <= end))[:, np.newaxis]
-        return curve(within), np.where(moving, curve(within, 1), 0.0), np.where(moving, curve(within, 2), 0.0)
+        position, velocity, acceleration = (held(self._curve, time, order) for order in range(3))
+        return position, velocity, acceleration
 
     @cached_property
     def _curve(self) -> CubicHermiteSpline:
@@ -155,19 +153,16 @@ class Reproduction:
         return CubicHermiteSpline(time, positions, velocities, axis=0)
 
     def plan(
-        self, time: Floats, goal: ArrayLike | None, start: ArrayLike | None, speed: float
+        self, time: Floats, goal: Floats | None, start: Floats | None, speed: float
     ) -> tuple[Floats, Floats, Floats, Floats]:
         """Position, velocity and acceleration (n, d) at times (n,) from 0, and movement time (n,) of the gains there.
 
         To goals (d,) or (n, d), from a start (d,), None for those demonstrated. With adaptation="safe" it brakes to
         rest at the end of the movement, if the times go on after it.
         """
-        begin = self.start if start is None else checks.array(start, "start", self.start.shape)
-        goals, shape = self.goal, (len(time), *self.goal.shape)
-        if goal is not None:
-            goals = checks.real_floats(goal, "goal")
-            goals = checks.array(goals, "goal", shape if goals.ndim > 1 else shape[1:])
-        goals, passed = np.broadcast_to(goals, shape), speed * time
+        begin = self.start if start is None else start
+        goals = np.broadcast_to(self.goal if goal is None else goal, (len(time), len(self.goal)))
+        passed = speed * time
         plan = self._safe if self.dmp.adaptation == "safe" else self._additive
         (position, velocity, acceleration), known = plan(passed, goals, begin, goal is not None or start is not None)
         return position, speed * velocity, speed**2 * acceleration, known
@@ -225,17 +220,16 @@ class Reproduction:
         return np.minimum(moved, end), rate, slope, np.maximum(moved, passed - 0.5 * brake)
 
 
+def held(curve: PPoly, time: Floats, order: int = 0) -> Floats:
+    """Values (n, d) of a curve at times (n,), or a derivative; constant before its start and after its end."""
+    within = np.clip(time, curve.x[0], curve.x[-1])
+    values: Floats = curve(within, order)
+    return values if order == 0 else np.where((within == time)[:, np.newaxis], values, 0.0)
+
+
 def primitive(controller: Any) -> DMP:
-    """Primitive of a controller whose duration is known; with adaptation="safe" its tau is that of 10 s."""
-    tau = float(controller.tau) * (controller.duration_ / 10.0 if controller.adaptation == "safe" else 1.0)
-    options = {"duration": controller.duration_, "gate": controller.gate, "adaptation": controller.adaptation}
-    beta = None if controller.beta is None else float(controller.beta)
-    return DMP(float(controller.alpha), beta, float(controller.gamma), tau, **options)
-
-
-def check_against_duration(controller: Any) -> None:
-    """Check parameters whose valid range depends on the duration of the movement."""
-    dmp, duration, cutoff = controller.dmp_, controller.duration_, controller.cutoff_
+    """Primitive of a controller, whose parameters are checked for its duration; a "safe" tau is that of 10 s."""
+    duration, cutoff, phase_input = controller.duration_, controller.cutoff_, controller.phase_input
     checks.number(duration, "duration", least=_BRIEFEST, most=1.0 / _BRIEFEST, unit="s")
     if cutoff is not None and not _CYCLES[0] <= cutoff * duration <= _CYCLES[1]:
         # Where the automatic one too would be out of range, the times are in another unit than they say.
@@ -246,17 +240,22 @@ def check_against_duration(controller: Any) -> None:
             f"cutoff is {cutoff:g} Hz, {cutoff * duration:.3g} cycles in a movement of {duration:.3g} s, must be "
             f"{_CYCLES[0]:g} to {_CYCLES[1]:g} of them: {remedy}."
         )
+    beta = None if controller.beta is None else float(controller.beta)
+    tau = float(controller.tau) * (duration / 10.0 if controller.adaptation == "safe" else 1.0)
+    options = {"duration": duration, "gate": controller.gate, "adaptation": controller.adaptation}
+    dmp = DMP(float(controller.alpha), beta, float(controller.gamma), tau, **options)
     ranges = [("alpha", dmp.alpha, _CONSTANTS), ("beta", math.sqrt(dmp.alpha) * math.sqrt(dmp.beta), (0.0, 1e12))]
     ranges += [("gamma", dmp.gamma, _GATE_CONSTANTS)] if dmp.gate == "phase" else []
-    ranges += [("gamma", dmp.gamma, _DECAY[controller.phase_input])] if controller.phase_input != "time" else []
+    ranges += [("gamma", dmp.gamma, _DECAY[phase_input])] if phase_input != "time" else []
     for name, rate, (least, most) in ranges:
         constants = rate * duration / dmp.tau
         if not least <= constants <= most:
             raise ValueError(
                 f"{name} is {getattr(dmp, name):g} and tau is {dmp.tau:g} s, {constants:.3g} time constants in a "
                 f"movement of {duration:.3g} s, must be {least:g} to {most:g} of them with gate={dmp.gate!r}, "
-                f"phase_input={controller.phase_input!r}: leave them as they are by default."
+                f"phase_input={phase_input!r}: leave them as they are by default."
             )
+    return dmp
 
 
 def _process_mean(X: Floats, forcing: Floats, n_demos: int, at: Floats) -> Floats:
