@@ -153,7 +153,7 @@ def test_positions_alone_have_their_acceleration_too(adaptation, options):
 def test_covariances_are_those_of_deviations_at_the_pose(rng):
     """Against the deviations themselves: at 100 degrees from the reference the chart is off by 43 degrees."""
     root = 1e-4 * rng.normal(size=(6, 6))
-    outputs = Outputs(3, exp(np.array([0.2, 0.9, -0.5])), np.eye(6))
+    outputs = Outputs(3, None, exp(np.array([0.2, 0.9, -0.5])), np.eye(6))
     path = np.hstack([np.zeros(3), 1.8 * np.array([0.6, 0.0, 0.8])])
     steps = path + np.concatenate([root.T, -root.T])
     positions, orientations = outputs.poses(steps)
