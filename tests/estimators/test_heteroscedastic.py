@@ -182,6 +182,27 @@ def test_where_demonstrations_agree_at_an_end_nothing_of_the_prior_is_left():
     assert model.predict_uncertainty(X[[0, 250]]).type1.max() < 1e-9
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_where_all_were_rounded_to_one_value_nothing_is_certain(seed):
+    """The tunnel's y has 2 um of noise, rounded to 5 um: at some steps six demonstrations are equal to the bit."""
+    y = make_tunnel_demonstrations(206, rate=10.0, random_state=seed).to_array()
+    grid = np.linspace(0.0, 1.0, 101)[:, np.newaxis]
+    model = HeteroscedasticGPRegressor().fit(np.tile(grid, (6, 1)), y[:6].reshape(-1, 2), np.repeat(np.arange(6), 101))
+    assert (np.ptp(y[:6, :, 1], axis=0) == 0.0).any()
+    mean, covariance = model.predict(grid, return_cov=True)
+    rms = np.sqrt(np.square(y[6:, :, 1] - mean[:, 1]).mean(0) / covariance[:, 1, 1])
+    assert rms.max() < 2.0
+    assert np.median(rms) == pytest.approx(1.0, abs=0.2)
+
+
+def test_values_that_are_multiples_of_a_step_by_themselves_are_not_rounded():
+    """At a constant speed y is a multiple of the way in a step, of which it is no rounding."""
+    steps = np.tile(np.arange(50.0), 6)
+    y = np.column_stack([np.random.default_rng(0).normal(size=300), 0.1 * steps])
+    model = HeteroscedasticGPRegressor().fit(steps[:, np.newaxis], y, groups=np.repeat(np.arange(6), 50))
+    assert np.sqrt(model.predict_cov(steps[:50, np.newaxis])[:, 1, 1]).max() < 1e-4
+
+
 def test_no_end_is_stretched_without_need():
     model, _ = fitted_to_collapsing(None, 100)
     assert not hasattr(model.module_.core, "stretch")

@@ -28,6 +28,7 @@ from torch_pbd.models.heteroscedastic.residuals import (
     NoiseCorrelation,
     demonstration_correlation,
     is_signal,
+    quantum,
 )
 from torch_pbd.models.heteroscedastic.search import Families, Search, SearchOptions, on_stretched_inputs, stretched
 from torch_pbd.models.heteroscedastic.steps import MOST_INPUTS, CovarianceSearch, fit_covariance, fit_mean, mean_start
@@ -77,6 +78,7 @@ class HeteroscedasticFit:
     def __post_init__(self) -> None:
         self._n_outputs = self.training.y.shape[1]
         self.n_demos = 1 if self.group is None else int(self.group.max()) + 1
+        self._quantum = quantum(self.training.y)
         self._mean_search = Search(self.families.mean, self._n_outputs, self.options)
         self._begin_covariance(self.families.log_variance)
 
@@ -181,6 +183,16 @@ class HeteroscedasticFit:
         """Residuals multiplied by the inverse of C."""
         return torch.linalg.solve_triangular(self.pooled_tril, self.residual.mT, upper=False).mT
 
+    def above_rounding(self, scatter: Float[Tensor, "n d d"]) -> Float[Tensor, "n d d"]:
+        """Scatter at each input with no output's less than that of rounding, q^2 / 12 for each row.
+
+        Where all demonstrations were rounded to one value their variance is not zero, but unknown below this.
+        """
+        rounding = torch.linalg.solve_triangular(self.pooled_tril, self._quantum.diag() / 12.0**0.5, upper=False)
+        # At most the pooled variance, which is one: at a constant speed values are multiples of a step by themselves.
+        least = self.training.counts[:, None] * rounding.square().sum(1).clamp_max(1.0)
+        return scatter + torch.diag_embed((least - scatter.diagonal(dim1=1, dim2=2)).clamp_min(0.0))
+
     def whitened(self) -> Float[Tensor, "rows d"]:
         """Residuals of unit covariance at each input."""
         assert self.covariance is not None
@@ -236,7 +248,7 @@ def fit_heteroscedastic(
             fit.pooled_tril = _pooled_tril(fit.residual, share)
         # w = inv(C) r of each row; at each input their scatter S, the sum of w w', and its degrees of freedom.
         root, part = training.scatter_root(fit.normal()), first_part if turn == 0 else 1.0
-        scatter, degrees = part * (root @ root.mT), part * training.sums(share).mT
+        scatter, degrees = part * fit.above_rounding(root @ root.mT), part * training.sums(share).mT
         noise = fit.noise_correlation(training, squares=True)
         if turn == 1:
             fit.stretch_ends(noise)

@@ -34,6 +34,10 @@ _SHARE_OF_THIRD = 0.433  # independent ones among third differences of white noi
 _CONSTANT = 1e-20  # variance of an output that does not vary
 _LEAST = 1e-300  # a divisor that is zero gives zero and not NaN
 
+# Differences below this share of an output's largest value are floating point's. So many others, all multiples of the
+# least to within so much of it (float32), are no chance: once in 10^15. The two states of a gripper are too few.
+_SAME, _FEWEST_STEPS, _OFF_STEP = 1e-12, 15, 0.05
+
 _N_BINS = 50  # bins of the distance between samples, up to the range of the inputs
 _MAX_SAMPLES = 400  # most samples used of one demonstration; longer ones are thinned
 _MAX_PAIRS = 100_000  # most pairs of samples compared at once, to bound memory
@@ -110,6 +114,18 @@ def _too_smooth(training: TrainingSet) -> Bool[Tensor, " d"]:
     chance = torch.special.gammainc(half, half * ratio)
     smooth = (chance < _LEVEL) & (ratio < _SMOOTH) & (expected > _CONSTANT)
     return smooth & training.repeats_inputs & (counts.min() > 1.0)
+
+
+def quantum(y: Float[Tensor, "rows d"]) -> Float[Tensor, " d"]:
+    """Step of which the values of each output are multiples, as encoders and pixels give them; zero if of none."""
+    steps = []
+    for values in y.mT:
+        difference = values.unique().diff()
+        difference = difference[difference > _SAME * values.abs().max()]
+        step = float(difference.min()) if len(difference) >= _FEWEST_STEPS else 0.0
+        multiple = difference / step
+        steps.append(step if bool(((multiple - multiple.round()).abs() < _OFF_STEP).all()) else 0.0)
+    return torch.tensor(steps).to(y)
 
 
 class NoiseCorrelation(NamedTuple):
