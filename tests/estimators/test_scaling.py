@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from torch_pbd.estimators.torch_estimator import Standardization, distinct_rows, spread_of
+from torch_pbd.estimators.door import Standardization, distinct_rows, spread_of
 
 
 @pytest.mark.parametrize("e", [1, 2, 3])

@@ -176,6 +176,16 @@ def test_labels_of_any_sound_kind_are_the_same_demonstrations():
         np.testing.assert_array_equal(new("heteroscedastic").fit(X, y, groups=same).predict_cov(X[:8]), expected)
 
 
+@pytest.mark.parametrize("name", DEFAULTS)
+def test_demonstrations_in_the_place_of_arrays_are_refused_with_the_way_to_make_arrays_of_them(name):
+    strokes = make_tunnel_demonstrations(random_state=0)
+    remedy = r"^X is of type Demonstrations, must be an array: use X, y, groups = demonstrations\.stack\(\)\.$"
+    with pytest.raises(ValueError, match=remedy):
+        new(name).fit(strokes)
+    with pytest.raises(ValueError, match=remedy):
+        fitted(name).predict(strokes)
+
+
 @pytest.mark.parametrize("weights", [[1.0], np.full(96, np.nan), -np.ones(96), np.zeros(96), ["a"] * 96])
 def test_weights_that_are_none_are_refused(weights):
     with pytest.raises(ValueError, match="sample_weight"):

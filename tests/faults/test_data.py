@@ -16,7 +16,7 @@ from sklearn import config_context
 import torch_pbd.files.memory
 from torch_pbd import CholeskyCovRegressor, DMPController, GMMBaseline, WishartProcessRegressor
 from torch_pbd.data import make_tunnel_demonstrations
-from torch_pbd.estimators.base import by_chunks
+from torch_pbd.estimators.door import by_chunks
 from torch_pbd.exceptions import DataRankWarning, UnimodalityWarning
 from torch_pbd.models.heteroscedastic import check_memory
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torch_pbd.estimators.base import CovarianceRegressor
-from torch_pbd.estimators.torch_estimator import Standardization
+from torch_pbd.estimators.door import Standardization
 from torch_pbd.estimators.validation import CONSTANT
 
 Floats = NDArray[np.float64]

@@ -7,7 +7,7 @@ import numpy as np
 from torch_pbd.checks import Floats
 from torch_pbd.control.matrices import damping_from_stiffness
 from torch_pbd.control.primitive.smoothing import UNKNOWN
-from torch_pbd.estimators.base import prior_covariance
+from torch_pbd.estimators.door import prior_covariance
 
 _FAR = 1e6  # distance in ranges of the input at which only the prior remains
 _AT_ONCE = 2**14  # times predicted at once: a regressor may need a hundred times the memory of its predictions

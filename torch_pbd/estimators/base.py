@@ -1,27 +1,48 @@
-"""Predictions of the covariance regressors, and their priors and other parameters in the units of the data."""
+"""Interface of the covariance regressors: rows are checked and ordered, a torch module learns them and predicts."""
 
+import inspect
+import sys
+from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
+from sklearn.base import MultiOutputMixin, RegressorMixin
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.utils._tags import Tags
 from sklearn.utils.validation import check_is_fitted
 from torch import Tensor
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.estimators.torch_estimator import TorchEstimator
+from torch_pbd.console import say
+from torch_pbd.estimators import validation
+from torch_pbd.estimators.door import Integers, Standardization, TorchEstimator
 from torch_pbd.estimators.validation import checked_queries, checked_rows
 from torch_pbd.files.memory import require_much
-from torch_pbd.linalg import gaussian_log_density, safe_cholesky, student_log_density
+from torch_pbd.linalg import gaussian_log_density, student_log_density
+from torch_pbd.models import Core
+from torch_pbd.models.conditional import ConditionalNormal
+from torch_pbd.optim import FitReport, Progress, Status
 
-Prior = float | list[list[float]] | str | Callable[[Any], Any] | None  # forms that YAML can express; or any array-like
+Fit = tuple[Core, Standardization, FitReport, float]
+"""Fitted core, the units of its inputs and outputs, how the fit ended, and the jitter."""
 
-_SHORTEST_PERIOD = 1e-8  # share of the input's range: ten decimals of a standardized input leave such a phase two
-# Shares of the variance of y beyond which the floor under variances shows far from data, or the prior near them.
-_LOWEST, _HIGHEST = 1e-6, 1e6
-_CHUNK = 1024  # rows: what a prediction needs on the way is then some tens of MB for ten outputs
+# What the docstrings of all regressors have in common, in the place of {common}.
+_COMMON = """device : str or None, default=None
+    Device of the torch module.
+verbose : int, default=0
+
+Attributes
+----------
+module_ : ConditionalNormal
+    The fitted torch module: maps x (n, e) to mean (n, d) and Cholesky factor (n, d, d), differentiably.
+n_features_in_, n_outputs_ : int
+n_iter_ : int
+converged_ : bool
+loss_curve_ : list of float"""
 
 
 class Uncertainty(NamedTuple):
@@ -33,8 +54,119 @@ class Uncertainty(NamedTuple):
     """(n, d, d): variability of the data, with the prior taken out; squared units of y."""
 
 
-class CovarianceRegressor(TorchEstimator):
-    """Base of the regressors whose covariance depends on the input; not for direct use."""
+class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator):
+    """Base of the regressors whose covariance depends on the input; not for direct use.
+
+    They are dataclasses whose fields are the parameters: scikit-learn requires ``__init__`` to store them and do
+    nothing else.
+    """
+
+    max_iter: int
+    tol: float
+    verbose: int
+    n_restarts: int
+    random_state: Any
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        cls.__doc__ = inspect.cleandoc(cls.__doc__ or "").replace("{common}", _COMMON)
+
+    def __sklearn_tags__(self) -> Tags:
+        tags = super().__sklearn_tags__()
+        tags.regressor_tags.poor_score = True  # score is a log-likelihood, not R^2
+        return tags
+
+    def fit(self, X: ArrayLike, y: ArrayLike | None = None, groups: ArrayLike | None = None) -> Self:
+        """Learn mean and covariance.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_features)
+            Time, phase or position of each sample. Rows that repeat exactly are aligned demonstrations.
+        y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+            Recorded outputs of each sample.
+        groups : array-like of shape (n_samples,), default=None
+            Label of each sample's demonstration. HeteroscedasticGPRegressor learns how the samples of a demonstration
+            repeat each other; without labels rows count as independent, and recorded demonstrations look more certain
+            than they are. Other regressors use them only to warn of too few.
+
+        Returns
+        -------
+        self
+
+        Raises
+        ------
+        ValueError
+            If X, y, groups or a parameter is invalid; the message names it and the remedy.
+
+        Warns
+        -----
+        DataRankWarning
+            If there are no more demonstrations, or rows, than outputs; or if no groups are given although neighbouring
+            rows are nearly equal, as samples of a demonstration are (HeteroscedasticGPRegressor).
+        UnimodalityWarning
+            If demonstrations over one input seem to have several modes (HeteroscedasticGPRegressor).
+        ConvergenceWarning
+            If the fit stopped early; the best point found is kept.
+        """
+        self.__dict__.pop("module_", None)  # a fit that fails leaves no mixture of two
+        self._check_parameters()
+        # Column-major order makes operations on each column many times as fast.
+        inputs, targets = map(np.asfortranarray, checked_rows(self, X, y, ensure_min_samples=2))
+        validation.check_squares(inputs, "X")
+        validation.check_squares(targets, "y")
+        validation.check_inputs_vary(inputs)
+        inputs = validation.without_rounding(inputs)
+        self._y_is_1d = targets.ndim == 1
+        self.n_outputs_ = 1 if self._y_is_1d else targets.shape[1]
+        targets = targets.reshape(len(inputs), -1, order="F")
+        # Rows are sorted, so that results do not depend on the order in which they are given.
+        order = np.lexsort(np.hstack([inputs, targets]).T)
+        numbers = None if groups is None else validation.check_groups(groups, len(inputs))[order]
+        with torch.inference_mode(False), torch.enable_grad():
+            rows = inputs.T.take(order, axis=1).T, targets.T.take(order, axis=1).T
+            core, scaling, report, self.jitter_ = self._fit(*rows, groups=numbers, recorded=order.argsort())
+            units = scaling.x_shift, scaling.x_scale, scaling.y_shift, scaling.y_scale
+            self.module_ = ConditionalNormal(core, *map(self._door, units)).requires_grad_(False)
+        self.n_iter_ = max(1, report.n_iter)
+        self.loss_, self.loss_curve_, self.converged_ = report.loss, list(report.loss_curve), report.converged
+        if not report.converged:
+            more = f"max_iter (now {self.max_iter}) or " if report.status is Status.MAX_ITER else ""
+            checks.warn(
+                f"{type(self).__name__} stopped early: {report.message}. The best point found is kept; "
+                f"raise {more}tol (now {self.tol:g}).",
+                ConvergenceWarning,
+            )
+        return self
+
+    @abstractmethod
+    def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, recorded: Integers) -> Fit:
+        """Fit to validated arrays (n, e) and (n, d).
+
+        ``groups`` has the number of each row's demonstration, ``recorded`` the rows in the order of their recording.
+        """
+
+    def _check_parameters(self) -> None:
+        """Check the parameters whose values do not depend on the data; subclasses check theirs too."""
+        checks.count(self.max_iter, "max_iter", least=1)
+        checks.number(self.tol, "tol", above=0.0)
+        checks.count(self.n_restarts, "n_restarts", least=0)
+        if not isinstance(self.verbose, bool):
+            checks.count(self.verbose, "verbose", least=0)
+        checks.seed(self.random_state)
+        if problem := self._device_problem():
+            raise ValueError(f"device is {self.device!r}, which cannot be used here: {problem}. None is the CPU.")
+
+    def _progress(self) -> Callable[[Progress], None] | None:
+        """Callback that prints the loss to the error output, more often for higher ``verbose``; None if it is 0."""
+
+        def show(progress: Progress) -> None:
+            count = progress.n_evaluations
+            if count < 5 or count % max(1, 10 // self.verbose) in (0, 1):
+                text = f"evaluation {count:5d}  loss {progress.loss:14.6f}  {progress.elapsed:7.2f} s"
+                say(f"{type(self).__name__}: {text}", sys.stderr)
+
+        return show if self.verbose else None
 
     def predict(self, X: ArrayLike, *, return_std: bool = False, return_cov: bool = False) -> Any:
         """Mean of y at X, and with it the standard deviations or the covariances.
@@ -62,11 +194,14 @@ class CovarianceRegressor(TorchEstimator):
         moments = self._arrays(lambda x: self.module_.moments(x, *self._prior_tril_at(x)), inputs)
         return shaped_as_y(*moments, y_is_1d=self._y_is_1d, return_cov=return_cov)
 
-    def predict_cov(self, X: ArrayLike) -> Floats:
+    def predict_cov(self, X: ArrayLike, *, missing_knowledge: bool = True) -> Floats:
         """Covariances of the outputs at X: (n_samples, n_outputs, n_outputs), also for one output.
 
-        They are symmetric to the last bit, positive definite, and in squared units of y.
+        They are symmetric to the last bit, positive definite, and in squared units of y. Without ``missing_knowledge``
+        they are the variability alone, ``type2`` of :meth:`predict_uncertainty`, not always definite.
         """
+        if not missing_knowledge:
+            return self.predict_uncertainty(X).type2
         inputs = checked_queries(self, X)
         return self._arrays(lambda x: (self.module_.covariance(x, *self._prior_tril_at(x)),), inputs)[0]
 
@@ -77,7 +212,12 @@ class CovarianceRegressor(TorchEstimator):
 
     def predict_df(self, X: ArrayLike) -> Floats:
         """Degrees of freedom of the predictive density at X: (n_samples,), infinite where it is normal."""
-        return self._degrees(checked_queries(self, X))
+
+        def degrees(x: Tensor) -> tuple[Tensor]:
+            found = self.module_.degrees(x)
+            return (torch.full_like(x[:, 0], torch.inf) if found is None else found,)
+
+        return self._arrays(degrees, checked_queries(self, X))[0]
 
     def log_likelihood(self, X: ArrayLike, y: ArrayLike) -> Floats:
         """Log density of each row of y at X, in nats: (n_samples,)."""
@@ -136,35 +276,12 @@ class CovarianceRegressor(TorchEstimator):
         normal = generator.standard_normal((*mean.shape, n_samples))
         # Student's t of this covariance: normal numbers times the root of (df - 2) over a chi-squared number, which is
         # a gamma number of shape df / 2 and scale 2.
-        degrees = self._degrees(inputs)[:, np.newaxis]
+        degrees = self.predict_df(inputs)[:, np.newaxis]
         if np.isfinite(degrees).any():  # everywhere or nowhere
             squares = generator.gamma(0.5 * degrees, 2.0, size=(len(inputs), n_samples))
             normal *= np.sqrt((degrees - 2.0) / squares)[:, np.newaxis]
         samples = mean[:, :, np.newaxis] + scale_tril @ normal
         return samples[:, 0] if self._y_is_1d else samples
-
-    def _degrees(self, X: Floats) -> Floats:
-        def degrees(x: Tensor) -> tuple[Tensor]:
-            found = self.module_.degrees(x)
-            return (torch.full_like(x[:, 0], torch.inf) if found is None else found,)
-
-        return self._arrays(degrees, X)[0]
-
-    def _prior_tril_at(self, x: Tensor) -> tuple[Tensor, ...]:
-        """Factor of the prior at x, where it depends on x; else nothing, as the module has it."""
-        prior = getattr(self, "prior", None)
-        if not callable(prior):
-            return ()
-        covariance = prior_covariance(prior, x.cpu().numpy(), self.n_outputs_)
-        return (safe_cholesky(self._door(covariance), name="prior(X)"),)
-
-    def _query(self, X: ArrayLike) -> Tensor:
-        return self._door(checked_queries(self, X))
-
-    def _arrays(self, function: Callable[[Tensor], Any], X: Floats) -> tuple[Floats, ...]:
-        """Arrays that a function of tensors gives for rows, a bounded number at a time."""
-        with torch.inference_mode():
-            return tuple(part.cpu().numpy() for part in by_chunks(function, self._door(X)))
 
 
 def shaped_as_y(mean: Floats, covariance: Floats, *, y_is_1d: bool, return_cov: bool) -> tuple[Floats, Floats]:
@@ -175,94 +292,3 @@ def shaped_as_y(mean: Floats, covariance: Floats, *, y_is_1d: bool, return_cov: 
     # Where an output is known its variance is zero but for rounding, which may be below.
     std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).clip(0.0))
     return mean, std.ravel() if y_is_1d else std
-
-
-def by_chunks(function: Callable[[Any], Any], x: Tensor | Floats) -> Any:
-    """Tuple of arrays that a function of rows gives for x, called for a bounded number of rows at a time."""
-    if len(x) <= _CHUNK:
-        return function(x)
-    # What the first chunk takes tells what all will take.
-    first = function(x[:_CHUNK])
-    require_much(
-        2.0 * len(x) / _CHUNK * sum(part.nbytes for part in first),  # in parts, and joined
-        what=f"what is predicted for {len(x)} rows",
-        remedy="Predict fewer at a time.",
-    )
-    others = (function(x[start : start + _CHUNK]) for start in range(_CHUNK, len(x), _CHUNK))
-    joined: Any = torch.cat if isinstance(x, Tensor) else np.concatenate
-    return tuple(joined(part) for part in zip(first, *others, strict=True))
-
-
-def check_length_scale(value: Any, n_features: int) -> Floats | None:
-    """Length scales as an array (n_features,), or None where they are to be learned."""
-    if value is None:
-        return None
-    must = "positive and in the units of its column of X"
-    return _of_columns(value, "length_scale", n_features, lambda scales: np.isfinite(scales) & (scales > 0), must)
-
-
-def check_period(value: Any, kernel: str, x_scale: Floats) -> Floats | None:
-    """Periods as an array (n_features,), infinite where an input of the range ``x_scale`` does not repeat, or None."""
-    if value is None:
-        if kernel == "periodic":
-            raise ValueError("kernel == 'periodic' needs a period, in units of X, such as period=1.0 for a phase.")
-        return None
-    least = f"{_SHORTEST_PERIOD:g} of its range, or of its value where it is constant"
-    must = f"in the units of its column of X (or inf), no shorter than {least}"
-    return _of_columns(value, "period", len(x_scale), lambda periods: periods >= _SHORTEST_PERIOD * x_scale, must)
-
-
-def _of_columns(value: Any, name: str, n_columns: int, good: Callable[[Floats], Any], must: str) -> Floats:
-    """Numbers (n_columns,), one for each column of X, of one or as many that are good."""
-    numbers = parameter_floats(value, name)
-    if numbers.shape not in [(), (n_columns,)] or not good(numbers).all():
-        raise checks.refusal(value, name, f"None, a number or {n_columns} of them, each {must}")
-    return np.broadcast_to(numbers, (n_columns,)).copy()
-
-
-def parameter_floats(value: Any, name: str) -> Floats:
-    """A parameter of numbers as an array of floats, of any shape."""
-    try:
-        array = checks.real_array(value, name)
-        if array.dtype.kind == "b":
-            raise TypeError("not bool")
-        return array.astype(np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} is {value!r}, must be numbers ({error}).") from error
-
-
-def standardized_prior(prior: Prior, X: Floats, y_scale: Floats) -> Floats:
-    """Covariances of a prior, as :func:`prior_covariance`, over the outputs' deviations ``y_scale`` (d,).
-
-    It warns of variances so far from those of y, or from each other, that float64 does not hold them beside those.
-    """
-    covariance = prior_covariance(prior, X, len(y_scale)) / y_scale[:, np.newaxis] / y_scale
-    eigenvalues = np.linalg.eigvalsh(covariance)
-    lowest, highest = float(eigenvalues.min()), float(eigenvalues.max())
-    if lowest < _LOWEST * max(1.0, highest) or highest > _HIGHEST:
-        checks.warn(
-            f"prior has variances of {lowest:.3g} to {highest:.3g} times those of y. Below {_LOWEST:g} of these, or of "
-            f"the largest, they come out larger; above {_HIGHEST:g} they show where there are data. Give the prior in "
-            "squared units of y."
-        )
-    return np.asarray(covariance)
-
-
-def prior_covariance(prior: Prior, X: Floats, n_outputs: int) -> Floats:
-    """Covariances (n, d, d) or (d, d) that a float, array or callable prior stands for, which are positive definite."""
-    name, value = "prior", prior
-    shape: tuple[int, ...] = (n_outputs, n_outputs)
-    if callable(prior):
-        name, shape = "prior(X)", (len(X), n_outputs, n_outputs)
-        try:
-            value = prior(X.copy())
-        except Exception as error:
-            error.add_note(f"Raised by prior(X), which was asked for covariances at X of shape {X.shape}.")
-            raise
-    covariance = parameter_floats(value, name)
-    if covariance.ndim == 0 and not callable(prior):
-        covariance = covariance * np.eye(n_outputs)
-    covariance = checks.array(covariance, name, shape)
-    remedy = "far from data it is the covariance, so give every direction some variance"
-    checks.semidefinite(covariance, name, definite=True, remedy=remedy)
-    return covariance

@@ -1,7 +1,7 @@
 """The recommended regressor: covariance from latent Gaussian processes that are integrated out."""
 
 from dataclasses import dataclass
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -9,12 +9,17 @@ from numpy.typing import ArrayLike
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.estimators.base import CovarianceRegressor, Prior, check_length_scale, check_period, standardized_prior
-from torch_pbd.estimators.torch_estimator import Fitted, Integers, Standardization
-from torch_pbd.estimators.validation import check_demonstrations, warn_if_few, warn_if_identical, warn_of_residuals
+from torch_pbd.estimators.base import CovarianceRegressor, Fit
+from torch_pbd.estimators.door import Integers, Prior, length_scale_in_ranges, period_in_ranges
+from torch_pbd.estimators.validation import (
+    check_demonstrations,
+    checked_queries,
+    warn_if_few,
+    warn_if_identical,
+    warn_of_residuals,
+)
 from torch_pbd.files.memory import require_much
 from torch_pbd.kernels import KERNELS, KernelName
-from torch_pbd.linalg import safe_cholesky
 from torch_pbd.models.heteroscedastic import (
     HeteroscedasticModel,
     ProcessFamily,
@@ -24,7 +29,6 @@ from torch_pbd.models.heteroscedastic import (
     fit_heteroscedastic,
     inducing_sizes,
 )
-from torch_pbd.models.training import TrainingSet, default_prior_tril
 
 _DRAWN = 65536  # covariance matrices drawn at a time, to bound memory
 
@@ -71,24 +75,12 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         Extra starts of the first searches, besides the best point of a small grid.
     random_state : int, RandomState instance or None, default=0
         Not used, since the fit is deterministic; present so that estimators are interchangeable.
-    device : str or None, default=None
-        Device of the torch module.
-    verbose : int, default=0
-
-    Attributes
-    ----------
-    module_ : ConditionalNormal
-        The fitted torch module: maps x (n, e) to mean (n, d) and Cholesky factor (n, d, d), differentiably.
+    {common}
+    loss_ : float
+        Final negative log evidence of the covariance's processes, in nats, up to a constant; ``loss_curve_`` has it
+        after each alternation of mean and covariance, for the residuals from the mean of that alternation.
     effective_share_ : float
         Effective number of independent samples per recorded sample, averaged over outputs; 1.0 without ``groups``.
-    n_features_in_, n_outputs_ : int
-    loss_ : float
-        Final negative log evidence of the covariance's processes, in nats, up to a constant.
-    loss_curve_ : list of float
-        ``loss_`` after each alternation of mean and covariance, for the residuals from the mean of that alternation.
-    n_iter_ : int
-        Largest number of iterations of any search.
-    converged_ : bool
     jitter_ : float
         Jitter of the kernel matrices, relative to their diagonal.
 
@@ -143,52 +135,6 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
     device: str | None = None
     verbose: int = 0
 
-    def fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None = None) -> Self:
-        """Learn mean and covariance.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_samples, n_features)
-            Time, phase or position of each sample.
-        y : array-like of shape (n_samples,) or (n_samples, n_outputs)
-            Recorded outputs of each sample.
-        groups : array-like of shape (n_samples,), default=None
-            Label of each sample's demonstration; without it rows count as independent, and recorded demonstrations
-            look more certain than they are.
-
-        Returns
-        -------
-        self
-
-        Raises
-        ------
-        ValueError
-            If X, y, groups or a parameter is invalid; the message names it and the remedy.
-
-        Warns
-        -----
-        UnimodalityWarning
-            If demonstrations over one input seem to have several modes.
-        DataRankWarning
-            If there are no more demonstrations than outputs, or no groups are given although neighbouring rows are
-            nearly equal, as samples of a demonstration are, in recorded order or at repeated inputs in any order.
-        UserWarning
-            If the mean does not follow the data.
-        """
-        return super().fit(X, y, groups)
-
-    def predict_cov(self, X: ArrayLike, *, missing_knowledge: bool = True) -> Floats:
-        """Covariances of the outputs at X: (n_samples, n_outputs, n_outputs), also for one output.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_samples, n_features)
-        missing_knowledge : bool, default=True
-            False gives the variability alone, ``type2`` of :meth:`predict_uncertainty`, without the prior and the
-            errors of mean and covariance.
-        """
-        return super().predict_cov(X) if missing_knowledge else self.predict_uncertainty(X).type2
-
     def sample_cov(self, X: ArrayLike, n_samples: int = 1, random_state: Any = None) -> Floats:
         """Draw covariance functions from their posterior and evaluate them at X.
 
@@ -207,7 +153,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         """
         checks.count(n_samples, "n_samples", least=1)
         generator = checks.seed(random_state)
-        x = self._query(X)
+        x = self._door(checked_queries(self, X))
         core: Any = self.module_.core
         require_much(
             8.0 * n_samples * (len(x) * self.n_outputs_**2 + 3 * sum(core.draw_sizes())),
@@ -232,12 +178,14 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
             checks.count(self.n_inducing, "n_inducing", least=2)
         checks.count(self.max_inputs, "max_inputs", least=2)
 
-    def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, recorded: Integers) -> Fitted:
+    def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, recorded: Integers) -> Fit:
         if groups is not None:
             check_demonstrations(X, y, groups)
         scaling, training = self._training_set(X, y)
-        held, circle = self._in_ranges(scaling)
-        prior_tril = self._prior_tril(X, training, scaling)
+        length_scale = length_scale_in_ranges(self.length_scale, scaling.x_scale)
+        period = period_in_ranges(self.period, self.kernel, scaling.x_scale)
+        held, circle = (None if value is None else self._door(value) for value in (length_scale, period))
+        prior_tril = self._prior_tril(training, scaling)
         warn_if_few(len(y), y.shape[1])
         warn_if_identical(training)
         # A mean that does not follow the data at the merged inputs is fitted anew, from all rows.
@@ -250,7 +198,8 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
             training.inputs, len(rows.inputs), sizes, kernel=kernel, period=circle, length_scale=held
         )
         fit = fit_heteroscedastic(training, group, to_try, options, rows=rows if self.n_inducing is None else None)
-        model = HeteroscedasticModel(fit, prior_tril)
+        # A callable prior is asked again at every prediction.
+        model = HeteroscedasticModel(fit, prior_tril if prior_tril.ndim == 2 else prior_tril[0])
         least = model.covariance_process.log_variances.family.shortest_length_scale
         if held is not None and bool((held < least).any()):
             checks.warn(
@@ -260,20 +209,7 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
         warn_of_residuals(fit, self._door(recorded).long())
         self.effective_share_ = 1.0 if fit.correlation is None else float(fit.correlation.share.mean())
         report = options.outcome(tuple(-value for value in fit.log_evidence))
-        return Fitted(self._assemble(model, scaling), report, ProcessFamily.jitter)
+        return model, scaling, report, ProcessFamily.jitter
 
     def _check_memory(self, n_distinct: int, n_features: int, n_outputs: int) -> None:
         check_memory(self.n_inducing, self.max_inputs, (n_distinct, n_features, n_outputs))
-
-    def _in_ranges(self, scaling: Standardization) -> tuple[torch.Tensor | None, torch.Tensor | None]:
-        """Length scale and period that the user gave, in ranges of the inputs."""
-        length_scale = check_length_scale(self.length_scale, len(scaling.x_scale))
-        period = check_period(self.period, self.kernel, scaling.x_scale)
-        held = None if length_scale is None else self._door(length_scale / scaling.x_scale)
-        return held, None if period is None else self._door(period / scaling.x_scale)
-
-    def _prior_tril(self, X: Floats, training: TrainingSet, scaling: Standardization) -> torch.Tensor:
-        if self.prior is None:
-            return default_prior_tril(training.y)
-        tril = safe_cholesky(self._door(standardized_prior(self.prior, X, scaling.y_scale)), name="prior")
-        return tril if tril.ndim == 2 else tril[0]  # a callable is asked again at every prediction

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.estimators.base import CovarianceRegressor, Prior, check_length_scale, standardized_prior
-from torch_pbd.estimators.torch_estimator import Fitted, Integers, Standardization
+from torch_pbd.estimators.base import CovarianceRegressor, Fit
+from torch_pbd.estimators.door import Integers, Prior, Standardization, length_scale_in_ranges
 from torch_pbd.estimators.validation import warn_if_few, warn_if_identical
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.files.memory import require_much
@@ -32,11 +32,10 @@ from torch_pbd.gp import (
 )
 from torch_pbd.gp.search import Found, Job
 from torch_pbd.kernels import KERNELS, KernelName
-from torch_pbd.linalg import safe_cholesky
 from torch_pbd.models.conditional import MeanAndCovariance
 from torch_pbd.models.costs import Likelihood, Solver, train
 from torch_pbd.models.links import Link
-from torch_pbd.models.training import TrainingSet, default_prior_tril
+from torch_pbd.models.training import TrainingSet
 from torch_pbd.optim import FitReport
 
 # A process is stretched if its amplitude exceeds its values by this factor; where it can follow them it is up to 2.
@@ -78,18 +77,7 @@ n_restarts : int, default=2
     Extra starting points of each hyperparameter search.
 random_state : int, RandomState instance or None, default=0
     Seed of the initial values of a Wishart process with "likelihood"; other fits are deterministic.
-device : str or None, default=None
-    Device of the torch module.
-verbose : int, default=0
-
-Attributes
-----------
-module_ : ConditionalNormal
-    The fitted torch module: maps x (n, e) to mean (n, d) and Cholesky factor (n, d, d), differentiably.
-n_features_in_, n_outputs_ : int
-loss_curve_ : list of float
-n_iter_ : int
-converged_ : bool
+{common}
 jitter_ : float
     Largest jitter that a kernel matrix needed, relative to its diagonal."""
 
@@ -131,8 +119,8 @@ class LatentCovarianceRegressor(CovarianceRegressor):
     verbose: int = 0
 
     def __init_subclass__(cls) -> None:
-        super().__init_subclass__()
         cls.__doc__ = inspect.cleandoc(cls.__doc__ or "").replace("{shared}", _SHARED)
+        super().__init_subclass__()
 
     def _check_parameters(self) -> None:
         super()._check_parameters()
@@ -147,16 +135,16 @@ class LatentCovarianceRegressor(CovarianceRegressor):
                 "solver='fisher' holds the hyperparameters, which latent_prior=False trains: use solver='auto'."
             )
 
-    def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, recorded: Integers) -> Fitted:
+    def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, recorded: Integers) -> Fit:
         scaling, training = self._training_set(X, y)
         counts = training.counts.cpu().numpy()
-        aligned = self._works_on_empirical(_in_units(training, scaling), counts, y.shape[1])
-        length_scale = check_length_scale(self.length_scale, X.shape[1])
+        aligned = self._works_on_empirical(scaling.in_units(training.inputs.cpu().numpy()), counts, y.shape[1])
+        length_scale = length_scale_in_ranges(self.length_scale, scaling.x_scale)
         if not aligned:
             # Where every input repeats, its rows have been counted already.
             warn_if_few(len(y), y.shape[1], groups if counts.min() < 2 else None)
             training = training.merged(self.max_inputs)
-        held = None if length_scale is None else self._door(length_scale / scaling.x_scale)
+        held = None if length_scale is None else self._door(length_scale)
         problem = Problem(training, scaling, self._prior_tril(training, scaling), held)
         warn_if_identical(training)
         if aligned:
@@ -165,7 +153,7 @@ class LatentCovarianceRegressor(CovarianceRegressor):
             mean, mean_report = self._fit_mean(training)
             core, report, jitter = self._fit_likelihood(problem, mean)
             report = report.after(mean_report, "search of the mean")
-        return Fitted(self._assemble(core, scaling), report, jitter)
+        return core, scaling, report, jitter
 
     @abstractmethod
     def _fit_empirical(self, problem: Problem) -> tuple[MeanAndCovariance, FitReport, float]:
@@ -199,12 +187,9 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         return aligned
 
     def _prior_tril(self, training: TrainingSet, scaling: Standardization) -> Tensor:
-        if self.prior is None:
-            return default_prior_tril(training.y)
         if isinstance(self.prior, str):  # "paper": the entries of the factor are in the units of y
             return torch.diag(1.0 / self._door(scaling.y_scale))
-        prior = standardized_prior(self.prior, _in_units(training, scaling), scaling.y_scale)
-        return safe_cholesky(self._door(prior), name="prior")
+        return super()._prior_tril(training, scaling)
 
     def _search(
         self, inputs: Tensor, longest: float, length_scale: Tensor | None = None, noise_scale: Tensor | None = None
@@ -291,11 +276,6 @@ class LatentCovarianceRegressor(CovarianceRegressor):
     def _n_processes(self, n_outputs: int) -> int:
         """Processes of the mean and the covariance, at most."""
         return (n_outputs + 1) ** 2
-
-
-def _in_units(training: TrainingSet, scaling: Standardization) -> Floats:
-    """Distinct inputs in the units of X."""
-    return scaling.x_shift + scaling.x_scale * training.inputs.cpu().numpy()
 
 
 def _is_stretched(hyperparameters: Hyperparameters, observations: Observations) -> Bool[Tensor, " b"]:

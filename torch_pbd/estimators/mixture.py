@@ -9,8 +9,8 @@ from sklearn.neighbors import NearestNeighbors
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.estimators.base import CovarianceRegressor
-from torch_pbd.estimators.torch_estimator import Fitted, Integers, Standardization, distinct_rows, spread_of
+from torch_pbd.estimators.base import CovarianceRegressor, Fit
+from torch_pbd.estimators.door import Integers, Standardization, distinct_rows, spread_of
 from torch_pbd.estimators.validation import warn_if_few_demonstrations
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.files.memory import require_much
@@ -45,20 +45,9 @@ class GMMBaseline(CovarianceRegressor):
         Extra k-means starts after the first; the likeliest mixture is kept.
     random_state : int, RandomState instance or None, default=0
         Seed of k-means.
-    device : str or None, default=None
-        Device of the torch module.
-    verbose : int, default=0
-
-    Attributes
-    ----------
-    module_ : ConditionalNormal
-        The fitted torch module: maps x (n, e) to mean (n, d) and Cholesky factor (n, d, d), differentiably.
-    n_features_in_, n_outputs_ : int
+    {common}
     loss_ : float
         Negative mean log-likelihood of the standardized rows [x, y], in nats.
-    loss_curve_ : list of float
-    n_iter_ : int
-    converged_ : bool
     jitter_ : float
         ``reg_covar``.
 
@@ -91,7 +80,7 @@ class GMMBaseline(CovarianceRegressor):
         checks.choice(self.solver, "solver", ("em", "lbfgs"))
         checks.number(self.reg_covar, "reg_covar", above=0.0)
 
-    def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, recorded: Integers) -> Fitted:
+    def _fit(self, X: Floats, y: Floats, *, groups: Integers | None, recorded: Integers) -> Fit:
         points = _points(X, y)
         n_distinct, n_components = len(distinct_rows(points)[0]), int(self.n_components)
         if n_distinct < self.n_components:
@@ -130,7 +119,7 @@ class GMMBaseline(CovarianceRegressor):
         mixture, report = min(runs, key=lambda run: run[1].loss)
         if self.solver == "lbfgs":
             report = refine(mixture, data, callback=self._progress(), **limits)
-        return Fitted(self._assemble(mixture, scaling), report, float(self.reg_covar))
+        return mixture, scaling, report, float(self.reg_covar)
 
 
 def _points(X: Floats, y: Floats) -> Floats:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
+from torch_pbd.data import Demonstrations
 from torch_pbd.data.alignment import interpolate, unit_phases
 from torch_pbd.data.description import follow_one_way
 from torch_pbd.exceptions import DataRankWarning
@@ -34,6 +35,8 @@ def checked_values(values: Any, name: str) -> Any:
 
     A type too coarse for their spread raises an error: unix time in float32 has steps of 128 s.
     """
+    if isinstance(values, Demonstrations):
+        raise checks.refusal(values, name, "an array", "use X, y, groups = demonstrations.stack()")
     if hasattr(values, "detach"):
         values = checks.from_tensor(values, name)
     if hasattr(values, "columns"):
@@ -61,7 +64,7 @@ def _check_numbers(array: NDArray[Any], name: str) -> None:
         checks.require(fine, np.asarray(step), f"the resolution of {array.dtype} in {name}", must, remedy)
 
 
-def checked_rows(estimator: Any, X: ArrayLike, y: ArrayLike, **options: Any) -> tuple[Floats, Floats]:
+def checked_rows(estimator: Any, X: ArrayLike, y: ArrayLike | None, **options: Any) -> tuple[Floats, Floats]:
     """X (n, e) and y (n,) or (n, d) in float64, checked by scikit-learn and by this package."""
     if issparse(y):
         raise TypeError("Sparse data was passed for y, but dense data is required. Use '.toarray()'.")

@@ -12,7 +12,8 @@ from sklearn.utils.validation import check_is_fitted
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.estimators.base import Uncertainty, by_chunks, shaped_as_y
+from torch_pbd.estimators.base import Uncertainty, shaped_as_y
+from torch_pbd.estimators.door import by_chunks
 from torch_pbd.estimators.validation import checked_rows
 from torch_pbd.files.memory import require_much
 from torch_pbd.linalg import gaussian_log_density, student_log_density

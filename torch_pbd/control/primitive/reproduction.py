@@ -16,7 +16,7 @@ from torch_pbd.checks import Floats
 from torch_pbd.control.primitive.dmp import DMP, adapt
 from torch_pbd.control.primitive.smoothing import CUTOFF_HZ, Movements, check_range
 from torch_pbd.data.units import TIMES
-from torch_pbd.estimators.torch_estimator import Standardization
+from torch_pbd.estimators.door import Standardization
 from torch_pbd.gp import EvidenceSearch, Observations, condition, fit_together
 
 # Ticks within the duration: with forcing that is linear between them eq. (16) reproduces 10 s to 1e-6 m.
