@@ -6,7 +6,8 @@ import torch
 from scipy.optimize import rosen
 
 from torch_pbd.exceptions import NotPositiveDefiniteError
-from torch_pbd.optim import FitReport, Status, first_failure, minimize, minimize_batch, minimize_scoring
+from torch_pbd.optim.batch import FitReport, Status, first_failure, minimize_batch
+from torch_pbd.optim.descent import minimize, minimize_scoring
 
 
 def parameter(*values):

@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 
 from torch_pbd import CholeskyCovRegressor, GMMBaseline, HeteroscedasticGPRegressor, WishartProcessRegressor
 from torch_pbd.estimators.validation import without_rounding
-from torch_pbd.gp import spacing
+from torch_pbd.gp.observations import spacing
 
 REGRESSORS = [CholeskyCovRegressor, WishartProcessRegressor, HeteroscedasticGPRegressor, GMMBaseline]
 EXACT = np.arange(20) / 30.0  # no float32

@@ -5,7 +5,8 @@ import torch
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern
 
-from torch_pbd.gp import Hyperparameters, LatentValues, Observations, condition
+from torch_pbd.gp.latent import LatentValues
+from torch_pbd.gp.observations import Hyperparameters, Observations, condition
 from torch_pbd.kernels import correlation
 
 LENGTH_SCALE = {1: [[0.2], [0.5]], 2: [[0.2, 1.0], [0.5, 0.3]]}
@@ -34,7 +35,7 @@ def regressor(x, y, length_scale, amplitude, alpha, oracle=RBF):
     ("kernel", "oracle"), [("squared_exponential", RBF), ("matern32", lambda length: Matern(length, nu=1.5))]
 )
 @pytest.mark.parametrize("e", [1, 2])
-def test_mean_and_variance_are_those_of_scikit_learn(kernel, oracle, e, rng):
+def test_the_mean_is_that_of_scikit_learn(kernel, oracle, e, rng):
     x, y, queries = data(e, rng)
     gp, jitter = condition(
         Observations(tensor(x), tensor(y), torch.ones(15, dtype=torch.float64)), hyperparameters(e), kernel
@@ -42,9 +43,8 @@ def test_mean_and_variance_are_those_of_scikit_learn(kernel, oracle, e, rng):
     assert jitter == 0.0
     for row in range(2):
         model = regressor(x, y[row], LENGTH_SCALE[e][row], AMPLITUDE[row], NOISE_SCALE[row] ** 2, oracle)
-        mean, scale = model.predict(queries, return_std=True)
+        mean = model.predict(queries)
         np.testing.assert_allclose(gp(tensor(queries)).detach()[:, row], mean, rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(gp.variance(tensor(queries))[:, row], scale**2, rtol=1e-9)
 
 
 class ExactGP(gpytorch.models.ExactGP):
@@ -61,7 +61,7 @@ class ExactGP(gpytorch.models.ExactGP):
 
 
 @pytest.mark.parametrize("e", [1, 2])
-def test_mean_and_variance_are_those_of_gpytorch(e, rng):
+def test_the_mean_is_that_of_gpytorch(e, rng):
     x, y, queries = data(e, rng)
     counts = rng.integers(1, 9, size=15).astype(float)
     gp, _ = condition(Observations(tensor(x), tensor(y), tensor(counts)), hyperparameters(e))
@@ -69,10 +69,8 @@ def test_mean_and_variance_are_those_of_gpytorch(e, rng):
         likelihood = gpytorch.likelihoods.FixedNoiseGaussianLikelihood(tensor(NOISE_SCALE[row] ** 2 / counts))
         model = ExactGP(tensor(x), tensor(y[row]), likelihood, LENGTH_SCALE[e][row], AMPLITUDE[row]).eval()
         with torch.no_grad(), gpytorch.settings.fast_computations(False, False, False):
-            expected = model(tensor(queries))
-            mean, variance = expected.mean, expected.variance
+            mean = model(tensor(queries)).mean
         np.testing.assert_allclose(gp(tensor(queries)).detach()[:, row], mean, rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(gp.variance(tensor(queries))[:, row], variance, rtol=1e-9)
 
 
 @pytest.mark.parametrize("e", [1, 2])
@@ -85,9 +83,8 @@ def test_means_with_their_counts_say_what_all_rows_say(e, rng):
     gp, _ = condition(Observations(tensor(x), tensor(means), tensor(counts)), hyperparameters(e))
     for row in range(2):
         model = regressor(x[index], rows[row], LENGTH_SCALE[e][row], AMPLITUDE[row], NOISE_SCALE[row] ** 2)
-        mean, scale = model.predict(queries, return_std=True)
+        mean = model.predict(queries)
         np.testing.assert_allclose(gp(tensor(queries)).detach()[:, row], mean, rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(gp.variance(tensor(queries))[:, row], scale**2, rtol=1e-9)
 
 
 def test_values_are_the_means_of_other_targets(rng):
@@ -109,8 +106,7 @@ def test_one_observation_gives_the_closed_form(count):
     decay = np.exp(-0.5 * ((query - x) / length_scale) ** 2)
     total = amplitude**2 + noise_scale**2 / count
     np.testing.assert_allclose(gp(tensor(query[:, None])).detach()[:, 0], amplitude**2 * decay * y / total, rtol=1e-9)
-    variance = amplitude**2 - amplitude**4 * decay**2 / total
-    np.testing.assert_allclose(gp.variance(tensor(query[:, None]))[:, 0], variance, rtol=1e-9)
+    np.testing.assert_allclose(gp.type1(tensor(query[:, None])), 1.0 - decay**2, rtol=1e-9, atol=1e-15)
 
 
 def test_far_from_data_the_prior_speaks(rng):
@@ -119,8 +115,24 @@ def test_far_from_data_the_prior_speaks(rng):
     for far in (1e3, 1e300):
         query = tensor([[far, -far]])
         assert gp(query).tolist() == gp.values(query).tolist() == [[0.0, 0.0]]
-        np.testing.assert_allclose(gp.variance(query)[0], np.square(AMPLITUDE), rtol=1e-15)
         assert gp.type1(query).item() == pytest.approx(1.0, rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("kernel", "oracle"), [("squared_exponential", RBF), ("matern32", lambda length: Matern(length, nu=1.5))]
+)
+@pytest.mark.parametrize("e", [1, 2])
+def test_type1_is_the_variance_of_scikit_learn_without_noise(kernel, oracle, e, rng):
+    x, y, queries = data(e, rng, n=5)  # apart from each other: more would leave nothing but rounding
+    x[:, 0] = np.linspace(0.0, 1.0, 5)
+    own = hyperparameters(e)
+    gp, _ = condition(Observations(tensor(x), tensor(y), torch.ones(5, dtype=torch.float64)), own, kernel)
+    variance = np.zeros(len(queries))
+    for row in range(2):
+        model = regressor(x, y[row], LENGTH_SCALE[e][row], AMPLITUDE[row], 0.0, oracle)
+        variance += model.predict(queries, return_std=True)[1] ** 2
+    expected = variance / np.square(AMPLITUDE).sum()
+    np.testing.assert_allclose(gp.type1(tensor(queries)), expected, rtol=1e-8, atol=1e-12)
 
 
 @pytest.mark.parametrize("length_scale", [[[0.2]], [[0.2], [0.05]], [[10.0]]])
@@ -160,7 +172,7 @@ def test_prediction_is_differentiable(e, rng):
     x, y, queries = data(e, rng)
     gp, _ = condition(Observations(tensor(x), tensor(y), torch.ones(15, dtype=torch.float64)), hyperparameters(e))
     query = tensor(queries[:5]).requires_grad_()
-    for predict in (gp, gp.variance, gp.type1):
+    for predict in (gp, gp.type1):
         assert torch.autograd.gradcheck(predict, query)
 
 
@@ -286,7 +298,7 @@ def test_interpolation_between_inputs_is_that_without_noise(train_hyperparameter
     expected = RBF(length_scale)(queries, GRID.numpy()) @ weight
     np.testing.assert_allclose(gp(tensor(queries)).detach(), expected, rtol=0, atol=1e-9)
     np.testing.assert_allclose(gp.values(tensor(queries)), expected, rtol=0, atol=1e-9)
-    assert gp.variance(GRID).abs().max() <= 1e-9
+    assert gp.type1(GRID).abs().max() <= 1e-9
 
 
 def test_interpolation_follows_hyperparameters_that_were_trained():

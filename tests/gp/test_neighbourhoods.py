@@ -3,7 +3,7 @@ import pytest
 import torch
 from sklearn.neighbors import NearestNeighbors
 
-from torch_pbd.gp import Observations, merge_observations, neighbourhoods, spacing
+from torch_pbd.gp.observations import Observations, merge_observations, neighbourhoods, spacing
 
 
 def tensor(array):

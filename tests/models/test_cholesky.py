@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from torch_pbd.gp import Hyperparameters, Observations, condition
+from torch_pbd.gp.observations import Hyperparameters, Observations, condition
 from torch_pbd.models.conditional import MeanAndCholesky
 from torch_pbd.models.links import CholeskyLink
 

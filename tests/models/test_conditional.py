@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from torch_pbd.gp import Hyperparameters, Observations, condition
+from torch_pbd.gp.observations import Hyperparameters, Observations, condition
 from torch_pbd.models import VARIANCE_FLOOR
 from torch_pbd.models.conditional import ConditionalNormal, MeanAndCholesky, MeanAndWishart
 from torch_pbd.models.links import CholeskyLink, WishartLink, padded

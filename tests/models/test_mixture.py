@@ -12,7 +12,7 @@ from sklearn.exceptions import ConvergenceWarning
 
 from torch_pbd.exceptions import NotPositiveDefiniteError
 from torch_pbd.models.mixture import GaussianMixture, expectation_maximization, refine
-from torch_pbd.optim import Status
+from torch_pbd.optim.batch import Status
 
 REG = 1e-6
 

@@ -6,12 +6,12 @@ import torch
 from scipy.stats import multivariate_normal
 from sklearn.gaussian_process.kernels import RBF
 
-from torch_pbd.gp import LatentValues
+from torch_pbd.gp.latent import LatentValues
 from torch_pbd.models import VARIANCE_FLOOR, with_floor
 from torch_pbd.models.costs import Likelihood
 from torch_pbd.models.links import CholeskyLink, WishartLink, padded
 from torch_pbd.models.training import TrainingSet
-from torch_pbd.optim import minimize
+from torch_pbd.optim.descent import minimize
 
 COUNTS = {"aligned": [7] * 5, "ragged": [1, 2, 3, 10, 1], "not aligned": [1] * 12}
 

@@ -5,7 +5,7 @@ import sys
 import pytest
 import torch
 
-from torch_pbd.gp import Hyperparameters, Observations, condition
+from torch_pbd.gp.observations import Hyperparameters, Observations, condition
 from torch_pbd.models.conditional import ConditionalNormal, MeanAndCholesky, MeanAndWishart
 from torch_pbd.models.links import CholeskyLink, WishartLink, padded
 from torch_pbd.models.mixture import GaussianMixture

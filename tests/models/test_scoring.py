@@ -3,7 +3,7 @@ import pytest
 import torch
 from scipy.optimize import minimize as scipy_minimize
 
-from torch_pbd.gp import LatentValues
+from torch_pbd.gp.latent import LatentValues
 from torch_pbd.linalg import scale_tril_from_root
 from torch_pbd.models import with_floor
 from torch_pbd.models.costs import Covariances, Likelihood, train

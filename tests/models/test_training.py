@@ -3,7 +3,7 @@ import pytest
 import torch
 from scipy.stats import chi
 
-from torch_pbd.gp import neighbourhoods
+from torch_pbd.gp.observations import neighbourhoods
 from torch_pbd.models.training import TrainingSet, empirical_tril, mean_over_geometric, pooled_tril
 
 COUNTS = {

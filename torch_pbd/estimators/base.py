@@ -25,7 +25,7 @@ from torch_pbd.files.memory import require_much
 from torch_pbd.linalg import gaussian_log_density, student_log_density
 from torch_pbd.models import Core
 from torch_pbd.models.conditional import ConditionalNormal
-from torch_pbd.optim import FitReport, Progress, Status
+from torch_pbd.optim.batch import FitReport, Progress, Status
 
 Fit = tuple[Core, Standardization, FitReport, float]
 """Fitted core, the units of its inputs and outputs, how the fit ended, and the jitter."""

@@ -7,11 +7,12 @@ from torch import Tensor
 
 from torch_pbd import checks
 from torch_pbd.estimators.latent import LatentCovarianceRegressor, Problem, warn_if_stretched
-from torch_pbd.gp import LatentGP, Observations, condition, fit_together, longest_within
+from torch_pbd.gp.observations import LatentGP, Observations, condition, longest_within
+from torch_pbd.gp.search import fit_together
 from torch_pbd.models.conditional import MeanAndCholesky
 from torch_pbd.models.links import CholeskyLink
 from torch_pbd.models.training import empirical_tril, mean_over_geometric, pooled_tril, residual_tril
-from torch_pbd.optim import FitReport
+from torch_pbd.optim.batch import FitReport
 
 # The empirical diagonal is clamped to this share of its root mean square over the inputs before its logarithm is taken:
 # an exact zero at one input, as where all recordings start at the origin, would dominate its neighbours. With 1e-3 the

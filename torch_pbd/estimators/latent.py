@@ -18,25 +18,24 @@ from torch_pbd.estimators.door import Integers, Prior, Standardization, length_s
 from torch_pbd.estimators.validation import warn_if_few, warn_if_identical
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.files.memory import require_much
-from torch_pbd.gp import (
-    EvidenceSearch,
+from torch_pbd.gp.evidence import EvidenceSearch
+from torch_pbd.gp.latent import LatentValues
+from torch_pbd.gp.observations import (
     Hyperparameters,
     LatentGP,
-    LatentValues,
     Observations,
     condition,
-    fit_together,
     longest_within,
     resolved_length_scale,
     spacing,
 )
-from torch_pbd.gp.search import Found, Job
+from torch_pbd.gp.search import Found, Job, fit_together
 from torch_pbd.kernels import KERNELS, KernelName
 from torch_pbd.models.conditional import MeanAndCovariance
 from torch_pbd.models.costs import Likelihood, Solver, train
 from torch_pbd.models.links import Link
 from torch_pbd.models.training import TrainingSet
-from torch_pbd.optim import FitReport
+from torch_pbd.optim.batch import FitReport
 
 # A process is stretched if its amplitude exceeds its values by this factor; where it can follow them it is up to 2.
 _STRETCHED = 10.0

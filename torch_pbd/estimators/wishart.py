@@ -5,15 +5,24 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torch_pbd import checks, gp
+from torch_pbd import checks
 from torch_pbd.estimators.latent import LatentCovarianceRegressor, Problem, warn_if_stretched
 from torch_pbd.exceptions import DataRankWarning, NotPositiveDefiniteError
+from torch_pbd.gp.observations import (
+    Hyperparameters,
+    LatentGP,
+    Observations,
+    condition,
+    longest_within,
+    merge_observations,
+)
+from torch_pbd.gp.search import fit_hyperparameters
 from torch_pbd.linalg import scale_tril_from_root
 from torch_pbd.models import with_floor
 from torch_pbd.models.conditional import MeanAndWishart
 from torch_pbd.models.links import WishartLink, padded
 from torch_pbd.models.training import empirical_tril, residual_tril
-from torch_pbd.optim import FitReport
+from torch_pbd.optim.batch import FitReport
 
 _PAPER_MEAN = 8.0  # prior mean of all latent processes in the paper's simulation
 _FEW_ROWS = 8  # fewer rows may by chance have a deviation near zero, through which interpolated vectors cross zero
@@ -83,31 +92,31 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         link = WishartLink(self._prior_root(problem))
         root = padded(target, self.df_)
 
-        def observed(root: Tensor) -> gp.Observations:
-            vectors = gp.Observations(inputs, link.flatten(root).mT.contiguous(), torch.ones_like(inputs[:, 0]))
-            return gp.merge_observations(vectors, self.max_inputs)
+        def observed(root: Tensor) -> Observations:
+            vectors = Observations(inputs, link.flatten(root).mT.contiguous(), torch.ones_like(inputs[:, 0]))
+            return merge_observations(vectors, self.max_inputs)
 
         # Evidence of the vectors themselves, not of their deviations from the prior: a far prior would allow any swing.
         observations = observed(root)
         hyperparameters, report = self._smoothing(observations, problem)
         warn_if_stretched(problem, hyperparameters, observations)
-        latent, jitter = gp.condition(observations, hyperparameters, self.kernel)
+        latent, jitter = condition(observations, hyperparameters, self.kernel)
         # Noise of the vectors must not pull them towards the prior where there are data.
         certain = replace(hyperparameters, noise_ratio=hyperparameters.noise_ratio.clamp_max(_CERTAIN))
         with torch.no_grad():
-            latent.weight -= gp.condition(observed(link.prior.expand_as(root)), certain, self.kernel)[0].weight
+            latent.weight -= condition(observed(link.prior.expand_as(root)), certain, self.kernel)[0].weight
             difference = scale_tril_from_root(with_floor(link.root(latent(inputs)))) - target
             mse = float(difference.square().sum((-2, -1)).mean())  # eq. (9)
         report = replace(report, loss=mse, loss_curve=(mse,)).after(mean_report, "search of the mean")
         return MeanAndWishart(mean, latent, link.far(), bounded=True), report, jitter
 
-    def _smoothing(self, observations: gp.Observations, problem: Problem) -> tuple[gp.Hyperparameters, FitReport]:
+    def _smoothing(self, observations: Observations, problem: Problem) -> tuple[Hyperparameters, FitReport]:
         """Hyperparameters without noise, or with a learned one where "auto" has few rows or inputs are too near."""
         inputs, none = observations.inputs, torch.zeros_like(observations.targets[:, 0])
 
-        def found(noise_scale: Tensor | None) -> tuple[gp.Hyperparameters, FitReport]:
-            search = self._search(inputs, gp.longest_within(inputs), problem.length_scale, noise_scale)
-            return gp.fit_hyperparameters(observations, search)[::2]
+        def found(noise_scale: Tensor | None) -> tuple[Hyperparameters, FitReport]:
+            search = self._search(inputs, longest_within(inputs), problem.length_scale, noise_scale)
+            return fit_hyperparameters(observations, search)[::2]
 
         if self.objective == "auto" and int(problem.training.counts.min()) < _FEW_ROWS:
             return found(None)
@@ -121,7 +130,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
             )
             return found(None)
 
-    def _fit_likelihood(self, problem: Problem, mean: gp.LatentGP) -> tuple[MeanAndWishart, FitReport, float]:
+    def _fit_likelihood(self, problem: Problem, mean: LatentGP) -> tuple[MeanAndWishart, FitReport, float]:
         prior_root, residual = self._prior_root(problem), problem.training.residual(mean)
         pooled = padded(residual_tril(residual), self.df_)
         # Around a distant prior the vectors might swing through zero between inputs. A free L would grow while the

@@ -1,4 +1,4 @@
-"""Observations of processes, reduced to few coordinates: merged neighbours, or nodes for the inputs."""
+"""Gaussian processes conditioned on observations, eq. (5) and (6), in few coordinates: merged neighbours, or nodes."""
 
 import heapq
 import math
@@ -6,9 +6,10 @@ from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int64
-from torch import Tensor
+from torch import Tensor, nn
 
-from torch_pbd.kernels import KERNELS
+from torch_pbd.kernels import KERNELS, correlation
+from torch_pbd.linalg import cholesky_with_jitter, safe_cholesky
 
 # Numbers of nodes to try: a decomposition costs two to six times more from one to the next. Below so many inputs for
 # each node nothing is gained by them.
@@ -191,3 +192,103 @@ def _interpolation(x: Float[Tensor, " n"], n_nodes: int) -> tuple[Tensor, Tensor
     terms = sign * torch.sin(angle) / torch.where(hit, 1.0, difference)
     matrix = terms / terms.sum(1, keepdim=True)
     return nodes, torch.where(hit.any(1, keepdim=True), hit.to(x), matrix)
+
+
+class LatentGP(nn.Module):
+    """b independent Gaussian processes, conditioned on values at the same n inputs, or nodes that stand for them.
+
+    ``weight`` times the correlations with the inputs is the mean of eq. (5), less the prior mean, and ``value_weight``
+    that of the values as they are, without a prior. The noise variance is the noise ratio over the counts. ``root`` are
+    the linear combinations of the values at nodes that were observed.
+    """
+
+    inputs: Tensor
+    value_weight: Tensor
+    length_scale: Tensor
+    amplitude: Tensor
+    root: Tensor | None
+
+    def __init__(
+        self,
+        inputs: Float[Tensor, "n e"],
+        weight: Float[Tensor, "b n"],
+        value_weight: Float[Tensor, "b n"],
+        hyperparameters: Hyperparameters,
+        counts: Float[Tensor, " n"],
+        kernel: str = "squared_exponential",
+        root: Float[Tensor, "r n"] | None = None,
+    ) -> None:
+        super().__init__()
+        self.kernel = kernel
+        self.weight = nn.Parameter(weight)
+        self.register_buffer("inputs", inputs)
+        self.register_buffer("value_weight", value_weight)
+        self.register_buffer("length_scale", hyperparameters.length_scale)
+        self.register_buffer("amplitude", hyperparameters.amplitude)
+        self.register_buffer("noise_ratio", hyperparameters.noise_ratio)
+        self.register_buffer("counts", counts)
+        self.register_buffer("root", root)
+
+    def forward(self, x: Float[Tensor, "m e"]) -> Float[Tensor, "m b"]:
+        """Mean at x less the prior mean: eq. (5)."""
+        return self._weighted(x, self.weight)[0]
+
+    def values(self, x: Float[Tensor, "m e"]) -> Float[Tensor, "m b"]:
+        """Mean at x of the processes of ``value_weight``, whose prior mean is zero: what data alone say."""
+        return self._weighted(x, self.value_weight)[0]
+
+    def both(self, x: Float[Tensor, "m e"]) -> list[Float[Tensor, "m b"]]:
+        """Results of :meth:`forward` and :meth:`values`, by one matrix of correlations."""
+        return self._weighted(x, self.weight, self.value_weight)
+
+    def _weighted(self, x: Tensor, *weights: Tensor) -> list[Tensor]:
+        cross = correlation(x, self.inputs, self.length_scale, self.kernel)
+        # Processes that share their length scales share the correlations.
+        if len(cross) == 1:
+            return [cross[0] @ weight.mT for weight in weights]
+        return [(cross @ weight.unsqueeze(-1)).squeeze(-1).mT for weight in weights]
+
+    def type1(self, x: Float[Tensor, "m e"]) -> Float[Tensor, " m"]:
+        """Type I uncertainty: 0 at the training inputs, 1 where only the prior speaks.
+
+        It is the variance of eq. (6) without noise, over the squared amplitude: the average over the processes with
+        their squared amplitudes for weights.
+        """
+        gram = correlation(self.inputs, self.inputs, self.length_scale, self.kernel)
+        cross = correlation(self.inputs, x, self.length_scale, self.kernel)
+        if self.root is not None:
+            gram, cross = self.root @ gram @ self.root.mT, self.root @ cross
+        # 1 - k' inv(K) k, by the factor of the matrix.
+        factor = safe_cholesky(gram, name="the kernel matrix of the training inputs")
+        whitened = torch.linalg.solve_triangular(factor, cross, upper=False)
+        reduced = (1.0 - whitened.square().sum(-2)).clamp(0.0, 1.0)
+        if len(reduced) == 1:
+            return reduced[0]
+        share = self.amplitude.square().clamp_min(torch.finfo(self.amplitude.dtype).tiny)
+        return ((share / share.sum()) @ reduced).clamp(max=1.0)
+
+
+def condition(
+    observations: Observations,
+    hyperparameters: Hyperparameters,
+    kernel: str = "squared_exponential",
+    values: Float[Tensor, "b n"] | None = None,
+    *,
+    basis: Basis | None = None,
+) -> tuple[LatentGP, float]:
+    """Gaussian processes conditioned on noisy observations, and the relative jitter that needed.
+
+    ``values`` are those whose prior mean is zero, if they are others than the targets. The nodes of a ``basis`` that
+    carries the processes, by default all inputs, become the inputs of the processes.
+    """
+    values = observations.targets if values is None else values
+    basis = Basis(observations) if basis is None else basis
+    targets, _ = basis.project(torch.cat([observations.targets, values]))
+    gram = basis.covariance(correlation(basis.nodes, basis.nodes, hyperparameters.length_scale, kernel))
+    gram = gram + hyperparameters.noise_ratio[:, None, None] * torch.eye(gram.shape[-1]).to(gram)
+    factor, jitter = cholesky_with_jitter(gram, name="the kernel matrix of the training inputs")
+    solved = torch.cholesky_solve(targets.reshape(2, -1, gram.shape[-1]).permute(1, 2, 0), factor)
+    weight, value_weight = basis.node_weights(solved).unbind(-1)
+    root = None if basis.root is None else basis.root.clone(memory_format=torch.contiguous_format)
+    weights = weight.contiguous(), value_weight.contiguous()
+    return LatentGP(basis.nodes.clone(), *weights, hyperparameters, basis.counts.clone(), kernel, root), jitter

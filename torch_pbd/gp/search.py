@@ -23,7 +23,7 @@ from torch.nn.functional import max_pool2d
 from torch_pbd.exceptions import NotPositiveDefiniteError
 from torch_pbd.gp.evidence import MIN_NOISE_RATIO, Coordinates, Evidence, EvidenceSearch
 from torch_pbd.gp.observations import Basis, Hyperparameters, Observations, levels_on_nodes, resolved_length_scale
-from torch_pbd.optim import FitReport, Status, first_failure, minimize_batch
+from torch_pbd.optim.batch import FitReport, Status, first_failure, minimize_batch
 
 # Entries of the matrices that are treated together: they stay near the cache, and memory is bounded.
 _ENTRIES = 1 << 20

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from torch_pbd import checks
 from torch_pbd.files.memory import require_memory
-from torch_pbd.gp import Hyperparameters, LatentGP
+from torch_pbd.gp.observations import Hyperparameters, LatentGP
 from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import scale_tril_from_root, symmetrize
 from torch_pbd.models import Core, Shapes, blank, size_of, with_floor

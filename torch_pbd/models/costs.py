@@ -9,11 +9,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torch_pbd.gp import LatentValues
+from torch_pbd.gp.latent import LatentValues
 from torch_pbd.linalg import cholesky_with_jitter, scale_tril_from_root
 from torch_pbd.models import VARIANCE_FLOOR, with_floor
 from torch_pbd.models.links import Blocks, Link, WishartLink
-from torch_pbd.optim import FitReport, Progress, minimize, minimize_scoring
+from torch_pbd.optim.batch import FitReport, Progress
+from torch_pbd.optim.descent import minimize, minimize_scoring
 
 Solver = Literal["auto", "fisher", "lbfgs"]
 

@@ -12,7 +12,8 @@ from torch import Tensor, nn
 from torch_pbd.exceptions import NotPositiveDefiniteError
 from torch_pbd.linalg import scale_tril_from_root, triangular_inverse
 from torch_pbd.models import Core, Shapes, blank, size_of
-from torch_pbd.optim import FitReport, Progress, Status, minimize
+from torch_pbd.optim.batch import FitReport, Progress, Status
+from torch_pbd.optim.descent import minimize
 
 _BLOCK = 1 << 13  # rows that an E step holds at a time: what it makes of them stays in the cache
 

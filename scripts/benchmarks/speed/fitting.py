@@ -11,7 +11,9 @@ from speed.timing import alternate
 from torch_pbd import CholeskyCovRegressor, WishartProcessRegressor
 from torch_pbd.data import make_paper_simulation
 from torch_pbd.experiments.comparison import empirical_covariances
-from torch_pbd.gp import EvidenceSearch, Observations, fit_hyperparameters, resolved_length_scale
+from torch_pbd.gp.evidence import EvidenceSearch
+from torch_pbd.gp.observations import Observations, resolved_length_scale
+from torch_pbd.gp.search import fit_hyperparameters
 from torch_pbd.metrics import covariance_mse
 
 _SKLEARN = "scikit-learn, a process for each entry of the factor"

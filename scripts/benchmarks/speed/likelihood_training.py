@@ -15,12 +15,13 @@ from torch import Tensor
 
 from torch_pbd.data import make_paper_simulation
 from torch_pbd.data.synthetic import paper_mean
-from torch_pbd.gp import LatentValues
+from torch_pbd.gp.latent import LatentValues
 from torch_pbd.kernels import correlation
 from torch_pbd.linalg import safe_cholesky, scale_tril_from_root
 from torch_pbd.models.costs import Likelihood, Solver, train
 from torch_pbd.models.links import CholeskyLink
-from torch_pbd.optim import Progress, minimize
+from torch_pbd.optim.batch import Progress
+from torch_pbd.optim.descent import minimize
 
 N_ROWS, LENGTH_SCALE = 500, 0.2
 WITHIN = 1e-3  # nats of the optimum

@@ -6,7 +6,7 @@ import torch
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ExpSineSquared, Matern
 
-from torch_pbd.gp import spacing
+from torch_pbd.gp.observations import spacing
 from torch_pbd.kernels import KERNELS
 from torch_pbd.models.heteroscedastic.processes import FixedFeatures, ProcessFamily, inducing_inputs
 from torch_pbd.models.heteroscedastic.regression import LinearEvidence

@@ -7,7 +7,7 @@ from torch_pbd.exceptions import NotPositiveDefiniteError
 from torch_pbd.models.heteroscedastic import ProcessFamily, SearchOptions
 from torch_pbd.models.heteroscedastic.regression import LinearEvidence
 from torch_pbd.models.heteroscedastic.search import Search
-from torch_pbd.optim import Status
+from torch_pbd.optim.batch import Status
 
 
 def tensor(values):

@@ -17,7 +17,9 @@ from torch_pbd.control.primitive.dmp import DMP, adapt
 from torch_pbd.control.primitive.smoothing import CUTOFF_HZ, Movements, check_range
 from torch_pbd.data.units import TIMES
 from torch_pbd.estimators.door import Standardization
-from torch_pbd.gp import EvidenceSearch, Observations, condition, fit_together
+from torch_pbd.gp.evidence import EvidenceSearch
+from torch_pbd.gp.observations import Observations, condition
+from torch_pbd.gp.search import fit_together
 
 # Ticks within the duration: with forcing that is linear between them eq. (16) reproduces 10 s to 1e-6 m.
 _TICKS = 4000

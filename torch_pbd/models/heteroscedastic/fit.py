@@ -33,7 +33,7 @@ from torch_pbd.models.heteroscedastic.residuals import (
 from torch_pbd.models.heteroscedastic.search import Families, Search, SearchOptions, on_stretched_inputs, stretched
 from torch_pbd.models.heteroscedastic.steps import MOST_INPUTS, CovarianceSearch, fit_covariance, fit_mean, mean_start
 from torch_pbd.models.training import TrainingSet, pooled_tril
-from torch_pbd.optim import Progress
+from torch_pbd.optim.batch import Progress
 
 # Rows at an input whose mean is all their own still count for this share of a degree of freedom, or nothing there
 # would be known of the variance.

@@ -21,7 +21,7 @@ from torch_pbd.files.memory import require_much
 from torch_pbd.gp.observations import spacing
 from torch_pbd.models.heteroscedastic.log_variance import Squares, log_variance_evidence
 from torch_pbd.models.heteroscedastic.processes import Evidence, FixedFeatures, Gradient, ProcessFamily, inducing_inputs
-from torch_pbd.optim import FitReport, Progress, Status, first_failure, minimize_batch
+from torch_pbd.optim.batch import FitReport, Progress, Status, first_failure, minimize_batch
 
 # Prior medians of length scale (in ranges of the input) and amplitude, and prior deviation of the constant. Means
 # are of outputs with unit variance, log variances and coefficients of residuals with a pooled unit covariance.

@@ -14,8 +14,9 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torch_pbd.gp import EvidenceSearch, Hyperparameters, Observations, fit_hyperparameters, negative_log_evidence
-from torch_pbd.gp.observations import resolved_length_scale
+from torch_pbd.gp.evidence import EvidenceSearch, negative_log_evidence
+from torch_pbd.gp.observations import Hyperparameters, Observations, resolved_length_scale
+from torch_pbd.gp.search import fit_hyperparameters
 from torch_pbd.linalg import triangular_inverse
 from torch_pbd.models.heteroscedastic.log_variance import (
     LEAST_SQUARE,
