@@ -76,17 +76,10 @@ def correlation(
 ) -> Float[Tensor, "*b n m"]:
     """Correlation of the latent values at two sets of inputs: eq. (4) with an amplitude of one.
 
-    Parameters
-    ----------
-    x, other : Tensor of shapes (n, e) and (m, e)
-    length_scale : Tensor of shape (..., e)
-        One per input dimension (automatic relevance determination), in the units of ``x``: the diagonal
-        of the paper's Omega.
-    kernel : {"squared_exponential", "matern32", "matern52"}, default="squared_exponential"
-    period : Tensor of shape (e,), default=None
-        Where it is finite the input is a phase on a circle of that circumference, and distances are chords
-        of it, which agree with the inputs' own where these are close: with the squared exponential this is
-        the periodic kernel of MacKay (Rasmussen and Williams, eq. (4.31)).
+    There is a length scale for each input dimension (automatic relevance determination), in the units of ``x``: the
+    diagonal of the paper's Omega. Where a ``period`` is finite the input is a phase on a circle of that circumference,
+    and distances are chords of it, which agree with the inputs' own where these are close: with the squared exponential
+    this is the periodic kernel of MacKay (Rasmussen and Williams, eq. (4.31)).
     """
     scaled = (
         (difference / length_scale[..., dimension, None, None]).square()

@@ -101,13 +101,9 @@ def scale_tril_from_root(root: Float[Tensor, "*b d r"]) -> Float[Tensor, "*b d d
 def cholesky_with_jitter(matrix: Float[Tensor, "*b n n"], *, name: str) -> tuple[Float[Tensor, "*b n n"], float]:
     """Lower Cholesky factors, and the largest jitter any of them needed.
 
-    The jitter is relative to the mean of a matrix's diagonal: none first, then 1e-14 to 1e-6 by factors of
-    ten, only for the matrices of the batch that need it.
-
-    Raises
-    ------
-    NotPositiveDefiniteError
-        If a matrix has an entry that is not finite, or is not positive definite with a jitter of 1e-6.
+    The jitter is relative to the mean of a matrix's diagonal: none first, then 1e-14 to 1e-6 by factors of ten, only
+    for the matrices of the batch that need it. Beyond, or where an entry is not finite, it is a
+    NotPositiveDefiniteError.
     """
     if not torch.isfinite(matrix).all():
         raise NotPositiveDefiniteError(f"{name} has entries that are not finite.")
@@ -201,20 +197,12 @@ def spectral_map(
     function: Callable[[Tensor], Tensor],
     spectrum: tuple[Float[Tensor, "*b d"], Float[Tensor, "*b d d"]] | None = None,
 ) -> Float[Tensor, "*b d d"]:
-    """``Q diag(function(eigenvalues)) Q'`` of symmetric matrices, symmetric to the last bit.
+    """``Q diag(function(eigenvalues)) Q'`` of the symmetric part of matrices, symmetric to the last bit.
 
-    Continuous in the matrix wherever ``function`` is in the eigenvalue, though the axes Q jump where eigenvalues
-    cross. Its gradient is by divided differences (Daleckii and Krein), finite at equal eigenvalues; where
-    ``function`` has a kink it is one-sided, that which autograd gives ``function``.
-
-    Parameters
-    ----------
-    matrix : Tensor of shape (..., d, d)
-        Symmetric; only the symmetric part is used.
-    function : callable
-        Maps eigenvalues (..., d) elementwise, differentiable by autograd.
-    spectrum : (Tensor of shape (..., d), Tensor of shape (..., d, d)), default=None
-        Eigenvalues and axes of the symmetric part, where they are known.
+    Continuous in the matrix wherever the elementwise ``function`` is in the eigenvalue, though the axes Q jump where
+    eigenvalues cross. Its gradient is by divided differences (Daleckii and Krein), finite at equal eigenvalues; where
+    ``function`` has a kink it is one-sided, that which autograd gives ``function``. ``spectrum`` are the eigenvalues
+    and axes of the symmetric part, where they are known.
     """
     result: Tensor = _SpectralMap.apply(symmetrize(matrix), function, spectrum)
     return result

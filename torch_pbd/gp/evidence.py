@@ -18,34 +18,19 @@ _LEAST_VARIANCE = 1e-200  # squared amplitude of targets that are all zero
 
 @dataclass(frozen=True)
 class EvidenceSearch:
-    """Bounds, held values and limits of a search for hyperparameters.
-
-    Parameters
-    ----------
-    kernel : str
-    length_scale_bounds : (float, float)
-        Smallest and largest length scale, in units of the range of the inputs. A lower bound at the spacing
-        of the inputs keeps out "needles", which explain every point by itself and nothing between.
-    length_scale : Tensor of shape (e,) or None
-        Held there if given.
-    noise_scale : Tensor of shape (b,) or None
-        Standard deviation of the noise of one observation, held there if given; learned if None. Zero for all
-        processes, or above zero for all.
-    max_inputs : int or None
-        Number of inputs above which neighbours are merged, for length scales too short for a lower rank.
-    n_restarts : int
-        Number of the grid's valleys to descend into besides the deepest.
-    max_iter, tol
-        Limit of iterations and tolerance of the optimization from the grid's points, in nats, as in
-        :func:`~torch_pbd.optim.minimize_batch`.
-    """
+    """Bounds, held values and limits of a search for hyperparameters, in ranges of the inputs and in nats."""
 
     kernel: str = "squared_exponential"
     length_scale_bounds: tuple[float, float] = (1e-3, 1e1)
+    """A lower one at the spacing of the inputs keeps out "needles", which explain every point by itself."""
     length_scale: Tensor | None = None
+    """(e,), held there if given."""
     noise_scale: Tensor | None = None
+    """Deviation (b,) of the noise of one observation, held if given: zero for all processes, or above it for all."""
     max_inputs: int | None = None
+    """Number above which neighbours are merged, for length scales too short for a lower rank."""
     n_restarts: int = 2
+    """Number of the grid's valleys to descend into besides the deepest."""
     max_iter: int = 100
     tol: float = 0.005
 

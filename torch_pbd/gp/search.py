@@ -71,24 +71,17 @@ class Found(NamedTuple):
 def fit_hyperparameters(
     observations: Observations, search: EvidenceSearch
 ) -> tuple[Hyperparameters, Float[Tensor, " b"], FitReport]:
-    """Hyperparameters, loss and report of one job: see :class:`Found`.
-
-    Raises
-    ------
-    ValueError
-        If the noise is held at zero for some processes and above zero for others.
-    NotPositiveDefiniteError
-        If there is no start from which the evidence can be computed, as for a length scale held at many
-        times the spacing of inputs without noise.
-    """
+    """Hyperparameters, loss and report of one job: see :class:`Found`."""
     return fit_together([(observations, search)])[0][:3]
 
 
 def fit_together(jobs: Sequence[Job]) -> list[Found]:
-    """Results of :func:`fit_hyperparameters` for each job, in one search where inputs and counts are the same.
+    """What is found for each job, in one search where inputs and counts are the same.
 
     A search of few processes costs little more than one of many: what is common is done once, and evaluations are
-    batched. Jobs that hold a length scale or a noise are searched by themselves.
+    batched. Jobs that hold a length scale or a noise are searched by themselves. Where there is no start from which the
+    evidence can be computed, as for a length scale held at many times the spacing of inputs without noise, it raises a
+    NotPositiveDefiniteError.
     """
     first, search = jobs[0]
     held = search.length_scale is not None or search.noise_scale is not None

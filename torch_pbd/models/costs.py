@@ -34,18 +34,9 @@ class Covariances:
 class Likelihood:
     """Negative log likelihood of all rows, eq. (11) and (12), times a weight: one over their number for nats per row.
 
-    It is a function of the covariances at the inputs, and through a link of the latent deviations there. Derivatives
+    It is a function of the covariances at the inputs, and through a link of the latent deviations there. Of the rows it
+    takes their ``counts`` and a root of the sums of ``w w'`` at each input, w the residuals from the mean. Derivatives
     are written in D, the change of a covariance over itself: dSigma = C D C'.
-
-    Parameters
-    ----------
-    link : Link
-    scatter_root : Tensor of shape (n, d, r)
-        Root of the sums of ``w w'`` at each distinct input, w the residuals from the mean, as
-        ``TrainingSet.scatter_root`` gives it.
-    counts : Tensor of shape (n,)
-        Rows there.
-    weight : float
     """
 
     def __init__(

@@ -102,36 +102,19 @@ def minimize_batch(
     tol: float = 1e-6,
     inverse_hessian: Float[Tensor, "b p p"] | None = None,
 ) -> tuple[Float[Tensor, "b p"], BatchReport]:
-    """Minimize b unrelated objectives of few parameters by BFGS, their evaluations in one batch.
+    """Minimize b unrelated objectives of few parameters (b, p), of order one, by BFGS, their evaluations in one batch.
 
-    Each problem has its own inverse Hessian, its own step and its own end: a joint L-BFGS over all of them
-    would share one line search and one memory between problems that have nothing to do with each other, and with a
-    handful of parameters the whole matrix costs less than a limited memory of it.
-    Steps are accepted by the Armijo rule, so the loss never rises; a value that is not finite counts as
-    too far. Where the slope along a step has not fallen, which tells no Hessian, the next step starts four times as
-    long.
+    Each problem has its own inverse Hessian, its own step and its own end: a joint L-BFGS over all of them would share
+    one line search and one memory between problems that have nothing to do with each other, and with a handful of
+    parameters the whole matrix costs less than a limited memory of it. Steps are accepted by the Armijo rule, so the
+    loss never rises. Where the slope along a step has not fallen, which tells no Hessian, the next step starts four
+    times as long.
 
-    Parameters
-    ----------
-    objective : callable
-        Given parameters (a, p), of order one, of a problems and their indices in the batch, returns their losses (a,)
-        and gradients (a, p). Problems at whose points it raises one of ``FAILURES`` count as not finite there; which
-        they are it is asked one by one.
-    start : Tensor of shape (b, p)
-        Initial points; a problem with a non-finite loss stays at its start.
-    max_iter : int, default=100
-        Largest number of iterations.
-    tol : float, default=1e-6
-        A problem ends when its gradient, summed over its absolute entries, is below it, when its next step promises
-        less than a hundredth of it, or when no step gained anything.
-    inverse_hessian : Tensor of shape (b, p, p), default=None
-        Positive definite inverse Hessians at the start. None estimates them by differences of the gradient, in one
-        batch, with the absolute values of the Hessian's eigenvalues.
-
-    Returns
-    -------
-    parameters : Tensor of shape (b, p)
-    report : BatchReport
+    ``objective`` is asked for the losses and gradients of some of the problems, by their indices. A value that is not
+    finite counts as too far, and so do problems at whose points it raises one of ``FAILURES``, which it is then asked
+    for one by one; a problem that starts there stays. A problem ends when its gradient, summed over its absolute
+    entries, is below ``tol``, when its next step promises less than a hundredth of it, or when no step gained anything.
+    Inverse Hessians that are not given are estimated by differences of the gradient.
     """
     objective = _guarded(objective)
     rows = torch.arange(len(start), device=start.device)

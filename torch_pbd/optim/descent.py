@@ -80,36 +80,15 @@ def minimize(
     tol: float = 1e-8,
     callback: Callback = None,
 ) -> FitReport:
-    """Minimize a scalar objective by L-BFGS with a strong Wolfe line search; leaves the best point seen.
+    """Minimize a scalar objective by L-BFGS with a strong Wolfe line search, in place; leaves the best point seen.
 
-    ``torch.optim.LBFGS`` can raise from its line search, and can return from a failed one at a worse point.
-    Here a failed run is restarted from the best point with a halved first step, at most three times. Whatever ends it,
-    be it a mistake in the objective or an interrupt, the parameters are left at the best point.
+    ``torch.optim.LBFGS`` can raise from its line search, and can return from a failed one at a worse point. Here a
+    failed run is restarted from the best point with a halved first step, at most three times. Whatever ends it, be it a
+    mistake in the objective or an interrupt, the parameters are left at the best point.
 
-    Parameters
-    ----------
-    objective : callable
-        Returns the loss, a scalar tensor, at the present values of ``parameters``. One of ``FAILURES`` that it raises
-        counts as a loss that is not finite.
-    parameters : sequence of Tensor
-        Leaf tensors, changed in place.
-    max_iter : int, default=200
-        Largest number of L-BFGS iterations, over all restarts.
-    tol : float, default=1e-8
-        Stop when the largest gradient entry, or the change of the loss, is below it: scale the objective
-        so that one unit matters.
-    callback : callable, optional
-        Called with a :class:`~torch_pbd.optim.Progress` after each improvement.
-
-    Returns
-    -------
-    FitReport
-        Report whose loss is never above that of the start.
-
-    Raises
-    ------
-    ValueError
-        If the loss or its gradient is not finite at the start.
+    It stops when the largest gradient entry, or the change of the loss, is below ``tol``: scale the objective so that
+    one unit matters. One of ``FAILURES`` that the objective raises counts as a loss that is not finite; at the start
+    that is a ValueError. ``callback`` hears of each improvement.
     """
     closure, n_iter = _Closure(objective, parameters, callback), 0
     losses = closure.curve.losses
@@ -159,38 +138,15 @@ def minimize_scoring(
     tol: float = 1e-8,
     callback: Callback = None,
 ) -> tuple[Tensor, FitReport]:
-    """Minimize a loss whose gradient and curvature are known in closed form; never ends above the start.
+    """Minimize a loss by steps of Newton's kind, known in closed form: the best point seen, never above the start.
 
-    Each iteration goes along the Newton step: all of it as a rule, less until the loss falls by a share of what
-    the slope promises, more where it falls like a line.
+    ``newton`` gives the gradient at a point, and the step: minus the gradient, times the inverse of a positive definite
+    matrix. Each iteration goes along it: all of it as a rule, less until the loss falls by a share of what the slope
+    promises, more where it falls like a line. A loss that is not finite counts as too far, and so does one of
+    ``FAILURES``; at the start it is a ValueError.
 
-    Parameters
-    ----------
-    loss : callable
-        Maps a point to its loss, a scalar tensor; a value that is not finite counts as too far, and so does one of
-        ``FAILURES`` that it raises.
-    newton : callable
-        Maps a point to gradient and step there, both shaped like it. The step is minus the gradient, multiplied
-        by the inverse of a positive definite matrix.
-    start : Tensor
-    max_iter : int, default=100
-        Largest number of steps.
-    tol : float, default=1e-8
-        Stop after a step that promises a fall below a hundredth of it, or brings one below a tenth, times the loss at
-        the start where that is above one.
-    callback : callable, optional
-        Called with a :class:`~torch_pbd.optim.Progress` after each improvement.
-
-    Returns
-    -------
-    point : Tensor
-        The best seen.
-    report : FitReport
-
-    Raises
-    ------
-    ValueError
-        If the loss, its gradient or the step is not finite at the start.
+    It stops after a step that promises a fall below a hundredth of ``tol``, or brings one below a tenth, times the loss
+    at the start where that is above one.
     """
     curve = _Curve(callback)
     evaluate = partial(_evaluate, loss, curve)
