@@ -212,12 +212,11 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator):
 
     def predict_df(self, X: ArrayLike) -> Floats:
         """Degrees of freedom of the predictive density at X: (n_samples,), infinite where it is normal."""
+        return self._arrays(lambda x: (self._degrees(x),), checked_queries(self, X))[0]
 
-        def degrees(x: Tensor) -> tuple[Tensor]:
-            found = self.module_.degrees(x)
-            return (torch.full_like(x[:, 0], torch.inf) if found is None else found,)
-
-        return self._arrays(degrees, checked_queries(self, X))[0]
+    def _degrees(self, x: Tensor) -> Tensor:
+        found = self.module_.degrees(x)
+        return torch.full_like(x[:, 0], torch.inf) if found is None else found
 
     def log_likelihood(self, X: ArrayLike, y: ArrayLike) -> Floats:
         """Log density of each row of y at X, in nats: (n_samples,)."""
@@ -272,11 +271,12 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator):
             what=f"n_samples={n_samples} at {len(inputs)} rows",
             remedy="Draw fewer at a time.",
         )
-        mean, scale_tril = self._arrays(lambda x: self.module_(x, *self._prior_tril_at(x)), inputs)
+        mean, scale_tril, degrees = self._arrays(
+            lambda x: (*self.module_(x, *self._prior_tril_at(x)), self._degrees(x)[:, None]), inputs
+        )
         normal = generator.standard_normal((*mean.shape, n_samples))
         # Student's t of this covariance: normal numbers times the root of (df - 2) over a chi-squared number, which is
         # a gamma number of shape df / 2 and scale 2.
-        degrees = self.predict_df(inputs)[:, np.newaxis]
         if np.isfinite(degrees).any():  # everywhere or nowhere
             squares = generator.gamma(0.5 * degrees, 2.0, size=(len(inputs), n_samples))
             normal *= np.sqrt((degrees - 2.0) / squares)[:, np.newaxis]
