@@ -16,7 +16,8 @@ from torch_pbd.data import Demonstrations, check_unimodal
 from torch_pbd.data.alignment import TIMING_REMOVED
 from torch_pbd.data.poses import ROTATION
 from torch_pbd.data.units import ANGLES, LENGTHS
-from torch_pbd.estimators.base import CovarianceRegressor, prior_covariance
+from torch_pbd.estimators.base import CovarianceRegressor
+from torch_pbd.estimators.door import prior_covariance
 from torch_pbd.estimators.heteroscedastic import HeteroscedasticGPRegressor
 from torch_pbd.estimators.validation import check_groups, check_squares, checked_rows, fit_with_groups
 
