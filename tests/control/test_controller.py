@@ -209,7 +209,8 @@ def test_outputs_in_different_units_are_told_of(tunnel):
 def test_phases_need_a_duration(tunnel, controller):
     phases = Demonstrations([time / 10.0 for time in tunnel.times], tunnel.positions, units="m", time_unit="1")
     with pytest.warns(UserWarning, match=r"in '1', not in s: the movement is taken to last 1 s\. Give duration"):
-        assert DMPController(CD).fit(phases).schedule(100.0).duration == 1.0
+        fitted = DMPController(CD).fit(phases)
+    assert (fitted.schedule(100.0).duration, fitted.cutoff_, controller.cutoff_) == (1.0, 40.0, 4.0)
     timed = DMPController(CD, duration=10.0, cutoff=4.0).fit(phases)
     plan = timed.schedule(50.0)
     np.testing.assert_allclose(plan.velocity, controller.schedule(50.0).velocity, atol=1e-6)

@@ -3,7 +3,7 @@ import pytest
 from scipy.signal import butter, filtfilt
 
 from torch_pbd.control.primitive import smoothing
-from torch_pbd.control.primitive.smoothing import automatic_cutoff, variance_share, white_noise
+from torch_pbd.control.primitive.smoothing import smoothed_noise, variance_share
 from torch_pbd.data import Demonstrations, make_tunnel_demonstrations
 
 
@@ -102,11 +102,6 @@ def test_the_shortest_demonstrations_have_an_acceleration(n_samples):
     np.testing.assert_allclose(movements.acceleration[:, :, 0], 2.0, atol=1e-9)
 
 
-def test_the_automatic_cutoff_knows_seconds_from_phases():
-    assert automatic_cutoff(10.0, knows_seconds=True) == 4.0
-    assert automatic_cutoff(2.0, knows_seconds=False) == 20.0
-
-
 def test_a_duration_slows_movement_and_cutoff_together(rng):
     time = np.arange(0.0, 1.0, 0.002)
     recorded = two(time, rng.normal(size=len(time)).cumsum())
@@ -130,7 +125,6 @@ def test_noise_is_told_from_movement():
     movements = smooth(recorded, 4.0, 100)
     # The tremor of 0.1 mm is above the cutoff; quantization and noise of y are micrometres.
     np.testing.assert_allclose(movements.noise_scale, [1e-4, 2.3e-6], rtol=0.2)
-    noise = Demonstrations(recorded.times, white_noise(recorded.n_steps, movements.noise_scale))
-    share = variance_share(smooth(noise, 4.0, 100).position, movements.position)
+    share = variance_share(smoothed_noise(movements, recorded.times, 4.0).position, movements.position)
     assert share[0] < 1e-4  # x moves by centimetres
     assert share[1] > 0.5  # y is the same for all, but for its noise

@@ -171,7 +171,7 @@ class DMPController(Planning):
         self.duration_, self.time_scale_ = smoothing.duration_of(shown, self.duration)
         self.start_time_ = smoothing.common_start(shown)
         seconds = self.time_unit_ in TIMES
-        automatic = smoothing.automatic_cutoff(self.duration_, knows_seconds=seconds)
+        automatic = max(smoothing.CUTOFF_HZ if seconds else 0.0, smoothing.CUTOFF_CYCLES / self.duration_)
         self.cutoff_ = automatic if self.cutoff == "auto" else self.cutoff
         self.dmp_ = primitive(self)
         smoothing.check_steps(self.n_steps, self.n_demos_, self.n_outputs_, learned=True)
@@ -196,9 +196,8 @@ class DMPController(Planning):
         )
         # Share of the variance that white noise as large as the smoothing's residual would make: not variability.
         self.noise_scale_ = movements.noise_scale
-        noise = smoothing.white_noise(shown.n_steps, self.noise_scale_)
-        smoothed = smoothing.smooth(shown.times, noise, self.cutoff_, self.n_steps, self.duration_, noise=True)
-        self.noise_share_ = smoothing.variance_share(self.varying(smoothed), varying)
+        noise = smoothing.smoothed_noise(movements, shown.times, self.cutoff_)
+        self.noise_share_ = smoothing.variance_share(self.varying(noise), varying)
         # 5. Gains. The bounds of eq. (20) are quantiles of the standard deviations where there are samples; eq. (19)
         # then gives each principal axis its stiffness, and the damping follows from stiffness and mass.
         self.law_ = fit_law(self, law, varying)

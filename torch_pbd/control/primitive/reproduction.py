@@ -85,23 +85,18 @@ class Reproduction:
     def phase(self, time: Floats) -> Floats:
         """Inputs (n, 1) of the regressors at movement times (n,): the phase, its logarithm, or the time itself."""
         if self.phase_input == "s":
-            return self.dmp.phase(_tensor(time)).numpy()[:, np.newaxis]
-        seen = time if self.phase_input == "time" else -self.dmp.gamma * time / self.dmp.tau
-        return seen[:, np.newaxis]
+            time = self.dmp.phase(time).numpy()
+        elif self.phase_input == "log_s":
+            time = -self.dmp.gamma * time / self.dmp.tau
+        return time[:, np.newaxis]
 
     def forcing_of(self, movements: Movements) -> Floats:
         """Forcing (K, n, d) that reproduces each movement, eq. (18)."""
         goal = movements.position[:, -1:] if self.own_goals else self.goal
-        goals = np.broadcast_to(goal, movements.position.shape)
-        parts = (movements.position, movements.velocity, movements.acceleration, goals)
-        forcing: Floats = self.dmp.forcing(*map(_tensor, parts)).numpy()
-        return forcing
+        return self.dmp.forcing(movements.position, movements.velocity, movements.acceleration, goal).numpy()
 
     def check_against(self, movements: Movements) -> float:
-        """Root mean square distance of the motion from the mean of the movements as recorded; of poses, of positions.
-
-        Warns of more than 1 % of the extent of all movements, and refuses a motion that leaves their range.
-        """
+        """Root mean square distance of positions from the mean as recorded, of which more than 1 % is told."""
         path, bounds, errors = self.motion(movements.time)[0], movements.bounds, []
         check_range(path, bounds, "The reproduced movement")
         for own, unit in zip(self.blocks, ("", " rad of rotation"), strict=False):
@@ -137,15 +132,13 @@ class Reproduction:
     @cached_property
     def _curve(self) -> CubicHermiteSpline:
         """Movement to the demonstrated goal, until it is at rest: exact at its ticks, and cubics between."""
-        step, dmp, time = float(self.time[1]), self.dmp, self.time
+        step, dmp, n_ticks = float(self.time[1]), self.dmp, len(self.time)
         if dmp.adaptation != "safe":
             slowest = max(2.0 * dmp.tau / dmp.alpha, dmp.tau / dmp.gamma if dmp.gate == "phase" else 0.0)
-            n_ticks = len(time) + int((_SETTLE * slowest + 0.1 * time[-1]) / step)
-            time = np.array(step * np.arange(n_ticks), dtype=np.float64)
-        ticks = step * np.arange(len(time))
-        held = np.stack([np.interp(ticks, self.time, column) for column in self.forcing.T], axis=1)
-        forcing, goal, start, velocity = map(_tensor, (held, self.goal, self.start, self.velocity))
-        run = dmp.rollout(forcing, step, goal=goal, position0=start, velocity0=velocity)
+            n_ticks += int((_SETTLE * slowest + 0.1 * self.time[-1]) / step)
+        ticks = np.arange(n_ticks)
+        time, forcing = step * ticks, self.forcing[np.minimum(ticks, len(self.time) - 1)]
+        run = dmp.rollout(forcing, step, goal=self.goal, position0=self.start, velocity0=self.velocity)
         positions, velocities = (part.numpy() for part in run)
         if dmp.adaptation == "safe":
             # What is left at the end is taken out by minimum jerk, as a change of the goal is.
@@ -174,9 +167,8 @@ class Reproduction:
         path = self.motion(passed)
         if changed:
             # The primitive is linear: another start and goal add its answer to their change alone.
-            still, change = torch.zeros(goals.shape, dtype=torch.float64), _tensor(goals - self.goal)
-            step = float(passed[1])
-            run = self.dmp.rollout(still, step, goal=change, position0=_tensor(start - self.start))
+            still, step = np.zeros(goals.shape), float(passed[1])
+            run = self.dmp.rollout(still, step, goal=goals - self.goal, position0=start - self.start)
             answer = CubicHermiteSpline(step * np.arange(len(passed)), *(part.numpy() for part in run), axis=0)
             position, velocity, acceleration = path
             path = position + answer(passed), velocity + answer(passed, 1), acceleration + answer(passed, 2)

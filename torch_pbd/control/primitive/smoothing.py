@@ -23,11 +23,9 @@ UNKNOWN = 0.5
 # less. Bursts of five samples 1e-9 to 1e-6 s apart, left unmerged, make a path of 8.7e7 m of recordings within 0.41 m.
 _RESOLUTION = 1e-3
 _INTERVALS = 4000  # intervals of a table, which gives the shortest gap, of 7.5 spacings, 200 of them
-CUTOFF_HZ = 4.0
-"""Cutoff of slow movements: hands move below it, and tremor (8 to 12 Hz) and encoders' steps are above."""
-
-_CUTOFF_CYCLES = 40.0  # in a movement, the least cutoff of any: fast ones have detail above 4 Hz
-_LEAST_SAMPLES = {True: LEAST_SAMPLES, False: 3}  # with a cutoff and without one
+# Least cutoff in Hz: hands move below it, and tremor (8 to 12 Hz) and steps of encoders are above. Fast movements have
+# detail above 4 Hz: of them it is 40 cycles in a movement.
+CUTOFF_HZ, CUTOFF_CYCLES = 4.0, 40.0
 _MOST_BEYOND = 0.1  # allowed excess of an output's range in all recordings; paths through gaps keep to half of it
 # Measured, in numbers: of each of a demonstration's positions while it is smoothed; of each pair of steps while the
 # forcing is learned, in all and of each axis where they are many; of each axis at a step, while it is tabulated.
@@ -36,11 +34,11 @@ _SMOOTHED, _PAIRED, _PAIRED_AXIS, _TABULATED = 10.0, 34.0, 5.0, 16e3
 
 @dataclass(frozen=True)
 class Movements:
-    """K movements at n common movement times (n,) in s, from 0 to the duration, to which each is stretched linearly.
+    """K movements (K, n, d) at n common times in s, from 0 to the duration, to which each is stretched linearly.
 
-    Positions and derivatives by movement time are (K, n, d), ``known`` (K, n) is where each has samples near, and
-    ``recorded_mean`` (n, d) the mean as recorded, not smoothed but for holes. ``bounds`` (2, d) are the lowest and
-    highest position of all recordings, ``noise_scale`` (d,) the root mean square of what the smoothing took away.
+    ``known`` (K, n) is where each has samples near, ``recorded_mean`` (n, d) the mean as recorded, not smoothed but for
+    holes. ``bounds`` (2, d) are the lowest and highest position of all recordings, ``noise_scale`` (d,) the root mean
+    square of what the smoothing took away.
     """
 
     time: Floats
@@ -66,17 +64,12 @@ def smooth(
 
     With a cutoff, in Hz of the movement, each output is the cubic smoothing spline whose weight halves the amplitude
     there: at even sampling it is a Butterworth filter of second order run forward and backward, and it takes the times
-    as they are. Without one it is the spline of degree 5 (3 below six samples) through all samples: exact for
-    polynomials, and noise goes through, times the square of its frequency in the acceleration.
-
-    In a hole it follows the mean of those that have none there, plus the least bent curve that joins the differences
-    from it on both sides, a cubic; not beyond the recorded range by more than a twentieth of it. Unless it is
-    ``noise``, a path that leaves that range by a tenth is refused.
+    as they are. Without one it is the spline of degree 5 (3 below six samples) through all samples. Unless it is
+    ``noise``, a path that leaves the recorded range by a tenth is refused.
     """
-    least = _LEAST_SAMPLES[cutoff is not None]
+    least, purpose = (3, "for an acceleration") if cutoff is None else (LEAST_SAMPLES, "to be smoothed, or cutoff=None")
     for number, n_samples in enumerate(map(len, times)):
         if n_samples < least:
-            purpose = "to be smoothed, or cutoff=None for 3" if cutoff is not None else "for an acceleration"
             raise ValueError(
                 f"demonstration {number} has {n_samples} samples, needs at least {least} {purpose}: leave it out, or "
                 "record it at a higher rate."
@@ -94,9 +87,8 @@ def smooth(
         motions.append([spline(own, order) * stretch**order for order in range(3)])
         removed.append(position - spline(time))
         known.append(unsampled(time, own) <= UNKNOWN)
-        recorded.append(
-            np.where(known[-1][:, np.newaxis], make_interp_spline(time, position, k=1)(own), motions[-1][0])
-        )
+        linear = make_interp_spline(time, position, k=1)
+        recorded.append(np.where(known[-1][:, np.newaxis], linear(own), motions[-1][0]))
     position, velocity, acceleration = (np.stack(parts) for parts in zip(*motions, strict=True))
     for number, path in enumerate(() if noise else position):
         check_range(path, bounds, f"demonstration {number}, smoothed,")
@@ -134,7 +126,7 @@ def check_range(path: Floats, bounds: Floats, name: str) -> None:
 def _splines(
     times: Sequence[Floats], positions: Sequence[Floats], cutoff: float | None, bounds: Floats
 ) -> list[BSpline]:
-    """Spline of each demonstration over its time from its start."""
+    """Spline of each demonstration over its time from its start; in a hole near the mean of those that have none."""
     margin = 0.5 * _MOST_BEYOND * np.ptp(bounds, axis=0)
     splines = [_spline(*recording, cutoff) for recording in zip(times, positions, strict=True)]
     bridged = splines.copy()
@@ -171,15 +163,11 @@ def _spline(time: Floats, position: Floats, cutoff: float | None) -> BSpline:
     return smoothing_spline(time, position, cutoff)
 
 
-def automatic_cutoff(duration: float, *, knows_seconds: bool) -> float:
-    """Cutoff of 40 cycles a movement of ``duration`` s; where the times are in seconds, not below 4 Hz."""
-    return max(CUTOFF_HZ if knows_seconds else 0.0, _CUTOFF_CYCLES / duration)
-
-
-def white_noise(n_samples: Sequence[int], scale: Floats) -> list[Floats]:
-    """White noise (T_k, d) of standard deviation ``scale`` (d,) at the samples of each demonstration."""
-    random = np.random.default_rng(0)
-    return [random.normal(size=(n, len(scale))) * scale for n in n_samples]
+def smoothed_noise(movements: Movements, times: Sequence[Floats], cutoff: float | None) -> Movements:
+    """White noise as large as what was taken away from movements, smoothed as they were."""
+    random, scale = np.random.default_rng(0), movements.noise_scale
+    noise = [random.normal(size=(len(time), len(scale))) * scale for time in times]
+    return smooth(times, noise, cutoff, len(movements.time), float(movements.time[-1]), noise=True)
 
 
 def variance_share(part: Floats, whole: Floats) -> Floats:
@@ -225,10 +213,9 @@ def unsampled(time: Floats, at: Floats) -> Floats:
 
 
 def tabulate_unsampled(demonstrations: Demonstrations, lasting: float, on_unknown: str) -> Floats:
-    """Type I uncertainty at 4001 even times from the start to the end to which all recordings are stretched.
+    """Type I uncertainty at 4001 even times from the start to the end, the second lowest of all recordings.
 
-    From one recording alone nothing is known of how they vary: it is the second lowest of theirs. Holes that all share
-    but one are told, at times in a movement of ``lasting``.
+    From one alone nothing is known of how they vary. Holes that all share but one are told, at times of ``lasting``.
     """
     share, each = np.linspace(0.0, 1.0, _INTERVALS + 1), []
     inside = np.zeros(len(share))
@@ -251,17 +238,15 @@ def tabulate_unsampled(demonstrations: Demonstrations, lasting: float, on_unknow
 
 def duration_of(demonstrations: Demonstrations, duration: float | None) -> tuple[float, float]:
     """Duration in s, by default the median of the demonstrations, and seconds per unit of their time."""
-    own = float(np.median([time[-1] - time[0] for time in demonstrations.times]))
+    own, unit = float(np.median([time[-1] - time[0] for time in demonstrations.times])), demonstrations.time_unit
     if duration is not None:
         return float(duration), duration / own
-    scale = TIMES.get(demonstrations.time_unit)  # none of a phase
-    if scale is None:
+    if unit not in TIMES:
         checks.warn(
-            f"The times of the demonstrations are in {demonstrations.time_unit!r}, not in s: the movement is taken to "
-            f"last {own:.3g} s. Give duration, in s."
+            f"The times of the demonstrations are in {unit!r}, not in s: the movement is taken to last {own:.3g} s. "
+            "Give duration, in s."
         )
-        scale = 1.0
-    return own * scale, scale
+    return own * TIMES.get(unit, 1.0), TIMES.get(unit, 1.0)
 
 
 def common_start(demonstrations: Demonstrations) -> float:
