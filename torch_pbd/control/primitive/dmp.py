@@ -115,9 +115,10 @@ class DMP:
         time = as_tensor(time, "time")
         if self.gate == "none" or self.duration is None:
             return torch.ones_like(time)
+        late = time - self.duration
         if self.gate == "phase":
-            return self.phase((time - self.duration).clamp_min(0.0))
-        u = ((time - self.duration) / (0.1 * self.duration)).clamp(0.0, 1.0)
+            return self.phase(late.clamp_min(0.0))
+        u = (late / (0.1 * self.duration)).clamp(0.0, 1.0)
         return 1.0 - u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
 
     def forcing(
@@ -135,9 +136,9 @@ class DMP:
             If shapes disagree, or a value is not finite.
         """
         parts = {"position": position, "velocity": velocity, "acceleration": acceleration, "goal": goal}
-        rows = {name: as_rows(part, name, 1) for name, part in parts.items()}
-        _broadcast(rows)
-        position, velocity, acceleration, goal = rows.values()
+        parts = {name: as_rows(part, name, 1) for name, part in parts.items()}
+        _broadcast(parts)
+        position, velocity, acceleration, goal = parts.values()
         spring = self.beta * (goal - position) - self.tau * velocity
         return self.tau**2 * acceleration - self.alpha * spring
 
@@ -173,31 +174,29 @@ class DMP:
             If a shape is wrong, or a value is not finite.
         """
         forcing, goal = as_rows(forcing, "forcing", 2), as_rows(goal, "goal", 1)
-        goals = goal if goal.ndim > 1 else goal[None]
-        starts = {"position0": position0, "velocity0": velocity0}
-        places = {**starts, "demonstrated_start": demonstrated_start, "demonstrated_goal": demonstrated_goal}
-        given = {name: as_rows(place, name, 1) for name, place in places.items() if place is not None}
-        dt = checks.number(dt, "dt", above=0.0, unit="s")
-        time = torch.arange(forcing.shape[-2]).to(goal) * dt
-        at_ticks = forcing * self.gate_at(time)[:, None]
-        rows = {"forcing": at_ticks, "goal": goals, **{name: place[..., None, :] for name, place in given.items()}}
+        time = torch.arange(forcing.shape[-2]).to(goal) * checks.number(dt, "dt", above=0.0, unit="s")
+        places = {"position0": position0, "velocity0": velocity0}
+        places |= {"demonstrated_start": demonstrated_start, "demonstrated_goal": demonstrated_goal}
+        rows = {name: as_rows(place, name, 1)[..., None, :] for name, place in places.items() if place is not None}
+        rows |= {"forcing": forcing * self.gate_at(time)[:, None], "goal": goal if goal.ndim > 1 else goal[None]}
         shape = _broadcast(rows, len(time))
-        at_ticks, goals = at_ticks.expand(shape), goals.expand(shape)
-        start, velocity = (given.get(name, goal.new_zeros(shape[-1])) for name in starts)
-        own_start, own_goal = given.get("demonstrated_start", start), given.get("demonstrated_goal", goals[..., 0, :])
+        rows = {name: part.expand(shape) for name, part in rows.items()}
+        at_ticks, goals, still = rows["forcing"], rows["goal"], goal.new_zeros(shape)
+        start, velocity = (rows.get(name, still)[..., 0, :] for name in ("position0", "velocity0"))
+        own_start = rows.get("demonstrated_start", rows.get("position0", still))[..., 0, :]
+        own_goal = rows.get("demonstrated_goal", goals)[..., 0, :]
         # A safe adaptation reproduces the demonstrated movement, and moves its path to the other start and goals.
         same = bool((own_start == start).all() and (goals == own_goal[..., None, :]).all())
         safe = self.adaptation == "safe" and not same
         driven = own_goal[..., None, :].expand(shape) if safe else goals
-        begin = (own_start if safe else start, self.tau * velocity)
-        trace = self._solve(at_ticks, driven, dt, torch.stack([each.expand(*shape[:-2], -1) for each in begin], dim=-1))
-        position, rate = trace[..., 0], trace[..., 1] / self.tau
-        if safe:
-            spring = self.beta * (driven - position) - trace[..., 1]
-            path = position, rate, (self.alpha * spring + at_ticks) / self.tau**2  # eq. (16)
-            ends = {"own_goal": own_goal, "goals": goals, "start": start}
-            position, rate, _ = adapt(path, time, (position, time), **ends, duration=self.duration or self.tau)
-        return position, rate
+        begin = torch.stack([own_start if safe else start, self.tau * velocity], dim=-1)
+        position, scaled = self._solve(at_ticks, driven, float(dt), begin).unbind(-1)
+        if not safe:
+            return position, scaled / self.tau
+        acceleration = (self.alpha * (self.beta * (driven - position) - scaled) + at_ticks) / self.tau**2  # eq. (16)
+        path, ends = (position, scaled / self.tau, acceleration), {"own_goal": own_goal, "goals": goals, "start": start}
+        position, velocity, _ = adapt(path, time, (position, time), **ends, duration=self.duration or self.tau)
+        return position, velocity
 
     def _solve(self, forcing: Tensor, goals: Tensor, dt: float, state: Tensor) -> Tensor:
         """States at the ticks, exact for forcing that is linear between them and goals held over them."""
@@ -240,10 +239,8 @@ def adapt(
 
     With u the path relative to its own goal, the motion is ``goal + k u + c``: c takes start and goal along, by minimum
     jerk over the duration, so that with k = 1 the acceleration is the sum of both. Where this would leave the hull of
-    start, goal and the whole path (positions, times), k is less: the motion is then a mean of that one and of the
-    straight minimum jerk, whose peak acceleration is 10 / sqrt(3) where that of any in this time is 4 or more.
-
-    Where the goal changes, k and c are chosen anew so that position, velocity and acceleration go on. k never grows.
+    start, goal and the whole path (positions, times), k is less: a mean of that motion and of the straight minimum
+    jerk. Where the goal changes, k and c are chosen anew so that the motion goes on smoothly. k never grows.
     """
     relative = torch.stack([path[0] - own_goal.unsqueeze(-2), *path[1:]], dim=-1)
     stride = -(-len(whole[1]) // _WATCHED)
