@@ -163,4 +163,4 @@ def fit_law(controller: Any, law: StiffnessLaw, varying: Floats) -> StiffnessLaw
     learned, path = controller.covariance_.predict_cov(reproduction.phase(time)), reproduction.motion(time)[0]
     covariance = outputs.covariance(learned, path, cross_terms=law.cross_terms)
     resolution = (RESOLUTION * outputs.extents(varying)).tolist()
-    return law.fitted(covariance, resolution=resolution, mass=outputs.mass(controller.mass))
+    return law.fitted(covariance, resolution=resolution, mass=controller.mass_)

@@ -23,6 +23,7 @@ from torch_pbd.control.simulation.rollout import Rollout
 from torch_pbd.control.simulation.run import simulate
 from torch_pbd.control.stiffness import StiffnessLaw
 from torch_pbd.control.via import conditioned, planned
+from torch_pbd.data.units import ANGLES, LENGTHS
 from torch_pbd.estimators.validation import checked_values
 
 _UNITS = {"duration": "s", "distance": "m", "speed": "m/s"}
@@ -53,6 +54,9 @@ class MotionLimits:
 
 
 _LIMITS = MotionLimits()
+# Radius of gyration of a virtual mass, m. The inertia felt at the tool of a Panda along the made pose task is 5.01 to
+# 16.1 kg and 0.0761 to 0.774 kg m^2 (docs/poses.md): the roots of the ratio are 0.12 and 0.22 m, this their mean.
+_LEVER = 0.17
 
 
 class Planning(BaseEstimator):
@@ -72,8 +76,9 @@ class Planning(BaseEstimator):
     @property
     def mass_(self) -> float | Floats:
         """Virtual mass that the gains assume, in kg or for angles kg m^2: a number or a matrix (d, d)."""
-        check_is_fitted(self)
-        return self.outputs_.mass(self.mass)
+        if self.mass is None and self.outputs_.reference is not None:
+            return np.diag([1.0] * self.outputs_.n_positions + [_LEVER**2] * 3)
+        return 1.0 if self.mass is None else self.mass
 
     def predict(self, X: ArrayLike) -> Floats:
         """Reproduced outputs (n, d) at times X (n, 1), in the time units and origin of the demonstrations.
@@ -265,10 +270,10 @@ class Planning(BaseEstimator):
 
 def _labels(controller: Any) -> dict[str, Any]:
     """Names, units, limits and JSON-compatible provenance of the schedules of a fitted controller."""
-    law, mass = controller.law_, controller.mass_
+    law, outputs, mass = controller.law_, controller.outputs_, controller.mass_
     return {
         "names": controller.names_,
-        "units": controller.outputs_.robot_unit,
+        "units": "m" if outputs.unit in LENGTHS else "rad" if outputs.unit in ANGLES else outputs.unit,
         "frame": controller.frame_,
         "stiffness_limits": law.limits(controller.n_outputs_),
         "covariance_of": controller.variability,

@@ -17,13 +17,6 @@ from torch_pbd.rotations import Chart
 RESOLUTION = 1e-5
 """Share of a movement's extent, for rotations of a radian, below which standard deviations count as none."""
 
-LEVER = 0.17
-"""Radius of gyration of a virtual mass, m: that of the inertia which is felt at the tool of an arm.
-
-Of a Panda along the made pose task it is 5.01 to 16.1 kg and 0.0761 to 0.774 kg m^2 (docs/poses.md), whose roots of the
-ratio are 0.12 and 0.22 m; this is their geometric mean, rounded.
-"""
-
 _ROUNDING = 1e-11  # rounding as a share of the largest position, and in rad
 _STEPS, _FLAT = 100, 1e-3  # at most; of curvature, where two axes are as good turned
 _FURTHEST = 150.0  # degrees from the reference, as for demonstrations: at 180 a chart takes the other way round
@@ -66,14 +59,9 @@ class Outputs:
         return (LENGTHS | ANGLES).get(self.unit or "", 1.0)
 
     @property
-    def robot_unit(self) -> str | None:
-        """Unit of the positions of a robot that follows the movement."""
-        return "m" if self.unit in LENGTHS else "rad" if self.unit in ANGLES else self.unit
-
-    @property
     def in_metres(self) -> bool:
         """Whether a robot's positions are in m, which is also assumed without units."""
-        return self.units is None or self.robot_unit == "m"
+        return self.units is None or self.unit in LENGTHS
 
     @property
     def scales(self) -> Floats:
@@ -152,24 +140,17 @@ class Outputs:
 
     def motion(self, path: Floats, velocity: Floats, acceleration: Floats) -> dict[str, Floats]:
         """Schedule rows in m and rad, in world axes, from a motion (n, d)."""
-        unit = self.si
+        position, velocity, acceleration = (self.scales * part for part in (path, velocity, acceleration))
         if self.reference is None:
-            return {"position": unit * path, "velocity": unit * velocity, "acceleration": unit * acceleration}
+            return {"position": position, "velocity": velocity, "acceleration": acceleration}
         p, chart = self.n_positions, self._chart
-        position, orientation = self.poses(path)
-        y, rate, second = path[:, p:], velocity[:, p:], acceleration[:, p:]
+        y, rate, second = position[:, p:], velocity[:, p:], acceleration[:, p:]
         return {
-            "position": unit * position,
-            "velocity": np.hstack([unit * velocity[:, :p], chart.velocity(y, rate)]),
-            "acceleration": np.hstack([unit * acceleration[:, :p], chart.acceleration(y, rate, second)]),
-            "orientation": orientation,
+            "position": position[:, :p],
+            "velocity": np.hstack([velocity[:, :p], chart.velocity(y, rate)]),
+            "acceleration": np.hstack([acceleration[:, :p], chart.acceleration(y, rate, second)]),
+            "orientation": chart.exp(y),
         }
-
-    def mass(self, given: float | Floats | None) -> float | Floats:
-        """Virtual mass, by default 1 kg, and for poses a matrix with the inertia of 1 kg at a distance ``LEVER``."""
-        if given is not None:
-            return given
-        return 1.0 if self.reference is None else np.diag([1.0] * self.n_positions + [LEVER**2] * 3)
 
     def rows(self, values: Any, name: str) -> Floats:
         """Outputs (..., d) of positions followed by a unit quaternion w x y z, or as they are; NaN where not given."""

@@ -187,9 +187,7 @@ def merge_bursts(demonstrations: Demonstrations) -> Demonstrations:
         f"and were merged with it: {preview([f'{few} of {n} in demonstration {k}' for k, n, few in lost])}. Take times "
         "from a clock that resolves them, or drop repeated samples."
     )
-    kept = ("names", "units", "frame", "time_unit", "rotation_reference")
-    labels = {name: getattr(demonstrations, name) for name in kept}
-    return Demonstrations([time for time, _ in merged], [position for _, position in merged], **labels)
+    return demonstrations._replace(*zip(*merged, strict=True))
 
 
 def _merge(time: Floats, position: Floats) -> tuple[Floats, Floats]:
