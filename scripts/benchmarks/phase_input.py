@@ -24,10 +24,10 @@ def errors(controller, truth, n_steps):
     residual = values - values.mean(axis=0)
     covariance = np.einsum("kti,ktj->tij", residual, residual) / (len(residual) - 1)
     law = StiffnessLaw().fitted(covariance)
-    inferred = controller.covariance_.predict_cov(controller.phase(movements.time))
+    inferred = controller.covariance_.predict_cov(controller.reproduction_.phase(movements.time))
     stiffness, true_stiffness = law(inferred).numpy()[:, 0, 0], law(covariance).numpy()[:, 0, 0]
     dense = np.linspace(0.0, controller.duration_, 2001)
-    served = law(controller.covariance_.predict_cov(controller.phase(dense))).numpy()[:, 0, 0]
+    served = law(controller.covariance_.predict_cov(controller.reproduction_.phase(dense))).numpy()[:, 0, 0]
     return (
         np.abs(stiffness - true_stiffness).mean(),
         0.5 * np.abs(np.log(inferred[:, 0, 0] / covariance[:, 0, 0])).mean(),

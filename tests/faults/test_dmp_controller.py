@@ -199,12 +199,10 @@ def test_24_where_nothing_is_known_it_is_compliant_or_the_prior_or_an_error():
         new(on_unknown="raise").fit(recorded()).predict_stiffness(far)
 
 
-@pytest.mark.parametrize("method", [*QUERIES, "phase"])
+@pytest.mark.parametrize("method", QUERIES)
 def test_25_misuse_of_queries_is_told(method):
     with pytest.raises(NotFittedError, match="not fitted yet"):
         getattr(new(), method)([[0.0]])
-    if method == "phase":
-        return
     for query, error, message in [
         ([0.0], ValueError, "Expected 2D array"),
         ([[0.0, 1.0]], ValueError, "X has 2 features, but DMPController is expecting 1"),
@@ -292,8 +290,6 @@ BAD_CALLS = [
     ("schedule", {"start": [np.inf, 0.0]}, r"start\[0\] is inf, must be finite"),
     ("schedule", {"settle": -1.0}, "settle is -1.0 s, must be a finite number of at least 0"),
     ("schedule", {"settle": np.nan}, "settle is nan s, must be a finite number"),
-    ("phase", {"time": 1.0}, r"time has shape \(\), must have shape \(n,\)"),
-    ("phase", {"time": [np.nan]}, r"time\[0\] is nan, must be finite"),
     ("smooth", {"demonstrations": np.zeros((4, 5, 2))}, "demonstrations is of type ndarray, must be a Demonstrations"),
     ("smooth", {"demonstrations": recorded(), "n_steps": 0}, "n_steps is 0, must be an integer of at least 2"),
     (

@@ -218,11 +218,6 @@ class Planning(BaseEstimator):
         """
         return simulate(self.schedule(rate), force, plant=plant, random_state=random_state)
 
-    def phase(self, time: ArrayLike) -> Floats:
-        """Inputs (n, 1) of ``covariance_`` at movement times (n,) from 0 on, as ``phase_input`` selects."""
-        check_is_fitted(self)
-        return self.reproduction_.phase(checks.array(time, "time", ("n",)))
-
     def _path(self, time: Floats) -> Floats:
         """Reproduced position (n, d) at movement times (n,)."""
         position = self.reproduction_.motion(time)[0]

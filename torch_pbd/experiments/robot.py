@@ -131,7 +131,7 @@ def task_figure(
     ax.plot(across, up, color=plotting.MODEL, lw=1.8, label="reproduction", zorder=4)
     if controller.variability == "position" and in_plane:
         some = np.linspace(0.0, controller.duration_, _N_ELLIPSES)
-        covariance = controller.covariance_.predict_cov(controller.phase(some))[:, :2, :2]
+        covariance = controller.covariance_.predict_cov(controller.reproduction_.phase(some))[:, :2, :2]
         centres = controller.reproduction_.motion(some)[0][:, :2]
         plotting.plot_covariance_ellipses(centres, covariance, ax, label="inferred: 2 sd")
     ax.set_title(name, fontsize=10)
@@ -158,7 +158,7 @@ def variability_figure(run: Run, demonstrations: Demonstrations, name: str) -> F
     n_shown = min(demonstrations.n_outputs, _MOST_OUTPUTS)
     figure, grid = style.figure_grid(n_shown + 1, 1, (6.4, 1.9 * (n_shown + 1)), sharex=True)
     axes = grid[:, 0]
-    covariance = controller.covariance_.predict_cov(controller.phase(movements.time))
+    covariance = controller.covariance_.predict_cov(controller.reproduction_.phase(movements.time))
     centre, deviation = varying.mean(axis=0), varying.std(axis=0, ddof=1)
     inferred = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     for output, ax in enumerate(axes[:-1]):

@@ -67,7 +67,9 @@ def smooth(
     as they are. Without one it is the spline of degree 5 (3 below six samples) through all samples. Unless it is
     ``noise``, a path that leaves the recorded range by a tenth is refused.
     """
-    least, purpose = (3, "for an acceleration") if cutoff is None else (LEAST_SAMPLES, "to be smoothed, or cutoff=None")
+    least, purpose = 3, "for an acceleration"
+    if cutoff is not None:
+        least, purpose = LEAST_SAMPLES, "to be smoothed, or cutoff=None for 3"
     for number, n_samples in enumerate(map(len, times)):
         if n_samples < least:
             raise ValueError(
