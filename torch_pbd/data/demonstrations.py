@@ -130,7 +130,7 @@ class Demonstrations(Editing):
                 reference = as_reference(rotation_reference, grids, outputs, labels, own)
         if angles is not None:
             outputs = tuple(unwrapped(grids, outputs, labels, own, angles))
-        outputs = tuple(frozen(output, fresh=True) for output in outputs)
+        outputs = tuple(map(frozen, outputs))
         # A frozen class can set its attributes only through its dictionary.
         vars(self).update(times=grids, positions=outputs, names=labels, units=own, rotation_reference=reference)
         vars(self).update(frame=frame, time_unit=time_unit, alignment=alignment)

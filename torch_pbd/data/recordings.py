@@ -19,14 +19,10 @@ _ALONE = "One demonstration alone is written [positions]."
 Arrays = list[NDArray[Any]]
 
 
-class Fresh(list[NDArray[Any]]):
-    """Arrays without other references, which need not be copied."""
-
-
 def as_recordings(times: Any, positions: Any, missing: str) -> tuple[tuple[Floats, ...], tuple[Floats, ...]]:
     """Read-only float64 copies of K times (T_k,) and positions (T_k, d), without missing samples if these are dropped.
 
-    Messages use the original sample indices. `Fresh` positions are not copied.
+    Messages use the original sample indices.
     """
     drop = checks.choice(missing, "missing", Missing) == "drop"
     samples = [_samples(entry, f"positions[{k}]", drop) for k, entry in enumerate(_as_list(positions, "positions"))]
@@ -54,11 +50,7 @@ def as_recordings(times: Any, positions: Any, missing: str) -> tuple[tuple[Float
         kept = _not_missing(grids, samples)
         grids = [grid[numbers] for grid, numbers in zip(grids, kept, strict=True)]
         samples = [sample[numbers] for sample, numbers in zip(samples, kept, strict=True)]
-    fresh = drop or isinstance(positions, Fresh)
-    return (
-        tuple(map(_rising, _from_common_origin(grids), grids, names, kept)),
-        tuple(frozen(sample, fresh) for sample in samples),
-    )
+    return tuple(map(_rising, _from_common_origin(grids), grids, names, kept)), tuple(map(frozen, samples))
 
 
 def as_texts(values: Any, name: str, n_outputs: int | None = None) -> tuple[str, ...]:
@@ -98,10 +90,11 @@ def preview(values: Sequence[object], limit: int = 12) -> str:
     return f"[{shown}, ... {len(values)} in all]" if len(values) > limit else f"[{shown}]"
 
 
-def frozen(array: NDArray[Any], fresh: bool = False) -> Floats:
-    """Read-only array, a copy of one that is not fresh."""
-    # A view would keep alive what it is a part of.
-    copy = np.array(array, dtype=np.float64, order="C", copy=None if fresh and array.base is None else True)
+def frozen(array: NDArray[Any]) -> Floats:
+    """Read-only float64 array: a copy, but for a whole array that is read-only already."""
+    # A view may change, and would keep alive what it is a part of.
+    is_own = array.base is None and not array.flags.writeable
+    copy = np.array(array, dtype=np.float64, order="C", copy=None if is_own else True)
     copy.setflags(write=False)
     return copy
 

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torch_pbd import checks
-from torch_pbd.data.recordings import Fresh, Missing, as_texts, preview
+from torch_pbd.checks import Floats
+from torch_pbd.data.recordings import Missing, as_texts, preview
 from torch_pbd.data.units import TIMES
 from torch_pbd.files.memory import require_memory
 
@@ -63,7 +64,6 @@ class Wanted:
         checks.text(self.demo, "demo", optional=True)
         checks.text(self.time, "time", optional=True)
         checks.number(self.rate, "rate", above=0.0, unit="Hz", optional=True)
-        checks.choice(self.missing, "missing", Missing)
         checks.flag(self.from_start, "from_start")
         checks.count(self.max_bytes, "max_bytes", remedy="the bytes of the largest file to read")
         for name in ("outputs", "rotation", "in_units"):
@@ -137,17 +137,18 @@ class Wanted:
 
     def read_each(self, chosen: Chosen, recordings: Iterable[Mapping[str, NDArray[Any]]], **labels: Any) -> Arguments:
         """Arguments of ``Demonstrations`` from the signals of each recording; ``labels`` are those in the file."""
-        times, positions = [], Fresh()
+        times, positions = [], []
         for signals in recordings:
             columns = [_column(signals, place) for place in chosen.outputs]
             for name, values in zip(chosen.names, columns, strict=True):
                 if values.dtype.kind not in "biuf":
                     raise ValueError(f"column {name!r} holds {values.dtype}, no numbers: leave it out by outputs=.")
             positions.append(np.stack(columns, axis=1, dtype=np.float64))
+            positions[-1].setflags(write=False)  # which need not be copied
             times.append(_column(signals, chosen.time) if chosen.time else np.arange(len(columns[0])))
-        labels = {"names": chosen.names, "time_unit": "s"} | {k: v for k, v in labels.items() if v is not None}
         given = {name: getattr(self, name) for name in ("units", "frame", "rotation", "angles", "time_unit")}
-        labels |= {name: value for name, value in given.items() if value is not None}
+        known = {name: value for name, value in (*labels.items(), *given.items()) if value is not None}
+        labels = {"names": chosen.names, "time_unit": "s", **known}
         if self.outputs is None:
             positions, labels = self._without_counts(positions, labels)
         if self.rate is not None:
@@ -173,7 +174,7 @@ class Wanted:
         whole = whole if self.trim is None else whole.trim(self.trim)
         return whole.from_start() if self.from_start else whole
 
-    def _without_counts(self, positions: Fresh, labels: Arguments) -> tuple[Fresh, Arguments]:
+    def _without_counts(self, positions: list[Floats], labels: Arguments) -> tuple[list[Floats], Arguments]:
         """Columns without those that count rows or number demonstrations, unless named as outputs."""
         names = labels["names"]
         found = {}
@@ -199,7 +200,7 @@ class Wanted:
         if not found or not kept:
             return positions, labels
         each = {key: [labels[key][i] for i in kept] for key in ("names", "units") if isinstance(labels.get(key), list)}
-        return Fresh(position[:, kept] for position in positions), labels | each
+        return [position[:, kept] for position in positions], labels | each
 
 
 OPTIONS = tuple(field.name for field in fields(Wanted) if field.name != "notes")

@@ -5,7 +5,6 @@ import io
 import re
 from array import array
 from collections import Counter
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from math import isfinite, nan
@@ -101,37 +100,29 @@ class _Table:
                 raise ValueError("the cell is blank.")
             return numbers.setdefault(label.strip(), len(numbers))
 
-        converters: dict[Any, Any] = {demo: number_of, time: self._time} | dict.fromkeys(
-            self.chosen.names, self._number
-        )
-        converters.pop(None, None)
+        converters: dict[Any, Any] = dict.fromkeys(self.chosen.names, self._number)
+        converters |= {name: own for name, own in ((demo, number_of), (time, self._time)) if name is not None}
         # Arrays of numbers take 8 bytes for each, where lists take 32.
         columns: dict[str, Any] = {name: [] if name == time else array("d") for name in converters}
         self.file.seek(self.start)
-        for line, cells in self._rows():
-            row = dict(zip(self.header, cells, strict=True))
-            for name, convert in converters.items():
-                try:
-                    columns[name].append(convert(row[name]))
-                except ValueError as error:
-                    raise ValueError(f"line {line}, column {name!r}: {error}") from error
-        return {name: np.array(values) for name, values in columns.items()}
-
-    def _rows(self) -> Iterator[tuple[int, list[str]]]:
-        """Cells of each line that has some, with the number of the line: a quoted cell may go on for several."""
-        reader, line = csv.reader(self.file, delimiter=self.delimiter), self.n_before + 1
+        reader, line, name = csv.reader(self.file, delimiter=self.delimiter), self.n_before + 1, None
         try:
             for cells in reader:
                 if cells and len(cells) != len(self.header):
                     marks = f"delimiter {self.delimiter!r}, decimal mark {self.decimal!r}"
-                    raise ValueError(
-                        f"line {line}: {len(cells)} cells under {len(self.header)} column names ({marks})."
-                    )
+                    raise ValueError(f"{len(cells)} cells under {len(self.header)} column names ({marks}).")
                 if cells:
-                    yield line, cells
-                line = self.n_before + reader.line_num + 1
-        except csv.Error as error:
-            raise ValueError(f"line {line}: {error}.") from error
+                    row = dict(zip(self.header, cells, strict=True))
+                    for name, convert in converters.items():
+                        columns[name].append(convert(row[name]))
+                # A quoted cell may go on for several lines: the first is told.
+                line, name = self.n_before + reader.line_num + 1, None
+        except UnicodeDecodeError:
+            raise
+        except (ValueError, csv.Error) as error:
+            place = "" if name is None else f", column {name!r}"
+            raise ValueError(f"line {line}{place}: {error}") from error
+        return {name: np.array(values) for name, values in columns.items()}
 
     def _number(self, cell: str) -> float:
         text, value = cell.strip(), nan

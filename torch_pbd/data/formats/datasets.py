@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +24,14 @@ _CODECS |= {"transpose", "sharding_indexed", "numcodecs.shuffle", "numcodecs.del
 
 def read_parquet(path: Path, wanted: Wanted) -> Arguments:
     """Read a long Parquet table with one row per sample."""
-    with _open_parquet(path, "parquet", f"{path.name}, as all of Parquet,") as file:
+    with _open_parquet(path) as file:
         chosen = wanted.choose({name: (name,) for name in file.schema_arrow.names}, demo="demo", time="time")
         return wanted.read_rows(chosen, _read_columns(file, chosen.signals, wanted))
 
 
-def _open_parquet(path: Path, extra: str, what: str) -> Any:
-    """Open Parquet file; ``extra`` and ``what`` are for the error where the library is not installed."""
-    return optional("pyarrow.parquet", extra, what).ParquetFile(path, buffer_size=_BUFFER, pre_buffer=False)
+def _open_parquet(path: Path, extra: str = "parquet") -> Any:
+    parquet = optional("pyarrow.parquet", extra, f"{path.name}, as all of Parquet,")
+    return parquet.ParquetFile(path, buffer_size=_BUFFER, pre_buffer=False)
 
 
 def _read_columns(file: Any, names: Sequence[str], wanted: Wanted) -> dict[str, NDArray[Any]]:
@@ -44,7 +43,7 @@ def _read_columns(file: Any, names: Sequence[str], wanted: Wanted) -> dict[str, 
     n = 0
     for batch in file.iter_batches(_ROWS, columns=list(names), use_threads=False):
         for name in names:
-            values = _array(batch.column(name))
+            values = _as_array(batch.column(name))
             if name not in columns:
                 columns[name] = np.empty((metadata.num_rows, *values.shape[1:]), values.dtype)
             column = columns[name]
@@ -59,7 +58,7 @@ def _read_columns(file: Any, names: Sequence[str], wanted: Wanted) -> dict[str, 
     return {name: columns.get(name, np.empty(0)) for name in names}
 
 
-def _array(column: Any) -> NDArray[Any]:
+def _as_array(column: Any) -> NDArray[Any]:
     if hasattr(column.type, "value_type") and not hasattr(column.type, "index_type"):
         values = column.flatten().to_numpy(zero_copy_only=False)
         if column.null_count or len(values) % len(column):
@@ -70,7 +69,6 @@ def _array(column: Any) -> NDArray[Any]:
 
 def read_lerobot(path: Path, wanted: Wanted) -> Arguments:
     """Read a LeRobot folder, version 2 or 3: Parquet files with metadata in meta/."""
-    opened = partial(_open_parquet, extra="lerobot", what=f"{path.name}, as all of LeRobot,")
     with (path / "meta" / "info.json").open(encoding="utf-8") as file:
         info = json.loads(file.read(_LARGEST_INFO))
     version = info.get("codebase_version") if isinstance(info, dict) else None
@@ -91,13 +89,13 @@ def read_lerobot(path: Path, wanted: Wanted) -> Arguments:
         raise ValueError("it has no Parquet files in data/.")
     parts = []
     for name in files:
-        with opened(name) as file:
+        with _open_parquet(name, "lerobot") as file:
             parts.append(_read_columns(file, list(dict.fromkeys(["episode_index", *chosen.signals])), wanted))
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     # A missing file would be fewer demonstrations.
     numbers, counts = np.unique(columns["episode_index"], return_counts=True)
     found = dict(zip(numbers.tolist(), counts.tolist(), strict=True))
-    declared = _declared_lengths(path, opened, wanted) or found
+    declared = _declared_lengths(path, wanted) or found
     for number in sorted(declared.keys() | found.keys()):
         if declared.get(number) != found.get(number):
             has = f"episode {number} has {found.get(number, 0)} samples in data/"
@@ -115,11 +113,11 @@ def _feature_columns(name: str, feature: dict[str, Any]) -> tuple[str, ...]:
     return column_names(name, (0, *feature["shape"]))
 
 
-def _declared_lengths(path: Path, opened: Any, wanted: Wanted) -> dict[int, int]:
+def _declared_lengths(path: Path, wanted: Wanted) -> dict[int, int]:
     """Samples of each episode by meta/; empty where that has none."""
     declared: dict[int, int] = {}
     for name in (path / "meta" / "episodes").rglob("*.parquet"):
-        with opened(name) as file:
+        with _open_parquet(name, "lerobot") as file:
             columns = _read_columns(file, ["episode_index", "length"], wanted)
             declared |= dict(zip(columns["episode_index"].tolist(), columns["length"].tolist(), strict=True))
     lines = path / "meta" / "episodes.jsonl"
@@ -151,7 +149,7 @@ def read_hdf5(path: Path, wanted: Wanted, mask: str | None = None) -> Arguments:
         # robosuite's quaternions have their real part last.
         turns = [key for key, columns in signals.items() if key.endswith("quat") and len(columns) == 4]
         signals |= {key: tuple(f"{key}_{letter}" for letter in "xyzw") for key in turns}
-        chosen = wanted.choose(signals, outputs="robot0_eef_pos" if "robot0_eef_pos" in signals else None)
+        chosen = wanted.choose(signals, outputs="robot0_eef_pos")
         for name in names:
             _check_hdf5(name, data[name].attrs.get("num_samples"), each[name], chosen.signals)
         wanted.require(sum(found[key].nbytes for found in each.values() for key in chosen.signals), "it")

@@ -10,7 +10,6 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from torch_pbd import checks
 from torch_pbd.data.demonstrations import Demonstrations
 from torch_pbd.data.poses import with_whole_rotation
 from torch_pbd.data.recordings import as_names, as_units, preview
@@ -38,9 +37,8 @@ def read(path: Path, wanted: Wanted) -> Arguments:
         ks = range(max(numbers, default=0) + 1)
         recordings = [{letter: _read(members, f"{letter}_{k}") for letter in "tx"} for k in ks]
     n_outputs = (*recordings[0]["x"].shape, 1)[1] if recordings else 0
-    for key, count in (("K", len(recordings)), ("d", n_outputs)):
-        if meta.get(key, count) != count:
-            raise ValueError(f"meta says {key} = {meta[key]}, but the arrays have {count}.")
+    if meta.get("K", len(recordings)) != len(recordings):
+        raise ValueError(f"meta says K = {meta['K']}, but the arrays have {len(recordings)}.")
     names = as_names(meta.get("dims"), n_outputs)
     outputs, reference = with_whole_rotation(wanted.outputs or names, names, meta.get("rotation_reference"))
     wanted = replace(wanted, outputs=outputs)
@@ -48,10 +46,14 @@ def read(path: Path, wanted: Wanted) -> Arguments:
     # Times are known by the name of their array, which an output may have too.
     chosen = chosen if wanted.rate else chosen._replace(time=("t", 0))
     units = None if wanted.units is not None else as_units(_units(meta), n_outputs)
-    # Public recordings say unit and t_unit, with a remark in brackets: "s (100 Hz)".
-    labels = {"frame": _text(meta, "frame"), "time_unit": _text(meta, "time_unit") or _plain(_text(meta, "t_unit"))}
-    labels |= {"units": units and [units[i] for _, i in chosen.outputs], "rotation_reference": reference}
-    return wanted.read_each(chosen, recordings, alignment=meta.get("alignment"), **labels)
+    return wanted.read_each(
+        chosen,
+        recordings,
+        units=units and [units[i] for _, i in chosen.outputs],
+        time_unit=meta.get("time_unit") or _plain(meta.get("t_unit")),
+        rotation_reference=reference,
+        **{name: meta.get(name) for name in ("frame", "alignment")},
+    )
 
 
 def read_array_file(path: Path, wanted: Wanted) -> Arguments:
@@ -111,10 +113,7 @@ def write(demonstrations: Demonstrations, handle: BinaryIO) -> None:
 def _read(members: Mapping[str, bytes], name: str) -> NDArray[Any]:
     if name not in members:
         raise ValueError(f"it has no array {name!r}; it has: {preview([*members])}. {LOADERS}")
-    try:
-        return read_array(name, members[name])
-    except ValueError as error:
-        raise ValueError(f"array {name!r} cannot be read: {error}") from error
+    return read_array(f"array {name!r}", members[name])
 
 
 def _read_meta(members: Mapping[str, bytes]) -> dict[str, Any]:
@@ -123,18 +122,12 @@ def _read_meta(members: Mapping[str, bytes]) -> dict[str, Any]:
     text = _read(members, "meta")
     require_memory(parsed_bytes([members["meta"]]), what="meta", remedy="Leave out what is not read.")
     try:
-        if text.ndim:
-            raise ValueError(f"it has shape {text.shape}")
         meta = json.loads(text.item())
         if not isinstance(meta, dict):
             raise TypeError(f"it is a {type(meta).__name__}")
     except (ValueError, TypeError, RecursionError) as error:
         raise ValueError(f"meta must be a 0-d string with a JSON object: {error}") from error
     return meta
-
-
-def _text(meta: dict[str, Any], name: str) -> Any:
-    return checks.text(meta.get(name), f"{name} in meta", optional=True)
 
 
 def _units(meta: dict[str, Any]) -> Any:
@@ -149,4 +142,5 @@ def _units(meta: dict[str, Any]) -> Any:
 
 
 def _plain(unit: Any) -> Any:
+    """Unit without a remark in brackets, as in public recordings: "s (100 Hz)"."""
     return unit.partition(" (")[0] if isinstance(unit, str) else unit
