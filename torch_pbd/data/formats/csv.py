@@ -6,7 +6,6 @@ import re
 from array import array
 from collections import Counter
 from contextlib import suppress
-from dataclasses import dataclass
 from math import isfinite, nan
 from pathlib import Path
 from typing import Any, BinaryIO, TextIO
@@ -18,7 +17,7 @@ from torch_pbd import checks
 from torch_pbd.data.demonstrations import Demonstrations
 from torch_pbd.data.poses import as_columns
 from torch_pbd.data.recordings import preview
-from torch_pbd.data.wanted import Arguments, Chosen, Wanted
+from torch_pbd.data.wanted import Arguments, Wanted
 from torch_pbd.files import LOADERS
 
 _DELIMITERS = (",", ";", "\t")
@@ -36,7 +35,7 @@ def read(path: Path, wanted: Wanted, delimiter: str | None = None, decimal: str 
         raise checks.refusal(delimiter, "delimiter", f"one character, and not the decimal mark {decimal!r}")
     with path.open(encoding="utf-8-sig", newline="") as file:
         try:
-            table = _open_table(file, delimiter, decimal, wanted)
+            table = _Table(file, delimiter, decimal, wanted)
             return wanted.read_rows(table.chosen, table.read_at_once() or table.read_lines())
         except UnicodeDecodeError as error:
             raise ValueError(f"it is not text in UTF-8: {error}.") from error
@@ -56,23 +55,35 @@ def write(demonstrations: Demonstrations, handle: BinaryIO) -> None:
     text.detach()
 
 
-@dataclass(frozen=True)
 class _Table:
-    """A CSV file whose header has been read: its columns of numbers, with the lines they stand in."""
+    """A CSV file whose header has been read, by the delimiter that yields the wanted and then the most columns."""
 
-    file: TextIO
-    header: list[str]
-    n_before: int  # lines up to the header
-    start: int  # where the file goes on behind it
-    delimiter: str
-    decimal: str
-    chosen: Chosen
-    missing: str
+    def __init__(self, file: TextIO, delimiter: str | None, decimal: str, wanted: Wanted) -> None:
+        self.file, self.decimal, self.missing = file, decimal, wanted.missing
+        first, self.n_before = _header_line(file)
+        candidates = [delimiter] if delimiter else [mark for mark in _DELIMITERS if mark != decimal]
+        try:
+            if first.startswith("# format:"):
+                raise ValueError(f"no columns of demonstrations, but {first.strip()!r:.80}. {LOADERS}")
+            headers = [[name.strip() for name in next(csv.reader([first], delimiter=c), [])] for c in candidates]
+            # A mark that is not the delimiter finds one column, or cuts names that hold it.
+            sought = {wanted.demo, wanted.time or "time", *(wanted.outputs or ())}
+            self.header = max(headers, key=lambda names: (len(sought & set(names)), len(names)))
+            twice = [name for name, count in Counter(self.header).items() if name and count > 1]
+            if twice:
+                raise ValueError(f"there are two columns {twice[0]!r}.")
+            self.chosen = wanted.choose({name: (name,) for name in self.header}, demo="demo", time="time")
+            if any(map(_is_number, self.header)):
+                raise ValueError(f"it must name the columns, and has numbers: {preview(self.header)}.")
+        except (ValueError, csv.Error) as error:
+            raise ValueError(f"line {self.n_before}: {str(error).rstrip('.')}.") from error
+        self.delimiter, self.start = candidates[headers.index(self.header)], file.tell()
+        self.demo, self.time = (place and place[0] for place in (self.chosen.demo, self.chosen.time))
 
     def read_at_once(self) -> dict[str, NDArray[Any]] | None:
         """Same as :meth:`read_lines` in a sixth of the time; None if some cell needs special treatment."""
-        demo, time = (place and place[0] for place in (self.chosen.demo, self.chosen.time))
-        kinds = ["S8" if name == demo else "f8" if name in (time, *self.chosen.names) else "S1" for name in self.header]
+        numbers = {self.time, *self.chosen.names}
+        kinds = ["S8" if name == self.demo else "f8" if name in numbers else "S1" for name in self.header]
         if self.decimal != "." or not self.file.readline().strip():
             return None
         self.file.seek(self.start)
@@ -84,15 +95,14 @@ class _Table:
         signals = {name: rows[str(i)] for i, name in enumerate(self.header) if kinds[i] == "f8"}
         # Larger ones may be stamps that float64 does not hold; not below is NaN, too.
         sound = all((np.abs(values) < 2**53).all() for values in signals.values())
-        if demo is not None:
-            signals[demo] = np.char.strip(rows[str(self.header.index(demo))])
-            lengths = np.char.str_len(signals[demo])
+        if self.demo is not None:
+            signals[self.demo] = np.char.strip(rows[str(self.header.index(self.demo))])
+            lengths = np.char.str_len(signals[self.demo])
             sound = sound and bool(0 < lengths.min() <= lengths.max() < 8)  # eight letters may have been more
         return signals if sound else None
 
     def read_lines(self) -> dict[str, NDArray[Any]]:
         """Chosen columns by name: numbers of the demonstrations, times as integers where all are, and outputs."""
-        demo, time = (place and place[0] for place in (self.chosen.demo, self.chosen.time))
         numbers: dict[str, int] = {}
 
         def number_of(label: str) -> int:
@@ -100,10 +110,11 @@ class _Table:
                 raise ValueError("the cell is blank.")
             return numbers.setdefault(label.strip(), len(numbers))
 
-        converters: dict[Any, Any] = dict.fromkeys(self.chosen.names, self._number)
-        converters |= {name: own for name, own in ((demo, number_of), (time, self._time)) if name is not None}
+        converters: dict[Any, Any] = dict.fromkeys(self.chosen.names, self._read_number)
+        converters |= {self.demo: number_of, self.time: self._read_time}
+        converters.pop(None, None)
         # Arrays of numbers take 8 bytes for each, where lists take 32.
-        columns: dict[str, Any] = {name: [] if name == time else array("d") for name in converters}
+        columns: dict[str, Any] = {name: [] if name == self.time else array("d") for name in converters}
         self.file.seek(self.start)
         reader, line, name = csv.reader(self.file, delimiter=self.delimiter), self.n_before + 1, None
         try:
@@ -124,7 +135,7 @@ class _Table:
             raise ValueError(f"line {line}{place}: {error}") from error
         return {name: np.array(values) for name, values in columns.items()}
 
-    def _number(self, cell: str) -> float:
+    def _read_number(self, cell: str) -> float:
         text, value = cell.strip(), nan
         if self.missing == "drop" and text.lower() in _MISSING:
             return nan
@@ -138,38 +149,15 @@ class _Table:
             raise ValueError(f"{what} (decimal mark {self.decimal!r}): {remedy}.")
         return value
 
-    def _time(self, cell: str) -> Any:
+    def _read_time(self, cell: str) -> Any:
         """Time of a cell: stamps in ns as integers, dates and times of day since 1970 or midnight as those of NumPy."""
         match = _CLOCK.fullmatch(cell.strip())
         if match is None:
-            return int(cell) if _WHOLE.fullmatch(cell.strip()) else self._number(cell)
+            return int(cell) if _WHOLE.fullmatch(cell.strip()) else self._read_number(cell)
         day, hours, minutes, seconds, fraction = match.groups()
         whole = int(hours) * 3600 + int(minutes) * 60 + int(seconds or 0)
         clock = np.timedelta64(whole * 10**9 + int((fraction or "0").ljust(9, "0")), "ns")
         return np.datetime64(day or "1970-01-01", "ns") + clock
-
-
-def _open_table(file: TextIO, delimiter: str | None, decimal: str, wanted: Wanted) -> _Table:
-    """Table with the delimiter that yields the wanted columns, and then the most columns."""
-    first, n_before = _header_line(file)
-    candidates = [delimiter] if delimiter else [mark for mark in _DELIMITERS if mark != decimal]
-    try:
-        if first.startswith("# format:"):
-            raise ValueError(f"no columns of demonstrations, but {first.strip()!r:.80}. {LOADERS}")
-        headers = [[name.strip() for name in next(csv.reader([first], delimiter=c), [])] for c in candidates]
-        # A mark that is not the delimiter finds one column, or cuts names that hold it.
-        sought = {wanted.demo, wanted.time or "time", *(wanted.outputs or ())}
-        header = max(headers, key=lambda names: (len(sought & set(names)), len(names)))
-        twice = [name for name, count in Counter(header).items() if name and count > 1]
-        if twice:
-            raise ValueError(f"there are two columns {twice[0]!r}.")
-        chosen = wanted.choose({name: (name,) for name in header}, demo="demo", time="time")
-        if any(map(_is_number, header)):
-            raise ValueError(f"it must name the columns, and has numbers: {preview(header)}.")
-    except (ValueError, csv.Error) as error:
-        raise ValueError(f"line {n_before}: {str(error).rstrip('.')}.") from error
-    mark = candidates[headers.index(header)]
-    return _Table(file, header, n_before, file.tell(), mark, decimal, chosen, wanted.missing)
 
 
 def _header_line(file: TextIO) -> tuple[str, int]:

@@ -25,18 +25,21 @@ def read(path: Path, wanted: Wanted, variable: str | None = None) -> Arguments:
     if name not in content:
         what = f"variable {variable!r}" if variable else "variables demos or data"
         raise ValueError(f"it has no {what}, but {preview([*content])}: say by variable= which is the recordings.")
-    cells = content[name] if isinstance(content[name], list) else [content[name]]
-    step = _number(content.get("dt"))
-    recordings = [_signals(cell, f"{name}{{{k + 1}}}", step) for k, cell in enumerate(cells)]
+    cells = content[name]
+    if isinstance(cells, np.ndarray) and cells.dtype == object:  # as scipy has cells
+        cells = [*cells.flat]
+    cells = cells if isinstance(cells, list) else [cells]
+    recordings = [_signals(cell, f"{name}{{{k}}}", content.get("dt")) for k, cell in enumerate(cells, 1)]
     columns = {key: column_names(key, value.shape) for key, value in (recordings or [{}])[0].items()}
     chosen = wanted.choose(columns, time="t" if "t" in columns else None, outputs="pos")
-    absent = [(k, key) for k, own in enumerate(recordings, 1) for key in chosen.signals if key not in own]
-    if absent:
-        raise ValueError(f"{name}{{{absent[0][0]}}} has no {absent[0][1]!r}, which {name}{{1}} has.")
+    for k, own in enumerate(recordings, 1):
+        for key in chosen.signals:
+            if key not in own:
+                raise ValueError(f"{name}{{{k}}} has no {key!r}, which {name}{{1}} has.")
     return wanted.read_each(chosen, recordings)
 
 
-def _signals(cell: Any, place: str, step: float | None) -> dict[str, NDArray[Any]]:
+def _signals(cell: Any, place: str, step: Any) -> dict[str, NDArray[Any]]:
     """Signals (T,) or (T, d) of one recording: of a struct of matrices (d, T), or of a matrix of them."""
     if not isinstance(cell, Mapping):
         matrix = np.asarray(cell)
@@ -46,7 +49,6 @@ def _signals(cell: Any, place: str, step: float | None) -> dict[str, NDArray[Any
         # ds-opt stacks positions on velocities.
         half = len(matrix) // 2 if len(matrix) in (4, 6) else len(matrix)
         cell = {"pos": matrix[:half], **({"vel": matrix[half:]} if half < len(matrix) else {})}
-    step = _number(cell.get("dt"), step)
     arrays = numeric({key: np.asarray(value) for key, value in cell.items() if not isinstance(value, Mapping | list)})
     arrays = {key: array for key, array in arrays.items() if array.size > 1}
     if not arrays:
@@ -58,14 +60,10 @@ def _signals(cell: Any, place: str, step: float | None) -> dict[str, NDArray[Any
         for key, array in arrays.items()
         if n in array.shape
     }
-    if "t" not in signals and step is not None:
-        signals["t"] = np.arange(n) * step
+    step = np.asarray(cell.get("dt", step))
+    if "t" not in signals and step.size == 1 and step.dtype.kind in "iuf":
+        signals["t"] = np.arange(n) * float(step.item())
     return signals
-
-
-def _number(value: Any, default: float | None = None) -> float | None:
-    array = np.asarray(default if value is None else value)
-    return float(array.item()) if array.dtype.kind in "iuf" and array.size == 1 else default
 
 
 def _read_mat5(path: Path, wanted: Wanted) -> dict[str, Any]:
@@ -73,14 +71,7 @@ def _read_mat5(path: Path, wanted: Wanted) -> dict[str, Any]:
 
     sizes = [(shape, kind) for _, shape, kind in whosmat(path)]
     wanted.require(sum(8.0 * float(np.prod(shape, dtype=float)) for shape, kind in sizes if kind != "cell"), "it")
-    return {name: _plain(value) for name, value in loadmat(path, simplify_cells=True).items() if name[0] != "_"}
-
-
-def _plain(value: Any) -> Any:
-    """Lists for arrays of objects, as scipy makes of cells."""
-    if isinstance(value, np.ndarray) and value.dtype == object:
-        return [_plain(entry) for entry in value.reshape(-1)]
-    return {key: _plain(entry) for key, entry in value.items()} if isinstance(value, dict) else value
+    return {name: value for name, value in loadmat(path, simplify_cells=True).items() if name[0] != "_"}
 
 
 def _read_hdf5(path: Path, wanted: Wanted) -> dict[str, Any]:
