@@ -174,11 +174,9 @@ class Demonstrations(Editing):
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Demonstrations):
             return NotImplemented
-        mine, theirs = (
-            [(d.names, d.units, d.frame, d.time_unit, len(d)), d.rotation_reference, *d.times, *d.positions]
-            for d in (self, other)
-        )
-        return mine[0] == theirs[0] and all(map(np.array_equal, mine[1:], theirs[1:]))  # type: ignore[arg-type]
+        labels, others = ((d.names, d.units, d.frame, d.time_unit, len(d)) for d in (self, other))
+        arrays = ((d.rotation_reference, *d.times, *d.positions) for d in (self, other))
+        return labels == others and all(map(np.array_equal, *arrays))
 
     def __repr__(self) -> str:
         n_steps = "..".join(map(str, sorted({min(self.n_steps), max(self.n_steps)})))
@@ -244,17 +242,8 @@ class Demonstrations(Editing):
     def from_frame(cls, table: Any, **options: Any) -> "Demonstrations":
         """Demonstrations from a table with one row per sample, in the order in which they first appear.
 
-        Parameters
-        ----------
-        table : dataframe
-            Table of pandas, polars, pyarrow or another library that narwhals supports; its index is ignored.
-        **options
-            Options of `torch_pbd.data.load_demonstrations`, from ``outputs`` to ``from_start``.
-
-        Raises
-        ------
-        ValueError
-            If it is not a dataframe, or lacks columns that the options name, or these hold no numbers.
+        The table is of pandas, polars, pyarrow or another library that narwhals supports; its index is ignored. The
+        options are those of `torch_pbd.data.load_demonstrations`, from ``outputs`` to ``from_start``.
         """
         import narwhals
 

@@ -75,13 +75,9 @@ class Editing:
         return sets[0]._replace(times, positions, anew=True, alignment=alignment, rotation_reference=reference)
 
     def to_poses(self) -> tuple[list[Floats], list[Floats]]:
-        """Poses as positions and unit quaternions, where the last three outputs are a rotation.
+        """Positions (T_k, d - 3) and unit quaternions (T_k, 4), w x y z, where the last three outputs are a rotation.
 
-        Returns
-        -------
-        positions : list of K ndarray of shape (T_k, d - 3)
-        quaternions : list of K ndarray of shape (T_k, 4)
-            Unit quaternions w x y z, whose signs are continuous along time and between demonstrations.
+        Signs of quaternions are continuous along time and between demonstrations.
         """
         if self.rotation_reference is None:
             raise InvalidParameterError("the demonstrations have no rotation: name its columns by rotation=, w x y z.")
@@ -130,15 +126,10 @@ class Editing:
         return self._replace(times, positions, units=units, time_unit=time_unit or self.time_unit)
 
     def cut(self, at: Literal["pauses"] | Sequence[tuple[float, float]] = "pauses") -> Self:
-        """Split one long recording into several demonstrations.
+        """Several demonstrations of one long recording: between its pauses, or the start and end of each.
 
-        Where a column of a file labels them, use ``demo=`` of `torch_pbd.data.load_demonstrations`.
-
-        Parameters
-        ----------
-        at : "pauses" or sequence of (start, end), default="pauses"
-            Start and end of each demonstration in ``time_unit``. "pauses" splits where all outputs stay within 2 % of
-            their extent for half a second.
+        ``at`` is "pauses", where all outputs stay within 2 % of their extent for half a second, or pairs (start, end)
+        in ``time_unit``. For a column that labels them, `torch_pbd.data.load_demonstrations` has ``demo=``.
         """
         if len(self.times) != 1:
             raise InvalidParameterError(f"there are {len(self.times)} recordings, must be one to be cut, as [:1].")
@@ -190,16 +181,12 @@ class Editing:
         return self._replace(grids, list(map(interpolate, self.times, self.positions, grids)))
 
     def low_pass(self, cutoff: float) -> Self:
-        """Low-pass filtered demonstrations at their own times.
+        """Low-pass filtered demonstrations, each of five samples or more, at their own times.
 
-        Each is the cubic smoothing spline that halves amplitudes at the cutoff: a second-order Butterworth filter run
-        forward and backward, without lag, at even or uneven times. ``DMPController`` smooths its input itself;
-        covariance regressors and movement models use recordings with all their noise.
-
-        Parameters
-        ----------
-        cutoff : float
-            Cutoff frequency in Hz, or in cycles per unit of phase. Each demonstration needs five samples.
+        Each is the cubic smoothing spline that halves amplitudes at ``cutoff``, in Hz or in cycles per unit of phase: a
+        second-order Butterworth filter run forward and backward, without lag, at even or uneven times.
+        ``DMPController`` smooths its input itself; covariance regressors and movement models use recordings with all
+        their noise.
         """
         each = checks.number(cutoff, "cutoff", above=0.0, unit="Hz") * TIMES.get(self.time_unit, 1.0)
         smooth = []

@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import BSpline, make_interp_spline
+from scipy.interpolate import make_interp_spline
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
@@ -45,13 +45,16 @@ _PEG = np.array(
         (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, 0, 20),
     ]
 )
+_PEG_MEANS = _PEG[:-1, :6]
+# In m and rad, for each of the six outputs.
+_PEG_DEVIATIONS = (_PEG[:, 6:] * [1e-3, 1e-3, np.pi / 180.0, np.pi / 180.0])[:, [0, 0, 1, 2, 2, 3]]
 _POSE_TREMOR = np.repeat([2e-4, 2e-3], 3)  # rms in m and rad of tremor up to 2 Hz
 
 
 def handwriting_mean(phase: ArrayLike, shape: Shape = "S") -> Floats:
     """Mean (n, 2) of a letter in m, at phases (n,) or (n, 1) from 0, its start, to 1, its end."""
     via_points, _ = _via_law(shape, None)
-    return _minimum_jerk(via_points)(_phases(phase)) @ via_points
+    return _weights(phase, via_points) @ via_points
 
 
 def handwriting_covariance(phase: ArrayLike, shape: Shape = "S", *, via_precision: ArrayLike | None = None) -> Floats:
@@ -61,8 +64,7 @@ def handwriting_covariance(phase: ArrayLike, shape: Shape = "S", *, via_precisio
     """
     via_points, covariances = _via_law(shape, via_precision)
     # A movement is linear in its via points, which are independent: x = sum_k b_k p_k, so C = sum_k b_k^2 C_k.
-    weights = _minimum_jerk(via_points)(_phases(phase)) ** 2
-    return np.einsum("nk,kij->nij", weights, covariances) + _TREMOR**2 * np.eye(2)
+    return np.einsum("nk,kij->nij", _weights(phase, via_points) ** 2, covariances) + _TREMOR**2 * np.eye(2)
 
 
 def make_handwriting_demonstrations(
@@ -96,28 +98,21 @@ def make_handwriting_demonstrations(
         Relative standard deviation of durations and of the pace within a demonstration, below 0.5. With 0 all
         demonstrations share one grid, and time / duration is the phase of the truth.
     random_state : int, Generator, RandomState or None, default=None
-
-    Examples
-    --------
-    >>> from torch_pbd.data import make_handwriting_demonstrations
-    >>> make_handwriting_demonstrations("G", timing=0.0, random_state=0)
-    Demonstrations(n_demos=6, n_steps=201, outputs=('x', 'y'), time_unit='s', aligned=True)
     """
     via_points, covariances = _via_law(shape, via_precision)
-    roots, weights = np.linalg.cholesky(covariances), _minimum_jerk(via_points)
+    roots = np.linalg.cholesky(covariances)
     times, positions = [], []
     for time, phase, random in _paces(n_demos, duration, rate, timing, random_state):
         passed = via_points + np.einsum("kij,kj->ki", roots, random.normal(size=via_points.shape))
         tremor = np.stack([band_noise(time, 0.0, 2.0, random) for _ in range(2)], axis=1)
         times.append(time)
-        positions.append(weights(phase) @ passed + _TREMOR * tremor)
+        positions.append(_weights(phase, via_points) @ passed + _TREMOR * tremor)
     return Demonstrations(times, positions, names=("x", "y"), units="m")
 
 
 def pose_mean(phase: ArrayLike) -> tuple[Floats, Floats]:
     """Mean positions (n, 3) in m and rotations (n, 4) as quaternions w x y z, at phases (n,) or (n, 1) from 0 to 1."""
-    means, _, weights = _peg_law()
-    place = weights(_phases(phase)) @ means
+    place = _weights(phase, _PEG_MEANS[:, :3]) @ _PEG_MEANS
     return _HOLE + place[:, :3] @ matrix(_TURN).T, multiply(_TURN, exp(place[:, 3:]))
 
 
@@ -126,9 +121,9 @@ def pose_covariance(phase: ArrayLike) -> Floats:
 
     It is the covariance of ``(x - x_d, Log(R R_d'))`` at the mean pose in world axes, as in schedules.
     """
-    _, deviations, weights = _peg_law()
     # Deviations are linear in those of the via points, which are independent, as in handwriting_covariance.
-    variances = weights(_phases(phase)) ** 2 @ deviations[:-1] ** 2 + deviations[-1] ** 2 + _POSE_TREMOR**2
+    *own, common = _PEG_DEVIATIONS**2
+    variances = _weights(phase, _PEG_MEANS[:, :3]) ** 2 @ np.array(own) + common + _POSE_TREMOR**2
     turned = matrix(_TURN), matrix(pose_mean(phase)[1])
     covariance = np.zeros((len(variances), 6, 6))
     for block, turn in zip((slice(3), slice(3, 6)), turned, strict=True):
@@ -157,20 +152,13 @@ def make_pose_demonstrations(
         Number of demonstrations; six or fewer cannot determine a covariance of six outputs.
     duration, rate, timing, random_state
         Parameters of `make_handwriting_demonstrations`, in s and Hz.
-
-    Examples
-    --------
-    >>> from torch_pbd.data import make_pose_demonstrations
-    >>> make_pose_demonstrations(timing=0.0, random_state=0)
-    Demonstrations(n_demos=8, n_steps=401, outputs=('x', 'y', 'z', 'rx', 'ry', 'rz'), time_unit='s', aligned=True)
     """
-    _, deviations, weights = _peg_law()
     times, positions = [], []
     for time, phase, random in _paces(n_demos, duration, rate, timing, random_state):
         place, turn = pose_mean(phase)
         tremor = np.stack([band_noise(time, 0.0, 2.0, random) for _ in range(6)], axis=1)
-        *own, common = deviations * random.normal(size=deviations.shape)
-        deviation = weights(phase) @ np.array(own) + common + _POSE_TREMOR * tremor
+        *own, common = _PEG_DEVIATIONS * random.normal(size=_PEG_DEVIATIONS.shape)
+        deviation = _weights(phase, _PEG_MEANS[:, :3]) @ np.array(own) + common + _POSE_TREMOR * tremor
         times.append(time)
         # In the axes of the tool: R = R_d Exp(deviation).
         positions.append(np.hstack([place + deviation[:, :3] @ matrix(_TURN).T, multiply(turn, exp(deviation[:, 3:]))]))
@@ -194,12 +182,6 @@ def _via_law(shape: Shape, via_precision: ArrayLike | None) -> tuple[Floats, Flo
     return means, across[:, np.newaxis, np.newaxis] ** 2 * (_ALONG**2 * along + (np.eye(2) - along))
 
 
-def _peg_law() -> tuple[Floats, Floats, BSpline]:
-    """Means (k, 6) and standard deviations (k + 1, 6) of via points in m and rad, and their weights over phases."""
-    means, deviations = _PEG[:-1, :6], _PEG[:, 6:] * [1e-3, 1e-3, np.pi / 180.0, np.pi / 180.0]
-    return means, deviations[:, [0, 0, 1, 2, 2, 3]], _minimum_jerk(means[:, :3])
-
-
 def _paces(
     n_demos: int, duration: float, rate: float, timing: float, random_state: Seed
 ) -> Iterator[tuple[Floats, Floats, Random]]:
@@ -215,16 +197,12 @@ def _paces(
         yield time, phase.clip(0.0, 1.0), random
 
 
-def _minimum_jerk(via_points: Floats) -> BSpline:
-    """Weights (n, k) of the via points over phases (n,), in the movement of least jerk from rest to rest."""
+def _weights(phase: ArrayLike, via_points: Floats) -> Floats:
+    """Weights (n, k) of via points at phases (n,) or (n, 1) from 0 to 1, in the least jerk from rest to rest."""
+    at = column(phase, "phase")
+    checks.require((at >= 0.0) & (at <= 1.0), at, "phase", "from 0 to 1")
     # Phases advance by the square root of the distance: slower in narrow turns, as hands are.
     passes = np.append(0.0, np.linalg.norm(np.diff(via_points, axis=0), axis=1) ** 0.5).cumsum()
     rest = [(order, np.zeros(len(via_points))) for order in (1, 2)]
-    return make_interp_spline(passes / passes[-1], np.eye(len(via_points)), k=5, bc_type=(rest, rest))
-
-
-def _phases(phase: ArrayLike) -> Floats:
-    """Checked phases (n,) from 0 to 1, from (n,) or (n, 1)."""
-    at = column(phase, "phase")
-    checks.require((at >= 0.0) & (at <= 1.0), at, "phase", "from 0 to 1")
-    return at
+    spline = make_interp_spline(passes / passes[-1], np.eye(len(via_points)), k=5, bc_type=(rest, rest))
+    return np.asarray(spline(at))
