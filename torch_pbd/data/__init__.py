@@ -20,22 +20,9 @@ from torch_pbd.data.via_points import (
     pose_mean,
 )
 
-__all__ = [
-    "Demonstrations",
-    "check_unimodal",
-    "handwriting_covariance",
-    "handwriting_mean",
-    "inspect_demonstrations",
-    "load_demonstrations",
-    "make_handwriting_demonstrations",
-    "make_paper_simulation",
-    "make_pose_demonstrations",
-    "make_tunnel_demonstrations",
-    "paper_covariance",
-    "paper_mean",
-    "pose_covariance",
-    "pose_mean",
-    "save_demonstrations",
-    "tunnel_center",
-    "tunnel_half_width",
-]
+__all__ = ["Demonstrations", "check_unimodal", "inspect_demonstrations", "load_demonstrations", "save_demonstrations"]
+# Made data, each with the law that it is drawn from.
+__all__ += ["make_paper_simulation", "paper_covariance", "paper_mean"]
+__all__ += ["make_tunnel_demonstrations", "tunnel_center", "tunnel_half_width"]
+__all__ += ["handwriting_covariance", "handwriting_mean", "make_handwriting_demonstrations"]
+__all__ += ["make_pose_demonstrations", "pose_covariance", "pose_mean"]

@@ -25,9 +25,8 @@ _COPIES = 10
 # Readers take (path, wanted, **options) and return arguments of Demonstrations; the path is added to their errors here.
 # Their modules, with optional dependencies, are imported when a file of their kind is read.
 _FORMATS = {".npz": "npz.read", ".npy": "npz.read_array_file", ".mat": "mat.read"}
-_FORMATS |= dict.fromkeys([".csv", ".txt", ".tsv"], "csv.read") | dict.fromkeys(
-    [".bag", ".mcap", ".db3"], "rosbag.read"
-)
+_FORMATS |= dict.fromkeys([".csv", ".txt", ".tsv"], "csv.read")
+_FORMATS |= dict.fromkeys([".bag", ".mcap", ".db3"], "rosbag.read")
 _FORMATS |= {".parquet": "datasets.read_parquet", ".zip": "datasets.read_zarr"}
 _FORMATS |= dict.fromkeys([".hdf5", ".h5"], "datasets.read_hdf5")
 _WRITTEN = {".npz": "npz.write", ".csv": "csv.write"}

@@ -19,7 +19,6 @@ from torch_pbd.files.memory import require_memory
 _FEWEST_COUNTED = 5  # fewest rows that identify a count; fewer increase by one by chance
 MAX_BYTES = 512 * 2**20
 _UNNAMED = ("", "__index_level_0__")  # names of a table's index in files written by pandas
-_DATE_UNITS = {"h": "h", "min": "m", "s": "s", "ms": "ms", "us": "us", "ns": "ns"}
 Arguments = dict[str, Any]
 _Recorded = TypeVar("_Recorded", bound=Any)  # Demonstrations, whose import would be circular
 
@@ -158,7 +157,7 @@ class Wanted:
             labels["time_unit"] = "samples"
         elif times and all(time.dtype.kind in "mM" for time in times):
             # Counted from the first of all, in which they are exact where dates would not be.
-            unit = _DATE_UNITS[checks.choice(labels["time_unit"], "time_unit", _DATE_UNITS)]
+            unit = checks.choice(labels["time_unit"], "time_unit", TIMES).replace("min", "m")  # as NumPy has it
             origin, step = min(time.min() for time in times), np.array(1, dtype=f"m8[{unit}]")
             times = [(time - origin).astype("m8[ns]") / step for time in times]
         return {"times": times, "positions": positions, "missing": self.missing, **labels}

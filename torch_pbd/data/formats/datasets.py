@@ -129,7 +129,6 @@ def _declared_lengths(path: Path, wanted: Wanted) -> dict[int, int]:
 
 def read_hdf5(path: Path, wanted: Wanted, mask: str | None = None) -> Arguments:
     """Read HDF5 of robomimic, with a group data/demo_k for each demonstration; ``mask`` is a list of them in /mask."""
-    checks.text(mask, "mask", optional=True)
     h5py = optional("h5py", "hdf5", f"{path.name}, as all of HDF5,")
     with h5py.File(path, "r") as file:
         data = file.get("data")
@@ -139,8 +138,7 @@ def read_hdf5(path: Path, wanted: Wanted, mask: str | None = None) -> Arguments:
         if mask is not None:
             if mask not in (known := [*file.get("mask", ())]):
                 raise checks.refusal(mask, "mask", f"one of {preview(known)}")
-            listed = file["mask"][mask][()]
-            names = sorted((n.decode() if isinstance(n, bytes) else str(n) for n in listed), key=natural)
+            names = sorted(file["mask"][mask].asstr()[()], key=natural)
             absent = [name for name in names if name not in data]
             if absent or not names:
                 raise ValueError(f"mask {mask!r} names {preview(absent)}, must name demonstrations in data/.")
@@ -150,8 +148,17 @@ def read_hdf5(path: Path, wanted: Wanted, mask: str | None = None) -> Arguments:
         turns = [key for key, columns in signals.items() if key.endswith("quat") and len(columns) == 4]
         signals |= {key: tuple(f"{key}_{letter}" for letter in "xyzw") for key in turns}
         chosen = wanted.choose(signals, outputs="robot0_eef_pos")
-        for name in names:
-            _check_hdf5(name, data[name].attrs.get("num_samples"), each[name], chosen.signals)
+        # Texts of variable length, as the environment's arguments with their rate, are not read: from damaged files the
+        # HDF5 library may not come back.
+        for name, found in each.items():
+            declared = data[name].attrs.get("num_samples")
+            for key in chosen.signals:
+                if key not in found:
+                    raise ValueError(f"data/{name} has no {key!r}, which others have; it has {preview([*found])}.")
+                if declared is not None and len(found[key]) != int(np.asarray(declared).item()):
+                    raise ValueError(f"data/{name} says num_samples = {declared}, but {key} has {len(found[key])}.")
+                if found[key].id.get_storage_size() == 0:
+                    raise ValueError(f"data/{name}/{key} of shape {found[key].shape} was never written.")
         wanted.require(sum(found[key].nbytes for found in each.values() for key in chosen.signals), "it")
         recordings = [{key: found[key][()] for key in chosen.signals} for found in each.values()]
     # Positions of robosuite's end effectors are in m.
@@ -169,18 +176,6 @@ def _hdf5_datasets(group: Any, h5py: Any) -> dict[str, Any]:
             if isinstance(value, h5py.Dataset) and not value.is_virtual and not value.external:
                 found[key] = value
     return numeric(found)
-
-
-# Texts of variable length, as the environment's arguments with their rate, are not read: from damaged files the HDF5
-# library may not come back.
-def _check_hdf5(name: str, declared: Any, found: dict[str, Any], signals: list[str]) -> None:
-    for key in signals:
-        if key not in found:
-            raise ValueError(f"data/{name} has no {key!r}, which others have; it has {preview([*found])}.")
-        if declared is not None and len(found[key]) != int(np.asarray(declared).item()):
-            raise ValueError(f"data/{name} says num_samples = {declared}, but {key} has {len(found[key])}.")
-        if found[key].id.get_storage_size() == 0:
-            raise ValueError(f"data/{name}/{key} of shape {found[key].shape} was never written.")
 
 
 def read_zarr(path: Path, wanted: Wanted) -> Arguments:

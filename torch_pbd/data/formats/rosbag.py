@@ -44,7 +44,6 @@ _JOINT_FIELDS = {"position": ("", "rad"), "velocity": ("velocity.", "rad/s"), "e
 def read(path: Path, wanted: Wanted, topic: str | None = None, child: str | None = None) -> Arguments:
     """Read the format of `torch_pbd.data.load_demonstrations`, which describes the options."""
     checks.text(topic, "topic", optional=True)
-    checks.text(child, "child", optional=True)
     highlevel = optional("rosbags.highlevel", "ros", f"{path.name}, as all of ROS,")
     stores = optional("rosbags.typesys", "ros", path.name)
     # SQLite bags of older versions do not hold the definitions of their messages: standard ones did not change.
