@@ -3,7 +3,6 @@
 import math
 import struct
 from collections.abc import Sequence
-from operator import mul
 from typing import Any, final
 
 import numpy as np
@@ -91,7 +90,7 @@ class ScheduleTable:
         is_apart = len(blocks) == 2 and _are_apart(self.stiffness, *blocks)
         self.springs, self._are_shared = blocks if is_apart else (slice(0, self.n_axes),), modes is not None
         self._is_plane = modes is not None and mass is not None and self.n_place == self.n_axes == 2
-        self._start = self._modes = self.n_place + self.n_axes
+        self._start = self.n_place + self.n_axes
         # |K e|^2 <= k_max e'K e in each block, with k_max that of the block, also where others are displaced, for
         # |B'K e|^2 <= |B'K B| e'K e for any B.
         if modes is not None and mass is not None and len(blocks) == 1:
@@ -107,10 +106,8 @@ class ScheduleTable:
             return tops
         if self._is_plane and mass is not None:  # along axes, with all per kg
             return [*tops, *modes[:2], modes[2][:, 0] / math.sqrt(mass), np.full(len(tops[0]), mass)]
-        if is_apart:  # no spring is limited as a whole
-            self._modes += 2 + sum((block.stop - block.start) ** 2 for block in blocks)
-            return [*tops, *[self.stiffness[:, block, block] for block in blocks], 0.0 * tops[0], *modes]
-        return [*tops, *modes]
+        # Both of two springs are within their limits where the whole is within the tighter one.
+        return [*tops, np.max(tops, axis=0), *modes]
 
     def row(self, index: int) -> Vector:
         """Row of the table, unpacked."""
@@ -129,9 +126,11 @@ class ScheduleTable:
             return advance_plane(row, push, state, step)
         place, velocity = state
         motion, off = (row[self.n_place : self._start], velocity), deviation(place, row[: self.n_place], self.n_axes)
-        if gains is None and self._are_shared and (len(self.springs) == 1 or self._is_within_limits(row, off)):
-            move, velocity, scale = along_modes(row[self._modes :], push, off, motion, step)
-            return (moved(place, move), velocity), scale
+        if gains is None and self._are_shared:
+            by_modes = row[self._start + len(self.springs) :]
+            move, faster, scale = along_modes(by_modes, push, off, motion, step)
+            if scale == 1.0 or len(self.springs) == 1:
+                return (moved(place, move), faster), scale
         # Where one of two springs is limited, modes are no longer shared: twisted beyond its torque, a tool keeps its
         # stiffness along the way.
         stiffness, damping = (self.stiffness[index], self.damping[index]) if gains is None else gains
@@ -139,13 +138,6 @@ class ScheduleTable:
         scaled = self.scaled(stiffness, scales)
         move, velocity = coupled(scaled, damping, self._one_mass or self.mass[index], push, off, motion, step)
         return (moved(place, move), velocity), scales[0] if scales[0] == scales[-1] else scales
-
-    def _is_within_limits(self, row: Vector, off: Vector) -> bool:
-        """Whether neither of two uncoupled springs is limited at a deviation."""
-        p, at = self.n_axes - 3, self._start
-        middle = at + 2 + p * p
-        pull, torque = _quadratic(row[at + 2 : middle], off[:p]), _quadratic(row[middle : middle + 9], off[p:])
-        return row[at] * pull <= 1.0 >= row[at + 1] * torque
 
     def scales(self, row: Vector, stiffness: Floats, off: Floats) -> Vector:
         """Scale of each spring of a stiffness (d, d) at a deviation, by its limit."""
@@ -210,8 +202,3 @@ def _mobility(damping: Floats, blocks: Sequence[slice]) -> Floats:
     parts = [[inverse[:, b, c] for c in blocks] for b in blocks]
     # Eigenvalues take a tenth of the time of singular values.
     return np.array([[math.sqrt(np.linalg.eigvalsh(part.mT @ part).max()) for part in row] for row in parts])
-
-
-def _quadratic(matrix: Vector, x: Vector) -> float:
-    d = len(x)
-    return sum([part * sum(map(mul, matrix[i * d : (i + 1) * d], x)) for i, part in enumerate(x)])
