@@ -274,7 +274,7 @@ class RealTimeAdmittance:
     @property
     def stiffness(self) -> Floats:
         """Stiffness K (d, d) of the last tick in N/m, scaled by ``spring_limit``."""
-        return self._table.scaled(self._motion.gains[0], self._motion.scale)
+        return self._table.along_axes(self._motion.scale)[:, None] * self._motion.gains[0]
 
     @property
     def damping(self) -> Floats:

@@ -54,7 +54,6 @@ class ScheduleClock:
         self._catches_up = checks.choice(on_gap, "on_gap", ("pause", "resume")) == "resume"
         self._table, self._d, self._n_place, self._rate = table, table.n_axes, table.n_place, table.rate
         self._motion = slice(table.n_place, table.n_place + table.n_axes)
-        self._packed, self._row_size, self._unpack = table.packed, table.layout.size, table.layout.unpack_from
         self._soft_start = checks.number(soft_start, "soft_start", least=0.0, unit="s")
         # What a soft start does not tell apart counts as equally fast.
         self.scales = scales = tuple([approach_speeds[0] / speed for speed in approach_speeds])
@@ -161,10 +160,10 @@ class ScheduleClock:
         if self._is_steady:
             self.index = index = int((begin - self._origin) * self._rate + 0.5)
             if index < self._tail:
-                return self._unpack(self._packed, index * self._row_size)
+                return self._table.row(index)
             if begin - self._origin >= self._table.end:
                 self.index, self.boost = self._table.last, ()
-                return self._unpack(self._packed, self.index * self._row_size)
+                return self._table.row(self.index)
         return self._ramped(begin, step)
 
     def brake(self, begin: float, passed: float, deceleration: float, robot_speed: float) -> None:
@@ -259,8 +258,7 @@ class ScheduleClock:
             self.index = index = min(int(time * self._rate + _ON_ROW), table.last - 1)
             start, stop = index / self._rate, table.end if index + 1 == table.last else (index + 1) / self._rate
             share = (time - start) / (stop - start) if time < stop else 1.0
-            row = list(self._unpack(self._packed, index * self._row_size))
-            after = self._unpack(self._packed, (index + 1) * self._row_size)
+            row, after = list(table.row(index)), table.row(index + 1)
             # Quaternions this close are interpolated linearly: angles change evenly enough, and lengths do not matter.
             for i in range(n_place + self._d):
                 row[i] += share * (after[i] - row[i])

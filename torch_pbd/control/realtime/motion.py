@@ -222,8 +222,7 @@ class FilteredGains:
             turn: Floats = np.array(deviation(row[: table.n_place], self._row[: table.n_place], table.n_axes)[-3:])
             if table.n_place > table.n_axes and turn.any():
                 active.carry(rotations.matrix(rotations.exp(turn)))
-            for spring, part in zip(table.springs, table.scales(row, active.gains[0], off), strict=True):
-                scale[spring] = part
+            scale = table.along_axes(table.scales(row, active.gains[0], off))
         active.select(table.stiffness[index], table.damping[index], table.mass[index], step, off, scale)
         self._row = row
         return table.advance(row, index, push, here, step, active.gains[:2] if active.gains[2] < 1.0 else None)

@@ -135,8 +135,8 @@ class ScheduleTable:
         # stiffness along the way.
         stiffness, damping = (self.stiffness[index], self.damping[index]) if gains is None else gains
         scales = self.scales(row, stiffness, np.array(off))
-        scaled = self.scaled(stiffness, scales)
-        move, velocity = coupled(scaled, damping, self._one_mass or self.mass[index], push, off, motion, step)
+        stiffness = self.along_axes(scales)[:, np.newaxis] * stiffness
+        move, velocity = coupled(stiffness, damping, self._one_mass or self.mass[index], push, off, motion, step)
         return (moved(place, move), velocity), scales[0] if scales[0] == scales[-1] else scales
 
     def scales(self, row: Vector, stiffness: Floats, off: Floats) -> Vector:
@@ -145,10 +145,10 @@ class ScheduleTable:
         pulls = [top * float(off[b] @ stiffness[b, b] @ off[b]) for b, top in springs]
         return tuple([1.0 / math.sqrt(max(pull, 1.0)) for pull in pulls])
 
-    def scaled(self, stiffness: Floats, scale: Scale) -> Floats:
-        """Stiffness (d, d) scaled as in a tick."""
+    def along_axes(self, scale: Scale) -> Floats:
+        """Scale (d,) of each axis."""
         sizes = [spring.stop - spring.start for spring in self.springs]
-        return np.repeat(np.broadcast_to(scale, len(sizes)), sizes)[:, np.newaxis] * stiffness
+        return np.repeat(np.broadcast_to(scale, len(sizes)), sizes)
 
     def forced(self, acceleration: Vector, index: int) -> Vector:
         """Force that causes an acceleration."""
