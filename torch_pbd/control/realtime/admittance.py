@@ -143,7 +143,7 @@ class RealTimeAdmittance:
         self._channel = ForceChannel(options, schedule.blocks, hold_ticks)
         steady = stiffness_filter is not None
         self._table = table = ScheduleTable(schedule, self._mass, rate, options["spring_limit"], steady=steady)
-        self._clock = ScheduleClock(table, soft_start, options["approach_speed"], options["acceleration_limit"], on_gap)
+        self._clock = ScheduleClock(table, options, soft_start, on_gap)
         self._motion = Motion(table, self._clock, options, stiffness_filter, max_step, max_bad_ticks)
         self._is_pose, self._turn = len(table.blocks) == 2, threading.Lock()
         self.start(0.0)
@@ -269,7 +269,7 @@ class RealTimeAdmittance:
     @property
     def desired_velocity(self) -> Vector:
         """Desired velocity v_d of the last tick, d floats in units/s."""
-        return self._motion.row[self._table.n_place :][: self._table.n_axes]
+        return self._motion.row[self._table.twist]
 
     @property
     def stiffness(self) -> Floats:

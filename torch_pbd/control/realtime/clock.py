@@ -1,7 +1,7 @@
 """Clock of the schedule in the real-time controller, and the desired motion at its time."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from operator import add, mul
 from typing import final
 
@@ -28,37 +28,29 @@ _STEEPEST, _SHARPEST = 1.875, 5.7735
 class ScheduleClock:
     """Schedule time, which runs at a pace from 0 to 1, or a little more to catch up, and the motion desired then.
 
-    At a pace r the desired velocity is r x' and its acceleration r^2 x'' + r' x'. The second term is at most ``gain``,
-    also towards the end of a schedule that ends while moving: there r^2 <= 2 gain times the integral of dt / |x'| over
-    what is left. ``boost`` is that term, to be fed forward, so that no change of pace displaces the robot. At a pace
-    of 1 schedule time is a difference of two times of the loop's clock, which adds up no rounding.
+    At a pace r the desired velocity is r x' and its acceleration r^2 x'' + r' x'. The second term, ``boost``, is fed
+    forward, so that no change of pace displaces the robot. It is at most ``gain``, also before the end of a schedule
+    that ends while moving: there r^2 <= 2 gain times the integral of dt / |x'| over what is left. At a pace of 1
+    schedule time is a difference of two times of the loop's clock, which adds up no rounding.
 
     The desired motion stays within ``acceleration``, and with it a robot that nobody pushes: an approach from elsewhere
     takes what the schedule's own acceleration leaves, and a change of pace what both leave; nothing is caught up
     meanwhile; and the pace rises no faster than the pull of the spring leaves room for (see `spare`). The end of the
     schedule does not slow an approach, which has a pace of its own, ``_free``, and is ``_ahead`` of the schedule then.
 
-    Speeds and accelerations of poses are those of `norm`, with a lever: both blocks then keep to all of the above. An
-    approach turns the desired orientation by A, a share of the way in between: ``A R_d`` moves at w_A + A w_d, and the
-    acceleration of that has w_A x A w_d besides, which is allowed for at full speed.
+    An approach of poses turns the desired orientation by A, a share of the way in between: ``A R_d`` moves at
+    w_A + A w_d, and the acceleration of that has w_A x A w_d besides, which is allowed for at full speed.
     """
 
-    def __init__(
-        self,
-        table: ScheduleTable,
-        soft_start: float,
-        approach_speeds: Vector,
-        acceleration_limits: Vector,
-        on_gap: str,
-    ) -> None:
+    def __init__(self, table: ScheduleTable, options: Mapping[str, Vector], soft_start: float, on_gap: str) -> None:
         self._catches_up = checks.choice(on_gap, "on_gap", ("pause", "resume")) == "resume"
-        self._table, self._d, self._n_place, self._rate = table, table.n_axes, table.n_place, table.rate
-        self._motion = slice(table.n_place, table.n_place + table.n_axes)
+        self._table, self._rate = table, table.rate
         self._soft_start = checks.number(soft_start, "soft_start", least=0.0, unit="s")
         # What a soft start does not tell apart counts as equally fast.
-        self.scales = scales = tuple([approach_speeds[0] / speed for speed in approach_speeds])
+        approach_speed = options["approach_speed"][0]
+        self.scales = scales = tuple([approach_speed / speed for speed in options["approach_speed"]])
         self._lever = None if len(scales) == 1 else scales[1]
-        approach_speed, acceleration_limit = approach_speeds[0], self.least(acceleration_limits)
+        acceleration_limit = self.least(options["acceleration_limit"])
         speeds, accelerations = (
             np.max(
                 [scale * np.linalg.norm(rows[:, b], axis=1) for scale, b in zip(scales, table.blocks, strict=True)],
@@ -101,14 +93,13 @@ class ScheduleClock:
         The robot's place, where the schedule is if None is given, comes back too: if the desired place begins
         elsewhere, it comes to the schedule's by minimum jerk, and turns about one axis.
         """
-        d = self._d
         self._at, self._origin, self._lag, self._is_soft = at, now - at, 0.0, False
         self.boost: Vector = ()
         self._spare, self._ahead, self._end_share = self.gain, 0.0, 1.0
         row, squared_limit = self._desired(at)
-        n_place, n_position = self._n_place, len(velocity) - 3 * (self._lever is not None)
-        place = (*(position or row[:n_position]), *(orientation or row[n_position:n_place]))
-        self._distance = deviation(row[:n_place], place, d)
+        goal, n_positions = row[: self._table.n_place], self._table.blocks[0].stop
+        place = (*(position or goal[:n_positions]), *(orientation or goal[n_positions:]))
+        self._distance = deviation(goal, place, len(velocity))
         way, room = self.norm(self._distance), self._room
         self._blend = self._time_of(way, room)
         # An approach that meets the slow end of its schedule leaves one half of `gain` to it.
@@ -124,14 +115,14 @@ class ScheduleClock:
         # The pace at which the desired motion is nearest to that of the robot.
         square = along = 0.0
         for scale, block in zip(self.scales, self._table.blocks, strict=True):
-            desired = row[self._motion][block]
+            desired = row[self._table.twist][block]
             square += scale**2 * sum(map(mul, desired, desired))
             along += scale**2 * sum(map(mul, desired, velocity[block]))
         pace = max(0.0, along / square) if square and self._soft_start else 1.0
         self._free = min(1.0, pace)
         self._pace = min(self._free, math.sqrt(squared_limit))
         self._is_steady = self._pace == 1.0 and not self._is_soft
-        return tuple(row), moved(place, (0.0,) * d)  # between two rows quaternions are shorter than 1
+        return tuple(row), moved(place, (0.0,) * len(velocity))  # between two rows quaternions are shorter than 1
 
     def norm(self, twist: Sequence[float]) -> float:
         """Length of a velocity; for poses the larger of linear speed and lever, in units/rad, times angular speed."""
@@ -150,7 +141,7 @@ class ScheduleClock:
     def speed_at(self, now: float) -> float:
         """Desired speed at the end of the last tick."""
         row, _ = self._desired(now - self._origin)
-        motion = row[self._motion]
+        motion = row[self._table.twist]
         if self._is_soft:
             return self.norm([self._pace * v + self._free * w for v, w in zip(motion, self._slope, strict=True)])
         return self._pace * self.norm(motion)
@@ -203,7 +194,7 @@ class ScheduleClock:
     def _ramped(self, begin: float, step: float) -> Vector:
         time, last_pace = begin - self._origin, self._pace
         row, squared_limit = self._desired(time)
-        motion = row[self._motion]
+        motion = row[self._table.twist]
         speed, last_free, gain = self.norm(motion), last_pace, self.gain
         if self._is_soft:
             slope, last_free = self._slope, self._free
@@ -217,12 +208,12 @@ class ScheduleClock:
             self.boost, self._spare = (), 0.0
         else:
             self.boost = tuple([(pace - last_pace) / step * part for part in motion])
-        row[self._motion] = [pace * part for part in motion]
+        row[self._table.twist] = [pace * part for part in motion]
         if self._is_soft:
             if self.boost:
                 self.boost = tuple([a + (free - last_free) / step * b for a, b in zip(self.boost, slope, strict=True)])
             self._ahead += 0.5 * step * (free + last_free - pace - last_pace)
-            row[self._motion] = [pace * a + free * b for a, b in zip(motion, slope, strict=True)]
+            row[self._table.twist] = [pace * a + free * b for a, b in zip(motion, slope, strict=True)]
         self._free = free if self._is_soft else pace
         lost = step - 0.5 * step * (pace + last_pace)
         self._origin, self._lag = self._origin + lost, max(0.0, self._lag + lost) if self._lag else 0.0
@@ -251,7 +242,7 @@ class ScheduleClock:
 
         An approach under way changes the position, and its own velocity at a pace of 1 is ``_slope``.
         """
-        table, limits, n_place = self._table, self._squared_limits, self._n_place
+        table, limits, n_place = self._table, self._squared_limits, self._table.n_place
         if time >= table.end:
             self.index, row, squared_limit = table.last, list(table.row(table.last)), math.inf
         else:
@@ -260,7 +251,7 @@ class ScheduleClock:
             share = (time - start) / (stop - start) if time < stop else 1.0
             row, after = list(table.row(index)), table.row(index + 1)
             # Quaternions this close are interpolated linearly: angles change evenly enough, and lengths do not matter.
-            for i in range(n_place + self._d):
+            for i in range(table.twist.stop):
                 row[i] += share * (after[i] - row[i])
             low, high = limits[index], limits[index + 1]
             squared_limit = low + share * (high - low)
@@ -274,7 +265,7 @@ class ScheduleClock:
             away = [-left * part for part in self._distance]
             row[:n_place] = moved(row[:n_place], away)
             if self._lever is not None:
-                turning = slice(n_place + self._d - 3, n_place + self._d)
+                turning = slice(table.twist.stop - 3, table.twist.stop)
                 row[turning] = (rotations.matrix(rotations.exp(np.array(away[-3:]))) @ row[turning]).tolist()
             self._slope = [slope * part for part in self._distance]
             squared_limit *= self._end_share

@@ -206,7 +206,7 @@ class FilteredGains:
                 "stiffness_filter is a RateLimit, but the schedule has poses, or a mass that varies: it cannot know "
                 "before the loop whether the damping pays for what turns or grows. Take EnergyTank()."
             )
-        self._table, self._start = table, table.n_place + table.n_axes
+        self._table = table
         self._fresh = wanted.start(table.stiffness, table.damping, mass, _tick_change)
 
     def begin(self) -> None:
@@ -230,14 +230,14 @@ class FilteredGains:
     def settle(self, row: Vector, push: Vector, before: State, after: State) -> None:
         """Record the tick: place and velocity at its start and end, and the push held during it."""
         n_place, d = self._table.n_place, self._table.n_axes
-        force = push + self.active.gains[1] @ row[n_place : self._start]
+        force = push + self.active.gains[1] @ row[self._table.twist]
         start, end = ((np.array(deviation(place, row[:n_place], d)), np.array(v)) for place, v in (before, after))
         self.active.settle(start, end, force, self._energy)
 
     def _energy(self, stiffness: Floats, off: Floats) -> float:
         """Energy of the limited springs in J."""
         energy = 0.0
-        for spring, top in zip(self._table.springs, self._row[self._start :], strict=False):
+        for spring, top in zip(self._table.springs, self._row[self._table.twist.stop :], strict=False):
             stretch = float(off[spring] @ stiffness[spring, spring] @ off[spring])
             energy += 0.5 * stretch if top * stretch <= 1.0 else math.sqrt(stretch / top) - 0.5 / top
         return energy

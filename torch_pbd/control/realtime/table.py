@@ -33,8 +33,6 @@ def virtual_mass(schedule: Schedule, given: Any) -> float | Floats:
     elif given is not None:
         mass = checks.array(mass, "mass", (d, d))
         checks.semidefinite(mass, "mass", definite=True)
-    elif (mass == mass[0]).all():
-        mass = mass[0]
     if own is not None:
         used, wanted = (each * np.eye(d) if np.ndim(each) == 0 else each for each in (mass, own))
         if not np.all(used == wanted):
@@ -47,12 +45,11 @@ def virtual_mass(schedule: Schedule, given: Any) -> float | Floats:
 class ScheduleTable:
     """Schedule in evenly spaced rows, the last one at ``end`` s with zero velocity.
 
-    A row has the desired place, of ``n_place`` floats, and its velocity, of ``n_axes``; the largest stiffness of each
-    of the ``springs`` over its squared limit; and what `advance` takes besides where modes are shared. ``stiffness``,
-    ``damping`` and ``mass`` (n, d, d) are those of the rows, ``velocity`` (n, d) and ``acceleration`` (n - 1, d) of the
-    desired motion those before the last row was stopped. ``mobility`` has the largest norm of each block of D^-1: of
-    the velocities of positions and rotations under steady forces and torques where damping alone acts. Rows of a
-    ``steady`` table limit their springs by the largest stiffness of all.
+    A row has the desired place, of ``n_place`` floats, and its velocity, at ``twist``; the largest stiffness of each of
+    the ``springs`` over its squared limit, that of all rows if ``steady``; and what `advance` takes besides where modes
+    are shared. ``velocity`` (n, d) and ``acceleration`` (n - 1, d) of the desired motion are those before the last row
+    was stopped. ``mobility`` has the largest norm of each block of D^-1: of the velocities of positions and rotations
+    under steady forces and torques where damping alone acts.
     """
 
     mobility: Floats
@@ -64,14 +61,14 @@ class ScheduleTable:
         if count_rows(duration, rate) > _MAX_ROWS:
             must = f"at most {_MAX_ROWS / duration:g} for a schedule of {duration:g} s, a table of {_MAX_ROWS} rows"
             raise checks.refusal(rate, "rate", must, "lower it", unit="1/s")
-        # A schedule shorter than a tick of the loop is begun and ended.
-        grid = row_times(duration, rate) if count_rows(duration, rate) > 1 else np.array([0.0, duration])
+        grid = row_times(duration, rate)
         between = Between(schedule.time - schedule.time[0], grid)
         position, velocity, orientation = between.motion(schedule)
         place = position if orientation is None else np.concatenate([position, orientation], axis=1)
         self.stiffness, self.damping = between.linear(schedule.stiffness), between.linear(schedule.damping)
         self.rate, self.last, self.end = rate, len(grid) - 1, duration
         self.n_place, self.n_axes, self.blocks = place.shape[1], velocity.shape[1], schedule.blocks
+        self.twist = slice(self.n_place, self.n_place + self.n_axes)
         self.velocity, self.acceleration = velocity.copy(), np.diff(velocity, axis=0) / np.diff(grid)[:, np.newaxis]
         velocity[-1] = 0.0
         self._one_mass = mass if isinstance(mass, float) else None
@@ -90,7 +87,6 @@ class ScheduleTable:
         is_apart = len(blocks) == 2 and _are_apart(self.stiffness, *blocks)
         self.springs, self._are_shared = blocks if is_apart else (slice(0, self.n_axes),), modes is not None
         self._is_plane = modes is not None and mass is not None and self.n_place == self.n_axes == 2
-        self._start = self.n_place + self.n_axes
         # |K e|^2 <= k_max e'K e in each block, with k_max that of the block, also where others are displaced, for
         # |B'K e|^2 <= |B'K B| e'K e for any B.
         if modes is not None and mass is not None and len(blocks) == 1:
@@ -125,9 +121,9 @@ class ScheduleTable:
         if self._is_plane and gains is None:
             return advance_plane(row, push, state, step)
         place, velocity = state
-        motion, off = (row[self.n_place : self._start], velocity), deviation(place, row[: self.n_place], self.n_axes)
+        motion, off = (row[self.twist], velocity), deviation(place, row[: self.n_place], self.n_axes)
         if gains is None and self._are_shared:
-            by_modes = row[self._start + len(self.springs) :]
+            by_modes = row[self.twist.stop + len(self.springs) :]
             move, faster, scale = along_modes(by_modes, push, off, motion, step)
             if scale == 1.0 or len(self.springs) == 1:
                 return (moved(place, move), faster), scale
@@ -141,7 +137,7 @@ class ScheduleTable:
 
     def scales(self, row: Vector, stiffness: Floats, off: Floats) -> Vector:
         """Scale of each spring of a stiffness (d, d) at a deviation, by its limit."""
-        springs = zip(self.springs, row[self._start :], strict=False)
+        springs = zip(self.springs, row[self.twist.stop :], strict=False)
         pulls = [top * float(off[b] @ stiffness[b, b] @ off[b]) for b, top in springs]
         return tuple([1.0 / math.sqrt(max(pull, 1.0)) for pull in pulls])
 

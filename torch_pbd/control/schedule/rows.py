@@ -25,8 +25,8 @@ def count_rows(duration: float, rate: float) -> int:
 
 
 def row_times(duration: float, rate: float) -> Floats:
-    """Times (n,) of the rows of :func:`count_rows`; the last interval may be shorter."""
-    return np.append(np.arange(count_rows(duration, rate) - 1) / rate, duration)
+    """Times (n,), n >= 2, of rows every ``1 / rate`` and at the end; the last interval may be shorter."""
+    return np.append(np.arange(max(count_rows(duration, rate) - 1, 1)) / rate, duration)
 
 
 def tick_times(duration: float, rate: float, d: int, *, settle: float = 0.0) -> Floats:
