@@ -153,18 +153,23 @@ public:
     }
 
     /// Position to command, in units.
-    Position position() const { return position_of(state_); }
+    Position position() const { return places::part<n_positions<N, M>>(state_.place, 0); }
     /// Orientation to command, a unit quaternion w x y z from the tool to the world; of poses.
-    Quaternion orientation() const { return orientation_of(state_); }
+    Quaternion orientation() const {
+        static_assert(kIsPose, "positions have no orientation");
+        return places::part<4>(state_.place);
+    }
     const Vector<N>& velocity() const { return state_.velocity; }  ///< to command, in units/s and rad/s
     Faults faults() const { return faults_; }  ///< all since `start`
 
     /// External force that acted in the last tick, in N and Nm.
     const Vector<N>& force() const { return channel_.push; }
-    Position desired_position() const { return position_of(desired_); }  ///< of the last tick
+    /// Desired position of the last tick.
+    Position desired_position() const { return places::part<n_positions<N, M>>(desired_.place, 0); }
     /// Desired orientation of the last tick; of poses.
     Quaternion desired_orientation() const {
-        const Quaternion turned = orientation_of(desired_);
+        static_assert(kIsPose, "positions have no orientation");
+        const Quaternion turned = places::part<4>(desired_.place);
         return (1.0 / linalg::norm(turned)) * turned;
     }
     const Vector<N>& desired_velocity() const { return desired_.velocity; }  ///< of the last tick
@@ -199,17 +204,6 @@ private:
     template <std::size_t K>
     static void check_finite(const Vector<K>& values, const char* name) {
         for (const double value : values) checked(value, std::isfinite(value), name, "finite");
-    }
-
-    static Position position_of(const State<N, M>& state) {
-        Position position;
-        std::copy(state.place.begin(), state.place.begin() + position.size(), position.begin());
-        return position;
-    }
-
-    static Quaternion orientation_of(const State<N, M>& state) {
-        static_assert(kIsPose, "positions have no orientation");
-        return places::orientation_of(state.place);
     }
 
     Faults live(double now, double step) {

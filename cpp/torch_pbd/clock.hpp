@@ -297,7 +297,7 @@ private:
             row.place = places::moved(row.place, away);
             if constexpr (M != N)
                 places::set_tail(row.velocity,
-                                 rotations::rotated(places::rotation_of(row.velocity), places::rotation_of(away)));
+                                 rotations::rotated(places::part<3>(row.velocity), places::part<3>(away)));
             slope_ = slope * distance_;
             squared_limit *= end_share_;
         }

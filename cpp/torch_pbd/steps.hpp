@@ -103,14 +103,12 @@ namespace places {
 
 using namespace rotations;
 
-template <std::size_t N>
-Vector<3> rotation_of(const Vector<N>& twist) {
-    return {twist[N - 3], twist[N - 2], twist[N - 1]};
-}
-
-template <std::size_t M>
-Quaternion orientation_of(const Vector<M>& place) {
-    return {place[M - 4], place[M - 3], place[M - 2], place[M - 1]};
+/// K components of a vector, the last ones if not from another on: the rotation of a twist, the quaternion of a place.
+template <std::size_t K, std::size_t N>
+Vector<K> part(const Vector<N>& vector, std::size_t begin = N - K) {
+    Vector<K> result;
+    std::copy_n(vector.begin() + begin, K, result.begin());
+    return result;
 }
 
 template <std::size_t M, std::size_t K>
@@ -126,7 +124,7 @@ Vector<N> deviation(const Vector<M>& place, const Vector<M>& goal) {
     Vector<N> move;
     for (std::size_t i = 0; i < n_positions<N, M>; ++i) move[i] = place[i] - goal[i];
     if constexpr (M != N) {
-        const Quaternion turned = orientation_of(place), still = orientation_of(goal);
+        const Quaternion turned = part<4>(place), still = part<4>(goal);
         // Products of equal quaternions are not zero to the last bit.
         const bool is_equal = turned == still;
         set_tail(move, is_equal ? Vector<3>{} : log(multiply(turned, conjugate(still))));
@@ -139,7 +137,7 @@ template <std::size_t N, std::size_t M>
 Vector<M> moved(Vector<M> place, const Vector<N>& move) {
     for (std::size_t i = 0; i < n_positions<N, M>; ++i) place[i] += move[i];
     if constexpr (M != N) {
-        const Quaternion turned = multiply(exp(rotation_of(move)), orientation_of(place));
+        const Quaternion turned = multiply(exp(part<3>(move)), part<4>(place));
         set_tail(place, (1.0 / linalg::norm(turned)) * turned);
     }
     return place;
