@@ -88,10 +88,9 @@ class ScheduleClock:
     def begin(
         self, now: float, at: float, position: Vector | None, orientation: Vector | None, velocity: Vector
     ) -> tuple[Vector, Vector]:
-        """Start at a time of the schedule, whose row it is, as fast as the velocity of the robot is the desired one.
+        """Row of the schedule at the time of the start, and place of the robot, which is the row's where that is None.
 
-        The robot's place, where the schedule is if None is given, comes back too: if the desired place begins
-        elsewhere, it comes to the schedule's by minimum jerk, and turns about one axis.
+        The desired place comes from there by minimum jerk, at first as fast as the robot, and turns about one axis.
         """
         self._at, self._origin, self._lag, self._is_soft = at, now - at, 0.0, False
         self.boost: Vector = ()

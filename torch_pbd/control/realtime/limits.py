@@ -107,9 +107,8 @@ class ForceChannel:
     def take(self, force: Numbers, step: float) -> int:
         """Let a measured force act within the limits, ``step`` s after the last one; returns its faults."""
         try:
-            given = (
-                *map(float, force),
-            )  # tuple() of an iterator leaves one more tuple on Python's free list each time
+            # tuple() of an iterator leaves one more tuple on Python's free list each time.
+            given = (*map(float, force),)
         except (TypeError, ValueError, OverflowError):
             given = ()
         if len(given) != self._n_axes:

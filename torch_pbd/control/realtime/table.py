@@ -114,9 +114,8 @@ class ScheduleTable:
     ) -> tuple[State, Scale]:
         """Place and velocity after ``step`` s, and the scale of the stiffness, by the row's gains or the given ones.
 
-        For poses the angular velocity is integrated over the tick as that of a fixed axis would be, and turns the robot
-        in world axes: ``R <- Exp(dr) R``. The deviation is then told anew from where both are, so that the transport of
-        it by the desired rotation, which turns e by w_d x e, comes out by itself.
+        Poses turn as about a fixed axis of the world, ``R <- Exp(dr) R``. The deviation is then told anew from where
+        both are, so that its transport by the desired rotation, w_d x e, comes out by itself.
         """
         if self._is_plane and gains is None:
             return advance_plane(row, push, state, step)
