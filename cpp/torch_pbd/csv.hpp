@@ -88,61 +88,6 @@ private:
     std::uint64_t n_bytes_ = 0;
 };
 
-/// Letters of a key of JSON, which stands in ASCII with escapes, whose order is another one.
-inline std::u16string letters(std::string_view key) {
-    constexpr std::string_view escapes = "nrtbf", meant = "\n\r\t\b\f";
-    std::u16string decoded;
-    for (std::size_t i = 1; i + 1 < key.size(); ++i) {
-        char16_t letter = static_cast<unsigned char>(key[i]);
-        if (letter == u'\\') {
-            const char escape = key[++i];
-            const std::size_t known = escapes.find(escape);
-            letter = static_cast<unsigned char>(known < escapes.size() ? meant[known] : escape);
-            if (escape == 'u') {
-                letter = static_cast<char16_t>(std::stoul(std::string(key.substr(i + 1, 4)), nullptr, 16));
-                i += 4;
-            }
-        }
-        decoded += letter;
-    }
-    return decoded;
-}
-
-/// Takes so many letters off the front of JSON; they must be there, and what is expected.
-inline std::string take(std::string_view& text, std::size_t n_letters, std::string_view expected = "") {
-    if (n_letters == 0 || n_letters > text.size() || text.compare(0, expected.size(), expected) != 0)
-        throw std::runtime_error("its labels are not JSON");
-    const std::string taken(text.substr(0, n_letters));
-    text.remove_prefix(n_letters);
-    return taken;
-}
-
-/// Takes a value off the front of JSON: with the entries of its objects in the order of their keys, as Python's
-/// `json.dumps(..., sort_keys=True)` has them.
-inline std::string take_sorted(std::string_view& text, int depth = 0) {
-    constexpr int deepest = 200;
-    if (text.empty() || depth > deepest) take(text, 0);
-    const bool is_object = text.front() == '{';
-    if (text.front() == '"') {
-        std::size_t end = 1;
-        while (end < text.size() && text[end] != '"') end += text[end] == '\\' ? 2 : 1;
-        return take(text, end + 1);
-    }
-    if (!is_object && text.front() != '[') return take(text, std::min(text.find_first_of(",]} "), text.size()));
-    std::string joined = take(text, 1);
-    const char close = is_object ? '}' : ']';
-    std::vector<std::pair<std::u16string, std::string>> entries;
-    while (text.empty() || text.front() != close) {
-        if (!entries.empty()) take(text, 2, ", ");
-        const std::string key = is_object ? take_sorted(text, depth + 1) : "";
-        const std::string colon = is_object ? take(text, 2, ": ") : "";
-        entries.emplace_back(letters(key), key + colon + take_sorted(text, depth + 1));
-    }
-    if (is_object) std::sort(entries.begin(), entries.end());
-    for (const auto& [key, entry] : entries) joined += (joined.size() > 1 ? ", " : "") + entry;
-    return joined + take(text, 1);
-}
-
 /// Number of a cell; the decimal point is a point in every locale.
 inline double number(std::string_view cell, std::size_t line) {
     double value = 0.0;
@@ -215,13 +160,11 @@ public:
 
     /// Values of the next array: whole symmetric matrices (n, d, d).
     std::vector<double> take_matrices(const std::string& name, const std::vector<std::string>& outputs) {
-        // Files once had titles with commas, stiffness[x,y].
         const std::size_t d = outputs.size();
-        const bool is_old = next_ + 1 < titles_.size() && titles_[next_].find("][") == std::string::npos;
         std::vector<std::string> titles;
         for (std::size_t i = 0; i < d; ++i)
             for (std::size_t j = i; j < d; ++j)
-                titles.push_back(name + "[" + outputs[i] + (is_old ? "," : "][") + outputs[j] + "]");
+                titles.push_back(name + "[" + outputs[i] + "][" + outputs[j] + "]");
         const std::vector<double> upper = take(name, titles);
         std::vector<double> whole(n_rows * d * d);
         std::size_t next = 0;
@@ -245,12 +188,8 @@ private:
 /// JSON of the labels, which the checksum of a file begins with: but for itself, in the order of their keys.
 inline std::string header_of(const std::map<std::string, std::string>& labels) {
     std::string header;
-    for (const auto& [key, value] : labels) {
-        if (key == "sha256") continue;
-        std::string_view rest = value;
-        header += (header.empty() ? "{\"" : ", \"") + key + "\": " + take_sorted(rest);
-        if (!rest.empty()) take(rest, 0);
-    }
+    for (const auto& [key, value] : labels)
+        if (key != "sha256") header += (header.empty() ? "{\"" : ", \"") + key + "\": " + value;
     return header + "}";
 }
 

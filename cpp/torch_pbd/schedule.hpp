@@ -118,8 +118,8 @@ inline Schedule read(std::istream& stream) {
         return found == schedule.labels.end() ? std::string() : found->second;
     };
     if (label("format") != "\"torch_pbd.schedule\"") throw std::runtime_error("it is no schedule");
-    if (label("version") != "1" && label("version") != "2")
-        throw std::runtime_error("it has version " + label("version") + ", must have 1 or 2");
+    if (label("version") != "2")
+        throw std::runtime_error("it has version " + label("version") + ", must have 2: save it anew by this Python");
     Table table(line);
     while (next())
         if (!line.empty()) table.add(line, n_lines);

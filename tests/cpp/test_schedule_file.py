@@ -40,7 +40,7 @@ def assert_read_as(path, schedule):
 @pytest.mark.parametrize("is_pose", [False, True])
 def test_every_number_is_the_same_to_the_bit(is_pose, rng, tmp_path):
     names = ["x, across", '"y"', "z]", "rx", "r\u00e9", "\U0001f600"][: 6 if is_pose else 2]
-    # Keys in another order than that of the checksum, which is the order of their letters and not of their escapes.
+    # Keys that come in another order than that of the checksum: of their letters and not of their escapes.
     nested = {"b": [1e-05, {}], "a": '} " {'}
     provenance = {"z": nested, "\u00e9": None, "e": [], "\u65e5": True, "\\": -0.0, "\n": 1, "e ": 2, "e\\u0041": 3}
     schedule = made(rng, is_pose=is_pose, names=names, provenance=provenance, units="mm")
@@ -52,10 +52,12 @@ def test_every_number_is_the_same_to_the_bit(is_pose, rng, tmp_path):
     assert_read_as(path, schedule)
 
 
-def test_files_of_the_first_format_are_read():
-    path = ROOT / "tests" / "golden" / "v1" / "schedule.csv"
-    assert '"stiffness[x,y]"' in path.read_text(encoding="utf-8")
-    assert_read_as(path, Schedule.load(path))
+def test_files_of_the_first_format_are_read_once_they_are_saved_anew(tmp_path):
+    old, path = ROOT / "tests" / "golden" / "v1" / "schedule.csv", tmp_path / "schedule.csv"
+    with pytest.raises(ValueError, match="it has version 1, must have 2: save it anew"):
+        read_array(old, "time")
+    Schedule.load(old).save(path)
+    assert_read_as(path, Schedule.load(old))
 
 
 def refusal(path, content):
@@ -86,7 +88,7 @@ def test_a_torn_or_flipped_file_is_refused(rng, tmp_path):
     ("old", "new", "message"),
     [
         ("torch_pbd.schedule", "other", "it is no schedule"),
-        ("version: 2", "version: 3", "it has version 3, must have 1 or 2"),
+        ("version: 2", "version: 3", "it has version 3, must have 2"),
         ("# units", "# frame", "has a label that was there before"),
         ("position[0],position[1]", "position[1],position[0]", "columns of velocity are not those of position"),
         ("stiffness[0][1]", "stiffness[1][0]", "its columns of stiffness are not 3 in the order of the outputs"),

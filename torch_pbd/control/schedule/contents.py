@@ -145,13 +145,13 @@ def _checked_labels(labels: Labels, n_outputs: int) -> dict[str, Any]:
 
 
 def _json_copy(value: Any, where: str, depth: int = 0) -> Any:
-    """Copy of a value that survives a JSON round trip; tuples come back as lists."""
+    """Copy of a value that survives a JSON round trip: lists for tuples, and keys in order, as checksums have them."""
     if depth > _DEEPEST:
         raise InvalidParameterError(
             f"provenance is more than {_DEEPEST} levels deep, or holds itself, at {where:.80}...: take fewer levels."
         )
     if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
-        return {key: _json_copy(entry, f"{where}[{key!r}]", depth + 1) for key, entry in value.items()}
+        return {key: _json_copy(entry, f"{where}[{key!r}]", depth + 1) for key, entry in sorted(value.items())}
     if isinstance(value, list | tuple):
         return [_json_copy(entry, f"{where}[{i}]", depth + 1) for i, entry in enumerate(value)]
     if isinstance(value, np.generic):
