@@ -11,11 +11,10 @@ from torch_pbd.robots import ros as ros
 from torch_pbd.robots import ur_rtde as ur_rtde
 from torch_pbd.robots.kinematics import inverse_kinematics, operational_inertia
 from torch_pbd.robots.mujoco import HOME as HOME
-from torch_pbd.robots.mujoco import ArmRun, panda, panda_mjcf
+from torch_pbd.robots.mujoco import panda, panda_mjcf
 from torch_pbd.robots.session import RobotLimits, RobotRun, RobotStoppedError
 
 __all__ = [
-    "ArmRun",
     "RobotLimits",
     "RobotRun",
     "RobotStoppedError",

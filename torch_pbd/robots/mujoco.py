@@ -4,7 +4,6 @@
 """
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
 
@@ -17,7 +16,7 @@ from torch_pbd.control.schedule import Schedule
 from torch_pbd.exceptions import InvalidParameterError
 from torch_pbd.registry import optional
 from torch_pbd.robots.kinematics import MujocoArm, pose_error
-from torch_pbd.robots.session import RobotStoppedError, accelerations, check_start, poses, warn_of_mass
+from torch_pbd.robots.session import RobotRun, RobotStoppedError, accelerations, check_start, poses, warn_of_mass
 
 HOME = (0.0, -math.pi / 4, 0.0, -3 * math.pi / 4, 0.0, math.pi / 2, math.pi / 4)
 """Joint angles of the Panda in rad, far from limits and singularities: the hand points down, 0.31 m before the base."""
@@ -52,46 +51,6 @@ def panda() -> Any:
     return optional("mujoco", "robot", "a model for MuJoCo").MjModel.from_xml_string(panda_mjcf())
 
 
-@final
-@dataclass(frozen=True, eq=False, repr=False)
-class ArmRun:
-    """States of an arm at the start of each tick, with the wrench and torques during it, in world axes.
-
-    Attributes
-    ----------
-    time : (T,), s
-    position, orientation : (T, 3) in m and (T, 4), quaternions w x y z of the tool
-    twist : (T, 6), m/s and rad/s
-    deviation : (T, 6), m and rad
-        Translation from the schedule, and the rotation vector from the desired to the true orientation.
-    wrench : (T, 6), N and Nm
-        External wrench at the tool.
-    joints, torque : (T, n), rad and Nm
-        Joint angles and commanded torques.
-    mass : (T, 6, 6), kg, kg m and kg m^2
-        Inertia at the tool at the true joint angles.
-    saturated : (T,) of bool, whether a motor gives less than the commanded torque
-    """
-
-    time: Floats
-    position: Floats
-    orientation: Floats
-    twist: Floats
-    deviation: Floats
-    wrench: Floats
-    joints: Floats
-    torque: Floats
-    mass: Floats
-    saturated: Any
-
-    def __repr__(self) -> str:
-        farthest, widest = (np.linalg.norm(part, axis=1).max() for part in np.split(self.deviation, 2, axis=1))
-        return (
-            f"ArmRun(n_ticks={len(self.time)}, n_joints={self.joints.shape[1]}, time={self.time[0]:.6g}.."
-            f"{self.time[-1]:.6g} s, deviation up to {farthest:.3g} m, {widest:.3g} rad)"
-        )
-
-
 def run(
     model: Any,
     schedule: Schedule,
@@ -99,7 +58,7 @@ def run(
     *,
     tool: str = "tool",
     wrench: ArrayLike | None = None,
-) -> ArmRun:
+) -> RobotRun:
     """Follow a schedule of poses by torques, ``J' (Lambda a_d - K e - D e') + h + N' M (...)``.
 
     The arm keeps its inertia Lambda(q), with gravity and Coriolis forces h compensated: under a force f at the tool it
@@ -123,7 +82,8 @@ def run(
 
     Returns
     -------
-    ArmRun
+    RobotRun
+        States at the start of each tick, with the wrench and torques during it.
 
     Warns
     -----
@@ -146,7 +106,7 @@ def run(
     pushes = np.zeros((len(schedule), 6)) if wrench is None else checks.array(wrench, "wrench", (len(schedule), 6))
     ticks = [simulation.tick(row, push) for row, push in enumerate(pushes)]
     measured = {name: np.stack([tick[name] for tick in ticks]) for name in ticks[0]}
-    return ArmRun(time=schedule.time, wrench=pushes, **measured)
+    return RobotRun(schedule.time, wrench=pushes, **measured)
 
 
 def _steps_a_tick(time: Floats, timestep: float) -> int:

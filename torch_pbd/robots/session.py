@@ -113,9 +113,9 @@ def check_start(schedule: Schedule, position: Floats, orientation: Floats) -> No
 
 
 @final
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RobotRun:
-    """Poses of a tool that followed a schedule, up to the end or a fault.
+    """Motion of a tool that followed a schedule, up to the end or a fault; what follows ``deviation`` if simulated.
 
     Attributes
     ----------
@@ -123,12 +123,26 @@ class RobotRun:
     position, orientation : (m, 3) in m and (m, 4), quaternions w x y z
     deviation : (m, 6), m and rad
         Translation from the schedule, and the rotation vector from the desired to the true orientation.
+    twist : (m, 6), m/s and rad/s
+    wrench : (m, 6), N and Nm
+        External wrench at the tool.
+    joints, torque : (m, n), rad and Nm
+        Joint angles and commanded torques.
+    mass : (m, 6, 6), kg, kg m and kg m^2
+        Inertia at the tool at the true joint angles.
+    saturated : (m,) of bool, whether a motor gives less than the commanded torque
     """
 
     time: Floats
     position: Floats
     orientation: Floats
     deviation: Floats
+    twist: Any = None
+    wrench: Any = None
+    joints: Any = None
+    torque: Any = None
+    mass: Any = None
+    saturated: Any = None
 
     def __repr__(self) -> str:
         parts = np.split(self.deviation, 2, axis=1)
