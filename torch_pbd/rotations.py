@@ -85,18 +85,15 @@ def matrix(quaternion: Floats) -> Floats:
 def from_matrix(rotation: Floats) -> Floats:
     """Quaternion (..., 4) with w >= 0 of a rotation matrix (..., 3, 3).
 
-    4 q q' is linear in the matrix, and q its eigenvector (I. Y. Bar-Itzhack, "New method for extracting the quaternion
+    4 q q' - 1 is linear in the matrix, and q its eigenvector (I. Y. Bar-Itzhack, "New method for extracting the quaternion
     from a rotation matrix", Journal of Guidance, Control, and Dynamics 23, 2000).
     """
-    r = np.moveaxis(rotation, (-2, -1), (0, 1))
-    diagonal = np.stack([r[0, 0], r[1, 1], r[2, 2]])
-    outer = np.empty((4, 4, *r.shape[2:]))
-    outer[0, 0] = 1.0 + diagonal.sum(axis=0)
+    trace = np.trace(rotation, axis1=-2, axis2=-1)[..., np.newaxis, np.newaxis]
+    outer = np.empty((*rotation.shape[:-2], 4, 4))
+    outer[..., :1, :1], outer[..., 1:, 1:] = trace, rotation + rotation.mT - trace * np.eye(3)
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        outer[i + 1, i + 1] = 1.0 + 2.0 * diagonal[i] - diagonal.sum(axis=0)
-        outer[0, i + 1] = outer[i + 1, 0] = r[k, j] - r[j, k]
-        outer[i + 1, j + 1] = outer[j + 1, i + 1] = r[i, j] + r[j, i]
-    quaternion = np.linalg.eigh(np.moveaxis(outer, (0, 1), (-2, -1)))[1][..., -1]
+        outer[..., 0, i + 1] = outer[..., i + 1, 0] = rotation[..., k, j] - rotation[..., j, k]
+    quaternion = np.linalg.eigh(outer)[1][..., -1]
     return np.where(quaternion[..., :1] < 0.0, -quaternion, quaternion)
 
 

@@ -42,11 +42,10 @@ _NEARLY_UNIT = 1e-6
 class AdmittancePlant:
     """Mass, spring and damper in d axes, pulled along a desired motion and batched over rollouts.
 
-    ``M a = f + K (x_d - x) + D (v_d - v)``, eq. (15) as admittance. All inputs are held over a tick (zero-order hold),
-    in which the desired position stands still; states are those at the start of ticks. For poses, ``x - x_d`` is
-    ``(p - p_d, Log(R R_d'))`` in world axes and v the twist. The model is linear in the deviation from the desired
-    orientation, which itself may turn arbitrarily: peaks under pushes are right to 1 % up to 1 rad, while the paths to
-    them err by 3 % at 0.2 rad and 16 % at 1 rad.
+    ``M a = f + K (x_d - x) + D (v_d - v)``, eq. (15) as admittance. All inputs are held over a tick, in which the
+    desired position stands still. For poses, ``x - x_d`` is ``(p - p_d, Log(R R_d'))`` in world axes and v the twist.
+    The model is linear in the deviation from the desired orientation, which itself may turn arbitrarily: peaks under
+    pushes are right to 1 % up to 1 rad, while the paths to them err by 3 % at 0.2 rad and 16 % at 1 rad.
 
     Parameters
     ----------
@@ -64,10 +63,10 @@ class AdmittancePlant:
     position_loop : PositionLoop, default=None
         Position loop between the admittance and the robot; None follows at once.
     environment : Tunnel, default=None
-        Walls, whose force adds to the external one, or any object with a method ``force(position, velocity)``.
+        Walls, or any object with a method ``force(position, velocity)``, whose force adds to the external one.
     substeps : int, default=1
-        Evaluations of the walls per tick. A wall of 1e5 N/m needs about 4 at 1 kHz. Sensors, position loops and
-        filters act once per tick, as on a real robot, and require 1.
+        Evaluations of the walls per tick: a wall of 1e5 N/m needs about 4 at 1 kHz. Sensors, position loops and
+        filters act once per tick, and require 1.
     stiffness_filter : RateLimit or EnergyTank, default=None
         Filter that holds back stiffness changes that would feed energy into the robot.
 
@@ -127,10 +126,10 @@ class AdmittancePlant:
         orientation0: Tensor | Any = None,
         generator: torch.Generator | Any = None,
     ) -> Rollout:
-        """Run T ticks of ``dt`` seconds.
+        """Run T ticks of ``dt`` seconds, of d = p axes, or of poses with ``orientation_desired``.
 
-        Positions alone have d = p axes. With ``orientation_desired`` the run is of poses with d = p + 3 axes, the last
-        three being rotations in world axes, in rad/s, rad/s^2, Nm, Nm/rad and Nm s/rad.
+        Poses have d = p + 3 axes, the last three being rotations in world axes, in rad/s, rad/s^2, Nm, Nm/rad and
+        Nm s/rad.
 
         Parameters
         ----------

@@ -33,14 +33,13 @@ _N_DIMS = {"position": 2, "velocity": 2, "force": 2, "commanded_position": 2, "s
 class Rollout:
     """States at the start of each tick of a simulated run, as tensors or, by ``numpy()``, arrays.
 
-    Runs of positions have p = d. Runs of poses have p = d - 3, and the last three axes of velocity, force and gains are
-    rotations in world axes, in rad/s, Nm, Nm/rad and Nm s/rad.
+    Runs of positions have p = d. Runs of poses have p = d - 3, the last three axes being rotations in world axes, in
+    rad/s, Nm, Nm/rad and Nm s/rad.
 
     Attributes
     ----------
     time : (T,), s
     position, velocity : (..., T, p), m, and (..., T, d), m/s
-        Motion of the robot.
     force : (..., T, d), N
         External force on the robot, including that of walls.
     stiffness, damping : (..., T, d, d), N/m and N s/m
@@ -57,8 +56,7 @@ class Rollout:
     orientation, desired_orientation, commanded_orientation : (..., T, 4) or None
         Unit quaternions w x y z in runs of poses.
     pose_deviation : (..., T, d) or None, m and rad
-        In runs of poses, position minus desired position, and the rotation vector e from the desired orientation in
-        world axes, ``R = exp([e]) R_d``.
+        In runs of poses ``deviation``, with the rotation vector e in world axes, ``R = exp([e]) R_d``.
     units : str or None
         Units of the schedule's positions, None if unknown. For "rad" (joints), read rad for m and Nm for N above.
     """
@@ -97,7 +95,7 @@ class Rollout:
         return replace(self, **arrays)
 
     def plot(self, *, unpushed: "Rollout | None" = None, names: Sequence[str] | None = None) -> Any:
-        """Plot deviation, external force and stiffness over time in a new figure, with rotations in a second column.
+        """Plot deviation, external force and stiffness over time, of a single run, in a new figure.
 
         Parameters
         ----------
@@ -109,11 +107,6 @@ class Rollout:
         Returns
         -------
         list of three matplotlib Axes, or for poses of six: three of positions, then three of rotations
-
-        Raises
-        ------
-        ValueError
-            If this is a batch of runs.
         """
         from torch_pbd.plotting.display import plot_pushes  # here: it needs matplotlib, a run does not
 
@@ -141,19 +134,17 @@ class Loop:
         self._commands = [self._deviation] * (loop.delay_steps if loop else 0)
         self._read = task.sensor and task.sensor.start(state[0], task.dt, generator)
         gains = task.stiffness, task.damping, task.mass
-        wanted = task.stiffness_filter
-        self._filter = None if wanted is None else wanted.start(*gains, tick_change)
+        self._filter = task.stiffness_filter and task.stiffness_filter.start(*gains, tick_change)
         self._maps = (each for _, maps in tick_maps(task, task.dt / task.substeps) for each in maps.unbind(-3))
 
     def run(self, tick: int, force: Tensor) -> dict[str, Tensor]:
         """Fields of a Rollout at the start of a tick under a force (..., d): measure, choose the gains, move."""
         task, commanded = self._task, self._deviation
         desired, mass = task.position[..., tick, :], mass_at(task.mass, tick)
-        stiffness, damping = task.stiffness[..., tick, :, :], task.damping[..., tick, :, :]
+        stiffness, damping = (gain[..., tick, :, :] for gain in (task.stiffness, task.damping))
         away, speed = (commanded, self._velocity) if self._follow is None else self._robot
         measured = total = force + self._wall(away + desired, speed)
-        record = {"position": away + desired, "velocity": speed, "force": total}
-        record["commanded_position"] = commanded + desired
+        record = {"position": away + desired, "velocity": speed, "commanded_position": commanded + desired}
         if self._read is not None:
             measured, record["saturated"] = self._read(total)
         if self._filter is None:
@@ -176,7 +167,7 @@ class Loop:
             if self._filter is not None:
                 self._filter.settle(before, (self._deviation, self._velocity), held)
         self._move_on(tick, commanded)
-        return record | {"stiffness": stiffness, "damping": damping}
+        return record | {"force": total, "stiffness": stiffness, "damping": damping}
 
     def _move_on(self, tick: int, commanded: Tensor) -> None:
         """Let the robot follow its command, and express all relative to the next tick's desired pose."""
@@ -212,8 +203,7 @@ def run_task(
     force = torch.zeros_like(task.velocity) if force is None else force
     p, start = task.n_positions, _start(task, position0, orientation0)
     speed = task.velocity[..., 0, :] if velocity0 is None else velocity0
-    shapes = (part.shape[:-2] for part in (*task.motions, force, task.stiffness[..., 0]))
-    batch = broadcast_shapes(*shapes, start.shape[:-1], speed.shape[:-1])
+    batch = broadcast_shapes(task.batch, force.shape[:-2], start.shape[:-1], speed.shape[:-1])
     state = start.expand(*batch, -1), speed.expand(*batch, -1)
     _check_memory(task, batch.numel())
     if task.is_linear:

@@ -27,7 +27,7 @@ _SHARE = 0.1
 class RolloutSummary:
     """Effect of R random pushes on a robot, as NumPy arrays.
 
-    For poses this describes the positions, and ``rotation`` the rotation vectors. Where ``units`` are "rad", as for
+    For poses this is of the positions, and ``rotation`` of the rotation vectors. Where ``units`` are "rad", as for
     rotations and joints, read rad for m and Nm for N.
 
     Attributes
@@ -183,7 +183,7 @@ def push_many(
     Pushes are onsets (R,), durations (R,) and peaks (d, R); quantiles (n_quantiles,) are of each ``every``-th tick.
     """
     n_rollouts = len(pushes[0])
-    columns = [slice(first, min(first + _CHUNK, n_rollouts)) for first in range(0, n_rollouts, _CHUNK)]
+    columns = [slice(first, first + _CHUNK) for first in range(0, n_rollouts, _CHUNK)]
     chunks = [Chunk(some, *(part[..., some] for part in pushes)) for some in columns]
     tallies = [Tally(n_rollouts, block) for block in blocks]
     scratch, rows = torch.empty(0), list[Tensor]()

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from torch_pbd.control.filters import StiffnessFilter
 from torch_pbd.control.simulation.sensor import ForceSensor, PositionLoop
+from torch_pbd.linalg import broadcast_shapes
 
 State = tuple[Tensor, Tensor]
 """Position and velocity (..., d)."""
@@ -89,16 +90,16 @@ class Task:
         return self.position.shape[-1] - (0 if self.orientation is None else 3)
 
     @property
-    def motions(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Tensors (..., T, d) that have all batch dimensions of the desired motion."""
-        return self.velocity, self.inertial_force, self.steps
+    def batch(self) -> torch.Size:
+        """Batch dimensions of gains and desired motion."""
+        parts = (self.velocity, self.inertial_force, self.steps, self.stiffness[..., 0])
+        return broadcast_shapes(*(part.shape[:-2] for part in parts))
 
     @property
     def is_linear(self) -> bool:
         """Whether nothing acts in the loop and all rollouts of a batch share gains and desired motion."""
         acting = (self.sensor, self.position_loop, self.environment, self.stiffness_filter)
-        is_shared = self.stiffness.ndim == 3 and all(motion.ndim == 2 for motion in self.motions)
-        return is_shared and all(part is None for part in acting)
+        return not self.batch and all(part is None for part in acting)
 
     def carry(self, tick: int, deviation: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
         """Deviations from the desired pose after a tick instead of before it."""
@@ -150,8 +151,7 @@ def block_responses(task: Task, length: int) -> Iterator[Float[Tensor, "l1 m n"]
             maps = torch.cat([position, task.transport[ticks] @ rotation, velocity], dim=-2)
         drift = maps[..., 2 * d :] @ push[ticks].unsqueeze(-1) - steps[ticks].unsqueeze(-1)
         each = torch.cat([maps[..., : 2 * d], drift, maps[..., 2 * d :]], dim=-1)
-        surplus = -len(each) % length
-        each = torch.cat([each, each[-1:].expand(surplus, -1, -1)]).unflatten(0, (-1, length))
+        each = torch.cat([each, each[-1:].expand(-len(each) % length, -1, -1)]).unflatten(0, (-1, length))
         states = [unit[: 2 * d].expand(len(each), -1, -1)]
         for tick in range(length):
             held = torch.cat([unit[2 * d, None], unit[2 * d + 1 + tick * d :][:d]]).expand(len(each), -1, -1)
@@ -161,8 +161,7 @@ def block_responses(task: Task, length: int) -> Iterator[Float[Tensor, "l1 m n"]
 
 def tick_maps(task: Task, dt: float) -> Iterator[tuple[slice, Tensor]]:
     """Stretches of n ticks, each with its maps (..., n, 2 d, 3 d) over ``dt`` under the task's gains."""
-    batch = max(1, task.stiffness[..., 0, 0, 0].numel())
-    n_together = max(1, _MATRICES_AT_ONCE // batch)
+    n_together = max(1, _MATRICES_AT_ONCE // task.stiffness[..., 0, 0, 0].numel())
     for first in range(0, task.n_ticks, n_together):
         ticks = slice(first, min(first + n_together, task.n_ticks))
         gains = task.stiffness[..., ticks, :, :], task.damping[..., ticks, :, :]

@@ -22,10 +22,9 @@ _NOT_PROMISED = (
 class StabilityReport:
     """Stability of a schedule at one inertia and speed, computed by :func:`certify`; ``print`` gives a summary.
 
-    The guarantees hold for the force-free motion of this inertia, integrated exactly. They exclude the effects of a
-    real robot, above all lag, saturation and contact; only ``environment_stiffness`` covers a position loop and a force
-    filter in contact with a spring. All rates and ratios are independent of units; stiffnesses of positions and of
-    rotations are never compared.
+    The guarantees hold for the force-free motion of this inertia, integrated exactly, without the effects of a real
+    robot, above all lag, saturation and contact; only ``environment_stiffness`` covers a position loop and a force
+    filter in contact with a spring. Rates and ratios are independent of units.
 
     Attributes
     ----------
@@ -35,8 +34,8 @@ class StabilityReport:
         Ratio R of the largest to the smallest stiffness over all axes and times. NaN for poses and for a varying
         inertia, for which the rule below does not hold.
     required_damping_ratio : float
-        Smallest zeta of damping ``2 zeta (M K)^1/2`` from which any schedule within these limits is exponentially
-        stable: :func:`~torch_pbd.control.required_damping_ratio`. NaN where R is.
+        Damping ratio from which any schedule within these limits is exponentially stable, by
+        :func:`~torch_pbd.control.required_damping_ratio`. NaN where R is.
     stable_at_any_schedule : bool
         Whether a common Lyapunov function of all rows was found. Any schedule of these rows and of blends of their
         gains and inertias is then exponentially stable: in any order, held for any time or linear between rows, at any
@@ -44,15 +43,14 @@ class StabilityReport:
     any_schedule_rate : float
         Smallest decay rate of the root of that function in 1/s; NaN where none was found.
     any_schedule_speed : float
-        Replay speed up to which it decays; infinite, except for poses that rotate, which bound the angular velocity by
-        that at this speed.
+        Replay speed up to which it decays; infinite, except for poses that rotate.
     alpha : float
         Constant of the certificate in 1/s.
     margin : float
-        Smallest decay rate of the root of Kronander and Billard's V in 1/s: the smallest eigenvalue of ``-dV/dt``
-        relative to V, halved. If it is not negative, V never grows without a force, and the motion is passive with
-        respect to the force and ``v + alpha e``. It is exact for gains that are linear between the rows. A negative
-        margin means that this certificate does not hold, not that the schedule is unstable.
+        Smallest decay rate of the root of Kronander and Billard's V in 1/s, exact for gains that are linear between the
+        rows. If it is not negative, V never grows without a force, and the motion is passive with respect to the force
+        and ``v + alpha e``. A negative one means that this certificate does not hold, not that the schedule is
+        unstable.
     held_growth : float
         Largest growth of such a V, with this alpha, a half or a quarter of it, over an interval between rows with gains
         held instead, as in the ticks of a controller; 1 is no growth. NaN without an alpha.
@@ -62,11 +60,10 @@ class StabilityReport:
         Largest replay speed at which the margin is not negative; 1 is the schedule's own.
     gain : float
         Largest growth of ``sqrt(v'Mv + e'Ke)`` over a part of the schedule from any state, with gains held between
-        rows; not conservative. 1 is no growth. If many parts grow at a time, the 100 that grew most are followed.
+        rows; not conservative. 1 is no growth. If many parts grow at a time, the 64 that grew most are followed.
     environment_stiffness, environment_rotation : float
         Stiffest spring in N/m, and for poses Nm/rad, that the robot can press on in the softest phase without vibrating
-        with its position loop. NaN for a varying inertia, which is that of an arm without a position loop, and for the
-        second without an orientation.
+        with its position loop. NaN for a varying inertia, as an arm's own, and for the second without an orientation.
     speed : float
         Replay speed.
     mass : float, tuple of rows, or None
@@ -107,33 +104,34 @@ class StabilityReport:
         return self.certified or self.stable_at_any_schedule
 
     def __str__(self) -> str:
-        grows = self.margin >= 0.0 and self.held_growth > 1.0 + GROWTH_ROUNDING
-        held = f"; held between rows, V grows by {self.held_growth - 1.0:.2g}" if grows else ""
-        remedy = "slow down" if self.margin < 0.0 else "resample it finer"
-        verdict = "guaranteed" if self.stable else f"NOT GUARANTEED: {remedy}, damp more, or use a filter"
+        is_any, which = self.stable_at_any_schedule, "this schedule as it is"
         own, any_order = (
             "any" if math.isinf(limit) else f"{limit:.3g} x" for limit in (self.max_speed, self.any_schedule_speed)
         )
-        if self.stable_at_any_schedule and own != any_order:
-            own = f"{any_order}, by the rule; by the certificate {own}"
-        which = "these rows in any order, blended or held" if self.stable_at_any_schedule else "this schedule as it is"
-        what = f"of {which}; a bounded force moves it by a bounded amount"
+        if is_any:
+            which = "these rows in any order, blended or held"
+            own = own if own == any_order else f"{any_order}, by the rule; by the certificate {own}"
+        remedy = "slow down" if self.margin < 0.0 else "resample it finer"
+        certificate = f"rate {self.margin:.3g} /s at t = {self.margin_time:.3g} s, alpha {self.alpha:.3g} /s"
+        if self.margin >= 0.0 and not self.certified:
+            certificate += f"; held between rows, V grows by {self.held_growth - 1.0:.2g}"
         warning = "" if self.gain <= MAX_GAIN else f"  <- above {MAX_GAIN:g}: disturbances grow on the way"
+        promise = f"without a force deviations die out, of {which}; a bounded force moves it by a bounded amount"
         rows = {
-            "exact and without lag": verdict,
+            "exact and without lag": "guaranteed"
+            if self.stable
+            else f"NOT GUARANTEED: {remedy}, damp more, or use a filter",
             "any-schedule rule": self._any_schedule(),
-            "certificate of this one": f"{'holds' if self.certified else 'DOES NOT HOLD'}: rate {self.margin:.3g} /s "
-            f"at t = {self.margin_time:.3g} s, alpha {self.alpha:.3g} /s{held}",
+            "certificate of this one": f"{'holds' if self.certified else 'DOES NOT HOLD'}: {certificate}",
             "replay speed limit": own,
             "gain from any state": f"{self.gain:.3g}{warning}",
             "stiffest environment": self._environment(),
-            "promised": f"without a force deviations die out, {what}" if self.stable else "nothing",
+            "promised": promise if self.stable else "nothing",
             "not promised": _NOT_PROMISED,
         }
         head = fill(f"stability of {self._robot()}, replay speed {self.speed:g}", _WIDTH)
-        return "\n".join(
-            [head, *(fill(f"  {name:<25}{text}", _WIDTH, subsequent_indent=27 * " ") for name, text in rows.items())]
-        )
+        lines = (fill(f"  {name:<25}{text}", _WIDTH, subsequent_indent=27 * " ") for name, text in rows.items())
+        return "\n".join([head, *lines])
 
     def _robot(self) -> str:
         kilograms = ["kg m^2" if unit == "Nm/rad" else "kg" for unit in self.units]
@@ -143,15 +141,15 @@ class StabilityReport:
         return f"{'an inertia that varies' if self.mass is None else 'a mass matrix'}, {' and '.join(ranges)}"
 
     def _any_schedule(self) -> str:
-        text = "does not hold"
-        if self.stable_at_any_schedule:
-            text = f"holds: in any order at a rate of {self.any_schedule_rate:.3g} /s"
-        text += f"; damping ratio {self.damping_ratio:.3g}"
-        if not math.isnan(self.stiffness_ratio):
-            required = f"{self.required_damping_ratio:.3g} will do for stiffness ratio {self.stiffness_ratio:.3g}"
-            return f"{text}; one of {required}"
-        what = "an inertia that varies" if self.mass is None else "poses"
-        return f"{text}; no ratio is enough in itself for {what}"
+        holds = f"holds: in any order at a rate of {self.any_schedule_rate:.3g} /s"
+        text = f"{holds if self.stable_at_any_schedule else 'does not hold'}; damping ratio {self.damping_ratio:.3g}"
+        if math.isnan(self.stiffness_ratio):
+            return (
+                f"{text}; no ratio is enough in itself for {'an inertia that varies' if self.mass is None else 'poses'}"
+            )
+        return (
+            f"{text}; one of {self.required_damping_ratio:.3g} will do for stiffness ratio {self.stiffness_ratio:.3g}"
+        )
 
     def _environment(self) -> str:
         if math.isnan(self.environment_stiffness):
