@@ -85,8 +85,8 @@ def matrix(quaternion: Floats) -> Floats:
 def from_matrix(rotation: Floats) -> Floats:
     """Quaternion (..., 4) with w >= 0 of a rotation matrix (..., 3, 3).
 
-    4 q q' - 1 is linear in the matrix, and q its eigenvector (I. Y. Bar-Itzhack, "New method for extracting the quaternion
-    from a rotation matrix", Journal of Guidance, Control, and Dynamics 23, 2000).
+    4 q q' - 1 is linear in the matrix, and q its eigenvector (I. Y. Bar-Itzhack, "New method for extracting the
+    quaternion from a rotation matrix", Journal of Guidance, Control, and Dynamics 23, 2000).
     """
     trace = np.trace(rotation, axis1=-2, axis2=-1)[..., np.newaxis, np.newaxis]
     outer = np.empty((*rotation.shape[:-2], 4, 4))

@@ -69,8 +69,8 @@ def test_depth_and_normal_of_a_straight_wall_are_exact():
     position = on_wall - depth[..., None] * inward
     tunnel = Tunnel()
     torch.testing.assert_close(tunnel.penetration(position), depth.clamp_min(0).expand(8, 7), rtol=1e-12, atol=1e-15)
-    torch.testing.assert_close(tunnel.normal(position), inward.expand(8, 7, 2), rtol=1e-12, atol=0)
-    torch.testing.assert_close(tunnel.normal(-position), -inward.expand(8, 7, 2), rtol=1e-12, atol=0)
+    torch.testing.assert_close(tunnel._contact(position)[1], inward.expand(8, 7, 2), rtol=1e-12, atol=0)
+    torch.testing.assert_close(tunnel._contact(-position)[1], -inward.expand(8, 7, 2), rtol=1e-12, atol=0)
 
 
 def test_depth_is_the_distance_from_a_curved_wall_to_first_order():
@@ -91,7 +91,7 @@ def test_normals_are_unit_vectors_across_the_wall():
     y = torch.linspace(-0.1, 0.7, 32).double()
     step = 1e-6
     for here, ahead, behind in zip(beyond(0.0, y), beyond(0.0, y + step), beyond(0.0, y - step), strict=True):
-        normal = Tunnel().normal(here)
+        normal = Tunnel()._contact(here)[1]
         along = (ahead - behind) / (2 * step)
         torch.testing.assert_close(
             torch.linalg.vector_norm(normal, dim=-1), torch.ones(32).double(), rtol=1e-12, atol=0
@@ -141,7 +141,7 @@ def test_a_wall_pushes_and_never_pulls(rng):
     tunnel = Tunnel()
     for position in beyond(torch.tensor(rng.uniform(0.0, 0.01, size=500)), y):
         velocity = torch.tensor(rng.normal(size=(500, 2)))
-        normal, depth = tunnel.normal(position), tunnel.penetration(position)
+        normal, depth = tunnel._contact(position)[1], tunnel.penetration(position)
         force = tunnel.force(position, velocity)
         press = 1e4 * depth - 100.0 * (velocity * normal).sum(-1)
         assert 100 < (press < 0).sum() < 400

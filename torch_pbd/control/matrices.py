@@ -148,6 +148,7 @@ def as_mass(mass: Any) -> float | Tensor:
         checks.semidefinite(value.detach().cpu().numpy(), "mass", definite=True)
         return value
     number = value.item() if isinstance(value, Tensor) else value
+    checks.number(number, "mass", above=0.0, unit="kg")
     checked = checks.number(number, "mass", least=_LIGHTEST, most=1.0 / _LIGHTEST, unit="kg")
     return value if isinstance(value, Tensor) else checked
 

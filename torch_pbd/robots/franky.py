@@ -30,17 +30,16 @@ def run(
 ) -> RobotRun:
     """Follow a schedule of poses with ``franky.CartesianImpedanceTracker``; the arm must be at its first pose.
 
-    franky's controller adds Coriolis forces and the inertia times the commanded acceleration, which is ``a_d - J' q'``
-    by the robot's own model. The arm thus moves with its own inertia: make the schedule ``with_inertia`` of it
-    (franky's default damping, 2 K^1/2, ignores mass). Gains are sent ahead by the lag of franky's filter.
-    Deviations are clipped at ``translational_error_clip`` (0.10 m) and ``rotational_error_clip`` (0.25 rad) per axis,
-    beyond which the arm is softer than the schedule. Friction of 1.5 N holds the tool 30 mm away at 50 N/m: learn with
-    a ``stiffness_min`` of a few hundred N/m, and pass ``friction``.
+    franky's controller adds Coriolis forces and the inertia times the commanded acceleration, ``a_d - J' q'``. The arm
+    thus moves with its own inertia: make the schedule ``with_inertia`` of it (franky's default damping, 2 K^1/2,
+    ignores mass). Deviations are clipped at ``translational_error_clip`` (0.10 m) and ``rotational_error_clip``
+    (0.25 rad) per axis, beyond which the arm is softer than the schedule. Friction of 1.5 N holds the tool 30 mm away
+    at 50 N/m: learn with a ``stiffness_min`` of a few hundred N/m, and pass ``friction``.
 
     Parameters
     ----------
     robot : franky.Robot
-        Robot at rest, whose end effector is the tool and whose base is the frame of the schedule. Time is the robot's.
+        Robot at rest, whose end effector is the tool and whose base is the frame of the schedule.
     schedule : Schedule
         Schedule of poses in m.
     on_fault : callable, default=None
@@ -52,14 +51,13 @@ def run(
     settle : float, default=0.5
         Time at the first row before the motion begins, in s, in which gains are reached.
     gains_time_constant : float, default=0.1
-        Time constant of franky's gain filter in s.
+        Time constant of franky's gain filter in s, ahead of which gains are sent.
     **tracker
         Options of ``franky.CartesianImpedanceTracker``: ``posture_task``, ``friction``, clips, ``max_delta_tau``.
 
     Returns
     -------
     RobotRun
-        Motion up to the end or a fault.
 
     Warns
     -----
@@ -69,7 +67,7 @@ def run(
     Raises
     ------
     ValueError
-        Before anything moves, if the schedule exceeds the limits or does not begin at the arm's pose.
+        Before anything moves, if the schedule exceeds the limits or begins away from the arm.
     RobotStoppedError
         If the arm stops by itself, the connection breaks, or a target comes late.
     """

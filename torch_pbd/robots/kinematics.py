@@ -126,8 +126,7 @@ def arm(model: Any, tool: str) -> Arm:
 def operational_inertia(model: Any, joints: ArrayLike, tool: str) -> Floats:
     """Operational-space inertia at the tool of an arm, ``Lambda = (J M^-1 J')^-1``, in world axes.
 
-    Pass it to `torch_pbd.control.Schedule.with_inertia`: a torque-controlled arm under a push moves with it, not with
-    1 kg.
+    A torque-controlled arm moves with it, not with 1 kg: pass it to `torch_pbd.control.Schedule.with_inertia`.
 
     Parameters
     ----------
@@ -146,8 +145,7 @@ def operational_inertia(model: Any, joints: ArrayLike, tool: str) -> Floats:
     Raises
     ------
     ValueError
-        If the model has no such tool, joints exceed their limits by more than 0.1 rad, or the arm is singular, so that
-        it cannot move in some direction.
+        If the model has no such tool, joints exceed their limits by more than 0.1 rad, or the arm is singular.
 
     References
     ----------
@@ -179,8 +177,7 @@ def inverse_kinematics(
 ) -> Floats:
     """Joint angles along a path of the tool, nearest to a posture among all solutions.
 
-    Minimum-norm Newton steps from row to row, with the null space moving to the posture, so that angles depend on the
-    pose alone and not on the path to it.
+    Angles depend on the pose alone and not on the path to it.
 
     Parameters
     ----------
@@ -199,7 +196,7 @@ def inverse_kinematics(
     Returns
     -------
     ndarray of shape (T, n)
-        Joint angles in rad, which reach the poses to 1e-9 m and rad.
+        Joint angles in rad, which reach the poses to 1e-9 m and rad by Newton's steps of minimum norm.
 
     Raises
     ------

@@ -70,8 +70,8 @@ def run(
     model : mujoco.MjModel
         Arm with one torque motor per joint, in their order, such as `torch_pbd.robots.panda`.
     schedule : Schedule
-        Schedule of poses, whose rows are the ticks of the controller: evenly spaced, at 1 kHz for stiff gains
-        (``schedule.resample(1000.0)``), a whole number of the model's time steps apart.
+        Schedule of poses, whose rows are the ticks of the controller: a whole number of the model's time steps apart,
+        at 1 kHz for stiff gains (``schedule.resample(1000.0)``).
     joints : array_like of shape (T, n)
         Joint angles in rad along the schedule, from `torch_pbd.robots.inverse_kinematics`: the arm starts at the first,
         at the schedule's velocity.

@@ -27,9 +27,8 @@ def to_messages(schedule: Schedule, *, gains: Gains = "matrix") -> Iterator[tupl
     """Topic, time in ns and message for each row of a schedule of poses, as published by a node.
 
     Poses and gains use the topics of crisp_controllers, which takes ``gains="diagonal"``: six numbers, like the
-    parameters of ros2_control's admittance controller and FZI's cartesian controllers. None of them compensates the
-    friction of torque-controlled arms: 1.5 N hold the tool 30 mm away at 50 N/m, so learn with a ``stiffness_min`` of
-    a few hundred N/m.
+    parameters of ros2_control's admittance controller and FZI's cartesian controllers. None of them compensates
+    friction: 1.5 N hold the tool 30 mm away at 50 N/m, so learn with a ``stiffness_min`` of a few hundred N/m.
 
     Parameters
     ----------
@@ -58,18 +57,15 @@ def to_messages(schedule: Schedule, *, gains: Gains = "matrix") -> Iterator[tupl
         whole, (schedule, loss) = schedule, schedule.diagonal()
         if (schedule.stiffness != whole.stiffness).any():
             checks.warn(f"{loss}.")
-    geometry = {
-        name: types[f"geometry_msgs/msg/{name}"] for name in ("Point", "Quaternion", "Vector3", "Pose", "Twist")
-    }
+    names = ("Point", "Quaternion", "Vector3", "Pose", "Twist")
+    point, quaternion, vector, pose_of, twist_of = (types[f"geometry_msgs/msg/{name}"] for name in names)
     for row, time in enumerate(schedule.time):
         stamp = round(1e9 * time)
         when = types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
         header = types["std_msgs/msg/Header"](when, schedule.frame or "base")
-        turn = geometry["Quaternion"](*np.roll(orientation[row], -1).tolist())  # x y z w
-        pose = geometry["Pose"](geometry["Point"](*position[row].tolist()), turn)
-        twist = geometry["Twist"](
-            *(geometry["Vector3"](*part) for part in schedule.velocity[row].reshape(2, 3).tolist())
-        )
+        turn = quaternion(*np.roll(orientation[row], -1).tolist())  # x y z w
+        pose = pose_of(point(*position[row].tolist()), turn)
+        twist = twist_of(*(vector(*part) for part in schedule.velocity[row].reshape(2, 3).tolist()))
         yield "target_pose", stamp, types[_TOPICS["target_pose"]](header, pose)
         yield "target_twist", stamp, types[_TOPICS["target_twist"]](header, twist)
         yield "target_stiffness", stamp, _array(types, schedule.stiffness[row], gains)

@@ -43,8 +43,7 @@ def run(
     on_fault : callable, default=None
         Function called with the fault, a ``RobotStoppedError``, once the arm was stopped; None raises it.
     limits : RobotLimits, default=None
-        Limits that are checked before the arm moves; None is 1 m/s and 3.1 rad/s. The robot itself checks whether it
-        can reach the poses.
+        Limits that are checked before the arm moves; None is 1 m/s and 3.1 rad/s.
     lookahead_time, gain : float, default=0.05, 300.0
         Arguments of ``servoL``, 0.03 to 0.2 s and 100 to 2000.
     **loop
@@ -53,12 +52,11 @@ def run(
     Returns
     -------
     RobotRun
-        Motion up to the end or a fault.
 
     Raises
     ------
     ValueError
-        Before anything moves, if the schedule exceeds the limits, is out of reach, or starts away from the arm.
+        Before anything moves, if the schedule exceeds the limits, is out of reach, or begins away from the arm.
     RobotStoppedError
         If the robot stops, refuses a pose, or its force or clock is lost.
     """

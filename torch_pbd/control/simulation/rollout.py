@@ -134,7 +134,7 @@ class Loop:
         self._commands = [self._deviation] * (loop.delay_steps if loop else 0)
         self._read = task.sensor and task.sensor.start(state[0], task.dt, generator)
         gains = task.stiffness, task.damping, task.mass
-        self._filter = task.stiffness_filter and task.stiffness_filter.start(*gains, tick_change)
+        self._filter = None if task.stiffness_filter is None else task.stiffness_filter.start(*gains, tick_change)
         self._maps = (each for _, maps in tick_maps(task, task.dt / task.substeps) for each in maps.unbind(-3))
 
     def run(self, tick: int, force: Tensor) -> dict[str, Tensor]:

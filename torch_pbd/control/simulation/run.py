@@ -75,12 +75,11 @@ def simulate(
     0.1
     """
     task = _task_of(schedule, plant)
-    push = np.zeros(task.velocity.shape) if force is None else force
-    push = checks.array(push, "force", task.velocity.shape)
+    push = None if force is None else torch.tensor(checks.array(force, "force", task.velocity.shape))
     draw = checks.seed(random_state)
     noisy = task.sensor is not None and task.sensor.is_noisy  # else nothing is drawn: None is the caller's global state
     generator = torch.Generator().manual_seed(int(draw.randint(2**31 - 1))) if noisy else None
-    run = run_task(task, torch.tensor(push), generator=generator).numpy()
+    run = run_task(task, push, generator=generator).numpy()
     return replace(run, time=schedule.time[0] + run.time, units=schedule.units)
 
 
@@ -100,9 +99,8 @@ def simulate_many(
     """Simulate many rollouts of a schedule, each with one random push.
 
     A push is a squared sine over its duration, in a direction uniform on the sphere of the position axes; for poses a
-    torque in an independent direction acts at the same time. Trajectories are not kept, so that memory grows with
-    ``n_rollouts`` and not with their length. The result depends only on the arguments and ``random_state``; pushes do
-    not depend on the number of rows.
+    torque in an independent direction acts at the same time. Pushes depend on ``random_state`` and not on the number of
+    rows. Trajectories are not kept, so that memory grows with ``n_rollouts`` and not with their length.
 
     Parameters
     ----------
@@ -111,14 +109,11 @@ def simulate_many(
     n_rollouts : int, default=1000
         Number of rollouts R.
     plant : AdmittancePlant, default=None
-        Simulated robot; None as in :func:`simulate`. With a sensor or walls, thousands of rollouts take five to ten
-        times longer; with a filter, ten to two hundred times.
-    peak : float or (float, float), default=5.0
-        Peak force of each push in N; a pair draws it uniformly between both.
-    torque : float or (float, float), default=0.0
-        Peak torque of each push on a pose in Nm; ``peak=0.0`` leaves pushes by torque alone.
-    duration : float or (float, float), default=0.8
-        Duration of each push in s; a pair draws it uniformly between both.
+        Simulated robot; None as in :func:`simulate`. With sensor or walls, many rollouts take five to ten times longer,
+        with a filter ten to two hundred times.
+    peak, torque, duration : float or (float, float), default=5.0, 0.0, 0.8
+        Peak force of each push in N, its peak torque on a pose in Nm, and its duration in s. Pairs are drawn uniformly
+        between both.
     onset : (float, float), default=None
         Start time of each push in s, drawn uniformly between both; None lets all pushes end within the schedule.
     quantiles : tuple of float, default=(0.05, 0.5, 0.95)
@@ -153,37 +148,33 @@ def simulate_many(
     checks.require((levels >= 0.0) & (levels <= 1.0), levels, "quantiles", "from 0 to 1")
     task = _task_of(schedule, plant)
     # Per rollout the block of deviations, its order, and some numbers; per tick the gains and their maps.
-    d = schedule.n_outputs
+    d, remedy = schedule.n_outputs, "Simulate fewer at a time, with several seeds."
     needed = n_rollouts * (3 * block_length(d) + 10 * d + 16) + len(schedule) * (4 * d * d + 4 * d + len(levels))
-    require_memory(
-        8.0 * needed, what=f"n_rollouts={n_rollouts}", remedy="Simulate fewer at a time, with several seeds."
-    )
+    require_memory(8.0 * needed, what=f"n_rollouts={n_rollouts}", remedy=remedy)
     draw = checks.seed(random_state)
-    begin, lasting, push = _draw_pushes(draw, n_rollouts, schedule, [peak, torque], duration, onset)
+    begin, lasting, push = _draw_pushes(draw, n_rollouts, schedule, {"peak": peak, "torque": torque}, duration, onset)
     generators = (torch.Generator().manual_seed(int(draw.randint(2**31 - 1))) for _ in count())
     with torch.no_grad():
         pushes = torch.tensor(begin), torch.tensor(lasting), torch.tensor(push).mT.contiguous()
         tallies = push_many(task, pushes, generators, schedule.blocks, levels, every)
     shared = {"quantiles": levels, "onset": schedule.time[0] + begin, "duration": lasting}
-    summaries = list[RolloutSummary]()
-    for tally, units in zip(tallies, [schedule.units, "rad"], strict=False):
+    summary: Any = None
+    for tally, units in reversed(list(zip(tallies, [schedule.units, "rad"], strict=False))):
         last_above = tally.last_above.numpy()
         returned = np.maximum(task.dt * (last_above + 1.0) - begin - lasting, 0.0)
-        summaries.append(
-            RolloutSummary(
-                time=schedule.time[::every],
-                deviation=np.stack(tally.quantiles),
-                peak_deviation=tally.squared_peak.sqrt().numpy(),
-                return_time=np.where(last_above < len(schedule) - 1, returned, np.inf),
-                push=push[:, tally.axes],
-                units=units,
-                **shared,
-            )
+        summary = RolloutSummary(
+            time=schedule.time[::every],
+            deviation=np.stack(tally.quantiles),
+            peak_deviation=tally.squared_peak.sqrt().numpy(),
+            return_time=np.where(last_above < len(schedule) - 1, returned, np.inf),
+            push=push[:, tally.axes],
+            rotation=summary,
+            units=units,
+            **shared,
         )
-    if len(summaries) == 1:
-        return summaries[0]
-    warn_if_far(float(summaries[1].peak_deviation.max()))
-    return replace(summaries[0], rotation=summaries[1])
+    if summary.rotation is not None:
+        warn_if_far(float(summary.rotation.peak_deviation.max()))
+    return summary
 
 
 def _task_of(schedule: Schedule, plant: AdmittancePlant | None) -> Task:
@@ -220,7 +211,7 @@ def _draw_pushes(
     draw: np.random.RandomState,
     n_rollouts: int,
     schedule: Schedule,
-    peaks: list[Range],
+    peaks: dict[str, Range],
     duration: Range,
     onset: tuple[float, float] | None,
 ) -> tuple[Floats, Floats, Floats]:
@@ -233,10 +224,10 @@ def _draw_pushes(
     else:
         first, last = _ends(onset, "onset", "s", pair=True, least=start, most=end)
         begin = first + share * (last - first) - start
-    names = [("peak", "N"), ("torque", "Nm")]
-    limits = [_ends(of, *named, least=0.0, most=checks.LARGEST) for of, named in zip(peaks, names, strict=True)]
+    units = zip(peaks.items(), ("N", "Nm"), strict=True)
+    limits = [_ends(peak, name, unit, least=0.0, most=checks.LARGEST) for (name, peak), unit in units]
     if len(schedule.blocks) == 1 and limits[1] != (0.0, 0.0):
-        raise checks.refusal(peaks[1], "torque", "0 for a schedule without orientation", unit="Nm")
+        raise checks.refusal(peaks["torque"], "torque", "0 for a schedule without orientation", unit="Nm")
     push = np.zeros((n_rollouts, schedule.n_outputs))
     for block, ends in zip(schedule.blocks, limits, strict=False):
         direction = draw.standard_normal((n_rollouts, block.stop - block.start))

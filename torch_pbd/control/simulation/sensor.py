@@ -16,7 +16,6 @@ from torch_pbd.exceptions import InvalidParameterError
 
 _OF_AXES = ("bias", "noise_scale", "resolution", "range", "deadband")
 
-
 Reading = tuple[Tensor, Tensor]
 """Force read (..., d) in N, and of torques in Nm, and whether any of its axes was clipped (...)."""
 
@@ -27,12 +26,10 @@ class ForceSensor:
     """Model of a 6-axis force-torque sensor; works for any number of axes.
 
     The stages are, in order: true force plus ``bias``, low-pass, noise, saturation, quantization, delay, deadband. The
-    default is an ideal sensor of 200 N. The force is held over each tick and read at its start, so that a filtered
-    reading depends only on forces before its tick, and an unfiltered one also on that of its own tick. Before the
-    first tick the force is zero and the filter has settled at the bias.
-
-    A force that is not finite is a lost sample: its reading is NaN (after the delay), never zero, and the filter
-    holds through it. The controller decides how to react.
+    force is held over each tick and read at its start, so that a filtered reading depends only on forces before its
+    tick, and an unfiltered one also on that of its own tick. Before the first tick the force is zero and the filter has
+    settled at the bias. A force that is not finite is a lost sample: its reading is NaN (after the delay), never zero,
+    and the filter holds through it.
 
     Quantities in N are one number for all axes or d numbers; for poses, p numbers in N and three in Nm.
 
@@ -100,8 +97,8 @@ class ForceSensor:
         """Sensor like the paper's JR3, with plausible values that are not from a data sheet or a measurement.
 
         It has a range of 200 N in 2^13 steps, noise of 0.05 N, a bias of 0.3 N on each axis (a drift of 0.2 to 0.5 N is
-        usual), and a total delay of about ``1 / cutoff``, rounded to ticks of ``rate`` Hz; ``delay_steps`` adds to the
-        first-order filter's delay. The JR3's digital filters have 500, 125, 31.25, 7.813, 1.953 and 0.4883 Hz.
+        usual), and a total delay of about ``1 / cutoff``, rounded to ticks of ``rate`` Hz. The JR3's digital filters
+        have 500, 125, 31.25, 7.813, 1.953 and 0.4883 Hz.
         """
         checks.number(cutoff, "cutoff", above=0.0, unit="Hz")
         checks.number(rate, "rate", above=0.0, unit="Hz")

@@ -51,8 +51,8 @@ class Tunnel:
     """Corridor of the task in the plane, along y, between two smooth walls without friction.
 
     The wall is a spring and a damper along its normal, only while it is penetrated, and it never pulls. Depth and
-    normal are to first order at the y of the position, with a relative error of about the depth times the curvature
-    of the wall. Positions (..., 2) are x and y in m; NaN propagates.
+    normal are to first order, with a relative error of about the depth times the curvature of the wall. Positions
+    (..., 2) are x and y in m; NaN propagates.
 
     Parameters
     ----------
@@ -67,10 +67,9 @@ class Tunnel:
     -----
     A force that is held for a tick h makes the wall return more energy than it absorbed unless the damping is large
     enough; too much overshoots. A free mass m pressed against the wall can rest there if and only if
-    ``stiffness h / 2 < damping < 2 m / h`` (Jury's test on the sampled mass). The default damping meets it below
-    4 MN/m at 1 kHz, for masses above 0.05 kg (0.16 kg at 1e5 N/m). Where it is not met, compute the force several
-    times a tick. Behind a position loop that lags, the limit is lower by far: about the damping of the admittance
-    over the lag, 400 N/m in the soft phase of the paper (1 kg, loop of 20 Hz).
+    ``stiffness h / 2 < damping < 2 m / h`` (Jury's test on the sampled mass), which the default damping meets below
+    4 MN/m at 1 kHz, for masses above 0.05 kg (0.16 kg at 1e5 N/m). Else compute the force several times a tick. Behind
+    a position loop that lags, the limit is lower by far: see `StabilityReport.environment_stiffness`.
 
     References
     ----------
@@ -90,10 +89,6 @@ class Tunnel:
     def penetration(self, position: Float[Tensor, "*b 2"] | Any) -> Float[Tensor, "*b"]:
         """Depth beyond the nearer wall [m], along its normal: ``(|x - x_c| - w) / sqrt(1 + slope^2)``, or 0."""
         return self._contact(position)[0].clamp_min(0.0)
-
-    def normal(self, position: Float[Tensor, "*b 2"] | Any) -> Float[Tensor, "*b 2"]:
-        """Unit normal of the nearer wall, pointing into the corridor; on the centre line, that of the right wall."""
-        return self._contact(position)[1]
 
     def force(
         self, position: Float[Tensor, "*b 2"] | Any, velocity: Float[Tensor, "*b 2"] | Any
@@ -123,7 +118,7 @@ class Tunnel:
         return ContactReport(depth.amax(-1), dt * (depth > 0.0).sum(-1).to(depth), dt * press.sum(-1))
 
     def _contact(self, position: Tensor | Any) -> tuple[Tensor, Tensor]:
-        """Depth along the normal, negative in the free corridor, and the normal."""
+        """Depth along the normal of the nearer wall, negative in the free corridor, and the normal into it."""
         position = as_tensor(position, "position")
         if position.ndim == 0 or position.shape[-1] != 2:
             raise InvalidParameterError(f"position has shape {tuple(position.shape)}, must have shape (..., 2).")

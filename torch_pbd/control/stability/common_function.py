@@ -137,9 +137,7 @@ def searched_function(rows: ErrorDynamics) -> Function | None:
     chosen, at, inverse, temperatures = evenly(len(rows.time), _N_ROWS), None, None, _TEMPERATURES
     for _ in range(_MAX_SEARCHES):
         some = rows.restrict(chosen)
-        parts = (some.time, some.stiffness, some.damping, some.mass, some.transport)
-        alone = ErrorDynamics(*(part if part is None else part[None] for part in parts))  # type: ignore[arg-type]
-        at, inverse = search(alone, at, inverse, temperatures)
+        at, inverse = search(rows.restrict(chosen[None]), at, inverse, temperatures)
         found = unpacked(at[0], rows.stiffness.shape[-1])
         largest = float(found.eigenvalues(some).max())
         if largest >= 0.0:

@@ -53,9 +53,9 @@ class ErrorDynamics:
         return squared, axes, damping if bool(coupled.any()) else own
 
     def restrict(self, rows: Tensor) -> "ErrorDynamics":
-        """Dynamics at the selected rows."""
+        """Dynamics at the selected rows (...), or schedules of those side by side."""
         transport = None if self.transport is None else self.transport[rows]
-        mass = self.mass if len(self.mass) == 1 else self.mass[rows]
+        mass = self.mass[rows.new_zeros(*rows.shape[:-1], 1) if len(self.mass) == 1 else rows]
         return ErrorDynamics(self.time[rows], self.stiffness[rows], self.damping[rows], mass, transport)
 
     def per_mass(self, gain: Float[Tensor, "n d d"], mass: Float[Tensor, "m d d"] | None = None) -> Tensor:
