@@ -69,16 +69,6 @@ class AdmittancePlant:
         filters act once per tick, and require 1.
     stiffness_filter : RateLimit or EnergyTank, default=None
         Filter that holds back stiffness changes that would feed energy into the robot.
-
-    Examples
-    --------
-    >>> import torch
-    >>> from torch_pbd.control import AdmittancePlant, damping_from_stiffness
-    >>> still, push = torch.zeros(2000, 1).double(), torch.full((2000, 1), 5.0).double()
-    >>> stiffness = torch.full((2000, 1, 1), 50.0).double()
-    >>> run = AdmittancePlant().simulate(still, still, stiffness, damping_from_stiffness(stiffness), push, dt=0.001)
-    >>> round(float(run.position[-1]), 4)  # 5 N on 50 N/m
-    0.1
     """
 
     mass: float | Tensor | Callable[[Floats], Any] | Any | None = 1.0

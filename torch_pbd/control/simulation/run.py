@@ -132,15 +132,6 @@ def simulate_many(
     ------
     ValueError
         If an argument is invalid, or the rollouts do not fit in memory.
-
-    Examples
-    --------
-    >>> from torch_pbd.control import DMPController, simulate_many
-    >>> from torch_pbd.data import make_tunnel_demonstrations
-    >>> schedule = DMPController().fit(make_tunnel_demonstrations(random_state=0)).schedule()
-    >>> summary = simulate_many(schedule, 200, random_state=0)
-    >>> summary.deviation.shape, bool((summary.peak_deviation > 0.0).all())
-    ((10001, 3), True)
     """
     checks.count(n_rollouts, "n_rollouts")
     checks.count(every, "every")
