@@ -201,7 +201,7 @@ def test_the_optimum_is_that_of_scipy(kind, rng):
         return loss.item(), gradient.flatten().numpy()
 
     expected = scipy_minimize(objective, start.flatten().numpy(), jac=True, method="BFGS", options={"gtol": 1e-7})
-    report = train(cost, latent, max_iter=200, tol=1e-11)
+    report = train(cost, latent, solver="auto", max_iter=200, tol=1e-11)
     assert report.converged
     assert report.loss / weight == pytest.approx(expected.fun, abs=1e-7)
     assert objective(latent.whitened.detach().flatten().numpy())[0] == pytest.approx(report.loss / weight, abs=1e-9)

@@ -4,7 +4,7 @@ import inspect
 import sys
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, NamedTuple, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -30,8 +30,8 @@ from torch_pbd.optim.batch import FitReport, Progress, Status
 Fit = tuple[Core, Standardization, FitReport, float]
 """Fitted core, the units of its inputs and outputs, how the fit ended, and the jitter."""
 
-# What the docstrings of all regressors have in common, in the place of {common}.
-_COMMON = """device : str or None, default=None
+# What the docstrings of all regressors have in common.
+COMMON = """device : str or None, default=None
     Device of the torch module.
 verbose : int, default=0
 
@@ -67,9 +67,12 @@ class CovarianceRegressor(MultiOutputMixin, RegressorMixin, TorchEstimator):
     n_restarts: int
     random_state: Any
 
+    _common: ClassVar[str] = COMMON
+    """What is in the place of {common} in docstrings."""
+
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        cls.__doc__ = inspect.cleandoc(cls.__doc__ or "").replace("{common}", _COMMON)
+        cls.__doc__ = inspect.cleandoc(cls.__doc__ or "").replace("{common}", cls._common)
 
     def __sklearn_tags__(self) -> Tags:
         tags = super().__sklearn_tags__()

@@ -44,7 +44,7 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
     bias_correction : bool, default=False
         Divide the empirical factors by their expected share of the true ones for normal data (Bartlett). With few
         demonstrations they are too small: by 5 and 16 % for six of two outputs. Only for "empirical".
-    {shared}
+    {common}
     loss_ : float
         Negative log marginal likelihood of the factors' entries, in nats, for "empirical"; negative log posterior
         density (or likelihood) of the latent values, in nats per row, for "likelihood". Both for standardized y.
@@ -121,8 +121,7 @@ class CholeskyCovRegressor(LatentCovarianceRegressor):
 
     def _fit_likelihood(self, problem: Problem, mean: LatentGP) -> tuple[MeanAndCholesky, FitReport, float]:
         link, residual = CholeskyLink(problem.prior_tril, self.diagonal != "raw"), problem.training.residual(mean)
-        likelihood, latent = self._likelihood_and_values(problem, link, residual, residual_tril(residual))
-        root, report = self._train(likelihood, latent)
+        root, latent, report = self._maximize(problem, link, residual, residual_tril(residual))
         processes = latent.interpolate(link.flatten(root).mT.contiguous())
         core = MeanAndCholesky(mean, processes, link.far(), bounded=self.latent_prior)
         return core, report, latent.jitter

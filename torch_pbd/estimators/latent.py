@@ -1,6 +1,5 @@
 """Base of the two regressors on latent Gaussian processes (CD and WP), and the mean that both share."""
 
-import inspect
 from abc import abstractmethod
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -13,7 +12,7 @@ from torch import Tensor
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
-from torch_pbd.estimators.base import CovarianceRegressor, Fit
+from torch_pbd.estimators.base import COMMON, CovarianceRegressor, Fit
 from torch_pbd.estimators.door import Integers, Prior, Standardization, length_scale_in_ranges
 from torch_pbd.estimators.validation import warn_if_few, warn_if_identical
 from torch_pbd.exceptions import DataRankWarning
@@ -46,18 +45,18 @@ _LEVEL = 1e-4  # significance level of the lack-of-fit tests: how often a right 
 _CLEAR = 5.0  # standard errors that always reject a mean: with two rows at two inputs the t test would allow 100
 _LEAST_SPREAD = 0.03  # smallest credible spread at one input, as a share of the pooled spread
 _UNRESOLVED = 1e-10  # squared error in standardized outputs that a smooth process may always have
+_SPREAD = 0.01  # standard deviation of the random part of whitened values at the start
 _SHARE, _LEAST_NOISE = 0.1, 1e-6  # noise of a mean: share of its smallest error, and least share of the outputs' scale
 
-_SHARED = """latent_prior : bool, default=True
-    Only for "likelihood". True maximizes the posterior density of the processes at the inputs, with hyperparameters
-    fixed. False maximizes the paper's likelihood, which trains the hyperparameters too and overfits, without bound
-    where inputs do not repeat.
-solver : {"auto", "fisher", "lbfgs"}, default="auto"
-    Only for "likelihood". "fisher" is Newton's method with the Fisher information, "lbfgs" is torch's L-BFGS,
-    preconditioned with the initial Fisher information; both reach the same optimum. "auto" takes "fisher", but "lbfgs"
-    for linear systems that are too large: above 2500 unknowns for CD, the rank of the kernel matrix times d, and above
-    600 for WP, that times ``df``. Without ``latent_prior`` it is always L-BFGS.
-kernel : {"squared_exponential", "matern32", "matern52"}, default="squared_exponential"
+_COMMON = f"""latent_prior : bool, default=True
+    Only for "likelihood". True maximizes the posterior density of the processes at the inputs, hyperparameters fixed;
+    False the paper's likelihood, which trains these too and overfits, without bound where inputs do not repeat.
+solver : {{"auto", "fisher", "lbfgs"}}, default="auto"
+    Only for "likelihood". "fisher" is Newton's method with the Fisher information, "lbfgs" torch's L-BFGS,
+    preconditioned with the initial one; both reach the same optimum. "auto" takes "fisher", but "lbfgs" above 2500
+    unknowns for CD, the rank of the kernel matrix times d, and above 600 for WP, that times ``df``. Without
+    ``latent_prior`` it is always L-BFGS.
+kernel : {{"squared_exponential", "matern32", "matern52"}}, default="squared_exponential"
 prior : None, float, array-like of shape (d, d), callable or "paper", default=None
     Covariance far from data, in squared units of y. A float multiplies the identity matrix; a callable maps
     X (n, e) to (n, d, d). None takes a wide one: four times the covariance of all of y. "paper" is an identity
@@ -76,7 +75,7 @@ n_restarts : int, default=2
     Extra starting points of each hyperparameter search.
 random_state : int, RandomState instance or None, default=0
     Seed of the initial values of a Wishart process with "likelihood"; other fits are deterministic.
-{common}
+{COMMON}
 jitter_ : float
     Largest jitter that a kernel matrix needed, relative to its diagonal."""
 
@@ -88,7 +87,6 @@ class Problem:
     training: TrainingSet
     scaling: Standardization
     prior_tril: Tensor
-    """(d, d), or (n, d, d) at the training inputs where the prior is callable."""
     length_scale: Tensor | None
     """(e,), where the user gave it."""
 
@@ -97,9 +95,9 @@ class Problem:
 class LatentCovarianceRegressor(CovarianceRegressor):
     """Base of CD and WP: mean by d Gaussian processes, covariance by more of them; not for direct use."""
 
+    _common = _COMMON
     _aligned_objective: ClassVar[str]
     """Value of ``objective`` that works on empirical covariances."""
-    _core_class: ClassVar[type[MeanAndCovariance]]
     _costly: ClassVar = "max_inputs"
     """Parameters that decide on the memory."""
 
@@ -116,10 +114,6 @@ class LatentCovarianceRegressor(CovarianceRegressor):
     random_state: Any = 0
     device: str | None = None
     verbose: int = 0
-
-    def __init_subclass__(cls) -> None:
-        cls.__doc__ = inspect.cleandoc(cls.__doc__ or "").replace("{shared}", _SHARED)
-        super().__init_subclass__()
 
     def _check_parameters(self) -> None:
         super()._check_parameters()
@@ -163,7 +157,7 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         """Core by maximum likelihood of the residuals from the mean, and its jitter."""
 
     def _works_on_empirical(self, inputs: Floats, counts: Any, n_outputs: int) -> bool:
-        """Decide the objective; ``inputs`` are the distinct ones, with their counts."""
+        """Decide the objective, by the distinct inputs and their counts."""
         fewest = int(counts.min())
         aligned = self.objective != "likelihood" and fewest >= 2
         if self.objective == self._aligned_objective and not aligned:
@@ -173,11 +167,9 @@ class LatentCovarianceRegressor(CovarianceRegressor):
                 "row). Align the demonstrations, record more, or use objective='likelihood'."
             )
         if 2 <= fewest <= n_outputs:
-            what = (
-                "that empirical covariance is singular, and is shrunk towards the pooled covariance"
-                if aligned
-                else "the likelihood takes for certain what was only not seen to vary; objective='auto' shrinks it"
-            )
+            what = "that empirical covariance is singular, and is shrunk towards the pooled covariance"
+            if not aligned:
+                what = "the likelihood takes for certain what was only not seen to vary; objective='auto' shrinks it"
             checks.warn(
                 f"y has {fewest} demonstrations at an input but {n_outputs} outputs: {what}. {n_outputs + 1} or more "
                 "demonstrations determine the covariance.",
@@ -207,11 +199,11 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         return observations, self._search(training.inputs, _LONGEST_MEAN)
 
     def _fit_mean(self, training: TrainingSet, found: Found | None = None) -> tuple[LatentGP, FitReport]:
-        """Processes by evidence, or processes through the means where rows that repeat inputs contradict the first.
+        """Processes by evidence, or through the means where rows that repeat inputs contradict these.
 
-        The evidence sees the mean at each input, not how far the rows there differ. With few inputs, or jumps between
-        them, it may take for noise what all demonstrations agree on. A process that could follow the means only by
-        swinging far beyond them between the inputs is rejected with a warning.
+        The evidence sees the mean at each input, not how far the rows there differ: with few inputs, or jumps between
+        them, it may take for noise what all demonstrations agree on. A process that would swing far beyond the means
+        between the inputs to follow them is rejected with a warning.
         """
         observations, search = job = self._mean_job(training)
         found = fit_together([job])[0] if found is None else found
@@ -226,8 +218,8 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         noise_scale = torch.where(wrong, _SHARE * least_error, learned).clamp_min(_LEAST_NOISE)
         (again,) = fit_together([(observations, replace(search, noise_scale=noise_scale))])
         # Over a range or more a large amplitude is a trend.
-        swings = _is_stretched(again.hyperparameters, observations)
-        swings &= again.hyperparameters.length_scale.amin(1) < 1.0
+        short = again.hyperparameters.length_scale.amin(1) < 1.0
+        swings = short & _is_stretched(again.hyperparameters, observations)
         if bool(swings[wrong].any()):
             checks.warn(
                 "y has means at the inputs that differ by more than its scatter there, between inputs too near to each "
@@ -237,12 +229,14 @@ class LatentCovarianceRegressor(CovarianceRegressor):
             return mean, found.report
         return condition(observations, again.hyperparameters, self.kernel, basis=again.basis)[0], again.report
 
-    def _likelihood_and_values(
-        self, problem: Problem, link: Link, residual: Tensor, start: Tensor
-    ) -> tuple[Likelihood, LatentValues]:
-        """Likelihood in nats per row, and latent values at the inputs from which training starts, those of a root.
+    @torch.no_grad()
+    def _maximize(
+        self, problem: Problem, link: Link, residual: Tensor, start: Tensor, first_random: int | None = None
+    ) -> tuple[Tensor, LatentValues, FitReport]:
+        """Roots at the inputs at the maximum of the likelihood, and the latent values there.
 
-        Length scales default to a fifth of the range of the inputs, and to less beside a gap in them.
+        Training starts from a root, of processes from ``first_random`` on a little beside it. Length scales default to
+        a fifth of the range of the inputs, and to less beside a gap in them.
         """
         training, length_scale = problem.training, problem.length_scale
         n_inputs, n_features = training.inputs.shape
@@ -252,19 +246,15 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         deviation = link.deviation(start).expand(n_inputs, -1).mT.contiguous()
         options: Any = {"kernel": self.kernel, "train_hyperparameters": not self.latent_prior}
         latent = LatentValues(training.inputs, deviation, link.amplitude(), length_scale[None], **options)
+        if first_random is not None:
+            noise = self._door(checks.seed(self.random_state).standard_normal(latent.whitened.shape))
+            latent.whitened[first_random:] += _SPREAD * noise[first_random:]
         likelihood = Likelihood(link, training.scatter_root(residual), training.counts, 1.0 / len(residual))
-        return likelihood, latent
-
-    def _train(self, likelihood: Likelihood, latent: LatentValues) -> tuple[Tensor, FitReport]:
-        """Roots at the inputs at the likelihood's maximum; ``latent`` keeps its values there."""
-        limits: Any = {"max_iter": self.max_iter, "tol": self.tol, "callback": self._progress()}
-        report = train(likelihood, latent, solver=self.solver, **limits)
-        with torch.no_grad():
-            return likelihood.link.root(latent()), report
+        report = train(likelihood, latent, self.solver, self.max_iter, self.tol, self._progress())
+        return link.root(latent()), latent, report
 
     def _check_memory(self, n_distinct: int, n_features: int, n_outputs: int) -> None:
-        n_inputs = min(n_distinct, self.max_inputs)
-        n_processes = self._n_processes(n_outputs)
+        n_inputs, n_processes = min(n_distinct, self.max_inputs), self._n_processes(n_outputs)
         require_much(
             8.0 * n_inputs**2 * n_processes * 4,
             what=f"max_inputs={self.max_inputs} lets {n_inputs} distinct inputs into kernel matrices of "
@@ -273,7 +263,6 @@ class LatentCovarianceRegressor(CovarianceRegressor):
         )
 
     def _n_processes(self, n_outputs: int) -> int:
-        """Processes of the mean and the covariance, at most."""
         return (n_outputs + 1) ** 2
 
 

@@ -11,7 +11,7 @@ from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.estimators.base import CovarianceRegressor, Fit
 from torch_pbd.estimators.door import Integers, Standardization, distinct_rows, spread_of
-from torch_pbd.estimators.validation import warn_if_few_demonstrations
+from torch_pbd.estimators.validation import warn_if_few
 from torch_pbd.exceptions import DataRankWarning
 from torch_pbd.files.memory import require_much
 from torch_pbd.models.mixture import GaussianMixture, expectation_maximization, refine
@@ -99,14 +99,7 @@ class GMMBaseline(CovarianceRegressor):
                 "y is constant: its covariance is zero, and the smallest that can be told from it is used.",
                 DataRankWarning,
             )
-        if n_distinct <= y.shape[1]:
-            checks.warn(
-                f"y has {n_distinct} distinct rows but {y.shape[1]} outputs: they leave directions of the covariance "
-                "undetermined, which reg_covar decides. Record more.",
-                DataRankWarning,
-            )
-        else:
-            warn_if_few_demonstrations(groups, y.shape[1])
+        warn_if_few(n_distinct, y.shape[1], groups, rows="distinct rows", decides="reg_covar")
         scaling = _by_residual(X, y)
         data = self._door(np.hstack([scaling.exact_inputs(X), scaling.exact_outputs(y)]))
         generator = checks.seed(self.random_state)

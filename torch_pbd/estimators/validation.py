@@ -193,7 +193,7 @@ def check_demonstrations(X: Floats, y: Floats, groups: Any) -> None:
             DataRankWarning,
         )
     elif len(y) > y.shape[1]:
-        warn_if_few_demonstrations(groups, y.shape[1])
+        warn_if_few(len(y), y.shape[1], groups)
     if _unimodality_reported.get() or X.shape[1] > 1 or len(counts) < 2 or counts.min() < 2:
         return
     # Of rows of a demonstration at the same time only the first counts.
@@ -207,21 +207,17 @@ def check_demonstrations(X: Floats, y: Floats, groups: Any) -> None:
         follow_one_way(np.stack([interpolate(phase, own, grid) for phase, own in zip(phases, positions, strict=True)]))
 
 
-def warn_if_few(n_rows: int, n_outputs: int, groups: NDArray[np.intp] | None = None) -> None:
+def warn_if_few(
+    n_rows: int, n_outputs: int, groups: Any = None, *, rows: str = "rows", decides: str = "the prior"
+) -> None:
     """Warn if there are no more rows, or no more demonstrations, than outputs: their covariance is singular."""
     if n_rows <= n_outputs:
         checks.warn(
-            f"y has {n_rows} rows but {n_outputs} outputs: they leave directions of the covariance undetermined, "
-            "which the prior decides. Record more.",
+            f"y has {n_rows} {rows} but {n_outputs} outputs: they leave directions of the covariance undetermined, which "
+            f"{decides} decides. Record more.",
             DataRankWarning,
         )
-    else:
-        warn_if_few_demonstrations(groups, n_outputs)
-
-
-def warn_if_few_demonstrations(groups: NDArray[np.intp] | None, n_outputs: int) -> None:
-    """Warn if there are no more demonstrations than outputs: samples of one demonstration repeat each other."""
-    if groups is not None and (n_demos := int(groups.max()) + 1) <= n_outputs:
+    elif groups is not None and (n_demos := int(groups.max()) + 1) <= n_outputs:  # whose samples repeat each other
         checks.warn(
             f"y has {n_demos} demonstrations but {n_outputs} outputs: they leave open how the outputs vary together. "
             f"Record {n_outputs + 1} or more, or learn fewer outputs at a time.",

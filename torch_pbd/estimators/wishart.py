@@ -27,7 +27,6 @@ from torch_pbd.optim.batch import FitReport
 _PAPER_MEAN = 8.0  # prior mean of all latent processes in the paper's simulation
 _FEW_ROWS = 8  # fewer rows may by chance have a deviation near zero, through which interpolated vectors cross zero
 _CERTAIN = 1e-8  # noise ratio that keeps kernel matrices positive definite and is otherwise negligible
-_SPREAD = 0.01  # standard deviation of the random part of whitened values at the start
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
@@ -47,7 +46,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         input has fewer than 8 rows, since interpolated vectors then cross zero.
     df : int, "auto" or None, default=None
         Number of vectors, the degrees of freedom nu, at least d; None or "auto" is d + 1.
-    {shared}
+    {common}
     df_ : int
     loss_ : float
         Eq. (9) for "mse"; negative log posterior density (or likelihood) of the latent values, in nats per row, for
@@ -138,12 +137,8 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         link = WishartLink(pooled)
         if not self.latent_prior:
             link = WishartLink(prior_root, scale_matrix_tril=torch.eye(len(pooled)).to(pooled).requires_grad_())
-        likelihood, latent = self._likelihood_and_values(problem, link, residual, pooled)
         # Vectors that start equal, or at zero, stay so by symmetry: noise separates those after the first d.
-        noise = self._door(checks.seed(self.random_state).standard_normal(latent.whitened.shape))
-        with torch.no_grad():
-            latent.whitened[len(pooled) ** 2 :] += _SPREAD * noise[len(pooled) ** 2 :]
-        root, report = self._train(likelihood, latent)
+        root, latent, report = self._maximize(problem, link, residual, pooled, first_random=len(pooled) ** 2)
         link = WishartLink(prior_root, scale_matrix_tril=link.scale_matrix_tril)
         deviations = link.deviation(root).mT.contiguous() if self.latent_prior else None
         processes = latent.interpolate(link.flatten(root).mT.contiguous(), deviations)

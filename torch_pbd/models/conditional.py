@@ -28,16 +28,19 @@ class MeanAndCovariance(Core):
     """Module of the latent processes and the prior, whose name is in files."""
     _prior: ClassVar[str]
     """Name of the prior there."""
+    _link: ClassVar[type[Link]]
 
     def __init__(self, mean: LatentGP, latent: LatentGP, link: Link, *, bounded: bool = False) -> None:
         super().__init__()
         self.mean, self.covariance, self.bounded = mean, nn.Module(), bounded
-        self.covariance.latent = latent
+        self.covariance.latent, self.log_diagonal = latent, link.log_diagonal
         self.covariance.register_buffer(self._prior, link.prior)
 
-    @abstractmethod
     def link(self, prior_tril: Float[Tensor, "*n d d"] | None = None) -> Link:
         """From the processes to the root, with the prior of the fit or another."""
+        prior = getattr(self.covariance, self._prior)
+        prior = prior if prior_tril is None else padded(prior_tril, prior.shape[1])
+        return self._link(prior, self.log_diagonal, getattr(self.covariance, "scale_matrix_tril", None))
 
     def forward(
         self, x: Float[Tensor, "n e"], prior_tril: Float[Tensor, "n d d"] | None = None
@@ -90,15 +93,7 @@ class MeanAndCovariance(Core):
 class MeanAndCholesky(MeanAndCovariance):
     """Core of the Cholesky decomposition approach."""
 
-    kind, _prior = "cholesky", "prior_tril"
-
-    def __init__(self, mean: LatentGP, latent: LatentGP, link: Link, *, bounded: bool = False) -> None:
-        super().__init__(mean, latent, link, bounded=bounded)
-        self.log_diagonal = link.log_diagonal
-
-    def link(self, prior_tril: Float[Tensor, "*n d d"] | None = None) -> CholeskyLink:
-        """From the processes to the lower factor."""
-        return CholeskyLink(self.covariance.prior_tril if prior_tril is None else prior_tril, self.log_diagonal)
+    kind, _prior, _link = "cholesky", "prior_tril", CholeskyLink
 
     def config(self) -> dict[str, Any]:
         """Kernels, and on what the processes act."""
@@ -117,18 +112,12 @@ class MeanAndWishart(MeanAndCovariance):
     far from data, and stays so while L is trained.
     """
 
-    kind, _prior = "wishart", "prior_root"
+    kind, _prior, _link = "wishart", "prior_root", WishartLink
 
     def __init__(self, mean: LatentGP, latent: LatentGP, link: Link, *, bounded: bool = False) -> None:
         super().__init__(mean, latent, link, bounded=bounded)
         matrix = torch.eye(len(link.prior)).to(link.prior) if link.scale_matrix_tril is None else link.scale_matrix_tril
         self.covariance.scale_matrix_tril = nn.Parameter(matrix.detach())
-
-    def link(self, prior_tril: Float[Tensor, "*n d d"] | None = None) -> WishartLink:
-        """From the processes to the vectors."""
-        prior = self.covariance.prior_root
-        prior = prior if prior_tril is None else padded(prior_tril, prior.shape[1])
-        return WishartLink(prior, scale_matrix_tril=self.covariance.scale_matrix_tril)
 
     @classmethod
     def _blank_link(cls, config: Mapping[str, Any], shapes: Shapes, n_outputs: int) -> tuple[WishartLink, int]:
@@ -154,15 +143,8 @@ def _blank_processes(shapes: Shapes, prefix: str, n_processes: int, n_features: 
 class ConditionalNormal(nn.Module):
     """Mean and covariance of y given x, in the units of the data; differentiable in x.
 
-    The density is normal, or Student's t with these moments where the core has ``degrees``.
-
-    Parameters
-    ----------
-    core : Core
-    x_shift, x_scale : Tensor of shape (e,)
-        Standardized inputs are ``(x - x_shift) / x_scale``.
-    y_shift, y_scale : Tensor of shape (d,)
-        Standardized outputs are ``(y - y_shift) / y_scale``.
+    The density is normal, or Student's t with these moments where the core has ``degrees``. The core works on
+    ``(x - x_shift) / x_scale`` and ``(y - y_shift) / y_scale``.
     """
 
     x_shift: Tensor

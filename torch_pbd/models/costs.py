@@ -150,8 +150,7 @@ class _Posterior:
 def train(
     likelihood: Likelihood,
     latent: LatentValues,
-    *,
-    solver: Solver = "auto",
+    solver: Solver,
     max_iter: int,
     tol: float,
     callback: Callable[[Progress], None] | None = None,
