@@ -11,7 +11,7 @@ import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from numbers import Integral, Real
-from typing import Any, Literal, TypedDict, Unpack, get_args, overload
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,21 +42,6 @@ def refusal(value: Any, name: str, must: str, remedy: str = "", unit: str = "") 
     )
 
 
-class _Bounds(TypedDict, total=False):
-    """Bounds of a number, and additions to the message that refuses one."""
-
-    above: float | None
-    least: float | None
-    below: float | None
-    most: float | None
-    unit: str
-    remedy: str
-
-
-@overload
-def number(value: Any, name: str, *, optional: Literal[False] = ..., **bounds: Unpack[_Bounds]) -> float: ...
-@overload
-def number(value: Any, name: str, *, optional: Literal[True], **bounds: Unpack[_Bounds]) -> float | None: ...
 def number(
     value: Any,
     name: str,
@@ -68,7 +53,7 @@ def number(
     unit: str = "",
     optional: bool = False,
     remedy: str = "",
-) -> float | None:
+) -> Any:
     """Finite real number within bounds, of which ``above`` and ``below`` are themselves not allowed; no bool, no text.
 
     ``unit`` and ``remedy``, what to do, are said in the message. None comes back if it is ``optional``.

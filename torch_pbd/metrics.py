@@ -116,18 +116,13 @@ def negative_log_likelihood(mean: Any, covariance: ArrayLike, y: ArrayLike) -> f
 
     ``negative_log_likelihood(mean, covariance, y)`` uses the Gaussians N(mean, covariance). The scorer
     ``negative_log_likelihood(estimator, X, y)`` uses the estimator's own predictive density, of any form, from its
-    ``log_likelihood(X, y)`` or that of a Pipeline's last step.
+    ``log_likelihood(X, y)``, which it must have, or that of a Pipeline's last step.
 
     Parameters
     ----------
     mean : array_like of shape (n, d) or (n,), or a fitted estimator
     covariance : array_like of shape (n, d, d), or inputs X
     y : array_like of shape (n, d) or (n,)
-
-    Raises
-    ------
-    TypeError
-        If the estimator has no ``log_likelihood``.
     """
     if hasattr(mean, "predict"):
         last = mean[-1] if isinstance(mean, Pipeline) else mean
@@ -149,7 +144,7 @@ def mahalanobis_coverage(
 ) -> Any:
     """Fraction of the rows of y inside the ellipsoid that should hold ``level`` of them.
 
-    There are three forms: ``mahalanobis_coverage(mean, covariance, y, level=0.95)`` takes arrays;
+    ``mahalanobis_coverage(mean, covariance, y, level=0.95)`` takes arrays;
     ``mahalanobis_coverage(estimator, X, y, level=0.95)`` uses ``estimator.predict(X, return_cov=True)``; and
     ``mahalanobis_coverage(0.95)`` returns a picklable scorer ``(estimator, X, y)`` for that level. The ellipsoid
     is the Gaussian's: squared Mahalanobis distance up to the chi-squared quantile for d outputs.
@@ -161,11 +156,6 @@ def mahalanobis_coverage(
     y : array_like of shape (n, d) or (n,)
     level : float, default=0.95
         Nominal coverage, between 0 and 1 exclusive.
-
-    Raises
-    ------
-    TypeError
-        If ``covariance`` or ``y`` is missing.
     """
     if covariance is None and y is None and (mean is None or isinstance(mean, Real)):
         level = checks.number(level if mean is None else mean, "level", above=0.0, below=1.0)

@@ -63,25 +63,19 @@ class Standardization:
         parts = (low, 0.5 * span), (y[0], (y - y[0]).mean(axis=0))
         return cls(low + 0.5 * span, x_scale, y_shift, y_scale, *parts)
 
-    def inputs(self, X: Floats) -> Floats:
-        """Standardized inputs, rounded."""
-        return self.exact_inputs(X).round(_DECIMALS)
+    def inputs(self, X: Floats, *, exact: bool = False) -> Floats:
+        """Standardized inputs, rounded; with all their digits if ``exact``."""
+        standardized = (X - self.x_parts[0] - self.x_parts[1]) / self.x_scale
+        return standardized if exact else standardized.round(_DECIMALS)
 
-    def outputs(self, y: Floats) -> Floats:
-        """Standardized outputs, rounded."""
-        return self.exact_outputs(y).round(_DECIMALS)
+    def outputs(self, y: Floats, *, exact: bool = False) -> Floats:
+        """Standardized outputs, rounded; with all their digits if ``exact``."""
+        standardized = (y - self.y_parts[0] - self.y_parts[1]) / self.y_scale
+        return standardized if exact else standardized.round(_DECIMALS)
 
     def in_units(self, inputs: Floats) -> Floats:
         """Inputs in the units of X."""
         return self.x_shift + self.x_scale * inputs
-
-    def exact_inputs(self, X: Floats) -> Floats:
-        """Standardized inputs with all their digits."""
-        return (X - self.x_parts[0] - self.x_parts[1]) / self.x_scale
-
-    def exact_outputs(self, y: Floats) -> Floats:
-        """Standardized outputs with all their digits."""
-        return (y - self.y_parts[0] - self.y_parts[1]) / self.y_scale
 
 
 def spread_of(columns: Floats) -> Floats:

@@ -86,10 +86,9 @@ class HeteroscedasticGPRegressor(CovarianceRegressor):
 
     Notes
     -----
-    Rows that repeat an input enter as count, mean and scatter, so the cost of a fit depends on the number n of
-    distinct inputs (at most ``max_inputs``), the number d of outputs and the number m of inducing inputs, of which
-    smooth processes use an effective rank r: n d (d r)^2 + d (d r)^3 per evaluation of the evidence, and once per
-    alternation with m instead of r. As d m is bounded by default, the cost grows linearly with many outputs.
+    With n distinct inputs (at most ``max_inputs``), d outputs and m inducing inputs, of which smooth processes use an
+    effective rank r, an evaluation of the evidence costs n d (d r)^2 + d (d r)^3, and an alternation once that with m
+    for r. As d m is bounded by default, the cost grows linearly with many outputs.
 
     Where demonstrations start or end at one point, and the evidence favours it, the input of the covariance's
     processes is stretched there, so that their length scale is short only near that end. This needs a single column

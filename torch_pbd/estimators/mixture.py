@@ -101,7 +101,7 @@ class GMMBaseline(CovarianceRegressor):
             )
         warn_if_few(n_distinct, y.shape[1], groups, rows="distinct rows", decides="reg_covar")
         scaling = _by_residual(X, y)
-        data = self._door(np.hstack([scaling.exact_inputs(X), scaling.exact_outputs(y)]))
+        data = self._door(np.hstack([scaling.inputs(X, exact=True), scaling.outputs(y, exact=True)]))
         generator = checks.seed(self.random_state)
         limits: dict[str, Any] = {"reg_covar": self.reg_covar, "tol": self.tol, "max_iter": self.max_iter}
         runs = []

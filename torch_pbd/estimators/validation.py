@@ -213,8 +213,8 @@ def warn_if_few(
     """Warn if there are no more rows, or no more demonstrations, than outputs: their covariance is singular."""
     if n_rows <= n_outputs:
         checks.warn(
-            f"y has {n_rows} {rows} but {n_outputs} outputs: they leave directions of the covariance undetermined, which "
-            f"{decides} decides. Record more.",
+            f"y has {n_rows} {rows} but {n_outputs} outputs: they leave directions of the covariance undetermined, "
+            f"which {decides} decides. Record more.",
             DataRankWarning,
         )
     elif groups is not None and (n_demos := int(groups.max()) + 1) <= n_outputs:  # whose samples repeat each other

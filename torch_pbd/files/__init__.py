@@ -72,15 +72,14 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
         draft.unlink(missing_ok=True)
 
 
-def remove_drafts(folder: Path) -> int:
-    """Number of files that :func:`replacing` left in a folder where a process was killed, and that are now removed.
+def remove_drafts(folder: Path) -> None:
+    """Remove the files that :func:`replacing` left in a folder where a process was killed.
 
     Nothing else may write files there meanwhile: drafts of what still runs cannot be told from others.
     """
-    drafts = [entry for entry in folder.iterdir() if _DRAFT.fullmatch(entry.name) and not entry.is_dir()]
-    for draft in drafts:
-        draft.unlink(missing_ok=True)
-    return len(drafts)
+    for entry in list(folder.iterdir()):
+        if _DRAFT.fullmatch(entry.name) and not entry.is_dir():
+            entry.unlink(missing_ok=True)
 
 
 def _target(path: Path) -> Path:
