@@ -12,8 +12,8 @@ from .strokes import make_strokes
 
 def learned_from(models=("CholeskyCovRegressor",), **settings):
     settings = messages.as_settings({"models": list(models), **settings})
-    learned, steps = learning.learn(messages.as_strokes(make_strokes()), settings)
-    return learned, [answer for step in steps if (answer := step())]
+    learned = learning.learn(messages.as_strokes(make_strokes()), settings)
+    return learned, [answer for step in learned.steps if (answer := step())]
 
 
 @pytest.fixture

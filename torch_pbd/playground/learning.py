@@ -33,6 +33,7 @@ class Learned:
 
     strokes: Demonstrations
     settings: Settings
+    steps: deque[Step] = field(default_factory=deque)  # that are left to do; each may be begun again if interrupted
     controllers: dict[str, DMPController] = field(default_factory=dict)
     via: list[tuple[float, float, float]] = field(default_factory=list)
     bent: DMPController | None = None
@@ -40,18 +41,15 @@ class Learned:
     scores: dict[tuple[str, int], float] = field(default_factory=dict)
 
 
-def learn(strokes: list[Stroke], settings: Settings) -> tuple[Learned, deque[Step]]:
-    """Steps that learn models of two strokes or more, the schedule of the first, and how likely left-out strokes are.
-
-    Each may be begun again if it was interrupted.
-    """
+def learn(strokes: list[Stroke], settings: Settings) -> Learned:
+    """Steps that learn models of two strokes or more, the schedule of the first, and how likely left-out ones are."""
     times, positions = zip(*strokes, strict=True)
     learned = Learned(Demonstrations(times, positions, names=["x", "y"], units="m"), settings)
     left_out = range(len(strokes)) if len(strokes) > 2 else ()
-    steps: list[Step] = [partial(_fit, learned, name) for name in settings.models]
-    steps.append(partial(follow, learned))
-    steps += [partial(_leave_out, learned, name, k) for name in settings.models for k in left_out]
-    return learned, deque(steps)
+    learned.steps.extend(partial(_fit, learned, name) for name in settings.models)
+    learned.steps.append(partial(follow, learned))
+    learned.steps.extend(partial(_leave_out, learned, name, k) for name in settings.models for k in left_out)
+    return learned
 
 
 def _fit(learned: Learned, name: str) -> Answer:

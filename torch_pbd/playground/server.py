@@ -49,8 +49,7 @@ class Robot:
     """Point that moves as :class:`~torch_pbd.control.realtime.RealTimeAdmittance` says, over and over."""
 
     def __init__(self) -> None:
-        self._schedule: Schedule | None = None
-        self._controller: RealTimeAdmittance | None = None
+        self._following: tuple[Schedule, RealTimeAdmittance] | None = None
         self._now = self._rest = self._left = 0.0
         self._desired: Sequence[float] = (0.0, 0.0)
 
@@ -61,21 +60,19 @@ class Robot:
 
     def follow(self, schedule: Schedule, controller: RealTimeAdmittance | None = None) -> None:
         """Take up a schedule, and its loop, from where the robot is, at the same share of the movement."""
-        here, at, before = None, 0.0, self._controller
-        if before is not None and self._schedule is not None:
-            here, at = before.position, min(1.0, before.schedule_time / self._schedule.duration) * schedule.duration
-        self._schedule, self._controller = schedule, controller or self.prepare(schedule)
-        self._controller.start(self._now, here, at=at)
-        self._desired = self._controller.desired_position
+        controller, here, at = controller or self.prepare(schedule), None, 0.0
+        if self._following is not None:
+            last, before = self._following
+            here, at = before.position, min(1.0, before.schedule_time / last.duration) * schedule.duration
+        self._following = schedule, controller
+        controller.start(self._now, here, at=at)
+        self._desired = controller.desired_position
 
     def advance(self, elapsed: float, hand: tuple[float, float] | None, push: tuple[float, float]) -> dict[str, Any]:
-        """State after ``elapsed`` s in which a hand at a place in m pulled by a spring, or None, and keys pushed in N.
-
-        The state is what the page draws: time in s, positions in m, force in N, stiffness in N/m as (xx, xy, yy).
-        """
-        controller, schedule = self._controller, self._schedule
-        if controller is None or schedule is None:
+        """State to draw after ``elapsed`` s in which a hand in m, or None, pulled by a spring, and keys pushed in N."""
+        if self._following is None:
             return {"type": "robot", "is_there": False}
+        schedule, controller = self._following
         self._left += min(elapsed, _LONGEST)
         force = push
         while self._left >= _TICK:
@@ -124,7 +121,11 @@ class Tab:
         """Do what a message asks for; a ValueError says what is wrong with it."""
         kind, request = message["type"], {"type": message["type"]}
         if kind == "frame":
-            await self._frame(message)
+            hand = messages.as_pair(message.get("hand"), "hand", 10.0)
+            push = messages.as_pair(message.get("push"), "push", 100.0) or (0.0, 0.0)
+            before, self._last = self._last, time.perf_counter()
+            elapsed = 0.0 if message.get("is_paused") else self._last - before
+            await self.send({**self._robot.advance(elapsed, hand, push), "frame": message.get("frame")})
             return
         if kind in ("learn", "adjust"):
             request["settings"] = messages.as_settings(message.get("settings", {}))
@@ -151,14 +152,6 @@ class Tab:
         """Send to the page, if it is still there."""
         with contextlib.suppress(RuntimeError, WebSocketDisconnect):
             await self._page.send_text(json.dumps(answer))
-
-    async def _frame(self, message: dict[str, Any]) -> None:
-        hand = messages.as_pair(message.get("hand"), "hand", 10.0)
-        push = messages.as_pair(message.get("push"), "push", 100.0) or (0.0, 0.0)
-        now = time.perf_counter()
-        elapsed, self._last = now - self._last, now
-        state = self._robot.advance(0.0 if message.get("is_paused") else elapsed, hand, push)
-        await self.send({**state, "frame": message.get("frame")})
 
 
 class Playground:
@@ -208,19 +201,16 @@ class Playground:
     @contextlib.asynccontextmanager
     async def _lifespan(self, _: Starlette) -> AsyncIterator[None]:
         loop = asyncio.get_running_loop()
-        self._worker = Worker(lambda tab, answer: loop.call_soon_threadsafe(self._deliver, tab, answer))
-        self._sending: set[asyncio.Task[None]] = set()
+        self._worker = Worker(lambda tab, answer: asyncio.run_coroutine_threadsafe(self._deliver(tab, answer), loop))
         try:
             yield
         finally:
             self._worker.close()
 
-    def _deliver(self, number: int, answer: dict[str, Any]) -> None:
-        # Tab -1 is every one.
-        for tab in [self._tabs[number]] if number in self._tabs else list(self._tabs.values()) * (number == -1):
-            task = asyncio.ensure_future(tab.deliver(dict(answer)))
-            self._sending.add(task)
-            task.add_done_callback(self._sending.discard)
+    async def _deliver(self, number: int | None, answer: dict[str, Any]) -> None:
+        """Hand an answer to a tab that is still open, or to all."""
+        for tab in [tab for key, tab in self._tabs.items() if number in (key, None)]:
+            await tab.deliver(dict(answer))
 
     async def _page(self, request: Request) -> Response:
         name = request.path_params.get("name", "index.html")

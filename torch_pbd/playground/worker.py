@@ -7,7 +7,6 @@ import signal
 import threading
 import warnings
 from _thread import interrupt_main
-from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection
@@ -22,10 +21,10 @@ Answer = dict[str, Any]
 class Worker:
     """The page's side of the process, which is begun again if it ends.
 
-    ``deliver`` is called with the tab and each answer to it, from another thread.
+    ``deliver`` is called with the tab, None for all, and each answer to it, from another thread.
     """
 
-    def __init__(self, deliver: Callable[[int, Answer], object]) -> None:
+    def __init__(self, deliver: Callable[[int | None, Answer], object]) -> None:
         self._deliver = deliver
         self._lock = threading.Lock()
         self._is_closed = False
@@ -61,7 +60,7 @@ class Worker:
             if not self._is_closed:
                 with self._lock:
                     self._begin()
-                self._deliver(-1, {"type": "restarted"})
+                self._deliver(None, {"type": "restarted"})
 
 
 def work(connection: Connection) -> None:
@@ -81,10 +80,7 @@ class _Newer(BaseException):
 
 
 class Desk:
-    """Learned models of each tab, and the remaining steps of their fits, newest strokes first.
-
-    A request interrupts the step under way, which begins again unless the request replaces the fit.
-    """
+    """Learned models of each tab, and the fits under way: a request interrupts their step, which begins again after."""
 
     def __init__(self, connection: Connection) -> None:
         from torch_pbd.playground import learning  # here: it loads torch
@@ -92,7 +88,7 @@ class Desk:
         self._learning, self._connection = learning, connection
         self._requests: SimpleQueue[tuple[int, Answer]] = SimpleQueue()
         self._learned: dict[int, learning.Learned] = {}
-        self._fits: dict[int, tuple[learning.Learned, deque[learning.Step]]] = {}
+        self._fits: dict[int, learning.Learned] = {}
         self._is_stepping = False
         signal.signal(signal.SIGINT, self._interrupt)
         threading.Thread(target=self._receive, daemon=True).start()
@@ -125,17 +121,17 @@ class Desk:
             raise _Newer
 
     def _advance(self, tab: int) -> None:
-        learned, steps = self._fits[tab]
+        fit = self._fits[tab]
         try:
             self._is_stepping = True
             self._interrupt()
-            is_sound = self._reply(tab, steps[0])
+            is_sound = self._reply(tab, fit.steps[0])
         except _Newer:
             return
         if is_sound:
-            self._learned[tab] = learned
-            steps.popleft()
-        if not (is_sound and steps):
+            self._learned[tab] = fit
+            fit.steps.popleft()
+        if not (is_sound and fit.steps):
             del self._fits[tab]
 
     def _reply(self, tab: int, make: Callable[[], Answer | None]) -> bool:
