@@ -154,7 +154,7 @@ class MovementDisplay:
             shown = shown.align(n=_N_STEPS)
         parts.plot_demonstrations(shown, [output], ax)
         for (name, (mean, covariance)), color in zip(self.laws.items(), _COLORS, strict=False):
-            std, label = np.sqrt(covariance[:, output, output]), self._label(name)
+            std, label = np.sqrt(covariance[:, output, output]), f"{name}: mean, {self.n_std:g} sd"
             parts.plot_std_band(self.grid, mean[:, output], std, ax, n_std=self.n_std, color=color, label=label)
         if self.truth is not None:
             mean, covariance = self.truth
@@ -167,7 +167,7 @@ class MovementDisplay:
         shown, laws = self.outputs, list(zip(self.laws.values(), _COLORS, strict=False))
         parts.plot_demonstrations(self.demonstrations, shown, ax)
         for name, ((mean, _), color) in zip(self.laws, laws, strict=False):
-            ax.plot(*mean.T[shown], color=color, lw=1.5, label=self._label(name), zorder=3)
+            ax.plot(*mean.T[shown], color=color, lw=1.5, label=f"{name}: mean, {self.n_std:g} sd", zorder=3)
         if len(shown) == 2:
             some = np.linspace(0, len(self.grid) - 1, _N_ELLIPSES).round().astype(int)
             for (mean, covariance), color in laws if self.truth is None else [*laws, (self.truth, style.TRUTH)]:
@@ -176,9 +176,6 @@ class MovementDisplay:
                 parts.plot_covariance_ellipses(mean[some][:, shown], in_plane, ax, **look)
         style.mark_ends(ax, laws[0][0][0][:, shown])
         style.equal_scales(ax)
-
-    def _label(self, name: str) -> str:
-        return f"{name}: mean, {self.n_std:g} sd"
 
 
 def plot_movements(demonstrations: Any, outputs: Sequence[int | str] | None = None, ax: Axes | None = None) -> Any:

@@ -97,10 +97,8 @@ class _Writer:
         p = schedule.position.shape[1]
         n_space = p if p in (2, 3) and schedule.units in (None, "m") else 0
         covariance = schedule.covariance if schedule.covariance_of == "position" else None
-        self._path("space/schedule", schedule.position, n_space, MODEL, covariance)
+        self._motion("space/schedule", schedule, n_space, MODEL, covariance)
         self._curves("outputs", "schedule", schedule.time, schedule.position, schedule_names(schedule)[:p], MODEL)
-        if n_space == 3:
-            self._frames("space/schedule/tool", schedule)
         for block, kind in zip(schedule.blocks, ("positions", "rotation"), strict=False):
             eigenvalues = np.linalg.eigvalsh(schedule.stiffness[:, block, block])
             axes = [f"axis {i}" for i in range(eigenvalues.shape[1])]
@@ -111,9 +109,7 @@ class _Writer:
             raise InvalidParameterError(f"rollout is {rollout!r}, must be a single run: take one of the batch.")
         run, p = rollout.numpy(), rollout.position.shape[1]
         names = names or [f"y{i}" for i in range(run.velocity.shape[1])]
-        self._path("space/run", run.position, p if p in (2, 3) else 0, ROBOT)
-        if p == 3:
-            self._frames("space/run/tool", run)
+        self._motion("space/run", run, p if p in (2, 3) else 0, ROBOT)
         self._curves("outputs", "run", run.time, run.position, names[:p], ROBOT)
         self._curves("force", "", run.time, run.force, names, FORCE)
 
@@ -140,16 +136,15 @@ class _Writer:
         )
         self._stream.log(f"{entity}/covariance", ellipsoids, static=True)
 
-    def _frames(self, entity: str, moving: Any) -> None:
-        """Tool of a schedule or a run, if it turns."""
-        orientation = getattr(moving, "orientation", None)
-        if orientation is None:
-            return
-        quaternion = np.roll(orientation, -1, axis=1)
-        columns = self._rerun.Transform3D.columns(translation=moving.position, quaternion=quaternion)
-        self._stream.send_columns(entity, indexes=[self._index(moving.time)], columns=columns)
-        extent = float(np.linalg.norm(np.ptp(moving.position, axis=0)))
-        self._stream.log(entity, self._rerun.TransformAxes3D(axis_length=0.1 * (extent or 1.0)), static=True)
+    def _motion(self, entity: str, moving: Any, n_space: int, color: str, covariance: Floats | None = None) -> None:
+        """Path of a schedule or a run, and its tool, if it turns in space."""
+        self._path(entity, moving.position, n_space, color, covariance)
+        if n_space == 3 and moving.orientation is not None:
+            tool, quaternion = f"{entity}/tool", np.roll(moving.orientation, -1, axis=1)
+            columns = self._rerun.Transform3D.columns(translation=moving.position, quaternion=quaternion)
+            self._stream.send_columns(tool, indexes=[self._index(moving.time)], columns=columns)
+            extent = float(np.linalg.norm(np.ptp(moving.position, axis=0)))
+            self._stream.log(tool, self._rerun.TransformAxes3D(axis_length=0.1 * (extent or 1.0)), static=True)
 
     def _curves(self, root: str, label: str, time: Floats, values: Floats, names: Sequence[str], color: str) -> None:
         for name, column in zip(names, np.transpose(values), strict=True):
