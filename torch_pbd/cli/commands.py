@@ -13,7 +13,7 @@ from torch_pbd.cli import options
 from torch_pbd.cli.options import MODELS, Option
 from torch_pbd.console import say
 from torch_pbd.exceptions import ConfigError, DataFormatError
-from torch_pbd.registry import MOVEMENTS
+from torch_pbd.registry import MOVEMENTS, optional
 
 COMMANDS = {
     "demo": "learn from six made demonstrations of the tunnel task; the main job, no data needed",
@@ -43,15 +43,15 @@ _GRID = {
     "n_steps": Option(_Count | None, None, "number of points to resample to"),
 }
 _CLASS_HELP = "by name, or class_path and init_args; see"
+_RECORDED = {**_FILE, "data": Option(str | list[str] | None, None, _DATA, required=True)}
 OPTIONS: dict[str, dict[str, Option]] = {
     "demo": _MADE,
     "fit": {
-        **_FILE,
-        "data": Option(str | list[str] | None, None, _DATA, required=True),
+        **_RECORDED,
         "model": Option("Model", MODELS["HGP"], f"estimator {_CLASS_HELP} --model.help NAME"),
         **_GRID,
     },
-    "inspect": {**_FILE, "data": Option(str | list[str] | None, None, _DATA, required=True)},
+    "inspect": _RECORDED,
     "experiment": {
         **_FILE,
         **_MADE,
@@ -126,12 +126,10 @@ def parse(command: str, arguments: Sequence[str]) -> tuple[Namespace, str]:
 
 def playground(options: Any) -> None:
     """A page in the browser, until Ctrl-C."""
-    try:
-        from torch_pbd.playground.server import serve
-    except ModuleNotFoundError as error:
-        raise ConfigError(
-            f"playground needs {error.name}, which is not installed: pip install 'torch_pbd[playground]'."
-        ) from error
+    for library in ("starlette", "uvicorn", "websockets"):
+        optional(library, "playground", "playground")
+    from torch_pbd.playground.server import serve
+
     serve(options.port, browse=options.browse)
 
 
@@ -147,14 +145,14 @@ def demo(options: Any, folder: Any) -> str:
 
 def fit(options: Any, folder: Any) -> str:
     """One model on a file of demonstrations."""
-    from torch_pbd.experiments.comparison import write_fitted
+    from torch_pbd.experiments.comparison import figure_of
     from torch_pbd.experiments.run_folder import fit_once
 
     demonstrations = _demonstrations(options)
     X, y, groups = demonstrations.stack(options.input)
     model, _ = fit_once(options.model, X, y, groups, finished=folder.finished)
     name = type(model).__name__
-    model_path, figure_path = write_fitted(model, demonstrations, folder, name, options.input)
+    model_path, figure_path = folder.write_fitted(name, model, figure_of(model, demonstrations, name, options.input))
     # A model of whole movements has no single optimization whose end could be told.
     if hasattr(model, "score_demonstrations"):
         learned, likelihood = {}, model.score(X, y, groups=groups)
@@ -186,7 +184,6 @@ def experiment(options: Any, folder: Any) -> str:
     from torch_pbd.data import load_demonstrations, make_pose_demonstrations, make_tunnel_demonstrations
     from torch_pbd.experiments.comparison import describe
     from torch_pbd.experiments.robot import framework_figure, run_robot
-    from torch_pbd.registry import optional
 
     made, source = options.data is None, f"{options.task} task"
     if not made:

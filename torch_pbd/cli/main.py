@@ -24,14 +24,7 @@ class _Terminated(BaseException):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command.
-
-    Returns
-    -------
-    int
-        Exit code: 0; 1, it failed; 2, it cannot be used; 3, another run writes the folder; 130 and 143, interrupted and
-        terminated.
-    """
+    """Exit code of one command: 0; 1, it failed; 2, it cannot be used; 3, its folder is in use; 130, 143, it is cut."""
     try:
         with _signals():
             _run(list(sys.argv[1:] if arguments is None else arguments))

@@ -107,10 +107,7 @@ for _tag, _pattern in (
 
 
 def read_yaml_file(path: str) -> Document:
-    """Document of a file of at most 1 MiB of UTF-8, which must hold one mapping; an empty file is an empty mapping.
-
-    Raises ConfigError, with file and line, if the file cannot be read, is not text, or is not such YAML.
-    """
+    """Document of a file of UTF-8, which must hold one mapping, or nothing; else a ConfigError has file and line."""
     source = path if path.isprintable() else repr(path)
     try:
         with Path(path).open("rb") as file:
@@ -131,12 +128,10 @@ def read_yaml_file(path: str) -> Document:
 
 
 def read_yaml(text: str, source: str) -> Document:
-    """One YAML document; ``source``, which says where the text is from, begins every message.
+    """One YAML document; ``source``, which says where the text is from, begins every message of a ConfigError.
 
     Only ``true`` and ``false`` are booleans, and a number is decimal: ``no``, ``1:20``, ``2026-01-01``, ``010``,
-    ``0x10`` and ``1_000`` are text, ``1e-3`` is a number. Keys are text. Raises ConfigError on text that is not YAML,
-    on tags, references, keys that are there twice or are no words, a second document, and more than 20,000 entries or
-    50 levels.
+    ``0x10`` and ``1_000`` are text, ``1e-3`` is a number. Keys are text.
     """
     lines: dict[Keys, int] = {}
     try:

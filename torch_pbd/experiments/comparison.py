@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -11,12 +10,12 @@ from matplotlib.figure import Figure
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import clone
 
-from torch_pbd import checks, plotting
+from torch_pbd import plotting
 from torch_pbd.checks import Floats
 from torch_pbd.console import format_table, steps
 from torch_pbd.data import Demonstrations
 from torch_pbd.estimators.base import CovarianceRegressor
-from torch_pbd.experiments.run_folder import FinishedFits, RunFolder, fit_once, slug
+from torch_pbd.experiments.run_folder import FinishedFits, RunFolder, fit_once
 from torch_pbd.metrics import covariance_mse, mahalanobis_coverage, negative_log_likelihood, relative_frobenius_error
 from torch_pbd.plotting import style
 
@@ -128,14 +127,12 @@ def score_fold(
     return row | judge_movement(model, X[left], y[left]) if whole else row
 
 
-def movement_statistics(movements: ArrayLike, mean: ArrayLike, std: ArrayLike) -> Floats:
+def movement_statistics(movements: Floats, mean: Floats, std: Floats) -> Floats:
     """Statistics of whole movements (s, n, d), by mean and std (n, d) of each step: (s, 4), as ``MOVEMENT_STATISTICS``.
 
     The mean squared deviation and the length of the time-averaged offset, in standard deviations of each step and
     output; the length of the path, in units of the outputs; the largest deviation, in standard deviations.
     """
-    movements = checks.array(movements, "movements", ("s", "n", "d"))
-    mean, std = (checks.array(part, name, movements.shape[1:]) for part, name in ((mean, "mean"), (std, "std")))
     standardized = (movements - mean) / std
     offset = np.linalg.norm(standardized.mean(axis=1), axis=1)
     length = np.linalg.norm(np.diff(movements, axis=1), axis=2).sum(axis=1)
@@ -233,10 +230,8 @@ def figure_of_recordings(demonstrations: Demonstrations, name: str) -> Figure:
 def _panels(n: int, height: float) -> tuple[Figure, list[Any]]:
     """Figure with n Axes in three columns, 4 by ``height`` inches each."""
     n_columns, n_rows = min(3, n), -(-n // 3)
-    figure, grid = style.figure_grid(n_rows, n_columns, (4.0 * n_columns, height * n_rows))
-    for ax in grid.flat[n:]:
-        ax.set_visible(False)
-    return figure, list(grid.flat[:n])
+    figure = Figure(figsize=(4.0 * n_columns, height * n_rows))
+    return figure, [figure.add_subplot(n_rows, n_columns, i + 1) for i in range(n)]
 
 
 def run_recordings(
@@ -258,14 +253,6 @@ def run_recordings(
         metrics.append(score.row | whole[-1] | folds)
     folder.write_metrics(metrics)
     for name, score in scores.items():
-        write_fitted(score.fitted, demonstrations, folder, name, input)
+        folder.write_fitted(name, score.fitted, figure_of(score.fitted, demonstrations, name, input))
     rows = [score.row for score in scores.values()]
     return "\n\n".join(map(format_table, [rows, whole] if metrics[0]["folds"] else [rows]))
-
-
-def write_fitted(
-    model: CovarianceRegressor, demonstrations: Demonstrations, folder: RunFolder, name: str, input: Input
-) -> tuple[Path, Path]:
-    """Write a fitted model and its figure."""
-    figure = figure_of(model, demonstrations, name, input)
-    return folder.write_model(model, slug(name)), folder.write_figure(figure, slug(name))

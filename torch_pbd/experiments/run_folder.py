@@ -155,7 +155,17 @@ class RunFolder:
                     if entry.suffix in _SUFFIXES and entry.exists() and not entry.is_file():
                         raise IsADirectoryError(f"{entry} stands where a file of results may have to: move it away")
                 remove_drafts(folder)
-            self.write_text("env.json", json.dumps(_environment(settings), indent=2) + "\n")
+            started = datetime.now(UTC).isoformat(" ", timespec="seconds")
+            environment = {
+                "torch_pbd": torch_pbd.__version__,
+                "python": platform.python_version(),
+                "platform": platform.platform(),
+                "packages": {package: version(package) for package in _PACKAGES},
+                "command": sys.argv,
+                "settings": dict(settings),
+                "process": {"id": os.getpid(), "host": socket.gethostname(), "started": started},
+            }
+            self.write_text("env.json", json.dumps(environment, indent=2) + "\n")
             if not resume and self.finished.files():
                 what = f"{self.finished.folder} of a run that was cut is cleared"
                 checks.warn(f"{what}: --resume would have gone on with it.")
@@ -210,6 +220,10 @@ class RunFolder:
         save(model, target)
         return target
 
+    def write_fitted(self, name: str, model: Any, figure: Any) -> tuple[Path, Path]:
+        """Write a fitted model and its figure, to files of its name."""
+        return self.write_model(model, slug(name)), self.write_figure(figure, slug(name))
+
     def write_controller(self, name: str, controller: Any, schedule: Any, **figures: Any) -> None:
         """Write figures, the model, and ``schedule/<name>.npz`` with a row each 10 ms as a table, to be looked at."""
         file = slug(name)
@@ -222,19 +236,6 @@ class RunFolder:
     def _target(self, part: str, name: str) -> Path:
         (self.path / part).mkdir(exist_ok=True)
         return self.path / part / name
-
-
-def _environment(settings: Mapping[str, Any]) -> dict[str, Any]:
-    started = datetime.now(UTC).isoformat(" ", timespec="seconds")
-    return {
-        "torch_pbd": torch_pbd.__version__,
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "packages": {package: version(package) for package in _PACKAGES},
-        "command": sys.argv,
-        "settings": dict(settings),
-        "process": {"id": os.getpid(), "host": socket.gethostname(), "started": started},
-    }
 
 
 def slug(name: str) -> str:

@@ -14,19 +14,12 @@ from torch_pbd import plotting
 from torch_pbd.checks import Floats
 from torch_pbd.console import format_table, steps
 from torch_pbd.control.controller import DMPController
-from torch_pbd.data import (
-    Demonstrations,
-    make_paper_simulation,
-    make_tunnel_demonstrations,
-    paper_covariance,
-    paper_mean,
-    save_demonstrations,
-)
-from torch_pbd.data.synthetic import Reading
+from torch_pbd.data import Demonstrations, make_tunnel_demonstrations, save_demonstrations
+from torch_pbd.data.synthetic import Reading, make_paper_simulation, paper_covariance, paper_mean
 from torch_pbd.estimators.base import CovarianceRegressor
-from torch_pbd.experiments.comparison import compare_models, empirical_covariances, write_fitted
+from torch_pbd.experiments.comparison import compare_models, empirical_covariances, figure_of
 from torch_pbd.experiments.robot import draw_tunnel, run_robot
-from torch_pbd.experiments.run_folder import RunFolder, slug
+from torch_pbd.experiments.run_folder import RunFolder
 from torch_pbd.metrics import mahalanobis_coverage
 from torch_pbd.plotting import style
 
@@ -51,10 +44,9 @@ def run_simulation(
     max_folds: int,
     n_jobs: int | None,
 ) -> str:
-    """Table I for each reading of eq. (14): medians over the seeds 0 to ``n_seeds - 1``; returns it as text.
+    """Table I, as text, for each reading of eq. (14): medians over ``n_seeds`` seeds, and the paper's figures beside.
 
-    A model whose name is one of the paper's (CD, WP, GMM 5, GMM 8) has the paper's figure beside it. Writes metrics,
-    and of each model, fitted to the data of the first reading and seed 0, the file and the figure.
+    Writes metrics, and of each model, fitted to the data of the first reading and seed 0, the file and the figure.
     """
     rows: list[dict[str, Any]] = []
     for reading in readings:
@@ -77,12 +69,11 @@ def run_simulation(
     folder.write_metrics(rows)
     (X, y, _), scores = first
     for name, score in scores.items():
-        folder.write_model(score.fitted, slug(name))
-        folder.write_figure(figure_of(score.fitted, X, y, name, readings[0]), slug(name))
+        folder.write_fitted(name, score.fitted, _simulation_figure(score.fitted, X, y, name, readings[0]))
     return format_table(rows)
 
 
-def figure_of(model: CovarianceRegressor, X: Floats, y: Floats, name: str, reading: Reading) -> Figure:
+def _simulation_figure(model: CovarianceRegressor, X: Floats, y: Floats, name: str, reading: Reading) -> Figure:
     """One of Figures 1 to 3: the outputs over xi, and the covariances at the inputs, beyond the data too."""
     figure, ((*bands, plane),) = style.figure_grid(1, 3, (12.0, 4.2))
 
@@ -127,10 +118,9 @@ def run_demo(models: Mapping[str, CovarianceRegressor], folder: RunFolder, *, n_
         row["fresh LL"] = model.score(np.tile(times, (_N_FRESH, 1)), positions)
         columns = ("model", "MSE", "error to truth", "fresh LL", "95 % of fresh", "least eig.", "fit [s]")
         rows.append({column: row[column] for column in columns})
-        write_fitted(model, demonstrations, folder, name, "time")
-    folder.write_figure(
-        _tunnel_figure({name: score.fitted for name, score in scores.items()}, demonstrations), "tunnel"
-    )
+        folder.write_fitted(name, model, figure_of(model, demonstrations, name))
+    fitted = {name: score.fitted for name, score in scores.items()}
+    folder.write_figure(_tunnel_figure(fitted, demonstrations), "tunnel")
     folder.write_metrics(rows)
     name, model = next(iter(models.items()))
     title = "A robot under its control, pushed with 5 N along x at 2 s and 8 s:\ndisplacement, and stiffness in N/m"
