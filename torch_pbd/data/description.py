@@ -141,12 +141,9 @@ def _of_outputs(units: Any, outputs: list[dict[str, Any]], notes: Sequence[str])
 
 
 def _flips(demonstrations: Any) -> Iterator[str]:
-    """Mistakes in unit quaternions: columns that were not named as such, or signs that differ."""
+    """Mistakes in the signs of unit quaternions."""
     for place in quaternions(demonstrations.positions, demonstrations.n_outputs):
-        columns = demonstrations.names[place : place + 4]
-        name = f"Quaternion {', '.join(columns)}"
-        if {column[-1] for column in columns} != set("wxyz"):
-            yield f"{name} has an order that nobody named: w may be first or last. Say it by rotation=, w x y z."
+        name = f"Quaternion {', '.join(demonstrations.names[place : place + 4])}"
         each = [position[:, place : place + 4] for position in demonstrations.positions]
         flips = [k for k, q in enumerate(each) if ((q[1:] * q[:-1]).sum(axis=1) < 0.0).any() or q[0] @ each[0][0] < 0.0]
         if flips:

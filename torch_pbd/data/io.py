@@ -101,12 +101,13 @@ def load_demonstrations(
     Raises
     ------
     FileNotFoundError, ModuleNotFoundError, ValueError, TypeError
-        If there is no such file, a library is missing, the suffix is unknown, or an option is invalid or another's.
+        If there is no such file, a library is missing, the suffix is unknown, or an option is invalid.
     DataFormatError
         If the file does not match its suffix, with the array, or the line and the column; or if it is too large.
     """
     given = locals()
-    return _read(source, Wanted(**{name: given[name] for name in OPTIONS}), options)
+    wanted = Wanted(**{name: given[name] for name in OPTIONS})
+    return wanted.finish([_load(file, wanted, options) for file in find_files(source)])
 
 
 def inspect_demonstrations(source: Source, **options: Any) -> tuple[Demonstrations, Description]:
@@ -118,7 +119,8 @@ def inspect_demonstrations(source: Source, **options: Any) -> tuple[Demonstratio
     common = {name: options.pop(name) for name in OPTIONS if name in options}
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        demonstrations = _read(source, Wanted(**common, notes=notes), options)
+        wanted = Wanted(**common, notes=notes)
+        demonstrations = wanted.finish([_load(file, wanted, options) for file in find_files(source)])
     suspects = " ".join(demonstrations.suspects)
     told = [message for message in (str(warning.message) for warning in caught) if message != suspects]
     return demonstrations, describe(demonstrations, [*dict.fromkeys(notes), *told])
@@ -144,10 +146,6 @@ def find_files(source: Source) -> list[Path]:
     else:
         return [path]
     return sorted(within, key=lambda file: natural(file.name))
-
-
-def _read(source: Source, wanted: Wanted, options: dict[str, Any]) -> Demonstrations:
-    return wanted.finish([_load(file, wanted, options) for file in find_files(source)])
 
 
 def _load(file: Path, wanted: Wanted, options: dict[str, Any]) -> Demonstrations:

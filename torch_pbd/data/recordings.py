@@ -29,14 +29,19 @@ def as_recordings(times: Any, positions: Any, missing: str) -> tuple[tuple[Float
     stamps = _as_list(times, "times")
     # Times are one array for all if the first entry is a number, and not an array of its own.
     if _numbers(stamps[0], "times[0]", drop).ndim == 0:
-        names, grids = ["times"] * len(samples), [_grid(times, "times", drop)] * len(samples)
+        names, grids = ["times"] * len(samples), [_numbers(times, "times", drop)] * len(samples)
     else:
         names = [f"times[{k}]" for k in range(len(stamps))]
-        grids = [_grid(time, name, drop) for time, name in zip(stamps, names, strict=True)]
+        grids = [_numbers(time, name, drop) for time, name in zip(stamps, names, strict=True)]
     if len(grids) != len(samples):
         must = f"{len(grids)} arrays but positions has {len(samples)} demonstrations"
         raise InvalidParameterError(f"times has {must}: give one for each, or a 1-D one for all.")
     for k, (grid, sample) in enumerate(zip(grids, samples, strict=True)):
+        if grid.ndim != 1:
+            raise InvalidParameterError(f"{names[k]} has shape {grid.shape}, must be 1-D: one time for each sample.")
+        if len(grid) < MIN_SAMPLES:
+            has = f"{names[k]} has {len(grid)} samples"
+            raise InvalidParameterError(f"{has}: a demonstration needs at least {MIN_SAMPLES}.")
         if len(grid) != len(sample):
             raise InvalidParameterError(
                 f"{names[k]} has {len(grid)} samples but positions[{k}] has {len(sample)}, of lengths "
@@ -127,15 +132,6 @@ def _samples(values: Any, name: str, drop: bool) -> NDArray[Any]:
         must = "(n_samples, n_outputs), or (n_samples,) for one output"
         raise InvalidParameterError(f"{name} has shape {array.shape}, must be {must}. {_ALONE}")
     return samples
-
-
-def _grid(values: Any, name: str, drop: bool) -> NDArray[Any]:
-    grid = _numbers(values, name, drop)
-    if grid.ndim != 1:
-        raise InvalidParameterError(f"{name} has shape {grid.shape}, must be 1-D: one time for each sample.")
-    if len(grid) < MIN_SAMPLES:
-        raise InvalidParameterError(f"{name} has {len(grid)} samples: a demonstration needs at least {MIN_SAMPLES}.")
-    return grid
 
 
 def _not_missing(grids: Arrays, samples: Arrays) -> list[NDArray[np.intp]]:

@@ -19,8 +19,15 @@ def read(path: Path, wanted: Wanted, variable: str | None = None) -> Arguments:
     """Read the format of `torch_pbd.data.load_demonstrations`, which describes the options."""
     checks.text(variable, "variable", optional=True)
     with path.open("rb") as file:
-        version_7_3 = file.read(10) == b"MATLAB 7.3"
-    content = _read_hdf5(path, wanted) if version_7_3 else _read_mat5(path, wanted)
+        is_hdf5 = file.read(10) == b"MATLAB 7.3"
+    if is_hdf5:
+        content = _read_hdf5(path, wanted)
+    else:
+        from scipy.io import loadmat, whosmat  # here: other formats do without
+
+        sizes = [8.0 * float(np.prod(shape, dtype=float)) for _, shape, kind in whosmat(path) if kind != "cell"]
+        wanted.require(sum(sizes), "it")
+        content = {name: value for name, value in loadmat(path, simplify_cells=True).items() if name[0] != "_"}
     name = variable or next((name for name in ("demos", "data") if name in content), None)
     if name not in content:
         what = f"variable {variable!r}" if variable else "variables demos or data"
@@ -64,14 +71,6 @@ def _signals(cell: Any, place: str, step: Any) -> dict[str, NDArray[Any]]:
     if "t" not in signals and step.size == 1 and step.dtype.kind in "iuf":
         signals["t"] = np.arange(n) * float(step.item())
     return signals
-
-
-def _read_mat5(path: Path, wanted: Wanted) -> dict[str, Any]:
-    from scipy.io import loadmat, whosmat
-
-    sizes = [(shape, kind) for _, shape, kind in whosmat(path)]
-    wanted.require(sum(8.0 * float(np.prod(shape, dtype=float)) for shape, kind in sizes if kind != "cell"), "it")
-    return {name: value for name, value in loadmat(path, simplify_cells=True).items() if name[0] != "_"}
 
 
 def _read_hdf5(path: Path, wanted: Wanted) -> dict[str, Any]:
