@@ -8,7 +8,7 @@ import numpy as np
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.data.alignment import comparable_scale, dtw_warps, interpolate, times_from_start, unit_phases
-from torch_pbd.data.poses import charted, mean_rotation, unwrapped, with_whole_rotation
+from torch_pbd.data.poses import charted, unwrapped, with_whole_rotation
 from torch_pbd.data.recordings import MIN_SAMPLES, as_recordings, as_texts, frozen, preview
 from torch_pbd.data.sampling import LEAST_SAMPLES, smoothing_spline, still
 from torch_pbd.data.units import ANGLES, LENGTHS, TIMES, check_unit, find_suspects
@@ -70,8 +70,7 @@ class Editing:
         reference = sets[0].rotation_reference
         if not all(np.array_equal(part.rotation_reference, reference) for part in sets):
             places, turns = ([a for part in sets for a in part.to_poses()[i]] for i in (0, 1))
-            reference = mean_rotation(times, turns)
-            positions = charted(times, places, turns, reference)
+            positions, reference = charted(times, places, turns)
         return sets[0]._replace(times, positions, anew=True, alignment=alignment, rotation_reference=reference)
 
     def to_poses(self) -> tuple[list[Floats], list[Floats]]:

@@ -56,26 +56,24 @@ def as_chart(times: Any, positions: Any, names: Any, units: Any, rotation: Any, 
         units = [units[i] for i in kept]
     own = as_units(units, len(kept))
     labels = as_names([*(names[i] for i in kept), *ROTATION], len(kept) + 3)
-    reference = mean_rotation(times, turns)
-    charts = charted(times, [position[:, kept] for position in positions], turns, reference)
-    return times, charts, labels, None if own is None else (*own, "rad", "rad", "rad"), frozen(reference)
-
-
-def mean_rotation(times: Sequence[Floats], quaternions: Sequence[Floats]) -> Floats:
-    """Frechet mean (4,) of recorded rotations (T_k, 4), each at evenly spaced phases."""
-    phases = np.linspace(0.0, 1.0, _N_PHASES)
-    pairs = zip(unit_phases(times), quaternions, strict=True)
-    together = np.concatenate([interpolate(own, continuous(turn), phases) for own, turn in pairs])
-    return mean(together / np.linalg.norm(together, axis=1, keepdims=True))
+    charts, reference = charted(times, [position[:, kept] for position in positions], turns)
+    return times, charts, labels, None if own is None else (*own, "rad", "rad", "rad"), reference
 
 
 def charted(
-    times: Sequence[Floats], places: Sequence[Floats], quaternions: Sequence[Floats], reference: Floats
-) -> list[Floats]:
-    """Outputs (T_k, p + 3) of poses with rotations in the chart around a reference; far rotations raise an error."""
+    times: Sequence[Floats], places: Sequence[Floats], quaternions: Sequence[Floats]
+) -> tuple[list[Floats], Floats]:
+    """Outputs (T_k, p + 3) of poses, with rotations in the chart around their Frechet mean, and that mean (4,).
+
+    The mean is of each recording at evenly spaced phases. Far rotations raise an error.
+    """
+    phases = np.linspace(0.0, 1.0, _N_PHASES)
+    pairs = zip(unit_phases(times), quaternions, strict=True)
+    together = np.concatenate([interpolate(own, continuous(turn), phases) for own, turn in pairs])
+    reference = frozen(mean(together / np.linalg.norm(together, axis=1, keepdims=True)))
     turns = list(map(Chart(reference).log, quaternions))
     _check_reach(times, turns)
-    return [np.column_stack([place, turn]) for place, turn in zip(places, turns, strict=True)]
+    return [np.column_stack([place, turn]) for place, turn in zip(places, turns, strict=True)], reference
 
 
 def as_columns(demonstrations: Any) -> tuple[tuple[str, ...], Sequence[Floats]]:
