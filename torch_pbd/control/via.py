@@ -93,7 +93,7 @@ def planned(
         known.append((at, change))
     times, changes = np.array([at for at, _ in known]), [change for _, change in known]
     # A controller that was conditioned may know its start or its end already.
-    phase, before = controller.reproduction_.phase, controller.covariance_.known_times()
+    phase, before = controller.reproduction_.phase, controller.covariance_._known.time
     pins = [at for at in pins if at not in times and not np.isclose(phase(np.array([at]))[0, 0], before).any()]
     bent = conditioned(controller, times, np.reshape(changes, (-1, controller.n_outputs_)), pins=pins)
     return bent, rest["goal"], rest["start"]

@@ -74,8 +74,8 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
 
     def _rows(self, time: Floats) -> tuple[Floats, Floats]:
         """Mean (n, d) and covariance (n, d, d) of each row under one component."""
-        law, rows = self._law(time)
-        return law.mean[rows].numpy(), law.marginal()[rows].numpy()
+        conditioned, rows = self._conditioned(time)
+        return conditioned.law.mean[rows].numpy(), conditioned.law.marginal()[rows].numpy()
 
     def _marginals(self, time: Floats) -> tuple[Floats, Floats]:
         """Mean (n, d) and covariance (n, d, d) of each row."""
@@ -146,8 +146,9 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         weight, parts = self._components(time)
         moments = []
         for model, own in parts:
-            law, rows = model._law(own)
-            moments.append((law.mean[rows].numpy(), law.covariance()[rows][:, :, rows].numpy()))
+            conditioned, rows = model._conditioned(own)
+            law = conditioned.law.at(rows)
+            moments.append((law.mean.numpy(), law.covariance().numpy()))
         return mixed(weight, moments, "kia,kjb->iajb")
 
     def sample_demonstrations(self, X: ArrayLike, n_samples: int = 1, random_state: Any = None) -> Floats:
@@ -167,7 +168,7 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         generator = checks.seed(random_state)
         time = self._times(X)
         require_much(
-            6 * 8.0 * n_samples * (len(time) + len(self.known_times())) * self.n_outputs_,
+            6 * 8.0 * n_samples * (len(time) + len(self._known.time)) * self.n_outputs_,
             what=f"n_samples={n_samples} at {len(time)} rows",
             remedy="Draw fewer at a time.",
         )
@@ -250,14 +251,14 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
     def _score(self, time: Floats, position: Floats) -> float:
         """Joint log density of one demonstration."""
         # A step that is known or repeated has no variance left, and so no density.
-        own, known = self._rounded(time), self._rounded(self.known_times())[self._known.exact.any(axis=1)]
+        own, known = self._rounded(time), self._rounded(self._known.time[self._known.exact.any(axis=1)])
         if len(np.unique(own)) < len(own) or np.isin(own, known).any():
             raise ValueError(
                 "X has a time twice in a demonstration, or one that is known without noise: leave it out, the movement "
                 "has no density there."
             )
-        law, rows = self._law(time)
-        return law.at(rows).log_density(torch.from_numpy(position), self.df_)
+        conditioned, rows = self._conditioned(time)
+        return conditioned.law.at(rows).log_density(torch.from_numpy(position), self.df_)
 
 
 def mixed(weight: Floats, moments: list[tuple[Floats, Floats]], outer: str) -> tuple[Floats, Floats]:

@@ -102,52 +102,40 @@ class JointNormal:
 
     def log_density(self, x: Float[Tensor, "n d"], df: float) -> float:
         """Log density of a movement under Student's t of this covariance, or the normal law for infinite ``df``."""
-        root, loadings = self.correlation_root, self.loadings
-
-        def solve_correlation(right: Float[Tensor, "n d s"]) -> Float[Tensor, "n d s"]:
-            return torch.cholesky_solve(right.transpose(0, 1), root).transpose(0, 1)
-
-        # The inner matrix S = R + U U' by Woodbury: inv(R) - inv(R) U inv(C) U' inv(R) of the capacitance
-        # C = I + U' inv(R) U; its determinant is det(R) det(C).
-        whitened = solve_correlation(loadings)
-        gram = torch.einsum("ndk,ndl->kl", loadings, whitened)
-        capacitance_root = torch.linalg.cholesky(symmetrize(gram) + torch.eye(len(gram)).to(gram))
-        n_alike = x.shape[1] // len(root)
-        along = n_alike * root.diagonal(dim1=1, dim2=2).log().sum()
-        log_det = 2.0 * (along + capacitance_root.diagonal().log().sum())
-        log_det = log_det + 2.0 * torch.linalg.slogdet(self.factor).logabsdet.sum()
-
-        def solve_inner(right: Float[Tensor, "n d s"]) -> Float[Tensor, "n d s"]:
-            cross = torch.einsum("ndk,nds->ks", whitened, right)
-            return solve_correlation(right) - whitened @ torch.cholesky_solve(cross, capacitance_root)
-
-        residual = torch.linalg.solve(self.factor, (x - self.mean)[..., None])
-        solved = solve_inner(residual)
-        square = (residual * solved).sum()
-        if self.explained.shape[-1]:
-            # Woodbury once more, for V V' that was taken off: it multiplies the determinant by that of
-            # I - V' inv(Sigma) V.
-            inner = torch.linalg.solve(self.factor, self.explained)
-            gram = torch.einsum("ndp,ndq->pq", inner, solve_inner(inner))
-            rest = torch.eye(len(gram)).to(gram) - symmetrize(gram)
-            rest_root = safe_cholesky(rest, name="what observations leave open of the movement")
-            cross = torch.einsum("ndp,nds->ps", inner, solved)
-            square = square + torch.linalg.solve_triangular(rest_root, cross, upper=False).square().sum()
-            log_det = log_det + 2.0 * rest_root.diagonal().log().sum()
-        half, size = 0.5 * float(log_det), x.numel()
+        # The residual and V, before A, and U, all whitened by R - W W'.
+        inner = torch.linalg.solve(self.factor, torch.cat([(x - self.mean)[..., None], self.explained], dim=2))
+        columns = torch.cat([self.loadings, inner], dim=2).transpose(0, 1)
+        root, size = self.correlation_root, x.numel()
+        whitened = torch.linalg.solve_triangular(root, columns, upper=False).flatten(0, 1)
+        loadings, rows = whitened.tensor_split([self.loadings.shape[2]], dim=1)
+        # Woodbury: with the capacitance C = I + U' U, the determinant of S = I + U U' is that of C, and the squares
+        # under inv(S) are those of what is left of a regression on U, (I - U inv(C) U') z, and of its coefficients.
+        capacitance = loadings.mT @ loadings
+        capacitance_root = torch.linalg.cholesky(capacitance + torch.eye(len(capacitance)).to(root))
+        weights = torch.cholesky_solve(loadings.mT @ rows, capacitance_root)
+        left = rows - loadings @ weights
+        gram = left.mT @ left + weights.mT @ weights
+        # Woodbury once more, for V V' that was taken off: its capacitance is I - V' inv(Sigma) V.
+        rest = torch.eye(len(gram) - 1).to(gram) - gram[1:, 1:]
+        rest_root = safe_cholesky(rest, name="what observations leave open of the movement")
+        cross = torch.linalg.solve_triangular(rest_root, gram[1:, :1], upper=False)
+        square = float(gram[0, 0] + cross.square().sum())
+        along = root.diagonal(dim1=1, dim2=2).log().sum() * (x.shape[1] // len(root))
+        half_log_det = float(along + torch.linalg.slogdet(self.factor).logabsdet.sum())
+        half_log_det += float(capacitance_root.diagonal().log().sum() + rest_root.diagonal().log().sum())
         if not math.isfinite(df):
-            return -0.5 * (float(square) + size * math.log(2.0 * math.pi)) - half
+            return -0.5 * (square + size * math.log(2.0 * math.pi)) - half_log_det
         # linalg.student_log_density is the same but takes a factor of the covariance, which is never formed here.
         constant = math.lgamma(0.5 * (df + size)) - math.lgamma(0.5 * df) - 0.5 * size * math.log((df - 2.0) * math.pi)
-        return constant - half - 0.5 * (df + size) * math.log1p(float(square) / (df - 2.0))
+        return constant - half_log_det - 0.5 * (df + size) * math.log1p(square / (df - 2.0))
 
 
 class Conditioned:
-    """Joint normal law given observations.
+    """Joint normal law given observations, ``law``.
 
     The observations at some of the steps have values (m, d), NaN where not given, and noise (m, d), the standard
-    deviation of their errors; they are of the outputs x or, with axes, of ``axes x``. Steps known whole and without
-    noise keep the structure of the law; all other entries are conditioned on one by one.
+    deviation of their errors; they are of ``axes x``. Steps known whole and without noise keep the structure of the
+    law; all other entries are conditioned on one by one.
 
     For exact steps E with ``L L' = R_EE``, let ``r = A_E^-1 (x_E - mean_E)`` and G = R_:E R_EE^-1. The loadings'
     coefficients c have the posterior precision ``P = I + U_E' R_EE^-1 U_E`` and mean ``P^-1 U_E' R_EE^-1 r``, and a
@@ -162,52 +150,43 @@ class Conditioned:
         steps: Int[Tensor, " m"],
         values: Float[Tensor, "m d"],
         noise: Float[Tensor, "m d"],
-        axes: Float[Tensor, "d d"] | None = None,
+        axes: Float[Tensor, "d d"],
     ) -> None:
         given = ~values.isnan()
         exact = (given & (noise == 0.0)).all(1)
         rows, entries = (given & ~exact[:, None]).nonzero().unbind(1)
-        self._entry_steps = steps[rows]
-        if len(rows):
-            self._entry_values, self._entry_noise = values[rows, entries], noise[rows, entries]
-            self._directions = (torch.eye(values.shape[1]).to(values) if axes is None else axes)[entries]
-        self._prior, self._steps, self._values = prior, steps[exact], values[exact]
-        if axes is not None:
-            self._values = torch.linalg.solve(axes, self._values.mT).mT
-        steps, n_loadings = self._steps, prior.loadings.shape[-1]
-        if not len(steps):
-            return
-        between = prior.prior_correlation[:, :, steps]
-        root = safe_cholesky(between[:, steps], name="the correlation of the steps given")
-        self._taken = torch.linalg.solve_triangular(root.mT, between, upper=True, left=False)
-        self._gain = torch.linalg.solve_triangular(root, self._taken, upper=False, left=False)
-        loadings = prior.loadings[steps].transpose(0, 1)  # (d, m, k)
+        self._prior, self._steps, self._entry_steps = prior, steps[exact], steps[rows]
+        self._directions, self._entry_noise = axes[entries], noise[rows, entries]
+
+        between = prior.prior_correlation[:, :, self._steps]
+        root = safe_cholesky(between[:, self._steps], name="the correlation of the steps given")
+        taken = torch.linalg.solve_triangular(root.mT, between, upper=True, left=False)
+        self._gain = torch.linalg.solve_triangular(root, taken, upper=False, left=False)
+        loadings = prior.loadings[self._steps].transpose(0, 1)  # (d, m, k)
         half = torch.linalg.solve_triangular(root, loadings, upper=False)
         self._whitened = torch.linalg.solve_triangular(root.mT, half, upper=True)
-        half = half.reshape(-1, n_loadings)
-        self._precision_root = torch.linalg.cholesky(half.mT @ half + torch.eye(n_loadings).to(loadings))
+        half = half.flatten(0, 1)
+        self._precision_root = torch.linalg.cholesky(half.mT @ half + torch.eye(half.shape[1]).to(half))
         self._open = prior.loadings - (self._gain @ loadings).transpose(0, 1)
+        left = torch.linalg.solve_triangular(self._precision_root.mT, self._open, upper=True, left=False)
+        # What is known has no variance, not even of rounding, which may be below zero.
+        law = replace(prior, factor=prior.factor.index_fill(0, self._steps, 0.0), loadings=left, taken=taken)
 
-    @cached_property
-    def law(self) -> JointNormal:
-        """Law of all steps; known ones have no variance left."""
-        law, steps = self._prior, self._steps
-        if len(steps):
-            law = replace(
-                law,
-                mean=law.mean + self._from_steps((self._values - law.mean[steps])[None])[0],
-                # What is known has no variance, not even of rounding, which may be below zero.
-                factor=law.factor.index_fill(0, steps, 0.0),
-                loadings=torch.linalg.solve_triangular(self._precision_root.mT, self._open, upper=True, left=False),
-                taken=self._taken,
-            )
-        if not len(self._entry_steps):
-            return law
-        columns, root = self._entries(law)
-        explained = torch.linalg.solve_triangular(root.mT, columns, upper=True, left=False)
-        error = self._entry_values - (self._directions * law.mean[self._entry_steps]).sum(1)
-        whitened = torch.linalg.solve_triangular(root, error[:, None], upper=False)[:, 0]
-        return replace(law, mean=law.mean + explained @ whitened, explained=explained)
+        # Covariances of all steps with the single entries, given the exact steps, and the root of the entries' own.
+        steps, projected = (
+            self._entry_steps,
+            torch.einsum("pc,pcd->pd", self._directions, law.factor[self._entry_steps]),
+        )
+        between = law.prior_correlation[:, :, steps] - taken @ taken[:, steps].mT
+        inner = between.transpose(0, 1) * projected.mT
+        inner = inner + left @ torch.einsum("pd,pdk->kp", projected, left[steps])
+        self._columns = law.factor @ inner
+        own = torch.einsum("pd,pdq->pq", self._directions, self._columns[steps]) + self._entry_noise.square().diag()
+        self._entry_root = safe_cholesky(symmetrize(own), name="the covariance of the entries given")
+        explained = torch.linalg.solve_triangular(self._entry_root.mT, self._columns, upper=True, left=False)
+        known = torch.linalg.solve(axes, values[exact].mT).mT
+        mean = self._passing(prior.mean[None], known, values[rows, entries])[0]
+        self.law = replace(law, mean=mean, explained=explained)
 
     def deviations(self, n_draws: int, normal: Callable[[tuple[int, int]], Tensor]) -> Float[Tensor, "s n d"]:
         """Draws of the deviation from the mean; ``normal`` gives standard normal numbers of a requested shape.
@@ -220,31 +199,18 @@ class Conditioned:
         along = prior.correlation_root @ normal((d * n, n_draws)).reshape(d, n, n_draws)
         inner = along.permute(2, 1, 0) + torch.einsum("ndk,ks->snd", prior.loadings, normal((n_loadings, n_draws)))
         drawn = torch.einsum("nab,snb->sna", prior.factor, inner)
-        if len(self._steps):
-            drawn = drawn - self._from_steps(drawn[:, self._steps])
-        if not len(self._entry_steps):
-            return drawn
-        columns, root = self._entries(self.law)
-        noise = self._entry_noise[:, None] * normal((len(self._entry_steps), n_draws))
-        errors = (self._directions * drawn[:, self._entry_steps]).sum(-1).mT + noise
-        return drawn - torch.einsum("ndp,ps->snd", columns, torch.cholesky_solve(errors, root))
+        noise = self._entry_noise[:, None] * normal((len(self._entry_noise), n_draws))
+        return self._passing(drawn, torch.zeros_like(prior.mean[self._steps]), -noise.mT)
 
-    def _from_steps(self, residual: Float[Tensor, "s m d"]) -> Float[Tensor, "s n d"]:
-        """Change of the mean by the residuals of steps that are known whole."""
-        factor = self._prior.factor
+    def _passing(
+        self, x: Float[Tensor, "s n d"], values: Float[Tensor, "m d"], entries: Float[Tensor, "*s p"]
+    ) -> Float[Tensor, "s n d"]:
+        """Movements moved, as the unconditioned law has them vary together, to these values of what was observed."""
+        factor, residual = self._prior.factor, values - x[:, self._steps]
         inner = torch.linalg.solve(factor[self._steps], residual[..., None])[..., 0]
         projected = torch.einsum("smd,dmk->sk", inner, self._whitened)
         common = torch.cholesky_solve(projected.mT, self._precision_root)
         change = (self._gain @ inner.permute(2, 1, 0)).permute(2, 1, 0) + (self._open @ common).permute(2, 0, 1)
-        return torch.einsum("nab,snb->sna", factor, change)
-
-    def _entries(self, law: JointNormal) -> tuple[Float[Tensor, "n d p"], Float[Tensor, "p p"]]:
-        """Covariances of all steps with the single entries, given the exact steps, and the root of the entries' own."""
-        steps, directions = self._entry_steps, self._directions
-        rows = torch.einsum("pc,pcd->pd", directions, law.factor[steps])
-        between = law.prior_correlation[:, :, steps] - law.taken @ law.taken[:, steps].mT
-        inner = between.transpose(0, 1) * rows.mT
-        inner = inner + law.loadings @ torch.einsum("pd,pdk->kp", rows, law.loadings[steps])
-        columns = law.factor @ inner
-        own = torch.einsum("pd,pdq->pq", directions, columns[steps]) + torch.diag(self._entry_noise.square())
-        return columns, safe_cholesky(symmetrize(own), name="the covariance of the entries given")
+        x = x + torch.einsum("nab,snb->sna", factor, change)
+        errors = entries - (self._directions * x[:, self._entry_steps]).sum(-1)
+        return x + torch.einsum("ndp,ps->snd", self._columns, torch.cholesky_solve(errors.mT, self._entry_root))

@@ -15,7 +15,7 @@ from torch_pbd.estimators.validation import fit_with_groups
 from torch_pbd.files.memory import require_much
 from torch_pbd.movement.base import MovementRegressor
 from torch_pbd.movement.joint import Conditioned, JointNormal
-from torch_pbd.movement.law import NOTHING, Recording, as_rows, check_arrays
+from torch_pbd.movement.law import Recording, as_rows, check_arrays
 
 _ARRAYS = ("reference.time", "reference.mean", "reference.covariance", "range", "deviation")  # names in model files
 
@@ -152,7 +152,7 @@ class KMPBaseline(MovementRegressor):
         """Reference whose nearest times are replaced by the via points; outputs that are not given stay."""
         if not len(self._known.time):
             return self._reference
-        axes = np.eye(self.n_outputs_) if self._axes is None else self._axes
+        axes = self._observed_axes()
         time, means = self._reference[0].copy(), self._reference[1] @ axes.T
         covariances = axes @ self._reference[2] @ axes.T
         # The paper gives a point without noise the variance 1e-6.
@@ -169,7 +169,7 @@ class KMPBaseline(MovementRegressor):
 
     def _conditioned(self, time: Floats) -> tuple[Conditioned, torch.Tensor]:
         # Via points are in the reference, so nothing is conditioned on.
-        union, rows, _ = self._union(time, NOTHING)
+        union, rows, none = self._union(time, time[:0])
         nothing = torch.empty(0, self.n_outputs_, dtype=torch.float64)
-        law = Conditioned(self._prior(union), nothing.new_empty(0, dtype=torch.long), nothing, nothing)
-        return law, torch.from_numpy(rows)
+        steps, axes = torch.from_numpy(none), torch.from_numpy(self._observed_axes())
+        return Conditioned(self._prior(union), steps, nothing, nothing, axes), torch.from_numpy(rows)

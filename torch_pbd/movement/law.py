@@ -90,6 +90,9 @@ class MovementLaw(BaseEstimator, ABC):
         """Times rounded so that those that count as one are equal."""
         return np.round(self._scaled(time), _DECIMALS)
 
+    def _observed_axes(self) -> Floats:
+        return np.eye(self.n_outputs_) if self._axes is None else self._axes
+
     def observed_along(self, axes: Floats | None) -> Self:
         """Copy whose :meth:`condition` takes rows and noise of ``axes @ y``, axes (d, d); None are the outputs."""
         copied = self._copy()
@@ -140,35 +143,26 @@ class MovementLaw(BaseEstimator, ABC):
             )
         return copied
 
-    def known_times(self) -> Floats:
-        """Times (m,) of the observations."""
-        return self._known.time
-
     def _times(self, X: ArrayLike) -> Floats:
         """Times (n,) of query rows."""
         return np.ascontiguousarray(checked_queries(self, X)[:, 0])
 
-    def _union(self, time: Floats, known: Known) -> tuple[Floats, NDArray[np.intp], NDArray[np.intp]]:
+    def _union(self, time: Floats, known: Floats) -> tuple[Floats, NDArray[np.intp], NDArray[np.intp]]:
         """Distinct times of queries and observations, and the indices of both among them."""
-        both = np.concatenate([time, known.time])
+        both = np.concatenate([time, known])
         _, first, index = np.unique(self._rounded(both), return_index=True, return_inverse=True)
         return both[first], index[: len(time)], index[len(time) :]
 
     def _conditioned(self, time: Floats) -> tuple[Conditioned, Tensor]:
         """Law at query and observation times given the observations, and the indices of ``time`` among them."""
-        union, rows, places = self._union(time, self._known)
+        union, rows, places = self._union(time, self._known.time)
         law, index = self._prior_with(union)
         return self._given(law, index[places]), torch.from_numpy(index[rows])
 
     def _given(self, law: JointNormal, places: NDArray[np.intp]) -> Conditioned:
         """Law given the observations, which are at these indices among its steps."""
         value, noise = (torch.from_numpy(part.reshape(-1, self.n_outputs_)) for part in self._known[1:])
-        axes = None if self._axes is None else torch.from_numpy(self._axes)
-        return Conditioned(law, torch.from_numpy(places), value, noise, axes)
-
-    def _law(self, time: Floats) -> tuple[JointNormal, Tensor]:
-        conditioned, rows = self._conditioned(time)
-        return conditioned.law, rows
+        return Conditioned(law, torch.from_numpy(places), value, noise, torch.from_numpy(self._observed_axes()))
 
     def _prior_with(self, time: Floats) -> tuple[JointNormal, NDArray[np.intp]]:
         """Joint law at increasing times, possibly at others too, and their indices in it.
