@@ -37,17 +37,14 @@ class TimeKernel(nn.Module):
     _weights: Tensor
     _left: Tensor
 
-    def __init__(
-        self, kernel: str, grid: Tensor, scales: Tensor, fine: Tensor, nugget: Tensor, residual: Tensor, share: Tensor
-    ) -> None:
+    def __init__(self, kernel: str, **buffers: Tensor) -> None:
         super().__init__()
         self.kernel = kernel
-        buffers = {"grid": grid, "scales": scales, "fine": fine, "nugget": nugget, "residual": residual, "share": share}
         for name, value in buffers.items():
             self.register_buffer(name, value)
         # Kernel weights of the smooth parts of all residuals, and the remainders of these: (d, T, K).
-        rows, own = residual.permute(2, 1, 0), self._correlation(grid, grid)
-        root = safe_cholesky(own + torch.diag_embed(nugget), name="the time kernel")
+        rows, own = self.residual.permute(2, 1, 0), self._correlation(self.grid, self.grid)
+        root = safe_cholesky(own + torch.diag_embed(self.nugget), name="the time kernel")
         self.register_buffer("_weights", torch.cholesky_solve(rows, root), persistent=False)
         self.register_buffer("_left", rows - own @ self._weights, persistent=False)
 
@@ -60,7 +57,7 @@ class TimeKernel(nn.Module):
 
     def loadings(self, time: Float[Tensor, " n"]) -> Float[Tensor, "n d K"]:
         """Residuals of the demonstrations at any times: smooth parts by the kernel, remainders linear between steps."""
-        left = _interpolated(self.grid, self._left.mT.flatten(0, 1), time).reshape(*self._left.mT.shape[:2], -1)
+        left = _interpolated(self.grid, self._left.mT, time)
         return (self._correlation(time, self.grid) @ self._weights + left.mT).transpose(0, 1)
 
     def _correlation(self, time: Tensor, other: Tensor) -> Float[Tensor, "d n m"]:
@@ -88,9 +85,9 @@ def smooth_correlation(
 
 
 def _interpolated(
-    grid: Float[Tensor, " T"], values: Float[Tensor, "c T"], time: Float[Tensor, " n"]
-) -> Float[Tensor, "c n"]:
+    grid: Float[Tensor, " T"], values: Float[Tensor, "*c T"], time: Float[Tensor, " n"]
+) -> Float[Tensor, "*c n"]:
     """Values at other times, linear between steps and constant beyond them."""
     right = torch.searchsorted(grid, time.contiguous()).clamp(1, len(grid) - 1)
     weight = ((time - grid[right - 1]) / (grid[right] - grid[right - 1])).clamp(0.0, 1.0)
-    return torch.lerp(values[:, right - 1], values[:, right], weight)
+    return torch.lerp(values[..., right - 1], values[..., right], weight)

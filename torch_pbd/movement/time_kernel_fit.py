@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -26,16 +27,12 @@ _ROUNDS = 3  # alternations of nuggets and length scale, which depend on each ot
 _SHARES = (1.0, 0.9, 0.75, 0.6, 0.45, 0.3, 0.2, 0.1, 0.05)  # candidate weights of the kernel in the correlation
 
 
-class Scales(NamedTuple):
-    """Length scales of the slow part and of the tremor, and the tremor's weight at a usual step, 0 without one."""
-
-    slow: float
-    fine: float
-    weight: float
+# Length scales of the slow part and of the tremor, and the tremor's weight at a usual step, 0 without one.
+Scales = tuple[float, float, float]
 
 
 class Found(NamedTuple):
-    """Likeliest scales and nugget, shared by all steps."""
+    """Likeliest scales of an output, and its nugget, shared by all steps."""
 
     log_likelihood: float
     scales: Scales
@@ -54,124 +51,127 @@ def fit_time_kernel(
     Each output's residuals, given the outputs before it, were divided by its ``deviation``. The likeliest of the
     ``kernels`` is taken, and for ``share`` None the share under which demonstrations left out in turn are likeliest.
     """
-    outputs = [_unit_rms(part) for part in residual.split(1, dim=2)]
-    usual = [_usual_steps(part) for part in outputs]
-    found = {name: [_search(grid, *each, name) for each in zip(outputs, usual, strict=True)] for name in kernels}
+    parts, tremor = map(_unit_rms, residual.unbind(2)), deviation.median(0).values / deviation
+    outputs = [_Output(grid, *part) for part in zip(parts, tremor.mT, strict=True)]
+    found = {name: [each.search(each.usual_steps(), name) for each in outputs] for name in kernels}
     kernel = max(kernels, key=lambda name: sum(each.log_likelihood for each in found[name]))
     shares = _SHARES if share is None else (share,)
-    tremor = deviation.median(0).values / deviation
     fitted = []
-    for part, steps, size, single in zip(outputs, usual, tremor.mT, found[kernel], strict=True):
+    for output, single in zip(outputs, found[kernel], strict=True):
         # A tremor that makes the residuals of one output likelier need not do so jointly with those of the others.
-        results = [_fit_output(grid, part, steps, size, kernel, single, is_sum) for is_sum in (False, True)]
+        results = [output.fit(kernel, single, is_sum) for is_sum in (False, True)]
         fitted.append(max(results, key=lambda result: _left_out(result, shares)[0]))
     stacked = {name: torch.cat([getattr(each, name) for each in fitted]) for name in ("scales", "fine", "nugget")}
     filled = torch.cat([each.residual for each in fitted], dim=2)
-    whole = TimeKernel(kernel, grid, **stacked, residual=filled, share=grid.new_ones(()))
+    whole = TimeKernel(kernel, grid=grid, **stacked, residual=filled, share=grid.new_ones(()))
     whole.share.fill_(_left_out(whole, shares)[1])
     return whole
 
 
-def _usual_steps(residual: Float[Tensor, "K T 1"]) -> Bool[Tensor, " T"]:
-    """Steps at which residuals are of about the median size."""
-    sizes = residual.square().nanmean((0, 2)).sqrt()
-    return (sizes > sizes.nanmedian() / _USUAL) & (sizes < sizes.nanmedian() * _USUAL)
+@dataclass(frozen=True)
+class _Output:
+    """Whitened residuals of one output, NaN where missing, and the size of a tremor at each step."""
 
+    grid: Float[Tensor, " T"]
+    residual: Float[Tensor, "K T"]
+    tremor: Float[Tensor, " T"]
 
-def _fit_output(
-    grid: Tensor,
-    residual: Float[Tensor, "K T 1"],
-    usual: Bool[Tensor, " T"],
-    tremor: Float[Tensor, " T"],
-    kernel: str,
-    single: Found,
-    is_sum: bool,
-) -> TimeKernel:
-    """Scales and nuggets of one output in alternation, starting from the likeliest scales of the usual steps."""
-    found = _with_tremor(grid, residual, usual, kernel, single, tremor) if is_sum else single
-    unit = _candidates(grid, tremor, [found.scales], kernel)[0]
-    nugget = _step_nuggets(unit, residual, _LEAST)
-    for _ in range(_ROUNDS):
-        smooth = nugget <= _SMOOTH
-        steps = smooth if 2 * smooth.sum() >= len(grid) else nugget <= nugget.median()
-        before, single = found, _search(grid, residual, steps, kernel, single.scales.slow)
-        found = _with_tremor(grid, residual, steps, kernel, single, tremor) if is_sum else single
-        if found[1:] == before[1:]:
-            break
-        unit = _candidates(grid, tremor, [found.scales], kernel)[0]
-        nugget = _step_nuggets(unit, residual, min(found.nugget, 0.1 * _SMOOTH))
-    filled = residual.clone()
-    for k, own in enumerate(residual):  # the kernel's expectation where there were no samples
-        seen = ~own.isnan().any(1)
-        root = safe_cholesky(unit[seen][:, seen] + torch.diag(nugget[seen]), name="the time kernel")
-        filled[k, ~seen] = unit[~seen][:, seen] @ torch.cholesky_solve(own[seen], root)
-    scales, fine = _tensors(tremor, [found.scales])
-    return TimeKernel(kernel, grid, scales, fine, nugget[None], filled, grid.new_ones(()))
+    def fit(self, kernel: str, single: Found, is_sum: bool) -> TimeKernel:
+        """Scales and nuggets in alternation, starting from the likeliest length scale of the usual steps."""
+        found = self._with_tremor(self.usual_steps(), kernel, single) if is_sum else single
+        unit = self._candidates([found.scales], kernel)[0]
+        nugget = self._step_nuggets(unit, _LEAST)
+        for _ in range(_ROUNDS):
+            smooth = nugget <= _SMOOTH
+            steps = smooth if 2 * smooth.sum() >= len(self.grid) else nugget <= nugget.median()
+            before, single = found, self.search(steps, kernel, near=single.scales[0])
+            found = self._with_tremor(steps, kernel, single) if is_sum else single
+            if found[1:] == before[1:]:
+                break
+            unit = self._candidates([found.scales], kernel)[0]
+            nugget = self._step_nuggets(unit, min(found.nugget, 0.1 * _SMOOTH))
+        filled = self.residual.clone()
+        for own in filled:  # the kernel's expectation where there were no samples
+            seen = ~own.isnan()
+            root = safe_cholesky(unit[seen][:, seen] + torch.diag(nugget[seen]), name="the time kernel")
+            own[~seen] = (unit[~seen][:, seen] @ torch.cholesky_solve(own[seen, None], root))[:, 0]
+        lengths, fine = self._parts([found.scales])
+        parts = {"grid": self.grid, "scales": lengths, "fine": fine, "nugget": nugget[None]}
+        return TimeKernel(kernel, **parts, residual=filled[..., None], share=nugget.new_ones(()))
 
+    def usual_steps(self) -> Bool[Tensor, " T"]:
+        """Steps at which residuals are of about the median size."""
+        sizes = self.residual.square().nanmean(0).sqrt()
+        return (sizes > sizes.nanmedian() / _USUAL) & (sizes < sizes.nanmedian() * _USUAL)
 
-def _tensors(
-    tremor: Float[Tensor, " n"], scales: Sequence[Scales]
-) -> tuple[Float[Tensor, "b 2"], Float[Tensor, "b n"]]:
-    """Length scales, and variances of the tremor over those of the slow part."""
-    whole = tremor.new_tensor(scales)
-    weight = whole[:, 2:]
-    return whole[:, :2], weight / (1.0 - weight) * tremor.square()
+    def search(self, steps: Bool[Tensor, " T"], kernel: str, near: float | None = None) -> Found:
+        """Likeliest length scale at some steps, among all or among those near a previous one."""
+        lengths = [length for length in _LENGTHS if near is None or near / _NEAR <= length <= near * _NEAR]
+        return self._likeliest(steps, kernel, [(length, length, 0.0) for length in lengths], _NUGGETS)
 
+    def _with_tremor(self, steps: Bool[Tensor, " T"], kernel: str, single: Found) -> Found:
+        """Likeliest of one length scale and of two on either side of it, where a tremor replaces part of the nugget."""
+        length = single.scales[0]
+        pairs = [
+            (slow, slow / ratio, weight)
+            for ratio in _RATIOS
+            for slow in _LENGTHS
+            if length <= slow <= ratio * length
+            for weight in _FINE_WEIGHTS
+        ]
+        nuggets = [nugget for nugget in _NUGGETS if nugget <= single.nugget]
+        return self._likeliest(steps, kernel, [single.scales, *pairs], nuggets)
 
-def _candidates(
-    time: Float[Tensor, " n"], tremor: Float[Tensor, " n"], scales: Sequence[Scales], kernel: str
-) -> Float[Tensor, "b n n"]:
-    lengths, fine = _tensors(tremor, scales)
-    return smooth_correlation(time, time, lengths, fine, fine, kernel)
+    def _likeliest(
+        self, steps: Bool[Tensor, " T"], kernel: str, candidates: Sequence[Scales], nuggets: Sequence[float]
+    ) -> Found:
+        """Highest log likelihood of ``(1 - eta) K + eta I`` at some steps, with its scales and shared nugget eta."""
+        steps = steps if 2 * int(steps.sum()) >= len(steps) else torch.ones_like(steps)
+        groups = _by_pattern(_unit_rms(self.residual[:, steps]))
+        unit = self._candidates(candidates, kernel, steps)
+        values = []
+        for nugget in nuggets:
+            whole = (1.0 - nugget) * unit + nugget * torch.eye(unit.shape[1]).to(unit)
+            each = [_log_likelihood(whole[:, seen][:, :, seen], rows) for seen, rows in groups]
+            values.append(torch.stack(each).sum(0))
+        table = torch.stack(values)
+        best = int(table.argmax())
+        return Found(float(table.max()), candidates[best % len(candidates)], nuggets[best // len(candidates)])
 
+    def _parts(self, scales: Sequence[Scales]) -> tuple[Float[Tensor, "b 2"], Float[Tensor, "b T"]]:
+        """Length scales, and variances of the tremor over those of the slow part."""
+        whole = self.tremor.new_tensor(scales)
+        weight = whole[:, 2:]
+        return whole[:, :2], weight / (1.0 - weight) * self.tremor.square()
 
-def _search(
-    grid: Tensor, residual: Float[Tensor, "K T 1"], steps: Bool[Tensor, " T"], kernel: str, near: float | None = None
-) -> Found:
-    """Likeliest length scale at some steps of an output, among all or among those near a previous one."""
-    lengths = [length for length in _LENGTHS if near is None or near / _NEAR <= length <= near * _NEAR]
-    candidates = [Scales(length, length, 0.0) for length in lengths]
-    return _likeliest(grid, residual, steps, kernel, candidates, _NUGGETS, torch.zeros_like(grid))
+    def _candidates(
+        self, scales: Sequence[Scales], kernel: str, steps: Tensor | slice = slice(None)
+    ) -> Float[Tensor, "b n n"]:
+        """Correlation between some of the steps, without nuggets, for each of the scales."""
+        (lengths, fine), time = self._parts(scales), self.grid[steps]
+        return smooth_correlation(time, time, lengths, fine[:, steps], fine[:, steps], kernel)
 
+    def _step_nuggets(self, unit: Float[Tensor, "T T"], least: float) -> Float[Tensor, " T"]:
+        """Nugget of each step, by expectation maximization over the independent parts of the residuals.
 
-def _with_tremor(
-    grid: Tensor, residual: Tensor, steps: Tensor, kernel: str, single: Found, tremor: Float[Tensor, " T"]
-) -> Found:
-    """Likeliest of one length scale and of two on either side of it, where a tremor replaces part of the nugget."""
-    length = single.scales.slow
-    candidates = [
-        Scales(slow, slow / ratio, weight)
-        for ratio in _RATIOS
-        for slow in _LENGTHS
-        if length <= slow <= ratio * length
-        for weight in _FINE_WEIGHTS
-    ]
-    nuggets = [nugget for nugget in _NUGGETS if nugget <= single.nugget]
-    pairs = [_likeliest(grid, residual, steps, kernel, candidates, nuggets, tremor)] if candidates else []
-    return max([single, *pairs])
-
-
-def _likeliest(
-    grid: Tensor,
-    residual: Float[Tensor, "K T 1"],
-    steps: Bool[Tensor, " T"],
-    kernel: str,
-    candidates: Sequence[Scales],
-    nuggets: Sequence[float],
-    tremor: Float[Tensor, " T"],
-) -> Found:
-    """Highest log likelihood of ``(1 - eta) K + eta I``, with its scales and shared nugget eta."""
-    steps = steps if 2 * int(steps.sum()) >= len(grid) else torch.ones_like(steps)
-    groups, time = _by_pattern(_unit_rms(residual[:, steps])), grid[steps]
-    unit = _candidates(time, tremor[steps], candidates, kernel)
-    values = []
-    for nugget in nuggets:
-        whole = (1.0 - nugget) * unit + nugget * torch.eye(len(time)).to(time)
-        each = [_log_likelihood(whole[:, seen][:, :, seen], rows) for seen, rows in groups]
-        values.append(torch.stack(each).sum(0))
-    table = torch.stack(values)
-    best = int(table.argmax())
-    return Found(float(table.max()), candidates[best % len(candidates)], nuggets[best // len(candidates)])
+        With ``S = K + diag e`` and ``a = S^-1 z`` an independent part has the mean ``e_t a_t`` and the variance
+        ``e_t - e_t^2 [S^-1]_tt``; their second moment is the next e_t.
+        """
+        groups, nugget = _by_pattern(self.residual), torch.full_like(self.grid, max(least, _FIRST))
+        for _ in range(_N_STEPS):
+            moment, count = torch.zeros_like(nugget), torch.zeros_like(nugget)
+            for seen, rows in groups:
+                own = nugget[seen]
+                root = safe_cholesky(unit[seen][:, seen] + torch.diag(own), name="the time kernel")
+                inverse = torch.cholesky_inverse(root)
+                second = (own[:, None] * (inverse @ rows)).square().sum(1)
+                moment[seen] += second + rows.shape[1] * (own - own.square() * inverse.diagonal())
+                count[seen] += rows.shape[1]
+            new = torch.where(count > 0, moment / count.clamp_min(1.0), nugget).clamp(least, _MOST)
+            change, nugget = (new / nugget).log().abs().max(), new
+            if float(change) < _TOLERANCE:
+                break
+        return nugget
 
 
 def _log_likelihood(covariance: Float[Tensor, "b n n"], rows: Float[Tensor, "n s"]) -> Float[Tensor, " b"]:
@@ -180,32 +180,6 @@ def _log_likelihood(covariance: Float[Tensor, "b n n"], rows: Float[Tensor, "n s
     whitened = torch.linalg.solve_triangular(root, rows.expand(len(root), *rows.shape), upper=False)
     value = -0.5 * whitened.square().sum((1, 2)) - rows.shape[1] * root.diagonal(dim1=1, dim2=2).log().sum(1)
     return torch.where((info == 0) & torch.isfinite(value), value, -torch.inf)
-
-
-def _step_nuggets(unit: Float[Tensor, "T T"], residual: Float[Tensor, "K T d"], least: float) -> Float[Tensor, " T"]:
-    """Nugget of each step, by expectation maximization over the independent parts of the residuals.
-
-    With ``S = K + diag e`` and ``a = S^-1 z`` an independent part has the mean ``e_t a_t`` and the variance
-    ``e_t - e_t^2 [S^-1]_tt``; their second moment is the next e_t.
-    """
-    groups = _by_pattern(residual)
-    nugget = torch.full_like(unit[0], max(least, _FIRST))
-    for _ in range(_N_STEPS):
-        moment, count = torch.zeros_like(nugget), torch.zeros_like(nugget)
-        for seen, rows in groups:
-            own = nugget[seen]
-            inverse = torch.cholesky_inverse(
-                safe_cholesky(unit[seen][:, seen] + torch.diag(own), name="the time kernel")
-            )
-            second = (own[:, None] * (inverse @ rows)).square().sum(1)
-            moment[seen] += second + rows.shape[1] * (own - own.square() * inverse.diagonal())
-            count[seen] += rows.shape[1]
-        new = torch.where(count > 0, moment / count.clamp_min(1.0), nugget).clamp(least, _MOST)
-        change = (new / nugget).log().abs().max()
-        nugget = new
-        if float(change) < _TOLERANCE:
-            break
-    return nugget
 
 
 def _left_out(kernel: TimeKernel, shares: Sequence[float]) -> tuple[float, float]:
@@ -252,16 +226,10 @@ def _left_out(kernel: TimeKernel, shares: Sequence[float]) -> tuple[float, float
     return max(values) - unit_log_det, shares[values.index(max(values))]
 
 
-def _by_pattern(residual: Float[Tensor, "K T d"]) -> list[tuple[Tensor, Tensor]]:
+def _by_pattern(residual: Float[Tensor, "K T"]) -> list[tuple[Tensor, Tensor]]:
     """Steps that demonstrations have, and the series of those that have the same: ((T,), (n, series)) each."""
-    seen = ~residual.isnan().any(2)
-    patterns, index = torch.unique(seen, dim=0, return_inverse=True)
-    pairs = []
-    for number, pattern in enumerate(patterns):
-        if bool(pattern.any()):
-            rows = residual[index == number][:, pattern]
-            pairs.append((pattern, rows.permute(1, 0, 2).reshape(int(pattern.sum()), -1)))
-    return pairs
+    patterns, index = torch.unique(~residual.isnan(), dim=0, return_inverse=True)
+    return [(seen, residual[index == number][:, seen].mT) for number, seen in enumerate(patterns) if bool(seen.any())]
 
 
 def _unit_rms(residual: Tensor) -> Tensor:
