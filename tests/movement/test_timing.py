@@ -123,8 +123,9 @@ def test_the_posterior_of_a_model_is_that_of_a_dense_grid(model):
             duration, pace = timing.location.numpy() + timing.root.numpy() @ [one, two]
             if np.exp(duration) < X[-1]:
                 continue
-            plain = model._over_phase(torch.tensor(np.exp(duration)), torch.tensor(pace))
-            phases = paced(np.append(X, ahead) / np.exp(duration), pace)
+            at = np.append(X, ahead)
+            [(plain, phases)] = model._over_phase(at, torch.tensor([np.exp(duration)]), torch.tensor([pace]))
+            np.testing.assert_allclose(phases, paced(at / np.exp(duration), pace))
             mean, covariance = plain.predict_joint(phases[: len(X), np.newaxis])
             own = (covariance.reshape(12, 12) + 0.02**2 * np.eye(12))[np.ix_(given, given)]
             law = multivariate_t(mean.ravel()[given], own * (plain.df_ - 2.0) / plain.df_, df=plain.df_)

@@ -11,10 +11,11 @@ from torch import Tensor
 from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.console import say
+from torch_pbd.data.alignment import interpolate
 from torch_pbd.linalg import safe_cholesky, student_log_density
 from torch_pbd.movement.base import MovementRegressor
-from torch_pbd.movement.law import Known, Recording
-from torch_pbd.movement.timing import Likelihood, Nodes, Timing, phase_of, register, time_of
+from torch_pbd.movement.law import Known, Recording, check_arrays
+from torch_pbd.movement.timing import Likelihood, Nodes, Timing, phases, register, time_of
 
 _FEWEST = 4  # demonstrations needed to estimate how duration and pace vary together
 _N_STEPS = 100  # steps of a curve whose pace is estimated
@@ -35,7 +36,7 @@ class TimedMovement(MovementRegressor):
     timing: str
     timing_: str
     timing_gain_: float
-    _timing: Timing | None = None
+    _timing: Any = None  # the Timing of movements; None where the law is over the input itself
     _nodes: Nodes  # posterior of duration and pace
 
     def predict_phase(self, X: ArrayLike) -> tuple[Floats, Floats]:
@@ -59,9 +60,9 @@ class TimedMovement(MovementRegressor):
         time = self._times(X)
         if self._timing is None:
             raise checks.refusal(self.timing, "timing", "'warp' or 'auto' where phases are to be estimated")
-        weight, phases = self._nodes.weight.numpy(), self._nodes.phases(torch.from_numpy(time)).numpy()
-        mean = weight @ phases
-        return mean, np.sqrt(weight @ np.square(phases - mean))
+        weight, phase = self._nodes.weight.numpy(), phases(torch.from_numpy(time), *self._nodes[:2]).numpy()
+        mean = weight @ phase
+        return mean, np.sqrt(weight @ np.square(phase - mean))
 
     def condition(self, X: ArrayLike, y: ArrayLike, *, noise_scale: ArrayLike = 0.0) -> Self:
         """Fitted copy, conditioned on passing y at X; see ``MovementRegressor.condition``.
@@ -70,50 +71,45 @@ class TimedMovement(MovementRegressor):
         """
         copied = super().condition(X, y, noise_scale=noise_scale)
         if copied._timing is not None:
-            known = copied._known
-            copied._nodes = copied._timing.posterior(copied._log_likelihood(known), copied._last(known.time))
+            copied._locate()
         return copied
 
+    def _locate(self) -> None:
+        known = self._known
+        self._nodes = self._timing.posterior(self._log_likelihood(known), self._last(known.time))
+
     def _components(self, time: Floats) -> tuple[Floats, list[tuple[Self, Floats]]]:
-        """Weights of durations and paces, with the law over phase and the phases of these times for each."""
         if self._timing is None:
             return super()._components(time)
-        nodes = self._nodes
-        laws = [self._over_phase(*node) for node in zip(nodes.duration, nodes.pace, strict=True)]
-        phases = nodes.phases(torch.from_numpy(time)).numpy()
-        return nodes.weight.numpy(), list(zip(laws, phases, strict=True))
+        duration, pace, weight, _ = self._nodes
+        return weight.numpy(), self._over_phase(time, duration, pace)
 
-    def _over_phase(self, duration: Tensor, pace: Tensor) -> Self:
-        """Law over phase, of a movement of this duration and pace."""
-        law = copy.copy(self)
-        law._timing = None
-        phase = phase_of(torch.from_numpy(self._known.time) / duration, pace).numpy()
-        law._known = self._known._replace(time=phase)
-        return law
+    def _over_phase(self, time: Floats, duration: Tensor, pace: Tensor) -> list[tuple[Self, Floats]]:
+        """Laws over phase of movements of these durations and paces (b,), each with its phases at these times (n,)."""
+        own, known = (phases(torch.from_numpy(part), duration, pace).numpy() for part in (time, self._known.time))
+        laws = [copy.copy(self) for _ in known]
+        for law, phase in zip(laws, known, strict=True):
+            law._timing, law._known = None, self._known._replace(time=phase)
+        return list(zip(laws, own, strict=True))
 
     def _score(self, time: Floats, position: Floats) -> float:
-        """Log of the mean density over the posterior, restricted to movements that still run."""
         if self._timing is None:
             return super()._score(time, position)
-        whole = self._known.and_also(time, position, np.zeros_like(position))
         before = self._log_likelihood(self._known)
 
         def exact(duration: Tensor, pace: Tensor) -> Tensor:
-            laws = [self._over_phase(*node) for node in zip(duration, pace, strict=True)]
-            phases = phase_of(torch.from_numpy(time) / duration[:, None], pace[:, None]).numpy()
-            scores = [law._score(own, position) for law, own in zip(laws, phases, strict=True)]
+            scores = [law._score(own, position) for law, own in self._over_phase(time, duration, pace)]
             return before(duration, pace) + torch.tensor(scores, dtype=torch.float64)
 
-        return self._log_ratio(self._log_likelihood(whole), before, self._last(whole.time), exact)
+        return self._log_density(self._known.and_also(time, position, np.zeros_like(position)), exact)
 
-    def _log_ratio(self, above: Likelihood, below: Likelihood, last: float, exact: Likelihood | None = None) -> float:
-        """Log of the ratio of two mean likelihoods of movements that run at the time ``last``."""
-        assert self._timing is not None
-        over = self._timing.posterior(above, last, exact=exact).log_integral
-        return over - self._timing.posterior(below, last).log_integral
+    def _log_density(self, whole: Known, exact: Likelihood | None = None) -> float:
+        """Log density of what goes beyond the observations: its mean over movements that run to the end of it."""
+        last = self._last(whole.time)
+        over = self._timing.posterior(self._log_likelihood(whole), last, exact=exact).log_integral
+        return float(over - self._timing.posterior(self._log_likelihood(self._known), last).log_integral)
 
     def _last(self, time: Floats) -> float:
-        assert self._timing is not None
         last, longest = float(time.max(initial=0.0)), self._timing.longest()
         if last > (1.0 + _SLACK) * longest:
             raise ValueError(
@@ -124,24 +120,22 @@ class TimedMovement(MovementRegressor):
 
     def _log_likelihood(self, known: Known) -> Likelihood:
         """Log density of what is known, at samples a twelfth of a movement apart, given durations and paces."""
-        assert self._timing is not None
         rows = _spread(known.time, float(self._timing.location[0].exp()))
         time, value, noise = (torch.from_numpy(each[rows]) for each in known)
         given = ~value.flatten().isnan()
         if not bool(given.any()):
-            return _flat
+            return lambda duration, _: torch.zeros_like(duration)
 
         def log_likelihood(duration: Tensor, pace: Tensor) -> Tensor:
-            phases = phase_of(time / duration[:, None], pace[:, None])
-            law = self._prior(phases.flatten().numpy())
-            steps = torch.arange(phases.numel()).reshape(phases.shape)
-            mean = law.mean[steps].flatten(1)[:, given]
-            size = steps.shape[1] * law.mean.shape[1]
+            law = self._prior(phases(time, duration, pace).flatten().numpy())
+            mean = law.mean.reshape(len(duration), -1)
+            steps, size = torch.arange(len(law.mean)).reshape(len(duration), -1), mean.shape[1]
             whole = torch.stack([law.at(own).covariance().reshape(size, size) for own in steps])
             whole = whole[:, given][:, :, given] + torch.diag(noise.square().flatten()[given])
             root = safe_cholesky(whole, name="the covariance of what is known")
-            degrees = torch.full_like(duration, self.df_)
-            return student_log_density(value.flatten()[given] - mean, root, degrees)
+            return student_log_density(
+                value.flatten()[given] - mean[:, given], root, torch.full_like(duration, self.df_)
+            )
 
         return log_likelihood
 
@@ -157,11 +151,13 @@ class TimedMovement(MovementRegressor):
                 "record more, or take timing='none'."
             )
         if self.timing == "auto":
-            self.timing_gain_ = self._gain(recordings)
-            self.timing_ = "warp" if self.timing_gain_ > 0.0 else "none"
+            self._choose_timing(self._gain(recordings))
             if getattr(self.regressor, "verbose", 0):
                 say(f"timing: a warp gains {self.timing_gain_:.3g} nats a step, taken is {self.timing_!r}")
         return self._phased(recordings, self.timing_)
+
+    def _choose_timing(self, gain: float) -> None:
+        self.timing_gain_, self.timing_ = gain, "warp" if gain > 0.0 else "none"
 
     def _phased(self, recordings: list[Recording], timing: str) -> list[Recording]:
         """Recordings over phase, after their timing was learned."""
@@ -171,10 +167,7 @@ class TimedMovement(MovementRegressor):
         durations, pace = torch.from_numpy(duration), torch.zeros(len(duration), dtype=torch.float64)
         if timing == "warp":
             grid = np.linspace(0.0, 1.0, _N_STEPS)
-            curves = np.stack([
-                np.stack([np.interp(grid * time[-1], time, column) for column in position.T], axis=1)
-                for time, position in recordings
-            ])  # fmt: skip
+            curves = np.stack([interpolate(time, position, grid * time[-1]) for time, position in recordings])
             size = curves.std((0, 1))
             pace = register(torch.from_numpy(curves / np.where(size > 0.0, size, 1.0)))
         self._set_timing(Timing.learn(durations, pace) if timing == "warp" else Timing.even(durations))
@@ -188,7 +181,8 @@ class TimedMovement(MovementRegressor):
         return phased
 
     def _set_timing(self, timing: Timing) -> None:
-        self._timing, self._nodes = timing, timing.posterior(_flat)
+        self._timing = timing
+        self._locate()
 
     def _gain(self, recordings: list[Recording]) -> float:
         """Gain of a warp over the mean duration at an even pace, in nats per step of left-out demonstrations.
@@ -199,15 +193,13 @@ class TimedMovement(MovementRegressor):
         gain, n_steps = 0.0, 0
         for fold in range(n_folds):
             train = [recording for number, recording in enumerate(recordings) if number % n_folds != fold]
-            models: list[Any] = [copy.copy(self), copy.copy(self)]
-            warp, none = models
-            for model, timing in zip(models, ("warp", "none"), strict=True):
+            warp, none = copy.copy(self), copy.copy(self)
+            for model, timing in ((warp, "warp"), (none, "none")):
                 model._fit_law(model._phased(train, timing))
             for time, position in recordings[fold::n_folds]:
                 seen = time <= min(mean, warp._timing.longest(), none._timing.longest())
                 known = Known(time[seen], position[seen], np.zeros_like(position[seen]))
-                own, other = (m._log_ratio(m._log_likelihood(known), _flat, time[seen][-1]) for m in models)
-                gain += own - other
+                gain += warp._log_density(known) - none._log_density(known)
                 n_steps += len(_spread(known.time, float(mean)))
         return gain / n_steps
 
@@ -215,30 +207,25 @@ class TimedMovement(MovementRegressor):
         """Arrays of the timing for model files; none where timing is "none"."""
         if self._timing is None:
             return {}
-        arrays = {name: np.asarray(getattr(self._timing, name)) for name in ("location", "root", "df")}
-        arrays |= {"gain": np.array(self.timing_gain_)} if self.timing == "auto" else {}
-        return {f"timing_{name}": array for name, array in arrays.items()}
+        numbers = vars(self._timing) | ({"gain": self.timing_gain_} if self.timing == "auto" else {})
+        return {f"timing_{name}": np.asarray(value) for name, value in numbers.items()}
 
     def _restore_timing(self, arrays: dict[str, Floats]) -> dict[str, Floats]:
         """Restore the timing from the arrays of a model file, and return the others."""
         self.timing_ = self.timing
         if self.timing == "none":
             return arrays
-        shapes: dict[str, tuple[int, ...]] = {"location": (2,), "root": (2, 2), "df": ()}
-        shapes |= {"gain": ()} if self.timing == "auto" else {}
-        own = {n: checks.array(arrays.get(f"timing_{n}"), f"timing_{n}", shape).copy() for n, shape in shapes.items()}
-        root = own["root"]
-        checks.require((root >= 0.0) | ~np.eye(2, dtype=bool), root, "timing_root", "at least 0 on its diagonal")
+        own = {name.removeprefix("timing_"): arrays[name] for name in arrays if name.startswith("timing_")}
+        shapes: dict[str, tuple[int | str, ...]] = {"location": (2,), "root": (2, 2), "df": ()}
+        check_arrays(own, shapes | ({"gain": ()} if self.timing == "auto" else {}))
+        checks.require(
+            own["root"].diagonal() >= 0.0, own["root"].diagonal(), "the diagonal of timing_root", "at least 0"
+        )
         df = checks.number(float(own["df"]), "timing_df", above=0.0)
-        self._set_timing(Timing(torch.from_numpy(own["location"]), torch.from_numpy(root), df))
-        if "gain" in own:
-            self.timing_gain_ = float(own["gain"])
-            self.timing_ = "warp" if self.timing_gain_ > 0.0 else "none"
+        self._set_timing(Timing(torch.tensor(own["location"]), torch.tensor(own["root"]), df))
+        if self.timing == "auto":
+            self._choose_timing(float(own["gain"]))
         return {name: array for name, array in arrays.items() if not name.startswith("timing_")}
-
-
-def _flat(duration: Tensor, pace: Tensor) -> Tensor:
-    return torch.zeros_like(duration)
 
 
 def _spread(time: Floats, duration: float) -> NDArray[np.intp]:
@@ -257,8 +244,7 @@ def n_grid_steps(recordings: list[Recording]) -> int:
 def sampled(recording: Recording, grid: Floats) -> Floats:
     """Positions of a recording at the steps of a grid, linear between samples; NaN where no sample is near."""
     time, position = recording
-    columns = [np.interp(grid, time, column) for column in position.T]
     right = np.clip(np.searchsorted(time, grid), 1, len(time) - 1)
     nearest = np.minimum(np.abs(grid - time[right - 1]), np.abs(time[right] - grid))
     seen = nearest <= _GAP * np.median(np.diff(time))
-    return np.where(seen[:, np.newaxis], np.stack(columns, axis=1), np.nan)
+    return np.where(seen[:, np.newaxis], interpolate(time, position, grid), np.nan)

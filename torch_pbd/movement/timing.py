@@ -39,9 +39,10 @@ class Nodes(NamedTuple):
     weight: Float[Tensor, " b"]
     log_integral: float
 
-    def phases(self, time: Float[Tensor, " n"]) -> Float[Tensor, "b n"]:
-        """Phases at these times under each node."""
-        return phase_of(time / self.duration[:, None], self.pace[:, None])
+
+def phases(time: Float[Tensor, " n"], duration: Float[Tensor, " b"], pace: Float[Tensor, " b"]) -> Float[Tensor, "b n"]:
+    """Phases at these times, for each of some durations and paces."""
+    return phase_of(time / duration[:, None], pace[:, None])
 
 
 def phase_of(time: Tensor, pace: Tensor) -> Tensor:

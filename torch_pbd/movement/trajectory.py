@@ -215,15 +215,16 @@ class TrajectoryRegressor(TimedMovement):
     def _uncertainty(self, time: Floats) -> tuple[Floats, Floats, Floats]:
         mean, (type1, type2) = self._rows(time)[0], self.regressor_.predict_uncertainty(time[:, np.newaxis])
         if not self._is_regressor:
-            union, rows, places = self._union(time, self._known)
+            union, rows, places = self._union(time, self._known.time)
             own = self.regressor_.predict_uncertainty(union[:, np.newaxis]).type2
             law = self._given(self._joint(union, self._regressor_rows(union)[0], own), places).law
             type2 = law.marginal()[torch.from_numpy(rows)].numpy()
         return mean, type1, type2
 
     def _arrays(self) -> dict[str, Floats]:
-        names = {key.rpartition(".")[2]: key for key in self.module_.state_dict() if not key.startswith("marginals.")}
-        return {name: self.module_.state_dict()[key].numpy() for name, key in names.items()} | self._timing_arrays()
+        state = self.module_.state_dict().items()
+        own = {key.rpartition(".")[2]: value.numpy() for key, value in state if not key.startswith("marginals.")}
+        return own | self._timing_arrays()
 
     def _restore(self, arrays: dict[str, Floats]) -> None:
         arrays = self._restore_timing(arrays)
@@ -237,20 +238,19 @@ class TrajectoryRegressor(TimedMovement):
             checks.require(arrays[name] > 0.0, arrays[name], name, "above 0")
         checks.require(np.diff(arrays["grid"]) > 0.0, arrays["grid"][1:], "grid", "increasing")
         checks.number(float(arrays["share"]), "share", above=0.0, most=1.0)
-        *own, shift, scale = (torch.tensor(arrays[name]) for name in shapes)
-        self._set_law(TimeKernel(self.time_kernel_, *own), float(shift), float(scale))
+        low, width = (float(arrays.pop(name)) for name in ("x_shift", "x_scale"))
+        own = {name: torch.tensor(array) for name, array in arrays.items()}
+        self._set_law(TimeKernel(self.time_kernel_, **own), low, width)
 
     def _prior(self, time: Floats) -> JointNormal:
         return self._joint(time, *self._regressor_rows(time))
 
     def _joint(self, time: Floats, mean: Floats, covariance: Floats) -> JointNormal:
-        with torch.inference_mode():
-            return self.module_.joint(*map(torch.from_numpy, (time, mean, covariance)))
+        return self.module_.joint(*map(torch.from_numpy, (time, mean, covariance)))
 
     def _between(self, time: Floats, other: Floats) -> Tensor:
         kernel, scaled = self.module_.time_kernel, (torch.from_numpy(self._scaled(part)) for part in (time, other))
-        with torch.inference_mode():
-            return kernel.share * kernel.correlation(*scaled)
+        return kernel.share * kernel.correlation(*scaled)
 
     def _rows(self, time: Floats) -> tuple[Floats, Floats]:
         return self._regressor_rows(time) if self._is_regressor else super()._rows(time)
