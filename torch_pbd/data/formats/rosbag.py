@@ -1,10 +1,11 @@
 """Recordings of ROS: rosbag2 (SQLite or MCAP) and ROS 1 bags; one topic, a sample a message."""
 
 from array import array
-from collections.abc import Callable, Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
-from itertools import chain, pairwise
+from itertools import chain
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ _PARTS |= dict.fromkeys(
     ["geometry_msgs/msg/PoseWithCovarianceStamped", "nav_msgs/msg/Odometry"], ("Pose", "pose.pose.")
 )
 _JOINTS, _TRANSFORMS = "sensor_msgs/msg/JointState", ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+Stretches = dict[int, tuple["array[int]", "array[float]"]]
 _KINDS = (*_PARTS, _JOINTS, *_TRANSFORMS)
 # Message types of topics that may label the demonstrations.
 _MARKS = {f"std_msgs/msg/{sign}Int{bits}" for sign in ("", "U") for bits in (8, 16, 32, 64)}
@@ -64,16 +66,15 @@ def read(path: Path, wanted: Wanted, topic: str | None = None, child: str | None
         signals = {field: tuple(own) for field, own in columns.items()} | {"time": ("time",)}
         chosen = replace(wanted, demo=None).choose(signals, time="time", outputs=next(iter(signals)))
         getters = [columns[field][name] for (field, _), name in zip(chosen.outputs, chosen.names, strict=True)]
-        # Arrays of numbers take 8 bytes for each, where lists of tuples take 60.
-        numbers, stamps, coordinates = array("i"), array("q"), array("d")
+        # Stamps and outputs of each stretch. Arrays of numbers take 8 bytes for each, where lists of tuples take 60.
+        stretches: Stretches = defaultdict(lambda: (array("q"), array("d")))
         for number, stamp, message in chain([first], messages):
-            numbers.append(number)
+            stamps, outputs = stretches[number]
             stamps.append(stamp)
-            coordinates.extend([get(message) for get, _ in getters])
-    arrays = {"time": np.frombuffer(stamps, "M8[ns]"), "y": np.frombuffer(coordinates).reshape(len(stamps), -1)}
+            outputs.extend([get(message) for get, _ in getters])
     return wanted.read_each(
         chosen._replace(outputs=[("y", i) for i in range(len(getters))]),
-        _recordings(arrays, numbers, marks, wanted.demo),
+        _recordings(stretches, marks, wanted.demo),
         units=[unit for _, unit in getters],
         frame=getattr(getattr(first[2], "header", None), "frame_id", "") or None,
     )
@@ -115,22 +116,18 @@ def _messages(reader: Any, topic: str, demo: str | None, marks: list[Any]) -> It
             marks.append(message.data)
 
 
-def _recordings(
-    signals: dict[str, NDArray[Any]], numbers: Sequence[int], marks: list[Any], demo: str | None
-) -> list[dict[str, NDArray[Any]]]:
+def _recordings(found: Stretches, marks: list[Any], demo: str | None) -> list[dict[str, NDArray[Any]]]:
     """Signals of each stretch that is a demonstration, in order of their stamps: drivers send some twice or late."""
-    heads = np.flatnonzero(np.diff(numbers, prepend=-2))
-    found = {numbers[a]: slice(a, b) for a, b in pairwise([*heads.tolist(), len(numbers)])}
     if demo is not None:
-        marked = {k: rows for k, rows in found.items() if k >= 0 and not _is_between(marks[k], marks)}
-        found = {k: rows for k, rows in marked.items() if rows.stop - rows.start >= MIN_SAMPLES}
+        marked = {k: own for k, own in found.items() if k >= 0 and not _is_between(marks[k], marks)}
+        found = {k: own for k, own in marked.items() if len(own[0]) >= MIN_SAMPLES}
         if not found:
             raise ValueError(f"demo={demo!r} marks no demonstration: its values are {preview(marks)}.")
         if lost := len(marked) - len(found):
             checks.warn(f"Left out, with less than two messages: {lost} of {len(marked)} demonstrations by {demo!r}.")
     recordings, n_late, n_repeated = [], 0, 0
-    for rows in found.values():
-        own = {name: values[rows] for name, values in signals.items()}
+    for stamps, outputs in found.values():
+        own = {"time": np.frombuffer(stamps, "M8[ns]"), "y": np.frombuffer(outputs).reshape(len(stamps), -1)}
         if not (np.diff(own["time"]) > np.timedelta64(0)).all():
             order = np.argsort(own["time"], kind="stable")
             repeated = np.r_[False, np.diff(own["time"][order]) == np.timedelta64(0)]
@@ -138,7 +135,8 @@ def _recordings(
             own = {name: values[order[~repeated]] for name, values in own.items()}
         recordings.append(own)
     if n_late or n_repeated:
-        late = f"{n_late} of {len(numbers)} messages came after later ones, and are put in order"
+        n_all = sum(len(stamps) for stamps, _ in found.values())
+        late = f"{n_late} of {n_all} messages came after later ones, and are put in order"
         checks.warn(f"{late}; {n_repeated} repeat the stamp of another one, of which the first is kept.")
     return recordings
 
