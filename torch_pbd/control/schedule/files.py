@@ -135,15 +135,8 @@ def _encode_npz(header: Labels, arrays: Arrays) -> bytes:
 
 def _decode_npz(content: bytes) -> Iterator[Any]:
     members = read_members(content, MAX_BYTES, remedy="Resample the schedule at a lower rate.")
-    header = read_array("header", members.pop("header")) if "header" in members else np.array("{}")
-    if header.dtype.kind != "U" or header.ndim:
-        raise ValueError(f"header is an array of {header.dtype}, must be one text.")
-    yield _parse_json(str(header))
-    arrays = {name: read_array(name, member) for name, member in members.items()}
-    for name, array in arrays.items():
-        if array.dtype.str != "<f8":
-            raise ValueError(f"{name} is an array of {array.dtype}, must be one of float64.")
-    yield arrays
+    yield _parse_json(str(read_array("header", members.pop("header")) if "header" in members else "{}"))
+    yield {name: read_array(name, member) for name, member in members.items()}
 
 
 def _columns(names: Sequence[str] | None, sizes: Mapping[str, int], between: str = "][") -> list[Column]:
