@@ -79,28 +79,30 @@ public:
         for (std::size_t b = 0; b < channels_.size(); ++b) {
             const Block block = blocks<N, M>[b];
             Channel& channel = channels_[b];
-            Vector<N> measured = force - bias_;
-            for (double& part : measured) part -= std::clamp(part, -deadband_[b], deadband_[b]);
-            const double length = linalg::norm(measured, block);
-            if (!(length < infinity)) {
+            Vector<N> acting = force - bias_;
+            for (double& part : acting) part -= std::clamp(part, -deadband_[b], deadband_[b]);
+            const double length = linalg::norm(acting, block);
+            if (length < infinity) {
+                if (length > limit_[b]) {
+                    acting = (limit_[b] / length) * acting;
+                    faults |= kForceSaturated;
+                }
+                const double change = linalg::norm(acting - push, block), most = rate_limit_[b] * step;
+                if (change > most) {
+                    acting = push + (most / change) * (acting - push);
+                    faults |= kForceRateLimited;
+                }
+                channel.n_lost = 0;
+            } else {
                 is_lost = ++channel.n_lost > hold_ticks_ || is_lost;
-                set(block, std::max(0.0, 1.0 - channel.n_lost / (hold_ticks_ + 1.0)) * median(channel.recent));
+                acting = std::max(0.0, 1.0 - channel.n_lost / (hold_ticks_ + 1.0)) * median(channel.recent);
                 faults |= kForceInvalid;
-                continue;
             }
-            if (length > limit_[b]) {
-                measured = (limit_[b] / length) * measured;
-                faults |= kForceSaturated;
+            std::copy(acting.begin() + block.begin, acting.begin() + block.end, push.begin() + block.begin);
+            if (channel.n_lost == 0) {
+                channel.newest = (channel.newest + 1) % kRecent;
+                channel.recent[channel.newest] = push;
             }
-            const double change = linalg::norm(measured - push, block), most = rate_limit_[b] * step;
-            if (change > most) {
-                measured = push + (most / change) * (measured - push);
-                faults |= kForceRateLimited;
-            }
-            set(block, measured);
-            channel.n_lost = 0;
-            channel.newest = (channel.newest + 1) % kRecent;
-            channel.recent[channel.newest] = push;
         }
         return faults;
     }
@@ -116,10 +118,6 @@ private:
         std::array<Vector<N>, kRecent> recent{};
         std::size_t newest = 0;
     };
-
-    void set(Block block, const Vector<N>& values) {
-        std::copy(values.begin() + block.begin, values.begin() + block.end, push.begin() + block.begin);
-    }
 
     static Vector<N> median(const std::array<Vector<N>, kRecent>& recent) {
         Vector<N> middle;

@@ -73,15 +73,6 @@ Vector<N> product(const Matrix<N>& a, const Vector<N>& x) {
     return result;
 }
 
-/// A' x, without the transpose.
-template <std::size_t N>
-Vector<N> transposed_product(const Matrix<N>& a, const Vector<N>& x) {
-    Vector<N> result{};
-    for (std::size_t i = 0; i < N; ++i)
-        for (std::size_t j = 0; j < N; ++j) result[j] += a[i][j] * x[i];
-    return result;
-}
-
 template <std::size_t N>
 Matrix<N> transposed(const Matrix<N>& a) {
     Matrix<N> result;
@@ -97,6 +88,12 @@ Matrix<N> product(const Matrix<N>& a, const Matrix<N>& b) {
         for (std::size_t k = 0; k < N; ++k)
             for (std::size_t j = 0; j < N; ++j) result[i][j] += a[i][k] * b[k][j];
     return result;
+}
+
+/// A' A.
+template <std::size_t N>
+Matrix<N> squared(const Matrix<N>& a) {
+    return product(transposed(a), a);
 }
 
 /// Largest entry of a matrix, in size.

@@ -224,24 +224,25 @@ Vector<N> along_modes(const Modes<N>& modes, double scale, const Drive<N>& drive
 template <std::size_t N>
 Vector<N> coupled(const Modes<N>& modes, const Matrix<N>& stiffness, const Matrix<N>& damping, const Drive<N>& drive,
                   Vector<N>& velocity) {
+    using linalg::product;
     const double step = drive.step;
-    const Matrix<N> k = linalg::transposed(stiffness), d = linalg::transposed(damping);
+    const Matrix<N> inverse = linalg::squared(modes.shapes);  // of the mass
+    const Matrix<N> k = product(inverse, stiffness), d = product(inverse, damping);
+    const Vector<N> f = product(inverse, drive.push + product(damping, drive.desired_velocity));
     Matrix<2 * N + 1> rate{};
-    const auto set_column = [&](std::size_t column, double factor, const Vector<N>& force) {
-        const Vector<N> acceleration = linalg::transposed_product(modes.shapes, linalg::product(modes.shapes, force));
-        for (std::size_t i = 0; i < N; ++i) rate[N + i][column] = factor * acceleration[i];
-    };
     Vector<2 * N + 1> start{};
     start[2 * N] = 1.0;
     for (std::size_t i = 0; i < N; ++i) {
         rate[i][N + i] = 1.0;
-        set_column(i, -step * step, k[i]);
-        set_column(N + i, -step, d[i]);
+        for (std::size_t j = 0; j < N; ++j) {
+            rate[N + i][j] = -step * step * k[i][j];
+            rate[N + i][N + j] = -step * d[i][j];
+        }
+        rate[N + i][2 * N] = step * step * f[i];
         start[i] = drive.off[i];
         start[N + i] = step * velocity[i];
     }
-    set_column(2 * N, step * step, drive.push + linalg::product(damping, drive.desired_velocity));
-    const Vector<2 * N + 1> change = linalg::product(linalg::expm1(rate), start);
+    const Vector<2 * N + 1> change = product(linalg::expm1(rate), start);
     Vector<N> move;
     for (std::size_t i = 0; i < N; ++i) {
         move[i] = change[i];

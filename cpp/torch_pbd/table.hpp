@@ -97,13 +97,13 @@ public:
     /// Force that causes an acceleration.
     Vector<N> forced(const Vector<N>& acceleration, std::size_t row) const {
         if (one_mass_ > 0.0) return one_mass_ * acceleration;
-        return linalg::transposed_product(modes_[row].tells, linalg::product(modes_[row].tells, acceleration));
+        return linalg::product(linalg::squared(modes_[row].tells), acceleration);
     }
 
     /// Acceleration that a force causes.
     Vector<N> accelerated(const Vector<N>& force, std::size_t row) const {
         if (one_mass_ > 0.0) return (1.0 / one_mass_) * force;
-        return linalg::transposed_product(modes_[row].shapes, linalg::product(modes_[row].shapes, force));
+        return linalg::product(linalg::squared(modes_[row].shapes), force);
     }
 
     /// Largest norm, over the rows, of each block of D^-1, times what acts on the blocks: velocities of positions and
