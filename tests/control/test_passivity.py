@@ -250,9 +250,9 @@ def test_parameters_are_checked(make, words):
 @pytest.mark.parametrize(
     ("alpha", "lowest", "words"),
     [
-        (5.0, 100.0, "below 4 /s"),
+        (5.0, 100.0, "below 4: leave it None"),
         (0.0, 100.0, "alpha is 0.0 1/s, must be a finite number above 0"),
-        (1.0, 0.0, "must be above zero for a rate limit"),
+        (1.0, 0.0, "must be a finite number above 0: a rate limit needs it"),
     ],
 )
 def test_a_rate_limit_needs_damping_and_stiffness(alpha, lowest, words):

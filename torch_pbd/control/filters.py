@@ -5,11 +5,8 @@ their invariant allows. Damping steps by the same share. State and gains are tho
 ``M a = u - K y - D v`` held over a tick, y the deviation from the desired position.
 
 Where a desired orientation turns, deviations of rotation turn with it, and so do the retained gains: their change is
-held back in the tool frame. A varying inertia, as of an arm, changes the kinetic energy by ``1/2 v' dM v`` from tick to
-tick at the same velocity; the filters document how they treat that.
-
-The simulation runs them on tensors (..., d) of many rollouts, the real-time loop on NumPy's arrays of one robot: the
-arithmetic is the same, of functions that have the same names in both.
+held back in the tool frame. The arithmetic is the same on tensors (..., d) of many rollouts, in the simulation, and on
+NumPy's arrays of one robot, in the real-time loop: of functions that have the same names in both.
 """
 
 import sys
@@ -76,16 +73,11 @@ class RateLimit(StiffnessFilter):
         limit = float(linalg.eigvalsh(inverse @ damping @ inverse.mT).min())
         softest = float(linalg.eigvalsh(stiffness).min())
         alpha = 0.5 * limit if self.alpha is None else self.alpha
-        if not 0.0 < alpha < limit:
-            raise InvalidParameterError(
-                f"alpha is {alpha:g} /s, must be above 0 and below {limit:g} /s, the smallest damping over mass of the "
-                "schedule: leave it None, or damp more."
-            )
-        if softest <= 0.0:
-            raise InvalidParameterError(
-                f"the smallest eigenvalue of stiffness is {softest:g} N/m, must be above zero for a rate limit: a free "
-                "axis has no equilibrium."
-            )
+        remedy = "leave it None, or damp more: it is below the smallest damping over mass of the schedule"
+        checks.number(alpha, "alpha", above=0.0, below=limit, unit="1/s", remedy=remedy)
+        remedy = "a rate limit needs it, for a free axis has no equilibrium"
+        checks.number(softest, "the smallest eigenvalue of stiffness", above=0.0, unit="N/m", remedy=remedy)
+        return _ActiveRateLimit(alpha, change)
         return _ActiveRateLimit(alpha, change)
 
 

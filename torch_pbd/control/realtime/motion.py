@@ -202,10 +202,9 @@ class FilteredGains:
             mass = mass[0]
         # In the simulation a run stops where the damping does not pay for what these add; a robot must not, half way.
         if isinstance(wanted, RateLimit) and (mass.ndim == 3 or len(table.blocks) == 2):
-            raise InvalidParameterError(
-                "stiffness_filter is a RateLimit, but the schedule has poses, or a mass that varies: it cannot know "
-                "before the loop whether the damping pays for what turns or grows. Take EnergyTank()."
-            )
+            must = "an EnergyTank for poses and masses that vary"
+            remedy = "before the loop nobody knows whether the damping pays for what turns or grows"
+            raise checks.refusal(wanted, "stiffness_filter", must, remedy)
         self._table = table
         self._fresh = wanted.start(table.stiffness, table.damping, mass, _tick_change)
 
