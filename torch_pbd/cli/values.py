@@ -1,7 +1,4 @@
-"""Values of options: YAML without surprises, types in words, and suggested remedies.
-
-YAML is that of plain values only, with the scalars of version 1.2 and each key once, bounded in size and depth.
-"""
+"""Values of options: YAML of plain values without surprises, types in words, and suggested remedies."""
 
 import difflib
 import json

@@ -32,11 +32,10 @@ class Run:
 
     controller: DMPController
     planned: Schedule
-    schedule: Schedule
-    """The planned one, or the same with the inertia of an arm."""
+    schedule: Schedule  # the planned one, or the same with the inertia of an arm
     unpushed: Rollout
+    # By kind: "force" along the first output, or for poses "force" and "torque" in each axis of the tool.
     pushes: Mapping[str, list[Rollout]]
-    """Runs by kind: "force" along the first output, or for poses "force" and "torque" in each axis of the tool."""
     report: StabilityReport
 
     def along(self, values: Floats, kind: style.Kind) -> Floats:

@@ -1,7 +1,4 @@
-"""Models on synthetic data of known truth: the paper's simulation (Section IV-E), and the demo's tunnel.
-
-Table I and Figures 1 to 3 are on data drawn from eq. (14). The demo is the main job, without arguments.
-"""
+"""Models on synthetic data of known truth: the paper's simulation (Table I, Figures 1 to 3), and the demo's tunnel."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial

@@ -19,10 +19,7 @@ Answer = dict[str, Any]
 
 
 class Worker:
-    """The page's side of the process, which is begun again if it ends.
-
-    ``deliver`` is called with the tab, None for all, and each answer to it, from another thread.
-    """
+    """The page's side of the process, which is begun again if it ends; ``deliver`` hands answers to a tab, or all."""
 
     def __init__(self, deliver: Callable[[int | None, Answer], object]) -> None:
         self._deliver = deliver

@@ -193,13 +193,13 @@ def draw_blocks(schedule: Any, bands: Sequence[Axes]) -> None:
 def _along_axes(schedule: Any, matrices: Floats, block: slice) -> tuple[style.Kind, Any, list[str], Sequence[str]]:
     """Kind of a block, values (n, k) of matrices (n, d, d) along its axes, and labels and colours of these.
 
-    Axes are the outputs or, for poses, the principal axes, that of the least value first; they have the same name and
-    dash in both blocks.
+    Axes are the outputs or, for poses, the principal axes, that of the least value first.
     """
     kind, own = style.kind_of(schedule.units, block), matrices[:, block, block]
     if len(schedule.blocks) == 1:
         names = [f"{kind.where} {name}" for name in style.schedule_names(schedule)]
         return kind, np.diagonal(own, axis1=1, axis2=2), names, style.SERIES
+    # One name is one dash in both blocks.
     in_space = schedule.position.shape[1] == 3
     others = ["middle axis", "freest axis"] if in_space else [f"axis {i + 2}" for i in range(own.shape[1] - 1)]
     return kind, np.linalg.eigvalsh(own), ["most precise axis", *others], [style.MODEL]

@@ -142,19 +142,18 @@ class _Writer:
         if n_space == 3 and moving.orientation is not None:
             tool, quaternion = f"{entity}/tool", np.roll(moving.orientation, -1, axis=1)
             columns = self._rerun.Transform3D.columns(translation=moving.position, quaternion=quaternion)
-            self._stream.send_columns(tool, indexes=[self._index(moving.time)], columns=columns)
+            index = self._rerun.TimeColumn("time", duration=moving.time)
+            self._stream.send_columns(tool, indexes=[index], columns=columns)
             extent = float(np.linalg.norm(np.ptp(moving.position, axis=0)))
             self._stream.log(tool, self._rerun.TransformAxes3D(axis_length=0.1 * (extent or 1.0)), static=True)
 
     def _curves(self, root: str, label: str, time: Floats, values: Floats, names: Sequence[str], color: str) -> None:
+        index = self._rerun.TimeColumn("time", duration=time)
         for name, column in zip(names, np.transpose(values), strict=True):
             entity = self._rerun.new_entity_path([part for part in (*root.split("/"), name, label) if part])
             self._stream.log(entity, self._rerun.SeriesLines(colors=[_rgb(color)], names=[label or name]), static=True)
             columns = self._rerun.Scalars.columns(scalars=column)
-            self._stream.send_columns(entity, indexes=[self._index(time)], columns=columns)
-
-    def _index(self, time: Floats) -> Any:
-        return self._rerun.TimeColumn("time", duration=np.asarray(time))
+            self._stream.send_columns(entity, indexes=[index], columns=columns)
 
 
 def _in_seconds(demonstrations: Any) -> Any:

@@ -111,11 +111,8 @@ def schedule_names(schedule: Any) -> Sequence[str]:
 
 
 def kind_of(unit: str | None, block: slice) -> Kind:
-    """Words and units of a block of outputs: of positions in this unit, of which joints are pushed by torques.
-
-    A block that does not begin with the first output is a rotation.
-    """
-    if block.start:
+    """Words and units of the block of a rotation, or of positions in this unit, of which joints feel torques."""
+    if block.start:  # after positions
         return ROTATION
     if unit == "rad":
         return Kind(block, "about", "torque", "Nm", "rad", 1.0, "Nm/rad")
