@@ -28,34 +28,28 @@ if TYPE_CHECKING:
     from torch_pbd.control.stiffness import StiffnessLaw as StiffnessLaw
     from torch_pbd.control.stiffness import lqt as lqt
 
-# Where each name lives: the controller of the control loop must load without torch.
-_HOMES = {
-    "AdmittancePlant": "simulation.plant",
-    "DMP": "primitive.dmp",
-    "DMPController": "controller",
-    "EnergyTank": "filters",
-    "ForceSensor": "simulation.sensor",
-    "MotionLimits": "planning",
-    "PositionLoop": "simulation.sensor",
-    "RateLimit": "filters",
-    "RealTimeAdmittance": "realtime",
-    "Rollout": "simulation.rollout",
-    "RolloutSummary": "simulation.rollouts",
-    "RotationLimits": "stiffness",
-    "Schedule": "schedule",
-    "StabilityReport": "stability.report",
-    "StiffnessLaw": "stiffness",
-    "TickStatus": "realtime",
-    "Tunnel": "simulation.walls",
-    "certify": "stability.certify",
-    "damping_from_stiffness": "matrices",
-    "lqt": "stiffness",
-    "required_damping_ratio": "matrices",
-    "simulate": "simulation.run",
-    "simulate_many": "simulation.run",
+# What each module has for users: the controller of the control loop must load without torch.
+_MODULES = {
+    "controller": ["DMPController"],
+    "filters": ["EnergyTank", "RateLimit"],
+    "matrices": ["damping_from_stiffness", "required_damping_ratio"],
+    "planning": ["MotionLimits"],
+    "primitive.dmp": ["DMP"],
+    "realtime": ["RealTimeAdmittance", "TickStatus"],
+    "schedule": ["Schedule"],
+    "simulation.plant": ["AdmittancePlant"],
+    "simulation.rollout": ["Rollout"],
+    "simulation.rollouts": ["RolloutSummary"],
+    "simulation.run": ["simulate", "simulate_many"],
+    "simulation.sensor": ["ForceSensor", "PositionLoop"],
+    "simulation.walls": ["Tunnel"],
+    "stability.certify": ["certify"],
+    "stability.report": ["StabilityReport"],
+    "stiffness": ["RotationLimits", "StiffnessLaw", "lqt"],
 }
+_HOMES = {name: module for module, names in _MODULES.items() for name in names}
 
-__all__ = [*_HOMES]
+__all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str) -> Any:

@@ -1,6 +1,7 @@
 """Dynamic movement primitives, eq. (16) to (18), and their safe adaptation to other starts and goals."""
 
 from contextlib import suppress
+from dataclasses import KW_ONLY, dataclass
 from itertools import pairwise
 from typing import Any, Literal, final
 
@@ -27,6 +28,7 @@ _WATCHED = 256  # points of the path that are checked against the hull
 
 
 @final
+@dataclass(eq=False)
 class DMP:
     """Spring-damper towards a goal with a forcing term over a phase that encodes the movement.
 
@@ -81,30 +83,23 @@ class DMP:
     (True, 1.0)
     """
 
-    def __init__(
-        self,
-        alpha: float = 25.0,
-        beta: float | None = None,
-        gamma: float = 0.7,
-        tau: float = 1.0,
-        *,
-        duration: float | None = None,
-        gate: Gate = "time",
-        adaptation: Adaptation = "safe",
-    ) -> None:
-        self.alpha = checks.number(alpha, "alpha", above=0.0)
-        self.beta = self.alpha / 4.0 if beta is None else checks.number(beta, "beta", above=0.0)
-        self.gamma = checks.number(gamma, "gamma", above=0.0)
-        self.tau = checks.number(tau, "tau", above=0.0, unit="s")
-        self.duration = checks.number(duration, "duration", above=0.0, unit="s", optional=True)
-        self.gate: Gate = checks.choice(gate, "gate", Gate)
-        self.adaptation: Adaptation = checks.choice(adaptation, "adaptation", Adaptation)
+    alpha: float = 25.0
+    beta: float | Any = None
+    gamma: float = 0.7
+    tau: float = 1.0
+    _: KW_ONLY
+    duration: float | None = None
+    gate: Gate = "time"
+    adaptation: Adaptation = "safe"
 
-    def __repr__(self) -> str:
-        return (
-            f"DMP(alpha={self.alpha:g}, beta={self.beta:g}, gamma={self.gamma:g}, tau={self.tau:g}, "
-            f"duration={self.duration}, gate={self.gate!r}, adaptation={self.adaptation!r})"
-        )
+    def __post_init__(self) -> None:
+        self.alpha = checks.number(self.alpha, "alpha", above=0.0)
+        self.beta = self.alpha / 4.0 if self.beta is None else checks.number(self.beta, "beta", above=0.0)
+        self.gamma = checks.number(self.gamma, "gamma", above=0.0)
+        self.tau = checks.number(self.tau, "tau", above=0.0, unit="s")
+        self.duration = checks.number(self.duration, "duration", above=0.0, unit="s", optional=True)
+        checks.choice(self.gate, "gate", Gate)
+        checks.choice(self.adaptation, "adaptation", Adaptation)
 
     def phase(self, time: Tensor | Any) -> Tensor:
         """Phase s of eq. (17) at ``time`` in s, by its solution ``exp(-gamma time / tau)``."""
