@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
-from scipy.stats import chi2, f
+from scipy.stats import f
 
 from torch_pbd import checks
 from torch_pbd.checks import Floats
@@ -123,10 +123,7 @@ def _distance(controller: Any, at: float, change: Floats) -> tuple[float, float]
     given = ~np.isnan(change)
     inputs, size = controller.reproduction_.phase(np.array([at])), int(given.sum())
     covariance = controller.outputs_.covariance(controller.covariance_.predict_cov(inputs))[0][np.ix_(given, given)]
-    degrees = float(controller.covariance_.predict_df(inputs)[0])
+    degrees = min(float(controller.covariance_.predict_df(inputs)[0]), 1e12)  # infinite ones are not for f
     square = float(change[given] @ np.linalg.solve(covariance, change[given]))
-    if np.isfinite(degrees):
-        limit = size * f.ppf(_LIKELY, size, degrees) * (degrees - 2.0) / degrees
-    else:
-        limit = chi2.ppf(_LIKELY, size)
-    return square**0.5, float(limit) ** 0.5
+    limit = float(size * f.ppf(_LIKELY, size, degrees) * (degrees - 2.0) / degrees)
+    return square**0.5, limit**0.5
