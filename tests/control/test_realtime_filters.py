@@ -165,7 +165,7 @@ def test_on_poses_along_an_inertia_the_loop_is_the_plant_of_torch_to_first_order
                 Rotation.from_quat(q, scalar_first=True) for q in (controller.orientation, told.orientation[i + 1])
             )
             off.append([*(controller.position - told.position[i + 1]), *(turn * plain.inv()).as_rotvec()])
-        away = np.linalg.norm(told.pose_deviation[: n + 1, 3:], axis=1).max()
+        away = np.linalg.norm(told.deviation[: n + 1, 3:], axis=1).max()
         differences.append(np.linalg.norm(np.array(off)[:, 3:], axis=1).max() / away)
         assert away > 0.05 * size
         if wanted is not None:

@@ -24,8 +24,8 @@ from torch_pbd.linalg import broadcast_shapes
 
 # Angle in rad beyond which a run warns: there the path of a push errs by a quarter of its largest angle.
 _FAR = 0.5 * math.pi
-# Number of dimensions of a run's values after the batch; values not listed have ticks alone.
-_N_DIMS = {"position": 2, "velocity": 2, "force": 2, "commanded_position": 2, "stiffness": 3, "damping": 3}
+# Number of dimensions of a run's values after the batch, ticks alone or what is listed.
+_N_DIMS = {"deviation": 2, "commanded": 2, "velocity": 2, "force": 2, "stiffness": 3, "damping": 3}
 
 
 @final
@@ -45,6 +45,9 @@ class Rollout:
     stiffness, damping : (..., T, d, d), N/m and N s/m
         Gains in effect during the tick, after the filter.
     desired_position : (..., T, p), m
+    deviation : (..., T, d), m
+        Position minus desired position, and for poses the rotation vector e from the desired orientation in world
+        axes, ``R = exp([e]) R_d``.
     commanded_position : (..., T, p), m
         Command of the admittance to the robot's position loop; ``position`` if there is no loop.
     filter_share : (..., T) or None
@@ -55,8 +58,6 @@ class Rollout:
         Whether the force sensor was saturated.
     orientation, desired_orientation, commanded_orientation : (..., T, 4) or None
         Unit quaternions w x y z in runs of poses.
-    pose_deviation : (..., T, d) or None, m and rad
-        In runs of poses ``deviation``, with the rotation vector e in world axes, ``R = exp([e]) R_d``.
     units : str or None
         Units of the schedule's positions, None if unknown. For "rad" (joints), read rad for m and Nm for N above.
     """
@@ -68,6 +69,7 @@ class Rollout:
     stiffness: Any
     damping: Any
     desired_position: Any
+    deviation: Any
     commanded_position: Any
     filter_share: Any = None
     tank_energy: Any = None
@@ -75,7 +77,6 @@ class Rollout:
     orientation: Any = None
     desired_orientation: Any = None
     commanded_orientation: Any = None
-    pose_deviation: Any = None
     units: str | None = "m"
 
     def __repr__(self) -> str:
@@ -113,11 +114,6 @@ class Rollout:
         return plot_pushes(self, unpushed, names)
 
     @property
-    def deviation(self) -> Any:
-        """Position minus desired position, and for poses the rotation vector from the desired one: (..., T, d)."""
-        return self.position - self.desired_position if self.pose_deviation is None else self.pose_deviation
-
-    @property
     def interventions(self) -> Any:
         """Times (n,) in s at which a filter held back the stiffness of a single run; batches have ``filter_share``."""
         return self.time[:0] if self.filter_share is None else self.time[self.filter_share < 1.0]
@@ -138,13 +134,13 @@ class Loop:
         self._maps = (each for _, maps in tick_maps(task, task.dt / task.substeps) for each in maps.unbind(-3))
 
     def run(self, tick: int, force: Tensor) -> dict[str, Tensor]:
-        """Fields of a Rollout at the start of a tick under a force (..., d): measure, choose the gains, move."""
+        """Fields of a Rollout at the start of a tick under a force (..., d), and the deviation that is commanded."""
         task, commanded = self._task, self._deviation
         desired, mass = task.position[..., tick, :], mass_at(task.mass, tick)
         stiffness, damping = (gain[..., tick, :, :] for gain in (task.stiffness, task.damping))
         away, speed = (commanded, self._velocity) if self._follow is None else self._robot
         measured = total = force + self._wall(away + desired, speed)
-        record = {"position": away + desired, "velocity": speed, "commanded_position": commanded + desired}
+        record = {"deviation": away, "commanded": commanded, "velocity": speed, "force": total}
         if self._read is not None:
             measured, record["saturated"] = self._read(total)
         if self._filter is None:
@@ -167,7 +163,7 @@ class Loop:
             if self._filter is not None:
                 self._filter.settle(before, (self._deviation, self._velocity), held)
         self._move_on(tick, commanded)
-        return record | {"force": total, "stiffness": stiffness, "damping": damping}
+        return record | {"stiffness": stiffness, "damping": damping}
 
     def _move_on(self, tick: int, commanded: Tensor) -> None:
         """Let the robot follow its command, and express all relative to the next tick's desired pose."""
@@ -208,29 +204,31 @@ def run_task(
     _check_memory(task, batch.numel())
     if task.is_linear:
         record: dict[str, Any] = {"force": force, "stiffness": task.stiffness, "damping": task.damping}
-        record["position"], record["velocity"] = open_loop(task, force, state)
-        record["commanded_position"] = record["position"]
+        record["deviation"], record["velocity"] = open_loop(task, force, state)
+        record["commanded"] = record["deviation"]
     else:
         loop = Loop(task, state, generator)
         ticks = [loop.run(tick, force[..., tick, :]) for tick in range(task.n_ticks)]
         record = {name: torch.stack([each[name] for each in ticks], dim=-_N_DIMS.get(name, 1)) for name in ticks[0]}
     record = {name: value.expand(*batch, *value.shape[-_N_DIMS.get(name, 1) :]) for name, value in record.items()}
-    finite = torch.isfinite(record["position"] + record["velocity"]).all(-1)
+    finite = torch.isfinite(record["deviation"] + record["velocity"]).all(-1)
     if not bool(finite.all()):
         tick = int((~finite.reshape(-1, task.n_ticks).all(0)).nonzero()[0])
         raise ValueError(
             f"the simulation diverged, and is not finite from tick {tick} on: take a shorter dt, or smaller stiffness, "
             "velocity and force."
         )
+    at, commanded = record["deviation"], record.pop("commanded")
     if task.orientation is not None:
-        deviation = record["position"] - task.position
-        warn_if_far(float(torch.linalg.vector_norm(deviation.detach()[..., p:], dim=-1).max()))
-        record |= {"desired_orientation": task.orientation, "pose_deviation": deviation}
-        for name, turned in {"position": "orientation", "commanded_position": "commanded_orientation"}.items():
-            record[turned] = rotations.multiply(rotations.exp(record[name][..., p:]), task.orientation)
-            record[name] = record[name][..., :p]
+        warn_if_far(float(torch.linalg.vector_norm(at.detach()[..., p:], dim=-1).max()))
+        record["desired_orientation"] = task.orientation
+        record["orientation"], record["commanded_orientation"] = (
+            rotations.multiply(rotations.exp(each[..., p:]), task.orientation) for each in (at, commanded)
+        )
+    desired = task.position[..., :p]
+    record["position"], record["commanded_position"] = (each[..., :p] + desired for each in (at, commanded))
     time = torch.arange(task.n_ticks, dtype=force.dtype, device=force.device) * task.dt
-    return Rollout(time, desired_position=task.position[..., :p], **record)
+    return Rollout(time, desired_position=desired, **record)
 
 
 def _start(task: Task, position0: Tensor | None, orientation0: Tensor | None) -> Tensor:

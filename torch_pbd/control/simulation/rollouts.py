@@ -147,8 +147,8 @@ def _looped(task: Task, chunks: Sequence[Chunk], generators: Iterator[torch.Gene
             pushed, forces = chunk.forces(times)
             force = times.new_zeros(ticks.stop - ticks.start, len(chunk), task.position.shape[-1])
             force[:, pushed] = forces[: len(force)].mT
-            moved = [loop.run(tick, each)["position"] for tick, each in enumerate(force, start=ticks.start)]
-            yield ticks, chunk, (torch.stack(moved, dim=1) - task.position[ticks]).permute(2, 1, 0)
+            away = [loop.run(tick, each)["deviation"] for tick, each in enumerate(force, start=ticks.start)]
+            yield ticks, chunk, torch.stack(away).permute(2, 0, 1)
 
 
 class Tally:

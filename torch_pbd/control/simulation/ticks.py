@@ -110,7 +110,7 @@ class Task:
 
 
 def open_loop(task: Task, force: Tensor, state: State) -> State:
-    """Poses and velocities (..., T, d) of a linear task under forces (..., T, d), a block of ticks at a time."""
+    """Deviations and velocities (..., T, d) of a linear task under forces (..., T, d), a block of ticks at a time."""
     d, length = task.position.shape[-1], block_length(task.position.shape[-1], n_forces=32)
     now = torch.cat([state[0] - task.position[0], state[1]], dim=-1)
     batch = now.shape[:-1]
@@ -123,7 +123,7 @@ def open_loop(task: Task, force: Tensor, state: State) -> State:
         states.append(within[: -2 * d])
         now = within[-2 * d :]
     trace = torch.cat(states).mT.reshape(*batch, -1, 2 * d)[..., : task.n_ticks, :]
-    return trace[..., :d] + task.position, trace[..., d:]
+    return trace[..., :d], trace[..., d:]
 
 
 def block_length(d: int, n_forces: int = 64) -> int:
