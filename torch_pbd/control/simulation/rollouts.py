@@ -60,11 +60,6 @@ class RolloutSummary:
     rotation: "RolloutSummary | None" = None
     units: str | None = "m"
 
-    @property
-    def n_rollouts(self) -> int:
-        """Number of rollouts R."""
-        return len(self.onset)
-
     def __repr__(self) -> str:
         scales = {"m": (1e3, "mm"), "rad": (180.0 / math.pi, "degrees")}
         shown = []
@@ -73,7 +68,7 @@ class RolloutSummary:
                 scale, unit = scales.get(part.units or "", (1.0, part.units or "units"))
                 peaks = "/".join(f"{scale * each:.3g}" for each in np.quantile(part.peak_deviation, (0.05, 0.5, 0.95)))
                 shown.append(f"{peaks} {unit} at 5/50/95 %, {np.isfinite(part.return_time).mean():.0%} return")
-        return f"RolloutSummary(n_rollouts={self.n_rollouts}, peak deviation {'; '.join(shown)})"
+        return f"RolloutSummary(n_rollouts={len(self.onset)}, peak deviation {'; '.join(shown)})"
 
 
 @final

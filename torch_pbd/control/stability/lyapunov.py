@@ -212,7 +212,7 @@ def held_growth(dynamics: ErrorDynamics, maps: Float[Tensor, "k s s"], alpha: fl
     damping = torch.diag_embed(damping) if damping.ndim == 2 else damping
     delayed, across = lag[:, :, None] * damping * lag[:, None, :], torch.diag_embed(lag)
     growths = []
-    for each in (alpha, alpha / 2.0, alpha / 4.0) if alpha > 0.0 else ():
+    for each in (alpha, alpha / 2.0, alpha / 4.0):
         function = _blocks(identity + each * delayed, each * across, identity)
 
         def pencil(rows: Tensor, q: float, p: float, function: Tensor = function) -> Tensor:
@@ -222,4 +222,4 @@ def held_growth(dynamics: ErrorDynamics, maps: Float[Tensor, "k s s"], alpha: fl
         growths.append(-float(smallest_eigenvalues(pencil, grown).min()) if len(grown) else 1.0)
         if growths[-1] <= 1.0 + GROWTH_ROUNDING:
             break
-    return min(growths, default=math.nan)
+    return min(growths)
