@@ -9,14 +9,13 @@ from torch_pbd import checks
 from torch_pbd.estimators.latent import LatentCovarianceRegressor, Problem, warn_if_stretched
 from torch_pbd.exceptions import DataRankWarning, NotPositiveDefiniteError
 from torch_pbd.gp.observations import (
-    Hyperparameters,
     LatentGP,
     Observations,
     condition,
     longest_within,
     merge_observations,
 )
-from torch_pbd.gp.search import fit_hyperparameters
+from torch_pbd.gp.search import Found, fit_together
 from torch_pbd.linalg import scale_tril_from_root
 from torch_pbd.models import with_floor
 from torch_pbd.models.conditional import MeanAndWishart
@@ -97,7 +96,7 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
 
         # Evidence of the vectors themselves, not of their deviations from the prior: a far prior would allow any swing.
         observations = observed(root)
-        hyperparameters, report = self._smoothing(observations, problem)
+        hyperparameters, _, report, _ = self._smoothing(observations, problem)
         warn_if_stretched(problem, hyperparameters, observations)
         latent, jitter = condition(observations, hyperparameters, self.kernel)
         # Noise of the vectors must not pull them towards the prior where there are data.
@@ -109,13 +108,13 @@ class WishartProcessRegressor(LatentCovarianceRegressor):
         report = replace(report, loss=mse, loss_curve=(mse,)).after(mean_report, "search of the mean")
         return MeanAndWishart(mean, latent, link.far(), bounded=True), report, jitter
 
-    def _smoothing(self, observations: Observations, problem: Problem) -> tuple[Hyperparameters, FitReport]:
+    def _smoothing(self, observations: Observations, problem: Problem) -> Found:
         """Hyperparameters without noise, or with a learned one where "auto" has few rows or inputs are too near."""
         inputs, none = observations.inputs, torch.zeros_like(observations.targets[:, 0])
 
-        def found(noise_scale: Tensor | None) -> tuple[Hyperparameters, FitReport]:
+        def found(noise_scale: Tensor | None) -> Found:
             search = self._search(inputs, longest_within(inputs), problem.length_scale, noise_scale)
-            return fit_hyperparameters(observations, search)[::2]
+            return fit_together([(observations, search)])[0]
 
         if self.objective == "auto" and int(problem.training.counts.min()) < _FEW_ROWS:
             return found(None)

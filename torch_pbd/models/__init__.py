@@ -12,6 +12,9 @@ VARIANCE_FLOOR = 1e-12
 """Added to every variance, relative to one plus the sum of the variances; outputs have unit variance."""
 
 Shapes = Mapping[str, torch.Size]
+PriorTril = Float[Tensor, "n d d"] | None
+"""Factor of a prior at each query, which replaces that of the fit, if there is one."""
+MeanAndRoot = tuple[Float[Tensor, "n d"], Float[Tensor, "n d r"]]
 
 
 def with_floor(root: Float[Tensor, "*b d r"]) -> Float[Tensor, "*b d s"]:
@@ -34,18 +37,14 @@ class Core(nn.Module, ABC):
     """Name of the class in files."""
 
     @abstractmethod
-    def forward(
-        self, x: Float[Tensor, "n e"], prior_tril: Float[Tensor, "n d d"] | None = None
-    ) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d r"]]:
-        """Mean, and a root of the covariance; ``prior_tril`` replaces the prior of the fit, if there is one."""
+    def forward(self, x: Float[Tensor, "n e"], prior_tril: PriorTril = None) -> MeanAndRoot:
+        """Mean, and a root of the covariance."""
 
     def predict_mean(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n d"]:
         """Mean alone, equal to the bit."""
         return self(x)[0]
 
-    def predict_root(
-        self, x: Float[Tensor, "n e"], prior_tril: Float[Tensor, "n d d"] | None = None
-    ) -> Float[Tensor, "n d r"]:
+    def predict_root(self, x: Float[Tensor, "n e"], prior_tril: PriorTril = None) -> Float[Tensor, "n d r"]:
         """Root of the covariance alone, equal to the bit."""
         return self(x, prior_tril)[1]
 

@@ -14,7 +14,7 @@ from torch_pbd.files.memory import require_memory
 from torch_pbd.gp.observations import Hyperparameters, LatentGP
 from torch_pbd.kernels import KERNELS
 from torch_pbd.linalg import scale_tril_from_root, symmetrize
-from torch_pbd.models import Core, Shapes, blank, size_of, with_floor
+from torch_pbd.models import Core, MeanAndRoot, PriorTril, Shapes, blank, size_of, with_floor
 from torch_pbd.models.links import CholeskyLink, Link, WishartLink, padded
 
 
@@ -42,9 +42,7 @@ class MeanAndCovariance(Core):
         prior = prior if prior_tril is None else padded(prior_tril, prior.shape[1])
         return self._link(prior, self.log_diagonal, getattr(self.covariance, "scale_matrix_tril", None))
 
-    def forward(
-        self, x: Float[Tensor, "n e"], prior_tril: Float[Tensor, "n d d"] | None = None
-    ) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d r"]]:
+    def forward(self, x: Float[Tensor, "n e"], prior_tril: PriorTril = None) -> MeanAndRoot:
         """Mean, and a root of the covariance."""
         return self.mean(x), self.predict_root(x, prior_tril)
 
@@ -52,9 +50,7 @@ class MeanAndCovariance(Core):
         """Mean alone."""
         return self.mean(x)
 
-    def predict_root(
-        self, x: Float[Tensor, "n e"], prior_tril: Float[Tensor, "n d d"] | None = None
-    ) -> Float[Tensor, "n d r"]:
+    def predict_root(self, x: Float[Tensor, "n e"], prior_tril: PriorTril = None) -> Float[Tensor, "n d r"]:
         """Root of the covariance alone."""
         deviation, values = self.covariance.latent.both(x)
         link = self.link(prior_tril)
@@ -147,19 +143,12 @@ class ConditionalNormal(nn.Module):
     ``(x - x_shift) / x_scale`` and ``(y - y_shift) / y_scale``.
     """
 
-    x_shift: Tensor
-    x_scale: Tensor
-    y_shift: Tensor
-    y_scale: Tensor
+    x_shift: Float[Tensor, " e"]
+    x_scale: Float[Tensor, " e"]
+    y_shift: Float[Tensor, " d"]
+    y_scale: Float[Tensor, " d"]
 
-    def __init__(
-        self,
-        core: Core,
-        x_shift: Float[Tensor, " e"],
-        x_scale: Float[Tensor, " e"],
-        y_shift: Float[Tensor, " d"],
-        y_scale: Float[Tensor, " d"],
-    ) -> None:
+    def __init__(self, core: Core, x_shift: Tensor, x_scale: Tensor, y_shift: Tensor, y_scale: Tensor) -> None:
         super().__init__()
         self.core = core
         self.register_buffer("x_shift", x_shift)
@@ -187,9 +176,7 @@ class ConditionalNormal(nn.Module):
         module.load_state_dict(state, strict=True, assign=True)
         return module
 
-    def forward(
-        self, x: Float[Tensor, "n e"], prior_scale_tril: Float[Tensor, "n d d"] | None = None
-    ) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d d"]]:
+    def forward(self, x: Float[Tensor, "n e"], prior_scale_tril: PriorTril = None) -> MeanAndRoot:
         """Mean, and lower Cholesky factor of the covariance.
 
         ``prior_scale_tril`` replaces the prior the model was fitted with, where that depends on x.
@@ -198,10 +185,8 @@ class ConditionalNormal(nn.Module):
         mean, root = self.core(self._standardized(x), self._standardized_prior(prior_scale_tril))
         return self.y_shift + self.y_scale * mean, scale_tril_from_root(self._in_units(root))
 
-    def moments(
-        self, x: Float[Tensor, "n e"], prior_scale_tril: Float[Tensor, "n d d"] | None = None
-    ) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d d"]]:
-        """Mean, and covariance, symmetric to the last bit."""
+    def moments(self, x: Float[Tensor, "n e"], prior_scale_tril: PriorTril = None) -> tuple[Tensor, Tensor]:
+        """Mean (n, d), and covariance (n, d, d), symmetric to the last bit."""
         mean, root = self.core(self._standardized(x), self._standardized_prior(prior_scale_tril))
         return self.y_shift + self.y_scale * mean, self._square(root)
 
@@ -209,9 +194,7 @@ class ConditionalNormal(nn.Module):
         """Mean alone, without the work that a covariance takes."""
         return self.y_shift + self.y_scale * self.core.predict_mean(self._standardized(x))
 
-    def covariance(
-        self, x: Float[Tensor, "n e"], prior_scale_tril: Float[Tensor, "n d d"] | None = None
-    ) -> Float[Tensor, "n d d"]:
+    def covariance(self, x: Float[Tensor, "n e"], prior_scale_tril: PriorTril = None) -> Float[Tensor, "n d d"]:
         """Covariance alone, symmetric to the last bit."""
         prior = self._standardized_prior(prior_scale_tril)
         return self._square(self.core.predict_root(self._standardized(x), prior))
@@ -221,10 +204,7 @@ class ConditionalNormal(nn.Module):
         return self.core.degrees(self._standardized(x))
 
     def draw_covariance(
-        self,
-        x: Float[Tensor, "n e"],
-        normal: list[Float[Tensor, "*s _"]],
-        prior_scale_tril: Float[Tensor, "n d d"] | None = None,
+        self, x: Float[Tensor, "n e"], normal: list[Float[Tensor, "*s _"]], prior_scale_tril: PriorTril = None
     ) -> Float[Tensor, "*s n d d"]:
         """Posterior draws of the covariance function at x, each made of standard normal numbers.
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from torch_pbd.exceptions import NotPositiveDefiniteError
 from torch_pbd.linalg import scale_tril_from_root, triangular_inverse
-from torch_pbd.models import Core, Shapes, blank, size_of
+from torch_pbd.models import Core, MeanAndRoot, PriorTril, Shapes, blank, size_of
 from torch_pbd.optim.batch import FitReport, Progress, Status
 from torch_pbd.optim.descent import minimize
 
@@ -78,9 +78,7 @@ class GaussianMixture(Core):
         """Log density at each row [x, y], or [x] alone."""
         return self.components(data.shape[1]).log_prob(data)
 
-    def forward(
-        self, x: Float[Tensor, "n e"], prior_tril: Float[Tensor, "n d d"] | None = None
-    ) -> tuple[Float[Tensor, "n d"], Float[Tensor, "n d r"]]:
+    def forward(self, x: Float[Tensor, "n e"], prior_tril: PriorTril = None) -> MeanAndRoot:
         """Mean of y given each row of ``x``, and a root of its covariance, r = k (d + 1); there is no prior in it.
 
         Gaussian mixture regression (Calinon, Intelligent Service Robotics 9, 2016, section 5): with h_k the
