@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 from torch_pbd.exceptions import NotPositiveDefiniteError
 from torch_pbd.gp.evidence import EvidenceSearch, negative_log_evidence
 from torch_pbd.gp.observations import Hyperparameters, Observations, condition, spacing
-from torch_pbd.gp.search import fit_hyperparameters, fit_together
+from torch_pbd.gp.search import fit_together
 from torch_pbd.optim.batch import Status
 from torch_pbd.optim.descent import minimize
 
@@ -32,6 +32,11 @@ def tensor(array):
 def once(x, y):
     """Observations of rows of y, one at each input."""
     return Observations(tensor(x), tensor(np.atleast_2d(y)), torch.ones(len(x), dtype=torch.float64))
+
+
+def fit_hyperparameters(observations, search):
+    """Hyperparameters, loss and report of one search."""
+    return fit_together([(observations, search)])[0][:3]
 
 
 def noisy(signal, n, rng, n_processes=10):

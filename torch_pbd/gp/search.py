@@ -68,13 +68,6 @@ class Found(NamedTuple):
     """The smallest of the search that carries the processes."""
 
 
-def fit_hyperparameters(
-    observations: Observations, search: EvidenceSearch
-) -> tuple[Hyperparameters, Float[Tensor, " b"], FitReport]:
-    """Hyperparameters, loss and report of one job: see :class:`Found`."""
-    return fit_together([(observations, search)])[0][:3]
-
-
 def fit_together(jobs: Sequence[Job]) -> list[Found]:
     """What is found for each job, in one search where inputs and counts are the same.
 

@@ -13,7 +13,7 @@ from torch_pbd.data import make_paper_simulation
 from torch_pbd.experiments.comparison import empirical_covariances
 from torch_pbd.gp.evidence import EvidenceSearch
 from torch_pbd.gp.observations import Observations, resolved_length_scale
-from torch_pbd.gp.search import fit_hyperparameters
+from torch_pbd.gp.search import fit_together
 from torch_pbd.metrics import covariance_mse
 
 _SKLEARN = "scikit-learn, a process for each entry of the factor"
@@ -82,7 +82,7 @@ def _evidence(plan: Plan, n_inputs: int) -> Row:
         nodes = torch.tensor(inputs)
         bounds = (resolved_length_scale(nodes), 10.0)
         data = Observations(nodes, targets, torch.ones(n_inputs, dtype=torch.float64))
-        _, loss, _ = fit_hyperparameters(data, EvidenceSearch(length_scale_bounds=bounds))
+        loss = fit_together([(data, EvidenceSearch(length_scale_bounds=bounds))])[0].loss
         kernel = ConstantKernel(1.0, (1e-6, 1e5)) * RBF(0.2, bounds) + WhiteKernel(0.1, (1e-9, 1e5))
         for ours, column in zip(loss.tolist(), targets.numpy(), strict=True):
             theirs = GaussianProcessRegressor(

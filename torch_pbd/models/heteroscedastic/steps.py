@@ -16,7 +16,7 @@ from torch.nn.functional import pad
 
 from torch_pbd.gp.evidence import EvidenceSearch, negative_log_evidence
 from torch_pbd.gp.observations import Hyperparameters, Observations, resolved_length_scale
-from torch_pbd.gp.search import fit_hyperparameters
+from torch_pbd.gp.search import fit_together
 from torch_pbd.linalg import triangular_inverse
 from torch_pbd.models.heteroscedastic.log_variance import (
     LEAST_SQUARE,
@@ -126,7 +126,7 @@ def mean_start(
     least = resolved_length_scale(training.inputs)
     for shortest in (max(_CHEAP, least), least):
         search = EvidenceSearch(length_scale_bounds=(shortest, _LONGEST), noise_scale=known)
-        found, loss, _ = fit_hyperparameters(observations, search)
+        found, loss, *_ = fit_together([(observations, search)])[0]
         noise_scale = found.amplitude * found.noise_ratio.sqrt()
         if bool((noise_scale < _NONE).all()):
             break
