@@ -50,15 +50,12 @@ struct Block {
 /// Length of a block of a vector; infinite or NaN only where a component is.
 template <std::size_t N>
 double norm(const Vector<N>& a, Block block) {
-    double square = 0.0, scale = 0.0, sum = 0.0;
+    double square = 0.0, length = 0.0;
     for (std::size_t i = block.begin; i < block.end; ++i) square += a[i] * a[i];
     if (1e-280 < square && square < 1e280) return std::sqrt(square);
     // Squares have overflown, or lost digits.
-    for (std::size_t i = block.begin; i < block.end; ++i)
-        if (std::abs(a[i]) > scale || std::isnan(a[i])) scale = std::abs(a[i]);
-    if (scale == 0.0 || !std::isfinite(scale)) return scale;
-    for (std::size_t i = block.begin; i < block.end; ++i) sum += (a[i] / scale) * (a[i] / scale);
-    return scale * std::sqrt(sum);
+    for (std::size_t i = block.begin; i < block.end; ++i) length = std::hypot(length, a[i]);
+    return length;
 }
 
 template <std::size_t N>
