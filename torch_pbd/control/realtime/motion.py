@@ -95,8 +95,8 @@ class Motion:
         self.velocity, self.scale = moving, 1.0
         self._top_speeds = tuple(map(max, self._speeds_due, speeds))
         self._least_top = -1.0 if min(*self._speed_limits, *self._rises) < math.inf else min(self._top_speeds)
-        if self.filtered is not None:
-            self.filtered.begin()
+        if self.filtered is not None:  # the first tick gets the gains of its row unfiltered
+            self.filtered.active = copy(self.filtered.fresh)
 
     @property
     def desired_place(self) -> Vector:
@@ -206,11 +206,7 @@ class FilteredGains:
             remedy = "before the loop nobody knows whether the damping pays for what turns or grows"
             raise checks.refusal(wanted, "stiffness_filter", must, remedy)
         self._table = table
-        self._fresh = wanted.start(table.stiffness, table.damping, mass, _tick_change)
-
-    def begin(self) -> None:
-        """Restart: the next tick gets the gains of its row unfiltered."""
-        self.active = copy(self._fresh)
+        self.fresh = wanted.start(table.stiffness, table.damping, mass, _tick_change)
 
     def advance(self, row: Vector, index: int, push: Vector, here: State, step: float) -> tuple[State, Scale]:
         """Place and velocity after a tick of ``step`` s along a row of the table, and the scale of the stiffness."""
