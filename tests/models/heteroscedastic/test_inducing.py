@@ -1,3 +1,4 @@
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -27,10 +28,9 @@ def family_on(inducing, kernel="squared_exponential", period=None, **options):
 
 
 def features(family, length_scale, x):
-    """Features of processes of unit variance, for one or several length scales."""
-    scales = torch.atleast_2d(length_scale)
-    values = family.processes(scales, torch.ones(len(scales)).to(scales))(x)
-    return values if length_scale.ndim > 1 else values[0]
+    """Features of a process of unit variance."""
+    held = replace(family, fixed_length_scale=length_scale)
+    return held.prepared(torch.zeros(1, x.shape[1] + 1).double())(x)[0]
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -48,19 +48,19 @@ def test_inner_products_of_features_are_the_kernel_at_the_inducing_inputs(kernel
 
 def test_each_length_scale_of_a_batch_is_on_its_own(generator):
     x = torch.rand(6, 2, dtype=torch.float64, generator=generator)
-    length_scale = tensor([[0.3, 2.0], [1.0, 0.2], [0.5, 0.5]])
+    theta = tensor([[0.3, 2.0, 1.0], [1.0, 0.2, 1.0], [0.5, 0.5, 1.0]]).log()
     family = family_on(x[:4])
-    batch = features(family, length_scale, x)
+    batch = family.prepared(theta)(x)
     for i in range(3):
-        torch.testing.assert_close(batch[i], features(family, length_scale[i], x), rtol=1e-9, atol=1e-11)
+        torch.testing.assert_close(batch[i], family.prepared(theta[i : i + 1])(x)[0], rtol=1e-9, atol=1e-11)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_features_are_differentiable_in_inputs_and_length_scales(kernel, generator):
     family = family_on(torch.rand(5, 2, dtype=torch.float64, generator=generator), kernel)
     x = torch.rand(3, 2, dtype=torch.float64, generator=generator).requires_grad_()
-    length_scale = tensor([[0.3, 0.8], [0.5, 0.4]]).requires_grad_()
-    assert torch.autograd.gradcheck(lambda x, length_scale: features(family, length_scale, x), (x, length_scale))
+    theta = tensor([[0.3, 0.8, 1.0], [0.5, 0.4, 1.0]]).log().requires_grad_()
+    assert torch.autograd.gradcheck(lambda x, theta: family.prepared(theta)(x), (x, theta))
 
 
 def test_periodic_predictions_are_those_of_scikit_learn(rng):
@@ -141,7 +141,8 @@ def test_stretched_features_are_those_of_inputs_with_more_length_at_the_ends():
     np.testing.assert_allclose(at[[0, 4, -1], 0] - at[20, 0], [-0.9, -0.5 + 0.1 - 0.4 * np.exp(-1), 1.5], atol=0.01)
     plain = family_on(stretched.warped(x[::4]))
     np.testing.assert_array_equal(features(stretched, tensor([0.3]), x), features(plain, tensor([0.3]), at))
-    values, _ = FixedFeatures(stretched, x).vjp(tensor([[0.3]]), tensor([0.0]))
+    held = replace(stretched, fixed_length_scale=tensor([0.3]))
+    values, _ = FixedFeatures(held, x).design_vjp(torch.zeros(1, 2).double(), tensor([1e99]))
     expected = features(stretched, tensor([0.3]), x)
     torch.testing.assert_close(values[0] @ values[0].mT, expected @ expected.mT, rtol=0, atol=1e-6)
     assert stretched.shortest_length_scale == plain.shortest_length_scale

@@ -17,7 +17,7 @@ def latent(family, rng):
     theta = torch.tensor([[-1.0, 0.3], [0.2, -0.5], [-0.5, 0.0]], dtype=torch.float64)
     coefficients = [weights(size=10), weights(size=20)]
     processes, rows = family.prepared(theta), family.prepared(theta[1:])
-    return LatentCovariance(theta, processes, weights(3, size=10), theta[1:], rows, coefficients)
+    return LatentCovariance(processes, weights(3, size=10), rows, coefficients)
 
 
 def test_a_draw_has_the_mean_and_the_variances_of_the_moments(latent, inputs):
@@ -44,7 +44,7 @@ def test_a_draw_has_the_mean_and_the_variances_of_the_moments(latent, inputs):
 def test_far_from_the_inducing_inputs_the_moments_are_those_of_the_prior(latent, family):
     """But for the constant, which the data tell everywhere."""
     moments = latent.at(torch.tensor([[100.0]], dtype=torch.float64))
-    amplitude = family.amplitude_of(latent.log_variance_theta).square()
+    amplitude = family.amplitude_of(latent.log_variances.theta).square()
     constant = 2.0**2 * latent.log_variance.root[:, -1].square().sum(-1)
     torch.testing.assert_close(moments.log_variance_variance[0], amplitude + constant, rtol=1e-9, atol=0)
 

@@ -37,7 +37,7 @@ def test_the_mean_is_a_dense_regression_of_all_outputs_under_their_noise(d, whit
     found = fit_mean(search_of(family, d), *arguments)
     order = np.arange(n * d).reshape(d, n).T.ravel()  # input by input instead of output by output
     x = torch.tensor(rng.uniform(-0.8, 0.8, size=(5, 1)))
-    theta = found.theta.detach()
+    theta = found.processes.theta.detach()
     gram = prior_gram(family, theta, inputs, inputs)[np.ix_(order, order)]
     cross = prior_gram(family, theta, inputs, x)[order]
     gain = np.linalg.solve(gram + noise, cross).T
@@ -56,7 +56,9 @@ def test_away_from_the_inducing_inputs_the_error_is_the_whole_prior_variance(inp
     found = fit_mean(search_of(family, 2), inputs, means, torch.full((9,), 4.0).double(), tril, None)
     mean, error = found.at(torch.tensor([[50.0]], dtype=torch.float64))
     assert torch.equal(mean, torch.zeros(1, 2).double())
-    torch.testing.assert_close(error[0], torch.diag(family.amplitude_of(found.theta).square()), rtol=1e-12, atol=0)
+    torch.testing.assert_close(
+        error[0], torch.diag(family.amplitude_of(found.processes.theta).square()), rtol=1e-12, atol=0
+    )
 
 
 def test_hyperparameters_of_an_output_do_not_depend_on_the_others(inputs, rng):
@@ -67,4 +69,4 @@ def test_hyperparameters_of_an_output_do_not_depend_on_the_others(inputs, rng):
     both = fit_mean(search_of(family, 2), inputs, means, counts, tril, None)
     for i in (0, 1):
         alone = fit_mean(search_of(family, 1), inputs, means[:, [i]], counts, tril[:, :1, :1], None)
-        torch.testing.assert_close(alone.theta[0], both.theta[i], rtol=0, atol=1e-6)
+        torch.testing.assert_close(alone.processes.theta[0], both.processes.theta[i], rtol=0, atol=1e-6)

@@ -38,7 +38,7 @@ def many_inputs():
 def test_the_search_ends_where_that_of_scipy_does(many_inputs, rng):
     family = ProcessFamily(many_inputs, 0.3, 1.2, 0.0, exact=True)
     evidence = evidence_of(family, many_inputs, curves(many_inputs, rng))
-    theta = Search(family, 2, SearchOptions(100, 1e-5)).run(evidence, 40)
+    theta = Search(family, 2, SearchOptions(100, 1e-5)).run(evidence)
     for i in (0, 1):
 
         def loss(point, i=i):
@@ -56,12 +56,12 @@ def test_the_next_run_starts_where_the_last_ended(many_inputs, rng):
     family = ProcessFamily(many_inputs, 0.3, 1.2, 0.0, exact=True)
     response = curves(many_inputs, rng)
     search = Search(family, 2, SearchOptions(100, 1e-5))
-    first = search.run(evidence_of(family, many_inputs, response), 40)
-    assert torch.equal(search.run(evidence_of(family, many_inputs, response), 40), first)
+    first = search.run(evidence_of(family, many_inputs, response))
+    assert torch.equal(search.run(evidence_of(family, many_inputs, response)), first)
     assert search.options.ends[-1] == (0, Status.CONVERGED)
     other = evidence_of(family, many_inputs, response + 0.05 * torch.randn(2, 40).double())
-    anew = Search(family, 2, SearchOptions(100, 1e-5)).run(other, 40)
-    torch.testing.assert_close(search.run(other, many_inputs), anew, rtol=0, atol=1e-3)
+    anew = Search(family, 2, SearchOptions(100, 1e-5)).run(other)
+    torch.testing.assert_close(search.run(other), anew, rtol=0, atol=1e-3)
 
 
 @pytest.mark.parametrize("n_restarts", [0, 2])
@@ -74,6 +74,6 @@ def test_evidence_that_cannot_be_computed_is_gone_around(n_restarts, many_inputs
             raise NotPositiveDefiniteError("too large")
         return evidence(theta, rows)
 
-    expected = Search(family, 2, SearchOptions(100, 1e-5)).run(evidence, 40)
-    found = Search(family, 2, SearchOptions(100, 1e-5, n_restarts)).run(limited, 40)
+    expected = Search(family, 2, SearchOptions(100, 1e-5)).run(evidence)
+    found = Search(family, 2, SearchOptions(100, 1e-5, n_restarts)).run(limited)
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-3)

@@ -157,7 +157,7 @@ class HeteroscedasticFit:
         """Go on with more inducing inputs where these do not resolve what was found; whether there is need to."""
         if self.larger is None or self.covariance is None:
             return False
-        coarse_mean = not self._mean_search.held and not self.mean.processes.resolved
+        coarse_mean = self._mean_search.held is None and not self.mean.processes.resolved
         if coarse_mean:
             self._mean_search = Search(self.larger.mean, self._n_outputs, self.options)
         coarse = not (self.covariance.log_variances.resolved and self.covariance.rows.resolved)
@@ -177,7 +177,7 @@ class HeteroscedasticFit:
             # themselves, which takes three more than outputs.
             n_rows = max(self.n_demos, self._n_outputs + 3)
             self.training = self.training.merged(max(8, len(self.training.x) // n_rows))
-            self.mean_rows = self.mean_rows.merged(MOST_INPUTS) if self._mean_search.held else self.training
+            self.mean_rows = self.training if self._mean_search.held is None else self.mean_rows.merged(MOST_INPUTS)
 
     def normal(self) -> Float[Tensor, "rows d"]:
         """Residuals multiplied by the inverse of C."""

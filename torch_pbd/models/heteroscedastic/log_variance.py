@@ -11,7 +11,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from torch_pbd.linalg import safe_cholesky, triangular_inverse
-from torch_pbd.models.heteroscedastic.processes import Evidence, FixedFeatures, Gradient, ProcessFamily
+from torch_pbd.models.heteroscedastic.processes import Evidence, FixedFeatures, Gradient
 from torch_pbd.models.heteroscedastic.regression import LinearEvidence, Weights, weights_factor
 from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation
 from torch_pbd.models.training import TrainingSet
@@ -43,6 +43,11 @@ class Squares:
         return Squares(self.total[outputs], self.degrees[outputs], noise)
 
     @cached_property
+    def information(self) -> Float[Tensor, " b"]:
+        """Sum of the precisions with which log variances are observed."""
+        return 0.5 * self.degrees.sum(-1)
+
+    @cached_property
     def log_mean(self) -> Float[Tensor, "b n"]:
         """Logarithm of the mean square."""
         return (self.total / self.degrees).clamp_min(LEAST_SQUARE).log()
@@ -71,14 +76,11 @@ class LogVariance(NamedTuple):
     """Computes the gradient of the evidence in the features."""
 
 
-def log_variance_evidence(
-    family: ProcessFamily, fixed: FixedFeatures, squares: Squares, near: Float[Tensor, "b n"]
-) -> Evidence:
+def log_variance_evidence(fixed: FixedFeatures, squares: Squares, near: Float[Tensor, "b n"]) -> Evidence:
     """Log evidence of hyperparameters; the log variances are looked for ``near`` those given, which it updates."""
-    information = 0.5 * squares.degrees.sum(-1)
 
     def evidence(theta: Tensor, rows: Int64[Tensor, " a"]) -> tuple[Tensor, Gradient]:
-        design, vjp = family.design_vjp(fixed, theta, information[rows])
+        design, vjp = fixed.design_vjp(theta, squares.information[rows])
         found = fit_log_variance(squares.restrict(rows), design, near[rows])
         if len(rows) <= len(near):
             near[rows] = found.location  # where the next evaluation starts

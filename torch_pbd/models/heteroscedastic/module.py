@@ -37,8 +37,8 @@ _FAMILIES = ("mean", "log_variance", "coefficient")
 class _Prepared(NamedTuple):
     """Processes of a module's buffers, with what does not depend on x computed."""
 
-    buffers: tuple[Tensor | None, ...]
-    versions: tuple[int, ...]
+    buffers: tuple[Tensor, ...]
+    versions: list[int]
     mean: LatentMean
     covariance: LatentCovariance
     nearness: Processes
@@ -58,18 +58,8 @@ class HeteroscedasticModel(Core):
     """
 
     kind = "heteroscedastic"
-    inducing: Tensor
-    mean_inducing: Tensor
-    mean_theta: Tensor
-    mean_weights: Tensor
-    mean_root: Tensor
-    log_variance_theta: Tensor
-    log_variance_weights: Tensor
-    log_variance_root: Tensor
-    coefficient_theta: Tensor
     pooled_tril: Tensor
     prior_tril: Tensor
-    correlation_error: Tensor
     correlation_variance: Tensor
     _kept: _Prepared | None = None
 
@@ -81,13 +71,13 @@ class HeteroscedasticModel(Core):
         tensors = {
             "inducing": families[1].inducing,
             "mean_inducing": families[0].inducing,
-            "mean_theta": mean.theta,
+            "mean_theta": mean.processes.theta,
             "mean_weights": mean.weights.mean,
             "mean_root": mean.weights.root,
-            "log_variance_theta": covariance.log_variance_theta,
+            "log_variance_theta": covariance.log_variances.theta,
             "log_variance_weights": covariance.log_variance.mean,
             "log_variance_root": covariance.log_variance.root,
-            "coefficient_theta": covariance.coefficient_theta,
+            "coefficient_theta": covariance.rows.theta,
             "pooled_tril": fit.pooled_tril,
             "prior_tril": prior_tril,
             "period": families[0].period,
@@ -241,8 +231,8 @@ class HeteroscedasticModel(Core):
 
     def draw_sizes(self) -> list[int]:
         """Sizes of the standard normal vectors that :meth:`draw` takes."""
-        rows, size = self.log_variance_weights.shape
-        return [size] * rows + [len(w.mean) for w in self.covariance_process.coefficients]
+        rows, size = self.covariance_process.log_variance.mean.shape
+        return [size] * rows + [len(weights.mean) for weights in self.covariance_process.coefficients]
 
     @property
     def mean_process(self) -> LatentMean:
@@ -256,38 +246,34 @@ class HeteroscedasticModel(Core):
 
     def _prepared(self) -> _Prepared:
         """Processes of the buffers, with what does not depend on x computed; anew where a buffer is another."""
-        buffers = tuple(self._buffers.values())
-        if any(buffer is None or buffer.is_inference() or buffer.requires_grad for buffer in buffers):
-            return self._prepare(buffers, ())
-        kept, versions = self._kept, tuple(buffer._version for buffer in buffers if buffer is not None)
-        if kept is None or kept.versions != versions or not all(map(operator.is_, buffers, kept.buffers)):
+        buffers = {name: buffer for name, buffer in self._buffers.items() if buffer is not None}
+        if any(buffer.is_inference() or buffer.requires_grad for buffer in buffers.values()):
+            return self._prepare(buffers, [])
+        kept, versions = self._kept, [buffer._version for buffer in buffers.values()]
+        if kept is None or kept.versions != versions or not all(map(operator.is_, buffers.values(), kept.buffers)):
             # Else, asked for in inference mode, these would be of no use to autograd later.
             with torch.inference_mode(False), torch.no_grad():
                 kept = self._kept = self._prepare(buffers, versions)
         return kept
 
-    def _prepare(self, buffers: tuple[Tensor | None, ...], versions: tuple[int, ...]) -> _Prepared:
-        # The mean rests on inducing inputs of its own, and is never stretched.
-        processes = self._family(0, self.mean_inducing, None).prepared(self.mean_theta)
-        mean = LatentMean(self.mean_theta, processes, Weights(self.mean_weights, self.mean_root))
-        stretch = getattr(self, "stretch", None)
-        coefficients = [
-            Weights(getattr(self, f"coefficient_weights_{i}"), getattr(self, f"coefficient_root_{i}"))
-            for i in range(1, len(self.coefficient_theta) + 1)
-        ]
-        covariance = LatentCovariance(
-            self.log_variance_theta,
-            self._family(1, self.inducing, stretch).prepared(self.log_variance_theta),
-            Weights(self.log_variance_weights, self.log_variance_root),
-            self.coefficient_theta,
-            self._family(2, self.inducing, stretch).prepared(self.coefficient_theta),
-            coefficients,
-        )
-        return _Prepared(buffers, versions, mean, covariance, nearness(covariance.log_variances))
+    def _prepare(self, buffers: Mapping[str, Tensor], versions: list[int]) -> _Prepared:
+        def processes(i: int, inducing: str, stretch: Tensor | None) -> Processes:
+            name, period = _FAMILIES[i], buffers.get("period")
+            length_scale, exact = buffers.get(f"{name}_length_scale"), self.exact[i]
+            family = ProcessFamily(
+                buffers[inducing], *self.medians[i], length_scale, self.kernel, period, exact, stretch
+            )
+            return family.prepared(buffers[f"{name}_theta"])
 
-    def _family(self, i: int, inducing: Tensor, stretch: Tensor | None) -> ProcessFamily:
-        length_scale, period = getattr(self, f"{_FAMILIES[i]}_length_scale", None), getattr(self, "period", None)
-        return ProcessFamily(inducing, *self.medians[i], length_scale, self.kernel, period, self.exact[i], stretch)
+        def weights(name: str, number: str = "") -> Weights:
+            return Weights(buffers[f"{name}_weights{number}"], buffers[f"{name}_root{number}"])
+
+        # The mean rests on inducing inputs of its own, and is never stretched.
+        mean = LatentMean(processes(0, "mean_inducing", None), weights("mean"))
+        of_variances, rows = (processes(i, "inducing", buffers.get("stretch")) for i in (1, 2))
+        coefficients = [weights("coefficient", f"_{i}") for i in range(1, len(rows.theta) + 1)]
+        covariance = LatentCovariance(of_variances, weights("log_variance"), rows, coefficients)
+        return _Prepared(tuple(buffers.values()), versions, mean, covariance, nearness(of_variances))
 
     def __getstate__(self) -> dict[str, Any]:
         """State for copies and pickle: without what is computed from the buffers."""

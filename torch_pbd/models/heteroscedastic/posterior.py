@@ -43,7 +43,6 @@ _LEAST_EIGENVALUE = 1e-12  # of correlations: rounding, where outputs are copies
 class LatentMean:
     """Posterior of the mean: weights of one output after another."""
 
-    theta: Float[Tensor, "d q"]
     processes: Processes
     weights: Weights
 
@@ -67,7 +66,7 @@ class LatentMean:
         if training.repeats_inputs:
             return self.expected_at(training.inputs)[training.index]
         processes = self.processes
-        weights = processes.amplitude[:, None] * self.weights.mean.reshape(len(self.theta), -1)
+        weights = processes.amplitude[:, None] * self.weights.mean.reshape(len(processes.theta), -1)
         # Weights of the kernel with the inducing inputs, from those of the features: no equations are solved for
         # each row.
         weights = torch.linalg.solve_triangular(processes.factor.mT, weights.unsqueeze(-1), upper=True)
@@ -122,10 +121,8 @@ class LatentCovariance:
     holds the coefficients of output i on the standardized outputs before it, which are i more.
     """
 
-    log_variance_theta: Float[Tensor, "d q"]
     log_variances: Processes
     log_variance: Weights
-    coefficient_theta: Float[Tensor, "d-1 q"]
     rows: Processes
     """Processes of the coefficients of an output, for each output but the first; they share one kernel."""
     coefficients: Sequence[Weights]
@@ -180,8 +177,8 @@ def nearness(log_variances: Processes) -> Processes:
     family, weight = log_variances.family, log_variances.amplitude.square()
     scale = ((weight / weight.sum()) @ log_variances.length_scale.log()).exp()
     scale = scale.clamp_max(_REACH * len(scale)).clamp_min(2.0 * spacing(family.inducing))
-    family = replace(family, kernel="squared_exponential", stretch=None, constant=0.0)
-    return family.processes(scale[None], torch.ones_like(scale[:1]))
+    family = replace(family, fixed_length_scale=scale, kernel="squared_exponential", stretch=None)
+    return replace(family, amplitude=1.0, constant=0.0).prepared(torch.zeros_like(log_variances.theta[:1]))
 
 
 def as_inverse_gamma(variance: Tensor) -> Tensor:

@@ -23,7 +23,7 @@ from torch_pbd.linalg import safe_cholesky
 _SHORTEST = 1e-3
 _EXACT_RESOLUTION = 0.75  # spacings of the inputs: shorter "needles" explain each input by itself
 _RESOLUTION = 1.0  # spacings: at this length scale features carry 0.995 of the variance between inducing inputs
-_CLEAR = 3.0  # times the shortest length scale, above which inducing inputs resolve one with room to spare
+CLEAR = 3.0  # times the shortest length scale, above which inducing inputs resolve one with room to spare
 # Of a process's variance: less than this that features do not carry is the jitter of kernel matrices, and rounding.
 _ROUNDING = 1e-11
 _WIDEST = 4.0  # amplitudes stay within a factor of exp(4) of their prior median
@@ -68,15 +68,11 @@ class ProcessFamily:
 
     def prepared(self, theta: Float[Tensor, "b q"]) -> "Processes":
         """Processes with these hyperparameters."""
-        return self.processes(self.length_scale_of(theta), self.amplitude_of(theta))
-
-    def processes(self, length_scale: Float[Tensor, "b e"], amplitude: Float[Tensor, " b"]) -> "Processes":
-        """Processes of these length scales and amplitudes."""
-        inducing = self.warped(self.inducing)
+        length_scale, inducing = self.length_scale_of(theta), self.warped(self.inducing)
         gram = correlation(inducing, inducing, length_scale, self.kernel, self.period)
         gram = gram + self.jitter * torch.eye(len(inducing)).to(gram)
         factor = safe_cholesky(gram, name="the kernel matrix of the inducing inputs")
-        return Processes(self, length_scale, amplitude, factor)
+        return Processes(self, theta, length_scale, self.amplitude_of(theta), factor)
 
     def warped(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "n e"]:
         """Inputs with length added next to the ends of their range, within which alone it is."""
@@ -129,10 +125,6 @@ class ProcessFamily:
         strength = (amplitude / self.amplitude).log().clamp(-0.5 * _WIDEST, 0.5 * _WIDEST)
         return torch.cat([above.log(), strength[:, None]], dim=1)
 
-    def n_needed(self, length_scale: float) -> float:
-        """Number of inducing inputs, over a range of one, that resolve a length scale with room to spare."""
-        return (_CLEAR / length_scale) ** self.inducing.shape[1]
-
     def log_prior(self, theta: Float[Tensor, "b q"]) -> tuple[Float[Tensor, " b"], Float[Tensor, "b q"]]:
         """Log density of hyperparameters, but for a constant, and its gradient."""
         median = theta.new_tensor([math.log(self.length_scale)] * (theta.shape[1] - 1) + [0.0])
@@ -145,38 +137,13 @@ class ProcessFamily:
         features = amplitude[:, None, None] * features
         return torch.nn.functional.pad(features, (0, 1), value=self.constant) if self.constant else features
 
-    def design_vjp(
-        self, fixed: "FixedFeatures", theta: Float[Tensor, "b q"], information: Float[Tensor, " b"]
-    ) -> tuple[Float[Tensor, "b n p"], Callable[[Float[Tensor, "b n p"]], Float[Tensor, "b q"]]]:
-        """Design at inputs that stay, and the product of a gradient in it with its derivative in the hyperparameters.
-
-        The gradient is that of a function of the design's inner products. Its log evidence is that of all features,
-        but for what cannot be told: where features that carry a variance of at most v are left out, it changes by
-        about half of v times the ``information``, the sum of the precisions of what is observed.
-        """
-        amplitude = self.amplitude_of(theta)
-        negligible = 2.0 * _NEGLIGIBLE / (amplitude.square() * information)
-        values, vjp = fixed.vjp(self.length_scale_of(theta), negligible)
-        design = self.scaled(values, amplitude)
-
-        def in_theta(gradient: Tensor) -> Tensor:
-            gradient = gradient[..., : values.shape[-1]]  # the constant has no hyperparameters
-            in_amplitude = (gradient * design[..., : values.shape[-1]]).sum((-2, -1))
-            in_amplitude = in_amplitude * (1.0 - torch.tanh(theta[:, -1] / _WIDEST).square())
-            if self.fixed_length_scale is not None:
-                return torch.nn.functional.pad(in_amplitude[:, None], (theta.shape[1] - 1, 0))
-            in_scale = vjp(amplitude[:, None, None] * gradient)
-            in_scale = in_scale * torch.sigmoid(theta[:, :-1] - math.log(self.shortest_length_scale))
-            return torch.cat([in_scale, in_amplitude[:, None]], dim=1)
-
-        return design, in_theta
-
 
 @dataclass(frozen=True)
 class Processes:
     """Processes of a family whose hyperparameters are known, with what does not depend on x computed."""
 
     family: ProcessFamily
+    theta: Float[Tensor, "b q"]
     length_scale: Float[Tensor, "b e"]
     amplitude: Float[Tensor, " b"]
     factor: Float[Tensor, "b m m"]
@@ -193,7 +160,7 @@ class Processes:
     @property
     def resolved(self) -> bool:
         """Whether length scales stay clear of the shortest that the inducing inputs resolve, or these are all."""
-        return self.family.exact or bool((self.length_scale > _CLEAR * self.family.shortest_length_scale).all())
+        return self.family.exact or bool((self.length_scale > CLEAR * self.family.shortest_length_scale).all())
 
     def cross(self, x: Float[Tensor, "n e"]) -> Float[Tensor, "b n m"]:
         """Kernel between x and the inducing inputs."""
@@ -214,7 +181,7 @@ class Processes:
 
 
 class FixedFeatures:
-    """Features of families on the same inducing inputs at x that stay, for one length scale after another.
+    """Features of a family at x that stay, for some hyperparameters after others.
 
     The inducing inputs are taken each as far as possible from those before it, and no more of them than carry what
     can be told: for a smooth kernel and a long length scale these are few. The features are those of the processes but
@@ -222,44 +189,59 @@ class FixedFeatures:
     """
 
     def __init__(self, family: ProcessFamily, x: Float[Tensor, "n e"]) -> None:
-        self._kernel = family.kernel
+        self.family = family
         chosen = family.inducing[family.farthest_first]
         self._gram = family.square_differences(chosen, chosen)
         self._cross = family.square_differences(chosen, x)
         self._jitter = family.jitter * torch.eye(len(chosen)).to(x)
 
-    def vjp(
-        self, length_scale: Float[Tensor, "b e"], negligible: Float[Tensor, " b"]
-    ) -> tuple[Float[Tensor, "b n r"], Callable[[Float[Tensor, "b n r"]], Float[Tensor, "b e"]]]:
-        """Features, and the product of a gradient in them with their derivative in the logarithms of length scales.
+    def design_vjp(
+        self, theta: Float[Tensor, "b q"], information: Float[Tensor, " b"]
+    ) -> tuple[Float[Tensor, "b n p"], Callable[[Float[Tensor, "b n p"]], Float[Tensor, "b q"]]]:
+        """Design, and the product of a gradient in it with its derivative in the hyperparameters.
 
-        The gradient is to be that of a function of the features' inner products alone. Left out are features that
-        carry less than ``negligible`` of the variance, which is one.
+        The gradient is to be that of a function of the design's inner products. Its log evidence is that of all
+        features, but for what cannot be told: where features that carry a variance of at most v are left out, it
+        changes by about half of v times the ``information``, the sum of the precisions of what is observed.
         """
+        family, length_scale, amplitude = (
+            self.family,
+            self.family.length_scale_of(theta),
+            self.family.amplitude_of(theta),
+        )
         inverse_square = length_scale.reciprocal().square()
-        gram, gram_slope = value_and_slope(self._gram, inverse_square, self._kernel)
+        gram, gram_slope = value_and_slope(self._gram, inverse_square, family.kernel)
         factor = safe_cholesky(gram + self._jitter, name="the kernel matrix of the inducing inputs")
         # The square of a diagonal entry is the variance at an inducing input given those before it, and given the
         # first r of them none is farther from these than the next. One feature is left in any case.
+        negligible = 2.0 * _NEGLIGIBLE / (amplitude.square() * information)
         carries = (factor.diagonal(dim1=-2, dim2=-1).square() > negligible[:, None]).any(0)
         size = int(carries.nonzero().max()) + 1 if bool(carries.any()) else 1
         factor, gram_slope = factor[:, :size, :size], gram_slope[:, :size, :size]
         gram_squares, cross_squares = self._gram[:, :size, :size], self._cross[:, :size]
-        cross, cross_slope = value_and_slope(cross_squares, inverse_square, self._kernel)
-        values = torch.linalg.solve_triangular(factor, cross, upper=False).mT
+        cross, cross_slope = value_and_slope(cross_squares, inverse_square, family.kernel)
+        features = torch.linalg.solve_triangular(factor, cross, upper=False).mT
+        design = family.scaled(features, amplitude)
 
         # With K = L L' of the inducing inputs and C their kernel with the others the features are F' = inv(L) C, and
         # dF' = inv(L) dC - P F', where P is the lower half of S = inv(L) dK inv(L)'. P and S / 2 differ by an
         # antisymmetric matrix, a rotation of the features, which a function of inner products does not see:
         # dF' = inv(L) (dC - dK inv(K) C / 2). For a squared distance s in length scales dk = -2 s k'(s) d log(scale).
-        def in_log_length_scale(gradient: Tensor) -> Tensor:
-            both = torch.cat([gradient.mT, values.mT], dim=-1)
+        def in_theta(gradient: Tensor) -> Tensor:
+            gradient = gradient[..., :size]  # the constant has no hyperparameters
+            in_amplitude = (gradient * design[..., :size]).sum((-2, -1))
+            in_amplitude = (in_amplitude * (1.0 - torch.tanh(theta[:, -1] / _WIDEST).square()))[:, None]
+            if family.fixed_length_scale is not None:
+                return torch.nn.functional.pad(in_amplitude, (theta.shape[1] - 1, 0))
+            both = torch.cat([amplitude[:, None, None] * gradient.mT, features.mT], dim=-1)
             adjoint, solved = torch.linalg.solve_triangular(factor.mT, both, upper=True).chunk(2, dim=-1)
             in_cross = (adjoint * cross_slope).flatten(1) @ cross_squares.flatten(1).mT
             in_gram = (adjoint @ solved.mT * gram_slope).flatten(1) @ gram_squares.flatten(1).mT
-            return (in_gram - 2.0 * in_cross) / length_scale.square()
+            in_scale = (in_gram - 2.0 * in_cross) / length_scale.square()
+            in_scale = in_scale * torch.sigmoid(theta[:, :-1] - math.log(family.shortest_length_scale))
+            return torch.cat([in_scale, in_amplitude], dim=1)
 
-        return values, in_log_length_scale
+        return design, in_theta
 
 
 def inducing_inputs(inputs: Float[Tensor, "n e"], n_inducing: int) -> Float[Tensor, "m e"]:

@@ -92,77 +92,35 @@ def weights_factor(design: Tensor, response: Tensor) -> tuple[Tensor, Tensor]:
     return upper, (orthogonal[..., : design.shape[-2], :].mT @ response.unsqueeze(-1)).squeeze(-1)
 
 
-class Couplings(NamedTuple):
-    """Scatters of the i outputs at an input with these and, last, the response, of coupled inputs: weighted by W'W."""
-
-    own: Float[Tensor, "n i j"]
-    """With those at the same input."""
-    after: Float[Tensor, "m i j"]
-    """With those at the next input: m = n - 1, or none where inputs are coupled with themselves alone."""
-    before: Float[Tensor, "m i j"]
-    """Of all inputs but the first, with those at the input before."""
-
-    def scaled(self, precision: Float[Tensor, " n"]) -> "Couplings":
-        """Scatters times the roots of the precisions on both sides."""
-        root, n = precision.sqrt()[:, None, None], len(self.after)
-        beside = root[:n] * root[len(root) - n :]
-        return Couplings(precision[:, None, None] * self.own, beside * self.after, beside * self.before)
-
-    def response(self) -> Float[Tensor, "n i"]:
-        """Sum over the coupled inputs of the scatters with the response."""
-        return _at_inputs(self.own[..., -1], self.after[..., -1], self.before[..., -1])
-
-    def precision(self, features: Float[Tensor, "b n p"]) -> Float[Tensor, "b ip ip"]:
-        """Precision of the weights: all pairs of coefficients by all products of two features."""
-        own, after = self.own[..., :-1].flatten(1), self.after[..., :-1].flatten(1)
-        first, last = features[:, : len(after)], features[:, len(own) - len(after) :]
-        half = 0.5 * own.mT @ _products(features, features) + after.mT @ _products(first, last)
-        size, n_features = self.own.shape[1], features.shape[-1]
-        half = half.reshape(-1, size, size, n_features, n_features).transpose(2, 3)
-        half = half.reshape(len(features), size * n_features, -1)
-        return half + half.mT + torch.eye(size * n_features).to(features)
-
-    def weighted(self, spread: Float[Tensor, "n ii p"]) -> Float[Tensor, "n p"]:
-        """Sum over the coupled inputs and the pairs of outputs."""
-        n = len(self.after)
-        parts = zip(self, (spread, spread[len(spread) - n :], spread[:n]), strict=True)
-        return _at_inputs(*((part[..., :-1].flatten(1).unsqueeze(1) @ each).squeeze(1) for part, each in parts))
-
-
-def _products(left: Float[Tensor, "b m p"], right: Float[Tensor, "b m p"]) -> Float[Tensor, "b m pp"]:
-    """All products of a feature on the left and one on the right."""
-    return (left.unsqueeze(-1) * right.unsqueeze(-2)).flatten(2)
-
-
-def _at_inputs(own: Float[Tensor, "n p"], after: Float[Tensor, "m p"], before: Float[Tensor, "m p"]) -> Tensor:
-    """Sum at each input of what it has with itself, with the next one and with the one before."""
-    none = own.new_zeros(len(own) - len(after), own.shape[1])
-    return own + torch.cat([after, none]) + torch.cat([none, before])
-
-
 @dataclass(frozen=True)
 class Regression:
     """Regression of an output on the i standardized outputs before it, at n inputs, with coefficients (n, i).
 
-    ``root.mT @ coefficients`` is ``response`` but for noise of the output's conditional variance,
-    independent between the rows of the root: sufficient statistics of the rows at an input.
+    ``root.mT @ coefficients`` is ``response`` but for noise of variance one, independent between the rows of the root:
+    sufficient statistics of the rows at an input.
     """
 
     scatter: Float[Tensor, "n j j"]
     """Scatter of the i standardized outputs and, last, the output: j = i + 1."""
+    precision: Float[Tensor, " n"]
+    """Expected inverse of the output's conditional variance."""
     whitener: Float[Tensor, "n n"] | None
     """W, that makes the rows at different inputs independent; None where they are."""
 
     @classmethod
     def standardize(
-        cls, scatter: Float[Tensor, "n j j"], tril: Float[Tensor, "n i i"], whitener: Float[Tensor, "n n"] | None
+        cls,
+        scatter: Float[Tensor, "n j j"],
+        tril: Float[Tensor, "n i i"],
+        precision: Float[Tensor, " n"],
+        whitener: Float[Tensor, "n n"] | None,
     ) -> "Regression":
         """Regression of the last output of a scatter; ``tril`` is the factor of the others' covariance."""
         size = tril.shape[-1]
         # diag(inv(T), 1) S diag(inv(T), 1)': the outputs before get unit covariance, the last one keeps its unit.
         standardizing = torch.eye(size + 1).to(scatter).repeat(len(scatter), 1, 1)
         standardizing[:, :size, :size] = triangular_inverse(tril)
-        return cls(symmetrize(standardizing @ scatter @ standardizing.mT), whitener)
+        return cls(symmetrize(standardizing @ scatter @ standardizing.mT), precision, whitener)
 
     @property
     def size(self) -> int:
@@ -176,72 +134,79 @@ class Regression:
 
     @cached_property
     def root(self) -> Float[Tensor, "n i i"]:
-        """Lower factor of the scatter of the i outputs."""
-        return safe_cholesky(self.before, name="the scatter of the outputs")
+        """Lower factor of the scatter of the i outputs times the precision."""
+        factor = safe_cholesky(self.before, name="the scatter of the outputs")
+        return self.precision.sqrt()[:, None, None] * factor
 
     @cached_property
     def response(self) -> Float[Tensor, "n i"]:
-        """Output at the root's rows: ``inv(root)`` times its scatter with the others."""
-        return torch.linalg.solve_triangular(self.root, self.scatter[:, :-1, -1:], upper=False).squeeze(-1)
+        """Output at the root's rows: ``inv(root)`` times its scatter with the others and the precision."""
+        cross = self.precision[:, None, None] * self.scatter[:, :-1, -1:]
+        return torch.linalg.solve_triangular(self.root, cross, upper=False).squeeze(-1)
 
     @cached_property
-    def couplings(self) -> Couplings | None:
-        """Couplings of inputs with themselves and their neighbours; None where they are coupled with others too.
+    def inverse(self) -> Float[Tensor, "n n"] | None:
+        """Inverse W'W of the correlation of the rows at different inputs; None where they are independent."""
+        return None if self.whitener is None else self.whitener.mT @ self.whitener
 
-        The inverse W'W of an exponential correlation along a line is zero but for neighbours, as that of a Markov
-        process.
+    @cached_property
+    def cross(self) -> Float[Tensor, "n i"]:
+        """Product of the root's rows at each input with the responses at all, weighted by W'W."""
+        response = self.response if self.inverse is None else self.inverse @ self.response
+        return (self.root @ response.unsqueeze(-1)).squeeze(-1)
+
+    @cached_property
+    def couplings(self) -> tuple[Float[Tensor, "n i i"], Float[Tensor, "m i i"]] | None:
+        """Products of the root's rows at one input and, m of n - 1, at one and the next, weighted by W'W.
+
+        None where inputs are coupled with others too. The inverse of an exponential correlation along a line is zero
+        but for neighbours, as that of a Markov process; where inputs are independent m is zero.
         """
-        # At each input the root's rows: of the outputs before, and of the response.
-        rows = torch.cat([self.root.mT, self.response.unsqueeze(-1)], dim=-1)
-        if self.whitener is None:
-            return Couplings(torch.cat([self.before, self.scatter[:, :-1, -1:]], dim=-1), rows[:0], rows[:0])
-        inverse = self.whitener.mT @ self.whitener
-        if float(inverse.tril(-2).abs().max()) > _NO_NEIGHBOUR * float(inverse.diagonal().min()):
+        if self.inverse is None:
+            return self.root @ self.root.mT, self.root[:0]
+        own, beside = self.inverse.diagonal()[:, None, None], self.inverse.diagonal(1)[:, None, None]
+        if float(self.inverse.tril(-2).abs().max()) > _NO_NEIGHBOUR * float(own.min()):
             return None
-        own, beside = inverse.diagonal()[:, None, None], inverse.diagonal(1)[:, None, None]
-        after, before = self.root[:-1] @ rows[1:], self.root[1:] @ rows[:-1]
-        return Couplings(own * (self.root @ rows), beside * after, beside * before)
+        return own * (self.root @ self.root.mT), beside * (self.root[:-1] @ self.root[1:].mT)
 
-    def fit(self, features: Float[Tensor, "b n p"], precision: Float[Tensor, " n"]) -> LinearEvidence:
+    def fit(self, features: Float[Tensor, "b n p"]) -> LinearEvidence:
         """Posterior of the weights of b sets of features, one coefficient after another, with its log evidence.
 
-        ``precision`` is the expected inverse of the conditional variance. Where inputs have to do with their
-        neighbours at most, the precision of the weights is formed of its blocks: by way of the design, which has i
-        rows an input, it would be i times the work.
+        Where inputs have to do with their neighbours at most, the precision of the weights is formed of its blocks: by
+        way of the design, which has i rows an input, it would be i times the work.
         """
         if self.couplings is not None:
-            couplings = self.couplings.scaled(precision)
-            blocks = couplings.precision(features)
-            if float(blocks.detach().diagonal(dim1=-2, dim2=-1).amax()) < _LARGEST_PRECISION:
-                factor = safe_cholesky(blocks, name="the precision of the coefficients' weights")
-                cross = (couplings.response().mT @ features).flatten(1).unsqueeze(-1)
+            precision = self._weights_precision(*self.couplings, features)
+            if float(precision.detach().diagonal(dim1=-2, dim2=-1).amax()) < _LARGEST_PRECISION:
+                factor = safe_cholesky(precision, name="the precision of the coefficients' weights")
+                cross = (self.cross.mT @ features).flatten(1).unsqueeze(-1)
                 projected = torch.linalg.solve_triangular(factor, cross, upper=False)
                 mean = torch.linalg.solve_triangular(factor.mT, projected, upper=True).squeeze(-1)
                 return LinearEvidence(0.5 * projected.square().sum((-2, -1)) - _log_det(factor), mean, factor.mT)
-        return LinearEvidence.fit(*self._design(features, precision))
+        return LinearEvidence.fit(*self._design(features))
 
-    def gradient(
-        self, linear: LinearEvidence, features: Float[Tensor, "b n p"], precision: Float[Tensor, " n"]
-    ) -> Float[Tensor, "b n p"]:
+    def gradient(self, linear: LinearEvidence, features: Float[Tensor, "b n p"]) -> Float[Tensor, "b n p"]:
         """Gradient of the log evidence in the features.
 
         With the mean m and the precision P = I + X of the weights, and their inner products c with the response, it is
         that of ``m' c - tr((inv(P) + m m') X) / 2``: block (j, k) of X is the sum over coupled inputs l and r of
         ``weight_jk F_l F_r'``.
         """
-        n_inputs, n_features = features.shape[1:]
         if self.couplings is None:
-            gradient = linear.gradient(*self._design(features, precision))
-            gradient = gradient.reshape(len(features), n_inputs, self.size, self.size, n_features)
+            gradient = linear.gradient(*self._design(features))
+            gradient = gradient.reshape(len(features), -1, self.size, self.size, features.shape[-1])
             gradient = torch.einsum("mn,bmajp->bnajp", self.whitener, gradient)
-            return torch.einsum("n,nja,bnajp->bnp", precision.sqrt(), self.root, gradient)
-        couplings = self.couplings.scaled(precision)
-        response = couplings.response()
+            return torch.einsum("nja,bnajp->bnp", self.root, gradient)
+        own, beside = (part.flatten(1).unsqueeze(1) for part in self.couplings)
+        after, n = self.couplings[1].mT.flatten(1).unsqueeze(1), len(beside)
         second = linear.covariance + linear.mean.unsqueeze(-1) * linear.mean.unsqueeze(-2)
         in_features = []
         for mean, its_second, its_features in zip(linear.mean, second, features, strict=True):  # bounds the memory
             spread = self._spread(its_second, its_features)
-            in_features.append(response @ mean.reshape(self.size, n_features) - couplings.weighted(spread))
+            weighted = own @ spread
+            weighted[:n] += beside @ spread[len(spread) - n :]
+            weighted[len(spread) - n :] += after @ spread[:n]
+            in_features.append(self.cross @ mean.reshape(self.size, -1) - weighted.squeeze(1))
         return torch.stack(in_features)
 
     def expected_squares(
@@ -257,7 +222,16 @@ class Regression:
 
     def local_squares(self) -> Float[Tensor, " n"]:
         """Sum of squared residuals from the coefficients that fit best at each input by itself."""
-        return (self.scatter[:, -1, -1] - self.response.square().sum(-1)).clamp_min(0.0)
+        return (self.scatter[:, -1, -1] - self.response.square().sum(-1) / self.precision).clamp_min(0.0)
+
+    def _weights_precision(self, own: Tensor, beside: Tensor, features: Tensor) -> Float[Tensor, "b ip ip"]:
+        """Precision of the weights: all pairs of coefficients by all products of two features."""
+        n, n_features = len(beside), features.shape[-1]
+        first, last = features[:, :n], features[:, len(own) - n :]
+        half = 0.5 * own.flatten(1).mT @ _products(features, features) + beside.flatten(1).mT @ _products(first, last)
+        half = half.reshape(-1, self.size, self.size, n_features, n_features).transpose(2, 3)
+        half = half.reshape(len(features), self.size * n_features, -1)
+        return half + half.mT + torch.eye(self.size * n_features).to(features)
 
     def _spread(self, covariance: Tensor, features: Tensor) -> Float[Tensor, "n ii p"]:
         """Each block of a covariance of the weights times the features (n, p) of each input."""
@@ -265,13 +239,16 @@ class Regression:
         blocks = covariance.reshape(size, n_features, size, n_features).permute(3, 0, 2, 1)
         return (features @ blocks.flatten(1)).unflatten(-1, (size * size, n_features))
 
-    def _design(self, features: Tensor, precision: Tensor) -> tuple[Tensor, Tensor]:
+    def _design(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Design (b, n * i, i * p) of the rows of the root at each input, whitened, and the response."""
         # Row a at an input holds root_ja F for each coefficient j: n i rows, of which the whitener mixes the inputs.
-        weight = precision.sqrt()
-        design = torch.einsum("n,nja,bnp->bnajp", weight, self.root, features).flatten(-2)
-        response = weight[:, None] * self.response
+        design, response = torch.einsum("nja,bnp->bnajp", self.root, features).flatten(-2), self.response
         if self.whitener is not None:
             design = torch.einsum("mn,bnaq->bmaq", self.whitener, design)
             response = self.whitener @ response
         return design.flatten(1, 2), response.flatten().expand(len(design), -1)
+
+
+def _products(left: Float[Tensor, "b m p"], right: Float[Tensor, "b m p"]) -> Float[Tensor, "b m pp"]:
+    """All products of a feature on the left and one on the right."""
+    return (left.unsqueeze(-1) * right.unsqueeze(-2)).flatten(2)

@@ -35,7 +35,7 @@ _OF_ONE, _OF_SEVERAL, _MOST, _TOGETHER, _FEWEST = 48, 128, 128, (800, 400), 12
 
 # Length scales, in ranges of the inputs, short to long by threes; and logarithms of amplitudes, weak and strong.
 _STARTS = tuple(product((0.04, 0.12, 0.35, 1.0), (-1.0, 0.5)))
-_SMALL = 10_000  # entries of all processes' features
+_SMALL = 1_000  # entries of all processes' kernel matrices
 
 # An end gets as much length as the whole range has, most of it within the first of these shares of the range (a spacing
 # of the inputs at least) or the second: a process of a usual length scale is then as free there as elsewhere in all.
@@ -145,71 +145,66 @@ class Search:
     """b."""
     options: SearchOptions
     """Its ``ends`` are added to."""
+    held: Float[Tensor, "b q"] | None = None
+    """Hyperparameters that are given, and not searched."""
     theta: Float[Tensor, "b q"] | None = None
-    held: bool = False
-    """Whether ``theta`` is given, and not searched."""
-    _inverse_hessian: Float[Tensor, "b q q"] | None = None
-    """Curvature that the last run ended with."""
+    """Hyperparameters that the last run ended with; beside them their log evidence times prior, and its curvature."""
+    value: Float[Tensor, " b"] = field(init=False)
+    _inverse_hessian: Float[Tensor, "b q q"] = field(init=False)
 
-    def run(self, evidence: Evidence, n_observed: int) -> Float[Tensor, "b q"]:
-        """Hyperparameters for this evidence, of so many observations of each process."""
-        if self.held and self.theta is not None:
-            return self.theta
-
-        def value(theta: Tensor, rows: Tensor) -> tuple[Tensor, Gradient]:
-            try:
-                return evidence(theta, rows)
-            except (NotPositiveDefiniteError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
-                return math.nan * theta.sum(-1), lambda: theta  # too far, for the optimizer
+    def run(self, evidence: Evidence) -> Float[Tensor, "b q"]:
+        """Hyperparameters for this evidence."""
+        if self.held is not None:
+            return self.held
 
         def loss(theta: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-            found, gradient = value(theta, rows)
+            found, gradient = _wherever(evidence, theta, rows % self.n_processes)
             prior, of_prior = self.family.log_prior(theta)
             return -found - prior, -gradient() - of_prior
 
-        if self.theta is None or self._inverse_hessian is None:
-            table = grid_evidence(value, self.family, self.n_processes, n_observed)
-            best = table.argsort(0, descending=True)[: 1 + self.options.n_restarts]
-            starts, inverse_hessian = grid_points(self.family)[best], None
+        if self.theta is None:
+            points, values = self.on_grid(evidence)
+            starts, inverse_hessian = points[values.argsort(0, descending=True)[: 1 + self.options.n_restarts]], None
         else:
             starts, inverse_hessian = self.theta[None], self._inverse_hessian
-        tol = self.options.slack * self.options.tol
         # All starts of all processes side by side, and of each process the best end.
         points, report = minimize_batch(
-            lambda theta, rows: loss(theta, rows % self.n_processes),
+            loss,
             starts.flatten(0, 1),
             max_iter=self.options.max_iter,
-            tol=tol,
+            tol=self.options.slack * self.options.tol,
             inverse_hessian=inverse_hessian,
         )
         shape = len(starts), self.n_processes
-        lowest = report.loss.reshape(shape).nan_to_num(nan=math.inf).argmin(0)
-        row = torch.arange(self.n_processes, device=lowest.device)
-        self.theta = points.unflatten(0, shape)[lowest, row]
-        self._inverse_hessian = report.inverse_hessian.unflatten(0, shape)[lowest, row]
+        losses = report.loss.reshape(shape).nan_to_num(nan=math.inf)
+        best = losses.argmin(0), torch.arange(self.n_processes, device=losses.device)
+        self.theta, self.value = points.unflatten(0, shape)[best], -losses[best]
+        self._inverse_hessian = report.inverse_hessian.unflatten(0, shape)[best]
         self.options.ends.append((report.n_iter, report.status))
         return self.theta
 
+    def on_grid(self, evidence: Evidence) -> tuple[Float[Tensor, "s q"], Float[Tensor, "s b"]]:
+        """Hyperparameters where a search may begin, and their log evidence times prior for each process.
 
-def grid_points(family: ProcessFamily) -> Float[Tensor, "s q"]:
-    """Hyperparameters where a search may begin."""
-    rows = [[math.log(scale)] * family.inducing.shape[1] + [amplitude] for scale, amplitude in _STARTS]
-    return family.inducing.new_tensor(rows)
+        Those of one length scale are tried together, as they take as many features; all, where calls cost more.
+        """
+        inducing, every = self.family.inducing, torch.arange(self.n_processes)
+        points = inducing.new_tensor([[math.log(scale)] * inducing.shape[1] + [size] for scale, size in _STARTS])
+        small = self.n_processes * len(inducing) ** 2 < _SMALL
+        parts = [
+            _wherever(evidence, part.repeat_interleave(len(every), dim=0), every.repeat(len(part)).to(points.device))[0]
+            for part in points.split(len(points) if small else 2)
+        ]
+        values = torch.cat(parts).reshape(len(points), -1) + self.family.log_prior(points)[0][:, None]
+        return points, values.nan_to_num(nan=-math.inf)
 
 
-def grid_evidence(evidence: Evidence, family: ProcessFamily, n_processes: int, n_observed: int) -> Float[Tensor, "s b"]:
-    """Log evidence times prior of each process at these points, of so many observations of each.
-
-    Those of one length scale are tried together, as they take as many features; all, where calls cost more.
-    """
-    points = grid_points(family)
-    every = torch.arange(n_processes, device=points.device)
-    small = n_observed * n_processes * len(family.inducing) < _SMALL
-    parts = [
-        evidence(part.repeat_interleave(n_processes, dim=0), every.repeat(len(part)))[0].reshape(-1, n_processes)
-        for part in points.split(len(points) if small else 2)
-    ]
-    return (torch.cat(parts) + family.log_prior(points)[0][:, None]).nan_to_num(nan=-math.inf)
+def _wherever(evidence: Evidence, theta: Tensor, rows: Tensor) -> tuple[Tensor, Gradient]:
+    """Log evidence, NaN where it is too far to be computed."""
+    try:
+        return evidence(theta, rows)
+    except (NotPositiveDefiniteError, torch.linalg.LinAlgError):  # type: ignore[attr-defined]
+        return math.nan * theta.sum(-1), lambda: theta
 
 
 def stretched(
@@ -229,13 +224,12 @@ def stretched(
     options = replace(options, n_restarts=0, tol=max(options.tol, 0.1))
 
     def evidence(family: ProcessFamily, *, searched: bool) -> float:
-        near = squares.log_pooled.clone()
-        of_theta = log_variance_evidence(family, FixedFeatures(family, inputs), squares, near)
+        search, near = Search(family, len(squares.total), options), squares.log_pooled.clone()
+        of_theta = log_variance_evidence(FixedFeatures(family, inputs), squares, near)
         if not searched:
-            return float(grid_evidence(of_theta, family, *near.shape).amax(0).sum())
-        theta = Search(family, len(near), options).run(of_theta, len(inputs))
-        value, _ = of_theta(theta, torch.arange(len(near), device=near.device))
-        return float((value + family.log_prior(theta)[0]).sum())
+            return float(search.on_grid(of_theta)[1].amax(0).sum())
+        search.run(of_theta)
+        return float(search.value.sum())
 
     result, stretch = family, inputs.new_tensor([[0.0, 1.0], [0.0, 1.0]])
     on_grid, highest = evidence(family, searched=False), None

@@ -20,13 +20,12 @@ from torch_pbd.gp.search import fit_together
 from torch_pbd.linalg import triangular_inverse
 from torch_pbd.models.heteroscedastic.log_variance import (
     LEAST_SQUARE,
-    LogVariance,
     Squares,
     fit_log_variance,
     log_variance_evidence,
 )
 from torch_pbd.models.heteroscedastic.posterior import LatentCovariance, LatentMean
-from torch_pbd.models.heteroscedastic.processes import FixedFeatures, Gradient, inducing_inputs
+from torch_pbd.models.heteroscedastic.processes import CLEAR, FixedFeatures, Gradient, inducing_inputs
 from torch_pbd.models.heteroscedastic.regression import LinearEvidence, Regression, Weights
 from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation
 from torch_pbd.models.heteroscedastic.search import Families, Search, SearchOptions
@@ -70,26 +69,25 @@ def fit_mean(
     noise_whitener = scale if whitener is None else whitener * scale.mT
     response = _times(noise_whitener, means.mT.unsqueeze(-1)).squeeze(-1)
     information = noise_whitener.square().sum((-2, -1))
-    family, fixed = search.family, FixedFeatures(search.family, inputs)
+    fixed = FixedFeatures(search.family, inputs)
 
     def evidence(theta: Tensor, rows: Int64[Tensor, " a"]) -> tuple[Tensor, Gradient]:
-        design, vjp = family.design_vjp(fixed, theta, information[rows])
+        design, vjp = fixed.design_vjp(theta, information[rows])
         chosen, its_response = noise_whitener[rows], response[rows]
         whitened = _times(chosen, design)
         linear = LinearEvidence.fit(whitened, its_response)
         transposed = chosen if whitener is None else chosen.mT
         return linear.value, lambda: vjp(_times(transposed, linear.gradient(whitened, its_response)))
 
-    theta = search.run(evidence, len(means))
+    processes = search.family.prepared(search.run(evidence))
     # All outputs: sqrt(count) inv(T) mean, with T the factor of the noise, has independent entries at an input.
-    processes = family.prepared(theta)
     whitening = counts.sqrt()[:, None, None] * triangular_inverse(noise_tril)
     design = torch.einsum("nij,jnp->nijp", whitening, processes(inputs)).flatten(2)
     response = (whitening @ means.unsqueeze(-1)).squeeze(-1)
     if whitener is not None:
         design = torch.einsum("imn,niq->miq", whitener, design)
         response = torch.einsum("imn,ni->mi", whitener, response)
-    return LatentMean(theta, processes, LinearEvidence.fit(design.flatten(0, 1), response.flatten()).weights)
+    return LatentMean(processes, LinearEvidence.fit(design.flatten(0, 1), response.flatten()).weights)
 
 
 def _times(whitener: Tensor, values: Tensor) -> Tensor:
@@ -97,25 +95,16 @@ def _times(whitener: Tensor, values: Tensor) -> Tensor:
     return whitener * values if whitener.shape[-1] == 1 else whitener @ values
 
 
-class MeanStart(NamedTuple):
-    """Beginning of a mean."""
-
-    search: Search
-    """Holds the hyperparameters that were found, on the inducing inputs that they need."""
-    noise_tril: Float[Tensor, "d d"]
-    """Factor of the noise of a row, the same everywhere."""
-    rows: TrainingSet
-    """Rows at as many inputs as are needed."""
-
-
 def mean_start(
     rows: TrainingSet, first: LatentMean, noise_tril: Float[Tensor, "d d"], options: SearchOptions
-) -> MeanStart | None:
+) -> tuple[Search, Float[Tensor, "d d"], TrainingSet] | None:
     """Start where inducing inputs are too few for the means at the inputs, or their noise was taken for too large.
 
-    None unless the evidence is clearly higher, of any output, than that of the ``first`` one under its noise. Residuals
-    that are not white by chance, or under noise that is louder in places, are no reason to begin here: these
-    hyperparameters stay, and noise that depends on the input would have led to others.
+    A search that holds the hyperparameters found, on the inducing inputs that they need; the factor of a row's noise;
+    and the rows, at as many inputs as are needed. None unless the evidence is clearly higher, of any output, than that
+    of the ``first`` one under its noise. Residuals that are not white by chance, or under noise that is louder in
+    places, are no reason to begin here: these hyperparameters stay, and noise that depends on the input would have led
+    to others.
     """
     training = rows.merged(MOST_INPUTS)
     rows_at_input = training.counts.mean()
@@ -137,11 +126,12 @@ def mean_start(
     if bool((negative_log_evidence(observations, before, family.kernel) - loss < _CLEARLY).all()):
         return None
     # As many inducing inputs as resolve the shortest length scale with room to spare.
-    needed = math.ceil(min(family.n_needed(float(found.length_scale.min())), len(training.inputs)))
+    needed = (CLEAR / float(found.length_scale.min())) ** training.inputs.shape[1]
+    needed = math.ceil(min(needed, len(training.inputs)))
     inducing = inducing_inputs(training.inputs, max(len(family.inducing), min(needed, _TOGETHER // n_outputs)))
     family = replace(family, inducing=inducing, exact=len(inducing) == len(rows.inputs))
-    held = Search(family, n_outputs, options, family.theta_of(found.length_scale, found.amplitude), held=True)
-    return MeanStart(held, (noise_scale * rows_at_input.sqrt()).diag(), rows.merged(_MOST_ROWS // n_outputs))
+    held = Search(family, n_outputs, options, family.theta_of(found.length_scale, found.amplitude))
+    return held, (noise_scale * rows_at_input.sqrt()).diag(), rows.merged(_MOST_ROWS // n_outputs)
 
 
 class CovarianceSearch:
@@ -167,16 +157,6 @@ _FitRow = Callable[[int, Regression], tuple[Tensor, Tensor, Tensor, Tensor | flo
 """Features (n, p) of the coefficients of output i, mean and covariance of their weights, and the divergence."""
 
 
-def search_log_variance(
-    search: Search, fixed: FixedFeatures, squares: Squares, near: Float[Tensor, "b n"] | None
-) -> LogVariance:
-    """Posterior with the hyperparameters of the highest evidence, of log variances that are ``near`` those given."""
-    near = (squares.log_pooled if near is None else near).clone()
-    theta = search.run(log_variance_evidence(search.family, fixed, squares, near), squares.total.shape[1])
-    information = 0.5 * squares.degrees.sum(-1)
-    return fit_log_variance(squares, search.family.design_vjp(fixed, theta, information)[0], near)
-
-
 def fit_covariance(
     search: CovarianceSearch,
     inputs: Float[Tensor, "n e"],
@@ -199,39 +179,43 @@ def fit_covariance(
     # any coefficient would fit, and its uncertainty would count as their variance.
     scatter = scatter + LEAST_SQUARE * torch.diag_embed(degrees.mT)
     fixed = FixedFeatures(search.log_variance.family, inputs)
-    location, rows = None, []
+    in_row = FixedFeatures(search.coefficient_family, inputs)
+    near, rows = None, []
     if previous is not None:
-        location = previous.log_variance_at(inputs)[0].mT
-        rows = _regress(scatter, location, noise, partial(_known_row, previous.coefficients, previous.rows(inputs)))
+        near = previous.log_variance_at(inputs)[0].mT
+        known = partial(_known_row, previous.coefficients, previous.rows(inputs))
+        rows = _regress(scatter, near, torch.exp(-near), noise, known)
     for sweep in range(_SWEEPS if scatter.shape[1] > 1 and not cautious else 1):
         squares = _squares(scatter, degrees, noise, rows)
-        log_variance = search_log_variance(search.log_variance, fixed, squares, location)
-        location = log_variance.location
+        near = (squares.log_pooled if near is None else near).clone()
+        theta = search.log_variance.run(log_variance_evidence(fixed, squares, near))
+        log_variance = fit_log_variance(squares, fixed.design_vjp(theta, squares.information)[0], near)
+        near = log_variance.location
         # E[exp(-l)] of a normal l: its mean and half its variance.
-        precision = torch.exp(-location + 0.5 * log_variance.variance)
-        fit_row = partial(_searched_row, search.coefficients, fixed, precision, anew=sweep < _SEARCHES)
-        rows = _regress(scatter, location, noise, fit_row)
+        precision = torch.exp(-near + 0.5 * log_variance.variance)
+        searched = partial(_searched_row, search.coefficients, in_row, anew=sweep < _SEARCHES)
+        rows = _regress(scatter, near, precision, noise, searched)
         evidence = float(log_variance.evidence.sum()) - float(sum(row.divergence for row in rows))
     # The weights of all features, where the searches took only those that carry something.
-    searches = search.log_variance, *search.coefficients
-    log_theta, *thetas = (each.theta for each in searches if each.theta is not None)
-    theta = torch.cat([log_theta[:0], *thetas])
-    log_variances, processes = search.log_variance.family.prepared(log_theta), search.coefficient_family.prepared(theta)
-    log_weights = fit_log_variance(squares, log_variances(inputs), location).weights
-    coefficients = []
-    for row, features, its_precision in zip(rows, processes(inputs), precision[1:], strict=True):
-        weights = row.regression.fit(features[None], its_precision).weights
-        coefficients.append(Weights(weights.mean[0], weights.root[0]))
-    return LatentCovariance(log_theta, log_variances, log_weights, theta, processes, coefficients), evidence
+    log_variances = search.log_variance.family.prepared(theta)
+    weights = fit_log_variance(squares, log_variances(inputs), near).weights
+    thetas = [each.theta for each in search.coefficients if each.theta is not None]
+    processes, coefficients = search.coefficient_family.prepared(torch.cat([theta[:0], *thetas])), []
+    for row, features in zip(rows, processes(inputs), strict=True):
+        mean, root = row.regression.fit(features[None]).weights
+        coefficients.append(Weights(mean[0], root[0]))
+    return LatentCovariance(log_variances, weights, processes, coefficients), evidence
 
 
-def _regress(scatter: Tensor, location: Tensor, noise: NoiseCorrelation | None, fit_row: _FitRow) -> list[_Row]:
-    """Regressions of one output after another on those before it, of log variances (d, n) that are known."""
+def _regress(
+    scatter: Tensor, location: Tensor, precision: Tensor, noise: NoiseCorrelation | None, fit_row: _FitRow
+) -> list[_Row]:
+    """Regressions of one output after another on those before it, of log variances and precisions (d, n) as known."""
     deviation = torch.exp(0.5 * location)
     tril, rows = deviation[0][:, None, None], []
     for i in range(1, len(location)):
         whitener = None if noise is None else noise.whitener[i]
-        regression = Regression.standardize(scatter[:, : i + 1, : i + 1], tril, whitener)
+        regression = Regression.standardize(scatter[:, : i + 1, : i + 1], tril, precision[i], whitener)
         features, mean, covariance, divergence = fit_row(i, regression)
         rows.append(_Row(regression, regression.expected_squares(features, mean, covariance), divergence))
         # The factor of outputs 0, ..., i, on which the next one is regressed.
@@ -248,20 +232,19 @@ def _known_row(
 
 
 def _searched_row(
-    searches: list[Search], fixed: FixedFeatures, precision: Tensor, i: int, regression: Regression, *, anew: bool
+    searches: list[Search], fixed: FixedFeatures, i: int, regression: Regression, *, anew: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Coefficients of output i given the expected precisions (d, n), their hyperparameters searched anew or kept."""
-    search, own = searches[i - 1], precision[i]
-    information = (own * regression.before.diagonal(dim1=1, dim2=2).sum(-1)).sum()
+    """Coefficients of output i, their hyperparameters searched anew or kept."""
+    search, information = searches[i - 1], regression.root.square().sum()[None]
 
-    def evidence(theta: Tensor, _: Tensor) -> tuple[Tensor, Gradient]:
-        design, vjp = search.family.design_vjp(fixed, theta, information.expand(len(theta)))
-        linear = regression.fit(design, own)
-        return linear.value, lambda: vjp(regression.gradient(linear, design, own))
+    def evidence(theta: Tensor, rows: Tensor) -> tuple[Tensor, Gradient]:
+        design, vjp = fixed.design_vjp(theta, information[rows])
+        linear = regression.fit(design)
+        return linear.value, lambda: vjp(regression.gradient(linear, design))
 
-    theta = search.run(evidence, regression.response.numel()) if anew or search.theta is None else search.theta
-    design, _ = search.family.design_vjp(fixed, theta, information.expand(1))
-    linear = regression.fit(design, own)
+    theta = search.run(evidence) if anew or search.theta is None else search.theta
+    design, _ = fixed.design_vjp(theta, information)
+    linear = regression.fit(design)
     return design[0], linear.mean[0], linear.covariance[0], linear.divergence_from_prior()
 
 
