@@ -16,9 +16,6 @@ from torch_pbd.exceptions import InvalidParameterError
 
 _OF_AXES = ("bias", "noise_scale", "resolution", "range", "deadband")
 
-Reading = tuple[Tensor, Tensor]
-"""Force read (..., d) in N, and of torques in Nm, and whether any of its axes was clipped (...)."""
-
 
 @final
 @dataclass(frozen=True)
@@ -139,8 +136,8 @@ class ForceReader:
         # Separate tensors, so that subtracting a bias in place from one does not change the next.
         self._under_way = deque(self._convert(self._bias) for _ in range(sensor.delay_steps))
 
-    def __call__(self, force: Float[Tensor, "*b d"]) -> Reading:
-        """Reading at this tick, over which the true force (..., d) is held [N]."""
+    def __call__(self, force: Float[Tensor, "*b d"]) -> tuple[Tensor, Tensor]:
+        """Force read (..., d) at this tick, over which the true one is held, and whether an axis was clipped (...)."""
         lost = ~torch.isfinite(force)
         level = torch.where(lost, self._filtered, force + self._bias)
         if self._gain is not None:
@@ -155,7 +152,7 @@ class ForceReader:
         self._under_way.append((reading.masked_fill(lost, math.nan), saturated))
         return self._under_way.popleft()
 
-    def _convert(self, level: Tensor) -> Reading:
+    def _convert(self, level: Tensor) -> tuple[Tensor, Tensor]:
         """Clip, round and apply the deadband, which may precede the delay since it has no memory."""
         saturated = (level.abs() >= self._range).any(-1)
         level = level.clamp(-self._range, self._range)
