@@ -4,6 +4,7 @@ import math
 import threading
 from typing import Literal, final
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from torch_pbd import checks
@@ -274,7 +275,8 @@ class RealTimeAdmittance:
     @property
     def stiffness(self) -> Floats:
         """Stiffness K (d, d) of the last tick in N/m, scaled by ``spring_limit``."""
-        return self._table.along_axes(self._motion.scale)[:, None] * self._motion.gains[0]
+        scales = np.broadcast_to(self._motion.scale, len(self._table.springs))
+        return self._table.along_axes(scales.tolist())[:, np.newaxis] * self._motion.gains[0]
 
     @property
     def damping(self) -> Floats:

@@ -140,10 +140,9 @@ class ScheduleTable:
         pulls = [top * float(off[b] @ stiffness[b, b] @ off[b]) for b, top in springs]
         return tuple([1.0 / math.sqrt(max(pull, 1.0)) for pull in pulls])
 
-    def along_axes(self, scale: Scale) -> Floats:
-        """Scale (d,) of each axis."""
-        sizes = [spring.stop - spring.start for spring in self.springs]
-        return np.repeat(np.broadcast_to(scale, len(sizes)), sizes)
+    def along_axes(self, scales: Sequence[float]) -> Floats:
+        """Scale (d,) of each axis, from that of each spring."""
+        return np.repeat(scales, [spring.stop - spring.start for spring in self.springs])
 
     def forced(self, acceleration: Vector, index: int) -> Vector:
         """Force that causes an acceleration."""
