@@ -17,7 +17,7 @@ from torch_pbd.estimators.door import by_chunks
 from torch_pbd.estimators.validation import checked_rows
 from torch_pbd.files.memory import require_much
 from torch_pbd.linalg import gaussian_log_density, student_log_density
-from torch_pbd.movement.law import MovementLaw, Recording, as_recordings
+from torch_pbd.movement.law import MovementLaw, Recording, as_recordings, semidefinite_root
 
 
 class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
@@ -57,6 +57,8 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
                 "groups has one demonstration, must have two or more: how whole movements differ is not seen in one. "
                 "Record more, or use a covariance regressor by itself."
             )
+        times = np.concatenate([time for time, _ in recordings])
+        self._range = float(times.min()), checks.number(float(np.ptp(times)), "the range of X", above=0.0)
         self._fit(recordings)
         return self
 
@@ -114,8 +116,8 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
     def predict_uncertainty(self, X: ArrayLike) -> Uncertainty:
         """Missing data (``type1``) and variability (``type2``) at X, separately (Section IV-C).
 
-        ``type1`` is that of the regressor, whatever is known of this movement; basis functions cannot detect missing
-        data and have 0 within the times of the fit and 1 beyond them. ``type2`` is the variability given observations.
+        ``type1`` is that of the regressor; basis functions cannot detect missing data and have 0 within the times of
+        the fit and 1 beyond them. ``type2`` is the variability given observations.
         """
         weight, parts = self._components(self._times(X))
         mean, type1, type2 = zip(*(law._uncertainty(own) for law, own in parts), strict=True)
@@ -199,9 +201,7 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         checks.count(n_samples, "n_samples")
         generator = checks.seed(random_state)
         mean, covariance = self._marginals(self._times(X))
-        values, vectors = np.linalg.eigh(covariance)  # the covariance of a known row is zero
-        root = vectors * np.sqrt(values.clip(0.0))[:, np.newaxis]
-        deviation = root @ generator.standard_normal((*mean.shape, n_samples))
+        deviation = semidefinite_root(covariance) @ generator.standard_normal((*mean.shape, n_samples))
         degrees = self.predict_df(X)[:, np.newaxis, np.newaxis]
         if np.isfinite(degrees).all():
             deviation *= np.sqrt((degrees - 2.0) / generator.chisquare(degrees, (len(mean), 1, n_samples)))

@@ -18,31 +18,20 @@ class JointNormal:
 
     A movement is ``x_t = mean_t + A_t (g_t + U_t c)``: entry j of g has the correlation R_j over the steps and is
     independent of the others, and c is standard normal. The covariance is ``A (R - W W' + U U') A' - V V'``, with A
-    block diagonal in the steps, and R and W in the outputs, of which one may stand for all; W is the reduction by
-    observations of whole steps, V that by single entries. Costs grow with d n^3 + n d (k + p)^2; the marginals of
-    single steps, given others, cost n alone.
+    block diagonal in the steps, and R, positive semidefinite, and W in the outputs, of which one may stand for all; W
+    is the reduction by observations of whole steps, V that by single entries. Costs grow with d n^3 + n d (k + p)^2;
+    the marginals of single steps, given others, cost n alone.
     """
 
     mean: Float[Tensor, "n d"]
-    factor: Float[Tensor, "n d d"]
-    """A, one block a step."""
-    prior_correlation: Float[Tensor, "c n n"]
-    """R, positive semidefinite."""
-    loadings: Float[Tensor, "n d k"]
-    """U."""
-    taken: Float[Tensor, "c n m"]
-    """W."""
-    explained: Float[Tensor, "n d p"]
-    """V."""
+    factor: Float[Tensor, "n d d"]  # A
+    prior_correlation: Float[Tensor, "c n n"]  # R
+    loadings: Float[Tensor, "n d k"]  # U
+    taken: Float[Tensor, "c n m"]  # W
+    explained: Float[Tensor, "n d p"]  # V
 
     @classmethod
-    def prior(
-        cls,
-        mean: Float[Tensor, "n d"],
-        factor: Float[Tensor, "n d d"],
-        correlation: Float[Tensor, "c n n"],
-        loadings: Float[Tensor, "n d k"],
-    ) -> "JointNormal":
+    def prior(cls, mean: Tensor, factor: Tensor, correlation: Tensor, loadings: Tensor) -> "JointNormal":
         """Law before anything is observed."""
         return cls(mean, factor, correlation, loadings, correlation[..., :0], loadings[..., :0])
 
@@ -66,21 +55,17 @@ class JointNormal:
 
     def at(self, steps: Int[Tensor, " m"]) -> "JointNormal":
         """Law of the selected steps."""
-        mean, factor, loadings, explained = (
-            part[steps] for part in (self.mean, self.factor, self.loadings, self.explained)
-        )
+        rows = {name: getattr(self, name)[steps] for name in ("mean", "factor", "loadings", "explained")}
         between = self.prior_correlation[:, steps][:, :, steps]
-        return JointNormal(mean, factor, between, loadings, self.taken[:, steps], explained)
+        return JointNormal(prior_correlation=between, taken=self.taken[:, steps], **rows)
 
     def joined(self, other: "JointNormal", between: Float[Tensor, "c n m"]) -> "JointNormal":
         """Law of the steps of two unobserved laws with the correlation ``between`` them."""
         upper = torch.cat([self.prior_correlation, between], dim=2)
-        return JointNormal.prior(
-            torch.cat([self.mean, other.mean]),
-            torch.cat([self.factor, other.factor]),
-            torch.cat([upper, torch.cat([between.mT, other.prior_correlation], dim=2)], dim=1),
-            torch.cat([self.loadings, other.loadings]),
-        )
+        whole = torch.cat([upper, torch.cat([between.mT, other.prior_correlation], dim=2)], dim=1)
+        pairs = ((self.mean, other.mean), (self.factor, other.factor), (self.loadings, other.loadings))
+        mean, factor, loadings = map(torch.cat, pairs)
+        return JointNormal.prior(mean, factor, whole, loadings)
 
     def covariance(self) -> Float[Tensor, "n d n d"]:
         """Covariance of all outputs at all steps."""
@@ -157,36 +142,40 @@ class Conditioned:
         rows, entries = (given & ~exact[:, None]).nonzero().unbind(1)
         self._prior, self._steps, self._entry_steps = prior, steps[exact], steps[rows]
         self._directions, self._entry_noise = axes[entries], noise[rows, entries]
+        law = self._given_steps(prior) if len(self._steps) else prior
+        law = self._given_entries(law) if len(rows) else law
+        known = torch.linalg.solve(axes, values[exact].mT).mT
+        self.law = replace(law, mean=self._passing(prior.mean[None], known, values[rows, entries])[0])
 
-        between = prior.prior_correlation[:, :, self._steps]
+    def _given_steps(self, law: JointNormal) -> JointNormal:
+        """Law, but for its mean, given steps known whole."""
+        between = law.prior_correlation[:, :, self._steps]
         root = safe_cholesky(between[:, self._steps], name="the correlation of the steps given")
         taken = torch.linalg.solve_triangular(root.mT, between, upper=True, left=False)
         self._gain = torch.linalg.solve_triangular(root, taken, upper=False, left=False)
-        loadings = prior.loadings[self._steps].transpose(0, 1)  # (d, m, k)
+        loadings = law.loadings[self._steps].transpose(0, 1)  # (d, m, k)
         half = torch.linalg.solve_triangular(root, loadings, upper=False)
         self._whitened = torch.linalg.solve_triangular(root.mT, half, upper=True)
         half = half.flatten(0, 1)
         self._precision_root = torch.linalg.cholesky(half.mT @ half + torch.eye(half.shape[1]).to(half))
-        self._open = prior.loadings - (self._gain @ loadings).transpose(0, 1)
+        self._open = law.loadings - (self._gain @ loadings).transpose(0, 1)
         left = torch.linalg.solve_triangular(self._precision_root.mT, self._open, upper=True, left=False)
         # What is known has no variance, not even of rounding, which may be below zero.
-        law = replace(prior, factor=prior.factor.index_fill(0, self._steps, 0.0), loadings=left, taken=taken)
+        return replace(law, factor=law.factor.index_fill(0, self._steps, 0.0), loadings=left, taken=taken)
 
-        # Covariances of all steps with the single entries, given the exact steps, and the root of the entries' own.
-        steps, projected = (
-            self._entry_steps,
-            torch.einsum("pc,pcd->pd", self._directions, law.factor[self._entry_steps]),
-        )
-        between = law.prior_correlation[:, :, steps] - taken @ taken[:, steps].mT
-        inner = between.transpose(0, 1) * projected.mT
-        inner = inner + left @ torch.einsum("pd,pdk->kp", projected, left[steps])
+    def _given_entries(self, law: JointNormal) -> JointNormal:
+        """Law, but for its mean, given single entries too."""
+        steps, directions = self._entry_steps, self._directions
+        rows = torch.einsum("pc,pcd->pd", directions, law.factor[steps])
+        between = law.prior_correlation[:, :, steps] - law.taken @ law.taken[:, steps].mT
+        inner = between.transpose(0, 1) * rows.mT
+        inner = inner + law.loadings @ torch.einsum("pd,pdk->kp", rows, law.loadings[steps])
+        # Covariances of all steps with the entries, and the root of the entries' own.
         self._columns = law.factor @ inner
-        own = torch.einsum("pd,pdq->pq", self._directions, self._columns[steps]) + self._entry_noise.square().diag()
+        own = torch.einsum("pd,pdq->pq", directions, self._columns[steps]) + self._entry_noise.square().diag()
         self._entry_root = safe_cholesky(symmetrize(own), name="the covariance of the entries given")
         explained = torch.linalg.solve_triangular(self._entry_root.mT, self._columns, upper=True, left=False)
-        known = torch.linalg.solve(axes, values[exact].mT).mT
-        mean = self._passing(prior.mean[None], known, values[rows, entries])[0]
-        self.law = replace(law, mean=mean, explained=explained)
+        return replace(law, explained=explained)
 
     def deviations(self, n_draws: int, normal: Callable[[tuple[int, int]], Tensor]) -> Float[Tensor, "s n d"]:
         """Draws of the deviation from the mean; ``normal`` gives standard normal numbers of a requested shape.
@@ -206,11 +195,14 @@ class Conditioned:
         self, x: Float[Tensor, "s n d"], values: Float[Tensor, "m d"], entries: Float[Tensor, "*s p"]
     ) -> Float[Tensor, "s n d"]:
         """Movements moved, as the unconditioned law has them vary together, to these values of what was observed."""
-        factor, residual = self._prior.factor, values - x[:, self._steps]
-        inner = torch.linalg.solve(factor[self._steps], residual[..., None])[..., 0]
-        projected = torch.einsum("smd,dmk->sk", inner, self._whitened)
-        common = torch.cholesky_solve(projected.mT, self._precision_root)
-        change = (self._gain @ inner.permute(2, 1, 0)).permute(2, 1, 0) + (self._open @ common).permute(2, 0, 1)
-        x = x + torch.einsum("nab,snb->sna", factor, change)
+        if len(self._steps):
+            factor, residual = self._prior.factor, values - x[:, self._steps]
+            inner = torch.linalg.solve(factor[self._steps], residual[..., None])[..., 0]
+            projected = torch.einsum("smd,dmk->sk", inner, self._whitened)
+            common = torch.cholesky_solve(projected.mT, self._precision_root)
+            change = (self._gain @ inner.permute(2, 1, 0)).permute(2, 1, 0) + (self._open @ common).permute(2, 0, 1)
+            x = x + torch.einsum("nab,snb->sna", factor, change)
+        if not len(self._entry_steps):
+            return x
         errors = entries - (self._directions * x[:, self._entry_steps]).sum(-1)
         return x + torch.einsum("ndp,ps->snd", self._columns, torch.cholesky_solve(errors.mT, self._entry_root))

@@ -15,7 +15,7 @@ from torch_pbd.estimators.validation import fit_with_groups
 from torch_pbd.files.memory import require_much
 from torch_pbd.movement.base import MovementRegressor
 from torch_pbd.movement.joint import Conditioned, JointNormal
-from torch_pbd.movement.law import Recording, as_rows, check_arrays
+from torch_pbd.movement.law import Recording, as_rows, check_arrays, semidefinite_root
 
 _ARRAYS = ("reference.time", "reference.mean", "reference.covariance", "range", "deviation")  # names in model files
 
@@ -57,8 +57,6 @@ class KMPBaseline(MovementRegressor):
     2019.
     """
 
-    df_ = float("inf")
-
     _learned: ClassVar[Any] = {}
 
     def __init__(
@@ -90,7 +88,6 @@ class KMPBaseline(MovementRegressor):
         X, y, groups = as_rows(recordings)
         regressor = GMMBaseline() if self.regressor is None else clone(self.regressor)
         self.regressor_ = fit_with_groups(regressor, X, y, groups)
-        self._range = float(X.min()), float(np.ptp(X))
         self._scale = y.std(axis=0)
         time = np.linspace(X.min(), X.max(), int(self.n_reference))
         self._reference = time, *self.regressor_.predict(time[:, np.newaxis], return_cov=True)
@@ -102,10 +99,9 @@ class KMPBaseline(MovementRegressor):
     def _restore(self, arrays: dict[str, Floats]) -> None:
         n, d = len(np.atleast_1d(arrays["reference.time"])), self.n_outputs_
         check_arrays(arrays, dict(zip(_ARRAYS, [(n,), (n, d), (n, d, d), (2,), (d,)], strict=True)))
-        time, mean, covariance, span, self._scale = (arrays[name] for name in _ARRAYS)
-        checks.semidefinite(covariance, "reference.covariance", definite=True)
-        self._reference = time, mean, covariance
-        self._range = float(span[0]), checks.number(float(span[1]), "the range of X", above=0.0)
+        *reference, (low, width), self._scale = (arrays[name] for name in _ARRAYS)
+        checks.semidefinite(reference[2], "reference.covariance", definite=True)
+        self._reference, self._range = tuple(reference), (float(low), checks.number(width, "the range of X", above=0.0))
 
     def _prior(self, time: Floats) -> JointNormal:
         n, d = len(time), self.n_outputs_
@@ -118,8 +114,7 @@ class KMPBaseline(MovementRegressor):
         explained = whitened.transpose(0, 2, 1).reshape(n * d, -1)
         # Time by time, all outputs of each: the kernel of the times acts on each output separately.
         gram = np.kron(self._kernel(time, time), np.eye(d))
-        values, vectors = np.linalg.eigh(level * (gram - explained @ explained.T))
-        root = (vectors * np.sqrt(values.clip(0.0))).reshape(n, d, -1)
+        root = semidefinite_root(level * (gram - explained @ explained.T)).reshape(n, d, -1)
         return JointNormal.with_noise(*map(torch.from_numpy, (mean, root, self._nugget_scale())))
 
     def _rows(self, time: Floats) -> tuple[Floats, Floats]:
@@ -152,7 +147,7 @@ class KMPBaseline(MovementRegressor):
         """Reference whose nearest times are replaced by the via points; outputs that are not given stay."""
         if not len(self._known.time):
             return self._reference
-        axes = self._observed_axes()
+        axes = self._observed_axes
         time, means = self._reference[0].copy(), self._reference[1] @ axes.T
         covariances = axes @ self._reference[2] @ axes.T
         # The paper gives a point without noise the variance 1e-6.
@@ -171,5 +166,5 @@ class KMPBaseline(MovementRegressor):
         # Via points are in the reference, so nothing is conditioned on.
         union, rows, none = self._union(time, time[:0])
         nothing = torch.empty(0, self.n_outputs_, dtype=torch.float64)
-        steps, axes = torch.from_numpy(none), torch.from_numpy(self._observed_axes())
+        steps, axes = torch.from_numpy(none), torch.from_numpy(self._observed_axes)
         return Conditioned(self._prior(union), steps, nothing, nothing, axes), torch.from_numpy(rows)

@@ -1,6 +1,7 @@
 """Base of the models of whole movements: recordings, observations of a movement, and its joint law given them."""
 
 import copy
+import math
 from abc import ABC, abstractmethod
 from typing import Any, NamedTuple, Self
 
@@ -51,19 +52,14 @@ NOTHING = Known(np.empty(0), np.empty((0, 1)), np.empty((0, 1)))
 
 
 class MovementLaw(BaseEstimator, ABC):
-    """Law of a movement at any times, given observations of it.
+    """Law of a movement at any times, given observations of it."""
 
-    A subclass provides the joint law of a demonstration, :meth:`_prior`, and its degrees of freedom ``df_``, infinite
-    for a normal law.
-    """
-
-    df_: float
+    df_: float = math.inf  # degrees of freedom; infinite for a normal law
     n_outputs_: int
-    _range: tuple[float, float]
-    """First of the times of the fit, and their range."""
+    _range: tuple[float, float]  # first of the times of the fit, and their range
     _known: Known = NOTHING
     _axes: Floats | None = None  # axes of the coordinates of observations; None are the outputs
-    _kept: dict[str, tuple[Floats, JointNormal]]  # cached last times and their law, shared by conditioned copies
+    _kept: dict[str, tuple[Floats, Any]]  # cached last times and their law, shared by conditioned copies
     _y_is_1d: bool
 
     @abstractmethod
@@ -90,6 +86,7 @@ class MovementLaw(BaseEstimator, ABC):
         """Times rounded so that those that count as one are equal."""
         return np.round(self._scaled(time), _DECIMALS)
 
+    @property
     def _observed_axes(self) -> Floats:
         return np.eye(self.n_outputs_) if self._axes is None else self._axes
 
@@ -128,10 +125,9 @@ class MovementLaw(BaseEstimator, ABC):
             )
         scale = np.broadcast_to(checks.real_floats(noise_scale, "noise_scale"), (self.n_outputs_,))
         checks.require((scale >= 0.0) & np.isfinite(scale), scale, "noise_scale", "a finite number of at least 0")
-        # Rows of NaN alone carry no information.
-        given = ~np.isnan(value).all(axis=1)
+        some = ~np.isnan(value).all(axis=1)
         copied = self._copy()
-        copied._known = known = self._known.and_also(time[given], value[given], np.tile(scale, (int(given.sum()), 1)))
+        copied._known = known = self._known.and_also(time[some], value[some], np.tile(scale, (int(some.sum()), 1)))
         rows, outputs = known.exact.nonzero()
         if len(set(zip(self._rounded(known.time)[rows], outputs, strict=True))) < len(rows):
             raise ValueError("X has a time that is given twice, or is known already, without noise: leave it out.")
@@ -162,31 +158,28 @@ class MovementLaw(BaseEstimator, ABC):
     def _given(self, law: JointNormal, places: NDArray[np.intp]) -> Conditioned:
         """Law given the observations, which are at these indices among its steps."""
         value, noise = (torch.from_numpy(part.reshape(-1, self.n_outputs_)) for part in self._known[1:])
-        return Conditioned(law, torch.from_numpy(places), value, noise, torch.from_numpy(self._observed_axes()))
+        return Conditioned(law, torch.from_numpy(places), value, noise, torch.from_numpy(self._observed_axes))
 
     def _prior_with(self, time: Floats) -> tuple[JointNormal, NDArray[np.intp]]:
-        """Joint law at increasing times, possibly at others too, and their indices in it.
-
-        The law of the last times is cached.
-        """
+        """Joint law at increasing times, possibly at others too, and their indices in it; the last one is cached."""
         kept = self.__dict__.setdefault("_kept", {})
-        if kept and len(time):
-            last, law = kept["last"]
-            known, asked = self._rounded(last), self._rounded(time)
-            place = np.searchsorted(known, asked).clip(max=len(known) - 1)
-            old = known[place] == asked
-            if 2 * old.sum() > len(old):
-                if 2 * old.sum() < len(known):
-                    last, law, place[old] = time[old], law.at(torch.from_numpy(place[old])), np.arange(old.sum())
-                new = time[~old]
-                if len(new):
-                    place[~old] = len(last) + np.arange(len(new))
-                    law = law.joined(self._prior(new), self._between(last, new))
-                return law, place
-        law = self._prior(time)
-        if 0 < len(time) <= _MOST_KEPT:
-            kept["last"] = time, law
-        return law, np.arange(len(time))
+        last, law = kept.get("last", (time[:0], None))
+        rounded = self._rounded(last), self._rounded(time)
+        _, place, old = np.intersect1d(*rounded, assume_unique=True, return_indices=True)
+        if 2 * len(old) <= len(time):
+            law = self._prior(time)
+            if 0 < len(time) <= _MOST_KEPT:
+                kept["last"] = time, law
+            return law, np.arange(len(time))
+        if 2 * len(old) < len(last):
+            last, law, place = last[place], law.at(torch.from_numpy(place)), np.arange(len(place))
+        new = np.delete(time, old)
+        if len(new):
+            law = law.joined(self._prior(new), self._between(last, new))
+        index = np.full(len(time), -1)
+        index[old] = place
+        index[index < 0] = len(last) + np.arange(len(new))
+        return law, index
 
     def _copy(self) -> Self:
         """Copy that shares the unconditioned law and its cache."""
@@ -242,6 +235,12 @@ def as_rows(recordings: list[Recording]) -> tuple[Floats, Floats, NDArray[np.int
     times, positions = zip(*recordings, strict=True)
     numbers = np.repeat(np.arange(len(recordings)), [len(time) for time in times])
     return np.concatenate(times)[:, np.newaxis], np.concatenate(positions), numbers
+
+
+def semidefinite_root(covariance: Floats) -> Floats:
+    """Roots, times their transposes the covariances (..., d, d), of which some directions may have no variance."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray(vectors * np.sqrt(values.clip(0.0))[..., np.newaxis, :])
 
 
 def check_arrays(arrays: dict[str, Floats], shapes: dict[str, tuple[int | str, ...]]) -> None:

@@ -11,7 +11,7 @@ from torch_pbd import checks
 from torch_pbd.checks import Floats
 from torch_pbd.movement.base import MovementRegressor
 from torch_pbd.movement.joint import JointNormal
-from torch_pbd.movement.law import Recording, as_rows, check_arrays
+from torch_pbd.movement.law import Recording, check_arrays, semidefinite_root
 
 _N_BASES = (8, 12, 16, 20)  # candidates of "auto", as far as recordings have enough samples
 _REACHES = (1.0, 2.0, 4.0)  # candidate length scales of the smooth prior, in bases
@@ -62,8 +62,6 @@ class ProMPBaseline(MovementRegressor):
     2018.
     """
 
-    df_ = float("inf")
-
     _learned: ClassVar[Any] = {
         "n_basis_": partial(checks.count, least=2),
         "overlap_": partial(checks.number, above=0.0, below=1.0),
@@ -94,8 +92,6 @@ class ProMPBaseline(MovementRegressor):
         checks.seed(self.random_state)
 
     def _fit(self, recordings: list[Recording]) -> None:
-        X, *_ = as_rows(recordings)
-        self._range = float(X.min()), checks.number(float(np.ptp(X)), "the range of X", above=0.0)
         scaled = [Recording(self._scaled(time), position) for time, position in recordings]
         most = max(2, min(len(time) for time, _ in recordings) - 1)
         sizes = _N_BASES if self.n_basis == "auto" else (int(self.n_basis),)
@@ -129,8 +125,7 @@ class ProMPBaseline(MovementRegressor):
 
     def _prior(self, time: Floats) -> JointNormal:
         bases = basis_functions(self._scaled(time), self.n_basis_, self.overlap_)
-        values, vectors = np.linalg.eigh(self.weight_covariance_)
-        root = (vectors * np.sqrt(values.clip(0.0))).reshape(self.n_basis_, self.n_outputs_, -1)
+        root = semidefinite_root(self.weight_covariance_).reshape(self.n_basis_, self.n_outputs_, -1)
         loadings = np.einsum("nb,bdk->ndk", bases, root)
         return JointNormal.with_noise(*map(torch.from_numpy, (bases @ self.weight_mean_, loadings, self.noise_scale_)))
 
@@ -140,22 +135,20 @@ class _Weights:
 
     def __init__(self, recordings: list[Recording], n_basis: int, overlap: float, ridge: float) -> None:
         self.n_basis, self.overlap = n_basis, overlap
-        self._bases = [basis_functions(time, n_basis, overlap) for time, _ in recordings]
-        self._positions = [position for _, position in recordings]
-        weights, squares = [], []
-        for bases, position in zip(self._bases, self._positions, strict=True):
+        self._samples = [(basis_functions(time, n_basis, overlap), position) for time, position in recordings]
+        weights, residuals = [], []
+        for bases, position in self._samples:
             gram = bases.T @ bases
             matrix = gram + ridge * gram.trace() / n_basis * np.eye(n_basis)
             weights.append(np.linalg.solve(matrix, bases.T @ position))
-            squares.append(np.square(position - bases @ weights[-1]).sum(axis=0))
-        self.values: Floats = np.stack(weights)
-        """(K, n_basis, d)."""
-        positions = np.concatenate(self._positions)
-        deviation = positions.std(axis=0)
+            residuals.append(position - bases @ weights[-1])
+        self.values: Floats = np.stack(weights)  # (K, n_basis, d)
+        deviation = np.concatenate([position for _, position in recordings]).std(axis=0)
         least = _LEAST_NOISE * np.where(deviation > 0.0, deviation, 1.0)
+        residual = np.concatenate(residuals)
         # Degrees of freedom: samples minus the weights that were fitted to them.
-        freedoms = max(1, len(positions) - n_basis * len(recordings))
-        self.noise_scale: Floats = np.maximum(np.sqrt(np.sum(squares, axis=0) / freedoms), least)
+        freedoms = max(1, len(residual) - n_basis * len(recordings))
+        self.noise_scale: Floats = np.maximum(np.sqrt(np.square(residual).sum(axis=0) / freedoms), least)
 
     def covariance(self, values: Floats, reach: float, share: float) -> Floats:
         """Shrunk covariance (B d, B d) of weights (K, B, d)."""
@@ -177,7 +170,7 @@ class _Weights:
         if len(self.values) < 3:
             return -float(np.log(self.noise_scale).sum())  # one other demonstration has no covariance
         total = 0.0
-        for k, (bases, position) in enumerate(zip(self._bases[:_MOST_LEFT_OUT], self._positions, strict=False)):
+        for k, (bases, position) in enumerate(self._samples[:_MOST_LEFT_OUT]):
             others = np.delete(self.values, k, axis=0)
             covariance = self.covariance(others, reach, share)
             residual = (position - bases @ others.mean(axis=0)) / self.noise_scale

@@ -165,12 +165,15 @@ class TimedMovement(MovementRegressor):
         good = (first >= 0.0) & (first < 0.5 * duration)
         checks.require(good, first, "the first time of a demonstration", "0 or a little later", "count from its start")
         durations, pace = torch.from_numpy(duration), torch.zeros(len(duration), dtype=torch.float64)
+        # Without a warp all movements take the mean duration, at an even pace.
+        location = torch.stack([durations.mean().log(), pace[0]])
+        self._set_timing(Timing(location, torch.zeros(2, 2).to(pace), 1.0))
         if timing == "warp":
             grid = np.linspace(0.0, 1.0, _N_STEPS)
             curves = np.stack([interpolate(time, position, grid * time[-1]) for time, position in recordings])
             size = curves.std((0, 1))
             pace = register(torch.from_numpy(curves / np.where(size > 0.0, size, 1.0)))
-        self._set_timing(Timing.learn(durations, pace) if timing == "warp" else Timing.even(durations))
+            self._set_timing(Timing.learn(durations, pace))
         # On shared phases, as if the demonstrations were aligned.
         shared = np.linspace(0.0, 1.0, n_grid_steps(recordings))
         phased = []

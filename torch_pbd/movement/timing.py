@@ -27,7 +27,6 @@ _SIDE, _SIDE_LAST, _REACH, _MOST_LATTICES, _FEW = 13, 6, 4.0, 20, 2.5
 _LEAST_POWER = 1e-9
 _RARE = 7.0  # the first lattice ends where the density is this many nats below that of its middle
 
-
 Likelihood = Callable[[Tensor, Tensor], Tensor]
 
 
@@ -92,13 +91,12 @@ class Timing:
 
     @classmethod
     def learn(cls, duration: Float[Tensor, " K"], pace: Float[Tensor, " K"]) -> "Timing":
-        """Predictive law from three or more demonstrations, whose mean and covariance (2, 2) are estimates.
+        """Predictive law from three or more demonstrations.
 
         For K normal pairs with mean m and sums of squares S, under Jeffreys' prior, the next pair has a t of K - 2
         degrees of freedom around m with the scale matrix ``(1 + 1 / K) S / (K - 2)``.
         """
-        values = torch.stack([duration.log(), pace], dim=1)
-        n_demos = len(values)
+        values, n_demos = torch.stack([duration.log(), pace], dim=1), len(pace)
         residual = values - values.mean(0)
         scale = (1.0 + 1.0 / n_demos) / (n_demos - 2) * residual.mT @ residual
         root = torch.zeros_like(scale)
@@ -106,11 +104,6 @@ class Timing:
             root[:, 0] = scale[:, 0] / scale[0, 0].sqrt()
         root[1, 1] = (scale[1, 1] - root[1, 0].square()).clamp_min(0.0).sqrt()
         return cls(values.mean(0), root, float(n_demos - 2))
-
-    @classmethod
-    def even(cls, duration: Float[Tensor, " K"]) -> "Timing":
-        """Timing of movements that all take the mean duration at an even pace."""
-        return cls(torch.stack([duration.mean().log(), duration.new_zeros(())]), torch.zeros(2, 2).to(duration), 1.0)
 
     def longest(self) -> float:
         """Longest duration of movements."""

@@ -71,12 +71,11 @@ class TrajectoryLaw(nn.Module):
 class TrajectoryRegressor(TimedMovement):
     """Joint law of a whole demonstration: marginals of a covariance regressor and a correlation along the movement.
 
-    The marginals stay those of the regressor. Demonstrations are smooth: a deviation now persists for a while. Each
-    output, given those before it, has a time kernel and a nugget at each step. The kernel has a slow part proportional
-    to the standard deviation at each step, and a tremor of constant size in the output's units. This correlation is
-    shrunk towards that of the demonstrations themselves. Draws and scores use a Student's t with one chi-squared
-    variable per movement; conditioning uses the normal formulas. Only :meth:`predict_joint` forms a matrix of all steps
-    and outputs.
+    The marginals stay those of the regressor. Each output, given those before it, has a nugget at each step and a time
+    kernel: a slow part proportional to the standard deviation at each step, and a tremor of constant size in the
+    output's units. This correlation is shrunk towards that of the demonstrations themselves. Draws and scores use a
+    Student's t with one chi-squared variable per movement; conditioning uses the normal formulas. Only
+    :meth:`predict_joint` forms a matrix of all steps and outputs.
 
     Parameters
     ----------
@@ -89,10 +88,10 @@ class TrajectoryRegressor(TimedMovement):
         left out in turn.
     timing : {"none", "warp", "auto"}, default="none"
         "none" takes the phase of a movement as known. With "warp", X is the time since the start of a movement of
-        unknown duration and pace, whose distribution is learned from four or more demonstrations. Observations passed
-        to :meth:`condition` locate the movement (:meth:`predict_phase`), and predictions average over the remaining
-        durations and paces. "auto" takes "warp" if left-out demonstrations are likelier than with the mean duration at
-        an even pace, which costs ten fits; X is time in both cases.
+        unknown duration and pace, whose distribution is learned from four or more demonstrations; :meth:`condition`
+        locates the movement (:meth:`predict_phase`), and predictions average over what is left of both. "auto" takes
+        "warp" if left-out demonstrations are likelier than with the mean duration at an even pace, at the cost of ten
+        fits; X is time in both cases.
     random_state : int, RandomState instance or None, default=0
         Not used, since the fit is as deterministic as the regressor's; present so that models are interchangeable.
 
@@ -174,8 +173,8 @@ class TrajectoryRegressor(TimedMovement):
         regressor = HeteroscedasticGPRegressor() if self.regressor is None else clone(self.regressor)
         self.regressor_ = fit_with_groups(regressor, X, y.ravel() if self._y_is_1d else y, groups)
 
-        low, high = float(X.min()), float(X.max())
-        grid = np.linspace(low, high, n_grid_steps(recordings))
+        self._range = low, width = float(X.min()), float(np.ptp(X))  # of phases, where timing is unknown
+        grid = np.linspace(low, low + width, n_grid_steps(recordings))
         mean, covariance = self._regressor_rows(grid)
         residual = np.stack([sampled(recording, grid) for recording in recordings]) - mean
         # z = inv(L_t) (y_t - m_t) has unit covariance at each step; only its correlation along time is to be found.
@@ -183,18 +182,18 @@ class TrajectoryRegressor(TimedMovement):
         whitened = np.linalg.solve(root, residual[..., np.newaxis])[..., 0]
         kernels = ("matern52", "squared_exponential") if self.time_kernel == "auto" else (self.time_kernel,)
         share = None if self.shrinkage == "auto" else 1.0 - float(self.shrinkage)
-        scaled = torch.from_numpy((grid - low) / (high - low))
+        scaled = torch.from_numpy((grid - low) / width)
         deviation = torch.from_numpy(root).diagonal(dim1=1, dim2=2)
         found = fit_time_kernel(scaled, torch.from_numpy(whitened), deviation, kernels, share)
-        self._set_law(found, low, high - low)
+        self._set_law(found)
         degrees = self.regressor_.predict_df(grid[:, np.newaxis])
         self.df_ = float(np.clip(np.median(degrees) / _WHOLE, _FEWEST_DF, _MOST_DF))
         self.time_kernel_ = found.kernel
 
-    def _set_law(self, time_kernel: TimeKernel, low: float, width: float) -> None:
-        self.module_ = TrajectoryLaw(getattr(self.regressor_, "module_", None), time_kernel, low, width)
-        self.length_scale_, self.shrinkage_ = width * time_kernel.scales[:, 0].numpy(), 1.0 - float(time_kernel.share)
-        self.nugget_scale_, self._range = np.sqrt(time_kernel.nugget.numpy().T), (low, width)
+    def _set_law(self, kernel: TimeKernel) -> None:
+        self.module_ = TrajectoryLaw(getattr(self.regressor_, "module_", None), kernel, *self._range)
+        self.length_scale_, self.shrinkage_ = self._range[1] * kernel.scales[:, 0].numpy(), 1.0 - float(kernel.share)
+        self.nugget_scale_ = np.sqrt(kernel.nugget.numpy().T)
 
     def predict(self, X: ArrayLike, *, return_std: bool = False, return_cov: bool = False) -> Any:
         """Prediction of the regressor, or after :meth:`condition` mean and covariance of the rest of the movement."""
@@ -238,9 +237,9 @@ class TrajectoryRegressor(TimedMovement):
             checks.require(arrays[name] > 0.0, arrays[name], name, "above 0")
         checks.require(np.diff(arrays["grid"]) > 0.0, arrays["grid"][1:], "grid", "increasing")
         checks.number(float(arrays["share"]), "share", above=0.0, most=1.0)
-        low, width = (float(arrays.pop(name)) for name in ("x_shift", "x_scale"))
+        self._range = float(arrays.pop("x_shift")), float(arrays.pop("x_scale"))
         own = {name: torch.tensor(array) for name, array in arrays.items()}
-        self._set_law(TimeKernel(self.time_kernel_, **own), low, width)
+        self._set_law(TimeKernel(self.time_kernel_, **own))
 
     def _prior(self, time: Floats) -> JointNormal:
         return self._joint(time, *self._regressor_rows(time))
@@ -249,8 +248,8 @@ class TrajectoryRegressor(TimedMovement):
         return self.module_.joint(*map(torch.from_numpy, (time, mean, covariance)))
 
     def _between(self, time: Floats, other: Floats) -> Tensor:
-        kernel, scaled = self.module_.time_kernel, (torch.from_numpy(self._scaled(part)) for part in (time, other))
-        return kernel.share * kernel.correlation(*scaled)
+        kernel, both = self.module_.time_kernel, (torch.from_numpy(self._scaled(part)) for part in (time, other))
+        return kernel.share * kernel.correlation(*both)
 
     def _rows(self, time: Floats) -> tuple[Floats, Floats]:
         return self._regressor_rows(time) if self._is_regressor else super()._rows(time)
