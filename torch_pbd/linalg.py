@@ -105,12 +105,13 @@ def cholesky_with_jitter(matrix: Float[Tensor, "*b n n"], *, name: str) -> tuple
     for the matrices of the batch that need it. Beyond, or where an entry is not finite, it is a
     NotPositiveDefiniteError.
     """
-    if not torch.isfinite(matrix).all():
-        raise NotPositiveDefiniteError(f"{name} has entries that are not finite.")
     factor, info = torch.linalg.cholesky_ex(matrix)
     failed = info > 0
-    if not bool(failed.any()):
+    # An entry that is not finite leaves one in the diagonal of the factor, or ends the factorization.
+    if not bool((failed | ~torch.isfinite(factor.diagonal(dim1=-2, dim2=-1)).all(-1)).any()):
         return factor, 0.0
+    if not torch.isfinite(matrix).all():
+        raise NotPositiveDefiniteError(f"{name} has entries that are not finite.")
     # The gradient of a factorization that failed is NaN: find the jitter first, then factorize once.
     scale = matrix.detach().diagonal(dim1=-2, dim2=-1).mean(-1).abs()
     jitter = torch.zeros_like(scale)

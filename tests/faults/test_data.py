@@ -18,7 +18,7 @@ from torch_pbd import CholeskyCovRegressor, DMPController, GMMBaseline, WishartP
 from torch_pbd.data import make_tunnel_demonstrations
 from torch_pbd.estimators.door import by_chunks
 from torch_pbd.exceptions import DataRankWarning, UnimodalityWarning
-from torch_pbd.models.heteroscedastic import check_memory
+from torch_pbd.models.heteroscedastic.search import check_memory
 
 EMPIRICAL = [CholeskyCovRegressor(objective="empirical"), WishartProcessRegressor(objective="mse")]
 LIKELIHOOD = ["cholesky-likelihood", "wishart-likelihood"]

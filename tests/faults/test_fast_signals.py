@@ -163,7 +163,7 @@ def test_independent_draws_raise_no_alarm(aligned, seed):
 
 def test_doubts_about_a_sound_draw_change_nothing(monkeypatch):
     """Of these 500 rows, much louder at one end, the first mean's residuals are not white; the KL rose by a half."""
-    from torch_pbd.models.heteroscedastic import HeteroscedasticFit
+    from torch_pbd.models.heteroscedastic.fit import HeteroscedasticFit
 
     X, y, _ = make_paper_simulation(500, 1, reading="printed", random_state=0)
     fits = []

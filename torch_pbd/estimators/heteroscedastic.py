@@ -20,15 +20,10 @@ from torch_pbd.estimators.validation import (
 )
 from torch_pbd.files.memory import require_much
 from torch_pbd.kernels import KERNELS, KernelName
-from torch_pbd.models.heteroscedastic import (
-    HeteroscedasticModel,
-    ProcessFamily,
-    SearchOptions,
-    candidate_families,
-    check_memory,
-    fit_heteroscedastic,
-    inducing_sizes,
-)
+from torch_pbd.models.heteroscedastic.fit import fit_heteroscedastic
+from torch_pbd.models.heteroscedastic.module import HeteroscedasticModel
+from torch_pbd.models.heteroscedastic.processes import ProcessFamily
+from torch_pbd.models.heteroscedastic.search import SearchOptions, candidate_families, check_memory, inducing_sizes
 
 _DRAWN = 65536  # covariance matrices drawn at a time, to bound memory
 

@@ -15,7 +15,8 @@ from torch_pbd.data import Demonstrations
 from torch_pbd.data.alignment import interpolate, unit_phases
 from torch_pbd.data.description import follow_one_way
 from torch_pbd.exceptions import DataRankWarning
-from torch_pbd.models.heteroscedastic import HeteroscedasticFit, are_copies
+from torch_pbd.models.heteroscedastic.fit import HeteroscedasticFit
+from torch_pbd.models.heteroscedastic.residuals import are_copies
 from torch_pbd.models.training import TrainingSet
 
 CONSTANT = 1e-11

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from torch_pbd.models.heteroscedastic import ProcessFamily
+from torch_pbd.models.heteroscedastic.processes import ProcessFamily
 
 
 @pytest.fixture

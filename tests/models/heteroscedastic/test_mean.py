@@ -4,8 +4,8 @@ import torch
 from scipy.linalg import block_diag
 
 from torch_pbd.kernels import correlation
-from torch_pbd.models.heteroscedastic import ProcessFamily, SearchOptions
-from torch_pbd.models.heteroscedastic.search import Search
+from torch_pbd.models.heteroscedastic.processes import ProcessFamily
+from torch_pbd.models.heteroscedastic.search import Search, SearchOptions
 from torch_pbd.models.heteroscedastic.steps import fit_mean
 
 

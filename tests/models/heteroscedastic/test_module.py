@@ -9,13 +9,10 @@ from scipy.optimize import brentq
 from scipy.special import polygamma
 
 from torch_pbd.models.conditional import ConditionalNormal
-from torch_pbd.models.heteroscedastic import (
-    Families,
-    HeteroscedasticModel,
-    ProcessFamily,
-    SearchOptions,
-    fit_heteroscedastic,
-)
+from torch_pbd.models.heteroscedastic.fit import fit_heteroscedastic
+from torch_pbd.models.heteroscedastic.module import HeteroscedasticModel
+from torch_pbd.models.heteroscedastic.processes import ProcessFamily
+from torch_pbd.models.heteroscedastic.search import Families, SearchOptions
 from torch_pbd.models.training import TrainingSet
 
 PRIOR = 3.0

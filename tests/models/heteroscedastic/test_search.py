@@ -4,9 +4,9 @@ import torch
 from scipy.optimize import minimize
 
 from torch_pbd.exceptions import NotPositiveDefiniteError
-from torch_pbd.models.heteroscedastic import ProcessFamily, SearchOptions
+from torch_pbd.models.heteroscedastic.processes import ProcessFamily
 from torch_pbd.models.heteroscedastic.regression import LinearEvidence
-from torch_pbd.models.heteroscedastic.search import Search
+from torch_pbd.models.heteroscedastic.search import Search, SearchOptions
 from torch_pbd.optim.batch import Status
 
 

@@ -206,6 +206,7 @@ class HeteroscedasticFit:
         return matters & is_signal(self.whitened(), self.training, self.group, NOT_WHITE)
 
 
+@torch.inference_mode()
 def fit_heteroscedastic(
     training: TrainingSet,
     group: Int64[Tensor, " rows"] | None,
@@ -217,19 +218,10 @@ def fit_heteroscedastic(
 ) -> HeteroscedasticFit:
     """Mean under the noise learned so far, then covariance of the residuals from it, ``n_turns`` times.
 
-    Parameters
-    ----------
-    training : TrainingSet
-    group : Tensor of shape (rows,), or None
-        Demonstration of each row. What a turn leaves of each, whitened, shows how far its samples are correlated, which
-        the next turn takes into account.
-    to_try : sequence of one or two Families
-        The second ones, on more inducing inputs, are to go on with where the first do not resolve a length scale with
-        room to spare: in the next turn, and in one more after the last.
-    options : SearchOptions
-    n_turns : int, default=3
-    rows : TrainingSet, default=None
-        At all their inputs: of these the mean begins anew where the first one does not follow the data.
+    What a turn leaves of the rows of each demonstration, of which there is a ``group``, shows how far they are
+    correlated, which the next turn takes into account. The second of two families, on more inducing inputs, is to go on
+    with where the first does not resolve a length scale with room to spare: in the next turn, and in one more after the
+    last. Of ``rows``, at all their inputs, the mean begins anew where the first one does not follow the data.
     """
     larger = to_try[1] if len(to_try) > 1 else None
     fit = HeteroscedasticFit(training, group, to_try[0], larger, options, training, _start_tril(training))

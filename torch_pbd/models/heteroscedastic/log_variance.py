@@ -147,16 +147,17 @@ def _fit_correlated(squares: Squares, noise: NoiseCorrelation, features: Tensor)
     half = 0.5 * squares.degrees / noise.copies
     unbiased = squares.log_mean - torch.digamma(half) + half.log()
     weight = (noise.copies / torch.polygamma(1, half)).sqrt()  # the whitener takes the copies out again
-    whitener = noise.whitener * weight.unsqueeze(-2)
-    design, response = whitener @ features, (whitener @ unbiased.unsqueeze(-1)).squeeze(-1)
+    design = noise.whitener @ (weight.unsqueeze(-1) * features)
+    response = (noise.whitener @ (weight * unbiased).unsqueeze(-1)).squeeze(-1)
     linear = LinearEvidence.fit(design, response)
     evidence = linear.value + weight.log().sum(-1)
     location = (features @ linear.mean.unsqueeze(-1)).squeeze(-1)
     variance = ((features @ linear.covariance) * features).sum(-1)
 
-    return LogVariance(
-        evidence, linear.weights, location, variance, lambda: whitener.mT @ linear.gradient(design, response)
-    )
+    def gradient() -> Tensor:
+        return weight.unsqueeze(-1) * (noise.whitener.mT @ linear.gradient(design, response))
+
+    return LogVariance(evidence, linear.weights, location, variance, gradient)
 
 
 def _maximize(features: Tensor, target: Tensor, half: Tensor, pooled: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:

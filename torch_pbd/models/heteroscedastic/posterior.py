@@ -21,7 +21,6 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import pad
 
 from torch_pbd.gp.observations import spacing
 from torch_pbd.linalg import spectral_map
@@ -138,17 +137,15 @@ class LatentCovariance:
     def at(self, x: Float[Tensor, "n e"]) -> FactorMoments:
         """Moments of the entries of the factor at x."""
         mean, variance = self.log_variance_at(x)
-        n_outputs = mean.shape[1]
-        rows, variances = [pad(0.0 * mean[:, :1], (0, n_outputs - 1))], [pad(0.0 * mean[:, :1], (0, n_outputs - 1))]
         features = self.rows(x)
         unexplained = self.rows.unexplained(features)
+        below, below_variance = (mean.new_zeros(*mean.shape, mean.shape[1]) for _ in range(2))
         # Coefficients of one output share their features, and each has a block of the weights.
         for i, (weights, own) in enumerate(zip(self.coefficients, features, strict=True), start=1):
-            blocks = weights.root.reshape(i, own.shape[1], -1)
-            known = (own @ blocks).square().sum(-1).mT
-            rows.append(pad(own @ weights.mean.reshape(i, -1).mT, (0, n_outputs - i)))
-            variances.append(pad(known + unexplained[i - 1, :, None], (0, n_outputs - i)))
-        return FactorMoments(mean, variance, torch.stack(rows, dim=1), torch.stack(variances, dim=1))
+            known = (own @ weights.root.reshape(i, own.shape[1], -1)).square().sum(-1).mT
+            below[:, i, :i] = own @ weights.mean.reshape(i, -1).mT
+            below_variance[:, i, :i] = known + unexplained[i - 1, :, None]
+        return FactorMoments(mean, variance, below, below_variance)
 
     def draw(self, x: Float[Tensor, "n e"], normal: Sequence[Float[Tensor, "*s _"]]) -> Float[Tensor, "*s n d d"]:
         """Factors at x of functions drawn from the posterior, made of standard normal numbers.

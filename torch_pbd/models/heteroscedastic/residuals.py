@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from torch_pbd.linalg import safe_cholesky, triangular_inverse
 from torch_pbd.models.training import TrainingSet
@@ -183,38 +184,34 @@ def demonstration_correlation(
     """
     limit = math.sqrt(x.shape[1])
     scaled = whitened / whitened.square().mean(0).clamp_min(_LEAST).sqrt()
-    parts, n_chosen = [], 0
-    for rows in _chosen_rows(x, group):
-        together = max(1, _MAX_PAIRS // rows.shape[1] ** 2)
-        parts += [_products_by_distance(x[some], scaled[some], limit) for some in rows.split(together)]
-        n_chosen += rows.numel()
-    independent = torch.ones_like(whitened[0])
-    if sum(len(pairs) for _, pairs in parts) < 2:
-        return DemonstrationCorrelation(0.0 * independent, independent)
-    products, pairs = (torch.cat(part) for part in zip(*parts, strict=True))
-    total = pairs.sum(0)
+    none = DemonstrationCorrelation(torch.zeros_like(scaled[0]), torch.ones_like(scaled[0]))
+    chosen = _chosen_rows(x, group)
+    if not chosen:
+        return none
+    # Those of fewer samples are filled up with some that are nowhere.
+    places = pad_sequence([x[rows] for rows in chosen], batch_first=True, padding_value=math.nan)
+    values = pad_sequence([scaled[rows] for rows in chosen], batch_first=True)
+    together = max(1, _MAX_PAIRS // places.shape[1] ** 2)
+    parts = zip(places.split(together), values.split(together), strict=True)
+    products, pairs = map(torch.cat, zip(*(_products_by_distance(*part, limit) for part in parts), strict=True))
+    total, n_chosen = pairs.sum(0), sum(map(len, chosen))
     sum_of_squares = (_squared_autocorrelation(products, pairs) * total[:, None]).sum(0)
     # Of n samples all pairs but those of a sample with itself; were some left out, there are as many more of each.
     share = 1.0 / (1.0 + 2.0 * sum_of_squares / n_chosen * len(x) / n_chosen)
     correlated = share <= _INDEPENDENT
     if not bool(correlated.any()):
-        return DemonstrationCorrelation(0.0 * independent, independent)
+        return none
     centre = (torch.arange(_N_BINS).to(x) + 0.5) * limit / _N_BINS
     decay = _decay_of(sum_of_squares, centre, total)
     return DemonstrationCorrelation(torch.where(correlated, decay, 0.0), torch.where(correlated, share, 1.0))
 
 
-def _chosen_rows(x: Tensor, group: Tensor) -> list[Int64[Tensor, "g t"]]:
-    """Rows of each demonstration along the first input, stacked for demonstrations of as many rows."""
-    counts = torch.bincount(group)
+def _chosen_rows(x: Tensor, group: Tensor) -> list[Int64[Tensor, " t"]]:
+    """Rows of each demonstration that has several, along the first input."""
     order = x[:, 0].argsort(stable=True)
     order = order[group[order].argsort(stable=True)]
-    by_size: dict[int, list[Tensor]] = {}
-    for rows in order.split(counts.tolist()):
-        chosen = rows[:: math.ceil(len(rows) / _MAX_SAMPLES) or 1]
-        if len(rows) > 1:
-            by_size.setdefault(len(chosen), []).append(chosen)
-    return [torch.stack(same) for same in by_size.values()]
+    demos = [rows for rows in order.split(torch.bincount(group).tolist()) if len(rows) > 1]
+    return [rows[:: math.ceil(len(rows) / _MAX_SAMPLES)] for rows in demos]
 
 
 def _products_by_distance(
@@ -225,8 +222,8 @@ def _products_by_distance(
     i, j = torch.triu_indices(x.shape[1], x.shape[1], offset=1, device=x.device)
     distance = (x[:, i] - x[:, j]).norm(dim=-1)
     edges = limit * torch.arange(1, _N_BINS).to(x) / _N_BINS + 1e-9
-    number = torch.bucketize(distance, edges)
-    number = torch.where(distance <= limit, number, _N_BINS)  # the last bin is of those that are too far apart
+    # The last bin is of those that are too far apart.
+    number = torch.where(distance <= limit, torch.bucketize(distance, edges), _N_BINS)
     number = (number + (_N_BINS + 1) * torch.arange(n_demos, device=x.device)[:, None]).flatten()
     size = n_demos * (_N_BINS + 1)
     products = x.new_zeros(size, n_outputs).index_add_(0, number, (values[:, i] * values[:, j]).flatten(0, 1))

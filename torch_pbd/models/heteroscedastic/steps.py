@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int64
@@ -143,16 +142,6 @@ class CovarianceSearch:
         self.coefficients = [Search(self.coefficient_family, 1, options) for _ in range(1, n_outputs)]
 
 
-class _Row(NamedTuple):
-    """Regression of an output on those before it, with its coefficients integrated out."""
-
-    regression: Regression
-    expected: Float[Tensor, " n"]
-    """Expected squares of the residuals."""
-    divergence: Tensor | float
-    """Of the coefficients' posterior from their prior, in nats."""
-
-
 _FitRow = Callable[[int, Regression], tuple[Tensor, Tensor, Tensor, Tensor | float]]
 """Features (n, p) of the coefficients of output i, mean and covariance of their weights, and the divergence."""
 
@@ -178,15 +167,16 @@ def fit_covariance(
     # An output that is constant is noise of the least variance too where later ones are regressed on it: to zeros
     # any coefficient would fit, and its uncertainty would count as their variance.
     scatter = scatter + LEAST_SQUARE * torch.diag_embed(degrees.mT)
-    fixed = FixedFeatures(search.log_variance.family, inputs)
-    in_row = FixedFeatures(search.coefficient_family, inputs)
-    near, rows = None, []
+    fixed, in_row = (
+        FixedFeatures(family, inputs) for family in (search.log_variance.family, search.coefficient_family)
+    )
+    near, following = None, Squares(scatter.diagonal(dim1=1, dim2=2).mT, degrees, noise)
     if previous is not None:
         near = previous.log_variance_at(inputs)[0].mT
         known = partial(_known_row, previous.coefficients, previous.rows(inputs))
-        rows = _regress(scatter, near, torch.exp(-near), noise, known)
+        _, following, _ = _regress(scatter, degrees, noise, near, torch.exp(-near), known)
     for sweep in range(_SWEEPS if scatter.shape[1] > 1 and not cautious else 1):
-        squares = _squares(scatter, degrees, noise, rows)
+        squares = following
         near = (squares.log_pooled if near is None else near).clone()
         theta = search.log_variance.run(log_variance_evidence(fixed, squares, near))
         log_variance = fit_log_variance(squares, fixed.design_vjp(theta, squares.information)[0], near)
@@ -194,34 +184,53 @@ def fit_covariance(
         # E[exp(-l)] of a normal l: its mean and half its variance.
         precision = torch.exp(-near + 0.5 * log_variance.variance)
         searched = partial(_searched_row, search.coefficients, in_row, anew=sweep < _SEARCHES)
-        rows = _regress(scatter, near, precision, noise, searched)
-        evidence = float(log_variance.evidence.sum()) - float(sum(row.divergence for row in rows))
+        regressions, following, divergence = _regress(scatter, degrees, noise, near, precision, searched)
+        evidence = float(log_variance.evidence.sum()) - divergence
     # The weights of all features, where the searches took only those that carry something.
     log_variances = search.log_variance.family.prepared(theta)
     weights = fit_log_variance(squares, log_variances(inputs), near).weights
     thetas = [each.theta for each in search.coefficients if each.theta is not None]
-    processes, coefficients = search.coefficient_family.prepared(torch.cat([theta[:0], *thetas])), []
-    for row, features in zip(rows, processes(inputs), strict=True):
-        mean, root = row.regression.fit(features[None]).weights
+    rows, coefficients = search.coefficient_family.prepared(torch.cat([theta[:0], *thetas])), []
+    for regression, features in zip(regressions, rows(inputs), strict=True):
+        mean, root = regression.fit(features[None]).weights
         coefficients.append(Weights(mean[0], root[0]))
-    return LatentCovariance(log_variances, weights, processes, coefficients), evidence
+    return LatentCovariance(log_variances, weights, rows, coefficients), evidence
 
 
 def _regress(
-    scatter: Tensor, location: Tensor, precision: Tensor, noise: NoiseCorrelation | None, fit_row: _FitRow
-) -> list[_Row]:
-    """Regressions of one output after another on those before it, of log variances and precisions (d, n) as known."""
+    scatter: Tensor,
+    degrees: Tensor,
+    noise: NoiseCorrelation | None,
+    location: Tensor,
+    precision: Tensor,
+    fit_row: _FitRow,
+) -> tuple[list[Regression], Squares, float]:
+    """Regressions of one output after another on those before it, of log variances and precisions (d, n) as known.
+
+    With the squares of their residuals, and the divergence of their coefficients from the prior. Where samples are
+    correlated and enough at an input the squares are of the regression there by itself: an error of the coefficients'
+    processes, as smooth as the demonstrations, would else count as residual.
+    """
     deviation = torch.exp(0.5 * location)
-    tril, rows = deviation[0][:, None, None], []
+    tril, regressions, whole = deviation[0][:, None, None], [], 0.0
+    totals, kept = [scatter[:, 0, 0]], [degrees[0]]
     for i in range(1, len(location)):
         whitener = None if noise is None else noise.whitener[i]
         regression = Regression.standardize(scatter[:, : i + 1, : i + 1], tril, precision[i], whitener)
         features, mean, covariance, divergence = fit_row(i, regression)
-        rows.append(_Row(regression, regression.expected_squares(features, mean, covariance), divergence))
+        regressions.append(regression)
+        whole += float(divergence)
+        totals.append(regression.expected_squares(features, mean, covariance))
+        kept.append(degrees[i])
+        if noise is not None:
+            local = degrees[i] - i * noise.copies[i]
+            enough = local >= _ENOUGH_DEGREES * noise.copies[i]
+            totals[i] = torch.where(enough, regression.local_squares(), totals[i])
+            kept[i] = torch.where(enough, local, degrees[i])
         # The factor of outputs 0, ..., i, on which the next one is regressed.
         row = torch.cat([features @ mean.reshape(i, -1).mT, deviation[i][:, None]], dim=1)
         tril = torch.cat([pad(tril, (0, 1)), row.unsqueeze(1)], dim=1)
-    return rows
+    return regressions, Squares(torch.stack(totals), torch.stack(kept), noise), whole
 
 
 def _known_row(
@@ -246,20 +255,3 @@ def _searched_row(
     design, _ = fixed.design_vjp(theta, information)
     linear = regression.fit(design)
     return design[0], linear.mean[0], linear.covariance[0], linear.divergence_from_prior()
-
-
-def _squares(scatter: Tensor, degrees: Tensor, noise: NoiseCorrelation | None, rows: list[_Row]) -> Squares:
-    """Squared residuals of each output from its regression on those before it.
-
-    Where samples are correlated and enough at an input, from the regression there by itself: an error of the
-    coefficients' processes, as smooth as the demonstrations, would else count as residual.
-    """
-    totals, kept = list(scatter.diagonal(dim1=1, dim2=2).mT), list(degrees)
-    for i, row in enumerate(rows, start=1):
-        totals[i] = row.expected
-        if noise is not None:
-            local = degrees[i] - i * noise.copies[i]
-            enough = local >= _ENOUGH_DEGREES * noise.copies[i]
-            totals[i] = torch.where(enough, row.regression.local_squares(), row.expected)
-            kept[i] = torch.where(enough, local, degrees[i])
-    return Squares(torch.stack(totals), torch.stack(kept), noise)
