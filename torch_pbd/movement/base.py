@@ -38,10 +38,6 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         groups : array-like of shape (n_samples,), default=None
             Label of each sample's demonstration, required where X is an array; there must be two or more.
 
-        Returns
-        -------
-        self
-
         Raises
         ------
         ValueError

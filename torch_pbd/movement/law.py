@@ -48,16 +48,13 @@ class Known(NamedTuple):
         return ~np.isnan(self.value) & (self.noise == 0.0)
 
 
-NOTHING = Known(np.empty(0), np.empty((0, 1)), np.empty((0, 1)))
-
-
 class MovementLaw(BaseEstimator, ABC):
     """Law of a movement at any times, given observations of it."""
 
     df_: float = math.inf  # degrees of freedom; infinite for a normal law
     n_outputs_: int
     _range: tuple[float, float]  # first of the times of the fit, and their range
-    _known: Known = NOTHING
+    _known: Known = Known(np.empty(0), np.empty((0, 1)), np.empty((0, 1)))
     _axes: Floats | None = None  # axes of the coordinates of observations; None are the outputs
     _kept: dict[str, tuple[Floats, Any]]  # cached last times and their law, shared by conditioned copies
     _y_is_1d: bool

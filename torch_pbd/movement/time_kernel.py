@@ -66,14 +66,12 @@ class TimeKernel(nn.Module):
 
 
 def smooth_correlation(
-    time: Float[Tensor, " n"],
-    other: Float[Tensor, " m"],
-    scales: Float[Tensor, "b 2"],
-    fine: Float[Tensor, "b n"],
-    other_fine: Float[Tensor, "b m"],
-    kernel: str,
+    time: Tensor, other: Tensor, scales: Tensor, fine: Tensor, other_fine: Tensor, kernel: str
 ) -> Float[Tensor, "b n m"]:
-    """Correlation, of unit variance, of a slow part and a tremor of these variances relative to it."""
+    """Correlation, of unit variance, of a slow part and a tremor, between times (n,) and others (m,).
+
+    There are b pairs ``scales`` (b, 2), and at each time the tremor's variance over the slow part's, (b, n) and (b, m).
+    """
     # Many share a length scale, and the exponentials dominate the cost.
     lengths, places = torch.unique(scales, return_inverse=True)
     each = correlation(time[:, None], other[:, None], lengths[:, None], kernel)

@@ -45,17 +45,12 @@ class TimedMovement(MovementRegressor):
         Parameters
         ----------
         X : array-like of shape (n_samples, 1)
-            Times since the start of the movement.
+            Times since the start of the movement, whose timing must not be "none".
 
         Returns
         -------
         mean, std : ndarray of shape (n_samples,)
             Mean and standard deviation of the phase, which is 0 at the start and 1 from the end on.
-
-        Raises
-        ------
-        ValueError
-            If timing is "none".
         """
         time = self._times(X)
         if self._timing is None:
@@ -71,12 +66,13 @@ class TimedMovement(MovementRegressor):
         """
         copied = super().condition(X, y, noise_scale=noise_scale)
         if copied._timing is not None:
-            copied._locate()
+            copied._locate(copied._timing)
         return copied
 
-    def _locate(self) -> None:
-        known = self._known
-        self._nodes = self._timing.posterior(self._log_likelihood(known), self._last(known.time))
+    def _locate(self, timing: Timing) -> None:
+        """Find durations and paces given the observations, for movements of this timing."""
+        self._timing, known = timing, self._known
+        self._nodes = timing.posterior(self._log_likelihood(known), self._last(known.time))
 
     def _components(self, time: Floats) -> tuple[Floats, list[tuple[Self, Floats]]]:
         if self._timing is None:
@@ -151,13 +147,11 @@ class TimedMovement(MovementRegressor):
                 "record more, or take timing='none'."
             )
         if self.timing == "auto":
-            self._choose_timing(self._gain(recordings))
+            self.timing_gain_ = self._gain(recordings)
+            self.timing_ = "warp" if self.timing_gain_ > 0.0 else "none"
             if getattr(self.regressor, "verbose", 0):
                 say(f"timing: a warp gains {self.timing_gain_:.3g} nats a step, taken is {self.timing_!r}")
         return self._phased(recordings, self.timing_)
-
-    def _choose_timing(self, gain: float) -> None:
-        self.timing_gain_, self.timing_ = gain, "warp" if gain > 0.0 else "none"
 
     def _phased(self, recordings: list[Recording], timing: str) -> list[Recording]:
         """Recordings over phase, after their timing was learned."""
@@ -166,14 +160,13 @@ class TimedMovement(MovementRegressor):
         checks.require(good, first, "the first time of a demonstration", "0 or a little later", "count from its start")
         durations, pace = torch.from_numpy(duration), torch.zeros(len(duration), dtype=torch.float64)
         # Without a warp all movements take the mean duration, at an even pace.
-        location = torch.stack([durations.mean().log(), pace[0]])
-        self._set_timing(Timing(location, torch.zeros(2, 2).to(pace), 1.0))
+        mean = Timing(torch.stack([durations.mean().log(), pace[0]]), torch.zeros(2, 2).to(pace), 1.0)
         if timing == "warp":
             grid = np.linspace(0.0, 1.0, _N_STEPS)
             curves = np.stack([interpolate(time, position, grid * time[-1]) for time, position in recordings])
             size = curves.std((0, 1))
             pace = register(torch.from_numpy(curves / np.where(size > 0.0, size, 1.0)))
-            self._set_timing(Timing.learn(durations, pace))
+        self._locate(Timing.learn(durations, pace) if timing == "warp" else mean)
         # On shared phases, as if the demonstrations were aligned.
         shared = np.linspace(0.0, 1.0, n_grid_steps(recordings))
         phased = []
@@ -182,10 +175,6 @@ class TimedMovement(MovementRegressor):
             seen = ~np.isnan(values).any(axis=1)
             phased.append(Recording(shared[seen], values[seen]))
         return phased
-
-    def _set_timing(self, timing: Timing) -> None:
-        self._timing = timing
-        self._locate()
 
     def _gain(self, recordings: list[Recording]) -> float:
         """Gain of a warp over the mean duration at an even pace, in nats per step of left-out demonstrations.
@@ -225,9 +214,9 @@ class TimedMovement(MovementRegressor):
             own["root"].diagonal() >= 0.0, own["root"].diagonal(), "the diagonal of timing_root", "at least 0"
         )
         df = checks.number(float(own["df"]), "timing_df", above=0.0)
-        self._set_timing(Timing(torch.tensor(own["location"]), torch.tensor(own["root"]), df))
+        self._locate(Timing(torch.tensor(own["location"]), torch.tensor(own["root"]), df))
         if self.timing == "auto":
-            self._choose_timing(float(own["gain"]))
+            self.timing_gain_, self.timing_ = float(own["gain"]), "warp" if own["gain"] > 0.0 else "none"
         return {name: array for name, array in arrays.items() if not name.startswith("timing_")}
 
 

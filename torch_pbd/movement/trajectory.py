@@ -212,13 +212,12 @@ class TrajectoryRegressor(TimedMovement):
         return self._timing is None and not len(self._known.time)
 
     def _uncertainty(self, time: Floats) -> tuple[Floats, Floats, Floats]:
-        mean, (type1, type2) = self._rows(time)[0], self.regressor_.predict_uncertainty(time[:, np.newaxis])
+        union, rows, places = self._union(time, self._known.time)
+        type1, type2 = self.regressor_.predict_uncertainty(union[:, np.newaxis])
         if not self._is_regressor:
-            union, rows, places = self._union(time, self._known.time)
-            own = self.regressor_.predict_uncertainty(union[:, np.newaxis]).type2
-            law = self._given(self._joint(union, self._regressor_rows(union)[0], own), places).law
-            type2 = law.marginal()[torch.from_numpy(rows)].numpy()
-        return mean, type1, type2
+            law = self._given(self._joint(union, self._regressor_rows(union)[0], type2), places).law
+            type2 = law.marginal().numpy()
+        return self._rows(time)[0], type1[rows], type2[rows]
 
     def _arrays(self) -> dict[str, Floats]:
         state = self.module_.state_dict().items()
