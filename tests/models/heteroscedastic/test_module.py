@@ -30,7 +30,7 @@ def fitted(d=2, *, period=None, length_scale=None, n=12, n_demos=8, seed=0):
         ProcessFamily(torch.tensor(inputs), 0.3, 1.2, 0.0, None, "matern52", period, exact=True),
         ProcessFamily(torch.tensor(inputs), 0.5, 1.0, 2.0, length_scale, "matern52", period, exact=True),
     )
-    fit = fit_heteroscedastic(training, None, [families], SearchOptions(), n_turns=2)
+    fit = fit_heteroscedastic(training, None, [families], SearchOptions())
     return HeteroscedasticModel(fit, PRIOR * torch.eye(d, dtype=torch.float64))
 
 

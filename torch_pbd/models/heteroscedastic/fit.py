@@ -35,6 +35,7 @@ from torch_pbd.models.heteroscedastic.steps import MOST_INPUTS, CovarianceSearch
 from torch_pbd.models.training import TrainingSet, pooled_tril
 from torch_pbd.optim.batch import Progress
 
+_TURNS = 3  # of mean and covariance, unless more inducing inputs are called for
 # Rows at an input whose mean is all their own still count for this share of a degree of freedom, or nothing there
 # would be known of the variance.
 _LEAST_SHARE = 0.1
@@ -87,28 +88,22 @@ class HeteroscedasticFit:
         self.families = self.families._replace(log_variance=log_variance)
         self.search = CovarianceSearch(self.families, self._n_outputs, self.options)
 
-    def fit_mean(self, rows: TrainingSet | None) -> None:
-        """Mean under the noise so far; of ``rows`` it begins anew where this one does not follow the data."""
-        self._fit_mean()
-        if rows is None or self._follows():
+    def fit_mean(self, anew: TrainingSet | None) -> None:
+        """Mean under the noise so far, and residuals; begun again of rows ``anew`` if it does not follow the data."""
+        noise = self.noise_correlation(self.mean_rows, squares=False)
+        self.mean = fit_mean(self._mean_search, self.mean_rows, self.noise_tril(self.mean_rows.inputs), noise)
+        self.residual = self.training.y - self.mean.expected_at_all(self.training)
+        if anew is None or self._follows():
             return
-        if (start := mean_start(rows, self.mean, self.pooled_tril, self.options)) is not None:
+        if (start := mean_start(anew, self.mean, self.pooled_tril, self.options)) is not None:
             self._mean_search, self.pooled_tril, self.mean_rows = start
-            self._fit_mean()
-
-    def _fit_mean(self) -> None:
-        rows, noise = self.mean_rows, self.noise_correlation(self.mean_rows, squares=False)
-        whitener = None if noise is None else noise.whitener
-        tril = self.noise_tril(rows.inputs)
-        self.mean = fit_mean(self._mean_search, rows.inputs, rows.means(), rows.counts, tril, whitener)
+            self.fit_mean(None)
 
     def _follows(self) -> bool:
         """Whether residuals of the first mean are the noise that it was fitted under: not far less, no signal, and not
         all of y.
         """
-        training = self.training
-        self.residual = training.y - self.mean.expected_at_all(training)
-        whitened = self.normal()
+        training, whitened = self.training, self.normal()
         less = whitened.square().mean(0) < _MUCH_LESS
         # By Schwarz's criterion: of 20 inputs once in 30 times by chance, of 500, which tell more, once in 3,000.
         wrong = is_signal(whitened, training, self.group, LAGS * math.log(len(training.inputs))) & ~less
@@ -213,10 +208,9 @@ def fit_heteroscedastic(
     to_try: Sequence[Families],
     options: SearchOptions,
     *,
-    n_turns: int = 3,
     rows: TrainingSet | None = None,
 ) -> HeteroscedasticFit:
-    """Mean under the noise learned so far, then covariance of the residuals from it, ``n_turns`` times.
+    """Mean under the noise learned so far, then covariance of the residuals from it, by turns.
 
     What a turn leaves of the rows of each demonstration, of which there is a ``group``, shows how far they are
     correlated, which the next turn takes into account. The second of two families, on more inducing inputs, is to go on
@@ -227,14 +221,13 @@ def fit_heteroscedastic(
     fit = HeteroscedasticFit(training, group, to_try[0], larger, options, training, _start_tril(training))
     # Share of the rows that count before the correlation of a demonstration's samples is known.
     first_part = 1.0 if group is None else min(1.0, _FIRST_SAMPLES * fit.n_demos / len(group))
-    started, turn = time.perf_counter(), 0
+    started, turn, n_turns = time.perf_counter(), 0, _TURNS
     while turn < n_turns:
         options.slack = _SLACK if turn < n_turns - 1 else 1.0
-        # mu given C and L, by generalized least squares.
+        # mu given C and L, by generalized least squares, and the residuals r = y - mu.
         fit.fit_mean(rows if turn == 0 else None)
-        # Residuals r = y - mu, and the share 1 - h of a degree of freedom that fitting mu has left of each.
+        # The share 1 - h of a degree of freedom that fitting mu has left of each.
         training, share = fit.training, fit.shares()
-        fit.residual = training.y - fit.mean.expected_at_all(training)
         # C C' = sum of r r' / sum of (1 - h), once: what changes later is L's.
         if turn == 0:
             fit.pooled_tril = _pooled_tril(fit.residual, share)

@@ -176,9 +176,9 @@ class Regression:
         way of the design, which has i rows an input, it would be i times the work.
         """
         if self.couplings is not None:
-            precision = self._weights_precision(*self.couplings, features)
-            if float(precision.detach().diagonal(dim1=-2, dim2=-1).amax()) < _LARGEST_PRECISION:
-                factor = safe_cholesky(precision, name="the precision of the coefficients' weights")
+            of_weights = self._weights_precision(*self.couplings, features)
+            if float(of_weights.detach().diagonal(dim1=-2, dim2=-1).amax()) < _LARGEST_PRECISION:
+                factor = safe_cholesky(of_weights, name="the precision of the coefficients' weights")
                 cross = (self.cross.mT @ features).flatten(1).unsqueeze(-1)
                 projected = torch.linalg.solve_triangular(factor, cross, upper=False)
                 mean = torch.linalg.solve_triangular(factor.mT, projected, upper=True).squeeze(-1)

@@ -161,9 +161,9 @@ class DemonstrationCorrelation:
         """Correlation of the means, or the mean ``squares``, at the inputs of rows of demonstrations ``group``."""
         inputs, counts = rows.inputs, rows.counts
         # Rows of one demonstration at one input are copies: a diagonal entry is the number of rows that count for one.
-        names, number = group.unique(return_inverse=True)
-        occurrences = torch.bincount(number * len(inputs) + rows.index, minlength=len(names) * len(inputs))
-        occurrences = occurrences.reshape(len(names), -1).to(inputs)
+        n_demos, n_inputs = int(group.max()) + 1, len(inputs)
+        occurrences = torch.bincount(group * n_inputs + rows.index, minlength=n_demos * n_inputs)
+        occurrences = occurrences.reshape(n_demos, n_inputs).to(inputs)
         shared = occurrences.mT @ occurrences / (counts[:, None] * counts).sqrt()
         distance = torch.cdist(inputs, inputs, compute_mode="donot_use_mm_for_euclid_dist")
         decay = self.decay[:, None, None].clamp_min(_LEAST)

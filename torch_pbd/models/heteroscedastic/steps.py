@@ -49,18 +49,15 @@ _ENOUGH_DEGREES = 2.0
 
 
 def fit_mean(
-    search: Search,
-    inputs: Float[Tensor, "n e"],
-    means: Float[Tensor, "n d"],
-    counts: Float[Tensor, " n"],
-    noise_tril: Float[Tensor, "n d d"],
-    whitener: Float[Tensor, "d n n"] | None,
+    search: Search, rows: TrainingSet, noise_tril: Float[Tensor, "n d d"], noise: NoiseCorrelation | None
 ) -> LatentMean:
-    """Posterior given means of ``counts`` rows, whose noise has the factor ``noise_tril``.
+    """Posterior given the means of rows at the inputs; of a row the noise has the factor ``noise_tril``.
 
     Hyperparameters are chosen for each output by its own evidence, as if its noise were independent of the others';
-    the posterior is that of all outputs together. ``whitener`` makes the means at different inputs independent.
+    the posterior is that of all outputs together.
     """
+    means, counts = rows.means(), rows.counts
+    whitener = None if noise is None else noise.whitener
     # One output: its mean over the deviation of its noise is features times weights, and noise of unit variance. In the
     # search alone no noise is less than _NONE. Rounding of kernels, 1e-16, changes the evidence of n inputs by about n
     # 1e-16 over the variance of the noise: of 1e-12 by .02 nats, and rounding of y then led to other length scales.
@@ -68,11 +65,11 @@ def fit_mean(
     noise_whitener = scale if whitener is None else whitener * scale.mT
     response = _times(noise_whitener, means.mT.unsqueeze(-1)).squeeze(-1)
     information = noise_whitener.square().sum((-2, -1))
-    fixed = FixedFeatures(search.family, inputs)
+    fixed = FixedFeatures(search.family, rows.inputs)
 
-    def evidence(theta: Tensor, rows: Int64[Tensor, " a"]) -> tuple[Tensor, Gradient]:
-        design, vjp = fixed.design_vjp(theta, information[rows])
-        chosen, its_response = noise_whitener[rows], response[rows]
+    def evidence(theta: Tensor, outputs: Int64[Tensor, " a"]) -> tuple[Tensor, Gradient]:
+        design, vjp = fixed.design_vjp(theta, information[outputs])
+        chosen, its_response = noise_whitener[outputs], response[outputs]
         whitened = _times(chosen, design)
         linear = LinearEvidence.fit(whitened, its_response)
         transposed = chosen if whitener is None else chosen.mT
@@ -81,7 +78,7 @@ def fit_mean(
     processes = search.family.prepared(search.run(evidence))
     # All outputs: sqrt(count) inv(T) mean, with T the factor of the noise, has independent entries at an input.
     whitening = counts.sqrt()[:, None, None] * triangular_inverse(noise_tril)
-    design = torch.einsum("nij,jnp->nijp", whitening, processes(inputs)).flatten(2)
+    design = torch.einsum("nij,jnp->nijp", whitening, processes(rows.inputs)).flatten(2)
     response = (whitening @ means.unsqueeze(-1)).squeeze(-1)
     if whitener is not None:
         design = torch.einsum("imn,niq->miq", whitener, design)
