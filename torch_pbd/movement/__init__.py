@@ -4,8 +4,4 @@ from torch_pbd.movement.kmp import KMPBaseline
 from torch_pbd.movement.promp import ProMPBaseline
 from torch_pbd.movement.trajectory import TrajectoryRegressor
 
-__all__ = [
-    "KMPBaseline",
-    "ProMPBaseline",
-    "TrajectoryRegressor",
-]
+__all__ = ["KMPBaseline", "ProMPBaseline", "TrajectoryRegressor"]

@@ -136,11 +136,9 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
             Covariance between all outputs at all rows.
         """
         time = self._times(X)
-        require_much(
-            4 * 8.0 * (len(time) * self.n_outputs_) ** 2,
-            what=f"the covariance between all {len(time)} rows and {self.n_outputs_} outputs",
-            remedy="Ask for fewer rows; sample_demonstrations and score_demonstrations never form it.",
-        )
+        what = f"the covariance between all {len(time)} rows and {self.n_outputs_} outputs"
+        remedy = "Ask for fewer rows; sample_demonstrations and score_demonstrations never form it."
+        require_much(4 * 8.0 * (len(time) * self.n_outputs_) ** 2, what=what, remedy=remedy)
         weight, parts = self._components(time)
         moments = []
         for model, own in parts:
@@ -165,11 +163,8 @@ class MovementRegressor(MultiOutputMixin, RegressorMixin, MovementLaw):
         checks.count(n_samples, "n_samples")
         generator = checks.seed(random_state)
         time = self._times(X)
-        require_much(
-            6 * 8.0 * n_samples * (len(time) + len(self._known.time)) * self.n_outputs_,
-            what=f"n_samples={n_samples} at {len(time)} rows",
-            remedy="Draw fewer at a time.",
-        )
+        what, n_rows = f"n_samples={n_samples} at {len(time)} rows", len(time) + len(self._known.time)
+        require_much(6 * 8.0 * n_samples * n_rows * self.n_outputs_, what=what, remedy="Draw fewer at a time.")
         weight, parts = self._components(time)
         counts = generator.multinomial(n_samples, weight).tolist()
         own = [law._draws(x, n, generator) for (law, x), n in zip(parts, counts, strict=True) if n]

@@ -130,12 +130,7 @@ class Conditioned:
     """
 
     def __init__(
-        self,
-        prior: JointNormal,
-        steps: Int[Tensor, " m"],
-        values: Float[Tensor, "m d"],
-        noise: Float[Tensor, "m d"],
-        axes: Float[Tensor, "d d"],
+        self, prior: JointNormal, steps: Int[Tensor, " m"], values: Tensor, noise: Tensor, axes: Float[Tensor, "d d"]
     ) -> None:
         given = ~values.isnan()
         exact = (given & (noise == 0.0)).all(1)

@@ -1,5 +1,6 @@
 """Kernelized movement primitives (KMP): kernel regression through a reference of means and covariances."""
 
+from dataclasses import KW_ONLY, dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -20,6 +21,7 @@ from torch_pbd.movement.law import Recording, as_rows, check_arrays, semidefinit
 _ARRAYS = ("reference.time", "reference.mean", "reference.covariance", "range", "deviation")  # names in model files
 
 
+@dataclass(eq=False, repr=False)
 class KMPBaseline(MovementRegressor):
     """Kernelized movement primitive through the reference of a Gaussian mixture regression.
 
@@ -57,26 +59,16 @@ class KMPBaseline(MovementRegressor):
     2019.
     """
 
-    _learned: ClassVar[Any] = {}
+    regressor: CovarianceRegressor | None = None
+    _: KW_ONLY
+    n_reference: int = 100
+    length_scale: float = 0.144
+    lambda_mean: float = 1.0
+    lambda_cov: float = 60.0
+    nugget: float = 1e-4
+    random_state: Any = 0
 
-    def __init__(
-        self,
-        regressor: CovarianceRegressor | None = None,
-        *,
-        n_reference: int = 100,
-        length_scale: float = 0.144,
-        lambda_mean: float = 1.0,
-        lambda_cov: float = 60.0,
-        nugget: float = 1e-4,
-        random_state: Any = 0,
-    ) -> None:
-        self.regressor = regressor
-        self.n_reference = n_reference
-        self.length_scale = length_scale
-        self.lambda_mean = lambda_mean
-        self.lambda_cov = lambda_cov
-        self.nugget = nugget
-        self.random_state = random_state
+    _learned: ClassVar[Any] = {}
 
     def _check_parameters(self) -> None:
         checks.count(self.n_reference, "n_reference", least=2)
@@ -105,11 +97,8 @@ class KMPBaseline(MovementRegressor):
 
     def _prior(self, time: Floats) -> JointNormal:
         n, d = len(time), self.n_outputs_
-        require_much(
-            4 * 8.0 * (n * d) ** 2,
-            what=f"the covariance between {n} rows and {d} outputs",
-            remedy="Ask for fewer rows.",
-        )
+        what = f"the covariance between {n} rows and {d} outputs"
+        require_much(4 * 8.0 * (n * d) ** 2, what=what, remedy="Ask for fewer rows.")
         mean, whitened, level = self._through_reference(time)
         explained = whitened.transpose(0, 2, 1).reshape(n * d, -1)
         # Time by time, all outputs of each: the kernel of the times acts on each output separately.

@@ -1,6 +1,7 @@
 """Probabilistic movement primitives (ProMP): a normal distribution of the weights of basis functions."""
 
 import itertools
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar
 
@@ -21,6 +22,7 @@ _LEAST_NOISE = 1e-4  # least noise as a share of an output's deviation: below it
 _MOST_LEFT_OUT = 40  # most demonstrations that are left out in turn
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class ProMPBaseline(MovementRegressor):
     """Probabilistic movement primitive: x_t = Psi_t w + noise, with normally distributed weights w.
 
@@ -62,27 +64,18 @@ class ProMPBaseline(MovementRegressor):
     2018.
     """
 
+    n_basis: int | str = "auto"
+    overlap: float | str = "auto"
+    ridge: float = 1e-6
+    shrinkage: float | str = "auto"
+    random_state: Any = 0
+
     _learned: ClassVar[Any] = {
         "n_basis_": partial(checks.count, least=2),
         "overlap_": partial(checks.number, above=0.0, below=1.0),
         "reach_": partial(checks.number, above=0.0),
         "shrinkage_": partial(checks.number, least=0.0, most=1.0),
     }
-
-    def __init__(
-        self,
-        *,
-        n_basis: int | str = "auto",
-        overlap: float | str = "auto",
-        ridge: float = 1e-6,
-        shrinkage: float | str = "auto",
-        random_state: Any = 0,
-    ) -> None:
-        self.n_basis = n_basis
-        self.overlap = overlap
-        self.ridge = ridge
-        self.shrinkage = shrinkage
-        self.random_state = random_state
 
     def _check_parameters(self) -> None:
         for name in ("n_basis", "overlap", "shrinkage"):
@@ -96,11 +89,8 @@ class ProMPBaseline(MovementRegressor):
         most = max(2, min(len(time) for time, _ in recordings) - 1)
         sizes = _N_BASES if self.n_basis == "auto" else (int(self.n_basis),)
         overlaps = _OVERLAPS if self.overlap == "auto" else (float(self.overlap),)
-        candidates = [
-            _Weights(scaled, size, overlap, float(self.ridge))
-            for size in sorted({min(size, most) for size in sizes})
-            for overlap in overlaps
-        ]
+        pairs = itertools.product(sorted({min(size, most) for size in sizes}), overlaps)
+        candidates = [_Weights(scaled, *pair, float(self.ridge)) for pair in pairs]
         shares = _SHARES if self.shrinkage == "auto" else (float(self.shrinkage),)
         choices = itertools.product(candidates, _REACHES, shares)
         weights, reach, share = max(choices, key=lambda choice: choice[0].left_out(*choice[1:]))

@@ -1,5 +1,6 @@
 """Fit of time kernels: length scales by likelihood alternating with nuggets by EM, then the kernel's share."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -112,13 +113,8 @@ class _Output:
     def _with_tremor(self, steps: Bool[Tensor, " T"], kernel: str, single: Found) -> Found:
         """Likeliest of one length scale and of two on either side of it, where a tremor replaces part of the nugget."""
         length = single.scales[0]
-        pairs = [
-            (slow, slow / ratio, weight)
-            for ratio in _RATIOS
-            for slow in _LENGTHS
-            if length <= slow <= ratio * length
-            for weight in _FINE_WEIGHTS
-        ]
+        choices = itertools.product(_RATIOS, _LENGTHS, _FINE_WEIGHTS)
+        pairs = [(slow, slow / ratio, weight) for ratio, slow, weight in choices if length <= slow <= ratio * length]
         nuggets = [nugget for nugget in _NUGGETS if nugget <= single.nugget]
         return self._likeliest(steps, kernel, [single.scales, *pairs], nuggets)
 

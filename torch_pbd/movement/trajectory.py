@@ -1,5 +1,6 @@
 """The joint law of a demonstration, on top of any covariance regressor."""
 
+from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from typing import Any, ClassVar
 
@@ -68,6 +69,7 @@ class TrajectoryLaw(nn.Module):
         return JointNormal.prior(mean, factor, kernel.share * kernel.correlation(time, time), loadings)
 
 
+@dataclass(eq=False, repr=False)
 class TrajectoryRegressor(TimedMovement):
     """Joint law of a whole demonstration: marginals of a covariance regressor and a correlation along the movement.
 
@@ -127,27 +129,17 @@ class TrajectoryRegressor(TimedMovement):
     (4, 3, 2)
     """
 
-    module_: TrajectoryLaw
+    regressor: CovarianceRegressor | None = None
+    _: KW_ONLY
+    time_kernel: str = "auto"
+    shrinkage: float | str = "auto"
+    timing: str = "none"
+    random_state: Any = 0
 
     _learned: ClassVar[Any] = {
         "df_": partial(checks.number, least=_FEWEST_DF, most=_MOST_DF),
         "time_kernel_": partial(checks.choice, choices=tuple(KERNELS)),
     }
-
-    def __init__(
-        self,
-        regressor: CovarianceRegressor | None = None,
-        *,
-        time_kernel: str = "auto",
-        shrinkage: float | str = "auto",
-        timing: str = "none",
-        random_state: Any = 0,
-    ) -> None:
-        self.regressor = regressor
-        self.time_kernel = time_kernel
-        self.shrinkage = shrinkage
-        self.timing = timing
-        self.random_state = random_state
 
     def _check_parameters(self) -> None:
         checks.choice(self.time_kernel, "time_kernel", ("auto", *KERNELS))
