@@ -7,16 +7,20 @@ from scipy.special import digamma, polygamma
 from scipy.stats import chi2, lognorm, multivariate_normal
 from torch.distributions import MultivariateNormal, kl_divergence
 
+from torch_pbd.models.heteroscedastic import log_variance
 from torch_pbd.models.heteroscedastic.log_variance import Squares
-from torch_pbd.models.heteroscedastic.log_variance import fit_log_variance as fit
 from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation
 
 INDEPENDENT = None
 
 
+def fit(squares, features, start=None):
+    return log_variance.fit_log_variance(squares, features, squares.log_pooled if start is None else start)
+
+
 def fit_log_variance(squares, features):
     found = fit(squares, features)
-    return found.weights, found.evidence
+    return found.posterior.weights, found.posterior.value
 
 
 def squares_at(n, rng, degrees=None, outputs=2, noise=INDEPENDENT):
@@ -71,7 +75,7 @@ class Evidence(torch.autograd.Function):
     def forward(ctx, features, squares):
         found = fit(squares, features.detach())
         ctx.save_for_backward(found.gradient())
-        return found.evidence
+        return found.posterior.value
 
     @staticmethod
     def backward(ctx, upstream):
@@ -95,7 +99,7 @@ def test_the_posterior_does_not_depend_on_where_it_starts(start, family, inputs,
     features = family.prepared(torch.tensor([[-1.0, 0.5]] * 2, dtype=torch.float64))(inputs)
     expected, found = fit(squares, features), fit(squares, features, torch.full((2, 9), start).double())
     torch.testing.assert_close(found.location, expected.location, rtol=0, atol=1e-7)
-    torch.testing.assert_close(found.evidence, expected.evidence, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(found.posterior.value, expected.posterior.value, rtol=1e-12, atol=1e-12)
 
 
 def exact_posterior(features, total, degrees):

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from torch_pbd.linalg import safe_cholesky, triangular_inverse
+from torch_pbd.linalg import safe_cholesky
 from torch_pbd.models.heteroscedastic.processes import Evidence, FixedFeatures, Gradient
-from torch_pbd.models.heteroscedastic.regression import LinearEvidence, Weights, weights_factor
+from torch_pbd.models.heteroscedastic.regression import LinearEvidence, log_det, weights_factor
 from torch_pbd.models.heteroscedastic.residuals import NoiseCorrelation
 from torch_pbd.models.training import TrainingSet
 
@@ -65,13 +65,10 @@ class LogVariance(NamedTuple):
     The last feature is a constant.
     """
 
-    evidence: Float[Tensor, " b"]
-    """Log evidence of the features, in nats."""
-    weights: Weights
+    posterior: LinearEvidence
+    """Of the weights; its value is the log evidence of the features, in nats."""
     location: Float[Tensor, "b n"]
     """Expected log variances."""
-    variance: Float[Tensor, "b n"]
-    """Variances of the log variances."""
     gradient: Callable[[], Float[Tensor, "b n p"]]
     """Computes the gradient of the evidence in the features."""
 
@@ -84,18 +81,16 @@ def log_variance_evidence(fixed: FixedFeatures, squares: Squares, near: Float[Te
         found = fit_log_variance(squares.restrict(rows), design, near[rows])
         if len(rows) <= len(near):
             near[rows] = found.location  # where the next evaluation starts
-        return found.evidence, lambda: vjp(found.gradient())
+        return found.posterior.value, lambda: vjp(found.gradient())
 
     return evidence
 
 
-def fit_log_variance(
-    squares: Squares, features: Float[Tensor, "b n p"], start: Float[Tensor, "b n"] | None = None
-) -> LogVariance:
-    """Posterior and log evidence; ``start`` are log variances near the posterior's, by None the pooled variance."""
+def fit_log_variance(squares: Squares, features: Float[Tensor, "b n p"], start: Float[Tensor, "b n"]) -> LogVariance:
+    """Posterior and log evidence; ``start`` are log variances near the posterior's."""
     if squares.noise is not None:
         return _fit_correlated(squares, squares.noise, features)
-    return _fit_independent(squares, features, squares.log_pooled if start is None else start)
+    return _fit_independent(squares, features, start)
 
 
 def _fit_independent(squares: Squares, features: Tensor, start: Tensor) -> LogVariance:
@@ -122,10 +117,9 @@ def _fit_independent(squares: Squares, features: Tensor, start: Tensor) -> LogVa
     residual = location - target
     decay = torch.exp(-residual)
     deviance = 2.0 * (half * (residual + decay - 1.0)).sum(-1)
-    log_det = -factor.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
     # The constant: the likelihood of log variances that are the log mean squares, each by itself.
     saturated = (squares.degrees * (log_mean + 1.0 + math.log(2.0 * math.pi))).sum(-1)
-    evidence = log_det - 0.5 * (deviance + mean.square().sum(-1) + saturated)
+    evidence = -0.5 * (deviance + mean.square().sum(-1) + saturated) - log_det(factor)
 
     def gradient() -> Tensor:
         slope = (half * (1.0 - decay)).unsqueeze(-1)
@@ -133,8 +127,7 @@ def _fit_independent(squares: Squares, features: Tensor, start: Tensor) -> LogVa
         in_log_det = (slope - half.unsqueeze(-1)) * spread
         return in_log_det - half.unsqueeze(-1) * through_variance - slope * mean.unsqueeze(-2)
 
-    weights = Weights(mean, triangular_inverse(factor, upper=True))
-    return LogVariance(evidence, weights, location, variance, gradient)
+    return LogVariance(LinearEvidence(evidence, mean, factor), location, gradient)
 
 
 def _fit_correlated(squares: Squares, noise: NoiseCorrelation, features: Tensor) -> LogVariance:
@@ -150,14 +143,12 @@ def _fit_correlated(squares: Squares, noise: NoiseCorrelation, features: Tensor)
     design = noise.whitener @ (weight.unsqueeze(-1) * features)
     response = (noise.whitener @ (weight * unbiased).unsqueeze(-1)).squeeze(-1)
     linear = LinearEvidence.fit(design, response)
-    evidence = linear.value + weight.log().sum(-1)
     location = (features @ linear.mean.unsqueeze(-1)).squeeze(-1)
-    variance = ((features @ linear.covariance) * features).sum(-1)
 
     def gradient() -> Tensor:
         return weight.unsqueeze(-1) * (noise.whitener.mT @ linear.gradient(design, response))
 
-    return LogVariance(evidence, linear.weights, location, variance, gradient)
+    return LogVariance(replace(linear, value=linear.value + weight.log().sum(-1)), location, gradient)
 
 
 def _maximize(features: Tensor, target: Tensor, half: Tensor, pooled: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:

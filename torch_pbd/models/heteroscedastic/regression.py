@@ -49,7 +49,7 @@ class LinearEvidence:
         # 1e13, and the right one of residuals; an error of m changes it by no more than its square.
         residual = response - (design @ mean.unsqueeze(-1)).squeeze(-1)
         square = residual.square().sum(-1) + mean.square().sum(-1)
-        return cls(-0.5 * square - _log_det(factor), mean, factor)
+        return cls(-0.5 * square - log_det(factor), mean, factor)
 
     @cached_property
     def covariance(self) -> Float[Tensor, "*b p p"]:
@@ -69,10 +69,11 @@ class LinearEvidence:
     def divergence_from_prior(self) -> Float[Tensor, "*b"]:
         """Kullback-Leibler divergence of the weights' posterior from standard normal numbers, in nats."""
         trace = self.covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
-        return 0.5 * (trace + self.mean.square().sum(-1) - self.mean.shape[-1]) + _log_det(self.factor)
+        return 0.5 * (trace + self.mean.square().sum(-1) - self.mean.shape[-1]) + log_det(self.factor)
 
 
-def _log_det(factor: Float[Tensor, "*b p p"]) -> Float[Tensor, "*b"]:
+def log_det(factor: Float[Tensor, "*b p p"]) -> Float[Tensor, "*b"]:
+    """Log determinants of triangular matrices, but for their signs."""
     return factor.diagonal(dim1=-2, dim2=-1).abs().log().sum(-1)
 
 
@@ -182,7 +183,7 @@ class Regression:
                 cross = (self.cross.mT @ features).flatten(1).unsqueeze(-1)
                 projected = torch.linalg.solve_triangular(factor, cross, upper=False)
                 mean = torch.linalg.solve_triangular(factor.mT, projected, upper=True).squeeze(-1)
-                return LinearEvidence(0.5 * projected.square().sum((-2, -1)) - _log_det(factor), mean, factor.mT)
+                return LinearEvidence(0.5 * projected.square().sum((-2, -1)) - log_det(factor), mean, factor.mT)
         return LinearEvidence.fit(*self._design(features))
 
     def gradient(self, linear: LinearEvidence, features: Float[Tensor, "b n p"]) -> Float[Tensor, "b n p"]:

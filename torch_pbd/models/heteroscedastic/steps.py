@@ -164,28 +164,29 @@ def fit_covariance(
     # An output that is constant is noise of the least variance too where later ones are regressed on it: to zeros
     # any coefficient would fit, and its uncertainty would count as their variance.
     scatter = scatter + LEAST_SQUARE * torch.diag_embed(degrees.mT)
-    fixed, in_row = (
-        FixedFeatures(family, inputs) for family in (search.log_variance.family, search.coefficient_family)
-    )
-    near, following = None, Squares(scatter.diagonal(dim1=1, dim2=2).mT, degrees, noise)
+    fixed = FixedFeatures(search.log_variance.family, inputs)
+    in_row = FixedFeatures(search.coefficient_family, inputs)
+    whole = Squares(scatter.diagonal(dim1=1, dim2=2).mT, degrees, noise)
+    near, following = None, whole
     if previous is not None:
         near = previous.log_variance_at(inputs)[0].mT
         known = partial(_known_row, previous.coefficients, previous.rows(inputs))
-        _, following, _ = _regress(scatter, degrees, noise, near, torch.exp(-near), known)
+        _, following, _ = _regress(scatter, whole, near, torch.exp(-near), known)
     for sweep in range(_SWEEPS if scatter.shape[1] > 1 and not cautious else 1):
         squares = following
         near = (squares.log_pooled if near is None else near).clone()
         theta = search.log_variance.run(log_variance_evidence(fixed, squares, near))
-        log_variance = fit_log_variance(squares, fixed.design_vjp(theta, squares.information)[0], near)
-        near = log_variance.location
+        design, _ = fixed.design_vjp(theta, squares.information)
+        log_variance = fit_log_variance(squares, design, near)
+        near, posterior = log_variance.location, log_variance.posterior
         # E[exp(-l)] of a normal l: its mean and half its variance.
-        precision = torch.exp(-near + 0.5 * log_variance.variance)
+        precision = torch.exp(-near + 0.5 * ((design @ posterior.covariance) * design).sum(-1))
         searched = partial(_searched_row, search.coefficients, in_row, anew=sweep < _SEARCHES)
-        regressions, following, divergence = _regress(scatter, degrees, noise, near, precision, searched)
-        evidence = float(log_variance.evidence.sum()) - divergence
+        regressions, following, divergence = _regress(scatter, whole, near, precision, searched)
+        evidence = float(posterior.value.sum()) - divergence
     # The weights of all features, where the searches took only those that carry something.
     log_variances = search.log_variance.family.prepared(theta)
-    weights = fit_log_variance(squares, log_variances(inputs), near).weights
+    weights = fit_log_variance(squares, log_variances(inputs), log_variance.location).posterior.weights
     thetas = [each.theta for each in search.coefficients if each.theta is not None]
     rows, coefficients = search.coefficient_family.prepared(torch.cat([theta[:0], *thetas])), []
     for regression, features in zip(regressions, rows(inputs), strict=True):
@@ -195,39 +196,34 @@ def fit_covariance(
 
 
 def _regress(
-    scatter: Tensor,
-    degrees: Tensor,
-    noise: NoiseCorrelation | None,
-    location: Tensor,
-    precision: Tensor,
-    fit_row: _FitRow,
+    scatter: Tensor, whole: Squares, location: Tensor, precision: Tensor, fit_row: _FitRow
 ) -> tuple[list[Regression], Squares, float]:
     """Regressions of one output after another on those before it, of log variances and precisions (d, n) as known.
 
-    With the squares of their residuals, and the divergence of their coefficients from the prior. Where samples are
-    correlated and enough at an input the squares are of the regression there by itself: an error of the coefficients'
-    processes, as smooth as the demonstrations, would else count as residual.
+    With the squares of their residuals, which are the ``whole`` ones of the first output, and the divergence of their
+    coefficients from the prior. Where samples are correlated and enough at an input the squares are of the regression
+    there by itself: an error of the coefficients' processes, as smooth as the demonstrations, would else count as
+    residual.
     """
-    deviation = torch.exp(0.5 * location)
-    tril, regressions, whole = deviation[0][:, None, None], [], 0.0
-    totals, kept = [scatter[:, 0, 0]], [degrees[0]]
+    deviation, noise = torch.exp(0.5 * location), whole.noise
+    tril, regressions, divergence = deviation[0][:, None, None], [], 0.0
+    totals, degrees = list(whole.total), list(whole.degrees)
     for i in range(1, len(location)):
         whitener = None if noise is None else noise.whitener[i]
         regression = Regression.standardize(scatter[:, : i + 1, : i + 1], tril, precision[i], whitener)
-        features, mean, covariance, divergence = fit_row(i, regression)
+        features, mean, covariance, own_divergence = fit_row(i, regression)
         regressions.append(regression)
-        whole += float(divergence)
-        totals.append(regression.expected_squares(features, mean, covariance))
-        kept.append(degrees[i])
+        divergence += float(own_divergence)
+        totals[i] = regression.expected_squares(features, mean, covariance)
         if noise is not None:
             local = degrees[i] - i * noise.copies[i]
             enough = local >= _ENOUGH_DEGREES * noise.copies[i]
             totals[i] = torch.where(enough, regression.local_squares(), totals[i])
-            kept[i] = torch.where(enough, local, degrees[i])
+            degrees[i] = torch.where(enough, local, degrees[i])
         # The factor of outputs 0, ..., i, on which the next one is regressed.
         row = torch.cat([features @ mean.reshape(i, -1).mT, deviation[i][:, None]], dim=1)
         tril = torch.cat([pad(tril, (0, 1)), row.unsqueeze(1)], dim=1)
-    return regressions, Squares(torch.stack(totals), torch.stack(kept), noise), whole
+    return regressions, Squares(torch.stack(totals), torch.stack(degrees), noise), divergence
 
 
 def _known_row(
