@@ -133,9 +133,7 @@ class HeteroscedasticFit:
 
     def noise_correlation(self, rows: TrainingSet, *, squares: bool) -> NoiseCorrelation | None:
         """Correlation of the means, or the mean ``squares``, of rows at different inputs; None where there is none."""
-        if self.group is None or self.correlation is None or not self.correlation.matters:
-            return None
-        return self.correlation.at_inputs(rows, self.group, squares=squares)
+        return None if self.correlation is None else self.correlation.at_inputs(rows, squares=squares)
 
     def stretch_ends(self, noise: NoiseCorrelation | None) -> None:
         """Stretch the ends where the covariance collapses; and begin its searches anew if what the first turn took for
@@ -167,7 +165,7 @@ class HeteroscedasticFit:
         if self.group is None:
             return
         self.correlation = demonstration_correlation(self.training.x, self.whitened(), self.group)
-        if self.correlation.matters:
+        if self.correlation is not None:
             # So many inputs that each holds about a row of each demonstration, and enough rows for a covariance by
             # themselves, which takes three more than outputs.
             n_rows = max(self.n_demos, self._n_outputs + 3)

@@ -93,7 +93,7 @@ class HeteroscedasticModel(Core):
         self.kernel: str = families[0].kernel
         self.exact = [family.exact for family in families]
         self.medians = [(family.length_scale, family.amplitude, family.constant) for family in families]
-        if fit.correlation is not None and fit.correlation.matters:
+        if fit.correlation is not None:
             n_places = float(fit.correlation.share.mean()) * len(fit.training.x) / fit.n_demos
             root, degrees = self._root_of_demonstrations(*self._known(fit.training.inputs)[1:])
             moments = log_correlation_moments(root, degrees, n_places, fit.n_demos)

@@ -151,15 +151,12 @@ class DemonstrationCorrelation:
     """Distance over which the correlation of squared residuals falls by e, of standardized inputs; 0 if none does."""
     share: Float[Tensor, " d"]
     """Independent samples that a sample of each output counts for."""
+    group: Int64[Tensor, " rows"]
+    """Demonstration of each row."""
 
-    @property
-    def matters(self) -> bool:
-        """Whether samples of any output are correlated."""
-        return bool((self.decay > 0).any())
-
-    def at_inputs(self, rows: TrainingSet, group: Int64[Tensor, " rows"], *, squares: bool) -> NoiseCorrelation:
-        """Correlation of the means, or the mean ``squares``, at the inputs of rows of demonstrations ``group``."""
-        inputs, counts = rows.inputs, rows.counts
+    def at_inputs(self, rows: TrainingSet, *, squares: bool) -> NoiseCorrelation:
+        """Correlation of the means, or the mean ``squares``, of rows at their inputs."""
+        inputs, counts, group = rows.inputs, rows.counts, self.group
         # Rows of one demonstration at one input are copies: a diagonal entry is the number of rows that count for one.
         n_demos, n_inputs = int(group.max()) + 1, len(inputs)
         occurrences = torch.bincount(group * n_inputs + rows.index, minlength=n_demos * n_inputs)
@@ -175,8 +172,8 @@ class DemonstrationCorrelation:
 
 def demonstration_correlation(
     x: Float[Tensor, "rows e"], whitened: Float[Tensor, "rows d"], group: Int64[Tensor, " rows"]
-) -> DemonstrationCorrelation:
-    """Estimate the correlation along demonstrations from whitened residuals.
+) -> DemonstrationCorrelation | None:
+    """Correlation along demonstrations, estimated from whitened residuals; None if of no output samples are correlated.
 
     The square of the autocorrelation at a distance is estimated without bias by products over pairs of
     different demonstrations, up to the distance where it first is not positive; the decay is that of the
@@ -184,10 +181,9 @@ def demonstration_correlation(
     """
     limit = math.sqrt(x.shape[1])
     scaled = whitened / whitened.square().mean(0).clamp_min(_LEAST).sqrt()
-    none = DemonstrationCorrelation(torch.zeros_like(scaled[0]), torch.ones_like(scaled[0]))
     chosen = _chosen_rows(x, group)
     if not chosen:
-        return none
+        return None
     # Those of fewer samples are filled up with some that are nowhere.
     places = pad_sequence([x[rows] for rows in chosen], batch_first=True, padding_value=math.nan)
     values = pad_sequence([scaled[rows] for rows in chosen], batch_first=True)
@@ -200,10 +196,10 @@ def demonstration_correlation(
     share = 1.0 / (1.0 + 2.0 * sum_of_squares / n_chosen * len(x) / n_chosen)
     correlated = share <= _INDEPENDENT
     if not bool(correlated.any()):
-        return none
+        return None
     centre = (torch.arange(_N_BINS).to(x) + 0.5) * limit / _N_BINS
     decay = _decay_of(sum_of_squares, centre, total)
-    return DemonstrationCorrelation(torch.where(correlated, decay, 0.0), torch.where(correlated, share, 1.0))
+    return DemonstrationCorrelation(torch.where(correlated, decay, 0.0), torch.where(correlated, share, 1.0), group)
 
 
 def _chosen_rows(x: Tensor, group: Tensor) -> list[Int64[Tensor, " t"]]:
