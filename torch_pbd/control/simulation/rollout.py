@@ -244,10 +244,11 @@ def _start(task: Task, position0: Tensor | None, orientation0: Tensor | None) ->
 def _check_memory(task: Task, n_rollouts: int) -> None:
     if task.position.device.type != "cpu":  # torch raises by itself on other devices
         return
-    # Measured: five motions are held, of poses six and two orientations, and where rollouts differ in their gains,
-    # twelve matrices.
+    # Measured: eight motions are held, tick by tick fourteen, of poses one more and two orientations, and where
+    # rollouts differ in their gains, twelve matrices.
     d = task.position.shape[-1]
-    of_each = 5 * d + (12 * d * d if task.stiffness.ndim > 3 or task.stiffness_filter is not None else 0)
+    own_gains = task.stiffness.ndim > 3 or task.stiffness_filter is not None
+    of_each = (8 if task.is_linear else 14) * d + (12 * d * d if own_gains else 0)
     of_each += 0 if task.orientation is None else d + 8
     needed = of_each * n_rollouts * task.n_ticks * task.position.element_size()
     remedy = "Simulate fewer at a time, or take simulate_many, which keeps no trajectories."

@@ -10,6 +10,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from torch_pbd import checks
 from torch_pbd.data.demonstrations import Demonstrations
 from torch_pbd.data.poses import with_whole_rotation
 from torch_pbd.data.recordings import as_names, as_units, preview
@@ -50,9 +51,10 @@ def read(path: Path, wanted: Wanted) -> Arguments:
         chosen,
         recordings,
         units=units and [units[i] for _, i in chosen.outputs],
-        time_unit=meta.get("time_unit") or _plain(meta.get("t_unit")),
+        time_unit=_text(meta, "time_unit") or _plain(_text(meta, "t_unit")),
         rotation_reference=reference,
-        **{name: meta.get(name) for name in ("frame", "alignment")},
+        frame=_text(meta, "frame"),
+        alignment=meta.get("alignment"),
     )
 
 
@@ -128,6 +130,10 @@ def _read_meta(members: Mapping[str, bytes]) -> dict[str, Any]:
     except (ValueError, TypeError, RecursionError) as error:
         raise ValueError(f"meta must be a 0-d string with a JSON object: {error}") from error
     return meta
+
+
+def _text(meta: dict[str, Any], name: str) -> Any:
+    return checks.text(meta.get(name), f"{name} in meta", optional=True)
 
 
 def _units(meta: dict[str, Any]) -> Any:
