@@ -48,13 +48,8 @@ class _Prepared(NamedTuple):
 class HeteroscedasticModel(Core):
     """Predictive density in standardized units: Student's t, its moments from the latent processes.
 
-    Where samples of demonstrations are correlated it is that of ``posterior.py``.
-
-    Parameters
-    ----------
-    fit : HeteroscedasticFit
-    prior_tril : Tensor of shape (d, d)
-        Factor of the covariance far from data.
+    Where samples of demonstrations are correlated it is that of ``posterior.py``. ``prior_tril`` is the factor of the
+    covariance far from data.
     """
 
     kind = "heteroscedastic"

@@ -231,22 +231,22 @@ def stretched(
         search.run(of_theta)
         return float(search.value.sum())
 
-    result, stretch = family, inputs.new_tensor([[0.0, 1.0], [0.0, 1.0]])
-    on_grid, highest = evidence(family, searched=False), None
+    result, on_grid, highest = family, evidence(family, searched=False), None
+    unstretched, finest = inputs.new_tensor([[0.0, 1.0], [0.0, 1.0]]), spacing(inputs) / _WIDTHS[0]
     # Each end by itself, and both: where one is stretched the other still asks for a short length scale.
     for ends in ([0], [1], [0, 1]) if len(falling) > 1 else [falling]:
         tried = []
         for width in _WIDTHS:
-            each = stretch.clone()
-            each[ends] = inputs.new_tensor([_LENGTH, max(width, width / _WIDTHS[0] * spacing(inputs))])
-            candidate = on_stretched_inputs(family, inputs, each)
-            tried.append((evidence(candidate, searched=False), candidate, each))
-        found, candidate, each = max(tried, key=itemgetter(0))
+            stretch = (unstretched if result.stretch is None else result.stretch).clone()
+            stretch[ends] = inputs.new_tensor([_LENGTH, width * max(1.0, finest)])
+            candidate = on_stretched_inputs(family, inputs, stretch)
+            tried.append((evidence(candidate, searched=False), candidate))
+        found, candidate = max(tried, key=itemgetter(0))
         if found < on_grid + _CLEARLY:
             continue
         highest = evidence(result, searched=True) if highest is None else highest
         if (now := evidence(candidate, searched=True)) > highest + _CLEARLY:
-            on_grid, highest, result, stretch = found, now, candidate, each
+            on_grid, highest, result = found, now, candidate
     return result
 
 
