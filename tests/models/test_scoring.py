@@ -6,7 +6,7 @@ from scipy.optimize import minimize as scipy_minimize
 from torch_pbd.gp.latent import LatentValues
 from torch_pbd.linalg import scale_tril_from_root
 from torch_pbd.models import with_floor
-from torch_pbd.models.costs import Covariances, Likelihood, train
+from torch_pbd.models.costs import Likelihood, train
 from torch_pbd.models.links import CholeskyLink, WishartLink, padded
 from torch_pbd.models.training import TrainingSet
 
@@ -64,7 +64,7 @@ def gradients(cost, deviation):
     """In closed form, and by autograd."""
     (expected,) = torch.autograd.grad(cost(deviation), deviation)
     with torch.no_grad():
-        return cost.gradient(Covariances(cost.link.root(deviation))), expected
+        return cost.gradient(cost.covariances(deviation)), expected
 
 
 @pytest.mark.parametrize("own_priors", [False, True])
@@ -102,7 +102,7 @@ def test_information_is_the_expected_hessian_of_autograd(kind, d, own_priors, rn
 
     hessian = torch.autograd.functional.hessian(nll, deviation.flatten())
     cost = Likelihood(link, expected_root, counts, 1.0)
-    found = block_diagonal(cost.curvature(Covariances(link.root(deviation)), 0.0), 3, n_processes(link))
+    found = block_diagonal(cost.curvature(cost.covariances(deviation), 0.0), 3, n_processes(link))
     torch.testing.assert_close(found, hessian, rtol=1e-7, atol=1e-7 * float(hessian.abs().max()))
 
 
@@ -115,7 +115,8 @@ def test_observed_information_is_the_hessian_of_autograd(d, rng):
         return gaussian_nll(link.root(flat.reshape(deviation.shape)), scatter_root, counts)
 
     hessian = torch.autograd.functional.hessian(nll, deviation.flatten())
-    cost, point = Likelihood(link, scatter_root, counts, 1.0), Covariances(link.root(deviation))
+    cost = Likelihood(link, scatter_root, counts, 1.0)
+    point = cost.covariances(deviation)
     found = [block_diagonal(cost.curvature(point, share), 3, n_processes(link)) for share in (0.0, 0.25, 1.0)]
     scale = float(hessian.abs().max())
     torch.testing.assert_close(found[2], hessian, rtol=1e-7, atol=1e-7 * scale)
@@ -195,7 +196,7 @@ def test_the_optimum_is_that_of_scipy(kind, rng):
         """The posterior density anew, with the root of the kernel matrix and autograd."""
         whitened = tensor(flat).reshape(start.shape).requires_grad_()
         deviation = (whitened * amplitude[:, None]) @ basis.mT
-        nll = gaussian_nll(cost.link.root(deviation.mT), cost._scatter_root, cost._counts[:, 0, 0])
+        nll = gaussian_nll(cost.link.root(deviation.mT), cost._rows[0], cost._rows[1][:, 0, 0])
         loss = nll + 0.5 * whitened.square().sum()
         (gradient,) = torch.autograd.grad(loss, whitened)
         return loss.item(), gradient.flatten().numpy()

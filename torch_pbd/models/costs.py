@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from functools import cached_property
 from typing import Any, Literal
 
 import torch
@@ -10,25 +9,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torch_pbd.gp.latent import LatentValues
-from torch_pbd.linalg import cholesky_with_jitter, scale_tril_from_root
-from torch_pbd.models import VARIANCE_FLOOR, with_floor
-from torch_pbd.models.links import Blocks, Link, WishartLink
+from torch_pbd.linalg import cholesky_with_jitter
+from torch_pbd.models import VARIANCE_FLOOR
+from torch_pbd.models.links import Blocks, Covariances, Link
 from torch_pbd.optim.batch import FitReport, Progress
 from torch_pbd.optim.descent import minimize, minimize_scoring
 
 Solver = Literal["auto", "fisher", "lbfgs"]
-
-
-class Covariances:
-    """Covariances at the inputs by a root without the floor, and their Cholesky factors C with it."""
-
-    def __init__(self, root: Float[Tensor, "n d r"]) -> None:
-        self.root, self.scale_tril = root, scale_tril_from_root(with_floor(root))
-
-    @cached_property
-    def inverse(self) -> Float[Tensor, "n d d"]:
-        """Inverse of C."""
-        return torch.linalg.inv(self.scale_tril).tril()
 
 
 class Likelihood:
@@ -42,22 +29,25 @@ class Likelihood:
     def __init__(
         self, link: Link, scatter_root: Float[Tensor, "n d r"], counts: Float[Tensor, " n"], weight: float
     ) -> None:
-        self.link, self._scatter_root, self.weight = link, scatter_root, weight
-        self._counts = counts[:, None, None]
-        size = scatter_root.shape[1]
-        self._identity = self._counts * torch.eye(size).to(scatter_root)
-        self._constant = 0.5 * size * math.log(2 * math.pi) * counts.sum()
+        self.link, self.weight = link, weight
+        self._rows = scatter_root, counts[:, None, None]
+        self._constant = 0.5 * scatter_root.shape[1] * math.log(2 * math.pi) * counts.sum()
 
     def __call__(self, deviation: Float[Tensor, "n b"]) -> Float[Tensor, ""]:
         """Value at deviations; differentiable by autograd, in the link's scale matrix too."""
         return self.at_root(self.link.root(deviation))
 
+    def covariances(self, deviation: Float[Tensor, "n b"]) -> Covariances:
+        """Covariances at deviations, and the rows there."""
+        return Covariances(self.link.root(deviation), *self._rows)
+
     def at_root(self, root: Float[Tensor, "n d r"]) -> Float[Tensor, ""]:
         """Value of any roots."""
         # Sum over all rows of w' Sigma^-1 w / 2 + log det C + d log(2 pi) / 2, the sum of squares by input.
-        scale_tril = Covariances(root).scale_tril
-        whitened = torch.linalg.solve_triangular(scale_tril, self._scatter_root, upper=False)
-        log_det = self._counts[:, 0, 0] @ scale_tril.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        scatter_root, counts = self._rows
+        scale_tril = Covariances(root, *self._rows).scale_tril
+        whitened = torch.linalg.solve_triangular(scale_tril, scatter_root, upper=False)
+        log_det = counts[:, 0, 0] @ scale_tril.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         return self.weight * (0.5 * whitened.square().sum() + log_det + self._constant)
 
     def gradient(self, point: Covariances) -> Float[Tensor, "n b"]:
@@ -65,25 +55,19 @@ class Likelihood:
         # In D it is G = (n I - Z) / 2 with Z the whitened scatter, and in Sigma C^-T G C^-1. Sigma is root root' and a
         # floor that grows with the trace of that, so the root's gradient is twice
         # (C^-T G C^-1 + floor tr(C^-T G C^-1) I) root.
-        in_change = 0.5 * self.weight * (self._identity - self._scatter(point))
+        in_change = 0.5 * self.weight * (point.expected_scatter - point.scatter)
         in_covariance = point.inverse.mT @ in_change @ point.inverse
         by_floor = VARIANCE_FLOOR * in_covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
         in_covariance.diagonal(dim1=-2, dim2=-1).add_(by_floor.unsqueeze(-1))
         return self.link.vjp(point.root, 2.0 * in_covariance @ point.root)
 
     def curvature(self, point: Covariances, share: float) -> Blocks:
-        """Expected Fisher information in the deviations at each input; of a Wishart process a share of the observed."""
-        for members, information in self.link.information(point.root, point.inverse):
-            total = information * (self.weight * self._counts)
-            if share and isinstance(self.link, WishartLink):
-                scatter = self._scatter(point)
-                observed = self.link.observed_information(point.root, point.inverse, scatter, self._counts)
-                total = total.lerp(self.weight * observed, share)
+        """Fisher information in the deviations at each input: the expected one, and a share of the observed one."""
+        for members, information in self.link.information(point):
+            total = information * (self.weight * point.counts)
+            if share:
+                total = total.lerp(self.weight * self.link.observed_information(point), share)
             yield members, total
-
-    def _scatter(self, point: Covariances) -> Float[Tensor, "n d d"]:
-        whitened = point.inverse @ self._scatter_root
-        return whitened @ whitened.mT
 
 
 class _Posterior:
@@ -103,10 +87,10 @@ class _Posterior:
         Its matrix is the expected information with as large a share of the observed one as leaves it positive
         definite: expected, it knows nothing of the bend of the valleys in which the vectors of a Wishart process turn.
         """
-        point = Covariances(self._likelihood.link.root(self._latent(whitened)))
+        point = self._likelihood.covariances(self._latent(whitened))
         gradient = self._latent.vjp(self._likelihood.gradient(point)) + self._likelihood.weight * whitened
         # Quarters, from one more than in the last step downwards: each that fails costs a decomposition.
-        self._share = min(1.0, self._share + 0.25) if isinstance(self._likelihood.link, WishartLink) else 0.0
+        self._share = min(self._likelihood.link.largest_share, self._share + 0.25)
         factors = self.factors(point, self._share)
         while not factors:
             self._share -= 0.25
@@ -134,7 +118,7 @@ class _Posterior:
     def preconditioned(self, start: Tensor) -> Callable[[Tensor], Tensor]:
         """Whitened values of coordinates in which the curvature at a start, which is zero there, is the unit matrix."""
         with torch.no_grad():
-            blocks = self.factors(Covariances(self._likelihood.link.root(self._latent(start))))
+            blocks = self.factors(self._likelihood.covariances(self._latent(start)))
 
         # With the curvature P = F F' and step = inv(F') z the quadratic form step' P step is |z|^2.
         def whitened(z: Tensor) -> Tensor:

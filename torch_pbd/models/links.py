@@ -3,13 +3,15 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar
 
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from torch_pbd.linalg import tril_to_vector, vector_to_tril
+from torch_pbd.linalg import scale_tril_from_root, tril_to_vector, vector_to_tril
+from torch_pbd.models import with_floor
 
 _LARGEST_LOGARITHM = 300.0  # largest logarithm of a diagonal entry whose square float64 holds
 _LEAST_DIAGONAL = 1e-6  # in standardized units: an entry of zero has no logarithm, and the floor is of this size
@@ -17,6 +19,30 @@ _LOG_AMPLITUDE = 2.0  # prior standard deviation of the logarithm of an entry: a
 
 Blocks = Iterator[tuple[Int64[Tensor, " m"], Float[Tensor, "n m ..."]]]
 """Indices of some processes, and matrices of their deviations at each input."""
+
+
+class Covariances:
+    """Covariances by a root without the floor, their factors C with it, and the rows: scatter and counts (n, 1, 1)."""
+
+    def __init__(self, root: Float[Tensor, "n d r"], scatter_root: Tensor, counts: Tensor) -> None:
+        self.root, self.scale_tril = root, scale_tril_from_root(with_floor(root))
+        self._scatter_root, self.counts = scatter_root, counts
+
+    @cached_property
+    def inverse(self) -> Float[Tensor, "n d d"]:
+        """Inverse of C."""
+        return torch.linalg.inv(self.scale_tril).tril()
+
+    @cached_property
+    def scatter(self) -> Float[Tensor, "n d d"]:
+        """Whitened scatter Z = C^-1 (sum w w') C^-T."""
+        whitened = self.inverse @ self._scatter_root
+        return whitened @ whitened.mT
+
+    @property
+    def expected_scatter(self) -> Float[Tensor, "n d d"]:
+        """Expectation of Z: the unit matrix for each row."""
+        return self.counts * torch.eye(self.root.shape[1]).to(self.root)
 
 
 @dataclass(frozen=True)
@@ -34,6 +60,8 @@ class Link(ABC):
 
     largest_block: ClassVar[int]
     """Whitened values to solve for together: a step costs the cube of it."""
+    largest_share: ClassVar[float] = 0.0
+    """Largest share of the observed information in a step of the training."""
 
     @abstractmethod
     def flatten(self, matrix: Float[Tensor, "*n d r"]) -> Float[Tensor, "*n b"]:
@@ -49,8 +77,12 @@ class Link(ABC):
         """Processes in the largest block of the information."""
 
     @abstractmethod
-    def information(self, root: Float[Tensor, "n d r"], inverse: Float[Tensor, "n d d"]) -> Blocks:
-        """Blocks of the expected Fisher information of one row; ``inverse`` is that of the factor C with the floor."""
+    def information(self, point: Covariances) -> Blocks:
+        """Blocks of the expected Fisher information of one row."""
+
+    def observed_information(self, point: Covariances) -> Float[Tensor, "n b b"]:
+        """Second derivatives of the negative log likelihood of all rows, of a link that takes a share of them."""
+        raise NotImplementedError
 
     def far(self) -> "Link":
         """Link of one prior: any of a callable one, which is handed in at every prediction."""
@@ -118,18 +150,18 @@ class CholeskyLink(Link):
         """Entries of the first column."""
         return self.prior.shape[-1]
 
-    def information(self, root: Float[Tensor, "n d d"], inverse: Float[Tensor, "n d d"]) -> Blocks:
+    def information(self, point: Covariances) -> Blocks:
         """Blocks of the expected Fisher information of one row, one for each column of the factor L.
 
         With D = B + B', B = L^-1 dL, it is 1/2 tr(D D) = sum_ij B_ij^2 + sum_i B_ii^2, and column j of B is made
         of column j of dL alone: the columns of the factor know nothing of each other.
         """
-        size = root.shape[-1]
-        diagonal = root.diagonal(dim1=-2, dim2=-1)
+        inverse, size = point.inverse, self.block_size
+        diagonal = point.root.diagonal(dim1=-2, dim2=-1)
         # One or minus one, and less where the floor is what is left of a diagonal entry.
         share = diagonal * inverse.diagonal(dim1=-2, dim2=-1)
         for column in range(size):
-            below = torch.arange(column, size, device=root.device)
+            below = torch.arange(column, size, device=inverse.device)
             jacobian = share[:, column, None, None] * inverse[:, column:, column:]
             jacobian[:, 0] *= 2.0**0.5
             if self.log_diagonal:
@@ -140,7 +172,7 @@ class CholeskyLink(Link):
 class WishartLink(Link):
     """The columns L u_i, i = 1..df, by processes on the entries of the vectors, eq. (8), one after the other."""
 
-    largest_block = 600  # tens of steps may be taken
+    largest_block, largest_share = 600, 1.0  # tens of steps may be taken
 
     def flatten(self, matrix: Float[Tensor, "*n d df"]) -> Float[Tensor, "*n b"]:
         """Columns one after the other."""
@@ -155,36 +187,28 @@ class WishartLink(Link):
         """All processes."""
         return self.prior.shape[-2] * self.prior.shape[-1]
 
-    def information(self, root: Float[Tensor, "n d df"], inverse: Float[Tensor, "n d d"]) -> Blocks:
+    def information(self, point: Covariances) -> Blocks:
         """Expected Fisher information of one row, in one block.
 
-        With D = S + S', S = C^-1 dU (C^-1 U)', it is 1/2 tr(D D) = tr(S' S) + tr(S S). ``inverse`` is that of C.
+        With D = S + S', S = C^-1 dU (C^-1 U)', it is 1/2 tr(D D) = tr(S' S) + tr(S S).
         """
         # Entry i of vector j, against entry k of vector l.
-        whitened = inverse @ root
+        inverse = point.inverse
+        whitened = inverse @ point.root
         cross = whitened.mT @ inverse
         block = _block("njl,nik->njilk", whitened.mT @ whitened, inverse.mT @ inverse)
-        yield torch.arange(self.block_size, device=root.device), block + _block("njk,nli->njilk", cross, cross)
+        yield torch.arange(self.block_size, device=inverse.device), block + _block("njk,nli->njilk", cross, cross)
 
-    def observed_information(
-        self,
-        root: Float[Tensor, "n d df"],
-        inverse: Float[Tensor, "n d d"],
-        scatter: Float[Tensor, "n d d"],
-        counts: Float[Tensor, "n 1 1"],
-    ) -> Float[Tensor, "n b b"]:
-        """Second derivatives of the negative log likelihood of all rows; its expectation is the information.
-
-        They are tr((Z - n/2) D D) + tr((n - Z) B B'), B = C^-1 dU, where ``scatter`` is Z = C^-1 (sum w w') C^-T.
-        """
-        identity = torch.eye(root.shape[1]).to(root)
-        whitened, weight = inverse @ root, scatter - 0.5 * counts * identity
+    def observed_information(self, point: Covariances) -> Float[Tensor, "n b b"]:
+        """Second derivatives of all rows, tr((Z - n/2) D D) + tr((n - Z) B B'), B = C^-1 dU."""
+        inverse, expected = point.inverse, point.expected_scatter
+        whitened, weight = inverse @ point.root, point.scatter - 0.5 * expected
         cross, weighted = whitened.mT @ inverse, whitened.mT @ weight @ inverse
         square = _block("nki,njl->njilk", inverse.mT @ weight @ inverse, whitened.mT @ whitened)
         square = square + _block("nlj,nik->njilk", whitened.mT @ weight @ whitened, inverse.mT @ inverse)
         half = 0.5 * square + _block("nli,njk->njilk", weighted, cross)
-        bend = inverse.mT @ (counts * identity - scatter) @ inverse
-        each = torch.eye(root.shape[2]).to(root).expand(len(root), -1, -1)
+        bend = inverse.mT @ (expected - point.scatter) @ inverse
+        each = torch.eye(whitened.shape[2]).to(whitened).expand(len(whitened), -1, -1)
         return half + half.mT + _block("njl,nik->njilk", each, bend)
 
 
