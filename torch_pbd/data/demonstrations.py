@@ -271,4 +271,4 @@ class Demonstrations(Editing):
 
     def describe(self) -> Description:
         """Description of the recordings: tables to print, and likely ``mistakes``."""
-        return describe(self)
+        return describe(self, {})

@@ -1,6 +1,6 @@
 """Description of recordings, likely mistakes in them with remedies, and a check for several modes."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,8 +54,8 @@ class Description:
     __repr__ = __str__
 
 
-def describe(demonstrations: Any, notes: Sequence[str] = ()) -> Description:
-    """Description of `torch_pbd.data.Demonstrations`; ``notes`` are mistakes that were found on the way to them."""
+def describe(demonstrations: Any, notes: Mapping[str, str]) -> Description:
+    """Description of `Demonstrations`; ``notes`` are mistakes on the way to them, and the options that mend these."""
     unit, names, reference = demonstrations.time_unit, demonstrations.names, demonstrations.rotation_reference
     second = 1.0 / TIMES.get(unit, 1.0)
     recordings = []
@@ -125,9 +125,9 @@ def _of_ends(demonstrations: Any, recordings: list[dict[str, Any]]) -> Iterator[
             yield f"{moving}: record from rest to rest, or give settle= to schedule()."
 
 
-def _of_outputs(units: Any, outputs: list[dict[str, Any]], notes: Sequence[str]) -> Iterator[str]:
+def _of_outputs(units: Any, outputs: list[dict[str, Any]], notes: Mapping[str, str]) -> Iterator[str]:
     covers = {row["output"]: row["extent"] for row in outputs}
-    if units is None and not any("units=" in note for note in notes):
+    if units is None and "units" not in notes.values():
         largest, name = max((extent, name) for name, extent in covers.items())
         far = f" Output {name} covers {largest:.4g}: as metres that is far." if largest > _FURTHEST else ""
         yield f"The outputs have no units: give units=, as 'm', 'mm', 'rad', or one for each.{far}"

@@ -106,8 +106,7 @@ def load_demonstrations(
         If the file does not match its suffix, with the array, or the line and the column; or if it is too large.
     """
     given = locals()
-    wanted = Wanted(**{name: given[name] for name in OPTIONS})
-    return wanted.finish([_load(file, wanted, options) for file in find_files(source)])
+    return _load(source, Wanted(**{name: given[name] for name in OPTIONS}), options)
 
 
 def inspect_demonstrations(source: Source, **options: Any) -> tuple[Demonstrations, Description]:
@@ -115,15 +114,14 @@ def inspect_demonstrations(source: Source, **options: Any) -> tuple[Demonstratio
 
     Contents that raise an error there are left out or guessed where possible, and listed in ``mistakes``.
     """
-    notes: list[str] = []
+    notes: dict[str, str] = {}
     common = {name: options.pop(name) for name in OPTIONS if name in options}
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        wanted = Wanted(**common, notes=notes)
-        demonstrations = wanted.finish([_load(file, wanted, options) for file in find_files(source)])
-    suspects = " ".join(demonstrations.suspects)
-    told = [message for message in (str(warning.message) for warning in caught) if message != suspects]
-    return demonstrations, describe(demonstrations, [*dict.fromkeys(notes), *told])
+        demonstrations = _load(source, Wanted(**common, notes=notes), options)
+    told = {str(warning.message): "" for warning in caught}
+    told.pop(" ".join(demonstrations.suspects), None)
+    return demonstrations, describe(demonstrations, notes | told)
 
 
 def find_files(source: Source) -> list[Path]:
@@ -148,7 +146,11 @@ def find_files(source: Source) -> list[Path]:
     return sorted(within, key=lambda file: natural(file.name))
 
 
-def _load(file: Path, wanted: Wanted, options: dict[str, Any]) -> Demonstrations:
+def _load(source: Source, wanted: Wanted, options: dict[str, Any]) -> Demonstrations:
+    return wanted.finish([_load_file(file, wanted, options) for file in find_files(source)])
+
+
+def _load_file(file: Path, wanted: Wanted, options: dict[str, Any]) -> Demonstrations:
     reader = _function(file, _reader_of(file), _FORMATS)
     own = list(inspect.signature(reader).parameters)[2:]
     check_options(options, [*OPTIONS, *own], f"{file.suffix or file.name} files")

@@ -56,8 +56,8 @@ class Wanted:
     trim: Literal["still"] | None = None
     from_start: bool = False
     max_bytes: int = MAX_BYTES
-    notes: list[str] | None = None
-    """If a list, it is told what would be refused and has a way around."""
+    notes: dict[str, str] | None = None
+    """If a mapping, it takes what would be refused and has a way around, each with the option that mends it."""
 
     def __post_init__(self) -> None:
         checks.text(self.demo, "demo", optional=True)
@@ -91,7 +91,8 @@ class Wanted:
         if time not in places and self.rate is not None:
             time = None
         elif time is not None and time not in places and len(likely) == 1:
-            self.refuse(f"no column {time!r} among {preview([*places])}: say time={likely[0]!r}, if that is it.")
+            what = f"no column {time!r} among {preview([*places])}"
+            self.refuse(f"{what}: say time={likely[0]!r}, if that is it.", "time")
             time = likely[0]
         taken = [name for name in (demo, time) if name is not None]
         named = self.outputs if self.outputs is not None or outputs not in signals else [str(outputs)]
@@ -102,7 +103,8 @@ class Wanted:
             names = [name for name in places if name not in (*taken, *_UNNAMED)]
             for place in [i for i, name in enumerate(places) if name in _UNNAMED and name not in taken]:
                 index = f"column {place + 1} has no name, as the index of a table written without index=False"
-                self.refuse(f"{index}: leave it out, or say by outputs= which of {preview(names)} are movements.")
+                remedy = f"leave it out, or say by outputs= which of {preview(names)} are movements"
+                self.refuse(f"{index}: {remedy}.", "outputs")
         absent = [repr(name) for name in (*taken, *names) if name not in places] or ["of outputs"] * (not names)
         if absent:
             remedy = "name the columns by demo=, time= (or rate=, in Hz, where there are none) and outputs="
@@ -110,11 +112,11 @@ class Wanted:
         own_time = None if self.rate is not None else places.get(time)
         return Chosen(places.get(demo), own_time, [places[name] for name in names], names)
 
-    def refuse(self, message: str) -> None:
+    def refuse(self, message: str, option: str) -> None:
         """Raise ValueError, or note the message where notes are taken and the caller knows a way around."""
         if self.notes is None:
             raise ValueError(message)
-        self.notes.append(message)
+        self.notes[message] = option
 
     def require(self, n_bytes: float, what: str) -> None:
         """Raise before reading if data unpack to more than ``max_bytes`` or than fits in memory."""
@@ -153,7 +155,7 @@ class Wanted:
         if self.rate is not None:
             times, labels["time_unit"] = [time / self.rate for time in times], "s"
         elif chosen.time is None:
-            self.refuse("it holds no times: give rate=, the samples a second (robosuite records 20).")
+            self.refuse("it holds no times: give rate=, the samples a second (robosuite records 20).", "rate")
             labels["time_unit"] = "samples"
         elif times and all(time.dtype.kind in "mM" for time in times):
             # Counted from the first of all, in which they are exact where dates would not be.
@@ -195,7 +197,8 @@ class Wanted:
         for name, what in found.items():
             apart = f", and demo={name!r} if it tells the demonstrations apart" if what.startswith("numbers") else ""
             movements = f"outputs={[names[i] for i in kept]}{apart}"
-            self.refuse(f"column {name!r}: it {what}, and is no movement: leave it out, or say {movements}.")
+            what = f"column {name!r}: it {what}, and is no movement"
+            self.refuse(f"{what}: leave it out, or say {movements}.", "outputs")
         if not found or not kept:
             return positions, labels
         each = {key: [labels[key][i] for i in kept] for key in ("names", "units") if isinstance(labels.get(key), list)}

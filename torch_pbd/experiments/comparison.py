@@ -118,13 +118,11 @@ def score_fold(
     start = time.thread_time()
     model, _ = fit_once(model, X[~left], y[~left], groups[~left], finished=finished)
     seconds = time.thread_time() - start
-    mean, covariance = model.predict(X[left], return_cov=True)
-    coverage = mahalanobis_coverage(mean.reshape(len(mean), -1), covariance, y[left], level=0.95)
-    # The score of a model of movements is that of the whole: here its rows are compared with those of regressors.
-    is_movement = hasattr(model, "score_demonstrations")
-    likelihood = -negative_log_likelihood(model, X[left], y[left]) if is_movement else model.score(X[left], y[left])
-    row = {"log_likelihood": likelihood, "coverage": float(coverage), "fit_seconds": seconds}
-    return row | judge_movement(model, X[left], y[left]) if whole else row
+    test = X[left], y[left]
+    # By rows, also of a model of movements, whose own score is that of the whole.
+    row = {"log_likelihood": -negative_log_likelihood(model, *test), "coverage": mahalanobis_coverage(model, *test)}
+    row["fit_seconds"] = seconds
+    return row | judge_movement(model, *test) if whole else row
 
 
 def movement_statistics(movements: Floats, mean: Floats, std: Floats) -> Floats:

@@ -82,7 +82,7 @@ def read_lerobot(path: Path, wanted: Wanted) -> Arguments:
     chosen = wanted.choose(signals, demo="episode_index", time="timestamp", outputs="observation.state")
     if wanted.units is None:
         joints = "'deg' or 'rad' of joints, 'percent' where they go from -100 to 100, or one for each"
-        wanted.refuse(f"it does not tell the units of {preview(chosen.names, 6)}: give units=, {joints}.")
+        wanted.refuse(f"it does not tell the units of {preview(chosen.names, 6)}: give units=, {joints}.", "units")
     # Several episodes a file in version 3, one in version 2; the numbers in the names are in order.
     files = sorted((path / "data").rglob("*.parquet"), key=lambda file: natural(file.relative_to(path).as_posix()))
     if not files:
